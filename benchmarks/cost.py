@@ -78,11 +78,8 @@ def fields() -> Iterator[tuple[str, Problems]]:
     tops = {f"top, {name}": tippe.Scene(top, arena, viscous) for name, arena in ARENAS.items()}
     tops |= {f"top, plane, {name}": tippe.Scene(top, tippe.Plane(), law) for name, law in LAWS.items()}
     tops |= {"egg": tippe.Scene(EGG, tippe.Plane(), viscous)}
-    rolling = tippe.NoSlip()
-    tops |= {
-        "rattleback": tippe.Scene(RATTLEBACK, friction=viscous),
-        "rattleback, rolling": tippe.Scene(RATTLEBACK, friction=rolling),
-    }
+    laws = {"": viscous, ", rolling": tippe.NoSlip(), ", set-valued": LAWS["set-valued"]}
+    tops |= {f"rattleback{name}": tippe.Scene(RATTLEBACK, friction=law) for name, law in laws.items()}
     tops |= {"rattleback, sphere": tippe.Scene(RATTLEBACK, tippe.Sphere(3.0), viscous)}
     tops |= {"top, sphere, with flights": tippe.Scene(top, tippe.Sphere(0.3), viscous, contact="hybrid")}
     tops |= {"top with a stem": tippe.Scene(ON_A_STEM, tippe.Plane(), LAWS["Coulomb"], contact="hybrid")}

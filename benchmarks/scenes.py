@@ -52,7 +52,7 @@ def scenes(launches: int) -> dict[str, Case]:
 
 
 def of_top(scene: tippe.Scene, launch: tippe.Launch, t1: float, angle: float | None, turns: bool = True) -> Case:
-    """A top that ends where theta reaches an angle, or, with `None`, at the horizon `t1` [s]; `turns`: as tables have it."""
+    """A top that ends where theta reaches an angle or, with `None`, at the horizon `t1` [s]; `turns`: as in tables."""
     body, law, cells = scene.body, scene.friction, launch.theta.shape[0]
     problem = InversionProblem.of(scene, launch, ANGLE if angle is None else angle, cells)
     if not turns:

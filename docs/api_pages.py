@@ -26,6 +26,16 @@ def of(package: str, names: str) -> list[str]:
     return [f"{package}.{name}" for name in names.split()]
 
 
+#: The rooms with the engine of the models.
+ENGINE_ROOMS = tuple(f"nonholonomic.{room}" for room in ("integration", "hybrid", "derivatives", "sweeps"))
+
+#: The public numbers of the engine; the docstrings of the rooms say what they mean.
+CONSTANTS = [
+    *of("nonholonomic.integration", "RUNNING REACHED_END CROSSED LEFT_DOMAIN FAILED UNRESOLVED"),
+    *of("nonholonomic.integration", "DEFAULT_MAX_STEPS MOST_STEPS TIGHTEST"),
+    *of("nonholonomic.hybrid", "MOST_ROUNDS BETWEEN"),
+]
+
 PAGES = {
     "scene": Page(
         "Scenes and launches",
@@ -89,6 +99,40 @@ PAGES = {
         ":doc:`runs <simulate>` and `plot` of :doc:`tables <sweeps>`.",
         ["tippe.explore", "stroller.explore"],
     ),
+    "engine": Page(
+        "The engine",
+        "Write models as fast as the top and the stroller, which use these names: functions of all runs at once. "
+        ":doc:`Your own systems <own_systems>` need none of them. The examples continue that of their room.",
+        [
+            "nonholonomic.integration",
+            *of(
+                "nonholonomic.integration",
+                "AbstractProblem CoreProblem AbstractPassive ExtendedProblem Settings "
+                "solve_ensemble traced_solve_ensemble solve_with_samples Outcome "
+                "crossing_time LaneState solve_by_diffrax follow DenseSolution padded sample explicit_tableau legal_run "
+                "run_bounds times_bounds tolerance_bound require_adaptive require_adjoint few_trials halved sign_changes",
+            ),
+            "nonholonomic.hybrid",
+            *of(
+                "nonholonomic.hybrid",
+                "AbstractBatchedMode AbstractHoppingMode Transition TransitionPath solve_hybrid traced_solve_hybrid "
+                "HybridOutcome solve_hybrid_with_tangents traced_solve_hybrid_with_tangents solve_hybrid_dense HybridPath "
+                "Segment hybrid_samples HybridSamples",
+            ),
+            "nonholonomic.derivatives",
+            *of(
+                "nonholonomic.derivatives",
+                "solve_ensemble_with_tangents traced_solve_ensemble_with_tangents tangents_of tangent_scale in_groups "
+                "VariationalProblem AbstractDifferentiableSolve differentiable_solve tangents_by sampled_run "
+                "sampled_run_by_diffrax SampledRun growth exponent_of",
+            ),
+            "nonholonomic.sweeps",
+            *of(
+                "nonholonomic.sweeps",
+                "sweep Axis axis Variable cells_to_check chunk_for saved_cells Quantity run_table Tabular",
+            ),
+        ],
+    ),
     "own_systems": Page(
         "Your own systems",
         "Run, time, sweep and fit systems that you write.",
@@ -130,6 +174,19 @@ MEMBERS = {
     "tippe.Free": "start lower upper prior unit",
     "nonholonomic.AbstractMode": "field margin reset",
     "nonholonomic.AbstractSystem": "dimension metric potential constraints frame force lagrangian energy",
+    "nonholonomic.integration.AbstractProblem": "leading direction_decides fits_one_kernel start field event_function "
+    "crossing_along domain_margin margins",
+    "nonholonomic.integration.AbstractPassive": "rates",
+    "nonholonomic.integration.Settings": "for_lanes for_single_runs for_steps_alone with_tolerance",
+    "nonholonomic.integration.DenseSolution": "at",
+    "nonholonomic.hybrid.AbstractBatchedMode": "problem reset_map shown between",
+    "nonholonomic.hybrid.AbstractHoppingMode": "most_hops lost hop closed motion_in",
+    "nonholonomic.hybrid.HybridPath": "left_domain failed mode_segments times states numbers at",
+    "nonholonomic.hybrid.Segment": "at",
+    "nonholonomic.derivatives.VariationalProblem": "parts",
+    "nonholonomic.sweeps.Quantity": "of",
+    "nonholonomic.sweeps.Tabular": "readable portrait_axes to_table to_xarray save portrait",
+    "nonholonomic.derivatives.AbstractDifferentiableSolve": "in_blocks movable absent solve value_and_tangents for_parts",
     "nonholonomic.Trajectory": "status to_table to_xarray save portrait plot",
 }
 
@@ -142,8 +199,8 @@ def public(package: str) -> list[str]:
 
 def resolve(dotted: str) -> Any:
     """The object behind a name such as "tippe.Scene"."""
-    package, name = dotted.split(".")
-    return getattr(importlib.import_module(package), name)
+    home, _, name = dotted.rpartition(".")
+    return getattr(importlib.import_module(home), name)
 
 
 def missing() -> list[str]:

@@ -29,7 +29,10 @@ from .geometry import Plane as Plane
 from .geometry import Sphere as Sphere
 from .geometry import Spheroid as Spheroid
 from .geometry import Torus as Torus
+from .identification import FitWarning as FitWarning
+from .identification import Free as Free
 from .integration import Status as Status
+from .sweeps import Table as Table
 from .sweeps import local_processes as local_processes
 from .systems import AbstractMode as AbstractMode
 from .systems import Hybrid as Hybrid

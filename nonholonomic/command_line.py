@@ -34,8 +34,8 @@ def import_quietly() -> None:
 def run_and_exit(main: Callable[[], int], program: str) -> NoReturn:
     """Run a command line and end the process.
 
-    A command line takes seconds. It therefore compiles quickly, and Python does not look for garbage among all the objects
-    that JAX holds, which would take up to a fifth of the time.
+    A command line takes seconds, so it compiles quickly. It also switches off garbage collection, which would take up
+    to a fifth of the time because JAX holds many objects.
 
     **Arguments:** as for `interruptible`.
     """
@@ -52,8 +52,8 @@ def run_and_exit(main: Callable[[], int], program: str) -> NoReturn:
 def closing_lines(runs: int, started: float, written: Iterable[Any], page: str) -> str:
     """The last lines of a command line.
 
-    **Arguments:** `runs`: how many runs there were; `started`: when, by `time.perf_counter`; `written`: the files; `page`:
-    what the user may open to see, and where it is.
+    **Arguments:** `runs`: number of runs; `started`: the start of the call, by `time.perf_counter`; `written`: the
+    files; `page`: what the page shows, and its path.
     """
     duration = time.perf_counter() - started
     files = ", ".join(map(str, written))

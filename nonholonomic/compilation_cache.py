@@ -35,24 +35,24 @@ _log = logging.getLogger(__name__)
 
 
 def enable_compilation_cache(folder: Any = None) -> Path | None:
-    """Keep compiled programs on disk, where later processes find them.
+    """Keep compiled programs on disk, where later processes find them. Call this function before the first computation.
+    If JAX's `jax_compilation_cache_dir` or an earlier call already chose a folder, that folder is kept unless you pass
+    another. In JAX's own folder, programs that compile in less than a second are not stored unless
+    `jax_persistent_cache_min_compile_time_secs` is 0.
 
-    Call it before the first computation. A folder that was already chosen, by JAX's own `jax_compilation_cache_dir` or
-    by an earlier call, is kept unless you pass another. In JAX's own folder, programs that compile in less than a
-    second are not stored unless `jax_persistent_cache_min_compile_time_secs` is 0.
-
-    In other folders, each new entry is checked once. If it does not decompress, because its writer was killed or its
-    copy is damaged, it is removed and compiled again. The check misses entries that are damaged later, entries that
-    decompress to something else, and damaged entries compressed by zstandard, which JAX uses if that package is
-    installed; these cost one compilation in every process. Nothing else is ever removed: delete the folder to remove
-    such entries and to reclaim space. The folder contains code, so choose one where nobody else can write.
+    In other folders, each new entry is checked once. An entry that does not decompress, because its writer was killed
+    or its copy is damaged, is removed and its program is compiled again. The check misses entries that are damaged
+    later, and entries compressed by zstandard, which JAX uses if that package is installed. Each missed entry costs a
+    compilation in every process; delete the folder to remove them, and to reclaim space. The folder contains code, so
+    choose one where nobody else can write.
 
     **Arguments:** `folder`: where to store the programs, by default `nonholonomic` in the user's cache folder
     (`XDG_CACHE_HOME`, or `~/.cache`). It gets a subfolder for every version of jaxlib, kind of processor and set of XLA
     flags.
 
-    **Returns:** the folder in use; `None` if `NONHOLONOMIC_CACHE` (0, off, false or no) forbids it or if the folder
-    cannot be written, which is logged as a warning. A full disk is also logged; programs are still read from it.
+    **Returns:** the folder in use; `None` if `NONHOLONOMIC_CACHE` (0, off, false or no) switches the cache off, or if
+    the folder cannot be written, which is logged as a warning. A full disk is also logged; programs can still be read
+    from it.
 
     **Raises:** `ValueError` if the folder is not a path.
 
@@ -184,10 +184,10 @@ def sound(entry: bytes) -> bool:
 
 
 def kept_text(folder: Path | None, facts: Any, compute: Callable[[], str]) -> str:
-    """A text that takes seconds to compute, such as a page with sliders; kept beside the compiled programs.
+    """A text that takes seconds to compute, such as a page with sliders, stored beside the compiled programs.
 
-    **Arguments:** `folder`: of `enable_compilation_cache`, `None` if nothing is kept; `facts`: all that the text depends on
-    besides these packages, with a `repr`.
+    **Arguments:** `folder`: that of `enable_compilation_cache`, or `None` to store nothing; `facts`: everything that
+    the text depends on besides these packages, with a `repr`.
     """
     if folder is None:
         return compute()

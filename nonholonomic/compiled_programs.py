@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 def forget_programs_if_many(most_memory: int = MOST_MEMORY) -> bool:
     """Clear all compiled programs if they take too much memory, and log a one-line warning.
 
-    A program that is used again is then compiled again, or read from disk (`enable_compilation_cache`). Nothing is
+    The next call of a cleared program compiles it again, or reads it from disk (`enable_compilation_cache`). Nothing is
     cleared inside transformations, outside the main thread, or if the system does not report the memory of a process
     (`/proc`).
 
@@ -90,7 +90,8 @@ def most_mappings() -> int:
 
 
 def release_memory() -> None:
-    """Return freed memory to the system: 240 of 700 MB after compiling a hybrid scene. Only glibc holds so much."""
+    """Return freed memory to the system: 240 of 700 MB after compiling a hybrid scene. Only glibc keeps so much freed
+    memory."""
     if hasattr(_libc, "malloc_trim"):
         _libc.malloc_trim(0)
 

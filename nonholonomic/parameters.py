@@ -22,8 +22,8 @@ def numbers(root: str, tree: Any, functions: bool = True) -> dict[str, Any]:
     - `tree`: an `equinox.Module`.
     - `functions`: whether to include the parameters of modules that are functions, which may be arrays.
 
-    **Returns:** dotted name -> number, in the order in which the modules declare them; `None` for an omitted number
-    (one that has an entry in the `units` of its module).
+    **Returns:** dotted name -> number, in the order in which the modules declare them; `None` for an optional number
+    that was omitted.
     """
     values = {}
     for field in dataclasses.fields(tree):

@@ -26,11 +26,9 @@ COMPILERS = (
 
 
 class Progress:
-    """A status line: what is being done and, once items are counted, how many are done, how fast, and how many are
-    left.
-
-    Use it as a context manager. If several are nested, the innermost one that counts items owns the line, or else the
-    outermost one. The line disappears at the end, unless the outermost context counts items.
+    """A status line: what a call does and, once it counts items, how many are done, how fast, and how many are left.
+    Use it as a context manager. If contexts are nested, the innermost context that counts items owns the line,
+    otherwise the outermost. The line disappears at the end, unless the outermost context counts items.
 
     A separate thread writes the line, because compiling blocks the caller's thread for many seconds. Nothing is written
     if standard error is neither a terminal nor a notebook's, or with `NONHOLONOMIC_PROGRESS=0`.
@@ -52,7 +50,7 @@ class Progress:
         self._bar: Any = None
 
     def begin(self, done: int = 0) -> None:
-        """End the preparations; `done` items had been done before."""
+        """Start counting; `done` items were done before."""
         with _LINE.lock:
             self._done = self._first = done
             self._since = time.time()
@@ -175,9 +173,8 @@ _LINE = _Line()
 
 @contextmanager
 def status_line(doing: str, shown: bool = True) -> Iterator[Progress]:
-    """Show what a call is doing if it takes long because it compiles; also a decorator for functions.
-
-    Before that, clear programs that take too much memory (`compiled_programs.py`).
+    """Show a status line while a call compiles; also a decorator for functions. First clear programs that take too much
+    memory (`compiled_programs.py`).
     """
     forget_programs_if_many()
     with Progress(None, doing=doing, shown=shown) as line:
@@ -185,8 +182,8 @@ def status_line(doing: str, shown: bool = True) -> Iterator[Progress]:
 
 
 def is_making_programs(thread: int) -> bool:
-    """Whether JAX is tracing or compiling in a thread, which JAX does not report. A call takes 0.5 ms, twice a
-    second."""
+    """Whether JAX is tracing or compiling in a thread, which JAX itself does not report. The check takes 0.5 ms, twice
+    a second."""
     frame = sys._current_frames().get(thread)
     while frame is not None:
         module, name = frame.f_globals.get("__name__"), frame.f_code.co_name
@@ -197,7 +194,7 @@ def is_making_programs(thread: int) -> bool:
 
 
 def is_watched() -> bool:
-    """Whether somebody may be looking: standard error is a terminal, or this is a notebook."""
+    """Whether a status line would be visible: standard error is a terminal, or this process is a notebook."""
     # A closed stream raises an error.
     is_open = not getattr(sys.stderr, "closed", False)
     return (is_open and getattr(sys.stderr, "isatty", bool)()) or is_notebook()

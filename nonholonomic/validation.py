@@ -29,8 +29,8 @@ IN_DEGREES = "; angles are in radians: did you mean np.radians({})?"
 
 
 def as_number(value: Any) -> Float[Array, "..."]:
-    """Convert to a floating-point array of the default precision; anything that is not a number is left for
-    `require`."""
+    """Convert to a floating-point array of the default precision; anything that is not a number stays unchanged, for
+    `require` to reject."""
     try:
         if isinstance(value, str):
             raise TypeError
@@ -46,7 +46,8 @@ def as_number_or_none(value: Any) -> Float[Array, "..."] | None:
 
 
 def as_known(value: Any) -> Float[Array, "..."]:
-    """Like `as_number`, but a known number stays known inside a transformation; `jax.jit` would trace the array."""
+    """Like `as_number`, but a concrete number stays concrete inside a transformation, where `jax.jit` would trace an
+    array."""
     if any(is_traced(leaf) for leaf in jax.tree.leaves(value)):
         return as_number(value)
     with jax.ensure_compile_time_eval():
@@ -127,14 +128,15 @@ def require(
 
 
 def require_scalars(values: dict[str, Any], otherwise: str) -> None:
-    """Raise `ValueError` unless each named value is one number or omitted; `otherwise` says what accepts lists."""
+    """Raise `ValueError` unless each named value is a single number or omitted; `otherwise` names what accepts
+    lists."""
     for name, value in values.items():
         if value is not None and np.ndim(value) != 0:
             raise ValueError(f"{name} must be one number, not of shape {np.shape(value)}; {otherwise}")
 
 
 def require_kind(value: Any, name: str, kind: type, example: str = "") -> None:
-    """Raise `ValueError` unless a value is of a kind, such as a `Scene`.
+    """Raise `ValueError` unless a value is of the given kind, such as a `Scene`.
 
     If the value is a module of the same name from another package, such as a stroller's scene for a top, the message
     names both packages; otherwise it ends in the `example`.
@@ -149,13 +151,14 @@ def require_kind(value: Any, name: str, kind: type, example: str = "") -> None:
 
 
 def uncalled(value: Any) -> str:
-    """Hint for a function passed instead of its result, as `tippe.presets.wooden` for `tippe.presets.wooden()`."""
+    """A hint if the value is a function instead of its result, such as `tippe.presets.wooden` for
+    `tippe.presets.wooden()`."""
     return f"; did you mean {value.__name__}()?" if inspect.isfunction(value) else ""
 
 
 def require_one_run(run: Any, action: str, many: str) -> None:
-    """Raise `ValueError` for a batch of runs. **Arguments:** `action`: what takes one run; `many`: what accepts
-    several."""
+    """Raise `ValueError` for a batch of runs. **Arguments:** `action`: what takes a single run; `many`: what accepts
+    several runs."""
     if np.ndim(run.t) != 1:
         raise ValueError(
             f"this is a batch of runs, with t of shape {np.shape(run.t)}, and {action} takes one run: select one by "
@@ -241,8 +244,8 @@ def require_file(path: Any, name: str, *endings: str) -> Path:
 def require_package(name: str, extra: str, purpose: str) -> None:
     """Raise `ModuleNotFoundError` unless an optional package is installed. Call this before the work begins.
 
-    **Arguments:** `name`: of the package; `extra`: the extra of this distribution that installs it; `purpose`: what
-    needs it.
+    **Arguments:** `name`: name of the package; `extra`: the extra of this distribution that installs it; `purpose`:
+    what needs it.
     """
     if find_spec(name) is None:
         raise ModuleNotFoundError(f"{purpose} needs {name}: pip install 'nonholonomic[{extra}]'", name=name)
@@ -293,7 +296,7 @@ class Bounded(eqx.Module):
         return ()
 
     def suspicion(self) -> str | None:
-        """A doubt that legal numbers raise, such as another unit; `None` if there is none."""
+        """A possible mistake in legal numbers, such as another unit, as text; `None` if there is none."""
         return None
 
     def __check_init__(self):
@@ -348,7 +351,7 @@ def all_bounds(module: Any) -> Iterator[Bound]:
 
 
 def legal(bounds: Iterable[Bound]) -> Bool[Array, "..."]:
-    """Whether all numbers are within their ranges, for numbers that were traced when `require` checked them.
+    """Whether all numbers are within their ranges; for traced numbers, which `require` cannot check.
 
     Numbers of different shapes are broadcast: one for all cells, or one per cell.
     """

@@ -1,4 +1,4 @@
-"""The friction laws, and what a law of your own is made of."""
+"""The friction laws, and the classes for a law of your own."""
 
 from .model.friction import AbstractFriction as AbstractFriction
 from .model.friction import Damping as Damping

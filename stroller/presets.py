@@ -1,6 +1,6 @@
 """Ready-made strollers and rides.
 
-The papers on the stroller print no numbers. These values were chosen to be of ordinary size; no stroller was measured.
+The papers on the stroller state no numbers. We chose ordinary values; no stroller was measured.
 
 **Example:**
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import api_pages
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -180,6 +181,24 @@ def test_private_modules_and_names_stay_in_their_rooms():
         return any(part.startswith("_") and not part.endswith("__") for part in parts)
 
     assert [str(arrow) for arrow in ALL_ARROWS if private(arrow) and room(arrow.file) != room(arrow.module)] == []
+
+
+def test_the_vehicles_use_only_the_public_engine():
+    """What they import from its rooms is on a page of the API, so that others can write models as fast as theirs."""
+    public = {id(api_pages.resolve(name)) for page in api_pages.PAGES.values() for name in page.names}
+
+    def is_private(name: str) -> bool:
+        return name not in api_pages.CONSTANTS and id(api_pages.resolve(name)) not in public
+
+    used = {
+        f"{arrow.module}.{name}": str(arrow)
+        for arrow in ARROWS
+        if arrow.file.split("/")[0] in ("tippe", "stroller") and arrow.module.startswith(api_pages.ENGINE_ROOMS)
+        for name in arrow.names
+    }
+    assert {"nonholonomic.integration.AbstractProblem", "nonholonomic.hybrid.Transition"} <= set(used)
+    assert [arrow for name, arrow in used.items() if is_private(name)] == []
+    assert is_private("nonholonomic.integration.LaneScheduler")
 
 
 def test_what_is_imported_at_once_is_required():

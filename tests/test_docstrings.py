@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import pytest
+from api_pages import ENGINE_ROOMS, PAGES, resolve
 from jax.experimental.compilation_cache import compilation_cache
 
 PACKAGES = ("tippe", "stroller", "nonholonomic")
@@ -58,9 +59,13 @@ MEMBERS = [
 ]
 
 
-def complaints(text: str, known: dict[str, Any]) -> str:
+#: The rooms of the engine, and the names in each that are handed out for fast models.
+ENGINE = {room: [name for name in PAGES["engine"].names if name.startswith(f"{room}.")] for room in ENGINE_ROOMS}
+
+
+def complaints(text: str, known: dict[str, Any], name: str = "example") -> str:
     """What is wrong with the examples in a text: none runs, or one gives something else; `known` gets the names they make."""
-    example = doctest.DocTestParser().get_doctest(text, {}, "example", None, None)
+    example = doctest.DocTestParser().get_doctest(text, {}, name, None, None)
     if all(doctest.SKIP in line.options for line in example.examples):
         return "no example runs"
     # A copy of the names was made, which is to be kept.
@@ -115,3 +120,12 @@ def test_the_public_names_are_those_that_people_use():
     names = {name for name, *_ in (*NAMES.values(), *MEMBERS)}
     assert {"tippe.Top", "tippe.steady.group", "tippe.inversion_table", "stroller.simulate"} <= names
     assert len(names) > 40
+
+
+@pytest.mark.parametrize("room", ENGINE)
+def test_the_examples_of_the_engine_give_what_they_say(room):
+    """They go on from the example of their room."""
+    known: dict[str, Any] = {}
+    assert not complaints(inspect.getdoc(importlib.import_module(room)) or "", known, room)
+    for name in ENGINE[room]:
+        assert not complaints(inspect.getdoc(resolve(name)) or "", dict(known), name)

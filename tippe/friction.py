@@ -1,4 +1,5 @@
-"""The friction laws, and what a law of your own is made of: the slip that it is asked about and the load that it answers."""
+"""The friction laws, and the classes for a law of your own: the slip at the contact, and the load that the law
+returns."""
 
 from .model.friction import AbstractFriction as AbstractFriction
 from .model.friction import ContactLoad as ContactLoad

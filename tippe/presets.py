@@ -1,7 +1,7 @@
 """Ready-made tops from a classroom and from the literature, each with its source.
 
-The tippe tops that Cross filmed (Am. J. Phys. 81 (2013) 280; Phys. Teach. 51 (2013) 144) are missing: we had no access to their
-dimensions and did not guess them. `Top.turned` makes a top of a measured shape.
+The tippe tops that Cross filmed (Am. J. Phys. 81 (2013) 280; Phys. Teach. 51 (2013) 144) are missing, because we do not
+know their dimensions. Use `Top.turned` for a top whose shape you can measure.
 
 **Example:** a wooden top, spun by hand with `tippe.Launch.degrees(theta=6, rpm=1900)`, climbs onto its stem within 3 s.
 
@@ -54,8 +54,8 @@ def classroom(surface: AbstractSurface = Plane()) -> Scene:  # noqa: B008
 def rutstam() -> Top:
     """Rutstam's top: 20 g, R = 2 cm, alpha = 0.3, I3 = 2/5 m R^2, I1 = 131/350 m R^2 (his later papers have this I1).
 
-    He computes with viscous friction, `Viscous(0.3)`. The papers do not say how the top is made, and it has no stem.
-    SIGMA 8 (2012) 019 has I1 = 235/625 m R^2; use that value for the figures of that paper.
+    He computes with viscous friction, `Viscous(0.3)`. The top has no stem; the papers do not describe its shape. For
+    the figures of SIGMA 8 (2012) 019, use that paper's I1 = 235/625 m R^2.
 
     **Example:**
 
@@ -69,8 +69,8 @@ def rutstam() -> Top:
 def cohen() -> Top:
     """Cohen's top: 15 g, R = 2.5 cm, a = 0.5 cm, I1 = I3 = 2/5 m R^2 (Am. J. Phys. 45 (1977) 12).
 
-    He computes with Coulomb friction, mu = 0.3. The paper does not say how friction behaves as the slip vanishes, and
-    exact Coulomb friction does not turn this top over; regularised with 0.11 m/s, it follows his Figure 5
+    He computes with Coulomb friction, mu = 0.3. The paper does not state how friction behaves as the slip vanishes.
+    Exact Coulomb friction does not turn this top over; with a slip speed of 0.11 m/s, the top follows his Figure 5
     (`examples/cohens_figure.py`). The top has no stem.
 
     **Example:**
@@ -85,8 +85,8 @@ def cohen() -> Top:
 def leine_glocker() -> Top:
     """Leine and Glocker's top with a stem: 6 g, R = 1.5 cm (Eur. J. Mech. A/Solids 22 (2003) 193).
 
-    Their top starts at theta = 0.1 rad with 180 rad/s and mu = 0.3, under Coulomb-Contensou friction. The paper gives
-    the moments of inertia as numbers, but not how the top is made.
+    Their top starts at theta = 0.1 rad with 180 rad/s and mu = 0.3, under Coulomb-Contensou friction. The paper states
+    the moments of inertia, but not the shape of the top.
 
     **Example:**
 

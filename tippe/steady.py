@@ -3,8 +3,8 @@
 A standing top spins with its axis along the normal: upright (stem out, theta = 0) or inverted (stem in, theta = pi). On
 the plane, tumbling tops lie between: the axis precesses at a fixed inclination, with the centre of mass at rest and
 without slip. The formulas hold for friction laws that vanish only with the slip, not for `Contensou` and `Rolling`,
-under which every spin decays; alpha = a / R and gamma = I1 / I3. For a top with a stem, they describe the motions on
-its own sphere; only `inverted_critical_spin` refers to the stem, on which such a top stands inverted.
+under which every spin decays; alpha = a / R and gamma = I1 / I3. For a top with a stem, the formulas describe the
+motions on the top's own sphere; only `inverted_critical_spin` refers to the stem, on which such a top stands inverted.
 
 The stability matrices are Jacobians of the scene's own field, without the directions that are neutral by symmetry or by
 conservation, so an eigenvalue with a positive real part always means instability.
@@ -64,8 +64,8 @@ def proportions(body: Top) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
 def group(body: Top) -> str:
     """The group of a top (Rutstam 2012; Ciocci et al. 2012).
 
-    **Returns:** "I" if gamma < 1 - alpha: the top stands upright at every spin; "III" if gamma > 1 + alpha: it never
-    stands inverted, and ends tumbling; "II" otherwise: it inverts if Jellett's constant is large enough.
+    **Returns:** "I" if gamma < 1 - alpha: the top stands upright at every spin; "III" if gamma > 1 + alpha: the top
+    never stands inverted, and ends tumbling; "II" otherwise: the top inverts if Jellett's constant is large enough.
 
     **Example:** with the scene of the module.
 
@@ -80,7 +80,7 @@ def folds(body: Top) -> bool:
     """Whether Jellett's constant has an extremum over the tumbling angles of a top of group II, which causes
     hysteresis.
 
-    It has none if gamma > 1 - delta, delta = (1 + 6 alpha + alpha^2 - (1 - alpha) sqrt(1 + 14 alpha + alpha^2)) / 8.
+    There is none if gamma > 1 - delta, delta = (1 + 6 alpha + alpha^2 - (1 - alpha) sqrt(1 + 14 alpha + alpha^2)) / 8.
 
     **Example:** with the scene of the module.
 
@@ -101,9 +101,8 @@ def _root_of_ratio(value: Float[Array, "..."], excess: Float[Array, "..."]) -> F
 
 
 def upright_critical_spin(scene: Scene[Top]) -> Float[Array, "..."]:
-    """Spin [rad/s] above which the upright top on the plane is unstable; infinite if it never is.
-
-    omega^2 = m g a (1 - alpha)^2 / (I3 (gamma - 1 + alpha)).
+    """Spin [rad/s] above which the upright top on the plane is unstable; infinite if there is none. omega^2 = m g a (1
+    - alpha)^2 / (I3 (gamma - 1 + alpha)).
 
     **Example:** with the scene of the module.
 
@@ -116,9 +115,9 @@ def upright_critical_spin(scene: Scene[Top]) -> Float[Array, "..."]:
 
 
 def inverted_critical_spin(scene: Scene[Top]) -> Float[Array, "..."]:
-    """Spin [rad/s] above which the inverted top on the plane (on its stem, if any) is stable; infinite if it never is.
-
-    omega^2 = m g a (1 + alpha)^2 / (I3 (1 + alpha - gamma)), for a stem with its offset and radius (`tippe.md`, sections 4, 6).
+    """Spin [rad/s] above which the inverted top on the plane (on its stem, if any) is stable; infinite if there is
+    none. omega^2 = m g a (1 + alpha)^2 / (I3 (1 + alpha - gamma)), for a stem with its offset and radius (`tippe.md`,
+    sections 4, 6).
 
     **Example:** with the scene of the module.
 
@@ -134,7 +133,8 @@ def inverted_critical_spin(scene: Scene[Top]) -> Float[Array, "..."]:
 def jellett_thresholds(scene: Scene[Top]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Jellett's constant [kg m^3/s] of the standing tops at their critical spins, upright and inverted.
 
-    Below the first, the upright top is stable; above the second, the inverted one is (Rutstam's lambda_thres).
+    Below the first constant, the upright top is stable; above the second, the inverted top is stable (Rutstam's
+    lambda_thres).
 
     **Raises:** `ValueError` for a top with a stem: Jellett's constant of its sphere is not that of its stem.
 
@@ -267,7 +267,7 @@ def tumbling(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> Tumbling:
 
 
 def tumbling_is_stable(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
-    """Whether the tumbling top is stable: J^2 grows with theta there, that is 4 D^2 + G (I1 - I3) > 0.
+    """Whether the tumbling top is stable: J^2 grows with theta, that is, 4 D^2 + G (I1 - I3) > 0.
 
     **Example:** with the scene of the module.
 
@@ -283,7 +283,7 @@ def effective_energy(
 ) -> Float[Array, "..."]:
     """Least energy [J] of a top with the given inclination and Jellett's constant: J^2 / (2 R^2 G) + m g (R - a cos).
 
-    Its extrema over theta are the steady motions, its minima the stable ones.
+    Its extrema over theta are the steady motions, and its minima are the stable motions.
 
     **Example:** with the scene of the module.
 
@@ -356,12 +356,12 @@ def quarter_turn(state: Float[Array, " 8"]) -> Float[Array, " 8"]:
 def tumbling_matrix(scene: Scene[Top], motion: Tumbling) -> Float[Array, "5 5"]:
     """Matrix [1/s] of the linear motion near a tumbling top, in a frame that precesses with it.
 
-    It covers the five directions that keep |e| and Jellett's constant and do not only turn the top about the vertical.
+    The matrix covers the five directions that keep |e| and Jellett's constant, except a mere turn about the vertical.
 
     **Arguments:**
 
     - `scene`: a `Scene` on the plane, with friction.
-    - `motion`: from `tumbling`.
+    - `motion`: a motion from `tumbling`.
 
     **Example:** with the scene of the module.
 

@@ -147,7 +147,7 @@ def angles() -> Any:
     arrow(tangent, (0.0, 0.0), (1.6, 0.0), r"$\mathbf{t}_1$", PLAIN)
     arrow(tangent, (0.0, 0.0), (0.0, 1.6), r"$\mathbf{t}_2$", PLAIN)
     arrow(tangent, (0.0, 0.0), 1.3 * np.array([np.cos(azimuth), np.sin(azimuth)]), r"$\mathbf{e}$", BODY)
-    arc(tangent, (0.0, 0.0), 0.6, (0.0, azimuth), r"azimuth $\varphi$")
+    arc(tangent, (0.0, 0.0), 0.6, (0.0, azimuth), r"azimuth $\phi$")
     tangent.plot(0.0, 0.0, "o", color=PLAIN, markersize=5)
     tangent.text(-0.15, -0.2, r"$\mathbf{n}$ points at you", fontsize=10)
     tangent.set(xlim=(-0.4, 2.0), ylim=(-0.4, 1.9), title="the tangent plane")

@@ -25,7 +25,13 @@ Primal = Any
 
 
 class AbstractDifferentiableSolve(eqx.Module):
-    """A solve as a function of `leaves`; the first `movable` leaves are differentiable."""
+    """A solve as a function of `leaves`; the first `movable` leaves are differentiable.
+
+    **Example:** the solve of the room's example, for two cells.
+
+    >>> print(HalfLife().solve(2, jnp.array([1.0, 2.0])).round(6))
+    [0.693147 0.346574]
+    """
 
     #: Whether a batch is run as one ensemble; otherwise each run is separate, with a single cell.
     in_blocks: ClassVar[bool] = True
@@ -38,7 +44,7 @@ class AbstractDifferentiableSolve(eqx.Module):
 
     @abc.abstractmethod
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Primal:
-        """The primal in every cell; each leaf is a scalar or has one number per cell."""
+        """The primal in every cell; each leaf is a scalar or an array with one number per cell."""
 
     @abc.abstractmethod
     def value_and_tangents(
@@ -47,12 +53,12 @@ class AbstractDifferentiableSolve(eqx.Module):
         """The primal and its derivative by each active leaf, shaped like the primal with the leaf's own axes last;
         `None` for a part of the primal that is not differentiable.
 
-        **Arguments:** `active`: which leaves; `nested`: whether the outputs will be differentiated once more, in forward
-        mode; `cells`, `leaves`: as for `solve`.
+        **Arguments:** `active`: which leaves to differentiate by; `nested`: whether the outputs will be differentiated
+        again, in forward mode; `cells`, `leaves`: as for `solve`.
         """
 
     def for_parts(self, wanted: tuple[int, ...]) -> Self:
-        """A solve that may omit (as `None`) all but some outputs; by default it omits none.
+        """A solve that may replace outputs that are not wanted by `None`; by default it replaces none.
 
         **Arguments:** `wanted`: indices into the parts of the primal, or of the primal followed by its derivatives.
         """
@@ -65,6 +71,11 @@ def differentiable_solve(solve: AbstractDifferentiableSolve, *leaves: Float[Arra
     **Arguments:** `leaves`: the numbers of a single cell, in the order of the solve.
 
     **Returns:** the primal, without the axis of cells.
+
+    **Example:**
+
+    >>> print(f"{jax.jvp(half_life, (2.0,), (1.0,))[1]:.6f}")
+    -0.173287
     """
 
     @jax.custom_jvp
@@ -154,11 +165,17 @@ def tangents_by(
     **Arguments:**
 
     - `build`: (leaves, cells) -> problem.
-    - `active`, `leaves`: the leaves to move, and all leaves. With `cells` they are scalars or one per cell; without,
-      arrays of any shape, each entry of which has its own tangent.
+    - `active`, `leaves`: the leaves to move, and all leaves. With `cells`, a leaf is a scalar or an array with one
+      number per cell; without, it is an array of any shape, and each of its entries has its own tangent.
 
     **Returns:** the problem; its tangents; and a function that turns derivatives along the tangents (trees of arrays)
     into derivatives by each leaf, the leaf's own axes last (with `cells` there are none, and the cells come first).
+
+    **Example:** the tangent of a problem moves its rate by its own size.
+
+    >>> problem, tangents, gather = tangents_by(build, (0,), (jnp.array([1.0, 2.0]),), 2)
+    >>> print(tangents[0].rate)
+    [1. 2.]
     """
 
     def moved(*moving: Array) -> Any:

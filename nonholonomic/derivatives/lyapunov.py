@@ -25,7 +25,7 @@ class VariedProblem(AbstractProblem):
 
     - `problem`: an autonomous problem; only its field and its domain margin are used.
     - `states`: the problem's state, the tangent and the growth of every cell.
-    - `magnitudes`: of the problem's own components.
+    - `magnitudes`: magnitudes of the problem's own components.
     """
 
     problem: AbstractProblem
@@ -59,10 +59,8 @@ class VariedProblem(AbstractProblem):
 
 
 def probed(problem: AbstractProblem) -> VariedProblem:
-    """A run and a generic tangent, for a derivative that does not take part in step-size control itself.
-
-    The tangent follows the linearised motion and takes part in step-size control, so that the steps suit tangents even
-    where the state is at rest.
+    """A run and a generic tangent, for derivatives that do not take part in step-size control. The generic tangent does
+    take part, so that the steps suit tangents even where the state is at rest.
     """
     start, magnitudes = problem.start()
     direction = jnp.cos(1.0 + jnp.arange(len(start)))
@@ -75,9 +73,9 @@ def probed(problem: AbstractProblem) -> VariedProblem:
 class Growth(NamedTuple):
     """Growth of a tangent in every cell, in equal intervals of time.
 
-    - `logarithm`: of the growth in each interval.
-    - `status`: code of `integration/status.py`: how the run ended; `end_time` [s] and `state`: when and where; `steps`:
-      accepted and rejected ones.
+    - `logarithm`: logarithm of the growth in each interval.
+    - `status`: how the run ended, a code of `integration/status.py`; `end_time` [s] and `state`: when and where it
+      ended; `steps`: number of accepted and rejected steps.
     """
 
     logarithm: Float[np.ndarray, "stretches cells"]
@@ -98,13 +96,21 @@ def growth(
 
     **Arguments:**
 
-    - `problem`: as for `ensemble_solve`.
-    - `tangents`: in the problem's own units.
+    - `problem`: as for `solve_ensemble`.
+    - `tangents`: tangents in the problem's own units.
     - `t1`: horizon [s].
     - `stretches`: number of time intervals; the growth is returned for each.
-    - `settings`: with an explicit Runge-Kutta solver of Diffrax.
+    - `settings`: their solver must be an explicit Runge-Kutta solver of Diffrax.
 
     **Returns:** the `Growth`; nothing grows in a cell after its run has ended.
+
+    **Example:** neighbouring runs of a decay approach each other.
+
+    >>> from nonholonomic.derivatives import growth
+    >>> result = growth(Decays(jnp.array([1.0, 2.0])), jnp.ones((1, 2)), 8.0, 2, settings)
+    >>> print(result.logarithm.round(6))
+    [[-4. -8.]
+     [-4. -8.]]
     """
     start, magnitudes = problem.start()
     size, cells = start.shape
@@ -137,15 +143,23 @@ def exponent_of(
     """Estimate the exponent and its error from the growth.
 
     The first half of the run is left out: there the tangent still turns towards the direction of fastest growth. The
-    error has two parts: the scatter of the other half's intervals, in groups of 1, 2 and 4, and that of the last three
-    quarters, whichever is largest, because chaotic motion lingers near orderly motion (Flyvbjerg and Petersen, J. Chem.
-    Phys. 91 (1989) 461); and ln 2 over half the run, the share of the linear divergence of orderly motion. An exponent
-    below twice its error is no sign of chaos. Where motion lingers for long, the error is too small by a factor of up
-    to four (`tests/tippe/test_lyapunov.py`).
+    error has two parts. The first is the largest scatter of the intervals of the other half, in groups of 1, 2 and 4,
+    and of the last three quarters, because chaotic motion lingers near orderly motion (Flyvbjerg and Petersen, J. Chem.
+    Phys. 91 (1989) 461). The second is ln 2 over half the duration of the run, for the linear divergence of orderly
+    motion. An exponent below twice its error is no sign of chaos. Where motion lingers for long, the error is up to
+    four times too small (`tests/tippe/test_lyapunov.py`).
 
-    **Arguments:** `logarithm`: as in `Growth`, the number of intervals a multiple of 8; `t1`: time [s] that it spans.
+    **Arguments:** `logarithm`: as in `Growth`, with a multiple of 8 intervals; `t1`: duration [s] of all intervals.
 
     **Returns:** exponent and error [1/s].
+
+    **Example:** growth by a factor of e per second.
+
+    >>> import numpy as np
+    >>> from nonholonomic.derivatives import exponent_of
+    >>> exponent, error = exponent_of(np.ones((16, 1)), t1=16.0)
+    >>> print(exponent, error.round(3))
+    [1.] [0.087]
     """
     count = logarithm.shape[0]
     rates = logarithm / (t1 / count)

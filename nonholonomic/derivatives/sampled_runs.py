@@ -36,11 +36,17 @@ NOT_DIFFERENTIATED: tuple[Any, ...] = (None,) * 4
 
 
 class SampledRun(NamedTuple):
-    """A run at given times, all floats: its states, NaN after its end; when and where it ended, the status code
-    (`REACHED_END`, `LEFT_DOMAIN` or `FAILED`), and the numbers of accepted and rejected steps.
+    """A run at given times, as floats: its states, NaN after its end; when and where it ended; the status code
+    (`REACHED_END`, `LEFT_DOMAIN` or `FAILED`); and the numbers of accepted and rejected steps.
 
-    `states` and `end_state` are the core components (the problem's `leading` ones), `quadratures` the passive quadratures,
-    `None` if there are none. If a program does not use `quadratures`, the ensemble runs without them.
+    `states` and `end_state` are the core components (the problem's `leading` ones), and `quadratures` are the passive
+    quadratures, `None` if there are none. If a program does not use `quadratures`, the ensemble runs without them.
+
+    **Example:** as for `sampled_run`.
+
+    >>> from nonholonomic.derivatives import SampledRun
+    >>> SampledRun._fields[:3]
+    ('states', 'quadratures', 'end_time')
     """
 
     states: Float[Array, "*cells times components"]
@@ -67,13 +73,22 @@ def sampled_run(
 
     **Arguments:**
 
-    - `build`: makes the problem from the modules; compared by identity, so do not create a new function for each call.
+    - `build`: function from the modules to the problem. Functions are compared by identity, so do not create a new one
+      for each call.
     - `modules`: the tree whose numbers are differentiable.
-    - `times`: of the samples [s], increasing; `t1`: horizon [s].
+    - `times`: times of the samples [s], increasing; `t1`: horizon [s].
     - `settings`: the tolerance may be traced.
     - `grid`: the ends of the steps [s], concrete, for a solver without an error estimate.
 
     **Returns:** a `SampledRun`; its states and the time of its end have derivatives.
+
+    **Example:**
+
+    >>> from nonholonomic.derivatives import sampled_run
+    >>> def final(rate):
+    ...     return sampled_run(build, (rate,), jnp.array([0.1, 0.3]), jnp.asarray(0.3), settings).states[-1, 0]
+    >>> print(f"{jax.grad(final)(2.0):.6f}")  # -0.3 exp(-0.6)
+    -0.164643
     """
     scalars = all(leaf.ndim == 0 for leaf in jax.tree.leaves(modules) if eqx.is_inexact_array(leaf))
     kind = BlockSampling if scalars and isinstance(settings.for_lanes, diffrax.AbstractERK) else SingleSampling
@@ -137,11 +152,21 @@ def sampled_run_by_diffrax(
     adjoint: diffrax.AbstractAdjoint,
     grid: Float[Array, " steps"] | None = None,
 ) -> SampledRun:
-    """Run a problem and let Diffrax differentiate its steps, which a probe keeps short enough for tangents.
-
-    Fixed steps (`grid`) need no probe.
+    """Run a problem and let Diffrax differentiate its steps. A probe (`probed`) keeps the steps short enough for
+    tangents; fixed steps (`grid`) need none.
 
     **Arguments:** as for `sampled_run`; `adjoint`: how Diffrax differentiates.
+
+    **Returns:** a `SampledRun`.
+
+    **Example:**
+
+    >>> import diffrax
+    >>> from nonholonomic.derivatives import sampled_run_by_diffrax
+    >>> times, adjoint = jnp.array([0.1, 0.3]), diffrax.ForwardMode()
+    >>> run = sampled_run_by_diffrax(Decays(jnp.asarray(2.0)), times, jnp.asarray(0.3), settings, adjoint)
+    >>> print(run.states[:, 0].round(6))
+    [0.818731 0.548812]
     """
     size = len(problem.start()[0])
     leading = size if problem.leading is None else problem.leading
@@ -158,7 +183,7 @@ def _status(path: SampledSolution, t1: Float[Array, ""]) -> Int[Array, ""]:
 
 
 class BlockSampling(AbstractSampling):
-    """Samples by an ensemble solve, with the passive quadratures or without (`alone`)."""
+    """Samples by an ensemble solve, with passive quadratures or, if `alone`, without them."""
 
     movable: int
     spec: ProblemSpec

@@ -24,15 +24,13 @@ class ProblemSpec(eqx.Module):
     grid: Float[Array, " steps"] | None
 
     def built(self, numbers: tuple[Array, ...], extra: Any) -> Any:
-        """Build the problem from the modules with some numbers, and from the extra argument of `build`."""
+        """Build the problem from the modules with other numbers, and from the extra argument of `build`."""
         return self.build(eqx.combine(jax.tree.unflatten(self.structure, numbers), self.rest), extra)
 
 
 class AbstractSampling(AbstractDifferentiableSolve):
-    """Samples of a run; the leaves are the modules' numbers, the times, the horizon, the tolerance and the spec's
-    arrays.
-
-    `spec` is without its arrays, and `places` holds their positions in it.
+    """Samples of a run. The leaves are the modules' numbers, the times, the horizon, the tolerance and the arrays of
+    the spec. `spec` is the rest of the spec, and `places` the positions of the arrays in it.
     """
 
     spec: eqx.AbstractVar[ProblemSpec]
@@ -58,8 +56,8 @@ def solve_for_samples(
 ) -> Any:
     """Solve for the samples of a run.
 
-    **Arguments:** `sampling`: builds the solve from its first three fields; `build`: builds the problem from the
-    modules and an extra argument of the solve, compared by identity; the others as for `sampled_run`.
+    **Arguments:** `sampling`: function from the first three fields of a solve to the solve; `build`: function from the
+    modules and an extra argument of the solve to the problem, compared by identity; the others as for `sampled_run`.
     """
     numbers, rest = eqx.partition(modules, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(numbers)

@@ -1,9 +1,10 @@
 """Derivatives of the event times of many cells along tangents of a problem.
 
-Up to `MOST_FORWARD` tangents are integrated forward, as variations beside the run (`variation.py`); more of them take
-one backward pass of every run (`_adjoint.py`).
+Up to `MOST_FORWARD` tangents are integrated forward, as variations beside the run (`variation.py`); for more tangents,
+each run takes one backward pass (`_adjoint.py`).
 """
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -46,17 +47,28 @@ def ensemble_solve_with_tangents(
     nonterminal: bool = False,
     one_kernel: bool = False,
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
-    """Run every cell, and differentiate the time of its event along some tangents.
+    """Run every cell, and differentiate the time of its event along tangents.
 
-    **Arguments:** as for `ensemble_solve`, and
+    `solve_ensemble_with_tangents` is compiled on its own, for use outside of other transformed functions;
+    `traced_solve_ensemble_with_tangents` is for use inside them.
 
-    - `tangents`: of the problem, as for `VariationalProblem`. Their variations, or a mixture of them, take part in
-      step-size control.
-    - `one_kernel`: as for `ensemble_solve`. Without it, so that the result can be differentiated again, there is no
-      backward pass: all tangents are integrated forward, whatever their number.
+    **Arguments:** as for `solve_ensemble`, and
+
+    - `tangents`: tangents of the problem, as for `VariationalProblem`. Their variations, or a mixture of the
+      variations, take part in step-size control.
+    - `one_kernel`: as for `solve_ensemble`. If it is false, all tangents are integrated forward, whatever their number,
+      so that the result can be differentiated again.
 
     **Returns:** the `Outcome`, and for each tangent the derivative of `crossing_time`, 0 where that is infinite.
     Source: implicit function theorem at the event; step lengths are held fixed.
+
+    **Example:** half-lives, and their derivatives by the rates.
+
+    >>> from nonholonomic.derivatives import solve_ensemble_with_tangents
+    >>> problem, tangents = Decays(jnp.array([1.0, 2.0])), (Decays(jnp.ones(2)),)
+    >>> outcome, slopes = solve_ensemble_with_tangents(problem, tangents, t1, jnp.asarray(2), settings)
+    >>> print(outcome.crossing_time.round(6), slopes[0].round(6))
+    [0.693147 0.346574] [-0.693147 -0.173287]
     """
     horizon = t1
     if nonterminal:
@@ -147,10 +159,13 @@ def _moving(problem: AbstractProblem, direction: Any) -> Any:
     )
 
 
-#: `ensemble_solve_with_tangents`, compiled on its own, for use outside of other transformed functions.
-solve_ensemble_with_tangents = compiled_alone(eqx.Partial(ensemble_solve_with_tangents, one_kernel=True))
+# With its docstring.
+solve_ensemble_with_tangents = compiled_alone(
+    functools.update_wrapper(
+        functools.partial(ensemble_solve_with_tangents, one_kernel=True), ensemble_solve_with_tangents
+    )
+)
 
-#: `ensemble_solve_with_tangents`, for use inside other transformed functions.
 traced_solve_ensemble_with_tangents = eqx.filter_jit(ensemble_solve_with_tangents)
 
 
@@ -166,6 +181,13 @@ def tangents_of(
     - `tangents`: each with the rates at which the numbers move.
 
     **Returns:** for each tangent the tangent of the problem, `None` for leaves that depend on no number.
+
+    **Example:**
+
+    >>> from nonholonomic.derivatives import tangents_of
+    >>> tangents = tangents_of(Decays, (jnp.ones(2),), [(jnp.array([1.0, 0.0]),)])
+    >>> print(tangents[0].rate)
+    [1. 0.]
     """
 
     def built(*numbers: Any) -> Any:

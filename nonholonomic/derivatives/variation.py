@@ -21,16 +21,32 @@ TOGETHER = 2
 
 
 def tangent_scale(number: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The scale of a number's tangent: its own size, or 1 where it is zero."""
+    """The scale of a number's tangent: its own size, or 1 where it is zero.
+
+    **Example:**
+
+    >>> from nonholonomic.derivatives import tangent_scale
+    >>> print(tangent_scale(jnp.array([0.0, -3.0])))
+    [1. 3.]
+    """
     return jax.lax.stop_gradient(jnp.where(number == 0.0, 1.0, jnp.abs(number)))
 
 
 class VariationalProblem(AbstractProblem):
-    """A problem and its first variation along each of some tangents, the variations stacked behind the state.
+    """A problem whose state is followed by its first variations along several tangents.
 
     A tangent of the problem is the same tree, with the rate at which each number moves, `None` where no tangent moves
     it. A variation's absolute tolerance is that of the state, so a tangent should move a number by about its own size
     (`tangent_scale`).
+
+    **Arguments:** `ends_on_event`: whether runs end on the event of the problem, or continue to their horizon.
+
+    **Example:** the state and its variation by the rate, two components.
+
+    >>> from nonholonomic.derivatives import VariationalProblem
+    >>> varied = VariationalProblem(Decays(jnp.ones(3)), (Decays(jnp.ones(3)),), True)
+    >>> varied.start()[0].shape
+    (2, 3)
     """
 
     problem: AbstractProblem
@@ -90,7 +106,8 @@ def slopes_by_variations(
     **Arguments:**
 
     - `problem`, `tangents`: as for `VariationalProblem`.
-    - `ends_on_event`: whether runs end on the event, or at the horizon, which is then the event's time.
+    - `ends_on_event`: whether runs end on the event; otherwise they end at the horizon, which then counts as the
+      event's time.
     - `options`, `one_kernel`: horizon, number of cells and settings, as for `LaneScheduler.of`.
 
     **Returns:** the `Outcome`, without crossing times, and for each tangent the derivative of the event's time.
@@ -111,14 +128,22 @@ def slopes_by_variations(
 
 
 def in_groups(run: Callable[..., tuple[Any, list[Any]]], tangents: tuple[Any, ...]) -> tuple[Any, list[Any]]:
-    """Apply `run` to many tangents, `TOGETHER` at a time, with one program.
+    """Apply `run` to many tangents, a few at a time, with one program.
 
     **Arguments:**
 
-    - `run`: a tuple of at most `TOGETHER` tangents -> a result that does not depend on them, and a derivative for each.
+    - `run`: a tuple of one or two tangents -> a result that does not depend on them, and a derivative for each.
     - `tangents`: any number of them.
 
     **Returns:** the result, and the derivatives.
+
+    **Example:**
+
+    >>> from nonholonomic.derivatives import in_groups
+    >>> tangents = tuple(jnp.array([1.0, 2.0, 3.0]))
+    >>> result, slopes = in_groups(lambda group: (jnp.zeros(()), [2.0 * tangent for tangent in group]), tangents)
+    >>> [float(slope) for slope in slopes]
+    [2.0, 4.0, 6.0]
     """
     if len(tangents) <= TOGETHER:
         return run(tangents)

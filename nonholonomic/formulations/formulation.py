@@ -8,8 +8,8 @@ generalised force f(t, q, q') of drives and friction. From them follow
 - `ConstrainedConnection`: geodesics, with forces, of the constrained Levi-Civita connection;
 - `ReducedBracket`: the reduced Poisson-like bracket of van der Schaft and Maschke.
 
-They use the data in different ways, so their agreement checks all of them. To choose one, pass its object. They take
-one state (n,); use `jax.vmap` for many. The models of the vehicles are faster and do not need them.
+The formulations use the data in different ways, so their agreement checks all of them. Each takes a single state (n,);
+use `jax.vmap` for many. The models of the vehicles are faster and do not use the formulations.
 """
 
 import abc
@@ -189,7 +189,7 @@ class Multipliers(AbstractFormulation):
     **Arguments:**
 
     - `system`: the data, an `AbstractSystem`.
-    - `baumgarte`: rate [1/s] at which a violation W q' is made to decay, at least 0.
+    - `baumgarte`: rate [1/s] at which a violation W q' decays, at least 0.
     - `project`: whether to take the velocity from the momentum after projecting it on the constraints.
 
     **Raises:** `ValueError` for a negative rate.

@@ -1,8 +1,8 @@
 """The surfaces that bodies move on, vectors in their frames, and small linear systems.
 
-A surface answers, for a position on it: the unit normal and its rate for a velocity, the height and the Gaussian curvature,
-and how a person names a place. A frame moves along one with a ball; `frame_of` says which. Components that vanish identically
-are `None`, so that nothing is computed for them.
+For a position on a surface, its methods return the unit normal and its rate, the height, the Gaussian curvature and the
+coordinates in which users name the place. A frame moves with a ball along a surface; `frame_of` chooses the frame.
+Components that vanish identically are `None`, so that nothing is computed for them.
 """
 
 from .carried_frame import CarriedFrame as CarriedFrame

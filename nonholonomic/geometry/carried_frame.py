@@ -38,8 +38,7 @@ from .vector import Component, Vector, cross, dot, scale, sum_vectors, tangents,
 
 
 def place_named(surface: AbstractSurface, place: Place) -> Place:
-    """A place in the form that `surface.chart` takes, from one in which the eta of a closed surface counts from the
-    lowest point.
+    """A place in the form for `surface.chart`, from a place whose eta counts from the lowest point of a closed surface.
 
     **Arguments:** `place`: numbers named by `surface.coordinates`, or (x, y, z).
     """
@@ -154,7 +153,7 @@ class CarriedFrame(AbstractFrame):
     def _moved(
         self, foot: Fixed, axes: tuple[Fixed, Fixed, Fixed], velocity: Tangent, turning: Tangent, room: Component
     ) -> FrameMotion:
-        """The motion of the frame. **Arguments:** `velocity`: of the foot, along the axes."""
+        """The motion of the frame. **Arguments:** `velocity`: velocity of the foot, along the axes."""
         t1, t2, n = axes
         o1, o2, *up = stored(*turning, *self._seen(t1, t2, n))
         back = -self.pull * self.side * self.surface.offset(foot)

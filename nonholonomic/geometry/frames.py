@@ -80,8 +80,8 @@ class FrameMotion(NamedTuple):
 class AbstractFrame(eqx.Module):
     """A moving frame of a ball on a surface.
 
-    The place contains the numbers that the frame must integrate to know its position; `cyclic` contains those needed
-    only to draw it.
+    The place contains the numbers that are integrated because the motion depends on them; `cyclic` contains those
+    needed only to draw the motion.
     """
 
     #: Distance R [m] from the foot to the point with which the frame moves.
@@ -97,7 +97,7 @@ class AbstractFrame(eqx.Module):
 
     @abc.abstractmethod
     def place_scales(self, size: Component) -> tuple[Component, ...]:
-        """Magnitudes of the place's components. **Arguments:** `size`: of the body [m]."""
+        """Magnitudes of the place's components. **Arguments:** `size`: size of the body [m]."""
 
     @abc.abstractmethod
     def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
@@ -116,7 +116,8 @@ class AbstractFrame(eqx.Module):
 
     @abc.abstractmethod
     def height(self, place: Place) -> Component:
-        """Height [m] of the centre above the lowest point of the surface, or above z = 0 where it has none."""
+        """Height [m] of the centre above the lowest point of the surface, or above z = 0 if there is no lowest
+        point."""
 
     @abc.abstractmethod
     def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
@@ -196,7 +197,7 @@ class CylinderFrame(AbstractFrame):
 
     Inside, c is eta and t1 points along growing eta; outside, c = eta - pi.
 
-    - `radius`: of the path of the centre [m], negative outside; `distance`: R [m].
+    - `radius`: radius of the path of the centre [m], negative outside; `distance`: R [m].
     """
 
     radius: Float[Array, "..."]

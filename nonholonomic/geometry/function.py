@@ -24,8 +24,8 @@ class Plain(eqx.Module):
 
 
 class Closure(eqx.Module):
-    """A function with the traced numbers that it closes over as leaves; it was traced with single numbers, which may
-    have become one number per lane since."""
+    """A function whose leaves are the traced numbers that it closes over. It was traced with single numbers; since
+    then, each may have become one number per lane."""
 
     numbers: tuple[Any, ...]
     # JAX's Jaxpr; equal only if it is the same object.
@@ -41,7 +41,7 @@ class Closure(eqx.Module):
 
 
 class Numbers(eqx.Module):
-    """The numbers of an array, each of them a leaf, and its shape."""
+    """An array as separate numbers, each a leaf, and its shape."""
 
     numbers: tuple[Any, ...]
     shape: tuple[int, ...] = eqx.field(static=True)
@@ -53,16 +53,16 @@ class Numbers(eqx.Module):
 
 
 class Held(eqx.Module):
-    """A function that is a module with arrays, whose numbers are leaves one by one, as those of a `Closure` are.
+    """A function that is a module with arrays. Each number of these arrays is a leaf, as in a `Closure`.
 
-    `function` is the module with `Numbers` in place of its arrays. The attributes of the module are those of this one too.
+    `function` is the module with `Numbers` in place of its arrays. This object has the attributes of the module, too.
     """
 
     function: eqx.Module
 
     @classmethod
     def of(cls, function: eqx.Module) -> "Held":
-        """A module whose arrays hold numbers of one function, not one for each lane."""
+        """From a module whose arrays are the numbers of a single function, not one number per lane."""
 
         def parted(leaf: Any) -> Any:
             return Numbers(spread([leaf]), leaf.shape) if eqx.is_array(leaf) and leaf.ndim else leaf
@@ -96,12 +96,12 @@ class Held(eqx.Module):
 
 
 def spread(arrays: Sequence[Array]) -> tuple[Array, ...]:
-    """The numbers of some arrays, one by one."""
+    """The numbers of arrays, one by one."""
     return tuple(number for array in arrays for number in (jnp.unstack(array.ravel()) if array.ndim else (array,)))
 
 
 def gathered(numbers: Sequence[Array], shapes: Sequence[tuple[int, ...]]) -> list[Array]:
-    """The arrays of some shapes that were `spread`."""
+    """The arrays with the given shapes, from their `spread` numbers."""
     arrays, begin = [], 0
     for shape in shapes:
         end = begin + math.prod(shape)
@@ -111,7 +111,7 @@ def gathered(numbers: Sequence[Array], shapes: Sequence[tuple[int, ...]]) -> lis
 
 
 def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module:
-    """A function of some lengths [m] as a module whose numbers are arrays.
+    """A function of lengths [m] as a module whose numbers are arrays.
 
     **Raises:** `ValueError` unless the function returns one number for numbers.
     """

@@ -1,10 +1,10 @@
-"""Zero sets of functions, known only by the function and its derivatives.
+"""Surfaces on which a function vanishes, known only by the function and its derivatives.
 
 Both searches here are minimisations. The nearest point minimises the distance over the surface, which may have many
 local minima for positions farther than the surface's least radius of curvature. The region that can contain the nearest
-point is therefore divided into sectors, and a descent starts at the best of some points in each. The gap below a ball
-needs no nearest point: the ball touches where the function is least over the ball, so the search never leaves the ball,
-however far the surface is. The gap is negative only if a point of the ball is in the arena.
+point is therefore divided into sectors, and a descent starts at the best of several points in each sector. The gap
+below a ball needs no nearest point: the ball touches where the function is least over the ball, so the search never
+leaves the ball, however far the surface is. The gap is negative only if a point of the ball is in the arena.
 
 Each descent is Newton's method with the curvature kept positive and steps cut to a trust region (Nocedal and Wright, Numerical
 Optimization, chapter 4). A last Newton step carries the derivatives (implicit function theorem).

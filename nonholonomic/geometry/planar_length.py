@@ -1,8 +1,8 @@
 """The length of a vector in a plane, such as the sine of an angle from a pole, with its derivative where the length is 0.
 
 At length 0 there is no gradient, only one-sided derivatives: the length grows in every direction. The forward
-derivative is that of a step in the direction of the tangent, |tangent|. The reverse derivative is NaN, and 0 by numbers
-that do not move the vector.
+derivative is that of a step in the direction of the tangent, |tangent|. The reverse derivative is NaN, but 0 with
+respect to numbers that do not move the vector.
 """
 
 from typing import Any
@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 def planar_length(x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
     """sqrt(x^2 + y^2), without overflow.
 
-    **Arguments:** `x`, `y`: of one shape.
+    **Arguments:** `x`, `y`: of the same shape.
 
     **Example:** along t at the origin, and away from it.
 

@@ -1,9 +1,9 @@
 """The interface of all surfaces.
 
-A surface has its own axes, in which positions, velocities and normals are given. They are those of the fixed frame (x,
-y, z), z up, except on a tilted plane, whose third axis is its normal; `up` is the vertical in them. The components have
-no singularities. `chart` and `place_at` convert between positions and places, the few coordinates with which users name
-a position.
+A surface has its own axes, in which positions, velocities and normals are given. These are the axes of the fixed frame
+(x, y, z), z up, except on a tilted plane, whose third axis is its normal; `up` is the vertical in the surface's axes.
+The components have no singularities. `chart` and `place_at` convert between positions and places, the few coordinates
+with which users name a position.
 
 The unit normal points outward on a closed surface (sphere, spheroid, torus, cylinder), upward on an open one (plane,
 paraboloid, graph) and to positive values of an implicit surface's function. The scene decides on which side of the
@@ -36,7 +36,7 @@ DIVIDED: Mapping[str, float] = {"positive": 1.0}
 class BallGap(NamedTuple):
     """The gap between a ball and a surface.
 
-    - `foot`: the point [m] that the ball is about to touch; `normal`: from it towards the ball.
+    - `foot`: the point [m] that the ball is about to touch; `normal`: the unit normal there, towards the ball.
     - `gap`: distance [m] between them, to first order if the surface is given by a function alone; negative only where
       the ball is in the arena.
     """
@@ -78,7 +78,7 @@ class AbstractSurface(Bounded):
 
     @abc.abstractmethod
     def normal(self, position: Vector) -> Vector:
-        """Unit normal n at a position [m]; off the surface, the normal of a surface alongside."""
+        """Unit normal n at a position [m]; off the surface, the normal of a nearby parallel surface."""
 
     @abc.abstractmethod
     def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
@@ -102,14 +102,14 @@ class AbstractSurface(Bounded):
         """The point [m] of the surface that is nearest to a position [m]; if there are several, one of them."""
 
     def onto(self, position: Vector) -> Vector:
-        """A position [m] that has drifted off the surface, brought back to it."""
+        """The point of the surface for a position [m] that has drifted off it."""
         return self.nearest(position)
 
     def ball_gap(self, centre: Vector, radius: Component, side: float) -> BallGap:
         """The point where a ball is about to touch the surface, and the gap.
 
-        **Arguments:** `centre`: of the ball [m]; `radius`: of the ball [m], less than the radii of curvature where the
-        surface is concave; `side`: 1.0 if the ball is on the side to which n points, else -1.0.
+        **Arguments:** `centre`, `radius`: centre and radius of the ball [m]; the radius must be less than the radii of
+        curvature where the surface is concave; `side`: 1.0 if the ball is on the side to which n points, else -1.0.
         """
         foot = self.nearest(centre)
         foot = tuple(0.0 * centre[0] if part is None else part for part in foot)
@@ -120,7 +120,7 @@ class AbstractSurface(Bounded):
         )
 
     def offset(self, position: Vector) -> Component:
-        """Distance [m] of a position close to the surface, exact or, where that is cheaper, to first order."""
+        """Distance [m] of a position close to the surface, exact, or to first order if that is cheaper."""
         return self.distance(position)
 
     def distance(self, position: Vector) -> Component:

@@ -2,7 +2,7 @@
 
 A vector is a tuple of components, each an array over the lanes, or `None` where the model says that the component
 vanishes identically (no curvature on a plane, no force without friction). Sums skip `None` and products with `None` are
-`None`, so one formula serves every scene and a scene evaluates only the terms it has.
+`None`, so the same formula serves every scene, and each scene evaluates only its own terms.
 """
 
 from collections.abc import Iterable
@@ -88,7 +88,8 @@ def sum_vectors(*vectors: tuple[Component, ...]) -> tuple[Component, ...]:
 
 
 def stacked(vector: tuple[Component, ...], like: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-    """The components along axis 0, in the shape of those of `like`, with zeros for those that vanish identically."""
+    """The components along axis 0, in the shape of the components of `like`, with zeros for those that vanish
+    identically."""
     zero = jnp.zeros_like(like[0])
     return jnp.stack([zero if part is None else jnp.broadcast_to(part, zero.shape) for part in vector])
 

@@ -33,7 +33,14 @@ MOST_ROUNDS = 2000
 
 
 class HybridOutcome(NamedTuple, Generic[Numbers]):
-    """How every cell ended, as in `integration.Outcome`, in which mode, and the counters."""
+    """How every cell ended, as in `integration.Outcome`, with the mode in which it ended, and the counters.
+
+    **Example:** as for `solve_hybrid`.
+
+    >>> from nonholonomic.integration import CROSSED
+    >>> print(outcome.status == CROSSED, outcome.mode)
+    [ True  True] [0 0]
+    """
 
     status: Int[Numbers, " cells"]
     crossing_time: Float[Numbers, " cells"]
@@ -199,14 +206,20 @@ def solve_hybrid(
 
     - `modes`: the modes; `mode` and `Transition.mode` are indices into them.
     - `mode`, `state`: initial mode and state of every cell.
-    - `t1`: horizon [s], one for all or one per cell.
-    - `cells`: how many cells to run; the rest is padding. With 0, the programs are compiled and nothing is run.
-    - `settings`: with an explicit Runge-Kutta solver of Diffrax.
+    - `t1`: horizon [s], one number for all cells or one per cell.
+    - `cells`: number of cells to run; the rest is padding. With 0, the programs are only compiled.
+    - `settings`: their solver must be an explicit Runge-Kutta solver of Diffrax.
     - `counters`: number of counters, the rows of `Transition.counts`.
-    - `nonterminal`, `n_blocks`: as for `ensemble_solve`.
+    - `nonterminal`, `n_blocks`: as for `solve_ensemble`.
     - `most_rounds`: a cell that needs more ends as `UNRESOLVED`.
 
     **Returns:** a `HybridOutcome`.
+
+    **Example:** the balls of the room's example, through their highest points up to 1 s.
+
+    >>> last = solve_hybrid(modes, first, start, 1.0, 2, settings, counters=1, nonterminal=True)
+    >>> print(last.crossing_time.round(6), last.end_time)
+    [0.722438 0.812743] [1. 1.]
     """
     t1 = np.broadcast_to(np.asarray(t1, float), len(mode))
     runs = at_start(np, np.asarray(mode), np.asarray(state), cells, counters)
@@ -268,11 +281,18 @@ def traced_solve_hybrid(
 ) -> HybridOutcome[Array]:
     """Run every cell through its modes to its event, to `t1`, or to where the model ends.
 
-    Cells are not gathered: in each round every mode runs all cells, those in another mode for no time.
+    In each round, every mode runs all cells, but the horizon is 0 for cells in another mode.
 
     **Arguments:** as for `solve_hybrid`.
 
     **Returns:** a `HybridOutcome`, of traced numbers.
+
+    **Example:**
+
+    >>> from nonholonomic.hybrid import traced_solve_hybrid
+    >>> solve = lambda t1: traced_solve_hybrid(modes, jnp.asarray(first), jnp.asarray(start), t1, 2, settings, counters=1)
+    >>> print(jax.jit(solve)(5.0).crossing_time.round(6))
+    [0.722438 0.812743]
     """
     size = state.shape[1]
     t1 = jnp.broadcast_to(t1, (size,))
@@ -304,13 +324,13 @@ def traced_solve_hybrid(
 
 
 def padded(selected: Bool[Array, " cells"]) -> Int[Array, " cells"]:
-    """The numbers of the selected cells, and that of the first of them in place of the others, whose states may have another
-    meaning."""
+    """The numbers of the selected cells. The first selected cell replaces all others, because their states may have
+    another meaning."""
     return jnp.where(selected, jnp.arange(selected.size), jnp.argmax(selected))
 
 
 def chosen(
     selected: Bool[Array, " cells"], new: HybridOutcome[Array], old: HybridOutcome[Array]
 ) -> HybridOutcome[Array]:
-    """The new outcome of some cells and the old one of the others."""
+    """The new outcome for the selected cells, and the old outcome for the others."""
     return jax.tree.map(lambda a, b: jnp.where(selected, a, b), new, old)

@@ -15,9 +15,14 @@ class TransitionPath(NamedTuple):
     """Path of a single run from one mode to the next, as successive stretches of motion in closed form.
 
     - `ends`: when each stretch ends [s], counted from the end of the mode; infinite for unused entries.
-    - `motions`: the argument of `AbstractBatchedMode.between` for each, with the stretches on the first axis of every
-      leaf.
+    - `motions`: for each stretch the argument of `AbstractBatchedMode.between`; the first axis of every leaf counts the
+      stretches.
     - `shown`: number of default output times of each stretch.
+
+    **Example:** a hop of 0.4 s in closed form, drawn with three points.
+
+    >>> from nonholonomic.hybrid import TransitionPath
+    >>> record = TransitionPath(jnp.array([[0.4]]), {"speed": jnp.array([[1.962]])}, jnp.array([[3]]))
     """
 
     ends: Float[Array, " stretches 1"]
@@ -28,11 +33,17 @@ class TransitionPath(NamedTuple):
 class Transition(NamedTuple, Generic[Numbers]):
     """The result of a reset map, one number per cell.
 
-    `status` is `RUNNING` where the motion continues in the mode numbered `mode`, else how it ended; `state` is the new
-    state, `elapsed` [s] the duration of the transition, `crossing_time` [s] the (last) time of the event during the
-    transition, infinite if there was none; `counts` holds the counters, one per row. `record` is the path of a single
-    run (`path.py`); `None` for instantaneous transitions, or where no path is kept. `log_rates` is the sum of the
-    logarithms of the rates at which events on the way are met; `None` if there are none.
+    `status` is `RUNNING` where the motion continues in the mode numbered `mode`, otherwise the code for how it ended;
+    `state` is the new state, `elapsed` [s] the duration of the transition, `crossing_time` [s] the (last) time of the
+    event during the transition, infinite if there was none; `counts` holds the counters, one per row. `record` is the
+    path of a single run (`path.py`); `None` for instantaneous transitions, or where no path is kept. `log_rates` is the
+    sum of the logarithms of the rates at which events on the way are met; `None` if there are none.
+
+    **Example:** the bounce of both balls at 5 m/s.
+
+    >>> transition = modes[0].reset_map(jnp.array([[0.0, 0.0], [-5.0, -5.0]]), jnp.ones(2))
+    >>> print(transition.state[1], transition.mode)
+    [3. 4.] [0 0]
     """
 
     mode: Int[Numbers, " cells"]
@@ -46,7 +57,13 @@ class Transition(NamedTuple, Generic[Numbers]):
 
 
 class AbstractBatchedMode(eqx.Module):
-    """One mode of a hybrid system. Its leaves are scalars, or hold one number per cell in their last axis."""
+    """One mode of a hybrid system. Its leaves are scalars, or hold one number per cell in their last axis.
+
+    **Example:** the mode of the room's example, at its start.
+
+    >>> print(modes[0].problem(start).field(0.0, start)[1])
+    [-9.81 -9.81]
+    """
 
     @abc.abstractmethod
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
@@ -78,6 +95,30 @@ class AbstractHoppingMode(AbstractBatchedMode):
 
     The reset map goes on while a stretch's `open` holds, for at most `most_hops` stretches; its `elapsed` [s] counts from the
     end of the mode.
+
+    **Example:** small hops of a ball, and the first of them.
+
+    >>> from typing import NamedTuple
+    >>> from nonholonomic.hybrid import AbstractHoppingMode
+    >>> class Hop(NamedTuple):
+    ...     speed: jax.Array
+    ...     elapsed: jax.Array
+    ...     open: jax.Array
+    >>> class Hops(Bounce, AbstractHoppingMode):
+    ...     most_hops = 100
+    ...     def lost(self, state):
+    ...         return Hop(-self.restitution * state[1], 0.0 * state[1], state[1] < -0.1)
+    ...     def hop(self, stretch, left):
+    ...         end = stretch._replace(elapsed=stretch.elapsed + 2.0 * stretch.speed / 9.81)
+    ...         return end, Hop(self.restitution * stretch.speed, end.elapsed, stretch.speed > 0.1)
+    ...     def closed(self, stretch):
+    ...         return self.reset_map(jnp.stack([0.0 * stretch.speed, -stretch.speed]), stretch.elapsed)
+    ...     def motion_in(self, stretch):
+    ...         return stretch.speed
+    >>> hops = Hops(jnp.array([0.6, 0.8]))
+    >>> end, following = hops.hop(hops.lost(jnp.array([[0.0, 0.0], [-9.81, -9.81]])), jnp.ones(2))
+    >>> print(end.elapsed, (following.speed / 9.81).round(2))
+    [1.2 1.6] [0.36 0.64]
     """
 
     most_hops: ClassVar[int]
@@ -88,9 +129,9 @@ class AbstractHoppingMode(AbstractBatchedMode):
 
     @abc.abstractmethod
     def hop(self, stretch: Any, left: Float[Array, " cells"]) -> tuple[Any, Any]:
-        """Go through a stretch; `left` [s] is the time from the end of the mode to the horizon.
+        """Follow one stretch of motion; `left` [s] is the time from the end of the mode to the horizon.
 
-        **Returns:** the stretch at its end, before the jump; and the next one, behind the jump.
+        **Returns:** the stretch at its end, before the jump; and the next stretch, after the jump.
         """
 
     @abc.abstractmethod

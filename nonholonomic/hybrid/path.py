@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..integration.dense import DenseSolution, follow, padded
+from ..integration.dense import PIECE_OF_MODE, DenseSolution, follow, padded
 from ..integration.problem import AbstractProblem
 from ..integration.scheduler import Outcome
 from ..integration.settings import Settings
@@ -28,6 +28,13 @@ class Segment(NamedTuple):
 
     `motion` is the `DenseSolution` in the mode, its times counted from `begin`, or one stretch of a `TransitionPath`;
     `shown` holds the default output times [s].
+
+    **Example:** as for `solve_hybrid_dense`.
+
+    >>> from nonholonomic.hybrid import solve_hybrid_dense
+    >>> path = solve_hybrid_dense((Bounce(jnp.array([0.6])),), 0, start[:, 0], 0.4, settings, counters=1)
+    >>> [(segment.begin, segment.end, segment.number) for segment in path.segments]
+    [(0.0, 0.4, 0)]
     """
 
     begin: float
@@ -48,7 +55,14 @@ class Segment(NamedTuple):
 class HybridPath(NamedTuple):
     """A hybrid run: its segments in order, how and when [s] it ended, its final state, and its cost.
 
-    `status` is one of the codes of a `HybridOutcome`; `counts` holds the counters.
+    `status` is a code as in a `HybridOutcome`; `counts` holds the counters.
+
+    **Example:** as for `solve_hybrid_dense`.
+
+    >>> from nonholonomic.hybrid import solve_hybrid_dense
+    >>> path = solve_hybrid_dense((Bounce(jnp.array([0.6])),), 0, start[:, 0], 0.4, settings, counters=1)
+    >>> path.failed, path.end_time, path.counts.tolist()
+    (False, 0.4, [0])
     """
 
     segments: list[Segment]
@@ -66,7 +80,7 @@ class HybridPath(NamedTuple):
 
     @property
     def failed(self) -> bool:
-        """Whether the run could not be finished."""
+        """Whether the integration failed."""
         return self.status in (FAILED, UNRESOLVED)
 
     @property
@@ -144,24 +158,39 @@ def solve_hybrid_dense(
 
     **Arguments:**
 
-    - `modes`: as for `solve_hybrid`, of one cell; the path includes the transitions that the modes record.
+    - `modes`: as for `solve_hybrid`, for one cell; each mode must begin with a positive margin. The path includes the
+      transitions that the modes record.
     - `number`, `state`: initial mode and state.
     - `t1`: horizon [s].
-    - `settings`: as for `follow`; the most steps are those of the whole run.
+    - `settings`: as for `follow`; `max_steps` limits the steps of the whole run.
     - `counters`: number of counters, the rows of `Transition.counts`.
 
     **Returns:** a `HybridPath`.
+
+    **Example:** a ball that rises in closed form, recorded as a transition, and falls from 0.722438 s on.
+
+    >>> from nonholonomic.hybrid import TransitionPath, solve_hybrid_dense
+    >>> class Rise(Bounce):
+    ...     def reset_map(self, state, left):
+    ...         rise = -self.restitution * state[1] / 9.81
+    ...         apex = jnp.stack([0.5 * 9.81 * rise**2, 0.0 * rise])
+    ...         record = TransitionPath(rise[None], rise[None], jnp.full((1, 1), 3))
+    ...         return super().reset_map(state, left)._replace(state=apex, elapsed=rise, record=record)
+    ...     def between(self, rise, passed):
+    ...         return 9.81 * jnp.stack([rise * passed - 0.5 * passed**2, rise - passed])
+    >>> path = solve_hybrid_dense((Rise(jnp.array([0.6])),), 0, start[:, 0], 1.0, settings, counters=1)
+    >>> times = np.array([0.6, 0.8])
+    >>> print(path.at(times)[0].round(5), path.numbers(times))
+    [0.28647 0.33049] [-1  0]
     """
 
     def solve(numbers: Sequence[int], carry: Carry, active: Bool[np.ndarray, "1"]) -> Carry:
         if not active[0]:
             return carry
-        (runs, segments), (number,) = carry, numbers
-        begin, problem = float(runs.end_time[0]), _problem(modes[number], jnp.asarray(runs.state[:, 0]))
-        path = follow(
-            problem, t1 - begin, dataclasses.replace(settings, max_steps=settings.max_steps - int(runs.steps[0]))
-        )
-        stay = Segment(begin, begin + float(path.times[-1]), number, modes[number], path, begin + path.times[1:])
+        (runs, segments), (number,), mode, begin = carry, numbers, modes[numbers[0]], float(carry[0].end_time[0])
+        left = dataclasses.replace(settings, max_steps=settings.max_steps - int(runs.steps[0]))
+        path = follow(_problem(mode, jnp.asarray(runs.state[:, 0])), t1 - begin, left, piece=PIECE_OF_MODE)
+        stay = Segment(begin, begin + float(path.times[-1]), number, mode, path, begin + path.times[1:])
         return after_solve(np, runs, _outcome(path), np.full(1, t1)), [*segments, stay]
 
     def reset(numbers: Sequence[int], carry: Carry, lost: Bool[np.ndarray, "1"]) -> Carry:

@@ -1,6 +1,6 @@
 """First derivatives of hybrid runs: the variations of the state pass through every change of mode.
 
-A variation of a run at an event is that of the state there, dx, and that of the time, dt. With the event g(x) = 0,
+At an event, a run has the variations dx of the state and dt of the time. With the event g(x) = 0,
 x' = f(x) and the mode entered at t + dt,
 
     dT = -dg / (Dg f),   dx <- dx + f dT,   dt <- dt + dT,
@@ -10,8 +10,8 @@ take time itself. That is the saltation matrix (Leine and Nijmeijer, Dynamics an
 Systems, 2004, ch. 7) in two halves: the next mode counts its time from its own beginning, so -f dt of it is not needed
 there, and is added where a time is held fixed.
 
-The rates at which events are met stand in the denominator of a derivative. Where such a rate may be zero, within the
-tolerance, the event is grazing and the derivative has no correct digits: such events are counted (`GRAZING`).
+The rate of the event function at an event is the denominator of the derivative. Where this rate may be zero within the
+tolerance, the event is grazing and the derivative has no correct digits; `GRAZING` counts such events.
 """
 
 import math
@@ -53,7 +53,8 @@ UNMEASURED = 1e9
 
 
 class Clock(AbstractPassive):
-    """The time since a mode began, which is passive; the clock's variation is that of the beginning."""
+    """The time since a mode began, as a passive component; its variation is that of the time at which the mode
+    began."""
 
     def rates(self, problem: AbstractProblem, time: Lanes, state: States, passive: States) -> States:
         return jnp.concatenate([problem.field(time, state), jnp.ones_like(passive)])
@@ -65,12 +66,12 @@ def with_row(state: Float[Array, "components cells"], row: Float[Array, " cells"
 
 
 class VariationalMode(AbstractBatchedMode):
-    """A mode, and first variations of its runs behind the state: of the state and, last, of the time at which it began.
+    """A mode whose state is followed by its first variations, and by that of the time at which the mode began.
 
     The mode's equations must not depend on time.
 
-    - `tangents`: of the mode, as for `VariationalProblem`.
-    - `ends_on_event`: as there; `tolerance`: relative tolerance of the integration.
+    - `tangents`: tangents of the mode, as for `VariationalProblem`.
+    - `ends_on_event`: as for `VariationalProblem`; `tolerance`: relative tolerance of the integration.
     """
 
     mode: AbstractBatchedMode
@@ -99,9 +100,9 @@ class VariationalMode(AbstractBatchedMode):
     def left_behind(
         self, state: Float[Array, "components cells"], left: Float[Array, " cells"], seen: Callable[..., Any]
     ) -> tuple[Transition, Any, Any]:
-        """The transition by the mode's `reset_map`, and a function of its path.
+        """The transition by the mode's `reset_map`, and numbers computed from its path.
 
-        **Arguments:** `seen`: (mode, the `TransitionPath`, `left`) -> a tree of numbers.
+        **Arguments:** `seen`: function of the mode, the `TransitionPath` and `left` that returns a tree of numbers.
 
         **Returns:** the `Transition`; the numbers; and their variations, with the tangents first.
         """
@@ -270,11 +271,20 @@ def solve_hybrid_with_tangents(
 
     **Arguments:** as for `solve_hybrid`, and
 
-    - `tangents`: for each, the tangents of the modes and that of the states, `None` for what does not move.
-    - `ends_on_event`: whether runs end on the event; else they end at `t1`, which is then the event's time.
+    - `tangents`: pairs of the tangents of the modes and the tangent of the states, with `None` for leaves that do not
+      move.
+    - `ends_on_event`: whether runs end on the event; otherwise they end at `t1`, which then counts as the event's time.
 
-    **Returns:** the `HybridOutcome`, and the `Slopes`, 0 where there is no event, or it is at the start.
+    **Returns:** the `HybridOutcome`, and the `Slopes`, 0 where there is no event or the event is at the start.
     Source: implicit function theorem at the event, saltation at every change of mode.
+
+    **Example:** by the restitution.
+
+    >>> from nonholonomic.hybrid import solve_hybrid_with_tangents
+    >>> tangents = (((Bounce(jnp.ones(2)),), None),)
+    >>> _, sensitivities = solve_hybrid_with_tangents(modes, tangents, first, start, 5.0, 2, settings, counters=1)
+    >>> print(sensitivities.slopes.round(6))  # the time of the fall
+    [[0.451524 0.451524]]
     """
     varied = variational_modes(modes, tangents, settings.tolerance, ends_on_event)
     start, n_blocks = np.asarray(variational_start(jnp.asarray(state), tangents)), 1 + len(tangents)
@@ -296,7 +306,16 @@ def traced_solve_hybrid_with_tangents(
     counters: int,
     ends_on_event: bool = True,
 ) -> tuple[HybridOutcome[Array], Slopes[Array]]:
-    """`solve_hybrid_with_tangents` inside other transformed functions; arguments and results are traced."""
+    """`solve_hybrid_with_tangents` inside other transformed functions; arguments and results are traced.
+
+    **Example:** as for `solve_hybrid_with_tangents`.
+
+    >>> from nonholonomic.hybrid import traced_solve_hybrid_with_tangents
+    >>> tangents, options = (((Bounce(jnp.ones(2)),), None),), (jnp.asarray(first), jnp.asarray(start), 5.0, 2, settings)
+    >>> _, sensitivities = traced_solve_hybrid_with_tangents(modes, tangents, *options, counters=1)
+    >>> print(sensitivities.slopes.round(6))
+    [[0.451524 0.451524]]
+    """
 
     def run(group: tuple[Any, ...]) -> tuple[tuple[HybridOutcome[Array], Array], list[Float[Array, " cells"]]]:
         varied = variational_modes(modes, group, settings.tolerance, ends_on_event)

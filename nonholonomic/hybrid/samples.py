@@ -31,9 +31,15 @@ UNCHANGED: Any = None
 class HybridSamples(NamedTuple):
     """A hybrid run at given times, all floats.
 
-    - `shown`: the output rows, NaN after the end of the run; `number`: of the mode at each time, or `BETWEEN`.
-    - `end_time`, `end_state`, `end_mode`: when, where and in which mode the run ended; `status`: the code of how.
+    - `shown`: the output rows, NaN after the end of the run; `number`: index of the mode at each time, or `BETWEEN`.
+    - `end_time`, `end_state`, `end_mode`: when, where and in which mode the run ended; `status`: the status code.
     - `steps`, `rejected`; `counts`: the counters.
+
+    **Example:** as for `hybrid_samples`.
+
+    >>> from nonholonomic.hybrid import HybridSamples
+    >>> HybridSamples._fields[:3]
+    ('shown', 'number', 'end_time')
     """
 
     shown: Float[Array, "shown times"]
@@ -60,15 +66,29 @@ def hybrid_samples(
 
     **Arguments:**
 
-    - `build`: compared by identity, so do not create a new function for each call.
-    - `modules`: the tree whose numbers are differentiable, once.
-    - `times`: of the samples [s], growing; `t1`: horizon [s]. Neither is differentiable.
-    - `settings`: with an explicit Runge-Kutta solver; the tolerance may be traced.
+    - `build`: function of the modules and the tolerance that returns the modes of one cell, the index of the first
+      mode, (1,), and the start, (components, 1). Functions are compared by identity, so do not create a new one for
+      each call.
+    - `modules`: the tree whose numbers are differentiable; there are no second derivatives.
+    - `times`: times of the samples [s], increasing; `t1`: horizon [s]. Neither is differentiable.
+    - `settings`: settings with an explicit Runge-Kutta solver; their tolerance may be traced.
     - `counters`: number of counters, the rows of `Transition.counts`.
 
     **Returns:** `HybridSamples`; the output rows and the end time have derivatives, NaN after a grazing event.
 
     **Raises:** `ValueError` for derivatives by the times, and for second derivatives.
+
+    **Example:** the height at 0.8 s, after a bounce, and its derivative by the restitution: v (t - T) with the speed v at
+    the ground, and the time T of the bounce.
+
+    >>> from nonholonomic.hybrid import hybrid_samples
+    >>> def build(restitution, tolerance):
+    ...     return (Bounce(restitution),), jnp.zeros(1, int), jnp.array([[1.0], [0.0]])
+    >>> def height(restitution):
+    ...     return hybrid_samples(build, restitution, jnp.array([0.8]), jnp.asarray(1.0), settings, 1).shown[0, 0]
+    >>> slope, speed = jax.grad(height)(0.6), np.sqrt(2 * 9.81)
+    >>> print(f"{slope:.6f} {speed * (0.8 - speed / 9.81):.6f}")
+    1.543558 1.543558
     """
     sampling = functools.partial(HybridSampling, counters=counters)
     return solve_for_samples(sampling, build, modules, _fixed(times), t1, settings)
@@ -84,7 +104,8 @@ def _fixed(times: Float[Array, " times"]) -> Float[Array, " times"]:
 def _refused(primals: Any, tangents: Any) -> Any:
     if tangents[0] is not None:
         raise ValueError(
-            "derivatives with respect to times are not available for runs of several modes: contact = 'hybrid'"
+            "derivatives with respect to times or t1 are not available for runs with resets; differentiate by the start or "
+            "the parameters"
         )
     return primals[0], jnp.zeros_like(primals[0])
 
@@ -109,7 +130,9 @@ class HybridSampling(AbstractSampling):
         self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[HybridSamples, list[HybridSamples]]:
         if nested:
-            raise ValueError("second derivatives are not available through changes of mode: contact = 'hybrid'")
+            raise ValueError(
+                "second derivatives are not available through changes of mode; take differences of a gradient instead"
+            )
         numbers, (*horizon, tolerance), spec = self._sorted(leaves)
         settings = spec.settings.with_tolerance(tolerance)
 
@@ -148,7 +171,7 @@ class Filled(NamedTuple):
     grazed: Float[Array, ""]
 
     def with_samples(self, at: Bool[Array, " times"], output: tuple[Array, Array], number: Array | int) -> "Filled":
-        """Fill in the samples at some times that have none yet."""
+        """Fill in missing samples."""
         at = at & jnp.isnan(self.number)
         shown, variations = (
             jnp.where(at, new, old) for new, old in zip(output, (self.shown, self.variations), strict=True)
@@ -176,7 +199,8 @@ def _followed(
             run, filled = carry
             at = run.mode[0]
             mode = selected(modes, numbers, at)
-            since, left = times - run.end_time, greatest(t1 - run.end_time, 0.0)
+            # In a batch this branch is taken for all runs: those in another mode stay in this one for no time.
+            since, left = times - run.end_time, jnp.where(active, greatest(t1 - run.end_time, 0.0), 0.0)
             outcome, samples = solve_with_samples(
                 mode.problem(run.state), since, left, jnp.asarray(1), settings, n_blocks=1 + count
             )
@@ -210,7 +234,8 @@ def _followed(
 
 
 def alike(modes: tuple[AbstractBatchedMode, ...]) -> list[tuple[int, ...]]:
-    """The numbers of the modes, those together that differ in the values of their arrays only: one program serves them."""
+    """The numbers of the modes in groups. The modes of a group differ only in the values of their arrays, so they share
+    a program."""
     groups: list[list[int]] = []
     for number, mode in enumerate(modes):
         shape = _shape(mode)
@@ -228,7 +253,7 @@ def _shape(mode: AbstractBatchedMode) -> Any:
 
 
 def selected(modes: tuple[VariationalMode, ...], numbers: Sequence[int], at: Array) -> VariationalMode:
-    """The mode numbered `at`, one of some that are `alike`."""
+    """The mode numbered `at` in a group of modes that are `alike`."""
     mode = modes[numbers[0]]
     for number in numbers[1:]:
 

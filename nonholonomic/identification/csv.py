@@ -41,11 +41,11 @@ def read_columns(path: Any, columns: Any, fps: float | None, error: Any, quantit
 
     **Arguments:**
 
-    - `path`: of the file; lines that begin with # are ignored, empty cells and `nan` are missing samples.
+    - `path`: path of the file. Lines that begin with # are ignored; empty cells and `nan` are missing samples.
     - `columns`: name of a column of the model -> (header, unit); the unit is one of `UNITS`, or a factor that converts
-      the file's numbers to SI units. `"time"` is the clock, `"frame"` the number of the frame, which needs `fps`.
-    - `fps`: frames per second; without a column for the frame, each line is a frame.
-    - `error`: name of a column -> (standard error or header of its column, unit), for some or all of them; or `None`.
+      the file's numbers to SI units. `"time"` is the clock; `"frame"` is the number of the frame and needs `fps`.
+    - `fps`: frames per second. Without a column for the frame, each line is a frame.
+    - `error`: name of a column -> (standard error or header of its column, unit), for some or all columns; or `None`.
     - `quantities`: the quantities that can be recorded.
 
     **Raises:** `ValueError` that names the file, the column and the problem.

@@ -1,4 +1,4 @@
-"""Fit several sets of data together: joined measurements, and names for shared parameters and for those of a single
+"""Fit several sets of data together: join measurements, and name the parameters that are shared or belong to a single
 set."""
 
 import itertools
@@ -18,9 +18,10 @@ EACH = "data[*]."
 
 
 def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], Int[np.ndarray, " n"]]:
-    """The measurements of several sets of data, their labels, and a mask of the predictions that were measured.
+    """The joined measurements of several sets of data, their labels, and a mask of the predictions that were measured.
 
-    **Arguments:** `data`: each with `measurements`, `labels`, `seen`, and `size`, the number of its predictions.
+    **Arguments:** `data`: sets of data, each with `measurements`, `labels`, `seen`, and `size`, the number of its
+    predictions.
     """
     labels = tuple(
         f"{i + 1}: {label}" if len(data) > 1 else label for i, source in enumerate(data) for label in source.labels
@@ -31,7 +32,8 @@ def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], Int[np
 
 
 def series_units(data: tuple[Any, ...]) -> tuple[str, ...]:
-    """The unit of each series of the joined measurements. **Arguments:** `data`: each with `measurements`, `series_units`."""
+    """The unit of each series of the joined measurements. **Arguments:** `data`: sets of data, each with `measurements`
+    and `series_units`."""
     return tuple(unit for source in data for unit in source.series_units[: 1 + int(np.max(source.measurements.series))])
 
 
@@ -44,7 +46,8 @@ def of_data(parameters: dict[str, Any], k: int) -> dict[str, Any]:
 
 
 def scene_unknowns(free: Any, scene: Any, launch: Any, shared: list[str], own: list[list[str]]) -> dict[str, Free]:
-    """The unknowns of a scene, its launches and its data, as for `free_numbers`; scene and launch check their numbers."""
+    """The unknowns of a scene, its launches and its data, as for `free_numbers`; the scene and the launches check their
+    values."""
     roots = {"scene": scene, "launch": launch}
 
     def check(values: dict[str, float]) -> None:
@@ -67,7 +70,7 @@ def free_numbers(
       second set of data alone, and `data[*].launch.azimuth` stands for one parameter of each set.
     - `shared`: full names of the parameters of the model; `own`: names of the parameters of each set of data, without
       the prefix. A name of `own` without a prefix is shared, too.
-    - `check`: name -> number, without prefixes; it raises `ValueError` for illegal values.
+    - `check`: function of a dictionary (name without prefix -> number) that raises `ValueError` for illegal values.
 
     **Returns:** full name -> `Free`.
 

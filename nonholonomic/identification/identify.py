@@ -42,19 +42,19 @@ def identify(
     """Find the parameters of a model that make measurements most likely.
 
     Levenberg-Marquardt runs from every start at once, on the residuals of the data (`likelihood.py`) and of the priors.
-    It finds a local minimum near each start; the result is the best of them and reports where the others ended.
+    It finds a local minimum near each start; the result is the best minimum and reports where the other starts ended.
 
     **Arguments:**
 
     - `model`: function from parameters, name -> (rows,), to predictions (rows, n); `jax.vmap` converts a function of
-      one set of parameters. It is differentiated in forward mode, or not at all (see `slopes`).
+      one set of parameters. With exact `slopes`, JAX differentiates the model in forward mode.
     - `measurements`: `Measurements` of shape (n,).
     - `free`: name -> a `Free`, or only the start value.
-    - `starts`: number of start points: the given one, and others drawn around it.
-    - `spread`: range of the drawn points, as a factor greater than 1 in either direction; `seed`: of the draw.
+    - `starts`: number of start points: the start values, and others drawn around them.
+    - `spread`: range of the drawn points, as a factor greater than 1 in either direction; `seed`: seed of the draw.
     - `max_steps`: a fit that needs more steps has not converged.
     - `slopes`: "exact", by automatic differentiation; or "differences", central differences of 1 % in every parameter,
-      for a model that has no derivative or a rough one. They take twice as many runs as parameters, and one more.
+      for a model without a derivative or with a rough one. Each step then takes 2 k + 1 runs for k parameters.
     - `labels`: (n,), names of the measurements in the result.
     - `progress`: whether to show progress, on a terminal or in a notebook.
     **Returns:** an `Identification` with its `verdict`; a doubtful fit gives a `FitWarning`.
@@ -139,7 +139,7 @@ def check_search(starts: Any, spread: Any, seed: Any, max_steps: Any, progress: 
 
 
 def step_of(slopes: str) -> float | None:
-    """Step of the coordinates for each kind of slopes; `None` for automatic differentiation.
+    """The step of the differences for a kind of slopes; `None` for automatic differentiation.
 
     **Raises:** `ValueError` for an unknown kind.
     """

@@ -24,19 +24,21 @@ class Measurements(eqx.Module):
 
     **Arguments:**
 
-    - `value`: (n,), the measured values; where `censored`, a lower limit of the quantity with its own error (a clock
-      stopped by hand is also uncertain). -inf if the quantity is only known to be below `upper`.
+    - `value`: (n,), the measured values. Where `censored`, a lower limit of the quantity, which also has an error (a
+      clock stopped by hand is uncertain); -inf if the quantity is only known to be below `upper`.
     - `error`: (n,), standard deviations, positive; or one scalar for all.
     - `censored`: (n,), which values are lower limits; none by default.
-    - `upper`: (n,), upper limits of the quantities: infinite for lower limits; by default `value` itself, for measured
-      values.
+    - `upper`: (n,), upper limits of the quantities: `value` itself for measured values (the default), infinite if there
+      is only a lower limit.
     - `period`: (n,), period of a quantity, such as 2 pi for an azimuth; infinite by default.
-    - `student`: (n,), degrees of freedom of Student's t distribution of the errors, whose scale is then `error`;
-      infinite by default, for Gaussian errors. Limits always have Gaussian errors.
-    - `series`: (n,), index of the series, each in the order in which it was measured; 0 by default.
-    - `time`: (n,) [s], time of a sample since the start of its recording; 0 by default. Fits follow a recording from
-      its start.
-    - `estimated`: (n,), whether `error` is only a start value, to be estimated from the residuals of the series.
+    - `student`: (n,), degrees of freedom of Student's t distribution, if the errors have this distribution with the
+      scale `error`; infinite by default, for Gaussian errors. Limits always have Gaussian errors.
+    - `series`: (n,), index of the series to which a value belongs; 0 by default. Within a series, values are in the
+      order of measurement.
+    - `time`: (n,) [s], time of a sample since the start of its recording; 0 by default. A fit first uses the early
+      samples of a recording.
+    - `estimated`: (n,), whether `error` is only a start value, and the error is to be estimated from the residuals of
+      the series.
 
     **Raises:** `ValueError` for numbers that are not finite or shapes that do not match.
     """
@@ -134,7 +136,7 @@ class Measurements(eqx.Module):
         return jnp.where(heavy, z * jnp.sqrt((freedom + 1.0) / freedom * flat), z)
 
     def whole_periods(self, off: Float[Array | np.ndarray, "... n"]) -> Float[Array, "... n"]:
-        """The part of some differences that is whole periods, rounded to the nearest; without a slope."""
+        """Differences rounded to the nearest whole period; without a slope."""
         wraps = jnp.isfinite(self.period)
         period = jnp.where(wraps, self.period, 1.0)
         return jnp.where(wraps, period * jax.lax.stop_gradient(jnp.round(off / period)), 0.0)
@@ -146,8 +148,7 @@ class Measurements(eqx.Module):
         return off / self.error
 
     def information(self, prediction: Float[Array | np.ndarray, "... n"]) -> Float[Array, "... n"]:
-        """Square roots of Fisher's information about the predictions, from the expected curvature, for standard errors.
-
+        """Square roots of Fisher's information about the predictions, from the expected curvature, for standard errors:
         1 / error for Gaussian errors, sqrt((nu + 1) / (nu + 3)) / error for Student's t; the slope of the residual for
         limits.
         """
@@ -205,10 +206,9 @@ def between(z: Float[Array, "..."], half: Float[Array, "..."]) -> Float[Array, "
 
 
 def estimated_errors(measurements: Measurements, prediction: Any, unknowns: int) -> Float[np.ndarray, " n"]:
-    """The errors; unknown ones are estimated from the residuals of their series.
-
-    With n values in the series and k unknowns shared by N values in all, the estimate is the root of the sum of squares
-    / (n - k n / N); for Student's t, the scale for which the mean weight of the squares is 1 (maximum likelihood).
+    """The errors; unknown errors are estimated from the residuals of their series. For a series of n values, in a fit
+    of k unknowns to N values, the estimate is the root of the sum of squares / (n - k n / N); for Student's t, the
+    scale for which the mean weight of the squares is 1 (maximum likelihood).
     """
     errors = np.array(measurements.error)
     series, open_ = np.asarray(measurements.series), np.asarray(measurements.estimated)

@@ -1,4 +1,4 @@
-"""The part that fits of tops, strollers and users' systems share: sets of data, their predictions, and the search.
+"""What fits of tops, strollers and users' systems share: sets of data, their predictions, and the search.
 
 Each of these fits adds the names of its parameters and the prediction of a set of data.
 """
@@ -31,7 +31,7 @@ class AbstractDataModel(eqx.Module):
 
     @abc.abstractmethod
     def together(self, source: Any, values: Values) -> Hashable:
-        """A key for sets of data; sets with equal keys can be predicted together."""
+        """A key for a set of data; sets with equal keys can be predicted together."""
 
     @abc.abstractmethod
     def predict(self, sources: list[tuple[Any, Values]], rows: int) -> list[Float[Array, "rows size"]]:

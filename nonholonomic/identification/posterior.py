@@ -23,11 +23,12 @@ Prior = tuple[float, float] | Callable[[Float[Array, ""]], Float[Array, ""]]
 class LogDensity(eqx.Module):
     """The log of a posterior density, up to a constant, as a function of coordinates (unknowns,) without bounds.
 
-    You can differentiate it, forwards and backwards, compile it, and batch it by `jax.vmap`: then all cells of all
-    chains run together. Unknown errors are unknowns, too, each by its logarithm, with a flat prior. Where the model has
-    no prediction, the value is about -1e8, without a slope.
+    You can differentiate it in forward and reverse mode, compile it, and batch it with `jax.vmap`, so that the runs of
+    all chains advance together. Unknown errors are also unknowns: the coordinate of each is its logarithm, with a flat
+    prior. Where the model has no prediction, the value is about -1e8, without a slope.
 
-    - `names`: of the unknowns, in the order of the coordinates; `start`: (unknowns,), where to start.
+    - `names`: names of the unknowns, in the order of the coordinates; `start`: (unknowns,), coordinates at which to
+      start.
     - `units`: name of an unknown -> its unit, if known.
     """
 
@@ -79,7 +80,7 @@ class LogDensity(eqx.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the unknowns; those of errors are numbered by their series."""
+        """The names of the unknowns; the names of errors contain the number of their series."""
         return (*self.problem.names, *(f"error[{k}]" for k in self.open_series))
 
     @property
@@ -103,8 +104,8 @@ class LogDensity(eqx.Module):
     def values(self, coordinates: Float[Array, "... unknowns"]) -> dict[str, Float[Array, "..."]]:
         """The unknowns at some coordinates: name -> (...,).
 
-        **Arguments:** `coordinates`: of all unknowns, or those of a fit, without the errors, which are then the first
-        guess.
+        **Arguments:** `coordinates`: the coordinates of all unknowns, or only those of a fit; the errors then have
+        their first guess.
 
         **Raises:** `ValueError` for another number of coordinates.
         """

@@ -19,7 +19,7 @@ class Problem(eqx.Module):
     """A model and its free parameters.
 
     - `model`: parameters, name -> (rows,), to predictions (rows, n).
-    - `names`, `unknowns`: of the free parameters; `free` has both, as pairs.
+    - `names`, `unknowns`: the names of the free parameters, and the parameters; `free` combines both.
     - `step`: `None` for automatic differentiation in forward mode; otherwise the step of central differences in the
       coordinates. The model then need not be differentiable, nor traceable if it has `on_host = True`.
     """
@@ -118,7 +118,7 @@ def _differences(problem: Problem, step: float, coordinates: Rows) -> tuple[np.n
 
 
 def predictions_and_slopes(problem: Problem, coordinates: Rows, asked: Any = None) -> tuple[np.ndarray, np.ndarray]:
-    """Predictions and their slopes in every row.
+    """Predictions and their slopes, for every row of coordinates.
 
     **Arguments:** `coordinates`: (rows, unknowns); `asked`: (rows,), which rows are needed, by default all.
 

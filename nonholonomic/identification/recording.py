@@ -1,4 +1,4 @@
-"""Recorded runs: samples of some quantities at the readings of a clock, converted to measurements."""
+"""Recorded runs: quantities sampled at the times of a clock, converted to measurements."""
 
 import dataclasses
 import math
@@ -69,20 +69,19 @@ def as_quantity(words: Any) -> Any:
 
 
 class AbstractRecording(eqx.Module):
-    """A recorded run: samples of some quantities at the readings of a clock.
+    """A recorded run: quantities sampled at the times of a clock.
 
     **Arguments:**
 
-    - `launch`: the launch, every number a scalar.
+    - `launch`: the launch; all its numbers must be scalars.
     - `times`: (times,) [s], increasing.
     - `value`: (times,) for one column, (times, columns) for several; NaN where a sample is missing.
-    - `error`: standard errors, one for all, (columns,), or of the shape of `value`; `None`: estimated for each column
-      from the residuals.
+    - `error`: standard errors: a scalar, (columns,), or of the shape of `value`; with `None`, they are estimated for
+      each column from the residuals.
     - `quantity`: what was recorded: a quantity, a column, or a tuple of them.
     - `t0`: the clock's reading [s] at the launch.
-    - `student`: degrees of freedom of Student's t distribution of the errors; `None`: Gaussian.
-
-    The attribute `quantities` of a subclass lists what can be recorded.
+    - `student`: degrees of freedom of Student's t distribution of the errors; `None` for Gaussian errors. The attribute
+      `quantities` of a subclass lists what can be recorded.
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
     """
@@ -126,7 +125,7 @@ class AbstractRecording(eqx.Module):
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The names of a sample's columns."""
+        """The names of the columns of a sample."""
         return self.quantities.of(self.quantity)
 
     @property
@@ -190,7 +189,7 @@ def noise(value: Float[np.ndarray, "times columns"]) -> Float[np.ndarray, " colu
 
 
 def model_times(times: Float[Array, " times"], t0: Float[Array, ""]) -> Float[Array, " times"]:
-    """The times of the samples since the launch [s]; samples before the launch get its time."""
+    """The times of the samples since the launch [s]; 0 for samples before the launch."""
     return greatest(times - t0, INSTANT * jnp.arange(times.shape[0]))
 
 
@@ -205,9 +204,9 @@ def predicted(
     **Arguments:**
 
     - `scene`: the scene of all runs, before its parameters are replaced.
-    - `recordings`: each with its parameters, name -> (rows,), with the same names for all; their launches hold the same
-      numbers.
-    - `run`: from a scene, a launch and times since the launch [s] to a trajectory.
+    - `recordings`: pairs of a recording and its parameters, name -> (rows,). All have the same names, and all launches
+      the same kinds of numbers.
+    - `run`: function of a scene, a launch and times since the launch [s] that returns a trajectory.
 
     **Returns:** for each recording its samples, ordered by time, including missing ones; NaN after the end of a run.
     """

@@ -42,11 +42,11 @@ class Profile(NamedTuple):
 
 
 class Identifiability(NamedTuple):
-    """The combinations of parameters that the data determine and those that they do not, to first order, without
-    priors.
+    """The combinations of parameters that the data determine, and those that they do not determine, to first order and
+    without priors.
 
-    They come from the singular values of the slopes of the residuals with respect to relative changes: of 1 in the
-    logarithm of a parameter that cannot be negative, otherwise of `Free.unit`.
+    They come from the singular values of the slopes of the residuals with respect to relative changes: changes of the
+    logarithm for a parameter that cannot be negative, otherwise changes in units of `Free.unit`.
 
     - `singular_values`: (unknowns,), decreasing; the inverse of a value is the relative error of its combination of
       parameters.
@@ -103,9 +103,9 @@ class Identification:
     - `degrees`: measurements and priors less unknowns.
     - `identifiability`: an `Identifiability`; `residuals`: a `ResidualRow` for every measurement.
     - `status`: "converged" or why not; `starts`, `ends`: name -> (starts,), where each fit began and ended;
-      `end_deviances`: (starts,); `statuses`: one of "converged", "not_converged", "failed" for each start.
+      `end_deviances`: (starts,); `statuses`: "converged", "not_converged" or "failed" for each start.
     - `verdict`: a `Verdict`, whether the fit can be believed.
-    - `coordinates`, `coordinate_covariance`: the same in the coordinates in which the fit was done.
+    - `coordinates`, `coordinate_covariance`: estimates and covariance in the coordinates of the fit.
 
     **Example:**
 
@@ -143,7 +143,7 @@ class Identification:
     def interval(self, name: str, deviations: float = 1.96) -> tuple[float, float]:
         """The confidence interval of a parameter, symmetric in its coordinate and so within its bounds.
 
-        **Arguments:** `name`: of the parameter, or the end of its name; `deviations`: half the width in standard
+        **Arguments:** `name`: name of the parameter, or the end of its name; `deviations`: half the width in standard
         errors, 1.96 for 95 %.
 
         **Raises:** `ValueError` for a name that was not free.
@@ -161,12 +161,13 @@ class Identification:
 
         **Arguments:**
 
-        - `name`: of the parameter, or the end of its name.
-        - `values`: at which to hold the parameter, by default 13 within three standard errors.
+        - `name`: name of the parameter, or the end of its name.
+        - `values`: values at which to hold the parameter, by default 13 within three standard errors.
 
         **Returns:** a `Profile`.
 
-        **Raises:** `ValueError` for a name that was not free, or without `values` for a parameter of infinite error.
+        **Raises:** `ValueError` for a name that was not free, and for a parameter with an infinite error if `values` is
+        missing.
         """
         k = self._place(name)
         free = self.problem.unknowns[k]
@@ -248,7 +249,7 @@ def deviance_of(problem: Problem, coordinates: Any, measurements: Measurements) 
 def coordinate_covariance(jacobian: Float[np.ndarray, "residuals unknowns"]) -> Float[np.ndarray, "unknowns unknowns"]:
     """The inverse of the Gauss-Newton matrix J^T J; infinite for unknowns that take part in an undetermined direction.
 
-    Directions are judged with every unknown in units of its own error, with the other unknowns held.
+    To find these directions, every unknown is measured in units of its own error at fixed other unknowns.
     """
     norms = np.linalg.norm(jacobian, axis=0)
     norms = np.where(norms > 0.0, norms, 1.0)
@@ -367,8 +368,8 @@ def agreement(
     covariance: Float[np.ndarray, "unknowns unknowns"],
     best: int,
 ) -> tuple[int, int, int]:
-    """Numbers of starts that ended at the best minimum, of those elsewhere with nearly the same likelihood, and of
-    all."""
+    """The numbers of starts that ended at the best minimum, that ended elsewhere with nearly the same likelihood, and
+    of all starts."""
     errors = np.sqrt(np.diag(covariance))
     with np.errstate(invalid="ignore"):
         off = np.abs(ends - ends[best]) / errors

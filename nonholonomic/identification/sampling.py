@@ -7,8 +7,8 @@ respect to q, the draws are from p, whatever q is (surrogate transitions: J. S. 
 Scientific Computing (2001), chapter 9; Christen and Fox, J. Comput. Graph. Stat. 14 (2005) 795). A bad surrogate lowers
 the fraction of accepted proposals.
 
-Event times need this method: they are rough on the scale of a nutation period, so a slope at one point says little
-about the next point, and walks that follow slopes take hundreds of steps.
+Event times need this method: they vary roughly on the scale of a nutation period, so the slope at one point predicts
+little about the next point, and walks that follow slopes take hundreds of steps.
 """
 
 from collections.abc import Callable
@@ -49,7 +49,7 @@ class Draws(NamedTuple):
     - `r_hat`, `ess`: name -> number: the potential scale reduction, which should be below 1.01, and the effective number of
       independent draws.
     - `units`: name -> unit, of the unknown errors.
-    - `accepted`: fraction of accepted proposals; `runs`: number of sets of parameters for which the model was run.
+    - `accepted`: fraction of accepted proposals; `runs`: number of parameter sets for which the model ran.
     """
 
     values: dict[str, Float[np.ndarray, "chains draws"]]
@@ -103,11 +103,11 @@ def sample(
     **Arguments:**
 
     - `density`: a `LogDensity`.
-    - `centre`, `covariance`: (unknowns,), (unknowns, unknowns), of a fit in its coordinates: `Identification.coordinates` and
-      `coordinate_covariance`. Unknown errors, which are not among the unknowns of a fit, start from their first guess.
-    - `chains`, `warmup`, `draws`: number of chains, at least 2, which R-hat compares; number of draws of each chain to
-      discard; and number of draws to keep, at least 2. The chains start from draws of the surrogate.
-    - `seed`: of the draw; `progress`: whether to show progress, on a terminal or in a notebook.
+    - `centre`, `covariance`: (unknowns,), (unknowns, unknowns), the `coordinates` and `coordinate_covariance` of an
+      `Identification`. Unknown errors, which are not among the unknowns of a fit, start from their first guess.
+    - `chains`: number of chains, at least 2, because R-hat compares chains; `warmup`, `draws`: number of draws of each
+      chain to discard and to keep, the latter at least 2. The chains start from draws of the surrogate.
+    - `seed`: seed of the draws; `progress`: whether to show progress, on a terminal or in a notebook.
 
     **Returns:** `Draws`.
 

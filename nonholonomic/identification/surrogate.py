@@ -27,8 +27,8 @@ class Surrogate(eqx.Module):
 
     It is a function of points: the coordinates of the density are `centre` + the sum of `bends[k]` point^(k + 1). If
     the data determine one combination far better than another, the posterior is a thin, bent ridge; in points it is
-    nearly round. Along the axes of `among` the bends are triangular, so volumes change only by a factor. An unknown
-    error, on which no prediction depends, is also one of the coordinates.
+    nearly round. Along the axes of `among` the bends are triangular, so volumes change only by a factor. Unknown
+    errors, on which no prediction depends, are also coordinates.
 
     - `power`: the power of the density; less than 1 makes it wider.
     - `origin`, `scale`: (numbers,), (numbers, numbers): the polynomials are in `scale` (coordinates - `origin`).
@@ -45,7 +45,8 @@ class Surrogate(eqx.Module):
 
     @classmethod
     def around(cls, density: LogDensity, centre: Any, covariance: Any) -> "Surrogate":
-        """A surrogate before learning, with points in units of a fit's errors along its own directions.
+        """A surrogate before learning, whose points are in units of a fit's errors, along the principal directions of
+        the fit.
 
         An unknown error of n values has the variance 1 / 2n.
         """
@@ -113,8 +114,8 @@ class Surrogate(eqx.Module):
         """A surrogate whose points are adapted to some draws, which are nearly round in the new points; also returns
         these points.
 
-        Along the principal axes of the draws, the widest first, the part that is predicted by powers of the earlier
-        points is subtracted.
+        Along each principal axis of the draws, the widest first, the part that powers of the earlier points predict is
+        subtracted.
         """
         centre = coordinates.mean(axis=0)
         axes = np.linalg.eigh(np.atleast_2d(np.cov(coordinates.T)))[1][:, ::-1]

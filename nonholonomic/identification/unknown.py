@@ -59,9 +59,10 @@ class Free(NamedTuple):
 
 
 class Unknown(eqx.Module):
-    """A `Free` for compiled programs, which depend on which bounds and prior exist but take their numbers as arguments.
+    """A `Free` for compiled programs. A program depends on which bounds exist and on whether there is a prior, and
+    takes their values as arguments.
 
-    - `start`, `unit`, `lower`, `upper`: as of the `Free`; `has_lower`, `has_upper`: which bounds are finite.
+    - `start`, `unit`, `lower`, `upper`: as for `Free`; `has_lower`, `has_upper`: which bounds are finite.
     - `prior`: mean and standard deviation, or `None`.
     """
 
@@ -75,7 +76,8 @@ class Unknown(eqx.Module):
 
     @classmethod
     def of(cls, free: Free) -> "Unknown":
-        """A `Free` whose numbers are arrays: Python numbers would be compiled in."""
+        """The unknown of a `Free`, with arrays in place of Python numbers, which would become constants of the
+        program."""
         numbers = (free.start, free.unit, free.lower, free.upper)
         start, unit, lower, upper = (np.asarray(number, float) for number in numbers)
         prior = None if free.prior is None else np.asarray(free.prior, float)
@@ -143,10 +145,10 @@ def as_free(free: Any, lower: dict[str, float] | None = None) -> dict[str, Free]
 
 
 def draw_starts(free: dict[str, Free], count: int, spread: float, seed: int) -> Float[np.ndarray, "count unknowns"]:
-    """Coordinates of several starts: the given one first, then others around it.
+    """Coordinates of several starts: first the start values, then others around them.
 
     A parameter fitted in its logarithm is drawn uniformly in the logarithm, up to a factor `spread` in either
-    direction; any other is drawn within the distance by which that factor would change its start.
+    direction; any other parameter is drawn from an interval whose half width is the change of its start by that factor.
     """
     centre = np.array([float(unknown.coordinate(unknown.start)) for unknown in free.values()])
     reach = np.array(

@@ -42,8 +42,8 @@ class FitWarning(UserWarning):
 
 
 class Series(NamedTuple):
-    """The order of the residuals of one series: their number, their runs of one sign, and the probability of so few
-    runs or fewer if signs were drawn at random."""
+    """The order of the residuals of one series: the number of residuals, the number of runs of one sign, and the
+    probability of at most so many runs if the signs were random."""
 
     count: int
     runs: int
@@ -56,7 +56,7 @@ class Verdict(NamedTuple):
     - `p_value`: probability of residuals this large or larger if the model and the errors are right (chi squared of the
       measurements that are not limits); NaN if errors were estimated or no degree of freedom is left.
     - `series`: a `Series` for each series of measurements.
-    - `agree`, `starts`: number of starts that reached the same minimum, and of all starts.
+    - `agree`, `starts`: number of starts that reached the same minimum, and number of all starts.
     - `undetermined`: the parameters that the data do not determine, in words.
     - `concerns`: the concerns, in words; empty for a flawless fit.
     """
@@ -101,8 +101,9 @@ def judge(
 
     - `measurements`, `prediction`, `residual`: (n,).
     - `degrees`: measurements and priors less unknowns, without limits.
-    - `agreement`: starts that agree with the best, starts that ended elsewhere nearly as well, all starts.
-    - `undetermined`: combinations of parameters, in words; `status`: of the fit.
+    - `agreement`: numbers of starts that agree with the best, that ended elsewhere with nearly the same likelihood, and
+      of all starts.
+    - `undetermined`: combinations of parameters, in words; `status`: status of the fit.
 
     **Returns:** a `Verdict`.
     """
@@ -160,7 +161,8 @@ def chi_squared_tail(value: float, degrees: int) -> float:
 
 
 def runs_of_signs(values: Float[np.ndarray, " n"]) -> Series:
-    """Runs of one sign in a series, and the probability of so few (Wald and Wolfowitz, Ann. Math. Stat. 11 (1940) 147).
+    """The number of runs of one sign in a series, and the probability of at most so many runs (Wald and Wolfowitz, Ann.
+    Math. Stat. 11 (1940) 147).
 
     Given the numbers of both signs, the number of runs of either sign is hypergeometric; the sum is exact.
     """

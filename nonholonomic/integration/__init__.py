@@ -2,8 +2,38 @@
 
 `solve_ensemble` runs many cells of a problem in lanes that step together; `follow` and `sample` integrate single runs
 with any solver of Diffrax. `solve_by_diffrax` is an independent reference. Hybrid runs are in `nonholonomic.hybrid`.
-`Settings` holds the options, and the status codes of a run are `RUNNING`, `REACHED_END`, `CROSSED`, `LEFT_DOMAIN`,
-`FAILED` and `UNRESOLVED`.
+`Settings` holds the options. The status codes of a run are `RUNNING`, `REACHED_END` (at the horizon), `CROSSED` (on the
+event), `LEFT_DOMAIN`, `FAILED` and `UNRESOLVED`. The limits are `DEFAULT_MAX_STEPS`, `MOST_STEPS` for runs that should
+be short, and `TIGHTEST`, the smallest tolerance.
+
+A `nonholonomic.AbstractMode` has functions of one state, and the package maps them over cells. An `AbstractProblem` has
+functions of all cells at once: components along the first axis, cells along the last.
+
+**Example:** a decay, first as a mode, then as a problem with three cells.
+
+>>> import jax
+>>> import jax.numpy as jnp
+>>> import nonholonomic
+>>> from nonholonomic.integration import AbstractProblem, Settings, solve_ensemble
+>>> class Decay(nonholonomic.AbstractMode):
+...     rate: float
+...     def field(self, t, y):
+...         return -self.rate * y
+>>> class Decays(AbstractProblem):
+...     rate: jax.Array  # (cells,), or () for a single run
+...     def start(self):
+...         return jnp.ones((1, *self.rate.shape)), jnp.ones((1, *self.rate.shape))
+...     def field(self, time, state):
+...         return jnp.stack([-self.rate * state[0]])
+...     def event_function(self, state):
+...         return state[0] - 0.5
+...     def domain_margin(self, time, state):
+...         return None
+>>> problem, settings = Decays(jnp.array([1.0, 2.0, 4.0])), Settings(1e-9)
+>>> outcome, iterations = solve_ensemble(problem, jnp.asarray(5.0), jnp.asarray(3), settings)
+>>> decay = nonholonomic.Hybrid([Decay(2.0)], event=lambda t, y: y[0] - 0.5)
+>>> print(outcome.crossing_time.round(6), nonholonomic.event_time(decay, [1.0], t1=5.0).round(6))
+[0.693147 0.346574 0.173287] 0.346574
 """
 
 from .dense import DenseSolution as DenseSolution

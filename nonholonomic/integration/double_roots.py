@@ -1,7 +1,9 @@
-"""Functions that fall below zero and come back within a step: two zeros that do not show at the ends of the step.
+"""Functions that fall below zero and return within a step, so that the signs at the ends of the step do not show the
+two zeros.
 
-Where a double root may have been missed, the step is tried again with an end near the minimum. Either the function is
-negative there, and its zero is located as any other; or the step is accepted, and the next one checks the rest.
+Where a double root may have been missed, the step is tried again with an end near the minimum. If the function is
+negative there, its zero is located like any other. Otherwise the shorter step is accepted, and the next step checks the
+rest.
 """
 
 from collections.abc import Callable
@@ -34,14 +36,13 @@ FLAT = 1e-10
 def missed_double_root(
     function: Callable[[States], Lanes | None], side: Lanes, before: tuple[States, States], tried: Step, length: Lanes
 ) -> Lanes:
-    """Fraction of a step at which a function may fall below zero and come back; 2 if nowhere.
-
-    This is the minimum of the cubic through values and derivatives at both ends, if it is low against both ends.
+    """Fraction of a step at which a function may fall below zero and return; 2 if nowhere. This is the minimum of the
+    cubic through values and derivatives at both ends, if the minimum is far below both values.
 
     **Arguments:**
 
-    - `function`: of the state, counted positive where `side` is 1 and negative where it is -1.
-    - `before`: state and rate at the start of the step; `tried`: the step, of some `length` [s].
+    - `function`: function of the state; where `side` is -1, its negative is used.
+    - `before`: state and rate at the start of the step; `tried`: the step, of the given `length` [s].
     """
     state, rate = before
     if function(state) is None:
@@ -59,15 +60,15 @@ def missed_loss(
     margins: Float[Array, "places margins lanes"] | None,
     free: Bool[Array, " lanes"],
 ) -> Lanes:
-    """Fraction of a step at which one of its margins may first fall below zero and come back; 2 if nowhere.
+    """Fraction of a step at which a margin may first fall below zero and return; 2 if nowhere.
 
     This is the minimum of the polynomial through the known values, if its error may hide a zero.
 
     **Arguments:**
 
-    - `places`: the fractions of the step, from 0 to 1, at which the `margins` are known; these are `None` if there are
-      none.
-    - `free`: the lanes that matter.
+    - `places`: the fractions of the step, from 0 to 1, at which the `margins` are known; `margins` is `None` if there
+      are none.
+    - `free`: the lanes to check.
     """
     if margins is None or len(places) < 3:
         return jnp.full(free.shape, 2.0)

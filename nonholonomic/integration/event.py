@@ -44,7 +44,7 @@ def refine(
     - `bracketing`: which lanes have a bracket; any other lane opens its bracket with the step it just took.
     - `was`: the bracket.
     - `before`, `margin`: the margin at the start of the trial step and at its end.
-    - `length`: of the trial step [s].
+    - `length`: length of the trial step [s].
 
     **Returns:** the bracket, the length to try next, and whether the trial step ended on the event.
     """

@@ -17,11 +17,22 @@ Core = TypeVar("Core", bound=AbstractProblem)
 
 
 class AbstractPassive(eqx.Module):
-    """Rates of passive components."""
+    """Rates of passive components.
+
+    **Example:** as for `ExtendedProblem`.
+
+    >>> from nonholonomic.integration import AbstractPassive
+    >>> class Area(AbstractPassive):
+    ...     def rates(self, problem, time, state, passive):
+    ...         return jnp.concatenate([problem.field(time, state), state])
+    >>> print(Area().rates(problem, 0.0, jnp.ones((1, 3)), jnp.zeros((1, 3)))[1])
+    [1. 1. 1.]
+    """
 
     @abc.abstractmethod
     def rates(self, problem: AbstractProblem, time: Lanes, state: States, passive: States) -> States:
-        """Rates of change of the problem's state and, behind them, of the passive components: they share work."""
+        """Rates of change of the problem's state, followed by those of the passive components. Both are computed
+        together because they share work."""
 
 
 class ExtendedProblem(AbstractProblem, Generic[Core]):
@@ -29,6 +40,17 @@ class ExtendedProblem(AbstractProblem, Generic[Core]):
 
     - `passive`: the rates; `values`, `scales`: initial values, and the magnitudes that scale absolute errors.
     - `ends_on_event`: whether the problem's event is kept.
+
+    **Example:** a decay and the area under it.
+
+    >>> from nonholonomic.integration import AbstractPassive, ExtendedProblem
+    >>> class Area(AbstractPassive):
+    ...     def rates(self, problem, time, state, passive):
+    ...         return jnp.concatenate([problem.field(time, state), state])
+    >>> extended = ExtendedProblem(problem, Area(), jnp.zeros((1, 3)), jnp.ones((1, 3)))
+    >>> print(extended.field(0.0, extended.start()[0]))
+    [[-1. -2. -4.]
+     [ 1.  1.  1.]]
     """
 
     problem: Core

@@ -19,12 +19,13 @@ ITERATIONS = 8
 class ImplicitMidpoint(diffrax.AbstractSolver):
     """The implicit midpoint rule y1 = y0 + h f((y0 + y1) / 2), second order, with a fixed step.
 
-    It keeps every linear and quadratic invariant, and on the P-form the balance of energy and work, to round-off
-    (`stroller.md`, section 5).
+    It conserves every linear and quadratic invariant, and on the P-form the balance of energy and work, up to rounding
+    errors (`stroller.md`, section 5).
 
     **Arguments:**
 
-    - `step_length`: longest step [s], positive. The steps between two times of output are equal and end on them.
+    - `step_length`: longest step [s], positive. The steps between two output times are equal, and steps end on the
+      output times.
 
     **Raises:** `ValueError` if the step is not positive.
 

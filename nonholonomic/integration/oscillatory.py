@@ -4,10 +4,10 @@ The pair has the thirteen stages, and all simplifying assumptions, of Prince and
 embedded Runge-Kutta formulae, J. Comput. Appl. Math. 7, 1981), which is Diffrax's `Dopri8`. These leave ten
 coefficients free. Prince and Dormand chose them for a small error in ninth order, whatever the field. Here they
 minimise the error of a step along the motions of tops and strollers, for lengths at which the error is about the
-tolerance, and keep the weights small, because large weights magnify round-off;
-`python benchmarks/tune_pair.py --starts 50 --seed 0` computed them. `docs/performance.md` has the gain. A
-rotation by 1 rad a step changes the amplitude by 3e-10 and the phase by 7e-10, with `Dopri8` by 1e-8 and 3e-8;
-by 3 rad, which only the loosest tolerances allow, both by 8e-4, `Dopri8` inwards and this pair outwards.
+tolerance, and keep the weights small, because large weights magnify round-off; `python benchmarks/tune_pair.py --starts
+50 --seed 0` computed them. `docs/performance.md` lists the gain. A rotation by 1 rad per step changes the amplitude by
+3e-10 and the phase by 7e-10; with `Dopri8`, the changes are 1e-8 and 3e-8. A rotation by 3 rad per step, which only the
+loosest tolerances allow, changes both by 8e-4; `Dopri8` shrinks the amplitude and this pair enlarges it.
 """
 
 from typing import Any, ClassVar
@@ -137,9 +137,9 @@ PLACES = np.array([*(sum(row) for row in STAGES), 1.0])
 class Oscillatory8(diffrax.AbstractERK):
     """A Runge-Kutta pair of orders 8 and 7 with thirteen stages, for motions that oscillate or turn.
 
-    Its dense output is the cubic through states and rates at both ends, far less accurate than its steps: it is for runs that
-    end, or are sampled, at the ends of steps, as those of tables are. Functions that
-    interpolate within steps, such as `tippe.simulate` for a single run, therefore raise a `ValueError` for this solver.
+    Its dense output is the cubic through states and rates at both ends, which is far less accurate than its steps. Use
+    this solver for runs that end, or are sampled, at the ends of steps, as in tables. Functions that interpolate within
+    steps, such as `tippe.simulate` for a single run, therefore raise a `ValueError` for this solver.
 
     **Example:**
 

@@ -15,23 +15,28 @@ from .runge_kutta import Lanes, States, lesser
 class AbstractProblem(eqx.Module):
     """An initial value problem: a field, an event function, and a domain margin that ends the run where it vanishes.
 
-    The leaves of a problem are scalars, or hold one number per cell in their last axis.
+    The leaves of a problem are scalars, or hold one number per cell in their last axis. Its functions receive one
+    number per lane, or scalars for a single run.
+
+    **Example:** the problem of the room's example, at its start.
+
+    >>> start, scales = problem.start()
+    >>> print(problem.event_function(start), problem.field(0.0, start)[0])
+    [0.5 0.5 0.5] [-1. -2. -4.]
     """
 
     @property
     def leading(self) -> int | None:
-        """Number of leading components (the core state) that evolve independently of the rest, and on which event
-        function and domain margin depend alone; `None` if all are coupled.
+        """Number of leading components (the core state) that evolve independently of the rest; the event function and
+        the domain margin depend only on these. `None` if all components are coupled.
         """
         return None
 
     @property
     def direction_decides(self) -> bool:
-        """Whether the direction of motion decides on which side of a zero of the event function or domain margin a run
-        starts.
-
-        A run that starts beyond the event then waits until the event function next falls through zero; otherwise it
-        ends at once.
+        """Whether a run may start at a zero of the event function or of the domain margin, so that the direction of
+        motion decides on which side the run is. If true, a run that starts beyond the event continues until the event
+        function next falls through zero; otherwise the run ends at once.
         """
         return False
 
@@ -60,7 +65,7 @@ class AbstractProblem(eqx.Module):
 
     @abc.abstractmethod
     def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
-        """A function of order 1 that is positive while the model holds; `None` if it always does."""
+        """A function of order 1 that is positive while the model holds; `None` if the model always holds."""
 
     def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
         """The smooth functions of which `domain_margin` is the least; a step searches each of them for a missed double root."""
@@ -69,7 +74,19 @@ class AbstractProblem(eqx.Module):
 
 
 class CoreProblem(AbstractProblem):
-    """The core state of a problem: the leading components, on which the others do not act."""
+    """The core state of a problem: the leading components, on which the others do not act.
+
+    **Arguments:**
+
+    - `whole`: the problem.
+    - `size`: number of leading components.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import CoreProblem
+    >>> CoreProblem(problem, size=1).start()[0].shape
+    (1, 3)
+    """
 
     whole: AbstractProblem
     size: int = eqx.field(static=True)
@@ -105,14 +122,14 @@ class CoreProblem(AbstractProblem):
 
 
 def least_margin(problem: AbstractProblem, side: Lanes, time: Lanes, state: States, rate: States) -> Lanes:
-    """The least of the problem's event function, counted positive on the lane's side of the event, and its domain
-    margin, where the field is known.
+    """The lesser of the domain margin and the event function, where the sign of the event function is positive on the
+    lane's side of the event; used where the field is known.
     """
     return lesser(problem.domain_margin(time, state), side_of(problem, side)(state, rate), side)
 
 
 def side_of(problem: AbstractProblem, side: Lanes) -> Callable[[States, States], Lanes | None]:
-    """The problem's event function by state and rate, counted positive on the lane's side of the event."""
+    """The event function of state and rate, with the sign that makes it positive on the lane's side of the event."""
 
     def crossing(state: States, rate: States) -> Lanes | None:
         value = problem.crossing_along(state, rate)
@@ -122,7 +139,23 @@ def side_of(problem: AbstractProblem, side: Lanes) -> Callable[[States, States],
 
 
 def crossing_time(problem: AbstractProblem, time: Lanes, state: States) -> Lanes:
-    """Time at which the event function vanishes, for a state close to the event (`event_time`)."""
+    """Time [s] at which the event function vanishes, for a state close to the event.
+
+    The time is differentiable by the numbers of the problem and by the state (implicit function theorem).
+
+    **Arguments:**
+
+    - `problem`: a problem with an event.
+    - `time`, `state`: time and state close to the event, (cells,) and (components, cells).
+
+    **Returns:** the times, (cells,), to third order in the distance.
+
+    **Example:** a state that is 1e-4 s before the event.
+
+    >>> from nonholonomic.integration import crossing_time
+    >>> print(f"{crossing_time(Decays(jnp.asarray(2.0)), 0.3465, jnp.exp(jnp.array([-0.693]))):.8f}")
+    0.34657359
+    """
     return event_time(problem, problem.event_function, time, state)
 
 

@@ -27,9 +27,15 @@ def solve_by_diffrax(
     The domain margin is checked at the ends of steps, so a short loss can be missed; events are located on Diffrax's
     dense output.
 
-    **Arguments:** as for `ensemble_solve`, but any solver of Diffrax works.
+    **Arguments:** as for `solve_ensemble`, but any solver of Diffrax works.
 
     **Returns:** the `Outcome`.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import solve_by_diffrax
+    >>> print(solve_by_diffrax(problem, jnp.asarray(5.0), settings).crossing_time.round(6))
+    [0.693147 0.346574 0.173287]
     """
     (starts, scales), rtol = problem.start(), settings.tolerance
     varying = jax.tree.map(lambda leaf: None if jnp.ndim(leaf) == 0 else -1, problem)

@@ -19,10 +19,10 @@ Stages = Float[Array, "stages components lanes"]
 
 
 class Step(NamedTuple):
-    """A step that was tried.
+    """The result of a trial step.
 
-    - `state`, `rate`: where it leads, and the field there; `error`: its estimated error.
-    - `watched`: the least of the margins and the event function at its end.
+    - `state`, `rate`: the state at the end, and the field there; `error`: the estimated error.
+    - `watched`: the least of the margins and the event function at the end.
     - `first_negative`: the fraction of the step of the first stage at which one of these was negative, 2 if none was.
     - `margins`: all margins at `watched_places` of the step; `None` if there are none.
     """
@@ -39,6 +39,13 @@ def explicit_tableau(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau:
     """The tableau of an explicit, embedded Runge-Kutta solver of Diffrax.
 
     **Raises:** `ValueError` for any other solver.
+
+    **Example:**
+
+    >>> import diffrax
+    >>> from nonholonomic.integration import explicit_tableau
+    >>> explicit_tableau(diffrax.Dopri8()).num_stages
+    14
     """
     tableau = getattr(solver, "tableau", None)
     if not isinstance(solver, diffrax.AbstractERK) or not isinstance(tableau, diffrax.ButcherTableau):
@@ -49,7 +56,7 @@ def explicit_tableau(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau:
 def explicit_order(solver: diffrax.AbstractSolver) -> int:
     """The order of such a solver.
 
-    **Raises:** `ValueError` for a solver that does not know its order.
+    **Raises:** `ValueError` for a solver that does not declare its order.
     """
     order = solver.order(None)
     if order is None:
@@ -77,11 +84,11 @@ def explicit_step(
 
     - `tableau`: the method.
     - `field`: (time [s], state) -> rate of the state.
-    - `margins`, `crossing`: (time, state) -> any number of margins, and (state, rate) -> the event function or `None`:
-      numbers per lane that should stay positive. They are evaluated at the end and at three stages between: the
-      margins, which may need all of the state, in a branch of those stages; the event function, which may need few
-      components, after the stages.
-    - `time`, `state`, `rate`: where the step starts, and the field there.
+    - `margins`, `crossing`: functions of (time, state) that returns the margins, and of (state, rate) that returns the
+      event function, or `None`. Their values, one per lane, should stay positive. Both are evaluated at the end of the
+      step and at three stages: the margins, which may need the whole state, within these stages; the event function,
+      which may need few components, after all stages.
+    - `time`, `state`, `rate`: time and state at the start of the step, and the field there.
     - `length`: length of the step [s], one per lane.
     - `margins_before`: the margins at the start; `None` if there are none.
 
@@ -170,9 +177,8 @@ def weighted_sum(weights: Float[np.ndarray, " stages"], rates: Sequence[States])
 def moved_state(
     stage: Int[Array, ""], rows: Iterable[Float[np.ndarray, " before"]], state: States, length: Lanes, rates: Stages
 ) -> States:
-    """The state moved along the first of the rates, with the weights in the row of a stage.
-
-    Every row is a branch of its own: the weights are then constants, of which many are 0.
+    """The state moved along the rates of the earlier stages, with the weights of a stage. Every stage is a branch of
+    its own, so that its weights are constants, of which many are 0.
     """
 
     def moved(row: Float[np.ndarray, " before"]) -> Callable[[Stages], States]:
@@ -218,9 +224,9 @@ def first_length(
     """Length of the first step [s] (Hairer, Norsett and Wanner, Solving ODEs I, section II.4), in the motion's own
     unit.
 
-    Their formula compares |y'| with |y''|, which depends on the unit of time; Diffrax uses seconds. Here the unit is
-    |y|/|y'|, so that motions that differ only in scale are integrated alike. If the state has several blocks (`n_blocks`),
-    the first one counts.
+    The comparison of |y'| with |y''| in their formula depends on the unit of time; Diffrax uses seconds. Here the unit
+    is |y|/|y'|, so that motions that differ only in scale are integrated alike. If the state has several blocks
+    (`n_blocks`), the first one counts.
     """
     scale = atol + jnp.abs(state) * rtol
     size = state.shape[0] // n_blocks

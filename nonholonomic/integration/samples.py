@@ -41,7 +41,7 @@ class Collected(NamedTuple):
 
 
 class SampleRecorder(AbstractRecorder):
-    """Lets steps end on the samples of every cell, and collects these.
+    """Lets steps end on the sample times of every cell, and collects the samples.
 
     `times` [s] are those of the samples; `first` is the number of each cell's first sample after its start.
     """
@@ -74,7 +74,7 @@ class SampleRecorder(AbstractRecorder):
         record: tuple[Bool[Array, " lanes"], Array, Reached],
         iteration: Int[Array, ""],
     ) -> tuple[LaneState, tuple[Bool[Array, " lanes"], Array, Reached]]:
-        """Whether the last step was accepted, and the number of the next sample, are part of the record."""
+        """The record also contains whether the last step was accepted, and the number of the next sample."""
         (problem, control, atol), (accepted, sample, reached) = in_lanes, record
         count, horizon = len(self.times), jnp.broadcast_to(control.t1, lane_state.time.shape)
         next_time = self._time_of(sample, lane_state)
@@ -128,11 +128,21 @@ def solve_with_samples(
 
     **Arguments:** as for `LaneScheduler.of`, and
 
-    - `times`: of the samples [s], increasing, from 0 or later; (times,) for all cells or (times, cells). Those after
-      `t1` are not reached.
+    - `times`: times of the samples [s], increasing, at least 0; (times,) for all cells or (times, cells). Runs do not
+      reach times after `t1`.
 
     **Returns:** the `Outcome`, without crossing times; and the states at the times, (cells, times, components), NaN
     after the end of a run.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import solve_with_samples
+    >>> times = jnp.array([0.1, 0.3])
+    >>> _, states = solve_with_samples(problem, times, jnp.asarray(5.0), jnp.asarray(3), settings)
+    >>> print(states[..., 0].round(6))
+    [[0.904837 0.740818]
+     [0.818731 0.548812]
+     [0.67032       nan]]
     """
     scheduler = LaneScheduler.of(problem, t1, cells, settings, n_blocks=n_blocks, one_kernel=one_kernel)
     recorder = SampleRecorder.of(times, scheduler.capacity)

@@ -1,7 +1,7 @@
 """The cells of a problem, and the lanes that run them.
 
 A lane whose run has ended takes the next cell of the queue, so cheap and expensive cells share the lanes without
-waiting for one another. All ensemble solves share this loop; a recorder says what is kept of the steps.
+waiting for one another. All ensemble solves share this loop; a recorder stores what they keep of the steps.
 """
 
 import abc
@@ -39,8 +39,14 @@ class Outcome(NamedTuple, Generic[Numbers]):
     """How every cell ended.
 
     `status` is one of the codes of `status.py`; `first_crossing` and `crossing_time` [s] are the times of the first and
-    the last event, the same where runs end on it, infinite if there was none; `end_time` [s] and `state` are those at
-    which the run ended; `steps` counts accepted and rejected steps, `rejected` the latter.
+    the last event, which are equal if runs end on the event, and infinite if there was none; `end_time` [s] and `state`
+    are time and state at the end of the run; `steps` counts accepted and rejected steps, `rejected` only rejected ones.
+
+    **Example:** the outcome of the room's example, whose runs end on the event.
+
+    >>> from nonholonomic.integration import CROSSED
+    >>> print(outcome.status == CROSSED, outcome.state.shape)
+    [ True  True  True] (1, 3)
     """
 
     status: Int[Numbers, " cells"]
@@ -53,7 +59,7 @@ class Outcome(NamedTuple, Generic[Numbers]):
 
 
 class Progress(NamedTuple):
-    """The lanes, the number of cells that have left the queue, and the number of iterations made."""
+    """The lanes, the number of cells that have left the queue, and the number of iterations so far."""
 
     lane_state: LaneState
     loaded: Int[Array, ""]
@@ -67,7 +73,8 @@ InLanes = tuple[AbstractProblem, Control, States]
 class AbstractRecorder(eqx.Module):
     """What a solve keeps of the steps between two refills of the lanes (a period), beside the `Outcome`.
 
-    `period`: the greatest number of iterations of a period, `None` for any number; `refill_cost`: in steps of all lanes.
+    `period`: the greatest number of iterations of a period, `None` for any number; `refill_cost`: cost of a refill, in
+    steps of all lanes.
     """
 
     period: ClassVar[int | None] = None
@@ -170,7 +177,7 @@ class LaneScheduler(eqx.Module):
     def recorded(self, recorder: AbstractRecorder, collected: Any) -> tuple[Outcome, Int[Array, ""], Any]:
         """Run every cell, as `outcome` does, and also return what a recorder has collected.
 
-        **Arguments:** `recorder`; `collected`: by it before the first step.
+        **Arguments:** `recorder`; `collected`: what the recorder has collected before the first step.
         """
 
         def period(carry: tuple[Progress, Outcome, Any]) -> tuple[Progress, Outcome, Any]:
@@ -194,9 +201,8 @@ class LaneScheduler(eqx.Module):
         return jnp.any(progress.lane_state.status == RUNNING) | (progress.loaded < self.cells)
 
     def run(self, progress: Progress, recorder: AbstractRecorder, collected: Any = None) -> tuple[Progress, Any]:
-        """Advance the lanes by a period: until they should be refilled, have all ended, or the record is full.
-
-        While cells wait, the loop stops for a refill as soon as the refill pays off.
+        """Advance the lanes by a period: until all have ended, the record is full, or a refill pays off while cells
+        wait.
 
         **Returns:** the `Progress`, and the record of the period.
         """

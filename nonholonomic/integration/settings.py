@@ -32,11 +32,17 @@ class Settings(eqx.Module):
     **Arguments:**
 
     - `tolerance`: relative tolerance.
-    - `solver`: a solver of Diffrax, an explicit Runge-Kutta one for ensembles; `None` for `Oscillatory8` in ensembles
-      and `Dopri8` in single runs, which need its dense output.
+    - `solver`: a solver of Diffrax, which must be an explicit Runge-Kutta solver for ensembles; `None` for
+      `Oscillatory8` in ensembles and `Dopri8` in single runs, which need its dense output.
     - `absolute`: absolute tolerance as a fraction of the relative one, in units of the problem's magnitudes.
     - `max_steps`: a run that needs more steps fails.
     - `lanes`: number of cells that advance together; by default as many as suit the machine (`lanes_for`).
+
+    **Example:**
+
+    >>> from nonholonomic.integration import Settings
+    >>> type(Settings(1e-9).for_lanes).__name__, type(Settings(1e-9).for_single_runs).__name__
+    ('Oscillatory8', 'Dopri8')
     """
 
     tolerance: Float[Array, ""] = eqx.field(converter=as_number)
@@ -54,7 +60,7 @@ class Settings(eqx.Module):
     def for_single_runs(self) -> diffrax.AbstractSolver:
         """The solver for integration by Diffrax that locates events, and interpolates states, within steps.
 
-        **Raises:** `ValueError` for one whose dense output is less accurate than its steps.
+        **Raises:** `ValueError` for a solver whose dense output is less accurate than its steps.
         """
         if isinstance(self.solver, Oscillatory8):
             raise ValueError(
@@ -68,7 +74,7 @@ class Settings(eqx.Module):
         return diffrax.Dopri8() if self.solver is None else self.solver
 
     def with_tolerance(self, tolerance: Float[Array, ""] | None) -> Self:
-        """The same settings with another tolerance, or without one if the caller stores it."""
+        """The same settings with another tolerance, or without a tolerance if the caller stores it."""
         return eqx.tree_at(lambda settings: settings.tolerance, self, tolerance, is_leaf=lambda leaf: leaf is None)
 
     def lanes_of(self, cells: int, n_blocks: int = 1) -> int:
@@ -77,18 +83,41 @@ class Settings(eqx.Module):
 
 
 def tolerance_bound(tolerance: Any) -> Bound:
-    """The range of the relative tolerance."""
+    """The legal range of the relative tolerance.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import tolerance_bound
+    >>> tolerance_bound(1.0).require()
+    Traceback (most recent call last):
+    ValueError: tolerance = 1.0 must be at most 0.01
+    """
     return Bound(tolerance, "tolerance", at_least=TIGHTEST, at_most=LOOSEST)
 
 
 def run_bounds(t1: Any, tolerance: Any) -> Iterator[Bound]:
-    """The ranges of the horizon [s] and of the tolerance."""
+    """The ranges of the horizon [s] and of the tolerance.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import run_bounds
+    >>> [bound.name for bound in run_bounds(t1=5.0, tolerance=1e-9)]
+    ['t1', 'tolerance']
+    """
     yield Bound(t1, "t1", above=0.0)
     yield tolerance_bound(tolerance)
 
 
 def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
-    """The range of the times of output [s]."""
+    """The range of the times of output [s].
+
+    **Example:**
+
+    >>> from nonholonomic.integration import times_bounds
+    >>> next(times_bounds(times=jnp.array([1.0, 6.0]), t1=5.0)).require()
+    Traceback (most recent call last):
+    ValueError: times ...
+    """
     yield Bound(times, "times", at_least=0.0, at_most=t1)
 
 
@@ -98,13 +127,20 @@ def legal_run(
     tolerance: Float[ArrayLike, "..."],
     times: Any = None,
 ) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
-    """Whether the traced numbers of a run are legal, with its horizon and tolerance: if not, 0 and the largest
-    tolerance.
+    """Whether the traced numbers of a run are legal, and its horizon and tolerance. A run with illegal numbers might
+    never end, so it gets the horizon 0, and the largest tolerance, which does not affect its batch.
 
-    A run of illegal numbers might never end, so it does not begin, and its tolerance does not affect its batch.
+    **Arguments:** `others`: whether all other numbers are legal. This function checks `t1`, `tolerance`, and the output
+    `times` (times,), which must increase.
 
-    **Arguments:** `others`: whether all other numbers are legal; `t1`, `tolerance`, and the `times` of output (times,),
-    which must increase, are checked here.
+    **Returns:** whether the run is legal, its horizon and its tolerance.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import legal_run
+    >>> legal, t1, tolerance = legal_run(True, t1=-1.0, tolerance=1e-9)
+    >>> print(legal, t1, tolerance)
+    False 0.0 0.01
     """
     may = jnp.asarray(others) & legal(run_bounds(t1, tolerance))
     if times is not None:
@@ -113,9 +149,14 @@ def legal_run(
 
 
 def require_adaptive(solver: Any, others: str = "") -> None:
-    """Raise `ValueError` unless this is `None` or a solver of Diffrax that estimates its errors and takes one field.
+    """Raise `ValueError` unless the solver is `None` or a solver of Diffrax that estimates its errors and integrates a
+    single field (others add a stiff part or noise). **Arguments:** `others`: what else the message lists as allowed.
 
-    Solvers with two fields add a stiff part or noise. **Arguments:** `others`: what else the message should allow.
+    **Example:**
+
+    >>> import diffrax
+    >>> from nonholonomic.integration import require_adaptive
+    >>> require_adaptive(diffrax.Tsit5())
     """
     structure = getattr(solver, "term_structure", None)
     adaptive = isinstance(solver, diffrax.AbstractAdaptiveSolver) and isinstance(structure, type)
@@ -127,13 +168,20 @@ def require_adaptive(solver: Any, others: str = "") -> None:
 
 
 def require_adjoint(adjoint: Any) -> None:
-    """Raise `ValueError` unless this is `None` or an adjoint method of Diffrax."""
+    """Raise `ValueError` unless this is `None` or an adjoint method of Diffrax.
+
+    **Example:**
+
+    >>> import diffrax
+    >>> from nonholonomic.integration import require_adjoint
+    >>> require_adjoint(diffrax.DirectAdjoint())
+    """
     if not isinstance(adjoint, diffrax.AbstractAdjoint | None):
         raise ValueError(f"adjoint = {adjoint!r} must be one of Diffrax, such as RecursiveCheckpointAdjoint(), or None")
 
 
 def lanes_for(cells: int, n_blocks: int = 1) -> int:
-    """Number of lanes for a number of cells whose state has a number of equal blocks.
+    """Number of lanes for cells whose state has the given number of equal blocks.
 
     On a CPU the lanes and their stages should fit the first caches; an accelerator is idle below tens of thousands.
     """

@@ -1,4 +1,4 @@
-"""How a run stands or has ended: the codes of the integration, and the words for users."""
+"""The state of a run: codes of the integration, and words for users."""
 
 import enum
 from typing import Self
@@ -12,18 +12,18 @@ FORMER_WORDS = {"reached t1": "completed", "reached_end": "completed"}
 
 
 class Status(enum.IntEnum):
-    """How a run ended: the words of all functions of both packages, and the integers that stand for them in transformations.
+    """How a run ended: the words that all functions use, and the integers for transformations.
 
-    Results outside of transformations and tables hold the word, such as "contact_lost"; runs inside `jit` and `vmap` hold the
-    integer. (A file has integers of its own, which its attribute `flag_meanings` explains.)
+    Runs and tables contain the word, such as "contact_lost"; runs inside `jit` and `vmap` contain the integer. (Files
+    have other integers, which the attribute `flag_meanings` explains.)
 
     - `COMPLETED`: the run reached its horizon `t1`. `INVERTED` and `NOT_INVERTED`: whether the top had turned over by then, in
       tables of inversion times, whose runs end at the inversion.
     - `CONTACT_LOST`: the ground would have to pull. `JAMMED`: the equation for the normal force has no solution.
-      `DOES_NOT_FIT`: a curvature of the arena is that of the top. `RANK_LOST`: the projected heading of a stroller is
+      `DOES_NOT_FIT`: the arena is as strongly curved as the top. `RANK_LOST`: the projected heading of a stroller is
       undetermined.
-    - `UNRESOLVED`: the model determines no motion, or the run changed its mode too often. `FAILED`: the integration was given
-      up. `ILLEGAL`: a number inside a transformation is out of range, and all results are NaN.
+    - `UNRESOLVED`: the model determines no motion, or the run changed its mode too often. `FAILED`: the integration
+      failed. `ILLEGAL`: a number inside a transformation is out of range, and all results are NaN.
     - `PENDING`: a cell of a table that has not been computed.
 
     **Example:**
@@ -59,7 +59,7 @@ class Status(enum.IntEnum):
 
     @classmethod
     def of(cls, word: str) -> Self:
-        """The status for a word of this version or an earlier one.
+        """The status for a word of this version or an earlier version.
 
         **Raises:** `ValueError` for an unknown word.
         """

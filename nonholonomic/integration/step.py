@@ -1,7 +1,7 @@
 """Try one step in every lane: step-size control, events, and the new status of each lane.
 
-A lane is free until an accepted step ends beyond an event; then the lane locates the event by trying that step again
-from the same start with other lengths, until the step ends on the event. So the event has the accuracy of the method.
+When a step ends beyond an event, the lane locates the event: it repeats the step from the same start with other
+lengths, until the step ends on the event. The time of the event therefore has the accuracy of the method.
 """
 
 from typing import NamedTuple
@@ -45,12 +45,19 @@ class LaneState(NamedTuple):
 
     - `cell`: which cell of the problem a lane runs; `status`: a code of `status.py`.
     - `time` [s], `state`, `rate`: where the lane is, and the field there.
-    - `length`: of the step to be tried [s], if the horizon is not nearer.
-    - `side`: 1 before the event, -1 beyond it; `margin`: the least of `side` times the event function and the margins.
-    - `margins`: those of the problem, `None` if there are none.
-    - `first_crossing`, `crossing_time`: of the first and the last event passed [s], infinite if there was none.
+    - `length`: length of the next step [s], unless the horizon is nearer.
+    - `side`: 1 before the event, -1 beyond it; `margin`: the least of the margins and of `side` times the event
+      function.
+    - `margins`: the margins of the problem, `None` if there are none.
+    - `first_crossing`, `crossing_time`: times of the first and the last event passed [s], infinite if there was none.
     - `bracketing`: whether the lane is locating an event; `bracket`: the current bracket.
-    - `steps`: number of tried steps; `rejected`: of those rejected by step-size control.
+    - `steps`: number of all steps; `rejected`: number of steps that step-size control rejected.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import LaneState
+    >>> LaneState._fields[:5]
+    ('cell', 'status', 'time', 'state', 'rate')
     """
 
     cell: Int[Array, " lanes"]
@@ -83,7 +90,7 @@ def try_step(problem: AbstractProblem, control: Control, atol: States, lane_stat
 
     **Arguments:**
 
-    - `problem`: the problem with one number per lane (or a scalar) in every leaf.
+    - `problem`: the problem; every leaf is a scalar or has one number per lane.
     - `control`: the method and its tolerances.
     - `atol`: absolute tolerances, (components, lanes).
     - `lane_state`: the lanes; those that have ended do not change.
@@ -101,9 +108,9 @@ def try_step(problem: AbstractProblem, control: Control, atol: States, lane_stat
 def after_step(
     problem: AbstractProblem, control: Control, atol: States, lane_state: LaneState, tried_length: Lanes, tried: Step
 ) -> LaneState:
-    """Update each lane after a step was tried.
+    """Update each lane after a trial step.
 
-    **Arguments:** as for `try_step`; `tried_length` is the length of the steps [s], `tried` their results.
+    **Arguments:** as for `try_step`; `tried_length` contains the lengths of the steps [s], and `tried` their results.
 
     **Returns:** the lanes after the step.
     """

@@ -23,14 +23,21 @@ MOST_TRIALS = 60
 def halved(
     holds: Callable[[Float[Array, "..."]], Bool[Array, "..."]], low: Float[Array, "..."], high: Float[Array, "..."]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Halve brackets, inside transformations too, down to where a condition ceases to hold.
+    """Find where a condition ceases to hold, by halving brackets; also inside transformations.
 
     **Arguments:**
 
     - `holds`: the condition, true at `low` and false at `high`.
     - `low`, `high`: the brackets, of any shape.
 
-    **Returns:** the last value at which the condition held and the next one, at which it does not.
+    **Returns:** the last value at which the condition holds, and the next value, at which it does not.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import halved
+    >>> low, high = halved(lambda x: x**2 < 2.0, jnp.asarray(1.0), jnp.asarray(2.0))
+    >>> print(f"{low:.6f}")
+    1.414214
     """
 
     def halve(_, bracket):
@@ -47,7 +54,13 @@ def sign_changes(
 ) -> Float[Array, " zeros"]:
     """Zeros of a function between neighbours of a grid at which it has different signs, to round-off.
 
-    **Arguments:** `function`: of an array of numbers, element by element; `grid`: growing numbers.
+    **Arguments:** `function`: function of an array, element by element; `grid`: increasing numbers.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import sign_changes
+    >>> print(sign_changes(jnp.cos, jnp.arange(0.5, 7.0)).round(6))
+    [1.570796 4.712389]
     """
     values = function(grid)
     changes = np.flatnonzero(np.sign(values[:-1]) != np.sign(values[1:]))
@@ -65,8 +78,16 @@ def few_trials(
 
     **Arguments:**
 
-    - `function`: of NumPy arrays, element by element; it is not traced.
+    - `function`: function of NumPy arrays, element by element; JAX does not trace it.
     - `low`, `high`: the brackets; `at_low`, `at_high`: the function there, of opposite signs.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from nonholonomic.integration import few_trials
+    >>> low, high = np.array([1.0]), np.array([2.0])
+    >>> few_trials(lambda x: x**2 - 2.0, low, high, low**2 - 2.0, high**2 - 2.0).round(6)
+    array([1.414214])
     """
     guess = low
     for trial in range(MOST_TRIALS if low.size else 0):

@@ -1,7 +1,20 @@
 """Grids of named axes, computed in chunks by any executor, and the resulting labelled tables and files.
 
-`sweep` computes a grid and returns a `Table`; with a file it writes every finished chunk, and an interrupted sweep
-resumes. Any executor can compute the chunks; `local_processes` is one.
+`sweep` computes a grid and returns a `Table`. With a file, it writes every finished chunk, and can resume after an
+interruption. Any executor can compute the chunks, such as that of `local_processes`.
+
+**Example:** a table of half-lives by rate and level.
+
+>>> import numpy as np
+>>> from nonholonomic.sweeps import Variable, axis, sweep
+>>> def half_lives(columns, count):
+...     return {"time": -np.log(columns["event.level"]) / columns["system.rate"]}
+>>> axes = [axis("rate", "system.rate", "1/s", [1.0, 2.0]), axis("level", "event.level", "1", [0.5, 0.1])]
+>>> variables = {"time": Variable("s", np.float64, long_name="time of the event")}
+>>> table = sweep(half_lives, axes, variables, {"system": "decay"}, progress=False)
+>>> print(table.time.round(6))
+[[0.693147 2.302585]
+ [0.346574 1.151293]]
 """
 
 from ._chunks import saved_cells as saved_cells

@@ -208,7 +208,15 @@ def with_spaces(count: int) -> str:
 
 
 def saved_cells(path: Path) -> int:
-    """Number of cells of a table that are on disk, in its file or in the files of its chunks."""
+    """Number of cells of a table that are on disk, in its file or in the files of its chunks.
+
+    **Example:**
+
+    >>> from pathlib import Path
+    >>> from nonholonomic.sweeps import saved_cells
+    >>> saved_cells(Path("none.h5"))
+    0
+    """
     folder = folder_of(path)
     if path.exists():
         return Stored(path).layout.cells

@@ -9,7 +9,8 @@ from jaxtyping import Float, Shaped
 def concise(value: float, error: float) -> str:
     """A number with its correct digits and, in parentheses, the error of the last digit, rounded up.
 
-    **Arguments:** `value`, `error`: finite numbers, the error at least 0; without one the number is written in full.
+    **Arguments:** `value`, `error`: finite numbers, the error at least 0; with an error of 0, the number is written in
+    full.
     """
     if error == 0.0:
         return repr(float(value))
@@ -32,7 +33,7 @@ def concise_strings(
 
     - `values`: numbers; not finite if there is none.
     - `errors`: their errors; infinite if it is doubtful whether there is a number.
-    - `words`: the words for missing numbers; a question mark is added if that is doubtful.
+    - `words`: the words for missing numbers, with a question mark if it is doubtful that the number is missing.
 
     **Returns:** an array of strings.
     """

@@ -1,4 +1,4 @@
-"""Dispatch chunks to an executor as its workers become free, and again if a worker died."""
+"""Dispatch chunks to an executor as its workers become free, and dispatch a chunk again if its worker died."""
 
 import itertools
 import sys
@@ -13,21 +13,21 @@ MAX_CRASHES = 3
 
 
 class ExecutorBroken(Exception):
-    """The executor no longer computes anything."""
+    """The executor has broken down."""
 
 
 def handed_out(submit: Callable[[int], Future], chunks: Iterable[int], most: int) -> Iterator[tuple[int, Any]]:
-    """Have chunks computed, each as soon as a worker is free.
+    """Dispatch chunks, each as soon as a worker is free.
 
     After an exception, Ctrl-C included, no further chunk starts.
 
-    **Arguments:** `submit`: dispatches a chunk; `chunks`: their indices; `most`: greatest number of dispatched chunks
-    at a time.
+    **Arguments:** `submit`: function that dispatches a chunk; `chunks`: the indices of the chunks; `most`: greatest
+    number of chunks dispatched at a time.
 
     **Returns:** the index and the results of each chunk as it finishes; `None` for a chunk that killed `MAX_CRASHES`
     workers.
 
-    **Raises:** `ExecutorBroken` if the executor is gone; exceptions of the chunks.
+    **Raises:** `ExecutorBroken` if the executor broke down; exceptions of the chunks.
     """
     finished: SimpleQueue[tuple[int, Future]] = SimpleQueue()
     out: set[Future] = set()

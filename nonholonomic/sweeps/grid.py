@@ -14,7 +14,14 @@ CHECKED_WHOLE = 1 << 20
 
 
 class Axis(NamedTuple):
-    """One axis of a grid: its name in the table, the full name of the varied parameter, the unit, and a long name."""
+    """One axis of a grid: its name in the table, the full name of the varied parameter, the unit, and a long name.
+
+    **Example:** as for `axis`, which checks the values.
+
+    >>> from nonholonomic.sweeps import Axis
+    >>> Axis("rate", "system.rate", "1/s", np.array([1.0, 2.0])).name
+    'rate'
+    """
 
     name: str
     number: str
@@ -27,6 +34,12 @@ class Variable(NamedTuple):
     """One result of every cell: its unit and dtype, and, for a code, the words for its values.
 
     `inner`: names of the dimensions of an array result, in order; `long_name`: description.
+
+    **Example:** a code with words.
+
+    >>> from nonholonomic.sweeps import Variable
+    >>> Variable("1", np.int8, words=("completed", "failed")).words[1]
+    'failed'
     """
 
     unit: str
@@ -39,7 +52,17 @@ class Variable(NamedTuple):
 def axis(name: str, number: str, unit: str, values: Any, long_name: str = "") -> Axis:
     """An axis, checked.
 
+    **Arguments:** `name`: name in the table; `number`: full name of the varied parameter; `unit`; `values`, (values,);
+    `long_name`: description.
+
     **Raises:** `ValueError` that names the axis unless the values are finite numbers in a one-dimensional, non-empty array.
+
+    **Example:**
+
+    >>> from nonholonomic.sweeps import axis
+    >>> axis("rate", "system.rate", "1/s", [])
+    Traceback (most recent call last):
+    ValueError: rate must be a number or a non-empty list of numbers, not of shape (0,)
     """
     require(values, name)
     array = np.asarray(values, dtype=float)
@@ -56,8 +79,8 @@ def size_of(axes: list[Axis]) -> int:
 def columns(axes: list[Axis], first: int, count: int) -> dict[str, Values]:
     """The parameters of some cells; the last axis varies fastest.
 
-    **Arguments:** `axes`: the grid; `first`: index of the first cell; `count`: number of cells. Beyond the end, the
-    last cell is repeated.
+    **Arguments:** `axes`: the grid; `first`: index of the first cell; `count`: number of cells. Beyond the end of the
+    grid, the last cell is repeated.
 
     **Returns:** full name of a parameter -> its value in every cell.
     """
@@ -72,6 +95,12 @@ def cells_to_check(axes: list[Axis]) -> Iterator[dict[str, Values]]:
 
     If a limit on one parameter is monotonic in the others, as in the models, a violation also occurs in a corner. All
     other cells are checked later, when they run.
+
+    **Example:**
+
+    >>> from nonholonomic.sweeps import cells_to_check
+    >>> next(cells_to_check(axes))["system.rate"]
+    array([1., 1., 2., 2.])
     """
     if size_of(axes) <= CHECKED_WHOLE:
         yield columns(axes, 0, size_of(axes))

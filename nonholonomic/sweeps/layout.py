@@ -16,7 +16,8 @@ PENDING, UNREACHED = -1, "pending"
 class Layout(NamedTuple):
     """A table without its numbers.
 
-    `kinds`: variable -> dtype; `chunk`: number of cells in a chunk, except for the last one; the rest is as in `Table`.
+    `kinds`: variable -> dtype; `chunk`: number of cells in every chunk but the last; the other fields are as in
+    `Table`.
     """
 
     coords: dict[str, Values]
@@ -61,7 +62,7 @@ class Layout(NamedTuple):
         return tuple(len(self.coords[dim]) for dim in self.inner.get(name, ()))
 
     def empty(self, cells: int, status: int = PENDING) -> dict[str, Values]:
-        """The variables of cells without results, along the first axis; variables of words get `status`."""
+        """Variables without results, with cells along the first axis; variables of words are filled with `status`."""
         variables = {}
         for name, kind in self.kinds.items():
             value = status if name in self.words else np.nan if kind.kind == "f" else PENDING
@@ -69,7 +70,7 @@ class Layout(NamedTuple):
         return variables
 
     def shaped(self, name: str, values: Values) -> Values:
-        """A variable of all cells in the shape of the grid, with words instead of codes."""
+        """A variable in the shape of the grid, with words instead of codes."""
         values = values.reshape((*self.shape, *self.inner_shape(name)))
         return np.array([*self.words[name], UNREACHED])[values] if name in self.words else values
 
@@ -85,7 +86,7 @@ def axes_of(coords: dict[str, Values], inner: dict[str, tuple[str, ...]]) -> lis
 
 
 def boxes(shape: tuple[int, ...], first: int, end: int) -> Iterator[tuple[slice, ...]]:
-    """The parts of an array, as slices and in order, that hold its elements from `first` to before `end` of them all."""
+    """Slices of an array that contain its elements with the flat indices from `first` to `end` - 1, in order."""
     if not shape:
         yield ()
         return

@@ -18,12 +18,10 @@ from ..validation import require
 
 @contextlib.contextmanager
 def local_processes(n: int, threads: int = 1) -> Iterator[Executor]:
-    """Processes for `executor=`, which compute on this machine's processor.
-
-    Each process gets its own cores, and the parent's compilation cache if there is one, before it imports JAX.
-    Processes start when chunks arrive. A process that dies is replaced, and its chunk is retried in another one. The
-    processes end with the context, or with the parent, however it ends. As for any process started by Python's
-    `multiprocessing`, the script must have its own calls under `if __name__ == "__main__":`.
+    """Processes for `executor=`, which compute on this machine's processor. Each process has its own cores, and uses
+    the parent's compilation cache if there is one. Processes start when chunks arrive. A process that dies is replaced,
+    and its chunk is retried in another one. The processes end with the context or with the parent process. As for all
+    processes that Python's `multiprocessing` starts, put the calls in your script under `if __name__ == "__main__":`.
 
     **Arguments:** `n`: number of processes; `threads`: number of cores for each.
 
@@ -53,7 +51,7 @@ def local_processes(n: int, threads: int = 1) -> Iterator[Executor]:
 
 
 class LocalProcesses(Executor):
-    """An executor of single-process pools: if a process dies, its call is known, and no other call is lost."""
+    """An executor of single-process pools, so that a process that dies loses only its own call."""
 
     def __init__(self, n: int, threads: int):
         """Set the number of processes and the number of cores for each."""

@@ -49,14 +49,15 @@ def sweep(
 
     **Arguments:**
 
-    - `job`: function of a dictionary (full name of a parameter -> values of some cells) and of the number of cells that
-      count, the rest being padding. It returns a dictionary (name -> results). Several threads may call it at once; the
-      first call, in which no cell counts, compiles it. It is pickled if the workers of the executor are other processes.
+    - `job`: function of a dictionary (full name of a parameter -> values of several cells) and of the number of cells
+      that count; the other cells are padding. It returns a dictionary (name -> results). Several threads may call the
+      job at once; the first call, in which no cell counts, compiles it. If the executor has other processes, the job is
+      pickled.
     - `axes`: the grid, the last axis varying fastest.
     - `variables`: the results of `job`.
-    - `request`: plain data that describes the computation; it is stored in the table, and only equal requests may
-      resume a file.
-    - `path`: file to write, chunk by chunk; if it holds part of the same request, only the rest is computed.
+    - `request`: plain data that describes the computation, stored in the table. To resume a file, the request must be
+      equal.
+    - `path`: file to write, chunk by chunk; if it contains part of the same request, only the rest is computed.
     - `chunk`: number of cells in a call of `job`, by default `chunk_for` the number of cells; `most`: an upper limit,
       for large results.
     - `inner`: the coordinates of the results' own dimensions, numbers or words.
@@ -67,8 +68,16 @@ def sweep(
 
     **Raises:** `ValueError` for an illegal executor, and if there is no file and not enough memory for the table;
     `OSError` or `ValueError` if the file cannot be written or holds another request; `RuntimeError` if the executor
-    breaks down or a worker has other versions: what had finished is in the file. `KeyboardInterrupt` after Ctrl-C, with
-    a message that says how many cells are saved.
+    breaks down or a worker has other versions; the file then contains all finished chunks. `KeyboardInterrupt` after
+    Ctrl-C, with the number of saved cells in the message.
+
+    **Example:** in another thread, by any executor.
+
+    >>> from concurrent.futures import ThreadPoolExecutor
+    >>> with ThreadPoolExecutor(1) as executor:
+    ...     again = sweep(half_lives, axes, variables, {"system": "decay"}, progress=False, executor=executor)
+    >>> np.array_equal(again.time, table.time)
+    True
     """
     require_flag(progress, "progress")
     if executor is not None and not isinstance(executor, Executor):
@@ -100,7 +109,7 @@ def sweep(
 def computed(
     work: ChunkTask, layout: Layout, finished: set[int], executor: Executor | None, progress: bool
 ) -> Iterator[tuple[int, dict[str, Values]]]:
-    """The unfinished chunks, each when it is computed; see `sweep`."""
+    """Compute the unfinished chunks, and yield each when it is finished; see `sweep`."""
     todo = [chunk for chunk in range(layout.chunks) if chunk not in finished]
     done = layout.cells - sum(map(layout.size, todo))
     with Progress(layout.cells, "cell", shown=progress) as shown, workforce(work, executor) as submit:
@@ -164,7 +173,7 @@ class Held:
         self._layout, self._found = layout, layout.empty(layout.cells)
 
     def filled(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> dict[str, Values]:
-        """Keep the computed chunks, and return the variables with all cells along the first axis."""
+        """Store the computed chunks, and return the variables with all cells along the first axis."""
         for chunk, values in computed:
             first, end = self._layout.ends(chunk)
             for name, values_of_chunk in values.items():
@@ -209,7 +218,8 @@ def workforce(work: ChunkTask, executor: Executor | None) -> Iterator[Callable[[
 
 
 def failed_chunk(axes: list[Axis], layout: Layout, chunk: int) -> dict[str, Values]:
-    """The results of a chunk that is given up: the status `failed`, without numbers. A warning names its cells."""
+    """The results of a chunk that could not be computed: the status `failed`, without numbers. A warning names the
+    cells."""
     first, end = layout.ends(chunk)
     ends = [columns(axes, cell, 1) for cell in (first, end - 1)]
     named = ", ".join(f"{name} {ends[0][name].item():.6g} to {ends[1][name].item():.6g}" for name in ends[0])
@@ -223,10 +233,15 @@ def failed_chunk(axes: list[Axis], layout: Layout, chunk: int) -> dict[str, Valu
 
 
 def chunk_for(cells: int) -> int:
-    """Number of cells in a chunk: few different sizes, so that few programs are compiled, but many chunks, so that
-    cores share the work.
+    """Number of cells in a chunk. There are few different sizes, so that few programs are compiled, but many chunks, so
+    that cores share the work. The size does not depend on the number of cores, so that another machine can resume a
+    file.
 
-    It does not depend on the number of cores, so that a file can be resumed on another machine.
+    **Example:**
+
+    >>> from nonholonomic.sweeps import chunk_for
+    >>> chunk_for(100_000) >= chunk_for(4)
+    True
     """
     if jax.default_backend() != "cpu":
         return 65536 if cells > 4096 else 4096

@@ -21,18 +21,18 @@ CHUNK = 1 << 15
 
 
 class Table(eqx.Module):
-    """Variables over a grid of named coordinates; `table.time` and `table["time"]` are one of them.
+    """Variables over a grid of named coordinates. Get a variable by `table["time"]` or `table.time`.
 
     **Arguments:**
 
     - `coords`: name -> values, one for each axis of the grid, in order, followed by the additional dimensions of some
       variables, such as "time".
-    - `variables`: name -> array over the grid; `status` is an array of words. The variables of a table with a file of
-      more than 128 MB stay in the file: each is read and checked against its checksums when needed.
+    - `variables`: name -> array over the grid; `status` is an array of words. If the file of a table has more than 128
+      MB, the variables stay in the file: each is read, and its checksums are checked, when needed.
     - `units`: name of a coordinate or variable -> its unit.
     - `attributes`: the request and the versions, as plain data.
     - `words`: variable of words -> the words, in the order of their codes in a file.
-    - `inner`: variable -> the names of its own dimensions after those of the grid, if any.
+    - `inner`: variable -> the names of its additional dimensions, which follow those of the grid.
 
     **Example:**
 
@@ -92,17 +92,17 @@ class Table(eqx.Module):
         return tuple(len(self.coords[name]) for name in axes_of(self.coords, self.inner))
 
     def dims(self, variable: str) -> tuple[str, ...]:
-        """The names of a variable's dimensions: the axes of the grid, and its own."""
+        """The names of a variable's dimensions: the axes of the grid, and its additional dimensions."""
         return (*axes_of(self.coords, self.inner), *self.inner.get(variable, ()))
 
     def to_xarray(self, chunks: Any = None) -> Any:
-        """The table as an `xarray.Dataset` (needs xarray), with named dimensions and units; words stay words.
+        """The table as an `xarray.Dataset` (needs xarray), with named dimensions, units, and statuses as words.
 
-        **Arguments:** `chunks`: sizes of the pieces along each dimension, such as `{"theta": 100}`, or "auto", to read
-        the numbers piece by piece when they are needed (needs dask, and h5netcdf for a table that stays in its file,
-        which is then read without its checksums).
+        **Arguments:** `chunks`: to read the numbers piece by piece when they are needed, the size of the pieces along
+        each dimension, such as `{"theta": 100}`, or "auto". This needs dask; for a table that stays in its file, it
+        also needs h5netcdf, and does not check the checksums.
 
-        **Returns:** the dataset; `Table.save` and a sweep's file hold the same.
+        **Returns:** the dataset, with the same contents as the file of `Table.save` or a sweep.
 
         **Raises:** `ModuleNotFoundError`, with the command that installs it, for a missing package.
         """
@@ -134,8 +134,8 @@ class Table(eqx.Module):
     def to_dataframe(self) -> Any:
         """The table as a `pandas.DataFrame` (needs pandas): one row per cell, one column per axis and variable.
 
-        A table with variables that have dimensions of their own, such as "time", has one row for each point of these
-        dimensions, too, and the other variables are repeated. `attrs["units"]` of the frame are the units.
+        If variables have additional dimensions, such as "time", there is a row for each point along these dimensions,
+        and the other variables are repeated. `attrs["units"]` contains the units.
 
         **Raises:** `ModuleNotFoundError`, with the command that installs it, if pandas is missing.
 
@@ -172,7 +172,7 @@ class Table(eqx.Module):
     def save(self, path: Any) -> None:
         """Write the table to an HDF5 file that `xarray.open_dataset(path, engine="h5netcdf")` opens.
 
-        **Raises:** `OSError` that names the path if it cannot be written.
+        **Raises:** `OSError` that names the path if the file cannot be written.
         """
         if isinstance(self.variables, StoredVariables):
             with replacing(Path(path)) as scratch:
@@ -192,17 +192,17 @@ class Table(eqx.Module):
 
     @classmethod
     def load(cls, path: Any) -> "Table":
-        """Read a table from a file that `save` or a sweep wrote, also before the sweep has finished; cells not yet
-        computed are `pending`.
+        """Read a table from a file that `save` or a sweep wrote. You can read the file before the sweep has finished;
+        cells that are not computed yet have the status `pending`.
 
-        **Raises:** `OSError` that names the path if it cannot be read or holds no table.
+        **Raises:** `OSError` that names the path if the file cannot be read or contains no table.
         """
         begun = unfinished(Path(path))
         return cls.of(Stored(Path(path))) if begun is None else cls.laid_out(*begun)
 
     @classmethod
     def of(cls, stored: Stored) -> "Table":
-        """A table in its file; a small one is read at once."""
+        """A table whose variables stay in the file; a small table is read at once."""
         layout = stored.layout
         if layout.bytes_of_cells(layout.cells) <= HELD:
             return cls.laid_out(layout, {name: stored.whole(name) for name in layout.kinds})
@@ -211,14 +211,15 @@ class Table(eqx.Module):
 
     @classmethod
     def laid_out(cls, layout: Layout, values: dict[str, Values]) -> "Table":
-        """A table of numbers with all cells along the first axis, codes for words."""
+        """A table from arrays with all cells along the first axis, and with codes instead of words."""
         variables = {name: layout.shaped(name, of_cells) for name, of_cells in values.items()}
         return cls(layout.coords, variables, layout.units, layout.attributes, layout.words, layout.inner)
 
     def digits(self, variable: str = "time") -> Values:
         """A variable with its correct digits: "5.01142(3)" is 5.01142 with an error of 0.00003.
 
-        **Arguments:** `variable`: name of a numeric variable, such as "time", whose error the table holds as "time_error".
+        **Arguments:** `variable`: name of a numeric variable whose error is also in the table, such as "time" with
+        "time_error".
 
         **Returns:** an array of strings over the grid. For a cell without a number, the string is the cell's status,
         with a question mark if it is in doubt.
@@ -238,13 +239,13 @@ class Table(eqx.Module):
     ) -> Any:
         """Draw a variable over the grid (needs matplotlib): lines over the first axis, or a map of the first two.
 
-        For further axes, the plot uses the first value, or the value in `at`; the title names it. The colours of a map
-        range from the 2 % to the 98 % quantile.
+        For other axes, the plot uses the first value, or the value in `at`, and states the value in the title. The
+        colours of a map range from the 2 % to the 98 % quantile.
 
         **Arguments:**
 
         - `variable`: name of a numeric variable, the first by default.
-        - `at`: name of an axis -> the value at which to cut it; the nearest grid value is used.
+        - `at`: name of an axis -> its value in the plot; the plot uses the nearest value of the grid.
         - `log`: whether the variable's scale is logarithmic.
         - `ax`: axes of matplotlib to draw in, instead of a new figure.
 

@@ -1,11 +1,11 @@
-"""The quantities of a run over its times, as a table, and what every run offers with it."""
+"""The quantities of a run over its times, as a table, and the methods that every run derives from this table."""
 
 import abc
 import json
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
-from ..parameters import likely, text_as_html
+from ..parameters import likely, readable_unit, text_as_html
 from ..validation import require_package
 from .layout import Values
 from .table import Table
@@ -16,12 +16,23 @@ class Quantity(NamedTuple):
     """A quantity of a run: its unit, a description, and the dimension of its components if it is a vector.
 
     `read` returns it from a run; by default it is the property with the name of the quantity.
+
+    **Example:**
+
+    >>> from nonholonomic.sweeps import Quantity
+    >>> Quantity("m", "height", read=lambda run: run["height"]).of("height", {"height": np.zeros(3)})
+    array([0., 0., 0.])
     """
 
     unit: str
     long_name: str
     components: str | None = None
     read: Callable[[Any], Any] | None = None
+
+    @property
+    def label(self) -> str:
+        """The description with the unit, as beside a curve."""
+        return f"{self.long_name} [{readable_unit(self.unit) or '1'}]"
 
     def of(self, name: str, run: Any) -> Any:
         """The values of the quantity in a run."""
@@ -39,9 +50,19 @@ def run_table(
 
     **Arguments:**
 
-    - `quantities`: name -> `Quantity`; `values`: name -> its values.
-    - `coords`: name -> values, those of the `axes` first.
+    - `quantities`: name -> `Quantity`; `values`: name -> values.
+    - `coords`: name -> values; the `axes` come first.
     - `request`: plain data that describes the run.
+
+    **Returns:** the `Table`.
+
+    **Example:**
+
+    >>> from nonholonomic.sweeps import Quantity, run_table
+    >>> times, heights = np.array([0.0, 0.1]), np.array([1.0, 0.95])
+    >>> run_table({"height": Quantity("m", "height")}, {"time": times}, {"height": heights}, ["time"], {})
+    Table over time (2)
+      height [m]: 0.95 to 1
     """
     attributes = {
         "request": json.dumps(request, default=repr),
@@ -57,7 +78,18 @@ def run_table(
 
 
 class Tabular(abc.ABC):
-    """A run whose quantities over time are a table."""
+    """A run whose quantities over time are a table, which gives it `to_xarray`, `save` and `portrait`.
+
+    **Example:**
+
+    >>> from nonholonomic.sweeps import Table, Tabular
+    >>> class Fall(Tabular):
+    ...     portrait_axes = ("height", "speed")
+    ...     def to_table(self):
+    ...         return Table({"time": np.zeros(1)}, {"height": np.ones(1), "speed": np.zeros(1)}, {"time": "s"}, {})
+    >>> Fall().to_xarray()["height"].dims
+    ('time',)
+    """
 
     #: The names that a message for an unknown attribute lists; empty for the ordinary message.
     readable: ClassVar[tuple[str, ...]] = ()

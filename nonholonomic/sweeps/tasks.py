@@ -1,4 +1,5 @@
-"""The computation of some cells of a grid, in this process or in another process that has only the data it received."""
+"""The computation of several cells of a grid, in this process or in another process that has only the data that it
+received."""
 
 import functools
 import os
@@ -48,9 +49,9 @@ class ChunkTask(NamedTuple):
 
 
 def packed(work: ChunkTask) -> bytes:
-    """The work in a form that can be sent to another process.
+    """The task in a form that can be sent to another process.
 
-    **Raises:** `ValueError` that names what cannot be sent.
+    **Raises:** `ValueError` that names the object that cannot be sent.
     """
     try:
         return pickle.dumps(work)
@@ -62,12 +63,13 @@ def packed(work: ChunkTask) -> bytes:
 
 
 def remote_results(sent: bytes, needed: dict[str, str], first: int, count: int, mark: str) -> dict[str, Values]:
-    """The results of some cells, in the process that this is called in.
+    """Compute the results of several cells in a worker process.
 
-    **Arguments:** `sent`: from `packed`; `needed`: the `stamp` of the sender; `first`, `count`: as for
+    **Arguments:** `sent`: the result of `packed`; `needed`: the `stamp` of the sender; `first`, `count`: as for
     `ChunkTask.results`; `mark`: different in every call, because Dask merges calls with equal arguments.
 
-    **Raises:** `RuntimeError` that names the worker if it has another version of a package whose numbers may differ.
+    **Raises:** `RuntimeError` that names the worker if a package there has another version, which may give other
+    results.
     """
     own = stamp()
     for name in MUST_AGREE:
@@ -102,7 +104,7 @@ def versions() -> dict[str, str]:
 
 
 def stamp() -> dict[str, str]:
-    """What `MUST_AGREE`, in this process."""
+    """The versions in this process of the packages in `MUST_AGREE`."""
     # Float64 may have been switched off by hand.
     own = versions() | {"float": str(np.dtype(jnp.result_type(float)))}
     return {name: own[name] for name in MUST_AGREE}

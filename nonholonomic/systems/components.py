@@ -2,8 +2,8 @@
 
 Users write functions of small matrices. Mapped over lanes, these are arrays with a short last axis, which compilers do
 not turn into vector instructions, and their zeros are multiplied like other numbers. Here each element of each array is
-a separate number: zeros and ones disappear, and repeated expressions are computed once. A factor of zero that is not
-finite still makes a result NaN.
+a separate number: zeros and ones disappear, and repeated expressions are computed once. A product of zero and a factor
+that is not finite still makes a result NaN.
 """
 
 import functools
@@ -64,7 +64,7 @@ def by_components(function: Callable[..., Any], *shapes: Any) -> Callable[..., A
     - `shapes`: shapes of its arguments, as for `jax.eval_shape`.
 
     **Returns:** the function, whose arguments are scalars or have one number per lane. It raises `TooLarge` for a
-    function that is better left in arrays.
+    function that is faster with arrays.
     """
 
     def evaluated(*args: Any) -> Any:
@@ -182,10 +182,9 @@ class Evaluation:
         return self.computed[key]
 
     def with_hidden(self, results: list[Any]) -> list[Any]:
-        """The results, the first of which is NaN where a factor of zero is not finite and no result would show it.
-
-        A product of zero and what is not finite is NaN. Most such factors are terms of a result too, which is then not finite;
-        the others, which are rare, are added to the first result, times zero.
+        """The results. The first result is NaN where zero is multiplied by a factor that is not finite and no result
+        shows this. Most such factors are also terms of a result, which is then not finite. The other factors, which are
+        rare, are multiplied by zero and added to the first result.
         """
         shown, waiting = set(), list(results)
         while waiting:

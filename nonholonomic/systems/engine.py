@@ -105,10 +105,10 @@ class BatchedMode(AbstractBatchedMode):
         return ModeProblem(self.numbers, state, self.scales, self.form, self.mode)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """The reset, or the end of the run if the mode has none.
+        """The reset, or the end of the run if the mode has no reset.
 
         An event at the end of the mode comes before the reset. If the reset jumps over the zero of the event function,
-        the event happens at the reset: the run has then ended between two modes.
+        the event happens at the reset, and the run ends between two modes.
         """
         axes = tuple(0 if jnp.ndim(number) else None for number in self.numbers)
         return jax.vmap(self._reset_one, in_axes=(axes, 1, 1), out_axes=_TRANSITION_AXES)(
@@ -190,16 +190,16 @@ class _Watched(eqx.Module):
 
 
 class Cells(eqx.Module):
-    """Runs of a system: its numbers and the components of the starts, each a scalar or one per cell."""
+    """Runs of a system: its numbers and the components of the starts, each a scalar or an array with one number per
+    cell."""
 
     numbers: tuple[Float[Array, "..."], ...]
     start: tuple[Float[Array, "..."], ...]
     form: Form = eqx.field(static=True)
 
     def states(self, cells: int | None) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
-        """States at the start, including time if a function depends on it, and the magnitudes for their errors.
-
-        The magnitude is the largest component of a start if that is at most 1, otherwise 1.
+        """States at the start, including the time if a function depends on it, and the magnitudes that scale their
+        errors: the largest component of a start, but at most 1.
         """
         shape = () if cells is None else (cells,)
         states = jnp.stack([jnp.broadcast_to(part, shape) for part in self.start])

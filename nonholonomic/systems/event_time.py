@@ -49,7 +49,8 @@ def event_time(
 
     Derivatives with respect to the start and every number of the system and of the event are exact: they use the
     implicit function theorem at the event and the saltation matrix at every reset (`nonholonomic/hybrid/saltation.py`).
-    They are 0 if the time is infinite.
+    Derivatives are 0 if the time is infinite. Without resets, there are second derivatives, by `jax.hessian` (forward
+    over reverse mode).
 
     **Arguments:**
 
@@ -62,9 +63,10 @@ def event_time(
       units of the largest component of the start if that is below 1.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default `nonholonomic.integration.Oscillatory8()`.
 
-    **Returns:** the time [s]; infinite if there is no event by `t1` or if the run ends before; NaN if the integration
-    failed, if resets follow one another without end, or if numbers inside a transformation are out of range. If the
-    margin of a mode only touches zero, so that the mode may or may not end within the tolerance, derivatives are NaN.
+    **Returns:** the time [s]; infinite if there is no event by `t1` or if the run ends before the event; NaN if the
+    integration failed, if resets follow one another without end, or if numbers inside a transformation are out of
+    range. If the margin of a mode only touches zero, so that the mode may or may not end within the tolerance,
+    derivatives are NaN.
 
     **Raises:** `ValueError` for arguments out of range, functions that return a wrong type or shape, and second
     derivatives through resets.
@@ -100,36 +102,35 @@ def event_time(
     run = run_of(system, start, event)
     if not run.cells.form.has_event:
         raise ValueError("event = None: the system has no event of its own; pass event=, a function of time and state")
-    explicit_tableau(Settings(tolerance, solver).for_lanes)
-    return _time(run.cells, as_number(t1), as_number(tolerance), solver)
+    settings = Settings(tolerance, solver)
+    explicit_tableau(settings.for_lanes)
+    return _time(run.cells, as_number(t1), settings)
 
 
 # Compile the whole, so that further calls with the same functions need no tracing.
 @eqx.filter_jit
-def _time(
-    cells: Cells, t1: Float[Array, ""], tolerance: Float[Array, ""], solver: diffrax.AbstractERK | None
-) -> Float[Array, ""]:
+def _time(cells: Cells, t1: Float[Array, ""], settings: Settings) -> Float[Array, ""]:
     numbers, structure = jax.tree.flatten(cells)
     movable = [number for number in numbers if eqx.is_inexact_array(number)]
     others = [number for number in numbers if not eqx.is_inexact_array(number)]
     places = tuple(eqx.is_inexact_array(number) for number in numbers)
     solve = SmoothEvent if cells.form.traits.smooth else HybridEvent
-    return differentiable_solve(solve(len(movable), structure, places, solver), *movable, *others, t1, tolerance)
+    event = solve(len(movable), structure, places, settings.with_tolerance(None))
+    return differentiable_solve(event, *movable, *others, t1, settings.tolerance)
 
 
 class SmoothEvent(AbstractDifferentiableSolve):
     """Event times of cells with smooth runs.
 
-    The leaves are the numbers of `Cells`, floats first, the horizon and the tolerance.
-
-    `structure`: of the `Cells`; `places`: which of its leaves are floats.
+    The leaves are the numbers of `Cells`, floats first, the horizon and the tolerance. `structure`: structure of the
+    `Cells`; `places`: positions of the leaves that are floats; `settings`: without the tolerance.
     """
 
     movable: int
     # JAX's PyTreeDef, which type checkers take for a variable.
     structure: Any = eqx.field(static=True)
     places: tuple[bool, ...] = eqx.field(static=True)
-    solver: diffrax.AbstractERK | None
+    settings: Settings
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.isinf(value)
@@ -147,7 +148,7 @@ class SmoothEvent(AbstractDifferentiableSolve):
         *_, t1, tolerance = leaves
         finite = jnp.isfinite(jnp.asarray(sum(self.of_leaves(leaves).start)))
         may, t1, tolerance = legal_run(finite, t1, tolerance)
-        return may, t1, Settings(jnp.min(tolerance), self.solver)
+        return may, t1, self.settings.with_tolerance(jnp.min(tolerance))
 
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         may, t1, settings = self.permitted(leaves)

@@ -29,7 +29,7 @@ def is_number(leaf: Any) -> bool:
 class Form:
     """A hybrid system without its numbers, which are listed one by one, those of an array in order.
 
-    - `structure`: of the tree of numbers; `kinds`: shape and type of each leaf.
+    - `structure`: structure of the tree of numbers; `kinds`: shape and type of each leaf.
     - `rest`, `rest_structure`: the leaves that are not numbers.
     - `modes`: number of modes; `first`: mode in which runs start; `has_event`: whether there is an event.
     - `size`: number of components of the state.

@@ -47,15 +47,15 @@ class Components(Quantities):
 
 
 class Recording(AbstractRecording):
-    """A recorded run of a user's system: some components of its state at the readings of a clock.
+    """A recorded run of your own system: components of its state, sampled at the times of a clock.
 
     **Arguments:**
 
     - `launch`: the start, as for `simulate`.
     - `times`: (times,), increasing.
-    - `value`: (times,) for one component, (times, columns) for several; NaN where a sample is missing.
-    - `error`: standard errors, one for all, (columns,), or of the shape of `value`; `None`: estimated for each column
-      from the residuals.
+    - `value`: (times,) for a single component, (times, columns) for several; NaN where a sample is missing.
+    - `error`: standard errors: a scalar, (columns,), or of the shape of `value`; with `None`, they are estimated for
+      each column from the residuals.
     - `quantity`: names of the recorded components, as in `Trajectory.names`, such as "y0" or ("q0", "q1").
     - `t0`: the clock's reading at the start.
     - `student`: degrees of freedom of Student's t distribution of the errors, against outliers, such as 4; `None`: Gaussian.
@@ -124,16 +124,17 @@ def identify(
     max_steps: int = 60,
     progress: bool = True,
 ) -> Identification:
-    """Estimate numbers of a user's system and its starts from recorded runs, with errors and undetermined combinations.
+    """Estimate parameters and starts of your own system from recorded runs, with errors and undetermined combinations.
 
     **Arguments:**
 
     - `system`: a `Hybrid`, or an `AbstractSystem`, with the values of the numbers that are not free.
     - `data`: a `Recording`, or a list of several to be fitted together.
-    - `free`: full name of a number -> a `nonholonomic.identification.Free` or only the start value:
-      `"system.modes[0].drag"`, or `"drag"` if no other name ends so; `"start[0]"`, `"start.q[0]"`. A start, or `"t0"`,
-      the reading of a recording's clock at the start, is the same in all recordings; `"data[1].start[0]"` is that of
-      the second, and `"data[*].t0"` stands for one of each. In systems with resets, `"t0"` cannot be free.
+    - `free`: full name of a number -> a `nonholonomic.Free` or only the start value. Examples of names are
+      `"system.modes[0].drag"`, or `"drag"` if no other name ends so, `"start[0]"`, `"start.q[0]"` and `"t0"`, the
+      reading of a recording's clock at the start. `"start[0]"` and `"t0"` are the same in all recordings;
+      `"data[1].start[0]"` belongs to the second recording, and `"data[*].t0"` is a separate number for each. In systems
+      with resets, `"t0"` cannot be free.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
     - `tolerance`: relative tolerance of the integration.
 

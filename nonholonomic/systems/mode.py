@@ -14,11 +14,10 @@ Event = Callable[[Float[Array, ""], State], Float[Array, ""]]
 
 
 class AbstractMode(eqx.Module):
-    """A mode of a hybrid system: its equations of motion, when it ends, and what follows.
-
-    Subclass it, declare the numbers of your model as fields, and write functions of one time and one state with
-    `jax.numpy`. You can sweep, fit and differentiate every field that is a float or an array. A mode that never ends
-    needs only `field`.
+    """A mode of a hybrid system: its equations of motion, its end, and the next mode. Subclass it, declare the
+    parameters of your model as attributes, and write functions of one time and one state with `jax.numpy`. You can
+    sweep, fit and differentiate every attribute that is a float or an array. A mode that never ends needs only the
+    method `field`.
 
     **Example:** a ball that falls and bounces.
 
@@ -59,14 +58,14 @@ class AbstractMode(eqx.Module):
 
         **Arguments:** as for `field`.
 
-        **Returns:** a number; `None`, the default, for a mode that never ends.
+        **Returns:** a number; or `None`, the default, for a mode that never ends.
         """
         return None
 
     def reset(self, t: Float[Array, ""], y: State) -> tuple[State, Any] | None:
         """The state and mode that follow when the margin has fallen to zero.
 
-        A reset may leave the state at zero margin if the margin then rises, as for a ball that has just bounced.
+        The margin of the next state may be zero if it then rises, as for a ball that has just bounced.
 
         **Arguments:** as for `field`, at the end of the mode.
 

@@ -15,9 +15,10 @@ from .form import is_number
 
 
 class Named(NamedTuple):
-    """The numbers of a tree, one by one, and the tree as a function of them.
+    """The numbers of a tree, one by one, and the tree as a function of these numbers.
 
-    `names` and `values` are those of the numbers, in the same order; `shapes`: of the arrays that contain them.
+    `names` and `values` are those of the numbers, in the same order; `shapes`: the shapes of the arrays that contain
+    the numbers.
     """
 
     names: tuple[str, ...]
@@ -28,7 +29,7 @@ class Named(NamedTuple):
 
     @classmethod
     def of(cls, tree: dict[str, Any]) -> "Named":
-        """The numbers of trees, by the names of the trees."""
+        """The numbers of several trees, which have names."""
         numbers, rest = eqx.partition(tree, is_number)
         leaves, structure = jax.tree_util.tree_flatten_with_path(numbers)
         names, values, shapes = [], [], []
@@ -41,7 +42,7 @@ class Named(NamedTuple):
         return cls(tuple(names), tuple(values), tuple(shapes), structure, rest)
 
     def tree(self, values: tuple[Array, ...]) -> dict[str, Any]:
-        """The trees with other numbers."""
+        """The trees for other values of the numbers."""
         leaves, begin = [], 0
         for shape in self.shapes:
             end = begin + math.prod(shape)
@@ -50,7 +51,7 @@ class Named(NamedTuple):
         return eqx.combine(jax.tree.unflatten(self.structure, leaves), self.rest)
 
     def replaced(self, changes: dict[str, Any]) -> tuple[Array, ...]:
-        """The numbers, some of them replaced by name."""
+        """The numbers with replacements, by name."""
         return tuple(changes.get(name, value) for name, value in zip(self.names, self.values, strict=True))
 
     @property
@@ -73,7 +74,8 @@ def _name(path: KeyPath) -> str:
 
 
 def short_names(names: list[str]) -> dict[str, str]:
-    """For each full name, the part after its last dot, in the form `start_0`; the whole name if several end alike."""
+    """For each full name, the part after its last dot, in the form `start_0`; if several names end alike, the whole
+    name."""
     ends = [_plain(name.rsplit(".", 1)[-1]) for name in names]
     return {name: end if ends.count(end) == 1 else _plain(name) for name, end in zip(names, ends, strict=True)}
 

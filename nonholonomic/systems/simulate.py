@@ -43,7 +43,7 @@ def simulate(
     - `t1`: end of the run [s], positive.
     - `times`: times [s] to report, increasing, within [0, t1]; by default 201 equally spaced ones.
 
-    **Returns:** a `Trajectory`, whose `status` says how the run ended.
+    **Returns:** a `Trajectory`; its `status` is how the run ended.
 
     **Raises:** `ValueError` for arguments out of range, times that do not increase, functions that return a wrong type
     or shape, and second derivatives through resets.
@@ -74,11 +74,12 @@ def simulate(
         times = jnp.linspace(0.0, end, DEFAULT_TIMES) if is_traced(end) else np.linspace(0.0, end, DEFAULT_TIMES)
     require_increasing(times, "times")
     require_all(times_bounds(times, t1))
-    explicit_tableau(Settings(as_number(tolerance), solver).for_lanes)
+    settings = Settings(tolerance, solver)
+    explicit_tableau(settings.for_lanes)
     if isinstance(system, Hybrid):
         system = dataclasses.replace(system, event=None)
     run = run_of(system, start, None)
-    return _sampled(run, as_number(times), as_number(t1), as_number(tolerance), solver)
+    return _sampled(run, as_number(times), as_number(t1), settings)
 
 
 @eqx.filter_jit
@@ -86,13 +87,12 @@ def _sampled(
     run: Run,
     times: Float[Array, " times"],
     t1: Float[Array, ""],
-    tolerance: Float[Array, ""],
-    solver: diffrax.AbstractERK | None,
+    settings: Settings,
 ) -> Trajectory:
     """The run, or NaN and "failed" if a traced number is out of range."""
     cells = run.cells
-    may, horizon, tolerance = legal_run(True, t1, tolerance, times)
-    settings, at = Settings(tolerance, solver), jnp.where(may, times, 0.0)
+    may, horizon, tolerance = legal_run(True, t1, settings.tolerance, times)
+    settings, at = settings.with_tolerance(tolerance), jnp.where(may, times, 0.0)
     if cells.form.traits.smooth:
         samples = sampled_run(_problem, cells, at, horizon, settings)
         states, reached = samples.states, jnp.all(jnp.isfinite(samples.states), axis=1)

@@ -65,21 +65,21 @@ def sweep(
     - `system`, `start`, `event`, `tolerance`, `solver`: as for `event_time`. Without an event, runs end at `t1`.
     - `t1`: horizon [s].
     - `axes`: full name of a number -> values, such as `{"system.modes[0].drag": [0.1, 0.2], "start[1]": [0.0, 1.0]}`;
-      the end of a name is enough if only one number has it. The start of an `AbstractSystem` has the names
-      `"start.q[0]"` and `"start.rate[0]"`, an event that is an `equinox.Module` those of its numbers, such as
-      `"event.level"` or `"system.event.level"`. The first axis varies slowest.
+      the end of a name is enough if it is unique. The start of an `AbstractSystem` has the names `"start.q[0]"` and
+      `"start.rate[0]"`, and numbers of an event that is an `equinox.Module` have names such as `"event.level"` or
+      `"system.event.level"`. The first axis varies slowest.
     - `sensitivities`: names of the numbers with respect to which the times are differentiated.
-    - `path`: HDF5 file to write, chunk by chunk. The same call resumes an interrupted sweep from it.
+    - `path`: HDF5 file to write, chunk by chunk. Repeat the same call to resume an interrupted sweep.
     - `progress`: whether to show progress, on a terminal or in a notebook.
     - `executor`: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes`; by default a thread
       for each core. For other processes, define classes and functions at the top level of a module.
 
     **Returns:** a `Table` with `time` [s] of the event, infinite without one; `status`: "event", "completed" if the run
     reached `t1`, "stopped" if a mode without a reset ended, "failed" or "unresolved"; `end_time` [s]; the state at the
-    end, `y0` and so on, or `q0`, `rate0` and so on; `steps` and `rejected`; and for a system with resets `switches`,
-    their number. With `sensitivities` also the derivative of `time` by each number, `time_by_drag` for
-    `"system.modes[0].drag"`, and for a system with resets `grazes`: 1 if the derivative is NaN because the margin of a
-    mode only touched zero.
+    end, `y0` and so on, or `q0`, `rate0` and so on; `steps` and `rejected`; and for a system with resets their number,
+    `switches`. With `sensitivities`, the table also contains the derivative of `time` by each number, such as
+    `time_by_drag` for `"system.modes[0].drag"`, and for a system with resets `grazes`: 1 if the derivative is NaN
+    because the margin of a mode only touched zero.
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
     `RuntimeError` for an executor that breaks down, or a worker with other versions.
@@ -104,7 +104,8 @@ def sweep(
     check_run(system, start, t1, tolerance)
     if not isinstance(axes, dict) or not all(isinstance(name, str) for name in axes):
         raise ValueError(f"axes = {axes!r} must be a dictionary, name of a number -> values")
-    explicit_tableau(Settings(tolerance, solver).for_lanes)
+    settings = Settings(tolerance, solver)
+    explicit_tableau(settings.for_lanes)
     if isinstance(system, Hybrid) and event is not None:
         system, event = dataclasses.replace(system, event=event), None
     mechanical = isinstance(system, AbstractSystem)
@@ -117,7 +118,7 @@ def sweep(
     for grid_axis in grid if has_checks(system) or has_checks(event) else ():
         for value in grid_axis.values:
             check_again(named.tree(named.replaced({grid_axis.number: jnp.asarray(value)})))
-    job = SweepJob(named, float(t1), float(tolerance), solver, tuple(by))
+    job = SweepJob(named, float(t1), settings, tuple(by))
     run = _run(named.tree(named.values))
     if by and not run.cells.form.has_event:
         raise ValueError("sensitivities are those of the event's time: pass event=, a function of time and state")
@@ -131,7 +132,7 @@ def sweep(
     request |= {
         "t1": float(t1),
         "tolerance": float(tolerance),
-        "solver": type(Settings(tolerance, solver).for_lanes).__name__,
+        "solver": type(settings.for_lanes).__name__,
     }
     cells = size_of(grid)
     chunk = max(LEAST_CHUNK, chunk_for(cells)) if cells > 4 * LEAST_CHUNK else None
@@ -154,8 +155,7 @@ class SweepJob(NamedTuple):
 
     named: Named
     t1: float
-    tolerance: float
-    solver: diffrax.AbstractERK | None
+    settings: Settings
     by: tuple[str, ...]
 
     @classmethod
@@ -185,7 +185,7 @@ class SweepJob(NamedTuple):
         """The variables of some cells, of which only the first `count` are run."""
         size = next((len(values) for values in columns.values()), 1)
         cells, begin, tangents, scales = _cells(self.named, columns, self.by, size)
-        settings, t1 = Settings(np.asarray(self.tolerance), self.solver), np.asarray(self.t1)
+        settings, t1 = self.settings, np.asarray(self.t1)
         grazing, slopes = np.zeros(size, bool), []
         if cells.form.traits.smooth:
             problem, counted = begin, np.asarray(count)

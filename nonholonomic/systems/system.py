@@ -54,8 +54,8 @@ def formulation_of(system: AbstractSystem) -> AbstractFormulation:
 
 
 class Run(NamedTuple):
-    """A run in the form for the engine; `formulation`: that of a mechanical system, which defines its state, or
-    `None`."""
+    """A run in the form for the engine; `formulation`: the formulation of a mechanical system, which defines the state,
+    or `None`."""
 
     cells: Cells
     formulation: AbstractFormulation | None
@@ -94,7 +94,8 @@ def run_of(system: System, start: Any, event: Event | None) -> Run:
 
 
 def check_run(system: Any, start: Any, t1: Any, tolerance: Any) -> None:
-    """Raise `ValueError` unless these are a system, a start of it, a positive horizon and a tolerance in range."""
+    """Raise `ValueError` unless the arguments are a system, a start of this system, a positive horizon and a legal
+    tolerance."""
     if not isinstance(system, Hybrid | AbstractSystem):
         hint = "; wrap modes in nonholonomic.Hybrid([...])" if isinstance(system, AbstractMode) else ""
         raise ValueError(f"system = {system!r} must be a Hybrid or an AbstractSystem{hint}")

@@ -1,4 +1,4 @@
-"""What JAX knows about a user's functions: which arguments matter, and which operations they consist of."""
+"""Trace a user's functions to find the arguments on which they depend, and the operations of which they consist."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -115,7 +115,7 @@ def depends_on_first(function: Callable[..., Any], first: Any, *args: Any) -> bo
 
 
 def dependent_outputs(function: Callable[..., Any], *args: Any) -> list[bool]:
-    """Which of a function's results depend on its arguments."""
+    """A mask of the function's results that depend on its arguments."""
     closed = jax.make_jaxpr(function)(*args)
     return _reached(closed.jaxpr, closed.jaxpr.invars)
 

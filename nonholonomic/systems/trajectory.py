@@ -16,15 +16,16 @@ WORDS = {REACHED_END: "completed", LEFT_DOMAIN: "stopped", FAILED: "failed", UNR
 
 
 class Trajectory(Tabular, eqx.Module):
-    """A run of a user's system at given times, which are the first axis of its arrays; `jax.vmap` adds an axis.
+    """A run of your own system at given times. The times are the first axis of the arrays; `jax.vmap` adds an axis
+    before it.
 
     - `t`: times [s], (times,).
     - `state`: (times, components), NaN after the end of the run; for an `AbstractSystem` the coordinates, followed by
       their rates. At the time of a reset, this is the state before the reset.
     - `mode`: index of the mode, (times,), -1 after the end.
     - `end_time`: time at which the run ended [s]; `switches`: number of resets.
-    - `steps`, `rejected`: numbers of integration steps and of rejected ones.
-    - `code`: code of `status`.
+    - `steps`, `rejected`: numbers of all integration steps and of rejected steps.
+    - `code`: the status as an integer.
     - `names`: names of the components in tables.
 
     **Example:**
@@ -59,7 +60,7 @@ class Trajectory(Tabular, eqx.Module):
         """How the run ended: "completed" at `t1`; "stopped" if a mode without a reset ended; "failed"; or "unresolved"
         if resets followed one another without end.
 
-        For a batch of runs, an array of words; inside a transformation, the code.
+        For a batch of runs, an array of words; inside a transformation, the integer.
         """
         if is_traced(self.code):
             return self.code

@@ -1,4 +1,4 @@
-"""The part of a surface on which runs take place, drawn from the surface's chart or from its nearest points."""
+"""The part of a surface on which runs take place. It is drawn from the chart of the surface or from nearest points."""
 
 import equinox as eqx
 import numpy as np

@@ -78,9 +78,9 @@ def page(
     **Arguments:**
 
     - `stages`: the stages to show; without any, the page has text only.
-    - `title`: of the page; `above`, `below`: HTML around the view.
+    - `title`: title of the page; `above`, `below`: HTML around the view.
     - `speed`: speed of time at the start, one of `SPEEDS`.
-    - `height`: of each stage in pixels.
+    - `height`: height of each stage in pixels.
     - `scripts`: HTML of additional scripts, such as `script` returns, inserted after those of the page.
     - `autoplay`: whether the page plays once when it first becomes visible.
 

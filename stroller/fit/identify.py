@@ -65,12 +65,12 @@ def identify(
     **Arguments:**
 
     - `scene`: a `Scene`, with the values of the parameters that are not free.
-    - `data`: a `Recording`, or a list of several to be fitted together.
+    - `data`: a `Recording`, or a list of several, which are fitted together.
     - `free`: full name of a parameter -> a `Free` or only the start value: `"scene.friction.rolling"`, or `"rolling"`
       if no other name ends so; `"launch.place[0]"` and `"launch.place[1]"` are parts of the place. A parameter of the
-      launch, or `"t0"`, the reading of a recording's clock at the launch, is the same in all recordings;
-      `"data[1].launch.heading"` is that of the second, and `"data[*].t0"` stands for one of each. Parameters that
-      cannot be negative are fitted by their logarithms.
+      launch, and `"t0"`, the reading of a recording's clock at the launch, are the same in all recordings;
+      `"data[1].launch.heading"` belongs to the second recording, and `"data[*].t0"` is a separate number for each.
+      Parameters that cannot be negative are fitted by their logarithms.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
     - `tolerance`: relative tolerance of the integration.
 

@@ -3,14 +3,15 @@ tan(phi).
 
 The state, with vectors in the ground's axes, contains the position r of the rear axle, the heading e, the steering
 angle phi, the quasi-momentum P = w sqrt(M_w), where w is the speed of the front wheel and M_w its reduced mass, and the
-rate sg of the fork: phi', or phi' + Omega for a fork that turns with the frame. It also contains sin(phi) and cos(phi),
-which would otherwise take four fifths of the field's time; phi itself is for the spring, for inputs and for output, and
-may exceed pi. The last components are the work [J] done so far by the inputs and by friction, if there are any.
+rate sg of the fork: phi', or phi' + Omega for a fork that turns with the frame. The state also contains sin(phi) and
+cos(phi), because computing them would take four fifths of the field's time. Only the spring, inputs and outputs need
+phi itself, which may exceed pi. The last components are the work [J] done so far by the inputs and by friction, if
+there are any.
 
 The energy P^2/2 + J_f sg^2/2 + V is quadratic in the state, with V linear except for the spring, so the implicit
-midpoint rule keeps its balance exactly, and sin^2 + cos^2, too. With other solvers, this sum drifts with the errors of
-the steps. The velocities do not depend on it, except for the speed of the front wheel, so it is corrected when a state
-is read (`righted`), and not in the field.
+midpoint rule keeps the energy balance and sin^2 + cos^2 exactly. With other solvers, this sum drifts with the errors of
+the steps. Only the speed of the front wheel depends on the sum, so `righted` corrects the sum when a state is read, and
+the field does not.
 """
 
 from typing import NamedTuple
@@ -283,8 +284,9 @@ class Dynamics(eqx.Module):
     ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Side forces [N] like `side_force`, for the projected heading on curved ground: they act horizontally.
 
-        The missing momentum along d is -sin(phi) nu times the front force, the missing spin cos(phi) l times it;
-        together they give this force without dividing by cos(phi). The rear force follows from the sideways momentum.
+        The front force times -sin(phi) nu is the missing momentum along d, and the front force times cos(phi) l the
+        missing spin; together, both give the force without dividing by cos(phi). The rear force follows from the
+        sideways momentum.
         """
         body = self.body
 
@@ -312,6 +314,6 @@ class Dynamics(eqx.Module):
 
 
 def padded(components: State) -> Vector:
-    """Components as a vector; missing last components vanish identically."""
+    """Components as a vector; missing components at the end vanish identically."""
     vector = (*components, None, None)
     return vector[0], vector[1], vector[2]

@@ -17,7 +17,7 @@ class WheelMotion(NamedTuple):
     """The motion of the stroller for friction: rolling speeds of the wheels [m/s], rates [rad/s], loads [N] on the
     axles.
 
-    A load is `None` where it is exactly zero, as on the front axle with the centre of mass on the rear one.
+    A load is `None` where it is exactly zero, as on the front axle if the centre of mass is above the rear axle.
     """
 
     rear_speed: Float[Array, "..."]

@@ -1,7 +1,7 @@
 """Inputs of the stroller: functions of time and motion that return the drive force and the steering torque.
 
-Any function `(t, motion) -> (force, torque)` will do. It is called with arrays of any shape, one number per lane, so
-write it with `jax.numpy` and without `if`. Use an `equinox.Module` for parameters to sweep or differentiate.
+An input is any function `(t, motion) -> (force, torque)`. Its arguments are arrays of any shape, with one number per
+lane, so write it with `jax.numpy` and without `if`. Use an `equinox.Module` for parameters to sweep or differentiate.
 """
 
 import inspect
@@ -92,7 +92,7 @@ WANTED = "a function (t, motion) -> (drive force [N], steering torque [N m])"
 
 @eqx.filter_jit
 def at_start(scene: Any, launch: Any) -> tuple[Float[Array, ""], Motion]:
-    """Arguments of an input at the start of a ride: a time and a motion."""
+    """The arguments of an input at the start of a ride: time and motion."""
     state = scene.state(launch, True)
     return jnp.zeros(()), scene.dynamics.geometry(state).motion
 
@@ -154,7 +154,7 @@ class Program:
 class Formula(eqx.Module):
     """A function as an input module: the arrays in it are leaves, and its operations are compared by their text.
 
-    So redefining a function, as in a notebook's cell, does not compile it again.
+    If you define the same function again, as in a notebook's cell, it is not compiled again.
     """
 
     held: tuple[Array, ...]

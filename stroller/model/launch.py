@@ -10,7 +10,7 @@ from nonholonomic.validation import Bound, Bounded, as_number, shown
 
 
 def as_place(value: Any) -> Any:
-    """Two or three numbers as a tuple of arrays; anything else is left for later checks."""
+    """Two or three numbers as a tuple of arrays; anything else stays unchanged, for later checks."""
     try:
         numbers = tuple(value)
     except TypeError:
@@ -25,15 +25,15 @@ class Launch(Bounded):
 
     - `place`: (x, y) [m] on a plane (along it), paraboloid or graph; (mu, eta) [rad], azimuth and reduced latitude, on a
       sphere or spheroid, azimuth and angle about the tube on a torus; (y, eta), along the axis [m] and from the lowest line
-      [rad], on a cylinder. On any surface also (x, y, z) [m] in the fixed frame.
+      [rad], on a cylinder. Any surface also accepts (x, y, z) [m] in the fixed frame.
     - `heading`: angle psi [rad] of the heading from the surface's east towards its north: from x towards y on a plane.
       The projected heading of the paper is the angle theta [rad] of its horizontal projection from x towards y.
     - `speed`: speed v [m/s] of the rear axle along the heading, negative in reverse; the horizontal speed where the
       heading is projected.
     - `steering`: angle phi [rad] of the front wheel, positive to the driver's left.
-    - `steering_rate`: its rate phi' [rad/s].
+    - `steering_rate`: rate phi' of the steering angle [rad/s].
 
-    **Raises:** `ValueError` for numbers that are not finite, or a place that is not two or three of them.
+    **Raises:** `ValueError` for numbers that are not finite, or a place that does not have two or three numbers.
 
     **Example:**
 

@@ -60,12 +60,12 @@ class Scene(Bounded):
     - `friction`: `Frictionless()`, `Damping(rolling, front, scrub, steering)` or
       `RollingResistance(coefficient, speed)`.
     - `gravity`: acceleration of free fall [m/s^2], at least 0.
-    - `side`: "outside" (the default) or "inside" of a cylinder, sphere, spheroid or torus, "above" a plane, paraboloid
-      or graph, on the "positive" side of an implicit surface.
-    - `fork`: "relative" if the fork's inertia resists only the steering rate phi', "absolute" if it resists its whole
-      rate phi' + Omega about the steering axis, as a rigid fork does.
+    - `side`: "outside" (the default) or "inside" of a cylinder, sphere, spheroid or torus; "above" a plane, paraboloid
+      or graph; or the "positive" side of an implicit surface.
+    - `fork`: "relative" if the fork's inertia resists only the steering rate phi', "absolute" if it resists the whole
+      rate phi' + Omega about the steering axis, as in a rigid fork.
     - `heading`: "intrinsic", or "projected" to reproduce the paper on a plane, sphere or spheroid, which constrains the
-      horizontal projection of the velocities (`stroller.md`, section 3, says why that is not the default).
+      horizontal projection of the velocities (`stroller.md`, section 3, explains why this is not the default).
 
     **Raises:** `ValueError` if a part is of the wrong kind, a word is unknown, or a number is out of range.
 
@@ -164,8 +164,8 @@ class Scene(Bounded):
         return of.abs(sine) < RIGHT_ANGLE
 
     def may_start(self, launch: Launch, *others: Any) -> Bool[Array, ""]:
-        """Whether the numbers of the scene, a launch and other modules are legal, for numbers that `check` could not
-        see."""
+        """Whether the numbers of the scene, a launch and other modules are legal; for traced numbers, which `check`
+        ignores."""
         own = [bound for module in (self, launch, *others) for bound in all_bounds(module)]
         stuck = jnp.asarray(self.sideways(launch) | self.level(launch))
         return jnp.all(legal([*own, *self.start_bounds(launch)]) & ~stuck)
@@ -176,7 +176,7 @@ class Scene(Bounded):
         **Arguments:**
 
         - `launch`: a `Launch` whose numbers, like the scene's, are scalars or one per lane.
-        - `driven`: whether there is an input; the state then records its work.
+        - `driven`: whether there is an input, whose work is then part of the state.
 
         **Returns:** an array (components, ...) in SI units.
         """
@@ -201,8 +201,8 @@ class Scene(Bounded):
     def scales(self, launch: Launch, driven: bool = False) -> State:
         """Scales of absolute errors of the state, component by component.
 
-        Positions are measured in wheelbases, directions and angles in units of 1, the rest in units of the launch's own
-        speeds or of a fall through a wheelbase, whichever is greater.
+        Positions are measured in wheelbases, directions and angles in units of 1, other components in units of the
+        launch's speed or of the speed of a fall through a wheelbase, whichever is greater.
 
         **Arguments:** as for `state`. **Returns:** an array (components, ...) in SI units.
         """

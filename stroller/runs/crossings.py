@@ -1,4 +1,4 @@
-"""Find the times at which a quantity was zero during a run, within a step by repeating that step with other lengths."""
+"""Find the times at which a quantity was zero during a run. Within a step, the step is repeated with other lengths."""
 
 from typing import NamedTuple
 
@@ -43,7 +43,7 @@ class Between(NamedTuple):
 
 
 def watched(spec: RideSpec, states: States, name: str) -> Lanes:
-    """A quantity of `WATCHED` at some states."""
+    """A quantity in `WATCHED` at the given states."""
     return in_blocks(lambda at: _watched(spec, at), states)[WATCHED.index(name)]
 
 

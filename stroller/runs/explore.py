@@ -56,12 +56,13 @@ def explore(
     t1: float = 8.0,
     input: Input | None = None,
 ) -> Page:
-    """Make a page with sliders that simulates the ride again, in the browser, while you move a slider.
+    """Make a page with sliders that simulates the ride in the browser while you move a slider.
 
-    The page is one file that needs no network; a notebook shows the returned `Page`. The equations of motion, the Runge-Kutta
-    pair and the step-size control are generated from those of `simulate` and of tables, at a tolerance of 1e-7. In the
-    background, a map of how far the ride leads over two of the sliders fills in; click it to set both. The page's address holds
-    the sliders: a copied link opens the same ride. Press space to play or pause, r to reset the sliders.
+    The page is one file that needs no network; a notebook shows the returned `Page`. The equations of motion, the
+    Runge-Kutta pair and the step-size control are generated from those of `simulate` and of tables, at a tolerance of
+    1e-7. The page also computes a map, over two of the sliders, of the distance between the ends of the ride; click on
+    the map to set both sliders. The address of the page contains the slider values, so that you can copy a link to a
+    ride. Press space to play or pause, and r to reset the sliders.
 
     **Arguments:**
 
@@ -104,7 +105,8 @@ def explore(
 
 
 def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float, input: Any) -> LiveRun:
-    """The contents of the page for a scene, a launch and an input, `roots`, some of whose numbers come from sliders."""
+    """The contents of the page. `roots` are the scene, the launch and the input, some of whose numbers come from
+    sliders."""
     settings = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE)
     controls = as_module(input, roots["scene"], roots["launch"])
 
@@ -185,7 +187,8 @@ def outcome(problem: RideProblem, lane: LaneState) -> tuple[Int[Array, ""], Floa
 
 
 def stage(runs: list[dict[str, Any]], t1: float, controls: Any) -> Stage:
-    """The stage of the first of some scenes and launches, on a part of the ground that contains all of them."""
+    """The stage of the first scene and launch, on a part of the ground that contains the rides of all given scenes and
+    launches."""
     rides = [simulate(run["scene"], run["launch"], t1, run.get("input", controls), tolerance=DRAWN) for run in runs]
     (first,), length = rides[0].stages(), float(runs[0]["scene"].body.wheelbase)
     points = np.concatenate([np.asarray(ride.position) for ride in rides])

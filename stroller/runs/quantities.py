@@ -32,13 +32,13 @@ QUANTITIES = {
 
 
 def table_of(runs: list[Any], names: list[str], request: dict[str, Any]) -> Table:
-    """All quantities of some runs over their times, which are the same for all.
+    """All quantities of several runs with the same times, over these times.
 
     **Arguments:**
 
-    - `runs`: a `Trajectory` each.
-    - `names`: of the runs, without spaces, which become an axis "ride"; none for the only run.
-    - `request`: plain data that says what was computed.
+    - `runs`: the trajectories.
+    - `names`: names of the runs, without spaces, for the axis "ride"; empty for a single run.
+    - `request`: plain data that describes the computation.
     """
     flat = {isinstance(run.spec.ride.scene.surface, Plane) for run in runs}
     # On grounds of different kinds, a place has no common unit.

@@ -31,10 +31,8 @@ CONTACT_ROUND_OFF = 1e-12
 
 
 class RideProblem(AbstractProblem):
-    """One ride, or those of many cells.
-
-    With `watched`, the event is that the ground would have to pull; with `guarded`, a ride ends when the constraints
-    lose rank.
+    """One ride, or the rides of many cells. If `watched`, the event is that the ground would have to pull; if
+    `guarded`, a ride ends when the constraints lose rank.
     """
 
     dynamics: Dynamics
@@ -93,8 +91,8 @@ class Stats(NamedTuple):
 
 
 class Ride(NamedTuple):
-    """A ride and how it is integrated: until `t1` [s]; `grid`: the ends of the steps [s] of a solver without an error
-    estimate."""
+    """A ride and the options of its integration. `t1`: end [s]; `grid`: the ends of the steps [s] of a solver without
+    an error estimate."""
 
     scene: Scene
     launch: Launch

@@ -51,14 +51,14 @@ def simulate(
     - `tolerance`: relative tolerance of an adaptive solver, in [1e-14, 1e-2]; the absolute tolerance is a tenth of it,
       in units of the scene's magnitudes.
     - `solver`: any adaptive solver of Diffrax for ordinary differential equations, or an `ImplicitMidpoint`; by default
-      `diffrax.Dopri8()`, inside transformations, without `adjoint` and where every number is a scalar,
+      `diffrax.Dopri8()`; inside transformations without `adjoint`, if all numbers are scalars,
       `nonholonomic.integration.Oscillatory8()`.
     - `max_steps`: a run that needs more steps fails; at least 1.
-    - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for
-      each parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax differentiates, which is
-      cheaper for a loss with many parameters, such as the weights of an input.
+    - `adjoint`: an adjoint method of Diffrax, such as `RecursiveCheckpointAdjoint()`, with which Diffrax
+      differentiates. This is cheaper for a loss function with many parameters, such as the weights of an input. By
+      default, this package computes forward and reverse derivatives, at the cost of about one run for each parameter.
 
-    **Returns:** a `Trajectory`; its `status` says whether the run reached its end, and what happened before.
+    **Returns:** a `Trajectory`; its `status` is the word for how the run ended.
 
     **Raises:** `ValueError` for arguments out of range, a number that is a list, a launch that the scene cannot start
     from, times that do not increase, a solver without an error estimate, and an input that is not a function, cannot be
@@ -136,7 +136,7 @@ def even_steps(
 ) -> Float[Array, " steps"]:
     """Times from 0 to `t1`, at most `longest` apart, that include all `times` and are evenly spaced between them.
 
-    **Raises:** `ValueError` if one of the three is traced: the number of steps is part of the program.
+    **Raises:** `ValueError` if an argument is traced, because the number of steps is part of the program.
     """
     for name, number in {"t1": t1, "times": times, "step_length": longest}.items():
         if is_traced(number):

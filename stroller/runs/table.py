@@ -88,20 +88,19 @@ def sweep(
 
     **Arguments:**
 
-    - `scene`, `launch`, `input`: as for `simulate`, every number a scalar.
+    - `scene`, `launch`, `input`: as for `simulate`; all numbers must be scalars.
     - `t1`: end of every ride [s].
-    - `axes`: full name of a parameter, or its unambiguous end -> values, such as `{"launch.speed": [1.0, 2.0], "polar":
-      [0.8, 0.9]}`; the parts of the place are `"launch.place[0]"` and `"launch.place[1]"`, the parameters of an input
-      that is a module are under `"input."`. The first axis varies slowest; without any, `{}`, the table has a single
-      ride.
+    - `axes`: name of a parameter -> values, such as `{"launch.speed": [1.0, 2.0], "polar": [0.8, 0.9]}`; the end of a
+      full name is enough if it is unique. The parts of the place are `"launch.place[0]"` and `"launch.place[1]"`; the
+      names of parameters of an input that is a module begin with `"input."`. The first axis varies slowest. With `{}`,
+      the table has a single ride.
     - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
       `nonholonomic.integration.Oscillatory8()`.
-    - `path`: HDF5 file to write, chunk by chunk. The same call resumes an interrupted table from it.
+    - `path`: HDF5 file to write, chunk by chunk. Repeat the same call to resume an interrupted table.
     - `progress`: whether to show progress, on a terminal or in a notebook.
     - `executor`: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a Dask client;
-      it gets chunks as its workers become free. By default a thread for each core. The results are bitwise equal on the
-      same kind of processor.
+      by default, a thread for each core. On the same kind of processor, all executors give bitwise equal results.
     - `max_steps`: a ride that needs more steps, including rejected ones, fails; at least 1.
 
     **Returns:** a `Table` of the rides' ends: position `x`, `y`, `z` [m] in the fixed frame, `heading`, `end_steering`
@@ -132,8 +131,8 @@ def sweep(
     if not isinstance(axes, dict) or not all(isinstance(number, str) for number in axes):
         raise ValueError(f"axes = {axes!r} must be a dictionary, full name of a parameter -> values")
     require_whole(max_steps, "max_steps", 1)
-    method = Settings(tolerance, solver).for_lanes
-    explicit_tableau(method)
+    settings = Settings(tolerance, solver, max_steps=int(max_steps))
+    explicit_tableau(settings.for_lanes)
     roots = {"scene": scene, "launch": launch} | ({"input": input} if isinstance(input, eqx.Module) else {})
     grid = named_axes(full_axes(axes, variable_numbers(roots)), scene.surface, launch)
     # The modules check every value of every axis here, before anything compiles.
@@ -143,11 +142,11 @@ def sweep(
 
     request = description("scene", scene) | description("launch", dataclasses.replace(launch, place=(0.0, 0.0)))
     request |= {"launch.place": [float(part) for part in launch.place], "t1": float(t1), "tolerance": float(tolerance)}
-    request |= {"solver": type(method).__name__, "input": "none" if input is None else described(input)}
+    request |= {"solver": type(settings.for_lanes).__name__, "input": "none" if input is None else described(input)}
     request |= {grid_axis.number: "an axis" for grid_axis in grid}
     if max_steps != DEFAULT_MAX_STEPS:
         request |= {"max_steps": int(max_steps)}
-    job = RideJob.of(roots, input, float(t1), float(tolerance), method, int(max_steps))
+    job = RideJob.of(roots, input, float(t1), settings)
     return computed(job, grid, VARIABLES, request, path=path, progress=progress, executor=executor)
 
 
@@ -169,23 +168,13 @@ class RideJob(NamedTuple):
     roots: dict[str, Any]
     input: Input | None
     t1: float
-    tolerance: float
-    solver: diffrax.AbstractSolver
-    max_steps: int
+    settings: Settings
     controls: Input | None
 
     @classmethod
-    def of(
-        cls,
-        roots: dict[str, Any],
-        input: Any,
-        t1: float,
-        tolerance: float,
-        solver: diffrax.AbstractSolver,
-        max_steps: int,
-    ) -> "RideJob":
-        """The job, in this process."""
-        return cls(roots, input, t1, tolerance, solver, max_steps, as_module(input, roots["scene"], roots["launch"]))
+    def of(cls, roots: dict[str, Any], input: Any, t1: float, settings: Settings) -> "RideJob":
+        """The job for a scene, launch and input."""
+        return cls(roots, input, t1, settings, as_module(input, roots["scene"], roots["launch"]))
 
     def __reduce__(self) -> Any:
         return RideJob.of, tuple(self[:-1])
@@ -196,9 +185,10 @@ class RideJob(NamedTuple):
         size = next((len(values) for values in columns.values()), 1)
         controls = cells.get("input", self.controls)
         problem = RideProblem.of(cells["scene"], cells["launch"], controls, size, watched=True)
-        horizon, settings = as_number(self.t1), Settings(self.tolerance, self.solver, max_steps=self.max_steps)
         # A ride continues if contact is lost, as if the ground could pull.
-        outcome, _ = solve_ensemble(problem, horizon, jnp.asarray(count), settings, nonterminal=problem.watched)
+        outcome, _ = solve_ensemble(
+            problem, as_number(self.t1), jnp.asarray(count), self.settings, nonterminal=problem.watched
+        )
         contact_time = np.asarray(outcome.first_crossing)
         lost = np.isfinite(contact_time)
         words = np.select([outcome.status == FAILED, outcome.status == LEFT_DOMAIN, lost], [3, 2, 1], 0)
@@ -236,9 +226,8 @@ def place_numbers(launch: Launch) -> list[str]:
 
 
 def named_axes(axes: dict[str, Any], surface: AbstractSurface, launch: Launch) -> list[Axis]:
-    """The axes of the table, each named by the last part of its full name, or the last two if that is ambiguous.
-
-    The numbers of a place are named as the surface names them, with a zero: `x0`.
+    """The axes of the table. The name of an axis is the last part of its full name, or the last two parts if one is
+    ambiguous. Numbers of a place have the surface's names, followed by a zero: `x0`.
     """
     lasts = [number.rsplit(".", 1)[-1] for number in axes]
     named = surface.coordinates if len(launch.place) == len(surface.coordinates) else FIXED

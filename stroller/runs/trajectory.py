@@ -31,7 +31,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
 
     - `t` [s]; `place`, as the surface names it (see `Launch`), (times, 2), or (times, 3) on an implicit surface; `position`
       [m] in the fixed frame, z up, (times, 3);
-    - `heading` [rad], as in `Launch`; `direction`: the same as a unit vector in the fixed frame, (times, 3);
+    - `heading` [rad], as in `Launch`; `direction`: the heading as a unit vector in the fixed frame, (times, 3);
     - `steering` [rad], `steering_rate` [rad/s], `yaw_rate` [rad/s], `speed` of the rear axle and `front_speed` at which
       the front wheel rolls [m/s];
     - `energy` [J], `work` [J] done so far by inputs and friction, `power` [W] through each port (a `Power`);
@@ -39,8 +39,8 @@ class Trajectory(Viewable, Tabular, eqx.Module):
     - `normal_force` [N] of the ground, and `load` [N] on the rear and the front axle, (times, 2);
     - `constraint` [m/s]: speed at which the rear axle and the front wheel slip sideways, (times, 2);
     - `departure`: distance of the position from the ground [m], an integration error;
-    - `stats` of the integration; `spec`: the specification of the run; `steps`: the ends of its steps, `None` for a run
-      inside a transformation, which is repeated when you ask for events between the times.
+    - `stats` of the integration; `spec`: the specification of the run; `steps`: the ends of its steps. They are `None`
+      for a run inside a transformation, which is repeated when you request events between the times.
 
     **Example:**
 
@@ -89,15 +89,15 @@ class Trajectory(Viewable, Tabular, eqx.Module):
 
     @property
     def energy_residual(self) -> Float[Array, " times"]:
-        """Energy minus its start and the work done since [J]: zero for an exact solution."""
+        """Energy minus the initial energy and the work since the start [J]: zero for an exact solution."""
         return self.energy - self.energy[0] - (self.work - self.work[0])
 
     @property
     def wheelbase_error(self) -> Float[Array, " times"]:
         """Relative error |K| l^2 / 6 of replacing the ground by its tangent plane over the wheelbase l.
 
-        K is the Gaussian curvature (`stroller.md`, section 9). The model holds for a wheelbase short against the radii of
-        curvature.
+        K is the Gaussian curvature (`stroller.md`, section 9). The model holds if the wheelbase is short compared with
+        the radii of curvature.
         """
         scene = self.spec.ride.scene
         states = self.state.T
@@ -105,7 +105,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         return jnp.abs(spread(curvature, states[0])) * scene.body.wheelbase**2 / 6.0
 
     def grip(self) -> Float[Array, "times 2"]:
-        """Coefficient of friction that each axle needs so as not to slip; infinite for a force without a load."""
+        """Coefficient of friction that each axle needs to avoid slip; infinite for a force without a load."""
         force = jnp.abs(self.side_force)
         return jnp.where(force == 0.0, 0.0, force / jnp.maximum(self.load, 0.0))
 
@@ -134,7 +134,8 @@ class Trajectory(Viewable, Tabular, eqx.Module):
 
     @property
     def contact_lost_at(self) -> float:
-        """Time [s] at which the ground first has to pull to keep the stroller on it; infinite if it never does."""
+        """Time [s] at which the ground first has to pull on the stroller to keep contact; infinite if there is no such
+        time."""
         run = self.with_steps()
         assert run.steps is not None
         force = watched(run.spec, run.steps.states, "normal_force")
@@ -162,7 +163,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
 
     @property
     def status(self) -> str:
-        """The first of the words `failed`, `rank_lost`, `contact_lost` and `completed` that applies.
+        """How the run ended: the first of the words `failed`, `rank_lost`, `contact_lost` and `completed` that applies.
 
         After `contact_lost`, the run continues as if the ground could pull.
         """

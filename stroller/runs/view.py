@@ -152,8 +152,8 @@ def grip_warning(run: Any) -> str:
 
 
 def refined(run: Any, radius: float) -> tuple[np.ndarray, Any]:
-    """Times between which wheels roll little, including those of the ride, and a function that reads the ride's numbers
-    there."""
+    """Times so close that the wheels roll little between them, including the times of the ride, and a function that
+    returns the ride's numbers at these times."""
     times = np.asarray(run.t)
     if len(times) < 4:
         return times, np.asarray

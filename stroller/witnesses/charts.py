@@ -1,9 +1,9 @@
 """The stroller in coordinates, as data for the formulations of `nonholonomic/formulations/formulation.py`.
 
 The coordinates are q = (x, y, theta, phi) on a plane and (eta, mu, psi, phi), reduced latitude first as in the paper,
-on a sphere or spheroid, where psi is the paper's theta if the heading is projected. Unlike the P-form they are singular
-at the poles. They are an independent check of the P-form (`stroller.md`, sections 2 to 4 and 6), and the paper's own
-form.
+on a sphere or spheroid, where psi is the paper's theta if the heading is projected. Unlike the P-form, these equations
+are singular at the poles. They have the form of the paper, and are an independent check of the P-form (`stroller.md`,
+sections 2 to 4 and 6).
 """
 
 import jax
@@ -22,8 +22,9 @@ from ..model.scene import FORKS, Scene
 class Chart(AbstractSystem):
     """A scene in coordinates: metric, potential, constraints, frame and forces.
 
-    The constraints are those of the two axles, w1 = lat and w2 = -sin(phi) long + cos(phi) lat + l cos(phi) yaw; the
-    frame's first two fields are the motion of unit front-wheel speed at a fixed steering angle, and steering.
+    The constraints are those of the rear axle, w1 = lat, and of the front wheel, w2 = -sin(phi) long + cos(phi) lat + l
+    cos(phi) yaw. The first field of the frame is motion at a fixed steering angle and unit speed of the front wheel;
+    the second field is steering.
 
     **Arguments:**
 

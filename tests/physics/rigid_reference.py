@@ -6,7 +6,8 @@ m u' = F - m g z, J w' + w x J w = r x F, and as many conditions on the contact 
 velocity of the contact point stays zero as a vector; sliding, its normal component does, and F = N (z + f(slip)).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -106,3 +107,63 @@ class Rattleback:
 
     def _solve(self, y, t1, rtol=1e-12, **options):
         return solve_ivp(lambda t, y: self.motion(y)[0], (0.0, t1), y, "DOP853", rtol=rtol, atol=1e-2 * rtol, **options)
+
+
+class Mode(NamedTuple):
+    """A stretch of a run: whether the body rolls, its steps' times [s] and states (13, times)."""
+
+    rolls: bool
+    times: np.ndarray
+    states: np.ndarray
+
+
+def follow(body: Rattleback, mu: float, y, t1: float, floor=1e-8, onset=1e-9, rtol=1e-10, stiff=5e-4) -> list[Mode]:
+    """Stick and slip of a body on the level plane, mode by mode; `body` has no friction of its own.
+
+    A slip ends where its speed has fallen to `floor`, and begins with `onset` [m/s] against the force of rolling; for the time
+    `stiff` [s] after that, where its direction is stiff, the method is implicit.
+    """
+    slipping = replace(body, friction=lambda v: -mu * v / np.linalg.norm(v))
+
+    def slip(y):
+        return (y[3:6] + np.cross(y[10:13], body.lever(rotation(y[6:10]))[0]))[:2]
+
+    def struck(y, v):
+        """The state after the blow that gives the contact point the velocity v along the plane."""
+        Q = rotation(y[6:10])
+        r = skew(body.lever(Q)[0])
+        inverse = np.linalg.inv(Q @ np.array(body.inertia) @ Q.T)
+        blow = np.linalg.solve(np.eye(3) / body.mass - r @ inverse @ r, np.append(v - slip(y), 0.0))
+        return y + np.concatenate((np.zeros(3), blow / body.mass, np.zeros(4), inverse @ r @ blow))
+
+    def leaves(_, y):
+        force = body.motion(y)[1]
+        return mu * force[2] - np.hypot(*force[:2])
+
+    def stops(_, y):
+        return np.linalg.norm(slip(y)) - floor
+
+    stops.terminal = leaves.terminal = True
+    stops.direction = leaves.direction = -1.0
+    rolls, t, modes, began = stops(0.0, y) <= 0.0, 0.0, [], -stiff
+    while t < t1:
+        early = not rolls and t < began + stiff
+        equations, method = (body if rolls else slipping), "Radau" if early else "DOP853"
+        options = {"rtol": rtol, "atol": 1e-2 * rtol, "events": leaves if rolls else stops}
+        end = min(began + stiff, t1) if early else t1
+        out = solve_ivp(lambda t, y, at=equations: at.motion(y)[0], (t, end), y, method, **options)
+        if modes and not rolls and not modes[-1].rolls:
+            past = modes.pop()
+            modes.append(Mode(rolls, np.append(past.times, out.t[1:]), np.hstack((past.states, out.y[:, 1:]))))
+        else:
+            modes.append(Mode(rolls, out.t, out.y))
+        t, y = out.t[-1], out.y[:, -1]
+        if out.status == 0:
+            continue
+        if not rolls:
+            y = struck(y, np.zeros(2))
+        rolls = not rolls and leaves(t, y) > 0.0
+        if not rolls:
+            force, began = body.motion(y)[1], t
+            y = struck(y, -onset * force[:2] / np.hypot(*force[:2]))
+    return modes

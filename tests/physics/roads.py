@@ -15,6 +15,7 @@ import numpy as np
 from random_scenes import Batch, batch
 
 import tippe
+from nonholonomic.integration import Settings
 from nonholonomic.parameters import with_numbers
 from nonholonomic.xla_cpu import compile_quickly
 from tippe.runs.cells import InversionRuns
@@ -44,10 +45,12 @@ CODES = {
 def table_of(scenes: Batch, count: int, t1: float) -> dict[str, np.ndarray]:
     """What a table of these scenes has, with errors, and the status in words."""
     kind = run_kind_of(scenes.scene)
-    runs = InversionRuns(kind, t1, ANGLE, "first", None, "ensemble", [])
     roots = {"scene": scenes.scene, "launch": scenes.launch}
     first, second = (
-        runs.results(roots, scenes.columns, tolerance, count) for tolerance in (TOLERANCE, second_tolerance(TOLERANCE))
+        InversionRuns(kind, t1, ANGLE, "first", Settings(tolerance), "ensemble", []).results(
+            roots, scenes.columns, count
+        )
+        for tolerance in (TOLERANCE, second_tolerance(TOLERANCE))
     )
     silent = tuple(kind.words.index(word) for word in ("failed", "unresolved"))
     words = np.array(kind.words)[first["status"]]

@@ -119,6 +119,12 @@ def test_it_shows_the_time_of_the_launch_and_the_run(browser, page, rutstam_scen
     time = float(tippe.inversion_time(rutstam_scene, tippe.Launch(0.1, 155.0), 7.0))
     assert f"{time:.3f} s" in browser.find_element("id", "result").text
     assert "inverted" in browser.find_element("id", "result").text
+    # L.(R n - a e), not the angular momentum.
+    assert (
+        f"Jellett's quantity\n{float(run.jellett[0]):.4g}".replace("e-0", "e-")
+        in browser.find_element("id", "result").text
+    )
+    assert "kg m³/s" in browser.find_element("id", "result").text
     read = "return live.moves.trajectory(live.values(), 'frame').read([0, 2, 7]).map((row) => [...row])"
     rows = np.array(browser.execute_script(read))
     np.testing.assert_allclose(rows[:, 3:6], run.position, atol=CLOSE)

@@ -8,6 +8,7 @@ from random_scenes import IN_PHASES, SMOOTH, batch
 from tops import rutstam_top
 
 import tippe
+from nonholonomic.integration import Settings
 from nonholonomic.sweeps.digits import concise, concise_strings
 from tippe import steady
 from tippe.runs.cells import InversionRuns
@@ -180,8 +181,8 @@ def test_agreement_on_no_answer_is_no_agreement(monkeypatch):
         return times | ends | {"status": np.arange(len(words), dtype=np.int8)}
 
     monkeypatch.setattr(InversionRuns, "results", results)
-    runs = InversionRuns(run_kind_of(scene), 1.0, ANGLE, "both", None, "ensemble", [])
-    outcome = InversionJob(runs, {"scene": scene}, 1e-9, errors=True)({}, len(words))
+    runs = InversionRuns(run_kind_of(scene), 1.0, ANGLE, "both", Settings(1e-9), "ensemble", [])
+    outcome = InversionJob(runs, {"scene": scene}, errors=True)({}, len(words))
     for name in ("first_time", "last_time"):
         doubtful = np.isinf(outcome[f"{name}_error"])
         assert {word for word, doubt in zip(words, doubtful, strict=True) if doubt} == {"failed", "unresolved"}
@@ -203,9 +204,13 @@ def test_the_file_keeps_the_errors(tmp_path):
 def runs_of(kind, count, tolerances):
     """The variables of random scenes of a kind (`random_scenes.py`) at each tolerance, and how many things are counted."""
     scene, launch, columns = batch(kind, count)
-    runs = InversionRuns(run_kind_of(scene), 8.0, 0.95 * np.pi, "first", None, "ensemble", [])
-    roots = {"scene": scene, "launch": launch}
-    return {tolerance: runs.results(roots, columns, tolerance, count) for tolerance in tolerances}, runs.run_kind.counts
+    kind, roots = run_kind_of(scene), {"scene": scene, "launch": launch}
+
+    def results(tolerance):
+        runs = InversionRuns(kind, 8.0, 0.95 * np.pi, "first", Settings(tolerance), "ensemble", [])
+        return runs.results(roots, columns, count)
+
+    return {tolerance: results(tolerance) for tolerance in tolerances}, kind.counts
 
 
 def judged(first, second, true, counts):

@@ -125,17 +125,22 @@ def test_later_samples_are_further_along():
 
 def thetas_of_a_top_that_starts_along_the_normal(theta=0.0, azimuth=0.0, mu=0.3, surface=None, eta=0.0):
     scene = tippe.Scene(rutstam_top(), surface or tippe.Plane(), tippe.Viscous(mu))
-    return tippe.simulate(scene, tippe.Launch(theta, 155.0, eta, azimuth), 0.5, times=TIMES).theta
+    times = jnp.array([0.0, 0.1, 0.5, 1.0, 2.0])
+    return tippe.simulate(scene, tippe.Launch(theta, 155.0, eta, azimuth), 2.0, times=times).theta
 
 
 def test_theta_by_theta_at_the_pole_is_the_one_sided_derivative_forward_and_unknown_backward():
-    """In all azimuths alike, against launches beside the pole; by mu, which does not move the axis, it is 0."""
+    """In all azimuths alike, against launches beside the pole; by mu, which does not move the axis, it is 0.
+
+    The numbers are theta(t) / theta(0) of launches at 1e-4 to 1e-6 rad by SciPy's DOP853 at 1e-13, from Newton's and Euler's
+    equations in the fixed frame.
+    """
     by_theta = jax.jit(jax.vmap(jax.jacfwd(thetas_of_a_top_that_starts_along_the_normal), (None, 0)))
     slopes = by_theta(0.0, jnp.array([0.0, 1.0]))
     beside = thetas_of_a_top_that_starts_along_the_normal(1e-5, 1.0) / 1e-5
     assert_close(slopes[0], slopes[1], rtol=1e-7)
-    assert_close(slopes[1], beside, rtol=1e-6)
-    assert_close(slopes[0, [1, -1]], [0.606, 0.334], atol=6e-4)
+    assert_close(slopes[1], beside, rtol=3e-6)
+    assert_close(slopes[0], [1.0, 0.6063867, 0.3341863, 0.3490659, 0.2998009], atol=1e-7)
     backward = jax.grad(
         lambda *numbers: thetas_of_a_top_that_starts_along_the_normal(numbers[0], 1.0, numbers[1])[-1], (0, 1)
     )

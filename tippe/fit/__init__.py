@@ -1,1 +1,1 @@
-"""Measurements of a top, and the parameters identified from them: recordings, inversion times, fits and posteriors."""
+"""Estimate parameters of a top from measurements: recordings, inversion times, fits and posteriors."""

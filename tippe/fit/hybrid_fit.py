@@ -1,4 +1,4 @@
-"""Predictions for fits of runs with several modes, which use differences and run outside transformations."""
+"""Predictions for fits of runs with several modes. These fits use differences and run outside transformations."""
 
 from typing import Any, NamedTuple
 
@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nonholonomic.identification import of_data
+from nonholonomic.integration import Settings
 from nonholonomic.parameters import numbers, with_numbers
 
 from ..model.scene import Scene
@@ -18,10 +19,11 @@ from .recording import Recording
 
 
 class HybridModel(NamedTuple):
-    """Predictions of all data of a scene with flights, impacts, stick and slip, like `SceneModel` for smooth scenes.
+    """Predictions of all data for a scene with flights, impacts, stick and slip; `SceneModel` does the same for smooth
+    scenes.
 
-    Times are computed as in tables, in one ensemble; recordings are simulated one by one. Parameters that are illegal
-    in the scene have no predictions.
+    Times are computed as in tables, in one ensemble; recordings are simulated one by one. For parameters that are
+    illegal in the scene, there are no predictions.
     """
 
     scene: Scene
@@ -73,9 +75,9 @@ class HybridModel(NamedTuple):
         }
         columns |= {name: np.repeat([row[name] for row in rows], launches) for name in rows[0] if name != "t0"}
         t1, angle = float(data.t1), float(data.angle)
-        runs = InversionRuns(run_kind_of(self.scene), t1, angle, "first", None, "ensemble", [])
+        runs = InversionRuns(run_kind_of(self.scene), t1, angle, "first", Settings(self.tolerance), "ensemble", [])
         count = launches * len(rows)
-        variables = runs.results({"scene": self.scene, "launch": data.launch}, columns, self.tolerance, count)
+        variables = runs.results({"scene": self.scene, "launch": data.launch}, columns, count)
         missing = np.log(angle / np.clip(np.asarray(variables["end_theta"]), LEAST_ANGLE, angle))
         whole = np.maximum(np.log(angle / np.clip(columns["launch.theta"], LEAST_ANGLE, angle)), 1.0)
         time = np.where(np.isfinite(variables["time"]), variables["time"], t1 * (1.0 + missing / whole))

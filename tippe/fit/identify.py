@@ -73,23 +73,23 @@ def identify(
     **Arguments:**
 
     - `scene`: a `Scene`, with the values of the parameters that are not free.
-    - `data`: an `InversionTimes` or a `Recording`, or a list of several to be fitted together.
+    - `data`: an `InversionTimes` or a `Recording`, or a list of several, which are fitted together.
     - `free`: full name of a parameter -> a `Free` or only the start value: `"scene.friction.mu"`, or `"friction.mu"` if
-      no other name ends so. A parameter of the launch, or `"t0"`, the reading of a recording's clock at the launch, is
-      the same in all data; `"data[1].launch.azimuth"` is that of the second, and `"data[*].t0"` stands for one of each
-      recording. Parameters that cannot be negative are fitted by their logarithms.
+      no other name ends so. A parameter of the launch, and `"t0"`, the reading of a recording's clock at the launch,
+      are the same in all data; `"data[1].launch.azimuth"` belongs to the second set of data, and `"data[*].t0"` is a
+      separate number for each recording. Parameters that cannot be negative are fitted by their logarithms.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
     - `slopes`: "exact", the derivatives of the equations; or "differences", central differences of 1 % in every
-      parameter, which smooth over the staircase of the times. They take 2 k + 1 runs for k parameters and simulate
+      parameter, which smooth over the jumps of the times. Differences take 2 k + 1 runs for k parameters and simulate
       recordings one by one. By default, slopes are exact if a run is one smooth motion, and differences through
       flights, impacts, stick and slip.
     - `tolerance`: relative tolerance of the integration.
 
     **Returns:** an `Identification` with its `verdict`; a doubtful fit gives a `FitWarning`.
 
-    **Raises:** `ValueError` for arguments out of range, an unknown name, and for exact slopes through modes: the time
-    of a hopping top has a slope, but because the time jumps with every flight, the slope may have the opposite sign of
-    the trend.
+    **Raises:** `ValueError` for arguments out of range, for an unknown name, and for exact slopes through several
+    modes. (Such slopes exist, but because the time jumps with every flight, they may have the opposite sign of the
+    trend.)
 
     **Example:**
 

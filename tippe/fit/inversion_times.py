@@ -23,24 +23,23 @@ Values = dict[str, Float[Array, " rows"]]
 
 
 class InversionTimes(eqx.Module):
-    """Measured inversion times of some launches.
-
-    Over a nutation period, the time is a staircase in every parameter, so its slope differs from its trend; it is
-    smooth if theta grows monotonically. Small initial angles, target angles of 0.6 to 0.8 pi, and several launches keep
-    the steps below the errors.
+    """Measured inversion times of launches. As a parameter varies, the time jumps by a nutation period, so its slope
+    differs from its trend; the time is smooth only if theta grows monotonically. Small initial angles, target angles of
+    0.6 to 0.8 pi, and several launches keep the jumps below the errors.
 
     **Arguments:**
 
-    - `launch`: a `Launch` whose numbers are one for all or (launches,).
-    - `time`: (launches,) [s], infinite for a launch that did not invert while watched; or (launches, 2), two times
-      between which it inverted: (0, a) before a, (b, inf) not until b, (a, b) between a and b, (t, t) at t.
-    - `error`: standard errors [s], one for all or (launches,); for a limit, the error of the clock.
+    - `launch`: a `Launch` whose numbers are scalars or arrays (launches,).
+    - `time`: (launches,) [s], infinite for a top that did not invert while you watched; or (launches, 2), two times
+      between which the top inverted: (0, a) before a, (b, inf) later than b, (a, b) between a and b, (t, t) at t.
+    - `error`: standard errors [s], a scalar or (launches,); for a limit, the error of the clock.
     - `t1`: horizon of the model's runs [s]: choose several times the longest measured time, because start values may be
       far off.
-    - `until`: time [s] until which a launch of infinite time was watched, one for all or (launches,); `t1` by default.
+    - `until`: time [s] until which you watched a launch of infinite time, a scalar or (launches,); `t1` by default.
       The likelihood of such a launch is the probability of a time beyond `until`.
     - `angle`: angle [rad] that counted as inverted.
-    - `student`: degrees of freedom of Student's t distribution of the errors, against outliers, such as 4; `None`: Gaussian.
+    - `student`: degrees of freedom of Student's t distribution of the errors, against outliers, such as 4; `None` for
+      Gaussian errors.
 
     **Raises:** `ValueError` for numbers out of range or shapes that do not fit.
 

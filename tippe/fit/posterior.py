@@ -19,9 +19,10 @@ def log_density(
 
     **Arguments:**
 
-    - `scene`, `data`, `free`, `tolerance`: as for `identify`; a recording's error of `None` is an unknown, too.
-    - `priors`: name of a free parameter -> (mean, standard deviation) of a Gaussian of the parameter, or a function,
-      written in JAX, that returns the log density of the parameter; in addition to the priors of `Free`.
+    - `scene`, `data`, `free`, `tolerance`: as for `identify`. If the error of a recording is `None`, the error is also
+      an unknown.
+    - `priors`: name of a free parameter -> (mean, standard deviation) of a Gaussian prior, or a function, written in
+      JAX, that returns the log density of the parameter. These priors add to those of `Free`.
 
     **Returns:** a `LogDensity`: a function of coordinates (unknowns,) for any sampler, with `value_and_gradient` for
     samplers without JAX, `values` to convert back to parameters, `names` and `start`.

@@ -26,20 +26,21 @@ NOISE = 0.3
 
 
 class Recording(AbstractRecording):
-    """A recorded run: some quantities at the readings of a clock.
+    """A recorded run: quantities sampled at the times of a clock.
 
     **Arguments:**
 
-    - `launch`: a `Launch`, every number a scalar.
+    - `launch`: a `Launch`; all its numbers must be scalars.
     - `times`: (times,) [s], increasing.
-    - `value`: (times,) for one column, (times, columns) for several; NaN where a sample is missing.
-    - `error`: standard errors, one for all, (columns,), or of the shape of `value`; `None`: estimated for each column
-      from the residuals.
+    - `value`: (times,) for a single column, (times, columns) for several; NaN where a sample is missing.
+    - `error`: standard errors: a scalar, (columns,), or of the shape of `value`; with `None`, they are estimated for
+      each column from the residuals.
     - `quantity`: "theta", "azimuth", "eta" [rad], "spin" [rad/s], "position" ("x", "y", "z") [m] of the sphere's centre
       or "axis" ("axis_x", "axis_y", "axis_z") [1] in the fixed frame, as in `Trajectory`; or a tuple of some of these
       words. Azimuth and eta may differ by whole turns.
-    - `t0`: the clock's reading [s] at the launch. Before that, the top is at its launch position.
-    - `student`: degrees of freedom of Student's t distribution of the errors, against outliers, such as 4; `None`: Gaussian.
+    - `t0`: the clock's reading [s] at the launch. Before this time, the top is at its launch position.
+    - `student`: degrees of freedom of Student's t distribution of the errors, against outliers, such as 4; `None` for
+      Gaussian errors.
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
 
@@ -86,15 +87,16 @@ def read_recording(
 
     **Arguments:**
 
-    - `path`: of the file. Columns are separated by commas, semicolons, tabs or blanks; empty cells and `nan` are
+    - `path`: path of the file. Columns are separated by commas, semicolons, tabs or blanks; empty cells and `nan` are
       missing samples; lines that begin with # are ignored.
     - `columns`: quantity -> (header of its column, unit): `"time"`, or `"frame"`, and any of `"theta"`, `"azimuth"`,
       `"eta"`, `"spin"`, `"x"`, `"y"`, `"z"`, `"axis_x"`, `"axis_y"`, `"axis_z"`. Units are s, ms, min; rad, deg, rev;
       rad/s, deg/s, rpm, rev/s; m, cm, mm; 1, %; or a factor that converts the file's numbers to SI units, such as
       metres per pixel.
-    - `fps`: frames per second, if there is no `"time"`; without a `"frame"`, every line is a frame.
-    - `launch`: a `Launch`, as far as known.
-    - `error`: quantity -> (standard error or the header of its column, unit); `None`: estimated from the residuals.
+    - `fps`: frames per second, if there is no `"time"`. If there is no `"frame"` either, every line is a frame.
+    - `launch`: a `Launch`, with guesses for unknown numbers.
+    - `error`: quantity -> (standard error or the header of its column, unit); with `None`, errors are estimated from
+      the residuals.
     - `t0`, `student`: as for `Recording`.
 
     **Returns:** a `Recording`.

@@ -64,8 +64,8 @@ class AbstractBody(Bounded):
 
     `mass` [kg]; `I1`, `I3`: moments of inertia about the centre of mass, across and along the axis [kg m^2].
 
-    The arena's frame moves with the point that is `size` above the contact. Runs report the path of a point on the
-    body's axis: by default the centre of mass.
+    The arena's frame moves with the point at the height `size` above the contact. Runs report the path of a point on
+    the body's axis, by default the centre of mass.
     """
 
     mass: eqx.AbstractVar[Float[Array, "..."]]

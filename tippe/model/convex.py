@@ -1,4 +1,4 @@
-"""Bodies of revolution other than spheres: the spheroid, and any that a support function describes.
+"""Bodies of revolution other than spheres: the spheroid, and any convex body that a support function describes.
 
 Source of the support function: Bonnesen and Fenchel, Theorie der konvexen Koerper (1934), section 15; of the motion on a plane:
 Moffatt and Shimomura, Nature 416 (2002) 385, and Moffatt, Shimomura and Branicki, Proc. R. Soc. A 460 (2004) 3643.
@@ -22,10 +22,9 @@ SAMPLES = 65
 
 
 class SpheroidBody(AbstractBody):
-    """A spheroid: prolate like an egg if `polar` exceeds `equatorial`, oblate like a pebble if it is less.
-
-    At theta = pi/2 it lies on its equator; at 0 and pi it stands on a pole. It runs on a level or tilted plane, with
-    every friction law except `SetValuedCoulomb`.
+    """A spheroid: prolate like an egg if `polar` exceeds `equatorial`, otherwise oblate like a pebble. At theta = pi/2
+    the spheroid lies on its equator; at 0 and pi it stands on a pole. The scene must have a level or tilted plane, and
+    a friction law other than `SetValuedCoulomb`.
 
     **Arguments:**
 
@@ -102,9 +101,7 @@ class SpheroidMeridian(AbstractMeridian):
 
 
 class ConvexBody(AbstractBody):
-    """A convex body of revolution, given by its support function.
-
-    It runs in the same scenes as a `SpheroidBody`.
+    """A convex body of revolution, given by its support function, for the same scenes as a `SpheroidBody`.
 
     **Arguments:**
 

@@ -60,10 +60,9 @@ LOSSES = (Status.CONTACT_LOST, Status.JAMMED, Status.DOES_NOT_FIT)
 class Motion(NamedTuple):
     """The result of the equations of motion for one state, with all vectors in the moving frame.
 
-    `painleve_factor` is the factor of N in its equation, 1 + m a A in `tippe.md`, section 2: 1 without an offset, and
-    zero if the friction due to each newton of N pulls the top down as strongly as that newton pushes it up. `velocity`
-    is that of the point with which the frame moves. `room` is positive where the ball fits, `None` if it fits
-    everywhere.
+    `painleve_factor` is the factor of N in its equation, 1 + m a A in `tippe.md`, section 2: 1 without an offset, and 0
+    if friction pulls the top down as strongly as N pushes it up. `velocity` is that of the point with which the frame
+    moves. `room` is positive where the ball fits, `None` if it fits everywhere.
     """
 
     rate: tuple[Component, ...]
@@ -121,8 +120,8 @@ class Dynamics(eqx.Module):
         """The same equations in a frame that turns about n, for an arena on which all directions across n are
         equivalent.
 
-        While a top inverts, L keeps its direction nearly constant in a frame at rest, and the axis turns about it at L
-        / I1. In the turning frame, each turns at a fraction of this rate: steps are longer, and errors are smaller,
+        While a top inverts, L has a nearly constant direction in a frame at rest, and the axis turns about L at the
+        rate L / I1. In the turning frame, both turn at a fraction of this rate, so steps are longer. Errors are smaller
         because they no longer add up along a circle.
         """
         return dataclasses.replace(self, turns=turns)
@@ -207,8 +206,8 @@ class Dynamics(eqx.Module):
 
     def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
         """The margin for each of `LOSSES`: the normal force as a fraction of the weight, plus a round-off allowance for
-        a start with N = 0; the excess of the Painlevé factor over `JAMMED`; the excess of the room over `FITS`, if it
-        can end."""
+        a start with N = 0; the excess of the Painlevé factor over `JAMMED`; and the excess of the room over `FITS`, if
+        the arena has places where the ball does not fit."""
         motion = self.motion(state)
         lost, jammed = motion.normal_force / (self.mass * self.gravity) + 1e-12, motion.painleve_factor - JAMMED
         return (lost, jammed) if motion.room is None else (lost, jammed, motion.room - FITS)

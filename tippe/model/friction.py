@@ -48,9 +48,8 @@ A_LAW = " law, such as tippe.Viscous(0.3) or tippe.Coulomb(mu=0.3, slip_speed=0.
 
 
 class AbstractFriction(Bounded):
-    """A friction law whose force and torque are proportional to the normal force.
-
-    This makes it a law for impacts, too: force and torque act during the normal impulse as under the normal force.
+    """A friction law whose force and torque are proportional to the normal force. The law therefore also determines
+    impacts, where the normal impulse takes the place of the normal force.
 
     **Example:**
 
@@ -318,10 +317,9 @@ class Rolling(AbstractFriction):
 
 
 class NoSlip(AbstractFriction):
-    """Pure rolling: the contact point is at rest, whatever force that takes, for an `Ellipsoid` or a `RigidBody`.
-
-    The nonholonomic constraint replaces the law of friction. A run reports the reaction, and as `grip` the coefficient of
-    friction that the reaction needs.
+    """Pure rolling of an `Ellipsoid` or a `RigidBody`: the contact point is at rest, whatever force this takes. The
+    nonholonomic constraint replaces the friction law. A run reports the force of the arena as `reaction`, and the
+    coefficient of friction that this force needs as `grip`.
 
     **Example:**
 
@@ -340,7 +338,7 @@ class NoSlip(AbstractFriction):
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         """
-        **Raises:** `ValueError`: the force follows from the equations of motion.
+        **Raises:** `ValueError`, because the force follows from the equations of motion.
         """
         raise ValueError("NoSlip has no force per slip: the reaction follows from the equations of motion")
 

@@ -14,7 +14,7 @@ from nonholonomic.validation import Bound, Bounded, as_number, is_traced, requir
 
 
 def as_numbers(value: Any) -> Any:
-    """Several numbers as a tuple of arrays; `None` and single values are left for later checks."""
+    """Several numbers as a tuple of arrays; `None` and single values stay unchanged, for later checks."""
     if value is None or isinstance(value, str) or getattr(value, "ndim", 1) == 0:
         return value
     try:
@@ -41,11 +41,11 @@ class Launch(Bounded):
     - `spin`: angular velocity about the axis [rad/s].
     - `eta`: angle [rad] of the place from the arena's lowest point, in [-pi, pi]; 0 on arenas without such an angle.
     - `azimuth`: direction [rad] in which the axis leans, from t1 towards t2.
-    - `place`: where the top touches the arena, instead of `eta`: (x, y) [m] on a plane, along it, a paraboloid and a
-      graph; (y, eta) on a cylinder; (mu, eta) [rad], azimuth and angle from the lowest point, on a sphere, spheroid or
-      torus; or (x, y, z) [m], a point of the arena up to round-off.
-    - `velocity`: (2,) [m/s] along (t1, t2), of the sphere's centre, or of the centre of mass for other bodies; at rest
-      by default.
+    - `place`: where the top touches the arena, instead of `eta`: (x, y) [m] on a plane (along the plane), a paraboloid
+      and a graph; (y, eta) on a cylinder; (mu, eta) [rad], azimuth and angle from the lowest point, on a sphere,
+      spheroid or torus; or (x, y, z) [m], a point of the arena up to round-off.
+    - `velocity`: velocity of the sphere's centre, or of the centre of mass for other bodies, along (t1, t2), (2,)
+      [m/s]; zero by default.
     - `angular_velocity`: (3,) [rad/s] in (t1, t2, n), in addition to the spin about the axis; zero by default.
 
     **Raises:** `ValueError` for numbers outside these ranges.

@@ -54,7 +54,8 @@ class AbstractRigidBody(Bounded):
     def surface_point(self, normal: Vector, rate: Vector) -> tuple[Vector, Vector]:
         """The point at which the body touches a plane.
 
-        **Arguments:** `normal`: of the plane, towards the body, in the body's axes; `rate`: of change of these components.
+        **Arguments:** `normal`: the normal of the plane, towards the body, in the body's axes; `rate`: the rate of
+        change of these components.
 
         **Returns:** the point [m] in the body's axes, and its rate of change [m/s].
         """
@@ -82,12 +83,12 @@ UNITS = {"mass": "kg", "centre_of_mass": "m"} | {f"centre_of_mass[{k}]": "m" for
 class Ellipsoid(AbstractRigidBody):
     """An ellipsoid with any inertia and any centre of mass inside: a rattleback, or an unbalanced sphere.
 
-    It runs on every arena, with every friction law except `SetValuedCoulomb`, or without slip (`NoSlip`). On a curved arena, a
-    run ends as "does_not_fit" where the body is not more curved than the arena; a second contact elsewhere is not noticed.
-    The part that never touches the plane does not matter: half an ellipsoid, or a boat, moves like the whole one.
-
-    At a `Launch`, the body's axes x, y and z are those of the arena (t1, t2, n), turned by theta about a horizontal axis so
-    that z leans in the direction `azimuth`. `spin` is the angular velocity about z.
+    The scene can have any arena, and any friction law; `NoSlip` is rolling without slip. On a
+    curved arena, a run ends with the status "does_not_fit" where the body is not more strongly curved than the arena;
+    the program does not notice a second contact elsewhere. The part of the surface that never touches the arena does
+    not matter: half an ellipsoid, such as a boat, moves like the whole ellipsoid. At a `Launch`, the body's axes x, y
+    and z are those of the arena (t1, t2, n), turned by theta about a horizontal axis so that z leans in the direction
+    `azimuth`. `spin` is the angular velocity about z.
 
     **Arguments:**
 
@@ -161,15 +162,14 @@ class Ellipsoid(AbstractRigidBody):
 
 
 class RigidBody(AbstractRigidBody):
-    """A body of any strictly convex shape, given by its support function, with any inertia.
-
-    It runs in the same scenes as an `Ellipsoid`.
+    """A body of any strictly convex shape, given by its support function, with any inertia, for the same scenes as an
+    `Ellipsoid`.
 
     **Arguments:**
 
     - `mass`: mass [kg], positive.
     - `inertia`: as for `Ellipsoid`.
-    - `support`: function of a unit vector (3,) in the body's axes: the distance [m] that the body reaches in that
+    - `support`: function of a unit vector (3,) in the body's axes that returns how far [m] the body extends in this
       direction from the origin of its axes, `jnp.sqrt(jnp.sum((semi_axes * d) ** 2))` for an ellipsoid. Write it with
       `jax.numpy`, smooth in the neighbourhood of all unit vectors. Both principal radii of curvature must be positive,
       which is checked in 200 directions. If it is an `equinox.Module`, you can sweep and differentiate its numbers.

@@ -4,8 +4,7 @@ singularities.
 The state is that of a top (`state.py`) with an additional vector: in the arena's frame (t1, t2, n) the velocity (u1,
 u2) of the centre of mass along the arena, the body's z axis e, the angular momentum L about the centre of mass, the
 arena's place, and the body's x axis c. With d = e x c, the components of n in the body's axes are (c.n, d.n, e.n),
-which determine the contact
-(`rigid_body.py`).
+which determine the contact (`rigid_body.py`).
 
 With r from the centre of mass to the contact, the laws of motion are L' = r x F + N tau and m u' = F - m g z; the contact
 persists if the contact point has no velocity along n. The frame moves with the contact point, whose velocity along the arena
@@ -44,11 +43,11 @@ from nonholonomic.geometry import (
 from nonholonomic.xla_cpu import least, stored
 
 from .dynamics import FITS, JAMMED, Motion
-from .friction import AbstractFriction, ContactLoad, NoSlip, Slip
+from .friction import AbstractFriction, ContactLoad, NoSlip, Slip, length
 from .inertia import SymmetricMatrix
 from .launch import Launch
 from .rigid_body import AbstractRigidBody
-from .state import joined, parts
+from .state import AXIS, joined, parts
 
 
 class Attitude(NamedTuple):
@@ -106,6 +105,16 @@ class AbstractRigidDynamics(eqx.Module):
     gravity: eqx.AbstractVar[Float[Array, "..."]]
     inverse: eqx.AbstractVar[SymmetricMatrix]
 
+    @property
+    def mass(self) -> Float[Array, "..."]:
+        """Mass of the body [kg]."""
+        return self.body.mass
+
+    @property
+    def size(self) -> Float[Array, "..."]:
+        """A length of the body [m]."""
+        return self.body.size
+
     @abc.abstractmethod
     def motion(self, state: Float[Array, "components ..."]) -> Motion:
         """Evaluate the equations of motion.
@@ -148,7 +157,8 @@ class AbstractRigidDynamics(eqx.Module):
         return Attitude(axes, n, momentum, turning, lever, (normal_rate, lever_rate))
 
     def contact_motion(self, place: Place, attitude: Attitude, slip: Tangent) -> ContactMotion:
-        """The motion of the contact point. **Arguments:** `place`: of the frame; `slip`: velocity v along the arena [m/s]."""
+        """The motion of the contact point. **Arguments:** `place`: place of the frame; `slip`: velocity v along the
+        arena [m/s]."""
         normal_rate, lever_rate = attitude.fixed_rates
         over_body = attitude.in_frame(lever_rate)
         along = (add(slip[0], over_body[0]), add(slip[1], over_body[1]))
@@ -229,12 +239,12 @@ class AbstractRigidDynamics(eqx.Module):
         return self.carried_along(state)
 
     def carried_along(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-        """The state with the velocity that the friction law imposes; only rolling imposes one."""
+        """The state with the velocity that the friction law imposes; only `NoSlip` imposes a velocity."""
         return state
 
 
 class SlippingDynamics(AbstractRigidDynamics):
-    """The equations of motion under a law of friction with a force at every slip."""
+    """The equations of motion under a friction law that determines the force from the slip."""
 
     frame: AbstractFrame
     body: AbstractRigidBody
@@ -290,7 +300,11 @@ class RollingDynamics(AbstractRigidDynamics):
     inverse: SymmetricMatrix
 
     def motion(self, state: Float[Array, "components ..."]) -> Motion:
-        """Evaluate the equations of motion and the reaction.
+        """Evaluate the equations of motion; `friction` is the force along the arena per unit normal force."""
+        return self._evaluate(state)[0]
+
+    def _evaluate(self, state: Float[Array, "components ..."]) -> tuple[Motion, Vector]:
+        """The motion and the reaction F in the frame.
 
         In the body's axes, with the velocity r x w of the centre of mass and r' the rate of r as a vector,
         (J + m (r^2 - r r^T)) w' = L x w + m r x (r' x w + g z), and F = m (r' x w + r x w' + g z).
@@ -302,16 +316,7 @@ class RollingDynamics(AbstractRigidDynamics):
         r_dot = sum_vectors(contact.lever_rate, cross(w, r))
         turning = sum_vectors(cross(vector_of(r_dot), w), scale(self.gravity, attitude.in_body(up)))
         torque = sum_vectors(cross(attitude.momentum, w), scale(m, cross(r, vector_of(turning))))
-        square, inertia = dot(r, r), self.body.inertia
-        about_contact = SymmetricMatrix(
-            inertia.xx + m * (square - r[0] * r[0]),
-            inertia.yy + m * (square - r[1] * r[1]),
-            inertia.zz + m * (square - r[2] * r[2]),
-            inertia.xy - m * r[0] * r[1],
-            inertia.xz - m * r[0] * r[2],
-            inertia.yz - m * r[1] * r[2],
-        )
-        w_dot = about_contact.solve(vector_of(stored(*torque)))
+        w_dot = self._about_contact(r).solve(vector_of(stored(*torque)))
         reaction = attitude.in_frame(vector_of(scale(m, sum_vectors(turning, cross(r, w_dot)))))
         F = vector_of(stored(*reaction))
 
@@ -321,7 +326,54 @@ class RollingDynamics(AbstractRigidDynamics):
         load = ContactLoad((F[0] / F[2], F[1] / F[2]))
         still = jnp.zeros_like(F[2])
         slip = Slip(still, still, attitude.in_frame(w))
-        return Motion(rates, F[2], load, slip, contact.along, o, w[2], 1.0 + still, room)
+        return Motion(rates, F[2], load, slip, contact.along, o, w[2], 1.0 + still, room), F
+
+    def _about_contact(self, lever: Vector) -> SymmetricMatrix:
+        """The inertia about the contact, J + m (r^2 - r r^T), in the body's axes."""
+        m, r, square, inertia = self.body.mass, lever, dot(lever, lever), self.body.inertia
+        return SymmetricMatrix(
+            inertia.xx + m * (square - r[0] * r[0]),
+            inertia.yy + m * (square - r[1] * r[1]),
+            inertia.zz + m * (square - r[2] * r[2]),
+            inertia.xy - m * r[0] * r[1],
+            inertia.xz - m * r[0] * r[2],
+            inertia.yz - m * r[1] * r[2],
+        )
+
+    def reaction(self, state: Float[Array, "components ..."]) -> Vector:
+        """As `rolling.RollingDynamics.reaction`."""
+        return self._evaluate(state)[1]
+
+    def grip(self, state: Float[Array, "components ..."], mu: Float[Array, "..."]) -> Float[Array, "..."]:
+        """As `rolling.RollingDynamics.grip`."""
+        F1, F2, N = self.reaction(state)
+        return (mu * N - length(F1, F2)) / (self.body.mass * self.gravity)
+
+    def with_slip(self, state: Float[Array, "components ..."], slip: Slip) -> Float[Array, "components ..."]:
+        """As `rolling.RollingDynamics.with_slip`."""
+        (u1, u2), e, _, place = parts(state)
+        attitude = self.attitude(state)
+        r, w, m = attitude.lever, attitude.turning, self.body.mass
+        # Seen by the body: the velocity u of the centre of mass, and v.
+        u = attitude.in_body((u1, u2, -dot(w, cross(r, attitude.normal))))
+        v = attitude.in_body((slip.x, slip.y, None))
+        jump = vector_of(sum_vectors(v, scale(-1.0, u)))
+        w = self._about_contact(r).solve(vector_of(sum_vectors(attitude.momentum, scale(m, cross(r, jump)))))
+        u = attitude.in_frame(vector_of(sum_vectors(cross(r, w), v)))
+        return joined(u[:2], e, attitude.in_frame(self.body.inertia.tensor.times(w)), place)
+
+    def blow(self, state: Float[Array, "components ..."], axis: int) -> tuple[Component, ...]:
+        """As `rolling.RollingDynamics.blow`."""
+        attitude = self.attitude(state)
+        v = vector_of(part[axis] for part in attitude.axes)
+        w = self._about_contact(attitude.lever).solve(vector_of(scale(self.body.mass, cross(attitude.lever, v))))
+        return scale(self.body.mass, attitude.in_frame(vector_of(sum_vectors(cross(attitude.lever, w), v))))
+
+    def with_unit_axes(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+        """The state with the body's axes at unit length and at right angles."""
+        e, x = state[AXIS] / jnp.linalg.norm(state[AXIS], axis=0), state[-3:]
+        x = x - jnp.sum(e * x, axis=0) * e
+        return state.at[AXIS].set(e).at[-3:].set(x / jnp.linalg.norm(x, axis=0))
 
     def carried_along(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """The state with the velocity r x w of the centre of mass."""

@@ -28,7 +28,7 @@ from nonholonomic.xla_cpu import stored
 
 from .dynamics import Motion
 from .friction import ContactLoad, Slip, length
-from .state import angular_velocity, joined, parts
+from .state import AXIS, angular_velocity, joined, parts
 from .top import Top
 
 
@@ -54,6 +54,11 @@ class RollingDynamics(eqx.Module):
         **Arguments:** as for `Dynamics.of`.
         """
         return cls(frame, body.radius, body.offset, body.mass, gravity, body.I1, body.I3)
+
+    @property
+    def size(self) -> Float[Array, "..."]:
+        """A length of the body [m]: the radius."""
+        return self.radius
 
     def motion(self, state: Float[Array, "components ..."]) -> Motion:
         """Evaluate the equations of motion and the reaction.
@@ -151,6 +156,11 @@ class RollingDynamics(eqx.Module):
         along = dot(w, e)
         L = sum_vectors(scale(self.I1, w), scale((self.I3 - self.I1) * along, e))
         return joined(u[:2], e, L, place)
+
+    def with_unit_axes(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+        """The state with the axis at unit length."""
+        axis = state[AXIS]
+        return state.at[AXIS].set(axis / jnp.sqrt(jnp.sum(axis * axis, axis=0)))
 
     def blow(self, state: Float[Array, "components ..."], axis: int) -> tuple[Component, ...]:
         """The impulse at the contact that changes the velocity of the contact point by 1 m/s along an axis of the arena

@@ -38,7 +38,7 @@ from .dynamics import TURNING, Dynamics
 from .friction import A_LAW, AbstractFriction, Frictionless, NoSlip
 from .launch import Launch
 from .rigid_body import AbstractRigidBody
-from .rigid_dynamics import rigid_dynamics
+from .rigid_dynamics import AbstractRigidDynamics, rigid_dynamics
 from .state import angular_velocity, inclination, joined, parts
 from .stick_slip import StickSlip
 from .top import Top
@@ -64,20 +64,21 @@ class Scene(Bounded, Generic[Body]):
 
     **Arguments:**
 
-    - `body`: a `Top`; or an `Ellipsoid` or a `RigidBody`, with `contact="stop"` and a friction law with a single mode; or a
-      `SpheroidBody` or a `ConvexBody`, likewise and on a plane.
+    - `body`: a `Top`, an `Ellipsoid`, a `RigidBody`, a `SpheroidBody` or a `ConvexBody`. All but a `Top` need
+      `contact="stop"`; a `SpheroidBody` and a `ConvexBody` also need a plane and a friction law with a single mode.
     - `surface`: the arena: `Plane(tilt)`, `Cylinder(radius)`, `Sphere(radius)`, `Spheroid(equatorial, polar)`, `Torus(ring,
       tube)`, `Paraboloid(p)`, `Graph(height)` or `Implicit(function)`.
     - `friction`: `Frictionless()`, `Viscous(mu)`, `Coulomb(mu, slip_speed)`, `Contensou(mu, contact_radius, slip_speed)`
-      or `Rolling(resistance, turning_speed, sliding)` with one of them; for a top without a stem also
-      `SetValuedCoulomb(mu)`, for an `Ellipsoid` or a `RigidBody` also `NoSlip()`.
+      or `Rolling(resistance, turning_speed, sliding)` with one of them; for a top without a stem, an
+      `Ellipsoid` or a `RigidBody` also `SetValuedCoulomb(mu)`, for an `Ellipsoid` or a `RigidBody` also `NoSlip()`.
     - `gravity`: acceleration of free fall [m/s^2], positive.
     - `contact`: "stop" (the default): a run ends where the contact is lost; "hybrid": it continues through flights,
-      impacts, and changes to the stem and back (`modes/`). "stop" is faster to compile and works for every body and
-      law; a run that loses contact says so. A top with a stem needs "hybrid". If it comes to rest on its sphere and its
-      stem at once, it leans on both on the level plane; on any other arena its run ends there as "unresolved".
+      impacts, and changes to the stem and back (`modes/`). "stop" compiles faster and works for every body and law; the
+      status of a run that loses contact is "contact_lost". A top with a stem needs "hybrid". If such a top comes to
+      rest on its sphere and its stem at once, it leans on both on the level plane; on any other arena, the run ends
+      with the status "unresolved".
     - `restitution`: Newton's coefficient e_N of impacts [1], in [0, 1], for "hybrid" only; `None` is 0.
-    - `side`: "inside" or "outside" of a closed surface, "above" an open one; `None` means inside, or above.
+    - `side`: "inside" or "outside" of a closed surface, or "above" an open surface; `None` means inside, or above.
 
     **Raises:** `ValueError` if a part is of the wrong kind, if the top does not fit into the arena, if gravity is not
     positive, or if the arena, the body or the friction does not allow the contact.
@@ -146,9 +147,10 @@ class Scene(Bounded, Generic[Body]):
             raise ValueError(f"surface = {self.surface!r} must be a Plane for {kind}; {others}")
         if self.contact != "stop":
             raise ValueError(f"contact = {self.contact!r} must be 'stop' for {kind}; only a Top can fly")
-        if self.friction.set_valued:
+        if self.friction.set_valued and isinstance(self.body, AbstractBody):
             raise ValueError(
-                f"friction = {self.friction!r} must be a law with a single mode for {kind}, such as Coulomb"
+                f"friction = {self.friction!r} must be a law with a single mode for {kind}, such as Coulomb; describe the body "
+                "as an Ellipsoid or a RigidBody to stick and slip"
             )
 
     def bounds(self) -> Iterator[Bound]:
@@ -206,17 +208,25 @@ class Scene(Bounded, Generic[Body]):
         """The equations of motion, with the precomputed combinations of the scene's numbers: a `Dynamics`, a `StickSlip` or an
         `AbstractRigidDynamics`."""
         numbers = (self.frame, self.friction, self.gravity)
+        if self.friction.set_valued and isinstance(self.body, Top | AbstractRigidBody):
+            return StickSlip.of(self.body, *numbers)
         if isinstance(self.body, AbstractRigidBody):
             return rigid_dynamics(self.body, *numbers)
-        if isinstance(self.body, Top) and self.friction.set_valued:
-            return StickSlip.of(self.body, *numbers)
         return Dynamics.of(self.body, *numbers)
+
+    @property
+    def _rigid_dynamics(self) -> AbstractRigidDynamics:
+        """The equations of motion of a rigid body; those of slipping where it may also roll."""
+        equations = self.dynamics
+        equations = equations.slipping if isinstance(equations, StickSlip) else equations
+        assert isinstance(equations, AbstractRigidDynamics)
+        return equations
 
     @property
     def turning_dynamics(self) -> Any:
         """The equations of motion for angles, times, energies and forces, which are cheaper in a turning frame.
 
-        On a level plane under an isotropic law, the frame turns with the top; its direction is not known afterwards.
+        On a level plane under an isotropic law, the frame turns with the top; how far it has turned is not recorded.
         """
         equations, body = self.dynamics, self.body
         alike = self.level and self.friction.isotropic
@@ -275,9 +285,7 @@ class Scene(Bounded, Generic[Body]):
         e = (sine * jnp.cos(launch.azimuth), sine * jnp.sin(launch.azimuth), jnp.cos(launch.theta))
         if isinstance(body, AbstractRigidBody):
             turning = sum_vectors(scale(launch.spin, e), launch.angular_velocity or (None, None, None))
-            return rigid_dynamics(body, self.frame, self.friction, self.gravity).start(
-                launch, self.start(launch)[0], e, vector_of(turning)
-            )
+            return self._rigid_dynamics.start(launch, self.start(launch)[0], e, vector_of(turning))
         L, u = scale(body.I3 * launch.spin, e), launch.velocity or (zero, zero)
         if launch.angular_velocity is not None:
             turning = vector_of(launch.angular_velocity)
@@ -343,7 +351,7 @@ class Scene(Bounded, Generic[Body]):
         """Kinetic energy plus weight times the height of the centre of mass above the arena's lowest point [J]."""
         body, dynamics = self.body, self.dynamics
         if isinstance(body, AbstractRigidBody):
-            return dynamics.energy(state)
+            return self._rigid_dynamics.energy(state)
         (u1, u2), e, L, place = parts(state)
         e3_dot = (L[0] * e[1] - L[1] * e[0]) / body.I1
         speed2 = u1**2 + u2**2 + (body.meridian.at(e[2]).offset * e3_dot) ** 2
@@ -361,7 +369,7 @@ class Scene(Bounded, Generic[Body]):
         """
         _, e, L, _ = parts(state)
         if isinstance(self.body, AbstractRigidBody):
-            return dot(L, self.dynamics.mass_from_contact(state))
+            return dot(L, self._rigid_dynamics.mass_from_contact(state))
         lever = self.body.meridian.at(e[2])
         return lever.radius * L[2] - lever.offset * dot(e, L)
 
@@ -379,12 +387,13 @@ class Scene(Bounded, Generic[Body]):
     def angular_velocity(self, state: Float[Array, "components ..."]) -> Vector:
         """Angular velocity of the body in the moving frame [rad/s]."""
         if isinstance(self.body, AbstractRigidBody):
-            return self.dynamics.angular_velocity(state)
+            return self._rigid_dynamics.angular_velocity(state)
         _, e, L, _ = parts(state)
         return angular_velocity(self.body, e, L)
 
     def path_from_frame(self, state: Float[Array, "components ..."]) -> Vector:
-        """From the point that the frame carries to the one whose path is reported [m], in the moving frame."""
+        """Vector from the point with which the frame moves to the point whose path is reported [m], in the moving
+        frame."""
         if isinstance(self.body, AbstractRigidBody):
-            return self.dynamics.mass_from_contact(state)
+            return self._rigid_dynamics.mass_from_contact(state)
         return self.body.path_from_frame(parts(state).axis)

@@ -1,4 +1,4 @@
-"""The onset of a slip: one implicit step from a contact at rest to a slipping one, as long as the tolerance allows.
+"""The onset of a slip: an implicit step from a contact at rest to a slipping contact, as long as the tolerance allows.
 
 Let G be the force that rolling requires beyond the friction cone. The slip velocity v changes as v' = M G, where M is
 the contact's inverse mass along the arena. Where rolling leaves the cone, G = 0, and so is the slip's acceleration;
@@ -11,9 +11,8 @@ A deviation of the slip's direction decays as exp(k / t), faster than any power,
 there. A collocation method can: it needs only the state at t = 0, and the polynomial of the smooth solution satisfies
 the equations at all nodes. This module takes one step of Radau IIA (Hairer and Wanner, Solving ODEs II, section IV.5).
 It solves the equations by Newton's method in the slip velocity, which alone is stiff, and by iteration in the other
-components. If the force of rolling is beyond the cone from the start, the contact begins with v = b t d + O(t^2), where
-d is the direction in which opposing friction lets the slip grow, close to that against the force of rolling; the same
-step applies.
+components. If the force of rolling is beyond the cone from the start, the slip begins as v = b t d + O(t^2), where d is
+the direction in which the slip grows against friction, nearly opposite to the force of rolling. The same step applies.
 """
 
 from collections.abc import Callable
@@ -29,6 +28,8 @@ from nonholonomic.xla_cpu import greatest
 
 from .dynamics import Dynamics
 from .friction import Slip, length
+from .rigid_dynamics import RollingDynamics as RigidRolling
+from .rigid_dynamics import SlippingDynamics
 from .rolling import RollingDynamics
 
 #: Stages of the step. Its error is of the order of this plus one in its length, its estimate of this order.
@@ -70,7 +71,7 @@ class Onset(eqx.Module):
     """The beginning of a slip.
 
     - `start`: the state at the onset, (components, ...); `length`: its duration [s].
-    - `rates`: of the state at the step's stages, (components, stages, ...).
+    - `rates`: rates of the state at the step's stages, (components, stages, ...).
     - `found`: whether the step reached the tolerance.
     """
 
@@ -84,23 +85,25 @@ class Onset(eqx.Module):
         powers = jnp.stack([fraction**k for k in range(STAGES + 1)])
         return self.start + self.length * jnp.einsum("ps,p...,cs...->c...", INTEGRALS, powers, self.rates)
 
-    def falls_to(self, component: int, value: Float[Array, "..."], first: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The fraction of the step, after `first`, at which a component of the state has fallen to a value; 1 if it
-        does not."""
-        onset = Onset(
-            self.start[component : component + 1], self.length, self.rates[component : component + 1], self.found
-        )
+    def of_components(self, chosen: slice) -> "Onset":
+        """The same step of some components alone."""
+        return Onset(self.start[chosen], self.length, self.rates[chosen], self.found)
+
+    def falls_to_zero(
+        self, event: Callable[[Float[Array, "components ..."]], Float[Array, "..."]], first: Float[Array, "..."]
+    ) -> Float[Array, "..."]:
+        """The fraction of the step, after `first`, at which a function of the state falls to zero; 1 if it does not fall
+        so far."""
 
         def halved(_, bracket):
             low, high = bracket
             middle = 0.5 * (low + high)
-            above = onset.at(middle)[0] > value
+            above = event(self.at(middle)) > 0.0
             return jnp.where(above, middle, low), jnp.where(above, high, middle)
 
         fraction = jax.lax.stop_gradient(jax.lax.fori_loop(0, 52, halved, (first, jnp.ones_like(first)))[1])
         # Halving has no derivative; the implicit function theorem gives it.
-        height, rise = jax.jvp(lambda at: onset.at(at)[0], (fraction,), (jnp.ones_like(fraction),))
-        missing = height - value
+        missing, rise = jax.jvp(lambda at: event(self.at(at)), (fraction,), (jnp.ones_like(fraction),))
         inside = (fraction < 1.0) & (rise != 0.0)
         shift = (missing - jax.lax.stop_gradient(missing)) / jax.lax.stop_gradient(jnp.where(inside, rise, 1.0))
         return fraction - jnp.where(inside, shift, 0.0)
@@ -113,8 +116,8 @@ class Onset(eqx.Module):
 
 
 def begin(
-    slipping: Dynamics,
-    rolling: RollingDynamics,
+    slipping: Dynamics | SlippingDynamics,
+    rolling: RollingDynamics | RigidRolling,
     mu: Float[Array, "..."],
     field: Callable[[Float[Array, "components ..."]], Float[Array, "components ..."]],
     state: Float[Array, "components ..."],
@@ -129,8 +132,9 @@ def begin(
 
     - `slipping`, `rolling`: the equations with slip and without; `mu`: coefficient of friction [1].
     - `field`: rate of the slipping state, including other integrated components.
-    - `state`: at rest, (components, ...), of which the equations use the first `size`; `scales`: their magnitudes.
-    - `most`: longest duration [s]; `tolerance`: of the estimated error, relative to the magnitudes.
+    - `state`: a state at rest, (components, ...); the equations use the first `size` components; `scales`: their
+      magnitudes.
+    - `most`: longest duration [s]; `tolerance`: tolerance for the estimated error, relative to the magnitudes.
 
     **Returns:** an `Onset`.
     """
@@ -189,7 +193,7 @@ class _Contact(eqx.Module):
     - `direction`: against the force of rolling; `rise`: the slip's acceleration [m/s^2] and half its rate [m/s^3] at
       the start.
     - `inverse_mass`: M [1/kg] as (M11, M12, M22); `lifted`: n, the change of N by the force along the arena.
-    - `mu`; `unloaded`: N without a force along the arena [N]; `speed`: sqrt(g R) [m/s]; `unit`: of time [s].
+    - `mu`; `unloaded`: N without a force along the arena [N]; `speed`: sqrt(g R) [m/s]; `unit`: unit of time [s].
     """
 
     direction: Float[Array, "2 ..."]
@@ -204,7 +208,7 @@ class _Contact(eqx.Module):
     @classmethod
     def of(
         cls,
-        rolling: RollingDynamics,
+        rolling: RollingDynamics | RigidRolling,
         mu: Float[Array, "..."],
         state: Float[Array, "components ..."],
         rate: Float[Array, "components ..."],
@@ -222,9 +226,9 @@ class _Contact(eqx.Module):
         lifted = jnp.stack([b * h - c * f, b * f - a * h]) / determinant
         yields = d[0] * (a * d[0] + b * d[1] + mu * f) + d[1] * (b * d[0] + c * d[1] + mu * h)
         rise = (greatest(-grip, 0.0) * weight / yields, greatest(-falls, 0.0) * weight / (2.0 * yields))
-        speed = jnp.sqrt(rolling.gravity * rolling.radius)
+        speed = jnp.sqrt(rolling.gravity * rolling.size)
         spin = jnp.sqrt(sum(x * x for x in rolling.angular_velocity(state)))
-        unit = 1.0 / jnp.maximum(spin, speed / rolling.radius)
+        unit = 1.0 / jnp.maximum(spin, speed / rolling.size)
         inverse_mass = (c / determinant, -b / determinant, a / determinant)
         return cls(d, rise, inverse_mass, lifted, mu, N + lifted[0] * F1 + lifted[1] * F2, speed, unit)
 

@@ -1,11 +1,11 @@
-"""Stick and slip under exact Coulomb friction: the two kinds of motion, when each ends, and what follows.
+"""Stick and slip under exact Coulomb friction: both kinds of motion, their ends, and the motion that follows.
 
 Within the friction cone, rolling is the only motion near zero slip, and a slip reaches zero in finite time. There the
-direction of the slip has no limit, and steps shrink with its speed. Therefore an impulse stops the slip when the
+direction of the slip has no limit, and steps shrink with the slip speed. Therefore an impulse stops the slip when the
 remaining sliding distance, v^2 / (2 |v'|), is `LEFT` times the tolerance in units of R. Friction would have given the
 same impulse in the remaining time, so the state errs by this distance, in proportion to the tolerance. Rolling ends
 where mu N = |F_t|; there a separate step begins the slip (`slip_onset.py`), with an estimated error within the
-tolerance (`tests/physics/test_stick_slip.py` has the figures).
+tolerance (`tests/physics/test_stick_slip.py`).
 """
 
 import dataclasses
@@ -22,6 +22,9 @@ from nonholonomic.xla_cpu import greatest, least
 
 from .dynamics import FITS, Dynamics, Motion
 from .friction import AbstractFriction, Frictionless, SetValuedCoulomb, Slip, length
+from .rigid_body import AbstractRigidBody
+from .rigid_dynamics import RollingDynamics as RigidRolling
+from .rigid_dynamics import SlippingDynamics
 from .rolling import RollingDynamics
 from .slip_onset import Onset, begin
 from .top import Top
@@ -48,36 +51,38 @@ class StickSlip(eqx.Module):
     - `mu`: coefficient of friction [1].
     """
 
-    slipping: Dynamics
-    rolling: RollingDynamics
+    slipping: Dynamics | SlippingDynamics
+    rolling: RollingDynamics | RigidRolling
     mu: Float[Array, "..."]
 
     @classmethod
     def of(
-        cls, body: Top, frame: AbstractFrame, friction: AbstractFriction, gravity: Float[Array, "..."]
+        cls,
+        body: Top | AbstractRigidBody,
+        frame: AbstractFrame,
+        friction: AbstractFriction,
+        gravity: Float[Array, "..."],
     ) -> "StickSlip":
         """The equations for a body on an arena.
 
         **Arguments:** as for `Dynamics.of`, with a `SetValuedCoulomb`.
         """
         assert isinstance(friction, SetValuedCoulomb)
+        if isinstance(body, AbstractRigidBody):
+            shared = (frame, body, gravity, body.inertia.tensor.inverse)
+            return cls(SlippingDynamics(*shared, friction, 1.0 / body.mass), RigidRolling(*shared), friction.mu)
         slipping = Dynamics.of(body, frame, friction, gravity)
         return cls(slipping, RollingDynamics.of(body, frame, gravity), friction.mu)
 
     @property
     def frame(self) -> AbstractFrame:
-        """The frame of the sphere on the arena."""
+        """The frame of the body on the arena."""
         return self.slipping.frame
 
     @property
     def speed(self) -> Float[Array, "..."]:
         """The speed sqrt(g R) [m/s]."""
-        return jnp.sqrt(self.slipping.gravity * self.rolling.radius)
-
-    @property
-    def per_transverse(self) -> Float[Array, "..."]:
-        """1 / I1 [1/(kg m^2)]."""
-        return self.slipping.per_transverse
+        return jnp.sqrt(self.slipping.gravity * self.rolling.size)
 
     def motion(self, state: Float[Array, "components ..."]) -> Motion:
         """Evaluate the equations of motion for the state's kind of motion.
@@ -116,23 +121,25 @@ class StickSlip(eqx.Module):
         slip = self.slipping.motion(state).slip
         return length(slip.x, slip.y)
 
-    def stopped(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-        """The state after the impulse that stops the slip, with the axis at unit length.
+    def normal_spin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Angular velocity of a rigid body about the arena's normal [rad/s]."""
+        return self.rolling.angular_velocity(state)[2]
 
-        Step errors change the length of the axis, and the slip after the impulse is only as small as these errors;
-        where a slip begins, its direction tolerates only round-off.
+    def stopped(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+        """The state after the impulse that stops the slip, with the body's axes at unit length.
+
+        Step errors change this length, so the slip after the impulse would be as large as these errors; but
+        where a slip begins, its direction tolerates only rounding errors.
         """
         nothing = jnp.zeros_like(state[0])
-        axis = state[2:5]
-        state = state.at[2:5].set(axis / jnp.sqrt(jnp.sum(axis * axis, axis=0)))
-        return self.rolling.with_slip(state, Slip(nothing, nothing))
+        return self.rolling.with_slip(self.rolling.with_unit_axes(state), Slip(nothing, nothing))
 
     def lifts_off(self, state: Float[Array, "components ..."]) -> Bool[Array, "..."]:
         """Whether a contact at rest separates at once: without a force at the contact point, the arena would have to
         pull.
 
-        Unless the contact jams, the normal forces of ending rolling, of the following slip and of no friction have the
-        same sign.
+        Unless the contact jams, the normal force has the same sign for the ending roll, for the following slip and
+        without friction.
         """
         return dataclasses.replace(self.slipping, friction=Frictionless()).motion(state).normal_force <= 0.0
 
@@ -171,13 +178,8 @@ class ContactMode(eqx.Module):
 
     @property
     def frame(self) -> AbstractFrame:
-        """The frame of the sphere on the arena."""
+        """The frame of the body on the arena."""
         return self.both.frame
-
-    @property
-    def per_transverse(self) -> Float[Array, "..."]:
-        """1 / I1 [1/(kg m^2)]."""
-        return self.both.per_transverse
 
     def motion(self, state: Float[Array, "components ..."]) -> Motion:
         """The equations of motion of this kind."""
@@ -199,10 +201,15 @@ class ContactMode(eqx.Module):
             return (grip,) if room is None else (grip, room - FITS)
         return (*self.both.slipping.margins(state), self.slip_left(state))
 
+    def normal_spin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """As `StickSlip.normal_spin`."""
+        return self.both.normal_spin(state)
+
     def slip_left(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """Slip speed above that at which a slip ends, in units of sqrt(g R). A slip that grows does not end."""
+        """Excess of the slip speed over the speed at which a slip ends, in units of sqrt(g R). A slip that grows does
+        not end."""
         speed, change = self._slowing(state)
-        way = LEFT * self.tolerance * self.both.rolling.radius
+        way = LEFT * self.tolerance * self.both.rolling.size
         return (speed - jnp.sqrt(2.0 * way * greatest(-change, 0.0))) / self.both.speed
 
     def _slowing(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
@@ -227,7 +234,7 @@ class ContactMode(eqx.Module):
 
         - `state`: (components, ...), at zero margin; the equations use the first `size` components.
         - `slipping`: rate of the whole state during slip; `scales`: its magnitudes.
-        - `left`: time [s] to the horizon, which the beginning of a slip does not exceed.
+        - `left`: time [s] to the horizon; the beginning of a slip is not longer.
         """
         both, own, rest = self.both, state[:size], state[size:]
         still = both.stopped(own)

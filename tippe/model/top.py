@@ -66,8 +66,9 @@ class Top(AbstractBody):
     - `radius`: radius of the sphere [m], positive.
     - `offset`: distance of the centre of mass from the sphere's centre [m], at least 0 and less than `radius`.
     - `I1`: transverse moment of inertia about the centre of mass [kg m^2], positive.
-    - `I3`: axial moment of inertia [kg m^2], positive and at most 2 `I1` (no rigid body exceeds it).
-    - `stem`: a `Stem`, its centre farther along e than the sphere's and neither sphere within the other, or `None`.
+    - `I3`: axial moment of inertia [kg m^2], positive and at most 2 `I1`, as for every rigid body.
+    - `stem`: a `Stem`, or `None`. Its centre must be farther along e than the sphere's centre, and neither sphere may
+      contain the other.
 
     **Raises:** `ValueError` for numbers outside these ranges.
 
@@ -109,17 +110,19 @@ class Top(AbstractBody):
         around the stem.
 
         Mass, offset, I1, I3 and the stem follow from the shape in closed form, and you can differentiate them. The top
-        touches with its sphere or with the half ball at the stem's end. `tippe.steady.group` says whether it turns
-        over.
+        touches with its sphere or with the half ball at the stem's end. `tippe.steady.group` returns whether the top
+        turns over.
 
         **Arguments:** (lengths in metres)
 
         - `radius`: radius of the sphere.
         - `density`: density of the material [kg/m^3]: beech 700, acrylic 1180, aluminium 2700.
-        - `cut`: height of the flat above the centre of the sphere, less than `radius`; everything above it is cut off.
+        - `cut`: height of the flat above the centre of the sphere, less than `radius`; the sphere is cut off above the
+          flat.
         - `stem_radius`: radius of the stem, which is a cylinder that ends in a half ball.
         - `stem_length`: length of the stem above the flat.
-        - `hole_radius`, `hole_depth`: a hole drilled from the flat around the stem; the stem stands on its bottom.
+        - `hole_radius`, `hole_depth`: a hole drilled from the flat around the stem; the stem stands on the bottom of
+          the hole.
 
         **Returns:** a `Top`.
 

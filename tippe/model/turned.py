@@ -28,7 +28,7 @@ class Moments(NamedTuple):
     transverse: Number
 
     def plus(self, other: "Moments", sign: float = 1.0) -> "Moments":
-        """Both solids together, or, with `sign` -1, the first without the second."""
+        """Both solids together, or, with `sign` -1, this solid without the other."""
         return Moments(*(a + sign * b for a, b in zip(self, other, strict=True)))
 
 
@@ -86,7 +86,7 @@ class Shape(NamedTuple):
 
     @classmethod
     def checked(cls, lengths: dict[str, Any]) -> "Shape":
-        """A shape from numbers.
+        """A shape with checked numbers.
 
         **Raises:** `ValueError` for numbers that are impossible for such a top.
         """

@@ -1,15 +1,13 @@
-"""Contact lost and regained on any arena: the modes of sliding and of flight, for a top without a stem (see
-`airborne_stem.py` for one with a stem).
+"""Contact lost and regained on any arena: the modes of sliding and of flight, for a top without a stem (for a top with
+a stem, see `airborne_stem.py`).
 
 In contact the state is that of `tippe/model/state.py` with a `CarriedFrame`, 14 components. In flight it is, in the
 surface's axes, the position of the centre of mass [m], its velocity [m/s], the axis, the angular momentum about it, and
 two zeros. A flight ends where the distance of the centre of a sphere from the arena equals its radius again; then that
-sphere strikes the tangent plane there (`impact.py`). theta counts from the normal below the top's own sphere, whichever
 sphere strikes the tangent plane there (`impact.py`). theta is measured from the normal below the top's own sphere,
-whichever sphere touches.
-A single run whose path is kept has five more components: the vector c of `trajectory_problem.py`, in the frame in
-contact, in the surface's axes in flight; the rotation angle of the top about its axis [rad]; and the work of friction
-and impacts [J].
+whichever sphere touches. A single run whose path is kept has five more components: the vector c of
+`trajectory_problem.py`, in the frame in contact, in the surface's axes in flight; the rotation angle of the top about
+its axis [rad]; and the work of friction and impacts [J].
 """
 
 import dataclasses
@@ -83,7 +81,8 @@ class Below(NamedTuple):
 
 
 def below(scene: Scene[Top], flying: FlightState, ball: Ball | None = None) -> Below:
-    """The nearest point of the arena to the centre of a sphere, by default the top's own: theta is measured there."""
+    """The point of the arena nearest to the centre of a sphere, by default the top's own sphere, for which theta is
+    measured."""
     frame, ball = carried_frame(scene), balls(scene.body)[0] if ball is None else ball
     centre = centre_of(flying, ball)
     foot = vector_of(0.0 * centre[0] if part is None else part for part in scene.surface.nearest(centre))
@@ -93,8 +92,8 @@ def below(scene: Scene[Top], flying: FlightState, ball: Ball | None = None) -> B
 
 
 def landing_site(scene: Scene[Top], flying: FlightState, ball: Ball) -> Below:
-    """The point where a sphere lands: the nearest point of the arena at that time. Earlier, only the sign of the gap is
-    valid.
+    """The point where a sphere lands: the nearest point of the arena at the time of landing. Before that time, only the
+    sign of the gap is valid.
     """
     centre = centre_of(flying, ball)
     site, zero = scene.surface.ball_gap(centre, ball.radius, carried_frame(scene).side), jnp.zeros_like(flying.place[0])
@@ -143,7 +142,8 @@ def as_free_body(scene: Scene[Top], flying: FlightState, ground: Below, ball: Ba
 
 
 def in_contact(ground: Below, free: FreeBody) -> Float[Array, "14 ..."]:
-    """The state of a top in contact at the foot below it; in flight, the state that it would have without the gap."""
+    """The state of a top in contact, at the foot below it; in flight, the state that the top would have without the
+    gap."""
     return joined(free.velocity[:2], free.axis, free.momentum, ground.foot, ground.axes[0])
 
 
@@ -244,7 +244,7 @@ class Slide(AbstractFlyingMode):
 def lift_off(
     scene: Scene[Top], state: Float[Array, "components ..."], with_quadratures: bool, ball: Ball | None = None
 ) -> Float[Array, "components ..."]:
-    """The flight state of a top that has lost contact, from its state in contact, with its passive quadratures if any.
+    """The flight state of a top that has lost contact, from its state in contact, including passive quadratures.
 
     **Arguments:** `ball`: the sphere that touched, by default the top's own.
     """

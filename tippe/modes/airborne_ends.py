@@ -1,4 +1,4 @@
-"""States of runs over any arena at their ends, in contact or in flight: as if in contact, their energy, why a contact ended."""
+"""The final states of runs over any arena: converted to states in contact, their energy, and why a contact ended."""
 
 from typing import Any
 

@@ -1,5 +1,5 @@
-"""Contact lost and regained on any arena by a top with a stem: sliding on either sphere, flights, and the impacts of
-both.
+"""Contact lost and regained on any arena by a top with a stem: sliding on either sphere, flights, and impacts of both
+spheres.
 
 States are those of `airborne.py`. A top that slides on its stem has a separate frame, which moves with the stem's
 sphere: its origin is the foot below that sphere. On a curved arena, the two spheres have different feet with different
@@ -124,8 +124,8 @@ class SlideOnOne(AbstractFlyingMode):
         return jnp.where(self.number == 1, beside, jnp.concatenate([state, jnp.zeros_like(state[:2])]))
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """Fly if the contact is lost, strike with the other sphere if that is at the arena, end if the contact jams or
-        the sphere does not fit. Counts the flights.
+        """Fly if the contact is lost, strike with the other sphere if it is at the arena, and end if the contact jams
+        or the sphere does not fit. Counts the flights.
         """
         own, other = self.spheres
         dynamics, zero = standing(self.scene, own), jnp.zeros_like(state[0])
@@ -142,7 +142,7 @@ class SlideOnOne(AbstractFlyingMode):
 
 
 class FlightToBlow(AbstractProblem):
-    """A flight that is over as it begins where a sphere is already at the arena (`strikes`)."""
+    """A flight; where a sphere is already at the arena (`strikes`), the flight ends at once."""
 
     flight: Flight
     strikes: Bool[Array, ""]
@@ -218,7 +218,7 @@ class ArenaImpact(NamedTuple):
 
     - `free`: the top after it, above the tangent plane.
     - `rebounds`: whether the top flies off; `throws`: whether the other sphere is thrown into the arena; `rests`:
-      whether the top is at rest on both; `fails`: whether the impact could not be computed.
+      whether the top is at rest on both spheres; `fails`: whether the computation of the impact failed.
     """
 
     free: FreeBody
@@ -231,8 +231,8 @@ class ArenaImpact(NamedTuple):
 def resolve_arena_impact(scene: Scene[Top], flying: FlightState, ground: Below, own: Ball, other: Ball) -> ArenaImpact:
     """The impact of one sphere on the tangent plane at its foot; a slow rebound closes the contact.
 
-    **Arguments:** `flying`: the top, its sphere `own` at the arena; `ground`: below that sphere; `other`: the other
-    one.
+    **Arguments:** `flying`: the top, whose sphere `own` is at the arena; `ground`: the arena below this sphere;
+    `other`: the other sphere.
     """
     body, closing = scene.body, CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
     free = as_free_body(scene, flying, ground, own)
@@ -251,7 +251,7 @@ def resolve_arena_impact(scene: Scene[Top], flying: FlightState, ground: Below, 
 
 
 def own_and_other(scene: Scene[Top], number: Int[Array, "..."]) -> tuple[Ball, Ball]:
-    """The sphere of a top with a number, and the other one."""
+    """The sphere of a top with the given number, and the other sphere."""
     main, stem = balls(scene.body)
     own = Ball(*(jnp.where(number == 0, a, b) for a, b in zip(main, stem, strict=True)))
     return own, Ball(*(jnp.where(number == 0, b, a) for a, b in zip(main, stem, strict=True)))

@@ -38,8 +38,7 @@ ITERATIONS = 30
 class Skid(AbstractProblem):
     """The slipping part of impacts: tangential and normal impulse as the state, the slip distance as the time.
 
-    - `impact`: the impacts, which define the units of the impulses; `pace`: the speed with which the sphere arrives
-      [m/s].
+    - `impact`: the impacts, which define the units of the impulses; `pace`: the speed of arrival of the sphere [m/s].
     """
 
     impact: Impact

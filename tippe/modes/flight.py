@@ -38,7 +38,8 @@ class Cone(NamedTuple):
 class Descent(NamedTuple):
     """The distance [m] of a sphere from the plane, g0 + v t - g t^2 / 2 - c (1 - cos W t) - s (W t - sin W t).
 
-    Written so that it is exact for a flight that has just begun: `start` is g0, `speed` its rate v [m/s] at the start.
+    This form is accurate even just after the beginning of a flight. `start` is g0, and `speed` the rate v [m/s] at the
+    start.
     """
 
     start: Cells
@@ -60,7 +61,7 @@ class Descent(NamedTuple):
 
 
 class Flight(NamedTuple):
-    """How a flight ended: its length [s], whether a sphere landed and which.
+    """How a flight ended: its duration [s], whether a sphere landed, and which sphere.
 
     `lost` is true where the search for the landing failed; `log_rate` is the logarithm of the speed of landing.
     """
@@ -132,11 +133,11 @@ def fly(
 
     **Arguments:**
 
-    - `spheres`: those that can land.
+    - `spheres`: the spheres that can land.
     - `free`: the body at the start.
     - `parted`: index of the sphere that has just left the plane.
-    - `rising`: whether that sphere leaves with a speed, as after an impact; otherwise it is at rest and its normal
-      force has vanished, so its distance grows with the third power of time.
+    - `rising`: whether that sphere leaves with a speed, as after an impact. Otherwise the sphere was at rest when the
+      normal force vanished, and its distance grows with the third power of time.
     - `most`: time [s] at which the flight is cut off.
 
     **Returns:** a `Flight`.
@@ -252,8 +253,8 @@ def _last_root(height: Cells, speed: Cells, gravity: Cells) -> Cells:
 
 
 def angle_reached(body: Top, free: FreeBody, cos_angle: Float[Array, "..."], until: Cells, last: bool) -> Cells:
-    """Time in flight at which theta rises through an angle, for the first or for the last time; infinite if not by
-    `until`.
+    """Time in flight at which theta rises through an angle, for the first or for the last time; infinite if theta does
+    not reach the angle by `until`.
 
     Along the normal the axis is a constant plus a cosine, so the times are known in closed form.
     """

@@ -13,8 +13,8 @@ from ..model.top import Top
 class AbstractFlyingMode(AbstractBatchedMode):
     """A mode of runs that continue through flights.
 
-    - `scene`: with `contact="hybrid"`; `scales`: magnitudes that scale absolute errors of the state.
-    - `cos_angle`: cosine of the angle of theta that is the event.
+    - `scene`: a scene with `contact="hybrid"`; `scales`: magnitudes that scale absolute errors of the state.
+    - `cos_angle`: cosine of the theta that is the event.
     - `with_quadratures`: whether this is a single run whose path is kept, with passive quadratures behind its state.
     """
 
@@ -26,7 +26,7 @@ class AbstractFlyingMode(AbstractBatchedMode):
     def extended(
         self, problem: AbstractProblem, passive: AbstractPassive, state: Float[Array, "components cells"]
     ) -> AbstractProblem:
-        """The problem of some states, with the passive quadratures behind them if there are any."""
+        """The problem for given states, including the passive quadratures."""
         size = len(problem.start()[0])
         if not self.with_quadratures:
             return problem

@@ -54,8 +54,8 @@ def balls(body: Top) -> tuple[Ball, ...]:
 
 
 def standing_on(dynamics: Dynamics | StickSlip, ball: Ball) -> Dynamics:
-    """The equations of motion of a top that stands on another of its spheres: of the same form with the sphere's
-    parameters.
+    """The equations of motion of a top that stands on another of its spheres: the same equations with the parameters of
+    this sphere.
     """
     assert isinstance(dynamics, Dynamics)
     coupling = dynamics.mass * ball.offset * dynamics.per_transverse
@@ -65,7 +65,7 @@ def standing_on(dynamics: Dynamics | StickSlip, ball: Ball) -> Dynamics:
 def as_free_body(body: Top, ball: Ball, state: Float[Array, "components ..."]) -> FreeBody:
     """A top that stands on a sphere, as a free body: the sphere's centre is at rest along the normal.
 
-    **Arguments:** `state`: (8, ...), as `tippe/model/state.py` has it.
+    **Arguments:** `state`: (8, ...), as in `tippe/model/state.py`.
     """
     velocity, axis, momentum, _ = parts(state)
     height = ball.radius - ball.offset * axis[2]
@@ -113,9 +113,10 @@ def still_parting(
 ) -> Float[Array, "..."]:
     """The round-off allowed for the distance of a sphere, as a fraction of R.
 
-    The full allowance holds while the sphere lifts off. When it returns there is none, which would delay the landing.
+    The full allowance holds while the sphere lifts off. There is none when the sphere returns, because it would delay
+    the landing.
 
-    **Arguments:** `rate`: of the distance [m/s]; `rounding`: an allowance in addition to `ROUNDING`.
+    **Arguments:** `rate`: rate of the distance [m/s]; `rounding`: an allowance in addition to `ROUNDING`.
     """
     return (ROUNDING + rounding) * jnp.clip(1.0 + rate / (COMES_BACK * jnp.sqrt(gravity * radius)), 0.0, 1.0)
 
@@ -133,9 +134,9 @@ def energy_in(
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """The least and the greatest energy [J] that a state at the end of a mode, or of a flight from there, may have.
 
-    In flight its sphere is above the plane, and the state does not tell at which speed along the normal.
+    In flight, the state does not contain the speed of the sphere along the normal.
 
-    **Arguments:** `number`: of the mode of `sliding.py`; where both spheres touch, each tells the height.
+    **Arguments:** `number`: index of the mode in `sliding.py`; where both spheres touch, either determines the height.
     """
     main, stem = balls(scene.body)[0], balls(scene.body)[-1]
     own = Ball(*(jnp.where(number == 1, of_stem, of_main) for of_stem, of_main in zip(stem, main, strict=True)))

@@ -6,11 +6,11 @@ friction force and torque per unit normal force. With the normal impulse p in pl
 f and d(impulse of the torque)/dp = tau, and slip and angular velocity change with the impulses (Routh, Dynamics of a
 System of Rigid Bodies, 1905, art. 198; Stronge, Impact Mechanics, ch. 4). This is the limit of a stiff contact with the
 same law, so it needs no separate law: a stop of the slip, a reversal, and friction that depends on the speed all follow
-from it. Newton's restitution e_N determines the end: the velocity along the normal is e_N times the speed of approach.
-With friction, Newton's rule may require more energy than there was (Stronge, section 3.3); the impact then ends
-earlier, when the kinetic energy equals that before the impact.
+from it. Newton's restitution e_N determines the end of the impact: the velocity along the normal is then e_N times the
+speed of approach. With friction, Newton's rule may require more energy than there was (Stronge, section 3.3); the
+impact then ends earlier, when the kinetic energy equals that before the impact.
 
-There is always an end. Strong friction can pull the sphere into the plane faster than the impulse pushes it out (a
+Every impact ends. Strong friction can pull the sphere into the plane faster than the impulse pushes it out (a
 jam), so the velocity along the normal is not monotone. But friction only dissipates energy, so the slip comes to an
 end, and a contact that does not slip is pushed out, because the response to an impulse is positive definite. The same
 holds with a torque, which also only dissipates energy: velocity and angular velocity of the contact respond to force
@@ -93,9 +93,7 @@ class Impact(AbstractProblem):
 
     @property
     def speed(self) -> Cells:
-        """Speed along the normal before the impact [m/s]; positive, because a sphere at rest would give no unit for
-        impulses.
-        """
+        """Speed along the normal before the impact [m/s], positive because it is the unit of the impulses."""
         return greatest(jnp.abs(self.approach.velocity[2]), 1e-12)
 
     def blow(self, normal: Cells, state: Float[Array, "rows cells"]) -> ContactImpulse:

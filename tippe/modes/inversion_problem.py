@@ -20,8 +20,8 @@ from ..model.top import Top
 class InversionProblem(AbstractProblem):
     """Launches that end when theta reaches an angle or the contact is lost or jams.
 
-    Without an angle, `cos_angle` being `None`, they end when the spin about the arena's normal reverses; `spin` is that at the
-    start [rad/s].
+    If `cos_angle` is `None`, they end when the spin about the arena's normal reverses; `spin` is the initial spin
+    [rad/s].
     """
 
     dynamics: Dynamics | StickSlip | ContactMode | AbstractRigidDynamics
@@ -35,9 +35,8 @@ class InversionProblem(AbstractProblem):
     def of(
         cls, scene: Scene[Top], launch: Launch, angle: Float[ArrayLike, "..."] | None, cells: int
     ) -> "InversionProblem":
-        """The problem of the given number of cells; the numbers of scene and launch are scalars or one per cell.
-
-        Its frame is that of `Scene.turning_dynamics`: its final states do not give directions.
+        """The problem of the given number of cells; the numbers of scene and launch are scalars or arrays with one
+        number per cell. The frame is that of `Scene.turning_dynamics`, so final states do not contain directions.
         """
         return _problem(scene, launch, None if angle is None else jnp.asarray(angle), cells)
 
@@ -49,7 +48,7 @@ class InversionProblem(AbstractProblem):
 
     def event_function(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"]:
         if self.cos_angle is None:
-            assert isinstance(self.dynamics, AbstractRigidDynamics)
+            assert not isinstance(self.dynamics, Dynamics)
             assert self.spin is not None
             return self.dynamics.normal_spin(state) / self.spin
         return state[COS_THETA] - self.cos_angle

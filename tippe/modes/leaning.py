@@ -1,4 +1,4 @@
-"""The top that slides on its sphere and on its stem at once: it leans.
+"""Leaning: the top slides on its sphere and on its stem at once.
 
 Both spheres touch the plane at one angle theta only, so the axis turns about the normal at some rate W, e' = W n x e,
 and the centre of mass stays at its height h = R_j - a_j c, c = cos theta. With L = A e + I1 W n and the momenta p = L.n
@@ -140,10 +140,9 @@ class LeaningDynamics(eqx.Module):
         """The end of rocking: the total effect of all remaining impacts on a top whose spheres are both at the plane.
 
         The top rocks from sphere to sphere with decreasing amplitude, and infinitely many impacts take a finite time T.
-        Sphere j gets the impulse P_j (f_j, 1), and P_j tau_j if the law has a torque, in addition to those of leaning
-        for T, and the sum stops both speeds along the normal, g + G P = 0. During T, both slips change only by the
-        order of the speeds g, so the error is of the order of their square.
-        this errs by their square.
+        In addition to the impulses of leaning for T, sphere j gets the impulse P_j (f_j, 1), and P_j tau_j if the law
+        has a torque. Together, these stop both speeds along the normal, g + G P = 0. During T, both slips change only
+        by the order of the speeds g, so the error is of the order of their square.
 
         **Returns:** the body after these impulses, before `at_rest`; and whether their friction dissipates energy. One
         P_j is negative, the reduction of that sphere's load in T; if its friction adds energy now, it dissipates some
@@ -172,14 +171,13 @@ class LeaningDynamics(eqx.Module):
         return FreeBody(velocity, free.height, free.axis, momentum), dot(impulses, tuple(gains)) <= 0.0
 
     def settled(self, free: FreeBody) -> tuple[FreeBody, Int[Array, "..."], Bool[Array, "..."]]:
-        """Contacts that keep a top at rest along the normal whose spheres are both at the plane.
+        """The contacts of a top whose spheres are both at rest at the plane. The normal forces must not be negative,
+        and the force on a sphere that leaves the plane is zero. If m_1 - m_0 is positive, there is a single solution:
+        the top stands on both spheres if this takes two positive forces, otherwise on the sphere with the positive
+        force.
 
-        Of all solutions with both normal forces at least zero, and each zero where its sphere leaves the plane, there
-        is one if m_1 - m_0 is positive: on both spheres if that takes two positive forces, else on the one with the
-        positive force.
-
-        **Returns:** the body, exactly at rest along the normal (`at_rest`); `BOTH`, or the number of the sphere that
-        it stands on; and whether that is the only solution.
+        **Returns:** the body, exactly at rest along the normal (`at_rest`); `BOTH`, or the number of the sphere on
+        which it stands; and whether this is the only solution.
         """
         free = at_rest(self.body, free)
         state = contact_state(free)
@@ -188,7 +186,7 @@ class LeaningDynamics(eqx.Module):
 
 
 def at_rest(body: Top, free: FreeBody) -> FreeBody:
-    """A body whose spheres are both at the plane, without its remaining speeds along the normal.
+    """A body whose spheres are both at the plane, with its remaining speeds along the normal removed.
 
     theta becomes the angle of both contacts, and L loses its component along n x e, the one that changes theta: as by
     an impulse along the normal at each sphere that ends its motion. L.n, L.e, and so Jellett's quantity of either

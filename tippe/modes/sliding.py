@@ -57,7 +57,7 @@ SHOWN = 0.4
 class Sliding(AbstractProblem):
     """Sliding until theta reaches an angle, a contact is lost or jams, or a sphere that does not touch the plane lands.
 
-    `own` is the sphere that slides and `other` the one that does not; `None` if there is none.
+    `own` is the sphere that slides, and `other` the other sphere; `None` without a stem.
     """
 
     dynamics: Dynamics | LeaningDynamics
@@ -97,7 +97,7 @@ def clearance(dynamics: Dynamics, own: Ball, other: Ball, state: Float[Array, "c
 
 
 def height(own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-    """Distance [m] of the other sphere from the plane, where a top stands on its own one."""
+    """Distance [m] of the other sphere from the plane, for a top that stands on the sphere `own`."""
     return own.radius - other.radius + (other.offset - own.offset) * state[COS_THETA]
 
 
@@ -162,7 +162,7 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
         return air.free, air.quadratures
 
     def closed(self, air: "Air") -> Transition:
-        """The transition of a top that is back on the plane, or whose run has ended."""
+        """The transition for a top that has returned to the plane, or whose run has ended."""
         status, state = jnp.where(air.open, UNRESOLVED, air.status), contact_state(air.free)
         if air.quadratures is not None:
             state = jnp.concatenate([state, air.quadratures])
@@ -198,7 +198,8 @@ def modes(
 
     **Arguments:**
 
-    - `scene`: with `contact="hybrid"`; `problem`: the problem of its launches, which stand on their lower sphere.
+    - `scene`: a scene with `contact="hybrid"`; `problem`: the problem of its launches, which stand on their lower
+      sphere.
     - `tolerance`: unused by these modes; `last`: whether the last crossing counts; `with_quadratures`: as for
       `AbstractFlyingMode`.
     """
@@ -230,8 +231,8 @@ class Air(NamedTuple):
       of the mode.
     - `status`: `RUNNING`, or how the run ended, `LEFT_DOMAIN` if it has jammed; `crossing_time` [s] of the event,
       infinite if there was none.
-    - `flights`: so far; `open`: whether there is no contact and the run continues.
-    - `log_rates`: of the landings, as in `Transition`.
+    - `flights`: number of flights so far; `open`: whether there is no contact and the run continues.
+    - `log_rates`: logarithms of the rates at the landings, as in `Transition`.
     - `quadratures`: the passive quadratures of a single run.
     """
 
@@ -331,7 +332,8 @@ def _with_other(
     """Effect of an impact on the other sphere if that is at the plane: it also strikes, or the top comes to rest on
     both.
 
-    **Arguments:** `air`: before the impact; `struck`: after it; `slow`: where it is so slow that it may be the last.
+    **Arguments:** `air`: the top before the impact; `struck`: the top after the impact; `slow`: mask of the impacts
+    that are so slow that they may be the last.
     """
     touches = gap(other, air.free) < TOUCHING * scene.body.radius
     falls = touches & (gap_rate(scene.body, other, struck.free) < -closing)

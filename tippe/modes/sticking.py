@@ -11,7 +11,7 @@ from nonholonomic.hybrid import AbstractBatchedMode, Transition, TransitionPath
 from nonholonomic.integration import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING, AbstractProblem, ExtendedProblem
 from nonholonomic.xla_cpu import compiled_setup
 
-from ..model.dynamics import NO_COSINE, Dynamics
+from ..model.dynamics import NO_COSINE
 from ..model.scene import Scene
 from ..model.slip_onset import Onset
 from ..model.state import COS_THETA
@@ -38,15 +38,18 @@ class StickSlipMode(AbstractBatchedMode):
     """Slipping or rolling until theta reaches an angle; with `last`, the last crossing counts.
 
     For a single run whose path is kept, `passive` quadratures follow the first `size` components. For the cells of a
-    table both are `None`.
+    table both are `None`. Without an angle, a run ends when the spin about the normal reverses; `spin` is that at the
+    start.
     """
 
     kind: ContactMode
-    cos_angle: Float[Array, "..."]
+    # An array, or `None`.
+    cos_angle: Any
     scales: Float[Array, "components cells"]
     last: bool = eqx.field(static=True)
     passive: Quadratures | None = None
     size: int | None = eqx.field(static=True, default=None)
+    spin: Float[Array, "..."] | None = None
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         return self._under(self.kind, state)
@@ -68,9 +71,15 @@ class StickSlipMode(AbstractBatchedMode):
         change = self.kind.ended(state, self._size(state), lambda at: slipping.field(left, at), self.scales, left)
         onset, length = change.onset, change.onset.length
         began = -change.wait / jnp.where(length > 0.0, length, 1.0)
-        falls = (state[COS_THETA] > self.cos_angle) & (change.state[COS_THETA] <= self.cos_angle)
-        crosses = falls & ~change.rolls & ~change.lost
-        fraction = onset.falls_to(COS_THETA, self.cos_angle, began)
+        falls = (self._event(state) > 0.0) & (self._event(change.state) <= 0.0)
+        if self.spin is None:
+            crosses = falls & ~change.rolls & ~change.lost
+            cosine = onset.of_components(slice(COS_THETA, COS_THETA + 1))
+            fraction = cosine.falls_to_zero(lambda part: part[0] - self.cos_angle, began)
+        else:
+            # The blow that stops a slip changes the spin, too.
+            crosses = falls & ~change.lost
+            fraction = onset.falls_to_zero(self._event, began)
         crossing = change.wait + fraction * length
         ends = crosses & (not self.last)
         status = jnp.where(change.elapsed >= left, REACHED_END, RUNNING)
@@ -85,14 +94,20 @@ class StickSlipMode(AbstractBatchedMode):
             record=None if self.passive is None else _recorded(change),
         )
 
+    def _event(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+        """The function whose fall to zero ends a run."""
+        if self.spin is None:
+            return state[COS_THETA] - self.cos_angle
+        return self.kind.both.normal_spin(state[: self._size(state)]) / self.spin
+
     def _size(self, state: Float[Array, "components ..."]) -> int:
         """Number of components in the equations of motion."""
         return len(state) if self.size is None else self.size
 
-    def _under(self, equations: Dynamics | ContactMode, state: Float[Array, "components cells"]) -> AbstractProblem:
+    def _under(self, equations: Any, state: Float[Array, "components cells"]) -> AbstractProblem:
         """The motion from some states under given equations."""
         size = self._size(state)
-        problem = InversionProblem(equations, self.cos_angle, state[:size], self.scales[:size])
+        problem = InversionProblem(equations, self.cos_angle, state[:size], self.scales[:size], self.spin)
         if self.passive is None:
             return problem
         return ExtendedProblem(problem, self.passive, state[size:], self.scales[size:], ends_on_event=False)
@@ -117,14 +132,15 @@ def modes(
 
     **Arguments:**
 
-    - `problem`: of launches in a scene with `SetValuedCoulomb`; contains everything needed of the scene.
+    - `problem`: the problem of launches in a scene with `SetValuedCoulomb`.
     - `tolerance`: relative tolerance of the integration; `last`: whether the last crossing counts.
     - `passive`, `size`: as for `StickSlipMode`.
     """
     both = problem.dynamics
     assert isinstance(both, StickSlip)
     kinds = (ContactMode(both, jnp.asarray(tolerance, float), rolls) for rolls in (False, True))
-    both_modes = tuple(StickSlipMode(kind, problem.cos_angle, problem.scales, last, passive, size) for kind in kinds)
+    options = (problem.cos_angle, problem.scales, last, passive, size, problem.spin)
+    both_modes = tuple(StickSlipMode(kind, *options) for kind in kinds)
     return both_modes, _first_mode(both, problem.states)
 
 
@@ -139,7 +155,7 @@ def contact_modes(
 ) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, "1"], Float[Array, "components 1"]]:
     """The modes of one run whose path is kept, the index of the first mode, and the initial state.
 
-    **Arguments:** `run`: of a scene with `SetValuedCoulomb`; `tolerance`: relative, of the integration.
+    **Arguments:** `run`: a run in a scene with `SetValuedCoulomb`; `tolerance`: relative tolerance of the integration.
     """
     state, scales = (values[:, None] for values in run.start())
     problem = InversionProblem(run.problem.dynamics, jnp.asarray(NO_COSINE), state[: run.leading], scales)

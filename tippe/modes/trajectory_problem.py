@@ -10,9 +10,9 @@ from nonholonomic.geometry import Component, Tangent, Vector, carried, cross, do
 from nonholonomic.integration import AbstractPassive, ExtendedProblem
 from nonholonomic.xla_cpu import compiled_setup
 
+from ..model.dynamics import Dynamics
 from ..model.launch import Launch
 from ..model.rigid_body import AbstractRigidBody
-from ..model.rigid_dynamics import AbstractRigidDynamics
 from ..model.scene import Scene
 from ..model.state import parts
 from .inversion_problem import InversionProblem
@@ -45,7 +45,7 @@ class Quadratures(AbstractPassive):
         c, turning = (c1, c2, c3), (None, None) if self.of_mass else motion.turning
         path_rate = u if self.of_mass else dynamics.frame.cyclic_rate(tuple(path), motion.velocity, turning)
         # In a frame that turns, the components of the axis have another rate than the axis.
-        if self.of_mass or isinstance(dynamics, AbstractRigidDynamics):
+        if self.of_mass or not isinstance(dynamics, Dynamics):
             falls = dot(sum_vectors(motion.rate[2:5], scale(-1.0, carried(e, turning))), c)
         else:
             falls = dot(cross(L, e), c) * dynamics.per_transverse
@@ -59,7 +59,7 @@ def c_rate(c: Vector, axis: Vector, falls: Component, turning: Tangent = (None, 
 
 
 def trajectory_problem(modules: tuple[Scene, Launch], cells: int | None = None) -> TrajectoryProblem:
-    """The run of one launch, or the runs of some cells, whose numbers are scalars or one per cell."""
+    """The run of one launch, or the runs of several cells; numbers are scalars or arrays with one number per cell."""
     return _problem(*modules, cells)
 
 

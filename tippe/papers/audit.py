@@ -1,4 +1,4 @@
-r"""Audit of the paper: each numbered equation as printed, the verdict, the correct form, and the tests that show it.
+r"""Audit of the paper: each numbered equation as printed, the verdict, the correct form, and the tests for both.
 
 `python -m tippe.papers.audit` prints the page `docs/development/tippe_paper.md`. In its formulas eta is the angle of the
 position from the lowest line, r the arena's radius, rho = r - R the radius of the centre's path, and phi the direction of the
@@ -12,11 +12,11 @@ from typing import NamedTuple
 class Equation(NamedTuple):
     """The verdict on one of the paper's statements.
 
-    - `number`: as the paper numbers it.
-    - `subject`: what the statement is about.
+    - `number`: the paper's number.
+    - `subject`: the subject of the statement.
     - `printed`: as printed, in TeX.
     - `verdict`: right, right on the plane, misprint, incomplete, wrong, meaningless or lost.
-    - `reason`: why, in a few sentences.
+    - `reason`: the reason for the verdict, in a few sentences.
     - `correct`: the correct formulas, in TeX; empty where there are none.
     - `code`: the functions that compute the correct form.
     - `tests`: the tests that show verdict and correct form, as pytest names them.
@@ -40,8 +40,8 @@ AUDIT = (
         subject="Jellett's constant",
         printed=r"J = Cn\left(R\cos\theta + A\dot\eta R\sin^2\theta\right)",
         verdict="misprint",
-        reason="The bracket closes in the wrong place, the offset a is missing, and the precession has the symbol of the "
-        "position. The first formula holds on the plane, the second in the cylinder.",
+        reason="The bracket closes in the wrong place, the offset a is missing, and the rate of precession has the symbol of "
+        "the position. The first correct formula holds on the plane, the second in the cylinder.",
         correct=(
             r"J = I_3\omega_3(R\cos\theta - a) + I_1\dot\phi R\sin^2\theta",
             r"J = R\left[I_1(\dot\phi\sin^2\theta + \dot\eta\sin\theta\cos\theta\sin\phi) "
@@ -55,7 +55,8 @@ AUDIT = (
         subject="constancy of Jellett's quantity",
         printed=r"\dot J = 0 \text{ whether or not there is slipping}",
         verdict="right on the plane",
-        reason="True on the plane for every force at the contact point. False in the cylinder, where the normal turns.",
+        reason="J is constant on the plane, for every force at the contact point, but not in the cylinder, where the normal "
+        "turns.",
         correct=(r"\dot J = R\,\mathbf L\cdot\dot{\mathbf n},\qquad \dot{\mathbf n} = -\dot\eta\,\mathbf t_\eta",),
         code=("tippe.Scene.jellett",),
         tests=(
@@ -90,9 +91,8 @@ AUDIT = (
         r"R_\phi = \partial_\eta,\quad "
         r"R_\psi = -y\sin\eta\,\partial_r - \tfrac yr\cos\eta\,\partial_\eta + r\sin\eta\,\partial_y",
         verdict="right",
-        reason="The last lines hold for x = r sin(eta), z = r cos(eta), with eta = 0 at the top; if eta counts from the "
-        "lowest line, z = -r cos(eta). The first line of (5) has phi and theta instead of eta and y. Only the "
-        "second field and d/dy are tangent to the cylinder. The model needs none of the others.",
+        reason="The formulas hold for x = r sin(eta) and z = r cos(eta), with eta = 0 at the top. The first line of (5) "
+        "contains phi and theta instead of eta and y. Only the second field is tangent to the cylinder.",
         correct=(r"[R_x, R_y] = -R_z,\qquad [R_y, R_z] = -R_x,\qquad [R_z, R_x] = -R_y",),
         code=("tippe.papers.paper.rotation_generators",),
         tests=(
@@ -106,9 +106,8 @@ AUDIT = (
         printed=r"L' = \tfrac12\left(m(\dot x^2+\dot y^2) + I\dot\theta^2 + I\sin^2\theta\,\dot\phi^2 "
         r"+ I_3(\dot\psi+\dot\phi\cos\theta)^2\right) - mg(R-a\cos\theta)",
         verdict="incomplete",
-        reason="The Lagrangian is for the plane, and lacks the vertical motion of the centre of mass. The first correct "
-        "formula is for the plane, in coordinates of the centre of mass; the second is for the cylinder, with the height z of "
-        "that centre.",
+        reason="This Lagrangian is for the plane, and lacks the vertical motion of the centre of mass. The first correct "
+        "formula is for the plane, the second for the cylinder, with the height z of the centre of mass.",
         correct=(
             r"L = L' + \tfrac12 ma^2\dot\theta^2\sin^2\theta",
             r"L = \tfrac12 m|\dot{\mathbf O} - a\dot{\mathbf e}|^2 + \tfrac12I_1(p^2+q^2) "
@@ -127,8 +126,8 @@ AUDIT = (
         printed=r"\beta_1 = \frac{J - I\dot\phi R\sin^2\theta}{R\cos\theta-a},\qquad "
         r"\dot\psi = \frac{\beta_1}{I_3} - \dot\phi\cos\theta",
         verdict="right on the plane",
-        reason="The algebra is right on the plane, except for an unbalanced bracket in (7). beta1 is the momentum I3 omega3. "
-        "In the cylinder the rate of eta adds a term.",
+        reason="The equations hold on the plane, except for an unbalanced bracket in (7). In the cylinder, the rate of eta "
+        "adds a term.",
         correct=(r"\dot\psi = \frac{\beta_1}{I_3} - \dot\phi\cos\theta + \dot\eta\sin\theta\sin\phi",),
         code=(
             "tippe.witnesses.reduced.spin_rate_from_jellett",
@@ -142,8 +141,7 @@ AUDIT = (
         subject="constancy of beta1",
         printed=r"\beta_1 = \text{constant}",
         verdict="wrong",
-        reason="Friction changes the spin about the axis. beta1 is constant without friction; Jellett's quantity is constant "
-        "with friction, but only on the plane.",
+        reason="Friction changes the spin about the axis.",
         correct=(r"\dot\beta_1 = -NR\,(\mathbf n\times\mathbf f)\cdot\mathbf e",),
         code=("tippe.Scene.field",),
         tests=(PAPER + "test_friction_changes_beta1",),
@@ -153,7 +151,7 @@ AUDIT = (
         subject="reduced kinetic energy",
         printed=r"T = \tfrac12\left(I\dot\theta^2 + I\sin^2\theta\,\dot\phi^2 + \frac{\beta_1^2}{I_3}\right)",
         verdict="wrong",
-        reason="This is the value of the rotational kinetic energy; equations of motion do not follow from it. The Routhian "
+        reason="This formula gives the rotational kinetic energy, but the equations of motion follow from the Routhian, which "
         "has a gyroscopic term, the opposite sign of the last term, and the translational and potential energy.",
         correct=(
             r"R = \tfrac12\left(m(\dot x^2+\dot y^2+a^2\dot\theta^2\sin^2\theta) + I\dot\theta^2 "
@@ -171,16 +169,15 @@ AUDIT = (
         subject="equations of motion in the cylinder",
         printed=r"(\ddot\eta,\ \ddot\phi,\ \ddot\theta,\ \ddot{\ },\ \ddot x)^T = (\ldots)",
         verdict="meaningless",
-        reason="One symbol on the left is lost. The right sides mix forces times lengths with accelerations, and mu does not "
-        "occur. In the correct equations, M is the moment of the contact forces about the centre of mass per unit of N, "
-        "and p, q, sigma are the components of the angular velocity of the axes e1, e2, e.",
+        reason="A symbol on the left is missing. The right sides mix forces times lengths with accelerations, and do not "
+        "contain mu.",
         correct=(
             r"m(\ddot{\mathbf O} - a\ddot{\mathbf e}) = N(\mathbf f + \mathbf n) - mg\mathbf z",
-            r"I_1\dot p + I_3\omega_3q - I_1q\sigma = N\mathbf M\cdot\mathbf e_1,\qquad "
-            r"I_1\dot q + I_1p\sigma - I_3\omega_3p = N\mathbf M\cdot\mathbf e_2,\qquad "
+            r"I_1\dot p + I_3\omega_3q - I_1qs = N\mathbf M\cdot\mathbf e_1,\qquad "
+            r"I_1\dot q + I_1ps - I_3\omega_3p = N\mathbf M\cdot\mathbf e_2,\qquad "
             r"I_3\dot\omega_3 = N\mathbf M\cdot\mathbf e",
             r"p = -(\dot\phi\sin\theta + \dot\eta\cos\theta\sin\phi),\quad q = \dot\theta - \dot\eta\cos\phi,\quad "
-            r"\sigma = \dot\phi\cos\theta - \dot\eta\sin\theta\sin\phi,\quad \omega_3 = \dot\psi + \sigma",
+            r"s = \dot\phi\cos\theta - \dot\eta\sin\theta\sin\phi,\quad \omega_3 = \dot\psi + s",
         ),
         code=("tippe.witnesses.euler_angles.equations", "tippe.witnesses.euler_angles.by_equation_11"),
         tests=(
@@ -193,8 +190,8 @@ AUDIT = (
         subject="normal force in the cylinder",
         printed=r"|F_N| = m\left[g\cos\eta + a(\ddot\theta\sin\theta + \dot\theta^2\cos\theta) + r\dot\eta^2\right]",
         verdict="incomplete",
-        reason="Three terms are missing, because the frame of the angles turns with the position, and r must be rho = r - R, "
-        "the radius of the centre's path. On the plane the equation is right.",
+        reason="The equation is right on the plane. In the cylinder, three terms are missing, and r must be rho = r - R, the "
+        "radius of the path of the centre.",
         correct=(
             r"\frac Nm = g\cos\eta + \rho\dot\eta^2 + a(\ddot\theta\sin\theta + \dot\theta^2\cos\theta) "
             r"+ a\dot\eta^2\cos\theta - a\ddot\eta\,e_t - 2a\dot\eta\,\dot e_t,\qquad e_t = \sin\theta\cos\phi",
@@ -207,7 +204,7 @@ AUDIT = (
         subject="the top",
         printed=r"I,\ I_3,\ m,\ R,\ D",
         verdict="lost",
-        reason="The values are missing. The last section says what Tables 2 and 3 determine about them.",
+        reason="The values are missing. The last section shows that Tables 2 and 3 do not determine them.",
         correct=(),
         code=(),
         tests=(
@@ -221,9 +218,9 @@ AUDIT = (
         printed=r"\beta_1 = 2{,}500\ \mathrm{g\,m^2\,rad/s},\qquad "
         r"\dot\theta=\dot\phi=\dot\psi=\dot\eta=\dot X=0",
         verdict="wrong",
-        reason="In the unit of the header, a top of ordinary size would spin at more than 1e5 rad/s. Zero rates contradict "
-        "beta1: such a top never rises. We take beta1 as 2500 g cm^2/s, which gives the initial spin. The paper does "
-        "not state the friction law for mu = 0.3.",
+        reason="With the printed unit, a top of ordinary size would spin at more than 1e5 rad/s. The zero rates contradict "
+        "beta1: such a top never rises. We use 2500 g cm^2/s, which gives the initial spin. The paper does not state the "
+        "friction law for mu = 0.3.",
         correct=(r"\omega_3(0) = \beta_1/I_3,\qquad \beta_1 = 2.5\cdot10^{-4}\ \mathrm{kg\,m^2/s}",),
         code=("tippe.papers.paper.launch",),
         tests=(
@@ -236,34 +233,31 @@ AUDIT = (
 TITLE = "# The paper on the tippe top in the cylinder, equation by equation"
 
 PREFACE = """
-This page lists which equations of *Modeling of Dynamics Object with Non-Holonomic Constraints Based on Maple in
-Cylinder Coordinate* hold, the corrected form of the others, and the code and tests.
+This page states which equations of *Modeling of Dynamics Object with Non-Holonomic Constraints Based on Maple in
+Cylinder Coordinate* hold, and corrects the others. The [equations of the top](../concepts/tippe.md) define the symbols;
+I is I₁ and J is Jellett's quantity λ.
 
 * With sliding friction the top has **no nonholonomic constraint**: the contact is holonomic, and friction is a force.
-* Jellett's quantity is constant on a plane, but **not in the cylinder**, where the paper uses it in place of an
-  equation of motion.
+* Jellett's quantity is constant on a plane, but **not in the cylinder**, where the paper uses its constancy in place of
+  an equation of motion.
 * Friction changes the momentum β₁. Either β₁ or Jellett's quantity is constant, never both.
 * This package uses none of the paper's equations. The corrected equations agree with its vector form to 10⁻¹⁰.
-
-`python -m tippe.papers.audit` prints this page.
 """
 
 TABLES = """
-## What Tables 2 and 3 say about the lost Table 1
+## Can Tables 2 and 3 replace the lost Table 1?
 
-Tables 2 and 3 contain six times and eighteen answers yes or no. They depend on eight unknown parameters and an unknown
-friction law. Here a top counts as reversed when it reaches 0.95 pi within 40 s.
+No. Each table states for nine launches whether the top reverses, and if so, when; there are six such times in all. They
+depend on eight unknown parameters and an unknown friction law. Here a top counts as reversed if it reaches 0.95 pi
+within 40 s.
 
-* **Table 2 alone** (`python benchmarks/paper_tables_scan.py`). Of 20 000 random tops under viscous friction, 294 reverse in
-  the printed rows; after variation, the best of them misses the times by 1.25 s.
-* **Table 3 alone** (the same program). No top was found: those that keep contact reverse after 3 to 30 s in another order.
-* **Both tables with one top** (`python benchmarks/paper_tables_joint.py --law viscous`). With an error of 1 s in each row,
-  the smallest -2 log likelihood is 29.6 at 11 degrees of freedom, for m = 11.573 g, R = 27.474 mm, a / R = 0.086495, I1 /
-  I3 = 1.0533, I3 / m R^2 = 0.4075, a cylinder of 84.428 R, azimuth 1.7971, mu = 0.32573 s/m. From the wall this top
-  reverses at 22.6, 19.3, 19.9 and 22.4 s (printed 23, 19, 20, 22), and from the lowest line at 26.3, 26.3, 28.2 and 30.3 s
-  (printed 25, 22, not, not). Other tops do as well (`examples/lost_numbers.py`).
-
-So the tables do not determine Table 1.
+* **Table 2** (`python benchmarks/paper_tables_scan.py`). Of 20 000 random tops under viscous friction, 294 reverse in the
+  printed rows; the best of them, after optimisation, misses the times by 1.25 s.
+* **Table 3** (the same program). No top reproduces it: tops that keep contact reverse after 3 to 30 s in another order.
+* **Both tables** (`python benchmarks/paper_tables_joint.py --law viscous`). With an error of 1 s in each row, the smallest -2
+  log likelihood is 29.6 at 11 degrees of freedom. From the wall, this top reverses at 22.6, 19.3, 19.9 and 22.4 s (printed:
+  23, 19, 20, 22), and from the lowest line at 26.3, 26.3, 28.2 and 30.3 s (printed: 25, 22, not, not). Other tops fit as
+  well (`examples/lost_numbers.py`).
 """
 
 

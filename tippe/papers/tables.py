@@ -108,7 +108,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def scenes(options: argparse.Namespace) -> dict[str, Scene]:
-    """The two arenas with the declared top, and the requested one."""
+    """The declared top in the two arenas of the papers, or in the requested arena."""
     inertia = options.mass * options.radius**2
     I1 = 131.0 / 350.0 * inertia if options.I1 is None else options.I1
     I3 = 0.4 * inertia if options.I3 is None else options.I3
@@ -144,7 +144,7 @@ def shown_name(options: argparse.Namespace, arena: str) -> str:
 
 
 def counts_eta(scene: Scene[Top]) -> bool:
-    """Whether an arena has places by eta; on others every launch starts at the origin."""
+    """Whether `eta` names places on an arena; on other arenas, every launch starts at the origin."""
     return any(name == "eta" for name, _ in scene.surface.coordinates)
 
 
@@ -173,7 +173,7 @@ def tables(options: argparse.Namespace) -> dict[str, Table]:
 
 
 def printed_times(options: argparse.Namespace, eta: float) -> list[str] | None:
-    """The paper's column for a place, if the launches are the paper's."""
+    """The paper's times for a place, if the launches are those of the paper."""
     for table in (paper.TABLE_2, paper.TABLE_3):
         if list(options.theta) == [row.theta for row in table.rows] and math.isclose(eta, table.eta):
             return ["-" if row.time is None else f"{row.time:g}" for row in table.rows]
@@ -241,7 +241,7 @@ def _friction(law: AbstractFriction) -> str:
 
 @compiled_quickly
 def moving(scene: Scene[Top], launches: Launch, times: Any, tolerance: Any) -> Motion:
-    """The drawn quantities of every launch up to the last of the times, in one batched run."""
+    """The drawn quantities of every launch at the given times, in one batched run."""
     return jax.vmap(lambda launch: Motion.of(simulate(scene, launch, times[-1], times, tolerance)))(launches)
 
 
@@ -281,7 +281,8 @@ def picture(options: argparse.Namespace, by_arena: dict[str, Table]) -> Any:
 
 
 def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[Stage]:
-    """The most upright launch that turns over and can be followed, or else the first to turn over, in both arenas."""
+    """In both arenas, the most upright launch that turns over without losing contact, or else the first launch that
+    turns over."""
     ends = np.stack([table.last_time.reshape(len(options.theta), -1)[:, 0] for table in by_arena.values()]).max(axis=0)
     # No longer than the spin can be followed from sample to sample.
     longest = SAMPLES / max(abs(spin_of(options, scene)) for scene in scenes(options).values())

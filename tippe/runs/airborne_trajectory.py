@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Any
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,8 +45,8 @@ NEAR = 1e-6
 
 class ArenaTrajectory(HybridTrajectory):
     """A `HybridTrajectory` over any arena: `theta` and `azimuth` refer to the frame at the foot, the point of the arena
-    nearest to the centre of the top's own sphere, and `distance` is the distance of this sphere from the arena. `slip`
-    refers to the frame at the foot of the touching sphere."""
+    nearest to the centre of the top's own sphere, and `distance` is the distance of this sphere from the arena and its
+    rate. `slip` refers to the frame at the foot of the touching sphere."""
 
     @of_each_run
     def energy(self) -> Float[Array, " times"]:
@@ -151,37 +150,29 @@ def _start(scene: Scene[Top], launch: Launch) -> InversionProblem:
     return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
 
 
-def simulate_airborne(
-    scene: Scene[Top],
-    launch: Launch,
-    t1: float,
-    times: Any,
-    tolerance: float | Float[Array, ""],
-    solver: diffrax.AbstractSolver | None,
-) -> ArenaTrajectory:
+def simulate_airborne(scene: Scene[Top], launch: Launch, t1: float, times: Any, settings: Settings) -> ArenaTrajectory:
     """Simulate one launch of a hybrid scene whose flights are integrated. **Arguments:** as for `simulate`, already
     checked."""
-    batched_modes, first, state = arena_modes((scene, launch), tolerance)
+    batched_modes, first, state = arena_modes((scene, launch), settings.tolerance)
     exact = scene.friction.set_valued
     start = int(np.asarray(first)[0]), np.asarray(state)[:, 0]
-    path = solve_hybrid_dense(batched_modes, *start, t1, Settings(tolerance, solver), counters=1 + exact)
+    path = solve_hybrid_dense(batched_modes, *start, t1, settings, counters=1 + exact)
     status = STATUS[path.status]
     if status == Status.JAMMED:
         status = LOSSES[int(loss(scene, jnp.asarray(path.state)))]
     hops = np.array(
         [(segment.begin, segment.end) for segment in path.mode_segments if segment.number == FLYING]
     ).reshape(-1, 2)
-    run = flights_of(
-        StickSlipArenaTrajectory if exact else ArenaTrajectory, scene, path, status.word, hops, times, tolerance
-    )
+    kind = StickSlipArenaTrajectory if exact else ArenaTrajectory
+    run = flights_of(kind, scene, path, status.word, hops, times, settings.tolerance)
     if exact:
         run.stats["sticks"] = int(path.counts[1])
     return run
 
 
 def sampled_airborne(scene: Scene[Top], launch: Launch, times: Any, t1: Any, settings: Settings) -> ArenaTrajectory:
-    """Simulate one launch of such a scene inside a transformation. **Arguments:** as for `simulate`, already
-    checked."""
+    """Simulate one launch of a hybrid scene inside a transformation, where flights are integrated. **Arguments:** as
+    for `simulate`, already checked."""
     samples = hybrid_samples(arena_modes, (scene, launch), times, t1, settings, counters=1)
     codes = jnp.array([int(status) for status in LOSSES])
     grown = has_grown_between(scene, arena_modes((scene, launch), settings.tolerance), samples, energy_in, settings)

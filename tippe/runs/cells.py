@@ -1,8 +1,7 @@
-"""The cells of an inversion table: how they are run, and the variables of each."""
+"""The cells of an inversion table: run them, and compute the variables of each cell."""
 
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +10,6 @@ from jaxtyping import Array, Bool, Float, Int
 from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import (
     CROSSED,
-    DEFAULT_MAX_STEPS,
     FAILED,
     LEFT_DOMAIN,
     UNRESOLVED,
@@ -70,16 +68,16 @@ def too_many_steps(t1: float, most: int, end: float) -> str:
 
 
 class InversionRuns(NamedTuple):
-    """The requested variables of every cell of a table; see `inversion_table`. `angle` is `None` where reversals are timed."""
+    """The requested variables of every cell of a table; see `inversion_table`. `angle` is `None` for a table of
+    reversal times."""
 
     run_kind: RunKind
     t1: float
     angle: float | None
     crossing: str
-    solver: diffrax.AbstractSolver | None
+    settings: Settings
     method: str
     slopes_by: list[str]
-    max_steps: int = DEFAULT_MAX_STEPS
 
     @property
     def times(self) -> tuple[str, ...]:
@@ -117,21 +115,20 @@ class InversionRuns(NamedTuple):
         }
         return {f"{name}_error": variable for name, variable in variables.items()}
 
-    def results(self, roots: dict[str, Any], columns: dict[str, Any], tolerance: float, count: int) -> dict[str, Any]:
+    def results(self, roots: dict[str, Any], columns: dict[str, Any], count: int) -> dict[str, Any]:
         """The variables of some cells.
 
         **Arguments:** `roots`: scene and launch; `columns`: full name of a parameter -> its value in every cell, of
-        which only the first `count` are run; `tolerance`: relative tolerance.
+        which only the first `count` are run.
         """
         cells = with_numbers(roots, columns)
         scene, launch = cells["scene"], cells["launch"]
         size = next((len(values) for values in columns.values()), 1)
-        settings = Settings(tolerance, self.solver, max_steps=self.max_steps)
-
+        settings = self.settings
         problem = InversionProblem.of(scene, launch, self.angle, size)
 
         def solved(last: bool) -> Any:
-            return Inversions.of(scene, problem, tolerance, last).solve(self.t1, count, settings)
+            return Inversions.of(scene, problem, settings.tolerance, last).solve(self.t1, count, settings)
 
         slopes, grazing = {}, False
         if self.slopes_by:

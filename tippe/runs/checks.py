@@ -37,10 +37,10 @@ def permitted(
 ) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, ""]]:
     """Which cells have legal numbers; the horizons, 0 for the others; and the tolerance of the ensemble.
 
-    One tolerance serves the whole ensemble: the smallest of a batch.
+    The whole ensemble has a single tolerance: the smallest of a batch.
 
-    **Arguments:** `structure`, `leaves`: of scene, launch, angle, horizon and tolerance; `unchecked`: whether some of
-    them were traced when they were checked.
+    **Arguments:** `structure`, `leaves`: structure and leaves of scene, launch, angle, horizon and tolerance;
+    `unchecked`: whether some leaves were traced, so that earlier checks ignored them.
     """
     scene, launch, angle, t1, tolerance = jax.tree.unflatten(structure, leaves)
     may = jnp.asarray(True)
@@ -65,7 +65,8 @@ LISTS = "inversion_table takes lists, and jax.vmap maps over them"
 
 
 def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str = LISTS) -> None:
-    """Raise `ValueError` unless these are a scene, a launch with a place on it, a positive horizon and a tolerance in range.
+    """Raise `ValueError` unless the arguments are a scene, a launch that the scene allows, a positive horizon and a
+    legal tolerance.
 
     **Arguments:** as for `check_numbers`.
     """
@@ -74,11 +75,11 @@ def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str = LIS
 
 
 def check_numbers(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str = LISTS) -> None:
-    """Raise `ValueError` unless these are a scene, a launch, a positive horizon and a tolerance in range, each by
-    itself.
+    """Raise `ValueError` unless the arguments are a scene, a launch, a positive horizon and a legal tolerance; each is
+    checked separately.
 
-    **Arguments:** as for `inversion_time`; `lists`: which functions accept lists instead of single numbers. The
-    parameters of a function, such as that of a `Graph`, may be lists.
+    **Arguments:** as for `inversion_time`; `lists`: the functions that accept lists instead of single numbers, for the
+    message. The parameters of a function, such as that of a `Graph`, may be lists.
     """
     require_kind(scene, "scene", Scene)
     require_kind(launch, "launch", Launch)
@@ -88,7 +89,7 @@ def check_numbers(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str =
 
 
 def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any) -> None:
-    """Warn of a scene without friction, and of a top that stands exactly upright on a level plane.
+    """Warn if the scene has no friction, or if the top stands exactly upright on a level plane.
 
     **Arguments:** `launch`: its theta is ignored; `theta`: one angle or several [rad].
     """
@@ -128,7 +129,7 @@ def check_smooth(scene: Scene, caller: str) -> None:
 
 
 def check_reversible(launch: Launch, values: dict[str, Any]) -> None:
-    """Raise `ValueError` for a launch without spin, which has none to reverse.
+    """Raise `ValueError` for a launch without spin, because there is no spin to reverse.
 
     **Arguments:** `values`: full name of a number -> values in place of the launch's own.
     """
@@ -138,14 +139,14 @@ def check_reversible(launch: Launch, values: dict[str, Any]) -> None:
 
 
 def check_revolution(scene: Scene, caller: str) -> None:
-    """Raise `ValueError` for a body of any shape and inertia, for what needs a body of revolution."""
+    """Raise `ValueError` unless the body is a body of revolution."""
     if isinstance(scene.body, AbstractRigidBody):
         kind = type(scene.body).__name__
         raise ValueError(f"body = {kind} must be a body of revolution, such as a Top, for {caller}")
 
 
 def check_event(angle: Any, crossing: Any, known: tuple[str, ...] = ("first", "last")) -> None:
-    """Raise `ValueError` unless the angle is in (0, pi] and the crossing one of the known words."""
+    """Raise `ValueError` unless the angle is in (0, pi] and the crossing is a known word."""
     require_all(event_bounds(angle))
     if np.ndim(angle) != 0:
         raise ValueError(f"angle must be one number, not of shape {np.shape(angle)}")

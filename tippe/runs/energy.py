@@ -1,4 +1,4 @@
-"""The energy of runs as a check: without a drive it never grows, and friction takes what is missing."""
+"""The energy of runs as a check: without a drive, energy never grows, and it decreases by the work of friction."""
 
 import dataclasses
 from typing import Any
@@ -17,7 +17,7 @@ BALANCED = 1e4
 
 
 def allowance(scene: Scene[Any], energy: Any, tolerance: Any) -> Any:
-    """By how much an energy of some size [J] may be off [J] at a tolerance."""
+    """The allowed error [J] of an energy of the given size [J] at a tolerance."""
     return BALANCED * tolerance * (abs(energy) + scene.body.mass * scene.gravity * scene.body.size)
 
 
@@ -34,7 +34,8 @@ def has_grown(
 
 
 def if_balanced(run: Any, tolerance: float | Float[Array, ""]) -> Any:
-    """A single run, with the status "unresolved" if its energy has grown or differs from what friction and impacts leave."""
+    """A single run, with the status "unresolved" if its energy has grown or does not balance the work of friction and
+    impacts."""
     energy = np.asarray(run.energy)
     most = float(allowance(run.scene, np.max(np.abs(energy)), tolerance))
     balanced = run.stats["energy_residual"] <= most and energy[-1] <= energy[0] + most
@@ -44,7 +45,7 @@ def if_balanced(run: Any, tolerance: float | Float[Array, ""]) -> Any:
 
 
 def why_unbalanced(run: Any) -> str:
-    """Why such a run is "unresolved"."""
+    """The reason why such a run is "unresolved"."""
     energy = np.asarray(run.energy)
     if (gained := energy[-1] - energy[0]) > run.stats["energy_residual"]:
         return f"the energy has grown by {gained:.1e} J, although nothing drives the top"

@@ -21,7 +21,7 @@ from nonholonomic.integration import (
     Status,
     crossing_time,
 )
-from nonholonomic.parameters import numbers, with_numbers
+from nonholonomic.parameters import numbers, readable_unit, with_numbers
 from nonholonomic.progress import status_line
 from nonholonomic.validation import all_bounds, legal
 from nonholonomic.views import Page, Stage, arena
@@ -49,6 +49,7 @@ from ..modes.trajectory_problem import TrajectoryProblem, trajectory_problem
 from .checks import check_revolution, check_run
 from .flight_trajectory import HybridTrajectory, level_modes
 from .launches import LONG_NAMES, UNITS
+from .quantities import QUANTITIES
 from .trajectory import Trajectory, simulate
 from .view import AXIS, BESIDE, Motion, aside, show
 
@@ -76,22 +77,21 @@ def explore(
     sliders: dict[str, tuple[float, float]] | None = None,
     t1: float = 8.0,
 ) -> Page:
-    """Make a page with sliders that simulates the top in the browser while you move a slider.
-
-    The page is one file that needs no network; a notebook shows the returned `Page`. The equations of motion, the Runge-Kutta
-    pair, the step-size control and the location of the event are generated from those of `inversion_table`, so times and
-    statuses are the same, at a tolerance of 1e-7. In the background, a map of inversion times over two of the sliders fills in;
-    click it to set both. The page's address holds the sliders: a copied link opens the same run. Press space to play or pause,
-    r to reset the sliders.
+    """Make a page with sliders that simulates the top in the browser while you move a slider. The page is one file that
+    needs no network; a notebook shows the returned `Page`. The equations of motion, the Runge-Kutta pair, the step-size
+    control and the location of the event are generated from those of `inversion_table`, so times and statuses are the
+    same, at a tolerance of 1e-7. The page also computes a map of inversion times over two of the sliders; click on the
+    map to set both. The address of the page contains the slider values, so that you can copy a link to a run. Press
+    space to play or pause, and r to reset the sliders.
 
     **Arguments:**
 
-    - `scene`, `launch`: the run at the start, every number a scalar; `contact` must be "stop" unless the arena is a level
-      plane, and the friction law must have a single mode.
+    - `scene`, `launch`: the run at the start; all numbers must be scalars; `contact` must be "stop" unless the arena is
+      a level plane, and the friction law must have a single mode.
     - `path`: file to write the page to, or `None`.
     - `sliders`: name of a parameter -> (lowest, highest) value. The end of a name is enough if only one parameter
       matches, such as "theta", "spin", "mu", "friction.mu" or "offset". By default theta, spin, the coefficient of
-      friction and, of a top without a stem, the offset.
+      friction and, for a top without a stem, the offset.
     - `t1`: horizon [s].
 
     **Returns:** a `Page`, with its `html`.
@@ -147,14 +147,17 @@ def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float
         allowed=allowed,
         answer=Answer("inversion time", "s", answer),
         motion=motion,
-        summaries=(Summary("energy", "J", 1), Summary("Jellett's constant", "kg m²/s", 2)),
+        summaries=tuple(
+            Summary(QUANTITIES[name].long_name, readable_unit(QUANTITIES[name].unit), row)
+            for row, name in enumerate(("energy", "jellett"), start=1)
+        ),
     )
 
 
 def smooth_simulators(
     modules: Callable[[Numbers], tuple[Scene, Launch]], t1: float, settings: Settings
 ) -> tuple[Simulator, Simulator]:
-    """The simulators of a run of one smooth motion: to its inversion, and of the drawn run."""
+    """The simulators of a smooth run: one up to the inversion, and one for the drawn run."""
 
     def moment(values: Numbers, problem: TrajectoryProblem, lane: LaneState) -> Frame:
         return smooth_frame(modules(values)[0], problem, lane)
@@ -258,7 +261,7 @@ def stage_of_runs(scene: Scene, launch: Launch, knobs: tuple[Slider, ...], t1: f
 
 
 def stage_at_start(scene: Scene[Top], launch: Launch, t1: float) -> Stage:
-    """A top on a level plane at its launch: the page simulates before it shows anything."""
+    """A top on a level plane at its launch; the page replaces it by a simulated run before it is visible."""
     start = Motion(*(np.repeat(np.asarray(part), 2, axis=0) for part in _motion_at_start(scene, launch)))
     drawn, size = show(scene, start._replace(times=np.array([0.0, 1.0])), 0, ""), float(scene.body.size)
     # Slips grow as the top rises: an arrow half as fast as the equator has the greatest length.
@@ -295,7 +298,7 @@ def hybrid_frame(scene: Scene, number: Int[Array, "1"], rows: Float[Array, "17 1
 def hybrid_run(
     scene: Scene[Top], number: Int[Array, "1"], rows: Float[Array, "17 1"], time: Float[Array, "1"]
 ) -> HybridTrajectory:
-    """The only time of a run in contact or in flight."""
+    """A run in contact or in flight, at a single time."""
     states, place, spin_angle, work, distance = HybridTrajectory.parts_of(rows)
     ends = (0, time[0], {}, None, distance, number, None)
     kind: Any = HybridTrajectory
@@ -303,7 +306,7 @@ def hybrid_run(
 
 
 def frame(scene: Scene, run: Any) -> Frame:
-    """The drawn quantities of a top at the only time of a run, in the order of `view.show`."""
+    """The drawn quantities of a top for a run with a single time, in the order of `view.show`."""
     motion = Motion(*(part[0] for part in Motion.of(run)))
     radius = scene.body.size
     lifted = motion.contact + 0.02 * radius * motion.normal

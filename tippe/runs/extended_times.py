@@ -15,7 +15,7 @@ from nonholonomic.derivatives import (
     in_groups,
     tangents_by,
 )
-from nonholonomic.integration import CROSSED, FAILED, MOST_STEPS, LaneScheduler, Settings, crossing_time
+from nonholonomic.integration import CROSSED, FAILED, MOST_STEPS, Settings, crossing_time, traced_solve_ensemble
 from nonholonomic.progress import status_line
 from nonholonomic.validation import as_number, is_traced
 from nonholonomic.xla_cpu import greatest, least
@@ -39,19 +39,16 @@ def extended_inversion_time(
     tolerance: float | Float[Array, ""] = 1e-8,
 ) -> Float[Array, ""]:
     """Inversion time, continued beyond the horizon so that a loss function is finite everywhere and its slope leads
-    back.
-
-    A top that is at theta at `t1` or at its loss of contact, without having inverted, counts as inverting at t1 (1 +
-    log(angle / theta) / C), C = log(angle / theta at the launch), at least 1. Where theta grows as exp(s t), as it does
-    from small angles, this is the tangent to the time C / s, taken at the rate s that arrives exactly at `t1`:
-    continuous with its slope where a time passes the horizon, and linear in the rate beyond. This is a penalty, not a
-    prediction. The function works under `jit`, `vmap`, `grad`, `jvp` and their compositions; the derivative is that of
-    the event's time (implicit function theorem) and of the penalty, with respect to every number except `t1` and
-    `tolerance`.
+    back to inversion. If a top has not inverted and is at theta at `t1` or at its loss of contact, the result is t1 (1
+    + log(angle / theta) / C), C = log(angle / theta at the launch), at least 1. This is a penalty, not a prediction.
+    For theta that grows as exp(s t), as it does from small angles, the penalty is linear in the rate s, and continues
+    the time C / s with the same value and slope at `t1`. The function works under `jit`, `vmap`, `grad`, `jvp` and
+    their compositions; the derivative is that of the event's time (implicit function theorem) and of the penalty, with
+    respect to every number except `t1` and `tolerance`.
 
     **Arguments:**
 
-    - `scene`, `launch`, `t1`, `angle`: as for `inversion_time`, every number a scalar.
+    - `scene`, `launch`, `t1`, `angle`: as for `inversion_time`; all numbers must be scalars.
     - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
 
     **Returns:** the time [s]; NaN where the integration failed or numbers inside a transformation are out of range.
@@ -121,10 +118,9 @@ class ExtendedSolve(AbstractDifferentiableSolve):
         varied = VariationalProblem(problem, tangents, True)
         # A fit may try parameters that are far off.
         settings = Settings(tolerance, max_steps=MOST_STEPS)
-        queue = LaneScheduler.of(
+        outcome, _ = traced_solve_ensemble(
             varied, t1, jnp.asarray(cells), settings, one_kernel=not nested, n_blocks=1 + len(tangents)
         )
-        outcome, _ = queue.outcome()
         state, *variations = varied.parts(outcome.state)
         crossed = outcome.status == CROSSED
 

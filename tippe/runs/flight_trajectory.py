@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -45,23 +44,23 @@ STATUS = {
 class HybridTrajectory(AbstractTrajectory):
     """A run through contacts, flights and impacts; vectors are arrays (times, 3) in the fixed frame (x, y, z).
 
-    `status` is "completed", "jammed" (as in `Trajectory`), "failed" or "unresolved" (more than 10 000 flights in a
-    row or 2000 contacts; sphere and stem on the plane together with so much friction that the forces are not
-    determined; sphere and stem at rest together on another arena, where the equations of both contacts at once are
-    not implemented; a flight that does not end at the arena; an energy that grows, or does not balance, by more than
-    1e4 times the tolerance, relative to the energy); the run ends at `end_time`, and `print(run)` says why it is
-    unresolved. `contact` is the sphere that touches at each time: 0 the top's, 1 its stem's, 2 both, -1 none. At the
-    time of an impact, values are those before the impact. `distance` is the distance of the top's own sphere from the
-    plane [m] with its rate [m/s]. `hops` has a row for each flight until `end_time`, with its start and end [s]; a
-    table counts only the flights before the inversion. Bounces that shrink by the restitution e are followed down to
-    a speed of 1e-5 sqrt(g R); after that the top counts as in contact, although the remaining bounces would take e /
-    (1 - e) of the last one's time. `work` is the work of friction and of the impacts [J]. `stats` holds accepted and
-    rejected steps, the greatest drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in
-    impacts [J]. `rotation` and `angular_velocity` are those of `Trajectory`.
+    `status` is "completed", "jammed" (as in `Trajectory`), "failed" or "unresolved" (more than 10 000 flights in a row
+    or 2000 contacts; sphere and stem on the plane together with so much friction that the forces are not determined;
+    sphere and stem at rest together on another arena, where the equations of both contacts at once are not implemented;
+    a flight that does not end at the arena; an energy that grows, or does not balance, by more than 1e4 times the
+    tolerance, relative to the energy); the run ends at `end_time`, and `print(run)` states why it is unresolved.
+    `contact` is the sphere that touches at each time: 0 for the top's sphere, 1 for the stem's, 2 for both, -1 for
+    none. At the time of an impact, values are those before the impact. `distance` is the distance of the top's own
+    sphere from the plane [m] with its rate [m/s]. `hops` has a row for each flight until `end_time`, with its start and
+    end [s]; a table counts only the flights before the inversion. Bounces that shrink by the restitution e are followed
+    down to a speed of 1e-5 sqrt(g R); after that the top counts as in contact, although the remaining bounces would
+    take e / (1 - e) of the duration of the last bounce. `work` is the work of friction and of the impacts [J]. `stats`
+    holds accepted and rejected steps, the greatest drift of |e|, the greatest energy residual |E - E(0) - work| and the
+    energy lost in impacts [J]. `rotation` and `angular_velocity` are those of `Trajectory`.
 
     Inside a transformation `status` is the integer of the `Status`; `hops` is `None`, `stats["hops"]` counts the
-    flights. First derivatives by the scene and the launch go through flights and impacts; they are NaN after a grazing
-    event, which may not happen within the tolerance.
+    flights. First derivatives with respect to the scene and the launch pass through flights and impacts. They are NaN
+    after a grazing event, because within the tolerance such an event may not happen.
 
     **Example:**
 
@@ -125,15 +124,15 @@ class HybridTrajectory(AbstractTrajectory):
 
     @of_each_run
     def normal_force(self) -> Float[Array, " times"]:
-        """Normal force [N]; 0 in flight. If both spheres touch, it is the sum of both, the weight."""
+        """Normal force [N]; 0 in flight. If both spheres touch, this is the sum of both forces, the weight."""
         motion = standing_on(self.scene.dynamics, self._ball).motion(self._states)
         both = jnp.where(self.contact == BOTH, self.scene.body.mass * self.scene.gravity, motion.normal_force)
         return jnp.where(self.contact < 0, 0.0, both)
 
     @of_each_run
     def slip(self) -> Float[Array, "times 2"]:
-        """Velocity along the plane of the lowest point of the sphere that touches [m/s]: of the top's own in flight,
-        and if both touch."""
+        """Velocity along the plane of the lowest point of the sphere that touches [m/s]; of the top's own sphere in
+        flight and if both touch."""
         return jnp.stack(approach(self.scene.body, self._ball, self._free).velocity[:2], axis=-1)
 
     def resampled(self, times: Float[np.ndarray, " times"]) -> "HybridTrajectory":
@@ -153,7 +152,7 @@ class HybridTrajectory(AbstractTrajectory):
 
     @staticmethod
     def work_in(piece: Segment) -> float:
-        """The work [J] of friction in a segment of the path, without that of impacts."""
+        """The work [J] of friction in a segment of the path, without the work of impacts."""
         return 0.0 if piece.number == BETWEEN else piece.motion.states[-1, -1] - piece.motion.states[-1, 0]
 
     @staticmethod
@@ -202,21 +201,14 @@ def _start(scene: Scene[Top], launch: Launch) -> InversionProblem:
     return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
 
 
-def simulate_hybrid(
-    scene: Scene[Top],
-    launch: Launch,
-    t1: float,
-    times: Any,
-    tolerance: float | Float[Array, ""],
-    solver: diffrax.AbstractSolver | None,
-) -> HybridTrajectory:
+def simulate_hybrid(scene: Scene[Top], launch: Launch, t1: float, times: Any, settings: Settings) -> HybridTrajectory:
     """Run one launch of a hybrid scene until `t1`. **Arguments:** as for `simulate`, already checked."""
-    batched_modes, first, state = level_modes((scene, launch), tolerance)
+    batched_modes, first, state = level_modes((scene, launch), settings.tolerance)
     start = int(np.asarray(first)[0]), np.asarray(state)[:, 0]
-    path = solve_hybrid_dense(batched_modes, *start, t1, Settings(tolerance, solver), counters=1)
+    path = solve_hybrid_dense(batched_modes, *start, t1, settings, counters=1)
     flights = [(segment.begin, segment.end) for segment in path.segments if segment.number == BETWEEN]
     hops = np.array(flights).reshape(-1, 2)
-    return flights_of(HybridTrajectory, scene, path, STATUS[path.status].word, hops, times, tolerance)
+    return flights_of(HybridTrajectory, scene, path, STATUS[path.status].word, hops, times, settings.tolerance)
 
 
 def sampled_hybrid(scene: Scene[Top], launch: Launch, times: Any, t1: Any, settings: Settings) -> HybridTrajectory:
@@ -229,8 +221,8 @@ def sampled_hybrid(scene: Scene[Top], launch: Launch, times: Any, t1: Any, setti
 def has_grown_between(scene: Scene[Top], built: Any, samples: HybridSamples, energies: Any, settings: Settings) -> Any:
     """Whether a sampled run has ended with more energy than it began with.
 
-    **Arguments:** `built`: modes, number of the first, and state; `energies`: gives the least and the greatest energy of a
-    state in a mode.
+    **Arguments:** `built`: the modes, the index of the first mode, and the state; `energies`: function that returns the
+    least and the greatest energy of a state in a mode.
     """
     _, first, state = built
     after, _ = energies(scene, samples.end_state[:, None], samples.end_mode[None].astype(int))
@@ -245,8 +237,8 @@ def sampled_flights(
     lost: Int[Array, ""],
     grown: Bool[Array, ""],
 ) -> Any:
-    """A trajectory of some kind from samples; `lost` is the code of how a run ended that left its domain, and `grown` whether
-    it has gained energy.
+    """A trajectory of the given class from samples. `lost` is the status code for a run that left its domain, and
+    `grown` whether the run has gained energy.
     """
     states, place, spin_angle, work, distance = kind.parts_of(samples.shown)
     # After the end, no sphere touches.

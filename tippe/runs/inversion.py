@@ -70,7 +70,7 @@ class Inversions(eqx.Module):
 
     - `problem`: the smooth motion, and the initial states of all cells.
     - `modes`, `first`: the modes of a hybrid run, and the index of each cell's first mode; `None` for smooth runs.
-    - `last`: whether a run continues through the angle: where it ends above it, the last crossing counts.
+    - `last`: whether a run continues through the angle; if it ends above the angle, the last crossing counts.
     """
 
     problem: InversionProblem
@@ -81,7 +81,7 @@ class Inversions(eqx.Module):
 
     @classmethod
     def of(cls, scene: Scene[Any], problem: InversionProblem, tolerance: Any, last: bool) -> "Inversions":
-        """The launches of a problem of this scene, to be run at a tolerance."""
+        """Launches in a scene, for runs at a tolerance."""
         kind = run_kind_of(scene)
         modes, first = (None, None) if kind.modes is None else kind.modes(scene, problem, tolerance, last)
         return cls(problem, modes, first, kind, last)
@@ -103,10 +103,10 @@ class Inversions(eqx.Module):
         settings: Settings,
         solvers: Solvers = ON_HOST,
     ) -> tuple[Outcome | HybridOutcome, Sequence[Any], Any]:
-        """The outcome of the runs, and the derivatives of their crossing times along some tangents.
+        """The outcome of the runs, and the derivatives of their crossing times along tangents.
 
-        **Returns:** the outcome; for each tangent the derivative in every cell, 0 if there is no crossing or if it is
-        at the start; and the cells whose derivative is NaN because an earlier event was grazing.
+        **Returns:** the outcome; for each tangent the derivative in every cell, 0 if there is no crossing or the
+        crossing is at the start; and the cells whose derivative is NaN because an earlier event was grazing.
         """
         if self.modes is None:
             arguments = (tuple(tangent.problem for tangent in tangents), jnp.asarray(t1), jnp.asarray(cells), settings)
@@ -134,8 +134,8 @@ class Inversions(eqx.Module):
 def checked(
     scene: Scene[Any], problem: InversionProblem, outcome: Outcome | HybridOutcome, tolerance: Float[Array, ""]
 ) -> Any:
-    """The outcome with all states in the layout of a contact, those of flight too, and unresolved where a run has ended with
-    more energy than it began with, which friction cannot do (`energy.py`).
+    """The outcome with all states, including those in flight, in the layout of a contact. Runs that end with more
+    energy than they began with are unresolved (`energy.py`).
     """
     kind = run_kind_of(scene)
     first: Any = None if kind.modes is None else kind.modes(scene, problem, tolerance, False)[1]
@@ -148,8 +148,8 @@ def checked(
 
 
 def is_inverted(outcome: Outcome | HybridOutcome, problem: InversionProblem, last: bool) -> Bool[Array, " cells"]:
-    """The cells that count as inverted: those that reached the angle, or those that end above it if the last crossing
-    counts."""
+    """The cells that count as inverted: the top reached the angle or, if the last crossing counts, ends above the
+    angle."""
     if not last:
         return outcome.status == CROSSED
     above = problem.event_function(jnp.asarray(outcome.state)) <= 0.0

@@ -39,31 +39,32 @@ def inversion_time(
 ) -> Float[Array, ""]:
     """Time at which theta reaches an angle; works under `jit`, `vmap`, `grad`, `jvp` and their compositions.
 
-    The derivative is that of the event's time by the implicit function theorem; it is 0 if the result is infinite. The
-    time and its derivative with respect to one parameter cost about three times the time alone; two parameters cost
-    five times, three or four seven to ten times, and more parameters eight to thirteen times
-    (`nonholonomic/derivatives/slopes.py`); second derivatives take forward-mode passes.
+    The derivative comes from the implicit function theorem at the event; it is 0 if the result is infinite. Together
+    with derivatives, a time costs about three times as much for one parameter, five times for two, seven to ten times
+    for three or four, and eight to thirteen times for more (`nonholonomic/derivatives/slopes.py`). Second derivatives
+    take forward-mode passes.
 
     **Arguments:**
 
-    - `scene`, `launch`: as for `simulate`, every number a scalar.
+    - `scene`, `launch`: as for `simulate`; all numbers must be scalars.
     - `t1`: horizon [s], positive.
     - `angle`: angle [rad] to be reached, in (0, pi].
     - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
-    - `crossing`: "first" for the first time theta reaches the angle, "last" for the up-crossing after which theta stays
-      above it until `t1`.
+    - `crossing`: "first" for the first time theta reaches the angle, "last" for the crossing after which theta stays
+      above the angle until `t1`.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
       `nonholonomic.integration.Oscillatory8()`.
 
-    **Returns:** the time [s]; infinite if the top has not inverted by `t1`, or has lost contact or jammed before; NaN
+    **Returns:** the time [s]; infinite if the top has not inverted by `t1`, or loses contact or jams before; NaN
     if the integration failed, if the run is unresolved, or if numbers inside a transformation are out of range.
 
     With `contact="hybrid"` and `SetValuedCoulomb`, first derivatives include flights, impacts, stick and slip
-    (`nonholonomic/hybrid/saltation.py`). If an earlier event is grazing, so that it may not happen within the
-    tolerance, the derivative is NaN; the variable `grazes` of `inversion_table` reports this.
+    (`nonholonomic/hybrid/saltation.py`). If an earlier event is grazing (within the tolerance, it may not happen), the
+    derivative is NaN; the variable `grazes` of `inversion_table` reports this.
 
     **Raises:** `ValueError` for arguments outside these ranges, for a run that needs more than 2 000 000 steps, for
-    second derivatives through changes of mode, and for derivatives with both, because an impact may stop a slip.
+    second derivatives through changes of mode, and for derivatives with both `contact="hybrid"` and `SetValuedCoulomb`,
+    because an impact may stop a slip.
 
     **Example:**
 
@@ -79,10 +80,10 @@ def inversion_time(
     """
     check_run(scene, launch, t1, tolerance)
     check_event(angle, crossing)
-    method = Settings(tolerance, solver).for_lanes
-    explicit_tableau(method)
+    settings = Settings(tolerance, solver)
+    explicit_tableau(settings.for_lanes)
     warn_if_it_cannot_invert(scene, launch, launch.theta)
-    return first_or_last_time(scene, launch, t1, as_number(angle), tolerance, crossing, method)
+    return first_or_last_time(scene, launch, t1, as_number(angle), crossing, settings)
 
 
 def first_or_last_time(
@@ -90,22 +91,21 @@ def first_or_last_time(
     launch: Launch,
     t1: float,
     angle: Float[Array, ""] | None,
-    tolerance: float,
     crossing: str,
-    method: diffrax.AbstractSolver,
+    settings: Settings,
 ) -> Float[Array, ""]:
-    """The time of a launch's event: that theta reaches an angle, or, without one, that the spin about the normal reverses.
+    """The time at which theta reaches an angle, or, without an angle, at which the spin about the normal reverses.
 
     **Arguments:** as for `inversion_time`, checked.
     """
-    leaves, structure = jax.tree.flatten((scene, launch, angle, as_number(t1), as_number(tolerance)))
+    leaves, structure = jax.tree.flatten((scene, launch, angle, as_number(t1), settings.tolerance))
     unchecked = any(is_traced(leaf) for leaf in leaves)
     # The last two leaves, horizon and tolerance, do not affect the event.
-    solve = InversionSolve(len(leaves) - 2, structure, method, crossing == "last", unchecked)
+    solve = InversionSolve(len(leaves) - 2, structure, settings.with_tolerance(None), crossing == "last", unchecked)
     time = differentiable_solve(solve, *leaves)
     if not is_traced(time) and not unchecked and np.isnan(time):
         known = None if angle is None else np.asarray(angle).item()
-        explain_failure(scene, launch, float(t1), known, float(tolerance), crossing, method)
+        explain_failure(scene, launch, float(t1), known, crossing, settings)
     return nan_if_illegal(time, structure, unchecked, leaves)
 
 
@@ -114,20 +114,17 @@ def explain_failure(
     launch: Launch,
     t1: float,
     angle: float | None,
-    tolerance: float,
     crossing: str,
-    solver: diffrax.AbstractSolver,
+    settings: Settings,
 ) -> None:
     """Raise `ValueError` for a run that needed too many steps; warn of any other failure. This repeats the run to find
     the cause.
 
     **Arguments:** as for `inversion_time`.
     """
-    most = Settings(tolerance, solver).max_steps
-    runs = InversionRuns(run_kind_of(scene), t1, angle, crossing, solver, "ensemble", [], most)
-    cell = {
-        name: values[0] for name, values in runs.results({"scene": scene, "launch": launch}, {}, tolerance, 1).items()
-    }
+    most = settings.max_steps
+    runs = InversionRuns(run_kind_of(scene), t1, angle, crossing, settings, "ensemble", [])
+    cell = {name: values[0] for name, values in runs.results({"scene": scene, "launch": launch}, {}, 1).items()}
     word = runs.run_kind.words[cell["status"]]
     if word == "failed" and cell["steps"] >= most:
         raise ValueError(too_many_steps(t1, most, cell["end_time"]))
@@ -147,7 +144,8 @@ class InversionSolve(AbstractDifferentiableSolve):
     movable: int
     # JAX's PyTreeDef, which type checkers take for a variable.
     structure: Any = eqx.field(static=True)
-    solver: diffrax.AbstractSolver
+    # Without the tolerance.
+    settings: Settings
     last: bool = eqx.field(static=True)
     # Whether some numbers were traced and therefore could not be checked.
     unchecked: bool = eqx.field(static=True)
@@ -158,7 +156,7 @@ class InversionSolve(AbstractDifferentiableSolve):
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         inversions = self._inversions((*leaves[: self.movable], tolerance), cells)
-        outcome = inversions.solve(t1, cells, Settings(tolerance, self.solver), traced())
+        outcome = inversions.solve(t1, cells, self.settings.with_tolerance(tolerance), traced())
         return self._times(leaves, may, tolerance, inversions, outcome, [])[0]
 
     def value_and_tangents(
@@ -173,7 +171,7 @@ class InversionSolve(AbstractDifferentiableSolve):
             raise ValueError(
                 "second derivatives are not available through changes of mode: contact = 'hybrid', SetValuedCoulomb"
             )
-        settings, solvers = Settings(tolerance, self.solver), traced(one_kernel=not nested)
+        settings, solvers = self.settings.with_tolerance(tolerance), traced(one_kernel=not nested)
         outcome, slopes, _ = inversions.solve_with_tangents(tangents, t1, cells, settings, solvers)
         return self._times(leaves, may, tolerance, inversions, outcome, gather([*slopes]))
 

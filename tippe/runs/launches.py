@@ -71,15 +71,15 @@ def launches(
 
     **Arguments:**
 
-    - `scene`: the scene, every number a scalar.
-    - `launch_values`: parameter of the launch, or "mu" for the scene's friction (`None` for its own value) -> a number
-      or a list.
+    - `scene`: the scene; all its numbers must be scalars.
+    - `launch_values`: parameter of the launch, or "mu" for the scene's friction -> a number or a list; `None` keeps the
+      scene's own `mu`.
     - `axes`: full name of a parameter, or its unambiguous end -> values, or `None`; the numbers of a launch's vectors
-      are `"launch.place[0]"` and so on, and omitted ones are 0.
+      are `"launch.place[0]"` and so on; omitted numbers are 0.
     - `t1`, `tolerance`: as for `inversion_table`.
-    - `taken`: names that no axis may have; such an axis gets its full name, as do axes that would share a name.
-    - `scattered`: whether the lists have equal length and are combined element by element: the k-th of each for the
-      k-th cell.
+    - `taken`: names that no axis may have. An axis gets its full name if its short name is taken or not unique.
+    - `scattered`: whether the lists have equal length and are combined element by element: the k-th cell has the k-th
+      element of each list.
 
     **Returns:** "scene" and "launch" with the numbers that are not axes, for `with_numbers`; the axes, the last varying
     fastest; and the units of numbers by their short names.

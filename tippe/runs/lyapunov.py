@@ -31,10 +31,11 @@ class LyapunovExponent(NamedTuple):
     """The largest Lyapunov exponent of a run, or of each of several.
 
     - `exponent`: mean rate [1/s] of exponential divergence in the second half of the run; NaN if the run ended early.
-    - `error`: of the exponent [1/s]; an exponent below twice its error does not indicate chaos.
+    - `error`: error of the exponent [1/s]; an exponent below twice its error does not indicate chaos.
     - `status`: "completed", "contact_lost", "jammed", "does_not_fit" or "failed".
     - `end_time`: time at which the run ended [s]; `steps`: numbers of accepted and rejected steps.
-    - `times`: [s], (32,), and `running`: the mean rate of divergence [1/s] from the start to each of them, (32, ...).
+    - `times`: 32 times [s], (32,); `running`: the mean rate of divergence [1/s] from the start to each of these times,
+      (32, ...).
 
     **Example:**
 
@@ -68,13 +69,13 @@ def lyapunov_exponent(
 ) -> LyapunovExponent:
     """The largest Lyapunov exponent of one launch or of many at once, by the variational equation.
 
-    The exponent is positive if nearby launches diverge exponentially. While a top rises, it is the rate of the rise; in
-    chaotic motion it stays positive as `t1` grows. Source: Benettin et al., Meccanica 15 (1980) 9; see
-    `nonholonomic/derivatives/lyapunov.py`.
+    The exponent is positive if nearby launches diverge exponentially. While a top rises, the exponent is the rate of
+    the rise; in chaotic motion, the exponent stays positive as `t1` grows. Source: Benettin et al., Meccanica 15 (1980)
+    9; see `nonholonomic/derivatives/lyapunov.py`.
 
     **Arguments:**
 
-    - `scene`, `launch`: every number a scalar or one per launch, of shape (n,).
+    - `scene`, `launch`: each number is a scalar or an array with one number per launch, (n,).
     - `t1`: time [s] to follow the motion, positive.
     - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default

@@ -36,7 +36,8 @@ NEAR, LOOKS = 0.3, 8
 def of_each_run(function: Callable[[Any], Array]) -> property:
     """A property of one run that is also defined for a batch of runs from `vmap`, run by run.
 
-    Outside transformations it is compiled for powers of two only, because every run has a different number of steps.
+    Outside transformations, the property is compiled only for numbers of times that are powers of two, because runs
+    differ in their numbers of steps.
     """
     compiled = eqx.filter_jit(function)
 
@@ -59,7 +60,7 @@ def unit(vectors: Float[Array, "times 3"]) -> Float[Array, "times 3"]:
 class AbstractTrajectory(Viewable, Tabular, eqx.Module):
     """A run at its times `t`: states as in `tippe/model/dynamics.py`, the path on the arena, spin angle [rad] and work [J].
 
-    Vectors are arrays (times, 3) in the fixed frame (x, y, z); `Trajectory` says more.
+    Vectors are arrays (times, 3) in the fixed frame (x, y, z); see `Trajectory`.
     """
 
     t: eqx.AbstractVar[Float[Any, " times"]]
@@ -112,10 +113,8 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
 
     @property
     def inversion_time(self) -> float:
-        """Time [s] at which theta first reaches 0.95 pi, like `tippe.inversion_time`; infinite if it does not by the
-        end.
-
-        It is located on the run's dense output, to the tolerance of the run.
+        """Time [s] at which theta first reaches 0.95 pi, like `tippe.inversion_time`; infinite if theta does not reach
+        this angle by the end. The time is located on the run's dense output, to the tolerance of the run.
 
         **Raises:** `ValueError` for a run that was made inside a transformation, and for a batch.
         """
@@ -194,7 +193,7 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
     @of_each_run
     def jellett(self) -> Float[Array, " times"]:
         """Jellett's quantity of the top's own sphere [kg m^3/s]; constant on the plane while friction acts at a point
-        of that sphere, so not while a stem touches."""
+        of this sphere, but not while a stem touches."""
         return self.scene.jellett(self.states)
 
     def at(self, times: Float[ArrayLike, " times"]) -> Self:
@@ -242,8 +241,9 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
 
     @of_each_run
     def rotation(self) -> Float[Array, "times 3 3"]:
-        """Rotation from the body to the fixed frame: its columns are the body's axes, and the third is e. At the start,
-        the first is de/dtheta, which points from e away from the arena's normal, but for an `Ellipsoid` or a `RigidBody`."""
+        """Rotation from the body to the fixed frame: its columns are the body's axes, and the third is e. For bodies of
+        revolution, the first axis is de/dtheta at the start: the direction across e that leads away from the arena's
+        normal."""
         # Step errors change the unit length of both vectors and their right angle.
         if isinstance(self.scene.body, AbstractRigidBody):
             e, x = unit(self.axis), self._fixed(tuple(self.states[-3:]))

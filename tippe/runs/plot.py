@@ -11,7 +11,7 @@ Values = Float[np.ndarray, "..."]
 class Panel(NamedTuple):
     """One arena and place: its title, times [s], theta [rad] of every launch (launches, times), and theta(0).
 
-    Where the times are too far apart to show nutation, the values are not `joined` by lines.
+    If the times are too far apart to show nutation, `joined` is false, and no lines join the values.
     """
 
     title: str

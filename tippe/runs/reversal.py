@@ -64,9 +64,9 @@ def reversal_time(
     check_run(scene, launch, t1, tolerance, "reversal_table takes lists, and jax.vmap maps over them")
     require_rigid(scene)
     check_reversible(launch, {})
-    method = Settings(tolerance, solver).for_lanes
-    explicit_tableau(method)
-    return first_or_last_time(scene, launch, t1, None, tolerance, "first", method)
+    settings = Settings(tolerance, solver)
+    explicit_tableau(settings.for_lanes)
+    return first_or_last_time(scene, launch, t1, None, "first", settings)
 
 
 def reversal_table(

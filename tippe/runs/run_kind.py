@@ -17,9 +17,9 @@ from ..modes import airborne, airborne_ends, airborne_stem, airborne_stick_slip,
 class RunKind(NamedTuple):
     """How to run a kind of scene: its status words, its counters besides steps, and its modes.
 
-    `modes` takes (scene, problem, tolerance, last) and returns the modes and the number of each cell's first; `None`
-    for runs of one smooth motion. `energy_in` takes (scene, state, mode) and returns the least and the greatest energy [J] that
-    the state may have. `flight_state` is whether states may be those of flight, in a layout of their own.
+    `modes` is a function of (scene, problem, tolerance, last) that returns the modes and the index of each cell's first
+    mode; `None` for smooth runs. `energy_in` is a function of (scene, state, mode) that returns the least and the
+    greatest energy [J] that the state may have. `flight_state` is true if states in flight have another layout.
     """
 
     words: tuple[str, ...]
@@ -63,12 +63,18 @@ WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_n
 SMOOTH = RunKind(WORDS, (), None, energy_of_state)
 REVERSAL = RunKind(("reversed", "not_reversed", *WORDS[2:]), (), None, energy_of_state)
 STICK_SLIP = RunKind(WORDS, ("sticks",), sticking.modes, sticking.energy_in)
+STICK_SLIP_REVERSAL = STICK_SLIP._replace(words=REVERSAL.words)
 HYBRID = RunKind(WORDS, ("hops",), sliding.modes, free_body.energy_in)
 AIRBORNE = RunKind(WORDS, ("hops",), airborne.modes, airborne_ends.energy_in, flight_state=True)
 ON_STEM_TOO = RunKind(WORDS, ("hops",), airborne_stem.modes, airborne_ends.energy_in, flight_state=True)
 STICK_SLIP_FLY = RunKind(
     WORDS, ("hops", "sticks"), airborne_stick_slip.modes, airborne_ends.energy_in, flight_state=True
 )
+
+
+def reversal_kind_of(scene: Scene[Any]) -> RunKind:
+    """The run kind of a scene until the spin about the normal reverses."""
+    return STICK_SLIP_REVERSAL if scene.friction.set_valued else REVERSAL
 
 
 def run_kind_of(scene: Scene[Any]) -> RunKind:
@@ -84,7 +90,7 @@ def run_kind_of(scene: Scene[Any]) -> RunKind:
 
 
 def why_unresolved(kind: RunKind) -> str:
-    """Why a run of some kind may be unresolved."""
+    """The reasons why a run of this kind may be unresolved."""
     grown = (
         "its energy has grown by more than the tolerance allows, although nothing drives the top: the law of friction pushes "
         "it, or the arena's heights do not fit its normals"

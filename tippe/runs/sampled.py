@@ -24,7 +24,7 @@ def ended(
     failed: Bool[Array, "..."],
     tolerance: float | Float[Array, ""],
 ) -> Int[Array, "..."]:
-    """The `Status` of a run that ended in some state, as an integer: unresolved if it has gained energy (`energy.py`)."""
+    """The `Status` of a run that has ended, as an integer: unresolved if the run has gained energy (`energy.py`)."""
     state = state[: run.leading]
     lost = jnp.array([int(status) for status in LOSSES])[run.problem.dynamics.loss(state)]
     grown = has_grown(scene, scene.energy(run.problem.states), scene.energy(state), tolerance)

@@ -20,7 +20,7 @@ from .inversion import Inversions
 def sensitivity_names(roots: dict[str, Any], names: Any) -> list[str]:
     """The full names of the parameters to differentiate by.
 
-    **Arguments:** `roots`: the table's scene and launch; `names`: full names, or their unambiguous ends.
+    **Arguments:** `roots`: the table's scene and launch; `names`: full names, or ends of names that are unique.
 
     **Raises:** `ValueError` unless `names` is a list of such names.
     """
@@ -43,7 +43,7 @@ def sensitivity_columns(names: list[str]) -> list[str]:
 
 
 def sensitivity_variables(names: list[str], units: dict[str, str], event: str = "inversion") -> dict[str, Variable]:
-    """The table's variables, with their units; `event`: what is timed."""
+    """The table's variables, with their units; `event`: description of the event."""
 
     def unit(name: str) -> str:
         of_number = units.get(name.rsplit(".", 1)[-1], "1")

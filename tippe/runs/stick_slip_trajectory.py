@@ -12,7 +12,7 @@ def solve_stick_slip_dense(run: TrajectoryProblem, t1: float, settings: Settings
 
     **Arguments:**
 
-    - `run`: of a scene with `SetValuedCoulomb`.
+    - `run`: a run in a scene with `SetValuedCoulomb`.
     - `t1`, `settings`: as for `follow`.
 
     **Returns:** a `HybridPath`, whose counts include the changes from slip to rolling.

@@ -12,13 +12,13 @@ import numpy as np
 
 from nonholonomic.integration import DEFAULT_MAX_STEPS, Settings, explicit_tableau
 from nonholonomic.sweeps import Axis, Table, Variable, sweep
-from nonholonomic.validation import require_flag, require_outside, require_whole
+from nonholonomic.validation import as_number, require_flag, require_outside, require_whole
 
 from ..model.scene import Scene
 from .cells import InversionRuns, too_many_steps
 from .checks import check_event, check_reversible, warn_if_it_cannot_invert
 from .launches import described, launches, rows
-from .run_kind import REVERSAL, RunKind, check_differentiable, run_kind_of, why_unresolved
+from .run_kind import RunKind, check_differentiable, reversal_kind_of, run_kind_of, why_unresolved
 from .sensitivities import sensitivity_names, sensitivity_variables
 from .time_error import errors_of, second_tolerance
 
@@ -50,52 +50,51 @@ def inversion_table(
 
     **Arguments:**
 
-    - `scene`: the scene, every number a scalar.
-    - `theta`, `spin`, `eta`, `azimuth`: of the launch, as for `Launch`; `mu`: of the scene's friction law, or of the
-      sliding law in it, by default its own value. A list or array becomes an axis of the table, in the order (theta,
-      eta, mu, spin, azimuth); a number does not.
+    - `scene`: the scene; all its numbers must be scalars.
+    - `theta`, `spin`, `eta`, `azimuth`: parameters of the launch, as for `Launch`; `mu`: coefficient of the scene's
+      friction law, by default that of the scene. Each list or array becomes an axis of the table, in the order (theta,
+      eta, mu, spin, azimuth).
     - `t1`: horizon [s].
     - `angle`: angle [rad] that counts as inverted.
     - `tolerance`: relative tolerance of the integration.
-    - `crossing`: "first" for the first time theta reaches the angle; "last" for the up-crossing after which theta stays
-      above it until `t1` (first crossings are ill-conditioned if theta oscillates about the angle); "both" for both
-      times from one run, in the variables `first_time` and `last_time` instead of `time`, with the status of the last.
-    - `path`: HDF5 file to write, chunk by chunk. The same call resumes an interrupted table from it.
-    - `axes`: further axes, full name of a parameter, or its unambiguous end -> values, such as `{"offset": [0.005,
-      0.006]}` for `"scene.body.offset"`.
+    - `crossing`: "first" for the first time theta reaches the angle; "last" for the crossing after which theta stays
+      above the angle until `t1` (if theta oscillates, first crossings are ill-conditioned); "both" for both times from
+      one run: the variables `first_time` and `last_time` replace `time`, and the status is that of the last crossing.
+    - `path`: HDF5 file to write, chunk by chunk. Repeat the same call to resume an interrupted table.
+    - `axes`: additional axes, name of a parameter -> values. The end of a full name is enough if it is unique, such as
+      `{"offset": [0.005, 0.006]}` for `"scene.body.offset"`.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
       `nonholonomic.integration.Oscillatory8()`, or `Dopri8()` for method "diffrax".
     - `method`: "ensemble" (fast); or "diffrax" for vmapped `diffeqsolve`, a slow reference that supports only first
       crossings and can miss a loss of contact shorter than a step.
     - `scattered`: whether the lists are columns of equal length instead of axes of a grid: the k-th cell has the k-th
-      number of each. The table then has the only axis "cell", and the columns are among its variables.
+      number of each list. The only axis of the table is then "cell", and the columns are variables.
     - `errors`: whether to run every cell again at a hundredth of the tolerance, for bounds of its errors; this costs
       2.8 times as much as a table without errors. Below a tolerance of 1e-12, the second run has a hundred times the
-      tolerance instead, and the bounds are wider.
+      tolerance instead of a hundredth, and the bounds are wider.
     - `sensitivities`: names of the parameters with respect to which the times are differentiated, such as
       `["scene.friction.mu", "launch.theta"]`; the end of a name is enough if only one parameter matches.
     - `progress`: whether to show progress, on a terminal or in a notebook; `NONHOLONOMIC_PROGRESS=0` hides it
       everywhere.
     - `executor`: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a Dask client;
-      it gets chunks as its workers become free. By default a thread for each core. The results are bitwise equal on the
-      same kind of processor.
-    - `max_steps`: a run that needs more steps, including rejected ones, fails; at least 1. With several modes, the
-      limit applies to each stay in a mode; `method="diffrax"` allows 100 000 steps at most.
+      by default, a thread for each core. On the same kind of processor, all executors give bitwise equal results.
+    - `max_steps`: a run that needs more steps, including rejected ones, fails; at least 1. In a hybrid run, the limit
+      applies to each time in a mode; `method="diffrax"` allows 100 000 steps at most.
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
-    "contact_lost", "failed", "jammed", "unresolved" if the energy grows), `end_time` [s] and `end_theta` [rad] at
-    which the run ended (also if contact was lost or jammed), `steps` and `rejected`. With `errors` also `time_error`
-    [s], a bound that is infinite if the two runs disagree on the status or failed, and 0 if both find no time;
-    `Table.digits("time")` shows the correct digits. The same for `end_time` and `end_theta`; `hops_error` and
-    `sticks_error` are the differences of the two runs, and `status_error` is 1 if the runs disagree on the status or
-    failed. With `sensitivities` also the derivative of `time` with respect to each parameter, `time_by_mu` for
-    `"scene.friction.mu"`, 0 if the top did not invert. It includes flights, impacts, stick and slip; `grazes` is 1
-    and the derivative is NaN if an earlier event, such as a landing, was grazing, so that it may not happen within
-    the tolerance (`SetValuedCoulomb` with `contact="hybrid"` has none). With `contact="hybrid"`, a run continues
-    through flights, and the angle also counts in flight; `hops` is the number of flights until the run ended, and
-    `status` may be "unresolved" (10 000 flights in a row, or sphere and stem on the plane together with so much
-    friction that the forces are undetermined). With `SetValuedCoulomb`, `sticks` is the number of changes from slip
-    to rolling outside impacts, and `status` may be "unresolved" (too many changes).
+    "contact_lost", "failed", "jammed", "unresolved" if the energy grows), `end_time` [s] and `end_theta` [rad] at which
+    the run ended (also if contact was lost or jammed), `steps` and `rejected`. With `errors`, also `time_error` [s], a
+    bound that is infinite if the two runs disagree on the status or failed, and 0 if both find no time;
+    `end_time_error` and `end_theta_error` are such bounds, too. `Table.digits("time")` shows the correct digits.
+    `hops_error` and `sticks_error` are the differences of the two runs, and `status_error` is 1 if the runs disagree on
+    the status or failed. With `sensitivities`, also the derivative of `time` with respect to each parameter, such as
+    `time_by_mu` for `"scene.friction.mu"`; 0 if the top did not invert. Derivatives pass through flights, impacts,
+    stick and slip (but there are none for `SetValuedCoulomb` with `contact="hybrid"`). If an earlier event, such as a
+    landing, was grazing and within the tolerance may not happen, `grazes` is 1 and the derivative is NaN. With
+    `contact="hybrid"`, a run continues through flights, and the angle also counts in flight; `hops` is the number of
+    flights until the run ended, and `status` may be "unresolved" (10 000 flights in a row, or sphere and stem on the
+    plane together with so much friction that the forces are undetermined). With `SetValuedCoulomb`, `sticks` is the
+    number of changes from slip to rolling outside impacts, and `status` may be "unresolved" (too many changes).
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
     `RuntimeError` for an executor that breaks down, or a worker with other versions.
@@ -152,17 +151,18 @@ def event_table(
     executor: Executor | None,
     max_steps: int,
 ) -> Table:
-    """The table of the times at which theta reaches an angle, or, without one, the spin about the normal reverses.
+    """The table of the times at which theta reaches an angle or, without an angle, the spin about the normal reverses.
 
-    **Arguments:** as for `inversion_table`; `launch_values`: number of the launch, or "mu" -> a number or a list.
+    **Arguments:** as for `inversion_table`; `launch_values`: name of a launch's parameter, or "mu" -> a number or a
+    list.
     """
     roots, grid, units = launches(scene, launch_values, axes, t1, tolerance, scattered=scattered)
     require_whole(max_steps, "max_steps", 1)
-    settings = Settings(tolerance, solver)
+    settings = Settings(tolerance, solver, max_steps=int(max_steps))
     integrator = settings.for_single_runs if method == "diffrax" else settings.for_lanes
     explicit_tableau(integrator)
     paths = sensitivity_names(roots, sensitivities)
-    run_kind = run_kind_of(scene) if angle is not None else REVERSAL
+    run_kind = run_kind_of(scene) if angle is not None else reversal_kind_of(scene)
     if paths:
         check_differentiable(scene)
     if not run_kind.smooth and method == "diffrax":
@@ -175,8 +175,8 @@ def event_table(
     else:
         warn_if_it_cannot_invert(scene, roots["launch"], looked_at.get("launch.theta", roots["launch"].theta))
         angle = float(angle)
-    runs = InversionRuns(run_kind, float(t1), angle, crossing, integrator, method, paths, int(max_steps))
-    job = InversionJob(runs, roots, float(tolerance), errors)
+    runs = InversionRuns(run_kind, float(t1), angle, crossing, settings, method, paths)
+    job = InversionJob(runs, roots, errors)
 
     event = {"event": "reversal"} if angle is None else {"angle": angle}
     request = {"t1": float(t1), **event, "tolerance": float(tolerance), "crossing": crossing}
@@ -204,7 +204,7 @@ def event_table(
 
 
 def warn_of_long_runs(table: Table, t1: float, most: int) -> None:
-    """Warn of runs that needed more than the allowed steps; tables that stay in their file are not checked."""
+    """Warn of runs that needed more than the allowed steps. Tables whose variables stay in the file are not checked."""
     if not isinstance(table.variables, dict):
         return
     long = (table.variables["status"] == "failed") & (table.variables["steps"] >= most)
@@ -216,7 +216,7 @@ def warn_of_long_runs(table: Table, t1: float, most: int) -> None:
 
 
 def warn_of_unresolved_runs(table: Table, run_kind: RunKind) -> None:
-    """Warn of runs that are unresolved and say why; a table that stays in its file is not looked at."""
+    """Warn of unresolved runs, with the reason. Tables whose variables stay in the file are not checked."""
     if not isinstance(table.variables, dict):
         return
     unresolved = np.asarray(table.variables["status"] == "unresolved")
@@ -233,7 +233,6 @@ class InversionJob(NamedTuple):
 
     runs: InversionRuns
     roots: dict[str, Any]
-    tolerance: float
     errors: bool
 
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
@@ -242,16 +241,17 @@ class InversionJob(NamedTuple):
         if runs.method == "diffrax" and count == 0:
             # The reference runs whole chunks: a call that only compiles would compute the first chunk twice.
             return {}
-        variables = runs.results(self.roots, columns, self.tolerance, count)
+        variables = runs.results(self.roots, columns, count)
         if self.errors:
-            second = runs._replace(slopes_by=[]).results(self.roots, columns, second_tolerance(self.tolerance), count)
+            settings = runs.settings.with_tolerance(as_number(second_tolerance(float(runs.settings.tolerance))))
+            second = runs._replace(settings=settings, slopes_by=[]).results(self.roots, columns, count)
             silent = tuple(words.index(word) for word in ("failed", "unresolved") if word in words)
             variables |= errors_of(variables, second, runs.times, runs.run_kind.counts, silent)
         return variables
 
 
 class ScatteredJob(NamedTuple):
-    """A job whose cells are the rows of some columns; the columns are among the results.
+    """A job whose cells are the rows of columns; the columns are among the results.
 
     `columns`: full name of a number -> its value in every cell; `names`: full name -> name of the variable.
     """

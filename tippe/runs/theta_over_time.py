@@ -20,21 +20,20 @@ from .run_kind import run_kind_of
 def theta_over_time(
     scene: Scene, launch: Launch, times: Float[np.ndarray, " times"], tolerance: float, axes: Sequence[str]
 ) -> Float[np.ndarray, " times"]:
-    """theta [rad] of one launch at some times, also in flight.
-
-    Each time has a separate run that ends there, and all runs are cells of a table. So a job that has computed a table
-    compiles nothing more for its plot, while `simulate` needs fifty programs.
+    """theta [rad] of one launch at the given times, also in flight. A separate run ends at each time, and all runs are
+    cells of a table. A program that has computed a table therefore compiles nothing more for its plot, whereas
+    `simulate` compiles fifty programs.
 
     **Arguments:** `axes`: full names of the parameters along the axes of that table, such as "launch.theta".
     """
     roots = {"scene": scene, "launch": launch}
     values = {path: value for root, tree in roots.items() for path, value in numbers(root, tree).items()}
-    size, solver = chunk_for(1), Settings(tolerance).for_lanes
+    size, settings = chunk_for(1), Settings(tolerance)
     columns, blocks = {name: np.full(size, float(values[name])) for name in axes}, []
     for first in range(0, len(times), size):
         block = times[first : first + size]
         # No inclination exceeds pi, so no run ends before its time.
         horizons: Any = np.pad(block, (0, size - len(block)))
-        runs = InversionRuns(run_kind_of(scene), horizons, math.pi, "first", solver, "ensemble", [])
-        blocks.append(runs.results(roots, columns, tolerance, len(block))["end_theta"][: len(block)])
+        runs = InversionRuns(run_kind_of(scene), horizons, math.pi, "first", settings, "ensemble", [])
+        blocks.append(runs.results(roots, columns, len(block))["end_theta"][: len(block)])
     return np.concatenate(blocks)

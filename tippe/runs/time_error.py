@@ -24,8 +24,8 @@ ROUND_OFF = 1e-14
 
 
 def second_tolerance(tolerance: float) -> float:
-    """Tolerance of the second run: a hundredth of that of the first run, or a hundred times as large if the integration
-    allows no smaller tolerance; the bound is then up to a hundred times wider."""
+    """Tolerance of the second run: a hundredth of that of the first run. If the integration allows no smaller
+    tolerance, it is a hundred times that of the first run, and the bound is up to a hundred times wider."""
     finer = tolerance / FINER
     # Because of rounding, the quotient of 1e-12 may be below the least tolerance.
     return max(finer, TIGHTEST) if finer > 0.99 * TIGHTEST else tolerance * FINER
@@ -37,12 +37,12 @@ def error_bound(
     agree: Bool[np.ndarray, " cells"],
     same_history: Bool[np.ndarray, " cells"],
 ) -> Float[np.ndarray, " cells"]:
-    """A bound of the error of a number (`docs/validation.md` has how often it fails and how wide it is).
+    """A bound of the error of a number. `docs/validation.md` lists how often the bound fails and how wide it is.
 
     **Arguments:**
 
     - `value`: times [s], infinite if there is no event, or other numbers.
-    - `second`: the same from the second run.
+    - `second`: the numbers from the second run.
     - `agree`: mask of the cells in which the two runs have the same status.
     - `same_history`: mask of the cells in which the numbers of all kinds of events agree.
 
@@ -63,13 +63,13 @@ def errors_of(
     counts: tuple[str, ...],
     silent: tuple[int, ...],
 ) -> dict[str, Num[np.ndarray, " cells"]]:
-    """The additional variables of a table with errors: for each variable its error, named by the suffix "_error".
+    """The additional variables of a table with errors; their names have the suffix "_error".
 
     **Arguments:**
 
     - `first`, `second`: the variables of the two runs of every cell.
     - `times`, `counts`: names of the variables that are times of crossings, and of those that count events.
-    - `silent`: codes of a status with which a run ends without a result: two such runs do not agree.
+    - `silent`: status codes of runs without a result; two such runs count as disagreeing.
 
     **Returns:** bounds for the times, `end_time` and `end_theta`; for each count the difference of the runs; and 1 as
     `status_error` if the runs disagree on the status or one is silent.

@@ -56,13 +56,13 @@ class Trajectory(AbstractTrajectory):
     centre of mass for other bodies; `contact` is the contact point, and `normal` the arena's normal there. `rotation`
     (times, 3, 3) rotates the body's axes to the fixed frame, and `angular_velocity` is its rate.
 
-    `status` is the word of a `Status`: "completed", "contact_lost", "failed", "jammed", "does_not_fit" or "unresolved" (its
-    energy grows, or does not balance, by more than 1e4 times the tolerance, relative to the energy); inside a
+    `status` is the word of a `Status`: "completed", "contact_lost", "failed", "jammed", "does_not_fit" or "unresolved"
+    (its energy grows, or does not balance, by more than 1e4 times the tolerance, relative to the energy); inside a
     transformation it is the integer; for numbers out of range it is `Status.ILLEGAL`, and everything is NaN. The run
-    ends at `end_time`. The top does not fit where a curvature of the arena reaches that of its sphere, which then
-    touches at other points, too. It is jammed if the equation for the normal force has no solution, because friction
-    pulls the top into the arena as strongly as the normal force pushes it out; this needs strong friction, a large
-    offset and a slip along the axis. `stats` holds accepted and rejected steps, the greatest drift of |e| and the
+    ends at `end_time`. The top does not fit where a curvature of the arena reaches that of the top's sphere, which
+    would then touch at other points, too. It is jammed if the equation for the normal force has no solution, because
+    friction pulls the top into the arena as strongly as the normal force pushes it out; this needs strong friction, a
+    large offset and a slip along the axis. `stats` holds accepted and rejected steps, the greatest drift of |e| and the
     greatest energy residual |E - E(0) - work of friction| [J]; with `SetValuedCoulomb` also `sticks`, the number of
     changes from slip to rolling.
 
@@ -96,7 +96,7 @@ class Trajectory(AbstractTrajectory):
 
     @property
     def above(self) -> tuple[None, None]:
-        """No distance from the arena: the contact persists."""
+        """`None`: the contact persists, so there is no distance from the arena."""
         return None, None
 
     @of_each_run
@@ -163,22 +163,23 @@ def simulate(
     """Simulate one launch until `t1`, or until contact is lost or jams; with `contact="hybrid"`, through flights and
     impacts.
 
-    Inside a transformation (`jit`, `vmap`, `grad`) `times` must be given; entries after the end of the run, given by
-    `status` and `end_time`, are then NaN. A batch from `vmap` is solved as one ensemble, like the cells of a table. If
+    Inside a transformation (`jit`, `vmap`, `grad`) `times` must be given; entries after the end of the run (see
+    `status` and `end_time`) are then NaN. A batch from `vmap` is solved as one ensemble, like the cells of a table. If
     a program under `jit` does not use path, rotation or work, they are not integrated.
 
     **Arguments:**
 
-    - `scene`, `launch`: every number a scalar.
+    - `scene`, `launch`: all their numbers must be scalars.
     - `t1`: horizon [s].
     - `times`: times of the result [s], increasing, within [0, t1]; by default those of the accepted steps. Outside
       transformations, times after the end of the run are omitted; `Trajectory.at` returns the run at other times.
     - `tolerance`: relative tolerance, in [1e-14, 1e-2]; absolute tolerances are `tolerance`/10 in units of `Scene.scales`.
     - `solver`: any adaptive solver of Diffrax for ordinary differential equations; by default `Dopri8()`, or inside
       transformations without `adjoint` `nonholonomic.integration.Oscillatory8()`.
-    - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for
-      each parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax integrates a traced run,
-      which is cheaper for a loss with many parameters, but can miss a loss of contact shorter than a step.
+    - `adjoint`: an adjoint method of Diffrax, such as `RecursiveCheckpointAdjoint()`, with which Diffrax integrates a
+      traced run. This is cheaper for a loss function with many parameters, but can miss a loss of contact shorter than
+      a step. By default, this package computes forward and reverse derivatives, at the cost of about one run for each
+      parameter.
 
     **Returns:** a `Trajectory`, or a `HybridTrajectory` for a hybrid scene.
 
@@ -202,19 +203,20 @@ def simulate(
     check_run(scene, launch, t1, tolerance, "jax.vmap(simulate) takes lists, and so does trajectory_table")
     require_adaptive(solver)
     require_adjoint(adjoint)
+    settings = Settings(tolerance, solver)
     if times is not None:
         times = as_number(times)
         require_all(times_bounds(times, t1))
         require_increasing(times, "times")
     if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1, tolerance))):
-        return _legal_or_nan(scene, launch, times, as_number(t1), as_number(tolerance), solver, adjoint)
+        return _legal_or_nan(scene, launch, times, as_number(t1), settings, adjoint)
     if scene.contact == "hybrid":
         solve_flights_dense = simulate_hybrid if scene.flies_in_closed_form else simulate_airborne
-        return solve_flights_dense(scene, launch, float(t1), times, tolerance, solver)
+        return solve_flights_dense(scene, launch, float(t1), times, settings)
     run = trajectory_problem((scene, launch))
     through = solve_stick_slip_dense if scene.friction.set_valued else follow
-    path = through(run, float(t1), Settings(tolerance, solver))
-    trajectory = _as_trajectory(scene, run, path, tolerance)
+    path = through(run, float(t1), settings)
+    trajectory = _as_trajectory(scene, run, path, settings.tolerance)
     if times is None:
         return trajectory
     reached = np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)]
@@ -233,20 +235,20 @@ def _legal_or_nan(
     launch: Launch,
     times: Any,
     t1: Any,
-    tolerance: Any,
-    solver: diffrax.AbstractSolver | None,
+    settings: Settings,
     adjoint: diffrax.AbstractAdjoint | None,
 ) -> Trajectory | HybridTrajectory:
     """The result of `_traced`, or NaN and the status "illegal" if a traced number is out of range."""
     if times is None:
         # This raises the error that explains the problem.
-        return _traced(scene, launch, times, t1, tolerance, solver, adjoint)
+        return _traced(scene, launch, times, t1, settings, adjoint)
     bounds = (*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch))
-    may, t1, tolerance = legal_run(legal(bounds), t1, tolerance, times)
+    may, t1, tolerance = legal_run(legal(bounds), t1, settings.tolerance, times)
+    settings = settings.with_tolerance(tolerance)
     if adjoint is not None:
         # Diffrax would differentiate a run of zero length.
         scene, launch = nan_unless(may, (scene, launch))
-    trajectory = _traced(scene, launch, times, t1, tolerance, solver, adjoint)
+    trajectory = _traced(scene, launch, times, t1, settings, adjoint)
     status = jnp.where(may, trajectory.status, int(Status.ILLEGAL))
     return eqx.tree_at(lambda run: (run.t, run.status), nan_unless(may, trajectory), (times, status))
 
@@ -256,8 +258,7 @@ def _traced(
     launch: Launch,
     times: Any,
     t1: Any,
-    tolerance: float,
-    solver: diffrax.AbstractSolver | None,
+    settings: Settings,
     adjoint: diffrax.AbstractAdjoint | None,
 ) -> Trajectory | HybridTrajectory:
     if scene.friction.set_valued:
@@ -266,7 +267,6 @@ def _traced(
         )
     if times is None:
         raise ValueError("times must be given inside jit, vmap and grad, where the number of steps is not known")
-    settings = Settings(tolerance, solver)
     if scene.contact == "hybrid":
         if adjoint is not None:
             raise ValueError(f"adjoint = {adjoint!r} must be omitted for contact = 'hybrid'")

@@ -29,9 +29,9 @@ WITHOUT_DIRECTION = {"theta", "theta_rate", "eta", "spin", "energy", "jellett", 
 def launches_with(scene: Scene, launch: Launch, cells: int, names: tuple[str, ...]) -> CoreProblem:
     """The runs of some cells with the parts of a `TrajectoryProblem` that the named quantities need.
 
-    Only some quantities need the path, and none needs rotation or work: on the plane, a run without them takes half the
-    time. If no quantity has a direction, the frame turns on the level plane, and samples are about thirty times as
-    accurate.
+    Only some quantities need the path, and none needs rotation or work. On the plane, a run without path, rotation and
+    work takes half the time. If no quantity has a direction, the frame turns on the level plane, and samples are about
+    thirty times as accurate.
     """
     run = trajectory_problem((scene, launch), cells)
     if scene.level and WITHOUT_DIRECTION.issuperset(names):
@@ -89,9 +89,9 @@ def solve_cells(
 ) -> dict[str, Array]:
     """The variables of some cells.
 
-    **Arguments:** `scene`, `launch`: numbers that are scalars or one per cell; `cells`: how many there are, of which
-    only the first `count` are run; `times`: of the samples [s], the last the horizon; `settings`: how they are
-    integrated; `names`: the quantities to be read.
+    **Arguments:** `scene`, `launch`: numbers that are scalars or one per cell; `cells`: number of cells, of which only
+    the first `count` are run; `times`: times of the samples [s], of which the last is the horizon; `settings`: settings
+    of the integration; `names`: names of the quantities.
 
     **Returns:** name -> values, the cells first.
     """

@@ -44,29 +44,29 @@ def trajectory_table(
     """Trajectories over a grid of launches and scenes, sampled at given times, in one batched call on all cores.
 
     The samples have the accuracy of `simulate`: a step ends on each of the times. With one sample per integration step,
-    it costs twice as much as a table of inversion times to the same horizon.
+    this table costs twice as much as a table of inversion times to the same horizon.
 
     **Arguments:**
 
-    - `scene`: the scene, every number a scalar.
-    - `theta`, `spin`, `eta`: of the launch, as for `Launch`; `mu`: of the scene's friction law, or of the sliding law
-      in it, by default its own value. A list or array becomes an axis of the table, in the order (theta, eta, mu,
-      spin); a number does not. The axes of the launch are called "launch.theta", "launch.eta" and "launch.spin",
-      because `theta` is the sampled quantity.
-    - `times`: of the samples [s], increasing, from 0 or later; the last is the horizon.
-    - `axes`: further axes, as for `inversion_table`, such as `{"azimuth": [0.0, 1.0]}`.
+    - `scene`: the scene; all its numbers must be scalars.
+    - `theta`, `spin`, `eta`: parameters of the launch, as for `Launch`; `mu`: coefficient of the scene's friction law,
+      by default that of the scene. Each list or array becomes an axis of the table, in the order (theta, eta, mu,
+      spin). The axes of the launch are called "launch.theta", "launch.eta" and "launch.spin", because `theta` is the
+      sampled quantity.
+    - `times`: times of the samples [s], increasing, at least 0; the last time is the horizon.
+    - `axes`: additional axes, as for `inversion_table`, such as `{"azimuth": [0.0, 1.0]}`.
     - `quantities`: what to sample: any of "theta", "eta", "azimuth" [rad], "theta_rate", "spin" [rad/s], "energy" [J],
       "jellett" [kg m^3/s], "normal_force" [N], and the vectors "axis" [1], "position" [m], "velocity" [m/s], "angular_momentum"
       [kg m^2/s] and "slip" [m/s]; all as in `Trajectory`.
     - `tolerance`: relative tolerance of the integration.
-    - `path`: HDF5 file to write, chunk by chunk. The same call resumes an interrupted table from it.
+    - `path`: HDF5 file to write, chunk by chunk. Repeat the same call to resume an interrupted table.
     - `progress`, `executor`: as for `inversion_table`.
     - `max_steps`: a run that needs more steps, including rejected ones, fails; at least 1.
 
-    **Returns:** a `Table` with a variable for each quantity, which has the axes' dimensions and a last dimension
-    "time"; a vector has one more dimension, "component" (x, y, z), or "tangent" (t1, t2) for "slip". Values after the
-    end of a run are NaN. The table also has, over the axes: `status` (the word of a `Status`, "completed" at the last
-    of the times), `end_time` [s], `steps` and `rejected`.
+    **Returns:** a `Table` with a variable for each quantity. Its dimensions are the axes and "time"; a vector has one
+    more dimension, "component" (x, y, z), or "tangent" (t1, t2) for "slip". Values after the end of a run are NaN. The
+    table also contains, over the axes: `status` (the word of a `Status`, "completed" at the last of the times),
+    `end_time` [s], `steps` and `rejected`.
 
     **Raises:** `ValueError` for arguments out of range, an unknown axis or quantity, and for a scene with
     `contact="hybrid"` or `SetValuedCoulomb`, whose runs only `simulate` samples, one by one; `OSError` for a path that
@@ -114,12 +114,13 @@ def trajectory_table(
     variables |= {"end_time": Variable("s", np.float64, long_name="end of the run")}
     variables |= {name: Variable("1", np.int64, long_name=COUNTED[name]) for name in ("steps", "rejected")}
     request = described(roots, grid) | {"quantities": list(names), "tolerance": float(tolerance)}
-    request |= {"solver": type(Settings(tolerance).for_lanes).__name__}
+    settings = Settings(tolerance, max_steps=int(max_steps))
+    request |= {"solver": type(settings.for_lanes).__name__}
     if max_steps != DEFAULT_MAX_STEPS:
         request |= {"max_steps": int(max_steps)}
     # A run has about a dozen components.
     most = max(16, 1 << (MOST_SAMPLED // (12 * len(times))).bit_length() - 1)
-    job = SamplingJob(roots, times, float(tolerance), int(max_steps), names)
+    job = SamplingJob(roots, times, settings, names)
     options = {"path": path, "most": most, "inner": inner, "progress": progress, "executor": executor}
     return sweep(job, grid, variables, request, **options)
 
@@ -129,16 +130,14 @@ class SamplingJob(NamedTuple):
 
     roots: dict[str, Any]
     times: Float[np.ndarray, " times"]
-    tolerance: float
-    max_steps: int
+    settings: Settings
     names: tuple[str, ...]
 
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
         """The variables of some cells, of which only the first `count` are run."""
         cells = with_numbers(self.roots, columns)
         size = next((len(values) for values in columns.values()), 1)
-        settings = Settings(self.tolerance, max_steps=self.max_steps)
-        variables = solve_cells(cells["scene"], cells["launch"], size, self.times, settings, self.names, count)
+        variables = solve_cells(cells["scene"], cells["launch"], size, self.times, self.settings, self.names, count)
         return {name: np.asarray(values, np.int8 if name == "status" else None) for name, values in variables.items()}
 
 

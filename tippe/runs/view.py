@@ -33,6 +33,7 @@ from ..model.body import AbstractBody
 from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
 from ..model.top import Top
+from .quantities import QUANTITIES
 
 #: Approximate angle [rad] by which the top turns from frame to frame, and the greatest number of frames.
 TURN_PER_FRAME = 0.4
@@ -123,8 +124,8 @@ def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
 
 
 def motion(run: Any) -> Motion[np.ndarray]:
-    """The motion of one run at times that are close enough to show its rotation, if the run can be evaluated between
-    its own times."""
+    """The motion of one run. If the run can be evaluated between its times, the times are close enough to show the
+    rotation."""
     if run.dense is not None:
         times = np.asarray(run.t)
         # The angle about the axis is not enough: half-way up, a top turns about other directions equally fast.
@@ -155,9 +156,7 @@ def show(scene: Scene, motion: Motion[np.ndarray], number: int, name: str) -> Sh
         arrows(motion, float(body.offset) if isinstance(body, Top) else 0.0, radius, weight),
         (
             Curve("θ, normal to axis [rad]", motion.theta),
-            Curve("energy [J]", motion.energy),
-            Curve("Jellett's quantity [kg m²/s]", motion.jellett),
-            Curve("normal force [N]", motion.normal_force),
+            *(Curve(QUANTITIES[name].label, getattr(motion, name)) for name in ("energy", "jellett", "normal_force")),
         ),
     )
 
@@ -204,7 +203,7 @@ def stages(groups: list[list[tuple[str, Scene, Motion]]]) -> list[Stage]:
 
 
 def aside(normal: Float[Array | np.ndarray, "times 3"]) -> Float[Array, "times 3"]:
-    """Unit vectors across the normal, towards x, or towards y where the normal is along x."""
+    """Unit vectors across the normal: the projection of x, or of y where the normal is along x."""
     x, y = jnp.array([[1.0, 0.0, 0.0]]), jnp.array([[0.0, 1.0, 0.0]])
     towards = jnp.where(jnp.abs(normal[:, :1]) < 0.9, x, y)
     across = towards - jnp.sum(towards * normal, axis=-1, keepdims=True) * normal
@@ -212,7 +211,7 @@ def aside(normal: Float[Array | np.ndarray, "times 3"]) -> Float[Array, "times 3
 
 
 def meshes(body: AbstractBody | AbstractRigidBody, colour: int) -> tuple[Mesh, ...]:
-    """The body in two colours; for a top with its stem, or with a short stem that only shows the axis."""
+    """The body in two colours; a top has its stem, or a short stem that only shows the axis."""
     if isinstance(body, AbstractRigidBody):
         return tuple(mesh._replace(vertices=touching(body, mesh.vertices)) for mesh in ball(1.0, (colour, PALE)))
     if not isinstance(body, Top):
@@ -226,7 +225,8 @@ def meshes(body: AbstractBody | AbstractRigidBody, colour: int) -> tuple[Mesh, .
 
 
 def touching(body: AbstractRigidBody, directions: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
-    """The points of a body's surface with some outward unit normals, from the centre of mass, in the body's axes [m]."""
+    """The points of a body's surface at which it has the given outward unit normals, from the centre of mass, in the
+    body's axes [m]."""
     normal, still = vector_of(-jnp.asarray(directions).T), jnp.zeros(len(directions))
     return np.stack(body.contact(normal, (still, still, still))[0], axis=-1)
 

@@ -1,4 +1,4 @@
 """Independent descriptions of the same top: Euler angles, reductions, Poincare's equations, quadratures.
 
-They would disagree if the vector form were wrong; no result for users depends on them.
+Tests compare them with the vector form; no result for users depends on them.
 """

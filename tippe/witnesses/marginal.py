@@ -5,8 +5,8 @@ the lowest line is still an exact equilibrium at every spin. Its marginal states
 curves in (curvature, spin, nu): two real equations in three unknowns, det(A(spin, curvature) - i nu) = 0. They are
 followed by pseudo-arclength continuation, which passes folds, where one curvature has several critical spins.
 
-There are no tumbling tops to follow: with friction, a periodic motion keeps its energy and so never slips, but on a
-cylinder, precession at a fixed inclination slips, and its energy decreases.
+There are no tumbling tops on a cylinder: a periodic motion has constant energy, so with friction it must not slip, but
+on a cylinder, precession at a fixed inclination slips.
 """
 
 import functools
@@ -36,7 +36,7 @@ class MarginalCurve(NamedTuple):
 
     - `ratio`: R / rc, the curvature of the arena [1]; 0 is the plane.
     - `spin`: spin [rad/s] at which a pair of eigenvalues is imaginary.
-    - `frequency`: that eigenvalue nu [rad/s].
+    - `frequency`: the imaginary part nu of these eigenvalues [rad/s].
     """
 
     ratio: np.ndarray

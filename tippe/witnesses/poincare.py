@@ -95,8 +95,9 @@ class TopSystem(AbstractSystem):
 
     **Arguments:**
 
-    - `scene`: a `Scene` on a `Plane` or a `Cylinder`. Its friction is not used: it needs the normal force.
-    - `rolling`: whether the contact point is at rest, the one case in which the top is nonholonomic.
+    - `scene`: a `Scene` on a `Plane` or a `Cylinder`. Its friction is not used, because friction needs the normal
+      force.
+    - `rolling`: whether the contact point is at rest, the only case in which the top is nonholonomic.
     """
 
     scene: Scene[Top]

@@ -1,8 +1,8 @@
 """Two reduced forms of the tippe top on the plane: Rutstam's equations, and the paper's reduction by Routh and Jellett.
 
 Both need friction at a point: with a contact torque, Jellett's quantity is not constant. Both use the nodal frame (tx,
-ty, z): tx along the horizontal projection of the axis e, ty = z x tx. Unlike the vector form, which they check, they
-are singular where sin(theta) = 0.
+ty, z): tx along the horizontal projection of the axis e, ty = z x tx. Unlike the vector form, both are singular where
+sin(theta) = 0.
 """
 
 from typing import NamedTuple

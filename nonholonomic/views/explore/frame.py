@@ -11,9 +11,9 @@ Three = Float[Array, "3"]
 class Frame(NamedTuple):
     """One moment of a run, with bodies, traces, arrows and curves in the order of the `Show` of the page.
 
-    - `normal`: of the arena, towards the body; `bodies`: position [m] and quaternion (x, y, z, w) of each.
-    - `traces`: the point of each [m], and the point that it is relative to, or `None`.
-    - `arrows`: start [m] and vector of each, in its unit; `curves`: one number each.
+    - `normal`: normal of the arena, towards the body; `bodies`: position [m] and quaternion (x, y, z, w) of each body.
+    - `traces`: the point of each trace [m], and the point to which it is relative, or `None`.
+    - `arrows`: start [m] and vector of each arrow, in its unit; `curves`: a number for each curve.
     - `turning_rate`: greatest rotation rate of all parts [rad/s], which determines the number of frames.
     """
 

@@ -38,13 +38,13 @@ Start = tuple[tuple[AbstractBatchedMode, ...], Int[Array, "1"], Float[Array, "co
 class HybridSimulator(NamedTuple):
     """A hybrid system that is integrated in the browser.
 
-    - `start`: from the numbers of the sliders to the modes, the index of the first, and the initial state, for one
-      cell.
-    - `t1`: horizon [s]; `settings`: with an explicit Runge-Kutta solver of Diffrax; `counters`: rows of
+    - `start`: function of the numbers of the sliders that returns the modes, the index of the first mode, and the
+      initial state, for one cell.
+    - `t1`: horizon [s]; `settings`: settings with an explicit Runge-Kutta solver of Diffrax; `counters`: rows of
       `Transition.counts`.
-    - `readings`: results at the end of a run, name -> a function of (the sliders' numbers, a `HybridOutcome`).
-    - `frame`: the frame at any time, from (the sliders' numbers, the index of the mode or -1 between modes, the output
-      rows of the modes, the time [s]); `None` if no path is needed.
+    - `readings`: results at the end of a run, name -> function of (the sliders' numbers, a `HybridOutcome`).
+    - `frame`: function that returns the frame at any time; its arguments are the sliders' numbers, the index of the
+      mode or -1 between modes, the output rows of the modes, and the time [s]. `None` if no path is needed.
     """
 
     start: Callable[[Numbers], Start]

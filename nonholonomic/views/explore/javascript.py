@@ -2,7 +2,7 @@
 
 The function's jaxpr is written element by element: an array becomes one scalar per element. Slices, stacks and similar
 operations then cost nothing, and unused elements are omitted. Loops and branches that depend on numbers stay loops and
-branches. No package that reads jaxprs writes JavaScript.
+branches. No existing package converts jaxprs to JavaScript.
 """
 
 import functools
@@ -76,12 +76,12 @@ def javascript(name: str, function: Callable[..., Any], *arguments: Any) -> str:
 
     **Arguments:**
 
-    - `name`: of the function in JavaScript.
+    - `name`: name of the function in JavaScript.
     - `function`: a function that JAX can trace.
     - `arguments`: examples of its arguments, arrays or trees of arrays.
 
-    **Returns:** the text of a function. Its arguments are a list of numbers for each argument, the elements of its
-    leaves one after another, and a list for the results, which it fills and returns.
+    **Returns:** the text of a JavaScript function. For each argument it takes a list of numbers: the elements of all
+    leaves, one after another. Its last argument is a list that it fills with the results and returns.
 
     **Raises:** `ValueError` for an unsupported primitive of JAX.
 

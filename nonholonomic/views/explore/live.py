@@ -22,8 +22,8 @@ Numbers = Float[Array, " numbers"]
 
 
 class Answer(NamedTuple):
-    """The result of every run, which is also shown as a map: its `label` and `unit`, and the `simulator` that computes
-    it.
+    """The result of a run, which the page also shows as a map: its `label` and `unit`, and the `simulator` that
+    computes it.
 
     The simulator has the reading "outcome": the `Status` of the run, and the result, or infinity.
     """
@@ -44,8 +44,8 @@ class Summary(NamedTuple):
 class LiveRun(NamedTuple):
     """The contents of a page with sliders.
 
-    - `title`: of the page.
-    - `sliders`: the sliders; `allowed`: whether their numbers are legal in combination.
+    - `title`: title of the page.
+    - `sliders`: the sliders; `allowed`: function that returns whether their numbers are legal in combination.
     - `answer`: the result of a run.
     - `motion`: the simulator of the drawn run, with the reading "frame", a `Frame`.
     - `summaries`: numbers shown beside the result.
@@ -62,7 +62,7 @@ class LiveRun(NamedTuple):
 def live_page(live: LiveRun, stage: Stage, speed: float = 1.0, below: str = "") -> Page:
     """The page of a run with sliders.
 
-    **Arguments:** `stage`: with one run, for its arena, meshes and names; `speed`, `below`: as for `page`.
+    **Arguments:** `stage`: a stage with one run, for its arena, meshes and names; `speed`, `below`: as for `page`.
 
     **Raises:** `ModuleNotFoundError` if the library for views is not installed; `ValueError` for equations that cannot be
     written in JavaScript.
@@ -76,7 +76,7 @@ def live_page(live: LiveRun, stage: Stage, speed: float = 1.0, below: str = "") 
 
 
 def programs(live: LiveRun) -> str:
-    """The JavaScript that simulates: the data of the sliders, all functions and the integrator, without a page."""
+    """The JavaScript of the simulation: the data of the sliders, all functions and the integrator, without a page."""
     values = jnp.array([slider.value for slider in live.sliders])
     facts = {
         "sliders": [slider._asdict() for slider in live.sliders],

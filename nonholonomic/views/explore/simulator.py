@@ -40,10 +40,9 @@ Functions = dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]
 class Simulator(NamedTuple):
     """A problem that is integrated in the browser.
 
-    - `problem`: of one cell, for the numbers of the sliders.
-    - `t1`: horizon [s]; `settings`: with an explicit Runge-Kutta solver of Diffrax.
-    - `readings`: results of a run, name -> a function of (the sliders' numbers, the problem, a `LaneState` of one
-      lane).
+    - `problem`: function of the numbers of the sliders that returns the problem of one cell.
+    - `t1`: horizon [s]; `settings`: settings with an explicit Runge-Kutta solver of Diffrax.
+    - `readings`: results of a run, name -> function of (the sliders' numbers, the problem, a `LaneState` of one lane).
     - `passes`: whether a run continues through its event.
     """
 
@@ -81,8 +80,8 @@ class Simulator(NamedTuple):
 class Stepper(NamedTuple):
     """The steps of a motion in JavaScript.
 
-    - `begin`: creates the scheduler of one cell from its arguments, of which `examples` are examples; `settings`: of
-      the steps.
+    - `begin`: function that returns the scheduler of one cell; `examples`: example arguments of this function;
+      `settings`: settings of the steps.
     - `constants`, `lane`: the shapes of the constants of a run, and of the lane; `run` computes problem, control and
       absolute tolerances from the constants.
     """

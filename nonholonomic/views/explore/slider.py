@@ -26,13 +26,13 @@ class Slider(NamedTuple):
 def sliders_of(
     ranges: Any, roots: dict[str, Any], labels: dict[str, str], units: dict[str, str], drawn: tuple[str, ...] = ()
 ) -> tuple[Slider, ...]:
-    """The sliders for the ranges of a user.
+    """The sliders for the ranges that a user passes.
 
     **Arguments:**
 
     - `ranges`: name of a parameter -> (lowest, highest) value.
     - `roots`: "scene" and "launch".
-    - `labels`, `units`: of parameters by their short names.
+    - `labels`, `units`: labels and units of parameters, by their short names.
     - `drawn`: parameters, in addition to `DRAWN`, that change the drawn meshes.
 
     **Raises:** `ValueError` for an unknown name, an illegal range, and numbers that the modules do not allow.

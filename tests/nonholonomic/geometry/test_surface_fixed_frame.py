@@ -196,7 +196,7 @@ def test_a_huge_torus_is_a_cylinder():
 
 
 def test_gaussian_curvature_of_the_oblate_spheroid():
-    """`stroller.md`, section 0: K = sinh^2(xi) / (a^2 D^2), D = sinh^2(xi) + sin^2(eta)."""
+    """`stroller.md`, section 1: K = sinh^2(xi) / (a^2 D^2), D = sinh^2(xi) + sin^2(eta)."""
     a, xi, eta = 2.0, 0.8, -0.4
     ground = Spheroid.from_oblate(a, xi)
     D = math.sinh(xi) ** 2 + math.sin(eta) ** 2

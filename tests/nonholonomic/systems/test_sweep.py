@@ -9,7 +9,9 @@ import pytest
 from close import assert_close
 from own_modes import GRAVITY, Ball, Bounces, Sleigh, bounce
 
+import nonholonomic
 from nonholonomic import AbstractMode, Hybrid, sweep
+from nonholonomic.integration import Settings
 from nonholonomic.systems.numbers import Named
 from nonholonomic.systems.sweep import SweepJob
 
@@ -52,7 +54,7 @@ def test_a_table_of_bounces_and_its_derivatives(table):
 
 def test_a_job_may_be_sent_to_another_process():
     named = Named.of({"system": BALL, "start": jnp.array([1.0, 0.0, 0.0]), "event": None})
-    job = SweepJob(named, 1.4, 1e-9, None, ())
+    job = SweepJob(named, 1.4, Settings(1e-9), ())
     sent = pickle.loads(pickle.dumps(job))
     assert sent.named.names == job.named.names
     assert_close(sent.named.values, job.named.values)
@@ -98,3 +100,10 @@ def test_long_steps_leave_no_error_in_the_times_of_bounces():
     heights = np.linspace(0.5, 2.0, 512)
     table = sweep(BALL, [1.0, 0.0, 0.0], 20.0, axes={"start[0]": heights}, progress=False)
     assert_close(table.time, bounce(heights, 0.8, GRAVITY, 3), rtol=1e-13)
+
+
+def test_what_a_user_of_own_systems_needs_has_public_names(table):
+    """The table in the file, and the unknowns of a fit, without imports from the rooms or the vehicles."""
+    assert nonholonomic.Table is type(table)
+    assert nonholonomic.Free(0.8, lower=0.0).lower == 0.0
+    assert issubclass(nonholonomic.FitWarning, UserWarning)
