@@ -34,10 +34,10 @@ class Transition(NamedTuple, Generic[Numbers]):
     """The result of a reset map, one number per cell.
 
     `status` is `RUNNING` where the motion continues in the mode numbered `mode`, otherwise the code for how it ended;
-    `state` is the new state, `elapsed` [s] the duration of the transition, `crossing_time` [s] the (last) time of the
-    event during the transition, infinite if there was none; `counts` holds the counters, one per row. `record` is the
-    path of a single run (`path.py`); `None` for instantaneous transitions, or where no path is kept. `log_rates` is the
-    sum of the logarithms of the rates at which events on the way are met; `None` if there are none.
+    `state` is the new state, `elapsed` [s] the duration of the transition, and `crossing_time` [s] the last time of the
+    event during the transition, infinite if there was none. `counts` contains the counters, one per row. `record` is
+    the path of a single run (`path.py`); `None` for instantaneous transitions, or where no path is kept. `log_rates` is
+    the sum of the logarithms of the rates at which events on the way are met; `None` if there are none.
 
     **Example:** the bounce of both balls at 5 m/s.
 

@@ -57,6 +57,7 @@ def identify(
       for a model without a derivative or with a rough one. Each step then takes 2 k + 1 runs for k parameters.
     - `labels`: (n,), names of the measurements in the result.
     - `progress`: whether to show progress, on a terminal or in a notebook.
+
     **Returns:** an `Identification` with its `verdict`; a doubtful fit gives a `FitWarning`.
 
     **Raises:** `ValueError` for arguments out of range.
@@ -71,7 +72,7 @@ def identify(
     ...     return p["start"][:, None] * 0.5 ** (times / p["half_life"][:, None])
     >>> fit = identify(model, counts, {"start": 800.0, "half_life": 1.5}, progress=False)
     >>> print(f"{fit.estimates['half_life']:.2f} +- {fit.standard_errors['half_life']:.2f}, good: {fit.verdict.good}")
-    0.99 +- 0.03, good: True
+    0.99 +- 0.05, good: True
     """
     check_search(starts, spread, seed, max_steps, progress)
     step, unknowns = step_of(slopes), as_free(free)

@@ -72,7 +72,14 @@ def axis(name: str, number: str, unit: str, values: Any, long_name: str = "") ->
 
 
 def size_of(axes: list[Axis]) -> int:
-    """Number of cells of a grid."""
+    """Number of cells of a grid.
+
+    **Example:**
+
+    >>> from nonholonomic.sweeps import size_of
+    >>> size_of(axes)
+    4
+    """
     return int(np.prod([len(axis.values) for axis in axes], dtype=int))
 
 
