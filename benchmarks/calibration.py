@@ -1,4 +1,5 @@
-"""Simulation-based calibration of a top's posterior (Talts et al., arXiv:1804.06788): are credible intervals what they say?
+"""Simulation-based calibration of a top's posterior (Talts et al., arXiv:1804.06788): do credible intervals have their
+stated probability?
 
     nice python benchmarks/calibration.py [--tables 200] [--draws 64]
 

@@ -22,7 +22,7 @@ class Task(NamedTuple):
     """The task: the time at which theta reaches an angle (`angle`), or `t1` (`angle` None), and the state there.
 
     `field` and `numbers` are those of `fields.py`; `starts` and `scales`, the magnitudes of the components, are
-    (components, launches); `compared` says which components of the end state are.
+    (components, launches); `compared` are the indices of the compared components of the end state.
     """
 
     field: Callable[..., Any]

@@ -1,4 +1,5 @@
-"""The no-U-turn samplers of BlackJAX and NumPyro on a density itself, to compare `nonholonomic.identification.sample` with."""
+"""The no-U-turn samplers of BlackJAX and NumPyro on the density itself, for a comparison with
+`nonholonomic.identification.sample`."""
 
 import math
 from typing import Any
@@ -28,7 +29,8 @@ class InPoints(eqx.Module):
 
 
 def plain(library: str, density: LogDensity, fit: Any, warmup: int, draws: int) -> tuple[Draws, int]:
-    """Draws by the no-U-turn sampler of a library, with the density's own gradient, and the leaps of the kept draws."""
+    """Draws by the no-U-turn sampler of a library with the gradient of the density, and the number of leaps for these
+    draws."""
     around = Surrogate.around(density, fit.coordinates, fit.coordinate_covariance)
     surrogate, walk, runs = learn(around, 4, np.random.default_rng(0))
     points, leaps = BY[library](InPoints(density, surrogate), walk.points, warmup, draws)
@@ -37,7 +39,7 @@ def plain(library: str, density: LogDensity, fit: Any, warmup: int, draws: int) 
 
 
 def by_numpyro(density: InPoints, starts: Any, warmup: int, draws: int) -> tuple[np.ndarray, int]:
-    """Points (chains, draws, unknowns) by NumPyro, and how many leaps of all chains they took."""
+    """Points (chains, draws, unknowns) by NumPyro, and their number of leaps over all chains."""
     from numpyro.infer import MCMC, NUTS
 
     chains = {"num_chains": len(starts), "chain_method": "vectorized", "progress_bar": False}

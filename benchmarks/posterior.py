@@ -1,14 +1,15 @@
-"""What draws from a posterior cost: friction, offset and I1 from ten times, and from one film, and by which sampler.
+"""Cost of draws from a posterior of friction, offset and I1, from ten times or from a film, by several samplers.
 
     python benchmarks/posterior.py times                      `nonholonomic.identification.sample`
     python benchmarks/posterior.py film
     python benchmarks/posterior.py times --plain blackjax     NUTS on the density itself, with its own gradient, by BlackJAX
     python benchmarks/posterior.py times --plain numpyro      and by NumPyro
 
-The ten times are those of `examples/posterior.py`. The film has 250 frames, 50 in a second, of inclination and azimuth, the
-clock's start and the azimuth of the launch unknown too. The plain samplers get the coordinates in which `sample` has found the
-posterior to be about round, and its starts. Printed are seconds of CPU and of the wall, compiling included, and the effective
-draws of the worst unknown. Run it alone: with other work beside it believe the CPU seconds.
+The ten times are those of `examples/posterior.py`. The film has 250 frames of inclination and azimuth at 50 frames per
+second; the clock's start and the azimuth of the launch are also unknown. The plain samplers use the coordinates in
+which `sample` found the posterior to be nearly round, and the starts of `sample`. The script prints CPU and wall time
+[s], including compilation, and the effective draws of the worst unknown. If other work runs on the machine, only the
+CPU time is meaningful.
 """
 
 import argparse
@@ -31,7 +32,7 @@ FRAMES, FPS, ERRORS = 250, 50.0, (0.02, 0.05)
 
 
 def film() -> tuple[tippe.Recording, dict[str, Any]]:
-    """The film, and what is free in it."""
+    """The film, and its unknowns."""
     launch, clock = tippe.Launch(0.1, 120.0), np.arange(1, FRAMES + 1) / FPS
     run = tippe.simulate(scene(0.3, 0.0035), launch, clock[-1], clock)
     exact = np.stack([run.theta, run.azimuth], axis=1)

@@ -1,4 +1,5 @@
-"""A rattleback: error against time, cost of a step compared with that of a top, and the same body in SciPy and MuJoCo.
+"""A rattleback: error against time in this package, SciPy and MuJoCo, and the cost of a step compared with that of a
+top.
 
     python benchmarks/rattleback.py
 
@@ -38,7 +39,7 @@ def ours(spin: float, tolerance: float) -> float:
 
 
 def scipy(spin: float, tolerance: float) -> float:
-    """By the reference of the tests, in NumPy and SciPy's DOP853 [s]."""
+    """The time of reversal by the reference of the tests, in NumPy and SciPy's DOP853 [s]."""
     sys.path.append(str(Path(__file__).parents[1] / "tests" / "physics"))
     from rigid_reference import Rattleback  # pyright: ignore[reportMissingImports]
 
@@ -47,7 +48,8 @@ def scipy(spin: float, tolerance: float) -> float:
 
 
 def mujoco(spin: float, step: float) -> float:
-    """By MuJoCo with RK4, elliptic cones and impratio 100 [s], infinite if the body does not reverse."""
+    """The time of reversal by MuJoCo with RK4, elliptic cones and impratio 100 [s]; infinite if the body does not
+    reverse."""
     import mujoco
 
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = INERTIA

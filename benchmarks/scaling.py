@@ -1,19 +1,19 @@
-"""Cost per launch for 1 to 10^5 launches and more, the memory, and how much of the machine's arithmetic is used.
+"""Cost per launch for 1 to 10^5 launches and more, memory, and the fraction of the machine's peak performance.
 
     python benchmarks/scaling.py [--most 100000]
     JAX_ENABLE_X64=0 python benchmarks/scaling.py        the same in single precision, at tolerance 1e-5
 
-The reference problem: Rutstam's top on the plane, viscous friction, 100 rad/s, theta(0) from 0.05 to 0.15, tolerance 1e-9. On a
-CPU with one core and with all; on an accelerator, where there is one, as it is (`--most 10000000` goes up to 10^7 launches).
-Then, whatever `--most` says, the 64 x 64 grid of theta x spin whose cells differ in cost by a factor of ten: how many of the
-steps that the lockstep took were useful; and what the number of lanes in a block does, for which six programs are compiled.
-Run it alone: other work on the machine shows in every number.
+The reference problem: Rutstam's top on the plane, viscous friction, 100 rad/s, theta(0) from 0.05 to 0.15, tolerance
+1e-9. It runs on one core and on all cores of a CPU, and on an accelerator if there is one (`--most 10000000` goes up to
+10^7 launches). Two more measurements do not depend on `--most`: on a 64 x 64 grid of theta x spin, whose cells differ
+in cost by a factor of ten, the fraction of lane-steps that were useful; and the cost for six numbers of lanes in a
+block. Run the script alone: other work on the machine changes every number.
 
-A first call compiles and runs; it is not in the other columns. "ratio" is the wall time with one core over that with all. Peak
-memory is the most that the process has held so far, compilers included.
+The first call, which compiles, has a column of its own. "ratio" is the wall time with one core over that with all
+cores. Peak memory is the greatest memory of the process so far, including the compiler's.
 
-Operations are counted in the program of a step, multiply and add as two; the peak is that of multiply-adds on registers,
-measured in the same run. Steps of idle lanes count as wasted.
+Operations are counted in the program of a step; a multiply-add counts as two. The peak is that of multiply-adds on
+registers, measured in the same run. Steps of idle lanes count as wasted.
 """
 
 import argparse
@@ -51,7 +51,7 @@ def times_of(scene: tippe.Scene, launches: int) -> tippe.Table:
 
 
 def cpu_row(scene: tippe.Scene, launches: int, cores: int, operations: float, most: float) -> dict[str, str]:
-    """Cost of one table on a CPU, where a step makes so many operations and a core at most so many a second."""
+    """Cost of one table on a CPU, for the given operations per step and the peak performance of a core."""
     times = {}
     for workers in sorted({1, cores}):
         with_workers(workers)
@@ -71,7 +71,7 @@ def cpu_row(scene: tippe.Scene, launches: int, cores: int, operations: float, mo
 
 
 def device_row(scene: tippe.Scene, launches: int, operations: float, most: float) -> dict[str, str]:
-    """Cost of one table on an accelerator, which makes at most so many operations a second."""
+    """Cost of one table on an accelerator with the given peak performance."""
     run = timed(lambda: times_of(scene, launches), 2)
     memory = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use", 0) / 2**30
     return {
@@ -85,7 +85,7 @@ def device_row(scene: tippe.Scene, launches: int, operations: float, most: float
 
 
 def useful_share(scene: tippe.Scene) -> float:
-    """The part of all lane-steps on a 64 x 64 grid of theta x spin that advanced a lane that was still running."""
+    """The fraction of lane-steps on a 64 x 64 grid of theta x spin that advanced a running lane."""
     theta, spin = np.meshgrid(np.linspace(0.05, 1.5, 64), np.linspace(20.0, 200.0, 64), indexing="ij")
     problem = InversionProblem.of(scene, tippe.Launch(theta.ravel(), spin.ravel()), 0.95 * np.pi, 4096)
     outcome, iterations = solve_ensemble(
@@ -98,7 +98,7 @@ def useful_share(scene: tippe.Scene) -> float:
 
 
 def lanes_table(scene: tippe.Scene) -> list[dict[str, str]]:
-    """What the number of lanes in a block does to the cost: it decides which cache the stages fit."""
+    """Cost for several numbers of lanes in a block, which determine the cache into which the stages fit."""
     cells = 4096 if ON_CPU else 262144
     problem = InversionProblem.of(scene, tippe.Launch(np.linspace(0.05, 0.15, cells), 100.0), 0.95 * np.pi, cells)
     rows = []

@@ -1,4 +1,4 @@
-"""The scenes of `work_precision.py`, each as this package runs it and as plain numbers for the peers."""
+"""The scenes of `work_precision.py`, each in the form of this package and as plain numbers for other programs."""
 
 import dataclasses
 import math
@@ -27,7 +27,7 @@ AXIS, POSITION = slice(2, 5), slice(0, 3)
 
 
 class Case(NamedTuple):
-    """A scene with its launches: the task of the peers, and the problem of this package's driver."""
+    """A scene with its launches: the task for other programs, and the problem for this package."""
 
     task: Task
     problem: AbstractProblem
@@ -52,7 +52,7 @@ def scenes(launches: int) -> dict[str, Case]:
 
 
 def of_top(scene: tippe.Scene, launch: tippe.Launch, t1: float, angle: float | None, turns: bool = True) -> Case:
-    """A top that ends where theta reaches an angle, or, with `None`, at the horizon `t1` [s]; `turns`: as tables have it."""
+    """A top that ends where theta reaches an angle or, with `None`, at the horizon `t1` [s]; `turns`: as in tables."""
     body, law, cells = scene.body, scene.friction, launch.theta.shape[0]
     problem = InversionProblem.of(scene, launch, ANGLE if angle is None else angle, cells)
     if not turns:
@@ -71,7 +71,7 @@ def of_top(scene: tippe.Scene, launch: tippe.Launch, t1: float, angle: float | N
 
 
 def of_stroller(launches: int, t1: float) -> Case:
-    """A damped stroller inside a spheroid: launches over speed and place, each seen until `t1` [s]."""
+    """A damped stroller inside a spheroid: launches over speed and place, each until `t1` [s]."""
     body = stroller.Stroller(12.0, 0.7, 1.5, 0.05, steering_spring=0.2)
     bowl, damping = stroller.Spheroid(6.0, 3.0), stroller.Damping(0.8, 0.4, 0.1, 0.02)
     scene = stroller.Scene(body, bowl, damping, side="inside")
@@ -87,15 +87,14 @@ def of_stroller(launches: int, t1: float) -> Case:
 
 
 def case(field, numbers, problem, t1: float, angle: float | None, compared: slice) -> Case:
-    """The peers are given the driver's own starts and magnitudes."""
+    """The case, with the same initial states and magnitudes for all programs."""
     starts, scales = map(np.asarray, problem.start())
     return Case(Task(field, numbers, starts, scales, t1, angle, compared), problem)
 
 
 def misprint(case: Case) -> float:
-    """Greatest difference of the peers' field from the scene's own, component by component, relative to the greatest rate.
-
-    The states are scattered about the launches, so that no part of the formulas vanishes by chance.
+    """Greatest difference of the field for other programs from the scene's own field, for each component, relative to
+    the greatest rate. The states are scattered about the launches, so that no term of the formulas vanishes by chance.
     """
     task = case.task
     states = task.starts + 0.3 * task.scales * np.random.default_rng(5).normal(size=task.starts.shape)

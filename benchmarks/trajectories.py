@@ -1,20 +1,21 @@
-"""Cost and error of sampled trajectories in batches, beside a table of times and vmapped Diffrax.
+"""Cost and error of sampled trajectories in batches, compared with a table of times and with vmapped Diffrax.
 
     python benchmarks/trajectories.py [--launches 512] [--samples 1001] [--quick]
 
-The reference problem: Rutstam's top on the plane, viscous friction, 100 rad/s, theta(0) from 0.05 to 0.15, 10 s at a relative
-tolerance of 1e-9. Cost is CPU time per launch on one core, the least of some runs, the first call (which compiles) apart:
+The reference problem: Rutstam's top on the plane, viscous friction, 100 rad/s, theta(0) from 0.05 to 0.15, 10 s at a
+relative tolerance of 1e-9. Cost is CPU time per launch on one core, the least of several runs, without the first call,
+which compiles:
 
-* `inversion_table` of last crossings, for which all runs go on to the same horizon: what they cost without samples;
-* `trajectory_table` with theta and eta, and with the position, for which the run carries its path;
-* `vmap(simulate)` under `jit`, and the same with the compiler's option for wide vectors, which only the outermost `jit` can
-  be given and tables give theirs;
+* `inversion_table` of last crossings, whose runs all continue to the same horizon: the cost without samples;
+* `trajectory_table` with theta and eta, and with the position, which needs the path of the run;
+* `vmap(simulate)` under `jit`, without and with the compiler's option for wide vectors, which tables use, but which
+  only the outermost `jit` accepts;
 * `vmap(diffeqsolve)` with `SaveAt(ts)`, Dopri8 and the same field, which interpolates its samples;
-* the derivative of the samples of theta by mu, forward and reverse, along with them.
+* the samples of theta together with their derivative by mu, in forward and reverse mode.
 
-Error is the greatest difference of theta over launches and samples to the same at a tolerance of 1e-13; beside it that of the
-end state of runs without samples to the same time, for errors grow while a top rises and shrink when it stands.
-Run it alone: other work on the machine shows in every number.
+Error is the greatest difference of theta, over launches and samples, from the same program at a tolerance of 1e-13.
+Errors grow while a top rises and shrink when it stands, so the error of the end state without samples is listed, too.
+Run the script alone: other work on the machine changes every number.
 """
 
 import argparse
@@ -48,7 +49,7 @@ def simulated(thetas: Any, times: Any, mu: Any = MU) -> Any:
 
 
 def by_diffrax(thetas: Any, times: Any) -> Any:
-    """theta at every sample of every launch, by `vmap(diffeqsolve)` as one writes it, with this package's field."""
+    """theta at every sample of every launch, by a plain `vmap(diffeqsolve)` with this package's field."""
     top = scene()
     dynamics = top.turning_dynamics
 

@@ -1,12 +1,13 @@
-"""Where the weights of `Oscillatory8` come from: the pair of its family with the smallest errors along motions.
+"""Compute the weights of `Oscillatory8`: the pair of its family with the smallest errors along motions.
 
     python benchmarks/tune_pair.py [--starts 40] [--launches 64] [--seed 0]
 
-The family (`tuning/family.py`) leaves ten weights free. From the pair of Prince and Dormand, and then from random
-neighbours of the best ones found, the sum of the logarithms of the errors along seven motions (`tuning/motions.py`) is made
-smaller, with a share of the squares of the weights, which magnify round-off. It prints every pair that is better than those
-before: its errors over those of `Dopri8`, the norms of what is left in ninth order, and at last the weights. There are many
-valleys of nearly the same depth, so another seed, or another machine's round-off, ends in other weights.
+The family (`tuning/family.py`) leaves ten weights free. The script minimises the sum of the logarithms of the errors
+along seven motions (`tuning/motions.py`), plus a multiple of the squares of the weights, because large weights magnify
+round-off. It starts from the pair of Prince and Dormand, and then from random neighbours of the best pairs so far. It
+prints every pair that is better than all before: its errors relative to those of `Dopri8`, the norms of the remaining
+errors in ninth order, and finally the weights. There are many minima of nearly the same depth, so another seed, or
+another machine's round-off, ends in other weights.
 """
 
 import argparse
@@ -36,7 +37,7 @@ SMALLNESS = 0.03**2
 
 
 class Aim:
-    """What is made smaller: the logarithms of the errors of each motion, weighted, and the weights of the pair."""
+    """The objective: the weighted logarithms of the errors of each motion, and the weights of the pair."""
 
     def __init__(self, cases: dict[str, Case], seed: int):
         self.motions: list[tuple[str, float, Steps]] = [
@@ -44,7 +45,7 @@ class Aim:
         ]
 
     def sizes(self, unknowns: Unknowns) -> list[float]:
-        """The errors of each motion over those of `Dopri8`."""
+        """The errors of each motion relative to those of `Dopri8`."""
         return [float(jnp.linalg.norm(errors(unknowns, steps))) for _, _, steps in self.motions]
 
     def __call__(self, unknowns: Unknowns) -> float:
@@ -52,7 +53,7 @@ class Aim:
         return float(logarithms + 0.5 * SMALLNESS * unknowns @ unknowns)
 
     def least_squares(self, unknowns: Unknowns) -> tuple[Any, Any]:
-        """Residuals, and their slopes, whose sum of squares falls as the aim does."""
+        """Residuals whose sum of squares decreases with the objective, and their slopes."""
         residuals, rows = [np.sqrt(SMALLNESS) * unknowns], [np.sqrt(SMALLNESS) * np.eye(len(unknowns))]
         for (_, weight, steps), size in zip(self.motions, self.sizes(unknowns), strict=True):
             residuals.append(np.sqrt(weight) / size * np.ravel(errors(unknowns, steps)))
@@ -61,7 +62,7 @@ class Aim:
 
 
 def descended(aim: Aim, unknowns: Unknowns, passes: int = 45) -> tuple[Unknowns, float]:
-    """The bottom of the valley, by Levenberg and Marquardt's method in the family's free directions."""
+    """The local minimum, by Levenberg and Marquardt's method in the family's free directions."""
     damping, heights = 1e-2, [aim(unknowns)]
     for _ in range(passes):
         free = free_directions(unknowns)
@@ -105,7 +106,7 @@ def shown(aim: Aim, unknowns: Unknowns, height: float) -> str:
 
 
 def main() -> None:
-    """Look for the pair and print its weights."""
+    """Search for the pair and print its weights."""
     command = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     command.add_argument("--starts", type=int, default=40, help="how many valleys are looked into")
     command.add_argument("--launches", type=int, default=64, help="steps of each motion")

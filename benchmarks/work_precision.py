@@ -1,12 +1,12 @@
-"""Speed against error: this package beside its peers on the same launches, one core each.
+"""Speed against error: this package and other programs on the same launches, on one core each.
 
     python benchmarks/work_precision.py [--out FOLDER] [--quick] [--scenes NAME ...]
 
-For each scene and tolerance: the error is the greatest over the launches, against heyoka at 1e-16 (SciPy's DOP853 at 1e-13
-where heyoka is missing): of the inversion time [s] where the scene has one, otherwise of the end, which has a column of its
-own (a top's axis, a stroller's position [m]). The time is the least CPU time of nine runs after a warm-up (one run of the
-slow peers), per launch. Compilation is given apart. Peers that are not installed are named and skipped. It writes a CSV, a
-picture and the README's table.
+For each scene and tolerance, the error is the greatest difference from heyoka at 1e-16 over the launches (from SciPy's
+DOP853 at 1e-13 if heyoka is missing): in the inversion time [s] if the scene has one, otherwise in the end state (a
+top's axis, a stroller's position [m]), which also has a column of its own. The time is the least CPU time per launch of
+nine runs after a warm-up (of one run for slow programs), without compilation, which is listed separately. Programs that
+are not installed are named and skipped. The script writes a CSV, a picture and the README's table.
 """
 
 import argparse
@@ -33,7 +33,7 @@ SOLVERS = {"Oscillatory8": Oscillatory8(), "Dopri8": diffrax.Dopri8(), "Tsit5": 
 
 
 def ours(case: Case, solver: Any) -> Any:
-    """This package's block driver, with the answer that the peers give."""
+    """This package's ensemble solver, with results in the form of the other programs."""
     task, cells = case.task, case.task.launches
 
     def run(tolerance: float) -> Ends:
@@ -48,7 +48,7 @@ def ours(case: Case, solver: Any) -> Any:
 
 
 def obvious_diffrax(task: Task, launches: int) -> Any:
-    """What one writes first: vectors of three, `jnp.cross`, lanes first, `vmap(diffeqsolve)` with an event."""
+    """The most obvious program: vectors of three, `jnp.cross`, lanes first, `vmap(diffeqsolve)` with an event."""
     p = task.numbers
     normal, cosine = jnp.array([0.0, 0.0, 1.0]), math.cos(task.angle)
 
@@ -91,13 +91,14 @@ def obvious_diffrax(task: Task, launches: int) -> Any:
 
 
 def spread(launches: int, most: int) -> Any:
-    """Which launches stand for all of them with a program that bears only so many: as cheap and as dear as the rest."""
+    """The launches for a program that is too slow for all of them: a sample with the same range of cost."""
     count = min(launches, most)
     return ((np.arange(count) + 0.5) * launches / count).astype(int)
 
 
 def errors(task: Task, ends: Ends, reference: Ends) -> tuple[float, float]:
-    """The greatest errors over the launches: of the time [s], or of the end where the horizon ends a run; of the end."""
+    """The greatest errors over the launches: of the time [s] (of the end state if the horizon ends a run), and of the
+    end state."""
     time, end = (float(np.max(np.abs(value - other))) for value, other in zip(ends, reference, strict=True))
     return (end if task.angle is None else time), end
 
@@ -117,7 +118,7 @@ def row(scene: str, program: str, tolerance: float, task: Task, measured: Any, r
 
 
 def measure(name: str, case: Case, quick: bool) -> list[dict[str, str]]:
-    """All programs on one scene."""
+    """Measure all programs on one scene."""
     task, difference = case.task, misprint(case)
     if not difference < 1e-12:
         raise RuntimeError(f"{name}: the peers' field differs from the scene's own by {difference:.1e}")
@@ -153,7 +154,7 @@ def measure(name: str, case: Case, quick: bool) -> list[dict[str, str]]:
 
 
 def cost_at(rows: list[dict[str, str]], scene: str, program: str, error: float) -> float:
-    """CPU time per launch [ms] at a given error, between the measured points (logarithms); infinite if out of reach."""
+    """CPU time per launch [ms] at a given error, interpolated in logarithms; infinite outside the measured errors."""
     points = [
         (math.log(float(row["error"]) + 1e-300), math.log(float(row["cpu ms per launch"])))
         for row in rows
@@ -179,7 +180,7 @@ def summary(rows: list[dict[str, str]]) -> list[dict[str, str]]:
 
 
 def draw(rows: list[dict[str, str]], path: Path) -> None:
-    """CPU time against error, a panel for each scene, and one for the names of the programs."""
+    """CPU time against error: a panel for each scene, and a panel for the names of the programs."""
     from matplotlib import colormaps
     from matplotlib.figure import Figure
 

@@ -27,12 +27,14 @@ def of(package: str, names: str) -> list[str]:
 
 
 #: The rooms with the engine of the models.
-ENGINE_ROOMS = tuple(f"nonholonomic.{room}" for room in ("integration", "hybrid", "derivatives", "sweeps"))
+ENGINE_ROOMS = tuple(
+    f"nonholonomic.{room}" for room in ("integration", "hybrid", "derivatives", "sweeps", "identification")
+)
 
-#: The public numbers of the engine; the docstrings of the rooms say what they mean.
+#: The public numbers and types of the engine; the docstrings of the rooms say what they mean.
 CONSTANTS = [
     *of("nonholonomic.integration", "RUNNING REACHED_END CROSSED LEFT_DOMAIN FAILED UNRESOLVED"),
-    *of("nonholonomic.integration", "DEFAULT_MAX_STEPS MOST_STEPS TIGHTEST"),
+    *of("nonholonomic.integration", "DEFAULT_MAX_STEPS MOST_STEPS TIGHTEST Lanes States"),
     *of("nonholonomic.hybrid", "MOST_ROUNDS BETWEEN"),
 ]
 
@@ -129,7 +131,14 @@ PAGES = {
             "nonholonomic.sweeps",
             *of(
                 "nonholonomic.sweeps",
-                "sweep Axis axis Variable cells_to_check chunk_for saved_cells Quantity run_table Tabular",
+                "sweep Axis axis Variable size_of cells_to_check chunk_for saved_cells Quantity run_table Tabular",
+            ),
+            "nonholonomic.identification",
+            *of(
+                "nonholonomic.identification",
+                "AbstractRecording Quantities as_quantity read_columns model_times predicted AbstractDataModel scene_unknowns "
+                "free_numbers search_options as_sources fit_data identify Identification Measurements joined of_data "
+                "series_units LogDensity",
             ),
         ],
     ),
@@ -185,6 +194,10 @@ MEMBERS = {
     "nonholonomic.hybrid.Segment": "at",
     "nonholonomic.derivatives.VariationalProblem": "parts",
     "nonholonomic.sweeps.Quantity": "of",
+    "nonholonomic.identification.AbstractRecording": "columns size seen labels series_units measurements",
+    "nonholonomic.identification.Quantities": "of samples",
+    "nonholonomic.identification.AbstractDataModel": "together predict",
+    "nonholonomic.identification.LogDensity": "of names units start values predict replicate",
     "nonholonomic.sweeps.Tabular": "readable portrait_axes to_table to_xarray save portrait",
     "nonholonomic.derivatives.AbstractDifferentiableSolve": "in_blocks movable absent solve value_and_tangents for_parts",
     "nonholonomic.Trajectory": "status to_table to_xarray save portrait plot",

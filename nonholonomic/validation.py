@@ -244,8 +244,8 @@ def require_file(path: Any, name: str, *endings: str) -> Path:
 def require_package(name: str, extra: str, purpose: str) -> None:
     """Raise `ModuleNotFoundError` unless an optional package is installed. Call this before the work begins.
 
-    **Arguments:** `name`: of the package; `extra`: the extra of this distribution that installs it; `purpose`: what
-    needs it.
+    **Arguments:** `name`: name of the package; `extra`: the extra of this distribution that installs it; `purpose`:
+    what needs it.
     """
     if find_spec(name) is None:
         raise ModuleNotFoundError(f"{purpose} needs {name}: pip install 'nonholonomic[{extra}]'", name=name)

@@ -10,10 +10,10 @@ from measure import Timed
 class Row(NamedTuple):
     """A line of the table of hard cases.
 
-    - `case`: what is hard about it, with its numbers.
+    - `case`: the difficulty of the scene, with its numbers.
     - `happens`: what the simulator does.
     - `error`: the measured error, or the distance of a measured order from the one it should be.
-    - `bound`: what the error must not exceed, about ten times what was measured when the row was written.
+    - `bound`: upper bound of the error, about ten times the error when the row was written.
     - `against`: the independent reference of the error, and its unit.
     - `steps`: accepted and rejected steps of one run.
     - `cpu`: CPU time of one run [s], compilation apart.

@@ -1,1 +1,2 @@
-"""What `tune_pair.py` puts together: the conditions of order, the family of pairs, and the motions it is tuned to."""
+"""The parts of `tune_pair.py`: the order conditions, the family of pairs, and the motions for which the pair is
+tuned."""

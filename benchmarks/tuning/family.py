@@ -1,7 +1,7 @@
 """The family of Runge-Kutta pairs of orders 8 and 7 to which Prince and Dormand's RK8(7)13M belongs.
 
-Thirteen stages, of which the second and the third help only to begin, with all simplifying assumptions of that pair. The
-weights that may differ from 0 are the unknowns; the equations leave ten of them free.
+The pairs have thirteen stages, of which only the next stages use the second and the third, and satisfy all simplifying
+assumptions of that pair. The unknowns are the weights that may differ from 0; the equations leave ten of them free.
 """
 
 from typing import NamedTuple
@@ -33,7 +33,7 @@ Unknowns = Float[Array, " unknowns"]
 
 
 class Pair(NamedTuple):
-    """Stages, and the weights of the steps of eighth and of seventh order."""
+    """The stages, and the weights of the steps of eighth and seventh order."""
 
     stages: Float[Array, "stages stages"]
     eighth: Float[Array, " stages"]
@@ -41,7 +41,7 @@ class Pair(NamedTuple):
 
 
 def pair_of(unknowns: Unknowns) -> Pair:
-    """The pair that has these weights."""
+    """The pair with the given weights."""
     inner, count = AT.shape[1], len(WEIGHTED)
     empty = jnp.zeros(STAGES)
     return Pair(
@@ -52,8 +52,8 @@ def pair_of(unknowns: Unknowns) -> Pair:
 
 
 def unknowns_of(tableau: diffrax.ButcherTableau, caution: float = 1.0) -> Unknowns:
-    """The weights of a pair of this family, whose last stage in Diffrax is the end of the step; `caution`: its estimate of the
-    error over the difference of the two steps."""
+    """The weights of a pair of this family, whose last stage in Diffrax is the end of the step; `caution`: ratio of its
+    error estimate to the difference of the two steps."""
     stages = np.zeros((STAGES, STAGES))
     for stage, row in enumerate(tableau.a_lower[: STAGES - 1], 1):
         stages[stage, :stage] = row
@@ -64,11 +64,13 @@ def unknowns_of(tableau: diffrax.ButcherTableau, caution: float = 1.0) -> Unknow
 
 @jax.jit
 def equations(unknowns: Unknowns) -> Float[Array, " equations"]:
-    """What vanishes for a pair of this family, c being the sums of the rows of A, b and h the weights of its steps.
+    """The expressions that vanish for a pair of this family, where c are the row sums of A, and b and h the weights of
+    the steps.
 
-    Stages: A c^k = c^(k+1) / (k+1) for k = 1, 2, 3 but for the first ones. Steps: w A = w (1 - c), the quadrature, and, as
-    the fourth and fifth stages are not of the order of the others, no trace of them where two or three stages follow each
-    other. With these, one more condition remains for seventh order and three for eighth.
+    For the stages, A c^k = c^(k+1) / (k+1) for k = 1, 2, 3, except for the first stages. For the steps, w A = w (1 -
+    c), and the quadrature conditions; the fourth and fifth stages have a lower order than the others, so their
+    contributions to products of two or three stages must vanish. Then one more condition remains for seventh order, and
+    three for eighth order.
     """
     A, b, h = pair_of(unknowns)
     c = A.sum(axis=1)
@@ -96,13 +98,13 @@ _slopes = jax.jit(jax.jacfwd(equations))
 
 
 def free_directions(unknowns: Unknowns) -> Float[np.ndarray, "unknowns free"]:
-    """In which directions the weights may move without leaving the family."""
+    """The directions in which the weights can move without leaving the family."""
     rank, _, right, _ = _decomposed(unknowns)
     return right[rank:].T
 
 
 def returned(unknowns: Unknowns, passes: int = 12) -> tuple[Unknowns, float]:
-    """The weights brought back into the family by Newton's method, and what is left of the equations."""
+    """The weights, returned to the family by Newton's method, and the residuals of the equations."""
     for _ in range(passes):
         left = np.asarray(equations(unknowns))
         if np.abs(left).max() < 1e-15:
@@ -113,7 +115,8 @@ def returned(unknowns: Unknowns, passes: int = 12) -> tuple[Unknowns, float]:
 
 
 def _decomposed(unknowns: Unknowns) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
-    """Rank, singular values and vectors of the equations' slopes: more equations than needed, so the rank is at the gap."""
+    """Rank, singular values and vectors of the slopes of the equations. There are more equations than needed, so a gap
+    in the singular values determines the rank."""
     left, values, right = np.linalg.svd(np.asarray(_slopes(unknowns)))
     falls = np.where(values[1:] < 1e-8 * values[0], values[:-1] / np.maximum(values[1:], 1e-300), 0.0)
     return 1 + int(np.argmax(falls)), values, right, left

@@ -1,4 +1,4 @@
-"""Steps along motions of tops and strollers, and the errors that a pair makes in them."""
+"""Steps along motions of tops and strollers, and the errors of a pair in these steps."""
 
 from typing import Any, NamedTuple
 
@@ -24,8 +24,8 @@ States = Float[Array, "components launches"]
 
 
 class Steps(NamedTuple):
-    """Steps of one motion: the problem, where they start, their lengths [s], where they lead, the units of errors, and how much
-    each step counts."""
+    """Steps of one motion: the problem, the start states, the lengths [s], the end states, the units of errors, and the
+    weight of each step."""
 
     problem: AbstractProblem
     starts: States
@@ -36,7 +36,8 @@ class Steps(NamedTuple):
 
 
 def motions(launches: int) -> dict[str, Case]:
-    """The scenes of `work_precision.py` without the stiff one, a top in a sphere, and a faster one with dry friction."""
+    """The scenes of `work_precision.py` without the stiff scene, a top in a sphere, and a faster top with dry
+    friction."""
     top, theta = tippe.Top(*TOP), np.linspace(0.05, 0.6, launches)
     ball = tippe.Scene(top, tippe.Sphere(0.3), tippe.Viscous(0.3))
     dry = tippe.Scene(top, friction=tippe.Coulomb(0.3, 1e-2))
@@ -47,7 +48,7 @@ def motions(launches: int) -> dict[str, Case]:
 
 
 def steps_of(case: Case, seed: int) -> list[Steps]:
-    """Steps from random times of a motion, one set for each of `STRETCHES`."""
+    """Steps from random times of a motion, a set for each of `STRETCHES`."""
     problem, launches = case.problem, case.task.launches
     when = np.random.default_rng(seed).uniform(0.02, 1.0, launches) * min(case.task.t1, 6.0)
     starts = solve_ensemble(problem, jnp.asarray(when), jnp.asarray(launches), Settings(1e-11))[0].state
@@ -70,7 +71,7 @@ def steps_of(case: Case, seed: int) -> list[Steps]:
 
 @eqx.filter_jit
 def moved(unknowns: Unknowns, problem: AbstractProblem, starts: States, lengths: Any) -> tuple[States, States]:
-    """Where one step leads, and its estimate of the error."""
+    """The end state of a step, and its error estimate."""
     pair = pair_of(unknowns)
 
     def rate(state: States) -> States:
@@ -88,7 +89,7 @@ def _sum(weights: Float[Array, " stages"], rates: list[States]) -> States:
 
 @eqx.filter_jit
 def errors(unknowns: Unknowns, steps: Steps) -> Float[Array, "components launches"]:
-    """The errors of the steps, in their units, each with its share."""
+    """The weighted errors of the steps, in their units."""
     ends, _ = moved(unknowns, steps.problem, steps.starts, steps.lengths)
     return jnp.where(steps.share > 0.0, (ends - steps.ends) / steps.units, 0.0) * steps.share
 
@@ -98,7 +99,7 @@ slopes = eqx.filter_jit(jax.jacfwd(errors))
 
 
 def shared(steps: Steps) -> Steps:
-    """The steps with such shares that the errors of `Dopri8` have the norm 1, and no step counts much more than another."""
+    """The steps with weights such that the errors of `Dopri8` have the norm 1 and all steps count about equally."""
     plain = jnp.sum(errors(PLAIN, steps) ** 2, axis=0)
     good = jnp.isfinite(plain)
     share = jnp.where(good, 1.0 / jnp.sqrt((plain + 0.1 * jnp.nanmedian(plain)) * jnp.sum(good)), 0.0)

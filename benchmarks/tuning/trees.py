@@ -26,7 +26,7 @@ def trees(order: int) -> list[list[Tree]]:
 
 
 def _forests(known: list[list[Tree]], vertices: int, largest: int) -> list[list[Tree]]:
-    """All lists of trees with so many vertices in all, none of them with more than `largest`."""
+    """All lists of trees with the given total number of vertices, none with more than `largest`."""
     if vertices == 0:
         return [[]]
     return [
@@ -38,7 +38,7 @@ def _forests(known: list[list[Tree]], vertices: int, largest: int) -> list[list[
 
 
 def vertices(tree: Tree) -> int:
-    """How many vertices a tree has: its order."""
+    """Number of vertices of a tree: its order."""
     return 1 + sum(map(vertices, tree))
 
 
@@ -48,7 +48,7 @@ def density(tree: Tree) -> int:
 
 
 def symmetry(tree: Tree) -> int:
-    """sigma(t): how many rearrangements leave the tree as it is."""
+    """sigma(t): number of rearrangements that do not change the tree."""
     return math.prod(math.factorial(count) * symmetry(branch) ** count for branch, count in Counter(tree).items())
 
 

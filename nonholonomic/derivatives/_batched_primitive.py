@@ -51,7 +51,7 @@ class Request:
 def solve_one(request: Request, *leaves: Float[Array, "..."]) -> Any:
     """The outputs for a single cell, without the axis of cells; under `vmap` the batch is solved as one ensemble.
 
-    **Arguments:** `request`: with all parts wanted; `leaves`: numbers of a single cell.
+    **Arguments:** `request`: a request for all parts; `leaves`: numbers of a single cell.
     """
     shapes, structure = _flat(jax.eval_shape(functools.partial(_compiled_tree, request.solve, request.active), *leaves))
     present = [k for k, shape in enumerate(shapes) if shape is not None]

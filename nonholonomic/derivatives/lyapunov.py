@@ -25,7 +25,7 @@ class VariedProblem(AbstractProblem):
 
     - `problem`: an autonomous problem; only its field and its domain margin are used.
     - `states`: the problem's state, the tangent and the growth of every cell.
-    - `magnitudes`: of the problem's own components.
+    - `magnitudes`: magnitudes of the problem's own components.
     """
 
     problem: AbstractProblem
@@ -73,7 +73,7 @@ def probed(problem: AbstractProblem) -> VariedProblem:
 class Growth(NamedTuple):
     """Growth of a tangent in every cell, in equal intervals of time.
 
-    - `logarithm`: of the growth in each interval.
+    - `logarithm`: logarithm of the growth in each interval.
     - `status`: how the run ended, a code of `integration/status.py`; `end_time` [s] and `state`: when and where it
       ended; `steps`: number of accepted and rejected steps.
     """
@@ -97,7 +97,7 @@ def growth(
     **Arguments:**
 
     - `problem`: as for `solve_ensemble`.
-    - `tangents`: in the problem's own units.
+    - `tangents`: tangents in the problem's own units.
     - `t1`: horizon [s].
     - `stretches`: number of time intervals; the growth is returned for each.
     - `settings`: their solver must be an explicit Runge-Kutta solver of Diffrax.

@@ -18,7 +18,7 @@ def lie_brackets(fields: Callable[[Coordinates], Float[Array, "n m"]], q: Coordi
     **Arguments:**
 
     - `fields`: function of the coordinates (n,) that returns m fields as the columns of an (n, m) array.
-    - `q`: where to evaluate, (n,).
+    - `q`: coordinates at which to evaluate, (n,).
     """
     along = jnp.einsum("ibk,ka->iab", jax.jacfwd(fields)(q), fields(q))
     return along - jnp.swapaxes(along, 1, 2)

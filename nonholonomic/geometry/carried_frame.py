@@ -153,7 +153,7 @@ class CarriedFrame(AbstractFrame):
     def _moved(
         self, foot: Fixed, axes: tuple[Fixed, Fixed, Fixed], velocity: Tangent, turning: Tangent, room: Component
     ) -> FrameMotion:
-        """The motion of the frame. **Arguments:** `velocity`: of the foot, along the axes."""
+        """The motion of the frame. **Arguments:** `velocity`: velocity of the foot, along the axes."""
         t1, t2, n = axes
         o1, o2, *up = stored(*turning, *self._seen(t1, t2, n))
         back = -self.pull * self.side * self.surface.offset(foot)

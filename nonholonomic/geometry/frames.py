@@ -97,7 +97,7 @@ class AbstractFrame(eqx.Module):
 
     @abc.abstractmethod
     def place_scales(self, size: Component) -> tuple[Component, ...]:
-        """Magnitudes of the place's components. **Arguments:** `size`: of the body [m]."""
+        """Magnitudes of the place's components. **Arguments:** `size`: size of the body [m]."""
 
     @abc.abstractmethod
     def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
@@ -197,7 +197,7 @@ class CylinderFrame(AbstractFrame):
 
     Inside, c is eta and t1 points along growing eta; outside, c = eta - pi.
 
-    - `radius`: of the path of the centre [m], negative outside; `distance`: R [m].
+    - `radius`: radius of the path of the centre [m], negative outside; `distance`: R [m].
     """
 
     radius: Float[Array, "..."]

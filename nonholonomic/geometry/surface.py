@@ -99,7 +99,7 @@ class AbstractSurface(Bounded):
 
     @abc.abstractmethod
     def nearest(self, position: Vector) -> Vector:
-        """The point [m] of the surface that is nearest to a position [m]; if there are several, one of them."""
+        """The point [m] of the surface that is nearest to a position [m]; if there are several, any of these points."""
 
     def onto(self, position: Vector) -> Vector:
         """The point of the surface for a position [m] that has drifted off it."""
@@ -108,8 +108,8 @@ class AbstractSurface(Bounded):
     def ball_gap(self, centre: Vector, radius: Component, side: float) -> BallGap:
         """The point where a ball is about to touch the surface, and the gap.
 
-        **Arguments:** `centre`: of the ball [m]; `radius`: of the ball [m], less than the radii of curvature where the
-        surface is concave; `side`: 1.0 if the ball is on the side to which n points, else -1.0.
+        **Arguments:** `centre`, `radius`: centre and radius of the ball [m]; the radius must be less than the radii of
+        curvature where the surface is concave; `side`: 1.0 if the ball is on the side to which n points, else -1.0.
         """
         foot = self.nearest(centre)
         foot = tuple(0.0 * centre[0] if part is None else part for part in foot)

@@ -48,7 +48,21 @@ def read_columns(path: Any, columns: Any, fps: float | None, error: Any, quantit
     - `error`: name of a column -> (standard error or header of its column, unit), for some or all columns; or `None`.
     - `quantities`: the quantities that can be recorded.
 
+    **Returns:** times, values, errors and quantity.
+
     **Raises:** `ValueError` that names the file, the column and the problem.
+
+    **Example:**
+
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> from nonholonomic.identification import read_columns
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "levels.csv"
+    ...     length = path.write_text("clock,level\\n0.1,90\\n0.2,80\\n")
+    ...     columns = {"time": ("clock", "s"), "level": ("level", "%")}
+    ...     read_columns(path, columns, None, None, Recording.quantities).value
+    array([0.9, 0.8])
     """
     if not isinstance(columns, Mapping) or not columns:
         raise ValueError(f"columns = {columns!r} must be a dictionary, such as {{'theta': ('tilt', 'deg')}}")

@@ -51,12 +51,13 @@ def identify(
     - `measurements`: `Measurements` of shape (n,).
     - `free`: name -> a `Free`, or only the start value.
     - `starts`: number of start points: the start values, and others drawn around them.
-    - `spread`: range of the drawn points, as a factor greater than 1 in either direction; `seed`: of the draw.
+    - `spread`: range of the drawn points, as a factor greater than 1 in either direction; `seed`: seed of the draw.
     - `max_steps`: a fit that needs more steps has not converged.
     - `slopes`: "exact", by automatic differentiation; or "differences", central differences of 1 % in every parameter,
       for a model without a derivative or with a rough one. Each step then takes 2 k + 1 runs for k parameters.
     - `labels`: (n,), names of the measurements in the result.
     - `progress`: whether to show progress, on a terminal or in a notebook.
+
     **Returns:** an `Identification` with its `verdict`; a doubtful fit gives a `FitWarning`.
 
     **Raises:** `ValueError` for arguments out of range.
@@ -71,7 +72,7 @@ def identify(
     ...     return p["start"][:, None] * 0.5 ** (times / p["half_life"][:, None])
     >>> fit = identify(model, counts, {"start": 800.0, "half_life": 1.5}, progress=False)
     >>> print(f"{fit.estimates['half_life']:.2f} +- {fit.standard_errors['half_life']:.2f}, good: {fit.verdict.good}")
-    0.99 +- 0.03, good: True
+    0.99 +- 0.05, good: True
     """
     check_search(starts, spread, seed, max_steps, progress)
     step, unknowns = step_of(slopes), as_free(free)

@@ -24,6 +24,13 @@ class AbstractDataModel(eqx.Module):
     """Predictions of several sets of data, in the form that `identify` expects.
 
     `seen`: mask of the predictions that were measured.
+
+    **Example:** the predictions of the room's example.
+
+    >>> model = Model(scene, data, jnp.arange(3))
+    >>> print(model({"scene.rate": jnp.array([1.0, 2.0])}).round(3))
+    [[0.368 0.135 0.05 ]
+     [0.135 0.018 0.002]]
     """
 
     data: eqx.AbstractVar[tuple[Any, ...]]
@@ -53,7 +60,16 @@ class AbstractDataModel(eqx.Module):
 def as_sources(data: Any, kinds: Any, expected: str) -> tuple[Any, ...]:
     """Sets of data as a tuple.
 
-    **Raises:** `ValueError`, with what was expected, unless there is at least one set and all are of these kinds.
+    **Arguments:** `data`: a set or several; `kinds`: a class or several; `expected`: words for the message.
+
+    **Raises:** `ValueError` that names the allowed kinds, unless there is at least one set of data and all sets are of
+    these kinds.
+
+    **Example:**
+
+    >>> from nonholonomic.identification import as_sources
+    >>> len(as_sources(data[0], Recording, "a Recording"))
+    1
     """
     sources = tuple(data) if isinstance(data, list | tuple) else (data,)
     if not sources or not all(isinstance(source, kinds) for source in sources):
@@ -62,7 +78,15 @@ def as_sources(data: Any, kinds: Any, expected: str) -> tuple[Any, ...]:
 
 
 def search_options(starts: Any, spread: Any, seed: Any, max_steps: Any, progress: Any) -> dict[str, Any]:
-    """The options of the search for `identify`, checked before a model prepares its data."""
+    """The options of the search for `identify`, checked before a model prepares its data.
+
+    **Example:**
+
+    >>> from nonholonomic.identification import search_options
+    >>> search_options(starts=0, spread=2.0, seed=0, max_steps=60, progress=False)
+    Traceback (most recent call last):
+    ValueError: starts = 0 ...
+    """
     check_search(starts, spread, seed, max_steps, progress)
     return {"starts": starts, "spread": spread, "seed": seed, "max_steps": max_steps, "progress": progress}
 
@@ -78,6 +102,14 @@ def fit_data(
 
     **Arguments:** `build`: function from the mask of measured predictions to the model; `search`: `search_options`; the
     others as for `identify`.
+
+    **Returns:** an `Identification`.
+
+    **Example:** by central differences instead of derivatives.
+
+    >>> rough = fit_data(lambda seen: Model(scene, data, jnp.asarray(seen)), data, free, search, slopes="differences")
+    >>> print(f"{rough.estimates['scene.rate']:.3f}")
+    0.997
     """
     measurements, labels, seen = joined(data)
     return identify(build(seen), measurements, unknowns, slopes=slopes, labels=labels, **search)

@@ -30,9 +30,15 @@ Values = dict[str, Float[Array, "..."]]
 class Quantities:
     """The quantities that can be recorded of a run.
 
-    - `columns`: name of a quantity -> names of its columns.
+    - `columns`: name of a quantity with several columns -> their names.
     - `units`: name of a column -> its SI unit.
     - `angles`: columns with a period of a whole turn.
+
+    **Example:**
+
+    >>> from nonholonomic.identification import Quantities
+    >>> Quantities({"place": ("x", "y")}, {"x": "m", "y": "m", "angle": "rad"}, frozenset({"angle"})).of(("place", "angle"))
+    ('x', 'y', 'angle')
     """
 
     columns: Mapping[str, tuple[str, ...]]
@@ -64,7 +70,14 @@ class Quantities:
 
 
 def as_quantity(words: Any) -> Any:
-    """A word, or a tuple of words."""
+    """A word, or a tuple of words.
+
+    **Example:**
+
+    >>> from nonholonomic.identification import as_quantity
+    >>> as_quantity(["x", "y"])
+    ('x', 'y')
+    """
     return tuple(words) if isinstance(words, list) else words
 
 
@@ -84,6 +97,11 @@ class AbstractRecording(eqx.Module):
       `quantities` of a subclass lists what can be recorded.
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
+
+    **Example:** the recording of the room's example.
+
+    >>> data[0].labels
+    ('level(1 s)', 'level(2 s)', 'level(3 s)')
     """
 
     launch: Any
@@ -140,7 +158,7 @@ class AbstractRecording(eqx.Module):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """A label for each sample, such as `theta(0.1 s)`; missing ones are left out."""
+        """A label for each sample, such as `theta(0.1 s)`; missing samples are omitted."""
         every = [f"{column}({time:.4g} s)" for time in np.asarray(self.times) for column in self.columns]
         return tuple(every[i] for i in self.seen)
 
@@ -151,7 +169,7 @@ class AbstractRecording(eqx.Module):
 
     @property
     def measurements(self) -> Measurements:
-        """The samples as `Measurements`, a series for each column; missing ones are left out."""
+        """The samples as `Measurements`, a series for each column; missing samples are omitted."""
         value = np.asarray(self.value).reshape(len(self.times), len(self.columns))
         if self.error is None:
             error = np.broadcast_to(noise(value), value.shape)
@@ -189,7 +207,14 @@ def noise(value: Float[np.ndarray, "times columns"]) -> Float[np.ndarray, " colu
 
 
 def model_times(times: Float[Array, " times"], t0: Float[Array, ""]) -> Float[Array, " times"]:
-    """The times of the samples since the launch [s]; 0 for samples before the launch."""
+    """The times of the samples since the launch [s]; samples before the launch get its time.
+
+    **Example:**
+
+    >>> from nonholonomic.identification import model_times
+    >>> print(model_times(jnp.array([0.5, 1.5]), t0=1.0))
+    [0.  0.5]
+    """
     return greatest(times - t0, INSTANT * jnp.arange(times.shape[0]))
 
 
@@ -204,11 +229,16 @@ def predicted(
     **Arguments:**
 
     - `scene`: the scene of all runs, before its parameters are replaced.
-    - `recordings`: pairs of a recording and its parameters, name -> (rows,). All have the same names, and all launches
-      the same kinds of numbers.
+    - `recordings`: pairs of a recording and its parameters, name -> (rows,). The names must be equal for all
+      recordings, and so must the kinds of numbers in their launches.
     - `run`: function of a scene, a launch and times since the launch [s] that returns a trajectory.
 
     **Returns:** for each recording its samples, ordered by time, including missing ones; NaN after the end of a run.
+
+    **Example:** with another rate.
+
+    >>> print(predicted(scene, [(data[0], {"scene.rate": jnp.array([2.0])})], 1, simulate)[0].round(3))
+    [[0.135 0.018 0.002]]
     """
     first, longest = recordings[0][0], max(len(recording.times) for recording, _ in recordings)
     columns = tuple(dict.fromkeys(name for recording, _ in recordings for name in recording.columns))

@@ -107,19 +107,10 @@ class Identification:
     - `verdict`: a `Verdict`, whether the fit can be believed.
     - `coordinates`, `coordinate_covariance`: estimates and covariance in the coordinates of the fit.
 
-    **Example:**
+    **Example:** the fit of the room's example.
 
-    ```
-    >>> import tippe
-    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
-    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
-    >>> launch = tippe.Launch(theta=[0.2, 0.2, 0.3, 0.2], spin=[155.0, 140.0, 110.0, 60.0])
-    >>> data = tippe.InversionTimes(launch, time=[5.60, 5.53, 5.52, float("inf")], error=0.05, t1=8.0)
-    >>> found = tippe.identify(scene, data, {"friction.mu": 0.25}, progress=False)
-    >>> isinstance(found, tippe.Identification), found.degrees, list(found.estimates)
-    (True, 3, ['scene.friction.mu'])
-
-    ```
+    >>> fit.status, fit.degrees, list(fit.estimates)
+    ('converged', 2, ['scene.rate'])
     """
 
     estimates: dict[str, float]
@@ -143,7 +134,7 @@ class Identification:
     def interval(self, name: str, deviations: float = 1.96) -> tuple[float, float]:
         """The confidence interval of a parameter, symmetric in its coordinate and so within its bounds.
 
-        **Arguments:** `name`: of the parameter, or the end of its name; `deviations`: half the width in standard
+        **Arguments:** `name`: name of the parameter, or the end of its name; `deviations`: half the width in standard
         errors, 1.96 for 95 %.
 
         **Raises:** `ValueError` for a name that was not free.
@@ -161,7 +152,7 @@ class Identification:
 
         **Arguments:**
 
-        - `name`: of the parameter, or the end of its name.
+        - `name`: name of the parameter, or the end of its name.
         - `values`: values at which to hold the parameter, by default 13 within three standard errors.
 
         **Returns:** a `Profile`.
@@ -189,7 +180,7 @@ class Identification:
 
     @property
     def correlation(self) -> Float[np.ndarray, "unknowns unknowns"]:
-        """Correlations of the estimates, in the coordinates of the fit; 0 with those of infinite error."""
+        """Correlations of the estimates, in the coordinates of the fit; 0 for estimates with infinite error."""
         errors = np.sqrt(np.diag(self.coordinate_covariance))
         with np.errstate(invalid="ignore"):
             shares = self.coordinate_covariance / np.outer(errors, errors)
@@ -305,7 +296,7 @@ def summarise(
     converged: np.ndarray,
     at_ends: Linearised,
 ) -> Identification:
-    """The result of fits from several starts: that of the best one, with a record of the others."""
+    """The result of fits from several starts: the best fit, with a record of the other fits."""
     known = np.any(np.isfinite(at_ends.prediction), axis=1) & np.all(np.isfinite(ends), axis=1)
     deviances = np.where(known & np.isfinite(at_ends.deviance), at_ends.deviance, np.inf)
     statuses = tuple(
@@ -368,8 +359,8 @@ def agreement(
     covariance: Float[np.ndarray, "unknowns unknowns"],
     best: int,
 ) -> tuple[int, int, int]:
-    """The numbers of starts that ended at the best minimum, that ended elsewhere with nearly the same likelihood, and
-    of all starts."""
+    """Three numbers of starts: those that ended at the best minimum, those that ended elsewhere with nearly the same
+    likelihood, and all."""
     errors = np.sqrt(np.diag(covariance))
     with np.errstate(invalid="ignore"):
         off = np.abs(ends - ends[best]) / errors

@@ -64,7 +64,7 @@ class Draws(NamedTuple):
     def of(
         cls, density: LogDensity, coordinates: Float[np.ndarray, "chains draws unknowns"], accepted: float, runs: int
     ) -> "Draws":
-        """Draws at some coordinates, with their diagnostics."""
+        """Draws at given coordinates, with diagnostics."""
         from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
 
         values = {name: np.asarray(value) for name, value in density.values(jnp.asarray(coordinates)).items()}
@@ -107,7 +107,7 @@ def sample(
       `Identification`. Unknown errors, which are not among the unknowns of a fit, start from their first guess.
     - `chains`: number of chains, at least 2, because R-hat compares chains; `warmup`, `draws`: number of draws of each
       chain to discard and to keep, the latter at least 2. The chains start from draws of the surrogate.
-    - `seed`: of the draw; `progress`: whether to show progress, on a terminal or in a notebook.
+    - `seed`: seed of the draws; `progress`: whether to show progress, on a terminal or in a notebook.
 
     **Returns:** `Draws`.
 

@@ -62,7 +62,7 @@ class Unknown(eqx.Module):
     """A `Free` for compiled programs. A program depends on which bounds exist and on whether there is a prior, and
     takes their values as arguments.
 
-    - `start`, `unit`, `lower`, `upper`: as of the `Free`; `has_lower`, `has_upper`: which bounds are finite.
+    - `start`, `unit`, `lower`, `upper`: as for `Free`; `has_lower`, `has_upper`: which bounds are finite.
     - `prior`: mean and standard deviation, or `None`.
     """
 

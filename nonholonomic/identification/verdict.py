@@ -101,9 +101,8 @@ def judge(
 
     - `measurements`, `prediction`, `residual`: (n,).
     - `degrees`: measurements and priors less unknowns, without limits.
-    - `agreement`: numbers of starts that agree with the best, that ended elsewhere with nearly the same likelihood, and
-      of all starts.
-    - `undetermined`: combinations of parameters, in words; `status`: of the fit.
+    - `agreement`: three numbers of starts, as returned by `result.agreement`.
+    - `undetermined`: combinations of parameters, in words; `status`: status of the fit.
 
     **Returns:** a `Verdict`.
     """

@@ -7,7 +7,8 @@ event), `LEFT_DOMAIN`, `FAILED` and `UNRESOLVED`. The limits are `DEFAULT_MAX_ST
 be short, and `TIGHTEST`, the smallest tolerance.
 
 A `nonholonomic.AbstractMode` has functions of one state, and the package maps them over cells. An `AbstractProblem` has
-functions of all cells at once: components along the first axis, cells along the last.
+functions of all cells at once: components along the first axis, cells along the last. `Lanes` is the type of one number
+per cell, `States` that of their states.
 
 **Example:** a decay, first as a mode, then as a problem with three cells.
 

@@ -159,14 +159,14 @@ def follow(
 
     **Arguments:**
 
-    - `problem`: with a `start()` of shape (components,).
+    - `problem`: a problem with a `start()` of shape (components,).
     - `t1`: horizon [s].
     - `settings`: their solver can be any solver of Diffrax. A run that needs more than `max_steps` steps, including
       rejected ones, fails.
     - `first`: length of the first step [s], by default selected as Diffrax does.
-    - `t0`: when the run starts [s].
+    - `t0`: time at which the run starts [s].
     - `dense`: whether to keep dense output for states within the steps (`DenseSolution.at`).
-    - `piece`: how many steps are integrated at once.
+    - `piece`: number of steps that are integrated at once.
 
     **Returns:** a `DenseSolution` with the accepted steps; it ends where the domain margin reaches zero, located on the
     dense output.

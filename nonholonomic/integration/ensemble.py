@@ -41,7 +41,7 @@ def ensemble_solve(
     - `t1`: horizon [s], one number for all cells or one per cell.
     - `cells`: number of cells to run; the other cells of the problem are padding, so that one compiled program serves
       grids of different sizes.
-    - `settings`: with an explicit Runge-Kutta solver of Diffrax.
+    - `settings`: settings with an explicit Runge-Kutta solver of Diffrax.
     - `nonterminal`: whether the event is nonterminal: a run continues through it, in either direction.
     - `one_kernel`: whether to compile the loop into a single kernel on a CPU, which halves its cost; not for programs
       that are differentiated again.

@@ -52,8 +52,8 @@ class Collected(NamedTuple):
 class SampleRecorder(AbstractRecorder):
     """Lets steps end on the sample times of every cell, and collects the samples.
 
-    `times` [s] are those of the samples; `first` is the number of each cell's first sample after its start; `read` gives
-    the values to keep.
+    `times` are the times of the samples [s]; `first` is the number of each cell's first sample after its start; `read`
+    gives the values to keep.
     """
 
     times: Float[Array, "times *cells"]

@@ -52,7 +52,7 @@ class Variable(NamedTuple):
 def axis(name: str, number: str, unit: str, values: Any, long_name: str = "") -> Axis:
     """An axis, checked.
 
-    **Arguments:** `name`: in the table; `number`: full name of the varied parameter; `unit`; `values`, (values,);
+    **Arguments:** `name`: name in the table; `number`: full name of the varied parameter; `unit`; `values`, (values,);
     `long_name`: description.
 
     **Raises:** `ValueError` that names the axis unless the values are finite numbers in a one-dimensional, non-empty array.
@@ -72,7 +72,14 @@ def axis(name: str, number: str, unit: str, values: Any, long_name: str = "") ->
 
 
 def size_of(axes: list[Axis]) -> int:
-    """Number of cells of a grid."""
+    """Number of cells of a grid.
+
+    **Example:**
+
+    >>> from nonholonomic.sweeps import size_of
+    >>> size_of(axes)
+    4
+    """
     return int(np.prod([len(axis.values) for axis in axes], dtype=int))
 
 

@@ -78,9 +78,9 @@ def page(
     **Arguments:**
 
     - `stages`: the stages to show; without any, the page has text only.
-    - `title`: of the page; `above`, `below`: HTML around the view.
+    - `title`: title of the page; `above`, `below`: HTML around the view.
     - `speed`: speed of time at the start, one of `SPEEDS`.
-    - `height`: of each stage in pixels.
+    - `height`: height of each stage in pixels.
     - `scripts`: HTML of additional scripts, such as `script` returns, inserted after those of the page.
     - `autoplay`: whether the page plays once when it first becomes visible.
 
@@ -268,7 +268,7 @@ def _size(stage: Stage) -> float:
 
 
 def among(points: Float[np.ndarray, "points 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
-    """The centre of some points, and their distance from it."""
+    """The centre of points, and their distance from the centre."""
     middle = points.mean(axis=0)
     return middle, float(np.linalg.norm(points - middle, axis=-1).max())
 

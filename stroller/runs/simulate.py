@@ -60,9 +60,9 @@ def simulate(
 
     **Returns:** a `Trajectory`; its `status` is the word for how the run ended.
 
-    **Raises:** `ValueError` for arguments out of range, a number that is a list, a launch that the scene cannot start
-    from, times that do not increase, a solver without an error estimate, and an input that is not a function, cannot be
-    traced, or is not finite at the start.
+    **Raises:** `ValueError` for arguments out of range, lists in place of numbers, an illegal launch, times that do not
+    increase, a solver without an error estimate, and an input that is not a function, cannot be traced, or is not
+    finite at the start.
 
     **Example:**
 

@@ -157,7 +157,8 @@ class AbstractRigidDynamics(eqx.Module):
         return Attitude(axes, n, momentum, turning, lever, (normal_rate, lever_rate))
 
     def contact_motion(self, place: Place, attitude: Attitude, slip: Tangent) -> ContactMotion:
-        """The motion of the contact point. **Arguments:** `place`: of the frame; `slip`: velocity v along the arena [m/s]."""
+        """The motion of the contact point. **Arguments:** `place`: place of the frame; `slip`: velocity v along the
+        arena [m/s]."""
         normal_rate, lever_rate = attitude.fixed_rates
         over_body = attitude.in_frame(lever_rate)
         along = (add(slip[0], over_body[0]), add(slip[1], over_body[1]))
@@ -224,7 +225,8 @@ class AbstractRigidDynamics(eqx.Module):
     ) -> Float[Array, "components ..."]:
         """The state at the start of a run.
 
-        **Arguments:** `place`: that of the frame; `axis`: e; `turning`: angular velocity [rad/s], both in the frame.
+        **Arguments:** `place`: place of the frame; `axis`, `turning`: axis e and angular velocity [rad/s], in the
+        frame.
         """
         zero = jnp.zeros_like(launch.theta)
         # The body's axes are those of the frame, rotated without rotation about n until z is e.

@@ -132,7 +132,8 @@ def begin(
 
     - `slipping`, `rolling`: the equations with slip and without; `mu`: coefficient of friction [1].
     - `field`: rate of the slipping state, including other integrated components.
-    - `state`: at rest, (components, ...), of which the equations use the first `size`; `scales`: their magnitudes.
+    - `state`: a state at rest, (components, ...); the equations use the first `size` components; `scales`: their
+      magnitudes.
     - `most`: longest duration [s]; `tolerance`: tolerance for the estimated error, relative to the magnitudes.
 
     **Returns:** an `Onset`.
@@ -192,7 +193,7 @@ class _Contact(eqx.Module):
     - `direction`: against the force of rolling; `rise`: the slip's acceleration [m/s^2] and half its rate [m/s^3] at
       the start.
     - `inverse_mass`: M [1/kg] as (M11, M12, M22); `lifted`: n, the change of N by the force along the arena.
-    - `mu`; `unloaded`: N without a force along the arena [N]; `speed`: sqrt(g R) [m/s]; `unit`: of time [s].
+    - `mu`; `unloaded`: N without a force along the arena [N]; `speed`: sqrt(g R) [m/s]; `unit`: unit of time [s].
     """
 
     direction: Float[Array, "2 ..."]

@@ -47,7 +47,7 @@ def inclination(axis: Vector) -> Float[Array, "..."]:
 def angular_velocity(body: Any, axis: Vector, momentum: Vector) -> Vector:
     """w = L / I1 + (1 / I3 - 1 / I1) (L.e) e [rad/s].
 
-    **Arguments:** `body`: with its moments of inertia `I1` and `I3` [kg m^2].
+    **Arguments:** `body`: a body with the moments of inertia `I1` and `I3` [kg m^2].
     """
     along = (1.0 / body.I3 - 1.0 / body.I1) * dot(momentum, axis)
     return sum_vectors(scale(1.0 / body.I1, momentum), scale(along, axis))

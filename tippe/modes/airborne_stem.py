@@ -109,7 +109,7 @@ class SlideOnOne(AbstractFlyingMode):
 
     @property
     def spheres(self) -> tuple[Ball, Ball]:
-        """The sphere that slides, and the other one."""
+        """The sphere that slides, and the other sphere."""
         return own_and_other(self.scene, self.number)
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
@@ -265,9 +265,15 @@ def modes(
     If the stem would be in the arena at launch, the top starts on the stem: place and theta then refer to the stem's
     foot.
     """
-    arguments, (main, stem) = (scene, problem.scales, problem.cos_angle, with_quadratures), balls(scene.body)
-    started = flight_state(lift_off(scene, problem.states[:OWN], False, main))
-    first = jnp.where(landing_site(scene, started, stem).gap < 0.0, ON_STEM, SLIDING)
+    arguments = (scene, problem.scales, problem.cos_angle, with_quadratures)
     slides = [SlideOnOne(*arguments, jnp.asarray(number)) for number in (0, 1)]
     flies, strikes = (FlyBoth(*arguments, jnp.asarray(strikes)) for strikes in (False, True))
-    return (slides[0], flies, slides[1], strikes), first
+    return (slides[0], flies, slides[1], strikes), _first_mode(scene, problem.states)
+
+
+@compiled_setup
+def _first_mode(scene: Scene[Top], states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+    """The index of the mode in which each run starts."""
+    main, stem = balls(scene.body)
+    started = flight_state(lift_off(scene, states[:OWN], False, main))
+    return jnp.where(landing_site(scene, started, stem).gap < 0.0, ON_STEM, SLIDING)

@@ -13,7 +13,7 @@ from ..model.top import Top
 class AbstractFlyingMode(AbstractBatchedMode):
     """A mode of runs that continue through flights.
 
-    - `scene`: with `contact="hybrid"`; `scales`: magnitudes that scale absolute errors of the state.
+    - `scene`: a scene with `contact="hybrid"`; `scales`: magnitudes that scale absolute errors of the state.
     - `cos_angle`: cosine of the theta that is the event.
     - `with_quadratures`: whether this is a single run whose path is kept, with passive quadratures behind its state.
     """

@@ -198,7 +198,8 @@ def modes(
 
     **Arguments:**
 
-    - `scene`: with `contact="hybrid"`; `problem`: the problem of its launches, which stand on their lower sphere.
+    - `scene`: a scene with `contact="hybrid"`; `problem`: the problem of its launches, which stand on their lower
+      sphere.
     - `tolerance`: unused by these modes; `last`: whether the last crossing counts; `with_quadratures`: as for
       `AbstractFlyingMode`.
     """
@@ -225,9 +226,9 @@ class Air(NamedTuple):
     """A top that may be in the air.
 
     - `free`, `elapsed` [s]: the body and the time since the contact was lost.
-    - `ball`: the sphere that touched last; `rising`: whether it left with a speed; `falls`: whether, without a flight,
-      it is about to strike the plane, `None` for a top without a stem. Once the contact is closed, `ball` is the index
-      of the mode.
+    - `ball`: the sphere that touched last; `rising`: whether it left with a speed; `falls`: whether the other sphere is
+      about to strike the plane without a flight; `None` for a top without a stem. Once the contact is closed, `ball` is
+      the index of the mode.
     - `status`: `RUNNING`, or how the run ended, `LEFT_DOMAIN` if it has jammed; `crossing_time` [s] of the event,
       infinite if there was none.
     - `flights`: number of flights so far; `open`: whether there is no contact and the run continues.
@@ -331,7 +332,8 @@ def _with_other(
     """Effect of an impact on the other sphere if that is at the plane: it also strikes, or the top comes to rest on
     both.
 
-    **Arguments:** `air`: before the impact; `struck`: after it; `slow`: where it is so slow that it may be the last.
+    **Arguments:** `air`: the top before the impact; `struck`: the top after the impact; `slow`: mask of the impacts
+    that are so slow that they may be the last.
     """
     touches = gap(other, air.free) < TOUCHING * scene.body.radius
     falls = touches & (gap_rate(scene.body, other, struck.free) < -closing)

@@ -12,8 +12,8 @@ from typing import NamedTuple
 class Equation(NamedTuple):
     """The verdict on one of the paper's statements.
 
-    - `number`: as the paper numbers it.
-    - `subject`: what the statement is about.
+    - `number`: the paper's number.
+    - `subject`: the subject of the statement.
     - `printed`: as printed, in TeX.
     - `verdict`: right, right on the plane, misprint, incomplete, wrong, meaningless or lost.
     - `reason`: the reason for the verdict, in a few sentences.
@@ -242,15 +242,14 @@ I is I₁ and J is Jellett's quantity λ.
   an equation of motion.
 * Friction changes the momentum β₁. Either β₁ or Jellett's quantity is constant, never both.
 * This package uses none of the paper's equations. The corrected equations agree with its vector form to 10⁻¹⁰.
-
-`python -m tippe.papers.audit` prints this page.
 """
 
 TABLES = """
 ## Can Tables 2 and 3 replace the lost Table 1?
 
-No. Tables 2 and 3 list for eighteen launches whether the top reverses, and six times. These depend on eight unknown
-parameters and an unknown friction law. Here a top counts as reversed if it reaches 0.95 pi within 40 s.
+No. Each table states for nine launches whether the top reverses, and if so, when; there are six such times in all. They
+depend on eight unknown parameters and an unknown friction law. Here a top counts as reversed if it reaches 0.95 pi
+within 40 s.
 
 * **Table 2** (`python benchmarks/paper_tables_scan.py`). Of 20 000 random tops under viscous friction, 294 reverse in the
   printed rows; the best of them, after optimisation, misses the times by 1.25 s.

@@ -28,6 +28,7 @@ from nonholonomic.views import (
     striped,
     turned,
 )
+from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.body import AbstractBody
 from ..model.rigid_body import AbstractRigidBody
@@ -202,6 +203,7 @@ def stages(groups: list[list[tuple[str, Scene, Motion]]]) -> list[Stage]:
     return all_stages
 
 
+@compiled_setup
 def aside(normal: Float[Array | np.ndarray, "times 3"]) -> Float[Array, "times 3"]:
     """Unit vectors across the normal: the projection of x, or of y where the normal is along x."""
     x, y = jnp.array([[1.0, 0.0, 0.0]]), jnp.array([[0.0, 1.0, 0.0]])

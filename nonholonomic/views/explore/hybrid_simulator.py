@@ -19,6 +19,7 @@ from ...hybrid import (
     HybridOutcome,
     after_reset,
     after_solve,
+    at_start,
 )
 from ...integration import (
     LEFT_DOMAIN,
@@ -39,7 +40,7 @@ class HybridSimulator(NamedTuple):
 
     - `start`: function of the numbers of the sliders that returns the modes, the index of the first mode, and the
       initial state, for one cell.
-    - `t1`: horizon [s]; `settings`: with an explicit Runge-Kutta solver of Diffrax; `counters`: rows of
+    - `t1`: horizon [s]; `settings`: settings with an explicit Runge-Kutta solver of Diffrax; `counters`: rows of
       `Transition.counts`.
     - `readings`: results at the end of a run, name -> function of (the sliders' numbers, a `HybridOutcome`).
     - `frame`: function that returns the frame at any time; its arguments are the sliders' numbers, the index of the
@@ -56,9 +57,7 @@ class HybridSimulator(NamedTuple):
     def first(self, values: Numbers) -> HybridOutcome[Array]:
         """The run for the sliders' numbers, at its start."""
         _, mode, state = self.start(values)
-        zero, none = jnp.zeros(1), jnp.zeros(1, int)
-        counts = jnp.zeros((self.counters, 1), int)
-        return HybridOutcome(none + RUNNING, zero + jnp.inf, zero, state, none, none, mode, counts)
+        return at_start(jnp, mode, state, 1, self.counters)
 
     def read(self, name: str, values: Numbers) -> Any:
         """A reading at the start of a run."""

@@ -76,7 +76,7 @@ def javascript(name: str, function: Callable[..., Any], *arguments: Any) -> str:
 
     **Arguments:**
 
-    - `name`: of the function in JavaScript.
+    - `name`: name of the function in JavaScript.
     - `function`: a function that JAX can trace.
     - `arguments`: examples of its arguments, arrays or trees of arrays.
 

@@ -41,7 +41,7 @@ class Simulator(NamedTuple):
     """A problem that is integrated in the browser.
 
     - `problem`: function of the numbers of the sliders that returns the problem of one cell.
-    - `t1`: horizon [s]; `settings`: with an explicit Runge-Kutta solver of Diffrax.
+    - `t1`: horizon [s]; `settings`: settings with an explicit Runge-Kutta solver of Diffrax.
     - `readings`: results of a run, name -> function of (the sliders' numbers, the problem, a `LaneState` of one lane).
     - `passes`: whether a run continues through its event.
     """
