@@ -61,12 +61,12 @@ def with_numbers(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any
 
 
 def full_name(argument: str, name: str, known: list[str]) -> str:
-    """The full name for a name: the name itself, or the only full name that ends in it.
+    """The full name for a name: the name itself, or the only full name that ends with it.
 
     **Arguments:** `argument`: the argument that contains the name, for messages; `name`: such as `"scene.friction.mu"`
     or `"friction.mu"`; `known`: the full names to choose from.
 
-    **Raises:** `ValueError` for a name that matches none or several of them.
+    **Raises:** `ValueError` for a name that matches no full name or several.
     """
     meant = _meant(name, known)
     if len(meant) != 1:
@@ -207,7 +207,7 @@ def in_lines(title: str, rows: list[tuple[str, str]]) -> str:
 
 
 def distinguishing_labels(starts: list[str], *groups: list[Any]) -> list[str]:
-    """Labels that tell things apart: the start of each label, followed by what differs between the modules.
+    """Labels that distinguish modules: the start of each label, followed by the differences between the modules.
 
     **Arguments:** `starts`: the starts of the labels; `groups`: modules of one role, such as the scenes, one per label.
 

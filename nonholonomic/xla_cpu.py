@@ -64,10 +64,10 @@ compiled_setup = _compiler(inline=True)
 def stored(*values: Float[Array, "..."] | None) -> tuple[Any, ...]:
     """The same values, computed once even if several results depend on them; `None` stays `None`.
 
-    Otherwise XLA fuses every result with everything that leads to it, and evaluates the common part again for each. A
-    barrier alone does not prevent this; joining the values with a barrier behind them does, and makes the top's field
-    1.2 times as fast. It also gives all readers the same value: two kernels may round differently. It can be removed
-    when XLA's fusion counts what it repeats.
+    Otherwise XLA fuses every result with everything that leads to it, and evaluates the common part again for each
+    result. A barrier alone does not prevent this; joining the values with a barrier behind them does, and makes the
+    top's field 1.2 times as fast. It also gives all readers the same value: two kernels may round differently. It can
+    be removed when XLA's fusion counts what it repeats.
     """
     present = [value for value in values if value is not None]
     if not present:
@@ -105,10 +105,10 @@ def written_by_component(
 def uncounted(going: Bool[Array, ""], carried: Int[Array, ""]) -> Bool[Array, ""]:
     """The condition of a loop, joined with a loop variable that is never negative.
 
-    XLA tries to count the iterations of a loop whose condition reads a single loop variable. To do so it copies
-    everything that leads to the variable's next value, possibly the whole body, and again in every round of its
-    simplifications: a twelfth of the time to compile derivatives by several numbers. XLA leaves conditions that read
-    two variables alone. This can be removed when XLA looks at how the variable changes before it copies.
+    XLA tries to count the iterations of a loop whose condition reads a single loop variable. To do so, XLA copies
+    everything that leads to the variable's next value, possibly the whole body, in every round of its simplifications.
+    This takes a twelfth of the time to compile derivatives by several numbers. XLA leaves conditions that read two
+    variables alone. This can be removed when XLA looks at how the variable changes before it copies.
     """
     return going & (carried >= 0)
 

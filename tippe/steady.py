@@ -136,7 +136,7 @@ def jellett_thresholds(scene: Scene[Top]) -> tuple[Float[Array, "..."], Float[Ar
     Below the first constant, the upright top is stable; above the second, the inverted top is stable (Rutstam's
     lambda_thres).
 
-    **Raises:** `ValueError` for a top with a stem: Jellett's constant of its sphere is not that of its stem.
+    **Raises:** `ValueError` for a top with a stem: Jellett's constants of its sphere and of its stem differ.
 
     **Example:** with the scene of the module.
 

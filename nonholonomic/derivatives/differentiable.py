@@ -166,7 +166,7 @@ def tangents_by(
 
     - `build`: (leaves, cells) -> problem.
     - `active`, `leaves`: the leaves to move, and all leaves. With `cells`, a leaf is a scalar or an array with one
-      number per cell; without, it is an array of any shape, and each of its entries has its own tangent.
+      number per cell. Without `cells`, a leaf is an array of any shape, and each entry has its own tangent.
 
     **Returns:** the problem; its tangents; and a function that turns derivatives along the tangents (trees of arrays)
     into derivatives by each leaf, the leaf's own axes last (with `cells` there are none, and the cells come first).

@@ -56,8 +56,9 @@ def solve_for_samples(
 ) -> Any:
     """Solve for the samples of a run.
 
-    **Arguments:** `sampling`: function from the first three fields of a solve to the solve; `build`: function from the
-    modules and an extra argument of the solve to the problem, compared by identity; the others as for `sampled_run`.
+    **Arguments:** `sampling`: function of the first three fields of a solve that returns the solve; `build`: function
+    of the modules and an extra argument of the solve that returns the problem, compared by identity; other arguments as
+    for `sampled_run`.
     """
     numbers, rest = eqx.partition(modules, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(numbers)

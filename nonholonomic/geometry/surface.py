@@ -99,7 +99,7 @@ class AbstractSurface(Bounded):
 
     @abc.abstractmethod
     def nearest(self, position: Vector) -> Vector:
-        """The point [m] of the surface that is nearest to a position [m]; if there are several, one of them."""
+        """The point [m] of the surface that is nearest to a position [m]; if there are several, any of these points."""
 
     def onto(self, position: Vector) -> Vector:
         """The point of the surface for a position [m] that has drifted off it."""

@@ -38,8 +38,8 @@ from ..integration import (
     States,
 )
 from ..integration.scheduler import Numbers
-from .ensemble import AbstractBatchedMode, HybridOutcome, Transition, solve_hybrid
-from .traced_ensemble import traced_solve_hybrid
+from .ensemble import HybridOutcome, solve_hybrid, traced_solve_hybrid
+from .mode import AbstractBatchedMode, Transition
 
 #: An event is grazing if a relative change of the numbers by the tolerance, or an error of the state that the tolerance
 #: allows, changes its rate by more than this fraction. The derivative then errs by about as much.
@@ -66,7 +66,7 @@ def with_row(state: Float[Array, "components cells"], row: Float[Array, " cells"
 
 
 class VariationalMode(AbstractBatchedMode):
-    """A mode whose state is followed by its first variations, and by that of the time at which the mode began.
+    """A mode whose state is followed by its first variations, and by the variation of the time at which the mode began.
 
     The mode's equations must not depend on time.
 
@@ -230,7 +230,8 @@ class VariationalMode(AbstractBatchedMode):
 
 
 def delay(function: Any, state: Float[Array, "components cells"], rates: Float[Array, "components cells"]) -> Any:
-    """Zero, with the variation of the time at which a function of the state vanishes (implicit function theorem)."""
+    """A number that is zero, and whose variation is that of the time at which a function of the state vanishes
+    (implicit function theorem)."""
     value, rate = jax.jvp(function, (state,), (rates,))
     return -(value - stop_gradient(value)) / stop_gradient(jnp.where(rate == 0.0, jnp.inf, rate))
 
@@ -267,7 +268,7 @@ def solve_hybrid_with_tangents(
     counters: int,
     ends_on_event: bool = True,
 ) -> tuple[HybridOutcome[np.ndarray], Slopes[np.ndarray]]:
-    """Run every cell through its modes to its event, and differentiate the event's time along some tangents.
+    """Run every cell through its modes to its event, and differentiate the event's time along tangents.
 
     **Arguments:** as for `solve_hybrid`, and
 

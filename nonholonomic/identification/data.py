@@ -52,7 +52,7 @@ def series_units(data: tuple[Any, ...]) -> tuple[str, ...]:
 
 
 def of_data(parameters: dict[str, Any], k: int) -> dict[str, Any]:
-    """The parameters of one set of data: the shared ones, and its own without the prefix `data[k].`.
+    """The parameters of one set of data: the shared parameters, and its own parameters without the prefix `data[k].`.
 
     **Example:**
 

@@ -107,10 +107,10 @@ class Measurements(eqx.Module):
         """Residuals whose squares are -2 log likelihood, up to a constant.
 
         For a measurement the residual is z = (prediction - value) / error, or with Student's t of nu degrees of freedom
-        r = sign(z) sqrt((nu + 1) log(1 + z^2 / nu)). For a lower limit it is the one-sided r = -sqrt(-2 log Phi(z)),
-        where Phi is the normal distribution: close to z if the prediction is far below the limit, close to 0 if it is
-        above; upper limits are the mirror image. Between two limits, see `between`. A prediction that is not finite
-        counts as `MISSING`, except that an infinite prediction exceeds a lower limit.
+        r = sign(z) sqrt((nu + 1) log(1 + z^2 / nu)). For a lower limit, the residual is r = -sqrt(-2 log Phi(z)), where
+        Phi is the normal distribution: close to z if the prediction is far below the limit, and close to 0 if the
+        prediction is above the limit. Upper limits are the mirror image. Between two limits, see `between`. A
+        prediction that is not finite counts as `MISSING`, except that an infinite prediction exceeds a lower limit.
 
         **Arguments:** `prediction`: (..., n). **Returns:** (..., n).
         """
@@ -184,7 +184,7 @@ def joined(parts: list[Measurements]) -> Measurements:
 
 
 def one_sided(z: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The residual -sqrt(-2 log Phi(z)) of a lower limit; 0 where it is less than 1e-9."""
+    """The residual -sqrt(-2 log Phi(z)) of a lower limit; 0 if its magnitude is less than 1e-9."""
     # Beyond this, the derivative of the square root would be infinity times zero.
     near = z < 9.0
     return jnp.where(near, -jnp.sqrt(-2.0 * log_ndtr(jnp.where(near, z, 0.0))), 0.0)

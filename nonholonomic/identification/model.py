@@ -62,7 +62,8 @@ def as_sources(data: Any, kinds: Any, expected: str) -> tuple[Any, ...]:
 
     **Arguments:** `data`: a set or several; `kinds`: a class or several; `expected`: words for the message.
 
-    **Raises:** `ValueError`, with what was expected, unless there is at least one set and all are of these kinds.
+    **Raises:** `ValueError` that names the allowed kinds, unless there is at least one set of data and all sets are of
+    these kinds.
 
     **Example:**
 

@@ -108,7 +108,7 @@ class LogDensity(eqx.Module):
         return jnp.array([*values, *(0.0 for _ in self.open_series)])
 
     def values(self, coordinates: Float[Array, "... unknowns"]) -> dict[str, Float[Array, "..."]]:
-        """The unknowns at some coordinates: name -> (...,).
+        """The unknowns at given coordinates: name -> (...,).
 
         **Arguments:** `coordinates`: the coordinates of all unknowns, or only those of a fit; the errors then have
         their first guess.
@@ -149,7 +149,7 @@ class LogDensity(eqx.Module):
         return self.of_prediction(coordinates, self.predict(coordinates[None])[0])
 
     def of_prediction(self, coordinates: Float[Array, " unknowns"], prediction: Float[Array, " n"]) -> Float[Array, ""]:
-        """The log density at some coordinates, for given predictions of the model."""
+        """The log density at given coordinates, for given predictions of the model."""
         return self._with_errors(coordinates).log_likelihood(prediction) + self._log_prior(coordinates)
 
     @status_line("simulating")

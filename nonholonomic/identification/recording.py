@@ -158,7 +158,7 @@ class AbstractRecording(eqx.Module):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """A label for each sample, such as `theta(0.1 s)`; missing ones are left out."""
+        """A label for each sample, such as `theta(0.1 s)`; missing samples are omitted."""
         every = [f"{column}({time:.4g} s)" for time in np.asarray(self.times) for column in self.columns]
         return tuple(every[i] for i in self.seen)
 
@@ -169,7 +169,7 @@ class AbstractRecording(eqx.Module):
 
     @property
     def measurements(self) -> Measurements:
-        """The samples as `Measurements`, a series for each column; missing ones are left out."""
+        """The samples as `Measurements`, a series for each column; missing samples are omitted."""
         value = np.asarray(self.value).reshape(len(self.times), len(self.columns))
         if self.error is None:
             error = np.broadcast_to(noise(value), value.shape)
@@ -229,8 +229,8 @@ def predicted(
     **Arguments:**
 
     - `scene`: the scene of all runs, before its parameters are replaced.
-    - `recordings`: pairs of a recording and its parameters, name -> (rows,). All have the same names, and all launches
-      the same kinds of numbers.
+    - `recordings`: pairs of a recording and its parameters, name -> (rows,). The names must be equal for all
+      recordings, and so must the kinds of numbers in their launches.
     - `run`: function of a scene, a launch and times since the launch [s] that returns a trajectory.
 
     **Returns:** for each recording its samples, ordered by time, including missing ones; NaN after the end of a run.

@@ -180,7 +180,7 @@ class Identification:
 
     @property
     def correlation(self) -> Float[np.ndarray, "unknowns unknowns"]:
-        """Correlations of the estimates, in the coordinates of the fit; 0 with those of infinite error."""
+        """Correlations of the estimates, in the coordinates of the fit; 0 for estimates with infinite error."""
         errors = np.sqrt(np.diag(self.coordinate_covariance))
         with np.errstate(invalid="ignore"):
             shares = self.coordinate_covariance / np.outer(errors, errors)
@@ -296,7 +296,7 @@ def summarise(
     converged: np.ndarray,
     at_ends: Linearised,
 ) -> Identification:
-    """The result of fits from several starts: that of the best one, with a record of the others."""
+    """The result of fits from several starts: the best fit, with a record of the other fits."""
     known = np.any(np.isfinite(at_ends.prediction), axis=1) & np.all(np.isfinite(ends), axis=1)
     deviances = np.where(known & np.isfinite(at_ends.deviance), at_ends.deviance, np.inf)
     statuses = tuple(
@@ -359,8 +359,8 @@ def agreement(
     covariance: Float[np.ndarray, "unknowns unknowns"],
     best: int,
 ) -> tuple[int, int, int]:
-    """The numbers of starts that ended at the best minimum, that ended elsewhere with nearly the same likelihood, and
-    of all starts."""
+    """Three numbers of starts: those that ended at the best minimum, those that ended elsewhere with nearly the same
+    likelihood, and all."""
     errors = np.sqrt(np.diag(covariance))
     with np.errstate(invalid="ignore"):
         off = np.abs(ends - ends[best]) / errors

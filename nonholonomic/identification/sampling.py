@@ -64,7 +64,7 @@ class Draws(NamedTuple):
     def of(
         cls, density: LogDensity, coordinates: Float[np.ndarray, "chains draws unknowns"], accepted: float, runs: int
     ) -> "Draws":
-        """Draws at some coordinates, with their diagnostics."""
+        """Draws at given coordinates, with diagnostics."""
         from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
 
         values = {name: np.asarray(value) for name, value in density.values(jnp.asarray(coordinates)).items()}

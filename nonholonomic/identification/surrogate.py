@@ -94,8 +94,8 @@ class Surrogate(eqx.Module):
         predictions: Float[np.ndarray, "runs n"],
         log_densities: Float[np.ndarray, " runs"],
     ) -> "Surrogate":
-        """The surrogate with the polynomials that fit the predictions of some runs best, with more weight for likely
-        runs."""
+        """The surrogate with the polynomials that best fit the predictions of the given runs, with more weight for
+        likely runs."""
         known = np.all(np.isfinite(predictions), axis=1)
         if not np.any(known):
             raise ValueError("density: the model has no predictions within the covariance around the centre")
@@ -111,8 +111,8 @@ class Surrogate(eqx.Module):
     def among(
         self, coordinates: Float[np.ndarray, "draws unknowns"]
     ) -> tuple["Surrogate", Float[np.ndarray, "draws unknowns"]]:
-        """A surrogate whose points are adapted to some draws, which are nearly round in the new points; also returns
-        these points.
+        """A surrogate whose points are adapted to the given draws: in the new points, the distribution of the draws is
+        nearly round. Also returns the new points of the draws.
 
         Along each principal axis of the draws, the widest first, the part that powers of the earlier points predict is
         subtracted.

@@ -101,8 +101,7 @@ def judge(
 
     - `measurements`, `prediction`, `residual`: (n,).
     - `degrees`: measurements and priors less unknowns, without limits.
-    - `agreement`: numbers of starts that agree with the best, that ended elsewhere with nearly the same likelihood, and
-      of all starts.
+    - `agreement`: three numbers of starts, as returned by `result.agreement`.
     - `undetermined`: combinations of parameters, in words; `status`: status of the fit.
 
     **Returns:** a `Verdict`.

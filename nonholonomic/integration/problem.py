@@ -122,8 +122,8 @@ class CoreProblem(AbstractProblem):
 
 
 def least_margin(problem: AbstractProblem, side: Lanes, time: Lanes, state: States, rate: States) -> Lanes:
-    """The lesser of the domain margin and the event function, where the sign of the event function is positive on the
-    lane's side of the event; used where the field is known.
+    """The lesser of the domain margin and the event function, if the field is known. The event function has the sign
+    that makes it positive on the lane's side of the event.
     """
     return lesser(problem.domain_margin(time, state), side_of(problem, side)(state, rate), side)
 

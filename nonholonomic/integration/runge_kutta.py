@@ -23,7 +23,8 @@ class Step(NamedTuple):
 
     - `state`, `rate`: the state at the end, and the field there; `error`: the estimated error.
     - `watched`: the least of the margins and the event function at the end.
-    - `first_negative`: the fraction of the step of the first stage at which one of these was negative, 2 if none was.
+    - `first_negative`: time of the first stage at which a margin or the event function was negative, as a fraction of
+      the step; 2 if there was none.
     - `margins`: all margins at `watched_places` of the step; `None` if there are none.
     """
 
@@ -54,7 +55,7 @@ def explicit_tableau(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau:
 
 
 def explicit_order(solver: diffrax.AbstractSolver) -> int:
-    """The order of such a solver.
+    """The order of an explicit Runge-Kutta solver.
 
     **Raises:** `ValueError` for a solver that does not declare its order.
     """

@@ -43,7 +43,7 @@ class Collected(NamedTuple):
 class SampleRecorder(AbstractRecorder):
     """Lets steps end on the sample times of every cell, and collects the samples.
 
-    `times` [s] are those of the samples; `first` is the number of each cell's first sample after its start.
+    `times` are the times of the samples [s]; `first` is the number of each cell's first sample after its start.
     """
 
     times: Float[Array, "times *cells"]

@@ -71,7 +71,8 @@ InLanes = tuple[AbstractProblem, Control, States]
 
 
 class AbstractRecorder(eqx.Module):
-    """What a solve keeps of the steps between two refills of the lanes (a period), beside the `Outcome`.
+    """The part of a solve that records steps, in addition to the `Outcome`. A period is the time between two refills of
+    the lanes.
 
     `period`: the greatest number of iterations of a period, `None` for any number; `refill_cost`: cost of a refill, in
     steps of all lanes.
@@ -99,7 +100,7 @@ class AbstractRecorder(eqx.Module):
 
 
 class Unrecorded(AbstractRecorder):
-    """Keeps nothing of the steps."""
+    """A recorder that records nothing."""
 
     def begin(self, lane_state: LaneState, collected: None) -> None:
         return None
@@ -157,7 +158,7 @@ class LaneScheduler(eqx.Module):
         return self.fresh.cell.shape[0]
 
     def pick(self, tree: Any, cell: Int[Array, " lanes"]) -> Any:
-        """The leaves of some cells; scalars stay as they are."""
+        """The leaves for the given cells; scalars stay unchanged."""
         inside = jnp.minimum(cell, self.capacity - 1)
         return jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., inside], tree)
 

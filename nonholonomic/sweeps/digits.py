@@ -32,7 +32,7 @@ def concise_strings(
     **Arguments:**
 
     - `values`: numbers; not finite if there is none.
-    - `errors`: their errors; infinite if it is doubtful whether there is a number.
+    - `errors`: errors of the values; infinite if it is doubtful whether there is a number.
     - `words`: the words for missing numbers, with a question mark if it is doubtful that the number is missing.
 
     **Returns:** an array of strings.

@@ -49,7 +49,7 @@ class Layout(NamedTuple):
         return -(-self.cells // self.chunk)
 
     def ends(self, chunk: int) -> tuple[int, int]:
-        """The first cell of a chunk, and the one after its last."""
+        """The index of the first cell of a chunk, and of the cell after its last."""
         return chunk * self.chunk, min((chunk + 1) * self.chunk, self.cells)
 
     def size(self, chunk: int) -> int:
@@ -80,7 +80,7 @@ class Layout(NamedTuple):
 
 
 def axes_of(coords: dict[str, Values], inner: dict[str, tuple[str, ...]]) -> list[str]:
-    """The coordinates that are axes of the grid: all but those of dimensions that only some variables have."""
+    """The coordinates that are axes of the grid, without those of the variables' additional dimensions."""
     within = {dim for dims in inner.values() for dim in dims}
     return [name for name in coords if name not in within]
 

@@ -15,7 +15,7 @@ from .tasks import versions
 class Quantity(NamedTuple):
     """A quantity of a run: its unit, a description, and the dimension of its components if it is a vector.
 
-    `read` returns it from a run; by default it is the property with the name of the quantity.
+    `read` returns the values from a run; by default, they are the property with the name of the quantity.
 
     **Example:**
 
@@ -117,7 +117,7 @@ class Tabular(abc.ABC):
     def save(self, path: Any) -> None:
         """Write the run to an HDF5 file that `Table.load` and xarray (`engine="h5netcdf"`) read.
 
-        **Raises:** `OSError` that names the path if it cannot be written; `ValueError` for a batch of runs.
+        **Raises:** `OSError` that names the path if the file cannot be written; `ValueError` for a batch of runs.
         """
         self.to_table().save(path)
 

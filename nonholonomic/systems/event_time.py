@@ -141,7 +141,8 @@ class SmoothEvent(AbstractDifferentiableSolve):
         return jax.tree.unflatten(self.structure, [next(floats if is_float else others) for is_float in self.places])
 
     def permitted(self, leaves: tuple[Array, ...]) -> tuple[Bool[Array, "..."], Float[Array, "..."], Settings]:
-        """Which cells have a legal horizon, tolerance and start; their horizons (0 for the others); and the settings.
+        """A mask of the cells with a legal horizon, tolerance and start; the horizons, 0 for all other cells; and the
+        settings.
 
         A batch has one tolerance: the smallest.
         """

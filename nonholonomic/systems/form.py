@@ -27,7 +27,7 @@ def is_number(leaf: Any) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class Form:
-    """A hybrid system without its numbers, which are listed one by one, those of an array in order.
+    """A hybrid system without its numbers. The numbers are listed one by one, in order within each array.
 
     - `structure`: structure of the tree of numbers; `kinds`: shape and type of each leaf.
     - `rest`, `rest_structure`: the leaves that are not numbers.

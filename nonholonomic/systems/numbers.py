@@ -17,8 +17,8 @@ from .form import is_number
 class Named(NamedTuple):
     """The numbers of a tree, one by one, and the tree as a function of these numbers.
 
-    `names` and `values` are those of the numbers, in the same order; `shapes`: the shapes of the arrays that contain
-    the numbers.
+    `names` and `values`: names and values of the numbers, in the same order; `shapes`: the shapes of the arrays that
+    contain the numbers.
     """
 
     names: tuple[str, ...]

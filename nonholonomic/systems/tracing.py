@@ -130,7 +130,7 @@ def _reached(jaxpr: Jaxpr, inputs: Sequence[Any]) -> list[bool]:
 
 
 def with_own_numbers(function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
-    """The function itself, or, if it closes over traced numbers (such as those of an enclosing `jax.grad`), a module
-    that holds them."""
+    """The function itself or, if it closes over traced numbers (such as those of an enclosing `jax.grad`), a module
+    that contains these numbers."""
     consts = jax.make_jaxpr(function)(*args).consts
     return eqx.filter_closure_convert(function, *args) if any(is_traced(const) for const in consts) else function

@@ -268,7 +268,7 @@ def _size(stage: Stage) -> float:
 
 
 def among(points: Float[np.ndarray, "points 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
-    """The centre of some points, and their distance from it."""
+    """The centre of points, and their distance from the centre."""
     middle = points.mean(axis=0)
     return middle, float(np.linalg.norm(points - middle, axis=-1).max())
 

@@ -77,9 +77,9 @@ class Curve(NamedTuple):
 
 
 class Show(NamedTuple):
-    """The drawing of one run: `size` is a length [m] of the body, `colour` that of its curves.
+    """The drawing of one run: `size` is a length [m] of the body, and `colour` the colour of its curves.
 
-    `normal` is the arena's unit normal at the body, towards the body; `note` says what the model leaves out.
+    `normal` is the arena's unit normal at the body, towards the body; `note` states what the model omits.
     """
 
     name: str
@@ -170,6 +170,6 @@ def matrices(turning: Float[np.ndarray, "times 4"]) -> Float[np.ndarray, "times 
 
 
 def nearest(times: Float[np.ndarray, " times"], at: Float[np.ndarray, " frames"]) -> Int[np.ndarray, " frames"]:
-    """The indices of the times that are nearest to the given ones."""
+    """The indices of the times that are nearest to the given times."""
     after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
     return after - (at - times[after - 1] < times[after] - at)

@@ -95,10 +95,10 @@ class Damping(AbstractFriction):
 
     **Arguments:**
 
-    - `rolling`: c_v [N s/m] of the rear wheels' speed, at least 0.
-    - `front`: c_w [N s/m] of the front wheel's speed, at least 0.
-    - `scrub`: c_O [N m s] of the yaw rate, at least 0.
-    - `steering`: c_s [N m s] of the steering rate, at least 0.
+    - `rolling`: coefficient c_v [N s/m] for the speed of the rear wheels, at least 0.
+    - `front`: coefficient c_w [N s/m] for the speed of the front wheel, at least 0.
+    - `scrub`: coefficient c_O [N m s] for the yaw rate, at least 0.
+    - `steering`: coefficient c_s [N m s] for the steering rate, at least 0.
 
     **Example:**
 

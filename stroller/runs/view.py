@@ -58,7 +58,7 @@ def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
 
 
 def grouped(groups: list[list[tuple[int, Any]]], names: list[str]) -> list[Stage]:
-    """A stage for each group of numbered rides on a common ground; `names` are those of the rides."""
+    """A stage for each group of numbered rides on a common ground; `names` are the names of the rides."""
     stages = []
     for group in groups:
         scene = group[0][1].spec.ride.scene

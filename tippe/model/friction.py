@@ -204,7 +204,8 @@ class Coulomb(AbstractFriction):
 
 
 class Contensou(AbstractFriction):
-    """Coulomb friction on a small contact disc: sliding and drilling share its limit (`tippe.md`, section 3).
+    """Coulomb friction on a small contact disc, with one limit for sliding and drilling together (`tippe.md`, section
+    3).
 
     F = -mu N v_s / Q and the torque -mu N Rb^2 w_n n / Q with Q = sqrt(v_s^2 + Rb^2 w_n^2 + slip_speed^2) and
     Rb = 3 pi / 16 contact_radius. The load is the gradient of the potential mu N Q, an ellipsoid that has the limits of
@@ -348,9 +349,9 @@ class SetValuedCoulomb(AbstractFriction):
     the arena up to mu N while it sticks (`tippe.md`, section 3).
 
     A run consists of modes. During a slip, the force has its full size. When the slip stops, the top rolls, with the
-    equations of `tippe/model/rolling.py`, if the required force is within the friction cone; the top slips again when
-    it no longer is. Rolling keeps the energy constant. With `contact="hybrid"`, a top without a stem flies when contact
-    is lost, and slips, rolls or rebounds after an impact (`tippe/modes/airborne_stick_slip.py`).
+    equations of `tippe/model/rolling.py`, if the required force is within the friction cone, and slips again when the
+    required force leaves the cone. Rolling keeps the energy constant. With `contact="hybrid"`, a top without a stem
+    flies when contact is lost, and slips, rolls or rebounds after an impact (`tippe/modes/airborne_stick_slip.py`).
 
     **Arguments:**
 

@@ -147,7 +147,7 @@ class SymmetricMatrix(eqx.Module):
 
     @property
     def principal_minors(self) -> tuple[Float[Array, "..."], ...]:
-        """The seven principal minors, those of one row first; all are nonnegative if the matrix is positive
+        """The seven principal minors, from one row to three rows; all are nonnegative if the matrix is positive
         semidefinite."""
         adjugate = self.adjugate
         smaller = (self.xx, self.yy, self.zz, adjugate.xx, adjugate.yy, adjugate.zz)

@@ -225,7 +225,8 @@ class AbstractRigidDynamics(eqx.Module):
     ) -> Float[Array, "components ..."]:
         """The state at the start of a run.
 
-        **Arguments:** `place`: that of the frame; `axis`: e; `turning`: angular velocity [rad/s], both in the frame.
+        **Arguments:** `place`: place of the frame; `axis`, `turning`: axis e and angular velocity [rad/s], in the
+        frame.
         """
         zero = jnp.zeros_like(launch.theta)
         # The body's axes are those of the frame, rotated without rotation about n until z is e.

@@ -107,7 +107,7 @@ class StickSlip(eqx.Module):
 
     def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
         """Normal force as a fraction of the weight, plus a round-off allowance for a start with N = 0 exactly; and the
-        remaining room, if it can end."""
+        remaining room, if the arena has places where the body does not fit."""
         motion = self.motion(state)
         margin = motion.normal_force / (self.slipping.mass * self.slipping.gravity) + 1e-12
         return (margin,) if motion.room is None else (margin, motion.room - FITS)

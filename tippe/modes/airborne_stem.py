@@ -116,7 +116,7 @@ class SlideOnOne(AbstractFlyingMode):
 
     @property
     def spheres(self) -> tuple[Ball, Ball]:
-        """The sphere that slides, and the other one."""
+        """The sphere that slides, and the other sphere."""
         return own_and_other(self.scene, self.number)
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:

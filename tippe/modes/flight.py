@@ -93,7 +93,7 @@ def cone(body: Top, free: FreeBody) -> Cone:
 
 
 def flown(body: Top, gravity: Float[Array, "..."], free: FreeBody, time: Float[Array, "..."]) -> FreeBody:
-    """A free body some time [s] later."""
+    """A free body after a time [s]."""
     turning = cone(body, free)
     angle = turning.rate * time
     turned = (turning.along, scale(jnp.cos(angle), turning.across), scale(jnp.sin(angle), turning.ahead))
@@ -103,7 +103,7 @@ def flown(body: Top, gravity: Float[Array, "..."], free: FreeBody, time: Float[A
 
 
 def c_in_flight(body: Top, free: FreeBody, across: Vector, time: Float[Array, "..."]) -> Vector:
-    """A vector across the axis, carried with the axis without rotation about it, some time [s] later.
+    """A vector across the axis after a time [s]; it moves with the axis without rotation about the axis.
 
     It turns at the rate L / I1 - (e.L / I1) e: about L, and less about e.
     """

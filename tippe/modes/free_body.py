@@ -36,7 +36,8 @@ class Ball(NamedTuple):
 
 
 class FreeBody(NamedTuple):
-    """A top that touches nothing: velocity [m/s] and height [m] of its centre of mass, axis, angular momentum about it.
+    """A top that touches nothing: velocity [m/s] and height [m] of its centre of mass, its axis, and its angular
+    momentum about the centre of mass.
 
     Vectors are tuples of components along x, y and the plane's normal z.
     """

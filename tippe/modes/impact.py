@@ -60,7 +60,7 @@ class Approach(NamedTuple):
     [m/s].
 
     `response` is the symmetric matrix W with (change of that velocity) = W (impulse) [1/kg], as three columns. `axis`
-    is that of the body; `turning` its angular velocity [rad/s].
+    and `turning` are the axis and the angular velocity [rad/s] of the body.
     """
 
     arm: Vector

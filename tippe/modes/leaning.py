@@ -145,9 +145,8 @@ class LeaningDynamics(eqx.Module):
         by the order of the speeds g, so the error is of the order of their square.
 
         **Returns:** the body after these impulses, before `at_rest`; and whether their friction dissipates energy. One
-        P_j is negative, the reduction of that sphere's load in T; if its friction adds energy now, it dissipates some
-        after the
-        impact of the other sphere (det G > 0).
+        P_j is negative: during T, the load of this sphere is reduced. If its friction adds energy now, its friction
+        dissipates energy after the impact of the other sphere (det G > 0).
         """
         spheres, zero = balls(self.body), jnp.zeros_like(free.height)
         w1, w2, w3 = angular_velocity(self.body, free.axis, free.momentum)
@@ -188,9 +187,9 @@ class LeaningDynamics(eqx.Module):
 def at_rest(body: Top, free: FreeBody) -> FreeBody:
     """A body whose spheres are both at the plane, with its remaining speeds along the normal removed.
 
-    theta becomes the angle of both contacts, and L loses its component along n x e, the one that changes theta: as by
-    an impulse along the normal at each sphere that ends its motion. L.n, L.e, and so Jellett's quantity of either
-    sphere, and the slip keep their values; the energy falls by that of the motion which ends.
+    theta becomes the angle at which both spheres touch, and L loses its component along n x e, which changes theta, as
+    by impulses along the normal at both spheres. L.n, L.e, Jellett's quantity of either sphere and the slip do not
+    change; the energy decreases by that of the removed motion.
     """
     main, stem = balls(body)
     e, L = free.axis, free.momentum

@@ -226,9 +226,9 @@ class Air(NamedTuple):
     """A top that may be in the air.
 
     - `free`, `elapsed` [s]: the body and the time since the contact was lost.
-    - `ball`: the sphere that touched last; `rising`: whether it left with a speed; `falls`: whether, without a flight,
-      it is about to strike the plane, `None` for a top without a stem. Once the contact is closed, `ball` is the index
-      of the mode.
+    - `ball`: the sphere that touched last; `rising`: whether it left with a speed; `falls`: whether the other sphere is
+      about to strike the plane without a flight; `None` for a top without a stem. Once the contact is closed, `ball` is
+      the index of the mode.
     - `status`: `RUNNING`, or how the run ended, `LEFT_DOMAIN` if it has jammed; `crossing_time` [s] of the event,
       infinite if there was none.
     - `flights`: number of flights so far; `open`: whether there is no contact and the run continues.

@@ -31,7 +31,7 @@ class Quadratures(AbstractPassive):
     turned about e by the spin angle, so every integrated component changes as slowly as the axis.
 
     - `axial`: the moment of inertia about the axis [kg m^2].
-    - `of_mass`: whether the path is that of the centre of mass along a level plane.
+    - `of_mass`: whether the path belongs to the centre of mass, along a level plane.
     """
 
     axial: Float[Array, "..."]

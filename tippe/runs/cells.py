@@ -116,7 +116,7 @@ class InversionRuns(NamedTuple):
         return {f"{name}_error": variable for name, variable in variables.items()}
 
     def results(self, roots: dict[str, Any], columns: dict[str, Any], count: int) -> dict[str, Any]:
-        """The variables of some cells.
+        """The variables of the given cells.
 
         **Arguments:** `roots`: scene and launch; `columns`: full name of a parameter -> its value in every cell, of
         which only the first `count` are run.

@@ -28,7 +28,7 @@ def has_grown(
     tolerance: float | Float[Array, "..."],
 ) -> Bool[Array, "..."]:
     """Whether the energy [J] at the end of a run is greater than at its start, by more than the tolerance allows: then the
-    arena's heights, the law of friction or the integration is wrong. NaN has not grown.
+    arena's heights, the law of friction or the integration is wrong. NaN counts as not grown.
     """
     return jnp.asarray(after > before + allowance(scene, before, tolerance))
 

@@ -95,7 +95,8 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
     @property
     @abc.abstractmethod
     def above(self) -> tuple[Component, Component]:
-        """Distance of the top's sphere from the arena [m] and its rate [m/s]; `None` if it touches at all times."""
+        """Distance of the top's sphere from the arena [m] and its rate [m/s]; `None` if the sphere touches at all
+        times."""
 
     @property
     @abc.abstractmethod

@@ -69,9 +69,9 @@ def inversion_table(
       crossings and can miss a loss of contact shorter than a step.
     - `scattered`: whether the lists are columns of equal length instead of axes of a grid: the k-th cell has the k-th
       number of each list. The only axis of the table is then "cell", and the columns are variables.
-    - `errors`: whether to run every cell again at a hundredth of the tolerance, for bounds of its errors; this costs
-      2.8 times as much as a table without errors. Below a tolerance of 1e-12, the second run has a hundred times the
-      tolerance instead of a hundredth, and the bounds are wider.
+    - `errors`: whether to run every cell again at a hundredth of the tolerance, for error bounds; this costs 2.8 times
+      as much as a table without errors. Below a tolerance of 1e-12, the second run has a hundred times the tolerance
+      instead of a hundredth, and the bounds are wider.
     - `sensitivities`: names of the parameters with respect to which the times are differentiated, such as
       `["scene.friction.mu", "launch.theta"]`; the end of a name is enough if only one parameter matches.
     - `progress`: whether to show progress, on a terminal or in a notebook; `NONHOLONOMIC_PROGRESS=0` hides it

@@ -20,7 +20,7 @@ from nonholonomic.integration import (
     legal_run,
     require_adaptive,
     require_adjoint,
-    times_bounds,
+    require_times,
 )
 from nonholonomic.progress import status_line
 from nonholonomic.validation import (
@@ -29,8 +29,6 @@ from nonholonomic.validation import (
     is_traced,
     legal,
     nan_unless,
-    require_all,
-    require_increasing,
     shown,
 )
 from nonholonomic.xla_cpu import on_device
@@ -58,13 +56,13 @@ class Trajectory(AbstractTrajectory):
 
     `status` is the word of a `Status`: "completed", "contact_lost", "failed", "jammed", "does_not_fit" or "unresolved"
     (its energy grows, or does not balance, by more than 1e4 times the tolerance, relative to the energy); inside a
-    transformation it is the integer; for numbers out of range it is `Status.ILLEGAL`, and everything is NaN. The run
-    ends at `end_time`. The top does not fit where a curvature of the arena reaches that of the top's sphere, which
-    would then touch at other points, too. It is jammed if the equation for the normal force has no solution, because
-    friction pulls the top into the arena as strongly as the normal force pushes it out; this needs strong friction, a
-    large offset and a slip along the axis. `stats` holds accepted and rejected steps, the greatest drift of |e| and the
-    greatest energy residual |E - E(0) - work of friction| [J]; with `SetValuedCoulomb` also `sticks`, the number of
-    changes from slip to rolling.
+    transformation, `status` is the integer. For numbers out of range, `status` is `Status.ILLEGAL`, and everything is
+    NaN. The run ends at `end_time`. The top does not fit where a curvature of the arena reaches that of the top's
+    sphere, which would then touch at other points, too. It is jammed if the equation for the normal force has no
+    solution, because friction pulls the top into the arena as strongly as the normal force pushes it out; this needs
+    strong friction, a large offset and a slip along the axis. `stats` holds accepted and rejected steps, the greatest
+    drift of |e| and the greatest energy residual |E - E(0) - work of friction| [J]; with `SetValuedCoulomb` also
+    `sticks`, the number of changes from slip to rolling.
 
     **Example:**
 
@@ -183,10 +181,10 @@ def simulate(
 
     **Returns:** a `Trajectory`, or a `HybridTrajectory` for a hybrid scene.
 
-    **Raises:** `ValueError` for arguments out of range, and for times that are all after the end of the run; inside a
-    transformation for a law with several modes (`SetValuedCoulomb`), and for a hybrid scene with `adjoint`, with a
-    solver that is not an explicit Runge-Kutta method, and for derivatives with respect to `times` or second
-    derivatives.
+    **Raises:** `ValueError` for arguments out of range, and for times that are all after the end of the run. Inside a
+    transformation, also for a law with several modes (`SetValuedCoulomb`). For a hybrid scene inside a transformation,
+    also for an `adjoint`, for a solver that is not an explicit Runge-Kutta method, for derivatives with respect to
+    `times`, and for second derivatives.
 
     **Example:**
 
@@ -206,8 +204,7 @@ def simulate(
     settings = Settings(tolerance, solver)
     if times is not None:
         times = as_number(times)
-        require_all(times_bounds(times, t1))
-        require_increasing(times, "times")
+        require_times(times, t1)
     if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1, tolerance))):
         return _legal_or_nan(scene, launch, times, as_number(t1), settings, adjoint)
     if scene.contact == "hybrid":

@@ -27,7 +27,7 @@ WITHOUT_DIRECTION = {"theta", "theta_rate", "eta", "spin", "energy", "jellett", 
 
 
 def launches_with(scene: Scene, launch: Launch, cells: int, names: tuple[str, ...]) -> CoreProblem:
-    """The runs of some cells with the parts of a `TrajectoryProblem` that the named quantities need.
+    """The runs of the given cells with the parts of a `TrajectoryProblem` that the named quantities need.
 
     Only some quantities need the path, and none needs rotation or work. On the plane, a run without path, rotation and
     work takes half the time. If no quantity has a direction, the frame turns on the level plane, and samples are about
@@ -87,7 +87,7 @@ def _followed(
 def solve_cells(
     scene: Scene, launch: Launch, cells: int, times: Any, settings: Settings, names: tuple[str, ...], count: int
 ) -> dict[str, Array]:
-    """The variables of some cells.
+    """The variables of the given cells.
 
     **Arguments:** `scene`, `launch`: numbers that are scalars or one per cell; `cells`: number of cells, of which only
     the first `count` are run; `times`: times of the samples [s], of which the last is the horizon; `settings`: settings
