@@ -112,7 +112,8 @@ PAGES = {
                 "AbstractProblem CoreProblem AbstractPassive ExtendedProblem Settings "
                 "solve_ensemble traced_solve_ensemble solve_with_samples Outcome "
                 "crossing_time LaneState solve_by_diffrax follow DenseSolution padded sample explicit_tableau legal_run "
-                "run_bounds times_bounds tolerance_bound require_adaptive require_adjoint few_trials halved sign_changes",
+                "run_bounds tolerance_bound require_run require_times require_adaptive require_adjoint few_trials halved "
+                "sign_changes",
             ),
             "nonholonomic.hybrid",
             *of(

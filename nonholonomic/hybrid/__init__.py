@@ -41,14 +41,16 @@ derivatives. A run that is not over after `MOST_ROUNDS` modes is `UNRESOLVED`; `
 """
 
 from .ensemble import MOST_ROUNDS as MOST_ROUNDS
-from .ensemble import AbstractBatchedMode as AbstractBatchedMode
-from .ensemble import AbstractHoppingMode as AbstractHoppingMode
 from .ensemble import HybridOutcome as HybridOutcome
-from .ensemble import Transition as Transition
-from .ensemble import TransitionPath as TransitionPath
 from .ensemble import after_reset as after_reset
 from .ensemble import after_solve as after_solve
+from .ensemble import at_start as at_start
 from .ensemble import solve_hybrid as solve_hybrid
+from .ensemble import traced_solve_hybrid as traced_solve_hybrid
+from .mode import AbstractBatchedMode as AbstractBatchedMode
+from .mode import AbstractHoppingMode as AbstractHoppingMode
+from .mode import Transition as Transition
+from .mode import TransitionPath as TransitionPath
 from .path import BETWEEN as BETWEEN
 from .path import HybridPath as HybridPath
 from .path import Segment as Segment
@@ -58,5 +60,3 @@ from .saltation import solve_hybrid_with_tangents as solve_hybrid_with_tangents
 from .saltation import traced_solve_hybrid_with_tangents as traced_solve_hybrid_with_tangents
 from .samples import HybridSamples as HybridSamples
 from .samples import hybrid_samples as hybrid_samples
-from .traced_ensemble import in_rounds as in_rounds
-from .traced_ensemble import traced_solve_hybrid as traced_solve_hybrid

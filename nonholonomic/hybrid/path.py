@@ -1,20 +1,23 @@
 """One hybrid run with its path: the modes of `ensemble.py`, each integrated by any solver of Diffrax."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..integration.dense import PIECE_OF_MODE, DenseSolution, follow, padded
 from ..integration.problem import AbstractProblem
+from ..integration.scheduler import Outcome
 from ..integration.settings import Settings
-from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
+from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED
 from ..xla_cpu import compiled_quickly
-from .ensemble import MOST_ROUNDS, AbstractBatchedMode, Transition
+from .ensemble import Carry, after_reset, after_solve, at_start, host_rounds
+from .mode import AbstractBatchedMode, Transition
 
 #: The number of a segment between two modes.
 BETWEEN = -1
@@ -180,35 +183,42 @@ def solve_hybrid_dense(
     >>> print(path.at(times)[0].round(5), path.numbers(times))
     [0.28647 0.33049] [-1  0]
     """
-    segments, counts, time, accepted, rejected = [], np.zeros(counters, int), 0.0, 0, 0
-    status, state = RUNNING, jnp.asarray(state)
-    for _ in range(MOST_ROUNDS):
-        mode = modes[number]
-        left = dataclasses.replace(settings, max_steps=settings.max_steps - accepted - rejected)
-        path = follow(_problem(mode, state), t1 - time, left, piece=PIECE_OF_MODE)
-        accepted, rejected = accepted + path.accepted, rejected + path.rejected
-        segments.append(_stay(mode, number, path, time))
-        time, state = segments[-1].end, jnp.asarray(path.states[:, -1])
-        if path.failed or not path.left_domain:
-            status, time = (FAILED, time) if path.failed else (REACHED_END, t1)
-            break
-        transition = _leave(mode, state, jnp.asarray(t1 - time))
-        segments += _way(mode, transition, time)
-        counts += np.asarray(transition.counts)[:, 0]
+
+    def solve(numbers: Sequence[int], carry: Carry, active: Bool[np.ndarray, "1"]) -> Carry:
+        if not active[0]:
+            return carry
+        (runs, segments), (number,), mode, begin = carry, numbers, modes[numbers[0]], float(carry[0].end_time[0])
+        left = dataclasses.replace(settings, max_steps=settings.max_steps - int(runs.steps[0]))
+        path = follow(_problem(mode, jnp.asarray(runs.state[:, 0])), t1 - begin, left, piece=PIECE_OF_MODE)
+        stay = Segment(begin, begin + float(path.times[-1]), number, mode, path, begin + path.times[1:])
+        return after_solve(np, runs, _outcome(path), np.full(1, t1)), [*segments, stay]
+
+    def reset(numbers: Sequence[int], carry: Carry, lost: Bool[np.ndarray, "1"]) -> Carry:
+        if not lost[0]:
+            return carry
+        (runs, segments), mode, begin = carry, modes[numbers[0]], float(carry[0].end_time[0])
+        transition = _leave(mode, jnp.asarray(runs.state[:, 0]), jnp.asarray(t1 - begin))
+        segments = segments + _way(mode, transition, begin)
         # NumPy cuts these: JAX would compile every cut.
         transition = jax.tree.map(np.asarray, transition._replace(record=None))
-        number, status, state = int(transition.mode[0]), int(transition.status[0]), transition.state[:, 0]
-        time = t1 if status == REACHED_END else time + float(transition.elapsed[0])
-        if not (np.isfinite(state).all() and np.isfinite(time)):
-            status, time = FAILED, segments[-1].end
-        if status != RUNNING:
-            break
-    status = UNRESOLVED if status == RUNNING else status
-    return HybridPath(segments, status, time, np.asarray(state), counts, accepted, rejected)
+        return after_reset(np, runs, transition, np.full(1, t1)), segments
+
+    start = at_start(np, np.full(1, number), np.asarray(state)[:, None], 1, counters)
+    runs, segments = host_rounds((start, []), [(mode,) for mode in range(len(modes))], solve, reset)
+    end_time, status, steps, rejected = (
+        values[0].item() for values in (runs.end_time, runs.status, runs.steps, runs.rejected)
+    )
+    if not (np.isfinite(runs.state).all() and np.isfinite(end_time)):
+        end_time = segments[-1].end
+    return HybridPath(segments, status, end_time, runs.state[:, 0], runs.counts[:, 0], steps - rejected, rejected)
 
 
-def _stay(mode: AbstractBatchedMode, number: int, path: DenseSolution, begin: float) -> Segment:
-    return Segment(begin, begin + float(path.times[-1]), number, mode, path, begin + path.times[1:])
+def _outcome(path: DenseSolution) -> Outcome[np.ndarray]:
+    """How the motion in a mode ended, as for an ensemble of one cell."""
+    status = FAILED if path.failed else LEFT_DOMAIN if path.left_domain else REACHED_END
+    never, steps = np.full(1, np.inf), path.accepted + path.rejected
+    ending = (np.asarray(path.times[-1:]), np.asarray(path.states[:, -1:]))
+    return Outcome(np.full(1, status), never, never, *ending, np.full(1, steps), np.full(1, path.rejected))
 
 
 def _way(mode: AbstractBatchedMode, transition: Transition, begin: float) -> list[Segment]:

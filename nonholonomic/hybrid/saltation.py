@@ -38,8 +38,8 @@ from ..integration import (
     States,
 )
 from ..integration.scheduler import Numbers
-from .ensemble import AbstractBatchedMode, HybridOutcome, Transition, solve_hybrid
-from .traced_ensemble import traced_solve_hybrid
+from .ensemble import HybridOutcome, solve_hybrid, traced_solve_hybrid
+from .mode import AbstractBatchedMode, Transition
 
 #: An event is grazing if a relative change of the numbers by the tolerance, or an error of the state that the tolerance
 #: allows, changes its rate by more than this fraction. The derivative then errs by about as much.

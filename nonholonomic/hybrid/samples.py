@@ -12,12 +12,12 @@ from jaxtyping import Array, Bool, Float
 from ..derivatives.differentiable import tangents_by
 from ..derivatives.sampling import AbstractSampling, ProblemSpec, solve_for_samples
 from ..derivatives.variation import in_groups
-from ..integration import LEFT_DOMAIN, REACHED_END, RUNNING, Settings, solve_with_samples
+from ..integration import REACHED_END, Settings, solve_with_samples
 from ..xla_cpu import greatest
-from .ensemble import AbstractBatchedMode, HybridOutcome, TransitionPath, after_reset, after_solve
+from .ensemble import Carry, HybridOutcome, after_reset, after_solve, at_start, traced_rounds
+from .mode import AbstractBatchedMode, TransitionPath
 from .path import BETWEEN
 from .saltation import VariationalMode, variational_modes, variational_start
-from .traced_ensemble import in_rounds
 
 #: From some modules (scene, launch, ...) and the tolerance to the modes of a single run, the number of the first mode,
 #: and the initial state.
@@ -187,63 +187,50 @@ def _followed(
     t1: Float[Array, ""],
     settings: Settings,
     counters: int,
-) -> tuple[HybridOutcome[Array], Filled]:
+) -> Carry:
     """Run round by round, as in `traced_solve_hybrid`, with samples of every mode and of the transition to the next."""
-    count, zero, none = len(modes[0].tangents), jnp.zeros(1), jnp.zeros(1, int)
+    count = len(modes[0].tangents)
     own = VariationalMode.parts(modes[0], state)[0][:-1]
-    rows = len(jax.eval_shape(modes[0].mode.shown, own))
-    start = HybridOutcome(
-        none + RUNNING, zero + jnp.inf, zero, state, none, none, first, jnp.zeros((counters + 1, 1), int)
-    )
-    missing = jnp.full((rows, len(times)), jnp.nan)
+    missing = jnp.full((len(jax.eval_shape(modes[0].mode.shown, own)), len(times)), jnp.nan)
     empty = Filled(missing, jnp.zeros((count, *missing.shape)), missing[0], jnp.full((), jnp.inf))
 
-    kinds_of_modes = alike(modes)
+    def solve(numbers: Sequence[int], carry: Carry, active: Bool[Array, " 1"]) -> Carry:
+        def solved() -> Carry:
+            run, filled = carry
+            at = run.mode[0]
+            mode = selected(modes, numbers, at)
+            # In a batch this branch is taken for all runs: those in another mode stay in this one for no time.
+            since, left = times - run.end_time, jnp.where(active, greatest(t1 - run.end_time, 0.0), 0.0)
+            outcome, samples = solve_with_samples(
+                mode.problem(run.state), since, left, jnp.asarray(1), settings, n_blocks=1 + count
+            )
+            after = after_solve(jnp, run, outcome, t1)
+            inside = (since >= 0.0) & (times <= after.end_time)
+            return after, filled.with_samples(inside, mode.seen(samples[0].T), at)
 
-    def stay(
-        mode: VariationalMode, number: Array, run: HybridOutcome[Array], filled: Filled, under_way: Bool[Array, ""]
-    ) -> tuple[HybridOutcome[Array], Filled]:
-        # In a batch this branch is taken for all runs: those in another mode stay in this one for no time.
-        since, left = times - run.end_time, jnp.where(under_way, greatest(t1 - run.end_time, 0.0), 0.0)
-        outcome, samples = solve_with_samples(
-            mode.problem(run.state), since, left, jnp.asarray(1), settings, n_blocks=1 + count
-        )
-        after = after_solve(jnp, run, outcome, t1)
-        return after, filled.with_samples((since >= 0.0) & (times <= after.end_time), mode.seen(samples[0].T), number)
+        return jax.lax.cond(active[0], solved, lambda: carry)
 
-    def change(mode: VariationalMode, run: HybridOutcome[Array], filled: Filled) -> tuple[HybridOutcome[Array], Filled]:
+    def reset(numbers: Sequence[int], carry: Carry, lost: Bool[Array, " 1"]) -> Carry:
         def seen(mode: AbstractBatchedMode, record: TransitionPath | None, left: Float[Array, " 1"]) -> Any:
             # Relative to an event that is later, a fixed time comes sooner, as the horizon does.
             return None if record is None else _on_the_way(mode, record, times - t1 + left)
 
-        left = greatest(t1 - run.end_time, 0.0)
-        transition, shown, variations = mode.left_behind(run.state, left, seen)
-        after = after_reset(jnp, run, transition, t1)
-        if shown is not None:
-            inside = (times > run.end_time) & (times <= after.end_time)
-            filled = filled.with_samples(inside, (shown, variations), BETWEEN)
-        grazes = after.counts[-1, 0] > run.counts[-1, 0]
-        return after, filled._replace(
-            grazed=jnp.where(grazes, jnp.minimum(filled.grazed, run.end_time[0]), filled.grazed)
-        )
+        def passed() -> Carry:
+            run, filled = carry
+            left = greatest(t1 - run.end_time, 0.0)
+            mode = selected(modes, numbers, run.mode[0])
+            transition, shown, variations = mode.left_behind(run.state, left, seen)
+            after = after_reset(jnp, run, transition, t1)
+            if shown is not None:
+                inside = (times > run.end_time) & (times <= after.end_time)
+                filled = filled.with_samples(inside, (shown, variations), BETWEEN)
+            grazes = after.counts[-1, 0] > run.counts[-1, 0]
+            grazed = jnp.where(grazes, jnp.minimum(filled.grazed, run.end_time[0]), filled.grazed)
+            return after, filled._replace(grazed=grazed)
 
-    def one_round(carry: Any) -> Any:
-        run, filled, rounds = carry
-        at = run.mode[0]
-        for numbers in kinds_of_modes:
-            under_way = (run.status[0] == RUNNING) & jnp.isin(at, jnp.asarray(numbers))
+        return jax.lax.cond(lost[0], passed, lambda: carry)
 
-            def advance(
-                numbers: tuple[int, ...] = numbers, run: Any = run, filled: Any = filled, under_way: Any = under_way
-            ) -> Any:
-                mode = selected(modes, numbers, at)
-                stayed = stay(mode, at, run, filled, under_way)
-                return jax.lax.cond(stayed[0].status[0] == LEFT_DOMAIN, lambda: change(mode, *stayed), lambda: stayed)
-
-            run, filled = jax.lax.cond(under_way, advance, lambda run=run, filled=filled: (run, filled))
-        return run, filled, rounds + 1
-
-    return in_rounds(one_round, start, empty)
+    return traced_rounds((at_start(jnp, first, state, 1, counters + 1), empty), alike(modes), solve, reset)
 
 
 def alike(modes: tuple[AbstractBatchedMode, ...]) -> list[tuple[int, ...]]:
@@ -265,7 +252,7 @@ def _shape(mode: AbstractBatchedMode) -> Any:
     return jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)) if eqx.is_array(leaf) else leaf, mode)
 
 
-def selected(modes: tuple[VariationalMode, ...], numbers: tuple[int, ...], at: Array) -> VariationalMode:
+def selected(modes: tuple[VariationalMode, ...], numbers: Sequence[int], at: Array) -> VariationalMode:
     """The mode numbered `at` in a group of modes that are `alike`."""
     mode = modes[numbers[0]]
     for number in numbers[1:]:

@@ -80,8 +80,9 @@ from .settings import lanes_for as lanes_for
 from .settings import legal_run as legal_run
 from .settings import require_adaptive as require_adaptive
 from .settings import require_adjoint as require_adjoint
+from .settings import require_run as require_run
+from .settings import require_times as require_times
 from .settings import run_bounds as run_bounds
-from .settings import times_bounds as times_bounds
 from .settings import tolerance_bound as tolerance_bound
 from .status import CROSSED as CROSSED
 from .status import FAILED as FAILED

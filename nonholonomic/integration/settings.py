@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from ..validation import Bound, as_number, legal
+from ..parameters import numbers
+from ..validation import Bound, as_number, legal, require_all, require_increasing, require_kind, require_scalars
 from .oscillatory import Oscillatory8
 
 #: The absolute tolerance as a fraction of the relative one, in units of a problem's own magnitudes.
@@ -109,15 +110,7 @@ def run_bounds(t1: Any, tolerance: Any) -> Iterator[Bound]:
 
 
 def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
-    """The range of the times of output [s].
-
-    **Example:**
-
-    >>> from nonholonomic.integration import times_bounds
-    >>> next(times_bounds(times=jnp.array([1.0, 6.0]), t1=5.0)).require()
-    Traceback (most recent call last):
-    ValueError: times ...
-    """
+    """The range of the times of output [s]."""
     yield Bound(times, "times", at_least=0.0, at_most=t1)
 
 
@@ -146,6 +139,41 @@ def legal_run(
     if times is not None:
         may = jnp.all(may & jnp.all(legal(times_bounds(times, t1)))) & jnp.all(jnp.diff(times) > 0.0)
     return may, jnp.where(may, t1, 0.0), jnp.where(may, tolerance, LOOSEST)
+
+
+def require_run(scene: Any, launch: Any, t1: Any, tolerance: Any, kinds: tuple[type, type], lists: str) -> None:
+    """Raise `ValueError` unless scene and launch are of these kinds and have scalars only, the horizon is positive, and
+    the tolerance is legal.
+
+    **Arguments:** `lists`: the functions that accept lists instead of single numbers, for the message. The parameters
+    of a function, such as that of a `Graph`, may be lists.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import Settings, require_run
+    >>> require_run(Settings(1e-9), Settings(1e-6), -1.0, 1e-9, (Settings, Settings), "jax.vmap takes lists")
+    Traceback (most recent call last):
+    ValueError: t1 = -1.0 ...
+    """
+    require_kind(scene, "scene", kinds[0])
+    require_kind(launch, "launch", kinds[1])
+    require_all(run_bounds(t1, tolerance))
+    values = numbers("scene", scene, functions=False) | numbers("launch", launch) | {"t1": t1, "tolerance": tolerance}
+    require_scalars(values, lists)
+
+
+def require_times(times: Any, t1: Any) -> None:
+    """Raise `ValueError` unless the times of output are an increasing list within [0, t1].
+
+    **Example:**
+
+    >>> from nonholonomic.integration import require_times
+    >>> require_times(jnp.array([1.0, 6.0]), t1=5.0)
+    Traceback (most recent call last):
+    ValueError: times ...
+    """
+    require_all(times_bounds(times, t1))
+    require_increasing(times, "times")
 
 
 def require_adaptive(solver: Any, others: str = "") -> None:

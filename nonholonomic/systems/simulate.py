@@ -12,9 +12,9 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from ..derivatives import sampled_run
 from ..hybrid import AbstractBatchedMode, hybrid_samples
-from ..integration import FAILED, Settings, explicit_tableau, legal_run, times_bounds
+from ..integration import FAILED, Settings, explicit_tableau, legal_run, require_times
 from ..progress import status_line
-from ..validation import as_known, as_number, is_traced, nan_unless, require_all, require_increasing
+from ..validation import as_known, as_number, is_traced, nan_unless
 from .engine import Cells, ModeProblem
 from .mode import Hybrid
 from .system import Run, System, check_run, run_of
@@ -72,8 +72,7 @@ def simulate(
     end = as_known(t1)
     if times is None:
         times = jnp.linspace(0.0, end, DEFAULT_TIMES) if is_traced(end) else np.linspace(0.0, end, DEFAULT_TIMES)
-    require_increasing(times, "times")
-    require_all(times_bounds(times, t1))
+    require_times(times, t1)
     settings = Settings(tolerance, solver)
     explicit_tableau(settings.for_lanes)
     if isinstance(system, Hybrid):

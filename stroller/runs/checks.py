@@ -2,9 +2,8 @@
 
 from typing import Any
 
-from nonholonomic.integration import ImplicitMidpoint, require_adaptive, require_adjoint, run_bounds, times_bounds
-from nonholonomic.parameters import numbers
-from nonholonomic.validation import require_all, require_increasing, require_kind, require_scalars, require_whole
+from nonholonomic.integration import ImplicitMidpoint, require_adaptive, require_adjoint, require_run
+from nonholonomic.validation import require_whole
 
 from ..model.input import check_input
 from ..model.launch import Launch
@@ -14,19 +13,10 @@ from ..model.scene import Scene
 def check_run(scene: Any, launch: Any, t1: Any, input: Any, tolerance: Any) -> None:
     """Raise `ValueError` unless scene, launch, horizon, input and tolerance are legal and the scene can start with the
     launch."""
-    require_kind(scene, "scene", Scene)
-    require_kind(launch, "launch", Launch)
-    require_all(run_bounds(t1, tolerance))
-    values = numbers("scene", scene, functions=False) | numbers("launch", launch) | {"t1": t1, "tolerance": tolerance}
-    require_scalars(values, "axes of sweep take lists, and jax.vmap maps over them")
+    lists = "axes of sweep take lists, and jax.vmap maps over them"
+    require_run(scene, launch, t1, tolerance, (Scene, Launch), lists)
     scene.check(launch)
     check_input(input, scene, launch)
-
-
-def check_times(times: Any, t1: Any) -> None:
-    """Raise `ValueError` unless the times of output are an increasing list within [0, t1]."""
-    require_all(times_bounds(times, t1))
-    require_increasing(times, "times")
 
 
 def check_options(solver: Any, max_steps: Any, adjoint: Any) -> None:

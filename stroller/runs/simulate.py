@@ -11,14 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.integration import ImplicitMidpoint, Settings, legal_run
+from nonholonomic.integration import ImplicitMidpoint, Settings, legal_run, require_times
 from nonholonomic.progress import status_line
 from nonholonomic.validation import as_known, is_traced, nan_unless
 
 from ..model.input import Input
 from ..model.launch import Launch
 from ..model.scene import Scene
-from .checks import check_options, check_run, check_times
+from .checks import check_options, check_run
 from .ride import Ride, RideSpec, as_module, traced_ride
 from .steps import followed
 from .trajectory import Trajectory, read_off
@@ -81,7 +81,7 @@ def simulate(
     check_options(solver, max_steps, adjoint)
     end, grid = as_known(t1), None
     times = _evenly_spaced(end) if times is None else as_known(times)
-    check_times(times, t1)
+    require_times(times, t1)
     if isinstance(solver, ImplicitMidpoint):
         grid = even_steps(times, end, solver.step_length)
         max_steps = grid.size

@@ -91,6 +91,13 @@ def below(scene: Scene[Top], flying: FlightState, ball: Ball | None = None) -> B
     return Below(foot, (*tangents(n), n), away - ball.radius)
 
 
+# A step evaluates it in several places, which share one trace.
+@compiled_setup
+def cosine(scene: Scene[Top], flying: FlightState, ball: Ball | None = None) -> Component:
+    """cos(theta) of a flying top: the angle between its axis and the normal below a sphere, by default its own."""
+    return dot(flying.axis, below(scene, flying, ball).axes[2])
+
+
 def landing_site(scene: Scene[Top], flying: FlightState, ball: Ball) -> Below:
     """The point where a sphere lands: the nearest point of the arena at the time of landing. Before that time, only the
     sign of the gap is valid.
@@ -191,8 +198,7 @@ class Flight(AbstractProblem):
         return stacked((*flying.velocity, *self.falls, *turning, None, None, None, None, None), state)
 
     def event_function(self, state):
-        flying = flight_state(state)
-        return dot(flying.axis, below(self.scene, flying).axes[2]) - self.cos_angle
+        return cosine(self.scene, flight_state(state)) - self.cos_angle
 
     def domain_margin(self, time, state):
         return functools.reduce(jnp.minimum, self.margins(time, state))

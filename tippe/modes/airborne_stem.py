@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.geometry import dot, scale, sum_vectors, vector_of
+from nonholonomic.geometry import scale, sum_vectors, vector_of
 from nonholonomic.hybrid import Transition
 from nonholonomic.integration import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, AbstractProblem
 from nonholonomic.xla_cpu import compiled_setup, greatest
@@ -33,7 +33,7 @@ from .airborne import (
     Fly,
     QuadraturesInFlight,
     as_free_body,
-    below,
+    cosine,
     flight_state,
     from_frame,
     gap_margin,
@@ -82,8 +82,7 @@ class OneOfTwo(AbstractProblem):
 
     def event_function(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
         # The angle from the normal below the top's own sphere; it is that of the state if that sphere slides.
-        flying = flight_state(lift_off(self.scene, state, False, self.own))
-        apart = dot(flying.axis, below(self.scene, flying, self.other).axes[2])
+        apart = _cosine_beside(self.scene, self.own, self.other, state)
         return jnp.where(self.on_stem, apart, state[COS_THETA]) - self.contact.cos_angle
 
     def domain_margin(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
@@ -91,6 +90,14 @@ class OneOfTwo(AbstractProblem):
 
     def margins(self, time: Any, state: Float[Array, "components cells"]) -> tuple[Float[Array, " cells"], ...]:
         return (*self.contact.margins(time, state), clearance(self.scene, self.own, self.other, state))
+
+
+@compiled_setup
+def _cosine_beside(
+    scene: Scene[Top], own: Ball, other: Ball, state: Float[Array, "components ..."]
+) -> Float[Array, "..."]:
+    """The cosine of the angle between the axis and the normal below the other sphere, while a sphere slides."""
+    return cosine(scene, flight_state(lift_off(scene, state, False, own)), other)
 
 
 @compiled_setup

@@ -11,18 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.integration import legal_run, run_bounds
-from nonholonomic.parameters import numbers
-from nonholonomic.validation import (
-    Bound,
-    all_bounds,
-    is_traced,
-    legal,
-    nan_unless,
-    require_all,
-    require_kind,
-    require_scalars,
-)
+from nonholonomic.integration import legal_run, require_run
+from nonholonomic.validation import Bound, all_bounds, is_traced, legal, nan_unless, require_all
 from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.friction import Frictionless
@@ -68,24 +58,10 @@ def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str = LIS
     """Raise `ValueError` unless the arguments are a scene, a launch that the scene allows, a positive horizon and a
     legal tolerance.
 
-    **Arguments:** as for `check_numbers`.
+    **Arguments:** as for `require_run`.
     """
-    check_numbers(scene, launch, t1, tolerance, lists)
+    require_run(scene, launch, t1, tolerance, (Scene, Launch), lists)
     scene.check_start(launch)
-
-
-def check_numbers(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str = LISTS) -> None:
-    """Raise `ValueError` unless the arguments are a scene, a launch, a positive horizon and a legal tolerance; each is
-    checked separately.
-
-    **Arguments:** as for `inversion_time`; `lists`: the functions that accept lists instead of single numbers, for the
-    message. The parameters of a function, such as that of a `Graph`, may be lists.
-    """
-    require_kind(scene, "scene", Scene)
-    require_kind(launch, "launch", Launch)
-    require_all(run_bounds(t1, tolerance))
-    values = numbers("scene", scene, functions=False) | numbers("launch", launch) | {"t1": t1, "tolerance": tolerance}
-    require_scalars(values, lists)
 
 
 def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from nonholonomic.integration import require_run
 from nonholonomic.parameters import description, full_axes, numbers, with_numbers
 from nonholonomic.sweeps import Axis, axis, cells_to_check
 from nonholonomic.validation import require_kind
@@ -13,7 +14,7 @@ from nonholonomic.validation import require_kind
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.top import Top
-from .checks import check_numbers
+from .checks import LISTS
 
 UNITS = Top.units | Scene.units | Launch.units
 
@@ -112,7 +113,7 @@ def launches(
             grid.append(axis(name if alone else number, number, unit, values[number], long_name))
     roots = with_numbers({"scene": scene, "launch": launch}, fixed)
     # The numbers of axes are 0 here, which may not be a place on the arena; starts are checked cell by cell.
-    check_numbers(roots["scene"], roots["launch"], t1, tolerance)
+    require_run(roots["scene"], roots["launch"], t1, tolerance, (Scene, Launch), LISTS)
     # The modules check their numbers, which may be illegal only in combination.
     for cells in [rows(grid)] if scattered else cells_to_check(grid):
         looked_at = with_numbers(roots, cells)

@@ -20,7 +20,7 @@ from nonholonomic.integration import (
     legal_run,
     require_adaptive,
     require_adjoint,
-    times_bounds,
+    require_times,
 )
 from nonholonomic.progress import status_line
 from nonholonomic.validation import (
@@ -29,8 +29,6 @@ from nonholonomic.validation import (
     is_traced,
     legal,
     nan_unless,
-    require_all,
-    require_increasing,
     shown,
 )
 from nonholonomic.xla_cpu import on_device
@@ -206,8 +204,7 @@ def simulate(
     settings = Settings(tolerance, solver)
     if times is not None:
         times = as_number(times)
-        require_all(times_bounds(times, t1))
-        require_increasing(times, "times")
+        require_times(times, t1)
     if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1, tolerance))):
         return _legal_or_nan(scene, launch, times, as_number(t1), settings, adjoint)
     if scene.contact == "hybrid":

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nonholonomic.integration import DEFAULT_MAX_STEPS, Settings, Status, times_bounds
+from nonholonomic.integration import DEFAULT_MAX_STEPS, Settings, Status, require_times
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, sweep
-from nonholonomic.validation import as_number, require, require_all, require_increasing, require_outside, require_whole
+from nonholonomic.validation import as_number, require, require_outside, require_whole
 
 from ..model.scene import Scene
 from .launches import described, launches
@@ -90,8 +90,7 @@ def trajectory_table(
     require_outside((scene, theta, spin, eta, mu, times, axes), "trajectory_table", "simulate with times=")
     names = _names(quantities)
     require_whole(max_steps, "max_steps", 1)
-    require_all(times_bounds(as_number(times), None))
-    require_increasing(times, "times")
+    require_times(as_number(times), None)
     times = np.asarray(times, dtype=float)
     require(times[-1], "times[-1]", above=0.0, why="it is the horizon")
     launch_values = {"theta": theta, "eta": eta, "mu": mu, "spin": spin}

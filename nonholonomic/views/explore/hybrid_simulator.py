@@ -19,6 +19,7 @@ from ...hybrid import (
     HybridOutcome,
     after_reset,
     after_solve,
+    at_start,
 )
 from ...integration import (
     LEFT_DOMAIN,
@@ -56,9 +57,7 @@ class HybridSimulator(NamedTuple):
     def first(self, values: Numbers) -> HybridOutcome[Array]:
         """The run for the sliders' numbers, at its start."""
         _, mode, state = self.start(values)
-        zero, none = jnp.zeros(1), jnp.zeros(1, int)
-        counts = jnp.zeros((self.counters, 1), int)
-        return HybridOutcome(none + RUNNING, zero + jnp.inf, zero, state, none, none, mode, counts)
+        return at_start(jnp, mode, state, 1, self.counters)
 
     def read(self, name: str, values: Numbers) -> Any:
         """A reading at the start of a run."""
