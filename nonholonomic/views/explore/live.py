@@ -83,7 +83,7 @@ def programs(live: LiveRun) -> str:
     values = jnp.array([slider.value for slider in live.sliders])
     facts = {
         "sliders": [slider._asdict() for slider in live.sliders],
-        "words": {int(status): status.word for status in Status} | live.answer.words,
+        "words": {int(status): status.word for status in Status} | dict(live.answer.words),
         "answer": {"label": live.answer.label, "unit": live.answer.unit},
         "summaries": [summary._asdict() for summary in live.summaries],
         "layout": _layout(live.motion, values),
