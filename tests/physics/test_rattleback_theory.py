@@ -13,7 +13,7 @@ from rigid_reference import Rattleback
 from scipy.linalg import expm
 
 import tippe
-from tippe.runs.lyapunov import _direction
+from tippe.runs.lyapunov import generic_direction
 
 THEORY = Oscillations.of_ellipsoid(1.0, SHAPE, 0.01, INERTIA)
 
@@ -100,7 +100,7 @@ def test_nearby_rattlebacks_part_within_the_states_of_a_rolling_body():
         e, x = state[2:5], state[-3:]
         return jnp.stack([e @ e, e @ x, x @ x, *(scene.dynamics.carried_along(state) - state)[:2]])
 
-    direction = _direction(scene, launch, 1)[:, 0]
+    direction = generic_direction(scene, launch, 1)[:, 0]
     assert_close(jax.jvp(kept, (state,), (direction,))[1], 0.0, atol=1e-15)
     assert np.abs(direction).min() > 0.0
 

@@ -116,7 +116,7 @@ def lyapunov_exponent(
     problem = InversionProblem.of(scene, launch, jnp.pi, cells)
     # A turning frame turns by a different angle for each launch, and the difference would count as divergence.
     problem = dataclasses.replace(problem, dynamics=scene.dynamics, cos_angle=jnp.asarray(NO_COSINE))
-    growths = growth(problem, _direction(scene, launch, cells), float(t1), STRETCHES, settings)
+    growths = growth(problem, generic_direction(scene, launch, cells), float(t1), STRETCHES, settings)
     exponent, error = exponent_of(growths.logarithm, float(t1))
     whole = growths.status == REACHED_END
     lost = np.array([status.word for status in LOSSES])[np.asarray(problem.dynamics.loss(jnp.asarray(growths.state)))]
@@ -136,7 +136,7 @@ def lyapunov_exponent(
     )
 
 
-def _direction(scene: Scene, launch: Launch, cells: int) -> Float[Array, "components cells"]:
+def generic_direction(scene: Scene, launch: Launch, cells: int) -> Float[Array, "components cells"]:
     """A generic direction, tangent to the set of states: the body's axes keep their length and right angle, and the
     vertical keeps length 1; a body that rolls keeps rolling."""
     magnitudes, state = scene.scales(launch), scene.state(launch)
