@@ -6,11 +6,14 @@ from collections.abc import Iterator
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Component, Vector, add, dot, sum_vectors
-from nonholonomic.validation import Bound, Bounded, as_number, require_kind
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, one_line, require_kind
+from nonholonomic.xla_cpu import compiled_setup
 
 
 class Slip(NamedTuple):
@@ -51,6 +54,9 @@ class AbstractFriction(Bounded):
     """A friction law whose force and torque are proportional to the normal force. The law therefore also determines
     impacts, where the normal impulse takes the place of the normal force.
 
+    Friction never does positive work: f.v_s + tau.w <= 0 (`ContactLoad.power`). You get a warning when you construct a law
+    that breaks this rule; a run whose energy grows ends as "unresolved".
+
     **Example:**
 
     ```
@@ -78,6 +84,11 @@ class AbstractFriction(Bounded):
     #: Whether friction on a contact at rest takes whatever value keeps it at rest, within limits.
     set_valued: ClassVar[bool] = False
 
+    def suspicion(self) -> str | None:
+        # The laws of this package oppose every slip. Traced numbers have no values to judge.
+        own = str(type(self).per_normal_force.__module__).startswith("tippe.")
+        return None if own or any(is_traced(leaf) for leaf in jax.tree.leaves(self)) else _drive(self)
+
     @property
     def uses_spin(self) -> bool:
         """Whether the law depends on the body's angular velocity about the normal."""
@@ -100,6 +111,38 @@ class AbstractFriction(Bounded):
 
         **Returns:** a `ContactLoad`.
         """
+
+
+#: Slip speeds [m/s] and turning rates [rad/s] at which a law is tried.
+SPEEDS, TURNINGS = (1e-3, 1e-2, 0.1, 1.0), (0.0, 100.0, -100.0)
+
+
+def _drive(law: AbstractFriction) -> str | None:
+    """The message about a law with positive power, by a few slips in eight directions; `None` if it brakes in all of them."""
+    angle, speed, turning = (
+        grid.ravel() for grid in np.meshgrid(np.arange(8) * math.pi / 4.0, SPEEDS, TURNINGS, indexing="ij")
+    )
+    x, y, drilling = speed * np.cos(angle), speed * np.sin(angle), turning if law.uses_spin else None
+    try:
+        with jax.ensure_compile_time_eval():
+            power = np.asarray(_power(law, Slip(x, y, (0.0 * turning, 0.0 * turning, drilling))))
+    except Exception:
+        # What is wrong with such a law, its first run says.
+        return None
+    if power.shape != x.shape or not np.any(power > 1e-12):
+        return None
+    worst = int(np.nanargmax(power / speed))
+    drills = f" and a turning of {turning[worst]:g} rad/s" if law.uses_spin and turning[worst] else ""
+    return (
+        f"friction = {one_line(law)} drives the top: at a slip of ({x[worst]:.3g}, {y[worst]:.3g}) m/s{drills} its power is "
+        f"{power[worst]:.3g} W per newton of normal force, and friction has none above 0. Is a sign wrong? A run whose energy "
+        "grows ends as 'unresolved'. For a level belt, give Launch the velocity relative to it"
+    )
+
+
+@compiled_setup
+def _power(law: AbstractFriction, slip: Slip) -> Component:
+    return law.per_normal_force(slip).power(slip)
 
 
 class Frictionless(AbstractFriction):
