@@ -35,9 +35,9 @@ def tangent_scale(number: Float[Array, "..."]) -> Float[Array, "..."]:
 class VariationalProblem(AbstractProblem):
     """A problem whose state is followed by its first variations along several tangents.
 
-    A tangent of the problem is the same tree, with the rate at which each number moves, `None` where no tangent moves
-    it. A variation's absolute tolerance is that of the state, so a tangent should move a number by about its own size
-    (`tangent_scale`).
+    A tangent has the structure of the problem, with the rate at which each number moves in place of the number; `None`
+    for a number that no tangent moves. A variation's absolute tolerance is that of the state, so a tangent should move
+    a number by about its own size (`tangent_scale`).
 
     **Arguments:** `ends_on_event`: whether runs end on the event of the problem, or continue to their horizon.
 

@@ -5,8 +5,10 @@ lengths. The state is recorded after each iteration, and the samples of a period
 """
 
 import functools
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -23,7 +25,14 @@ from .step import LaneState, try_step
 #: are proposed with a margin of `step.SAFETY`.
 STRETCH = 1.08
 
-Samples = Float[Array, "cells times components"]
+#: The values to keep of some states: (the cells in the lanes, (iterations, components, lanes)) -> a tree of arrays
+#: (iterations, lanes, ...).
+Read = Callable[[Int[Array, " lanes"], Float[Array, "iterations components lanes"]], Any]
+
+
+def components(cells: Int[Array, " lanes"], states: Float[Array, "iterations components lanes"]) -> Array:
+    """The states themselves."""
+    return jnp.moveaxis(states, 1, -1)
 
 
 class Reached(NamedTuple):
@@ -34,33 +43,41 @@ class Reached(NamedTuple):
 
 
 class Collected(NamedTuple):
-    """The number of the next sample in every lane, and the samples so far."""
+    """The number of the next sample in every lane, and the samples so far: a tree of arrays (cells, times, ...)."""
 
     sample: Int[Array, " lanes"]
-    samples: Samples
+    samples: Any
 
 
 class SampleRecorder(AbstractRecorder):
     """Lets steps end on the sample times of every cell, and collects the samples.
 
-    `times` are the times of the samples [s]; `first` is the number of each cell's first sample after its start.
+    `times` are the times of the samples [s]; `first` is the number of each cell's first sample after its start; `read`
+    gives the values to keep.
     """
 
     times: Float[Array, "times *cells"]
     first: Int[Array, " cells"]
+    read: Read = eqx.field(static=True)
 
     # As many iterations as fit the caches with their record.
     period = 64
 
     @classmethod
-    def of(cls, times: Float[Array, "times *cells"], cells: int) -> "SampleRecorder":
+    def of(cls, times: Float[Array, "times *cells"], cells: int, read: Read) -> "SampleRecorder":
         """The recorder of the samples of some cells."""
-        return cls(times, jnp.broadcast_to(jnp.sum(times <= 0.0, axis=0), (cells,)))
+        return cls(times, jnp.broadcast_to(jnp.sum(times <= 0.0, axis=0), (cells,)), read)
 
     def at_start(self, lane_state: LaneState, starts: Float[Array, "components cells"]) -> Collected:
         """The samples at the start."""
-        early = (self.times <= 0.0).reshape(len(self.times), -1).T[..., None]
-        return Collected(self._begin(lane_state), jnp.where(early, starts.T[:, None], jnp.nan))
+        early = (self.times <= 0.0).reshape(len(self.times), -1).T
+
+        def of_start(values: Float[Array, "1 cells ..."]) -> Float[Array, "cells times ..."]:
+            values = jnp.moveaxis(values, 0, 1)
+            return jnp.where(early.reshape(*early.shape, *[1] * (values.ndim - 2)), values, jnp.nan)
+
+        begun = self.read(jnp.arange(len(self.first)), starts[None])
+        return Collected(self._begin(lane_state), jax.tree.map(of_start, begun))
 
     def begin(self, lane_state: LaneState, collected: Collected) -> tuple[Bool[Array, " lanes"], Array, Reached]:
         room = jnp.zeros((self.period, *lane_state.state.shape), lane_state.state.dtype)
@@ -97,8 +114,12 @@ class SampleRecorder(AbstractRecorder):
         self, collected: Collected, record: tuple[Array, Array, Reached], ended: LaneState, refilled: LaneState
     ) -> Collected:
         _, sample, reached = record
-        rows, cell = jnp.moveaxis(reached.state, 1, -1), self._cell(ended)[None]
-        samples = collected.samples.at[cell, reached.sample].set(rows, mode="drop", unique_indices=True)
+        cell = self._cell(ended)
+
+        def added(samples: Float[Array, "cells times ..."], rows: Float[Array, "iterations lanes ..."]) -> Array:
+            return samples.at[cell[None], reached.sample].set(rows, mode="drop", unique_indices=True)
+
+        samples = jax.tree.map(added, collected.samples, self.read(cell, reached.state))
         return Collected(jnp.where(refilled.cell != ended.cell, self._begin(refilled), sample), samples)
 
     def _cell(self, lane_state: LaneState) -> Int[Array, " lanes"]:
@@ -123,16 +144,19 @@ def solve_with_samples(
     *,
     n_blocks: int = 1,
     one_kernel: bool = False,
-) -> tuple[Outcome, Samples]:
+    read: Read = components,
+) -> tuple[Outcome, Any]:
     """Run every cell from t = 0 to its event, to the end of the model's validity, or to `t1`, and sample it.
 
     **Arguments:** as for `LaneScheduler.of`, and
 
     - `times`: times of the samples [s], increasing, at least 0; (times,) for all cells or (times, cells). Runs do not
       reach times after `t1`.
+    - `read`: reads the values to return off some states: (cells (lanes,), states (iterations, components, lanes)) -> a
+      tree of arrays (iterations, lanes, ...); by default the states themselves. Reading less saves time and memory.
 
-    **Returns:** the `Outcome`, without crossing times; and the states at the times, (cells, times, components), NaN
-    after the end of a run.
+    **Returns:** the `Outcome`, without crossing times; and what was read off the states at the times, with the first
+    axes (cells, times), NaN after the end of a run: by default an array (cells, times, components).
 
     **Example:**
 
@@ -145,7 +169,7 @@ def solve_with_samples(
      [0.67032       nan]]
     """
     scheduler = LaneScheduler.of(problem, t1, cells, settings, n_blocks=n_blocks, one_kernel=one_kernel)
-    recorder = SampleRecorder.of(times, scheduler.capacity)
+    recorder = SampleRecorder.of(times, scheduler.capacity, read)
     at_start = recorder.at_start(scheduler.start().lane_state, scheduler.fresh.state)
     outcome, _, collected = scheduler.recorded(recorder, at_start)
     return outcome, collected.samples

@@ -40,7 +40,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
     - `constraint` [m/s]: speed at which the rear axle and the front wheel slip sideways, (times, 2);
     - `departure`: distance of the position from the ground [m], an integration error;
     - `stats` of the integration; `spec`: the specification of the run; `steps`: the ends of its steps. They are `None`
-      for a run inside a transformation, which is repeated when you request events between the times.
+      for a run inside a transformation; if you request events of such a run, the run is repeated.
 
     **Example:**
 

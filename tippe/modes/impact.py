@@ -81,8 +81,8 @@ class Impact(AbstractProblem):
     """Impacts, with the normal impulse as the time; the state is the tangential impulse and, if the law has a torque,
     the impulse of the torque.
 
-    The impulses are in units of the impulse that would stop the sphere without friction, and of this times the sphere's
-    radius. `gained` is the velocity along the normal [m/s] at which the impact ends.
+    The unit of impulses is the impulse that would stop the sphere without friction; impulses of a torque are in this
+    unit times the sphere's radius. `gained` is the velocity along the normal [m/s] at which the impact ends.
     """
 
     body: Top

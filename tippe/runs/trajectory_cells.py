@@ -1,5 +1,6 @@
 """The cells of a table of trajectories: samples of many launches, and the quantities at the samples."""
 
+from collections.abc import Callable
 from typing import Any, cast
 
 import equinox as eqx
@@ -41,29 +42,27 @@ def launches_with(scene: Scene, launch: Launch, cells: int, names: tuple[str, ..
     return CoreProblem(run, run.leading if needed.isdisjoint(names) else len(run.start()[0]) - BEHIND_PATH)
 
 
-def _read(
-    run: TrajectoryProblem,
-    scene: Scene,
-    times: Float[Array, " times"],
-    samples: Float[Array, "cells times components"],
-    name: str,
-) -> Float[Array, "cells times ..."]:
-    """A quantity at every sample, NaN after the end of a run."""
-    # Of the spin angle and the work, nothing is read.
-    missing = len(run.start()[0]) - 2 - samples.shape[-1]
+def _reader(
+    run: TrajectoryProblem, scene: Scene, names: tuple[str, ...]
+) -> Callable[[Int[Array, " lanes"], Float[Array, "iterations components lanes"]], dict[str, Array]]:
+    """A function that reads the named quantities of some cells off their states."""
 
-    def read_cell(scene: Scene, states: Float[Array, "times components"]) -> Float[Array, "times ..."]:
-        nothing = jnp.zeros(len(times))
+    def read_lane(scene: Scene, states: Float[Array, "iterations components"]) -> dict[str, Array]:
+        # Of the spin angle and the work, nothing is read.
+        missing = len(run.start()[0]) - 2 - states.shape[1]
+        nothing, end = jnp.zeros(len(states)), jnp.zeros(())
         state, cyclic = jnp.split(jnp.pad(states.T, ((0, missing), (0, 0))), [run.leading])
-        values = getattr(Trajectory(times, scene, state, cyclic, nothing, nothing, None, times[-1], {}, None), name)
-        # A quantity that does not depend on the state would be a number even after the end.
-        reached = jnp.isfinite(states[:, 0]).reshape(-1, *[1] * (values.ndim - 1))
-        return jnp.where(reached, values, jnp.nan)
+        trajectory = Trajectory(nothing, scene, state, cyclic, nothing, nothing, None, end, {}, None)
+        return {name: getattr(trajectory, name) for name in names}
 
-    def cell_axis(leaf: Any) -> int | None:
+    def own_axis(leaf: Any) -> int | None:
         return 0 if eqx.is_array(leaf) and leaf.ndim else None
 
-    return eqx.filter_vmap(read_cell, in_axes=(cell_axis, 0))(scene, samples)
+    def read(cells: Int[Array, " lanes"], states: Float[Array, "iterations components lanes"]) -> dict[str, Array]:
+        of_lanes = jax.tree.map(lambda leaf: leaf if own_axis(leaf) is None else leaf[cells], scene)
+        return eqx.filter_vmap(read_lane, in_axes=(own_axis, -1), out_axes=1)(of_lanes, states)
+
+    return read
 
 
 # Compiled on its own, not inside other transformed functions; otherwise it does not get the compiler's options.
@@ -77,11 +76,12 @@ def _followed(
     names: tuple[str, ...],
 ) -> tuple[Outcome, Int[Array, " cells"], dict[str, Float[Array, "cells times ..."]]]:
     """The `Status` of the runs as integers, and the named quantities at the samples."""
-    outcome, samples = solve_with_samples(problem, times, times[-1], count, settings, one_kernel=True)
     run = cast(TrajectoryProblem, problem.whole)
+    read = _reader(run, scene, names)
+    outcome, samples = solve_with_samples(problem, times, times[-1], count, settings, one_kernel=True, read=read)
     codes = (outcome.status == LEFT_DOMAIN, outcome.status == FAILED)
     status = ended(run, scene, outcome.state, *codes, settings.tolerance)
-    return outcome, status, {name: _read(run, scene, times, samples, name) for name in names}
+    return outcome, status, samples
 
 
 def solve_cells(

@@ -34,10 +34,10 @@ class Oscillators(AbstractProblem):
 RATES = jnp.linspace(1.0, 9.0, CELLS)
 
 
-def run(times, least=-2.0, tolerance=1e-10):
+def run(times, least=-2.0, tolerance=1e-10, **options):
     problem = Oscillators(RATES, jnp.full(CELLS, least))
     arguments = (jnp.asarray(10.0), jnp.asarray(CELLS), Settings(tolerance, lanes=16))
-    return eqx.filter_jit(solve_with_samples)(problem, jnp.asarray(times), *arguments)
+    return eqx.filter_jit(solve_with_samples)(problem, jnp.asarray(times), *arguments, **options)
 
 
 @pytest.mark.parametrize("count", [3, 701])
@@ -65,6 +65,21 @@ def test_after_the_end_there_are_no_numbers():
     ends = np.pi / 3.0 / np.asarray(RATES)
     assert_close(outcome.end_time, ends, rtol=1e-8)
     assert np.array_equal(np.isfinite(samples[..., 0]), times <= ends[:, None])
+
+
+def test_only_what_is_read_is_kept():
+    """Phases and scaled vectors of runs that end between samples, more of them than lanes, read with each cell's own rate."""
+    times = np.linspace(0.0, 10.0, 201)
+
+    def read(cells, states):
+        x, speed = states[:, 0], states[:, 1] / RATES[cells]
+        return {"phase": jnp.arctan2(-speed, x), "circle": jnp.stack([x, speed], axis=-1)}
+
+    _, samples = run(times, least=0.5, read=read)
+    phases = np.outer(RATES, times)
+    phases = np.where(phases <= np.pi / 3.0, phases, np.nan)
+    assert_close(samples["phase"], phases, atol=1e-8)
+    assert_close(samples["circle"], np.stack([np.cos(phases), -np.sin(phases)], axis=-1), atol=1e-8)
 
 
 def test_the_error_falls_with_the_tolerance():
