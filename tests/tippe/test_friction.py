@@ -13,7 +13,7 @@ from hard.friction import hertz_disc
 from tops import random_states, rutstam_top
 
 import tippe
-from tippe.model.friction import ContactLoad, Slip
+from tippe.model.contact_load import ContactLoad, Slip
 from tippe.witnesses import reduced
 
 ARENAS = {"plane": tippe.Plane(), "cylinder": tippe.Cylinder(0.3), "sphere": tippe.Sphere(0.3)}

@@ -3,48 +3,18 @@
 import abc
 import math
 from collections.abc import Iterator
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import Component, Vector, add, dot, sum_vectors
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced, one_line, require_kind
-from nonholonomic.xla_cpu import compiled_setup
+from nonholonomic.geometry import sum_vectors
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require_kind
 
-
-class Slip(NamedTuple):
-    """The motion of the body at the contact, in the moving frame (t1, t2, n).
-
-    - `x`, `y`: velocity of the material contact point along the arena [m/s].
-    - `turning`: angular velocity of the body [rad/s]; its component along n, the drilling, is `None` unless the law
-      `uses_spin`.
-    """
-
-    x: Float[Array, "..."]
-    y: Float[Array, "..."]
-    turning: Vector = (None, None, None)
-
-
-class ContactLoad(NamedTuple):
-    """The effect of friction at the contact per unit normal force, in the moving frame.
-
-    - `force`: the tangential force [1].
-    - `torque`: the torque about the contact point [m].
-
-    A component is `None` where it vanishes identically.
-    """
-
-    force: tuple[Component, Component]
-    torque: Vector = (None, None, None)
-
-    def power(self, slip: Slip) -> Component:
-        """Power per unit normal force, f.v_s + tau.w [m/s] (`tippe.md`, section 2)."""
-        return add(dot(self.force, (slip.x, slip.y)), dot(self.torque, slip.turning))
-
+from .contact_load import ContactLoad, Slip
+from .driving_law import drive
 
 #: Addition to the message about an object that is not a friction law.
 A_LAW = " law, such as tippe.Viscous(0.3) or tippe.Coulomb(mu=0.3, slip_speed=0.01)"
@@ -87,7 +57,7 @@ class AbstractFriction(Bounded):
     def suspicion(self) -> str | None:
         # The laws of this package oppose every slip. Traced numbers have no values to judge.
         own = str(type(self).per_normal_force.__module__).startswith("tippe.")
-        return None if own or any(is_traced(leaf) for leaf in jax.tree.leaves(self)) else _drive(self)
+        return None if own or any(is_traced(leaf) for leaf in jax.tree.leaves(self)) else drive(self)
 
     @property
     def uses_spin(self) -> bool:
@@ -111,38 +81,6 @@ class AbstractFriction(Bounded):
 
         **Returns:** a `ContactLoad`.
         """
-
-
-#: Slip speeds [m/s] and turning rates [rad/s] at which a law is tried.
-SPEEDS, TURNINGS = (1e-3, 1e-2, 0.1, 1.0), (0.0, 100.0, -100.0)
-
-
-def _drive(law: AbstractFriction) -> str | None:
-    """The message about a law with positive power, by a few slips in eight directions; `None` if it brakes in all of them."""
-    angle, speed, turning = (
-        grid.ravel() for grid in np.meshgrid(np.arange(8) * math.pi / 4.0, SPEEDS, TURNINGS, indexing="ij")
-    )
-    x, y, drilling = speed * np.cos(angle), speed * np.sin(angle), turning if law.uses_spin else None
-    try:
-        with jax.ensure_compile_time_eval():
-            power = np.asarray(_power(law, Slip(x, y, (0.0 * turning, 0.0 * turning, drilling))))
-    except Exception:
-        # What is wrong with such a law, its first run says.
-        return None
-    if power.shape != x.shape or not np.any(power > 1e-12):
-        return None
-    worst = int(np.nanargmax(power / speed))
-    drills = f" and a turning of {turning[worst]:g} rad/s" if law.uses_spin and turning[worst] else ""
-    return (
-        f"friction = {one_line(law)} drives the top: at a slip of ({x[worst]:.3g}, {y[worst]:.3g}) m/s{drills} its power is "
-        f"{power[worst]:.3g} W per newton of normal force, and friction has none above 0. Is a sign wrong? A run whose energy "
-        "grows ends as 'unresolved'. For a level belt, give Launch the velocity relative to it"
-    )
-
-
-@compiled_setup
-def _power(law: AbstractFriction, slip: Slip) -> Component:
-    return law.per_normal_force(slip).power(slip)
 
 
 class Frictionless(AbstractFriction):
