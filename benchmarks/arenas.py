@@ -56,7 +56,7 @@ def rows() -> list[dict[str, str]]:
 
         measured = timed(run, RUNS)
         times, exact = measured.result.time, run(1e-11).time
-        both = np.isfinite(times) & np.isfinite(exact)
+        finite = np.isfinite(times) & np.isfinite(exact)
         rate = measured.result.steps.sum() / measured.cpu
         plane = rate if plane is None else plane
         columns = {
@@ -65,8 +65,10 @@ def rows() -> list[dict[str, str]]:
             "compile [s]": f"{measured.first - measured.wall:.1f}",
             "10^6 steps/s": f"{rate / 1e6:.2f}",
             "cost": f"{plane / rate:.2f}",
-            "inverted": str(int(both.sum())),
-            "error": f"{np.max(np.abs(times / np.where(both, exact, 1.0) - 1.0)[both]):.0e}" if both.any() else "",
+            "inverted": str(int(finite.sum())),
+            "error": f"{np.max(np.abs(times / np.where(finite, exact, 1.0) - 1.0)[finite]):.0e}"
+            if finite.any()
+            else "",
         }
         entries.append(columns)
         print(*columns.values(), flush=True)

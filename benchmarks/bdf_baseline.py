@@ -114,8 +114,10 @@ def draw(reference: float, rows: list[Measured], path: str) -> None:
 
     figure, axes = plt.subplots(figsize=(6.0, 4.0), layout="constrained")
     for name in dict.fromkeys(row.name for row in rows):
-        mine = [row for row in rows if row.name == name]
-        axes.loglog([abs(row.time - reference) for row in mine], [row.wall for row in mine], "o-", label=name)
+        method_rows = [row for row in rows if row.name == name]
+        axes.loglog(
+            [abs(row.time - reference) for row in method_rows], [row.wall for row in method_rows], "o-", label=name
+        )
     axes.set_xlabel("error of the inversion time [s]")
     axes.set_ylabel("wall time [s]")
     axes.legend()

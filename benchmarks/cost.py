@@ -126,7 +126,7 @@ def of_stroller(ground: AbstractSurface) -> tuple[AbstractProblem, ...]:
     body = stroller.Stroller(12.0, 0.7, 1.5, 0.05, steering_spring=0.2)
     scene = stroller.Scene(body, ground, stroller.Damping(0.8, 0.4, 0.1, 0.02))
     launch = stroller.Launch((0.3, 0.5), 0.3, 1.5, 0.2, 0.5)
-    return (eqx.filter_eval_shape(lambda *both: RideProblem.of(*both, None, LAUNCHES, watched=True), scene, launch),)
+    return (eqx.filter_eval_shape(lambda *roots: RideProblem.of(*roots, None, LAUNCHES, watched=True), scene, launch),)
 
 
 def counts_of_field(problems: Problems) -> list[int]:
@@ -158,7 +158,7 @@ def has_grown(recorded: list[float], counted: list[float]) -> bool:
     """Whether a number has grown by more than 2 %, or the set of numbers has changed."""
     if len(recorded) != len(counted):
         return True
-    return any(now > (1.0 + GROWTH) * before for before, now in zip(recorded, counted, strict=True))
+    return any(count > (1.0 + GROWTH) * before for before, count in zip(recorded, counted, strict=True))
 
 
 def main() -> None:

@@ -37,8 +37,8 @@ VARIABLES |= {name: Variable("1", np.int64) for name in ("steps", "rejected")}
 def results(columns, count):
     """Numbers that cost nearly nothing."""
     variables = {name: columns["x"] for name in NAMES}
-    whole = np.zeros(len(columns["x"]), int)
-    return variables | {"status": whole.astype(np.int8), "steps": whole, "rejected": whole}
+    zeros = np.zeros(len(columns["x"]), int)
+    return variables | {"status": zeros.astype(np.int8), "steps": zeros, "rejected": zeros}
 
 
 class Sleepers(Executor):

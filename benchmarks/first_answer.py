@@ -155,14 +155,14 @@ def measured(program: str, launches: int, state: str, folder: Path) -> dict[str,
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     begin = time.perf_counter()
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
-    whole = time.perf_counter() - begin
+    duration = time.perf_counter() - begin
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode != 0:
         print(f"{program} skipped: {done.stderr.strip().splitlines()[-1]}", file=sys.stderr)
         return None
     answer = json.loads(done.stdout.splitlines()[-1])
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    row = {"launches": str(launches), "program": program, "state": state, "whole [s]": f"{whole:.2f}"}
+    row = {"launches": str(launches), "program": program, "state": state, "whole [s]": f"{duration:.2f}"}
     row |= {"CPU [s]": f"{cpu:.2f}"} | {f"{name} [s]": f"{answer[name]:.2f}" for name in MODES}
     return row | {"last time [s]": f"{answer['answer']:.7f}"}
 

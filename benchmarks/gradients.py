@@ -43,8 +43,8 @@ def times(scene: tippe.Scene, theta: np.ndarray, tolerance: float, paths: list[s
 
 def loss_of(scene: tippe.Scene, theta: np.ndarray, paths: list[str]) -> tuple[Callable[..., Any], list[Any]]:
     """Mean square of the launches' times, as a function of some numbers and the tolerance; and the numbers."""
-    known = {"scene.friction.mu": scene.friction.mu, "launch.spin": 100.0, "launch.theta": theta}
-    known |= {f"scene.body.{name}": getattr(scene.body, name) for name in ("offset", "I1", "I3")}
+    fixed_numbers = {"scene.friction.mu": scene.friction.mu, "launch.spin": 100.0, "launch.theta": theta}
+    fixed_numbers |= {f"scene.body.{name}": getattr(scene.body, name) for name in ("offset", "I1", "I3")}
 
     def loss(values: list[Any], tolerance: Any) -> Any:
         def time(angle: Any) -> Any:
@@ -57,7 +57,7 @@ def loss_of(scene: tippe.Scene, theta: np.ndarray, paths: list[str]) -> tuple[Ca
         angles = values[paths.index("launch.theta")] if "launch.theta" in paths else jnp.asarray(theta)
         return jnp.mean(jax.vmap(time)(angles) ** 2)
 
-    return loss, [jnp.asarray(known[path], float) for path in paths]
+    return loss, [jnp.asarray(fixed_numbers[path], float) for path in paths]
 
 
 def differences(scene: tippe.Scene, theta: float) -> tuple[float, float]:

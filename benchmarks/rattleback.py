@@ -74,10 +74,10 @@ def mujoco(spin: float, step: float) -> float:
     before = spin
     for count in range(round(HORIZON / step)):
         mujoco.mj_step(model, data)
-        now = float(data.xmat[1].reshape(3, 3)[2] @ data.qvel[3:])
-        if now * spin <= 0.0:
-            return (count + before / (before - now)) * step
-        before = now
+        normal_spin = float(data.xmat[1].reshape(3, 3)[2] @ data.qvel[3:])
+        if normal_spin * spin <= 0.0:
+            return (count + before / (before - normal_spin)) * step
+        before = normal_spin
     return np.inf
 
 

@@ -96,8 +96,8 @@ def main() -> None:
         return jax.jvp(lambda mu: simulated(*inputs, mu), (mu,), (jnp.ones(()),))
 
     def reverse(mu: Any) -> Any:
-        samples, back = jax.vjp(lambda mu: simulated(*inputs, mu), mu)
-        return samples, back(ones)
+        samples, pullback = jax.vjp(lambda mu: simulated(*inputs, mu), mu)
+        return samples, pullback(ones)
 
     refine, wide, obvious = jax.jit(simulated), compiled_alone(simulated), jax.jit(by_diffrax)
     along, back_through = jax.jit(forward), jax.jit(reverse)

@@ -235,7 +235,7 @@ def main() -> None:
     print(table(summary(rows)))
     if not options.quick and "plane, viscous" in (options.scenes or described):
         task = described["plane, viscous"].task
-        mine = next(
+        row = next(
             float(row["cpu ms per launch"])
             for row in rows
             if row["program"] == "nonholonomic Oscillatory8"
@@ -246,7 +246,7 @@ def main() -> None:
             measured = timed(obvious_diffrax(task, launches), 1)
             cost = measured.cpu / launches * 1e3
             label = f"vmapped Diffrax Dopri8 as one writes it first, {launches} lanes, rtol 1e-9"
-            print(f"{label}: {cost:.2f} ms a launch, {cost / mine:.1f} times ours")
+            print(f"{label}: {cost:.2f} ms a launch, {cost / row:.1f} times ours")
     if available("matplotlib"):
         draw(rows, options.out / "work_precision.png")
 

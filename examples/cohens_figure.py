@@ -34,9 +34,9 @@ def main() -> None:
     with warnings.catch_warnings():
         # The example shows how well the data determine both.
         warnings.simplefilter("ignore", tippe.FitWarning)
-        both = tippe.identify(scene(0.3, 0.08), figure, {"mu": 0.3, "slip_speed": 0.08})
-    shown(both, "both:")
-    for value, words in zip(both.identifiability.singular_values, both.identifiability.words, strict=True):
+        fit = tippe.identify(scene(0.3, 0.08), figure, {"mu": 0.3, "slip_speed": 0.08})
+    shown(fit, "both:")
+    for value, words in zip(fit.identifiability.singular_values, fit.identifiability.words, strict=True):
         print(f"  known to {100.0 / value:.2g} %: {words}")
     print("So the figure fixes mu / sqrt(v0) to 1 %, but mu and v0 along that line to 10 % only.")
 

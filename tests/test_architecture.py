@@ -72,10 +72,10 @@ def arrows_of(file: str) -> Iterator[Arrow]:
         else:
             above = folder[: len(folder) - node.level + 1] if node.level else ()
             module = ".".join([*above, *([node.module] if node.module else [])])
-            whole = [name.name for name in node.names if is_module(f"{module}.{name.name}")]
-            targets = [(f"{module}.{name}", ()) for name in whole]
-            rest = tuple(name.name for name in node.names if name.name not in whole)
-            targets += [(module, rest)] if rest else []
+            modules = [name.name for name in node.names if is_module(f"{module}.{name.name}")]
+            targets = [(f"{module}.{name}", ()) for name in modules]
+            imported_names = tuple(name.name for name in node.names if name.name not in modules)
+            targets += [(module, imported_names)] if imported_names else []
         yield from (Arrow(file, module, names, asked) for module, names in targets if module.split(".")[0] in PACKAGES)
 
 
@@ -126,8 +126,8 @@ def circle(edges: set[tuple[str, str]]) -> list[str]:
 
 
 def test_the_reader_of_imports_sees_them():
-    seen = {(room(arrow.file), room(arrow.module)) for arrow in ARROWS}
-    assert {("nonholonomic/derivatives", "nonholonomic/integration"), ("tippe", "nonholonomic/geometry")} <= seen
+    rooms = {(room(arrow.file), room(arrow.module)) for arrow in ARROWS}
+    assert {("nonholonomic/derivatives", "nonholonomic/integration"), ("tippe", "nonholonomic/geometry")} <= rooms
     assert ("nonholonomic/sweeps", "nonholonomic/views") in {
         (room(arrow.file), room(arrow.module)) for arrow in ARROWS if arrow.asked
     }
@@ -205,9 +205,9 @@ def test_the_vehicles_and_own_systems_use_only_the_public_engine():
 def test_what_is_imported_at_once_is_required():
     """Extras may be imported inside functions only: without them the packages must load."""
     required = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
-    known = {re.split(r"[^\w-]", requirement)[0] for requirement in required}
+    packages = {re.split(r"[^\w-]", requirement)[0] for requirement in required}
     # JAX brings jaxlib along.
-    known |= {"jaxlib", *sys.stdlib_module_names, *PACKAGES}
+    packages |= {"jaxlib", *sys.stdlib_module_names, *PACKAGES}
     imported = set()
     for file in files(*PACKAGES):
         for node, asked in statements(ast.parse((ROOT / file).read_text())):
@@ -216,7 +216,7 @@ def test_what_is_imported_at_once_is_required():
             elif not asked and not node.level:
                 imported.add(node.module.split(".")[0])
     assert {"jax", "numpy"} <= imported
-    assert imported - known == set()
+    assert imported - packages == set()
 
 
 def test_no_file_is_long():

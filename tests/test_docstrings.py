@@ -63,16 +63,16 @@ MEMBERS = [
 ENGINE = {room: [name for name in PAGES["engine"].names if name.startswith(f"{room}.")] for room in ENGINE_ROOMS}
 
 
-def complaints(text: str, known: dict[str, Any], name: str = "example") -> str:
+def complaints(text: str, namespace: dict[str, Any], name: str = "example") -> str:
     """What is wrong with the examples in a text: none runs, or one gives something else; `known` gets the names they make."""
     example = doctest.DocTestParser().get_doctest(text, {}, name, None, None)
     if all(doctest.SKIP in line.options for line in example.examples):
         return "no example runs"
     # A copy of the names was made, which is to be kept.
-    example.globs = known
-    said: list[str] = []
-    doctest.DocTestRunner(optionflags=FLAGS).run(example, out=said.append, clear_globs=False)
-    return "".join(said)
+    example.globs = namespace
+    messages: list[str] = []
+    doctest.DocTestRunner(optionflags=FLAGS).run(example, out=messages.append, clear_globs=False)
+    return "".join(messages)
 
 
 @pytest.fixture(autouse=True)
@@ -97,9 +97,9 @@ def test_its_example_gives_what_it_says(name, value):
 
 @pytest.mark.parametrize(("name", "value", "module"), MEMBERS, ids=[name for name, *_ in MEMBERS])
 def test_the_example_of_a_member_gives_what_it_says(name, value, module):
-    known: dict[str, Any] = {}
-    assert not complaints(inspect.getdoc(module) or "", known)
-    assert not complaints(inspect.getdoc(value) or "", known)
+    namespace: dict[str, Any] = {}
+    assert not complaints(inspect.getdoc(module) or "", namespace)
+    assert not complaints(inspect.getdoc(value) or "", namespace)
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_the_public_names_are_those_that_people_use():
 @pytest.mark.parametrize("room", ENGINE)
 def test_the_examples_of_the_engine_give_what_they_say(room):
     """They go on from the example of their room."""
-    known: dict[str, Any] = {}
-    assert not complaints(inspect.getdoc(importlib.import_module(room)) or "", known, room)
+    namespace: dict[str, Any] = {}
+    assert not complaints(inspect.getdoc(importlib.import_module(room)) or "", namespace, room)
     for name in ENGINE[room]:
-        assert not complaints(inspect.getdoc(resolve(name)) or "", dict(known), name)
+        assert not complaints(inspect.getdoc(resolve(name)) or "", dict(namespace), name)

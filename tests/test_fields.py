@@ -93,8 +93,8 @@ def trajectory_problems(scene, launch):
 
 def slow_in_scene(scene, launch):
     """Which slow functions are called in the steps of a table of the scene, and of `simulate`; nothing compiles."""
-    both = (eqx.filter_eval_shape(problems, scene, launch) for problems in (table_problems, trajectory_problems))
-    return set().union(*map(slow_in_problem, itertools.chain(*both)))
+    pair = (eqx.filter_eval_shape(problems, scene, launch) for problems in (table_problems, trajectory_problems))
+    return set().union(*map(slow_in_problem, itertools.chain(*pair)))
 
 
 #: Functions of the user's are what they are; these have no slow function, and the package adds none.

@@ -18,8 +18,8 @@ def test_every_public_name_is_on_a_page_of_the_api():
     for name, members in api_pages.MEMBERS.items():
         assert name in shown
         bases = api_pages.resolve(name).__mro__
-        known = {member for base in bases for member in (*vars(base), *inspect.get_annotations(base))}
-        assert set(members.split()) <= known
+        all_members = {member for base in bases for member in (*vars(base), *inspect.get_annotations(base))}
+        assert set(members.split()) <= all_members
     for name in api_pages.CONSTANTS:
         room, _, constant = name.rpartition(".")
         assert f"`{constant}`" in (inspect.getdoc(importlib.import_module(room)) or "")

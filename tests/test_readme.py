@@ -24,9 +24,11 @@ def test_the_map_and_the_gradient_run(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "table.png").exists()
     # What it prints is what stands below it.
     printed = [float(number) for number in re.findall(r"-?\d+\.\d+", capsys.readouterr().out)]
-    said = [float(number) for number in re.findall(r"-?\d+\.\d+", re.findall(r"^# (\d.*)$", SNIPPETS[1], re.M)[0])]
-    assert len(said) == 5
-    assert said == pytest.approx(printed, rel=2e-3)
+    stated_numbers = [
+        float(number) for number in re.findall(r"-?\d+\.\d+", re.findall(r"^# (\d.*)$", SNIPPETS[1], re.M)[0])
+    ]
+    assert len(stated_numbers) == 5
+    assert stated_numbers == pytest.approx(printed, rel=2e-3)
 
 
 def test_the_ride_runs(capsys):

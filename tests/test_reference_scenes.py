@@ -75,13 +75,15 @@ def test_the_package_agrees_with_every_scene(name):
 def test_the_scenes_are_what_their_program_computes():
     """The first ride, computed again by the program that wrote it."""
     scene = next(iter(generate.FAMILIES["strollers"]()))
-    kept = SCENES[scene["name"]]
+    stored_scene = SCENES[scene["name"]]
     assert {name: scene[name] for name in ("body", "start", "damping", "source")} == {
-        name: kept[name] for name in ("body", "start", "damping", "source")
+        name: stored_scene[name] for name in ("body", "start", "damping", "source")
     }
     for name, quantity in scene["states"].items():
         if name != "times":
-            assert_close(quantity["values"], kept["states"][name]["values"], atol=kept["states"][name]["bound"])
+            assert_close(
+                quantity["values"], stored_scene["states"][name]["values"], atol=stored_scene["states"][name]["bound"]
+            )
 
 
 def test_a_missing_event_has_an_infinite_error():

@@ -36,11 +36,11 @@ def just_above_the_threshold() -> Row:
     spins = [threshold_spin(factor) for factor in factors]
     run = timed(lambda: tippe.inversion_table(PLANE, theta=0.1, spin=spins, t1=40.0, angle=ANGLE, errors=True), 1)
     table = run.result
-    known = [inversion(NUMBERS | {"theta": 0.1, "spin": spin, "mu": 0.3}, 40.0, ANGLE, 1e-13)[1] for spin in spins]
+    references = [inversion(NUMBERS | {"theta": 0.1, "spin": spin, "mu": 0.3}, 40.0, ANGLE, 1e-13)[1] for spin in spins]
     return Row(
         f"Jellett's constant {', '.join(f'{factor:g}' for factor in factors)} times the threshold's",
         f"inverts after {', '.join(table.digits())} s",
-        float(np.max(np.abs(table.time - known) / table.time_error)),
+        float(np.max(np.abs(table.time - references) / table.time_error)),
         0.5,
         "Lagrange's equations, SciPy, over the table's own error estimate",
         int(table.steps.sum()),

@@ -25,15 +25,15 @@ def trees(order: int) -> list[list[Tree]]:
     return trees_by_size
 
 
-def _forests(known: list[list[Tree]], vertices: int, largest: int) -> list[list[Tree]]:
+def _forests(trees_by_size: list[list[Tree]], vertices: int, largest: int) -> list[list[Tree]]:
     """All lists of trees with the given total number of vertices, none with more than `largest`."""
     if vertices == 0:
         return [[]]
     return [
-        [tree, *rest]
+        [tree, *siblings]
         for size in range(min(vertices, largest), 0, -1)
-        for rest in _forests(known, vertices - size, size)
-        for tree in known[size - 1]
+        for siblings in _forests(trees_by_size, vertices - size, size)
+        for tree in trees_by_size[size - 1]
     ]
 
 
@@ -56,7 +56,7 @@ def error_coefficients(
     stages: Float[Array, "stages stages"], weights: Float[Array, " stages"], order: int
 ) -> Float[Array, " trees"]:
     """(b . Phi(t) - 1/gamma(t)) / sigma(t) of every tree of an order: all vanish if the method is of that order."""
-    known, grown = trees(order), {}
+    trees_by_order, grown = trees(order), {}
 
     def phi(tree: Tree) -> Float[Array, " stages"]:
         """The elementary weights of a tree, one per stage."""
@@ -67,4 +67,6 @@ def error_coefficients(
             value = value * grown[branch]
         return value
 
-    return jnp.stack([(weights @ phi(tree) - 1.0 / density(tree)) / symmetry(tree) for tree in known[order - 1]])
+    return jnp.stack(
+        [(weights @ phi(tree) - 1.0 / density(tree)) / symmetry(tree) for tree in trees_by_order[order - 1]]
+    )

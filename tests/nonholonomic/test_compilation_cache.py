@@ -76,16 +76,16 @@ def test_a_bad_entry_costs_a_compilation_and_nothing_else(tmp_path):
         if k % 2:
             # As from a copy that kept the times.
             os.utime(entry, (0, 0))
-        mended, said = run(SMALL, tmp_path)
-        assert (mended["result"], mended["found"], said) == (first["result"], 0, ""), way
+        mended, message = run(SMALL, tmp_path)
+        assert (mended["result"], mended["found"], message) == (first["result"], 0, ""), way
     assert run(SMALL, tmp_path)[0]["found"] == 1
 
 
 def test_an_entry_that_is_cut_while_it_is_used_costs_a_compilation_too(tmp_path):
     run(SMALL, tmp_path)
     cut = f"import pathlib\nfor entry in pathlib.Path(folder).glob('*-cache'): entry.write_bytes(b'')\n{SMALL}"
-    answer, said = run(cut, tmp_path)
-    assert (answer["result"], answer["found"], said) == (14.0, 0, "")
+    answer, message = run(cut, tmp_path)
+    assert (answer["result"], answer["found"], message) == (14.0, 0, "")
 
 
 def test_other_flags_have_another_folder(tmp_path):
@@ -97,11 +97,11 @@ def test_other_flags_have_another_folder(tmp_path):
 @pytest.mark.parametrize("forbidden", [False, True])
 def test_without_a_folder_everything_goes_on(forbidden, tmp_path):
     (tmp_path / "nonholonomic").write_text("this is a file")
-    answer, said = run(SMALL, tmp_path, **({"NONHOLONOMIC_CACHE": "0"} if forbidden else {}))
+    answer, message = run(SMALL, tmp_path, **({"NONHOLONOMIC_CACHE": "0"} if forbidden else {}))
     assert (answer["folder"], answer["result"], answer["found"]) == ("None", 14.0, 0)
     # One line names the folder; nobody needs to be told of what he has forbidden.
-    assert len(said.splitlines()) == (0 if forbidden else 1)
-    assert forbidden or str(tmp_path / "nonholonomic") in said
+    assert len(message.splitlines()) == (0 if forbidden else 1)
+    assert forbidden or str(tmp_path / "nonholonomic") in message
 
 
 SETTINGS = (
@@ -162,8 +162,8 @@ def test_a_full_disk_is_told_and_still_read(unset, tmp_path, caplog):
         assert enable_compilation_cache(tmp_path) == tmp_path / environment_name()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    (said,) = caplog.messages
-    assert said.startswith(f"compiled programs can no longer be stored in {tmp_path}")
+    (message,) = caplog.messages
+    assert message.startswith(f"compiled programs can no longer be stored in {tmp_path}")
     assert not list((tmp_path / environment_name()).iterdir())
 
 

@@ -53,20 +53,20 @@ def test_much_memory_or_many_mappings_forget_all_programs_with_one_line(why, pro
         assert forget_programs_if_many(1000 if why == "memory" else 10**12)
     assert double(3.0) == 6.0
     assert len(traced) == 2
-    (said,) = caplog.messages
-    assert said.endswith("memory mappings and were cleared; the next calls compile again")
-    assert "\n" not in said
+    (message,) = caplog.messages
+    assert message.endswith("memory mappings and were cleared; the next calls compile again")
+    assert "\n" not in message
 
 
 def test_memory_that_programs_do_not_take_forgets_nothing(program, monkeypatch):
     """Such as a large table: forgetting programs would not help, in any call."""
     monkeypatch.setattr(compiled_programs, "MANY_MAPPINGS", 10**9)
     double, traced = program
-    kept = jnp.zeros(1_000_000)
+    array = jnp.zeros(1_000_000)
     assert not forget_programs_if_many(1000)
     assert double(3.0) == 6.0
     assert len(traced) == 1
-    assert kept.nbytes
+    assert array.nbytes
 
 
 def test_looking_at_the_memory_compiles_nothing(program, monkeypatch):

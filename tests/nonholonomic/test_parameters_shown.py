@@ -39,9 +39,9 @@ def test_values_are_told():
 
 
 def test_traced_numbers_say_that_they_are():
-    seen = []
-    jax.jit(lambda mu: seen.append(repr(tippe.Viscous(mu))) or mu)(0.3)
-    assert seen == ["Viscous(mu=traced float64[])"]
+    shown_values = []
+    jax.jit(lambda mu: shown_values.append(repr(tippe.Viscous(mu))) or mu)(0.3)
+    assert shown_values == ["Viscous(mu=traced float64[])"]
 
 
 def test_html_escapes_and_lines_are_aligned():

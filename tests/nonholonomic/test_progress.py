@@ -94,9 +94,9 @@ def test_what_is_told_is_whether_a_program_is_being_made(monkeypatch):
     with status_line("simulating"):
         jax.jit(waits)(1.0)
         time.sleep(0.3)
-    told = words(terminal)
-    assert told[0] == "compiling"
-    assert told[-1] == "simulating"
+    lines = words(terminal)
+    assert lines[0] == "compiling"
+    assert lines[-1] == "simulating"
     assert left(terminal) == ""
 
 
@@ -111,9 +111,9 @@ def test_a_line_within_a_line_does_not_garble_it(monkeypatch):
             time.sleep(0.3)
             counted.advance(2)
         time.sleep(0.3)
-    told = words(terminal)
-    assert "simulating" not in told
-    assert told[0] == told[-1] == "fitting"
+    lines = words(terminal)
+    assert "simulating" not in lines
+    assert lines[0] == lines[-1] == "fitting"
     assert [text for _, text in terminal.lines if "fit/s" in text]
     assert left(terminal) == ""
 
@@ -141,9 +141,9 @@ def test_nothing_is_left_behind_after_an_error_and_nothing_is_in_the_way_of_what
         shown.begin()
         time.sleep(0.3)
         with shown.aside():
-            seen = left(terminal)
+            remainder = left(terminal)
             time.sleep(0.1)
-            assert left(terminal) == seen == ""
+            assert left(terminal) == remainder == ""
 
 
 def test_no_frame_is_written_twice(monkeypatch):

@@ -52,9 +52,9 @@ def test_words_of_earlier_versions_are_understood_and_others_refused():
 def test_all_tables_use_words_of_the_list():
     kinds = [kind for kind in vars(run_kind).values() if isinstance(kind, run_kind.RunKind)]
     assert len(kinds) == 7
-    known = {status.word for status in Status}
+    words_of_list = {status.word for status in Status}
     for words in (OF_RIDES, OF_TRAJECTORIES, *(kind.words for kind in kinds)):
-        assert known.issuperset(words)
+        assert words_of_list.issuperset(words)
         assert len(set(words)) == len(words)
     # Files say themselves what their integers mean; these are the ones that they have had from the beginning.
     words = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit", "unresolved")
@@ -97,5 +97,5 @@ def test_a_sweep_that_was_begun_with_the_former_words_goes_on_with_all_of_today(
         swept(FORMER, tmp_path / "old.h5", fails_at=8)
     part = Table.load(tmp_path / "old.h5")
     assert set(part.status) <= {"completed", "contact_lost", "failed", "jammed", "pending"}
-    whole = swept(OF_TRAJECTORIES, tmp_path / "old.h5")
-    assert whole.status.tolist() == [*2 * OF_TRAJECTORIES[:4], "completed", *3 * ["does_not_fit"]]
+    table = swept(OF_TRAJECTORIES, tmp_path / "old.h5")
+    assert table.status.tolist() == [*2 * OF_TRAJECTORIES[:4], "completed", *3 * ["does_not_fit"]]

@@ -70,15 +70,15 @@ class Hopper(Top):
         response = np.array([d / c.mass + cross(inverse @ cross(r, d), r) for d in np.eye(3)]).T
         v = u + cross(w, r)
         bounces = -RESTITUTION * (n @ v) > CLOSING * sqrt(c.gravity * c.radius)
-        wanted = -RESTITUTION * (n @ v) if bounces else 0.0
+        target_speed = -RESTITUTION * (n @ v) if bounces else 0.0
         along, matrix = np.eye(3) - np.outer(n, n), np.zeros((4, 4))
         matrix[:3, :3], matrix[:3, 3] = -c.mu * along @ response, n - c.mu * along @ v
 
         def impulse(p):
             return expm(p * matrix)[:3, 3]
 
-        most = 3.0 * (wanted - n @ v) / (n @ response @ n)
-        p = brentq(lambda p: n @ (v + response @ impulse(p)) - wanted, 0.0, most, xtol=1e-20, rtol=1e-15)
+        most = 3.0 * (target_speed - n @ v) / (n @ response @ n)
+        p = brentq(lambda p: n @ (v + response @ impulse(p)) - target_speed, 0.0, most, xtol=1e-20, rtol=1e-15)
         P = impulse(p)
         return np.concatenate([centre, u + P / c.mass, e, w + inverse @ cross(r, P)]), bounces
 
@@ -88,7 +88,7 @@ def follow(case, rtol=1e-13, longest=1e-3):
     top = Hopper(case)
     y, time, flying, bounced = top.start(), 0.0, False, False
     place, samples, hops = top.near.copy(), [], []
-    wanted = list(np.array(SAMPLES) * case.t1)
+    sample_times = list(np.array(SAMPLES) * case.t1)
     if top.motion(y)[1] <= 0.0:
         flying = True
     while True:
@@ -110,8 +110,8 @@ def follow(case, rtol=1e-13, longest=1e-3):
             rtol=rtol,
             atol=0.01 * rtol,
         )
-        while wanted and wanted[0] <= run.t[-1]:
-            samples.append(run.sol(wanted.pop(0)))
+        while sample_times and sample_times[0] <= run.t[-1]:
+            samples.append(run.sol(sample_times.pop(0)))
         if flying:
             hops.append((time, run.t[-1]))
         time, y = run.t[-1], run.y[:, -1]

@@ -114,7 +114,7 @@ def follow(case):
     top = TwoSpheres(case)
     y, touching = top.start()
     place, samples, landings, hops, time = top.spheres[touching].near.copy(), [], [], [], 0.0
-    wanted = list(np.array(SAMPLES) * case.t1)
+    sample_times = list(np.array(SAMPLES) * case.t1)
     if top.force(touching, y) <= 0.0:
         touching = None
     while True:
@@ -136,10 +136,13 @@ def follow(case):
             rtol=1e-13,
             atol=1e-15,
         )
-        while wanted and wanted[0] <= run.t[-1]:
-            seen = run.sol(wanted.pop(0))
+        while sample_times and sample_times[0] <= run.t[-1]:
+            sample = run.sol(sample_times.pop(0))
             samples.append(
-                (seen, *((0.0, 0.0) if touching is None else (top.force(touching, seen), top.slip(touching, seen))))
+                (
+                    sample,
+                    *((0.0, 0.0) if touching is None else (top.force(touching, sample), top.slip(touching, sample))),
+                )
             )
         if touching is None:
             hops.append((time, run.t[-1]))

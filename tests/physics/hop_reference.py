@@ -156,7 +156,7 @@ def resolve_impact(case, state, ball, closing=CLOSING):
     before = u + cross(w, r)
     response = np.array([d / case.mass + cross(solve_inertia(case, e, cross(r, d)), r) for d in np.eye(3)]).T
     bounces = -case.restitution * before[2] > closing * sqrt(case.gravity * case.radius)
-    wanted = -case.restitution * before[2] if bounces else 0.0
+    target_speed = -case.restitution * before[2] if bounces else 0.0
     torque = np.zeros(3)
     if case.slip_speed:
         # Impulses of the force and of the torque.
@@ -169,11 +169,11 @@ def resolve_impact(case, state, ball, closing=CLOSING):
             return np.concatenate((force + UP, torque))
 
         def reaches(_, P):
-            return moved(P)[0][2] - wanted
+            return moved(P)[0][2] - target_speed
 
         reaches.terminal = True
         # Strong friction can at first pull the ball down.
-        most = 1e3 * (wanted - before[2]) / response[2, 2]
+        most = 1e3 * (target_speed - before[2]) / response[2, 2]
         run = solve_ivp(change, (0.0, most), np.zeros(6), method="DOP853", rtol=1e-12, atol=1e-18, events=reaches)
         impulse, torque = np.split(run.y_events[0][0], 2)
     else:
@@ -184,8 +184,8 @@ def resolve_impact(case, state, ball, closing=CLOSING):
         def after(p):
             return expm(p * matrix)[:3, 3]
 
-        most = 3.0 * (wanted - before[2]) / response[2, 2]
-        p = brentq(lambda p: (before + response @ after(p))[2] - wanted, 0.0, most, xtol=1e-20, rtol=1e-15)
+        most = 3.0 * (target_speed - before[2]) / response[2, 2]
+        p = brentq(lambda p: (before + response @ after(p))[2] - target_speed, 0.0, most, xtol=1e-20, rtol=1e-15)
         impulse = after(p)
     turned = w + solve_inertia(case, e, cross(r, impulse) + torque)
     return np.concatenate((s, u + impulse / case.mass, e, turned)), bounces
@@ -229,12 +229,12 @@ def follow(case, rtol=1e-12, flight_step=2e-4, contact_step=2.5e-4, slowest=CLOS
     absolute = rtol * np.repeat((case.radius, swing * case.radius, 1.0, swing), 3)
     inverts = watched(lambda y: y[8] - cos(case.angle), -1.0)
     while True:
-        balls, others = [case.balls[k] for k in touching], [k for k in numbers if k not in touching]
+        balls, free_numbers = [case.balls[k] for k in touching], [k for k in numbers if k not in touching]
         ends = [watched(lambda y, k=k: contact(case, y, balls)[0][k], -1.0) for k in range(len(balls))]  # noqa: B023
-        ends += [watched(lambda y, k=k: gap(case.balls[k], y), -1.0) for k in others]
+        ends += [watched(lambda y, k=k: gap(case.balls[k], y), -1.0) for k in free_numbers]
         # A short bounce must not hide within the first step.
         speed, most = (
-            max((gap_rate(case.balls[k], state) for k in others), default=0.0),
+            max((gap_rate(case.balls[k], state) for k in free_numbers), default=0.0),
             [contact_step, flight_step][not balls],
         )
         first = min(0.2 * speed / case.gravity, most, case.t1 - time) if speed > 1e-9 else None
@@ -262,7 +262,7 @@ def follow(case, rtol=1e-12, flight_step=2e-4, contact_step=2.5e-4, slowest=CLOS
             touching = [k for k in touching if k != touching[which - 1]]
             flights += not touching
             continue
-        number = others[which - 1 - len(balls)]
+        number = free_numbers[which - 1 - len(balls)]
         ball = case.balls[number]
         # The ball is on the plane exactly; what the event left is round-off.
         state[2] = ball[1] - ball[0] * state[8]
@@ -271,8 +271,8 @@ def follow(case, rtol=1e-12, flight_step=2e-4, contact_step=2.5e-4, slowest=CLOS
         touching = [] if flying else [number]
         if not flying:
             state[5] -= gap_rate(ball, state)
-            both = [(k, b) for k, b in enumerate(case.balls) if abs(gap(b, state)) < 1e-9 * case.radius]
-            if len(both) == 2 and max(abs(gap_rate(b, state)) for _, b in both) <= closing:
+            touching_pairs = [(k, b) for k, b in enumerate(case.balls) if abs(gap(b, state)) < 1e-9 * case.radius]
+            if len(touching_pairs) == 2 and max(abs(gap_rate(b, state)) for _, b in touching_pairs) <= closing:
                 state = at_rest(state)
                 forces = contact(case, state, case.balls)[0]
                 touching = [k for k in numbers if forces[k] > 0.0]

@@ -198,8 +198,11 @@ def best_chart(state, pole):
     """The same state in the chart whose pole is farthest from e: (state, pole)."""
     u, th, ph, du, dy, dth, dph, dps = state
     e, e1, e2, _ = axis(th, ph)
-    back = {"z": "z", "x": "y", "y": "x"}[pole]  # undoes the turn to this chart
-    e, de = in_chart(e, back), in_chart(tuple(dth * p + dph * q for p, q in zip(e1, e2, strict=True)), back)
+    inverse_chart = {"z": "z", "x": "y", "y": "x"}[pole]  # undoes the turn to this chart
+    e, de = (
+        in_chart(e, inverse_chart),
+        in_chart(tuple(dth * p + dph * q for p, q in zip(e1, e2, strict=True)), inverse_chart),
+    )
     pole = min("xyz", key=lambda new: abs(in_chart(e, new)[2]))
     place, rate = in_angles(in_chart(e, pole), in_chart(de, pole), dps + dph * cos(th))
     return np.array((u, *place, du, dy, *rate)), pole

@@ -101,16 +101,16 @@ def difference(first, second):
     return max(times, abs(first[2] / second[2] - 1))
 
 
-def judge(scene, wanted):
+def judge(scene, quota):
     """(status, time, theta, error) of a scene, or in a word why it is not taken."""
     if scene.spin > FASTEST:
         return "too fast or no threshold"
     quick = follow(scene, T1, ANGLE, rtol=1e-8)
-    if wanted.get(quick[0], 1) == 0:
+    if quota.get(quick[0], 1) == 0:
         return "quota full: " + quick[0]
     fine = follow(scene, T1, ANGLE, rtol=1e-13, pole="x", closest=0.3)
     check = follow(scene, T1, ANGLE, rtol=1e-12, pole="y", closest=0.5)
-    if not fine[0] == check[0] == quick[0] or fine[0] not in wanted:
+    if not fine[0] == check[0] == quick[0] or fine[0] not in quota:
         return f"unclear: {quick[0]}, {check[0]}, {fine[0]}"
     error = difference(fine, check)
     if error > AGREEMENT or difference(fine, quick) > ROUGH_AGREEMENT:
@@ -121,13 +121,13 @@ def judge(scene, wanted):
 
 def rows(family, rng, count):
     """The rows of one family, as the columns of the file have them; counts what became of the draws."""
-    wanted = dict(QUOTA)
-    while any(wanted.values()):
+    quota = dict(QUOTA)
+    while any(quota.values()):
         scene = draw(rng, family)
-        result = judge(scene, wanted)
+        result = judge(scene, quota)
         count[result if isinstance(result, str) else "taken: " + result[0]] += 1
         if not isinstance(result, str):
-            wanted[result[0]] -= 1
+            quota[result[0]] -= 1
             fields = {name: "" if value is None else value for name, value in asdict(scene).items()}
             yield (family, *(fields[name] for name in PARAMETERS), T1, *map(plain, result))
 

@@ -66,14 +66,14 @@ class OnArena(Rattleback):
         system, right = np.zeros((9, 9)), np.zeros(9)
         system[:3, :3], system[:3, 6:], right[:3] = self.mass * np.eye(3), -np.eye(3), -self.mass * self.gravity * UP
         system[3:6, 3:6], system[3:6, 6:], right[3:6] = J, -skew(r), -np.cross(w, J @ w)
-        C, known = self.constraint(x, Q, foot), changes @ np.concatenate((u, w)) / STEP
+        C, right_side = self.constraint(x, Q, foot), changes @ np.concatenate((u, w)) / STEP
         if self.friction is None:
-            system[6:, :6], right[6:] = C, -known
+            system[6:, :6], right[6:] = C, -right_side
         else:
             slip = u + np.cross(w, r)
             across = np.linalg.svd(n[None])[2][1:]
             push = self.friction(slip - n * (n @ slip))
-            system[6, :6], right[6] = C[0], -known[0]
+            system[6, :6], right[6] = C[0], -right_side[0]
             system[7:, 6:] = across - np.outer(across @ push, n)
         solution = np.linalg.solve(system, right)
         q_dot = 0.5 * np.concatenate(([-w @ q[1:]], q[0] * w + np.cross(w, q[1:])))

@@ -66,13 +66,13 @@ class Rattleback:
         system[:3, :3], system[:3, 6:], right[:3] = self.mass * np.eye(3), -np.eye(3), -self.mass * self.gravity * UP
         system[3:6, 3:6], system[3:6, 6:], right[3:6] = J, -skew(r), -np.cross(w, J @ w)
         # The contact point's velocity u + w x r changes at the rate u' + w' x r + w x r'.
-        acceleration, known = np.hstack((np.eye(3), -skew(r))), np.cross(w, rate(w))
+        acceleration, right_side = np.hstack((np.eye(3), -skew(r))), np.cross(w, rate(w))
         if self.friction is None:
-            system[6:, :6], right[6:] = acceleration, -known
+            system[6:, :6], right[6:] = acceleration, -right_side
         else:
             slip = u + np.cross(w, r)
             along = self.friction(slip * (1.0 - UP))
-            system[8, :6], right[8] = acceleration[2], -known[2]
+            system[8, :6], right[8] = acceleration[2], -right_side[2]
             for k in range(2):
                 system[6 + k, 6 + k], system[6 + k, 8] = 1.0, -along[k]
         solution = np.linalg.solve(system, right)

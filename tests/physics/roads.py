@@ -120,15 +120,17 @@ def compare_roads(kind: str, count: int, singles: int, seed: int = 5) -> tuple[F
     t1 = HORIZON_OF_FLIGHTS if flies else HORIZON
     table = table_of(scenes, count, t1)
     time_error, end_error, end = table["time_error"], table["end_time_error"], table["end_time"]
-    known = (table["status_error"] == 0) & (time_error < 1e-3) & (end_error < 1e-3)
+    comparable = (table["status_error"] == 0) & (time_error < 1e-3) & (end_error < 1e-3)
     inverted, word = table["word"] == "inverted", table["word"]
-    stops = known & np.isin(word, list(CODES))
+    stops = comparable & np.isin(word, list(CODES))
 
     times = batch_of_times(scenes, t1)
-    findings.check("a batch of times inverts, or not", np.flatnonzero(known), np.isfinite(times) == inverted, times)
+    findings.check(
+        "a batch of times inverts, or not", np.flatnonzero(comparable), np.isfinite(times) == inverted, times
+    )
     near = apart(times, table["time"]) <= APART * time_error
     findings.check(
-        "time in a batch, in a table", np.flatnonzero(known & inverted), near, times, table["time"], time_error
+        "time in a batch, in a table", np.flatnonzero(comparable & inverted), near, times, table["time"], time_error
     )
 
     flat = FASTEST * (1e-6 * t1 + APART * end_error) + APART * table["end_theta_error"]
@@ -140,13 +142,15 @@ def compare_roads(kind: str, count: int, singles: int, seed: int = 5) -> tuple[F
         near = np.abs(ended - end) <= APART * end_error
         findings.check("end in a batch of runs, in a table", np.flatnonzero(stops), near, ended, end, end_error)
         near = np.abs(theta - table["end_theta"]) <= flat
-        findings.check("theta in a batch, in a table", np.flatnonzero(known), near, theta, table["end_theta"], flat)
+        findings.check(
+            "theta in a batch, in a table", np.flatnonzero(comparable), near, theta, table["end_theta"], flat
+        )
 
-    for cell in np.flatnonzero(known)[:singles]:
+    for cell in np.flatnonzero(comparable)[:singles]:
         scene, launch = scene_and_launch(scenes, cell)
-        alone = float(tippe.inversion_time(scene, launch, t1, ANGLE, TOLERANCE))
-        same = alone == table["time"][cell] or abs(alone - table["time"][cell]) <= APART * time_error[cell]
-        findings.check("time alone, in a table", cell, same, np.full(count, alone), table["time"], time_error)
+        single_time = float(tippe.inversion_time(scene, launch, t1, ANGLE, TOLERANCE))
+        same = single_time == table["time"][cell] or abs(single_time - table["time"][cell]) <= APART * time_error[cell]
+        findings.check("time alone, in a table", cell, same, np.full(count, single_time), table["time"], time_error)
         run = tippe.simulate(scene, launch, min(t1, 1.001 * float(end[cell]) + 1e-3), tolerance=OF_PATHS)
         state = run.at([min(float(end[cell]) * (1.0 - 1e-6), float(run.end_time))])
         same = abs(float(state.theta[0]) - table["end_theta"][cell]) <= flat[cell]
@@ -157,7 +161,7 @@ def compare_roads(kind: str, count: int, singles: int, seed: int = 5) -> tuple[F
 
     if flies:
         compare_with_stops(findings, scenes, table, count, t1)
-    return findings, int(known.sum())
+    return findings, int(comparable.sum())
 
 
 def compare_with_stops(findings: Findings, scenes: Batch, flies: dict[str, np.ndarray], count: int, t1: float) -> None:
@@ -169,12 +173,12 @@ def compare_with_stops(findings: Findings, scenes: Batch, flies: dict[str, np.nd
     stop = tippe.Scene(scene.body, scene.surface, scene.friction)
     stops = table_of(scenes._replace(scene=stop, columns=columns), count, t1)
     sure = (stops["status_error"] == 0) & (flies["status_error"] == 0)
-    kept = np.flatnonzero(sure & (stops["word"] != "contact_lost") & (flies["hops"] == 0))
+    indices = np.flatnonzero(sure & (stops["word"] != "contact_lost") & (flies["hops"] == 0))
     same = (stops["word"] == flies["word"]) & (np.isfinite(stops["time"]) == np.isfinite(flies["time"]))
-    findings.check("status with stop and hybrid", kept, same, stops["end_time"], flies["end_time"])
+    findings.check("status with stop and hybrid", indices, same, stops["end_time"], flies["end_time"])
     error = APART * (stops["time_error"] + flies["time_error"])
     near = apart(stops["time"], flies["time"]) <= error
-    findings.check("time with stop and hybrid", kept, near, stops["time"], flies["time"], error)
+    findings.check("time with stop and hybrid", indices, near, stops["time"], flies["time"], error)
     lost = np.flatnonzero(sure & (stops["word"] == "contact_lost") & (flies["end_time"] > stops["end_time"]))
     findings.check("flights of a top that loses its contact", lost, flies["hops"] > 0, flies["hops"])
 
@@ -185,10 +189,10 @@ def main(kinds: list[str]) -> int:
     for kind in kinds:
         count, singles = (45, 3) if kind.endswith("stop") else (16, 1) if kind.startswith("plane") else (4, 1)
         begun = time.process_time()
-        findings, known = compare_roads(kind, count, singles)
+        findings, comparable = compare_roads(kind, count, singles)
         differ += len(findings.lines)
         print(
-            f"{kind}: {findings.compared} comparisons, {known} of {count} scenes, {time.process_time() - begun:.0f} s"
+            f"{kind}: {findings.compared} comparisons, {comparable} of {count} scenes, {time.process_time() - begun:.0f} s"
         )
         print("".join(f"  {line}\n" for line in findings.lines), end="", flush=True)
     return differ

@@ -80,8 +80,8 @@ def test_a_ball_comes_to_rest():
     path = solve_hybrid_dense(batched_modes, FLYING, dropped, 0.16, Settings(1e-12, diffrax.Dopri8()), counters=1)
     *_, last, rests = path.mode_segments
     assert (last.number, rests.number) == (FLYING, SLIDING)
-    rest = last.end + (last.end - last.begin) * e / (1.0 - e)
-    assert_close(rest, np.sqrt(2.0 * h / 9.81) * (1.0 + e) / (1.0 - e), atol=1e-11)
+    rest_time = last.end + (last.end - last.begin) * e / (1.0 - e)
+    assert_close(rest_time, np.sqrt(2.0 * h / 9.81) * (1.0 + e) / (1.0 - e), atol=1e-11)
 
 
 @pytest.mark.slow

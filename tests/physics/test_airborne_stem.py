@@ -48,15 +48,15 @@ def check_against_the_program(number: int, surface: tippe.Cylinder | tippe.Parab
     scene = stem_scene(surface, case.restitution)
     run = tippe.simulate(scene, launch, case.t1, tolerance=1e-12, solver=diffrax.Tsit5())
     assert run.status == "completed"
-    seen = run.at(case.t1 * np.array(SAMPLES))
-    for name, values, size in (("O", seen.position, case.radius), ("e", seen.axis, 1.0)):
-        wanted = [[row[f"{name}{i}_{k}"] for i in range(3)] for k in range(1, len(SAMPLES) + 1)]
-        assert_close(values, wanted, atol=1e-10 * size)
-    touches = seen.contact >= 0
+    samples = run.at(case.t1 * np.array(SAMPLES))
+    for name, values, size in (("O", samples.position, case.radius), ("e", samples.axis, 1.0)):
+        expected = [[row[f"{name}{i}_{k}"] for i in range(3)] for k in range(1, len(SAMPLES) + 1)]
+        assert_close(values, expected, atol=1e-10 * size)
+    touches = samples.contact >= 0
     forces, slips = (np.array([row[f"{name}_{k}"] for k in range(1, len(SAMPLES) + 1)]) for name in ("N", "slip"))
     np.testing.assert_array_equal(touches, forces > 0.0)
-    assert_close(seen.normal_force, forces, atol=1e-9 * case.mass * case.gravity)
-    assert_close(np.linalg.norm(seen.slip, axis=1)[touches], slips[touches], atol=1e-10)
+    assert_close(samples.normal_force, forces, atol=1e-9 * case.mass * case.gravity)
+    assert_close(np.linalg.norm(samples.slip, axis=1)[touches], slips[touches], atol=1e-10)
     assert 10 < len(run.hops) <= row["hops"]
     assert {-1, 0} <= set(run.contact)
     # Friction and blows take energy only, and it is all accounted for.
@@ -109,11 +109,11 @@ def test_a_batch_is_its_single_runs():
     def run(theta):
         return tippe.simulate(scene, tippe.Launch(theta, 180.0), 0.05, times, 1e-10)
 
-    def seen(theta):
+    def observe(theta):
         outcome = run(theta)
         return outcome.theta, outcome.contact, outcome.stats["hops"]
 
-    batch = jax.jit(jax.vmap(seen))(jnp.array([0.1, 2.3]))
+    batch = jax.jit(jax.vmap(observe))(jnp.array([0.1, 2.3]))
     for theta, inclination, contact, hops in zip((0.1, 2.3), *batch, strict=True):
         single = run(theta)
         assert_close(inclination, single.theta, atol=1e-8)
@@ -201,7 +201,7 @@ def test_one_blow_may_throw_the_other_sphere_into_the_arena(monkeypatch):
     states = np.concatenate([np.tile(place[:, None], cells), u, np.tile(e[:, None], cells), L, rest])
     flies = FlyBoth(scene, jnp.ones((14, cells)), jnp.asarray(-2.0), False, jnp.asarray(True))
     transition = eqx.filter_jit(flies.reset_map)(jnp.asarray(states), jnp.ones(cells))
-    top, seen = TwoSpheres(case), []
+    top, outcomes = TwoSpheres(case), []
     for sphere in top.spheres:
         sphere.near = np.array((0.0, 0.0, -case.p1))
     for k in range(cells):
@@ -211,7 +211,7 @@ def test_one_blow_may_throw_the_other_sphere_into_the_arena(monkeypatch):
         after, _ = top.struck(1, y)
         throws = top.speed(0, after) < -1e-4
         assert int(transition.mode[k]) == (STRIKING if throws else ON_STEM)
-        seen.append(throws)
+        outcomes.append(throws)
         if throws:
             assert_close(transition.state[3:6, k], after[3:6], atol=1e-10)
-    assert {True, False} == set(seen)
+    assert {True, False} == set(outcomes)

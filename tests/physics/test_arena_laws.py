@@ -113,7 +113,7 @@ class Seen(NamedTuple):
     jellett: jax.Array
 
 
-def seen(scene, state, cyclic):
+def quantities_of(scene, state, cyclic):
     u, e, L, place = parts(state)
     where, offset = (place, cyclic), scene.body.offset
     turning = jnp.cross(filled(L), filled(e), axis=0) / scene.body.I1
@@ -148,7 +148,7 @@ def test_what_changes_and_what_stays(name):
     scene, where, state = Start.at_random(ARENAS[name], body, law)
     motion = scene.dynamics.motion(state)
     rates = (scene.field(state), scene.frame.cyclic_rate(where[1], motion.velocity, motion.turning))
-    quantities, rate = jax.jvp(lambda *both: seen(scene, *both), (state, where[1]), rates)
+    quantities, rate = jax.jvp(lambda *arguments: quantities_of(scene, *arguments), (state, where[1]), rates)
     rubs, balls = by_lanes(1, 0, 0) > 0, by_lanes(0, 0, 1) > 0
 
     assert_close(rate.place, quantities.velocity, atol=1e-12)
@@ -217,9 +217,9 @@ def forces(arena, spread):
 
 def departure(arena, other, spread):
     """Greatest difference on two arenas for each lane: of the forces, each by its size, and of the turning [rad/s]."""
-    both = list(zip(forces(arena, spread), forces(other, spread), strict=True))
-    sizes = [np.max(np.abs(a)) for a, _ in both[:-1]] + [1.0]
-    return np.max([np.max(np.abs(a - b), axis=0) / size for (a, b), size in zip(both, sizes, strict=True)], axis=0)
+    pairs = list(zip(forces(arena, spread), forces(other, spread), strict=True))
+    sizes = [np.max(np.abs(a)) for a, _ in pairs[:-1]] + [1.0]
+    return np.max([np.max(np.abs(a - b), axis=0) / size for (a, b), size in zip(pairs, sizes, strict=True)], axis=0)
 
 
 @pytest.mark.parametrize("name", LIMITS)

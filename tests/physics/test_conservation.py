@@ -105,7 +105,7 @@ def test_a_frictionless_run_goes_back_to_its_start():
     end_state = follow(run, 1.0, Settings(1e-12)).states[:10, -1]
     sign = np.array([-1.0, -1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0, 1.0])
     start = run.problem.states
-    back = eqx.tree_at(lambda run: run.problem.states, run, jnp.asarray(end_state * sign))
-    home = follow(back, 1.0, Settings(1e-12)).states[:10, -1] * sign
+    reversed_run = eqx.tree_at(lambda run: run.problem.states, run, jnp.asarray(end_state * sign))
+    home = follow(reversed_run, 1.0, Settings(1e-12)).states[:10, -1] * sign
     assert_close(home[2:5], start[2:5], atol=1e-8)
     assert_close(home[8:], start[8:], atol=1e-8)

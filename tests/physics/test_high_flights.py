@@ -165,7 +165,7 @@ class Mistaken(tippe.Paraboloid):
 def test_a_run_whose_energy_does_not_balance_is_unresolved():
     """The same run in a bowl that states its heights is whole."""
     launch = tippe.Launch(0.4, 100.0, place=(0.1, 0.0), velocity=(0.0, 0.2))
-    whole, mistaken = (thrown(kind(0.3), launch, 0.05, 1e-9) for kind in (tippe.Paraboloid, Mistaken))
-    assert [whole.status, mistaken.status] == ["completed", "unresolved"]
-    assert "unresolved" not in str(whole)
+    exact, mistaken = (thrown(kind(0.3), launch, 0.05, 1e-9) for kind in (tippe.Paraboloid, Mistaken))
+    assert [exact.status, mistaken.status] == ["completed", "unresolved"]
+    assert "unresolved" not in str(exact)
     assert "unresolved: the energy residual of" in str(mistaken)

@@ -219,8 +219,8 @@ def test_closed_forms_of_the_stem():
     def growth(spin):
         state = jnp.array([0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, -7e-7 * spin])
         # |e| and the spin are neutral.
-        kept = np.array([0, 1, 2, 3, 5, 6])
-        return np.max(np.linalg.eigvals(np.asarray(jacobian(state))[np.ix_(kept, kept)]).real)
+        rows_used = np.array([0, 1, 2, 3, 5, 6])
+        return np.max(np.linalg.eigvals(np.asarray(jacobian(state))[np.ix_(rows_used, rows_used)]).real)
 
     assert growth(0.97 * 88.11) > 1e-3
     # Two more are neutral: a circular slide of the tilted, slipless top does not exist above the threshold.

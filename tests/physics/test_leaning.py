@@ -79,13 +79,13 @@ def test_the_contacts_that_hold():
     states = leaning_states(scene.body, 200, 2)
     _, number, definite = leaning(scene).settled(as_free_body(scene.body, balls(scene.body)[0], jnp.asarray(states)))
     assert np.asarray(definite).all()
-    seen = []
+    outcomes = []
     for state, chosen in zip(states_of_the_reference(scene, states).T, np.asarray(number), strict=True):
         (holds,) = (touching for touching in ([], [0], [1], [0, 1]) if nothing_pulls(case, state, touching))
         # A top that nothing holds stands on the sphere whose force is positive with both, where a flight begins at once.
         assert not holds or (holds == [0, 1] if chosen == BOTH else holds == [chosen])
-        seen.append(tuple(holds))
-    assert set(seen) == {(), (0,), (1,), (0, 1)}
+        outcomes.append(tuple(holds))
+    assert set(outcomes) == {(), (0,), (1,), (0, 1)}
 
 
 def nothing_pulls(case: Case, state: np.ndarray, touching: list[int]) -> bool:

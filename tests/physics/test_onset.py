@@ -35,12 +35,20 @@ BEYOND = np.array(
 @eqx.filter_jit
 def beginning(scene, start, scales, tolerance):
     """A slip's beginning from a contact at rest, and the slip's velocity at its middle and end."""
-    both = scene.dynamics
-    state = both.stopped(start)
+    stick_slip = scene.dynamics
+    state = stick_slip.stopped(start)
     onset = begin(
-        both.slipping, both.rolling, both.mu, both.slipping.field, state, 11, scales, jnp.asarray(0.1), tolerance
+        stick_slip.slipping,
+        stick_slip.rolling,
+        stick_slip.mu,
+        stick_slip.slipping.field,
+        state,
+        11,
+        scales,
+        jnp.asarray(0.1),
+        tolerance,
     )
-    slips = [both.slipping.motion(at).slip for at in (onset.at(jnp.asarray(0.5)), onset.end)]
+    slips = [stick_slip.slipping.motion(at).slip for at in (onset.at(jnp.asarray(0.5)), onset.end)]
     return onset, [jnp.stack([slip.x, slip.y]) for slip in slips]
 
 

@@ -24,17 +24,17 @@ def test_a_top_sticks_and_slips_as_by_its_own_equations(arena):
     states = random_states(tippe.Scene(rutstam_top(), arena), 30)
     longer = turned_anyhow(states)
 
-    def quantities(both, states):
+    def quantities(stick_slip, states):
         return [
-            both.slipping.field(states),
-            both.slip_speed(states),
-            both.rolling.field(states),
-            both.stopped(states),
-            both.grip_left(states),
-            np.stack(both.rolling.reaction(states)),
-            np.stack(both.rolling.blow(states, 0)),
-            np.stack(both.rolling.blow(states, 1)),
-            both.rolling.with_slip(states, Slip(states[0], states[1])),
+            stick_slip.slipping.field(states),
+            stick_slip.slip_speed(states),
+            stick_slip.rolling.field(states),
+            stick_slip.stopped(states),
+            stick_slip.grip_left(states),
+            np.stack(stick_slip.rolling.reaction(states)),
+            np.stack(stick_slip.rolling.blow(states, 0)),
+            np.stack(stick_slip.rolling.blow(states, 1)),
+            stick_slip.rolling.with_slip(states, Slip(states[0], states[1])),
         ]
 
     for expected, value in zip(quantities(top, states), quantities(rigid, longer), strict=True):
@@ -45,14 +45,14 @@ def test_a_top_sticks_and_slips_as_by_its_own_equations(arena):
 
 def test_a_blow_that_stops_the_slip_takes_energy():
     """At 30 states; the contact point is at rest after it, and only the contact acts: L - r x m u does not change."""
-    both = rattleback(0.3).dynamics
-    states = both.rolling.with_unit_axes(turned_anyhow(random_states(tippe.Scene(rutstam_top()), 30)))
-    still = both.stopped(states)
-    assert_close(both.slip_speed(still) / both.slip_speed(states), 0.0, atol=1e-13)
-    assert np.all(np.asarray(both.slipping.energy(still) <= both.slipping.energy(states)))
+    stick_slip = rattleback(0.3).dynamics
+    states = stick_slip.rolling.with_unit_axes(turned_anyhow(random_states(tippe.Scene(rutstam_top()), 30)))
+    still = stick_slip.stopped(states)
+    assert_close(stick_slip.slip_speed(still) / stick_slip.slip_speed(states), 0.0, atol=1e-13)
+    assert np.all(np.asarray(stick_slip.slipping.energy(still) <= stick_slip.slipping.energy(states)))
 
     def about_contact(state):
-        attitude = both.rolling.attitude(state)
+        attitude = stick_slip.rolling.attitude(state)
         r, w = (np.stack(attitude.in_frame(vector)) for vector in (attitude.lever, attitude.turning))
         u = np.stack([*np.asarray(state[:2]), -np.cross(w, r, axis=0)[2]])
         return np.asarray(state[5:8]) - np.cross(r, u, axis=0)

@@ -74,7 +74,7 @@ def test_multipliers_give_the_same_accelerations():
 
     @jax.jit
     @jax.vmap
-    def both(state):
+    def accelerations_of(state):
         def chart(at):
             return euler_angles.from_vector_state(scene, at)
 
@@ -82,9 +82,9 @@ def test_multipliers_give_the_same_accelerations():
         system = poincare.TopSystem(scene, rolling=True)
         return rates[3:], Multipliers(system).acceleration(0.0, *poincare.from_angles(angles))
 
-    ours, theirs = both(states)
-    size = jnp.max(jnp.abs(theirs), axis=1, keepdims=True)
-    assert_close(ours / size, theirs / size, atol=1e-11)
+    own, reference = accelerations_of(states)
+    size = jnp.max(jnp.abs(reference), axis=1, keepdims=True)
+    assert_close(own / size, reference / size, atol=1e-11)
 
 
 def test_a_blow_changes_the_slip_and_neither_jellett_nor_the_momentum_about_the_contact():
@@ -93,8 +93,8 @@ def test_a_blow_changes_the_slip_and_neither_jellett_nor_the_momentum_about_the_
     struck = rolling.with_slip(states, Slip(jnp.full(20, 0.3), jnp.full(20, -0.2)))
     assert_close(scene.slip_velocity(struck), np.repeat([[0.3], [-0.2]], 20, axis=1), atol=1e-14)
     assert_close(scene.jellett(struck), scene.jellett(states), rtol=1e-12, atol=1e-20)
-    back = rolling.with_slip(struck, Slip(*scene.slip_velocity(states)))
-    assert_close(back, states, atol=1e-14)
+    slipping_state = rolling.with_slip(struck, Slip(*scene.slip_velocity(states)))
+    assert_close(slipping_state, states, atol=1e-14)
     still = rolling.with_slip(states, Slip(jnp.zeros(20), jnp.zeros(20)))
     assert jnp.all(scene.energy(still) < scene.energy(states))
 

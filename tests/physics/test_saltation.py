@@ -75,26 +75,26 @@ def test_samples_through_flights_and_impacts():
     """In contact, in the air and between impacts: what `simulate` gives inside a transformation, and how it varies."""
     scene, times = scene_of(CASES[0], 0.3), np.array([0.05, 4.0, 4.9, 4.95, 5.0, 5.05, 5.1, 5.2, 5.3])
 
-    def seen(run):
+    def observe(run):
         return jnp.stack([run.theta, run.distance[0], run.position[:, 0], run.spin_angle])
 
     def traced(spin):
         run = tippe.simulate(scene, tippe.Launch(0.1, spin), 5.3, times=times, tolerance=1e-10, solver=diffrax.Tsit5())
-        return seen(run), (run.contact, run.status, run.stats["hops"])
+        return observe(run), (run.contact, run.status, run.stats["hops"])
 
-    def told(spin):
+    def simulate_spin(spin):
         return tippe.simulate(scene, tippe.Launch(0.1, spin), 5.3, times=times, tolerance=1e-12)
 
     samples, slopes, (contact, status, hops) = jax.jit(lambda spin: jax.jvp(traced, (spin,), (1.0,), has_aux=True))(
         200.0
     )
-    whole = told(200.0)
-    np.testing.assert_array_equal(contact, whole.contact)
-    assert set(whole.contact) == {-1, 0}
+    reference_run = simulate_spin(200.0)
+    np.testing.assert_array_equal(contact, reference_run.contact)
+    assert set(reference_run.contact) == {-1, 0}
     assert status == 0
-    assert hops == len(whole.hops)
-    assert_close(samples, seen(whole), rtol=1e-6, atol=1e-8)
-    expected = scanned(lambda spin: seen(told(spin)), 200.0, [1e-2, 1e-3, 1e-4, 1e-5])
+    assert hops == len(reference_run.hops)
+    assert_close(samples, observe(reference_run), rtol=1e-6, atol=1e-8)
+    expected = scanned(lambda spin: observe(simulate_spin(spin)), 200.0, [1e-2, 1e-3, 1e-4, 1e-5])
     sizes = np.max(np.abs(expected), axis=1, keepdims=True)
     assert np.max(np.abs(slopes - expected) / sizes) < 1e-4
 

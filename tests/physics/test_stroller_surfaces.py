@@ -77,13 +77,13 @@ def test_a_steered_ride_is_that_of_a_rigid_body_with_multipliers(name):
     start = reference.started(
         level, np.asarray(run.position[0]), np.asarray(run.direction[0]), sign, 0.3, 1.1, 0.3, -0.4
     )
-    states, known = reference.ride(level, vehicle, start, TIMES)
+    states, expected = reference.ride(level, vehicle, start, TIMES)
     np.testing.assert_allclose(run.position, states[:, :3], atol=1e-8)
     np.testing.assert_allclose(run.direction, states[:, 6:9], atol=1e-8)
     np.testing.assert_allclose(np.stack([run.yaw_rate, run.steering, run.steering_rate], 1), states[:, 9:], atol=1e-8)
     np.testing.assert_allclose(run.speed, np.sum(states[:, 3:6] * states[:, 6:9], axis=1), atol=1e-8)
-    np.testing.assert_allclose(run.normal_force, [state.normal_force for state in known], atol=1e-7)
-    np.testing.assert_allclose(run.side_force, [(state.rear, state.front) for state in known], atol=1e-7)
+    np.testing.assert_allclose(run.normal_force, [state.normal_force for state in expected], atol=1e-7)
+    np.testing.assert_allclose(run.side_force, [(state.rear, state.front) for state in expected], atol=1e-7)
     np.testing.assert_allclose(run.energy_residual, 0.0, atol=1e-9)
     assert np.ptp(run.steering) > 0.3
     assert np.ptp(run.position, axis=0).min() > 0.1

@@ -145,8 +145,8 @@ def reference_jam(spin: float, slip_speed: float = SLIP_SPEED) -> tuple[float, f
         return 1.0 / contact(case, y[:-1], standing)[0][0]
 
     def rates(_, y):
-        each = softness(0.0, y)
-        return np.append(rate(case, y[:-1], standing) * each, each)
+        forces = softness(0.0, y)
+        return np.append(rate(case, y[:-1], standing) * forces, forces)
 
     softness.terminal, softness.direction = True, -1.0
     y0 = np.append(start, 0.0)

@@ -62,9 +62,9 @@ def legal_cases(arena, friction):
     scenes = random_scenes(rng, count, arena, friction)
     states = random_states(rng, scenes, count)
     legal = (scenes.normal_force(states) > 0.0) & (jnp.hypot(states[2], states[3]) > 0.05)
-    kept = np.flatnonzero(legal)[:STATES]
-    assert len(kept) == STATES
-    return jax.tree.map(lambda leaf: leaf[kept], scenes), states[:, kept].T
+    indices = np.flatnonzero(legal)[:STATES]
+    assert len(indices) == STATES
+    return jax.tree.map(lambda leaf: leaf[indices], scenes), states[:, indices].T
 
 
 @eqx.filter_jit
@@ -121,8 +121,8 @@ def test_rutstam_and_the_jellett_reduction_give_the_accelerations_of_the_vector_
         jellett = jnp.stack(jax.tree.map(lambda a, b, unit: (a - b) / unit, jellett_rate, expected, small))
         # Rates in 1/s^2, as a share of the squared angular velocity and of g / R together.
         w = jnp.linalg.norm(state[5:8]) / scene.body.I1
-        whole = w**2 + scene.gravity / scene.body.radius
-        return jnp.max(jnp.abs(rutstam)) / whole, jnp.max(jnp.abs(jellett)) / whole
+        scale = w**2 + scene.gravity / scene.body.radius
+        return jnp.max(jnp.abs(rutstam)) / scale, jnp.max(jnp.abs(jellett)) / scale
 
     rutstam, jellett = errors(scenes, states)
     assert jnp.max(rutstam) < 1e-10
@@ -166,8 +166,8 @@ def test_the_general_reduction_by_a_cyclic_angle_gives_the_accelerations_of_the_
 
     acceleration = accelerations(scenes, chart)
     # psi'' is not among the equations; it follows from the momentum.
-    whole = jnp.concatenate([acceleration, expected[:, poincare.PSI :]], axis=1)
-    assert jnp.max(relative_error(whole, expected, lengths)) < 1e-10
+    complete_acceleration = jnp.concatenate([acceleration, expected[:, poincare.PSI :]], axis=1)
+    assert jnp.max(relative_error(complete_acceleration, expected, lengths)) < 1e-10
 
 
 def rolling_chart(scene, state):

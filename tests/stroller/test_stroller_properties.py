@@ -162,10 +162,10 @@ def check_a_batch(scene: Scene, launch: Launch, knots, kink):
     return np.where(kink, 0.0, np.max([*errors, gained], axis=0))
 
 
-def signs_of(scene: Scene, place, heading, rest):
+def signs_of(scene: Scene, place, heading, remainder):
     """A column of signs for the components of a state."""
     turned = scene.dynamics.heading.axes(scene.surface)
-    return np.array([*place[: scene.surface.axes], *heading[:turned], *rest])[:, None]
+    return np.array([*place[: scene.surface.axes], *heading[:turned], *remainder])[:, None]
 
 
 def check_mirror(scene: Scene, launch: Launch):
@@ -206,8 +206,8 @@ def check_units(scene: Scene, launch: Launch, exponents: tuple[int, int, int]):
     if isinstance(scene.surface, Plane):
         place = tuple(part * length for part in place)
     moved = Launch(place, launch.heading, launch.speed * length / time, launch.steering, launch.steering_rate / time)
-    rest = (1.0, math.sqrt(mass) * length / time, 1.0 / time, 1.0, 1.0, inertia / time**2)
-    sizes = signs_of(scene, (length,) * 3, (1.0,) * 3, rest)
+    remainder = (1.0, math.sqrt(mass) * length / time, 1.0 / time, 1.0, 1.0, inertia / time**2)
+    sizes = signs_of(scene, (length,) * 3, (1.0,) * 3, remainder)
     near = ride(scene, launch)
     # The scales have a least rate of 1e-3 rad/s in them, so that rest has a scale.
     far = ride(other, moved, scales=sizes * scene.scales(launch), horizon=HORIZON * time)
@@ -217,15 +217,19 @@ def check_units(scene: Scene, launch: Launch, exponents: tuple[int, int, int]):
     np.testing.assert_array_equal(far.state / sizes, near.state)
 
 
-def missed_by(scene, launch, states, others, tolerance, steps, growth):
+def missed_by(scene, launch, states, reference_states, tolerance, steps, growth):
     """By how much two states of each lane differ, in what errors of one tolerance in each step make of it.
 
     **Returns:** that, and whether it can be told: errors must stay small for their growth to be that of small changes.
     """
-    states, others, allowed = np.asarray(states), np.asarray(others), tolerance * np.asarray(steps) * growth
-    difference = np.max(np.abs(states - others) / weights_of(scene, launch, states), axis=0)
-    told = allowed < SMALL
-    return np.where(told, difference / allowed, 0.0), told
+    states, reference_states, allowed = (
+        np.asarray(states),
+        np.asarray(reference_states),
+        tolerance * np.asarray(steps) * growth,
+    )
+    difference = np.max(np.abs(states - reference_states) / weights_of(scene, launch, states), axis=0)
+    mask = allowed < SMALL
+    return np.where(mask, difference / allowed, 0.0), mask
 
 
 def reached(*outcomes):
@@ -248,12 +252,12 @@ def check_reversal(scene: Scene, launch: Launch):
         smooth = eqx.tree_at(lambda scene: scene.friction.speed, smooth, scene.friction.speed)
     signs = signs_of(scene, (1, 1, 1), (1, 1, 1), (1, -1, -1, 1, 1, 1))
     arrival = ride(smooth, launch, tolerance)
-    back = ride(smooth, launch, tolerance, signs * arrival.state)
+    return_ride = ride(smooth, launch, tolerance, signs * arrival.state)
     knots = signs * knots_of(smooth, launch, STRETCHES)
     growth = growth_of([map_of(smooth, launch, a, b) for a, b in zip(knots[1:], knots[:-1], strict=True)])
-    steps = arrival.steps + back.steps
-    missed, told = missed_by(smooth, launch, smooth.state(launch), signs * back.state, tolerance, steps, growth)
-    stays = told & reached(arrival, back)
+    steps = arrival.steps + return_ride.steps
+    missed, mask = missed_by(smooth, launch, smooth.state(launch), signs * return_ride.state, tolerance, steps, growth)
+    stays = mask & reached(arrival, return_ride)
     return np.where(stays, missed, 0.0), stays
 
 
@@ -279,8 +283,8 @@ def check_moving(scene: Scene, launch: Launch, angle: float, knots, kink):
     plain_ride, moved_ride = ride(scene, launch, tolerance, states), ride(scene, launch, tolerance, moved(states))
     growth = growth_of([map_of(scene, launch, a, b) for a, b in zip(knots[:-1], knots[1:], strict=True)][::-1])
     steps = plain_ride.steps + moved_ride.steps
-    missed, told = missed_by(scene, launch, moved(plain_ride.state), moved_ride.state, tolerance, steps, growth)
-    stays = told & reached(plain_ride, moved_ride) & ~kink
+    missed, mask = missed_by(scene, launch, moved(plain_ride.state), moved_ride.state, tolerance, steps, growth)
+    stays = mask & reached(plain_ride, moved_ride) & ~kink
     return np.where(stays, missed, 0.0), stays
 
 

@@ -78,7 +78,7 @@ def test_midpoint_steps_end_on_the_times_asked_for():
 
 def test_a_batch_of_implicit_rides_compiles_without_a_complaint(capfd):
     """XLA's simplifier wrote that it was stuck in a loop, about `x | true` in a batch."""
-    known = jax.config.jax_enable_compilation_cache
+    setting = jax.config.jax_enable_compilation_cache
     jax.config.update("jax_enable_compilation_cache", False)
 
     @jax.jit
@@ -90,7 +90,7 @@ def test_a_batch_of_implicit_rides_compiles_without_a_complaint(capfd):
     try:
         speeds = speed(jnp.array([1.0, 2.0]))
     finally:
-        jax.config.update("jax_enable_compilation_cache", known)
+        jax.config.update("jax_enable_compilation_cache", setting)
     assert capfd.readouterr().err == ""
     assert jnp.isfinite(speeds).all()
 
@@ -165,8 +165,8 @@ def test_runs_are_vmapped_and_scene_numbers_too():
         launch = Launch((0.3, -0.6), 0.5, speed, 0.2, 0.1)
         return stroller.simulate(FULL, launch, 2.0, push, times=[2.0], tolerance=1e-10).position[0]
 
-    together = jax.jit(jax.vmap(end))(speeds)
-    np.testing.assert_allclose(together[1], end(1.0), atol=1e-9)
+    batch = jax.jit(jax.vmap(end))(speeds)
+    np.testing.assert_allclose(batch[1], end(1.0), atol=1e-9)
 
 
 def test_illegal_numbers_in_a_batch_of_rides_give_nothing_that_looks_right():
@@ -295,10 +295,10 @@ def test_what_happened_in_a_traced_ride_is_found_by_riding_again():
     scene, launch = Scene(BODY, Sphere(3.0)), Launch((0.0, 1.2), 0.5, 2.0)
     times = jnp.array([0.0, 1.0, 2.0])
     traced = jax.jit(lambda speed: stroller.simulate(scene, Launch(launch.place, 0.5, speed), 2.0, times=times))(2.0)
-    alone = stroller.simulate(scene, launch, 2.0, times=times)
-    assert alone.status == traced.status == "contact_lost"
-    np.testing.assert_allclose(traced.contact_lost_at, alone.contact_lost_at, rtol=1e-12)
-    np.testing.assert_allclose(traced.position, alone.position, atol=1e-8)
+    single_run = stroller.simulate(scene, launch, 2.0, times=times)
+    assert single_run.status == traced.status == "contact_lost"
+    np.testing.assert_allclose(traced.contact_lost_at, single_run.contact_lost_at, rtol=1e-12)
+    np.testing.assert_allclose(traced.position, single_run.position, atol=1e-8)
 
 
 def test_trajectory_reads_well():

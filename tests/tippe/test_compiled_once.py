@@ -67,7 +67,7 @@ def slope(function):
 
 
 def slopes(scene, mu):
-    return jax.grad(lambda both: time(scene, *both))(jnp.array([mu, 0.1]))
+    return jax.grad(lambda point: time(scene, *point))(jnp.array([mu, 0.1]))
 
 
 def table(scene, mu, **options):

@@ -261,9 +261,9 @@ def test_single_starts_a_factor_two_off_find_the_truth(experiment, capsys):
     tables = 25
     off = np.log(2.0) * np.array([[a, b] for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)])
     noisy = np.repeat(exact + error * np.random.default_rng(1).normal(size=(tables, 10)), len(off), axis=0)
-    each = Measurements(noisy, error)
-    ends = minimise(problem, np.tile(true + off, (tables, 1)), each)
-    linearised = linearise(problem, ends.coordinates, each)
+    measurements = Measurements(noisy, error)
+    ends = minimise(problem, np.tile(true + off, (tables, 1)), measurements)
+    linearised = linearise(problem, ends.coordinates, measurements)
     errors = np.array(
         [np.sqrt(np.diag(coordinate_covariance(np.asarray(jacobian)))) for jacobian in linearised.jacobian]
     )

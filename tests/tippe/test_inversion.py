@@ -294,7 +294,7 @@ def test_a_frame_that_turns_with_the_top_saves_digits_and_changes_none(rutstam_s
 def test_the_frame_of_a_top_that_cannot_invert_is_at_rest():
     """Its axis soon stands beside L, and both would be moved: 2.5 times the steps. Tops of both kinds share a block."""
     upright, inverting = tippe.Top(0.02, 0.02, 0.002, 2.1e-6, 3.2e-6), rutstam_top()
-    both = jax.tree.map(lambda a, b: jnp.stack([a, b]), upright, inverting)
-    turns = tippe.Scene(both, tippe.Plane(), tippe.Viscous(0.3)).turning_dynamics.turns
+    states = jax.tree.map(lambda a, b: jnp.stack([a, b]), upright, inverting)
+    turns = tippe.Scene(states, tippe.Plane(), tippe.Viscous(0.3)).turning_dynamics.turns
     assert turns[0] == 0.0 < turns[1]
     assert tippe.Scene(upright, tippe.Plane(0.1), tippe.Viscous(0.3)).turning_dynamics.turns is None

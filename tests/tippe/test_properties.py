@@ -128,10 +128,10 @@ def may_jam(scene: tippe.Scene) -> np.ndarray:
     return np.asarray(body.I1 / body.mass) < 1.001 * np.max(np.asarray(pull), axis=0)
 
 
-def departure(scene, launch, states, others):
+def departure(scene, launch, states, reference_states):
     """Greatest difference of two states in each lane, in units of the state's own magnitudes."""
     scales = np.broadcast_to(scene.scales(launch), np.shape(states))
-    return np.max(np.abs(np.asarray(states) - np.asarray(others)) / scales, axis=0)
+    return np.max(np.abs(np.asarray(states) - np.asarray(reference_states)) / scales, axis=0)
 
 
 def sensitivity(scene, launch, states, tolerance):
@@ -197,9 +197,9 @@ def check_reversal(scene: tippe.Scene, launch: tippe.Launch):
     signs = np.ones((smooth.state(launch).shape[0], 1))
     signs[:2] = signs[5:8] = -1.0
     arrival = ends(smooth, launch, tolerance)
-    back = ends(smooth, launch, tolerance, signs * arrival.state)
-    stays = (np.asarray(arrival.status) == REACHED_END) & (np.asarray(back.status) == REACHED_END)
-    missed = departure(smooth, launch, signs * back.state, smooth.state(launch))
+    return_run = ends(smooth, launch, tolerance, signs * arrival.state)
+    stays = (np.asarray(arrival.status) == REACHED_END) & (np.asarray(return_run.status) == REACHED_END)
+    missed = departure(smooth, launch, signs * return_run.state, smooth.state(launch))
     growth = 1.0 + sensitivity(smooth, launch, signs * arrival.state, tolerance)
     return np.where(stays, missed / (tolerance * growth * np.asarray(arrival.steps)), 0.0), stays
 
@@ -287,15 +287,15 @@ def test_properties_of_many_examples(arena):
 @pytest.mark.parametrize("arena", ARENAS)
 def test_runs_without_friction_are_mostly_kept(arena):
     """The reversal is tested on most lanes of a batch, not on the few that keep contact."""
-    kept = []
+    fractions = []
 
     @FEW
     @given(batch=batches(arena))
     def count(batch):
-        kept.append(check_reversal(*batch)[1].mean())
+        fractions.append(check_reversal(*batch)[1].mean())
 
     count()
-    assert np.mean(kept) > 0.4
+    assert np.mean(fractions) > 0.4
 
 
 def test_lengths_by_four_and_times_by_two_give_the_same_inversion_time():

@@ -49,11 +49,11 @@ def test_another_unit_is_suspected(change, message):
 
 
 def test_a_suspicion_is_told_once():
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as records:
         warnings.simplefilter("default")
         for _ in range(3):
             tippe.Top(**GOOD | {"mass": 21.0})
-    assert len(told) == 1
+    assert len(records) == 1
 
 
 def test_theta_changes_at_its_rate(run):

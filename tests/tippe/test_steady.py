@@ -225,15 +225,15 @@ def test_the_steady_motions_are_the_extrema_of_the_effective_energy():
     top_scene = scene(0.3, 0.75)
     energy = jax.grad(lambda theta, jellett: steady.effective_energy(top_scene, theta, jellett))
     curvature = jax.grad(energy)
-    seen = set()
+    angles = set()
     for theta in np.linspace(0.1, 3.0, 30):
         motion = steady.tumbling(top_scene, theta)
         stable = bool(steady.tumbling_is_stable(top_scene, theta))
-        seen.add(stable)
+        angles.add(stable)
         # The effective energy has its extremum there, and the angles found from J include it.
         assert abs(energy(motion.theta, motion.jellett)) < 1e-14
         assert (curvature(motion.theta, motion.jellett) > 0.0) == stable
-    assert seen == {True, False}
+    assert angles == {True, False}
     several = steady.tumbling_angles(top_scene, float(motion.jellett))
     assert any(abs(theta - 3.0) < 1e-9 for theta in several)
 

@@ -143,13 +143,13 @@ def test_grids_larger_than_a_block_are_cut_and_joined(rutstam_scene_module, monk
     """The order of cells survives blocks, threads and refilled lanes."""
     monkeypatch.setattr(sweeping, "chunk_for", lambda cells: 16)
     theta, spin = np.linspace(0.05, 0.6, 9), np.linspace(60.0, 200.0, 11)
-    asked = {"theta": theta, "spin": spin, "t1": 4.0, "tolerance": 1e-5, "solver": diffrax.Bosh3()}
-    cut = tippe.inversion_table(rutstam_scene_module, **asked)
+    arguments = {"theta": theta, "spin": spin, "t1": 4.0, "tolerance": 1e-5, "solver": diffrax.Bosh3()}
+    cut = tippe.inversion_table(rutstam_scene_module, **arguments)
     monkeypatch.undo()
-    whole = tippe.inversion_table(rutstam_scene_module, **asked)
-    assert (cut.status == whole.status).all()
-    assert_close(cut.end_theta, whole.end_theta, atol=1e-9)
-    assert_close(cut.end_time, whole.end_time, rtol=1e-9)
+    table = tippe.inversion_table(rutstam_scene_module, **arguments)
+    assert (cut.status == table.status).all()
+    assert_close(cut.end_theta, table.end_theta, atol=1e-9)
+    assert_close(cut.end_time, table.end_time, rtol=1e-9)
 
 
 def test_a_scene_that_changes_only_in_numbers_does_not_compile_again(rutstam_scene_module, caplog):
@@ -263,18 +263,18 @@ def test_first_and_last_crossing_come_from_one_run(arena):
     """From the cylinder's wall theta swings past the angle and back, so the two differ; each is what its own table says."""
     scene = tippe.Scene(rutstam_top(), arena, tippe.Viscous(0.3))
     eta = 0.0 if isinstance(arena, tippe.Plane) else math.pi / 2.0
-    asked = {"theta": np.linspace(0.1, 0.4, 4), "spin": 100.0, "eta": eta, "t1": 15.0, "angle": 2.5}
-    both = tippe.inversion_table(scene, crossing="both", errors=True, **asked)
-    first = tippe.inversion_table(scene, crossing="first", **asked)
-    last = tippe.inversion_table(scene, crossing="last", **asked)
-    assert_close(both.first_time, first.time, rtol=1e-11)
-    assert_close(both.last_time, last.time, rtol=1e-11)
-    assert both.status.tolist() == last.status.tolist()
-    assert np.isfinite(both.first_time).any()
+    arguments = {"theta": np.linspace(0.1, 0.4, 4), "spin": 100.0, "eta": eta, "t1": 15.0, "angle": 2.5}
+    table = tippe.inversion_table(scene, crossing="both", errors=True, **arguments)
+    first = tippe.inversion_table(scene, crossing="first", **arguments)
+    last = tippe.inversion_table(scene, crossing="last", **arguments)
+    assert_close(table.first_time, first.time, rtol=1e-11)
+    assert_close(table.last_time, last.time, rtol=1e-11)
+    assert table.status.tolist() == last.status.tolist()
+    assert np.isfinite(table.first_time).any()
     if isinstance(arena, tippe.Cylinder):
-        assert (both.last_time > both.first_time).any()
-    assert both.digits("last_time").shape == both.digits("first_time").shape == (4,)
-    assert "time" not in both.variables
+        assert (table.last_time > table.first_time).any()
+    assert table.digits("last_time").shape == table.digits("first_time").shape == (4,)
+    assert "time" not in table.variables
 
 
 @pytest.mark.slow
@@ -282,9 +282,9 @@ def test_first_and_last_crossing_come_from_one_run(arena):
 def test_both_crossings_through_phases(name):
     """Flights: the crossing of a run that goes on."""
     scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3), contact="hybrid")
-    asked = {"theta": [0.1], "spin": 200.0, "t1": 8.0}
-    both = tippe.inversion_table(scene, crossing="both", **asked)
-    assert_close(both.variables[f"{name}_time"], tippe.inversion_table(scene, crossing=name, **asked).time)
+    arguments = {"theta": [0.1], "spin": 200.0, "t1": 8.0}
+    table = tippe.inversion_table(scene, crossing="both", **arguments)
+    assert_close(table.variables[f"{name}_time"], tippe.inversion_table(scene, crossing=name, **arguments).time)
 
 
 def test_both_crossings_have_no_one_derivative():

@@ -79,12 +79,12 @@ def test_an_interrupted_sweep_resumes_and_recomputes_no_finished_block(rutstam_s
     part = tippe.Table.load(path)
     assert (part.status == "pending").sum() == 16
     second_writes = written_blocks.recorded(monkeypatch)
-    whole = tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
+    complete_table = tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
     assert sorted(second_writes + done) == [0, 1, 2]
     monkeypatch.setattr(sweeping.ChunkStore, "write", written_blocks.WRITE)
     fresh = tippe.inversion_table(rutstam_scene_module, **arguments)
-    np.testing.assert_array_equal(whole.status, fresh.status)
-    assert_close(whole.end_theta, fresh.end_theta, atol=1e-12)
+    np.testing.assert_array_equal(complete_table.status, fresh.status)
+    assert_close(complete_table.end_theta, fresh.end_theta, atol=1e-12)
     tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
     assert sorted(second_writes + done) == [0, 1, 2]
 
@@ -125,9 +125,9 @@ def test_a_killed_sweep_leaves_a_file_that_opens_and_resumes(tmp_path):
     assert (cells[sorted(blocks)] != "pending").all()
     scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
     fresh = tippe.inversion_table(scene, theta=np.linspace(0.05, 0.3, 400), spin=[80.0, 100.0], t1=5.0)
-    known = part.status != "pending"
-    np.testing.assert_array_equal(part.status[known], fresh.status[known])
-    assert_close(part.end_theta[known], fresh.end_theta[known], atol=1e-9)
+    finished_cells = part.status != "pending"
+    np.testing.assert_array_equal(part.status[finished_cells], fresh.status[finished_cells])
+    assert_close(part.end_theta[finished_cells], fresh.end_theta[finished_cells], atol=1e-9)
 
 
 @pytest.mark.slow

@@ -217,13 +217,13 @@ def judged(first, second, true, counts):
     """How many times a table with errors has, how many err by more than the bound, for how many the bound is more than 30
     times the error, and how many cells have a wrong status of which nothing is said."""
     bounds = errors_of(first, second, ("time",), counts, (3, 6))
-    both = np.isfinite(first["time"]) & np.isfinite(true["time"]) & np.isfinite(bounds["time_error"])
-    bound = bounds["time_error"][both]
-    error = np.abs(first["time"][both] - true["time"][both])
+    finite = np.isfinite(first["time"]) & np.isfinite(true["time"]) & np.isfinite(bounds["time_error"])
+    bound = bounds["time_error"][finite]
+    error = np.abs(first["time"][finite] - true["time"][finite])
     # The reference has its own round-off.
-    error = np.maximum(error - 1e-13 * true["time"][both], 0.0)
+    error = np.maximum(error - 1e-13 * true["time"][finite], 0.0)
     unseen = (first["status"] != true["status"]) & (bounds["status_error"] == 0)
-    return np.array([both.sum(), (error > bound).sum(), (bound > 30.0 * (error + 1e-13)).sum(), unseen.sum()])
+    return np.array([finite.sum(), (error > bound).sum(), (bound > 30.0 * (error + 1e-13)).sum(), unseen.sum()])
 
 
 def test_the_bound_holds_in_random_scenes():

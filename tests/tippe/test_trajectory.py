@@ -27,10 +27,10 @@ def test_a_run_prints_what_it_took(rutstam_scene):
 
 def test_given_times_and_dense_output_agree(rutstam_scene):
     times = np.linspace(0.0, 1.0, 11)
-    whole = tippe.simulate(rutstam_scene, LAUNCH, 1.0)
+    run = tippe.simulate(rutstam_scene, LAUNCH, 1.0)
     sampled_run = tippe.simulate(rutstam_scene, LAUNCH, 1.0, times=times)
     assert_close(sampled_run.t, times)
-    assert_close(sampled_run.theta, whole.at(times).theta)
+    assert_close(sampled_run.theta, run.at(times).theta)
     assert (
         sampled_run.axis.shape
         == sampled_run.angular_momentum.shape
@@ -43,7 +43,7 @@ def test_given_times_and_dense_output_agree(rutstam_scene):
     assert_close(sampled_run.spin[0], 155.0, rtol=1e-12)
     assert_close(sampled_run.velocity[0], 0.0, atol=1e-15)
     with pytest.raises(ValueError, match=r"times = .* must be at most 1\.0 \(the run ends there\)"):
-        whole.at([0.5, 1.5])
+        run.at([0.5, 1.5])
 
 
 def test_a_run_knows_its_inversion_time(rutstam_scene):
@@ -74,8 +74,8 @@ def test_illegal_numbers_in_a_batch_of_runs_give_nothing_that_looks_right(rutsta
     runs = jax.jit(jax.vmap(run))(*jnp.array(columns).T)
     assert runs.status.tolist() == [0] + 10 * [4]
     assert jax.vmap(run)(*jnp.array(columns).T[:, :0]).theta.shape == (0, 2)
-    alone = tippe.simulate(rutstam_scene, LAUNCH, 0.05, times=[0.0, 0.05])
-    assert_close(runs.theta[0], alone.theta, rtol=1e-8)
+    single_run = tippe.simulate(rutstam_scene, LAUNCH, 0.05, times=[0.0, 0.05])
+    assert_close(runs.theta[0], single_run.theta, rtol=1e-8)
     for read in (runs.theta, runs.energy, runs.position, runs.normal_force, runs.work, runs.end_time):
         assert np.all(np.isfinite(read[0]))
         assert np.all(np.isnan(read[1:]))
@@ -94,10 +94,10 @@ def test_a_run_without_contact_at_its_start_ends_there(options):
         scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Viscous(mu))
         return tippe.simulate(scene, tippe.Launch(0.1, 155.0, eta=eta), 0.1, [0.0, 0.1], 1e-6, **options)
 
-    both = jax.jit(jax.vmap(run))(jnp.array([0.3, 0.3]), jnp.array([0.0, 3.0]))
-    assert both.status.tolist() == [0, 1]
-    assert_close(both.end_time, [0.1, 0.0])
-    assert np.isfinite(both.theta).tolist() == [[True, True], [True, False]]
+    runs = jax.jit(jax.vmap(run))(jnp.array([0.3, 0.3]), jnp.array([0.0, 3.0]))
+    assert runs.status.tolist() == [0, 1]
+    assert_close(runs.end_time, [0.1, 0.0])
+    assert np.isfinite(runs.theta).tolist() == [[True, True], [True, False]]
     if "solver" not in options:
         slope = jax.jit(jax.jacfwd(lambda mu: run(mu, 0.0).theta[-1]))
         assert np.isfinite(slope(0.3))

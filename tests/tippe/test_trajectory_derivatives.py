@@ -61,16 +61,16 @@ def lost(spin, **options):
 
 
 def test_a_transformed_run_ends_where_the_contact_is_lost():
-    run, whole = jax.jit(lambda spin: lost(spin, tolerance=1e-11))(200.0), lost(200.0, tolerance=1e-11)
-    assert whole.status == "contact_lost"
+    run, reference_run = jax.jit(lambda spin: lost(spin, tolerance=1e-11))(200.0), lost(200.0, tolerance=1e-11)
+    assert reference_run.status == "contact_lost"
     with pytest.raises(ValueError, match=r"times = \[6\] are all after the end of the run at .* \(contact_lost\)"):
-        tippe.simulate(whole.scene, tippe.Launch(0.1, 200.0), 6.0, times=[6.0], tolerance=1e-11)
+        tippe.simulate(reference_run.scene, tippe.Launch(0.1, 200.0), 6.0, times=[6.0], tolerance=1e-11)
     assert run.status == 1
-    assert_close(run.end_time, whole.end_time, rtol=5e-8)
+    assert_close(run.end_time, reference_run.end_time, rtol=5e-8)
     inside = np.isfinite(run.normal_force)
-    assert inside.sum() == len(whole.t)
+    assert inside.sum() == len(reference_run.t)
     assert np.all(run.normal_force[inside] > 0.0)
-    assert_close(run.theta[inside], whole.theta, rtol=1e-6)
+    assert_close(run.theta[inside], reference_run.theta, rtol=1e-6)
 
 
 def test_the_loss_of_contact_moves_with_the_launch():

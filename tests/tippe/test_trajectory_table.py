@@ -172,7 +172,7 @@ def test_an_interrupted_table_resumes_and_a_damaged_block_is_computed_again(scen
     assert np.isnan(part.theta[part.status == "pending"]).all()
 
     second_writes = written_blocks.recorded(monkeypatch)
-    whole = tippe.trajectory_table(scene, path=path, **arguments)
+    complete_table = tippe.trajectory_table(scene, path=path, **arguments)
     assert sorted(done + second_writes) == [0, 1, 2]
     with h5py.File(path, "r+") as file:
         file["theta"][9, 1, 3, 7] += 1e-12
@@ -182,7 +182,7 @@ def test_an_interrupted_table_resumes_and_a_damaged_block_is_computed_again(scen
         mended = tippe.trajectory_table(scene, path=path, **arguments)
     assert sorted(done + second_writes) == [0, 0, 1, 1, 2, 2]
     fresh = tippe.trajectory_table(scene, **arguments)
-    for table in (whole, mended, tippe.Table.load(path)):
+    for table in (complete_table, mended, tippe.Table.load(path)):
         np.testing.assert_array_equal(table.theta, fresh.theta)
         np.testing.assert_array_equal(table.status, fresh.status)
     with pytest.raises(ValueError, match=r"another run: quantities is \['theta', 'eta'\] in the file"):

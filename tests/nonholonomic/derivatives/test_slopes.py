@@ -127,11 +127,11 @@ def test_padding_and_cells_beyond_the_event_have_no_slope(cells):
 @pytest.mark.parametrize("kept", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_runs_longer_than_what_is_kept_are_repeated(kept, monkeypatch):
     """Periods of two iterations, of which the starts of a few are kept: the slopes are the same to the last digit."""
-    _, whole, _ = found_and_expected(solver=diffrax.Dopri8())
+    _, single_pass, _ = found_and_expected(solver=diffrax.Dopri8())
     monkeypatch.setattr(adjoint.StepRecorder, "period", 2)
     monkeypatch.setattr(adjoint, "KEPT", kept)
     _, segments, expected = found_and_expected(solver=diffrax.Dopri8())
-    for whole_slope, segment_slope, expected_slope in zip(whole, segments, expected, strict=True):
+    for whole_slope, segment_slope, expected_slope in zip(single_pass, segments, expected, strict=True):
         assert_close(whole_slope, segment_slope, rtol=1e-12)
         assert_close(segment_slope, expected_slope, rtol=1e-7)
 
@@ -139,14 +139,14 @@ def test_runs_longer_than_what_is_kept_are_repeated(kept, monkeypatch):
 def test_the_starts_that_are_kept_are_spread_out(monkeypatch):
     """Of two hundred starts eight are kept: the first and the last always, the others with no gap above half of the run."""
     monkeypatch.setattr(adjoint, "KEPT", 8)
-    kept = adjoint.Checkpoints.of(jnp.zeros(()))
+    checkpoints = adjoint.Checkpoints.of(jnp.zeros(()))
     for index in range(1, 200):
-        kept = kept.added(jnp.asarray(index), jnp.asarray(float(index)), jnp.asarray(True))
-    indices = np.asarray(kept.index)
-    assert (indices[0], indices[-1], int(kept.depth)) == (0, 199, 8)
+        checkpoints = checkpoints.added(jnp.asarray(index), jnp.asarray(float(index)), jnp.asarray(True))
+    indices = np.asarray(checkpoints.index)
+    assert (indices[0], indices[-1], int(checkpoints.depth)) == (0, 199, 8)
     assert (np.diff(indices) > 0).all()
     assert np.diff(indices).max() <= 100
-    assert_close(np.asarray(kept.progress)[np.asarray(kept.slot)], indices)
+    assert_close(np.asarray(checkpoints.progress)[np.asarray(checkpoints.slot)], indices)
 
 
 class AtRest(AbstractProblem):

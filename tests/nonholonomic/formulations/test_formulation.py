@@ -113,10 +113,10 @@ def test_routhian_of_the_heavy_top_gives_its_precession_and_nutation():
     """Eliminating the spin angle leaves phi'' and theta'' as the whole system has them, with a damping force too."""
     top = HeavyTop(jnp.array([1.2, 1.2, 0.5]), jnp.array(0.9), 0.3)
     rate = jnp.array([0.8, -0.4, 6.0])
-    whole = Hamel(top).acceleration(0.0, ORIENTATION, rate)
+    acceleration = Hamel(top).acceleration(0.0, ORIENTATION, rate)
     reduced = Routhian(top, cyclic=2, momentum=(top.metric(ORIENTATION) @ rate)[2])
     part = Hamel(reduced).acceleration(0.0, ORIENTATION[:2], rate[:2])
-    np.testing.assert_allclose(part, whole[:2], rtol=1e-13)
+    np.testing.assert_allclose(part, acceleration[:2], rtol=1e-13)
     np.testing.assert_allclose(reduced.complete(ORIENTATION[:2], rate[:2])[1], rate, rtol=1e-14)
     energy = reduced.energy(ORIENTATION[:2], rate[:2])
     np.testing.assert_allclose(energy, top.energy(ORIENTATION, rate), rtol=1e-14)
@@ -157,8 +157,8 @@ def test_velocity_that_violates_a_constraint_is_projected_with_a_warning():
     skid = rate + 0.1 * SLEIGH.constraints(q)[0]
     with pytest.warns(UserWarning, match=r"violates the constraints by .* projected"):
         state = Multipliers(SLEIGH).state(q, skid)
-    _, kept = Multipliers(SLEIGH).split(state)
-    np.testing.assert_allclose(SLEIGH.constraints(q) @ kept, 0.0, atol=1e-15)
+    _, velocity = Multipliers(SLEIGH).split(state)
+    np.testing.assert_allclose(SLEIGH.constraints(q) @ velocity, 0.0, atol=1e-15)
 
 
 def test_drift_is_kept_damped_or_ignored():

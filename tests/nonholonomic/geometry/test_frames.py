@@ -63,16 +63,16 @@ def foot_of(name):
 def moved(frame, start, velocity, time, steps=200):
     """Place and cyclic coordinates after moving with the given velocity components, by small Runge-Kutta steps."""
 
-    def rate(both):
-        frame_motion = frame.frame_motion(both[0], velocity)
-        return frame_motion.place_rate, frame.cyclic_rate(both[1], velocity, frame_motion.turning)
+    def rate(point):
+        frame_motion = frame.frame_motion(point[0], velocity)
+        return frame_motion.place_rate, frame.cyclic_rate(point[1], velocity, frame_motion.turning)
 
-    def step(both, _):
-        k1 = rate(both)
-        k2 = rate(jax.tree.map(lambda x, k: x + 0.5 * dt * k, both, k1))
-        k3 = rate(jax.tree.map(lambda x, k: x + 0.5 * dt * k, both, k2))
-        k4 = rate(jax.tree.map(lambda x, k: x + dt * k, both, k3))
-        return jax.tree.map(lambda x, a, b, c, d: x + dt / 6.0 * (a + 2 * b + 2 * c + d), both, k1, k2, k3, k4), None
+    def step(point, _):
+        k1 = rate(point)
+        k2 = rate(jax.tree.map(lambda x, k: x + 0.5 * dt * k, point, k1))
+        k3 = rate(jax.tree.map(lambda x, k: x + 0.5 * dt * k, point, k2))
+        k4 = rate(jax.tree.map(lambda x, k: x + dt * k, point, k3))
+        return jax.tree.map(lambda x, a, b, c, d: x + dt / 6.0 * (a + 2 * b + 2 * c + d), point, k1, k2, k3, k4), None
 
     dt = time / steps
     return jax.jit(lambda: jax.lax.scan(step, start, length=steps)[0])()
@@ -92,11 +92,11 @@ def test_the_frame_is_orthonormal_and_turns_as_stated(name):
     assert_close(np.linalg.det(axes), 1.0, atol=1e-10)
     frame_motion = frame.frame_motion(place, velocity)
     rates = (frame_motion.place_rate, frame.cyclic_rate(cyclic, velocity, frame_motion.turning))
-    _, position_rate = jax.jvp(lambda *both: jnp.stack(frame.position(*both)), (place, cyclic), rates)
+    _, position_rate = jax.jvp(lambda *point: jnp.stack(frame.position(*point)), (place, cyclic), rates)
     assert_close(position_rate, 0.3 * axes[0] - 0.2 * axes[1], atol=1e-9)
     o1, o2 = numbers(frame_motion.turning)
     for axis, expected in enumerate((o1 * axes[2], o2 * axes[2], -(o1 * axes[0] + o2 * axes[1]))):
-        _, rate = jax.jvp(lambda *both, axis=axis: jnp.stack(frame.axes(*both)[axis]), (place, cyclic), rates)
+        _, rate = jax.jvp(lambda *point, axis=axis: jnp.stack(frame.axes(*point)[axis]), (place, cyclic), rates)
         assert_close(rate, expected, atol=1e-9)
     assert_close(numbers(frame.vertical(place)), axes[:, 2], atol=1e-10)
     assert_close(numbers(frame_motion.vertical), axes[:, 2], atol=1e-10)

@@ -25,14 +25,14 @@ def feet(surface, at) -> np.ndarray:
     return np.stack(jax.jit(lambda place: surface.nearest(place))(tuple(jnp.asarray(at.T)))).T
 
 
-def check_least(surface, at, profile, seen) -> None:
+def check_least(surface, at, profile, points) -> None:
     """No point of a profile is closer than the nearest one, and that one is on the surface.
 
     The profile is a curve (2, n) of points so close that the distance from it is right to 2e-5 m; `seen` are the positions
     beside it.
     """
     foot = feet(surface, at)
-    assert_close(np.linalg.norm(at - foot, axis=1), cKDTree(profile.T).query(seen.T)[0], atol=2e-5)
+    assert_close(np.linalg.norm(at - foot, axis=1), cKDTree(profile.T).query(points.T)[0], atol=2e-5)
     assert_close(jax.jit(lambda place: surface.offset(place))(tuple(jnp.asarray(foot.T))), 0.0, atol=1e-14)
 
 
@@ -41,15 +41,15 @@ def test_nearest_point_of_a_spheroid(semi_axes):
     """From inside and outside, the middle included."""
     (a, c), eta = semi_axes, np.linspace(-np.pi / 2.0, np.pi / 2.0, 40_001)
     at = positions(np.array([1.5 * a, 1.5 * a, 1.5 * c]))
-    seen = np.stack([np.hypot(at[:, 0], at[:, 1]), at[:, 2]])
-    check_least(Spheroid(a, c), at, np.stack([a * np.cos(eta), c * np.sin(eta)]), seen)
+    points = np.stack([np.hypot(at[:, 0], at[:, 1]), at[:, 2]])
+    check_least(Spheroid(a, c), at, np.stack([a * np.cos(eta), c * np.sin(eta)]), points)
 
 
 def test_nearest_point_of_a_paraboloid():
     """From below and above, the axis included."""
     at, r = positions(np.array([0.5, 0.5, 1.0])), np.linspace(-2.0, 2.0, 200_001)
-    seen = np.stack([np.hypot(at[:, 0], at[:, 1]), at[:, 2]])
-    check_least(Paraboloid(0.3), at, np.stack([r, r * r / 0.6]), seen)
+    points = np.stack([np.hypot(at[:, 0], at[:, 1]), at[:, 2]])
+    check_least(Paraboloid(0.3), at, np.stack([r, r * r / 0.6]), points)
 
 
 def test_nearest_point_of_ripples():
@@ -70,7 +70,9 @@ def test_nearest_point_of_a_function_is_that_of_the_same_spheroid():
     moved = (place, (jnp.zeros(len(at)), jnp.zeros(len(at)), jnp.ones(len(at))))
     slopes = []
     for surface in (egg, same):
-        rates = jax.jit(lambda *both, surface=surface: jax.jvp(lambda *place: surface.nearest(place), *both)[1])
+        rates = jax.jit(
+            lambda *arguments, surface=surface: jax.jvp(lambda *place: surface.nearest(place), *arguments)[1]
+        )
         slopes.append(np.stack(rates(*moved)))
     assert_close(*slopes, rtol=1e-6, atol=1e-9)
 

@@ -68,9 +68,18 @@ def columns(vector, count=LANES):
 def asked(surface, place):
     """What a surface answers at a place: position, east, north, normal, place, position of that, off it by, height less z."""
     r, east, north = surface.chart(place)
-    back, off, height = surface.place_at(r), surface.offset(r), surface.elevation(r)
+    recovered_place, off, height = surface.place_at(r), surface.offset(r), surface.elevation(r)
     above = 0.0 if height is None else height - surface.in_fixed_frame(r)[2]
-    return r, east, north, surface.normal(r), back, surface.chart(back)[0], 0.0 if off is None else off, above
+    return (
+        r,
+        east,
+        north,
+        surface.normal(r),
+        recovered_place,
+        surface.chart(recovered_place)[0],
+        0.0 if off is None else off,
+        above,
+    )
 
 
 def directions(count=LANES):
@@ -81,14 +90,14 @@ def directions(count=LANES):
 def test_chart_normal_and_places_belong_together(surface):
     """East and north are unit vectors with n = east x north, and a place comes back from its position, in space too."""
     place = places(surface)
-    r, east, north, normal, back, chart_position, off, above = asked(surface, place)
+    r, east, north, normal, recovered_place, chart_position, off, above = asked(surface, place)
     position, east, north, normal = (columns(value) for value in (r, east, north, normal))
     np.testing.assert_allclose(np.sum(east**2, axis=0), 1.0, atol=1e-14)
     np.testing.assert_allclose(np.cross(east, north, axis=0), normal, atol=1e-13)
     np.testing.assert_allclose(off, 0.0, atol=1e-13)
     np.testing.assert_allclose(columns(chart_position), position, atol=1e-13)
     if not isinstance(surface, Implicit):
-        np.testing.assert_allclose(np.exp(1j * np.stack(back)), np.exp(1j * np.stack(place)), atol=1e-13)
+        np.testing.assert_allclose(np.exp(1j * np.stack(recovered_place)), np.exp(1j * np.stack(place)), atol=1e-13)
     # The height is that in space but for its zero.
     assert np.ptp(np.asarray(above)) < 1e-13
 

@@ -114,8 +114,8 @@ def test_censored_mean_is_that_of_scipy():
     fit = identify(lambda p: jnp.repeat(p["mean"][:, None], 60, axis=1), data, {"mean": 0.0})
 
     def deviance(mean):
-        seen = scipy.stats.norm.logpdf(value[~hidden], mean, 0.5).sum()
-        return -2.0 * (seen + hidden.sum() * scipy.stats.norm.logsf(1.0, mean, 0.5))
+        log_density = scipy.stats.norm.logpdf(value[~hidden], mean, 0.5).sum()
+        return -2.0 * (log_density + hidden.sum() * scipy.stats.norm.logsf(1.0, mean, 0.5))
 
     best = scipy.optimize.minimize_scalar(deviance, (0.0, 1.0), tol=1e-12)
     assert_close(fit.estimates["mean"], best.x, atol=1e-5)

@@ -35,9 +35,14 @@ def test_between_two_limits_it_is_the_probability_of_lying_there(half):
 def test_limits_of_all_kinds_have_their_likelihoods():
     data = Measurements([-np.inf, 2.0, 1.0, 4.0], 0.5, upper=[1.0, np.inf, 1.8, 4.0])
     at = np.array([1.3, 1.9, 1.5, 3.6])
-    whole = [phi.cdf((1.0 - 1.3) / 0.5), phi.cdf((1.9 - 2.0) / 0.5), phi.cdf(0.6) - phi.cdf(-1.0)]
+    probabilities = [phi.cdf((1.0 - 1.3) / 0.5), phi.cdf((1.9 - 2.0) / 0.5), phi.cdf(0.6) - phi.cdf(-1.0)]
     middle = phi.cdf(0.8) - phi.cdf(-0.8)
-    expected = [-2.0 * np.log(whole[0]), -2.0 * np.log(whole[1]), -2.0 * np.log(whole[2] / middle), 0.64]
+    expected = [
+        -2.0 * np.log(probabilities[0]),
+        -2.0 * np.log(probabilities[1]),
+        -2.0 * np.log(probabilities[2] / middle),
+        0.64,
+    ]
     assert_close(data.residuals(jnp.asarray(at)) ** 2, expected, rtol=1e-9)
     assert data.censored.tolist() == [True, True, True, False]
     assert_close(np.sign(data.residuals(jnp.asarray(at))), [1.0, -1.0, 1.0, -1.0])

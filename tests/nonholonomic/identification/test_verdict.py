@@ -114,7 +114,7 @@ def test_the_picture_has_data_residuals_profiles_and_correlation():
 def test_an_angle_is_drawn_on_the_turn_of_its_prediction():
     """A camera sees it up to whole turns."""
     exact = 3.0 * T + 0.1 * np.random.default_rng(5).normal(size=T.size)
-    seen = Measurements((exact + math.pi) % (2.0 * math.pi) - math.pi, 0.1, period=2.0 * math.pi)
-    fit = identify(lambda p: p["rate"][:, None] * T, seen, {"rate": 3.01})
+    measured_angles = Measurements((exact + math.pi) % (2.0 * math.pi) - math.pi, 0.1, period=2.0 * math.pi)
+    fit = identify(lambda p: p["rate"][:, None] * T, measured_angles, {"rate": 3.01})
     drawn = fit.plot().axes[0].containers[0].lines[0].get_ydata()
     assert_close(drawn, exact, atol=1e-9)

@@ -32,10 +32,10 @@ def fail_on_disk(monkeypatch, moment, torn, error):
         return operation
 
     def saved(stream, savez=np.savez, **arrays):
-        whole = io.BytesIO()
-        savez(whole, **arrays)
+        buffer = io.BytesIO()
+        savez(buffer, **arrays)
         falls = next(count) == moment
-        stream.write(whole.getvalue()[: int(torn * len(whole.getvalue())) if falls else None])
+        stream.write(buffer.getvalue()[: int(torn * len(buffer.getvalue())) if falls else None])
         if falls:
             raise error
 

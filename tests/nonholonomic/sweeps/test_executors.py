@@ -104,14 +104,14 @@ def test_mpi_gives_the_same_bits_too(tmp_path, by_threads):
 
 
 def test_trajectories_and_rides_from_other_processes_have_the_same_bits(processes, many_blocks):
-    asked = {"theta": [0.1, 0.2, 1.6], "spin": [100.0, 250.0], "mu": [0.2, 0.3], "times": np.linspace(0.0, 1.5, 31)}
-    mine, theirs = (tippe.trajectory_table(TOP, executor=pool, **asked) for pool in (None, processes))
-    assert_same_bits(mine, theirs)
+    arguments = {"theta": [0.1, 0.2, 1.6], "spin": [100.0, 250.0], "mu": [0.2, 0.3], "times": np.linspace(0.0, 1.5, 31)}
+    local, remote = (tippe.trajectory_table(TOP, executor=pool, **arguments) for pool in (None, processes))
+    assert_same_bits(local, remote)
     scene = stroller.Scene(stroller.Stroller(1.7, 0.7, 0.4, 0.05), stroller.Plane())
     axes = {"launch.place[0]": [0.0, 1.0, 2.0], "launch.place[1]": np.linspace(0.0, 8.0, 9)}
     launch = stroller.Launch((0.0, 0.0), 0.5, 1.0, 0.3)
-    mine, theirs = (stroller.sweep(scene, launch, 2.0, axes=axes, executor=pool) for pool in (None, processes))
-    assert_same_bits(mine, theirs)
+    local, remote = (stroller.sweep(scene, launch, 2.0, axes=axes, executor=pool) for pool in (None, processes))
+    assert_same_bits(local, remote)
 
 
 @pytest.mark.parametrize("way", ["processes", "dask"])
@@ -127,8 +127,8 @@ def test_a_block_whose_worker_dies_is_computed_by_another(way, tmp_path, request
 @pytest.mark.parametrize("way", ["processes", pytest.param("dask", marks=pytest.mark.slow)])
 def test_a_block_that_three_workers_die_of_is_failed_and_the_others_are_not(way, tmp_path, request):
     job, path = CheapJob(tmp_path, deadly=2, crashes=99), tmp_path / "table.h5"
-    told = r"cells 16 to 23 \(x 0\.326\d* to 0\.469\d*\) are given up as failed: they killed 3 workers or more"
-    with pytest.warns(RuntimeWarning, match=told):
+    message = r"cells 16 to 23 \(x 0\.326\d* to 0\.469\d*\) are given up as failed: they killed 3 workers or more"
+    with pytest.warns(RuntimeWarning, match=message):
         table = cheap_sweep(path, job=job, executor=request.getfixturevalue(way))
     # Dask blames blocks that only waited at a worker that died, too; nobody else kills workers here.
     assert len(set(job.begun(2))) == len(job.begun(2)) == 3
@@ -142,9 +142,9 @@ def test_a_block_that_three_workers_die_of_is_failed_and_the_others_are_not(way,
 def test_a_pool_that_breaks_ends_the_sweep_and_another_goes_on(processes, tmp_path):
     """Python's own pool has no more workers after the first that dies."""
     job, path = CheapJob(tmp_path, deadly=3, crashes=1, pause=0.05), tmp_path / "table.h5"
-    told = r"accepts no more chunks .*; 24 of 50 cells are done, .*table\.h5 has"
+    message = r"accepts no more chunks .*; 24 of 50 cells are done, .*table\.h5 has"
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, spawn) as pool, pytest.raises(RuntimeError, match=told):
+    with ProcessPoolExecutor(1, spawn) as pool, pytest.raises(RuntimeError, match=message):
         cheap_sweep(path, job=job, executor=pool)
     assert finished_blocks(Table.load(path)) == {0, 1, 2}
     assert finished_blocks(cheap_sweep(path, job=job, executor=processes)) == set(range(7))
@@ -201,8 +201,8 @@ def test_a_scheduler_that_dies_ends_the_sweep_and_threads_go_on(tmp_path):
 def test_a_worker_of_another_version_is_refused_by_name(processes, tmp_path, monkeypatch):
     needed = running.stamp() | {"jax": "0.0.1"}
     monkeypatch.setattr(running, "stamp", lambda: needed)
-    told = rf"the worker .*, process \d+, has jax {jax.__version__}, and 0\.0\.1 is needed"
-    with pytest.raises(RuntimeError, match=told):
+    message = rf"the worker .*, process \d+, has jax {jax.__version__}, and 0\.0\.1 is needed"
+    with pytest.raises(RuntimeError, match=message):
         cheap_sweep(None, job=CheapJob(tmp_path), executor=processes)
     assert not list(tmp_path.iterdir())
 
@@ -232,11 +232,11 @@ def test_a_user_s_system_is_computed_by_other_processes(processes, monkeypatch):
 
 def test_local_processes_have_their_cores_and_settings(processes):
     futures = [processes.submit(place) for _ in range(4)]
-    settings_by_process = {process: rest for process, *rest in (future.result() for future in futures)}
-    mine = os.sched_getaffinity(0)
+    settings_by_process = {process: settings for process, *settings in (future.result() for future in futures)}
+    affinity = os.sched_getaffinity(0)
     for cores, platforms, cache in settings_by_process.values():
         assert len(cores) == 1
-        assert cores <= mine
+        assert cores <= affinity
         assert (platforms, cache) == ("cpu", jax.config.jax_compilation_cache_dir)
     assert os.getpid() not in settings_by_process
 
@@ -287,8 +287,10 @@ def test_processes_end_with_a_parent_that_is_killed(tmp_path):
 
 def test_a_script_without_a_guard_is_told_so(tmp_path):
     with script(tmp_path, "if True:") as parent:
-        _, said = parent.communicate(timeout=60)
-    assert "RuntimeError: a process ended before it computed anything; a script that starts processes must have" in said
+        _, output = parent.communicate(timeout=60)
+    assert (
+        "RuntimeError: a process ended before it computed anything; a script that starts processes must have" in output
+    )
 
 
 class Hands(Executor):

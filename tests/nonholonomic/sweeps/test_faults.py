@@ -115,7 +115,7 @@ def check_power_cuts(tmp_path, monkeypatch, rounds):
     path, blocks = tmp_path / "table.h5", tmp_path / "table.h5.blocks"
     done = record(path, monkeypatch)
     assert len(done) == 1 + 2 + 7 * 2 + 2
-    seen = set()
+    states = set()
     for _ in range(rounds):
         for file in tmp_path.iterdir():
             shutil.rmtree(file) if file.is_dir() else file.unlink()
@@ -130,10 +130,10 @@ def check_power_cuts(tmp_path, monkeypatch, rounds):
         begun = path.exists() or (blocks / "table.h5").exists()
         finished = finished_blocks(Table.load(path)) if begun else set()
         assert confirmed <= len(finished) <= confirmed + 1
-        seen.add(len(finished))
+        states.add(len(finished))
         assert resumed(path) == set(range(7)) - finished
         assert list(tmp_path.iterdir()) == [path]
-    return seen
+    return states
 
 
 def test_the_power_fails(tmp_path, monkeypatch):
@@ -161,8 +161,8 @@ def test_a_disk_too_small_for_anything(tmp_path, room):
 
 def test_a_disk_too_small_for_the_table(tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
-    told = r"cannot write .*table\.h5: 1e-06 GB are free, and the table needs 1\.7e-06 GB while"
-    with pytest.raises(OSError, match=told):
+    message = r"cannot write .*table\.h5: 1e-06 GB are free, and the table needs 1\.7e-06 GB while"
+    with pytest.raises(OSError, match=message):
         cheap_sweep(tmp_path / "table.h5", pytest.fail)
     assert not list(tmp_path.iterdir())
 
@@ -202,28 +202,28 @@ def test_one_of_many_writers(tmp_path):
 
 def test_a_reader_beside_the_writer_sees_whole_blocks(tmp_path):
     """A table that is read while a sweep computes it has blocks that are complete, or pending."""
-    path, seen = tmp_path / "table.h5", []
+    path, counts = tmp_path / "table.h5", []
 
     def look(start, end, replace=os.replace):
         replace(start, end)
-        seen.append(len(finished_blocks(Table.load(path))))
+        counts.append(len(finished_blocks(Table.load(path))))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "replace", look)
         cheap_sweep(path)
-    assert seen == [*range(8), 7]
+    assert counts == [*range(8), 7]
 
 
 def test_another_version_is_told_or_refused(tmp_path, monkeypatch):
     """Another version of this package may have other equations; other libraries have other last digits."""
     path = tmp_path / "table.h5"
-    now = running.versions()
+    versions = running.versions()
     with monkeypatch.context() as patch:
         fail_on_disk(patch, 20, torn=0.0, error=Killed())
-        patch.setattr(running, "versions", lambda: now | {"jax": "0.0.1", "python": "2.7"})
+        patch.setattr(running, "versions", lambda: versions | {"jax": "0.0.1", "python": "2.7"})
         with pytest.raises(Killed):
             cheap_sweep(path)
-    with pytest.warns(RuntimeWarning, match=rf"was begun with jax 0\.0\.1, now {now['jax']}: digits may differ"):
+    with pytest.warns(RuntimeWarning, match=rf"was begun with jax 0\.0\.1, now {versions['jax']}: digits may differ"):
         table = cheap_sweep(path)
     # The table says what its file says; now that all is there, no one need be told again.
     assert json.loads(table.attributes["versions"])["jax"] == "0.0.1"
@@ -231,6 +231,6 @@ def test_another_version_is_told_or_refused(tmp_path, monkeypatch):
         warnings.simplefilter("error")
         cheap_sweep(path)
     with monkeypatch.context() as patch:
-        patch.setattr(running, "versions", lambda: now | {"nonholonomic": "99.0"})
+        patch.setattr(running, "versions", lambda: versions | {"nonholonomic": "99.0"})
         with pytest.raises(ValueError, match=r"another run: nonholonomic is .* in the file and 99\.0 here"):
             cheap_sweep(path)

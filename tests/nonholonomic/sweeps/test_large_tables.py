@@ -66,11 +66,11 @@ def test_a_table_in_its_file_is_read_piece_by_piece(tmp_path, monkeypatch, in_it
     table.save(tmp_path / "copy.h5")
     monkeypatch.undo()
     held = Table.load(tmp_path / "copy.h5")
-    lazy, whole = table.to_xarray(chunks={"y": 100}), held.to_xarray()
+    lazy, eager = table.to_xarray(chunks={"y": 100}), held.to_xarray()
     with lazy:
         for name in VARIABLES:
             assert lazy[name].chunks[0] == (100,) * 5
-            assert lazy[name].dims == whole[name].dims == table.dims(name)
+            assert lazy[name].dims == eager[name].dims == table.dims(name)
         assert int((lazy["status"] == "high").sum()) == int((held.status == "high").sum())
         np.testing.assert_array_equal(lazy["pair"][3, 4], held.pair[3, 4])
     assert held.to_xarray(chunks={"y": 50})["value"].chunks[0] == (50,) * 10
@@ -148,16 +148,16 @@ def test_an_illegal_cell_inside_a_large_grid_ends_the_sweep_when_its_turn_comes(
             raise ValueError("mu = 0.25 must not be so odd")
 
     monkeypatch.setattr(tippe.Viscous, "bounds", odd)
-    asked = {"theta": 0.1, "spin": np.linspace(80.0, 120.0, 128), "mu": [0.3, 0.25, 0.2], "t1": 0.1}
+    arguments = {"theta": 0.1, "spin": np.linspace(80.0, 120.0, 128), "mu": [0.3, 0.25, 0.2], "t1": 0.1}
     with pytest.raises(ValueError, match=r"mu = 0\.25 must not be so odd"):
-        tippe.inversion_table(scene, path=tmp_path / "table.h5", **asked)
+        tippe.inversion_table(scene, path=tmp_path / "table.h5", **arguments)
 
 
 def test_more_cells_than_memory_holds_are_refused_at_once(tmp_path):
     """10^10 of them: without a file for want of memory, with one for want of room on the disk, unless there is that much."""
     many = [axis(name, name, "1", np.arange(1e5)) for name in ("x", "y")]
-    told = r"path = None: 1e\+10 cells take 2\d\d GB, and this machine has .* GB of memory; pass path= to keep them in a file"
-    with pytest.raises(ValueError, match=told):
+    text = r"path = None: 1e\+10 cells take 2\d\d GB, and this machine has .* GB of memory; pass path= to keep them in a file"
+    with pytest.raises(ValueError, match=text):
         sweep(
             job, many, {"value": VARIABLES["value"], "count": Variable("1", np.int64), "more": VARIABLES["value"]}, {}
         )

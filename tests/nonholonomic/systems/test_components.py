@@ -32,8 +32,8 @@ def odds(*parts):
 @pytest.mark.parametrize("function", [motion, odds])
 def test_numbers_and_arrays_give_the_same(function):
     expected = jax.jit(jax.vmap(function))(*LANES)
-    for result, wanted in zip(jax.jit(by_components(function, *SCALARS))(*LANES), expected, strict=True):
-        assert_close(result, wanted, rtol=1e-13, atol=1e-14)
+    for result, expected_value in zip(jax.jit(by_components(function, *SCALARS))(*LANES), expected, strict=True):
+        assert_close(result, expected_value, rtol=1e-13, atol=1e-14)
 
 
 def test_zeros_are_not_computed_with():

@@ -129,9 +129,9 @@ def test_a_trajectory_is_a_table():
 
 def test_a_lagrangian_of_one_s_own_is_run_by_poincare_s_equations():
     """Metric and potential alone would miss its terms that are linear in the velocities."""
-    whole = Sleigh()
-    assert isinstance(formulation_of(whole), Lagrange)
-    assert isinstance(formulation_of(Routhian(whole, cyclic=0, momentum=0.3)), Hamel)
+    system = Sleigh()
+    assert isinstance(formulation_of(system), Lagrange)
+    assert isinstance(formulation_of(Routhian(system, cyclic=0, momentum=0.3)), Hamel)
 
 
 def test_derivatives_that_do_not_exist_through_resets_are_refused_in_words():

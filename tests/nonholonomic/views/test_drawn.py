@@ -161,5 +161,5 @@ def test_a_page_without_motion_has_no_script(tmp_path):
 def test_traces_of_several_runs_have_their_colours():
     (show,) = rolling().shows
     assert distinguished_by_colour((show,)) == (show,)
-    both = distinguished_by_colour((show, show._replace(colour=0x2A6FB0)))
-    assert [drawing.traces[0].colour for drawing in both] == [0xC8412B, 0x2A6FB0]
+    drawings = distinguished_by_colour((show, show._replace(colour=0x2A6FB0)))
+    assert [drawing.traces[0].colour for drawing in drawings] == [0xC8412B, 0x2A6FB0]

@@ -69,8 +69,8 @@ def array_work(x):
     which = (x[2] > 0.0).astype(int)
     matrix = jnp.outer(x, x) + jnp.eye(3)
     picked = (x[which], x[which + jnp.arange(2)], x.at[which].set(7.0), jax.lax.dynamic_slice(x, (which,), (2,)))
-    whole = (matrix @ x, matrix.T.ravel(), x @ x, jnp.prod(x), jnp.max(x), jnp.min(x), jnp.argmin(x), jnp.argmax(x))
-    return (*picked, *whole, jnp.any(x > 2.0), jnp.all(x > 2.0), x[::-1], jnp.linalg.norm(x), jnp.hypot(x[0], x[1]))
+    outputs = (matrix @ x, matrix.T.ravel(), x @ x, jnp.prod(x), jnp.max(x), jnp.min(x), jnp.argmin(x), jnp.argmax(x))
+    return (*picked, *outputs, jnp.any(x > 2.0), jnp.all(x > 2.0), x[::-1], jnp.linalg.norm(x), jnp.hypot(x[0], x[1]))
 
 
 def slopes(x):

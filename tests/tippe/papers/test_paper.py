@@ -171,10 +171,10 @@ def test_the_frame_of_equation_2_has_the_structure_that_the_reduction_needs():
     c = structure_constants(poincare.nodal_frame, q)
     np.testing.assert_allclose(c[:, poincare.PSI, :], 0.0, atol=1e-14)
     np.testing.assert_allclose(c[poincare.PSI, 2, 3], 1.0, rtol=1e-13)
-    rest = c.at[poincare.PSI, 2, 3].set(0.0).at[poincare.PSI, 3, 2].set(0.0)
+    remainder = c.at[poincare.PSI, 2, 3].set(0.0).at[poincare.PSI, 3, 2].set(0.0)
     # The field in place of phi changes its own length with theta.
-    np.testing.assert_allclose(rest[3, 2, 3], -np.cos(0.9) / np.sin(0.9), rtol=1e-13)
-    np.testing.assert_allclose(rest.at[3, 2, 3].set(0.0).at[3, 3, 2].set(0.0), 0.0, atol=1e-14)
+    np.testing.assert_allclose(remainder[3, 2, 3], -np.cos(0.9) / np.sin(0.9), rtol=1e-13)
+    np.testing.assert_allclose(remainder.at[3, 2, 3].set(0.0).at[3, 3, 2].set(0.0), 0.0, atol=1e-14)
 
 
 # Tables
