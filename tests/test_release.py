@@ -20,7 +20,7 @@ import tippe
 from nonholonomic.sweeps import versions
 from nonholonomic.validation import Bound, as_number
 from tippe.model.body import AbstractBody, AbstractMeridian, ContactGeometry
-from tippe.model.friction import Slip
+from tippe.model.contact_load import Slip
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

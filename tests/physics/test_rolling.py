@@ -11,7 +11,8 @@ from tops import homogeneous_ball, random_states, rutstam_top
 
 import tippe
 from nonholonomic.formulations import Multipliers
-from tippe.model.friction import AbstractFriction, ContactLoad, Slip
+from tippe.model.contact_load import ContactLoad, Slip
+from tippe.model.friction import AbstractFriction
 from tippe.model.rolling import RollingDynamics
 from tippe.witnesses import euler_angles, poincare, quadrature
 

@@ -1,5 +1,8 @@
 """Friction with a torque: the disc it stands for, its potential, its limits, and what the laws refuse."""
 
+import warnings
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lagrange_top
@@ -10,7 +13,7 @@ from hard.friction import hertz_disc
 from tops import random_states, rutstam_top
 
 import tippe
-from tippe.model.friction import ContactLoad, Slip
+from tippe.model.contact_load import ContactLoad, Slip
 from tippe.witnesses import reduced
 
 ARENAS = {"plane": tippe.Plane(), "cylinder": tippe.Cylinder(0.3), "sphere": tippe.Sphere(0.3)}
@@ -158,3 +161,45 @@ def test_an_isotropic_law_turns_with_the_slip(law):
     assert_close(other.force, turned(*load.force), rtol=1e-12)
     if load.torque[0] is not None:
         assert_close(other.torque, (*turned(*load.torque[:2]), load.torque[2]), rtol=1e-12)
+
+
+class Belt(tippe.AbstractFriction):
+    """Viscous friction on a belt that moves along t1 [m/s]."""
+
+    belt: float = 0.2
+
+    def per_normal_force(self, slip):
+        return ContactLoad(force=(-0.3 * (slip.x - self.belt), -0.3 * slip.y))
+
+
+class Sideways(tippe.AbstractFriction):
+    """A brake that also pushes across the slip, which takes no power; and a torque against the drilling, of some sign."""
+
+    torque: object = eqx.field(converter=jnp.asarray)
+
+    @property
+    def uses_spin(self):
+        return True
+
+    def per_normal_force(self, slip):
+        force = (-0.3 * slip.x - 0.2 * slip.y, -0.3 * slip.y + 0.2 * slip.x)
+        return ContactLoad(force, (None, None, self.torque * jnp.tanh(slip.turning[2])))
+
+
+def test_a_law_that_drives_the_top_is_told_when_it_is_constructed():
+    """By its worst slip: in a belt's direction, for a slow slip, 0.3 (v_belt - v) v."""
+    slip = (
+        r"friction = Belt\(belt=0.2\) drives the top: at a slip of \(0.001, 0\) m/s its power is 5.97e-05 W per newton"
+    )
+    with pytest.warns(UserWarning, match=slip):
+        Belt()
+    with pytest.warns(UserWarning, match=r"and a turning of -?100 rad/s its power is .* Is a sign wrong\?"):
+        Sideways(1e-2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Sideways(-1e-2)
+        # A belt at rest brakes; a law whose numbers are traced is not judged.
+        Belt(0.0)
+        jax.jit(lambda torque: Sideways(torque).torque)(1.0)
+        # Nor does a law that cannot be evaluated prevent its construction: the first run says what is wrong.
+        type("Broken", (tippe.AbstractFriction,), {"per_normal_force": lambda self, slip: 1.0 / None})()

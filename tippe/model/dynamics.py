@@ -31,7 +31,8 @@ from nonholonomic.integration import Status
 from nonholonomic.xla_cpu import least, stored
 
 from .body import AbstractBody, AbstractMeridian
-from .friction import AbstractFriction, ContactLoad, Slip
+from .contact_load import ContactLoad, Slip
+from .friction import AbstractFriction
 from .state import parts
 
 #: The cosine of no angle, for runs without a target angle.

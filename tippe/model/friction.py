@@ -3,45 +3,18 @@
 import abc
 import math
 from collections.abc import Iterator
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import Component, Vector, add, dot, sum_vectors
-from nonholonomic.validation import Bound, Bounded, as_number, require_kind
+from nonholonomic.geometry import sum_vectors
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require_kind
 
-
-class Slip(NamedTuple):
-    """The motion of the body at the contact, in the moving frame (t1, t2, n).
-
-    - `x`, `y`: velocity of the material contact point along the arena [m/s].
-    - `turning`: angular velocity of the body [rad/s]; its component along n, the drilling, is `None` unless the law
-      `uses_spin`.
-    """
-
-    x: Float[Array, "..."]
-    y: Float[Array, "..."]
-    turning: Vector = (None, None, None)
-
-
-class ContactLoad(NamedTuple):
-    """The effect of friction at the contact per unit normal force, in the moving frame.
-
-    - `force`: the tangential force [1].
-    - `torque`: the torque about the contact point [m].
-
-    A component is `None` where it vanishes identically.
-    """
-
-    force: tuple[Component, Component]
-    torque: Vector = (None, None, None)
-
-    def power(self, slip: Slip) -> Component:
-        """Power per unit normal force, f.v_s + tau.w [m/s] (`tippe.md`, section 2)."""
-        return add(dot(self.force, (slip.x, slip.y)), dot(self.torque, slip.turning))
-
+from .contact_load import ContactLoad, Slip
+from .driving_law import drive
 
 #: Addition to the message about an object that is not a friction law.
 A_LAW = " law, such as tippe.Viscous(0.3) or tippe.Coulomb(mu=0.3, slip_speed=0.01)"
@@ -50,6 +23,9 @@ A_LAW = " law, such as tippe.Viscous(0.3) or tippe.Coulomb(mu=0.3, slip_speed=0.
 class AbstractFriction(Bounded):
     """A friction law whose force and torque are proportional to the normal force. The law therefore also determines
     impacts, where the normal impulse takes the place of the normal force.
+
+    Friction never does positive work: f.v_s + tau.w <= 0 (`ContactLoad.power`). You get a warning when you construct a law
+    that breaks this rule; a run whose energy grows ends as "unresolved".
 
     **Example:**
 
@@ -77,6 +53,11 @@ class AbstractFriction(Bounded):
 
     #: Whether friction on a contact at rest takes whatever value keeps it at rest, within limits.
     set_valued: ClassVar[bool] = False
+
+    def suspicion(self) -> str | None:
+        # The laws of this package oppose every slip. Traced numbers have no values to judge.
+        own = str(type(self).per_normal_force.__module__).startswith("tippe.")
+        return None if own or any(is_traced(leaf) for leaf in jax.tree.leaves(self)) else drive(self)
 
     @property
     def uses_spin(self) -> bool:

@@ -42,8 +42,9 @@ from nonholonomic.geometry import (
 )
 from nonholonomic.xla_cpu import least, stored
 
+from .contact_load import ContactLoad, Slip
 from .dynamics import FITS, JAMMED, Motion
-from .friction import AbstractFriction, ContactLoad, NoSlip, Slip, length
+from .friction import AbstractFriction, NoSlip, length
 from .inertia import SymmetricMatrix
 from .launch import Launch
 from .rigid_body import AbstractRigidBody

@@ -26,8 +26,9 @@ from nonholonomic.geometry import (
 )
 from nonholonomic.xla_cpu import stored
 
+from .contact_load import ContactLoad, Slip
 from .dynamics import Motion
-from .friction import ContactLoad, Slip, length
+from .friction import length
 from .state import AXIS, angular_velocity, joined, parts
 from .top import Top
 

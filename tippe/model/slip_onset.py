@@ -26,8 +26,9 @@ from numpy.polynomial import Polynomial, legendre
 
 from nonholonomic.xla_cpu import greatest
 
+from .contact_load import Slip
 from .dynamics import Dynamics
-from .friction import Slip, length
+from .friction import length
 from .rigid_dynamics import RollingDynamics as RigidRolling
 from .rigid_dynamics import SlippingDynamics
 from .rolling import RollingDynamics

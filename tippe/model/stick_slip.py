@@ -20,8 +20,9 @@ from jaxtyping import Array, Bool, Float, Int
 from nonholonomic.geometry import AbstractFrame, stacked
 from nonholonomic.xla_cpu import greatest, least
 
+from .contact_load import Slip
 from .dynamics import FITS, Dynamics, Motion
-from .friction import AbstractFriction, Frictionless, SetValuedCoulomb, Slip, length
+from .friction import AbstractFriction, Frictionless, SetValuedCoulomb, length
 from .rigid_body import AbstractRigidBody
 from .rigid_dynamics import RollingDynamics as RigidRolling
 from .rigid_dynamics import SlippingDynamics

@@ -28,7 +28,8 @@ from nonholonomic.geometry import Vector, cross, dot, scale, sum_vectors
 from nonholonomic.integration import LEFT_DOMAIN, MOST_STEPS, AbstractProblem, Settings, traced_solve_ensemble
 from nonholonomic.xla_cpu import greatest, least
 
-from ..model.friction import AbstractFriction, ContactLoad, Slip
+from ..model.contact_load import ContactLoad, Slip
+from ..model.friction import AbstractFriction
 from ..model.state import angular_velocity
 from ..model.top import Top
 from .free_body import Ball, FreeBody

@@ -28,7 +28,8 @@ from jaxtyping import Array, Bool, Float, Int
 from nonholonomic.geometry import Component, add, cross, dot, multiply, scale, stacked, subtract, sum_vectors
 from nonholonomic.xla_cpu import least
 
-from ..model.friction import AbstractFriction, Slip
+from ..model.contact_load import Slip
+from ..model.friction import AbstractFriction
 from ..model.state import angular_velocity, parts
 from ..model.top import Top
 from .free_body import FreeBody, axis_rate, balls, contact_state, gap_rate

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from nonholonomic.geometry import carried
 
-from ..model.friction import Slip
+from ..model.contact_load import Slip
 from ..model.scene import Scene
 from ..model.state import AXIS, MOMENTUM, PLACE, VELOCITY
 from ..model.top import Top

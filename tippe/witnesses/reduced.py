@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..model.friction import Slip
+from ..model.contact_load import Slip
 from ..model.scene import Scene
 from ..model.state import AXIS, VELOCITY
 from ..model.top import Top

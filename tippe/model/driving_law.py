@@ -1,0 +1,46 @@
+"""Friction laws that drive a top: what a warning says of them."""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nonholonomic.geometry import Component
+from nonholonomic.validation import one_line
+from nonholonomic.xla_cpu import compiled_setup
+
+from .contact_load import Slip
+
+#: Slip speeds [m/s] and turning rates [rad/s] at which a law is tried.
+SPEEDS, TURNINGS = (1e-3, 1e-2, 0.1, 1.0), (0.0, 100.0, -100.0)
+
+
+def drive(law: Any) -> str | None:
+    """The message about a law with positive power, by a few slips in eight directions; `None` if it brakes in all of them."""
+    angle, speed, turning = (
+        grid.ravel() for grid in np.meshgrid(np.arange(8) * math.pi / 4.0, SPEEDS, TURNINGS, indexing="ij")
+    )
+    x, y = speed * np.cos(angle), speed * np.sin(angle)
+    none, drilling = jnp.zeros(turning.shape), jnp.asarray(turning) if law.uses_spin else None
+    try:
+        with jax.ensure_compile_time_eval():
+            power = np.asarray(_power(law, Slip(jnp.asarray(x), jnp.asarray(y), (none, none, drilling))))
+    except Exception:
+        # What is wrong with such a law, its first run says.
+        return None
+    if power.shape != x.shape or not np.any(power > 1e-12):
+        return None
+    worst = int(np.nanargmax(power / speed))
+    drills = f" and a turning of {turning[worst]:g} rad/s" if law.uses_spin and turning[worst] else ""
+    return (
+        f"friction = {one_line(law)} drives the top: at a slip of ({x[worst]:.3g}, {y[worst]:.3g}) m/s{drills} its power is "
+        f"{power[worst]:.3g} W per newton of normal force, and friction has none above 0. Is a sign wrong? A run whose energy "
+        "grows ends as 'unresolved'. For a level belt, give Launch the velocity relative to it"
+    )
+
+
+@compiled_setup
+def _power(law: Any, slip: Slip) -> Component:
+    return law.per_normal_force(slip).power(slip)
