@@ -104,7 +104,7 @@ def height(own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Flo
 class Slide(AbstractFlyingMode, AbstractHoppingMode):
     """Sliding on the sphere numbered `number`, in the order of `free_body.balls`, up to an angle of theta.
 
-    The number is an array, so that one program serves both spheres; with `last` a run continues through the angle. A
+    `number` is an array, so that one program serves both spheres. With `last`, a run continues through the angle. A
     single run whose path is kept records its flights.
     """
 
