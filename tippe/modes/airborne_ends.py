@@ -28,7 +28,7 @@ from .free_body import balls, gap_rate
 def on_the_ground(
     scene: Scene[Top], state: Float[Array, "components cells"], mode: Int[Array, " cells"]
 ) -> Float[Array, "14 cells"]:
-    """States of runs in the layout of a contact of the top's own sphere; for other modes, relative to the foot below
+    """States of runs, in the layout for sliding on the top's own sphere. States of other modes refer to the foot below
     that sphere.
     """
     return _above_the_ground(scene, state, mode)[0]

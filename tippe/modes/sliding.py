@@ -88,8 +88,8 @@ class Sliding(AbstractProblem):
 
 
 def clearance(dynamics: Dynamics, own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-    """Distance of the other sphere from the plane as a fraction of the own radius, plus the round-off allowed at
-    lift-off.
+    """Distance of the other sphere from the plane as a fraction of the radius of the touching sphere, plus the
+    round-off allowed at lift-off.
     """
     _, e, L, _ = parts(state[:OWN])
     rate = (other.offset - own.offset) * dynamics.per_transverse * (L[0] * e[1] - L[1] * e[0])
