@@ -46,8 +46,8 @@ def energy_in(
 
 
 def lifted(scene: Scene[Top], state: Float[Array, "14 ..."], distance: Any, rate: Any) -> Float[Array, "..."]:
-    """Energy [J] that a flying top has beyond that of the same state in contact, for its sphere's `distance` [m] from
-    the ground and the distance's `rate` [m/s]."""
+    """Difference [J] between the energy of a flying top and that of the same state in contact; `distance` [m] is that
+    of its sphere from the ground, and `rate` [m/s] the rate of this distance."""
     _, e, L, place = parts(state)
     # In contact the velocity along n is that of the centre of mass about the sphere's centre.
     about = -scene.body.offset * (L[0] * e[1] - L[1] * e[0]) / scene.body.I1
