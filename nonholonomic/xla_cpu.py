@@ -65,9 +65,9 @@ def stored(*values: Float[Array, "..."] | None) -> tuple[Any, ...]:
     """The same values, computed once even if several results depend on them; `None` stays `None`.
 
     Otherwise XLA fuses every result with everything that leads to it, and evaluates the common part again for each
-    result. A barrier alone does not prevent this; joining the values with a barrier behind them does, and makes the
-    top's field 1.2 times as fast. It also gives all readers the same value: two kernels may round differently. It can
-    be removed when XLA's fusion counts what it repeats.
+    result. A barrier alone does not prevent this. Joining the values, and putting a barrier behind them, prevents it,
+    and makes the top's field 1.2 times as fast. It also gives all readers the same value: two kernels may round
+    differently. It can be removed when XLA's fusion counts what it repeats.
     """
     present = [value for value in values if value is not None]
     if not present:

@@ -210,7 +210,7 @@ def _places_across(scene: Scene) -> range:
 
 
 class Tumbling(NamedTuple):
-    """A steady precession on the plane, the centre of mass at rest and the contact point without slip.
+    """A steady precession on the plane, in which the centre of mass is at rest and the contact point does not slip.
 
     - `theta`: inclination [rad].
     - `precession`: phi' [rad/s].

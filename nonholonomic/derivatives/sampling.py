@@ -56,9 +56,9 @@ def solve_for_samples(
 ) -> Any:
     """Solve for the samples of a run.
 
-    **Arguments:** `sampling`: function of the first three fields of a solve that returns the solve; `build`: function
-    of the modules and an extra argument of the solve that returns the problem, compared by identity; other arguments as
-    for `sampled_run`.
+    **Arguments:** `sampling`: a function that returns the solve, given its first three fields; `build`: a function that
+    returns the problem, given the modules and an extra argument of the solve (the function is compared by identity);
+    other arguments as for `sampled_run`.
     """
     numbers, rest = eqx.partition(modules, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(numbers)

@@ -212,9 +212,11 @@ def between(z: Float[Array, "..."], half: Float[Array, "..."]) -> Float[Array, "
 
 
 def estimated_errors(measurements: Measurements, prediction: Any, unknowns: int) -> Float[np.ndarray, " n"]:
-    """The errors; unknown errors are estimated from the residuals of their series. For a series of n values, in a fit
-    of k unknowns to N values, the estimate is the root of the sum of squares / (n - k n / N); for Student's t, the
-    scale for which the mean weight of the squares is 1 (maximum likelihood).
+    """The errors; unknown errors are estimated from the residuals of their series.
+
+    In a fit of k unknowns to N values, the estimate for a series of n values is the root of the sum of squares / (n - k
+    n / N). For Student's t, the estimate is the scale for which the mean weight of the squares is 1 (maximum
+    likelihood).
     """
     errors = np.array(measurements.error)
     series, open_ = np.asarray(measurements.series), np.asarray(measurements.estimated)

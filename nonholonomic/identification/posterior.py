@@ -110,8 +110,8 @@ class LogDensity(eqx.Module):
     def values(self, coordinates: Float[Array, "... unknowns"]) -> dict[str, Float[Array, "..."]]:
         """The unknowns at given coordinates: name -> (...,).
 
-        **Arguments:** `coordinates`: the coordinates of all unknowns, or only those of a fit; the errors then have
-        their first guess.
+        **Arguments:** `coordinates`: the coordinates of all unknowns, or only those of a fit, without the unknown
+        errors; the errors then get their first guess.
 
         **Raises:** `ValueError` for another number of coordinates.
         """

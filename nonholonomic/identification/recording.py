@@ -207,7 +207,7 @@ def noise(value: Float[np.ndarray, "times columns"]) -> Float[np.ndarray, " colu
 
 
 def model_times(times: Float[Array, " times"], t0: Float[Array, ""]) -> Float[Array, " times"]:
-    """The times of the samples since the launch [s]; samples before the launch get its time.
+    """The times of the samples since the launch [s]; 0 for samples before the launch.
 
     **Example:**
 

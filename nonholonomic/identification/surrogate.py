@@ -26,9 +26,9 @@ class Surrogate(eqx.Module):
     """A log density whose predictions are polynomials of the coordinates; priors and likelihood are those of the density.
 
     It is a function of points: the coordinates of the density are `centre` + the sum of `bends[k]` point^(k + 1). If
-    the data determine one combination far better than another, the posterior is a thin, bent ridge; in points it is
-    nearly round. Along the axes of `among` the bends are triangular, so volumes change only by a factor. Unknown
-    errors, on which no prediction depends, are also coordinates.
+    the data determine one combination far better than another, the posterior is a thin, bent ridge as a function of the
+    coordinates, but nearly round as a function of the points. Along the axes of `among` the bends are triangular, so
+    volumes change only by a factor. Unknown errors, on which no prediction depends, are also coordinates.
 
     - `power`: the power of the density; less than 1 makes it wider.
     - `origin`, `scale`: (numbers,), (numbers, numbers): the polynomials are in `scale` (coordinates - `origin`).

@@ -163,7 +163,8 @@ def runs_of_signs(values: Float[np.ndarray, " n"]) -> Series:
     """The number of runs of one sign in a series, and the probability of at most so many runs (Wald and Wolfowitz, Ann.
     Math. Stat. 11 (1940) 147).
 
-    Given the numbers of both signs, the number of runs of either sign is hypergeometric; the sum is exact.
+    If the numbers of positive and negative values are given, the number of runs of one sign has a hypergeometric
+    distribution; the probability is summed exactly.
     """
     from scipy.special import gammaln
 

@@ -85,10 +85,10 @@ def explicit_step(
 
     - `tableau`: the method.
     - `field`: (time [s], state) -> rate of the state.
-    - `margins`, `crossing`: functions of (time, state) that returns the margins, and of (state, rate) that returns the
-      event function, or `None`. Their values, one per lane, should stay positive. Both are evaluated at the end of the
-      step and at three stages: the margins, which may need the whole state, within these stages; the event function,
-      which may need few components, after all stages.
+    - `margins`, `crossing`: a function of (time, state) that returns the margins, and a function of (state, rate) that
+      returns the event function; either may be `None`. Their values, one per lane, should stay positive. Both are
+      evaluated at the end of the step and at three stages. The margins, which may need the whole state, are evaluated
+      during these stages. The event function, which may need few components, is evaluated after all stages.
     - `time`, `state`, `rate`: time and state at the start of the step, and the field there.
     - `length`: length of the step [s], one per lane.
     - `margins_before`: the margins at the start; `None` if there are none.

@@ -53,7 +53,7 @@ class SampleRecorder(AbstractRecorder):
     """Lets steps end on the sample times of every cell, and collects the samples.
 
     `times` are the times of the samples [s]; `first` is the number of each cell's first sample after its start; `read`
-    gives the values to keep.
+    returns the values to keep.
     """
 
     times: Float[Array, "times *cells"]
@@ -152,11 +152,11 @@ def solve_with_samples(
 
     - `times`: times of the samples [s], increasing, at least 0; (times,) for all cells or (times, cells). Runs do not
       reach times after `t1`.
-    - `read`: reads the values to return off some states: (cells (lanes,), states (iterations, components, lanes)) -> a
-      tree of arrays (iterations, lanes, ...); by default the states themselves. Reading less saves time and memory.
+    - `read`: function of cells (lanes,) and states (iterations, components, lanes) that returns the values to keep, a
+      tree of arrays (iterations, lanes, ...); by default the states themselves. Keeping less saves time and memory.
 
-    **Returns:** the `Outcome`, without crossing times; and what was read off the states at the times, with the first
-    axes (cells, times), NaN after the end of a run: by default an array (cells, times, components).
+    **Returns:** the `Outcome`, without crossing times; and the kept values at the times, with the first axes (cells,
+    times), NaN after the end of a run. By default, these are an array (cells, times, components).
 
     **Example:**
 

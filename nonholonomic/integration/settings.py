@@ -211,7 +211,7 @@ def require_adjoint(adjoint: Any) -> None:
 def lanes_for(cells: int, n_blocks: int = 1) -> int:
     """Number of lanes for cells whose state has the given number of equal blocks.
 
-    On a CPU the lanes and their stages should fit the first caches; an accelerator is idle below tens of thousands.
+    On a CPU the lanes and their stages should fit the first caches; an accelerator needs tens of thousands of lanes.
     """
     most = 64 if jax.default_backend() == "cpu" else 32768
     alone = min(most, 1 << (cells - 1).bit_length())

@@ -138,7 +138,7 @@ def ride_problem(modules: tuple[Scene, Launch, Input | None], cells: int | None)
 def traced_ride(
     ride: Ride, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None
 ) -> tuple[State, Stats]:
-    """The states of a ride at `times`, inside a transformation, and statistics."""
+    """The states of a ride at `times`, and its statistics, inside a transformation."""
     modules = (ride.scene, ride.launch, ride.input)
     if adjoint is None:
         sampled = sampled_run(ride_problem, modules, times, ride.t1, ride.settings, ride.grid)

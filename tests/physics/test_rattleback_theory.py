@@ -13,6 +13,7 @@ from rigid_reference import Rattleback
 from scipy.linalg import expm
 
 import tippe
+from tippe.runs.lyapunov import generic_direction
 
 THEORY = Oscillations.of_ellipsoid(1.0, SHAPE, 0.01, INERTIA)
 
@@ -88,6 +89,29 @@ def test_a_slow_spin_reverses_as_the_amplitude_equations_say():
         time = float(tippe.reversal_time(rattleback(), tippe.Launch(theta, spin), 60.0, tolerance=1e-9))
         off.append(time / THEORY.reversal(spin, theta) - 1.0)
     assert 0.0 < off[1] < 0.3 * off[0] < 0.01
+
+
+def test_nearby_rattlebacks_part_within_the_states_of_a_rolling_body():
+    """The direction from which an exponent is computed keeps the axes orthonormal and the contact point at rest."""
+    scene, launch = rattleback(), tippe.Launch(0.3, -5.0, azimuth=0.4)
+    state = scene.state(launch)
+
+    def kept(state):
+        e, x = state[2:5], state[-3:]
+        return jnp.stack([e @ e, e @ x, x @ x, *(scene.dynamics.carried_along(state) - state)[:2]])
+
+    direction = generic_direction(scene, launch, 1)[:, 0]
+    assert_close(jax.jvp(kept, (state,), (direction,))[1], 0.0, atol=1e-15)
+    assert np.abs(direction).min() > 0.0
+
+
+@pytest.mark.slow
+def test_the_lyapunov_exponent_of_a_steady_spin_is_the_growth_rate():
+    """2.1207 /s at -5 rad/s, where pitch grows, and 0.2025 /s at 5 rad/s, where roll does."""
+    exponents = tippe.lyapunov_exponent(rattleback(), tippe.Launch(0.0, [-5.0, 5.0]), 400.0)
+    expected = [np.linalg.eigvals(THEORY.matrix(n)).real.max() for n in (-5.0, 5.0)]
+    assert exponents.status.tolist() == ["completed"] * 2
+    assert_close(exponents.exponent, expected, rtol=2e-3)
 
 
 @pytest.mark.slow

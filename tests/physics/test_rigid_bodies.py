@@ -334,8 +334,7 @@ def test_the_inertia_of_a_rattleback_is_found_from_its_motion():
         ),
         (lambda: tippe.reversal_time(rattleback(), tippe.Launch(0.1, 0.0), 1.0), "spin = 0.0"),
         (lambda: tippe.reversal_table(rattleback(), theta=0.1, spin=[0.0, 1.0], t1=1.0), "spin = 0.0"),
-        (lambda: tippe.lyapunov_exponent(rattleback(), tippe.Launch(0.1, 1.0), 1.0), "body of revolution"),
-        (lambda: tippe.explore(rattleback(), tippe.Launch(0.1, 1.0)), "body of revolution"),
+        (lambda: tippe.explore(rattleback(), tippe.Launch(0.1, 0.0)), "spin = 0.0"),
     ],
 )
 def test_what_is_not_possible_is_refused_by_name(make, words):

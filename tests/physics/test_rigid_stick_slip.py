@@ -43,6 +43,25 @@ def test_a_top_sticks_and_slips_as_by_its_own_equations(arena):
         assert_close(np.atleast_2d(value)[: len(size)] / size, expected / size, atol=1e-12)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("arena", "eta"), [(tippe.Plane(), 0.0), (tippe.Cylinder(0.3), 0.3)], ids=["plane", "cylinder"]
+)
+def test_runs_of_a_top_change_between_stick_and_slip_at_the_same_times(arena, eta):
+    """Within a nanosecond, and at most 1e-8 in the axis, at a tolerance of 1e-12."""
+    law, launch = tippe.SetValuedCoulomb(0.2), tippe.Launch(1.5, 30.0, eta=eta)
+    top, rigid = (
+        tippe.simulate(tippe.Scene(body, arena, law), launch, 0.9, tolerance=1e-12)
+        for body in (rutstam_top(), as_ellipsoid(rutstam_top()))
+    )
+    pieces, expected = rigid.dense.mode_segments, top.dense.mode_segments
+    assert [piece.number for piece in pieces] == [piece.number for piece in expected]
+    assert len(pieces) > 2
+    assert_close([piece.end for piece in pieces], [piece.end for piece in expected], atol=1e-9)
+    assert_close(rigid.axis[-1], top.axis[-1], atol=1e-8)
+    assert rigid.stats["energy_residual"] < 1e-10 * float(rigid.energy[0])
+
+
 def test_a_blow_that_stops_the_slip_takes_energy():
     """At 30 states; the contact point is at rest after it, and only the contact acts: L - r x m u does not change."""
     stick_slip = rattleback(0.3).dynamics

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from browser import complaints, needs_browser, open_browser, wait
+from rigid import rattleback
 from tops import rutstam_top
 
 import tippe
@@ -61,6 +62,18 @@ def table_of(scene: tippe.Scene, launch: tippe.Launch, grid: dict[str, np.ndarra
     return tippe.inversion_table(scene, **grid, **options)
 
 
+def answers(browser, live, values: np.ndarray) -> np.ndarray:
+    """Status, time of the event, end and final angle of runs in the browser; `values`: of the sliders, (runs, sliders)."""
+    browser.get("about:blank")
+    script = f"""{programs(live)}
+        const asks = integrator(live.answer), at = live.answer.lane, text = (x) => Number.isFinite(x) ? x : String(x);
+        return {json.dumps(values.tolist())}.map((values) => {{
+          const lane = asks.run(values), cosine = lane[at.state + 4];
+          return [...asks.read("outcome", values), lane[at.time], Math.acos(Math.max(-1, Math.min(1, cosine)))].map(text);
+        }})"""
+    return np.array(browser.execute_script(script), dtype=float).T
+
+
 @pytest.mark.parametrize(
     ("arena", "law"), [pytest.param(*case, marks=() if case in SHORT else pytest.mark.slow) for case in CASES]
 )
@@ -69,21 +82,30 @@ def test_the_browser_says_what_the_table_says(browser, arena, law):
     live = live_run(scene, launch, RANGES, HORIZONS[law])
     table = table_of(scene, launch, grid, HORIZONS[law])
     theta, mu, spin = (values.ravel() for values in np.meshgrid(grid["theta"], grid["mu"], grid["spin"], indexing="ij"))
-    runs = json.dumps(np.stack([theta, spin, mu], axis=-1).tolist())
-    browser.get("about:blank")
-    script = f"""{programs(live)}
-        const asks = integrator(live.answer), at = live.answer.lane, text = (x) => Number.isFinite(x) ? x : String(x);
-        return {runs}.map((values) => {{
-          const lane = asks.run(values), cosine = lane[at.state + 4];
-          return [...asks.read("outcome", values), lane[at.time], Math.acos(Math.max(-1, Math.min(1, cosine)))].map(text);
-        }})"""
-    status, time, end, angle = np.array(browser.execute_script(script), dtype=float).T
+    status, time, end, angle = answers(browser, live, np.stack([theta, spin, mu], axis=-1))
     assert [tippe.Status(int(code)).word for code in status] == list(np.ravel(table.status))
     np.testing.assert_allclose(time, np.ravel(table.time), rtol=CLOSE)
     np.testing.assert_allclose(end, np.ravel(table.end_time), rtol=CLOSE)
     np.testing.assert_allclose(angle, np.ravel(table.end_theta), atol=CLOSE)
     # Several ways to end, or little would be compared.
     assert len(set(status)) > 1
+
+
+def test_the_browser_says_when_rattlebacks_reverse(browser):
+    """The times of `reversal_table`, for both senses; the words are those of reversals, and a spin of 0 is not allowed."""
+    live = live_run(rattleback(), tippe.Launch(0.02, -5.0), None, 4.0)
+    assert [slider.path for slider in live.sliders] == ["launch.theta", "launch.spin"]
+    grid = {"theta": np.linspace(0.005, 0.06, 4), "spin": np.array([-8.0, -6.0, -3.0, 3.0])}
+    table = tippe.reversal_table(rattleback(), **grid, t1=4.0, tolerance=TOLERANCE, progress=False)
+    values = np.stack([part.ravel() for part in np.meshgrid(*grid.values(), indexing="ij")], axis=-1)
+    status, time, end, _ = answers(browser, live, values)
+    words = {int(code): word for code, word in browser.execute_script("return live.facts.words").items()}
+    assert [words[int(code)] for code in status] == list(np.ravel(table.status))
+    np.testing.assert_allclose(time, np.ravel(table.time), rtol=CLOSE)
+    np.testing.assert_allclose(end, np.ravel(table.end_time), rtol=CLOSE)
+    assert set(np.ravel(table.status)) == {"reversed", "not_reversed", "contact_lost"}
+    assert live.allowed(jnp.array([0.02, 1.0]))
+    assert not live.allowed(jnp.array([0.02, 0.0]))
 
 
 @pytest.fixture(scope="module")

@@ -100,7 +100,10 @@ class Inertia(Bounded):
         """The principal moments of a known tensor, as an addition to messages."""
         if any(is_traced(number) or np.ndim(number) for number in self.numbers):
             return ""
-        return f"; here they are {', '.join(f'{moment:.4g}' for moment in np.linalg.eigvalsh(self.matrix))}"
+        # In NumPy: inside a transformation, JAX would trace this even for known numbers.
+        xx, yy, zz, xy, xz, yz = map(float, self.numbers)
+        moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        return f"; here they are {', '.join(f'{moment:.4g}' for moment in moments)}"
 
 
 class SymmetricMatrix(eqx.Module):

@@ -28,7 +28,7 @@ from .free_body import balls, gap_rate
 def on_the_ground(
     scene: Scene[Top], state: Float[Array, "components cells"], mode: Int[Array, " cells"]
 ) -> Float[Array, "14 cells"]:
-    """States of runs in the layout of a contact of the top's own sphere; for other modes, relative to the foot below
+    """States of runs, in the layout for sliding on the top's own sphere. States of other modes refer to the foot below
     that sphere.
     """
     return _above_the_ground(scene, state, mode)[0]
@@ -46,7 +46,8 @@ def energy_in(
 
 
 def lifted(scene: Scene[Top], state: Float[Array, "14 ..."], distance: Any, rate: Any) -> Float[Array, "..."]:
-    """Energy [J] that a top gains over its state in contact if its sphere has a distance [m] and a rate of distance [m/s]."""
+    """Difference [J] between the energy of a flying top and that of the same state in contact; `distance` [m] is that
+    of its sphere from the ground, and `rate` [m/s] the rate of this distance."""
     _, e, L, place = parts(state)
     # In contact the velocity along n is that of the centre of mass about the sphere's centre.
     about = -scene.body.offset * (L[0] * e[1] - L[1] * e[0]) / scene.body.I1

@@ -146,8 +146,8 @@ class LeaningDynamics(eqx.Module):
         by the order of the speeds g, so the error is of the order of their square.
 
         **Returns:** the body after these impulses, before `at_rest`; and whether their friction dissipates energy. One
-        P_j is negative: during T, the load of this sphere is reduced. If its friction adds energy now, its friction
-        dissipates energy after the impact of the other sphere (det G > 0).
+        P_j is negative: during T, the load of this sphere is reduced. If the friction of this sphere adds energy now,
+        it dissipates energy after the impact of the other sphere (det G > 0).
         """
         spheres, zero = balls(self.body), jnp.zeros_like(free.height)
         w1, w2, w3 = angular_velocity(self.body, free.axis, free.momentum)

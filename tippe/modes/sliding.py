@@ -88,8 +88,8 @@ class Sliding(AbstractProblem):
 
 
 def clearance(dynamics: Dynamics, own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-    """Distance of the other sphere from the plane as a fraction of the own radius, plus the round-off allowed at
-    lift-off.
+    """Distance of the other sphere from the plane as a fraction of the radius of the touching sphere, plus the
+    round-off allowed at lift-off.
     """
     _, e, L, _ = parts(state[:OWN])
     rate = (other.offset - own.offset) * dynamics.per_transverse * (L[0] * e[1] - L[1] * e[0])
@@ -104,7 +104,7 @@ def height(own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Flo
 class Slide(AbstractFlyingMode, AbstractHoppingMode):
     """Sliding on the sphere numbered `number`, in the order of `free_body.balls`, up to an angle of theta.
 
-    The number is an array, so that one program serves both spheres; with `last` a run continues through the angle. A
+    `number` is an array, so that one program serves both spheres. With `last`, a run continues through the angle. A
     single run whose path is kept records its flights.
     """
 

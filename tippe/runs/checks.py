@@ -114,13 +114,6 @@ def check_reversible(launch: Launch, values: dict[str, Any]) -> None:
         raise ValueError("spin = 0.0 must not be zero: the time of reversal is that of a spin that changes its sign")
 
 
-def check_revolution(scene: Scene, caller: str) -> None:
-    """Raise `ValueError` unless the body is a body of revolution."""
-    if isinstance(scene.body, AbstractRigidBody):
-        kind = type(scene.body).__name__
-        raise ValueError(f"body = {kind} must be a body of revolution, such as a Top, for {caller}")
-
-
 def check_event(angle: Any, crossing: Any, known: tuple[str, ...] = ("first", "last")) -> None:
     """Raise `ValueError` unless the angle is in (0, pi] and the crossing is a known word."""
     require_all(event_bounds(angle))

@@ -40,18 +40,20 @@ from nonholonomic.views.explore import (
 )
 
 from ..model.dynamics import LOSSES
+from ..model.friction import NoSlip
 from ..model.launch import Launch
+from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
 from ..model.top import Top
 from ..modes.inversion_problem import InversionProblem
 from ..modes.sliding import Slide, modes
 from ..modes.trajectory_problem import TrajectoryProblem, trajectory_problem
-from .checks import check_revolution, check_run
+from .checks import check_reversible, check_run
 from .flight_trajectory import HybridTrajectory, level_modes
 from .launches import LONG_NAMES, UNITS
-from .quantities import QUANTITIES
+from .quantities import OF_RIGID_BODIES, QUANTITIES
 from .trajectory import Trajectory, simulate
-from .view import AXIS, BESIDE, Motion, aside, show
+from .view import AXIS, BESIDE, Motion, aside, curve_of_rotation, show
 
 Numbers = Float[Array, " numbers"]
 
@@ -69,6 +71,10 @@ REACH = 0.5
 MOST_STEPS_OF_A_PAGE = 50_000
 
 
+#: The words for the statuses of runs that end with a reversal of the spin.
+REVERSED = {int(Status.INVERTED): "reversed", int(Status.NOT_INVERTED): "not_reversed"}
+
+
 @status_line("writing a page")
 def explore(
     scene: Scene,
@@ -79,10 +85,10 @@ def explore(
 ) -> Page:
     """Make a page with sliders that simulates the top in the browser while you move a slider. The page is one file that
     needs no network; a notebook shows the returned `Page`. The equations of motion, the Runge-Kutta pair, the step-size
-    control and the location of the event are generated from those of `inversion_table`, so times and statuses are the
-    same, at a tolerance of 1e-7. The page also computes a map of inversion times over two of the sliders; click on the
-    map to set both. The address of the page contains the slider values, so that you can copy a link to a run. Press
-    space to play or pause, and r to reset the sliders.
+    control and the location of the event are generated from those of `inversion_table`, or, under `NoSlip`, of
+    `reversal_table`, so times and statuses are the same, at a tolerance of 1e-7. The page also computes a map of these
+    times over two of the sliders; click on the map to set both. The address of the page contains the slider values, so
+    that you can copy a link to a run. Press space to play or pause, and r to reset the sliders.
 
     **Arguments:**
 
@@ -91,7 +97,7 @@ def explore(
     - `path`: file to write the page to, or `None`.
     - `sliders`: name of a parameter -> (lowest, highest) value. The end of a name is enough if only one parameter
       matches, such as "theta", "spin", "mu", "friction.mu" or "offset". By default theta, spin, the coefficient of
-      friction and, for a top without a stem, the offset.
+      friction and, for a top without a stem, the offset; under `NoSlip` theta and spin in both senses.
     - `t1`: horizon [s].
 
     **Returns:** a `Page`, with its `html`.
@@ -124,7 +130,8 @@ def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float
     """The contents of the page. **Arguments:** as for `explore`."""
     check_run(scene, launch, t1, TOLERANCE)
     check_modes(scene)
-    check_revolution(scene, "explore")
+    if reverses(scene):
+        check_reversible(launch, {})
     roots = {"scene": scene, "launch": launch}
     ranges = default_ranges(scene, launch) if sliders is None else sliders
     # The stem's end counts from the centre of mass: moving that would change the shape.
@@ -137,19 +144,22 @@ def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float
 
     def allowed(values: Numbers) -> Bool[Array, ""]:
         scene, launch = modules(values)
-        return jnp.all(legal((*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch))))
+        may = jnp.all(legal((*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch))))
+        return may & (scene.dynamics.normal_spin(scene.state(launch)) != 0.0) if reverses(scene) else may
 
-    settings = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE)
+    settings, quantities = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE), QUANTITIES | OF_RIGID_BODIES
     answer, motion = (hybrid_simulators if flies(scene) else smooth_simulators)(modules, float(t1), settings)
     return LiveRun(
-        title=f"Tippe top on a {type(scene.surface).__name__.lower()}",
+        title=f"{'Rigid body' if is_rigid(scene) else 'Tippe top'} on a {type(scene.surface).__name__.lower()}",
         sliders=knobs,
         allowed=allowed,
-        answer=Answer("inversion time", "s", answer),
+        answer=Answer("reversal time", "s", answer, REVERSED)
+        if reverses(scene)
+        else Answer("inversion time", "s", answer),
         motion=motion,
         summaries=tuple(
-            Summary(QUANTITIES[name].long_name, readable_unit(QUANTITIES[name].unit), row)
-            for row, name in enumerate(("energy", "jellett"), start=1)
+            Summary(quantities[name].long_name, readable_unit(quantities[name].unit), row)
+            for row, name in enumerate(("energy", "normal_spin" if is_rigid(scene) else "jellett"), start=1)
         ),
     )
 
@@ -164,9 +174,24 @@ def smooth_simulators(
 
     asked = {"outcome": lambda values, problem, lane: outcome(problem, lane)}
     return (
-        Simulator(lambda values: InversionProblem.of(*modules(values), ANGLE, 1), t1, settings, asked),
+        Simulator(lambda values: event_problem(*modules(values)), t1, settings, asked),
         Simulator(lambda values: trajectory_problem(modules(values), 1), t1, settings, {"frame": moment}),
     )
+
+
+def event_problem(scene: Scene, launch: Launch) -> InversionProblem:
+    """The motion up to the inversion, or, without slip, to the reversal of the spin."""
+    return InversionProblem.of(scene, launch, None if reverses(scene) else ANGLE, 1)
+
+
+def is_rigid(scene: Scene) -> bool:
+    """Whether the body has any shape and inertia."""
+    return isinstance(scene.body, AbstractRigidBody)
+
+
+def reverses(scene: Scene) -> bool:
+    """Whether the page shows times of reversal: a body that rolls keeps its energy, so it does not invert."""
+    return isinstance(scene.friction, NoSlip)
 
 
 def hybrid_simulators(
@@ -215,6 +240,11 @@ def has_stem(scene: Scene) -> bool:
 def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float]]:
     """The default sliders: theta, spin, friction, and the offset of a top without a stem, around their own values."""
     theta, spin = float(launch.theta), float(launch.spin)
+    if reverses(scene):
+        return {
+            "theta": (0.25 * theta, 4.0 * theta) if theta > 0.0 else (0.0, 0.1),
+            "spin": (-1.4 * abs(spin), 1.4 * abs(spin)),
+        }
     ranges = {"theta": (min(0.02, theta), max(0.6, theta)), "spin": tuple(sorted((0.4 * spin, 1.4 * spin)))}
     if spin == 0.0:
         ranges["spin"] = (0.0, 200.0)
@@ -324,6 +354,6 @@ def frame(scene: Scene, run: Any) -> Frame:
             (centre, motion.angular_velocity),
             (centre, motion.angular_momentum),
         ),
-        curves=(motion.theta, motion.energy, motion.jellett, motion.normal_force),
+        curves=(motion.theta, motion.energy, curve_of_rotation(scene, motion)[1], motion.normal_force),
         turning_rate=jnp.linalg.norm(motion.angular_velocity),
     )

@@ -10,17 +10,17 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
 
 from nonholonomic.derivatives import exponent_of, growth
-from nonholonomic.geometry import cross
+from nonholonomic.geometry import cross, vector_of
 from nonholonomic.integration import LEFT_DOMAIN, REACHED_END, Settings, explicit_tableau, tolerance_bound
 from nonholonomic.progress import status_line
 from nonholonomic.validation import require, require_kind
 
 from ..model.dynamics import LOSSES, NO_COSINE
 from ..model.launch import Launch
+from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
 from ..model.state import joined, parts
 from ..modes.inversion_problem import InversionProblem
-from .checks import check_revolution
 from .run_kind import run_kind_of
 
 #: Number of time intervals with recorded growth; half of them give the exponent and its scatter.
@@ -99,7 +99,6 @@ def lyapunov_exponent(
     """
     require_kind(scene, "scene", Scene)
     require_kind(launch, "launch", Launch)
-    check_revolution(scene, "lyapunov_exponent")
     if not run_kind_of(scene).smooth:
         raise ValueError(
             "contact = 'hybrid' and SetValuedCoulomb have no exponents: variations end at a change of mode"
@@ -117,7 +116,7 @@ def lyapunov_exponent(
     problem = InversionProblem.of(scene, launch, jnp.pi, cells)
     # A turning frame turns by a different angle for each launch, and the difference would count as divergence.
     problem = dataclasses.replace(problem, dynamics=scene.dynamics, cos_angle=jnp.asarray(NO_COSINE))
-    growths = growth(problem, _direction(scene, launch, cells), float(t1), STRETCHES, settings)
+    growths = growth(problem, generic_direction(scene, launch, cells), float(t1), STRETCHES, settings)
     exponent, error = exponent_of(growths.logarithm, float(t1))
     whole = growths.status == REACHED_END
     lost = np.array([status.word for status in LOSSES])[np.asarray(problem.dynamics.loss(jnp.asarray(growths.state)))]
@@ -137,12 +136,17 @@ def lyapunov_exponent(
     )
 
 
-def _direction(scene: Scene, launch: Launch, cells: int) -> Float[Array, "components cells"]:
-    """A generic direction, tangent to the set of states: axis and vertical keep length 1."""
-    magnitudes = scene.scales(launch)
+def generic_direction(scene: Scene, launch: Launch, cells: int) -> Float[Array, "components cells"]:
+    """A generic direction, tangent to the set of states: the body's axes keep their length and right angle, and the
+    vertical keeps length 1; a body that rolls keeps rolling."""
+    magnitudes, state = scene.scales(launch), scene.state(launch)
     u1, u2, r1, r2, r3, *L = (magnitudes[i] * jnp.cos(1.0 + i) for i in range(8))
-    e = parts(scene.state(launch)).axis
+    _, e, _, last = parts(state)
     frame, (place, _) = scene.frame, scene.start(launch)
     place = frame.frame_motion(place, (scene.body.size, scene.body.size)).place_rate
-    direction = joined((u1, u2), cross((r1, r2, r3), e), tuple(L), place)
+    rigid = isinstance(scene.body, AbstractRigidBody)
+    x_axis = cross((r1, r2, r3), vector_of(last[-3:])) if rigid else ()
+    direction = joined((u1, u2), cross((r1, r2, r3), e), tuple(L), place, x_axis)
+    if rigid:
+        direction = jax.jvp(scene.dynamics.carried_along, (state,), (direction,))[1]
     return jnp.broadcast_to(direction.reshape(len(direction), -1), (len(direction), cells))

@@ -34,7 +34,7 @@ from ..model.body import AbstractBody
 from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
 from ..model.top import Top
-from .quantities import QUANTITIES
+from .quantities import OF_RIGID_BODIES, QUANTITIES
 
 #: Approximate angle [rad] by which the top turns from frame to frame, and the greatest number of frames.
 TURN_PER_FRAME = 0.4
@@ -157,9 +157,19 @@ def show(scene: Scene, motion: Motion[np.ndarray], number: int, name: str) -> Sh
         arrows(motion, float(body.offset) if isinstance(body, Top) else 0.0, radius, weight),
         (
             Curve("θ, normal to axis [rad]", motion.theta),
-            *(Curve(QUANTITIES[name].label, getattr(motion, name)) for name in ("energy", "jellett", "normal_force")),
+            Curve(QUANTITIES["energy"].label, motion.energy),
+            Curve(*curve_of_rotation(scene, motion)),
+            Curve(QUANTITIES["normal_force"].label, motion.normal_force),
         ),
     )
+
+
+def curve_of_rotation(scene: Scene, motion: Motion[Any]) -> tuple[str, Any]:
+    """Label and values of the curve of the rotation: Jellett's quantity, or, for a body of any shape and inertia, the spin
+    about the normal."""
+    if isinstance(scene.body, AbstractRigidBody):
+        return OF_RIGID_BODIES["normal_spin"].label, (motion.angular_velocity * motion.normal).sum(axis=-1)
+    return QUANTITIES["jellett"].label, motion.jellett
 
 
 def arrows(motion: Motion[np.ndarray], offset: float, radius: float, weight: float) -> tuple[Arrow, ...]:

@@ -208,7 +208,7 @@ def jellett_rate(scene: Scene[Top], state: JellettState, jellett: Float[Array, "
     """Routh's equation for theta, with beta1 driven by friction and phi' from Jellett's constant.
 
     d/dt dR/dtheta' - dR/dtheta = N f_x (a cos(theta) - R), beta1' = N f_y R sin(theta), and
-    N = m (g + a (theta'' sin(theta) + theta'^2 cos(theta))), which holds (12) of the paper on the plane.
+    N = m (g + a (theta'' sin(theta) + theta'^2 cos(theta))), which is (12) of the paper on the plane.
 
     **Arguments:**
 

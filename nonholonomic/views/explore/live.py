@@ -1,8 +1,9 @@
 """A page with sliders: its contents, and how they are combined into one file."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.resources import files
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -25,12 +26,14 @@ class Answer(NamedTuple):
     """The result of a run, which the page also shows as a map: its `label` and `unit`, and the `simulator` that
     computes it.
 
-    The simulator has the reading "outcome": the `Status` of the run, and the result, or infinity.
+    The simulator has the reading "outcome": the `Status` of the run, and the result, or infinity. `words` are those of
+    statuses that have other words than their own.
     """
 
     label: str
     unit: str
     simulator: Simulator | HybridSimulator
+    words: Mapping[int, str] = MappingProxyType({})
 
 
 class Summary(NamedTuple):
@@ -80,7 +83,7 @@ def programs(live: LiveRun) -> str:
     values = jnp.array([slider.value for slider in live.sliders])
     facts = {
         "sliders": [slider._asdict() for slider in live.sliders],
-        "words": {int(status): status.word for status in Status},
+        "words": {int(status): status.word for status in Status} | dict(live.answer.words),
         "answer": {"label": live.answer.label, "unit": live.answer.unit},
         "summaries": [summary._asdict() for summary in live.summaries],
         "layout": _layout(live.motion, values),

@@ -5,7 +5,7 @@ function makeMap(box, live, integrator, choose) {
   const across = 40, up = 30, levels = [8, 4, 2, 1], chunk = 24;
   const { sliders, words, answer } = live.facts;
   const [canvas, legend, selects] = [box.querySelector("canvas"), box.querySelector("#legend"), box.querySelectorAll("select")];
-  const colours = { not_inverted: "#dde1e6", completed: "#dde1e6", contact_lost: "#e9a23b", failed: "#c8412b", jammed: "#8c5a3c",
+  const colours = { not_inverted: "#dde1e6", not_reversed: "#dde1e6", completed: "#dde1e6", contact_lost: "#e9a23b", failed: "#c8412b", jammed: "#8c5a3c",
     does_not_fit: "#7b4fa3", unresolved: "#c8412b", rank_lost: "#7b4fa3", illegal: "#ffffff" };
   const stops = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
 
