@@ -19,8 +19,19 @@ _ending = threading.Lock()
 
 
 def import_quietly() -> None:
-    """End the process with one line instead of a traceback if Ctrl-C arrives while `python -m` imports the packages."""
+    """End the process with one line instead of a traceback if Ctrl-C arrives while `python -m` imports the packages.
+
+    A `KeyboardInterrupt` would be lost if it arrived during garbage collection, where JAX calls back into Python.
+    """
     program, shown = sys.orig_argv[sys.orig_argv.index("-m") + 1], sys.excepthook
+
+    def end(number: int, frame: Any) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        _end(f"python -m {program}: interrupted")
+
+    # A shell may have told this process to ignore the signal.
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, end)
 
     def hook(kind: type[BaseException], error: BaseException, trace: Any) -> None:
         if issubclass(kind, KeyboardInterrupt):
@@ -72,6 +83,8 @@ def interruptible(main: Callable[[], int], program: str) -> int:
 
     **Returns:** the exit status of `main`.
     """
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     watched, written = os.pipe()
     os.set_blocking(written, False)
     signal.set_wakeup_fd(written)
