@@ -149,7 +149,7 @@ def _put(array: "h5py.Dataset", values: Values, shape: tuple[int, ...], first: i
     for box in boxes(shape, first, end):
         sizes = [part.stop - part.start for part in box]
         stop = start + int(np.prod(sizes, dtype=int))
-        array[box] = values[start:stop].reshape(*sizes, *values.shape[1:])
+        array[box] = values[start:stop].reshape((*sizes, *values.shape[1:]))
         start = stop
 
 

@@ -206,3 +206,14 @@ def test_a_file_has_one_writer(rutstam_scene_module, tmp_path):
         table = tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
     assert (table.status == "not_inverted").all()
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_table_of_one_cell_is_written_and_read(rutstam_scene_module, tmp_path):
+    """Without lists a table has no axes; the second call reads the file and computes nothing."""
+    path = tmp_path / "one.h5"
+    written, again = (
+        tippe.inversion_table(rutstam_scene_module, theta=0.1, spin=110.0, t1=12.0, path=path) for _ in range(2)
+    )
+    table = tippe.Table.load(path)
+    assert table.time.shape == ()
+    assert float(table.time) == float(written.time) == float(again.time) < 12.0
