@@ -133,6 +133,14 @@ REFUSED = {
         "this is a batch of runs, with t of shape (2, 51), and to_table takes",
     ),
     "a batch for a page": (lambda: batch(2, 51).view(), "and a picture takes one run: select one by jax.tree.map"),
+    "a plot of a quantity": (
+        lambda: run_of_nothing().plot("theta"),
+        "others = 'theta' must be a list of runs, such as [run]",
+    ),
+    "a plot beside a number": (
+        lambda: run_of_nothing().plot([0.3]),
+        "others[0] = 0.3 must be a run of the same package",
+    ),
     "a page that is no page": (lambda: run_of_nothing().view("x.txt"), "path = 'x.txt' must end in .html or .htm"),
     "a page without a path": (lambda: run_of_nothing().view(3), "path = 3 must be the path of a file"),
     "an unknown variable to draw": (

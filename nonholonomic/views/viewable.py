@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..progress import status_line
-from ..validation import require_file, require_package
+from ..validation import require_file, require_package, shown
 from .animation import draw_curves, write_animation
 from .page import Page, page
 from .stage import Stage
@@ -42,7 +42,7 @@ class Viewable(abc.ABC):
         require_package("jupyter_threejs_sage", "view", "view")
         if path is not None:
             require_file(path, "path", ".html", ".htm")
-        stages = self.stages(others, overlaid)
+        stages = self._stages(others, overlaid)
         html_page = page(stages, "; ".join(stage.title for stage in stages), speed=0.5)
         if path is not None:
             html_page.save(path)
@@ -64,7 +64,7 @@ class Viewable(abc.ABC):
         """
         require_package("matplotlib", "plot", "animate")
         require_file(path, "path", ".gif", ".mp4")
-        write_animation(self.stages(others, overlaid), path, None if times is None else np.asarray(times, dtype=float))
+        write_animation(self._stages(others, overlaid), path, None if times is None else np.asarray(times, dtype=float))
 
     @status_line("drawing")
     def plot(self, others: Sequence[Any] = ()) -> Any:
@@ -79,4 +79,17 @@ class Viewable(abc.ABC):
         **Example:** `examples/a_page.py`.
         """
         require_package("matplotlib", "plot", "plot")
-        return draw_curves(self.stages(others))
+        return draw_curves(self._stages(others))
+
+    def _stages(self, others: Sequence[Any], overlaid: bool = False) -> list[Stage]:
+        """The stages, after a check that the others are runs of the same package."""
+        if isinstance(others, Viewable):
+            raise ValueError("others = a run must be a list of runs: write others=[run]")
+        if not isinstance(others, list | tuple):
+            raise ValueError(f"others = {shown(others)} must be a list of runs, such as [run]")
+        for k, other in enumerate(others):
+            if getattr(type(other), "stages", None) is not type(self).stages:
+                raise ValueError(
+                    f"others[{k}] = {shown(other)} must be a run of the same package, as simulate returns it"
+                )
+        return self.stages(others, overlaid)
