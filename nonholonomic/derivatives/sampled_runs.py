@@ -212,7 +212,8 @@ class BlockSampling(AbstractSampling):
         return self if quadratures else dataclasses.replace(self, alone=True)
 
     def _builder(self, leaves: tuple[Array, ...]) -> tuple[Callable[..., AbstractProblem], Any, Any, Settings]:
-        """(the modules' numbers, cells) -> the problem; these numbers; times, horizon and tolerance; and the settings."""
+        """A function (the modules' numbers, cells) -> problem; the modules' numbers; times, horizon and tolerance; the
+        settings."""
         numbers, arguments, spec = self._sorted(leaves)
 
         def build(numbers: tuple[Array, ...], cells: int | None) -> AbstractProblem:

@@ -40,7 +40,7 @@ class AbstractSampling(AbstractDifferentiableSolve):
         return jnp.isnan(value)
 
     def _sorted(self, leaves: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, Array, Array], ProblemSpec]:
-        """The modules' numbers; times, horizon and tolerance; and the whole spec."""
+        """Split the leaves into the modules' numbers; times, horizon and tolerance; and the whole spec."""
         numbers, (times, t1, tolerance, *held) = leaves[: self.movable], leaves[self.movable :]
         return numbers, (times, t1, tolerance), eqx.combine(self.spec, jax.tree.unflatten(self.places, held))
 

@@ -277,8 +277,8 @@ def identifiability(problem: Problem, estimates: Any, slopes: Any, jacobian: Any
 
 
 def _in_words(problem: Problem, direction: Float[np.ndarray, " unknowns"]) -> str:
-    """The parameters that change together: per cent of a parameter that cannot be negative, otherwise hundredths of its
-    unit."""
+    """The parameters that change together: in per cent if a parameter cannot be negative, otherwise in hundredths of
+    its unit."""
     most = np.argmax(np.abs(direction))
     parts = []
     for share, (name, free) in zip(direction / direction[most], problem.free, strict=True):

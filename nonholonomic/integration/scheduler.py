@@ -30,8 +30,8 @@ Numbers = TypeVar("Numbers", Array, np.ndarray)
 #: missed as many steps, so the loss is at most twice the loss of the best choice.
 REFILL = 0.25
 
-#: How far ahead the direction of motion is evaluated, in first steps; and the fraction of the change until then below
-#: which a start counts as a zero.
+#: Time at which the direction of motion is evaluated, in units of the first step; and the fraction of a function's
+#: change until then below which the function counts as zero at the start.
 SOON, AT_ZERO = 1e-2, 1e-6
 
 

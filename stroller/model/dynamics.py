@@ -315,6 +315,6 @@ class Dynamics(eqx.Module):
 
 
 def padded(components: State) -> Vector:
-    """Components as a vector; missing components at the end vanish identically."""
+    """A vector made from its components; missing components at the end vanish identically."""
     vector = (*components, None, None)
     return vector[0], vector[1], vector[2]

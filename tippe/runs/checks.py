@@ -25,7 +25,7 @@ from ..model.scene import Scene
 def permitted(
     structure: Any, unchecked: bool, leaves: Sequence[Float[Array, "..."]]
 ) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, ""]]:
-    """Which cells have legal numbers; the horizons, 0 for the others; and the tolerance of the ensemble.
+    """A mask of the cells with legal numbers; the horizons, 0 for all other cells; and the tolerance of the ensemble.
 
     The whole ensemble has a single tolerance: the smallest of a batch.
 

@@ -134,7 +134,7 @@ def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float
         check_reversible(launch, {})
     roots = {"scene": scene, "launch": launch}
     ranges = default_ranges(scene, launch) if sliders is None else sliders
-    # The stem's end counts from the centre of mass: moving that would change the shape.
+    # The position of the stem's end is relative to the centre of mass, so another offset would change the shape.
     drawn = ("scene.body.stem.", "scene.body.offset") if has_stem(scene) else ()
     knobs = sliders_of(ranges, roots, LONG_NAMES, UNITS | scene.body.units | scene.friction.units, drawn)
 
