@@ -397,4 +397,4 @@ def growth_rate(matrix: Float[Array, "k k"]) -> Float[Array, ""]:
 
 def _on_a_plane(scene: Scene) -> None:
     if not isinstance(scene.surface, Plane):
-        raise ValueError(f"surface = {scene.surface!r} must be a Plane: elsewhere no top tumbles steadily")
+        raise ValueError(f"surface = {scene.surface!r} must be a Plane: on other arenas, no top tumbles steadily")

@@ -103,8 +103,7 @@ class Checkpoints(NamedTuple):
         return self._replace(depth=self.depth - drop)
 
     def added(self, index: Int[Array, ""], progress: Progress, add: Bool[Array, ""]) -> "Checkpoints":
-        """Add a checkpoint if `add` is true; if all slots are full, drop the checkpoint whose neighbours are closest.
-        """
+        """Add a checkpoint if `add` is true; if all slots are full, drop the checkpoint whose neighbours are closest."""
         position = jnp.arange(KEPT)
         full = self.depth == KEPT
         following = jnp.where(position == KEPT - 1, index, jnp.roll(self.index, -1))

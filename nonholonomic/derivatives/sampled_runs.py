@@ -109,8 +109,8 @@ def _at_times(
     modules: Any,
     build: Build,
 ) -> Float[Array, "times rows"]:
-    """The samples themselves, shifted along the field by a variation of their times: the core components, or, where
-    these are passed too, the passive quadratures.
+    """The samples themselves, differentiable with respect to their times, along the field. The samples are the core
+    components; if `leading` passes these, they are the passive quadratures.
     """
     return samples
 

@@ -24,7 +24,7 @@ class ProblemSpec(eqx.Module):
     grid: Float[Array, " steps"] | None
 
     def built(self, numbers: tuple[Array, ...], extra: Any) -> Any:
-        """Build the problem from the modules with other numbers, and from the extra argument of `build`."""
+        """Build the problem from the modules, with their numbers replaced, and from the extra argument of `build`."""
         return self.build(eqx.combine(jax.tree.unflatten(self.structure, numbers), self.rest), extra)
 
 

@@ -22,7 +22,7 @@ NO_SLOPE = 1e-7
 #: A combination of parameters counts as undetermined if its relative error exceeds this.
 UNSEEN = 1.0
 
-#: Number of rows of the residual table, and of unknowns of a combination, in a summary.
+#: Greatest number of rows of the residual table in a summary, and least share of a parameter that a combination lists.
 MOST_ROWS, LEAST_SHARE = 24, 0.02
 
 

@@ -111,7 +111,7 @@ def check_reversible(launch: Launch, values: dict[str, Any]) -> None:
     """
     spin = values.get("launch.spin", launch.spin)
     if launch.angular_velocity is None and not is_traced(spin) and np.any(np.asarray(spin) == 0.0):
-        raise ValueError("spin = 0.0 must not be zero: the time of reversal is that of a spin that changes its sign")
+        raise ValueError("spin = 0.0 must not be zero: a spin of zero cannot reverse")
 
 
 def check_event(angle: Any, crossing: Any, known: tuple[str, ...] = ("first", "last")) -> None:
