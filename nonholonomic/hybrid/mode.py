@@ -60,7 +60,7 @@ class Transition(NamedTuple, Generic[Numbers]):
 class AbstractBatchedMode(eqx.Module):
     """One mode of a hybrid system. Its leaves are scalars, or hold one number per cell in their last axis.
 
-    **Example:** the mode of the room's example, at its start.
+    **Example:** the mode of the subpackage's example, at its start.
 
     >>> print(modes[0].problem(start).field(0.0, start)[1])
     [-9.81 -9.81]

@@ -107,7 +107,7 @@ class Identification:
     - `verdict`: a `Verdict`, whether the fit can be believed.
     - `coordinates`, `coordinate_covariance`: estimates and covariance in the coordinates of the fit.
 
-    **Example:** the fit of the room's example.
+    **Example:** the fit of the subpackage's example.
 
     >>> fit.status, fit.degrees, list(fit.estimates)
     ('converged', 2, ['scene.rate'])

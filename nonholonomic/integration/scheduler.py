@@ -42,7 +42,7 @@ class Outcome(NamedTuple, Generic[Numbers]):
     the last event, which are equal if runs end on the event, and infinite if there was none; `end_time` [s] and `state`
     are time and state at the end of the run; `steps` counts accepted and rejected steps, `rejected` only rejected ones.
 
-    **Example:** the outcome of the room's example, whose runs end on the event.
+    **Example:** the outcome of the subpackage's example, whose runs end on the event.
 
     >>> from nonholonomic.integration import CROSSED
     >>> print(outcome.status == CROSSED, outcome.state.shape)

@@ -82,7 +82,7 @@ class Power(NamedTuple):
 
 
 class Dynamics(eqx.Module):
-    """A scene with its choices resolved.
+    """The equations of motion of a scene, for its ground, side, fork and heading.
 
     `up` has the components of the upward vertical in the ground's axes; `side` is 1 outside and -1 inside; `absolute`
     is 1 if the fork turns with the frame, otherwise `None`.

@@ -116,7 +116,7 @@ class Scene(Bounded):
 
     @property
     def dynamics(self) -> Dynamics:
-        """The equations of motion, with the scene's choices resolved."""
+        """The equations of motion for the scene's ground, side, fork and heading."""
         return Dynamics(
             body=self.body,
             surface=self.surface,

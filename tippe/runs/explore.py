@@ -218,8 +218,8 @@ def check_modes(scene: Scene) -> None:
     """Raise `ValueError` for a scene whose runs have modes that the page does not support."""
     if flies(scene) and not scene.level:
         raise ValueError(
-            f"contact = 'hybrid' must be 'stop' for explore on a {type(scene.surface).__name__}: the page supports flights over "
-            "a level Plane only; show one run with its flights by simulate(...).view()"
+            f"contact = 'hybrid' must be 'stop' for explore on a {type(scene.surface).__name__}: the page supports flights "
+            "over a level Plane only; show one run with its flights by simulate(...).view()"
         )
     if scene.friction.set_valued:
         raise ValueError(
