@@ -92,9 +92,9 @@ def parser() -> argparse.ArgumentParser:
     body.add_argument("--steering-inertia", type=float, default=0.05, help="inertia of the fork [kg m^2]")
     scene = command.add_argument_group("the scene")
     scene.add_argument(
-        "--surface", nargs="+", choices=list(GROUNDS), default=["plane", "spheroid"], help="what to ride on"
+        "--surface", nargs="+", choices=list(GROUNDS), default=["plane", "spheroid"], help="surfaces to ride on"
     )
-    scene.add_argument("--side", choices=list(CLOSED), default="inside", help="side of those that have two")
+    scene.add_argument("--side", choices=list(CLOSED), default="inside", help="side of a closed surface")
     scene.add_argument("--tilt", type=float, default=0.05, help="tilt of the plane [rad]")
     scene.add_argument("--radius", type=float, default=6.0, help="radius of the cylinder and of the sphere [m]")
     scene.add_argument("--equatorial", type=float, default=6.0, help="equatorial radius of the spheroid [m]")

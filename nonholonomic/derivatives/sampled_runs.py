@@ -109,8 +109,8 @@ def _at_times(
     modules: Any,
     build: Build,
 ) -> Float[Array, "times rows"]:
-    """The samples themselves, differentiable with respect to their times, along the field. The samples are the core
-    components; if `leading` passes these, they are the passive quadratures.
+    """The samples themselves, with derivatives with respect to their times from the field. The samples are the core
+    components or, if `leading` contains the core components, the passive quadratures.
     """
     return samples
 

@@ -330,8 +330,8 @@ def _holds(
     rates: Float[Array, "components cells"],
     lengths: Float[Array, " cells"],
 ) -> Bool[Array, " cells"] | None:
-    """Where a function of the state is positive at the start; at a zero, up to round-off, whether it is about to become
-    positive.
+    """A mask of the cells in which a function of the state is positive at the start or, if it is zero up to round-off,
+    is about to become positive.
     """
     value, zero = function(states), jnp.zeros_like(lengths)
     if value is None:
