@@ -44,7 +44,7 @@ Numbers = Float[Array, " numbers"]
 TOLERANCE = 1e-7
 DRAWN = 1e-5
 
-#: Greatest number of steps of a run in the page, some hundred milliseconds.
+#: Greatest number of steps of a run in the page; they take some hundred milliseconds.
 MOST_STEPS_OF_A_PAGE = 50_000
 
 
