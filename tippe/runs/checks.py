@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from nonholonomic.integration import legal_run, require_run
-from nonholonomic.validation import Bound, all_bounds, is_traced, legal, nan_unless, require_all
+from nonholonomic.validation import Bound, all_bounds, is_traced, legal, nan_unless, require
 from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.friction import Frictionless
@@ -116,7 +116,7 @@ def check_reversible(launch: Launch, values: dict[str, Any]) -> None:
 
 def check_event(angle: Any, crossing: Any, known: tuple[str, ...] = ("first", "last")) -> None:
     """Raise `ValueError` unless the angle is in (0, pi] and the crossing is a known word."""
-    require_all(event_bounds(angle))
+    require(angle, "angle", above=0.0, at_most=math.pi, unit="rad")
     if np.ndim(angle) != 0:
         raise ValueError(f"angle must be one number, not of shape {np.shape(angle)}")
     if crossing not in known:

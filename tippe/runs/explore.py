@@ -23,7 +23,7 @@ from nonholonomic.integration import (
 )
 from nonholonomic.parameters import numbers, readable_unit, with_numbers
 from nonholonomic.progress import status_line
-from nonholonomic.validation import all_bounds, legal
+from nonholonomic.validation import all_bounds, legal, require_file
 from nonholonomic.views import Page, Stage, arena
 from nonholonomic.views.explore import (
     Answer,
@@ -118,6 +118,8 @@ def explore(
 
     ```
     """
+    if path is not None:
+        require_file(path, "path", ".html", ".htm")
     live = live_run(scene, launch, sliders, t1)
     drawn = stage_at_start(scene, launch, t1) if flies(scene) else stage_of_runs(scene, launch, live.sliders, float(t1))
     page = live_page(live, drawn)
