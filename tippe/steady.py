@@ -176,8 +176,8 @@ def standing_state(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = Fa
 def standing_matrix(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = False) -> Float[Array, "k k"]:
     """Matrix [1/s] of the linear motion near a standing top, on any arena.
 
-    Components along n change only at second order and are omitted, as are the frame's own direction and the places that
-    a symmetry makes equivalent. A scene with `contact="hybrid"` is treated like one with "stop".
+    The matrix omits components along n, which change only at second order, the direction of the frame, and
+    displacements along which the arena is symmetric. A scene with `contact="hybrid"` is treated like one with "stop".
 
     **Arguments:** as for `standing_state`.
 
@@ -198,7 +198,7 @@ def standing_matrix(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = F
 
 
 def _places_across(scene: Scene) -> range:
-    """Which components of a state are places that differ near the arena's lowest point."""
+    """Indices of the place components that matter for the motion near the arena's lowest point."""
     count = max(len(scene.frame.place_scales(1.0)) - 1, 0)
     if isinstance(scene.frame, CarriedFrame):
         # The foot (x, y, z), whose z is along n, and the first tangent, which is only the frame's choice of axes.
@@ -356,7 +356,7 @@ def quarter_turn(state: Float[Array, " 8"]) -> Float[Array, " 8"]:
 def tumbling_matrix(scene: Scene[Top], motion: Tumbling) -> Float[Array, "5 5"]:
     """Matrix [1/s] of the linear motion near a tumbling top, in a frame that precesses with it.
 
-    The matrix covers the five directions that keep |e| and Jellett's constant, except a mere turn about the vertical.
+    The matrix covers the five directions that preserve |e| and Jellett's constant, without the turn about the vertical.
 
     **Arguments:**
 
@@ -397,4 +397,4 @@ def growth_rate(matrix: Float[Array, "k k"]) -> Float[Array, ""]:
 
 def _on_a_plane(scene: Scene) -> None:
     if not isinstance(scene.surface, Plane):
-        raise ValueError(f"surface = {scene.surface!r} must be a Plane: elsewhere no top tumbles steadily")
+        raise ValueError(f"surface = {scene.surface!r} must be a Plane: on other arenas, no top tumbles steadily")

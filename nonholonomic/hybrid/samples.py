@@ -24,7 +24,7 @@ from .saltation import VariationalMode, variational_modes, variational_start
 Build = Callable[[Any, Array], tuple[tuple[AbstractBatchedMode, ...], Array, Float[Array, "components 1"]]]
 
 
-#: In the derivative of `HybridSamples`: what has none.
+#: In the derivative of `HybridSamples`: the entries that have none.
 UNCHANGED: Any = None
 
 
@@ -76,10 +76,10 @@ def hybrid_samples(
 
     **Returns:** `HybridSamples`; the output rows and the end time have derivatives, NaN after a grazing event.
 
-    **Raises:** `ValueError` for derivatives by the times, and for second derivatives.
+    **Raises:** `ValueError` for derivatives with respect to the times, and for second derivatives.
 
-    **Example:** the height at 0.8 s, after a bounce, and its derivative by the restitution: v (t - T) with the speed v at
-    the ground, and the time T of the bounce.
+    **Example:** the height at 0.8 s, after a bounce, and its derivative with respect to the restitution: v (t - T) with
+    the speed v at the ground, and the time T of the bounce.
 
     >>> from nonholonomic.hybrid import hybrid_samples
     >>> def build(restitution, tolerance):
@@ -104,8 +104,8 @@ def _fixed(times: Float[Array, " times"]) -> Float[Array, " times"]:
 def _refused(primals: Any, tangents: Any) -> Any:
     if tangents[0] is not None:
         raise ValueError(
-            "derivatives with respect to times or t1 are not available for runs with resets; differentiate by the start or "
-            "the parameters"
+            "derivatives with respect to times or t1 are not available for runs with resets; differentiate with respect to "
+            "the start or the parameters"
         )
     return primals[0], jnp.zeros_like(primals[0])
 
@@ -199,7 +199,7 @@ def _followed(
             run, filled = carry
             at = run.mode[0]
             mode = selected(modes, numbers, at)
-            # In a batch this branch is taken for all runs: those in another mode stay in this one for no time.
+            # In a batch, all runs take this branch; runs in another mode spend no time in this one.
             since, left = times - run.end_time, jnp.where(active, greatest(t1 - run.end_time, 0.0), 0.0)
             outcome, samples = solve_with_samples(
                 mode.problem(run.state), since, left, jnp.asarray(1), settings, n_blocks=1 + count
@@ -212,7 +212,7 @@ def _followed(
 
     def reset(numbers: Sequence[int], carry: Carry, lost: Bool[Array, " 1"]) -> Carry:
         def seen(mode: AbstractBatchedMode, record: TransitionPath | None, left: Float[Array, " 1"]) -> Any:
-            # Relative to an event that is later, a fixed time comes sooner, as the horizon does.
+            # If the event happens later, less time passes from the event to a fixed time, and to the horizon.
             return None if record is None else _on_the_way(mode, record, times - t1 + left)
 
         def passed() -> Carry:
@@ -234,8 +234,8 @@ def _followed(
 
 
 def alike(modes: tuple[AbstractBatchedMode, ...]) -> list[tuple[int, ...]]:
-    """The numbers of the modes in groups. The modes of a group differ only in the values of their arrays, so they share
-    a program."""
+    """The indices of the modes, in groups. The modes of a group differ only in the values of their arrays, so they
+    share a program."""
     groups: list[list[int]] = []
     for number, mode in enumerate(modes):
         shape = _shape(mode)
@@ -281,7 +281,7 @@ def _found(
     """The samples, and their derivative along each tangent."""
     end_time, status, grazed = ended.end_time[0], ended.status[0], ended.counts[-1, 0] > 0
     late = jnp.where(times > filled.grazed, jnp.nan, 0.0)
-    # The variation of a time stands behind that of the state; a horizon does not move.
+    # The variation of the time follows that of the state; a horizon does not move.
     later = [ended.state[k * (size + 1) + size, 0] for k in range(1, count + 1)]
     later = [jnp.where(status == REACHED_END, 0.0, jnp.where(grazed, jnp.nan, delay)) for delay in later]
     numbers = (ended.mode[0], status, ended.steps[0], ended.rejected[0], ended.counts[:-1, 0])

@@ -183,7 +183,7 @@ def _mark_words(drawing: Any, table: "Table", names: list[str], words: Any) -> N
 
 
 def draw_portrait(table: "Table", x: str, y: str, ax: Any = None) -> Any:
-    """Draw one variable of a run's table over another, with a dot at the start.
+    """Draw one variable of a run's table against another, with a dot at the start.
 
     **Arguments:**
 

@@ -82,7 +82,7 @@ class Power(NamedTuple):
 
 
 class Dynamics(eqx.Module):
-    """A scene with its choices resolved.
+    """The equations of motion of a scene, for its ground, side, fork and heading.
 
     `up` has the components of the upward vertical in the ground's axes; `side` is 1 outside and -1 inside; `absolute`
     is 1 if the fork turns with the frame, otherwise `None`.
@@ -236,7 +236,8 @@ class Dynamics(eqx.Module):
         return jnp.broadcast_to(multiply(1.0, self.geometry(state).normal_force), state[0].shape)
 
     def contact_along(self, state: State, rate: State) -> Float[Array, "..."]:
-        """Like `contact`, if the field is known: it contains the velocity, which is expensive."""
+        """Like `contact`, for a known rate of the state, which contains the velocity; computing the velocity is
+        expensive."""
         place, velocity = padded(state[: self.surface.axes]), padded(rate[: self.surface.axes])
         normal = self.surface.normal(place)
         force = self.normal_force(normal, self.surface.normal_rate(place, velocity), velocity)
@@ -314,6 +315,6 @@ class Dynamics(eqx.Module):
 
 
 def padded(components: State) -> Vector:
-    """Components as a vector; missing components at the end vanish identically."""
+    """A vector made from its components; missing components at the end vanish identically."""
     vector = (*components, None, None)
     return vector[0], vector[1], vector[2]

@@ -12,6 +12,7 @@ from nonholonomic.geometry import Plane
 from nonholonomic.integration import FAILED, LEFT_DOMAIN, AbstractProblem, LaneState, Settings, Status
 from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.progress import status_line
+from nonholonomic.validation import require_file
 from nonholonomic.views import Page, Stage, arena
 from nonholonomic.views.explore import (
     Answer,
@@ -43,7 +44,7 @@ Numbers = Float[Array, " numbers"]
 TOLERANCE = 1e-7
 DRAWN = 1e-5
 
-#: Greatest number of steps of a run in the page, some hundred milliseconds.
+#: Greatest number of steps of a run in the page; they take some hundred milliseconds.
 MOST_STEPS_OF_A_PAGE = 50_000
 
 
@@ -92,6 +93,8 @@ def explore(
 
     ```
     """
+    if path is not None:
+        require_file(path, "path", ".html", ".htm")
     check_run(scene, launch, t1, input, TOLERANCE)
     roots: dict[str, Any] = {"scene": scene, "launch": launch}
     if isinstance(input, eqx.Module):

@@ -39,14 +39,14 @@ from .state import parts
 NO_COSINE = -2.0
 
 #: Value of `Motion.painleve_factor` at which a contact counts as jammed. N grows as its inverse, and the factor falls
-#: to zero as the square root of the remaining time, so a run ends too early by the square of this value in units of
-#: about 1e-4 s: by 1e-12 s, and 100 times as much with ten times the value, in `tests/physics/test_strong_friction.py`;
-#: theta errs by 5e-13 there, velocities by 1e-4.
+#: to zero as the square root of the remaining time, so a run ends too early by about 1e-4 s times the square of this
+#: value. In `tests/physics/test_strong_friction.py`, this is 1e-12 s, and 1e-10 s with ten times the value; there, the
+#: error of theta is 5e-13, and that of velocities 1e-4.
 JAMMED = 1e-4
 
 #: Value of `Motion.room` at which the ball no longer fits, because a curvature of the arena reaches 1/R. There the foot
-#: moves as the square root of the remaining time, so a run ends too early by the square of this value in units of about
-#: 0.1 s.
+#: moves as the square root of the remaining time, so a run ends too early by about 0.1 s times the square of this
+#: value.
 FITS = 1e-4
 
 #: Rate of a frame that turns with an inverting top, as a fraction of L_n / I1 (`Dynamics.turning`). Among 0.5, 0.7,
@@ -83,7 +83,7 @@ class Motion(NamedTuple):
 
 
 class Dynamics(eqx.Module):
-    """A scene with the combinations of its numbers that every evaluation needs, computed once.
+    """A scene, with precomputed combinations of its numbers that every evaluation needs.
 
     `turns` is the additional rate of the frame about n, as a fraction of L_n / I1; `None` if there is none.
     """
@@ -135,15 +135,15 @@ class Dynamics(eqx.Module):
         - `state`: (8 + the arena's place, ...) as `state.py` describes it.
 
         **Returns:** a `Motion`; `rate` is (m/s^2, 1/s, N m, 1/s). Source: `tippe.md`, section 2 (i)-(iii); for other
-        bodies on the plane with the A and B of `body.py` for a and R, and the height's second rate H' c'' + H'' c'^2 in
-        N.
+        bodies on the plane, with the A and B of `body.py` in place of a and R, and with the second derivative of the
+        height, H' c'' + H'' c'^2, in N.
         """
         (u1, u2), e, L, place = parts(state)
         a, R, coupling, growth = self.meridian.at(e[2])
 
-        # The axis turns with the body. V is the velocity of the centre of the sphere that touches as the body does, o
-        # the rate at which the frame turns. The frame moves with this centre, or, if the sphere changes, with the point
-        # below it.
+        # The axis turns with the body. V is the velocity of the centre of a sphere that would touch the arena like the
+        # body, and o the rate at which the frame turns. The frame moves with the point at the height `size` above the
+        # contact, whose velocity is `path`.
         e_dot = scale(self.per_transverse, cross(L, e))
         V = (u1 + a * e_dot[0], u2 + a * e_dot[1])
         changing = multiply(growth, e_dot[2])

@@ -230,7 +230,7 @@ class AbstractRigidDynamics(eqx.Module):
         frame.
         """
         zero = jnp.zeros_like(launch.theta)
-        # The body's axes are those of the frame, rotated without rotation about n until z is e.
+        # The body's axes are those of the frame, rotated about a direction across n, so that z becomes e.
         x, y = jnp.cos(launch.azimuth), jnp.sin(launch.azimuth)
         fall = 1.0 - axis[2]
         c = (1.0 - fall * x * x, -fall * x * y, -axis[0])
@@ -356,7 +356,7 @@ class RollingDynamics(AbstractRigidDynamics):
         (u1, u2), e, _, place = parts(state)
         attitude = self.attitude(state)
         r, w, m = attitude.lever, attitude.turning, self.body.mass
-        # Seen by the body: the velocity u of the centre of mass, and v.
+        # In the body's axes: the velocity u of the centre of mass, and v.
         u = attitude.in_body((u1, u2, -dot(w, cross(r, attitude.normal))))
         v = attitude.in_body((slip.x, slip.y, None))
         jump = vector_of(sum_vectors(v, scale(-1.0, u)))

@@ -40,8 +40,8 @@ BOTH = 2
 
 #: A contact ends when its normal force is below minus this fraction of the weight. A top that begins to roll on its
 #: sphere presses its stem less and less, but never lifts it; without this margin, errors of a nearly zero force would
-#: determine the step lengths. Ending the contact late changes velocities by the square of this: a tenfold or a tenth of
-#: the value changes an inversion time by 4e-16.
+#: determine the step lengths. Ending the contact late changes velocities by the square of this value: ten times or a
+#: tenth of it changes an inversion time by 4e-16.
 HOLDS = 1e-8
 
 #: Where m_1 - m_0 is less than this fraction of its value without friction, rigid-body mechanics does not determine the
@@ -190,7 +190,7 @@ def at_rest(body: Top, free: FreeBody) -> FreeBody:
 
     theta becomes the angle at which both spheres touch, and L loses its component along n x e, which changes theta, as
     by impulses along the normal at both spheres. L.n, L.e, Jellett's quantity of either sphere and the slip do not
-    change; the energy decreases by that of the removed motion.
+    change; the energy decreases by the energy of the removed motion.
     """
     main, stem = balls(body)
     e, L = free.axis, free.momentum

@@ -284,7 +284,7 @@ def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[Sta
     """In both arenas, the most upright launch that turns over without losing contact, or else the first launch that
     turns over."""
     ends = np.stack([table.last_time.reshape(len(options.theta), -1)[:, 0] for table in by_arena.values()]).max(axis=0)
-    # No longer than the spin can be followed from sample to sample.
+    # In a longer run, the samples would be too far apart to follow the spin.
     longest = SAMPLES / max(abs(spin_of(options, scene)) for scene in scenes(options).values())
     tilt = np.where(ends + 0.5 <= longest, options.theta, np.inf)
     row = int(np.argmin(tilt if np.isfinite(tilt).any() else ends))

@@ -23,7 +23,7 @@ from nonholonomic.integration import (
 )
 from nonholonomic.parameters import numbers, readable_unit, with_numbers
 from nonholonomic.progress import status_line
-from nonholonomic.validation import all_bounds, legal
+from nonholonomic.validation import all_bounds, legal, require_file
 from nonholonomic.views import Page, Stage, arena
 from nonholonomic.views.explore import (
     Answer,
@@ -67,7 +67,7 @@ DRAWN = 1e-5
 #: Drawn radius of a level plane about the start of a run with flights, in units of sqrt(g R) t1.
 REACH = 0.5
 
-#: Greatest number of steps of a run in the page, some hundred milliseconds.
+#: Greatest number of steps of a run in the page; they take some hundred milliseconds.
 MOST_STEPS_OF_A_PAGE = 50_000
 
 
@@ -118,6 +118,8 @@ def explore(
 
     ```
     """
+    if path is not None:
+        require_file(path, "path", ".html", ".htm")
     live = live_run(scene, launch, sliders, t1)
     drawn = stage_at_start(scene, launch, t1) if flies(scene) else stage_of_runs(scene, launch, live.sliders, float(t1))
     page = live_page(live, drawn)
@@ -134,7 +136,7 @@ def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float
         check_reversible(launch, {})
     roots = {"scene": scene, "launch": launch}
     ranges = default_ranges(scene, launch) if sliders is None else sliders
-    # The stem's end counts from the centre of mass: moving that would change the shape.
+    # The position of the stem's end is relative to the centre of mass, so another offset would change the shape.
     drawn = ("scene.body.stem.", "scene.body.offset") if has_stem(scene) else ()
     knobs = sliders_of(ranges, roots, LONG_NAMES, UNITS | scene.body.units | scene.friction.units, drawn)
 
@@ -185,7 +187,7 @@ def event_problem(scene: Scene, launch: Launch) -> InversionProblem:
 
 
 def is_rigid(scene: Scene) -> bool:
-    """Whether the body has any shape and inertia."""
+    """Whether the body is an `Ellipsoid` or a `RigidBody`."""
     return isinstance(scene.body, AbstractRigidBody)
 
 
@@ -218,8 +220,8 @@ def check_modes(scene: Scene) -> None:
     """Raise `ValueError` for a scene whose runs have modes that the page does not support."""
     if flies(scene) and not scene.level:
         raise ValueError(
-            f"contact = 'hybrid' must be 'stop' for explore on a {type(scene.surface).__name__}: the page knows flights over a "
-            "level Plane only; show one run with its flights by simulate(...).view()"
+            f"contact = 'hybrid' must be 'stop' for explore on a {type(scene.surface).__name__}: the page supports flights "
+            "over a level Plane only; show one run with its flights by simulate(...).view()"
         )
     if scene.friction.set_valued:
         raise ValueError(
@@ -294,7 +296,7 @@ def stage_at_start(scene: Scene[Top], launch: Launch, t1: float) -> Stage:
     """A top on a level plane at its launch; the page replaces it by a simulated run before it is visible."""
     start = Motion(*(np.repeat(np.asarray(part), 2, axis=0) for part in _motion_at_start(scene, launch)))
     drawn, size = show(scene, start._replace(times=np.array([0.0, 1.0])), 0, ""), float(scene.body.size)
-    # Slips grow as the top rises: an arrow half as fast as the equator has the greatest length.
+    # Slips grow as the top rises; a slip at half the speed of the equator gets the longest arrow.
     normal_force, slip, *others = drawn.arrows
     assert slip.limit is not None
     fastest = 0.5 * size * float(np.linalg.norm(start.angular_velocity[0]))
