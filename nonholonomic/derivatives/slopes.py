@@ -121,8 +121,10 @@ def _slopes_by_adjoint(
 
 
 def _mixed(tangents: tuple[Any, ...]) -> Any:
-    """A mixture of some tangents, with shares that are unlikely to cancel."""
-    shares = [0.5 + math.modf(0.618 * k)[0] for k in range(len(tangents))]
+    """A mixture of some tangents, with shares that are unlikely to cancel. The mixture is about as large as each tangent,
+    so that steps are as short as for one tangent.
+    """
+    shares = [(0.5 + math.modf(0.618 * k)[0]) / len(tangents) for k in range(len(tangents))]
     return jax.tree.map(lambda *rates: sum(c * rate for c, rate in zip(shares, rates, strict=True)), *tangents)
 
 
