@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..integration import AbstractProblem, LaneScheduler, Outcome, crossing_time
+from ..integration import AbstractProblem, Outcome, crossing_time
+from ..integration.scheduler import LaneScheduler
 
 #: Tangents integrated together: two take 0.6 to 1.0 times as long as one after the other, and an eighth longer to
 #: compile; four take 1.1 times as long as two pairs.

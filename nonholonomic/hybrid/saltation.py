@@ -25,8 +25,8 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from ..derivatives.slopes import tangents_of
-from ..derivatives.variation import VariationalProblem, in_groups, where_active
+from ..derivatives import VariationalProblem, in_groups, tangents_of
+from ..derivatives.variation import where_active
 from ..integration import (
     CROSSED,
     REACHED_END,

@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..derivatives.differentiable import tangents_by
+from ..derivatives import in_groups, tangents_by
 from ..derivatives.sampling import AbstractSampling, ProblemSpec, solve_for_samples
-from ..derivatives.variation import in_groups
 from ..integration import REACHED_END, Settings, solve_with_samples
 from ..xla_cpu import greatest
 from .ensemble import Carry, HybridOutcome, after_reset, after_solve, at_start, traced_rounds

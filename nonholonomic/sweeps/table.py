@@ -11,6 +11,7 @@ import numpy as np
 
 from ..parameters import as_html, readable_unit
 from ..validation import require_package
+from ..views import draw_table
 from ._chunks import unfinished
 from ._file import HELD, LONG_NAMES, Stored, StoredVariables, coded, replacing, write_file
 from .digits import concise_strings
@@ -254,8 +255,6 @@ class Table(eqx.Module):
         **Raises:** `ValueError` for a variable that is not numeric, an unknown axis, or a table of one cell.
         """
         require_package("matplotlib", "plot", "plot")
-        from ..views import draw_table
-
         return draw_table(self, variable, at or {}, log, ax)
 
     @property
