@@ -14,7 +14,7 @@ from .frames import AbstractFrame as AbstractFrame
 from .frames import FrameMotion as FrameMotion
 from .frames import PlaneFrame as PlaneFrame
 from .frames import Tangent as Tangent
-from .frames import carried as carried
+from .frames import rate_in_frame as rate_in_frame
 from .function import as_function as as_function
 from .graph import Graph as Graph
 from .graph import Paraboloid as Paraboloid

@@ -231,13 +231,13 @@ def side_slip(scene: Scene, rate: State, state: State) -> tuple[Float[Array, "..
 
     g = dynamics.geometry(state)
     velocity = dynamics.unpack(rate)[0]
-    turning = padded(jax.jvp(heading_components, (state,), (rate,))[1])
+    heading_rate = padded(jax.jvp(heading_components, (state,), (rate,))[1])
     if scene.heading == "projected":
         along, left = g.motion.heading, (-g.motion.heading[1], g.motion.heading[0], None)
     else:
         along, left = g.direction, g.left
     sideways = sum_vectors(scale(-g.sine, along), scale(g.cosine, left))
-    front = sum_vectors(velocity, scale(multiply(body.wheelbase, dot(turning, left)), left))
+    front = sum_vectors(velocity, scale(multiply(body.wheelbase, dot(heading_rate, left)), left))
     return dot(velocity, left), dot(front, sideways)
 
 

@@ -18,10 +18,10 @@ from nonholonomic.geometry import (
     Tangent,
     Vector,
     add,
-    carried,
     cross,
     dot,
     multiply,
+    rate_in_frame,
     scale,
     stacked,
     subtract,
@@ -71,7 +71,7 @@ class Motion(NamedTuple):
     friction: ContactLoad
     slip: Slip
     velocity: Tangent
-    turning: Tangent
+    frame_rate: Tangent
     spin_momentum: Float[Array, "..."]
     painleve_factor: Float[Array, "..."]
     room: Component
@@ -181,8 +181,8 @@ class Dynamics(eqx.Module):
         u3 = multiply(-a, e_dot[2]) if o != (None, None) else None
         u1_dot = add(multiply(thrust, f1), multiply(-self.gravity, up[0]), multiply(o[0], u3))
         u2_dot = add(multiply(thrust, f2), multiply(-self.gravity, up[1]), multiply(o[1], u3))
-        e_dot = sum_vectors(e_dot, carried(e, o))
-        L_dot = sum_vectors(scale(N, (M1, M2, M3)), carried(L, o))
+        e_dot = sum_vectors(e_dot, rate_in_frame(e, o))
+        L_dot = sum_vectors(scale(N, (M1, M2, M3)), rate_in_frame(L, o))
         if self.turns is not None:
             turn = self.turns * self.per_transverse * L[2]
             u1_dot, u2_dot = add(u1_dot, turn * u2), subtract(u2_dot, turn * u1)

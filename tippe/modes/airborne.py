@@ -194,8 +194,8 @@ class Flight(AbstractProblem):
 
     def field(self, time, state):
         flying, body = flight_state(state), self.scene.body
-        turning = axis_rate(body, flying.axis, flying.momentum)
-        return stacked((*flying.velocity, *self.falls, *turning, None, None, None, None, None), state)
+        e_dot = axis_rate(body, flying.axis, flying.momentum)
+        return stacked((*flying.velocity, *self.falls, *e_dot, None, None, None, None, None), state)
 
     def event_function(self, state):
         return cosine(self.scene, flight_state(state)) - self.cos_angle
@@ -215,10 +215,10 @@ class QuadraturesInFlight(AbstractPassive):
 
     def rates(self, problem, time, state, passive):
         flying = flight_state(state)
-        turning = axis_rate(self.body, flying.axis, flying.momentum)
+        e_dot = axis_rate(self.body, flying.axis, flying.momentum)
         spin = dot(flying.momentum, flying.axis) / self.body.I3
         c = vector_of(passive[:3])
-        rates = (*c_rate(c, flying.axis, dot(turning, c)), spin, None)
+        rates = (*c_rate(c, flying.axis, dot(e_dot, c)), spin, None)
         return jnp.concatenate([problem.field(time, state), stacked(rates, passive)])
 
 

@@ -61,14 +61,14 @@ class Approach(NamedTuple):
     [m/s].
 
     `response` is the symmetric matrix W with (change of that velocity) = W (impulse) [1/kg], as three columns. `axis`
-    and `turning` are the axis and the angular velocity [rad/s] of the body.
+    and `angular_velocity` are the axis and the angular velocity [rad/s] of the body.
     """
 
     arm: Vector
     velocity: Vector
     response: tuple[Vector, Vector, Vector]
     axis: Vector
-    turning: Vector
+    angular_velocity: Vector
 
 
 class ContactImpulse(NamedTuple):
@@ -113,19 +113,19 @@ class Impact(AbstractProblem):
             torque = sum_vectors(torque, blow.torque)
         return velocity, angular_velocity(self.body, meets.axis, torque)
 
-    def load(self, velocity: Vector, turning: Vector) -> ContactLoad:
+    def load(self, velocity: Vector, w: Vector) -> ContactLoad:
         """Friction force and torque per unit normal impulse."""
-        drilling = turning[2] if self.friction.uses_spin else None
-        return self.friction.per_normal_force(Slip(velocity[0], velocity[1], (turning[0], turning[1], drilling)))
+        drilling = w[2] if self.friction.uses_spin else None
+        return self.friction.per_normal_force(Slip(velocity[0], velocity[1], (w[0], w[1], drilling)))
 
     def start(self) -> tuple[Float[Array, "rows cells"], Float[Array, "rows cells"]]:
-        turns = self.load(self.approach.velocity, self.approach.turning).torque != (None, None, None)
+        turns = self.load(self.approach.velocity, self.approach.angular_velocity).torque != (None, None, None)
         none = jnp.zeros((5 if turns else 2, *self.gained.shape))
         return none, jnp.ones_like(none)
 
     def field(self, time: Cells, state: Float[Array, "rows cells"]) -> Float[Array, "rows cells"]:
-        meets, (velocity, turning) = self.approach, self.changes(self.blow(time, state))
-        load = self.load(sum_vectors(meets.velocity, velocity), sum_vectors(meets.turning, turning))
+        meets, (velocity, w) = self.approach, self.changes(self.blow(time, state))
+        load = self.load(sum_vectors(meets.velocity, velocity), sum_vectors(meets.angular_velocity, w))
         torque = scale(1.0 / self.radius, load.torque) if len(state) > 2 else ()
         rows = [jnp.zeros_like(time) if component is None else component for component in (*load.force, *torque)]
         return jnp.stack(jnp.broadcast_arrays(*rows, time)[:-1])
@@ -142,7 +142,7 @@ class Impact(AbstractProblem):
         approaches = -(self.approach.velocity[2] + change[2]) / self.speed
         gain = dot(blow.force, self.approach.velocity) + 0.5 * dot(blow.force, change)
         if blow.torque is not None:
-            gain = gain + dot(blow.torque, self.approach.turning) + 0.5 * dot(blow.torque, turned)
+            gain = gain + dot(blow.torque, self.approach.angular_velocity) + 0.5 * dot(blow.torque, turned)
         short = -gain * response[2][2] / self.speed**2
         return least(missing, jnp.where(approaches > short, approaches, short))
 
@@ -167,8 +167,8 @@ def approach(body: Top, ball: Ball, free: FreeBody) -> Approach:
         ball.offset * free.axis[1],
         ball.offset * free.axis[2] - ball.radius,
     )
-    turning = angular_velocity(body, free.axis, free.momentum)
-    velocity = sum_vectors(free.velocity, cross(turning, arm))
+    w = angular_velocity(body, free.axis, free.momentum)
+    velocity = sum_vectors(free.velocity, cross(w, arm))
     zero, unit = jnp.zeros_like(arm[0]), jnp.ones_like(arm[0])
 
     def gained(impulse: Vector) -> Vector:
@@ -176,7 +176,7 @@ def approach(body: Top, ball: Ball, free: FreeBody) -> Approach:
         return sum_vectors(scale(1.0 / body.mass, impulse), cross(turned, arm))
 
     response = (gained((unit, zero, zero)), gained((zero, unit, zero)), gained((zero, zero, unit)))
-    return Approach(arm, velocity, response, free.axis, turning)
+    return Approach(arm, velocity, response, free.axis, w)
 
 
 def resolve_impact(

@@ -93,9 +93,9 @@ class LeaningDynamics(eqx.Module):
         precession = (p - c * along) / I1
         rolling = along / I1 + (1.0 / I3 - 1.0 / I1) * b
 
-        turning = (rolling * e[0], rolling * e[1], rolling * c + precession if self.friction.uses_spin else None)
+        w = (rolling * e[0], rolling * e[1], rolling * c + precession if self.friction.uses_spin else None)
         velocities = [sum_vectors(u, scale(rolling * R + precession * a, across)) for a, R in spheres]
-        slips = [Slip(x, y, turning) for x, y in velocities]
+        slips = [Slip(x, y, w) for x, y in velocities]
         loads = [self.friction.per_normal_force(slip) for slip in slips]
         height = spheres[0].radius - spheres[0].offset * c
         m_0, m_1 = (

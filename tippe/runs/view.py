@@ -87,12 +87,12 @@ class Motion(NamedTuple, Generic[Numbers]):
         if isinstance(body, Top) and body.stem is not None:
             stem = position + (body.stem.offset - body.offset) * axis - body.stem.radius * normal
             contact = jnp.where((run.contact == 1)[:, None], stem, contact)
-        turning = run.angular_velocity
+        w = run.angular_velocity
         if isinstance(body, AbstractRigidBody):
             momentum = run.angular_momentum
         else:
-            along = jnp.sum(turning * axis, axis=-1, keepdims=True)
-            momentum = body.I1 * turning + (body.I3 - body.I1) * along * axis
+            along = jnp.sum(w * axis, axis=-1, keepdims=True)
+            momentum = body.I1 * w + (body.I3 - body.I1) * along * axis
         return Motion(
             run.t,
             position,
@@ -105,13 +105,13 @@ class Motion(NamedTuple, Generic[Numbers]):
             run.energy,
             run.jellett,
             run.normal_force,
-            turning,
+            w,
             momentum,
         )
 
 
 _motion = eqx.filter_jit(Motion.of)
-_turning = eqx.filter_jit(lambda run: jnp.linalg.norm(run.angular_velocity, axis=-1))
+_rotation_rate = eqx.filter_jit(lambda run: jnp.linalg.norm(run.angular_velocity, axis=-1))
 
 
 def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
@@ -130,7 +130,7 @@ def motion(run: Any) -> Motion[np.ndarray]:
     if run.dense is not None:
         times = np.asarray(run.t)
         # The angle about the axis is not enough: half-way up, a top turns about other directions equally fast.
-        turned_by = np.trapezoid(np.asarray(_turning(run.padded()))[: len(times)], times)
+        turned_by = np.trapezoid(np.asarray(_rotation_rate(run.padded()))[: len(times)], times)
         frames = int(np.clip(turned_by / TURN_PER_FRAME, LEAST_FRAMES, MOST_FRAMES))
         run = run.at(np.linspace(0.0, float(run.end_time), frames))
     count = len(run.t)
