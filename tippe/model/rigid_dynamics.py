@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from nonholonomic.geometry import (
     AbstractFrame,
@@ -35,15 +35,14 @@ from nonholonomic.geometry import (
     multiply,
     rate_in_frame,
     scale,
-    stacked,
     subtract,
     sum_vectors,
     vector_of,
 )
-from nonholonomic.xla_cpu import least, stored
+from nonholonomic.xla_cpu import stored
 
+from .contact_dynamics import AbstractContactDynamics, Motion
 from .contact_load import ContactLoad, Slip
-from .dynamics import FITS, JAMMED, Motion
 from .friction import AbstractFriction, NoSlip, length
 from .inertia import SymmetricMatrix
 from .launch import Launch
@@ -98,7 +97,7 @@ class ContactMotion(NamedTuple):
     frame: FrameMotion
 
 
-class AbstractRigidDynamics(eqx.Module):
+class AbstractRigidDynamics(AbstractContactDynamics):
     """A scene with a rigid body, with the precomputed combinations of its numbers; in place of `Dynamics`."""
 
     frame: eqx.AbstractVar[AbstractFrame]
@@ -124,26 +123,6 @@ class AbstractRigidDynamics(eqx.Module):
 
         **Returns:** a `Motion`, whose `spin_momentum` is the angular velocity about the body's z axis.
         """
-
-    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
-        """Like `Dynamics.margins`."""
-        motion = self.motion(state)
-        lost, jammed = motion.normal_force / (self.body.mass * self.gravity) + 1e-12, motion.painleve_factor - JAMMED
-        return (lost, jammed) if motion.room is None else (lost, jammed, motion.room - FITS)
-
-    def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-        """Rate of change of the state, (components, ...)."""
-        return stacked(self.motion(state).rate, state)
-
-    def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """The least of `margins`."""
-        return least(*self.margins(state))
-
-    def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
-        """How a contact with zero margin has ended: a code in `LOSSES`."""
-        lost, *others = self.margins(state)
-        # As in `Dynamics.loss`.
-        return len(others) - jnp.argmin(jnp.stack([*others[::-1], jnp.maximum(lost, 0.0)]), axis=0)
 
     def attitude(self, state: Float[Array, "components ..."]) -> Attitude:
         """The attitude and rotation of the body, and its contact point."""
@@ -245,7 +224,7 @@ class AbstractRigidDynamics(eqx.Module):
         return state
 
 
-class SlippingDynamics(AbstractRigidDynamics):
+class RigidSlipping(AbstractRigidDynamics):
     """The equations of motion under a friction law that determines the force from the slip."""
 
     frame: AbstractFrame
@@ -294,7 +273,7 @@ class SlippingDynamics(AbstractRigidDynamics):
         return Motion(rates, N, friction, slip, contact.along, o, attitude.angular_velocity[2], painleve_factor, room)
 
 
-class RollingDynamics(AbstractRigidDynamics):
+class RigidRolling(AbstractRigidDynamics):
     """The equations of motion of a body whose contact point is at rest: the nonholonomic constraint itself.
 
     The velocity follows from attitude and angular momentum; its two components in the state are integrated but not
@@ -395,5 +374,5 @@ def rigid_dynamics(
     """The equations of motion of a body on an arena; arguments as for `Dynamics.of`."""
     inverse = body.inertia.tensor.inverse
     if isinstance(friction, NoSlip):
-        return RollingDynamics(frame, body, gravity, inverse)
-    return SlippingDynamics(frame, body, gravity, inverse, friction, 1.0 / body.mass)
+        return RigidRolling(frame, body, gravity, inverse)
+    return RigidSlipping(frame, body, gravity, inverse, friction, 1.0 / body.mass)

@@ -26,8 +26,8 @@ from nonholonomic.geometry import (
 )
 from nonholonomic.xla_cpu import stored
 
+from .contact_dynamics import Motion
 from .contact_load import ContactLoad, Slip
-from .dynamics import Motion
 from .friction import length
 from .state import AXIS, angular_velocity, joined, parts
 from .top import Top

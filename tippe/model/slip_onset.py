@@ -29,8 +29,7 @@ from nonholonomic.xla_cpu import greatest
 from .contact_load import Slip
 from .dynamics import Dynamics
 from .friction import length
-from .rigid_dynamics import RollingDynamics as RigidRolling
-from .rigid_dynamics import SlippingDynamics
+from .rigid_dynamics import RigidRolling, RigidSlipping
 from .rolling import RollingDynamics
 
 #: Stages of the step. Its error is of the order of this plus one in its length, its estimate of this order.
@@ -117,7 +116,7 @@ class Onset(eqx.Module):
 
 
 def begin(
-    slipping: Dynamics | SlippingDynamics,
+    slipping: Dynamics | RigidSlipping,
     rolling: RollingDynamics | RigidRolling,
     mu: Float[Array, "..."],
     field: Callable[[Float[Array, "components ..."]], Float[Array, "components ..."]],

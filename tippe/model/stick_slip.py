@@ -17,15 +17,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.geometry import AbstractFrame, stacked
-from nonholonomic.xla_cpu import greatest, least
+from nonholonomic.geometry import AbstractFrame
+from nonholonomic.xla_cpu import greatest
 
+from .contact_dynamics import FITS, AbstractDynamics, Motion
 from .contact_load import Slip
-from .dynamics import FITS, Dynamics, Motion
+from .dynamics import Dynamics
 from .friction import AbstractFriction, Frictionless, SetValuedCoulomb, length
 from .rigid_body import AbstractRigidBody
-from .rigid_dynamics import RollingDynamics as RigidRolling
-from .rigid_dynamics import SlippingDynamics
+from .rigid_dynamics import RigidRolling, RigidSlipping
 from .rolling import RollingDynamics
 from .slip_onset import Onset, begin
 from .top import Top
@@ -43,7 +43,7 @@ AT_REST = 1e-10
 ROUNDING = 1e-13
 
 
-class StickSlip(eqx.Module):
+class StickSlip(AbstractDynamics):
     """The equations of motion of a scene with `SetValuedCoulomb`, in place of `Dynamics`.
 
     A state whose contact is at rest rolls; any other state slips.
@@ -52,7 +52,7 @@ class StickSlip(eqx.Module):
     - `mu`: coefficient of friction [1].
     """
 
-    slipping: Dynamics | SlippingDynamics
+    slipping: Dynamics | RigidSlipping
     rolling: RollingDynamics | RigidRolling
     mu: Float[Array, "..."]
 
@@ -71,7 +71,7 @@ class StickSlip(eqx.Module):
         assert isinstance(friction, SetValuedCoulomb)
         if isinstance(body, AbstractRigidBody):
             shared = (frame, body, gravity, body.inertia.tensor.inverse)
-            return cls(SlippingDynamics(*shared, friction, 1.0 / body.mass), RigidRolling(*shared), friction.mu)
+            return cls(RigidSlipping(*shared, friction, 1.0 / body.mass), RigidRolling(*shared), friction.mu)
         slipping = Dynamics.of(body, frame, friction, gravity)
         return cls(slipping, RollingDynamics.of(body, frame, gravity), friction.mu)
 
@@ -97,14 +97,6 @@ class StickSlip(eqx.Module):
         slips = self.slip_speed(state) > AT_REST * self.speed
         kinds = (self.slipping.motion(state), self.rolling.motion(state))
         return jax.tree.map(lambda slipping, rolling: jnp.where(slips, slipping, rolling), *kinds)
-
-    def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-        """Rate of change of the state, (components, ...)."""
-        return stacked(self.motion(state).rate, state)
-
-    def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """The least of `margins`."""
-        return least(*self.margins(state))
 
     def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
         """Normal force as a fraction of the weight, plus a round-off allowance for a start with N = 0 exactly; and the
@@ -165,7 +157,7 @@ class Change(NamedTuple):
     elapsed: Float[Array, "..."]
 
 
-class ContactMode(eqx.Module):
+class ContactMode(AbstractDynamics):
     """One of the two kinds of motion of a `StickSlip`, in place of `Dynamics`; its contact margin falls to zero at its
     end.
 
@@ -186,17 +178,9 @@ class ContactMode(eqx.Module):
         """The equations of motion of this kind."""
         return (self.both.rolling if self.rolls else self.both.slipping).motion(state)
 
-    def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-        """Rate of change of the state, (components, ...)."""
-        return stacked(self.motion(state).rate, state)
-
-    def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
         """Positive while this kind of motion lasts. Rolling leaves the friction cone before the normal force
         vanishes."""
-        return least(*self.margins(state))
-
-    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
-        """The smooth functions whose least value is the contact margin."""
         if self.rolls:
             grip, room = self.both.grip_left(state), self.both.rolling.motion(state).room
             return (grip,) if room is None else (grip, room - FITS)

@@ -21,13 +21,12 @@ forces vanishes before that.
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.geometry import Component, add, cross, dot, multiply, scale, stacked, subtract, sum_vectors
-from nonholonomic.xla_cpu import least
+from nonholonomic.geometry import Component, add, cross, dot, multiply, scale, subtract, sum_vectors
 
+from ..model.contact_dynamics import AbstractDynamics
 from ..model.contact_load import Slip
 from ..model.friction import AbstractFriction
 from ..model.state import angular_velocity, parts
@@ -64,7 +63,7 @@ class LeaningMotion(NamedTuple):
     definiteness: Float[Array, "..."]
 
 
-class LeaningDynamics(eqx.Module):
+class LeaningDynamics(AbstractDynamics):
     """The equations of motion of a top with a stem while both of its spheres touch the plane.
 
     The state has the layout of `tippe/model/dynamics.py`. Its cos theta is constant to the bit; the part of L along
@@ -118,14 +117,6 @@ class LeaningDynamics(eqx.Module):
         power = dot(normal, tuple(load.power(slip) for load, slip in zip(loads, slips, strict=True)))
         stiff = (m_1 - m_0) / ((spheres[1].offset - spheres[0].offset) * sine2)
         return LeaningMotion(rate, normal, power, b, stiff)
-
-    def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-        """Rate of change of the state, (8, ...)."""
-        return stacked(self.motion(state).rate, state)
-
-    def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """The smaller of `margins`."""
-        return least(*self.margins(state))
 
     def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
         """Both normal forces as fractions of the weight, plus `HOLDS`."""

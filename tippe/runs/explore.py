@@ -39,7 +39,7 @@ from nonholonomic.views.explore import (
     sliders_of,
 )
 
-from ..model.dynamics import LOSSES
+from ..model.contact_dynamics import LOSSES
 from ..model.friction import NoSlip
 from ..model.launch import Launch
 from ..model.rigid_body import AbstractRigidBody

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from nonholonomic.derivatives import sampled_run, sampled_run_by_diffrax
 from nonholonomic.integration import FAILED, LEFT_DOMAIN, Settings, Status
 
-from ..model.dynamics import LOSSES
+from ..model.contact_dynamics import LOSSES
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..modes.trajectory_problem import TrajectoryProblem, trajectory_problem
