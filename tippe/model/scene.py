@@ -232,7 +232,7 @@ class Scene(Bounded, Generic[Body]):
         alike = self.level and self.friction.isotropic
         if not (isinstance(equations, Dynamics) and isinstance(body, Top)) or not alike:
             return equations
-        # The other tops, of group I (`steady.py`), soon stand upright with their axis beside L; a turning frame would
+        # The other tops, of group I (`tippe/steady/`), soon stand upright with their axis beside L; a turning frame would
         # move both.
         may_invert = 1.0 - body.offset / body.radius < body.I1 / body.I3
         return equations.turning(jax.lax.stop_gradient(jnp.where(may_invert, TURNING, 0.0)))
