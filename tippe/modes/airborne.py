@@ -180,7 +180,7 @@ def gap_margin(scene: Scene[Top], flying: FlightState, ball: Ball, rounding: flo
     return ground.gap / body.radius + still_parting(rate, scene.gravity, body.radius, rounding)
 
 
-class Flight(AbstractProblem):
+class FlightProblem(AbstractProblem):
     """Flying until theta reaches an angle or a sphere is back at the arena; `falls` is the acceleration [m/s^2]."""
 
     scene: Scene[Top]
@@ -222,7 +222,7 @@ class QuadraturesInFlight(AbstractPassive):
         return jnp.concatenate([problem.field(time, state), stacked(rates, passive)])
 
 
-class Slide(AbstractFlyingMode):
+class ArenaSlide(AbstractFlyingMode):
     """Sliding on the arena."""
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
@@ -275,13 +275,13 @@ class Fly(AbstractFlyingMode):
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         return self.extended(self.flight(state), QuadraturesInFlight(self.scene.body), state)
 
-    def flight(self, state: Float[Array, "components cells"]) -> Flight:
+    def flight(self, state: Float[Array, "components cells"]) -> FlightProblem:
         """The motion in flight from given states."""
         velocity, momentum = self.scales[0], self.scales[7]
         ones = jnp.ones_like(velocity)
         rows = [ones * self.scene.body.radius] * 3 + [velocity] * 3 + [ones] * 3 + [momentum] * 3 + [ones] * 2
         falls = scale(-1.0 * self.scene.gravity, self.scene.surface.up)
-        return Flight(self.scene, self.cos_angle, state[:OWN], jnp.stack(rows), falls)
+        return FlightProblem(self.scene, self.cos_angle, state[:OWN], jnp.stack(rows), falls)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         flying = flight_state(state)
@@ -328,4 +328,4 @@ def modes(
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `sliding.modes`."""
     arguments = (scene, problem.scales, problem.cos_angle, with_quadratures)
-    return (Slide(*arguments), Fly(*arguments)), jnp.zeros(problem.states.shape[1:], int)
+    return (ArenaSlide(*arguments), Fly(*arguments)), jnp.zeros(problem.states.shape[1:], int)

@@ -28,7 +28,7 @@ from .airborne import (
     SLIDING,
     STRIKING,
     Below,
-    Flight,
+    FlightProblem,
     FlightState,
     Fly,
     QuadraturesInFlight,
@@ -151,7 +151,7 @@ class SlideOnOne(AbstractFlyingMode):
 class FlightToBlow(AbstractProblem):
     """A flight; where a sphere is already at the arena (`strikes`), the flight ends at once."""
 
-    flight: Flight
+    flight: FlightProblem
     strikes: Bool[Array, ""]
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:

@@ -53,7 +53,7 @@ from .flight_trajectory import HybridTrajectory, level_modes
 from .launches import LONG_NAMES, UNITS
 from .quantities import OF_RIGID_BODIES, QUANTITIES
 from .trajectory import Trajectory, simulate
-from .view import AXIS, BESIDE, Motion, aside, curve_of_rotation, show
+from .view import AXIS, BESIDE, DrawnMotion, aside, curve_of_rotation, show
 
 Numbers = Float[Array, " numbers"]
 
@@ -292,7 +292,7 @@ def stage_of_runs(scene: Scene, launch: Launch, knobs: tuple[Slider, ...], t1: f
 
 def stage_at_start(scene: Scene[Top], launch: Launch, t1: float) -> Stage:
     """A top on a level plane at its launch; the page replaces it by a simulated run before it is visible."""
-    start = Motion(*(np.repeat(np.asarray(part), 2, axis=0) for part in _motion_at_start(scene, launch)))
+    start = DrawnMotion(*(np.repeat(np.asarray(part), 2, axis=0) for part in _motion_at_start(scene, launch)))
     drawn, size = show(scene, start._replace(times=np.array([0.0, 1.0])), 0, ""), float(scene.body.size)
     # Slips grow as the top rises: an arrow half as fast as the equator has the greatest length.
     normal_force, slip, *others = drawn.arrows
@@ -305,12 +305,12 @@ def stage_at_start(scene: Scene[Top], launch: Launch, t1: float) -> Stage:
 
 
 @eqx.filter_jit
-def _motion_at_start(scene: Scene[Top], launch: Launch) -> Motion[Array]:
+def _motion_at_start(scene: Scene[Top], launch: Launch) -> DrawnMotion[Array]:
     modes, number, state = level_modes((scene, launch), TOLERANCE)
     assert isinstance(modes[0], Slide)
     # The other tops stand on their stem.
     rows = dataclasses.replace(modes[0], number=number).shown(state)
-    return Motion.of(hybrid_run(scene, number, rows, jnp.zeros(1)))
+    return DrawnMotion.of(hybrid_run(scene, number, rows, jnp.zeros(1)))
 
 
 def smooth_frame(scene: Scene, problem: TrajectoryProblem, lane: LaneState) -> Frame:
@@ -337,7 +337,7 @@ def hybrid_run(
 
 def frame(scene: Scene, run: Any) -> Frame:
     """The drawn quantities of a top for a run with a single time, in the order of `view.show`."""
-    motion = Motion(*(part[0] for part in Motion.of(run)))
+    motion = DrawnMotion(*(part[0] for part in DrawnMotion.of(run)))
     radius = scene.body.size
     lifted = motion.contact + 0.02 * radius * motion.normal
     offset = scene.body.offset if isinstance(scene.body, Top) else 0.0

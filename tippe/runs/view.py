@@ -59,7 +59,7 @@ BLACK, TEAL, PINK = 0x23262B, 0x008C95, 0xC2378E
 Numbers = TypeVar("Numbers", Array, np.ndarray)
 
 
-class Motion(NamedTuple, Generic[Numbers]):
+class DrawnMotion(NamedTuple, Generic[Numbers]):
     """The drawn quantities of a run: vectors in the fixed frame, (times, 3), and the rotation from the body to this
     frame."""
 
@@ -78,7 +78,7 @@ class Motion(NamedTuple, Generic[Numbers]):
     angular_momentum: Float[Numbers, "times 3"]
 
     @staticmethod
-    def of(run: Any) -> "Motion[Array]":
+    def of(run: Any) -> "DrawnMotion[Array]":
         """The motion of one run, inside or outside of transformations."""
         body, slip = run.scene.body, run.slip
         zero = jnp.zeros_like(run.t)
@@ -93,7 +93,7 @@ class Motion(NamedTuple, Generic[Numbers]):
         else:
             along = jnp.sum(w * axis, axis=-1, keepdims=True)
             momentum = body.I1 * w + (body.I3 - body.I1) * along * axis
-        return Motion(
+        return DrawnMotion(
             run.t,
             position,
             axis,
@@ -110,7 +110,7 @@ class Motion(NamedTuple, Generic[Numbers]):
         )
 
 
-_motion = eqx.filter_jit(Motion.of)
+_motion = eqx.filter_jit(DrawnMotion.of)
 _rotation_rate = eqx.filter_jit(lambda run: jnp.linalg.norm(run.angular_velocity, axis=-1))
 
 
@@ -124,7 +124,7 @@ def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     return stages([named] if overlaid else [[run] for run in named])
 
 
-def motion(run: Any) -> Motion[np.ndarray]:
+def motion(run: Any) -> DrawnMotion[np.ndarray]:
     """The motion of one run. If the run can be evaluated between its times, the times are close enough to show the
     rotation."""
     if run.dense is not None:
@@ -134,13 +134,13 @@ def motion(run: Any) -> Motion[np.ndarray]:
         frames = int(np.clip(turned_by / TURN_PER_FRAME, LEAST_FRAMES, MOST_FRAMES))
         run = run.at(np.linspace(0.0, float(run.end_time), frames))
     count = len(run.t)
-    return Motion(*(np.asarray(part)[:count] for part in _motion(run.padded())))
+    return DrawnMotion(*(np.asarray(part)[:count] for part in _motion(run.padded())))
 
 
-def show(scene: Scene, motion: Motion[np.ndarray], number: int, name: str) -> Show:
+def show(scene: Scene, motion: DrawnMotion[np.ndarray], number: int, name: str) -> Show:
     """The drawing of one run, the `number`-th of its stage."""
     body, colour = scene.body, COLOURS[number % len(COLOURS)]
-    motion = Motion(*(np.asarray(part)[np.isfinite(motion.theta)] for part in motion))
+    motion = DrawnMotion(*(np.asarray(part)[np.isfinite(motion.theta)] for part in motion))
     radius, weight = float(body.size), float(body.mass * scene.gravity)
     lifted = motion.contact + 0.02 * radius * motion.normal
     return Show(
@@ -164,7 +164,7 @@ def show(scene: Scene, motion: Motion[np.ndarray], number: int, name: str) -> Sh
     )
 
 
-def curve_of_rotation(scene: Scene, motion: Motion[Any]) -> tuple[str, Any]:
+def curve_of_rotation(scene: Scene, motion: DrawnMotion[Any]) -> tuple[str, Any]:
     """Label and values of the curve of the rotation: Jellett's quantity, or, for a body of any shape and inertia, the spin
     about the normal."""
     if isinstance(scene.body, AbstractRigidBody):
@@ -172,7 +172,7 @@ def curve_of_rotation(scene: Scene, motion: Motion[Any]) -> tuple[str, Any]:
     return QUANTITIES["jellett"].label, motion.jellett
 
 
-def arrows(motion: Motion[np.ndarray], offset: float, radius: float, weight: float) -> tuple[Arrow, ...]:
+def arrows(motion: DrawnMotion[np.ndarray], offset: float, radius: float, weight: float) -> tuple[Arrow, ...]:
     """Forces and slip at the contact, weight, angular velocity and momentum at the centre of mass."""
     lifted = motion.contact + 0.02 * radius * motion.normal
     # Inside the sphere it would be invisible.
@@ -198,7 +198,7 @@ def arrows(motion: Motion[np.ndarray], offset: float, radius: float, weight: flo
     return tuple(drawn)
 
 
-def stages(groups: list[list[tuple[str, Scene, Motion]]]) -> list[Stage]:
+def stages(groups: list[list[tuple[str, Scene, DrawnMotion]]]) -> list[Stage]:
     """A stage for each group of runs on a common arena, with their names; all runs have different colours."""
     all_stages, number = [], 0
     for group in groups:
