@@ -172,9 +172,9 @@ def smooth_simulators(
     def moment(values: Numbers, problem: TrajectoryProblem, lane: LaneState) -> Frame:
         return smooth_frame(modules(values)[0], problem, lane)
 
-    asked = {"outcome": lambda values, problem, lane: outcome(problem, lane)}
+    readings = {"outcome": lambda values, problem, lane: outcome(problem, lane)}
     return (
-        Simulator(lambda values: event_problem(*modules(values)), t1, settings, asked),
+        Simulator(lambda values: event_problem(*modules(values)), t1, settings, readings),
         Simulator(lambda values: trajectory_problem(modules(values), 1), t1, settings, {"frame": moment}),
     )
 
@@ -207,9 +207,9 @@ def hybrid_simulators(
     def moment(values: Numbers, number: Any, rows: Any, time: Any) -> Frame:
         return hybrid_frame(modules(values)[0], number, rows, time)
 
-    asked = {"outcome": lambda values, runs: hybrid_outcome(runs)}
+    readings = {"outcome": lambda values, runs: hybrid_outcome(runs)}
     return (
-        HybridSimulator(to_inversion, t1, settings, 1, asked),
+        HybridSimulator(to_inversion, t1, settings, 1, readings),
         HybridSimulator(lambda values: level_modes(modules(values), TOLERANCE), t1, settings, 1, {}, moment),
     )
 
