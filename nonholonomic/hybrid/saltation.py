@@ -81,7 +81,7 @@ class VariationalMode(AbstractBatchedMode):
 
     def problem(self, state: Float[Array, "components cells"]) -> VariationalProblem:
         at, *variations = self.parts(state)
-        numbers, build = self._moving()
+        numbers, build = self._active_numbers()
 
         def clocked(state: Float[Array, "components cells"], *numbers: Array) -> ExtendedProblem:
             began = state[-1:]
@@ -95,54 +95,55 @@ class VariationalMode(AbstractBatchedMode):
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """The reset map of the mode itself, with variations. The last row of the counters counts grazing events."""
-        return self.left_behind(state, left, lambda mode, record, left: ())[0]
+        return self.reset_with_path(state, left, lambda mode, record, left: ())[0]
 
-    def left_behind(
-        self, state: Float[Array, "components cells"], left: Float[Array, " cells"], seen: Callable[..., Any]
+    def reset_with_path(
+        self, state: Float[Array, "components cells"], left: Float[Array, " cells"], read_path: Callable[..., Any]
     ) -> tuple[Transition, Any, Any]:
         """The transition by the mode's `reset_map`, and numbers computed from its path.
 
-        **Arguments:** `seen`: function of the mode, the `TransitionPath` and `left` that returns a tree of numbers.
+        **Arguments:** `read_path`: function of the mode, the `TransitionPath` and `left` that returns a tree of numbers.
 
         **Returns:** the `Transition`; the numbers; and their variations, with the tangents first.
         """
         at, *variations = self.parts(state)
-        at, lasted, count = at[:-1], at[-1], len(variations)
-        numbers, build = self._moving()
-        still = [jnp.zeros_like(number) for number in numbers]
-        rates = self.mode.problem(at).field(lasted, at)
+        at, duration, count = at[:-1], at[-1], len(variations)
+        numbers, build = self._active_numbers()
+        unmoved = [jnp.zeros_like(number) for number in numbers]
+        rates = self.mode.problem(at).field(duration, at)
 
-        def met(at: Float[Array, "components cells"], *numbers: Array) -> tuple[Array, Array]:
+        def margin_and_rate(at: Float[Array, "components cells"], *numbers: Array) -> tuple[Array, Array]:
             problem = build(*numbers).problem(at)
-            return jax.jvp(lambda at: problem.domain_margin(lasted, at), (at,), (problem.field(lasted, at),))
+            return jax.jvp(lambda at: problem.domain_margin(duration, at), (at,), (problem.field(duration, at),))
 
         # Behind the variations stand an error of the state, and a tangent along time.
         along = [(variation[:-1], *moved) for variation, moved in zip(variations, self._rates(), strict=True)]
-        along += [(self._error(at, lasted, rates), *still), (rates, *still)]
-        (_, rate), (domain_margins, changes) = _along(met, (at, *numbers), along)
+        along += [(self._error(at, duration, rates), *unmoved), (rates, *unmoved)]
+        (_, rate), (domain_margins, changes) = _along(margin_and_rate, (at, *numbers), along)
         # A mode that ended as it began has not met its event.
-        happened = (lasted > 0.0) & (rate != 0.0)
+        happened = (duration > 0.0) & (rate != 0.0)
         safe = jnp.where(happened, rate, 1.0)
         later = jnp.where(happened, -domain_margins[:-1] / safe, 0.0)
         log_rates = jnp.where(happened, (changes[:-1] + changes[-1] * later) / safe, 0.0)
 
-        def passed(at: Float[Array, "components cells"], left: Float[Array, " cells"], *numbers: Array) -> Any:
+        def reset(at: Float[Array, "components cells"], left: Float[Array, " cells"], *numbers: Array) -> Any:
             mode = build(*numbers)
             transition = mode.reset_map(at, left)
             inside = jnp.zeros_like(left) if transition.log_rates is None else transition.log_rates
-            path = seen(mode, transition.record, left)
+            path = read_path(mode, transition.record, left)
             return (transition.state, transition.elapsed, inside, path), transition._replace(
                 record=None, log_rates=None
             )
 
         begins = (
-            jnp.concatenate([*[variation[None, -1] for variation in variations], jnp.zeros_like(lasted)[None]]) + later
+            jnp.concatenate([*[variation[None, -1] for variation in variations], jnp.zeros_like(duration)[None]])
+            + later
         )
         after_event = [
             (moved[0] + shift * rates, -begin, *moved[1:])
             for moved, shift, begin in zip(along[:-1], later, begins, strict=True)
         ]
-        values, moved, transition = _along(passed, (at, left, *numbers), after_event, has_aux=True)
+        values, moved, transition = _along(reset, (at, left, *numbers), after_event, has_aux=True)
         states, elapsed, inside, changes = moved
         new_variations = jnp.concatenate([states, (begins + elapsed)[:, None]], axis=1)[:count]
         log_rates = jnp.max(jnp.abs(log_rates + inside), axis=0)
@@ -150,26 +151,26 @@ class VariationalMode(AbstractBatchedMode):
         grazes = ~finite | (self.tolerance * log_rates > GRAZING)
         # The run itself is valid: variations without correct digits must not end it.
         new_variations = jnp.where(finite, new_variations, 0.0)
-        whole = jnp.concatenate([transition.state, jnp.zeros_like(lasted)[None], *new_variations])
+        whole = jnp.concatenate([transition.state, jnp.zeros_like(duration)[None], *new_variations])
         transition = transition._replace(
             state=whole, counts=jnp.concatenate([transition.counts, grazes.astype(int)[None]])
         )
         return transition, values[-1], jax.tree.map(lambda change: change[:count], changes)
 
-    def seen(
+    def output_rows(
         self, state: Float[Array, "components times"]
     ) -> tuple[Float[Array, "shown times"], Float[Array, "tangents shown times"]]:
         """The output rows of a single run's states, and their variation at fixed times."""
         at, *variations = self.parts(state)
-        at, lasted = at[:-1], at[-1]
-        numbers, build = self._moving()
+        at, duration = at[:-1], at[-1]
+        numbers, build = self._active_numbers()
 
         def shown(at: Float[Array, "components times"], *numbers: Array) -> Float[Array, "shown times"]:
             return build(*numbers).shown(at)
 
         if not variations:
             return shown(at), jnp.zeros((0, *shown(at).shape))
-        rates = self.mode.problem(at).field(lasted, at)
+        rates = self.mode.problem(at).field(duration, at)
         # A mode that begins later has advanced less at the same time.
         along = [
             (variation[:-1] - rates * variation[-1], *moved)
@@ -180,7 +181,7 @@ class VariationalMode(AbstractBatchedMode):
     def slopes(self, state: Float[Array, "components cells"]) -> Float[Array, "tangents cells"]:
         """The derivative of the time of the event at which runs have ended in this mode, or in the transition to it."""
         at, *variations = self.parts(state)
-        numbers, build = self._moving()
+        numbers, build = self._active_numbers()
 
         def time(at: Float[Array, "components cells"], began: Float[Array, " cells"], *numbers: Array) -> Any:
             problem = build(*numbers).problem(at)
@@ -190,10 +191,10 @@ class VariationalMode(AbstractBatchedMode):
             rates = problem.field(began, at)
             value, rate = stop_gradient(jax.jvp(problem.event_function, (at,), (rates,)))
             rest = -value / jnp.where(rate == 0.0, jnp.inf, rate)
-            at = at + jnp.where(jnp.abs(rest) < NEARLY * lasted, rest, 0.0) * rates
+            at = at + jnp.where(jnp.abs(rest) < NEARLY * duration, rest, 0.0) * rates
             return began + delay(problem.event_function, at, problem.field(began, at))
 
-        lasted, point = at[-1], (at[:-1], jnp.zeros_like(at[-1]), *numbers)
+        duration, point = at[-1], (at[:-1], jnp.zeros_like(at[-1]), *numbers)
         tangents = [
             (variation[:-1], variation[-1], *rates) for variation, rates in zip(variations, self._rates(), strict=True)
         ]
@@ -206,18 +207,18 @@ class VariationalMode(AbstractBatchedMode):
     def _error(
         self,
         at: Float[Array, "components cells"],
-        lasted: Float[Array, " cells"],
+        duration: Float[Array, " cells"],
         rates: Float[Array, "components cells"],
     ) -> Float[Array, "components cells"]:
         """The error of the state at the end of the mode, over the tolerance: from the change of the state, and from the
         magnitudes.
         """
-        sizes = jnp.minimum(self.mode.problem(at).start()[1], jnp.abs(rates) * lasted)
+        sizes = jnp.minimum(self.mode.problem(at).start()[1], jnp.abs(rates) * duration)
         # Shares of both signs that are unlikely to cancel.
         shares = [(-1.0) ** k * (0.5 + math.modf(0.618 * k)[0]) for k in range(len(sizes))]
         return jnp.asarray(shares)[:, None] * sizes
 
-    def _moving(self) -> tuple[list[Array], Any]:
+    def _active_numbers(self) -> tuple[list[Array], Any]:
         """The mode's active numbers, and the mode as a function of them."""
         if not self.tangents:
             return [], lambda: self.mode
@@ -292,7 +293,9 @@ def solve_hybrid_with_tangents(
     ended = solve_hybrid(varied, mode, start, t1, cells, settings, counters=counters + 1, n_blocks=n_blocks)
     slopes = [np.asarray(_slopes(varied_mode, jnp.asarray(ended.state))) for varied_mode in varied]
     event_time = ended.crossing_time if ends_on_event else np.broadcast_to(t1, len(mode))
-    return _own(ended, len(state)), _known(np, ended, _of_mode(np, ended, slopes), event_time, ends_on_event)
+    return _without_variations(ended, len(state)), _where_defined(
+        np, ended, _of_mode(np, ended, slopes), event_time, ends_on_event
+    )
 
 
 def traced_solve_hybrid_with_tangents(
@@ -324,14 +327,14 @@ def traced_solve_hybrid_with_tangents(
         ended = traced_solve_hybrid(varied, mode, start, t1, cells, settings, counters=counters + 1, n_blocks=n_blocks)
         slopes = _of_mode(jnp, ended, [varied_mode.slopes(ended.state) for varied_mode in varied])
         event_time = ended.crossing_time if ends_on_event else jnp.broadcast_to(t1, mode.shape)
-        known = _known(jnp, ended, slopes, event_time, ends_on_event)
-        return (_own(ended, len(state)), known.grazing), list(known.slopes)
+        known = _where_defined(jnp, ended, slopes, event_time, ends_on_event)
+        return (_without_variations(ended, len(state)), known.grazing), list(known.slopes)
 
     (outcome, grazing), slopes = in_groups(run, tangents)
     return outcome, Slopes(jnp.stack(slopes), grazing)
 
 
-def _known(
+def _where_defined(
     xp: Any,
     ended: HybridOutcome[Numbers],
     slopes: Float[Numbers, "tangents cells"],
@@ -347,7 +350,7 @@ def _known(
     return Slopes(xp.where(happened, xp.where(grazing, xp.nan, slopes), 0.0), grazing)
 
 
-def _own(ended: HybridOutcome[Numbers], size: int) -> HybridOutcome[Numbers]:
+def _without_variations(ended: HybridOutcome[Numbers], size: int) -> HybridOutcome[Numbers]:
     """A hybrid outcome without its variations."""
     return ended._replace(state=ended.state[:size], counts=ended.counts[:-1])
 
