@@ -72,13 +72,13 @@ class Onset(eqx.Module):
 
     - `start`: the state at the onset, (components, ...); `length`: its duration [s].
     - `rates`: rates of the state at the step's stages, (components, stages, ...).
-    - `found`: whether the step reached the tolerance.
+    - `converged`: whether the step reached the tolerance.
     """
 
     start: Float[Array, "components ..."]
     length: Float[Array, "..."]
     rates: Float[Array, "components stages ..."]
-    found: Bool[Array, "..."]
+    converged: Bool[Array, "..."]
 
     def at(self, fraction: Float[Array, "..."]) -> Float[Array, "components ..."]:
         """The state after a fraction of the step."""
@@ -87,7 +87,7 @@ class Onset(eqx.Module):
 
     def of_components(self, chosen: slice) -> "Onset":
         """The same step of some components alone."""
-        return Onset(self.start[chosen], self.length, self.rates[chosen], self.found)
+        return Onset(self.start[chosen], self.length, self.rates[chosen], self.converged)
 
     def falls_to_zero(
         self, event: Callable[[Float[Array, "components ..."]], Float[Array, "..."]], first: Float[Array, "..."]
@@ -110,12 +110,12 @@ class Onset(eqx.Module):
 
     @property
     def end(self) -> Float[Array, "components ..."]:
-        """The state at the end of the step, NaN if no step was found."""
+        """The state at the end of the step, NaN if the step did not converge."""
         moved = self.start + self.length * jnp.einsum("s,cs...->c...", WEIGHTS[-1], self.rates)
-        return jnp.where(self.found, moved, jnp.nan)
+        return jnp.where(self.converged, moved, jnp.nan)
 
 
-def begin(
+def slip_onset(
     slipping: Dynamics | RigidSlipping,
     rolling: RollingDynamics | RigidRolling,
     mu: Float[Array, "..."],

@@ -27,7 +27,7 @@ from .friction import AbstractFriction, Frictionless, SetValuedCoulomb, length
 from .rigid_body import AbstractRigidBody
 from .rigid_dynamics import RigidRolling, RigidSlipping
 from .rolling import RollingDynamics
-from .slip_onset import Onset, begin
+from .slip_onset import Onset, slip_onset
 from .top import Top
 
 #: The remaining sliding distance at which a slip is stopped, over the tolerance and the radius. The state errs by at
@@ -243,6 +243,6 @@ class ContactMode(AbstractDynamics):
         whole = jnp.concatenate([still, rest])
         slips = ~(holds | lost)
         most = jnp.where(slips, left - wait, 0.0)
-        onset = begin(both.slipping, both.rolling, both.mu, slipping, whole, size, scales, most, self.tolerance)
+        onset = slip_onset(both.slipping, both.rolling, both.mu, slipping, whole, size, scales, most, self.tolerance)
         after = jnp.where(slips, onset.end, jnp.where(lost, state, whole))
         return Change(after, holds, lost, onset, wait, wait + jnp.where(slips, onset.length, 0.0))
