@@ -79,20 +79,19 @@ class AbstractDynamics(eqx.Module):
 
 
 class AbstractContactDynamics(AbstractDynamics):
-    """Equations of motion of a body on a single contact, which ends as one of `LOSSES`.
+    """Equations of motion of a body on a single contact, which ends as one of `LOSSES`."""
 
-    `mass` [kg] and `gravity` [m/s^2] are those of the scene.
-    """
-
-    mass: eqx.AbstractVar[Float[Array, "..."]]
-    gravity: eqx.AbstractVar[Float[Array, "..."]]
+    @property
+    @abc.abstractmethod
+    def weight(self) -> Float[Array, "..."]:
+        """Weight of the body [N]."""
 
     def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
         """The margin for each of `LOSSES`: the normal force as a fraction of the weight, plus a round-off allowance for
         a start with N = 0; the excess of the Painlevé factor over `JAMMED`; and the excess of the room over `FITS`, if
         the arena has places where the ball does not fit."""
         motion = self.motion(state)
-        lost, jammed = motion.normal_force / (self.mass * self.gravity) + 1e-12, motion.painleve_factor - JAMMED
+        lost, jammed = motion.normal_force / self.weight + 1e-12, motion.painleve_factor - JAMMED
         return (lost, jammed) if motion.room is None else (lost, jammed, motion.room - FITS)
 
     def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:

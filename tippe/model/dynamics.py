@@ -74,6 +74,10 @@ class Dynamics(AbstractContactDynamics):
             axial_excess=1.0 / body.I3 - 1.0 / body.I1,
         )
 
+    @property
+    def weight(self) -> Float[Array, "..."]:
+        return self.mass * self.gravity
+
     def turning(self, turns: Float[Array, "..."]) -> Self:
         """The same equations in a frame that turns about n, for an arena on which all directions across n are
         equivalent.

@@ -111,6 +111,10 @@ class AbstractRigidDynamics(AbstractContactDynamics):
         return self.body.mass
 
     @property
+    def weight(self) -> Float[Array, "..."]:
+        return self.body.mass * self.gravity
+
+    @property
     def size(self) -> Float[Array, "..."]:
         """A length of the body [m]."""
         return self.body.size
