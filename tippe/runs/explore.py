@@ -144,8 +144,8 @@ def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float
 
     def allowed(values: Numbers) -> Bool[Array, ""]:
         scene, launch = modules(values)
-        may = jnp.all(legal((*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch))))
-        return may & (scene.dynamics.normal_spin(scene.state(launch)) != 0.0) if reverses(scene) else may
+        is_legal = jnp.all(legal((*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch))))
+        return is_legal & (scene.dynamics.normal_spin(scene.state(launch)) != 0.0) if reverses(scene) else is_legal
 
     settings, quantities = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE), QUANTITIES | OF_RIGID_BODIES
     answer, motion = (hybrid_simulators if flies(scene) else smooth_simulators)(modules, float(t1), settings)
