@@ -352,8 +352,8 @@ class RigidRolling(AbstractRigidDynamics):
         u = attitude.in_frame(vector_of(sum_vectors(cross(r, w), v)))
         return joined(u[:2], e, attitude.in_frame(self.body.inertia.tensor.times(w)), place)
 
-    def blow(self, state: Float[Array, "components ..."], axis: int) -> tuple[Component, ...]:
-        """As `rolling.RollingDynamics.blow`."""
+    def unit_impulse(self, state: Float[Array, "components ..."], axis: int) -> tuple[Component, ...]:
+        """As `rolling.RollingDynamics.unit_impulse`."""
         attitude = self.attitude(state)
         v = vector_of(part[axis] for part in attitude.axes)
         w = self._about_contact(attitude.lever).solve(vector_of(scale(self.body.mass, cross(attitude.lever, v))))

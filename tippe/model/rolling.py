@@ -163,7 +163,7 @@ class RollingDynamics(eqx.Module):
         axis = state[AXIS]
         return state.at[AXIS].set(axis / jnp.sqrt(jnp.sum(axis * axis, axis=0)))
 
-    def blow(self, state: Float[Array, "components ..."], axis: int) -> tuple[Component, ...]:
+    def unit_impulse(self, state: Float[Array, "components ..."], axis: int) -> tuple[Component, ...]:
         """The impulse at the contact that changes the velocity of the contact point by 1 m/s along an axis of the arena
         [N s].
 

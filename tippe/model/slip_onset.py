@@ -149,8 +149,8 @@ def slip_onset(
 
         def newton(_, carry):
             v, moved, _, _ = carry
-            struck = rolling.with_slip(moved[:size], Slip(v[0], v[1]))
-            rates = field(jnp.concatenate([struck, moved[size:]]))
+            slipping_state = rolling.with_slip(moved[:size], Slip(v[0], v[1]))
+            rates = field(jnp.concatenate([slipping_state, moved[size:]]))
             moved = state[:, None] + age * jnp.einsum("js,cs...->cj...", WEIGHTS, rates)
             slip = slipping.motion(moved[:size]).slip
             change = contact.correction(age, v, jnp.stack([slip.x, slip.y]) - v)
@@ -221,7 +221,7 @@ class _Contact(eqx.Module):
         d = jnp.stack([-F1 / force, -F2 / force])
 
         # The impulses that give the contact unit velocities: P_t = M^-1 v and P_n = -n . P_t.
-        (a, b, f), (_, c, h) = rolling.blow(state, 0), rolling.blow(state, 1)
+        (a, b, f), (_, c, h) = rolling.unit_impulse(state, 0), rolling.unit_impulse(state, 1)
         determinant = a * c - b * b
         lifted = jnp.stack([b * h - c * f, b * f - a * h]) / determinant
         yields = d[0] * (a * d[0] + b * d[1] + mu * f) + d[1] * (b * d[0] + c * d[1] + mu * h)

@@ -302,16 +302,16 @@ class Fly(AbstractFlyingMode):
         rebounds = bounce * speed > CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
         bounce = jnp.where(rebounds, bounce, 0.0)
         if isinstance(scene.friction, SetValuedCoulomb):
-            struck, fails = resolve_coulomb_impact(scene.body, scene.friction, ball, free, bounce)
+            after_impact, fails = resolve_coulomb_impact(scene.body, scene.friction, ball, free, bounce)
         else:
-            struck, fails = resolve_impact(scene.body, scene.friction, ball, free, bounce)
+            after_impact, fails = resolve_impact(scene.body, scene.friction, ball, free, bounce)
         # If the landing was located slightly below the arena, the next flight would end where it begins.
         lifted = vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2])))
-        after = jnp.where(rebounds, in_flight(lifted, ground.axes, struck), in_contact(ground, struck))
+        after = jnp.where(rebounds, in_flight(lifted, ground.axes, after_impact), in_contact(ground, after_impact))
         if self.with_quadratures:
             across = vector_of(state[OWN + k] for k in range(3))
             across = jnp.where(rebounds, jnp.stack(across), jnp.stack(to_frame(across, ground.axes)))
-            gained = energy(scene.body, 0.0, struck) - energy(scene.body, 0.0, free)
+            gained = energy(scene.body, 0.0, after_impact) - energy(scene.body, 0.0, free)
             after = jnp.concatenate([after, across, state[OWN + 3 :].at[1].add(gained)])
         return Transition(
             mode=jnp.where(rebounds, FLYING, SLIDING),

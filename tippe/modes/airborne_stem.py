@@ -148,7 +148,7 @@ class SlideOnOne(AbstractFlyingMode):
         )
 
 
-class FlightToBlow(AbstractProblem):
+class FlightToImpact(AbstractProblem):
     """A flight; where a sphere is already at the arena (`strikes`), the flight ends at once."""
 
     flight: FlightProblem
@@ -179,7 +179,7 @@ class FlyBoth(Fly):
     strikes: Bool[Array, ""]
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
-        problem = FlightToBlow(self.flight(state), self.strikes)
+        problem = FlightToImpact(self.flight(state), self.strikes)
         return self.extended(problem, QuadraturesInFlight(self.scene.body), state)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
@@ -194,7 +194,7 @@ class FlyBoth(Fly):
         number = (stem < main).astype(int)
         own, other = own_and_other(scene, number)
         ground = landing_site(scene, flying, own)
-        astray = missed(scene, ground, own)
+        misses = missed(scene, ground, own)
         # If the landing was located slightly below the arena, the next mode would end where it begins.
         flying = flying._replace(place=vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2]))))
         ground = ground._replace(gap=zero)
@@ -214,7 +214,7 @@ class FlyBoth(Fly):
             mode=jnp.where(impact.throws, STRIKING, jnp.where(impact.rebounds, FLYING, slides)),
             state=after,
             elapsed=zero,
-            status=jnp.where(astray | impact.rests, UNRESOLVED, jnp.where(impact.fails, FAILED, RUNNING)),
+            status=jnp.where(misses | impact.rests, UNRESOLVED, jnp.where(impact.fails, FAILED, RUNNING)),
             crossing_time=jnp.full_like(zero, jnp.inf),
             counts=(impact.rebounds & ~impact.throws).astype(int)[None],
         )

@@ -316,37 +316,37 @@ def land(scene: Scene[Top], air: Air) -> Air:
     closing = CLOSING_SPEED * jnp.sqrt(scene.gravity * body.radius)
     rebounds = restitution * speed > closing
     free, fails = resolve_impact(body, scene.friction, own, air.free, jnp.where(rebounds, restitution, 0.0))
-    struck = air._replace(free=free, rising=rebounds, open=rebounds, status=jnp.where(fails, FAILED, air.status))
+    after_impact = air._replace(free=free, rising=rebounds, open=rebounds, status=jnp.where(fails, FAILED, air.status))
     if other is not None:
-        struck = _with_other(scene, air, struck, other, (speed <= closing) & ~rebounds, closing)
+        after_impact = _with_other(scene, air, after_impact, other, (speed <= closing) & ~rebounds, closing)
     if air.quadratures is not None:
-        gained = energy(body, scene.gravity, struck.free) - energy(body, scene.gravity, air.free)
+        gained = energy(body, scene.gravity, after_impact.free) - energy(body, scene.gravity, air.free)
         *others, work = air.quadratures
-        struck = struck._replace(quadratures=jnp.stack([*others, work + gained]))
-    return struck._replace(open=struck.open & ~fails)
+        after_impact = after_impact._replace(quadratures=jnp.stack([*others, work + gained]))
+    return after_impact._replace(open=after_impact.open & ~fails)
 
 
 def _with_other(
-    scene: Scene[Top], air: Air, struck: Air, other: Ball, slow: Bool[Array, " cells"], closing: Cells
+    scene: Scene[Top], air: Air, after_impact: Air, other: Ball, slow: Bool[Array, " cells"], closing: Cells
 ) -> Air:
     """Effect of an impact on the other sphere if that is at the plane: it also strikes, or the top comes to rest on
     both.
 
-    **Arguments:** `air`: the top before the impact; `struck`: the top after the impact; `slow`: mask of the impacts
+    **Arguments:** `air`: the top before the impact; `after_impact`: the top after the impact; `slow`: mask of the impacts
     that are so slow that they may be the last.
     """
     touches = gap(other, air.free) < TOUCHING * scene.body.radius
-    falls = touches & (gap_rate(scene.body, other, struck.free) < -closing)
+    falls = touches & (gap_rate(scene.body, other, after_impact.free) < -closing)
     stopped, takes = leaning(scene).stopped(air.free)
     rests = touches & slow & (jnp.abs(gap_rate(scene.body, other, air.free)) <= closing) & takes
     free, number, definite = leaning(scene).settled(stopped)
     falls &= ~rests
-    return struck._replace(
-        free=_where(rests, free, struck.free),
+    return after_impact._replace(
+        free=_where(rests, free, after_impact.free),
         ball=jnp.where(rests, number, jnp.where(falls, 1 - air.ball, air.ball)),
         falls=falls,
-        status=jnp.where(rests & ~definite & (struck.status == RUNNING), UNRESOLVED, struck.status),
-        open=struck.open | falls,
+        status=jnp.where(rests & ~definite & (after_impact.status == RUNNING), UNRESOLVED, after_impact.status),
+        open=after_impact.open | falls,
     )
 
 
