@@ -100,7 +100,7 @@ def require(
     # NumPy would convert these to numbers.
     if value is None or isinstance(value, str):
         raise ValueError(f"{name} = {value!r} is not a number")
-    # A pytree rebuilt by a JAX transformation may hold placeholders, but not if it was made by a constructor.
+    # JAX transformations rebuild pytrees with placeholders, but constructors must not receive any.
     try:
         numbers = np.asarray(value, dtype=float)
     except (TypeError, ValueError):

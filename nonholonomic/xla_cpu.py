@@ -107,8 +107,8 @@ def uncounted(going: Bool[Array, ""], carried: Int[Array, ""]) -> Bool[Array, ""
 
     XLA tries to count the iterations of a loop whose condition reads a single loop variable. To do so, XLA copies
     everything that leads to the variable's next value, possibly the whole body, in every round of its simplifications.
-    This takes a twelfth of the time to compile derivatives by several numbers. XLA leaves conditions that read two
-    variables alone. This can be removed when XLA looks at how the variable changes before it copies.
+    This takes a twelfth of the time to compile derivatives with respect to several numbers. XLA does not do this for
+    conditions that read two variables. This can be removed when XLA looks at how the variable changes before it copies.
     """
     return going & (carried >= 0)
 
@@ -174,7 +174,7 @@ def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
     def called(argument: Any) -> Any:
         plain = jax.make_jaxpr(jnp.negative)(0.0).jaxpr.eqns[0].ctx
-        # The attributes also prevent that small functions inside, such as `where`, are fused into everything that uses
+        # The attributes also prevent XLA from fusing small functions inside, such as `where`, into everything that uses
         # them.
         with set_xla_metadata(**_ATTRIBUTES):
             closed, shape = jax.make_jaxpr(function, return_shape=True)(argument)
@@ -233,7 +233,7 @@ def _without_attributes(program: Any, plain: Any) -> Any:
 
 def _without_unused(used: list[bool], *others: Any) -> tuple[list[bool], Any]:
     """The equation with a program without unused computations, as JAX 0.12 prunes its own."""
-    # Since JAX 0.12, a list of inputs is between the two.
+    # Since JAX 0.12, a list of inputs comes before the equation.
     equation = others[-1]
     if not any(used):
         return [False] * len(equation.invars), None

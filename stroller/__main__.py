@@ -122,7 +122,7 @@ def parser() -> argparse.ArgumentParser:
 def scenes(options: argparse.Namespace) -> dict[tuple[str, str], tuple[Scene, Launch]]:
     """The rides, without and with friction on each surface: (ground, friction) -> scene and launch."""
     body = Stroller(options.mass, options.wheelbase, options.inertia, options.steering_inertia)
-    # No friction is damping by nothing: so both rides have one program.
+    # Zero damping stands for no friction, so that both rides share one program.
     laws = dict(zip(RIDES, (Damping(0.0, 0.0, 0.0, 0.0), Damping(*options.damping)), strict=True))
     rides = {}
     for name in dict.fromkeys(options.surface):
@@ -190,7 +190,7 @@ def write_page(
         groups.setdefault(ground, []).append((number, run))
     drawn = []
     if can_view():
-        # The place of both rides is the title of their stage, and their names are beside it.
+        # The title of the stage names the ground of both rides; the name of each ride is beside it.
         drawn = [
             stage._replace(title=ground)
             for ground, stage in zip(groups, grouped(list(groups.values()), [ride for _, ride in rides]), strict=True)

@@ -143,7 +143,7 @@ def computed(options: argparse.Namespace, folder: Path | None) -> tuple[dict[str
         return json.dumps(theta_over_time(*run, times, options.tolerance, axes).tolist())
 
     def on_plane() -> tuple[Table, Any]:
-        # The table first, whose programs the picture needs.
+        # Compute the table first, because the picture uses its programs.
         plane = table(options, "plane")
         return plane, json.loads(kept_text(folder, ("theta", facts), angles)) if has_matplotlib() else None
 

@@ -1,9 +1,9 @@
-"""First derivatives of event times by any number of parameters at once: the discrete adjoint of an ensemble solve.
+"""First derivatives of event times with respect to any number of parameters: the discrete adjoint of an ensemble solve.
 
 A run is cut into periods, and the steps of each period are recorded. After the last period, a backward pass carries the
-derivatives of the event times by the states from the last period to the first. A period whose record is gone is
-computed again from the latest checkpoint before it. The cost does not depend on the number of parameters, nor the
-memory on the length of the runs. Step lengths are held fixed, as in `variation.py`.
+derivatives of the event times with respect to the states from the last period to the first. A period whose record is
+gone is computed again from the latest checkpoint before it. The cost does not depend on the number of parameters, and
+the memory does not depend on the length of the runs. Step lengths are held fixed, as in `variation.py`.
 """
 
 import dataclasses
@@ -29,8 +29,8 @@ from .variation import VariationalProblem
 #: the 64 lanes of a CPU the checkpoints take 5 MB, with the 32768 of an accelerator 2 GB.
 KEPT = 256
 
-#: The quantity measured at the end of a run: (problem, lane state) -> a number per lane, differentiable by the
-#: problem's parameters and the lanes' states.
+#: The quantity measured at the end of a run: (problem, lane state) -> a number per lane, differentiable with respect to
+#: the problem's parameters and the lanes' states.
 Measured = Callable[[Any, LaneState], Lanes]
 
 
@@ -110,8 +110,9 @@ class Checkpoints(NamedTuple):
 class Backward(NamedTuple):
     """State of a backward pass: `needed` is the period after the next one.
 
-    `adjoint` holds, for the cell in each lane, the derivatives of the measured quantity: with respect to the state in
-    its first rows, then to the parameters; `gradient` holds those of every cell with respect to its initial state.
+    `adjoint` holds, for the cell in each lane, the derivatives of the measured quantity: the first rows are those with
+    respect to the state, the others those with respect to the parameters. `gradient` holds the derivatives of every
+    cell with respect to its initial state.
     """
 
     kept: Checkpoints
@@ -132,18 +133,19 @@ def solve_with_adjoint(
     measured: Measured,
     one_kernel: bool = False,
 ) -> tuple[Outcome, Float[Array, "components cells"], Any]:
-    """Run every cell to its end, and differentiate a quantity measured there by the parameters of the problem.
+    """Run every cell to its end, and differentiate a quantity at the end with respect to the problem's parameters.
 
     **Arguments:** as for `ensemble_solve`, except `nonterminal`, and
 
     - `problem`: without tangents.
-    - `moving`: a tree of booleans like the problem: which of its leaves, scalars or (cells,), to differentiate by.
+    - `moving`: a tree of booleans like the problem: the leaves, scalars or (cells,), with respect to which to
+      differentiate.
     - `probe`: a tangent of the inner problem. Its variation is also integrated and takes part in step-size control, so
       that the steps suit tangents even where the state is at rest.
     - `measured`: the quantity to differentiate.
 
-    **Returns:** the `Outcome`, without crossing times; the derivatives for every cell by its initial state; and those
-    by the parameters, one per cell, in a tree like the problem with `None` for the other leaves.
+    **Returns:** the `Outcome`, without crossing times; the derivatives of every cell with respect to its initial state;
+    and those with respect to the parameters, one per cell, in a tree like the problem with `None` for the other leaves.
 
     **Raises:** `ValueError` for a chosen leaf that has several components.
     """
@@ -292,11 +294,11 @@ def step_taken_back(
     **Arguments:**
 
     - `weights`: the method.
-    - `problem`, `moving`: the problem, with leaves that are scalars or have one number per lane; the leaves to
-      differentiate by.
+    - `problem`, `moving`: the problem, with leaves that are scalars or have one number per lane; the leaves with
+      respect to which to differentiate.
     - `time`, `state`, `length`: where the step starts, and its length; 0 if no step was made.
     - `adjoint`: derivatives at the end of the step, with respect to the state and the parameters.
-    - `room`: working memory for the derivatives by the end and by the stages; finite.
+    - `room`: working memory for the derivatives with respect to the end and the stages; finite.
 
     **Returns:** the derivatives at the start, and the working memory for reuse.
     """

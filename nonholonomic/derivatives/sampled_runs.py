@@ -248,7 +248,8 @@ def _found(
     ends: tuple[Float[Array, "*cells"], Float[Array, "components *cells"], Int[Array, "*cells"]],
     counts: tuple[Int[Array, "*cells"], Int[Array, "*cells"]],
 ) -> tuple[SampledRun, list[SampledRun]]:
-    """The samples and their derivative along each tangent, from when, where and how the runs ended."""
+    """The samples and their derivative along each tangent, given the time, the state and the status at which the runs
+    ended."""
     states, *variations = jnp.split(samples, 1 + len(varied.tangents), axis=-1)
     time, end, status = ends
     end, *end_variations = varied.parts(end)

@@ -38,7 +38,7 @@ from .vector import Component, Vector, cross, dot, scale, sum_vectors, tangents,
 
 
 def place_named(surface: AbstractSurface, place: Place) -> Place:
-    """A place in the form for `surface.chart`, from a place whose eta counts from the lowest point of a closed surface.
+    """Convert a place whose eta counts from the lowest point of a closed surface to a place for `surface.chart`.
 
     **Arguments:** `place`: numbers named by `surface.coordinates`, or (x, y, z).
     """
@@ -64,7 +64,7 @@ def frame_of(
 
 
 def room_bounds(surface: AbstractSurface, side: float, distance: Float[Array, "..."]) -> Iterator[Bound]:
-    """The ranges of a surface's numbers within which a ball fits somewhere.
+    """The ranges of a surface's parameters for which a ball fits at some point of the surface.
 
     **Arguments:** as for `CarriedFrame`.
     """

@@ -105,6 +105,6 @@ def tangents(normal: Vector) -> tuple[Vector, Vector]:
 
 
 def _projected(vector: Vector, used: Component) -> Vector:
-    """The vector at unit length; where it is not used, something finite with finite derivatives."""
+    """The vector at unit length; where it is not used, a finite vector with finite derivatives."""
     square = jnp.where(used, dot(vector, vector), 1.0)
     return scale(1.0 / jnp.sqrt(square), vector)

@@ -37,7 +37,8 @@ class Transition(NamedTuple, Generic[Numbers]):
     `state` is the new state, `elapsed` [s] the duration of the transition, and `crossing_time` [s] the last time of the
     event during the transition, infinite if there was none. `counts` contains the counters, one per row. `record` is
     the path of a single run (`path.py`); `None` for instantaneous transitions, or where no path is kept. `log_rates` is
-    the sum of the logarithms of the rates at which events on the way are met; `None` if there are none.
+    the sum of the logarithms of the rates of the event functions at the events during the transition; `None` if there
+    are none.
 
     **Example:** the bounce of both balls at 5 m/s.
 
@@ -144,6 +145,6 @@ class AbstractHoppingMode(AbstractBatchedMode):
 
 
 def mode_of_cells(mode: AbstractBatchedMode, cell: Int[Numbers, " selected"]) -> AbstractBatchedMode:
-    """The mode of the cells with these numbers."""
+    """The mode of the cells with these indices."""
     numbers, static = eqx.partition(mode, eqx.is_array)
     return eqx.combine(jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[..., cell], numbers), static)

@@ -6,9 +6,9 @@ x' = f(x) and the mode entered at t + dt,
     dT = -dg / (Dg f),   dx <- dx + f dT,   dt <- dt + dT,
 
 by the implicit function theorem; then the mode's own `reset_map` is differentiated, an impact or a flight, which may
-take time itself. That is the saltation matrix (Leine and Nijmeijer, Dynamics and Bifurcations of Non-Smooth Mechanical
-Systems, 2004, ch. 7) in two halves: the next mode counts its time from its own beginning, so -f dt of it is not needed
-there, and is added where a time is held fixed.
+itself take time. These are the two halves of the saltation matrix (Leine and Nijmeijer, Dynamics and Bifurcations of
+Non-Smooth Mechanical Systems, 2004, ch. 7). The next mode counts its time from its own beginning, so it does not need
+the term -f dt of this matrix; the term is added where a time is held fixed.
 
 The rate of the event function at an event is the denominator of the derivative. Where this rate may be zero within the
 tolerance, the event is grazing and the derivative has no correct digits; `GRAZING` counts such events.
@@ -42,10 +42,10 @@ from .ensemble import HybridOutcome, solve_hybrid, traced_solve_hybrid
 from .mode import AbstractBatchedMode, Transition
 
 #: An event is grazing if a relative change of the numbers by the tolerance, or an error of the state that the tolerance
-#: allows, changes its rate by more than this fraction. The derivative then errs by about as much.
+#: allows, changes its rate by more than this fraction. The relative error of the derivative is then about as large.
 GRAZING = 1e-2
 
-#: An event that is nearer than this fraction of the time in its mode is the one at which a run has ended.
+#: If an event is nearer than this fraction of the time in its mode, the run has ended at this event.
 NEARLY = 1e-6
 
 #: Magnitude that scales the error of the clock [s]: the clock has no error, and no share in step-size control.
@@ -53,8 +53,8 @@ UNMEASURED = 1e9
 
 
 class Clock(AbstractPassive):
-    """The time since a mode began, as a passive component; its variation is that of the time at which the mode
-    began."""
+    """The time since a mode began, as a passive component. The variation of this component is the variation of the time
+    at which the mode began."""
 
     def rates(self, problem: AbstractProblem, time: Lanes, state: States, passive: States) -> States:
         return jnp.concatenate([problem.field(time, state), jnp.ones_like(passive)])
@@ -116,11 +116,11 @@ class VariationalMode(AbstractBatchedMode):
             problem = build(*numbers).problem(at)
             return jax.jvp(lambda at: problem.domain_margin(duration, at), (at,), (problem.field(duration, at),))
 
-        # Behind the variations stand an error of the state, and a tangent along time.
+        # The last two tangents are an error of the state, and a tangent along time.
         along = [(variation[:-1], *moved) for variation, moved in zip(variations, self._rates(), strict=True)]
         along += [(self._error(at, duration, rates), *unmoved), (rates, *unmoved)]
         (_, rate), (domain_margins, changes) = _along(margin_and_rate, (at, *numbers), along)
-        # A mode that ended as it began has not met its event.
+        # A mode that ended when it began has not reached its event.
         happened = (duration > 0.0) & (rate != 0.0)
         safe = jnp.where(happened, rate, 1.0)
         later = jnp.where(happened, -domain_margins[:-1] / safe, 0.0)
@@ -149,7 +149,7 @@ class VariationalMode(AbstractBatchedMode):
         log_rates = jnp.max(jnp.abs(log_rates + inside), axis=0)
         finite = jnp.isfinite(new_variations).all(axis=(0, 1)) & jnp.isfinite(log_rates)
         grazes = ~finite | (self.tolerance * log_rates > GRAZING)
-        # The run itself is valid: variations without correct digits must not end it.
+        # The run itself is valid, so variations without correct digits must not end the run.
         new_variations = jnp.where(finite, new_variations, 0.0)
         whole = jnp.concatenate([transition.state, jnp.zeros_like(duration)[None], *new_variations])
         transition = transition._replace(
@@ -171,7 +171,7 @@ class VariationalMode(AbstractBatchedMode):
         if not variations:
             return shown(at), jnp.zeros((0, *shown(at).shape))
         rates = self.mode.problem(at).field(duration, at)
-        # A mode that begins later has advanced less at the same time.
+        # If the mode begins later, the state has advanced less at the same time.
         along = [
             (variation[:-1] - rates * variation[-1], *moved)
             for variation, moved in zip(variations, self._rates(), strict=True)
@@ -187,7 +187,8 @@ class VariationalMode(AbstractBatchedMode):
             problem = build(*numbers).problem(at)
             if problem.event_function(at) is None:
                 return began
-            # The event was located to a fraction of a step: on the rest of the way the variations change too.
+            # The event was located to a small fraction of a step, and the variations also change over the remaining
+            # time.
             rates = problem.field(began, at)
             value, rate = stop_gradient(jax.jvp(problem.event_function, (at,), (rates,)))
             rest = -value / jnp.where(rate == 0.0, jnp.inf, rate)
@@ -210,8 +211,8 @@ class VariationalMode(AbstractBatchedMode):
         duration: Float[Array, " cells"],
         rates: Float[Array, "components cells"],
     ) -> Float[Array, "components cells"]:
-        """The error of the state at the end of the mode, over the tolerance: from the change of the state, and from the
-        magnitudes.
+        """The error of the state at the end of the mode, divided by the tolerance, from the change of the state and
+        from the magnitudes.
         """
         sizes = jnp.minimum(self.mode.problem(at).start()[1], jnp.abs(rates) * duration)
         # Shares of both signs that are unlikely to cancel.
@@ -249,8 +250,8 @@ def _along(function: Any, point: tuple[Array, ...], tangents: list[tuple[Array, 
 
 
 class Slopes(NamedTuple, Generic[Numbers]):
-    """Derivatives of the times of the events at which runs ended, (tangents, cells); and where they are NaN because an event on
-    the way was `grazing`, so that they have no correct digits.
+    """Derivatives of the times of the events at which runs ended, (tangents, cells); and a mask of those that are NaN
+    because an earlier event was `grazing`, so that the derivative would have no correct digits.
     """
 
     slopes: Float[Numbers, "tangents cells"]
@@ -280,7 +281,7 @@ def solve_hybrid_with_tangents(
     **Returns:** the `HybridOutcome`, and the `Slopes`, 0 where there is no event or the event is at the start.
     Source: implicit function theorem at the event, saltation at every change of mode.
 
-    **Example:** by the restitution.
+    **Example:** the derivative with respect to the restitution.
 
     >>> from nonholonomic.hybrid import solve_hybrid_with_tangents
     >>> tangents = (((Bounce(jnp.ones(2)),), None),)
@@ -358,8 +359,8 @@ def _without_variations(ended: HybridOutcome[Numbers], size: int) -> HybridOutco
 def _of_mode(xp: Any, ended: HybridOutcome[Numbers], slopes: list[Float[Numbers, "tangents cells"]]) -> Any:
     """Select, for each cell, the derivatives of its mode.
 
-    A run that has ended between two modes is in none of them: its event is the end of the previous mode, whose
-    variation is the last row.
+    A run that has ended between two modes is in neither. Its event is the end of the previous mode, whose variation is
+    the last row.
     """
     of_cells = xp.reshape(ended.state, (1 + len(slopes[0]), -1, len(ended.mode)))[1:, -1]
     for number, of_mode in enumerate(slopes):
@@ -388,7 +389,7 @@ def variational_modes(
 def variational_start(
     state: Float[Array, "components cells"], tangents: tuple[tuple[tuple[Any, ...], Any], ...]
 ) -> Float[Array, "more cells"]:
-    """Initial states with their clocks, and the variations of both behind them."""
+    """Initial states with their clocks, followed by the variations of both."""
     zero = jnp.zeros_like(state[0])
     moved = [jnp.zeros_like(state) if direction[1] is None else direction[1] for direction in tangents]
     return jnp.concatenate([with_row(part, zero) for part in (state, *moved)])

@@ -23,7 +23,7 @@ from .saltation import VariationalMode, variational_modes, variational_start
 Build = Callable[[Any, Array], tuple[tuple[AbstractBatchedMode, ...], Array, Float[Array, "components 1"]]]
 
 
-#: In the derivative of `HybridSamples`: what has none.
+#: In the derivative of `HybridSamples`: the entries that have none.
 UNCHANGED: Any = None
 
 
@@ -75,10 +75,10 @@ def hybrid_samples(
 
     **Returns:** `HybridSamples`; the output rows and the end time have derivatives, NaN after a grazing event.
 
-    **Raises:** `ValueError` for derivatives by the times, and for second derivatives.
+    **Raises:** `ValueError` for derivatives with respect to the times, and for second derivatives.
 
-    **Example:** the height at 0.8 s, after a bounce, and its derivative by the restitution: v (t - T) with the speed v at
-    the ground, and the time T of the bounce.
+    **Example:** the height at 0.8 s, after a bounce, and its derivative with respect to the restitution: v (t - T) with
+    the speed v at the ground, and the time T of the bounce.
 
     >>> from nonholonomic.hybrid import hybrid_samples
     >>> def build(restitution, tolerance):
@@ -198,7 +198,7 @@ def _rounds_with_samples(
             run, filled = carry
             at = run.mode[0]
             mode = mode_numbered(modes, numbers, at)
-            # In a batch this branch is taken for all runs: those in another mode stay in this one for no time.
+            # In a batch, all runs take this branch; runs in another mode spend no time in this one.
             since, left = times - run.end_time, jnp.where(active, greatest(t1 - run.end_time, 0.0), 0.0)
             outcome, samples = solve_with_samples(
                 mode.problem(run.state), since, left, jnp.asarray(1), settings, n_blocks=1 + count
@@ -211,7 +211,7 @@ def _rounds_with_samples(
 
     def reset(numbers: Sequence[int], carry: Carry, lost: Bool[Array, " 1"]) -> Carry:
         def rows_on_path(mode: AbstractBatchedMode, record: TransitionPath | None, left: Float[Array, " 1"]) -> Any:
-            # Relative to an event that is later, a fixed time comes sooner, as the horizon does.
+            # If the event happens later, less time passes from the event to a fixed time, and to the horizon.
             return None if record is None else _rows_in_transition(mode, record, times - t1 + left)
 
         def after_transition() -> Carry:
@@ -233,8 +233,8 @@ def _rounds_with_samples(
 
 
 def program_groups(modes: tuple[AbstractBatchedMode, ...]) -> list[tuple[int, ...]]:
-    """The numbers of the modes in groups. The modes of a group differ only in the values of their arrays, so they share
-    a program."""
+    """The indices of the modes, in groups. The modes of a group differ only in the values of their arrays, so they
+    share a program."""
     groups: list[list[int]] = []
     for number, mode in enumerate(modes):
         shape = _shape(mode)
@@ -280,7 +280,7 @@ def _as_samples(
     """The samples, and their derivative along each tangent."""
     end_time, status, grazed = ended.end_time[0], ended.status[0], ended.counts[-1, 0] > 0
     late = jnp.where(times > filled.grazed, jnp.nan, 0.0)
-    # The variation of a time stands behind that of the state; a horizon does not move.
+    # The variation of the time follows that of the state; a horizon does not move.
     later = [ended.state[k * (size + 1) + size, 0] for k in range(1, count + 1)]
     later = [jnp.where(status == REACHED_END, 0.0, jnp.where(grazed, jnp.nan, delay)) for delay in later]
     numbers = (ended.mode[0], status, ended.steps[0], ended.rejected[0], ended.counts[:-1, 0])

@@ -20,8 +20,8 @@ EACH = "data[*]."
 def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], Int[np.ndarray, " n"]]:
     """The joined measurements of several sets of data, their labels, and the indices of the predictions that were measured.
 
-    **Arguments:** `data`: sets of data, each with `measurements`, `labels`, `seen`, and `size`, the number of its
-    predictions.
+    **Arguments:** `data`: sets of data, each with the attributes `measurements`, `labels`, `seen`, and `size` (the
+    number of its predictions).
 
     **Example:**
 

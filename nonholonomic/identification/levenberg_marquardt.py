@@ -1,4 +1,4 @@
-"""Nonlinear least squares from many starts, or for many sets of data, at once.
+"""Nonlinear least squares, from many starts or for many sets of data at once.
 
 Each row is a fit. All rows advance together, and the model is evaluated for all of them, with its slopes, in one call,
 so a model that computes its cases as lanes computes the cases of all rows together. Optimistix under `vmap` compiles

@@ -229,8 +229,8 @@ def predicted(
     **Arguments:**
 
     - `scene`: the scene of all runs, before its parameters are replaced.
-    - `recordings`: pairs of a recording and its parameters, name -> (rows,). The names must be equal for all
-      recordings, and so must the kinds of numbers in their launches.
+    - `recordings`: pairs of a recording and its parameters, name -> (rows,). All recordings must have the same
+      parameter names, and the same kinds of numbers in their launches.
     - `run`: function of a scene, a launch and times since the launch [s] that returns a trajectory.
 
     **Returns:** for each recording its samples, ordered by time, including missing ones; NaN after the end of a run.

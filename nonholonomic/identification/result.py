@@ -239,7 +239,7 @@ def deviance_of(problem: Problem, coordinates: Any, measurements: Measurements) 
 def coordinate_covariance(jacobian: Float[np.ndarray, "residuals unknowns"]) -> Float[np.ndarray, "unknowns unknowns"]:
     """The inverse of the Gauss-Newton matrix J^T J; infinite for unknowns that take part in an undetermined direction.
 
-    To find these directions, every unknown is measured in units of its own error at fixed other unknowns.
+    To find these directions, every unknown is measured in units of its own error with the other unknowns held fixed.
     """
     norms = np.linalg.norm(jacobian, axis=0)
     norms = np.where(norms > 0.0, norms, 1.0)

@@ -7,7 +7,7 @@ respect to q, the draws are from p, whatever q is (surrogate transitions: J. S. 
 Scientific Computing (2001), chapter 9; Christen and Fox, J. Comput. Graph. Stat. 14 (2005) 795). A bad surrogate lowers
 the fraction of accepted proposals.
 
-Event times need this method: they vary roughly on the scale of a nutation period, so the slope at one point predicts
+Event times need this method: they vary irregularly on the scale of a nutation period, so the slope at one point says
 little about the next point, and walks that follow slopes take hundreds of steps.
 """
 
@@ -37,8 +37,8 @@ MOVES = 16
 #: never propose its tails, and never leave them.
 LEARNING, PROPOSING = 0.35, 0.75
 
-#: Learning ends with the round whose runs the polynomials predicted to this standard deviation of the log density, so
-#: that nine tenths of the proposals would be accepted; and the least and greatest number of rounds.
+#: Learning ends when the polynomials predict the log density of a round's runs with this standard deviation, at which
+#: nine tenths of the proposals are accepted; and the least and greatest number of rounds.
 FORETOLD, LEAST, ROUNDS = 0.3, 2, 6
 
 
@@ -183,7 +183,7 @@ def learn(surrogate: Surrogate, chains: int, random: np.random.Generator) -> tup
         surrogate = surrogate.learned(*(np.concatenate(parts) for parts in zip(*pool, strict=True)))
         if turn > 0:
             surrogate, points = surrogate.among(drawn)
-        # As arrays: a Python number would be compiled in.
+        # Convert to arrays, because a Python number would become a constant of the program.
         adaptation = jax.tree.map(np.asarray, begin(1.0 / len(surrogate.centre) ** 0.25))
         walk, path = Walk(jnp.asarray(points[-chains:]), adaptation), []
         for _ in range(-(-2 * runs // chains)):

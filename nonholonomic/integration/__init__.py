@@ -1,4 +1,4 @@
-"""Runs in time: from a start along a field to an event, to the end of the model's validity, or to a horizon.
+"""Integrate runs from an initial state to an event, to the end of the model's validity, or to a horizon.
 
 `solve_ensemble` runs many cells of a problem in lanes that step together; `follow` and `sample` integrate single runs
 with any solver of Diffrax. `solve_by_diffrax` is an independent reference. Hybrid runs are in `nonholonomic.hybrid`.
@@ -8,7 +8,7 @@ be short, and `TIGHTEST`, the smallest tolerance.
 
 A `nonholonomic.AbstractMode` has functions of one state, and the package maps them over cells. An `AbstractProblem` has
 functions of all cells at once: components along the first axis, cells along the last. `Lanes` is the type of one number
-per cell, `States` that of their states.
+per cell, and `States` the type of the states of all cells.
 
 **Example:** a decay, first as a mode, then as a problem with three cells.
 

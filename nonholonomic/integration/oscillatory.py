@@ -126,8 +126,8 @@ SEVENTH = (
     0.0,
 )
 
-#: The error of a step is estimated by this factor times the difference of the two. With 2, smooth motions take about as
-#: many steps as with Prince and Dormand's pair at the same tolerance, and err less.
+#: The error of a step is estimated by this factor times the difference between the two orders. With 2, smooth motions
+#: take about as many steps as with Prince and Dormand's pair at the same tolerance, and err less.
 CAUTION = 2.0
 
 #: Positions of the stages after the first in the step, and of the step's end, where the next step begins.

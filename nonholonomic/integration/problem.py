@@ -58,8 +58,8 @@ class AbstractProblem(eqx.Module):
         """A smooth function of order 1, positive before the event, negative after it; `None` if there is no event."""
 
     def crossing_along(self, state: States, rate: States) -> Lanes | None:
-        """The event function where the field is known too: equal to `event_function`, for problems where this saves
-        work.
+        """The event function of a state whose rate is known: equal to `event_function`, for problems where the rate
+        saves work.
         """
         return self.event_function(state)
 
@@ -141,7 +141,7 @@ def side_of(problem: AbstractProblem, side: Lanes) -> Callable[[States, States],
 def crossing_time(problem: AbstractProblem, time: Lanes, state: States) -> Lanes:
     """Time [s] at which the event function vanishes, for a state close to the event.
 
-    The time is differentiable by the numbers of the problem and by the state (implicit function theorem).
+    The time is differentiable with respect to the numbers of the problem and the state (implicit function theorem).
 
     **Arguments:**
 

@@ -27,7 +27,7 @@ from .step import Control, LaneState, try_step
 Numbers = TypeVar("Numbers", Array, np.ndarray)
 
 #: Cost of refilling the lanes, in steps of all lanes, measured on a CPU. The lanes are refilled when idle lanes have
-#: missed as many steps, so the loss is at most twice that of the best moment.
+#: missed as many steps, so the loss is at most twice the loss of the best choice.
 REFILL = 0.25
 
 #: How far ahead the direction of motion is evaluated, in first steps; and the fraction of the change until then below

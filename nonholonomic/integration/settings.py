@@ -16,7 +16,8 @@ from .oscillatory import Oscillatory8
 #: The absolute tolerance as a fraction of the relative one, in units of a problem's own magnitudes.
 ABSOLUTE = 0.1
 
-#: The least and the greatest relative tolerance: below, round-off decides on steps; above, steps are hardly controlled.
+#: The least and the greatest relative tolerance: below this range, round-off would control the steps; above it, the
+#: steps are hardly controlled.
 TIGHTEST, LOOSEST = 1e-14, 1e-2
 
 #: Default limit of the steps of a run.

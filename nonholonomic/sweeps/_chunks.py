@@ -30,8 +30,8 @@ def folder_of(path: Path) -> Path:
 class ChunkStore:
     """The finished chunks of a table's file.
 
-    Each chunk is complete and on disk before it counts, even if the process dies, or if the machine dies and its disk
-    keeps confirmed data.
+    A chunk counts as finished only when it is complete and on disk. It then survives if the process dies, or if the
+    machine dies and its disk keeps confirmed data.
 
     `finished`: the indices of the chunks that existed when the sweep began.
     """
@@ -170,7 +170,7 @@ class ChunkStore:
         return f"saved {with_spaces(cells)} of {total} cells to {self.path}; run the same call again to resume"
 
     def _locked(self) -> Any:
-        """Keep other processes from computing the same file; the system releases it when the process ends."""
+        """Keep other processes from computing the same file; the system releases the lock when this process ends."""
         if fcntl is None:
             return None
         beside = self.path.with_name(self.path.name + ".lock")

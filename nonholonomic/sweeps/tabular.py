@@ -123,7 +123,7 @@ class Tabular(abc.ABC):
         self.to_table().save(path)
 
     def portrait(self, x: str | None = None, y: str | None = None, ax: Any = None) -> Any:
-        """Draw one quantity over another, a phase portrait (needs matplotlib).
+        """Draw one quantity against another, a phase portrait (needs matplotlib).
 
         **Arguments:**
 
@@ -141,7 +141,8 @@ class Tabular(abc.ABC):
         return draw_portrait(self.to_table(), across if x is None else x, up if y is None else y, ax)
 
     def __getattr__(self, name: str) -> Any:
-        # Reached for unknown names, and where reading a known one has raised this kind of error: it raises it again.
+        # Python calls this for unknown names, and for known names whose property raised an AttributeError, which is
+        # raised again here.
         if name.startswith("_") or hasattr(type(self), name) or not self.readable:
             return object.__getattribute__(self, name)
         raise AttributeError(f"the run has no {name!r}{likely(name, self.readable)} It has {', '.join(self.readable)}")

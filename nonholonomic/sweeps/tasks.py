@@ -34,7 +34,7 @@ class ChunkTask(NamedTuple):
     chunk: int
 
     def compile(self) -> None:
-        """Call the job without counting cells, to compile it."""
+        """Call the job with padding alone, to compile it."""
         self.job(columns(self.axes, 0, self.chunk), 0)
 
     def results(self, first: int, count: int) -> dict[str, Values]:

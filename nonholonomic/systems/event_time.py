@@ -47,7 +47,7 @@ def event_time(
     motion or by a reset. For a run that starts at or below zero, the event is the next time at which the function falls
     through zero. Under `vmap`, all runs are lanes of one batch.
 
-    Derivatives with respect to the start and every number of the system and of the event are exact: they use the
+    Derivatives with respect to the start and every parameter of the system and of the event are exact: they use the
     implicit function theorem at the event and the saltation matrix at every reset (`nonholonomic/hybrid/saltation.py`).
     Derivatives are 0 if the time is infinite. Without resets, there are second derivatives, by `jax.hessian` (forward
     over reverse mode).

@@ -43,7 +43,7 @@ def simulate(
     - `t1`: end of the run [s], positive.
     - `times`: times [s] to report, increasing, within [0, t1]; by default 201 equally spaced ones.
 
-    **Returns:** a `Trajectory`; its `status` is how the run ended.
+    **Returns:** a `Trajectory`; its `status` states how the run ended.
 
     **Raises:** `ValueError` for arguments out of range, times that do not increase, functions that return a wrong type
     or shape, and second derivatives through resets.

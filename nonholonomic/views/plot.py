@@ -209,7 +209,7 @@ def _mark_words(drawing: Any, table: Labelled, names: list[str], words: Any) -> 
 
 
 def draw_portrait(table: Labelled, x: str, y: str, ax: Any = None) -> Any:
-    """Draw one variable of a run's table over another, with a dot at the start.
+    """Draw one variable of a run's table against another, with a dot at the start.
 
     **Arguments:**
 

@@ -69,7 +69,7 @@ def identify(
     - `free`: full name of a parameter -> a `Free` or only the start value: `"scene.friction.rolling"`, or `"rolling"`
       if no other name ends so; `"launch.place[0]"` and `"launch.place[1]"` are parts of the place. A parameter of the
       launch, and `"t0"`, the reading of a recording's clock at the launch, are the same in all recordings;
-      `"data[1].launch.heading"` belongs to the second recording, and `"data[*].t0"` is a separate number for each.
+      `"data[1].launch.heading"` belongs to the second recording, and `"data[*].t0"` is a separate parameter for each.
       Parameters that cannot be negative are fitted by their logarithms.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
     - `tolerance`: relative tolerance of the integration.

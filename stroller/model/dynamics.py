@@ -236,7 +236,8 @@ class Dynamics(eqx.Module):
         return jnp.broadcast_to(multiply(1.0, self.geometry(state).normal_force), state[0].shape)
 
     def contact_along(self, state: State, rate: State) -> Float[Array, "..."]:
-        """Like `contact`, if the field is known: it contains the velocity, which is expensive."""
+        """Like `contact`, for a known rate of the state, which contains the velocity; computing the velocity is
+        expensive."""
         place, velocity = padded(state[: self.surface.axes]), padded(rate[: self.surface.axes])
         normal = self.surface.normal(place)
         force = self.normal_force(normal, self.surface.normal_rate(place, velocity), velocity)

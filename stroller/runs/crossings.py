@@ -1,4 +1,5 @@
-"""Find the times at which a quantity was zero during a run. Within a step, the step is repeated with other lengths."""
+"""Find the times at which a quantity was zero during a run. To find a time within a step, the step is repeated with
+other lengths."""
 
 from typing import NamedTuple
 

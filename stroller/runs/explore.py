@@ -46,7 +46,7 @@ DRAWN = 1e-5
 #: The quantities of a ride that the page draws.
 SHOWN = ("position", "direction", "steering", "speed", "front_speed", "energy", "normal_force", "side_force")
 
-#: Greatest number of steps of a run in the page, some hundred milliseconds.
+#: Greatest number of steps of a run in the page; they take some hundred milliseconds.
 MOST_STEPS_OF_A_PAGE = 50_000
 
 

@@ -58,7 +58,7 @@ def simulate(
       differentiates. This is cheaper for a loss function with many parameters, such as the weights of an input. By
       default, this package computes forward and reverse derivatives, at the cost of about one run for each parameter.
 
-    **Returns:** a `Trajectory`; its `status` is the word for how the run ended.
+    **Returns:** a `Trajectory`; its `status` states how the run ended.
 
     **Raises:** `ValueError` for arguments out of range, lists in place of numbers, an illegal launch, times that do not
     increase, a solver without an error estimate, and an input that is not a function, cannot be traced, or is not
@@ -119,7 +119,7 @@ def _legal_or_nan(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.Ab
     if ride.grid is None:
         begun, run_times = begun._replace(t1=t1), jnp.where(is_legal, times, 0.0)
     if adjoint is not None:
-        # Diffrax would differentiate a run that never begins.
+        # A run with illegal numbers never begins, but Diffrax would differentiate it.
         begun = begun._replace(
             **nan_unless(is_legal, {"scene": ride.scene, "launch": ride.launch, "input": ride.input})
         )

@@ -77,7 +77,7 @@ def identify(
     - `free`: full name of a parameter -> a `Free` or only the start value: `"scene.friction.mu"`, or `"friction.mu"` if
       no other name ends so. A parameter of the launch, and `"t0"`, the reading of a recording's clock at the launch,
       are the same in all data; `"data[1].launch.azimuth"` belongs to the second set of data, and `"data[*].t0"` is a
-      separate number for each recording. Parameters that cannot be negative are fitted by their logarithms.
+      separate parameter for each recording. Parameters that cannot be negative are fitted by their logarithms.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
     - `slopes`: "exact", the derivatives of the equations; or "differences", central differences of 1 % in every
       parameter, which smooth over the jumps of the times. Differences take 2 k + 1 runs for k parameters and simulate

@@ -35,7 +35,7 @@ class InversionTimes(eqx.Module):
     - `error`: standard errors [s], a scalar or (launches,); for a limit, the error of the clock.
     - `t1`: horizon of the model's runs [s]: choose several times the longest measured time, because start values may be
       far off.
-    - `until`: time [s] until which you watched a launch of infinite time, a scalar or (launches,); `t1` by default.
+    - `until`: time [s] until which you watched a launch that did not invert, a scalar or (launches,); `t1` by default.
       The likelihood of such a launch is the probability of a time beyond `until`.
     - `angle`: angle [rad] that counted as inverted.
     - `student`: degrees of freedom of Student's t distribution of the errors, against outliers, such as 4; `None` for

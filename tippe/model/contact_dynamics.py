@@ -14,14 +14,14 @@ from nonholonomic.xla_cpu import least
 from .contact_load import ContactLoad, Slip
 
 #: Value of `Motion.painleve_factor` at which a contact counts as jammed. N grows as its inverse, and the factor falls
-#: to zero as the square root of the remaining time, so a run ends too early by the square of this value in units of
-#: about 1e-4 s: by 1e-12 s, and 100 times as much with ten times the value, in `tests/physics/test_strong_friction.py`;
-#: theta errs by 5e-13 there, velocities by 1e-4.
+#: to zero as the square root of the remaining time, so a run ends too early by about 1e-4 s times the square of this
+#: value. In `tests/physics/test_strong_friction.py`, this is 1e-12 s, and 1e-10 s with ten times the value; there, the
+#: error of theta is 5e-13, and that of velocities 1e-4.
 JAMMED = 1e-4
 
 #: Value of `Motion.room` at which the ball no longer fits, because a curvature of the arena reaches 1/R. There the foot
-#: moves as the square root of the remaining time, so a run ends too early by the square of this value in units of about
-#: 0.1 s.
+#: moves as the square root of the remaining time, so a run ends too early by about 0.1 s times the square of this
+#: value.
 FITS = 1e-4
 
 #: The ways in which a contact can end; the index is the code of the word.

@@ -96,15 +96,15 @@ class Dynamics(AbstractContactDynamics):
         - `state`: (8 + the arena's place, ...) as `state.py` describes it.
 
         **Returns:** a `Motion`; `rate` is (m/s^2, 1/s, N m, 1/s). Source: `tippe.md`, section 2 (i)-(iii); for other
-        bodies on the plane with the A and B of `body.py` for a and R, and the height's second rate H' c'' + H'' c'^2 in
-        N.
+        bodies on the plane, with the A and B of `body.py` in place of a and R, and with the second derivative of the
+        height, H' c'' + H'' c'^2, in N.
         """
         (u1, u2), e, L, place = parts(state)
         a, R, coupling, growth = self.meridian.at(e[2])
 
-        # The axis turns with the body. V is the velocity of the centre of the sphere that touches as the body does, o
-        # the rate at which the frame turns. The frame moves with this centre, or, if the sphere changes, with the point
-        # below it.
+        # The axis turns with the body. V is the velocity of the centre of a sphere that would touch the arena like the
+        # body, and o the rate at which the frame turns. The frame moves with the point at the height `size` above the
+        # contact, whose velocity is `path`.
         e_dot = scale(self.per_transverse, cross(L, e))
         V = (u1 + a * e_dot[0], u2 + a * e_dot[1])
         changing = multiply(growth, e_dot[2])

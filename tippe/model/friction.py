@@ -188,11 +188,12 @@ class Contensou(AbstractFriction):
     """Coulomb friction on a small contact disc, with one limit for sliding and drilling together (`tippe.md`, section
     3).
 
-    F = -mu N v_s / Q and the torque -mu N Rb^2 w_n n / Q with Q = sqrt(v_s^2 + Rb^2 w_n^2 + slip_speed^2) and
-    Rb = 3 pi / 16 contact_radius. The load is the gradient of the potential mu N Q, an ellipsoid that has the limits of
-    the disc under Hertz' pressure for pure sliding and for pure drilling. Between these limits it differs from the
-    disc's exact force by at most 0.12 mu N and from its torque by at most 0.09 mu N contact_radius. As the radius tends
-    to 0, the law tends to `Coulomb`.
+    The force is -mu N v_s / Q and the torque is -mu N Rb^2 w_n n / Q, with Q = sqrt(v_s^2 + Rb^2 w_n^2 + slip_speed^2)
+    and Rb = 3 pi / 16 contact_radius. Both are minus the derivatives of the potential mu N Q, with respect to v_s and
+    w_n. For small slip_speed, force and torque lie on an ellipsoid with the semi-axes mu N and mu N Rb: the limits of a
+    disc under Hertzian pressure in pure sliding and in pure drilling. Between these limits, the force differs from the
+    exact force of the disc by at most 0.12 mu N, and the torque by at most 0.09 mu N contact_radius. As the radius
+    tends to 0, the law tends to `Coulomb`.
 
     **Arguments:**
 
@@ -241,8 +242,8 @@ class Contensou(AbstractFriction):
 
 
 class Rolling(AbstractFriction):
-    """Rolling resistance in addition to a sliding law: a torque N resistance against the rolling (`tippe.md`, section
-    3).
+    """Rolling resistance in addition to a sliding law: a torque of the size N resistance opposes the rolling
+    (`tippe.md`, section 3).
 
     The torque is -N resistance w_t / sqrt(w_t^2 + turning_speed^2), with w_t the angular velocity without its component
     along n: the normal force acts ahead of the contact point, at the distance `resistance`.

@@ -102,7 +102,7 @@ class Ellipsoid(AbstractRigidBody):
 
     **Raises:** `ValueError` for numbers outside these ranges.
 
-    **Example:** Kane and Levinson's rattleback, spun against its sense.
+    **Example:** Kane and Levinson's rattleback, spun against its preferred sense.
 
     ```
     >>> import tippe

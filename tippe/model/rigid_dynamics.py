@@ -344,7 +344,7 @@ class RigidRolling(AbstractRigidDynamics):
         (u1, u2), e, _, place = parts(state)
         attitude = self.attitude(state)
         r, w, m = attitude.lever, attitude.angular_velocity, self.body.mass
-        # Seen by the body: the velocity u of the centre of mass, and v.
+        # In the body's axes: the velocity u of the centre of mass, and v.
         u = attitude.in_body((u1, u2, -dot(w, cross(r, attitude.normal))))
         v = attitude.in_body((slip.x, slip.y, None))
         jump = vector_of(sum_vectors(v, scale(-1.0, u)))

@@ -69,8 +69,8 @@ class Scene(Bounded, Generic[Body]):
     - `surface`: the arena: `Plane(tilt)`, `Cylinder(radius)`, `Sphere(radius)`, `Spheroid(equatorial, polar)`, `Torus(ring,
       tube)`, `Paraboloid(p)`, `Graph(height)` or `Implicit(function)`.
     - `friction`: `Frictionless()`, `Viscous(mu)`, `Coulomb(mu, slip_speed)`, `Contensou(mu, contact_radius, slip_speed)`
-      or `Rolling(resistance, turning_speed, sliding)` with one of them; for a top without a stem, an
-      `Ellipsoid` or a `RigidBody` also `SetValuedCoulomb(mu)`, for an `Ellipsoid` or a `RigidBody` also `NoSlip()`.
+      or `Rolling(resistance, turning_speed, sliding)` with one of them. A top without a stem, an `Ellipsoid` and a
+      `RigidBody` also allow `SetValuedCoulomb(mu)`; the latter two also allow `NoSlip()`.
     - `gravity`: acceleration of free fall [m/s^2], positive.
     - `contact`: "stop" (the default): a run ends where the contact is lost; "hybrid": it continues through flights,
       impacts, and changes to the stem and back (`modes/`). "stop" compiles faster and works for every body and law; the
@@ -216,7 +216,7 @@ class Scene(Bounded, Generic[Body]):
 
     @property
     def _rigid_dynamics(self) -> AbstractRigidDynamics:
-        """The equations of motion of a rigid body; those of slipping where it may also roll."""
+        """The equations of motion of a rigid body; if it can both slip and roll, the equations of slipping."""
         equations = self.dynamics
         equations = equations.slipping if isinstance(equations, StickSlip) else equations
         assert isinstance(equations, AbstractRigidDynamics)
@@ -232,8 +232,8 @@ class Scene(Bounded, Generic[Body]):
         alike = self.level and self.friction.isotropic
         if not (isinstance(equations, Dynamics) and isinstance(body, Top)) or not alike:
             return equations
-        # The other tops, of group I (`tippe/steady/`), soon stand upright with their axis beside L; a turning frame would
-        # move both.
+        # Tops of group I (`tippe/steady/`) soon stand upright, with the axis close to L; in a turning frame, both would
+        # move.
         may_invert = 1.0 - body.offset / body.radius < body.I1 / body.I3
         return equations.turning(jax.lax.stop_gradient(jnp.where(may_invert, TURNING, 0.0)))
 
@@ -244,7 +244,7 @@ class Scene(Bounded, Generic[Body]):
     def start_bounds(self, launch: Launch) -> Iterator[Bound]:
         """The ranges of a launch's numbers on this arena.
 
-        **Raises:** `ValueError` for a place with the wrong number of numbers.
+        **Raises:** `ValueError` for a place with the wrong number of coordinates.
         """
         if isinstance(self.friction, NoSlip) and launch.velocity is not None:
             raise ValueError(

@@ -1,4 +1,5 @@
-"""The onset of a slip: an implicit step from a contact at rest to a slipping contact, as long as the tolerance allows.
+"""The onset of a slip: an implicit step from a contact at rest to a slipping contact, of the length that the tolerance
+allows.
 
 Let G be the force that rolling requires beyond the friction cone. The slip velocity v changes as v' = M G, where M is
 the contact's inverse mass along the arena. Where rolling leaves the cone, G = 0, and so is the slip's acceleration;
@@ -32,7 +33,8 @@ from .friction import length
 from .rigid_dynamics import RigidRolling, RigidSlipping
 from .rolling import RollingDynamics
 
-#: Stages of the step. Its error is of the order of this plus one in its length, its estimate of this order.
+#: Stages of the step. In powers of the step's length, the error of the step is of order `STAGES` + 1, and the estimate
+#: of the error of order `STAGES`.
 STAGES = 6
 
 #: Length of the first trial over tolerance^(1 / STAGES), in units of the shorter of sqrt(R / g) and the time for a
@@ -40,7 +42,7 @@ STAGES = 6
 FIRST = 5.0
 
 #: Estimates below this are round-off: where a slip of 1e-7 m/s begins, its direction has nine digits. Below it, the
-#: step's length still follows the tolerance; steps with an estimate of 1e-11 were found to err by 1e-13.
+#: step's length still follows the tolerance; steps with an estimate of 1e-11 had errors of 1e-13.
 ROUNDING = 1e-10
 
 #: Trials of the length, and iterations for each; if they are not enough, the run fails (none of 256 tops that slip and
@@ -102,7 +104,7 @@ class Onset(eqx.Module):
             return jnp.where(above, middle, low), jnp.where(above, high, middle)
 
         fraction = jax.lax.stop_gradient(jax.lax.fori_loop(0, 52, halved, (first, jnp.ones_like(first)))[1])
-        # Halving has no derivative; the implicit function theorem gives it.
+        # Bisection has no derivative, so the implicit function theorem supplies it.
         missing, rise = jax.jvp(lambda at: event(self.at(at)), (fraction,), (jnp.ones_like(fraction),))
         inside = (fraction < 1.0) & (rise != 0.0)
         shift = (missing - jax.lax.stop_gradient(missing)) / jax.lax.stop_gradient(jnp.where(inside, rise, 1.0))
@@ -254,7 +256,7 @@ class _Contact(eqx.Module):
         share = self.mu * (n[0] * across[0] + n[1] * across[1]) / painleve_factor
         x, y = self.mu * self.unloaded / painleve_factor * (across + share * along)
         pull = jnp.stack([M11 * x + M12 * y, M12 * x + M22 * y])
-        # Stage by stage: across_j . pull_k, times what the step gives stage j of stage k.
+        # For each pair of stages: across_j . pull_k, times the weight of stage k in stage j.
         matrix = age * jnp.einsum("jk,ij...,ik...->jk...", WEIGHTS, across, pull)
         matrix = matrix + jnp.eye(STAGES).reshape((STAGES, STAGES) + (1,) * (size.ndim - 1)) * size
         turn = _solved(matrix, across[0] * missing[0] + across[1] * missing[1])

@@ -3,9 +3,9 @@
 Within the friction cone, rolling is the only motion near zero slip, and a slip reaches zero in finite time. There the
 direction of the slip has no limit, and steps shrink with the slip speed. Therefore an impulse stops the slip when the
 remaining sliding distance, v^2 / (2 |v'|), is `LEFT` times the tolerance in units of R. Friction would have given the
-same impulse in the remaining time, so the state errs by this distance, in proportion to the tolerance. Rolling ends
-where mu N = |F_t|; there a separate step begins the slip (`slip_onset.py`), with an estimated error within the
-tolerance (`tests/physics/test_stick_slip.py`).
+same impulse in the remaining time, so the error of the state is of the order of this distance, and proportional to the
+tolerance. Rolling ends where mu N = |F_t|; there a separate step begins the slip (`slip_onset.py`), with an estimated
+error within the tolerance (`tests/physics/test_stick_slip.py`).
 """
 
 import dataclasses
@@ -30,12 +30,13 @@ from .rolling import RollingDynamics
 from .slip_onset import Onset, slip_onset
 from .top import Top
 
-#: The remaining sliding distance at which a slip is stopped, over the tolerance and the radius. The state errs by at
-#: most a tenth of the tolerance; the impulse is early by the speed over the deceleration, 8e-8 s at 1e-11.
+#: The remaining sliding distance at which a slip is stopped, over the tolerance and the radius. The error of the state
+#: is at most a tenth of the tolerance. The impulse comes too early by the speed over the deceleration: 8e-8 s at a
+#: tolerance of 1e-11.
 LEFT = 0.1
 
-#: Slip speed, in units of sqrt(g R), below which a state counts as rolling: rounding leaves less. No run depends on it;
-#: where a slip begins, the forces of both kinds of motion are equal in the limit.
+#: Slip speed, in units of sqrt(g R), below which a state counts as rolling; rounding errors leave a smaller speed. No
+#: run depends on it; where a slip begins, the forces of both kinds of motion are equal in the limit.
 AT_REST = 1e-10
 
 #: Round-off allowed in the grip of rolling: a top that stands upright needs no grip. It delays a slip by this value
@@ -142,7 +143,7 @@ class StickSlip(AbstractDynamics):
 
 
 class Change(NamedTuple):
-    """The change at the end of a mode.
+    """The transition at the end of a mode.
 
     - `state`: the state that follows, and whether it `rolls`; `lost`: whether the contact is lost instead.
     - `onset`: the beginning of the slip if the top does not roll; it starts `wait` [s] after the mode has ended.

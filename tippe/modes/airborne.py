@@ -6,8 +6,8 @@ surface's axes, the position of the centre of mass [m], its velocity [m/s], the 
 two zeros. A flight ends where the distance of the centre of a sphere from the arena equals its radius again; then that
 sphere strikes the tangent plane there (`impact.py`). theta is measured from the normal below the top's own sphere,
 whichever sphere touches. A single run whose path is kept has five more components: the vector c of
-`trajectory_problem.py`, in the frame in contact, in the surface's axes in flight; the rotation angle of the top about
-its axis [rad]; and the work of friction and impacts [J].
+`trajectory_problem.py`, which is expressed in the frame during contact and in the surface's axes in flight; the
+rotation angle of the top about its axis [rad]; and the work of friction and impacts [J].
 """
 
 import dataclasses
@@ -50,7 +50,7 @@ from .trajectory_problem import Quadratures, c_rate
 #: the state is that of a flight.
 SLIDING, FLYING, ON_STEM, STRIKING = range(4)
 
-#: Components of a state, behind which passive quadratures may follow.
+#: Number of components of a state, without the passive quadratures that may follow.
 OWN = 14
 
 #: Largest distance of a sphere from the arena at the end of its flight, as a fraction of its radius, and largest

@@ -5,10 +5,10 @@ the contact slips, the tangential impulse grows by -mu v / |v|, whose direction 
 the slip distance s as the independent variable, ds = dp / |v|, nothing is singular, v' = |v| W_n - mu W_t v, and a slip
 that stops does so exponentially in s.
 
-After a stop, the tangential impulse per p is the f with |f| <= mu that minimises f.W_tt f / 2 + f.W_tn: v then grows
-along -f if |f| = mu, and stays zero if |f| < mu. Because W_tt is positive definite, there is one such f, (W_tt + k) f =
--W_tn with k >= 0: the solution after the stop is unique, straight, and lasts to the end. The normal velocity grows
-along it.
+After a stop, the tangential impulse per unit of p is the f with |f| <= mu that minimises f.W_tt f / 2 + f.W_tn: v then
+grows along -f if |f| = mu, and stays zero if |f| < mu. Because W_tt is positive definite, there is one such f, (W_tt +
+k) f = -W_tn with k >= 0: the solution after the stop is unique, straight, and lasts to the end. The normal velocity
+grows during this motion.
 """
 
 import diffrax

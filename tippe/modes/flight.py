@@ -105,7 +105,7 @@ def flown(body: Top, gravity: Float[Array, "..."], free: FreeBody, time: Float[A
 def c_in_flight(body: Top, free: FreeBody, across: Vector, time: Float[Array, "..."]) -> Vector:
     """A vector across the axis after a time [s]; it moves with the axis without rotation about the axis.
 
-    It turns at the rate L / I1 - (e.L / I1) e: about L, and less about e.
+    Its angular velocity is L / I1 - (e.L / I1) e: that of the axis about L, without the component along e.
     """
     size = jnp.sqrt(dot(free.momentum, free.momentum))
     direction = scale(1.0 / jnp.where(size == 0.0, 1.0, size), free.momentum)

@@ -44,14 +44,14 @@ TOLERANCE = 1e-12
 LARGEST = 1e9
 
 #: A rebound slower than this fraction of sqrt(g R) closes the contact. During the time T of the remaining bounces, the
-#: sliding top gets the impulse that they would give it, so the error is of the order of the square. On the plane, a
-#: tenfold value changes inversion times by a relative 3e-12 if a top bounces, and by 4e-11 if it rocks from sphere to
-#: sphere with decreasing amplitude until it leans on both (`LeaningDynamics.stopped`); the value itself errs by 3e-13.
-#: On other arenas, a tenfold value changes positions and axes after the last bounce by 5e-13, and inversion times after
-#: 270 flights in a bowl by a relative 3e-13. Contact begins too early by T.
+#: sliding top gets the impulse that these bounces would give it, so the error is of the order of the square of this
+#: value. On the plane, a tenfold value changes inversion times by a relative 3e-12 if a top bounces, and by 4e-11 if it
+#: rocks from sphere to sphere with decreasing amplitude until it leans on both (`LeaningDynamics.stopped`); the value
+#: itself causes an error of 3e-13. On other arenas, a tenfold value changes positions and axes after the last bounce by
+#: 5e-13, and inversion times after 270 flights in a bowl by a relative 3e-13. Contact begins too early by T.
 CLOSING_SPEED = 1e-5
 
-#: Two spheres touch the arena together if neither is farther from it than this fraction of R. On the plane, a tenfold
+#: Two spheres touch the arena together if neither is farther from it than this fraction of R. On the plane, ten times
 #: or a tenth of this value does not change a time at all.
 TOUCHING = 1e-9
 
@@ -149,7 +149,7 @@ class Impact(AbstractProblem):
     def ended(self, time: Cells, state: Float[Array, "rows cells"]) -> ContactImpulse:
         """The impulses of an impact whose end has been located, corrected by one step of Newton's method.
 
-        The search leaves an error of 1e-10; its square is round-off.
+        The search leaves an error of 1e-10, and this step leaves its square, which is round-off.
         """
         left, slope = jax.jvp(self.domain_margin, (time, state), (jnp.ones_like(time), self.field(time, state)))
         step = -left / jnp.where(slope == 0.0, 1.0, slope)

@@ -39,8 +39,8 @@ BOTH = 2
 
 #: A contact ends when its normal force is below minus this fraction of the weight. A top that begins to roll on its
 #: sphere presses its stem less and less, but never lifts it; without this margin, errors of a nearly zero force would
-#: determine the step lengths. Ending the contact late changes velocities by the square of this: a tenfold or a tenth of
-#: the value changes an inversion time by 4e-16.
+#: determine the step lengths. Ending the contact late changes velocities by the square of this value: ten times or a
+#: tenth of it changes an inversion time by 4e-16.
 HOLDS = 1e-8
 
 #: Where m_1 - m_0 is less than this fraction of its value without friction, rigid-body mechanics does not determine the

@@ -1,7 +1,7 @@
 """Sliding as a mode of the motion, on one sphere or on both, and its transitions: to a flight, to the other sphere, or
 to the end.
 
-A single run whose path is kept has seven passive quadratures behind its state: the position (x, y) of the centre of
+A single run whose path is kept has seven passive quadratures after its state: the position (x, y) of the centre of
 mass [m], the vector c of `trajectory_problem.py`, the rotation angle of the top about its axis [rad], and the work of
 friction and impacts [J].
 """
@@ -47,7 +47,7 @@ Cells = Float[Array, " cells"]
 #: Most consecutive bounces before a run fails.
 MOST_BOUNCES = 10_000
 
-#: Components of a state, behind which passive quadratures may follow.
+#: Number of components of a state, without the passive quadratures that may follow.
 OWN = 8
 
 #: Angle by which the axis turns between the default output times of a flight [rad].
@@ -152,7 +152,7 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
         return start._replace(quadratures=state[OWN:]) if self.with_quadratures else start
 
     def hop(self, air: "Air", left: Cells) -> tuple["Air", "Air"]:
-        """One flight of a top whose contact is open, and after it the impact at its end."""
+        """One flight of a top whose contact is open, and the impact at its end."""
         after, landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
         if air.falls is not None:
             after, landed = _where(air.falls, air, after), air.falls | landed
@@ -372,7 +372,7 @@ def _no_flights(start: Air) -> TransitionPath:
 
 
 def _with_flight(body: Top, record: TransitionPath | None, before: Air, after: Air) -> TransitionPath | None:
-    """The record, if one is kept, with the flight of a single run between two states added, if it flew."""
+    """The record of a single run, if there is one, with the flight between two states added, if there was one."""
     if record is None:
         return None
     place, flew = before.flights[0], after.flights > before.flights
@@ -384,7 +384,7 @@ def _with_flight(body: Top, record: TransitionPath | None, before: Air, after: A
 
 
 def _where(condition: Bool[Array, " cells"], this: Any, that: Any) -> Any:
-    """Each leaf of one tree where a condition holds, of the other elsewhere."""
+    """Each leaf of one tree where a condition holds, and of the other tree elsewhere."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), this, that)
 
 

@@ -38,8 +38,8 @@ class StickSlipMode(AbstractBatchedMode):
     """Slipping or rolling until theta reaches an angle; with `last`, the last crossing counts.
 
     For a single run whose path is kept, `passive` quadratures follow the first `size` components. For the cells of a
-    table both are `None`. Without an angle, a run ends when the spin about the normal reverses; `spin` is that at the
-    start.
+    table both are `None`. Without an angle, a run ends when the spin about the normal reverses; `spin` is the initial
+    spin.
     """
 
     kind: ContactMode
@@ -77,7 +77,7 @@ class StickSlipMode(AbstractBatchedMode):
             cosine = onset.of_components(slice(COS_THETA, COS_THETA + 1))
             fraction = cosine.falls_to_zero(lambda part: part[0] - self.cos_angle, began)
         else:
-            # The blow that stops a slip changes the spin, too.
+            # The impulse that stops a slip changes the spin, too.
             crosses = falls & ~change.lost
             fraction = onset.falls_to_zero(self._event, began)
         crossing = change.wait + fraction * length

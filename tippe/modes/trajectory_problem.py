@@ -20,7 +20,7 @@ from .inversion_problem import InversionProblem
 #: Launches with their passive quadratures, without an event.
 TrajectoryProblem = ExtendedProblem[InversionProblem]
 
-#: Number of the passive quadratures behind the path.
+#: Number of the passive quadratures after the path.
 BEHIND_PATH = 5
 
 

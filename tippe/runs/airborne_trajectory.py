@@ -87,7 +87,7 @@ class ArenaTrajectory(HybridTrajectory):
         reported one."""
         scene, place = self.scene, parts(self._states).place
         (distance, rate), own, stem = self.above, *balls(scene.body)
-        # Its place is that of a top with a larger sphere that touches.
+        # The flying top is treated as one whose own sphere is larger by the distance, so that this sphere touches.
         flying = flight_state(lift_off(scene, self._states, False, Ball(own.offset, own.radius + distance)))
         frame = carried_frame(scene)
         flying = flying._replace(velocity=vector_of(sum_vectors(flying.velocity, scale(rate, frame.normal(place[:3])))))

@@ -67,7 +67,7 @@ DRAWN = 1e-5
 #: Drawn radius of a level plane about the start of a run with flights, in units of sqrt(g R) t1.
 REACH = 0.5
 
-#: Greatest number of steps of a run in the page, some hundred milliseconds.
+#: Greatest number of steps of a run in the page; they take some hundred milliseconds.
 MOST_STEPS_OF_A_PAGE = 50_000
 
 
@@ -294,7 +294,7 @@ def stage_at_start(scene: Scene[Top], launch: Launch, t1: float) -> Stage:
     """A top on a level plane at its launch; the page replaces it by a simulated run before it is visible."""
     start = DrawnMotion(*(np.repeat(np.asarray(part), 2, axis=0) for part in _motion_at_start(scene, launch)))
     drawn, size = show(scene, start._replace(times=np.array([0.0, 1.0])), 0, ""), float(scene.body.size)
-    # Slips grow as the top rises: an arrow half as fast as the equator has the greatest length.
+    # Slips grow as the top rises; a slip at half the speed of the equator gets the longest arrow.
     normal_force, slip, *others = drawn.arrows
     assert slip.limit is not None
     fastest = 0.5 * size * float(np.linalg.norm(start.angular_velocity[0]))

@@ -47,8 +47,8 @@ class HybridTrajectory(AbstractTrajectory):
     The run ends at `end_time`. `status` is "completed", "jammed" (as in `Trajectory`), "failed" or "unresolved";
     `print(run)` states why a run is unresolved. The possible reasons are more than 10 000 flights in a row or 2000
     contacts; a flight that does not end at the arena; an energy that grows or does not balance, by more than 1e4 times
-    the tolerance, relative to the energy; and, for a top with a stem, a contact of sphere and stem at once, either with
-    so much friction on the plane that the forces are not determined, or at rest on another arena. `contact` is the
+    the tolerance, relative to the energy; and, for a top with a stem, contact of sphere and stem at once: on the level
+    plane with so much friction that the forces are not determined, or at rest on any other arena. `contact` is the
     sphere that touches at each time: 0 for the top's sphere, 1 for the stem's, 2 for both, -1 for none. At the time of
     an impact, values are those before the impact. `distance` is the distance of the top's own sphere from the plane [m]
     with its rate [m/s]. `hops` has a row for each flight until `end_time`, with its start and end [s]; a table counts

@@ -42,7 +42,7 @@ def inversion_time(
     The derivative comes from the implicit function theorem at the event; it is 0 if the result is infinite. Together
     with derivatives, a time costs about three times as much for one parameter, five times for two, seven to ten times
     for three or four, and eight to thirteen times for more (`nonholonomic/derivatives/slopes.py`). Second derivatives
-    take forward-mode passes.
+    use forward mode.
 
     **Arguments:**
 

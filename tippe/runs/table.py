@@ -253,7 +253,8 @@ class InversionJob(NamedTuple):
         """The variables of some cells, of which only the first `count` are run."""
         runs, words = self.runs, self.runs.run_kind.words
         if runs.method == "diffrax" and count == 0:
-            # The reference runs whole chunks: a call that only compiles would compute the first chunk twice.
+            # The slow reference always computes a whole chunk, so a call only to compile would compute the first chunk
+            # twice.
             return {}
         variables = runs.results(self.roots, columns, count)
         if self.errors:

@@ -116,7 +116,7 @@ class Trajectory(AbstractTrajectory):
 
     @of_each_run
     def grip(self) -> Float[Array, " times"]:
-        """Friction over normal force [1]: the coefficient of friction that the contact needs at least."""
+        """Friction over normal force [1]: the least coefficient of friction that the contact needs."""
         motion = self.scene.dynamics.motion(self.states)
         f1, f2 = (jnp.zeros_like(self.t) if part is None else part for part in motion.friction.force)
         return length(f1, f2)
@@ -243,7 +243,7 @@ def _legal_or_nan(
     is_legal, t1, tolerance = legal_run(legal(bounds), t1, settings.tolerance, times)
     settings = settings.with_tolerance(tolerance)
     if adjoint is not None:
-        # Diffrax would differentiate a run of zero length.
+        # An illegal run has zero length, but Diffrax would differentiate it.
         scene, launch = nan_unless(is_legal, (scene, launch))
     trajectory = _traced(scene, launch, times, t1, settings, adjoint)
     status = jnp.where(is_legal, trajectory.status, int(Status.ILLEGAL))
@@ -287,7 +287,7 @@ _ended = eqx.filter_jit(ended)
 def _as_trajectory(
     scene: Scene, run: TrajectoryProblem, path: DenseSolution | HybridPath, tolerance: float | Float[Array, ""]
 ) -> Trajectory:
-    # NumPy cuts these: JAX would compile every cut anew for every number of steps.
+    # NumPy slices these arrays, because JAX would compile each slice again for every number of steps.
     states = np.asarray(path.states)
     times, end, last = on_device(path.times, path.times[-1], states[:, -1])
     codes = (jnp.asarray(path.left_domain), jnp.asarray(path.failed))

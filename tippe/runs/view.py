@@ -48,7 +48,7 @@ AXIS, WEIGHT, SLIP, SPIN = 1.6, 1.5, 2.0, 2.5
 #: Distance of the drawn normal force from the contact, in units of the radius.
 BESIDE = 1.35
 
-#: Slips above this quantile are clipped; otherwise the first moments would hide the rest.
+#: Slips above this quantile are clipped; otherwise the large slips at the start would make all others invisible.
 COMMON_SLIP = 0.9
 
 GREEN, VIOLET, BLUE, GOLD = 0x1F8A4C, 0x7B4FA3, 0x1B6CA8, 0xE0A100

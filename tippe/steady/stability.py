@@ -46,8 +46,8 @@ def standing_state(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = Fa
 def standing_matrix(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = False) -> Float[Array, "k k"]:
     """Matrix [1/s] of the linear motion near a standing top, on any arena.
 
-    Components along n change only at second order and are omitted, as are the frame's own direction and the places that
-    a symmetry makes equivalent. A scene with `contact="hybrid"` is treated like one with "stop".
+    The matrix omits components along n, which change only at second order, the direction of the frame, and
+    displacements along which the arena is symmetric. A scene with `contact="hybrid"` is treated like one with "stop".
 
     **Arguments:** as for `standing_state`.
 
@@ -75,7 +75,7 @@ def _standing_matrix(scene: Scene, spin: Float[Array, ""], inverted: bool) -> Fl
 
 
 def _places_across(scene: Scene) -> range:
-    """Which components of a state are places that differ near the arena's lowest point."""
+    """Indices of the place components that matter for the motion near the arena's lowest point."""
     count = max(len(scene.frame.place_scales(1.0)) - 1, 0)
     if isinstance(scene.frame, CarriedFrame):
         # The foot (x, y, z), whose z is along n, and the first tangent, which is only the frame's choice of axes.

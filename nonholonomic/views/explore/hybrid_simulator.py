@@ -77,7 +77,7 @@ class HybridSimulator(NamedTuple):
         return as_object(facts, functions, kinds=f"[{', '.join(kinds)}]")
 
     def _mode(self, values: Numbers, group: list[int], number: Any) -> Any:
-        """The mode with an index, one of a group of similar modes."""
+        """The mode with the given index, from a group of similar modes."""
         modes = self.start(values)[0]
         return _chosen([modes[k] for k in group], group, number)
 
@@ -147,7 +147,7 @@ def _alike(modes: tuple[AbstractBatchedMode, ...]) -> list[list[int]]:
 
 
 def _chosen(modes: list[AbstractBatchedMode], numbers: list[int], number: Any) -> Any:
-    """The mode with an index."""
+    """The mode with the given index."""
 
     def leaf(*leaves: Any) -> Any:
         value = leaves[-1]
