@@ -52,7 +52,7 @@ from .path import BETWEEN as BETWEEN
 from .path import HybridPath as HybridPath
 from .path import Segment as Segment
 from .path import solve_hybrid_dense as solve_hybrid_dense
-from .saltation import solve_hybrid_with_tangents as solve_hybrid_with_tangents
-from .saltation import traced_solve_hybrid_with_tangents as traced_solve_hybrid_with_tangents
 from .samples import HybridSamples as HybridSamples
 from .samples import hybrid_samples as hybrid_samples
+from .tangents import solve_hybrid_with_tangents as solve_hybrid_with_tangents
+from .tangents import traced_solve_hybrid_with_tangents as traced_solve_hybrid_with_tangents

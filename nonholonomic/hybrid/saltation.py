@@ -16,29 +16,23 @@ tolerance, the event is grazing and the derivative has no correct digits; `GRAZI
 
 import math
 from collections.abc import Callable
-from typing import Any, Generic, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
-from ..derivatives import VariationalProblem, in_groups, tangents_of
+from ..derivatives import VariationalProblem, tangents_of
 from ..derivatives.variation import where_active
 from ..integration import (
-    CROSSED,
-    REACHED_END,
     AbstractPassive,
     AbstractProblem,
     ExtendedProblem,
     Lanes,
-    Settings,
     States,
 )
-from ..integration.scheduler import Numbers
-from .ensemble import HybridOutcome, solve_hybrid, traced_solve_hybrid
 from .mode import AbstractBatchedMode, Transition
 
 #: An event is grazing if a relative change of the numbers by the tolerance, or an error of the state that the tolerance
@@ -111,20 +105,10 @@ class VariationalMode(AbstractBatchedMode):
         numbers, build = self._active_numbers()
         unmoved = [jnp.zeros_like(number) for number in numbers]
         rates = self.mode.problem(at).field(duration, at)
-
-        def margin_and_rate(at: Float[Array, "components cells"], *numbers: Array) -> tuple[Array, Array]:
-            problem = build(*numbers).problem(at)
-            return jax.jvp(lambda at: problem.domain_margin(duration, at), (at,), (problem.field(duration, at),))
-
-        # The last two tangents are an error of the state, and a tangent along time.
+        # The last tangent is an error of the state.
         along = [(variation[:-1], *moved) for variation, moved in zip(variations, self._rates(), strict=True)]
-        along += [(self._error(at, duration, rates), *unmoved), (rates, *unmoved)]
-        (_, rate), (domain_margins, changes) = _along(margin_and_rate, (at, *numbers), along)
-        # A mode that ended when it began has not reached its event.
-        happened = (duration > 0.0) & (rate != 0.0)
-        safe = jnp.where(happened, rate, 1.0)
-        later = jnp.where(happened, -domain_margins[:-1] / safe, 0.0)
-        log_rates = jnp.where(happened, (changes[:-1] + changes[-1] * later) / safe, 0.0)
+        along.append((self._error(at, duration, rates), *unmoved))
+        delays, log_rates = self._delays(at, duration, [*along, (rates, *unmoved)])
 
         def reset(at: Float[Array, "components cells"], left: Float[Array, " cells"], *numbers: Array) -> Any:
             mode = build(*numbers)
@@ -137,11 +121,11 @@ class VariationalMode(AbstractBatchedMode):
 
         begins = (
             jnp.concatenate([*[variation[None, -1] for variation in variations], jnp.zeros_like(duration)[None]])
-            + later
+            + delays
         )
         after_event = [
             (moved[0] + shift * rates, -begin, *moved[1:])
-            for moved, shift, begin in zip(along[:-1], later, begins, strict=True)
+            for moved, shift, begin in zip(along, delays, begins, strict=True)
         ]
         values, moved, transition = _along(reset, (at, left, *numbers), after_event, has_aux=True)
         states, elapsed, inside, changes = moved
@@ -156,6 +140,26 @@ class VariationalMode(AbstractBatchedMode):
             state=whole, counts=jnp.concatenate([transition.counts, grazes.astype(int)[None]])
         )
         return transition, values[-1], jax.tree.map(lambda change: change[:count], changes)
+
+    def _delays(
+        self, at: Float[Array, "components cells"], duration: Float[Array, " cells"], along: list[tuple[Array, ...]]
+    ) -> tuple[Float[Array, "tangents cells"], Float[Array, "tangents cells"]]:
+        """The variations of the time at which the mode ends, and of the logarithm of the rate of its margin there.
+
+        **Arguments:** `along`: the tangents, and behind them the tangent along time, which has no variations of its own.
+        """
+        numbers, build = self._active_numbers()
+
+        def margin_and_rate(at: Float[Array, "components cells"], *numbers: Array) -> tuple[Array, Array]:
+            problem = build(*numbers).problem(at)
+            return jax.jvp(lambda at: problem.domain_margin(duration, at), (at,), (problem.field(duration, at),))
+
+        (_, rate), (domain_margins, changes) = _along(margin_and_rate, (at, *numbers), along)
+        # A mode that ended when it began has not reached its event.
+        happened = (duration > 0.0) & (rate != 0.0)
+        safe = jnp.where(happened, rate, 1.0)
+        delays = jnp.where(happened, -domain_margins[:-1] / safe, 0.0)
+        return delays, jnp.where(happened, (changes[:-1] + changes[-1] * delays) / safe, 0.0)
 
     def output_rows(
         self, state: Float[Array, "components times"]
@@ -247,130 +251,6 @@ def _along(function: Any, point: tuple[Array, ...], tangents: list[tuple[Array, 
     # The function itself is computed once, whatever the number of tangents.
     stacked = jax.tree.map(lambda *moved: jnp.stack(moved), *tangents)
     return jax.vmap(along, out_axes=(None, 0, None) if has_aux else (None, 0))(stacked)
-
-
-class Slopes(NamedTuple, Generic[Numbers]):
-    """Derivatives of the times of the events at which runs ended, (tangents, cells); and a mask of those that are NaN
-    because an earlier event was `grazing`, so that the derivative would have no correct digits.
-    """
-
-    slopes: Float[Numbers, "tangents cells"]
-    grazing: Bool[Numbers, " cells"]
-
-
-def solve_hybrid_with_tangents(
-    modes: tuple[AbstractBatchedMode, ...],
-    tangents: tuple[tuple[tuple[Any, ...], Any], ...],
-    mode: Int[np.ndarray, " cells"],
-    state: Float[np.ndarray, "components cells"],
-    t1: float | Float[np.ndarray, "..."],
-    cells: int,
-    settings: Settings,
-    *,
-    counters: int,
-    ends_on_event: bool = True,
-) -> tuple[HybridOutcome[np.ndarray], Slopes[np.ndarray]]:
-    """Run every cell through its modes to its event, and differentiate the event's time along tangents.
-
-    **Arguments:** as for `solve_hybrid`, and
-
-    - `tangents`: pairs of the tangents of the modes and the tangent of the states, with `None` for leaves that do not
-      move.
-    - `ends_on_event`: whether runs end on the event; otherwise they end at `t1`, which then counts as the event's time.
-
-    **Returns:** the `HybridOutcome`, and the `Slopes`, 0 where there is no event or the event is at the start.
-    Source: implicit function theorem at the event, saltation at every change of mode.
-
-    **Example:** the derivative with respect to the restitution.
-
-    >>> from nonholonomic.hybrid import solve_hybrid_with_tangents
-    >>> tangents = (((Bounce(jnp.ones(2)),), None),)
-    >>> _, sensitivities = solve_hybrid_with_tangents(modes, tangents, first, start, 5.0, 2, settings, counters=1)
-    >>> print(sensitivities.slopes.round(6))  # the time of the fall
-    [[0.451524 0.451524]]
-    """
-    varied = variational_modes(modes, tangents, settings.tolerance, ends_on_event)
-    start, n_blocks = np.asarray(variational_start(jnp.asarray(state), tangents)), 1 + len(tangents)
-    ended = solve_hybrid(varied, mode, start, t1, cells, settings, counters=counters + 1, n_blocks=n_blocks)
-    slopes = [np.asarray(_slopes(varied_mode, jnp.asarray(ended.state))) for varied_mode in varied]
-    event_time = ended.crossing_time if ends_on_event else np.broadcast_to(t1, len(mode))
-    return _without_variations(ended, len(state)), _where_defined(
-        np, ended, _of_mode(np, ended, slopes), event_time, ends_on_event
-    )
-
-
-def traced_solve_hybrid_with_tangents(
-    modes: tuple[AbstractBatchedMode, ...],
-    tangents: tuple[tuple[tuple[Any, ...], Any], ...],
-    mode: Int[Array, " cells"],
-    state: Float[Array, "components cells"],
-    t1: Float[Array, "..."],
-    cells: int,
-    settings: Settings,
-    *,
-    counters: int,
-    ends_on_event: bool = True,
-) -> tuple[HybridOutcome[Array], Slopes[Array]]:
-    """`solve_hybrid_with_tangents` inside other transformed functions; arguments and results are traced.
-
-    **Example:** as for `solve_hybrid_with_tangents`.
-
-    >>> from nonholonomic.hybrid import traced_solve_hybrid_with_tangents
-    >>> tangents, options = (((Bounce(jnp.ones(2)),), None),), (jnp.asarray(first), jnp.asarray(start), 5.0, 2, settings)
-    >>> _, sensitivities = traced_solve_hybrid_with_tangents(modes, tangents, *options, counters=1)
-    >>> print(sensitivities.slopes.round(6))
-    [[0.451524 0.451524]]
-    """
-
-    def run(group: tuple[Any, ...]) -> tuple[tuple[HybridOutcome[Array], Array], list[Float[Array, " cells"]]]:
-        varied = variational_modes(modes, group, settings.tolerance, ends_on_event)
-        start, n_blocks = variational_start(state, group), 1 + len(group)
-        ended = traced_solve_hybrid(varied, mode, start, t1, cells, settings, counters=counters + 1, n_blocks=n_blocks)
-        slopes = _of_mode(jnp, ended, [varied_mode.slopes(ended.state) for varied_mode in varied])
-        event_time = ended.crossing_time if ends_on_event else jnp.broadcast_to(t1, mode.shape)
-        known = _where_defined(jnp, ended, slopes, event_time, ends_on_event)
-        return (_without_variations(ended, len(state)), known.grazing), list(known.slopes)
-
-    (outcome, grazing), slopes = in_groups(run, tangents)
-    return outcome, Slopes(jnp.stack(slopes), grazing)
-
-
-def _where_defined(
-    xp: Any,
-    ended: HybridOutcome[Numbers],
-    slopes: Float[Numbers, "tangents cells"],
-    event_time: Float[Numbers, " cells"],
-    ends_on_event: bool,
-) -> Slopes[Numbers]:
-    """The derivatives of the times of events, where these happened and the derivatives have correct digits."""
-    # An event at the start has a fixed time, whatever the tangent.
-    happened = xp.isfinite(event_time) & (event_time > 0.0)
-    # With its variations a run takes other steps: where it does not reach the event, it has no derivative.
-    arrived = ended.status == (CROSSED if ends_on_event else REACHED_END)
-    grazing = happened & ((ended.counts[-1] > 0) | ~arrived)
-    return Slopes(xp.where(happened, xp.where(grazing, xp.nan, slopes), 0.0), grazing)
-
-
-def _without_variations(ended: HybridOutcome[Numbers], size: int) -> HybridOutcome[Numbers]:
-    """A hybrid outcome without its variations."""
-    return ended._replace(state=ended.state[:size], counts=ended.counts[:-1])
-
-
-def _of_mode(xp: Any, ended: HybridOutcome[Numbers], slopes: list[Float[Numbers, "tangents cells"]]) -> Any:
-    """Select, for each cell, the derivatives of its mode.
-
-    A run that has ended between two modes is in neither. Its event is the end of the previous mode, whose variation is
-    the last row.
-    """
-    of_cells = xp.reshape(ended.state, (1 + len(slopes[0]), -1, len(ended.mode)))[1:, -1]
-    for number, of_mode in enumerate(slopes):
-        of_cells = xp.where(ended.mode == number, of_mode, of_cells)
-    return of_cells
-
-
-@eqx.filter_jit
-def _slopes(varied: VariationalMode, state: Float[Array, "components cells"]) -> Float[Array, "tangents cells"]:
-    return varied.slopes(state)
 
 
 def variational_modes(
