@@ -29,6 +29,7 @@ from nonholonomic.geometry import Component, add, cross, dot, multiply, scale, s
 from ..model.contact_dynamics import AbstractDynamics
 from ..model.contact_load import Slip
 from ..model.friction import AbstractFriction
+from ..model.scene import Scene
 from ..model.state import angular_velocity, parts
 from ..model.top import Top
 from .free_body import FreeBody, axis_rate, balls, contact_state, gap_rate
@@ -73,6 +74,11 @@ class LeaningDynamics(AbstractDynamics):
     body: Top
     friction: AbstractFriction
     gravity: Float[Array, "..."]
+
+    @classmethod
+    def of(cls, scene: Scene[Top]) -> "LeaningDynamics":
+        """The equations for the top of a scene."""
+        return cls(scene.body, scene.friction, scene.gravity)
 
     def motion(self, state: Float[Array, "components ..."]) -> LeaningMotion:
         """Evaluate the equations of motion.
