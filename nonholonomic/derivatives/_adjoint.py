@@ -85,13 +85,11 @@ class Checkpoints(NamedTuple):
         return self.index[last], jax.tree.map(functools.partial(_read, at=self.slot[last]), self.progress)
 
     def dropped(self, drop: Bool[Array, ""]) -> "Checkpoints":
-        """The checkpoints without the latest one, if `drop` holds."""
+        """Drop the latest checkpoint if `drop` is true."""
         return self._replace(depth=self.depth - drop)
 
     def added(self, index: Int[Array, ""], progress: Progress, add: Bool[Array, ""]) -> "Checkpoints":
-        """The checkpoints with another one, if `add` holds; if all slots are full, the one whose neighbours are closest
-        is dropped.
-        """
+        """Add a checkpoint if `add` is true; if all slots are full, drop the checkpoint whose neighbours are closest."""
         position = jnp.arange(KEPT)
         full = self.depth == KEPT
         following = jnp.where(position == KEPT - 1, index, jnp.roll(self.index, -1))
@@ -108,7 +106,7 @@ class Checkpoints(NamedTuple):
 
 
 class Backward(NamedTuple):
-    """State of a backward pass: `needed` is the period after the next one.
+    """State of a backward pass. The pass takes the period before `needed` next.
 
     `adjoint` holds, for the cell in each lane, the derivatives of the measured quantity: the first rows are those with
     respect to the state, the others those with respect to the parameters. `gradient` holds the derivatives of every

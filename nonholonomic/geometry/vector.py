@@ -27,7 +27,8 @@ def none_if_zero(value: Any) -> Any:
     if value is None:
         return None
     number = as_number(value)
-    return number if is_traced(number) or np.any(np.asarray(number) != 0.0) else None
+    # An empty list stays, for the module to reject.
+    return None if not is_traced(number) and np.size(number) and np.all(np.asarray(number) == 0.0) else number
 
 
 def vector_of(components: Iterable[Component]) -> Vector:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..validation import require
+from ..validation import as_path, require
 from .recording import Quantities
 
 #: Value of each unit in the SI unit of the same dimension.
@@ -66,7 +66,7 @@ def read_columns(path: Any, columns: Any, fps: float | None, error: Any, quantit
     """
     if not isinstance(columns, Mapping) or not columns:
         raise ValueError(f"columns = {columns!r} must be a dictionary, such as {{'theta': ('tilt', 'deg')}}")
-    table = _table(Path(path))
+    table = _table(as_path(path, "path"))
     names = quantities.of(tuple(name for name in columns if name not in ("time", "frame")))
     for name in columns:
         if name not in ("time", "frame", *names):

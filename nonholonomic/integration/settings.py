@@ -66,7 +66,8 @@ class Settings(eqx.Module):
         """
         if isinstance(self.solver, Oscillatory8):
             raise ValueError(
-                f"solver = {self.solver!r} must have a dense output of its order, as Dopri8() has, where Diffrax integrates"
+                f"solver = {self.solver!r} must have a dense output as accurate as its steps, as Dopri8() has, where Diffrax "
+                "integrates"
             )
         return self.for_steps_alone
 

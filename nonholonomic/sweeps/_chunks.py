@@ -18,6 +18,7 @@ except ImportError:  # not a POSIX system
 
 import numpy as np
 
+from ..validation import as_path
 from ._file import Stored, replacing, sync_folder, write_file
 from .layout import Layout, Values
 
@@ -42,10 +43,7 @@ class ChunkStore:
         **Raises:** `OSError` that names the path if it cannot be read or written; `ValueError` that names the first
         difference if it holds the result of another request or of another version of this package.
         """
-        try:
-            self.path = Path(path)
-        except TypeError:
-            raise ValueError(f"path = {path!r} must be the path of a file") from None
+        self.path = as_path(path, "path")
         self.folder, self.layout = folder_of(self.path), layout
         self._lock = self._locked()
         try:
@@ -198,7 +196,8 @@ class ChunkStore:
 
 
 def layout_words(begun: dict[str, tuple[str, ...]], ours: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """The words of a resumed table: ours if they begin with those of the file, otherwise those of the file."""
+    """The words of a resumed table: `ours` if they begin with the words of the file, otherwise the words of the
+    file."""
     return {name: ours[name] if ours.get(name, ())[: len(words)] == words else words for name, words in begun.items()}
 
 

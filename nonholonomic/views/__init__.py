@@ -1,4 +1,4 @@
-"""Pictures, animations and pages of results. The rooms above compute the results and draw them by these functions."""
+"""Pictures, animations and pages of results. The subpackages above compute the results and draw them by these functions."""
 
 from .arena import arena as arena
 from .fit import draw_fit as draw_fit

@@ -12,6 +12,7 @@ from nonholonomic.geometry import Plane
 from nonholonomic.integration import FAILED, LEFT_DOMAIN, AbstractProblem, LaneState, Settings, Status
 from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.progress import status_line
+from nonholonomic.validation import require_file
 from nonholonomic.views import Page, Stage, arena
 from nonholonomic.views.explore import (
     Answer,
@@ -95,6 +96,8 @@ def explore(
 
     ```
     """
+    if path is not None:
+        require_file(path, "path", ".html", ".htm")
     check_run(scene, launch, t1, input, TOLERANCE)
     roots: dict[str, Any] = {"scene": scene, "launch": launch}
     if isinstance(input, eqx.Module):

@@ -51,7 +51,7 @@ class AbstractFriction(Bounded):
             # The types only know the property of the base class.
             cls.isotropic = property(lambda self: False)  # pyright: ignore[reportAttributeAccessIssue]
 
-    #: Whether friction on a contact at rest takes whatever value keeps it at rest, within limits.
+    #: Whether friction on a contact at rest takes the value that keeps the contact at rest, within limits.
     set_valued: ClassVar[bool] = False
 
     def suspicion(self) -> str | None:
@@ -332,7 +332,7 @@ class SetValuedCoulomb(AbstractFriction):
 
     A run consists of modes. During a slip, the force has its full size. When the slip stops, the top rolls, with the
     equations of `tippe/model/rolling.py`, if the required force is within the friction cone, and slips again when the
-    required force leaves the cone. Rolling keeps the energy constant. With `contact="hybrid"`, a top without a stem
+    required force leaves the cone. Rolling conserves the energy. With `contact="hybrid"`, a top without a stem
     flies when contact is lost, and slips, rolls or rebounds after an impact (`tippe/modes/airborne_stick_slip.py`).
 
     **Arguments:**

@@ -187,7 +187,7 @@ def at_rest(body: Top, free: FreeBody) -> FreeBody:
 
     theta becomes the angle at which both spheres touch, and L loses its component along n x e, which changes theta, as
     by impulses along the normal at both spheres. L.n, L.e, Jellett's quantity of either sphere and the slip do not
-    change; the energy decreases by that of the removed motion.
+    change; the energy decreases by the energy of the removed motion.
     """
     main, stem = balls(body)
     e, L = free.axis, free.momentum

@@ -55,7 +55,7 @@ def extended_inversion_time(
 
     **Raises:** `ValueError` for arguments out of range, and for a scene with `contact="hybrid"` or `SetValuedCoulomb`.
 
-    **Example:** this top does not invert by 3 s, and counts as one that inverts later.
+    **Example:** this top does not invert by 3 s, so the result is a later time.
 
     >>> import tippe
     >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=3.0e-6, I3=3.2e-6)

@@ -1,4 +1,4 @@
-"""The grid of launches and scenes of a table, from its arguments, checked."""
+"""Build and check the grid of launches and scenes of a table."""
 
 from collections import Counter
 from collections.abc import Collection

@@ -206,8 +206,8 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         """
         if self.dense is None:
             raise ValueError("a run made inside jit, vmap or grad has no dense output: pass `times` to simulate")
-        times = np.asarray(times, dtype=float)
         require(times, "times", at_least=0.0, at_most=self.end_time, why="the run ends there")
+        times = np.asarray(times, dtype=float)
         require_increasing(times, "times")
         return self.resampled(times)
 

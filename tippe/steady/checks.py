@@ -42,7 +42,9 @@ def require_plane(scene: Any) -> None:
     """Raise `ValueError` unless this is a scene of a `Top` on a level plane."""
     require_scene_of_a_top(scene)
     if not scene.level:
-        raise ValueError(f"surface = {scene.surface!r} must be a Plane without tilt: elsewhere no top tumbles steadily")
+        raise ValueError(
+            f"surface = {scene.surface!r} must be a Plane without tilt: on other arenas, no top tumbles steadily"
+        )
 
 
 def require_standing(scene: Any, spin: Any, inverted: Any) -> None:

@@ -86,7 +86,7 @@ def _places_across(scene: Scene) -> range:
 def tumbling_matrix(scene: Scene[Top], motion: Tumbling) -> Float[Array, "5 5"]:
     """Matrix [1/s] of the linear motion near a tumbling top, in a frame that precesses with it.
 
-    The matrix covers the five directions that keep |e| and Jellett's constant, except a mere turn about the vertical.
+    The matrix covers the five directions that preserve |e| and Jellett's constant, without the turn about the vertical.
 
     **Arguments:**
 
