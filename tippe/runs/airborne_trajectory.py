@@ -1,4 +1,4 @@
-"""One run through contacts, flights and impacts, with its path, where flights are integrated."""
+"""One run through contacts, flights and impacts, with its path, in scenes whose flights are integrated numerically."""
 
 import dataclasses
 from typing import Any

@@ -131,7 +131,7 @@ def inversion_table(
     if method == "diffrax" and sensitivities:
         raise ValueError("method = 'diffrax' must be 'ensemble' for sensitivities")
     if crossing == "both" and sensitivities:
-        raise ValueError("crossing = 'both' must be 'first' or 'last' for sensitivities, which are of one time")
+        raise ValueError("crossing = 'both' must be 'first' or 'last' for sensitivities, which differentiate one time")
     if method == "diffrax" and crossing != "first":
         raise ValueError(f"crossing = {crossing!r} must be 'first' for method = 'diffrax'")
     launch_values = {"theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
@@ -258,7 +258,7 @@ class InversionJob(NamedTuple):
 
 
 class ScatteredJob(NamedTuple):
-    """A job whose cells are the rows of columns; the columns are among the results.
+    """A job whose cells are listed in columns, one row per cell. The results include the columns.
 
     `columns`: full name of a number -> its value in every cell; `names`: full name -> name of the variable.
     """
