@@ -41,8 +41,8 @@ TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
 
 
 class Ground(NamedTuple):
-    """A surface to ride on: how options create it, and where a ride starts, near the bottom or, outside, near the
-    top."""
+    """A surface to ride on: how options create it, and where a ride starts (near the bottom; outside a surface, near
+    the top)."""
 
     build: Callable[[argparse.Namespace], AbstractSurface]
     place: tuple[float, float]
@@ -61,7 +61,7 @@ GROUNDS = {
 
 
 class Helm(eqx.Module):
-    """Steer alternately left and right, and pull with a constant force: a torque towards a moving angle."""
+    """Steer alternately left and right, by a torque towards a moving angle, and pull with a constant force."""
 
     force: Any = eqx.field(converter=as_number)
     angle: Any = eqx.field(converter=as_number)
@@ -92,9 +92,9 @@ def parser() -> argparse.ArgumentParser:
     body.add_argument("--steering-inertia", type=float, default=0.05, help="inertia of the fork [kg m^2]")
     scene = command.add_argument_group("the scene")
     scene.add_argument(
-        "--surface", nargs="+", choices=list(GROUNDS), default=["plane", "spheroid"], help="what to ride on"
+        "--surface", nargs="+", choices=list(GROUNDS), default=["plane", "spheroid"], help="surfaces to ride on"
     )
-    scene.add_argument("--side", choices=list(CLOSED), default="inside", help="side of those that have two")
+    scene.add_argument("--side", choices=list(CLOSED), default="inside", help="side of a closed surface")
     scene.add_argument("--tilt", type=float, default=0.05, help="tilt of the plane [rad]")
     scene.add_argument("--radius", type=float, default=6.0, help="radius of the cylinder and of the sphere [m]")
     scene.add_argument("--equatorial", type=float, default=6.0, help="equatorial radius of the spheroid [m]")

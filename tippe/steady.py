@@ -356,7 +356,7 @@ def quarter_turn(state: Float[Array, " 8"]) -> Float[Array, " 8"]:
 def tumbling_matrix(scene: Scene[Top], motion: Tumbling) -> Float[Array, "5 5"]:
     """Matrix [1/s] of the linear motion near a tumbling top, in a frame that precesses with it.
 
-    The matrix covers the five directions that keep |e| and Jellett's constant, except a mere turn about the vertical.
+    The matrix covers the five directions that preserve |e| and Jellett's constant, without the turn about the vertical.
 
     **Arguments:**
 
@@ -397,4 +397,4 @@ def growth_rate(matrix: Float[Array, "k k"]) -> Float[Array, ""]:
 
 def _on_a_plane(scene: Scene) -> None:
     if not isinstance(scene.surface, Plane):
-        raise ValueError(f"surface = {scene.surface!r} must be a Plane: elsewhere no top tumbles steadily")
+        raise ValueError(f"surface = {scene.surface!r} must be a Plane: on other arenas, no top tumbles steadily")

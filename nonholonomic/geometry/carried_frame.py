@@ -143,7 +143,7 @@ class CarriedFrame(AbstractFrame):
 
     def _bent(self, place: Place) -> tuple[tuple[Fixed, Fixed, Fixed], TangentOperator]:
         """The vectors t1, t2 and n in the surface's axes, and the shape operator of the arena."""
-        # Stored: otherwise the values below, and above all their derivatives, would each compute these again.
+        # Stored, because otherwise each of the values below, and each of their derivatives, would compute these again.
         n = stored(*self.normal(place[:3]))
         # If the first tangent has drifted, only its direction along the surface counts.
         t1 = stored(*along(n, place[3:])[0])

@@ -62,7 +62,7 @@ class Held(eqx.Module):
 
     @classmethod
     def of(cls, function: eqx.Module) -> "Held":
-        """From a module whose arrays are the numbers of a single function, not one number per lane."""
+        """Convert a module whose arrays hold the numbers of a single function, not one number per lane."""
 
         def parted(leaf: Any) -> Any:
             return Numbers(spread([leaf]), leaf.shape) if eqx.is_array(leaf) and leaf.ndim else leaf
@@ -111,7 +111,7 @@ def gathered(numbers: Sequence[Array], shapes: Sequence[tuple[int, ...]]) -> lis
 
 
 def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module:
-    """A function of lengths [m] as a module whose numbers are arrays.
+    """Convert a function of lengths [m] to a module whose parameters are arrays.
 
     **Raises:** `ValueError` unless the function returns one number for numbers.
     """

@@ -215,7 +215,7 @@ def solve_hybrid(
 
     **Returns:** a `HybridOutcome`.
 
-    **Example:** the balls of the room's example, through their highest points up to 1 s.
+    **Example:** the balls of the subpackage's example, through their highest points up to 1 s.
 
     >>> last = solve_hybrid(modes, first, start, 1.0, 2, settings, counters=1, nonterminal=True)
     >>> print(last.crossing_time.round(6), last.end_time)

@@ -104,8 +104,8 @@ def _fixed(times: Float[Array, " times"]) -> Float[Array, " times"]:
 def _refused(primals: Any, tangents: Any) -> Any:
     if tangents[0] is not None:
         raise ValueError(
-            "derivatives with respect to times or t1 are not available for runs with resets; differentiate by the start or "
-            "the parameters"
+            "derivatives with respect to times or t1 are not available for runs with resets; differentiate with respect to "
+            "the start or the parameters"
         )
     return primals[0], jnp.zeros_like(primals[0])
 

@@ -139,7 +139,7 @@ def free_numbers(
 
 
 def _full_names(short: str, known: list[str], own: list[list[str]]) -> list[str]:
-    """The full names for a name."""
+    """The full names that a name matches."""
     if not str(short).startswith("data["):
         return [full_name("free", short, known)]
     if short.startswith(EACH):

@@ -25,7 +25,7 @@ class AbstractDataModel(eqx.Module):
 
     `seen`: mask of the predictions that were measured.
 
-    **Example:** the predictions of the room's example.
+    **Example:** the predictions of the subpackage's example.
 
     >>> model = Model(scene, data, jnp.arange(3))
     >>> print(model({"scene.rate": jnp.array([1.0, 2.0])}).round(3))

@@ -98,7 +98,7 @@ class AbstractRecording(eqx.Module):
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
 
-    **Example:** the recording of the room's example.
+    **Example:** the recording of the subpackage's example.
 
     >>> data[0].labels
     ('level(1 s)', 'level(2 s)', 'level(3 s)')

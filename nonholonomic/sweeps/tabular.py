@@ -31,7 +31,7 @@ class Quantity(NamedTuple):
 
     @property
     def label(self) -> str:
-        """The description with the unit, as beside a curve."""
+        """The description with the unit, for the axis of a plot."""
         return f"{self.long_name} [{readable_unit(self.unit) or '1'}]"
 
     def of(self, name: str, run: Any) -> Any:

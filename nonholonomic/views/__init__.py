@@ -1,4 +1,4 @@
-"""Pictures, animations and pages of the results of other rooms. No other room needs this one to compute."""
+"""Pictures, animations and pages of the results of other subpackages. No computation needs this subpackage."""
 
 from .arena import arena as arena
 from .fit import draw_fit as draw_fit

@@ -82,7 +82,7 @@ class Power(NamedTuple):
 
 
 class Dynamics(eqx.Module):
-    """A scene with its choices resolved.
+    """The equations of motion of a scene, for its ground, side, fork and heading.
 
     `up` has the components of the upward vertical in the ground's axes; `side` is 1 outside and -1 inside; `absolute`
     is 1 if the fork turns with the frame, otherwise `None`.
@@ -315,6 +315,6 @@ class Dynamics(eqx.Module):
 
 
 def padded(components: State) -> Vector:
-    """Components as a vector; missing components at the end vanish identically."""
+    """A vector made from its components; missing components at the end vanish identically."""
     vector = (*components, None, None)
     return vector[0], vector[1], vector[2]

@@ -83,7 +83,7 @@ class Motion(NamedTuple):
 
 
 class Dynamics(eqx.Module):
-    """A scene with the combinations of its numbers that every evaluation needs, computed once.
+    """A scene, with precomputed combinations of its numbers that every evaluation needs.
 
     `turns` is the additional rate of the frame about n, as a fraction of L_n / I1; `None` if there is none.
     """

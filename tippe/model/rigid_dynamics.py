@@ -230,7 +230,7 @@ class AbstractRigidDynamics(eqx.Module):
         frame.
         """
         zero = jnp.zeros_like(launch.theta)
-        # The body's axes are those of the frame, rotated without rotation about n until z is e.
+        # The body's axes are those of the frame, rotated about a direction across n, so that z becomes e.
         x, y = jnp.cos(launch.azimuth), jnp.sin(launch.azimuth)
         fall = 1.0 - axis[2]
         c = (1.0 - fall * x * x, -fall * x * y, -axis[0])

@@ -42,8 +42,8 @@ STAGES = 6
 #: radian. It does not affect the error: a step with too large an estimate is repeated with a shorter length.
 FIRST = 5.0
 
-#: Estimates below this are round-off: where a slip of 1e-7 m/s begins, its direction has nine digits. Below it, the
-#: step's length still follows the tolerance; steps with an estimate of 1e-11 had errors of 1e-13.
+#: Estimates below this are round-off: where a slip of 1e-7 m/s begins, its direction has only nine correct digits.
+#: Below it, the step's length still follows the tolerance; steps with an estimate of 1e-11 had errors of 1e-13.
 ROUNDING = 1e-10
 
 #: Trials of the length, and iterations for each; if they are not enough, the run fails (none of 256 tops that slip and
@@ -263,8 +263,8 @@ class _Contact(eqx.Module):
         turn = _solved(matrix, across[0] * missing[0] + across[1] * missing[1])
         change = missing - age * jnp.einsum("js,is...->ij...", WEIGHTS, pull * turn)
         # The force depends only on the slip's direction, and where a slip begins, v is much smaller than the change of
-        # v by a small turn of the force. So the direction turns as the equations require, and not to where v points; v
-        # is not turned round.
+        # v by a small turn of the force. So the new direction is the turned direction, not the direction of the
+        # corrected v, and v is never reversed.
         turned = along + turn * across
         longer = greatest(size + change[0] * along[0] + change[1] * along[1], 0.2 * size)
         return longer / length(turned[0], turned[1]) * turned - v

@@ -1,4 +1,5 @@
-"""The final states of runs over any arena: converted to states in contact, their energy, and why a contact ended."""
+"""Convert the final states of runs over any arena to states in contact, and compute their energy and why a contact
+ended."""
 
 from typing import Any
 

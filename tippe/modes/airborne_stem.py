@@ -81,7 +81,8 @@ class OneOfTwo(AbstractProblem):
         return self.contact.field(time, state)
 
     def event_function(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
-        # The angle from the normal below the top's own sphere; it is that of the state if that sphere slides.
+        # theta is measured from the normal below the top's own sphere; if this sphere slides, the state contains
+        # cos(theta).
         apart = _cosine_beside(self.scene, self.own, self.other, state)
         return jnp.where(self.on_stem, apart, state[COS_THETA]) - self.contact.cos_angle
 

@@ -1,7 +1,7 @@
 """Slipping, rolling and flying over any arena, the level plane included, under set-valued Coulomb friction.
 
-Slipping and rolling are as in `sticking.py`, flight as in `airborne.py`, with the states and passive quadratures of the
-latter.
+Slipping and rolling are as in `sticking.py`, flight as in `airborne.py`, with the states and passive quadratures of
+`airborne.py`.
 """
 
 from typing import Any
@@ -22,7 +22,7 @@ from .flying_mode import AbstractFlyingMode
 from .inversion_problem import InversionProblem
 from .trajectory_problem import Quadratures
 
-#: The mode numbers; flying has that of `airborne.py`.
+#: The numbers of the modes; flying has the same number as in `airborne.py`.
 SLIPPING, ROLLING = SLIDING, 2
 
 

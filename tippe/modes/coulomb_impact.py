@@ -3,12 +3,12 @@
 As in `impact.py` the normal impulse p replaces time, and the contact's velocity changes by the constant matrix W. While
 the contact slips, the tangential impulse grows by -mu v / |v|, whose direction has no limit where a slip stops. With
 the slip distance s as the independent variable, ds = dp / |v|, nothing is singular, v' = |v| W_n - mu W_t v, and a slip
-that stops does so exponentially in s.
+that stops decays exponentially in s.
 
 After a stop, the tangential impulse per unit of p is the f with |f| <= mu that minimises f.W_tt f / 2 + f.W_tn: v then
 grows along -f if |f| = mu, and stays zero if |f| < mu. Because W_tt is positive definite, there is one such f, (W_tt +
-k) f = -W_tn with k >= 0: the solution after the stop is unique, straight, and lasts to the end. The normal velocity
-grows during this motion.
+k) f = -W_tn with k >= 0: the solution after the stop is unique and straight, and lasts to the end of the impact. The
+normal velocity grows during this motion.
 """
 
 import diffrax
@@ -31,7 +31,7 @@ Cells = Float[Array, " cells"]
 #: most this fraction. Integration errors, a tenth of the tolerance, must be smaller.
 STOPS = 1e-11
 
-#: Newton iterations for the force after a stop. They converge from one side, in about six.
+#: Newton iterations for the force after a stop. They converge from one side, in about six iterations.
 ITERATIONS = 30
 
 
@@ -115,7 +115,8 @@ def _onward(impact: Impact, mu: Float[Array, "..."], blow: Vector) -> Vector:
     )
     blow = sum_vectors(blow, (*rest, None))
     velocity, along = sum_vectors(meets.velocity, change(blow)), (f1, f2, jnp.ones_like(f1))
-    # The impact ends as in `Impact.domain_margin`: the normal velocity grows in proportion, the energy as a parabola.
+    # The impact ends as in `Impact.domain_margin`: the normal velocity is linear in the impulse, and the energy is
+    # quadratic.
     gains = change(along)
     wanted = greatest((meets.velocity[2] + impact.gained - velocity[2]) / gains[2], 0.0)
     compressed = greatest(-velocity[2], 0.0) / gains[2]

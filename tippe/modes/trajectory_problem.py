@@ -75,7 +75,7 @@ def _problem(scene: Scene, launch: Launch, cells: int | None) -> TrajectoryProbl
     rows = (scene.state(launch), scene.scales(launch), values, scales)
     if cells is not None:
         rows = tuple(jnp.broadcast_to(row.reshape(len(row), -1), (len(row), cells)) for row in rows)
-    # The equations of a rigid body give its spin itself in place of the angular momentum about the axis.
+    # The equations of a rigid body return the spin in place of the angular momentum about the axis.
     axial = jnp.ones(()) if isinstance(scene.body, AbstractRigidBody) else scene.body.I3
     problem = InversionProblem(scene.dynamics, None, rows[0], rows[1])
     return ExtendedProblem(problem, Quadratures(axial), rows[2], rows[3], ends_on_event=False)

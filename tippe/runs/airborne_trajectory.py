@@ -57,7 +57,7 @@ class ArenaTrajectory(HybridTrajectory):
     def theta_rate(self) -> Float[Array, " times"]:
         """Rate of change of theta [rad/s]."""
         dynamics = self.scene.dynamics
-        # The frame moves with the centre of the top's sphere, in flight, too.
+        # The frame moves with the centre of the top's sphere, also in flight.
         frame = dataclasses.replace(carried_frame(self.scene), distance=self.scene.body.radius + self.above[0])
         rates = dataclasses.replace(dynamics, frame=frame).field(self._states)
         return jax.jvp(self.scene.theta, (self._states,), (rates,))[1]

@@ -25,7 +25,7 @@ from ..model.scene import Scene
 def permitted(
     structure: Any, unchecked: bool, leaves: Sequence[Float[Array, "..."]]
 ) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, ""]]:
-    """Which cells have legal numbers; the horizons, 0 for the others; and the tolerance of the ensemble.
+    """A mask of the cells with legal numbers; the horizons, 0 for all other cells; and the tolerance of the ensemble.
 
     The whole ensemble has a single tolerance: the smallest of a batch.
 
@@ -111,7 +111,7 @@ def check_reversible(launch: Launch, values: dict[str, Any]) -> None:
     """
     spin = values.get("launch.spin", launch.spin)
     if launch.angular_velocity is None and not is_traced(spin) and np.any(np.asarray(spin) == 0.0):
-        raise ValueError("spin = 0.0 must not be zero: the time of reversal is that of a spin that changes its sign")
+        raise ValueError("spin = 0.0 must not be zero: a spin of zero cannot reverse")
 
 
 def check_event(angle: Any, crossing: Any, known: tuple[str, ...] = ("first", "last")) -> None:

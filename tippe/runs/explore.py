@@ -136,7 +136,7 @@ def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float
         check_reversible(launch, {})
     roots = {"scene": scene, "launch": launch}
     ranges = default_ranges(scene, launch) if sliders is None else sliders
-    # The stem's end counts from the centre of mass: moving that would change the shape.
+    # The position of the stem's end is relative to the centre of mass, so another offset would change the shape.
     drawn = ("scene.body.stem.", "scene.body.offset") if has_stem(scene) else ()
     knobs = sliders_of(ranges, roots, LONG_NAMES, UNITS | scene.body.units | scene.friction.units, drawn)
 
@@ -187,7 +187,7 @@ def event_problem(scene: Scene, launch: Launch) -> InversionProblem:
 
 
 def is_rigid(scene: Scene) -> bool:
-    """Whether the body has any shape and inertia."""
+    """Whether the body is an `Ellipsoid` or a `RigidBody`."""
     return isinstance(scene.body, AbstractRigidBody)
 
 
@@ -220,8 +220,8 @@ def check_modes(scene: Scene) -> None:
     """Raise `ValueError` for a scene whose runs have modes that the page does not support."""
     if flies(scene) and not scene.level:
         raise ValueError(
-            f"contact = 'hybrid' must be 'stop' for explore on a {type(scene.surface).__name__}: the page knows flights over a "
-            "level Plane only; show one run with its flights by simulate(...).view()"
+            f"contact = 'hybrid' must be 'stop' for explore on a {type(scene.surface).__name__}: the page supports flights "
+            "over a level Plane only; show one run with its flights by simulate(...).view()"
         )
     if scene.friction.set_valued:
         raise ValueError(
