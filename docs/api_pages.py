@@ -42,7 +42,7 @@ PAGES = {
     "scene": Page(
         "Scenes and launches",
         "A scene is a body, an arena and a friction law. A launch is the start of a run.",
-        [*of("tippe", "Scene Launch presets"), *of("stroller", "Scene Launch presets")],
+        [*of("tippe", "Scene Launch"), *of("stroller", "Scene Launch"), "tippe.presets", "stroller.presets"],
     ),
     "bodies": Page(
         "Bodies",
@@ -114,8 +114,8 @@ PAGES = {
     ),
     "engine": Page(
         "The engine",
-        "Write models as fast as the top and the stroller, which use these names: functions of all runs at once. "
-        ":doc:`Your own systems <own_systems>` need none of them. The examples continue that of their room.",
+        "Use these names to write a model that is as fast as the top and the stroller; its functions take all runs at once. "
+        ":doc:`Your own systems <own_systems>` need none of them. In each section, every example continues the one before.",
         [
             "nonholonomic.integration",
             *of(
@@ -236,18 +236,34 @@ def missing() -> list[str]:
 
 
 def text(page: Page) -> str:
-    """The page in reStructuredText: a table of all names, then an entry for each."""
+    """The page in reStructuredText: a table of its names, then an entry for each; a module has a section with a table of
+    its own."""
     introduction = re.sub(r"(:\w+:`[^`]+`)|(`[^`]+`)", lambda match: match[1] or f"`{match[2]}`", page.introduction)
-    lines = [page.title, "=" * len(page.title), "", introduction, ""]
-    lines += [".. autosummary::", "   :nosignatures:", "", *(f"   {name}" for name in page.names), ""]
-    for name in page.names:
-        value = resolve(name)
-        if inspect.ismodule(value):
-            heading = f"``{name}``"
-            lines += [heading, "-" * len(heading), "", f".. automodule:: {name}", "   :members:", ""]
-        elif inspect.isclass(value):
-            members = [f"   :members: {', '.join(MEMBERS[name].split())}"] if name in MEMBERS else []
-            lines += [f".. autoclass:: {name}", *members, ""]
-        else:
-            lines += [f".. autofunction:: {name}", ""]
+    modules = [name for name in page.names if inspect.ismodule(resolve(name))]
+    sections = {module: [name for name in page.names if name.startswith(f"{module}.")] for module in modules}
+    outside = [name for name in page.names if name.rpartition(".")[0] not in sections]
+    lines = [page.title, "=" * len(page.title), "", introduction, "", *summary(outside)]
+    for name in outside:
+        lines += entry(name)
+        if sections.get(name):
+            # Sphinx looks the names up in the module that it has just documented.
+            lines += summary([inner.removeprefix(f"{name}.") for inner in sections[name]])
+            lines += [line for inner in sections[name] for line in entry(inner)]
     return "\n".join(lines)
+
+
+def summary(names: list[str]) -> list[str]:
+    """A table of names with their first sentences."""
+    return [".. autosummary::", "   :nosignatures:", "", *(f"   {name}" for name in names), ""]
+
+
+def entry(name: str) -> list[str]:
+    """The docstring of a name, with those of its members that users need."""
+    value = resolve(name)
+    if inspect.ismodule(value):
+        heading = f"``{name}``"
+        return [heading, "-" * len(heading), "", f".. automodule:: {name}", "   :members:", ""]
+    if inspect.isclass(value):
+        members = [f"   :members: {', '.join(MEMBERS[name].split())}"] if name in MEMBERS else []
+        return [f".. autoclass:: {name}", *members, ""]
+    return [f".. autofunction:: {name}", ""]

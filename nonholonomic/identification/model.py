@@ -1,4 +1,4 @@
-"""What fits of tops, strollers and users' systems share: sets of data, their predictions, and the search.
+"""Common parts of the fits of tops, strollers and users' systems: sets of data, their predictions, and the search.
 
 Each of these fits adds the names of its parameters and the prediction of a set of data.
 """

@@ -74,7 +74,7 @@ class AbstractRecorder(eqx.Module):
     """The part of a solve that records steps, in addition to the `Outcome`. A period is the time between two refills of
     the lanes.
 
-    `period`: the greatest number of iterations of a period, `None` for any number; `refill_cost`: cost of a refill, in
+    `period`: the greatest number of iterations of a period, `None` if unlimited; `refill_cost`: cost of a refill, in
     steps of all lanes.
     """
 

@@ -180,7 +180,7 @@ def require_times(times: Any, t1: Any) -> None:
 
 def require_adaptive(solver: Any, others: str = "") -> None:
     """Raise `ValueError` unless the solver is `None` or a solver of Diffrax that estimates its errors and integrates a
-    single field (others add a stiff part or noise). **Arguments:** `others`: what else the message lists as allowed.
+    single field (others add a stiff part or noise). **Arguments:** `others`: further allowed solvers, for the message.
 
     **Example:**
 

@@ -192,8 +192,8 @@ class Contensou(AbstractFriction):
     and Rb = 3 pi / 16 contact_radius. Both are minus the derivatives of the potential mu N Q, with respect to v_s and
     w_n. For small slip_speed, force and torque lie on an ellipsoid with the semi-axes mu N and mu N Rb: the limits of a
     disc under Hertzian pressure in pure sliding and in pure drilling. Between these limits, the force differs from the
-    exact force of the disc by at most 0.12 mu N, and the torque by at most 0.09 mu N contact_radius. As the radius
-    tends to 0, the law tends to `Coulomb`.
+    exact force of the disc by up to 0.11 mu N, and the torque by up to 0.083 mu N contact_radius. As the radius tends
+    to 0, the law tends to `Coulomb`.
 
     **Arguments:**
 

@@ -172,7 +172,7 @@ def slip_onset(
         # The scales of a launch that is upright up to round-off are nearly zero.
         sizes = jnp.maximum(scales, jnp.max(jnp.abs(moved), axis=1))
         error = jnp.maximum(jnp.max((highest / sizes)[:size], axis=0), unsettled)
-        # The contact must persist, or the slip would miss its loss.
+        # The contact must persist, or this step would miss a loss of contact.
         lost = jnp.min(slipping.contact_margin(moved[:size]), axis=0) <= 0.0
         error = jnp.where(jnp.isfinite(error) & ~lost, error, jnp.inf)
         converged = error <= jnp.maximum(tolerance, ROUNDING)

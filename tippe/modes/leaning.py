@@ -185,9 +185,9 @@ class LeaningDynamics(AbstractDynamics):
 def at_rest(body: Top, free: FreeBody) -> FreeBody:
     """A body whose spheres are both at the plane, with its remaining speeds along the normal removed.
 
-    theta becomes the angle at which both spheres touch, and L loses its component along n x e, which changes theta, as
-    by impulses along the normal at both spheres. L.n, L.e, Jellett's quantity of either sphere and the slip do not
-    change; the energy decreases by the energy of the removed motion.
+    theta becomes the angle at which both spheres touch. L loses its component along n x e, the only one that changes
+    theta; impulses along the normal at both spheres would have this effect. L.n, L.e, Jellett's quantity of either
+    sphere and the slip do not change; the energy decreases by the energy of the removed motion.
     """
     main, stem = balls(body)
     e, L = free.axis, free.momentum

@@ -1,4 +1,4 @@
-"""One run through contacts, flights and impacts, with its path, where flights are integrated."""
+"""One run through contacts, flights and impacts, with its path, in scenes whose flights are integrated numerically."""
 
 import dataclasses
 from typing import Any
@@ -58,7 +58,7 @@ class ArenaTrajectory(HybridTrajectory):
     def theta_rate(self) -> Float[Array, " times"]:
         """Rate of change of theta [rad/s]."""
         dynamics = self.scene.dynamics
-        # The frame moves with the centre of the top's sphere, in flight, too.
+        # The frame moves with the centre of the top's sphere, also in flight.
         frame = dataclasses.replace(carried_frame(self.scene), distance=self.scene.body.radius + self.above[0])
         rates = dataclasses.replace(dynamics, frame=frame).field(self._states)
         return jax.jvp(self.scene.theta, (self._states,), (rates,))[1]

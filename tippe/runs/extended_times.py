@@ -38,13 +38,16 @@ def extended_inversion_time(
     angle: Float[ArrayLike, ""] = 0.95 * math.pi,
     tolerance: float | Float[Array, ""] = 1e-8,
 ) -> Float[Array, ""]:
-    """Inversion time, continued beyond the horizon so that a loss function is finite everywhere and its slope leads
-    back to inversion. If a top has not inverted and is at theta at `t1` or at its loss of contact, the result is t1 (1
-    + log(angle / theta) / C), C = log(angle / theta at the launch), at least 1. This is a penalty, not a prediction.
-    For theta that grows as exp(s t), as it does from small angles, the penalty is linear in the rate s, and continues
-    the time C / s with the same value and slope at `t1`. The function works under `jit`, `vmap`, `grad`, `jvp` and
-    their compositions; the derivative is that of the event's time (implicit function theorem) and of the penalty, with
-    respect to every number except `t1` and `tolerance`.
+    """Inversion time, continued beyond the horizon, for loss functions: the result is finite everywhere, and its slope
+    leads back to inversion.
+
+    If a top has not inverted, and is at theta at `t1` or when it loses contact, the result is
+    t1 (1 + log(angle / theta) / C) with C = log(angle / theta at the launch), at least 1. This is a penalty, not a
+    prediction. Where theta grows as exp(s t), as it does from small angles, the penalty is linear in the rate s. It then
+    continues the time C / s with the same value and slope at `t1`.
+
+    The function works under `jit`, `vmap`, `grad`, `jvp` and their compositions. The derivatives of the time (implicit
+    function theorem) and of the penalty are with respect to every number except `t1` and `tolerance`.
 
     **Arguments:**
 

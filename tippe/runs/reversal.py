@@ -125,5 +125,6 @@ def require_rigid(scene: Scene) -> None:
     if not isinstance(scene.body, AbstractRigidBody):
         kind = type(scene.body).__name__
         raise ValueError(
-            f"body = {kind} must be an Ellipsoid or a RigidBody for times of reversal: a body of revolution keeps its sense"
+            f"body = {kind} must be an Ellipsoid or a RigidBody for times of reversal: a body of revolution keeps its "
+            "sense of rotation"
         )

@@ -81,20 +81,26 @@ def inversion_table(
     - `max_steps`: a run that needs more steps, including rejected ones, fails; at least 1. In a hybrid run, the limit
       applies to each time in a mode; `method="diffrax"` allows 100 000 steps at most.
 
-    **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
-    "contact_lost", "failed", "jammed", "unresolved" if the energy grows), `end_time` [s] and `end_theta` [rad] at which
-    the run ended (also if contact was lost or jammed), `steps` and `rejected`. With `errors`, also `time_error` [s], a
-    bound that is infinite if the two runs disagree on the status or failed, and 0 if both find no time;
-    `end_time_error` and `end_theta_error` are such bounds, too. `Table.digits("time")` shows the correct digits.
-    `hops_error` and `sticks_error` are the differences of the two runs, and `status_error` is 1 if the runs disagree on
-    the status or failed. With `sensitivities`, also the derivative of `time` with respect to each parameter, such as
-    `time_by_mu` for `"scene.friction.mu"`; 0 if the top did not invert. Derivatives pass through flights, impacts,
-    stick and slip (but there are none for `SetValuedCoulomb` with `contact="hybrid"`). If an earlier event, such as a
-    landing, was grazing and within the tolerance may not happen, `grazes` is 1 and the derivative is NaN. With
-    `contact="hybrid"`, a run continues through flights, and the angle also counts in flight; `hops` is the number of
-    flights until the run ended, and `status` may be "unresolved" (10 000 flights in a row, or sphere and stem on the
-    plane together with so much friction that the forces are undetermined). With `SetValuedCoulomb`, `sticks` is the
-    number of changes from slip to rolling outside impacts, and `status` may be "unresolved" (too many changes).
+    **Returns:** a `Table` with the variables
+
+    - `time` [s]: the inversion time, infinite if the top did not invert.
+    - `status`: "inverted", "not_inverted" by `t1`, "contact_lost", "failed", "jammed", or "unresolved" (the energy grows;
+      with `contact="hybrid"`, also 10 000 flights in a row, or sphere and stem on the plane together with so much
+      friction that the forces are undetermined; with `SetValuedCoulomb`, also too many changes between slip and rolling).
+    - `end_time` [s], `end_theta` [rad]: when and at which inclination the run ended, also if contact was lost or jammed.
+    - `steps`, `rejected`: numbers of integration steps.
+    - `hops`, with `contact="hybrid"`: number of flights until the run ended. The run continues through flights, and may
+      reach the angle in flight.
+    - `sticks`, with `SetValuedCoulomb`: number of changes from slip to rolling outside impacts.
+    - `time_error` [s], with `errors`: a bound that is infinite if the two runs disagree on the status or failed, and 0 if
+      both find no time. `end_time_error` and `end_theta_error` are such bounds, too; `hops_error` and `sticks_error` are
+      the differences of the two runs; `status_error` is 1 if the runs disagree on the status or failed.
+      `Table.digits("time")` shows the correct digits.
+    - `time_by_mu` and so on, with `sensitivities`: the derivative of `time` with respect to each parameter; 0 if the top
+      did not invert. Derivatives pass through flights, impacts, stick and slip; there are none for `SetValuedCoulomb`
+      with `contact="hybrid"`.
+    - `grazes`, with `sensitivities`: 1 if an earlier event, such as a landing, was grazing, so that within the tolerance
+      it may not happen; the derivative is then NaN.
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
     `RuntimeError` for an executor that breaks down, or a worker with other versions.
@@ -123,7 +129,7 @@ def inversion_table(
     if method == "diffrax" and sensitivities:
         raise ValueError("method = 'diffrax' must be 'ensemble' for sensitivities")
     if crossing == "both" and sensitivities:
-        raise ValueError("crossing = 'both' must be 'first' or 'last' for sensitivities, which are of one time")
+        raise ValueError("crossing = 'both' must be 'first' or 'last' for sensitivities, which differentiate one time")
     if method == "diffrax" and crossing != "first":
         raise ValueError(f"crossing = {crossing!r} must be 'first' for method = 'diffrax'")
     launch_values = {"theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
@@ -266,7 +272,7 @@ class InversionJob(NamedTuple):
 
 
 class ScatteredJob(NamedTuple):
-    """A job whose cells are the rows of columns; the columns are among the results.
+    """A job whose cells are listed in columns, one row per cell. The results include the columns.
 
     `columns`: full name of a number -> its value in every cell; `names`: full name -> name of the variable.
     """

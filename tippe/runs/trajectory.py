@@ -54,15 +54,15 @@ class Trajectory(AbstractTrajectory):
     centre of mass for other bodies; `contact` is the contact point, and `normal` the arena's normal there. `rotation`
     (times, 3, 3) rotates the body's axes to the fixed frame, and `angular_velocity` is its rate.
 
-    `status` is the word of a `Status`: "completed", "contact_lost", "failed", "jammed", "does_not_fit" or "unresolved"
-    (its energy grows, or does not balance, by more than 1e4 times the tolerance, relative to the energy); inside a
-    transformation, `status` is the integer. For numbers out of range, `status` is `Status.ILLEGAL`, and everything is
-    NaN. The run ends at `end_time`. The top does not fit where a curvature of the arena reaches that of the top's
-    sphere, which would then touch at other points, too. It is jammed if the equation for the normal force has no
-    solution, because friction pulls the top into the arena as strongly as the normal force pushes it out; this needs
-    strong friction, a large offset and a slip along the axis. `stats` holds accepted and rejected steps, the greatest
-    drift of |e| and the greatest energy residual |E - E(0) - work of friction| [J]; with `SetValuedCoulomb` also
-    `sticks`, the number of changes from slip to rolling.
+    - `status`: the word of a `Status`; inside a transformation, its integer. The run ends at `end_time`.
+      "does_not_fit": a curvature of the arena reaches that of the top's sphere, which would then touch at other points,
+      too. "jammed": the equation for the normal force has no solution, because friction pulls the top into the arena as
+      strongly as the normal force pushes it out; this needs strong friction, a large offset and a slip along the axis.
+      "unresolved": the energy grows, or does not balance, by more than 1e4 times the tolerance, relative to the energy.
+      For numbers out of range, `status` is `Status.ILLEGAL`, and all results are NaN.
+    - `stats`: accepted and rejected steps, the greatest drift of |e| and the greatest energy residual
+      |E - E(0) - work of friction| [J]; with `SetValuedCoulomb`, also `sticks`, the number of changes from slip to
+      rolling.
 
     **Example:**
 
