@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ..integration import Progress
+from ..integration.scheduler import Progress
 from ..xla_cpu import written_in_place
 
 #: Number of checkpoints. With more periods, some checkpoints are dropped and computed again from an earlier one. With

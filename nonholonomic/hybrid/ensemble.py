@@ -20,11 +20,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..integration.ensemble import solve_ensemble, traced_solve_ensemble
-from ..integration.problem import AbstractProblem
-from ..integration.scheduler import Numbers, Outcome
-from ..integration.settings import Settings
-from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
+from ..integration import (
+    FAILED,
+    LEFT_DOMAIN,
+    REACHED_END,
+    RUNNING,
+    UNRESOLVED,
+    AbstractProblem,
+    Outcome,
+    Settings,
+    solve_ensemble,
+    traced_solve_ensemble,
+)
+from ..integration.scheduler import Numbers
 from ..xla_cpu import compiled_quickly, greatest
 from .mode import AbstractBatchedMode, Transition, mode_of_cells
 

@@ -50,6 +50,12 @@ class Draws(NamedTuple):
       independent draws.
     - `units`: name -> unit, of the unknown errors.
     - `accepted`: fraction of accepted proposals; `runs`: number of parameter sets for which the model ran.
+
+    **Example:** as for `sample`.
+
+    >>> from nonholonomic.identification import Draws
+    >>> Draws._fields[:3]
+    ('values', 'coordinates', 'r_hat')
     """
 
     values: dict[str, Float[np.ndarray, "chains draws"]]
@@ -113,6 +119,14 @@ def sample(
 
     **Raises:** `ValueError` for numbers out of range and a covariance that is not finite and positive; `ModuleNotFoundError`
     without BlackJAX.
+
+    **Example:** the posterior of the room's example.
+
+    >>> from nonholonomic.identification import LogDensity, sample
+    >>> density = LogDensity.of(Model(scene, data, jnp.arange(3)), data[0].measurements, free)
+    >>> draws = sample(density, fit.coordinates, fit.coordinate_covariance, draws=200, progress=False)
+    >>> print(f"{draws.values['scene.rate'].mean():.2f}")
+    1.00
     """
     require_package("blackjax", "bayes", "sample")
     for name, value, least in (("chains", chains, 2), ("warmup", warmup, 0), ("draws", draws, 2), ("seed", seed, 0)):

@@ -236,7 +236,7 @@ def _show(show: Show, numbers: _Numbers) -> dict[str, Any]:
                 "name": body.name,
                 "meshes": [_mesh(mesh, numbers) for mesh in body.meshes],
                 "position": numbers.add(body.position),
-                "turning": numbers.add(body.turning),
+                "orientation": numbers.add(body.orientation),
             }
             for body in show.bodies
         ],

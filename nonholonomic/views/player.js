@@ -31,7 +31,7 @@ window.views = window.views || {};
         ...run,
         times: floats(run.times),
         normal: floats(run.normal),
-        bodies: run.bodies.map((one) => ({ ...one, position: floats(one.position), turning: floats(one.turning), meshes: one.meshes.map(mesh) })),
+        bodies: run.bodies.map((one) => ({ ...one, position: floats(one.position), orientation: floats(one.orientation), meshes: one.meshes.map(mesh) })),
         traces: run.traces.map((one) => ({ ...one, points: floats(one.points), about: one.about && floats(one.about) })),
         arrows: run.arrows.map((one) => ({ ...one, start: floats(one.start), vector: floats(one.vector) })),
         curves: run.curves.map((one) => ({ ...one, values: floats(one.values) })),
@@ -41,7 +41,7 @@ window.views = window.views || {};
 
   const point = (values, [k, part]) =>
     [0, 1, 2].map((c) => (values.length > 3 ? (1 - part) * values[3 * k + c] + part * values[3 * k + 3 + c] : values[c]));
-  function turning(values, [k, part]) {
+  function orientation(values, [k, part]) {
     const a = values.subarray(4 * k, 4 * k + 4), b = values.length > 4 ? values.subarray(4 * k + 4, 4 * k + 8) : a;
     let cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3];
     const sign = cosine < 0 ? -1 : 1;
@@ -154,7 +154,7 @@ window.views = window.views || {};
     show(stage, r, time) {
       const run = stage.fact.runs[r], at = views.place(run.times, time), count = at[0] + at[1];
       stage.setNormal(r, point(run.normal, at));
-      run.bodies.forEach((body, k) => stage.setPose(r, k, point(body.position, at), turning(body.turning, at)));
+      run.bodies.forEach((body, k) => stage.setPose(r, k, point(body.position, at), orientation(body.orientation, at)));
       run.traces.forEach((trace, k) => stage.setTrace(r, k, Math.round(count), trace.about && point(trace.about, at)));
       run.arrows.forEach((arrow, k) => stage.setArrow(r, k, point(arrow.start, at), point(arrow.vector, at)));
       return point(run.bodies[0].position, at);

@@ -232,7 +232,7 @@ class Scene(Bounded, Generic[Body]):
         alike = self.level and self.friction.isotropic
         if not (isinstance(equations, Dynamics) and isinstance(body, Top)) or not alike:
             return equations
-        # Tops of group I (`steady.py`) soon stand upright, with the axis close to L; in a turning frame, both would
+        # Tops of group I (`tippe/steady/`) soon stand upright, with the axis close to L; in a turning frame, both would
         # move.
         may_invert = 1.0 - body.offset / body.radius < body.I1 / body.I3
         return equations.turning(jax.lax.stop_gradient(jnp.where(may_invert, TURNING, 0.0)))
@@ -284,14 +284,14 @@ class Scene(Bounded, Generic[Body]):
         body, sine, zero = self.body, jnp.sin(launch.theta), jnp.zeros_like(launch.theta)
         e = (sine * jnp.cos(launch.azimuth), sine * jnp.sin(launch.azimuth), jnp.cos(launch.theta))
         if isinstance(body, AbstractRigidBody):
-            turning = sum_vectors(scale(launch.spin, e), launch.angular_velocity or (None, None, None))
-            return self._rigid_dynamics.start(launch, self.start(launch)[0], e, vector_of(turning))
+            w = sum_vectors(scale(launch.spin, e), launch.angular_velocity or (None, None, None))
+            return self._rigid_dynamics.start(launch, self.start(launch)[0], e, vector_of(w))
         L, u = scale(body.I3 * launch.spin, e), launch.velocity or (zero, zero)
         if launch.angular_velocity is not None:
-            turning = vector_of(launch.angular_velocity)
-            along = dot(turning, e)
-            L = sum_vectors(L, scale(body.I1, turning), scale((body.I3 - body.I1) * along, e))
-            u = sum_vectors(u, scale(multiply(-1.0, body.offset_of_path), cross(turning, e)[:2]))
+            w = vector_of(launch.angular_velocity)
+            along = dot(w, e)
+            L = sum_vectors(L, scale(body.I1, w), scale((body.I3 - body.I1) * along, e))
+            u = sum_vectors(u, scale(multiply(-1.0, body.offset_of_path), cross(w, e)[:2]))
         return joined(u, e, L, self.start(launch)[0])
 
     def scales(self, launch: Launch) -> Float[Array, "components ..."]:
@@ -310,8 +310,8 @@ class Scene(Bounded, Generic[Body]):
         I1, I3 = self._moments
         momentum = jnp.maximum(I3 * jnp.abs(launch.spin), I1 * rate)
         if launch.angular_velocity is not None:
-            turning = launch.angular_velocity
-            momentum = jnp.maximum(momentum, I1 * jnp.sqrt(dot(turning, turning)))
+            w = launch.angular_velocity
+            momentum = jnp.maximum(momentum, I1 * jnp.sqrt(dot(w, w)))
         place = scale(ones, self.frame.place_scales(self.body.size))
         tilt = jnp.sin(launch.theta) / NEARLY_UPRIGHT
         # A top that stands exactly upright has no growth to resolve.

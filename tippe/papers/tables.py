@@ -34,7 +34,7 @@ from ..model.top import Top
 from ..runs.plot import Panel, draw_launches
 from ..runs.table import inversion_table
 from ..runs.trajectory import simulate
-from ..runs.view import Motion, stages
+from ..runs.view import DrawnMotion, stages
 from . import paper
 
 #: The arenas by name, and their numbers.
@@ -240,12 +240,12 @@ def _friction(law: AbstractFriction) -> str:
 
 
 @compiled_quickly
-def moving(scene: Scene[Top], launches: Launch, times: Any, tolerance: Any) -> Motion:
+def moving(scene: Scene[Top], launches: Launch, times: Any, tolerance: Any) -> DrawnMotion:
     """The drawn quantities of every launch at the given times, in one batched run."""
-    return jax.vmap(lambda launch: Motion.of(simulate(scene, launch, times[-1], times, tolerance)))(launches)
+    return jax.vmap(lambda launch: DrawnMotion.of(simulate(scene, launch, times[-1], times, tolerance)))(launches)
 
 
-def drawn(options: argparse.Namespace, t1: float) -> tuple[Any, dict[str, Motion]]:
+def drawn(options: argparse.Namespace, t1: float) -> tuple[Any, dict[str, DrawnMotion]]:
     """The times of the plot, up to `t1` [s], and the drawn quantities of every launch in each arena.
 
     All numbers are arrays: another Python number would compile a new program, so the picture and the page could not
@@ -292,7 +292,7 @@ def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[Sta
     (_, runs), groups = drawn(options, last), []
     for arena, scene in scenes(options).items():
         name = f"{shown_name(options, arena)}, θ(0) = {options.theta[row]:.4g} rad"
-        groups.append([(name, scene, Motion(*(np.asarray(part)[row] for part in runs[arena])))])
+        groups.append([(name, scene, DrawnMotion(*(np.asarray(part)[row] for part in runs[arena])))])
     return stages(groups)
 
 

@@ -13,7 +13,8 @@ from nonholonomic.hybrid import BETWEEN, Segment, hybrid_samples, solve_hybrid_d
 from nonholonomic.integration import Settings, Status
 from nonholonomic.xla_cpu import compiled_setup
 
-from ..model.dynamics import LOSSES, NO_COSINE, Motion
+from ..model.contact_dynamics import LOSSES, Motion
+from ..model.dynamics import NO_COSINE
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.state import parts

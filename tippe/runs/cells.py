@@ -21,7 +21,7 @@ from nonholonomic.integration import (
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Variable
 
-from ..model.dynamics import LOSSES
+from ..model.contact_dynamics import LOSSES
 from ..model.scene import Scene
 from ..modes import airborne_ends
 from ..modes.inversion_problem import InversionProblem

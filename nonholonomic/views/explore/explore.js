@@ -37,7 +37,7 @@
     return {
       times,
       normal: take(3),
-      bodies: list(layout.bodies, () => ({ position: take(3), turning: take(4) })),
+      bodies: list(layout.bodies, () => ({ position: take(3), orientation: take(4) })),
       traces: list(layout.traces.length, (k) => ({ points: take(3), about: layout.traces[k] ? take(3) : null })),
       arrows: list(layout.arrows, () => ({ start: take(3), vector: take(3) })),
       curves: list(layout.curves, () => ({ values: take(1) })),
