@@ -2,7 +2,7 @@
 
 The store is JAX's persistent compilation cache. This module adds a separate folder for every jaxlib, kind of processor
 and set of XLA flags, because code compiled for one processor may not run on another. It also checks the entries,
-because a process that is killed while writing leaves half an entry, about which JAX would warn forever.
+because a process that is killed while writing leaves half an entry, and JAX would warn about this entry in every run.
 """
 
 import contextlib
@@ -89,7 +89,7 @@ def enable_compilation_cache(folder: Any = None) -> Path | None:
     settings.update("jax_compilation_cache_dir", str(place))
     settings.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     settings.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    # A size limit would need a lock, for which parallel processes would wait.
+    # A size limit would need a lock, and parallel processes would wait for it.
     settings.update("jax_compilation_cache_max_size", -1)
     # Another process may be writing the entry that this one reads. Then compile the program and go on.
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry", UserWarning)
@@ -132,7 +132,7 @@ def is_off(variable: str) -> bool:
 
 
 def remove_damaged(folder: Path) -> None:
-    """Remove entries that do not decompress, among those written since the last check.
+    """Check the entries written since the last check, and remove those that do not decompress.
 
     JAX neither writes entries atomically nor replaces damaged ones. Without this check, a program whose writer was
     killed (as by Ctrl-C on a command line) would be compiled in every later process. Checking 600 known entries takes
@@ -186,8 +186,8 @@ def sound(entry: bytes) -> bool:
 def kept_text(folder: Path | None, facts: Any, compute: Callable[[], str]) -> str:
     """A text that takes seconds to compute, such as a page with sliders, stored beside the compiled programs.
 
-    **Arguments:** `folder`: that of `enable_compilation_cache`, or `None` to store nothing; `facts`: everything that
-    the text depends on besides these packages, with a `repr`.
+    **Arguments:** `folder`: that of `enable_compilation_cache`, or `None` to store nothing; `facts`: an object whose
+    `repr` contains everything that the text depends on, besides these packages.
     """
     if folder is None:
         return compute()
@@ -199,7 +199,7 @@ def kept_text(folder: Path | None, facts: Any, compute: Callable[[], str]) -> st
         return zlib.decompress(path.read_bytes()).decode()
     except (OSError, zlib.error):
         text = compute()
-    # As a whole, for another process may read it; a full disk is no reason to stop.
+    # Write the file as a whole, because another process may read it. A full disk must not stop the program.
     with contextlib.suppress(OSError):
         written = path.with_name(f".{uuid.uuid4().hex}")
         written.write_bytes(zlib.compress(text.encode(), 1))

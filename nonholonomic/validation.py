@@ -1,7 +1,7 @@
 """Check arguments on concrete numbers, before anything compiles.
 
 Traced numbers pass these checks. A module states the ranges of its numbers once, in `bounds`: concrete numbers out of
-range raise an error; for traced ones, `legal` is false in the program, whose results are then NaN.
+range raise an error; traced numbers out of range make `legal` false and the results NaN.
 """
 
 import dataclasses
@@ -32,10 +32,10 @@ def as_number(value: Any) -> Float[Array, "..."]:
     """Convert to a floating-point array of the default precision; anything that is not a number stays unchanged, for
     `require` to reject."""
     try:
-        if isinstance(value, str):
+        if isinstance(value, str | bytes):
             raise TypeError
         return jnp.asarray(value, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         # The types exclude what `require` will reject.
         return value  # pyright: ignore[reportReturnType]
 
@@ -98,13 +98,15 @@ def require(
     if is_traced(value):
         return
     # NumPy would convert these to numbers.
-    if value is None or isinstance(value, str):
+    if value is None or isinstance(value, str | bytes):
         raise ValueError(f"{name} = {value!r} is not a number")
-    # A pytree rebuilt by a JAX transformation may hold placeholders, but not if it was made by a constructor.
+    # JAX transformations rebuild pytrees with placeholders, but constructors must not receive any.
     try:
         numbers = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
         raise ValueError(f"{name} = {value!r} is not a number") from None
+    except OverflowError:
+        raise ValueError(f"{name} is an integer beyond 1.8e308 and must be finite") from None
     remark = f" ({why})" if why else ""
     finite = np.isfinite(numbers)
     if not np.all(finite):
@@ -128,8 +130,7 @@ def require(
 
 
 def require_scalars(values: dict[str, Any], otherwise: str) -> None:
-    """Raise `ValueError` unless each named value is a single number or omitted; `otherwise` names what accepts
-    lists."""
+    """Raise `ValueError` unless each named value is a single number or omitted; `otherwise` is the advice for lists."""
     for name, value in values.items():
         if value is not None and np.ndim(value) != 0:
             raise ValueError(f"{name} must be one number, not of shape {np.shape(value)}; {otherwise}")
@@ -220,15 +221,20 @@ def require_folder(path: Path, name: str) -> None:
         raise OSError(f"{name} = {path}: nothing can be written there: {error.strerror}") from None
 
 
+def as_path(path: Any, name: str) -> Path:
+    """Convert to a path; raise `ValueError` for a value that is not a path."""
+    try:
+        return Path(path)
+    except TypeError:
+        raise ValueError(f"{name} = {path!r} must be the path of a file") from None
+
+
 def require_file(path: Any, name: str, *endings: str) -> Path:
     """Raise `ValueError` unless a path has one of the endings, and `OSError` unless a file can be written there.
 
     **Returns:** the path.
     """
-    try:
-        file = Path(path)
-    except TypeError:
-        raise ValueError(f"{name} = {path!r} must be the path of a file") from None
+    file = as_path(path, name)
     if file.suffix not in endings:
         raise ValueError(f"{name} = {str(path)!r} must end in {' or '.join(endings)}")
     if file.is_dir():
@@ -308,7 +314,7 @@ class Bounded(eqx.Module):
             warnings.warn(suspicion, UserWarning, stacklevel=1)
 
     def _require_one_shape(self) -> None:
-        """Raise `ValueError` if the module's own numbers are lists of different lengths."""
+        """Raise `ValueError` if the module's own numbers are lists of different lengths, or empty."""
         shapes = {}
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
@@ -316,6 +322,8 @@ class Bounded(eqx.Module):
             for name, part in (parts or {field.name: value}).items():
                 if isinstance(part, jax.Array | np.ndarray):
                     shapes[name] = np.shape(part)
+                    if 0 in shapes[name]:
+                        raise ValueError(f"{name} = [] must be a number, not an empty list")
         try:
             np.broadcast_shapes(*shapes.values())
         except ValueError:

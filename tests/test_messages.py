@@ -20,6 +20,7 @@ import tippe
 from nonholonomic.identification import Draws, sample
 from nonholonomic.integration import Settings
 from nonholonomic.parameters import numbers
+from nonholonomic.views import Page
 from tippe.runs.launches import launches
 from tippe.runs.table import warn_of_long_runs
 
@@ -43,6 +44,11 @@ class Hill(eqx.Module):
 def batch(*shape):
     """A batch of runs that was never run."""
     return eqx.tree_at(lambda run: run.t, run_of_nothing(), jnp.zeros(shape))
+
+
+def followed():
+    """A run with a dense output, which is never asked."""
+    return dataclasses.replace(run_of_nothing(), dense=object())
 
 
 def run_of_nothing():
@@ -143,11 +149,83 @@ REFUSED = {
     ),
     "a page that is no page": (lambda: run_of_nothing().view("x.txt"), "path = 'x.txt' must end in .html or .htm"),
     "a page without a path": (lambda: run_of_nothing().view(3), "path = 3 must be the path of a file"),
+    "a table at a number": (lambda: small_table().plot("time", at=3), "at = 3 must be a dictionary, name of an axis"),
+    "a table's cell": (
+        lambda: small_table()[0],
+        "table[0]: 0 must be the name of a variable or an axis: time, mu",
+    ),
+    "a list of names in a table": (
+        lambda: small_table()[[]],
+        "table[[]]: [] must be the name of a variable or an axis",
+    ),
+    "a table's file that is no path": (lambda: small_table().save(3), "path = 3 must be the path of a file"),
+    "a table from no file": (lambda: tippe.Table.load(None), "path = None must be the path of a file"),
+    "a run's file that is no path": (lambda: run_of_nothing().save(3), "path = 3 must be the path of a file"),
+    "a page's file that is no path": (lambda: Page("").save(3), "path = 3 must be the path of a file"),
+    "a sweep's file that is no path": (
+        lambda: tippe.inversion_table(TOP, theta=0.1, spin=155.0, t1=1.0, path=3),
+        "path = 3 must be the path of a file",
+    ),
+    "a recording from no file": (
+        lambda: tippe.read_recording(3, {"time": ("t", "s"), "theta": ("theta", "rad")}, launch=LAUNCH),
+        "path = 3 must be the path of a file",
+    ),
+    "sliders in a file that is no path": (
+        lambda: tippe.explore(TOP, LAUNCH, 3),
+        "path = 3 must be the path of a file",
+    ),
+    "sliders in a file that is no page": (
+        lambda: stroller.explore(PRAM, RIDE, "x.txt"),
+        "path = 'x.txt' must end in .html or .htm",
+    ),
+    "times that are no numbers": (lambda: followed().at("a"), "times = 'a' is not a number"),
+    "no angle": (
+        lambda: tippe.inversion_table(TOP, theta=0.1, spin=155.0, t1=1.0, angle=None),
+        "angle = None is not a number",
+    ),
+    "a number too large for a float": (
+        lambda: tippe.Launch(0.1, 10**400),
+        "spin is an integer beyond 1.8e308 and must be finite",
+    ),
+    "a horizon too large for a float": (
+        lambda: tippe.simulate(TOP, LAUNCH, 10**400),
+        "t1 is an integer beyond 1.8e308 and must be finite",
+    ),
+    "an axis too large for a float": (
+        lambda: tippe.inversion_table(TOP, theta=0.1, spin=[10**400], t1=1.0),
+        "spin is an integer beyond 1.8e308 and must be finite",
+    ),
+    "bytes": (lambda: tippe.Viscous(b"1"), "mu = b'1' is not a number"),
     "an unknown variable to draw": (
         lambda: nonholonomic.sweeps.Table({"mu": np.ones(2)}, {"time": np.ones(2)}, {}, {}).plot("tme"),
         "variable = 'tme' must be a numeric variable of the table: time; did you mean 'time'?",
     ),
 }
+
+
+#: An empty list for a number, by what it would be the number of.
+EMPTY = {
+    "mass": lambda: tippe.Top([], 0.02, 0.006, 3e-6, 3.2e-6),
+    "radius": lambda: tippe.Top(0.02, [[]], 0.006, 3e-6, 3.2e-6),
+    "semi_axes[1]": lambda: tippe.Ellipsoid(1.0, (0.2, [], 0.02), (0.0, 0.0, -0.01), np.eye(3)),
+    "polar": lambda: tippe.Spheroid(0.3, []),
+    "tilt": lambda: tippe.Plane([]),
+    "mu": lambda: tippe.Viscous([]),
+    "slip_speed": lambda: tippe.Coulomb(0.3, []),
+    "theta": lambda: tippe.Launch.degrees([], 100.0),
+    "place[0]": lambda: tippe.Launch(0.1, 155.0, place=([], 0.0)),
+    "restitution": lambda: tippe.Scene(rutstam_top(), contact="hybrid", restitution=[]),
+    "wheelbase": lambda: stroller.Stroller(12.0, [], 1.5, 0.05),
+    "heading": lambda: stroller.Launch((0.0, 0.0), [], 2.0),
+    "front": lambda: stroller.Damping(2.0, []),
+    "force": lambda: stroller.Steady([]),
+}
+
+
+@pytest.mark.parametrize("name", EMPTY)
+def test_an_empty_list_is_no_number(name):
+    with pytest.raises(ValueError, match=re.escape(f"{name} = [] must be a number, not an empty list")):
+        EMPTY[name]()
 
 
 @pytest.mark.parametrize("name", REFUSED)

@@ -38,7 +38,7 @@ CALLS = {
         "differentiable_solve",
     ),
     "simulate": (lambda: tippe.simulate(TOP, LAUNCH, 1.0), "tippe.runs.trajectory", "follow"),
-    "exponent": (lambda: tippe.lyapunov_exponent(TOP, LAUNCH, 1.0), "tippe.runs.lyapunov", "_direction"),
+    "exponent": (lambda: tippe.lyapunov_exponent(TOP, LAUNCH, 1.0), "tippe.runs.lyapunov", "generic_direction"),
     "ride": (lambda: stroller.simulate(STROLLER, RIDE, 1.0), "stroller.runs.simulate", "_concrete"),
     "identify": (lambda: tippe.identify(TOP, TIMES, {"mu": 0.3}), "tippe.fit.identify", "unknowns_of"),
     "stroller identify": (
@@ -55,9 +55,9 @@ CALLS = {
         "_value_and_gradient",
     ),
     "profile": (lambda: Identification.profile(stub("_place"), "x"), None, None),
-    "page": (lambda: Viewable.view(stub("stages")), None, None),
-    "animation": (lambda: Viewable.animate(stub("stages"), "a.gif"), None, None),
-    "curves": (lambda: Viewable.plot(stub("stages")), None, None),
+    "page": (lambda: SlowRun().view(), None, None),
+    "animation": (lambda: SlowRun().animate("a.gif"), None, None),
+    "curves": (lambda: SlowRun().plot(), None, None),
     "table of a run": (lambda: tippe.Trajectory.to_table(SimpleNamespace(t=0.0)), "tippe.runs.observables", "table_of"),
     "table of a ride": (
         lambda: stroller.Trajectory.to_table(SimpleNamespace()),
@@ -84,6 +84,12 @@ class Enough(Exception):
 def waits(*_, **__):
     time.sleep(0.25)
     raise Enough
+
+
+class SlowRun(Viewable):
+    """A run that takes long to describe for a page."""
+
+    stages = waits
 
 
 def stub(name):

@@ -54,7 +54,7 @@ def classroom(surface: AbstractSurface = Plane()) -> Scene:  # noqa: B008
 def rutstam() -> Top:
     """Rutstam's top: 20 g, R = 2 cm, alpha = 0.3, I3 = 2/5 m R^2, I1 = 131/350 m R^2 (his later papers have this I1).
 
-    He computes with viscous friction, `Viscous(0.3)`. The top has no stem; the papers do not describe its shape. For
+    Rutstam uses viscous friction, `Viscous(0.3)`. The top has no stem; the papers do not describe its shape. For
     the figures of SIGMA 8 (2012) 019, use that paper's I1 = 235/625 m R^2.
 
     **Example:**
@@ -69,7 +69,7 @@ def rutstam() -> Top:
 def cohen() -> Top:
     """Cohen's top: 15 g, R = 2.5 cm, a = 0.5 cm, I1 = I3 = 2/5 m R^2 (Am. J. Phys. 45 (1977) 12).
 
-    He computes with Coulomb friction, mu = 0.3. The paper does not state how friction behaves as the slip vanishes.
+    Cohen uses Coulomb friction with mu = 0.3. The paper does not state how friction behaves as the slip vanishes.
     Exact Coulomb friction does not turn this top over; with a slip speed of 0.11 m/s, the top follows his Figure 5
     (`examples/cohens_figure.py`). The top has no stem.
 

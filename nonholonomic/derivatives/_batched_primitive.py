@@ -27,7 +27,8 @@ class Request:
     """Which outputs of a differentiable solve to compute for a number of cells.
 
     - `solve`: an `AbstractDifferentiableSolve`.
-    - `active`: indices of the leaves to differentiate by, as for `value_and_tangents`; `None` for the primal alone.
+    - `active`: indices of the leaves with respect to which to differentiate, as for `value_and_tangents`; `None` for
+      the primal alone.
     - `wanted`: indices of the parts of the output tree to compute, all if `None`; parts that are `None` count.
     """
 
@@ -139,7 +140,7 @@ batching.primitive_batchers[_solve_cells] = _batched
 
 def _only_read(read: list[bool], *others: Any) -> tuple[list[bool], Any]:
     """The operation restricted to the parts that are used."""
-    # Since JAX 0.12, a list of inputs is between the two.
+    # Since JAX 0.12, a list of inputs comes before the equation.
     equation = others[-1]
     if not any(read):
         return [False] * len(equation.invars), None

@@ -1,7 +1,8 @@
 """Solves with their own derivative rules: functions of scalars for `jit`, `vmap`, `grad`, `jvp` and their compositions.
 
-A run is not differentiated operation by operation. A solve returns its primal together with the derivatives by some of
-the parameters (forward or adjoint), and JAX's rules combine these. A batch under `vmap` is solved as one ensemble.
+A run is not differentiated operation by operation. A solve returns its primal together with the derivatives with
+respect to some of the parameters (forward or adjoint), and JAX's rules combine these. A batch under `vmap` is solved as
+one ensemble.
 """
 
 import abc
@@ -27,7 +28,7 @@ Primal = Any
 class AbstractDifferentiableSolve(eqx.Module):
     """A solve as a function of `leaves`; the first `movable` leaves are differentiable.
 
-    **Example:** the solve of the room's example, for two cells.
+    **Example:** the solve of the subpackage's example, for two cells.
 
     >>> print(HalfLife().solve(2, jnp.array([1.0, 2.0])).round(6))
     [0.693147 0.346574]
@@ -50,11 +51,11 @@ class AbstractDifferentiableSolve(eqx.Module):
     def value_and_tangents(
         self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[Primal, list[Primal]]:
-        """The primal and its derivative by each active leaf, shaped like the primal with the leaf's own axes last;
-        `None` for a part of the primal that is not differentiable.
+        """The primal and its derivative with respect to each active leaf, shaped like the primal with the leaf's own
+        axes last; `None` for a part of the primal that is not differentiable.
 
-        **Arguments:** `active`: which leaves to differentiate by; `nested`: whether the outputs will be differentiated
-        again, in forward mode; `cells`, `leaves`: as for `solve`.
+        **Arguments:** `active`: the leaves with respect to which to differentiate; `nested`: whether the outputs will
+        be differentiated again, in forward mode; `cells`, `leaves`: as for `solve`.
         """
 
     def for_parts(self, wanted: tuple[int, ...]) -> Self:
@@ -169,7 +170,8 @@ def tangents_by(
       number per cell. Without `cells`, a leaf is an array of any shape, and each entry has its own tangent.
 
     **Returns:** the problem; its tangents; and a function that turns derivatives along the tangents (trees of arrays)
-    into derivatives by each leaf, the leaf's own axes last (with `cells` there are none, and the cells come first).
+    into derivatives with respect to each leaf, the leaf's own axes last (with `cells` there are none, and the cells
+    come first).
 
     **Example:** the tangent of a problem moves its rate by its own size.
 
@@ -216,10 +218,11 @@ def tangents_by(
 
 
 def _by_entries(size: Array, *parts: Array) -> Array:
-    """Convert derivatives along the entries of a leaf to derivatives by the leaf, with its axes last."""
+    """Convert derivatives along the entries of a leaf to derivatives with respect to the leaf, whose axes come last."""
     return jnp.stack(parts, axis=-1).reshape(*parts[0].shape, *size.shape) / size
 
 
 def _by_cells(size: Array, part: Array) -> Array:
-    """Convert derivatives along a leaf to derivatives by the leaf, which is one for all cells or one per cell."""
+    """Convert derivatives along a leaf to derivatives with respect to it; the leaf has one number for all cells or one
+    per cell."""
     return part / size.reshape((-1,) + (1,) * (part.ndim - 1))

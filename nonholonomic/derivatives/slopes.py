@@ -16,24 +16,17 @@ from jax.extend.core import Literal
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
-from ..integration import (
-    CROSSED,
-    REACHED_END,
-    AbstractProblem,
-    LaneScheduler,
-    LaneState,
-    Outcome,
-    Settings,
-    with_crossing_times,
-)
+from ..integration import CROSSED, REACHED_END, AbstractProblem, LaneState, Outcome, Settings
+from ..integration.ensemble import with_crossing_times
+from ..integration.scheduler import LaneScheduler
 from ..xla_cpu import compiled_alone
 from ._adjoint import solve_with_adjoint
 from .variation import VariationalProblem, in_groups, slopes_by_variations
 
-#: Up to this many tangents are integrated forward, in pairs. Cost in tables of the same launches, at 1e-8, by 2, 3, 4
-#: and 6 numbers, forward and backward: on the plane 5.0, 7.3, 8.4, 15 and 7.8, 13, 7.4, 7.6 (jax 0.10) or 4.6, 6.9,
-#: 8.4, 14 and 8.5, 11, 10, 11 (jax 0.12); in a cylinder 5.2, 8.5, 9.5, 16 and 9.4, 12, 10, 12 (jax 0.10). By one
-#: number: 2.8.
+#: Up to this many tangents are integrated forward, in pairs. The cost relative to a table without derivatives, at a
+#: tolerance of 1e-8, for 2, 3, 4 and 6 parameters, is on the plane 5.0, 7.3, 8.4, 15 forward and 7.8, 13, 7.4, 7.6
+#: backward (jax 0.10), or 4.6, 6.9, 8.4, 14 forward and 8.5, 11, 10, 11 backward (jax 0.12); in a cylinder 5.2, 8.5,
+#: 9.5, 16 forward and 9.4, 12, 10, 12 backward (jax 0.10). One parameter costs 2.8.
 MOST_FORWARD = 4
 
 
@@ -62,7 +55,7 @@ def ensemble_solve_with_tangents(
     **Returns:** the `Outcome`, and for each tangent the derivative of `crossing_time`, 0 where that is infinite.
     Source: implicit function theorem at the event; step lengths are held fixed.
 
-    **Example:** half-lives, and their derivatives by the rates.
+    **Example:** half-lives, and their derivatives with respect to the rates.
 
     >>> from nonholonomic.derivatives import solve_ensemble_with_tangents
     >>> problem, tangents = Decays(jnp.array([1.0, 2.0])), (Decays(jnp.ones(2)),)
@@ -99,7 +92,7 @@ def _slopes_by_adjoint(
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """The result of `slopes_by_variations`, at a cost that does not depend on the number of tangents."""
     moving = _moving(problem, tangents[0])
-    # Without tangents this is the problem itself, with the choice not to end on its event.
+    # Without tangents, a `VariationalProblem` is the problem itself, with the option not to end on its event.
     ended, by_start, by_number = solve_with_adjoint(
         VariationalProblem(problem, (), ends_on_event),
         VariationalProblem(moving, (), ends_on_event),

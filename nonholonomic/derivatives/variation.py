@@ -13,10 +13,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..integration import AbstractProblem, LaneScheduler, Outcome, crossing_time
+from ..integration import AbstractProblem, Outcome, crossing_time
+from ..integration.scheduler import LaneScheduler
 
-#: Tangents integrated together: two take 0.6 to 1.0 times as long as one after the other, and an eighth longer to
-#: compile; four take 1.1 times as long as two pairs.
+#: Number of tangents that are integrated together. Two together take 0.6 to 1.0 times as long as two in turn, and an
+#: eighth longer to compile; four together take 1.1 times as long as two pairs.
 TOGETHER = 2
 
 
@@ -41,7 +42,7 @@ class VariationalProblem(AbstractProblem):
 
     **Arguments:** `ends_on_event`: whether runs end on the event of the problem, or continue to their horizon.
 
-    **Example:** the state and its variation by the rate, two components.
+    **Example:** the state and its variation with respect to the rate, two components.
 
     >>> from nonholonomic.derivatives import VariationalProblem
     >>> varied = VariationalProblem(Decays(jnp.ones(3)), (Decays(jnp.ones(3)),), True)

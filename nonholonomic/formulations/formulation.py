@@ -4,7 +4,7 @@ The data of a system are its metric G(q), potential V(q), constraint one-forms W
 generalised force f(t, q, q') of drives and friction. From them follow
 
 - `Multipliers`: Hamilton's equations with Lagrange multipliers, the constrained port-Hamiltonian form;
-- `Hamel`: Poincare's equations in the quasi-velocities of the frame, Hamel's where there are constraints;
+- `Hamel`: Poincare's equations in the quasi-velocities of the frame; with constraints, Hamel's equations;
 - `ConstrainedConnection`: geodesics, with forces, of the constrained Levi-Civita connection;
 - `ReducedBracket`: the reduced Poisson-like bracket of van der Schaft and Maschke.
 
@@ -77,7 +77,7 @@ class AbstractSystem(eqx.Module):
         return jnp.zeros((), q.dtype)
 
     def constraints(self, q: Coordinates) -> Float[Array, "k n"]:
-        """One-forms W(q), one per row, that vanish on every velocity; none by default."""
+        """One-forms W(q), one per row, that vanish on every allowed velocity; none by default."""
         return jnp.zeros((0, q.size), q.dtype)
 
     def frame(self, q: Coordinates) -> Float[Array, "n n"]:

@@ -12,9 +12,9 @@ from .formulation import AbstractSystem, AbstractVelocityFormulation, Coordinate
 class Lagrange(AbstractVelocityFormulation):
     """Lagrange's equations with multipliers, G q'' + G' q' = dL/dq + f + W^T lambda, with W q'' + W' q' = 0.
 
-    The multipliers are those of `Multipliers`, but the state is (q, q'), so the metric's equations are solved once, for
-    the force and the rows of W together. The Lagrangian must be kinetic minus potential energy. Source: `stroller.md`,
-    section 6, F1.
+    The multipliers are those of `Multipliers`, but the state is (q, q'), so one linear system with the metric is solved
+    for the force and the rows of W together. The Lagrangian must be kinetic minus potential energy. Source:
+    `stroller.md`, section 6, F1.
 
     **Arguments:**
 

@@ -84,9 +84,9 @@ class Paraboloid(AbstractOpen):
     def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
         x, y, _ = position
         per_length, normal = 1.0 / jnp.sqrt(x * x + y * y + self.p * self.p), self.normal(position)
-        turning = (-velocity[0], -velocity[1], None)
-        along = scale(subtract(None, dot(normal, turning)), normal)
-        rate = scale(per_length, sum_vectors(turning, along))
+        gradient_rate = (-velocity[0], -velocity[1], None)
+        along = scale(subtract(None, dot(normal, gradient_rate)), normal)
+        rate = scale(per_length, sum_vectors(gradient_rate, along))
         return (rate[0], rate[1], rate[2])
 
     def gaussian_curvature(self, position: Vector) -> Component:
@@ -116,11 +116,11 @@ class Paraboloid(AbstractOpen):
 
 
 def _above_the_root(r: Component, rise: Component, bend: Component) -> Component:
-    """A number not below the greatest root s of bend s^3 + rise s = r, for r and bend above 0."""
+    """An upper bound of the greatest root s of bend s^3 + rise s = r, for r and bend above 0."""
     cube = r / bend
     fourth_root = jnp.sqrt(jnp.sqrt(cube))
-    # A cube root is expensive. By the inequality of means, (2 c + cube / c^2) / 3 is not below it for any c; this c is
-    # close to it.
+    # A cube root is expensive. By the inequality of means, (2 c + cube / c^2) / 3 is not below the cube root for any c;
+    # this c is close to the root.
     c = fourth_root * jnp.sqrt(jnp.sqrt(fourth_root))
     bound = jnp.sqrt(jnp.maximum(-rise / bend, 0.0)) + (2.0 * c + cube / (c * c)) / 3.0
     return jnp.where(rise > 0.0, jnp.minimum(bound, r / jnp.where(rise > 0.0, rise, 1.0)), bound)

@@ -1,4 +1,4 @@
-"""Surfaces on which a function vanishes, known only by the function and its derivatives.
+"""Surfaces on which a function vanishes, computed from the function and its derivatives alone.
 
 Both searches here are minimisations. The nearest point minimises the distance over the surface, which may have many
 local minima for positions farther than the surface's least radius of curvature. The region that can contain the nearest
@@ -23,10 +23,11 @@ from jaxtyping import Array, Bool, Float
 from .surface import AbstractSurface, BallGap
 from .vector import Component, Vector, dot, scale, subtract, sum_vectors, tangents, vector_of
 
-#: Most iterations of a search. Most take three to six; ten times as many move no point.
+#: Most iterations of a search. Most searches take three to six; ten times as many would not move any point.
 MOST_ITERATIONS = 40
 
-#: Least curvature of the minimised function for which a step is computed, relative to that above a flat surface.
+#: Smaller curvatures of the minimised function are raised to this value, relative to the curvature above a flat
+#: surface.
 LEAST_CURVATURE = 0.05
 
 #: A search ends when a step is shorter than this fraction of the distance; the last step squares this error.
@@ -164,7 +165,7 @@ class AbstractLevel(AbstractSurface):
 
     def nearest(self, position: Vector) -> Vector:
         surface, place = _held(self), jax.lax.stop_gradient(position)
-        # A start off the surface, on the position's side, would be nearer than every point of the surface.
+        # A start that is off the surface, on the position's side, could be nearer than every point of the surface.
         first = surface.onto(surface.onto(place))
         within = jnp.sqrt(_square(place, first))
         starts = jnp.asarray(self.starts)
@@ -229,7 +230,7 @@ class AbstractLevel(AbstractSurface):
 
 
 def _held(surface: AbstractLevel) -> AbstractLevel:
-    """A surface that is not differentiated by its numbers."""
+    """A surface whose parameters are constants in derivatives."""
     return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, surface)
 
 

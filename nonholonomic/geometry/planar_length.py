@@ -42,8 +42,8 @@ def _change(primals: Any, tangents: Any) -> Any:
     return length, jnp.where(at_pole, _departure.bind(dx, dy), (x * dx + y * dy) / divisor)
 
 
-#: The length of a tangent at the pole, which no linear function has as its own transpose: NaN for every cotangent but
-#: 0.
+#: The length of a tangent at the pole. This function is not linear, so it has no true transpose: reverse mode gives NaN
+#: for every cotangent but 0.
 _departure = Primitive("departure_from_pole")
 _departure.def_impl(lambda dx, dy: jnp.hypot(dx, dy))
 _departure.def_abstract_eval(lambda dx, dy: ShapedArray(dx.shape, dx.dtype))

@@ -34,7 +34,7 @@ class AbstractQuadric(AbstractSurface):
         """Equatorial radius A and polar semi-axis c [m]."""
 
     def gradient(self, vector: Vector) -> Vector:
-        """The vector N r [1/m] for a position r, along the normal; also N times any other vector."""
+        """The product of N and a vector. For a position r on the surface, N r [1/m] points along the normal."""
         equatorial, polar = self.semi_axes
         across, along = 1.0 / (equatorial * equatorial), 1.0 / (polar * polar)
         return (multiply(across, vector[0]), multiply(across, vector[1]), multiply(along, vector[2]))
@@ -46,9 +46,9 @@ class AbstractQuadric(AbstractSurface):
 
     def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
         gradient, normal = self.gradient(position), self.normal(position)
-        turning = self.gradient(velocity)
-        along = scale(subtract(None, dot(normal, turning)), normal)
-        return scale(1.0 / jnp.sqrt(dot(gradient, gradient)), sum_vectors(turning, along))
+        gradient_rate = self.gradient(velocity)
+        along = scale(subtract(None, dot(normal, gradient_rate)), normal)
+        return scale(1.0 / jnp.sqrt(dot(gradient, gradient)), sum_vectors(gradient_rate, along))
 
     def bending(self, position: Vector, a: Vector, b: Vector) -> tuple[Component, Component, Component]:
         # The gradient's size changes the normal only along n, which is perpendicular to a and b.
@@ -188,7 +188,8 @@ class Spheroid(AbstractQuadric):
         # Journal on Scientific and Statistical Computing 4 (1983) 553).
         equatorial, polar = self.semi_axes
         x, y, z = position
-        # Where all directions are equally near, take that of growing coordinates.
+        # Where the nearest points in all directions are equally near, take the point in the direction of growing
+        # coordinates.
         across, along = jnp.sqrt(jnp.maximum(x * x + y * y, TINY * TINY)), jnp.maximum(jnp.abs(z), TINY)
         least = jnp.minimum(equatorial, polar)
         numbers = (equatorial * across, polar * along, equatorial**2 - least**2, polar**2 - least**2)

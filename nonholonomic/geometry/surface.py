@@ -82,7 +82,8 @@ class AbstractSurface(Bounded):
 
     @abc.abstractmethod
     def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
-        """Rate n' [1/s] of the normal at a position [m] that moves with a velocity [m/s]: minus the shape operator times it."""
+        """Rate n' [1/s] of the normal at a position [m] that moves with a velocity [m/s]: minus the shape operator
+        times the velocity."""
 
     def bending(self, position: Vector, a: Vector, b: Vector) -> tuple[Component, Component, Component]:
         """(a . n'(a), a . n'(b), b . n'(b)) [1/m] for two vectors along the surface: minus its second fundamental form."""
@@ -153,7 +154,7 @@ class AbstractSurface(Bounded):
 
         **Arguments:** `place`: as for `chart`; `size`: a length [m] of the body, the scale for round-off.
 
-        **Raises:** `ValueError` for a wrong number of numbers.
+        **Raises:** `ValueError` for a wrong number of coordinates.
         """
         count = len(self.coordinates)
         if len(place) not in (count, 3):

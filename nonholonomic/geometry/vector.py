@@ -27,7 +27,8 @@ def none_if_zero(value: Any) -> Any:
     if value is None:
         return None
     number = as_number(value)
-    return number if is_traced(number) or np.any(np.asarray(number) != 0.0) else None
+    # An empty list stays unchanged, so that the module rejects it.
+    return None if not is_traced(number) and np.size(number) and np.all(np.asarray(number) == 0.0) else number
 
 
 def vector_of(components: Iterable[Component]) -> Vector:
@@ -105,6 +106,6 @@ def tangents(normal: Vector) -> tuple[Vector, Vector]:
 
 
 def _projected(vector: Vector, used: Component) -> Vector:
-    """The vector at unit length; where it is not used, something finite with finite derivatives."""
+    """The vector at unit length; where it is not used, a finite vector with finite derivatives."""
     square = jnp.where(used, dot(vector, vector), 1.0)
     return scale(1.0 / jnp.sqrt(square), vector)

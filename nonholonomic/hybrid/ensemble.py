@@ -20,15 +20,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..integration.ensemble import solve_ensemble, traced_solve_ensemble
-from ..integration.problem import AbstractProblem
-from ..integration.scheduler import Numbers, Outcome
-from ..integration.settings import Settings
-from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
+from ..integration import (
+    FAILED,
+    LEFT_DOMAIN,
+    REACHED_END,
+    RUNNING,
+    UNRESOLVED,
+    AbstractProblem,
+    Outcome,
+    Settings,
+    solve_ensemble,
+    traced_solve_ensemble,
+)
+from ..integration.scheduler import Numbers
 from ..xla_cpu import compiled_quickly, greatest
 from .mode import AbstractBatchedMode, Transition, mode_of_cells
 
-#: Most rounds, and so most modes of a single run, before unfinished cells end as `UNRESOLVED`.
+#: Largest number of rounds, and so of modes in a run; then unfinished cells end as `UNRESOLVED`.
 MOST_ROUNDS = 2000
 
 
@@ -55,7 +63,7 @@ class HybridOutcome(NamedTuple, Generic[Numbers]):
 #: The `HybridOutcome` of some runs, and what else is kept of them.
 Carry = tuple[Any, ...]
 
-#: (the numbers of some modes, carry, a mask of cells in these modes) -> the carry after these cells have advanced.
+#: (the indices of some modes, carry, a mask of cells in these modes) -> the carry after these cells have advanced.
 Advance = Callable[[Sequence[int], Carry, Any], Carry]
 
 
@@ -81,7 +89,7 @@ def one_round(carry: Carry, groups: Sequence[Sequence[int]], solve: Advance, res
 
     **Arguments:**
 
-    - `groups`: the numbers of the modes; one program serves the modes of a group.
+    - `groups`: the indices of the modes, in groups; one program serves the modes of a group.
     - `solve`, `reset`: advance the cells to the end of their mode, and through the reset map.
     """
     # A cell that changes its mode during the round waits for the next round.
@@ -125,7 +133,7 @@ def finished(xp: Any, runs: HybridOutcome[Numbers]) -> HybridOutcome[Numbers]:
 
 
 def runs_of_cells(runs: HybridOutcome[Numbers], cell: Int[Numbers, " selected"]) -> HybridOutcome[Numbers]:
-    """The runs of the cells with these numbers."""
+    """The runs of the cells with these indices."""
     return HybridOutcome(*(values[..., cell] for values in runs))
 
 
@@ -215,7 +223,7 @@ def solve_hybrid(
 
     **Returns:** a `HybridOutcome`.
 
-    **Example:** the balls of the room's example, through their highest points up to 1 s.
+    **Example:** the balls of the subpackage's example, through their highest points up to 1 s.
 
     >>> last = solve_hybrid(modes, first, start, 1.0, 2, settings, counters=1, nonterminal=True)
     >>> print(last.crossing_time.round(6), last.end_time)
@@ -254,7 +262,7 @@ def solve_hybrid(
 def _gathered(
     runs: HybridOutcome[np.ndarray], selected: Int[np.ndarray, " selected"], t1: Float[np.ndarray, " cells"]
 ) -> tuple[Int[np.ndarray, " cells"], Float[np.ndarray, "components cells"], Float[np.ndarray, " cells"]]:
-    """The numbers, the states and the remaining times of some cells, padded to the full number of cells."""
+    """The indices, the states and the remaining times of some cells, padded to the full number of cells."""
     padding = np.full(len(runs.status) - selected.size, selected[-1] if selected.size else 0)
     cell = np.concatenate([selected, padding])
     return cell, runs.state[:, cell], np.maximum(t1[cell] - runs.end_time[cell], 0.0)
@@ -324,8 +332,8 @@ def traced_solve_hybrid(
 
 
 def padded(selected: Bool[Array, " cells"]) -> Int[Array, " cells"]:
-    """The numbers of the selected cells. The first selected cell replaces all others, because their states may have
-    another meaning."""
+    """The indices of the selected cells. The first selected cell replaces all others, because the states of the others
+    may have another meaning."""
     return jnp.where(selected, jnp.arange(selected.size), jnp.argmax(selected))
 
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float, Int
 
-from ..integration.problem import AbstractProblem
+from ..integration import AbstractProblem
 from ..integration.scheduler import Numbers
 
 
@@ -37,7 +37,8 @@ class Transition(NamedTuple, Generic[Numbers]):
     `state` is the new state, `elapsed` [s] the duration of the transition, and `crossing_time` [s] the last time of the
     event during the transition, infinite if there was none. `counts` contains the counters, one per row. `record` is
     the path of a single run (`path.py`); `None` for instantaneous transitions, or where no path is kept. `log_rates` is
-    the sum of the logarithms of the rates at which events on the way are met; `None` if there are none.
+    the sum of the logarithms of the rates of the event functions at the events during the transition; `None` if there
+    are none.
 
     **Example:** the bounce of both balls at 5 m/s.
 
@@ -59,7 +60,7 @@ class Transition(NamedTuple, Generic[Numbers]):
 class AbstractBatchedMode(eqx.Module):
     """One mode of a hybrid system. Its leaves are scalars, or hold one number per cell in their last axis.
 
-    **Example:** the mode of the room's example, at its start.
+    **Example:** the mode of the subpackage's example, at its start.
 
     >>> print(modes[0].problem(start).field(0.0, start)[1])
     [-9.81 -9.81]
@@ -93,8 +94,8 @@ class AbstractBatchedMode(eqx.Module):
 class AbstractHoppingMode(AbstractBatchedMode):
     """A mode whose reset map is a succession of stretches of motion in closed form, each with a jump at its end.
 
-    The reset map goes on while a stretch's `open` holds, for at most `most_hops` stretches; its `elapsed` [s] counts from the
-    end of the mode.
+    The reset map continues while `open` is true for the current stretch, for at most `most_hops` stretches; `elapsed`
+    [s] of a stretch is the time since the end of the mode.
 
     **Example:** small hops of a ball, and the first of them.
 
@@ -144,6 +145,6 @@ class AbstractHoppingMode(AbstractBatchedMode):
 
 
 def mode_of_cells(mode: AbstractBatchedMode, cell: Int[Numbers, " selected"]) -> AbstractBatchedMode:
-    """The mode of the cells with these numbers."""
+    """The mode of the cells with these indices."""
     numbers, static = eqx.partition(mode, eqx.is_array)
     return eqx.combine(jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[..., cell], numbers), static)

@@ -10,11 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..integration.dense import PIECE_OF_MODE, DenseSolution, follow, padded
-from ..integration.problem import AbstractProblem
-from ..integration.scheduler import Outcome
-from ..integration.settings import Settings
-from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED
+from ..integration import (
+    FAILED,
+    LEFT_DOMAIN,
+    REACHED_END,
+    UNRESOLVED,
+    AbstractProblem,
+    DenseSolution,
+    Outcome,
+    Settings,
+    follow,
+    padded,
+)
+from ..integration.dense import PIECE_OF_MODE
 from ..xla_cpu import compiled_quickly
 from .ensemble import Carry, after_reset, after_solve, at_start, host_rounds
 from .mode import AbstractBatchedMode, Transition
@@ -90,7 +98,7 @@ class HybridPath(NamedTuple):
 
     @property
     def times(self) -> Float[np.ndarray, " times"]:
-        """The default output times [s]: those of all steps."""
+        """The default output times [s]: the times of all steps."""
         return np.unique(
             np.minimum(np.concatenate([np.zeros(1), *(segment.shown for segment in self.segments)]), self.end_time)
         )
@@ -101,7 +109,7 @@ class HybridPath(NamedTuple):
         return self.at(self.times)
 
     def numbers(self, times: Float[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
-        """The mode numbers at given times, or `BETWEEN`."""
+        """The indices of the modes at given times, or `BETWEEN`."""
         return np.array([segment.number for segment in self.segments])[self._where(times)]
 
     def at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "shown times"]:
@@ -199,7 +207,7 @@ def solve_hybrid_dense(
         (runs, segments), mode, begin = carry, modes[numbers[0]], float(carry[0].end_time[0])
         transition = _leave(mode, jnp.asarray(runs.state[:, 0]), jnp.asarray(t1 - begin))
         segments = segments + _way(mode, transition, begin)
-        # NumPy cuts these: JAX would compile every cut.
+        # NumPy slices these arrays, because JAX would compile every slice.
         transition = jax.tree.map(np.asarray, transition._replace(record=None))
         return after_reset(np, runs, transition, np.full(1, t1)), segments
 

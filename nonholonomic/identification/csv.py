@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..validation import require
+from ..validation import as_path, require
 from .recording import Quantities
 
 #: Value of each unit in the SI unit of the same dimension.
@@ -66,7 +66,7 @@ def read_columns(path: Any, columns: Any, fps: float | None, error: Any, quantit
     """
     if not isinstance(columns, Mapping) or not columns:
         raise ValueError(f"columns = {columns!r} must be a dictionary, such as {{'theta': ('tilt', 'deg')}}")
-    table = _table(Path(path))
+    table = _table(as_path(path, "path"))
     names = quantities.of(tuple(name for name in columns if name not in ("time", "frame")))
     for name in columns:
         if name not in ("time", "frame", *names):
@@ -139,7 +139,7 @@ def _errors(table: dict[str, list[str]], name: str, header_and_unit: Any, si: st
 
 
 def _parts(name: str, header_and_unit: Any, si: str) -> tuple[Any, float]:
-    """The header or number, and the factor that converts the file's numbers to SI units."""
+    """The header (or, for an error, possibly a number), and the factor that converts the file's numbers to SI units."""
     if not isinstance(header_and_unit, tuple) or len(header_and_unit) != 2:
         raise ValueError(f"columns: {name!r} = {header_and_unit!r} must be (header, unit), such as ('tilt', 'deg')")
     first, unit = header_and_unit

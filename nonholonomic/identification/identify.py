@@ -54,7 +54,7 @@ def identify(
     - `spread`: range of the drawn points, as a factor greater than 1 in either direction; `seed`: seed of the draw.
     - `max_steps`: a fit that needs more steps has not converged.
     - `slopes`: "exact", by automatic differentiation; or "differences", central differences of 1 % in every parameter,
-      for a model without a derivative or with a rough one. Each step then takes 2 k + 1 runs for k parameters.
+      for a model whose derivative does not exist or is not smooth. Each step then takes 2 k + 1 runs for k parameters.
     - `labels`: (n,), names of the measurements in the result.
     - `progress`: whether to show progress, on a terminal or in a notebook.
 
@@ -107,9 +107,10 @@ def identify(
 def _fitted(
     problem: Problem, begins: Any, measurements: Measurements, max_steps: int, progress: bool
 ) -> tuple[Ends, Linearised]:
-    """The ends of the fits. Recordings are also fitted by way of longer and longer parts; the better end counts.
+    """The ends of the fits. Recordings are also fitted in stages, to longer and longer parts; the better of the two
+    ends counts.
 
-    A run is followed from its start: late samples can be whole turns off, and would lead to another minimum.
+    Predicted late samples can be wrong by whole turns, and would then lead to another minimum.
     """
     ends = minimise(problem, begins, measurements, max_steps=max_steps, progress=progress)
     at_ends = linearise(problem, ends.coordinates, measurements)

@@ -1,4 +1,4 @@
-"""Nonlinear least squares from many starts, or for many sets of data, at once.
+"""Nonlinear least squares, from many starts or for many sets of data at once.
 
 Each row is a fit. All rows advance together, and the model is evaluated for all of them, with its slopes, in one call,
 so a model that computes its cases as lanes computes the cases of all rows together. Optimistix under `vmap` compiles
@@ -33,9 +33,9 @@ CONVERGED = 1e-16
 #: this: it is as close as the integration errors allow, within a thirtieth of a standard error of the minimum.
 NEGLIGIBLE = 1e-3
 
-#: On a staircase, steps keep gaining very little. A fit has also converged if `PATIENCE` steps together lower -2 log
-#: likelihood by less than `STALLED`, or, for a bad fit, by less than this fraction of its excess over `BAD` per degree
-#: of freedom.
+#: Where the predictions jump like a staircase, every step gains very little. A fit has also converged if `PATIENCE`
+#: steps together lower -2 log likelihood by less than `STALLED`, or, for a bad fit, by less than this fraction of its
+#: excess over `BAD` per degree of freedom.
 PATIENCE, STALLED, BAD = 8, 1e-2, 3.0
 
 #: No step changes a parameter with a bound by more than a factor of e: slopes are not valid farther away, where runs

@@ -15,7 +15,7 @@ from ..validation import require
 #: Residual of a measurement for which the model has no prediction: a penalty without a slope.
 MISSING = 1e4
 
-#: Factor on the error of a measurement that does not count yet.
+#: Factor on the error of a measurement that is not fitted yet.
 DOWN_WEIGHTED = 1e6
 
 
@@ -109,7 +109,7 @@ class Measurements(eqx.Module):
         For a measurement the residual is z = (prediction - value) / error, or with Student's t of nu degrees of freedom
         r = sign(z) sqrt((nu + 1) log(1 + z^2 / nu)). For a lower limit, the residual is r = -sqrt(-2 log Phi(z)), where
         Phi is the normal distribution: close to z if the prediction is far below the limit, and close to 0 if the
-        prediction is above the limit. Upper limits are the mirror image. Between two limits, see `between`. A
+        prediction is above the limit. Upper limits are the mirror image. `between` states the residual of two limits. A
         prediction that is not finite counts as `MISSING`, except that an infinite prediction exceeds a lower limit.
 
         **Arguments:** `prediction`: (..., n). **Returns:** (..., n).

@@ -127,7 +127,8 @@ def predictions_and_slopes(problem: Problem, coordinates: Rows, asked: Any = Non
     """
     coordinates = np.asarray(coordinates, float)
     asked = np.ones(len(coordinates), bool) if asked is None else np.asarray(asked)
-    # The program is compiled for a number of rows; runs with NaN parameters end at once.
+    # The program is compiled for a fixed number of rows. Rows that are not needed get NaN parameters, so their runs end
+    # at once.
     needed = np.where(asked[:, None], coordinates, np.nan)
     if problem.step is None:
         prediction, slopes = _differentiated(problem, needed)

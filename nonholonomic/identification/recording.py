@@ -98,7 +98,7 @@ class AbstractRecording(eqx.Module):
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
 
-    **Example:** the recording of the room's example.
+    **Example:** the recording of the subpackage's example.
 
     >>> data[0].labels
     ('level(1 s)', 'level(2 s)', 'level(3 s)')
@@ -153,7 +153,7 @@ class AbstractRecording(eqx.Module):
 
     @property
     def seen(self) -> np.ndarray:
-        """Mask of the samples that are not missing, ordered by time."""
+        """Indices of the samples that are not missing, ordered by time."""
         return np.flatnonzero(~np.isnan(np.asarray(self.value).reshape(-1)))
 
     @property
@@ -229,8 +229,8 @@ def predicted(
     **Arguments:**
 
     - `scene`: the scene of all runs, before its parameters are replaced.
-    - `recordings`: pairs of a recording and its parameters, name -> (rows,). The names must be equal for all
-      recordings, and so must the kinds of numbers in their launches.
+    - `recordings`: pairs of a recording and its parameters, name -> (rows,). All recordings must have the same
+      parameter names, and the same kinds of numbers in their launches.
     - `run`: function of a scene, a launch and times since the launch [s] that returns a trajectory.
 
     **Returns:** for each recording its samples, ordered by time, including missing ones; NaN after the end of a run.

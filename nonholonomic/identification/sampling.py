@@ -7,7 +7,7 @@ respect to q, the draws are from p, whatever q is (surrogate transitions: J. S. 
 Scientific Computing (2001), chapter 9; Christen and Fox, J. Comput. Graph. Stat. 14 (2005) 795). A bad surrogate lowers
 the fraction of accepted proposals.
 
-Event times need this method: they vary roughly on the scale of a nutation period, so the slope at one point predicts
+Event times need this method: they vary irregularly on the scale of a nutation period, so the slope at one point says
 little about the next point, and walks that follow slopes take hundreds of steps.
 """
 
@@ -34,11 +34,11 @@ ACCEPTED, DOUBLINGS = 0.8, 8
 MOVES = 16
 
 #: Powers of the surrogate for learning and for proposals: a surrogate that decreases faster than the posterior would
-#: never propose its tails, and never leave them.
+#: never propose points in the tails of the posterior, and a chain would never leave them.
 LEARNING, PROPOSING = 0.35, 0.75
 
-#: Learning ends with the round whose runs the polynomials predicted to this standard deviation of the log density, so
-#: that nine tenths of the proposals would be accepted; and the least and greatest number of rounds.
+#: Learning ends when the polynomials predict the log density of a round's runs with this standard deviation, at which
+#: nine tenths of the proposals are accepted; and the least and greatest number of rounds.
 FORETOLD, LEAST, ROUNDS = 0.3, 2, 6
 
 
@@ -50,6 +50,12 @@ class Draws(NamedTuple):
       independent draws.
     - `units`: name -> unit, of the unknown errors.
     - `accepted`: fraction of accepted proposals; `runs`: number of parameter sets for which the model ran.
+
+    **Example:** as for `sample`.
+
+    >>> from nonholonomic.identification import Draws
+    >>> Draws._fields[:3]
+    ('values', 'coordinates', 'r_hat')
     """
 
     values: dict[str, Float[np.ndarray, "chains draws"]]
@@ -109,6 +115,14 @@ def sample(
 
     **Raises:** `ValueError` for numbers out of range and a covariance that is not finite and positive; `ModuleNotFoundError`
     without BlackJAX.
+
+    **Example:** the posterior of the subpackage's example.
+
+    >>> from nonholonomic.identification import LogDensity, sample
+    >>> density = LogDensity.of(Model(scene, data, jnp.arange(3)), data[0].measurements, free)
+    >>> draws = sample(density, fit.coordinates, fit.coordinate_covariance, draws=200, progress=False)
+    >>> print(f"{draws.values['scene.rate'].mean():.2f}")
+    1.00
     """
     require_package("blackjax", "bayes", "sample")
     for name, value, least in (("chains", chains, 2), ("warmup", warmup, 0), ("draws", draws, 2), ("seed", seed, 0)):
@@ -165,7 +179,7 @@ def learn(surrogate: Surrogate, chains: int, random: np.random.Generator) -> tup
         surrogate = surrogate.learned(*(np.concatenate(parts) for parts in zip(*pool, strict=True)))
         if turn > 0:
             surrogate, points = surrogate.among(drawn)
-        # As arrays: a Python number would be compiled in.
+        # Convert to arrays, because a Python number would become a constant of the program.
         adaptation = jax.tree.map(np.asarray, begin(1.0 / len(surrogate.centre) ** 0.25))
         walk, path = Walk(jnp.asarray(points[-chains:]), adaptation), []
         for _ in range(-(-2 * runs // chains)):

@@ -1,4 +1,5 @@
-"""A posterior whose predictions are polynomials: cheap to walk in, and close enough to propose draws from."""
+"""A posterior whose predictions are polynomials: cheap to evaluate, and close enough to the true posterior to propose
+draws."""
 
 import itertools
 import math
@@ -11,8 +12,8 @@ from jaxtyping import Array, Float
 
 from .posterior import LogDensity
 
-#: Highest degree of the polynomials, and their greatest number of terms, for which the degree is lowered, but not below
-#: 2.
+#: Highest degree of the polynomials, and their greatest number of terms. To respect this number, the degree is lowered,
+#: but not below 2.
 HIGHEST, MOST_TERMS = 4, 90
 
 #: The highest power in the bends of points.

@@ -70,7 +70,7 @@ class Verdict(NamedTuple):
 
     @property
     def good(self) -> bool:
-        """Whether nothing speaks against the fit."""
+        """Whether there are no concerns about the fit."""
         return not self.concerns
 
     def __str__(self) -> str:

@@ -1,4 +1,4 @@
-"""Runs in time: from a start along a field to an event, to the end of the model's validity, or to a horizon.
+"""Integrate runs from an initial state to an event, to the end of the model's validity, or to a horizon.
 
 `solve_ensemble` runs many cells of a problem in lanes that step together; `follow` and `sample` integrate single runs
 with any solver of Diffrax. `solve_by_diffrax` is an independent reference. Hybrid runs are in `nonholonomic.hybrid`.
@@ -8,7 +8,7 @@ be short, and `TIGHTEST`, the smallest tolerance.
 
 A `nonholonomic.AbstractMode` has functions of one state, and the package maps them over cells. An `AbstractProblem` has
 functions of all cells at once: components along the first axis, cells along the last. `Lanes` is the type of one number
-per cell, `States` that of their states.
+per cell, and `States` the type of the states of all cells.
 
 **Example:** a decay, first as a mode, then as a problem with three cells.
 
@@ -38,13 +38,11 @@ per cell, `States` that of their states.
 """
 
 from .dense import DenseSolution as DenseSolution
-from .dense import SampledSolution as SampledSolution
 from .dense import follow as follow
 from .dense import padded as padded
 from .dense import sample as sample
 from .ensemble import solve_ensemble as solve_ensemble
 from .ensemble import traced_solve_ensemble as traced_solve_ensemble
-from .ensemble import with_crossing_times as with_crossing_times
 from .extended import AbstractPassive as AbstractPassive
 from .extended import ExtendedProblem as ExtendedProblem
 from .midpoint import ImplicitMidpoint as ImplicitMidpoint
@@ -52,31 +50,16 @@ from .oscillatory import Oscillatory8 as Oscillatory8
 from .problem import AbstractProblem as AbstractProblem
 from .problem import CoreProblem as CoreProblem
 from .problem import crossing_time as crossing_time
-from .problem import event_time as event_time
 from .reference import solve_by_diffrax as solve_by_diffrax
 from .runge_kutta import Lanes as Lanes
-from .runge_kutta import Stages as Stages
 from .runge_kutta import States as States
-from .runge_kutta import Step as Step
 from .runge_kutta import explicit_tableau as explicit_tableau
-from .runge_kutta import moved_state as moved_state
-from .runge_kutta import over_stages as over_stages
-from .runge_kutta import stages_to_look as stages_to_look
-from .runge_kutta import watched_places as watched_places
 from .samples import solve_with_samples as solve_with_samples
-from .scheduler import AbstractRecorder as AbstractRecorder
-from .scheduler import InLanes as InLanes
-from .scheduler import LaneScheduler as LaneScheduler
 from .scheduler import Outcome as Outcome
-from .scheduler import Progress as Progress
-from .scheduler import outcome_of as outcome_of
-from .settings import ABSOLUTE as ABSOLUTE
 from .settings import DEFAULT_MAX_STEPS as DEFAULT_MAX_STEPS
-from .settings import LOOSEST as LOOSEST
 from .settings import MOST_STEPS as MOST_STEPS
 from .settings import TIGHTEST as TIGHTEST
 from .settings import Settings as Settings
-from .settings import lanes_for as lanes_for
 from .settings import legal_run as legal_run
 from .settings import require_adaptive as require_adaptive
 from .settings import require_adjoint as require_adjoint
@@ -86,17 +69,12 @@ from .settings import run_bounds as run_bounds
 from .settings import tolerance_bound as tolerance_bound
 from .status import CROSSED as CROSSED
 from .status import FAILED as FAILED
-from .status import FORMER_WORDS as FORMER_WORDS
 from .status import LEFT_DOMAIN as LEFT_DOMAIN
 from .status import REACHED_END as REACHED_END
 from .status import RUNNING as RUNNING
 from .status import UNRESOLVED as UNRESOLVED
 from .status import Status as Status
-from .step import Control as Control
 from .step import LaneState as LaneState
-from .step import after_step as after_step
-from .step import length_to_try as length_to_try
-from .step import try_step as try_step
 from .zeros import few_trials as few_trials
 from .zeros import halved as halved
 from .zeros import sign_changes as sign_changes

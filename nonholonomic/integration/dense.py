@@ -1,4 +1,5 @@
-"""One trajectory with Diffrax: any of its solvers, dense output or given times, and the end of the model's validity."""
+"""Integrate one trajectory with any solver of Diffrax, with dense output or at given times, to the end of the model's
+validity."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -18,8 +19,9 @@ from .zeros import halved
 #: Steps that are integrated and stored at once; a longer run consists of several such segments.
 PIECE = 2048
 
-#: The same for a run of several modes, which may last for a few steps each: room is reserved, and the domain margin checked,
-#: for all steps of a segment. With 2048 a short flight of a top takes 37 ms and 5 MB, with 128 it takes 7 ms and 0.4 MB.
+#: The same for a run of several modes, each of which may last only a few steps: memory is allocated, and the domain
+#: margin checked, for all steps of a segment. With 2048 a short flight of a top takes 37 ms and 5 MB, with 128 it takes
+#: 7 ms and 0.4 MB.
 PIECE_OF_MODE = 128
 
 #: Least number of times at which a program evaluates a run: few runs are so long that more sizes are worth a compilation.
@@ -237,8 +239,8 @@ def _loss(
 
 
 class _GivenSteps(diffrax.StepTo):
-    """Steps that end at given times, growing, without Diffrax's checks: these call back into Python, and such programs
-    are not cached on disk.
+    """Steps that end at given, increasing times, without the checks of Diffrax, which call back into Python: such
+    programs are not cached on disk.
     """
 
     def wrap(self, direction: Any) -> "_GivenSteps":
@@ -290,7 +292,7 @@ def sample(
     state, scales = problem.start()
     margin = problem.domain_margin(jnp.zeros_like(t1), state)
     watched = margin is not None
-    # Diffrax detects an event where the margin changes its sign: a run that starts outside the domain has ended.
+    # Diffrax detects only changes of the margin's sign, so a run that starts outside the domain must end at once.
     at_once = jnp.zeros((), bool) if margin is None else margin <= 0.0
     t1 = jnp.where(at_once, 0.0, t1)
     event = diffrax.Event(

@@ -17,13 +17,13 @@ from jaxtyping import Array, Bool, Float
 from .runge_kutta import Lanes, States, Step, weighted_sum
 
 #: A minimum of the event function within a step is checked if its estimate is below this fraction of the values at both
-#: ends. With a tenth of it one first crossing of 1279 in a cylinder is missed at a tolerance of 1e-7 and none at 1e-9;
-#: ten times as much takes a quarter more steps and locates no further crossing.
+#: ends. With a tenth of this value, one of 1279 first crossings in a cylinder is missed at a tolerance of 1e-7, and
+#: none at 1e-9. Ten times this value takes a quarter more steps and locates no further crossing.
 DIP = 0.2
 
-#: Only a margin whose least known value is below this fraction of its range in the step can have a minimum below zero between
-#: the places at which it is known: inside the step, and where the least value is that of an end. For a parabola whose minimum
-#: lies midway between two places the fractions are 0.1 and 0.014.
+#: A margin can fall below zero between the places at which it is known only if its least known value is below this
+#: fraction of its range in the step. The first fraction holds if the least value lies inside the step, the second if it
+#: lies at an end. For a parabola whose minimum is midway between two places, the fractions are 0.1 and 0.014.
 SUSPECT_INSIDE, SUSPECT_AT_END = 0.15, 0.05
 
 #: The error of the polynomial through the known values of a margin, midway in the step, as a fraction of the margin's range.
@@ -76,12 +76,13 @@ def missed_loss(
     lowest = jnp.minimum(inside, at_end)
     spread = jnp.max(margins, axis=0) - lowest
     suspect = (lowest < jnp.where(inside < at_end, SUSPECT_INSIDE, SUSPECT_AT_END) * spread) & (spread > FLAT) & free
-    # A mode that begins on its margin has no zero before it: where the margin rises from there without a slope, the
-    # polynomial may fall at first.
+    # Where a mode begins with a margin of 0, this zero does not end the mode. If the margin rises from there with slope
+    # 0, the polynomial may fall at first.
     suspect &= margins[0] > FLAT
 
     def first_minimum() -> Lanes:
-        # Of several margins only the least is searched: the step then ends there, and the others are looked at again.
+        # Only the least of several margins is searched. The step then ends at its minimum, and the others are checked
+        # again.
         known, width = _least_of(suspect, lowest, margins, spread)
         low, fall, high, rise, begin, end = _first_valley(places, list(known))
         part, least = _minimum(low, fall * (end - begin), high, rise * (end - begin))
@@ -115,7 +116,7 @@ def _least_of(
     margins: Float[Array, "places margins lanes"],
     spread: Float[Array, "margins lanes"],
 ) -> tuple[Float[Array, "places lanes"], Lanes]:
-    """Of the suspect margins of each lane the one with the least known value: its values and their range."""
+    """The values, and their range, of the suspect margin with the least known value in each lane."""
     rank, known, width = jnp.where(suspect[0], lowest[0], jnp.inf), margins[:, 0], spread[0]
     for k in range(1, len(lowest)):
         lower = suspect[k] & (lowest[k] < rank)
@@ -127,8 +128,8 @@ def _least_of(
 def _first_valley(places: Float[np.ndarray, " places"], values: list[Lanes]) -> tuple[Lanes, ...]:
     """The first two neighbouring places between which the polynomial through all values has a minimum.
 
-    **Returns:** value and slope at the one, value and slope at the other, and the two places. Where there is no minimum they
-    are the first two places, between which the slope does not change from falling to rising.
+    **Returns:** value and slope at the first place, value and slope at the second, and the two places. If there is no
+    minimum, these are the first two places, between which the slope does not change from falling to rising.
     """
     powers = np.arange(len(places))
     weights = (powers * places[:, None] ** np.maximum(powers - 1, 0)) @ np.linalg.inv(places[:, None] ** powers)

@@ -49,7 +49,7 @@ def ensemble_solve(
 
     **Returns:** the `Outcome`, and the number of iterations, each of which advanced all lanes.
 
-    **Example:** with `nonterminal`, the runs continue to `t1`; here inside `jit`, with `traced_solve_ensemble`.
+    **Example:** inside `jit`, with `traced_solve_ensemble`. With `nonterminal`, the runs continue to `t1`.
 
     >>> from nonholonomic.integration import traced_solve_ensemble
     >>> def solve(problem, t1):

@@ -1,6 +1,6 @@
 """Locate an event within a step: retry the step from its start with other lengths.
 
-So the event has the accuracy of the method, not that of an interpolant.
+The event therefore has the accuracy of the method, not that of an interpolant.
 """
 
 from typing import NamedTuple
@@ -11,12 +11,12 @@ from jaxtyping import Array, Bool, Int
 from .runge_kutta import Lanes
 
 #: An event is located once the next trial would differ by less than this fraction of the step that contains it. The
-#: time of the end of contact then errs by a relative 2e-13, and by 2e-12 with ten times the value; `crossing_time`
+#: time at which contact ends then has a relative error of 2e-13, or of 2e-12 with ten times this value; `crossing_time`
 #: removes this error from the times of events.
 LOCATED = 1e-10
 
-#: Trials after which the far end of the bracket is taken for the event. A safety net: ten times as many change no bit
-#: of a result, six would let the end of contact err by 1e-8.
+#: After this number of trials, the far end of the bracket counts as the event. This is a safety net: ten times as many
+#: trials change no bit of a result; with only six, the end of contact would err by 1e-8.
 MOST_TRIALS = 64
 
 

@@ -1,5 +1,5 @@
-"""Passive components: quantities integrated behind a problem's state that do not act on it, such as a path, work or a
-clock.
+"""Passive components: quantities that are integrated with a problem's state but do not act on it, such as a path, work
+or a clock.
 """
 
 import abc
@@ -36,7 +36,7 @@ class AbstractPassive(eqx.Module):
 
 
 class ExtendedProblem(AbstractProblem, Generic[Core]):
-    """A problem with passive components behind its state; event function and domain margin are those of the problem.
+    """A problem with passive components after its state; event function and domain margin are those of the problem.
 
     - `passive`: the rates; `values`, `scales`: initial values, and the magnitudes that scale absolute errors.
     - `ends_on_event`: whether the problem's event is kept.

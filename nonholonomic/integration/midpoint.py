@@ -12,7 +12,8 @@ from ..geometry import inverse
 from ..parameters import one_line
 from ..validation import as_known, require
 
-#: Simplified Newton iterations; each gains a factor of the order of (step times rate of change)^2.
+#: Number of simplified Newton iterations; each reduces the error by a factor of the order of (step times rate of
+#: change)^2.
 ITERATIONS = 8
 
 

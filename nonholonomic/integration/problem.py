@@ -18,7 +18,7 @@ class AbstractProblem(eqx.Module):
     The leaves of a problem are scalars, or hold one number per cell in their last axis. Its functions receive one
     number per lane, or scalars for a single run.
 
-    **Example:** the problem of the room's example, at its start.
+    **Example:** the problem of the subpackage's example, at its start.
 
     >>> start, scales = problem.start()
     >>> print(problem.event_function(start), problem.field(0.0, start)[0])
@@ -58,8 +58,8 @@ class AbstractProblem(eqx.Module):
         """A smooth function of order 1, positive before the event, negative after it; `None` if there is no event."""
 
     def crossing_along(self, state: States, rate: States) -> Lanes | None:
-        """The event function where the field is known too: equal to `event_function`, for problems where this saves
-        work.
+        """The event function of a state whose rate is known: equal to `event_function`, for problems where the rate
+        saves work.
         """
         return self.event_function(state)
 
@@ -141,7 +141,7 @@ def side_of(problem: AbstractProblem, side: Lanes) -> Callable[[States, States],
 def crossing_time(problem: AbstractProblem, time: Lanes, state: States) -> Lanes:
     """Time [s] at which the event function vanishes, for a state close to the event.
 
-    The time is differentiable by the numbers of the problem and by the state (implicit function theorem).
+    The time is differentiable with respect to the numbers of the problem and the state (implicit function theorem).
 
     **Arguments:**
 

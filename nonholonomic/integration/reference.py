@@ -50,7 +50,8 @@ def solve_by_diffrax(
             else (lambda t, y, args, **_: args.domain_margin(t, y)),
         }
         conditions = {code: condition for code, condition in conditions.items() if condition is not None}
-        # Diffrax detects an event where a condition changes its sign: a cell that starts beyond one has ended.
+        # Diffrax detects only changes of a condition's sign, so a cell that starts with a negative condition must end
+        # at once.
         at_once = [condition(jnp.zeros(()), state, cell_problem) <= 0.0 for condition in conditions.values()]
         ends_at_once = functools.reduce(jnp.logical_or, at_once, jnp.asarray(False))
         event = diffrax.Event(list(conditions.values()), root_finder=optimistix.Newton(1e-13, 1e-13))

@@ -95,7 +95,7 @@ def explicit_step(
 
     **Returns:** a `Step`.
     """
-    # In a method whose steps end with a stage, the last stage is the end of the step, below.
+    # If the last stage of the method is the end of the step, it is computed below.
     inner = len(tableau.c) - 1 if tableau.fsal else len(tableau.c)
     looks = stages_to_look(tableau.c)
     places, looked = jnp.asarray(tableau.c[:inner]), jnp.asarray(np.isin(np.arange(inner), looks))
@@ -109,7 +109,7 @@ def explicit_step(
         def look(seen: Float[Array, "places margins lanes"]) -> Float[Array, "places margins lanes"]:
             return written_in_place(seen, jnp.stack(margins(at, trial)), at=rows[stage])
 
-        # A branch, so that the other stages do not pay for it: a tenth of a step of a top in a cylinder.
+        # A branch, because margins in every stage would add a tenth to the cost of a step of a top in a cylinder.
         seen = None if seen is None else jax.lax.cond(looked[stage], look, lambda seen: seen, seen)
         return written_by_component(rates, field(at, trial), at=stage + 1), seen
 
@@ -195,7 +195,7 @@ def scaled_error(
     scale).
 
     The squares are added one by one: XLA compiles a sum over an axis of more than eight components lane by lane, which
-    took half of the time of a run with twelve.
+    took half of the time of a run with twelve components.
     """
     ratio = error / (atol + rtol * jnp.maximum(jnp.abs(before), jnp.abs(after)))
     squares, size = [component * component for component in ratio], ratio.shape[0] // n_blocks
@@ -237,7 +237,7 @@ def first_length(
 
     magnitude, slope = measure(state), measure(rate)
     unit = magnitude / slope
-    # A state at rest has no unit of its own; longer units would overflow below.
+    # A state at rest has no unit of time of its own; longer units would overflow below.
     still = (magnitude < 1e-5) | ~(unit < 1e15)
     unit = jnp.where(still, 1e-4, unit)
     trial = 0.01 * unit

@@ -1,4 +1,4 @@
-"""Zeros of functions of one number, many at once. (Events within a step are located in `event.py`.)"""
+"""Find many zeros of functions of one variable at once. (Events within a step are located in `event.py`.)"""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,7 +16,7 @@ HALVINGS = 60
 #: `few_trials` stops once a bracket, or the change from one trial to the next, is shorter than this fraction of the value.
 LOCATED = 1e-14
 
-#: Trials after which `few_trials` takes the last one.
+#: After this number of trials, `few_trials` returns the last trial.
 MOST_TRIALS = 60
 
 

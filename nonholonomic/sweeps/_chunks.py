@@ -18,6 +18,7 @@ except ImportError:  # not a POSIX system
 
 import numpy as np
 
+from ..validation import as_path
 from ._file import Stored, replacing, sync_folder, write_file
 from .layout import Layout, Values
 
@@ -30,8 +31,8 @@ def folder_of(path: Path) -> Path:
 class ChunkStore:
     """The finished chunks of a table's file.
 
-    Each chunk is complete and on disk before it counts, even if the process dies, or if the machine dies and its disk
-    keeps confirmed data.
+    A chunk counts as finished only when it is complete and on disk. It then survives if the process dies, or if the
+    machine dies and its disk keeps confirmed data.
 
     `finished`: the indices of the chunks that existed when the sweep began.
     """
@@ -42,10 +43,7 @@ class ChunkStore:
         **Raises:** `OSError` that names the path if it cannot be read or written; `ValueError` that names the first
         difference if it holds the result of another request or of another version of this package.
         """
-        try:
-            self.path = Path(path)
-        except TypeError:
-            raise ValueError(f"path = {path!r} must be the path of a file") from None
+        self.path = as_path(path, "path")
         self.folder, self.layout = folder_of(self.path), layout
         self._lock = self._locked()
         try:
@@ -170,7 +168,7 @@ class ChunkStore:
         return f"saved {with_spaces(cells)} of {total} cells to {self.path}; run the same call again to resume"
 
     def _locked(self) -> Any:
-        """Keep other processes from computing the same file; the system releases it when the process ends."""
+        """Keep other processes from computing the same file; the system releases the lock when this process ends."""
         if fcntl is None:
             return None
         beside = self.path.with_name(self.path.name + ".lock")
@@ -198,7 +196,8 @@ class ChunkStore:
 
 
 def layout_words(begun: dict[str, tuple[str, ...]], ours: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """The words of a resumed table: ours if they begin with those of the file, otherwise those of the file."""
+    """The words of a resumed table: `ours` if they begin with the words of the file, otherwise the words of the
+    file."""
     return {name: ours[name] if ours.get(name, ())[: len(words)] == words else words for name, words in begun.items()}
 
 

@@ -3,14 +3,14 @@
 import json
 import shutil
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import numpy as np
 
 from ..parameters import as_html, readable_unit
-from ..validation import require_package
+from ..validation import as_path, require_package
+from ..views import draw_table
 from ._chunks import unfinished
 from ._file import HELD, LONG_NAMES, Stored, StoredVariables, coded, replacing, write_file
 from .digits import concise_strings
@@ -65,6 +65,9 @@ class Table(eqx.Module):
         raise AttributeError(f"the table has no variable {name!r}; it has {', '.join(variables)}")
 
     def __getitem__(self, name: str) -> Values:
+        if not isinstance(name, str):
+            known = ", ".join([*self.variables, *self.coords])
+            raise ValueError(f"table[{name!r}]: {name!r} must be the name of a variable or an axis: {known}")
         for known in (self.variables, self.coords):
             if name in known:
                 return known[name]
@@ -174,8 +177,9 @@ class Table(eqx.Module):
 
         **Raises:** `OSError` that names the path if the file cannot be written.
         """
+        file = as_path(path, "path")
         if isinstance(self.variables, StoredVariables):
-            with replacing(Path(path)) as scratch:
+            with replacing(file) as scratch:
                 shutil.copyfile(self.variables.stored.path, scratch)
             return
         words, stored = {}, {}
@@ -188,7 +192,7 @@ class Table(eqx.Module):
         flat = {name: values.reshape(-1, *layout.inner_shape(name)) for name, values in stored.items()}
         ends = enumerate(map(layout.ends, range(layout.chunks)))
         cut = ((chunk, {name: values[first:end] for name, values in flat.items()}) for chunk, (first, end) in ends)
-        write_file(Path(path), layout, cut)
+        write_file(file, layout, cut)
 
     @classmethod
     def load(cls, path: Any) -> "Table":
@@ -197,8 +201,9 @@ class Table(eqx.Module):
 
         **Raises:** `OSError` that names the path if the file cannot be read or contains no table.
         """
-        begun = unfinished(Path(path))
-        return cls.of(Stored(Path(path))) if begun is None else cls.laid_out(*begun)
+        file = as_path(path, "path")
+        begun = unfinished(file)
+        return cls.of(Stored(file)) if begun is None else cls.laid_out(*begun)
 
     @classmethod
     def of(cls, stored: Stored) -> "Table":
@@ -254,8 +259,8 @@ class Table(eqx.Module):
         **Raises:** `ValueError` for a variable that is not numeric, an unknown axis, or a table of one cell.
         """
         require_package("matplotlib", "plot", "plot")
-        from ..views import draw_table
-
+        if not isinstance(at, dict | None):
+            raise ValueError(f"at = {at!r} must be a dictionary, name of an axis -> its value")
         return draw_table(self, variable, at or {}, log, ax)
 
     @property

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from ..parameters import likely, readable_unit, text_as_html
 from ..validation import require_package
+from ..views import draw_portrait
 from .layout import Values
 from .table import Table
 from .tasks import versions
@@ -31,7 +32,7 @@ class Quantity(NamedTuple):
 
     @property
     def label(self) -> str:
-        """The description with the unit, as beside a curve."""
+        """The description with the unit, for the axis of a plot."""
         return f"{self.long_name} [{readable_unit(self.unit) or '1'}]"
 
     def of(self, name: str, run: Any) -> Any:
@@ -122,7 +123,7 @@ class Tabular(abc.ABC):
         self.to_table().save(path)
 
     def portrait(self, x: str | None = None, y: str | None = None, ax: Any = None) -> Any:
-        """Draw one quantity over another, a phase portrait (needs matplotlib).
+        """Draw one quantity against another, a phase portrait (needs matplotlib).
 
         **Arguments:**
 
@@ -136,13 +137,12 @@ class Tabular(abc.ABC):
         **Raises:** `ValueError` for an unknown variable.
         """
         require_package("matplotlib", "plot", "portrait")
-        from ..views import draw_portrait
-
         across, up = self.portrait_axes
         return draw_portrait(self.to_table(), across if x is None else x, up if y is None else y, ax)
 
     def __getattr__(self, name: str) -> Any:
-        # Reached for unknown names, and where reading a known one has raised this kind of error: it raises it again.
+        # Python calls this for unknown names, and for known names whose property raised an AttributeError, which is
+        # raised again here.
         if name.startswith("_") or hasattr(type(self), name) or not self.readable:
             return object.__getattribute__(self, name)
         raise AttributeError(f"the run has no {name!r}{likely(name, self.readable)} It has {', '.join(self.readable)}")

@@ -172,7 +172,7 @@ class Evaluation:
                 FUNCTIONS[name] if name in FUNCTIONS else functools.partial(equation.primitive.bind, **equation.params)
             )
             result = bind(*full)
-            # Joined with its operands: XLA would compute a result that stands alone again.
+            # Stored together with an operand, because XLA would recompute a result that is stored alone.
             result = stored(result, full[0])[0] if name in COSTLY.split() else result
             if _is_risky(name, operands, equation) or any(id(operand) in self.risky for operand in operands):
                 self.risky.add(id(result))

@@ -22,9 +22,9 @@ from .form import Form, OfRun
 from .mode import State
 from .tracing import spelled_out
 
-#: A function counts as zero if changing every component of the state by this fraction of its size could make it zero:
-#: first at the end of a mode, which is located to 1e-10 of a step, so that a long step leaves an error to be removed;
-#: then up to round-off.
+#: A function counts as zero if changing every component of the state by this fraction of its size could make it zero.
+#: The first fraction is for the end of a mode, which is located only to 1e-10 of a step, so that a long step leaves an
+#: error; the second is for round-off.
 AT_END, ROUND_OFF = 1e-6, 1e-14
 
 #: Magnitude for errors of the time [s]: time has no error and no influence on step-size control.
@@ -217,7 +217,7 @@ class Cells(eqx.Module):
     def modes(
         self, cells: int
     ) -> tuple[tuple[BatchedMode, ...], Int[Array, " cells"], Float[Array, "components cells"]]:
-        """The modes of a system with resets, the number of the first, and the states there."""
+        """The modes of a system with resets, the index of the first mode, and the initial states in it."""
         states, scales = self.states(cells)
         phases = tuple(BatchedMode(self.numbers, scales, self.form, mode) for mode in range(self.form.modes))
         return phases, jnp.full(cells, self.form.first), states

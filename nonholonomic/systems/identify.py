@@ -1,4 +1,4 @@
-"""Estimate numbers of a user's system from recorded runs."""
+"""Estimate parameters of a user's system from recorded runs."""
 
 import dataclasses
 import re
@@ -58,7 +58,8 @@ class Recording(AbstractRecording):
       each column from the residuals.
     - `quantity`: names of the recorded components, as in `Trajectory.names`, such as "y0" or ("q0", "q1").
     - `t0`: the clock's reading at the start.
-    - `student`: degrees of freedom of Student's t distribution of the errors, against outliers, such as 4; `None`: Gaussian.
+    - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for outliers; `None`:
+      Gaussian.
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
 
@@ -105,7 +106,7 @@ class SystemModel(AbstractDataModel):
 
 
 def numbers_of(system: System, recording: Recording) -> Named:
-    """The numbers of a system and of the start of a recording, by name."""
+    """The parameters of a system and of the start of a recording, by name."""
     start = recording.launch
     if isinstance(system, AbstractSystem):
         start = dict(zip(("q", "rate"), map(as_number, start), strict=True))
@@ -128,13 +129,13 @@ def identify(
 
     **Arguments:**
 
-    - `system`: a `Hybrid`, or an `AbstractSystem`, with the values of the numbers that are not free.
+    - `system`: a `Hybrid`, or an `AbstractSystem`, with the values of the parameters that are not free.
     - `data`: a `Recording`, or a list of several to be fitted together.
-    - `free`: full name of a number -> a `nonholonomic.Free` or only the start value. Examples of names are
+    - `free`: full name of a parameter -> a `nonholonomic.Free` or only the start value. Examples of names are
       `"system.modes[0].drag"`, or `"drag"` if no other name ends so, `"start[0]"`, `"start.q[0]"` and `"t0"`, the
       reading of a recording's clock at the start. `"start[0]"` and `"t0"` are the same in all recordings;
-      `"data[1].start[0]"` belongs to the second recording, and `"data[*].t0"` is a separate number for each. In systems
-      with resets, `"t0"` cannot be free.
+      `"data[1].start[0]"` belongs to the second recording, and `"data[*].t0"` is a separate parameter for each. In
+      systems with resets, `"t0"` cannot be free.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
     - `tolerance`: relative tolerance of the integration.
 

@@ -15,9 +15,9 @@ Event = Callable[[Float[Array, ""], State], Float[Array, ""]]
 
 class AbstractMode(eqx.Module):
     """A mode of a hybrid system: its equations of motion, its end, and the next mode. Subclass it, declare the
-    parameters of your model as attributes, and write functions of one time and one state with `jax.numpy`. You can
-    sweep, fit and differentiate every attribute that is a float or an array. A mode that never ends needs only the
-    method `field`.
+    parameters of your model as attributes, and write functions of a single time and a single state with `jax.numpy`.
+    You can sweep, fit and differentiate every attribute that is a float or an array. A mode that never ends needs only
+    the method `field`.
 
     **Example:** a ball that falls and bounces.
 
@@ -83,7 +83,7 @@ class Hybrid(eqx.Module):
     - `modes`: the modes, whose states have the same components.
     - `event`: a function of time [s] and state, `event(t, y)`, or `None`. The event is the first time after the start
       at which the function falls through zero, along the motion or by a reset. An `equinox.Module` can have its own
-      numbers.
+      parameters.
     - `first`: index of the mode in which runs start.
 
     **Raises:** `ValueError` for wrong modes, an event that is not a function, and a first mode that does not exist.

@@ -1,4 +1,4 @@
-"""Tables of many runs of a user's system, over a grid of its numbers and starts."""
+"""Tables of many runs of a user's system, over a grid of its parameters and starts."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -58,17 +58,17 @@ def sweep(
     progress: bool = True,
     executor: Executor | None = None,
 ) -> Table:
-    """Event times and ends of all runs over a grid of numbers, in one batched call on all cores.
+    """Event times and ends of all runs over a grid of parameters, in one batched call on all cores.
 
     **Arguments:**
 
     - `system`, `start`, `event`, `tolerance`, `solver`: as for `event_time`. Without an event, runs end at `t1`.
     - `t1`: horizon [s].
-    - `axes`: full name of a number -> values, such as `{"system.modes[0].drag": [0.1, 0.2], "start[1]": [0.0, 1.0]}`;
-      the end of a name is enough if it is unique. The start of an `AbstractSystem` has the names `"start.q[0]"` and
-      `"start.rate[0]"`, and numbers of an event that is an `equinox.Module` have names such as `"event.level"` or
-      `"system.event.level"`. The first axis varies slowest.
-    - `sensitivities`: names of the numbers with respect to which the times are differentiated.
+    - `axes`: full name of a parameter -> values, such as `{"system.modes[0].drag": [0.1, 0.2], "start[1]": [0.0,
+      1.0]}`; the end of a name is enough if it is unique. The start of an `AbstractSystem` has the names `"start.q[0]"`
+      and `"start.rate[0]"`, and parameters of an event that is an `equinox.Module` have names such as `"event.level"`
+      or `"system.event.level"`. The first axis varies slowest.
+    - `sensitivities`: names of the parameters with respect to which the times are differentiated.
     - `path`: HDF5 file to write, chunk by chunk. Repeat the same call to resume an interrupted sweep.
     - `progress`: whether to show progress, on a terminal or in a notebook.
     - `executor`: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes`; by default a thread
@@ -77,9 +77,9 @@ def sweep(
     **Returns:** a `Table` with `time` [s] of the event, infinite without one; `status`: "event", "completed" if the run
     reached `t1`, "stopped" if a mode without a reset ended, "failed" or "unresolved"; `end_time` [s]; the state at the
     end, `y0` and so on, or `q0`, `rate0` and so on; `steps` and `rejected`; and for a system with resets their number,
-    `switches`. With `sensitivities`, the table also contains the derivative of `time` by each number, such as
-    `time_by_drag` for `"system.modes[0].drag"`, and for a system with resets `grazes`: 1 if the derivative is NaN
-    because the margin of a mode only touched zero.
+    `switches`. With `sensitivities`, the table also contains the derivative of `time` with respect to each parameter,
+    such as `time_by_drag` for `"system.modes[0].drag"`, and for a system with resets `grazes`: 1 if the derivative is
+    NaN because the margin of a mode only touched zero.
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
     `RuntimeError` for an executor that breaks down, or a worker with other versions.

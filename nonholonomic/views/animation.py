@@ -166,7 +166,7 @@ class _Space:
         for show, frames in zip(self.stage.shows, self.frames, strict=True):
             now = frames[frame]
             for body in show.bodies:
-                turn = matrices(body.turning[now : now + 1])[0]
+                turn = matrices(body.orientation[now : now + 1])[0]
                 for mesh in body.meshes:
                     corners = (mesh.vertices @ turn.T + body.position[now])[mesh.triangles]
                     triangles.append(corners)

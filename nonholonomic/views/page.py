@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..validation import as_path
 from .stage import Mesh, Show, Stage, css, finite
 
 #: Selectable speeds of time.
@@ -48,7 +49,7 @@ class Page(NamedTuple):
 
         **Raises:** `OSError` if it cannot be written.
         """
-        Path(path).write_text(self.html, encoding="utf-8")
+        as_path(path, "path").write_text(self.html, encoding="utf-8")
 
     def _repr_html_(self) -> str:
         style = "width:100%;height:820px;border:0"
@@ -235,7 +236,7 @@ def _show(show: Show, numbers: _Numbers) -> dict[str, Any]:
                 "name": body.name,
                 "meshes": [_mesh(mesh, numbers) for mesh in body.meshes],
                 "position": numbers.add(body.position),
-                "turning": numbers.add(body.turning),
+                "orientation": numbers.add(body.orientation),
             }
             for body in show.bodies
         ],

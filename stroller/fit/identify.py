@@ -69,7 +69,7 @@ def identify(
     - `free`: full name of a parameter -> a `Free` or only the start value: `"scene.friction.rolling"`, or `"rolling"`
       if no other name ends so; `"launch.place[0]"` and `"launch.place[1]"` are parts of the place. A parameter of the
       launch, and `"t0"`, the reading of a recording's clock at the launch, are the same in all recordings;
-      `"data[1].launch.heading"` belongs to the second recording, and `"data[*].t0"` is a separate number for each.
+      `"data[1].launch.heading"` belongs to the second recording, and `"data[*].t0"` is a separate parameter for each.
       Parameters that cannot be negative are fitted by their logarithms.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
     - `tolerance`: relative tolerance of the integration.
@@ -106,6 +106,6 @@ def identify(
 
 
 def _unknowns_of(scene: Scene, data: tuple[Recording, ...], free: Any) -> dict[str, Free]:
-    """The unknowns of a scene and its data by their full names, checked."""
+    """Check the unknowns of a scene and its data, and return them by their full names."""
     own = [[*numbers("launch", recording.launch), "t0"] for recording in data]
     return scene_unknowns(free, scene, data[0].launch, list(numbers("scene", scene)), own)

@@ -1,4 +1,5 @@
-"""Find the times at which a quantity was zero during a run. Within a step, the step is repeated with other lengths."""
+"""Find the times at which a quantity was zero during a run. To find a time within a step, the step is repeated with
+other lengths."""
 
 from typing import NamedTuple
 
@@ -29,7 +30,7 @@ CLOSEST = 1e-14
 
 
 class Between(NamedTuple):
-    """A watched quantity, less a level, at any time of a run."""
+    """A watched quantity, minus a level, at any time of a run."""
 
     spec: RideSpec
     steps: Steps

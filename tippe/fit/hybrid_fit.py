@@ -1,4 +1,5 @@
-"""Predictions for fits of runs with several modes. These fits use differences and run outside transformations."""
+"""Predictions for fits of runs with several modes. These fits use central differences, and their models run outside
+JAX's transformations."""
 
 from typing import Any, NamedTuple
 
@@ -85,7 +86,8 @@ class HybridModel(NamedTuple):
         return np.where(failed, np.nan, time).reshape(len(rows), launches)
 
     def _samples(self, data: Recording, row: dict[str, float]) -> Float[np.ndarray, " size"]:
-        """The samples of one run; before the launch those at the launch, after its end NaN."""
+        """The samples of one run. Samples before the launch equal those at the launch; samples after the run's end are
+        NaN."""
         roots = self._roots(data, row)
         since = np.maximum(np.asarray(data.times) - row.get("t0", float(data.t0)), 0.0)
         at, where = np.unique(since, return_inverse=True)

@@ -77,7 +77,7 @@ def identify(
     - `free`: full name of a parameter -> a `Free` or only the start value: `"scene.friction.mu"`, or `"friction.mu"` if
       no other name ends so. A parameter of the launch, and `"t0"`, the reading of a recording's clock at the launch,
       are the same in all data; `"data[1].launch.azimuth"` belongs to the second set of data, and `"data[*].t0"` is a
-      separate number for each recording. Parameters that cannot be negative are fitted by their logarithms.
+      separate parameter for each recording. Parameters that cannot be negative are fitted by their logarithms.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
     - `slopes`: "exact", the derivatives of the equations; or "differences", central differences of 1 % in every
       parameter, which smooth over the jumps of the times. Differences take 2 k + 1 runs for k parameters and simulate
@@ -118,7 +118,7 @@ def identify(
 
 
 def checked_data(scene: Scene, data: Any, tolerance: float, caller: str | None) -> tuple[Any, ...]:
-    """The sets of data as a tuple, after all checks; `caller`: name of the function that needs derivatives, or
+    """Check the sets of data, and return them as a tuple; `caller`: name of the function that needs derivatives, or
     `None`."""
     require_kind(scene, "scene", Scene)
     if caller is not None:
@@ -129,7 +129,7 @@ def checked_data(scene: Scene, data: Any, tolerance: float, caller: str | None) 
 
 
 def unknowns_of(scene: Scene, data: tuple[Any, ...], free: Any) -> dict[str, Free]:
-    """The unknowns of a scene and its data by their full names, checked."""
+    """Check the unknowns of a scene and its data, and return them by their full names."""
     launches = [
         [name for name, value in numbers("launch", source.launch).items() if value is not None] for source in data
     ]

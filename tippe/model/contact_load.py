@@ -1,4 +1,4 @@
-"""What a friction law is asked and what it answers: the motion at the contact, and force and torque per unit normal force."""
+"""Argument and result of a friction law: the motion at the contact, and force and torque per unit normal force."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Friction laws that drive a top: what a warning says of them."""
+"""The warning about friction laws that drive a top."""
 
 import math
 from typing import Any
@@ -18,7 +18,8 @@ SPEEDS, TURNINGS = (1e-3, 1e-2, 0.1, 1.0), (0.0, 100.0, -100.0)
 
 
 def drive(law: Any) -> str | None:
-    """The message about a law with positive power, by a few slips in eight directions; `None` if it brakes in all of them."""
+    """The message about a law whose power is positive for one of some slips in eight directions; `None` if the law
+    always brakes."""
     angle, speed, turning = (
         grid.ravel() for grid in np.meshgrid(np.arange(8) * math.pi / 4.0, SPEEDS, TURNINGS, indexing="ij")
     )
@@ -28,7 +29,7 @@ def drive(law: Any) -> str | None:
         with jax.ensure_compile_time_eval():
             power = np.asarray(_power(law, Slip(jnp.asarray(x), jnp.asarray(y), (none, none, drilling))))
     except Exception:
-        # What is wrong with such a law, its first run says.
+        # The first run reports what is wrong with such a law.
         return None
     if power.shape != x.shape or not np.any(power > 1e-12):
         return None
@@ -36,8 +37,8 @@ def drive(law: Any) -> str | None:
     drills = f" and a turning of {turning[worst]:g} rad/s" if law.uses_spin and turning[worst] else ""
     return (
         f"friction = {one_line(law)} drives the top: at a slip of ({x[worst]:.3g}, {y[worst]:.3g}) m/s{drills} its power is "
-        f"{power[worst]:.3g} W per newton of normal force, and friction has none above 0. Is a sign wrong? A run whose energy "
-        "grows ends as 'unresolved'. For a level belt, give Launch the velocity relative to it"
+        f"{power[worst]:.3g} W per newton of normal force, but the power of friction is never positive. Is a sign wrong? A run "
+        "whose energy grows ends as 'unresolved'. For a level belt, give Launch the velocity relative to it"
     )
 
 

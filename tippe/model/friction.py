@@ -51,7 +51,7 @@ class AbstractFriction(Bounded):
             # The types only know the property of the base class.
             cls.isotropic = property(lambda self: False)  # pyright: ignore[reportAttributeAccessIssue]
 
-    #: Whether friction on a contact at rest takes whatever value keeps it at rest, within limits.
+    #: Whether friction on a contact at rest takes the value that keeps the contact at rest, within limits.
     set_valued: ClassVar[bool] = False
 
     def suspicion(self) -> str | None:
@@ -188,10 +188,11 @@ class Contensou(AbstractFriction):
     """Coulomb friction on a small contact disc, with one limit for sliding and drilling together (`tippe.md`, section
     3).
 
-    F = -mu N v_s / Q and the torque -mu N Rb^2 w_n n / Q with Q = sqrt(v_s^2 + Rb^2 w_n^2 + slip_speed^2) and
-    Rb = 3 pi / 16 contact_radius. The load is the gradient of the potential mu N Q, an ellipsoid that has the limits of
-    the disc under Hertz' pressure for pure sliding and for pure drilling. Between these limits it differs from the
-    disc's exact force by at most 0.12 mu N and from its torque by at most 0.09 mu N contact_radius. As the radius tends
+    The force is -mu N v_s / Q and the torque is -mu N Rb^2 w_n n / Q, with Q = sqrt(v_s^2 + Rb^2 w_n^2 + slip_speed^2)
+    and Rb = 3 pi / 16 contact_radius. Both are minus the derivatives of the potential mu N Q, with respect to v_s and
+    w_n. For small slip_speed, force and torque lie on an ellipsoid with the semi-axes mu N and mu N Rb: the limits of a
+    disc under Hertzian pressure in pure sliding and in pure drilling. Between these limits, the force differs from the
+    exact force of the disc by up to 0.11 mu N, and the torque by up to 0.083 mu N contact_radius. As the radius tends
     to 0, the law tends to `Coulomb`.
 
     **Arguments:**
@@ -241,8 +242,8 @@ class Contensou(AbstractFriction):
 
 
 class Rolling(AbstractFriction):
-    """Rolling resistance in addition to a sliding law: a torque N resistance against the rolling (`tippe.md`, section
-    3).
+    """Rolling resistance in addition to a sliding law: a torque of the size N resistance opposes the rolling
+    (`tippe.md`, section 3).
 
     The torque is -N resistance w_t / sqrt(w_t^2 + turning_speed^2), with w_t the angular velocity without its component
     along n: the normal force acts ahead of the contact point, at the distance `resistance`.
@@ -331,7 +332,7 @@ class SetValuedCoulomb(AbstractFriction):
 
     A run consists of modes. During a slip, the force has its full size. When the slip stops, the top rolls, with the
     equations of `tippe/model/rolling.py`, if the required force is within the friction cone, and slips again when the
-    required force leaves the cone. Rolling keeps the energy constant. With `contact="hybrid"`, a top without a stem
+    required force leaves the cone. Rolling conserves the energy. With `contact="hybrid"`, a top without a stem
     flies when contact is lost, and slips, rolls or rebounds after an impact (`tippe/modes/airborne_stick_slip.py`).
 
     **Arguments:**

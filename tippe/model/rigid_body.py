@@ -1,8 +1,8 @@
 """Bodies of any shape and any inertia: an unbalanced top, a rattleback.
 
-A strictly convex body touches an arena at the point that is farthest against the arena's normal. In the body's own axes
-this point is p(d) = grad h at d = -normal. The support function h(d), extended to all vectors with degree 1, is the
-distance from the origin of the axes to the plane that the body touches with the outward normal d.
+A strictly convex body touches an arena at the point that is farthest in the direction opposite to the arena's normal.
+In the body's own axes this point is p(d) = grad h at d = -normal. The support function h(d), extended to all vectors
+with degree 1, is the distance from the origin of the axes to the plane that the body touches with the outward normal d.
 
 Source: Bonnesen and Fenchel, Theorie der konvexen Koerper (1934), section 15.
 """
@@ -102,7 +102,7 @@ class Ellipsoid(AbstractRigidBody):
 
     **Raises:** `ValueError` for numbers outside these ranges.
 
-    **Example:** Kane and Levinson's rattleback, spun against its sense.
+    **Example:** Kane and Levinson's rattleback, spun against its preferred sense.
 
     ```
     >>> import tippe
@@ -272,7 +272,7 @@ class Plain(eqx.Module):
 
 
 def as_support(value: Any) -> eqx.Module:
-    """A support function as a module whose numbers are arrays.
+    """Convert a support function to a module whose parameters are arrays.
 
     **Raises:** `ValueError` unless it returns one number for a vector of three.
     """

@@ -69,8 +69,8 @@ class Scene(Bounded, Generic[Body]):
     - `surface`: the arena: `Plane(tilt)`, `Cylinder(radius)`, `Sphere(radius)`, `Spheroid(equatorial, polar)`, `Torus(ring,
       tube)`, `Paraboloid(p)`, `Graph(height)` or `Implicit(function)`.
     - `friction`: `Frictionless()`, `Viscous(mu)`, `Coulomb(mu, slip_speed)`, `Contensou(mu, contact_radius, slip_speed)`
-      or `Rolling(resistance, turning_speed, sliding)` with one of them; for a top without a stem, an
-      `Ellipsoid` or a `RigidBody` also `SetValuedCoulomb(mu)`, for an `Ellipsoid` or a `RigidBody` also `NoSlip()`.
+      or `Rolling(resistance, turning_speed, sliding)` with one of them. A top without a stem, an `Ellipsoid` and a
+      `RigidBody` also allow `SetValuedCoulomb(mu)`; the latter two also allow `NoSlip()`.
     - `gravity`: acceleration of free fall [m/s^2], positive.
     - `contact`: "stop" (the default): a run ends where the contact is lost; "hybrid": it continues through flights,
       impacts, and changes to the stem and back (`modes/`). "stop" compiles faster and works for every body and law; the
@@ -216,7 +216,7 @@ class Scene(Bounded, Generic[Body]):
 
     @property
     def _rigid_dynamics(self) -> AbstractRigidDynamics:
-        """The equations of motion of a rigid body; those of slipping where it may also roll."""
+        """The equations of motion of a rigid body; if it can both slip and roll, the equations of slipping."""
         equations = self.dynamics
         equations = equations.slipping if isinstance(equations, StickSlip) else equations
         assert isinstance(equations, AbstractRigidDynamics)
@@ -232,8 +232,8 @@ class Scene(Bounded, Generic[Body]):
         alike = self.level and self.friction.isotropic
         if not (isinstance(equations, Dynamics) and isinstance(body, Top)) or not alike:
             return equations
-        # The other tops, of group I (`steady.py`), soon stand upright with their axis beside L; a turning frame would
-        # move both.
+        # Tops of group I (`tippe/steady/`) soon stand upright, with the axis close to L; in a turning frame, both would
+        # move.
         may_invert = 1.0 - body.offset / body.radius < body.I1 / body.I3
         return equations.turning(jax.lax.stop_gradient(jnp.where(may_invert, TURNING, 0.0)))
 
@@ -244,7 +244,7 @@ class Scene(Bounded, Generic[Body]):
     def start_bounds(self, launch: Launch) -> Iterator[Bound]:
         """The ranges of a launch's numbers on this arena.
 
-        **Raises:** `ValueError` for a place with the wrong number of numbers.
+        **Raises:** `ValueError` for a place with the wrong number of coordinates.
         """
         if isinstance(self.friction, NoSlip) and launch.velocity is not None:
             raise ValueError(
@@ -254,7 +254,7 @@ class Scene(Bounded, Generic[Body]):
         names, kind = [name for name, _ in surface.coordinates], type(surface).__name__
         if launch.place is None:
             if len(names) == 3:
-                raise ValueError(f"place = None must be (x, y, z) on a {kind}, which has no places by eta")
+                raise ValueError(f"place = None must be (x, y, z) on a {kind}, which has no coordinate eta")
             if "eta" not in names and not isinstance(self.frame, PlaneFrame):
                 yield Bound(launch.eta, "eta", at_least=0.0, at_most=0.0, why=f"a place on a {kind} is given by place")
             return
@@ -284,14 +284,14 @@ class Scene(Bounded, Generic[Body]):
         body, sine, zero = self.body, jnp.sin(launch.theta), jnp.zeros_like(launch.theta)
         e = (sine * jnp.cos(launch.azimuth), sine * jnp.sin(launch.azimuth), jnp.cos(launch.theta))
         if isinstance(body, AbstractRigidBody):
-            turning = sum_vectors(scale(launch.spin, e), launch.angular_velocity or (None, None, None))
-            return self._rigid_dynamics.start(launch, self.start(launch)[0], e, vector_of(turning))
+            w = sum_vectors(scale(launch.spin, e), launch.angular_velocity or (None, None, None))
+            return self._rigid_dynamics.start(launch, self.start(launch)[0], e, vector_of(w))
         L, u = scale(body.I3 * launch.spin, e), launch.velocity or (zero, zero)
         if launch.angular_velocity is not None:
-            turning = vector_of(launch.angular_velocity)
-            along = dot(turning, e)
-            L = sum_vectors(L, scale(body.I1, turning), scale((body.I3 - body.I1) * along, e))
-            u = sum_vectors(u, scale(multiply(-1.0, body.offset_of_path), cross(turning, e)[:2]))
+            w = vector_of(launch.angular_velocity)
+            along = dot(w, e)
+            L = sum_vectors(L, scale(body.I1, w), scale((body.I3 - body.I1) * along, e))
+            u = sum_vectors(u, scale(multiply(-1.0, body.offset_of_path), cross(w, e)[:2]))
         return joined(u, e, L, self.start(launch)[0])
 
     def scales(self, launch: Launch) -> Float[Array, "components ..."]:
@@ -310,8 +310,8 @@ class Scene(Bounded, Generic[Body]):
         I1, I3 = self._moments
         momentum = jnp.maximum(I3 * jnp.abs(launch.spin), I1 * rate)
         if launch.angular_velocity is not None:
-            turning = launch.angular_velocity
-            momentum = jnp.maximum(momentum, I1 * jnp.sqrt(dot(turning, turning)))
+            w = launch.angular_velocity
+            momentum = jnp.maximum(momentum, I1 * jnp.sqrt(dot(w, w)))
         place = scale(ones, self.frame.place_scales(self.body.size))
         tilt = jnp.sin(launch.theta) / NEARLY_UPRIGHT
         # A top that stands exactly upright has no growth to resolve.

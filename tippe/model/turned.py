@@ -106,7 +106,8 @@ class Shape(NamedTuple):
             require(shape.hole_radius, "hole_radius", below=rim, why="the radius of the flat that the cut leaves")
             wall = cut + jnp.sqrt(radius**2 - shape.hole_radius**2)
             require(shape.hole_depth, "hole_depth", above=0.0, below=wall, why="the hole must not pierce the sphere")
-        # On the level plane sphere and stem touch together where cos(theta) = (stem - radius) / tip, the rim at -cut / radius.
+        # On the level plane, sphere and stem touch together where cos(theta) is (stem - radius) / tip; the rim touches
+        # where it is -cut / radius.
         why = "else the rim of the cut touches the table before the stem; lengthen the stem, or cut less off"
         require(shape.tip, "cut + stem_length - stem_radius", above=radius * (radius - stem) / cut, why=why)
         return shape

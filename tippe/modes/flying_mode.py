@@ -15,7 +15,7 @@ class AbstractFlyingMode(AbstractBatchedMode):
 
     - `scene`: a scene with `contact="hybrid"`; `scales`: magnitudes that scale absolute errors of the state.
     - `cos_angle`: cosine of the theta that is the event.
-    - `with_quadratures`: whether this is a single run whose path is kept, with passive quadratures behind its state.
+    - `with_quadratures`: whether this is a single run whose path is kept, with passive quadratures after its state.
     """
 
     scene: Scene[Top]

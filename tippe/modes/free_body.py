@@ -20,11 +20,11 @@ from ..model.stick_slip import StickSlip
 from ..model.top import Top
 
 #: Round-off allowed for a sphere that has just left the arena, as a fraction of R. A sphere that returns gets no
-#: allowance, so a tenfold or a tenth of this value changes no landing.
+#: allowance, so ten times or a tenth of this value changes no landing.
 ROUNDING = 1e-12
 
-#: A sphere comes back if its speed is more than this fraction of sqrt(g R). Until then it sinks by half the square, in
-#: R.
+#: A sphere counts as returning if it sinks faster than this fraction of sqrt(g R). Before it reaches this speed, it
+#: sinks by half the square of this fraction, in units of R.
 COMES_BACK = 1e-8
 
 
@@ -147,5 +147,6 @@ def energy_in(
 
 
 def jellett(ball: Ball, free: FreeBody) -> Float[Array, "..."]:
-    """Jellett's quantity L.(R n - a e) [kg m^3/s] for one of the spheres: constant while no force acts at another."""
+    """Jellett's quantity L.(R n - a e) [kg m^3/s] for one of the spheres: constant while no force acts on the other
+    sphere."""
     return ball.radius * free.momentum[2] - ball.offset * dot(free.axis, free.momentum)

@@ -21,7 +21,7 @@ from nonholonomic.integration import (
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Variable
 
-from ..model.dynamics import LOSSES
+from ..model.contact_dynamics import LOSSES
 from ..model.scene import Scene
 from ..modes import airborne_ends
 from ..modes.inversion_problem import InversionProblem
@@ -159,7 +159,7 @@ class InversionRuns(NamedTuple):
         outcome: Outcome | HybridOutcome,
         tolerance: Float[Array, ""],
     ) -> dict[str, Any]:
-        """The variables that describe how the runs ended, but for the first of two times."""
+        """The variables that describe how the runs ended, except the first of two times."""
         ended, inverted, theta = _at_the_end(scene, problem, outcome, self.last, tolerance)
         others = [np.asarray(ended) == status for status in WORD_OF_STATUS]
         code = np.select([np.asarray(inverted), *others], [0, *WORD_OF_STATUS.values()], 1)

@@ -1,4 +1,4 @@
-"""The energy of runs as a check: without a drive, energy never grows, and it decreases by the work of friction."""
+"""Check runs by their energy: without a drive, energy never grows, and it decreases by the work of friction."""
 
 import dataclasses
 from typing import Any
@@ -11,8 +11,8 @@ from nonholonomic.integration import Status
 
 from ..model.scene import Scene
 
-#: The most by which an energy may be off, relative to its size and over the tolerance. Flights over ripples and in a spheroid
-#: stay below 1e-4 of this; a landing where no arena was had left a residual of 8e4 times it.
+#: Largest allowed error of the energy, relative to its size, divided by the tolerance. Flights over ripples and in a
+#: spheroid stay below 1e-4 of this value; a faulty landing away from the arena once left 8e4 times this value.
 BALANCED = 1e4
 
 

@@ -18,7 +18,7 @@ from .inversion import Inversions
 
 
 def sensitivity_names(roots: dict[str, Any], names: Any) -> list[str]:
-    """The full names of the parameters to differentiate by.
+    """The full names of the parameters with respect to which to differentiate.
 
     **Arguments:** `roots`: the table's scene and launch; `names`: full names, or ends of names that are unique.
 
@@ -73,7 +73,7 @@ def sensitivities_of_cells(
     **Arguments:** as for `inversion_table`, and
 
     - `columns`: full name of a parameter -> its value in every cell; only `count` of the `size` cells are run.
-    - `names`: full names of the numbers to differentiate by.
+    - `names`: full names of the parameters with respect to which to differentiate.
 
     **Returns:** the outcome; name of the variable -> derivatives (size,); and the cells whose derivatives are NaN
     because an earlier event was grazing.
@@ -95,8 +95,7 @@ def _with_tangents(
     size: int,
     last: bool,
 ) -> tuple[Inversions, tuple[Any, ...], list[Float[Array, "..."]]]:
-    """The launches of all cells, their tangents along the parameters to differentiate by, and the scale of each
-    tangent."""
+    """The launches of all cells, the tangents along the named parameters, and the scale of each tangent."""
 
     def build(*moving: Any) -> Inversions:
         cells = with_numbers(roots, columns | dict(zip(names, moving, strict=True)))

@@ -5,11 +5,11 @@ from jaxtyping import Bool, Float, Num
 
 from nonholonomic.integration import TIGHTEST
 
-#: Ratio of a tolerance to that of the second run, which with a pair of eighth order costs 1.8 times the first. The
-#: error of the second run is then a hundredth of that of the first, so the difference of the two is the error of the
-#: first. With a ratio of 10, three to five times as many errors exceed the bound; with a second run ten times coarser,
-#: twenty times as many do at 1e-8 with a bound of twice the difference, which exceeds the error by more than a factor
-#: of 30 in a third of the cells.
+#: Ratio of the tolerance of the first run to that of the second. With a pair of eighth order, the second run costs 1.8
+#: times as much as the first. The error of the second run is a hundredth of that of the first, so the difference of the
+#: runs is the error of the first. With a ratio of 10, three to five times as many errors exceed the bound. A second run
+#: at ten times the tolerance, with a bound of twice the difference, is worse: at 1e-8, twenty times as many errors
+#: exceed the bound, and a third of the bounds are more than 30 times the error.
 FINER = 100.0
 
 #: Ratio of the bound to the difference of the two runs. With a ratio of 3, twice as many errors exceed the bound.

@@ -19,8 +19,8 @@ from .quantities import QUANTITIES
 from .sampled import ended
 from .trajectory import Trajectory
 
-#: Quantities that follow from the state alone; the others need the path, except that on the plane only the position
-#: does.
+#: Quantities that follow from the state alone. The other quantities need the path; on a plane, only the position needs
+#: it.
 OF_THE_STATE = {"theta", "azimuth", "spin", "energy", "jellett", "normal_force", "slip", "theta_rate"}
 
 #: Quantities that do not change if the frame turns about n.
@@ -45,10 +45,10 @@ def launches_with(scene: Scene, launch: Launch, cells: int, names: tuple[str, ..
 def _reader(
     run: TrajectoryProblem, scene: Scene, names: tuple[str, ...]
 ) -> Callable[[Int[Array, " lanes"], Float[Array, "iterations components lanes"]], dict[str, Array]]:
-    """A function that reads the named quantities of some cells off their states."""
+    """A function that computes the named quantities of some cells from their states."""
 
     def read_lane(scene: Scene, states: Float[Array, "iterations components"]) -> dict[str, Array]:
-        # Of the spin angle and the work, nothing is read.
+        # No quantity reads the spin angle or the work.
         missing = len(run.start()[0]) - 2 - states.shape[1]
         nothing, end = jnp.zeros(len(states)), jnp.zeros(())
         state, cyclic = jnp.split(jnp.pad(states.T, ((0, missing), (0, 0))), [run.leading])

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import carried
+from nonholonomic.geometry import rate_in_frame
 
 from ..model.contact_load import Slip
 from ..model.scene import Scene
@@ -40,7 +40,7 @@ def across(scene: Scene[Top]) -> Across:
 
     **Raises:** `ValueError` for an arena that is curved in both directions.
     """
-    curvature, along = scene.frame.frame_motion(scene.frame.at_angle(0.0)[0], (1.0, 0.0)).turning
+    curvature, along = scene.frame.frame_motion(scene.frame.at_angle(0.0)[0], (1.0, 0.0)).frame_rate
     if along is not None:
         raise ValueError(f"surface = {scene.surface!r} must be a Plane or a Cylinder for these coordinates")
     return Across(1.0, 0.0) if curvature is None else Across(1.0 / curvature, 1.0)
@@ -61,8 +61,10 @@ def from_vector_state(scene: Scene[Top], state: Float[Array, " components"]) -> 
     e, L = state[AXIS], state[MOMENTUM]
     spinning = jnp.cross(L, e) / scene.body.I1
     velocity = state[VELOCITY] + scene.body.offset * spinning[:2]
-    turning = scene.frame.frame_motion(tuple(state[PLACE]), (velocity[0], velocity[1])).turning
-    seen = jnp.stack([a if b is None else a + b for a, b in zip(spinning, carried(tuple(e), turning), strict=True)])
+    turning = scene.frame.frame_motion(tuple(state[PLACE]), (velocity[0], velocity[1])).frame_rate
+    seen = jnp.stack(
+        [a if b is None else a + b for a, b in zip(spinning, rate_in_frame(tuple(e), turning), strict=True)]
+    )
 
     def angles(axis):
         return jnp.stack([jnp.arctan2(jnp.hypot(axis[0], axis[1]), axis[2]), jnp.arctan2(axis[1], axis[0])])
@@ -215,8 +217,8 @@ def by_lagrange(scene: Scene[Top], state: Float[Array, " 8"]) -> Accelerations:
 def equations(scene: Scene[Top], state: Float[Array, " 8"]) -> tuple[Float[Array, "6 6"], Float[Array, " 6"]]:
     """The paper's (11), corrected, with (12) among its rows: A (eta'', y'', theta'', phi'', psi'', N) = b.
 
-    The rows are the momentum of the centre of mass along t1, t2 and n, the last one being (12), and the angular
-    momentum about it along e1, e2 and e (`tippe.md`, section 2 (ii)):
+    The first three rows are the momentum of the centre of mass along t1, t2 and n, of which the third is (12); the
+    others are the angular momentum about the centre of mass along e1, e2 and e (`tippe.md`, section 2 (ii)):
 
         m s'' = N (f1, f2, 1) - m g z,   s'' = O'' - a e''
         I1 p' + I3 omega3 q - I1 q sigma = N M.e1,   I1 q' + I1 p sigma - I3 omega3 p = N M.e2,   I3 omega3' = N M.e

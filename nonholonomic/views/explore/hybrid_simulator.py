@@ -12,24 +12,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ...hybrid import (
-    MOST_ROUNDS,
-    AbstractBatchedMode,
-    AbstractHoppingMode,
-    HybridOutcome,
-    after_reset,
-    after_solve,
-    at_start,
-)
-from ...integration import (
-    LEFT_DOMAIN,
-    RUNNING,
-    UNRESOLVED,
-    LaneScheduler,
-    Settings,
-    outcome_of,
-    with_crossing_times,
-)
+from ...hybrid import MOST_ROUNDS, AbstractBatchedMode, AbstractHoppingMode, HybridOutcome
+from ...hybrid.ensemble import after_reset, after_solve, at_start
+from ...integration import LEFT_DOMAIN, RUNNING, UNRESOLVED, Settings
+from ...integration.ensemble import with_crossing_times
+from ...integration.scheduler import LaneScheduler, outcome_of
 from .simulator import Functions, Numbers, Stepper, as_object, offsets_of, size_of
 
 Start = tuple[tuple[AbstractBatchedMode, ...], Int[Array, "1"], Float[Array, "components 1"]]
@@ -90,7 +77,7 @@ class HybridSimulator(NamedTuple):
         return as_object(facts, functions, kinds=f"[{', '.join(kinds)}]")
 
     def _mode(self, values: Numbers, group: list[int], number: Any) -> Any:
-        """The mode with an index, one of a group of similar modes."""
+        """The mode with the given index, from a group of similar modes."""
         modes = self.start(values)[0]
         return _chosen([modes[k] for k in group], group, number)
 
@@ -160,7 +147,7 @@ def _alike(modes: tuple[AbstractBatchedMode, ...]) -> list[list[int]]:
 
 
 def _chosen(modes: list[AbstractBatchedMode], numbers: list[int], number: Any) -> Any:
-    """The mode with an index."""
+    """The mode with the given index."""
 
     def leaf(*leaves: Any) -> Any:
         value = leaves[-1]

@@ -26,8 +26,8 @@ class Answer(NamedTuple):
     """The result of a run, which the page also shows as a map: its `label` and `unit`, and the `simulator` that
     computes it.
 
-    The simulator has the reading "outcome": the `Status` of the run, and the result, or infinity. `words` are those of
-    statuses that have other words than their own.
+    The simulator has the reading "outcome": the `Status` of the run, and the result, or infinity. `words` contains the
+    words of statuses to which the page gives another name.
     """
 
     label: str
