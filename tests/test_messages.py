@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from never_run import LAUNCH, PRAM, RIDE, TOP, batch, followed, run_of_nothing
+from never_run import LAUNCH, PRAM, RIDE, TOP, batch, followed, run_of_nothing, small_table
 from tops import rutstam_top
 
 import nonholonomic

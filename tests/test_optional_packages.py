@@ -4,19 +4,13 @@ import re
 import tomllib
 from pathlib import Path
 
-import numpy as np
 import pytest
-from never_run import density_of_a_film, run_of_nothing
+from never_run import density_of_a_film, run_of_nothing, small_table
 
 import nonholonomic
-import tippe
 from nonholonomic.identification import sample
 
 pytestmark = pytest.mark.newest
-
-
-def small_table():
-    return tippe.Table({"mu": np.ones(2)}, {"time": np.ones(2)}, {}, {})
 
 
 OPTIONAL = {

@@ -38,3 +38,7 @@ def density_of_a_film():
     value = np.column_stack([0.1 + 0.0175 * random.normal(size=12), np.zeros(12)])
     film = tippe.Recording(LAUNCH, times, value, None, ("theta", "azimuth"))
     return tippe.log_density(TOP, film, {"mu": 0.3}), film
+
+
+def small_table():
+    return tippe.Table({"mu": np.ones(2)}, {"time": np.ones(2)}, {}, {})
