@@ -34,7 +34,7 @@ ACCEPTED, DOUBLINGS = 0.8, 8
 MOVES = 16
 
 #: Powers of the surrogate for learning and for proposals: a surrogate that decreases faster than the posterior would
-#: never propose its tails, and never leave them.
+#: never propose points in the tails of the posterior, and a chain would never leave them.
 LEARNING, PROPOSING = 0.35, 0.75
 
 #: Learning ends when the polynomials predict the log density of a round's runs with this standard deviation, at which
@@ -120,7 +120,7 @@ def sample(
     **Raises:** `ValueError` for numbers out of range and a covariance that is not finite and positive; `ModuleNotFoundError`
     without BlackJAX.
 
-    **Example:** the posterior of the room's example.
+    **Example:** the posterior of the subpackage's example.
 
     >>> from nonholonomic.identification import LogDensity, sample
     >>> density = LogDensity.of(Model(scene, data, jnp.arange(3)), data[0].measurements, free)
