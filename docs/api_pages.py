@@ -42,7 +42,7 @@ PAGES = {
     "scene": Page(
         "Scenes and launches",
         "A scene is a body, an arena and a friction law. A launch is the start of a run.",
-        [*of("tippe", "Scene Launch presets"), *of("stroller", "Scene Launch presets")],
+        [*of("tippe", "Scene Launch"), *of("stroller", "Scene Launch"), "tippe.presets", "stroller.presets"],
     ),
     "bodies": Page(
         "Bodies",
@@ -85,7 +85,18 @@ PAGES = {
     "derivatives": Page(
         "Times, derivatives and stability",
         "Differentiable inversion times, Lyapunov exponents and steady states.",
-        of("tippe", "inversion_time reversal_time extended_inversion_time lyapunov_exponent LyapunovExponent steady"),
+        [
+            *of(
+                "tippe",
+                "inversion_time reversal_time extended_inversion_time lyapunov_exponent LyapunovExponent steady",
+            ),
+            *of(
+                "tippe.steady",
+                "group proportions folds upright_critical_spin inverted_critical_spin jellett_thresholds standing_state "
+                "standing_matrix growth_rate Tumbling tumbling tumbling_is_stable effective_energy tumbling_angles "
+                "tumbling_state quarter_turn tumbling_matrix",
+            ),
+        ],
     ),
     "fitting": Page(
         "Fitting",
@@ -103,8 +114,8 @@ PAGES = {
     ),
     "engine": Page(
         "The engine",
-        "Write models as fast as the top and the stroller, which use these names: functions of all runs at once. "
-        ":doc:`Your own systems <own_systems>` need none of them. The examples continue that of their room.",
+        "Use these names to write a model that is as fast as the top and the stroller; its functions take all runs at once. "
+        ":doc:`Your own systems <own_systems>` need none of them. In each section, every example continues the one before.",
         [
             "nonholonomic.integration",
             *of(
@@ -113,7 +124,7 @@ PAGES = {
                 "solve_ensemble traced_solve_ensemble solve_with_samples Outcome "
                 "crossing_time LaneState solve_by_diffrax follow DenseSolution padded sample explicit_tableau legal_run "
                 "run_bounds tolerance_bound require_run require_times require_adaptive require_adjoint few_trials halved "
-                "sign_changes",
+                "sign_changes Oscillatory8",
             ),
             "nonholonomic.hybrid",
             *of(
@@ -139,7 +150,7 @@ PAGES = {
                 "nonholonomic.identification",
                 "AbstractRecording Quantities as_quantity read_columns model_times predicted AbstractDataModel scene_unknowns "
                 "free_numbers search_options as_sources fit_data identify Identification Measurements joined of_data "
-                "series_units LogDensity",
+                "series_units LogDensity sample Draws",
             ),
         ],
     ),
@@ -206,7 +217,7 @@ MEMBERS = {
 
 
 def public(package: str) -> list[str]:
-    """The names that the `__init__.py` of a package exports."""
+    """The names that the `__init__.py` of a package or of a room exports."""
     text = inspect.getsource(importlib.import_module(package))
     return sorted(set(re.findall(r"import (?!__)(\w+) as \1$", text, re.M)), key=str.lower)
 
@@ -218,25 +229,41 @@ def resolve(dotted: str) -> Any:
 
 
 def missing() -> list[str]:
-    """Public names that are on no page, neither themselves nor another name of the same object."""
+    """Exported names that are on no page, neither themselves nor another name of the same object."""
     shown = {id(resolve(name)) for page in PAGES.values() for name in page.names}
-    every = [f"{package}.{name}" for package in PACKAGES for name in public(package)]
-    return [name for name in every if id(resolve(name)) not in shown]
+    every = [f"{home}.{name}" for home in (*PACKAGES, "tippe.steady", *ENGINE_ROOMS) for name in public(home)]
+    return [name for name in every if name not in CONSTANTS and id(resolve(name)) not in shown]
 
 
 def text(page: Page) -> str:
-    """The page in reStructuredText: a table of all names, then an entry for each."""
+    """The page in reStructuredText: a table of its names, then an entry for each; a module has a section with a table of
+    its own."""
     introduction = re.sub(r"(:\w+:`[^`]+`)|(`[^`]+`)", lambda match: match[1] or f"`{match[2]}`", page.introduction)
-    lines = [page.title, "=" * len(page.title), "", introduction, ""]
-    lines += [".. autosummary::", "   :nosignatures:", "", *(f"   {name}" for name in page.names), ""]
-    for name in page.names:
-        value = resolve(name)
-        if inspect.ismodule(value):
-            heading = f"``{name}``"
-            lines += [heading, "-" * len(heading), "", f".. automodule:: {name}", "   :members:", ""]
-        elif inspect.isclass(value):
-            members = [f"   :members: {', '.join(MEMBERS[name].split())}"] if name in MEMBERS else []
-            lines += [f".. autoclass:: {name}", *members, ""]
-        else:
-            lines += [f".. autofunction:: {name}", ""]
+    modules = [name for name in page.names if inspect.ismodule(resolve(name))]
+    sections = {module: [name for name in page.names if name.startswith(f"{module}.")] for module in modules}
+    outside = [name for name in page.names if name.rpartition(".")[0] not in sections]
+    lines = [page.title, "=" * len(page.title), "", introduction, "", *summary(outside)]
+    for name in outside:
+        lines += entry(name)
+        if sections.get(name):
+            # Sphinx looks the names up in the module that it has just documented.
+            lines += summary([inner.removeprefix(f"{name}.") for inner in sections[name]])
+            lines += [line for inner in sections[name] for line in entry(inner)]
     return "\n".join(lines)
+
+
+def summary(names: list[str]) -> list[str]:
+    """A table of names with their first sentences."""
+    return [".. autosummary::", "   :nosignatures:", "", *(f"   {name}" for name in names), ""]
+
+
+def entry(name: str) -> list[str]:
+    """The docstring of a name, with those of its members that users need."""
+    value = resolve(name)
+    if inspect.ismodule(value):
+        heading = f"``{name}``"
+        return [heading, "-" * len(heading), "", f".. automodule:: {name}", "   :members:", ""]
+    if inspect.isclass(value):
+        members = [f"   :members: {', '.join(MEMBERS[name].split())}"] if name in MEMBERS else []
+        return [f".. autoclass:: {name}", *members, ""]
+    return [f".. autofunction:: {name}", ""]

@@ -132,7 +132,7 @@ def is_off(variable: str) -> bool:
 
 
 def remove_damaged(folder: Path) -> None:
-    """Remove entries that do not decompress, among those written since the last check.
+    """Check the entries written since the last check, and remove those that do not decompress.
 
     JAX neither writes entries atomically nor replaces damaged ones. Without this check, a program whose writer was
     killed (as by Ctrl-C on a command line) would be compiled in every later process. Checking 600 known entries takes

@@ -1,7 +1,7 @@
 """Check arguments on concrete numbers, before anything compiles.
 
 Traced numbers pass these checks. A module states the ranges of its numbers once, in `bounds`: concrete numbers out of
-range raise an error; for traced ones, `legal` is false in the program, whose results are then NaN.
+range raise an error; traced numbers out of range make `legal` false and the results NaN.
 """
 
 import dataclasses
@@ -130,8 +130,7 @@ def require(
 
 
 def require_scalars(values: dict[str, Any], otherwise: str) -> None:
-    """Raise `ValueError` unless each named value is a single number or omitted; `otherwise` names what accepts
-    lists."""
+    """Raise `ValueError` unless each named value is a single number or omitted; `otherwise` is the advice for lists."""
     for name, value in values.items():
         if value is not None and np.ndim(value) != 0:
             raise ValueError(f"{name} must be one number, not of shape {np.shape(value)}; {otherwise}")

@@ -38,7 +38,8 @@ _HAS_OLDER_EMITTERS = jaxlib_version.startswith("0.10.")
 
 #: For programs that are called on their own and run only for a moment: jaxlib 0.10 compiles them in half the time
 #: without the newer of its two emitters of fused operations. Loops may run slower, a table with two derivatives by a
-#: quarter. It can be removed with 0.10: later versions have a single emitter, and reject the option.
+#: quarter. It can be removed when jaxlib 0.10 is no longer supported: later versions have a single emitter, and reject
+#: the option.
 compiled_quickly = _compiler(compiler_options={"xla_cpu_use_fusion_emitters": False} if _HAS_OLDER_EMITTERS else {})
 
 #: XLA's flags for short jobs: without LLVM's optimisations, and without the newer emitter. A flag that XLA does not know ends
@@ -65,8 +66,8 @@ def stored(*values: Float[Array, "..."] | None) -> tuple[Any, ...]:
     """The same values, computed once even if several results depend on them; `None` stays `None`.
 
     Otherwise XLA fuses every result with everything that leads to it, and evaluates the common part again for each
-    result. A barrier alone does not prevent this. Joining the values, and putting a barrier behind them, prevents it,
-    and makes the top's field 1.2 times as fast. It also gives all readers the same value: two kernels may round
+    result. A barrier alone does not prevent this. Joining the values, and putting a barrier after them, prevents it and
+    makes the top's field 1.2 times as fast. It also gives all readers the same value: two kernels may round
     differently. It can be removed when XLA's fusion counts what it repeats.
     """
     present = [value for value in values if value is not None]
@@ -162,9 +163,9 @@ def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """A function of a tree of arrays that XLA compiles, on a CPU, into a single kernel.
 
     Otherwise every fused operation in the body of a loop is a separate call; for blocks that fit the first-level
-    caches, calling costs as much as computing. XLA does this by itself only for loops over very small arrays. The gain
-    is 2.5 times with jaxlib 0.10.2 and 1.3 times with 0.12. It can be removed when XLA's threshold can be set for one
-    program.
+    caches, calling costs as much as computing. XLA does this by itself only for loops over very small arrays. A single
+    kernel is 2.5 times as fast with jaxlib 0.10.2, and 1.3 times as fast with 0.12. It can be removed when XLA's
+    threshold can be set for one program.
 
     JAX chooses the platform when it lowers a program; on platforms other than CPUs this function has no effect
     (`jax.export` lowers for platforms that this machine does not have).

@@ -34,7 +34,7 @@ from .runs.table import Table as Table
 from .runs.table import sweep as sweep
 from .runs.trajectory import Trajectory as Trajectory
 
-# `import *` exports the names above, and not the rooms.
+# `import *` exports the names above, and not the subpackages.
 __all__ = [
     name for name, value in list(globals().items()) if not name.startswith("_") and not isinstance(value, _Module)
 ]

@@ -41,8 +41,8 @@ TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
 
 
 class Ground(NamedTuple):
-    """A surface to ride on: how options create it, and where a ride starts, near the bottom or, outside, near the
-    top."""
+    """A surface to ride on: how options create it, and where a ride starts (near the bottom; outside a surface, near
+    the top)."""
 
     build: Callable[[argparse.Namespace], AbstractSurface]
     place: tuple[float, float]
@@ -61,7 +61,7 @@ GROUNDS = {
 
 
 class Helm(eqx.Module):
-    """Steer alternately left and right, and pull with a constant force: a torque towards a moving angle."""
+    """Steer alternately left and right, by a torque towards a moving angle, and pull with a constant force."""
 
     force: Any = eqx.field(converter=as_number)
     angle: Any = eqx.field(converter=as_number)
@@ -80,8 +80,8 @@ def parser() -> argparse.ArgumentParser:
     command = argparse.ArgumentParser(
         prog="python -m stroller",
         description="Rides of a stroller on a plane and inside a spheroid, or on the surfaces named, with and without "
-        "friction, steered to and fro and pulled. Prints the energy audit of both integrators, writes an HDF5 file and a "
-        "picture.",
+        "friction, steered alternately left and right, and pulled. Prints the energy audit of both integrators, writes an "
+        "HDF5 file and a picture.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     command.add_argument("--version", action="version", version=f"nonholonomic {__version__}")
@@ -92,9 +92,9 @@ def parser() -> argparse.ArgumentParser:
     body.add_argument("--steering-inertia", type=float, default=0.05, help="inertia of the fork [kg m^2]")
     scene = command.add_argument_group("the scene")
     scene.add_argument(
-        "--surface", nargs="+", choices=list(GROUNDS), default=["plane", "spheroid"], help="what to ride on"
+        "--surface", nargs="+", choices=list(GROUNDS), default=["plane", "spheroid"], help="surfaces to ride on"
     )
-    scene.add_argument("--side", choices=list(CLOSED), default="inside", help="side of those that have two")
+    scene.add_argument("--side", choices=list(CLOSED), default="inside", help="side of a closed surface")
     scene.add_argument("--tilt", type=float, default=0.05, help="tilt of the plane [rad]")
     scene.add_argument("--radius", type=float, default=6.0, help="radius of the cylinder and of the sphere [m]")
     scene.add_argument("--equatorial", type=float, default=6.0, help="equatorial radius of the spheroid [m]")
@@ -155,7 +155,7 @@ def audit(name: str, runs: dict[str, Trajectory]) -> list[str]:
 def tolerance_curve(options: argparse.Namespace, helm: Helm) -> list[str]:
     """The largest energy residual over the tolerance of Dopri8, for the last ride."""
     (ground, ride), (scene, launch) = list(scenes(options).items())[-1]
-    lines = [f"Dopri8 {ground}, {ride}: residual [J] of energy against work over the tolerance"]
+    lines = [f"Dopri8 {ground}, {ride}: largest residual [J] of energy minus work, by tolerance"]
     for tolerance in TOLERANCES:
         run = simulate(scene, launch, options.t1, helm, tolerance=tolerance)
         residual = float(jnp.max(jnp.abs(run.energy_residual)))

@@ -52,7 +52,7 @@ from .runs.trajectory import Trajectory as Trajectory
 from .runs.trajectory import simulate as simulate
 from .runs.trajectory_table import trajectory_table as trajectory_table
 
-# `import *` exports the names above, and not the rooms.
+# `import *` exports the names above, and not the subpackages.
 __all__ = [
     "steady",
     *(name for name, value in list(globals().items()) if not name.startswith("_") and not isinstance(value, _Module)),

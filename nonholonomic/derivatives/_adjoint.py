@@ -1,9 +1,10 @@
 """First derivatives of event times with respect to any number of parameters: the discrete adjoint of an ensemble solve.
 
 A run is cut into periods, and the steps of each period are recorded. After the last period, a backward pass carries the
-derivatives of the event times with respect to the states from the last period to the first. A period whose record is
-gone is computed again from the latest checkpoint before it. The cost does not depend on the number of parameters, and
-the memory does not depend on the length of the runs. Step lengths are held fixed, as in `variation.py`.
+derivatives of the event times with respect to the states from the last period to the first. The records of the latest
+periods are kept; a period whose record is gone is computed again from the latest checkpoint before it. The cost does not
+depend on the number of parameters, and the memory does not depend on the length of the runs. Step lengths are held
+fixed, as in `variation.py`.
 """
 
 import dataclasses
@@ -18,42 +19,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..integration import (
-    RUNNING,
-    AbstractProblem,
-    AbstractRecorder,
-    InLanes,
-    Lanes,
-    LaneScheduler,
-    LaneState,
-    Outcome,
-    Progress,
-    Settings,
-    Stages,
-    States,
-    length_to_try,
-    moved_state,
-    over_stages,
-    try_step,
-)
+from ..integration import RUNNING, AbstractProblem, Lanes, LaneState, Outcome, Settings, States
+from ..integration.runge_kutta import Stages, moved_state, over_stages
+from ..integration.scheduler import AbstractRecorder, InLanes, LaneScheduler, Progress
+from ..integration.step import length_to_try, try_step
 from ..xla_cpu import uncounted, written_by_component, written_in_place
+from ._periods import Checkpoints, LatestSteps, Period, StepRecord, read
 from .variation import VariationalProblem
-
-#: Number of checkpoints. With more periods, some checkpoints are dropped and computed again from an earlier one. With
-#: the 64 lanes of a CPU the checkpoints take 5 MB, with the 32768 of an accelerator 2 GB.
-KEPT = 256
 
 #: The quantity measured at the end of a run: (problem, lane state) -> a number per lane, differentiable with respect to
 #: the problem's parameters and the lanes' states.
 Measured = Callable[[Any, LaneState], Lanes]
-
-
-class StepRecord(NamedTuple):
-    """The steps of a period: where each step began, and its length, 0 for a lane that did not move."""
-
-    time: Float[Array, "iterations lanes"]
-    state: Float[Array, "iterations components lanes"]
-    length: Float[Array, "iterations lanes"]
 
 
 class StepRecorder(AbstractRecorder):
@@ -76,61 +52,20 @@ class StepRecorder(AbstractRecorder):
         return after, jax.tree.map(functools.partial(written_in_place, at=iteration), record, entry)
 
 
-class Checkpoints(NamedTuple):
-    """The stored starts of periods, the earliest first.
-
-    There are `depth` of them; `index` holds the period that each one starts, `slot` its place in `progress`.
-    """
-
-    depth: Int[Array, ""]
-    index: Int[Array, " slots"]
-    slot: Int[Array, " slots"]
-    progress: Progress
-
-    @classmethod
-    def of(cls, progress: Progress) -> "Checkpoints":
-        """The start of the first period."""
-        room = jax.tree.map(lambda leaf: jnp.zeros((KEPT, *leaf.shape), leaf.dtype).at[0].set(leaf), progress)
-        return cls(jnp.ones((), int), jnp.zeros(KEPT, int), jnp.arange(KEPT), room)
-
-    def latest(self) -> tuple[Int[Array, ""], Progress]:
-        """The period of the latest checkpoint, and the checkpoint itself."""
-        last = self.depth - 1
-        return self.index[last], jax.tree.map(functools.partial(_read, at=self.slot[last]), self.progress)
-
-    def dropped(self, drop: Bool[Array, ""]) -> "Checkpoints":
-        """The checkpoints without the latest one, if `drop` holds."""
-        return self._replace(depth=self.depth - drop)
-
-    def added(self, index: Int[Array, ""], progress: Progress, add: Bool[Array, ""]) -> "Checkpoints":
-        """The checkpoints with another one, if `add` holds; if all slots are full, the one whose neighbours are closest
-        is dropped.
-        """
-        position = jnp.arange(KEPT)
-        full = self.depth == KEPT
-        following = jnp.where(position == KEPT - 1, index, jnp.roll(self.index, -1))
-        gap = jnp.where(position == 0, jnp.iinfo(self.index.dtype).max, following - jnp.roll(self.index, 1))
-        forgotten = jnp.where(full, jnp.argmin(gap), self.depth)
-        free = self.slot[forgotten]
-        moves = full & (position >= forgotten)
-        to = jnp.minimum(self.depth, KEPT - 1)
-        indices = jnp.where(moves, jnp.roll(self.index, -1), self.index).at[to].set(index)
-        slots = jnp.where(moves, jnp.roll(self.slot, -1), self.slot).at[to].set(free)
-        # Always written: if no checkpoint is added, the slot stays free.
-        room = jax.tree.map(functools.partial(written_in_place, at=free), self.progress, progress)
-        return Checkpoints(jnp.minimum(self.depth + add, KEPT), indices, slots, room)
-
-
 class Backward(NamedTuple):
-    """State of a backward pass: `needed` is the period after the next one.
+    """State of the forward pass and of the backward pass.
 
-    `adjoint` holds, for the cell in each lane, the derivatives of the measured quantity: the first rows are those with
-    respect to the state, the others those with respect to the parameters. `gradient` holds the derivatives of every
-    cell with respect to its initial state.
+    `ahead` holds the lanes at the start of the next period to compute, and `number` its number. The backward pass takes
+    the period before `needed` next. `adjoint` holds, for the cell in each lane, the derivatives of the measured
+    quantity: the first rows are those with respect to the state, the others those with respect to the parameters.
+    `gradient` holds the derivatives of every cell with respect to its initial state.
     """
 
-    kept: Checkpoints
+    ahead: Progress
+    number: Int[Array, ""]
     needed: Int[Array, ""]
+    kept: Checkpoints
+    latest: LatestSteps
     outcome: Outcome
     adjoint: Float[Array, "rows lanes"]
     gradient: Float[Array, "rows cells"]
@@ -184,33 +119,58 @@ def solve_with_adjoint(
     scheduler = LaneScheduler.of(probed, t1, cells, settings, one_kernel=one_kernel, n_blocks=2)
     rows = components + len(jax.tree.leaves(numbers))
 
-    def period(run: Backward) -> Backward:
-        index, before = run.kept.latest()
-        after, record = scheduler.run(before, StepRecorder())
-        outcome = scheduler.store(run.outcome, after.lane_state)
-        refilled = scheduler.refill(after)
-        back = ~scheduler.unfinished(refilled) | (index + 1 == run.needed)
-        count = jnp.where(back, after.iterations - before.iterations, 0)
-        adjoint = _taken_back(scheduler, moving, measured, after.lane_state, record, count, run.adjoint)
-        # A cell that had made no step was at its start.
-        began = back & (before.lane_state.steps == 0) & (before.lane_state.cell < cells)
-        to = jnp.where(began, before.lane_state.cell, size)
-        return Backward(
-            kept=run.kept.dropped(back).added(index + 1, refilled, ~back),
-            needed=jnp.where(back, index, run.needed),
-            outcome=outcome,
-            adjoint=jnp.where(back, adjoint, run.adjoint),
-            gradient=run.gradient.at[:, to].set(adjoint, mode="drop"),
+    recorder = StepRecorder()
+
+    def is_ahead(run: Backward) -> Bool[Array, ""]:
+        return uncounted(scheduler.unfinished(run.ahead) & (run.number < run.needed), run.number)
+
+    def forward(run: Backward) -> Backward:
+        after, steps = scheduler.run(run.ahead, recorder)
+        return run._replace(
+            ahead=scheduler.refill(after),
+            number=run.number + 1,
+            kept=run.kept.added(run.number, Period(run.ahead, after)),
+            latest=run.latest.added(run.ahead.iterations, steps),
+            outcome=scheduler.store(run.outcome, after.lane_state),
         )
 
+    def is_recorded(run: Backward) -> Bool[Array, ""]:
+        number, period = run.kept.latest()
+        recorded = (number == run.needed - 1) & (period.before.iterations >= run.latest.since)
+        return uncounted((run.kept.depth > 0) & recorded, run.number)
+
+    def backward(run: Backward) -> Backward:
+        number, (before, after) = run.kept.latest()
+        steps = run.latest.of_period(before.iterations, recorder.period)
+        count = after.iterations - before.iterations
+        adjoint = _taken_back(scheduler, moving, measured, after.lane_state, steps, count, run.adjoint)
+        # A cell that had made no step was at its start.
+        began = (before.lane_state.steps == 0) & (before.lane_state.cell < cells)
+        gradient = run.gradient.at[:, jnp.where(began, before.lane_state.cell, size)].set(adjoint, mode="drop")
+        return run._replace(needed=number, kept=run.kept.without_latest(), adjoint=adjoint, gradient=gradient)
+
+    def there_and_back(run: Backward) -> Backward:
+        run = jax.lax.while_loop(is_ahead, forward, run)
+        run = run._replace(needed=jnp.minimum(run.needed, run.number))
+        run = jax.lax.while_loop(is_recorded, backward, run)
+        # The steps before are gone: continue from the latest checkpoint.
+        number, (before, _) = run.kept.latest()
+        kept, latest = run.kept.without_latest(), run.latest._replace(since=before.iterations)
+        return run._replace(ahead=before, number=number, kept=kept, latest=latest)
+
+    start = scheduler.start()
+    steps = jax.eval_shape(lambda: recorder.begin(start.lane_state, None))
     run = Backward(
-        kept=Checkpoints.of(scheduler.start()),
+        ahead=start,
+        number=jnp.zeros((), int),
         needed=jnp.asarray(jnp.iinfo(jnp.arange(0).dtype).max),
+        kept=Checkpoints.none(Period(start, start)),
+        latest=LatestSteps.none(steps, size),
         outcome=scheduler.empty(),
         adjoint=jnp.zeros((rows, scheduler.lanes), states.dtype),
         gradient=jnp.zeros((rows, size), states.dtype),
     )
-    run = jax.lax.while_loop(lambda run: uncounted(run.needed > 0, run.outcome.steps[0]), period, run)
+    run = jax.lax.while_loop(lambda run: uncounted(run.needed > 0, run.outcome.steps[0]), there_and_back, run)
     by_number = jax.tree.unflatten(jax.tree.structure(numbers), list(run.gradient[components:]))
     return run.outcome._replace(state=run.outcome.state[:components]), run.gradient[:components], by_number
 
@@ -244,7 +204,7 @@ def _taken_back(
 
         def step(carry: Any) -> Any:
             index, *along = carry
-            step_record = jax.tree.map(functools.partial(_read, at=index - 1), record)
+            step_record = jax.tree.map(functools.partial(read, at=index - 1), record)
             return index - 1, *step_taken_back(weights, problem, moving, *step_record, *along)
 
         room = jnp.zeros((1 + len(weights.fractions), *lane_state.state.shape), adjoint.dtype)
@@ -322,7 +282,7 @@ def step_taken_back(
 
     def stage_made(stage: Int[Array, ""], carry: tuple[Stages, Stages]) -> tuple[Stages, Stages]:
         along, rates = carry
-        rate = problem.field(time + fractions[stage] * length, _read(along, at=stage))
+        rate = problem.field(time + fractions[stage] * length, read(along, at=stage))
         rates = written_by_component(rates, rate, at=stage)
         return written_in_place(along, moved_state(stage, weights.rows, state, length, rates), at=stage + 1), rates
 
@@ -341,7 +301,7 @@ def step_taken_back(
         stage, (by_stage, total) = stages - 1 - done, carry
         by_rate = jax.lax.optimization_barrier(moved_state(stage, weights.shares, nothing, length, by_stage))
         at = time + fractions[stage] * length
-        pulled = pull(at, numbers, tuple(jnp.unstack(_read(along, at=stage))), tuple(jnp.unstack(by_rate)))
+        pulled = pull(at, numbers, tuple(jnp.unstack(read(along, at=stage))), tuple(jnp.unstack(by_rate)))
         # If no step was made, values may not be finite.
         pulled = jax.lax.optimization_barrier(jnp.where(length > 0.0, jnp.stack(pulled), 0.0))
         return written_in_place(by_stage, pulled[:components], at=stage + 1), total + pulled
@@ -349,8 +309,3 @@ def step_taken_back(
     nothing, ends = jnp.zeros_like(state), written_in_place(room, adjoint[:components], at=jnp.zeros((), int))
     room, total = over_stages(stages, stage_taken_back, (ends, jnp.zeros_like(adjoint)))
     return adjoint + total, room
-
-
-def _read(whole: Array, at: Int[Array, ""]) -> Array:
-    """One of the arrays stacked in another."""
-    return jax.lax.dynamic_index_in_dim(whole, at, 0, keepdims=False)

@@ -28,7 +28,7 @@ Primal = Any
 class AbstractDifferentiableSolve(eqx.Module):
     """A solve as a function of `leaves`; the first `movable` leaves are differentiable.
 
-    **Example:** the solve of the room's example, for two cells.
+    **Example:** the solve of the subpackage's example, for two cells.
 
     >>> print(HalfLife().solve(2, jnp.array([1.0, 2.0])).round(6))
     [0.693147 0.346574]

@@ -143,8 +143,8 @@ def exponent_of(
     """Estimate the exponent and its error from the growth.
 
     The first half of the run is left out: there the tangent still turns towards the direction of fastest growth. The
-    error has two parts. The first is the largest scatter of the intervals of the other half, in groups of 1, 2 and 4,
-    and of the last three quarters, because chaotic motion lingers near orderly motion (Flyvbjerg and Petersen, J. Chem.
+    error has two parts. The first is the largest scatter of the intervals in the second half, in groups of 1, 2 and 4,
+    and in the last three quarters, because chaotic motion lingers near orderly motion (Flyvbjerg and Petersen, J. Chem.
     Phys. 91 (1989) 461). The second is ln 2 over half the duration of the run, for the linear divergence of orderly
     motion. An exponent below twice its error is no sign of chaos. Where the motion stays near orderly motion for a long
     time, the error is up to four times too small (`tests/tippe/test_lyapunov.py`).

@@ -16,12 +16,12 @@ from ..integration import (
     REACHED_END,
     AbstractProblem,
     CoreProblem,
-    SampledSolution,
     Settings,
-    event_time,
     sample,
     solve_with_samples,
 )
+from ..integration.dense import SampledSolution
+from ..integration.problem import event_time
 from .differentiable import tangents_by
 from .lyapunov import probed
 from .sampling import AbstractSampling, ProblemSpec, solve_for_samples
@@ -109,8 +109,8 @@ def _at_times(
     modules: Any,
     build: Build,
 ) -> Float[Array, "times rows"]:
-    """The samples themselves, shifted along the field by a variation of their times: the core components, or, where
-    these are passed too, the passive quadratures.
+    """The samples themselves, with derivatives with respect to their times from the field. The samples are the core
+    components or, if `leading` contains the core components, the passive quadratures.
     """
     return samples
 
@@ -212,7 +212,8 @@ class BlockSampling(AbstractSampling):
         return self if quadratures else dataclasses.replace(self, alone=True)
 
     def _builder(self, leaves: tuple[Array, ...]) -> tuple[Callable[..., AbstractProblem], Any, Any, Settings]:
-        """(the modules' numbers, cells) -> the problem; these numbers; times, horizon and tolerance; and the settings."""
+        """A function (the modules' numbers, cells) -> problem; the modules' numbers; times, horizon and tolerance; the
+        settings."""
         numbers, arguments, spec = self._sorted(leaves)
 
         def build(numbers: tuple[Array, ...], cells: int | None) -> AbstractProblem:

@@ -24,7 +24,7 @@ class ProblemSpec(eqx.Module):
     grid: Float[Array, " steps"] | None
 
     def built(self, numbers: tuple[Array, ...], extra: Any) -> Any:
-        """Build the problem from the modules with other numbers, and from the extra argument of `build`."""
+        """Build the problem from the modules, with their numbers replaced, and from the extra argument of `build`."""
         return self.build(eqx.combine(jax.tree.unflatten(self.structure, numbers), self.rest), extra)
 
 
@@ -40,7 +40,7 @@ class AbstractSampling(AbstractDifferentiableSolve):
         return jnp.isnan(value)
 
     def _sorted(self, leaves: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, Array, Array], ProblemSpec]:
-        """The modules' numbers; times, horizon and tolerance; and the whole spec."""
+        """Split the leaves into the modules' numbers; times, horizon and tolerance; and the whole spec."""
         numbers, (times, t1, tolerance, *held) = leaves[: self.movable], leaves[self.movable :]
         return numbers, (times, t1, tolerance), eqx.combine(self.spec, jax.tree.unflatten(self.places, held))
 

@@ -62,7 +62,7 @@ class Held(eqx.Module):
 
     @classmethod
     def of(cls, function: eqx.Module) -> "Held":
-        """From a module whose arrays are the numbers of a single function, not one number per lane."""
+        """Convert a module whose arrays hold the numbers of a single function, not one number per lane."""
 
         def parted(leaf: Any) -> Any:
             return Numbers(spread([leaf]), leaf.shape) if eqx.is_array(leaf) and leaf.ndim else leaf
@@ -111,7 +111,7 @@ def gathered(numbers: Sequence[Array], shapes: Sequence[tuple[int, ...]]) -> lis
 
 
 def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module:
-    """A function of lengths [m] as a module whose numbers are arrays.
+    """Convert a function of lengths [m] to a module whose parameters are arrays.
 
     **Raises:** `ValueError` unless the function returns one number for numbers.
     """
@@ -136,7 +136,7 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module
         shown = ", ".join(map(str, results))
         raise ValueError(f"{name} = {value!r} must return one number for numbers {', '.join(arguments)}, not {shown}")
     if isinstance(value, eqx.Module):
-        # A function of numbers in each lane has as many results.
+        # If the parameters have one number per lane, so have the results.
         arrays = results[0].shape == () and len(shapes) > 1 and not isinstance(value, Held)
         return Held.of(value) if arrays else value
     closes_over = any(is_traced(constant) for constant in traced.consts)

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float, Int
 
-from ..integration.problem import AbstractProblem
+from ..integration import AbstractProblem
 from ..integration.scheduler import Numbers
 
 
@@ -60,7 +60,7 @@ class Transition(NamedTuple, Generic[Numbers]):
 class AbstractBatchedMode(eqx.Module):
     """One mode of a hybrid system. Its leaves are scalars, or hold one number per cell in their last axis.
 
-    **Example:** the mode of the room's example, at its start.
+    **Example:** the mode of the subpackage's example, at its start.
 
     >>> print(modes[0].problem(start).field(0.0, start)[1])
     [-9.81 -9.81]
@@ -94,8 +94,8 @@ class AbstractBatchedMode(eqx.Module):
 class AbstractHoppingMode(AbstractBatchedMode):
     """A mode whose reset map is a succession of stretches of motion in closed form, each with a jump at its end.
 
-    The reset map goes on while a stretch's `open` holds, for at most `most_hops` stretches; its `elapsed` [s] counts from the
-    end of the mode.
+    The reset map continues while `open` is true for the current stretch, for at most `most_hops` stretches; `elapsed`
+    [s] of a stretch is the time since the end of the mode.
 
     **Example:** small hops of a ball, and the first of them.
 

@@ -139,7 +139,7 @@ def _errors(table: dict[str, list[str]], name: str, header_and_unit: Any, si: st
 
 
 def _parts(name: str, header_and_unit: Any, si: str) -> tuple[Any, float]:
-    """The header or number, and the factor that converts the file's numbers to SI units."""
+    """The header (or, for an error, possibly a number), and the factor that converts the file's numbers to SI units."""
     if not isinstance(header_and_unit, tuple) or len(header_and_unit) != 2:
         raise ValueError(f"columns: {name!r} = {header_and_unit!r} must be (header, unit), such as ('tilt', 'deg')")
     first, unit = header_and_unit

@@ -33,9 +33,9 @@ CONVERGED = 1e-16
 #: this: it is as close as the integration errors allow, within a thirtieth of a standard error of the minimum.
 NEGLIGIBLE = 1e-3
 
-#: On a staircase, steps keep gaining very little. A fit has also converged if `PATIENCE` steps together lower -2 log
-#: likelihood by less than `STALLED`, or, for a bad fit, by less than this fraction of its excess over `BAD` per degree
-#: of freedom.
+#: Where the predictions jump like a staircase, every step gains very little. A fit has also converged if `PATIENCE`
+#: steps together lower -2 log likelihood by less than `STALLED`, or, for a bad fit, by less than this fraction of its
+#: excess over `BAD` per degree of freedom.
 PATIENCE, STALLED, BAD = 8, 1e-2, 3.0
 
 #: No step changes a parameter with a bound by more than a factor of e: slopes are not valid farther away, where runs

@@ -15,7 +15,7 @@ from ..validation import require
 #: Residual of a measurement for which the model has no prediction: a penalty without a slope.
 MISSING = 1e4
 
-#: Factor on the error of a measurement that does not count yet.
+#: Factor on the error of a measurement that is not fitted yet.
 DOWN_WEIGHTED = 1e6
 
 

@@ -190,7 +190,8 @@ def _value_and_gradient(density: LogDensity, coordinates: Float[Array, "*batch u
 
 
 def _as_leaves(prior: Prior) -> Any:
-    """A prior whose numbers are arguments of compiled programs, while its function, if any, is part of them."""
+    """Convert a prior: its numbers become arguments of compiled programs; its function, if any, becomes part of
+    them."""
     if not callable(prior):
         return np.asarray(prior, float)
     return prior if isinstance(prior, eqx.Module) else jax.tree_util.Partial(prior)

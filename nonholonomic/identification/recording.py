@@ -98,7 +98,7 @@ class AbstractRecording(eqx.Module):
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
 
-    **Example:** the recording of the room's example.
+    **Example:** the recording of the subpackage's example.
 
     >>> data[0].labels
     ('level(1 s)', 'level(2 s)', 'level(3 s)')
@@ -153,7 +153,7 @@ class AbstractRecording(eqx.Module):
 
     @property
     def seen(self) -> np.ndarray:
-        """Mask of the samples that are not missing, ordered by time."""
+        """Indices of the samples that are not missing, ordered by time."""
         return np.flatnonzero(~np.isnan(np.asarray(self.value).reshape(-1)))
 
     @property

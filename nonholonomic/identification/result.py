@@ -11,6 +11,7 @@ from jaxtyping import Float
 from ..parameters import full_name, text_as_html
 from ..progress import status_line
 from ..validation import require_package
+from ..views import draw_fit
 from .levenberg_marquardt import minimise
 from .likelihood import Measurements
 from .problem import Linearised, Problem, linearise
@@ -22,7 +23,7 @@ NO_SLOPE = 1e-7
 #: A combination of parameters counts as undetermined if its relative error exceeds this.
 UNSEEN = 1.0
 
-#: Number of rows of the residual table, and of unknowns of a combination, in a summary.
+#: Greatest number of rows of the residual table in a summary, and least share of a parameter that a combination lists.
 MOST_ROWS, LEAST_SHARE = 24, 0.02
 
 
@@ -107,7 +108,7 @@ class Identification:
     - `verdict`: a `Verdict`, whether the fit can be believed.
     - `coordinates`, `coordinate_covariance`: estimates and covariance in the coordinates of the fit.
 
-    **Example:** the fit of the room's example.
+    **Example:** the fit of the subpackage's example.
 
     >>> fit.status, fit.degrees, list(fit.estimates)
     ('converged', 2, ['scene.rate'])
@@ -193,8 +194,6 @@ class Identification:
         **Returns:** a matplotlib figure.
         """
         require_package("matplotlib", "plot", "plot")
-        from ..views import draw_fit
-
         return draw_fit(self)
 
     def _place(self, name: str) -> int:
@@ -277,8 +276,8 @@ def identifiability(problem: Problem, estimates: Any, slopes: Any, jacobian: Any
 
 
 def _in_words(problem: Problem, direction: Float[np.ndarray, " unknowns"]) -> str:
-    """The parameters that change together: per cent of a parameter that cannot be negative, otherwise hundredths of its
-    unit."""
+    """The parameters that change together: in per cent if a parameter cannot be negative, otherwise in hundredths of
+    its unit."""
     most = np.argmax(np.abs(direction))
     parts = []
     for share, (name, free) in zip(direction / direction[most], problem.free, strict=True):

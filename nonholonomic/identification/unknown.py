@@ -40,8 +40,8 @@ class Free(NamedTuple):
 
     @property
     def unit(self) -> float:
-        """The relative change that counts as 1: e-fold for a parameter fitted in its logarithm, otherwise the start's
-        size."""
+        """The unit of changes of the parameter: the size of the start value; if this is 0, the prior's standard
+        deviation, or 1."""
         return abs(self.start) or (self.prior[1] if self.prior else 1.0)
 
     @property

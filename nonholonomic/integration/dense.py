@@ -236,8 +236,8 @@ def _loss(
 
 
 class _GivenSteps(diffrax.StepTo):
-    """Steps that end at given times, growing, without Diffrax's checks: these call back into Python, and such programs
-    are not cached on disk.
+    """Steps that end at given, increasing times, without the checks of Diffrax, which call back into Python: such
+    programs are not cached on disk.
     """
 
     def wrap(self, direction: Any) -> "_GivenSteps":

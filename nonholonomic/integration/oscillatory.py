@@ -1,13 +1,13 @@
 """An explicit Runge-Kutta pair of orders 8 and 7 for motions that oscillate or rotate, the default of ensemble solves.
 
 The pair has the thirteen stages, and all simplifying assumptions, of Prince and Dormand's pair RK8(7)13M (High order
-embedded Runge-Kutta formulae, J. Comput. Appl. Math. 7, 1981), which is Diffrax's `Dopri8`. These leave ten
-coefficients free. Prince and Dormand chose them for a small error in ninth order, whatever the field. Here they
-minimise the error of a step along the motions of tops and strollers, for lengths at which the error is about the
-tolerance, and keep the weights small, because large weights magnify round-off; `python benchmarks/tune_pair.py --starts
-50 --seed 0` computed them. `docs/performance.md` lists the gain. A rotation by 1 rad per step changes the amplitude by
-3e-10 and the phase by 7e-10; with `Dopri8`, the changes are 1e-8 and 3e-8. A rotation by 3 rad per step, which only the
-loosest tolerances allow, changes both by 8e-4; `Dopri8` shrinks the amplitude and this pair enlarges it.
+embedded Runge-Kutta formulae, J. Comput. Appl. Math. 7, 1981), which is Diffrax's `Dopri8`. These assumptions leave ten
+coefficients free. Prince and Dormand chose them for a small error in ninth order, for any field. Here they minimise the
+error of a step along the motions of tops and strollers, for lengths at which the error is about the tolerance, and keep
+the weights small, because large weights magnify round-off; `python benchmarks/tune_pair.py --starts 50 --seed 0`
+computed them. `docs/performance.md` lists the gain. A rotation by 1 rad per step changes the amplitude by 3e-10 and the
+phase by 7e-10; with `Dopri8`, the changes are 1e-8 and 3e-8. A rotation by 3 rad per step, which only the loosest
+tolerances allow, changes both by 8e-4; `Dopri8` shrinks the amplitude and this pair enlarges it.
 """
 
 from typing import Any, ClassVar
@@ -130,7 +130,7 @@ SEVENTH = (
 #: take about as many steps as with Prince and Dormand's pair at the same tolerance, and err less.
 CAUTION = 2.0
 
-#: Positions of the stages after the first in the step, and of the step's end, where the next step begins.
+#: Positions in the step of all stages but the first, and of the end of the step, where the next step begins.
 PLACES = np.array([*(sum(row) for row in STAGES), 1.0])
 
 

@@ -18,7 +18,7 @@ class AbstractProblem(eqx.Module):
     The leaves of a problem are scalars, or hold one number per cell in their last axis. Its functions receive one
     number per lane, or scalars for a single run.
 
-    **Example:** the problem of the room's example, at its start.
+    **Example:** the problem of the subpackage's example, at its start.
 
     >>> start, scales = problem.start()
     >>> print(problem.event_function(start), problem.field(0.0, start)[0])

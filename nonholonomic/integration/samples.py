@@ -97,7 +97,7 @@ class SampleRecorder(AbstractRecorder):
         next_time = self._time_of(sample, lane_state)
         stop = jnp.where(sample < count, jnp.minimum(next_time, horizon), horizon)
         even = _even(lane_state.length, stop - lane_state.time, lane_state.bracketing)
-        # After a step that was not accepted the next one is shorter on purpose: it may have to end on a minimum of a margin.
+        # The step after a rejected step is shorter on purpose, because it may have to end on a minimum of a margin.
         length = jnp.where(accepted, even, jnp.minimum(even, lane_state.length))
         lane_state = lane_state._replace(length=length)
         after = try_step(problem, control._replace(t1=stop), atol, lane_state)

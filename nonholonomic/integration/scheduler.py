@@ -30,8 +30,8 @@ Numbers = TypeVar("Numbers", Array, np.ndarray)
 #: missed as many steps, so the loss is at most twice the loss of the best choice.
 REFILL = 0.25
 
-#: How far ahead the direction of motion is evaluated, in first steps; and the fraction of the change until then below
-#: which a start counts as a zero.
+#: Time at which the direction of motion is evaluated, in units of the first step; and the fraction of a function's
+#: change until then below which the function counts as zero at the start.
 SOON, AT_ZERO = 1e-2, 1e-6
 
 
@@ -42,7 +42,7 @@ class Outcome(NamedTuple, Generic[Numbers]):
     the last event, which are equal if runs end on the event, and infinite if there was none; `end_time` [s] and `state`
     are time and state at the end of the run; `steps` counts accepted and rejected steps, `rejected` only rejected ones.
 
-    **Example:** the outcome of the room's example, whose runs end on the event.
+    **Example:** the outcome of the subpackage's example, whose runs end on the event.
 
     >>> from nonholonomic.integration import CROSSED
     >>> print(outcome.status == CROSSED, outcome.state.shape)
@@ -74,7 +74,7 @@ class AbstractRecorder(eqx.Module):
     """The part of a solve that records steps, in addition to the `Outcome`. A period is the time between two refills of
     the lanes.
 
-    `period`: the greatest number of iterations of a period, `None` for any number; `refill_cost`: cost of a refill, in
+    `period`: the greatest number of iterations of a period, `None` if unlimited; `refill_cost`: cost of a refill, in
     steps of all lanes.
     """
 
@@ -330,8 +330,8 @@ def _holds(
     rates: Float[Array, "components cells"],
     lengths: Float[Array, " cells"],
 ) -> Bool[Array, " cells"] | None:
-    """Where a function of the state is positive at the start; at a zero, up to round-off, whether it is about to become
-    positive.
+    """A mask of the cells in which a function of the state is positive at the start or, if it is zero up to round-off,
+    is about to become positive.
     """
     value, zero = function(states), jnp.zeros_like(lengths)
     if value is None:

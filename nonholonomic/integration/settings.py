@@ -66,7 +66,8 @@ class Settings(eqx.Module):
         """
         if isinstance(self.solver, Oscillatory8):
             raise ValueError(
-                f"solver = {self.solver!r} must have a dense output of its order, as Dopri8() has, where Diffrax integrates"
+                f"solver = {self.solver!r} must have a dense output as accurate as its steps, as Dopri8() has, where Diffrax "
+                "integrates"
             )
         return self.for_steps_alone
 
@@ -136,10 +137,10 @@ def legal_run(
     >>> print(legal, t1, tolerance)
     False 0.0 0.01
     """
-    may = jnp.asarray(others) & legal(run_bounds(t1, tolerance))
+    is_legal = jnp.asarray(others) & legal(run_bounds(t1, tolerance))
     if times is not None:
-        may = jnp.all(may & jnp.all(legal(times_bounds(times, t1)))) & jnp.all(jnp.diff(times) > 0.0)
-    return may, jnp.where(may, t1, 0.0), jnp.where(may, tolerance, LOOSEST)
+        is_legal = jnp.all(is_legal & jnp.all(legal(times_bounds(times, t1)))) & jnp.all(jnp.diff(times) > 0.0)
+    return is_legal, jnp.where(is_legal, t1, 0.0), jnp.where(is_legal, tolerance, LOOSEST)
 
 
 def require_run(scene: Any, launch: Any, t1: Any, tolerance: Any, kinds: tuple[type, type], lists: str) -> None:
@@ -179,7 +180,7 @@ def require_times(times: Any, t1: Any) -> None:
 
 def require_adaptive(solver: Any, others: str = "") -> None:
     """Raise `ValueError` unless the solver is `None` or a solver of Diffrax that estimates its errors and integrates a
-    single field (others add a stiff part or noise). **Arguments:** `others`: what else the message lists as allowed.
+    single field (others add a stiff part or noise). **Arguments:** `others`: further allowed solvers, for the message.
 
     **Example:**
 

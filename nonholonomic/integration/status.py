@@ -3,8 +3,8 @@
 import enum
 from typing import Self
 
-#: Still running; at the horizon; on its event; where the model ceases to hold; stopped by step-size control; stopped
-#: because it changed its mode too often, or because the forces are not determined.
+#: In this order: not ended; ended at the horizon; ended on its event; ended where the model ceases to hold; stopped by
+#: step-size control; stopped because the mode changed too often or the forces are not determined.
 RUNNING, REACHED_END, CROSSED, LEFT_DOMAIN, FAILED, UNRESOLVED = range(6)
 
 #: Words of earlier versions that may be in files and scripts.

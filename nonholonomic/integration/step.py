@@ -190,9 +190,10 @@ def _classify(
     time: Lanes,
     hit: Bool[Array, " lanes"],
 ) -> tuple[Int[Array, " lanes"], Lanes, Lanes, Lanes]:
-    """Status, side, first and latest crossing time of the lanes, where `hit` says that an event was located."""
+    """Status, side, first and latest crossing time of the lanes, where `hit` marks the lanes in which an event was
+    located."""
     crossing, margins = problem.event_function(tried.state), tried.margins
-    # The located event is the lesser of the two; its sign may be round-off.
+    # The located event belongs to the lesser of the margins and the event function, whose sign may be round-off.
     by_margin = hit
     if crossing is not None:
         lost = False if margins is None else jnp.min(stop_gradient(margins[-1]), axis=0) <= lane_state.side * crossing
@@ -202,7 +203,7 @@ def _classify(
         status = jnp.where(hit, jnp.where(by_margin, LEFT_DOMAIN, CROSSED), lane_state.status)
         if not problem.direction_decides:
             return status, lane_state.side, lane_state.first_crossing, lane_state.crossing_time
-        # A run that waited beyond the event is before it now.
+        # A run that started beyond the event is now before the event.
         returns = crossed & (lane_state.side < 0.0)
         status, side = jnp.where(returns, lane_state.status, status), jnp.where(returns, 1.0, lane_state.side)
         return status, side, lane_state.first_crossing, lane_state.crossing_time

@@ -196,7 +196,8 @@ class ChunkStore:
 
 
 def layout_words(begun: dict[str, tuple[str, ...]], ours: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """The words of a resumed table: ours if they begin with those of the file, otherwise those of the file."""
+    """The words of a resumed table: `ours` if they begin with the words of the file, otherwise the words of the
+    file."""
     return {name: ours[name] if ours.get(name, ())[: len(words)] == words else words for name, words in begun.items()}
 
 

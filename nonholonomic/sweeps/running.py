@@ -50,8 +50,8 @@ def sweep(
     **Arguments:**
 
     - `job`: function of a dictionary (full name of a parameter -> values of several cells) and of the number of cells
-      that count; the other cells are padding. It returns a dictionary (name -> results). Several threads may call the
-      job at once; the first call, in which no cell counts, compiles it. If the executor has other processes, the job is
+      to compute; the other cells are padding. It returns a dictionary (name -> results). Several threads may call the
+      job at once; the first call, with padding alone, compiles the job. If the executor has other processes, the job is
       pickled.
     - `axes`: the grid, the last axis varying fastest.
     - `variables`: the results of `job`.
@@ -200,7 +200,7 @@ def in_a_thread(function: Callable[[], None]) -> None:
 
 @contextlib.contextmanager
 def workforce(work: ChunkTask, executor: Executor | None) -> Iterator[Callable[[int, int], Future]]:
-    """A function that submits the computation of `count` cells from `first` on.
+    """A function that submits the computation of `count` cells, starting with cell `first`.
 
     Threads share this process and its compiled programs. Other executors receive all data that they need.
     """

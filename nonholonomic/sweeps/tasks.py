@@ -18,7 +18,7 @@ from ..compiled_programs import forget_programs_if_many
 from .grid import Axis, columns, size_of
 from .layout import Values
 
-#: A function from (full name of a parameter -> values of some cells, number of cells that count) to (name -> results).
+#: A function from (full name of a parameter -> values of some cells, number of cells to compute) to (name -> results).
 Job = Callable[[dict[str, Values], int], dict[str, Values]]
 
 #: Packages and settings that must agree wherever a part of a table is computed.
@@ -38,7 +38,7 @@ class ChunkTask(NamedTuple):
         self.job(columns(self.axes, 0, self.chunk), 0)
 
     def results(self, first: int, count: int) -> dict[str, Values]:
-        """The results of `count` cells from `first` on."""
+        """The results of `count` cells, starting with cell `first`."""
         end = min(first + count, size_of(self.axes))
         parts = []
         for start in range(first, end, self.chunk):

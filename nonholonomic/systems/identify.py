@@ -58,7 +58,8 @@ class Recording(AbstractRecording):
       each column from the residuals.
     - `quantity`: names of the recorded components, as in `Trajectory.names`, such as "y0" or ("q0", "q1").
     - `t0`: the clock's reading at the start.
-    - `student`: degrees of freedom of Student's t distribution of the errors, against outliers, such as 4; `None`: Gaussian.
+    - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for outliers; `None`:
+      Gaussian.
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
 

@@ -29,7 +29,7 @@ class Named(NamedTuple):
 
     @classmethod
     def of(cls, tree: dict[str, Any]) -> "Named":
-        """The numbers of several trees, which have names."""
+        """The numbers of several named trees."""
         numbers, rest = eqx.partition(tree, is_number)
         leaves, structure = jax.tree_util.tree_flatten_with_path(numbers)
         names, values, shapes = [], [], []

@@ -13,7 +13,7 @@ from jaxtyping import Array
 from ..validation import is_traced
 
 #: Operations that XLA compiles into a single kernel on a CPU, forwards and backwards. A function with other operations,
-#: such as LAPACK calls, scatters and sorts, is compiled without a single kernel.
+#: such as LAPACK calls, scatters and sorts, is not compiled into a single kernel.
 ELEMENTARY = """
     abs acos acosh add add_any and asin asinh atan atan2 atanh bessel_i0e bessel_i1e broadcast_in_dim cbrt ceil clamp
     concatenate convert_element_type copy copy_p cos cosh custom_jvp_call custom_vjp_call digamma div eq erf erf_inv erfc exp

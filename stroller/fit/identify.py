@@ -106,6 +106,6 @@ def identify(
 
 
 def _unknowns_of(scene: Scene, data: tuple[Recording, ...], free: Any) -> dict[str, Free]:
-    """The unknowns of a scene and its data by their full names, checked."""
+    """Check the unknowns of a scene and its data, and return them by their full names."""
     own = [[*numbers("launch", recording.launch), "t0"] for recording in data]
     return scene_unknowns(free, scene, data[0].launch, list(numbers("scene", scene)), own)

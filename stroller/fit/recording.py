@@ -35,8 +35,8 @@ class Recording(AbstractRecording):
       heading may differ by whole turns.
     - `input`: the input of the ride, as for `simulate`.
     - `t0`: the clock's reading [s] at the launch. Before this time, the stroller is at its launch position.
-    - `student`: degrees of freedom of Student's t distribution of the errors, against outliers, such as 4; `None` for
-      Gaussian errors.
+    - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for data with outliers;
+      `None` for Gaussian errors.
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
 

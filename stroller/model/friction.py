@@ -14,8 +14,8 @@ from nonholonomic.xla_cpu import greatest
 
 
 class WheelMotion(NamedTuple):
-    """The motion of the stroller for friction: rolling speeds of the wheels [m/s], rates [rad/s], loads [N] on the
-    axles.
+    """The motion of the stroller as friction laws use it: rolling speeds of the wheels [m/s], rates [rad/s], loads [N]
+    on the axles.
 
     A load is `None` where it is exactly zero, as on the front axle if the centre of mass is above the rear axle.
     """

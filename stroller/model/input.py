@@ -152,7 +152,8 @@ class Program:
 
 
 class Formula(eqx.Module):
-    """A function as an input module: the arrays in it are leaves, and its operations are compared by their text.
+    """An input module made from a function. The arrays in the function are leaves, and its operations are compared by
+    their text.
 
     If you define the same function again, as in a notebook's cell, it is not compiled again.
     """

@@ -23,10 +23,10 @@ class Launch(Bounded):
 
     **Arguments:**
 
-    - `place`: position on the surface. On a plane, paraboloid or graph, (x, y) [m], on a tilted plane along the plane.
-      On a sphere or spheroid, azimuth and reduced latitude [rad]. On a torus, azimuth and angle about the tube [rad].
-      On a cylinder, distance along the axis [m] and angle from the lowest line [rad]. Any surface also accepts (x, y,
-      z) [m] in the fixed frame.
+    - `place`: position on the surface. On a plane, paraboloid or graph, (x, y) [m], which on a tilted plane are
+      measured along the plane. On a sphere or spheroid, azimuth and reduced latitude [rad]. On a torus, azimuth and
+      angle about the tube [rad]. On a cylinder, distance along the axis [m] and angle from the lowest line [rad]. Any
+      surface also accepts (x, y, z) [m] in the fixed frame.
     - `heading`: angle psi [rad] of the heading from the surface's east towards its north: from x towards y on a plane.
       The projected heading of the paper is the angle theta [rad] of its horizontal projection from x towards y.
     - `speed`: speed v [m/s] of the rear axle along the heading, negative in reverse; the horizontal speed where the

@@ -116,7 +116,7 @@ class Scene(Bounded):
 
     @property
     def dynamics(self) -> Dynamics:
-        """The equations of motion, with the scene's choices resolved."""
+        """The equations of motion for the scene's ground, side, fork and heading."""
         return Dynamics(
             body=self.body,
             surface=self.surface,
@@ -149,13 +149,14 @@ class Scene(Bounded):
         yield from self.surface.place_bounds(launch.place, self.body.wheelbase)
 
     def sideways(self, launch: Launch) -> Any:
-        """Whether a launch has speed although its front wheel is at a right angle; concrete for a concrete launch."""
+        """Whether a launch has a speed although its front wheel is at a right angle; a concrete value for a concrete
+        launch."""
         steering, speed = launch.steering, launch.speed
         of = jnp if is_traced(steering) or is_traced(speed) else np
         return (of.abs(of.cos(of.asarray(steering))) < RIGHT_ANGLE) & (of.asarray(speed) != 0.0)
 
     def level(self, launch: Launch) -> Any:
-        """Whether a launch with a projected heading is on the equator; concrete for a concrete launch."""
+        """Whether a launch with a projected heading is on the equator; a concrete value for a concrete launch."""
         if self.heading != "projected" or not isinstance(self.surface, AbstractQuadric):
             return False
         polar, last = self.surface.semi_axes[1], launch.place[-1]

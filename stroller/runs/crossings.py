@@ -30,7 +30,7 @@ CLOSEST = 1e-14
 
 
 class Between(NamedTuple):
-    """A watched quantity, less a level, at any time of a run."""
+    """A watched quantity, minus a level, at any time of a run."""
 
     spec: RideSpec
     steps: Steps

@@ -221,7 +221,7 @@ def read_ends(scene: Scene, states: State, starts: State) -> dict[str, Float[Arr
 
 
 def place_numbers(launch: Launch) -> list[str]:
-    """The full names of the numbers of a launch's place."""
+    """The full names of the coordinates of a launch's place."""
     return [f"launch.place[{k}]" for k in range(len(launch.place))]
 
 

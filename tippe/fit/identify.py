@@ -118,7 +118,7 @@ def identify(
 
 
 def checked_data(scene: Scene, data: Any, tolerance: float, caller: str | None) -> tuple[Any, ...]:
-    """The sets of data as a tuple, after all checks; `caller`: name of the function that needs derivatives, or
+    """Check the sets of data, and return them as a tuple; `caller`: name of the function that needs derivatives, or
     `None`."""
     require_kind(scene, "scene", Scene)
     if caller is not None:
@@ -129,7 +129,7 @@ def checked_data(scene: Scene, data: Any, tolerance: float, caller: str | None) 
 
 
 def unknowns_of(scene: Scene, data: tuple[Any, ...], free: Any) -> dict[str, Free]:
-    """The unknowns of a scene and its data by their full names, checked."""
+    """Check the unknowns of a scene and its data, and return them by their full names."""
     launches = [
         [name for name, value in numbers("launch", source.launch).items() if value is not None] for source in data
     ]

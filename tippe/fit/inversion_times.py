@@ -38,8 +38,8 @@ class InversionTimes(eqx.Module):
     - `until`: time [s] until which you watched a launch that did not invert, a scalar or (launches,); `t1` by default.
       The likelihood of such a launch is the probability of a time beyond `until`.
     - `angle`: angle [rad] that counted as inverted.
-    - `student`: degrees of freedom of Student's t distribution of the errors, against outliers, such as 4; `None` for
-      Gaussian errors.
+    - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for data with outliers;
+      `None` for Gaussian errors.
 
     **Raises:** `ValueError` for numbers out of range or shapes that do not fit.
 
@@ -116,7 +116,7 @@ class InversionTimes(eqx.Module):
 
     @property
     def seen(self) -> np.ndarray:
-        """Mask of the measured predictions, which are all predictions."""
+        """Indices of the measured predictions, which are all predictions."""
         return np.arange(self.size)
 
     @property

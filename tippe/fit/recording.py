@@ -39,8 +39,8 @@ class Recording(AbstractRecording):
       or "axis" ("axis_x", "axis_y", "axis_z") [1] in the fixed frame, as in `Trajectory`; or a tuple of some of these
       words. Azimuth and eta may differ by whole turns.
     - `t0`: the clock's reading [s] at the launch. Before this time, the top is at its launch position.
-    - `student`: degrees of freedom of Student's t distribution of the errors, against outliers, such as 4; `None` for
-      Gaussian errors.
+    - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for data with outliers;
+      `None` for Gaussian errors.
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
 

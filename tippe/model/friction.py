@@ -51,7 +51,7 @@ class AbstractFriction(Bounded):
             # The types only know the property of the base class.
             cls.isotropic = property(lambda self: False)  # pyright: ignore[reportAttributeAccessIssue]
 
-    #: Whether friction on a contact at rest takes whatever value keeps it at rest, within limits.
+    #: Whether friction on a contact at rest takes the value that keeps the contact at rest, within limits.
     set_valued: ClassVar[bool] = False
 
     def suspicion(self) -> str | None:
@@ -192,8 +192,8 @@ class Contensou(AbstractFriction):
     and Rb = 3 pi / 16 contact_radius. Both are minus the derivatives of the potential mu N Q, with respect to v_s and
     w_n. For small slip_speed, force and torque lie on an ellipsoid with the semi-axes mu N and mu N Rb: the limits of a
     disc under Hertzian pressure in pure sliding and in pure drilling. Between these limits, the force differs from the
-    exact force of the disc by at most 0.12 mu N, and the torque by at most 0.09 mu N contact_radius. As the radius
-    tends to 0, the law tends to `Coulomb`.
+    exact force of the disc by up to 0.11 mu N, and the torque by up to 0.083 mu N contact_radius. As the radius tends
+    to 0, the law tends to `Coulomb`.
 
     **Arguments:**
 
@@ -330,9 +330,9 @@ class SetValuedCoulomb(AbstractFriction):
     """Exact Coulomb friction without a slip speed: F = -mu N v_s / |v_s| while the contact slips, and any force along
     the arena up to mu N while it sticks (`tippe.md`, section 3).
 
-    A run consists of modes. During a slip, the force has its full size. When the slip stops, the top rolls, with the
+    A run consists of modes. During a slip, the force is mu N. When the slip stops, the top rolls, with the
     equations of `tippe/model/rolling.py`, if the required force is within the friction cone, and slips again when the
-    required force leaves the cone. Rolling keeps the energy constant. With `contact="hybrid"`, a top without a stem
+    required force leaves the cone. Rolling conserves the energy. With `contact="hybrid"`, a top without a stem
     flies when contact is lost, and slips, rolls or rebounds after an impact (`tippe/modes/airborne_stick_slip.py`).
 
     **Arguments:**

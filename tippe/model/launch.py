@@ -41,9 +41,9 @@ class Launch(Bounded):
     - `spin`: angular velocity about the axis [rad/s].
     - `eta`: angle [rad] of the place from the arena's lowest point, in [-pi, pi]; 0 on arenas without such an angle.
     - `azimuth`: direction [rad] in which the axis leans, from t1 towards t2.
-    - `place`: where the top touches the arena, instead of `eta`. On a plane, paraboloid or graph, (x, y) [m], on a
-      tilted plane along the plane. On a cylinder, (y, eta). On a sphere, spheroid or torus, (mu, eta) [rad], azimuth
-      and angle from the lowest point. On any arena, (x, y, z) [m], a point of the arena up to round-off.
+    - `place`: where the top touches the arena, instead of `eta`. On a plane, paraboloid or graph, (x, y) [m], which on
+      a tilted plane are measured along the plane. On a cylinder, (y, eta). On a sphere, spheroid or torus, (mu, eta)
+      [rad], azimuth and angle from the lowest point. On any arena, (x, y, z) [m], a point of the arena up to round-off.
     - `velocity`: velocity of the sphere's centre, or of the centre of mass for other bodies, along (t1, t2), (2,)
       [m/s]; zero by default.
     - `angular_velocity`: (3,) [rad/s] in (t1, t2, n), in addition to the spin about the axis; zero by default.

@@ -1,8 +1,8 @@
 """Bodies of any shape and any inertia: an unbalanced top, a rattleback.
 
-A strictly convex body touches an arena at the point that is farthest against the arena's normal. In the body's own axes
-this point is p(d) = grad h at d = -normal. The support function h(d), extended to all vectors with degree 1, is the
-distance from the origin of the axes to the plane that the body touches with the outward normal d.
+A strictly convex body touches an arena at the point that is farthest in the direction opposite to the arena's normal.
+In the body's own axes this point is p(d) = grad h at d = -normal. The support function h(d), extended to all vectors
+with degree 1, is the distance from the origin of the axes to the plane that the body touches with the outward normal d.
 
 Source: Bonnesen and Fenchel, Theorie der konvexen Koerper (1934), section 15.
 """
@@ -87,8 +87,8 @@ class Ellipsoid(AbstractRigidBody):
     curved arena, a run ends with the status "does_not_fit" where the body is not more strongly curved than the arena;
     the program does not notice a second contact elsewhere. The part of the surface that never touches the arena does
     not matter: half an ellipsoid, such as a boat, moves like the whole ellipsoid. At a `Launch`, the body's axes x, y
-    and z are those of the arena (t1, t2, n), turned by theta about a horizontal axis so that z leans in the direction
-    `azimuth`. `spin` is the angular velocity about z.
+    and z are those of the arena (t1, t2, n), turned by theta about a tangent of the arena so that z leans in the
+    direction `azimuth`. `spin` is the angular velocity about z.
 
     **Arguments:**
 
@@ -272,7 +272,7 @@ class Plain(eqx.Module):
 
 
 def as_support(value: Any) -> eqx.Module:
-    """A support function as a module whose numbers are arrays.
+    """Convert a support function to a module whose parameters are arrays.
 
     **Raises:** `ValueError` unless it returns one number for a vector of three.
     """

@@ -1,4 +1,5 @@
-"""The final states of runs over any arena: converted to states in contact, their energy, and why a contact ended."""
+"""Convert the final states of runs over any arena to states in contact, and compute their energy and why a contact
+ended."""
 
 from typing import Any
 
@@ -72,7 +73,7 @@ def _above_the_ground(
 
 
 def loss(scene: Scene[Top], state: Float[Array, "components ..."]) -> Int[Array, "..."]:
-    """Why a contact ended, if it was not merely lost: a code in `LOSSES` (`tippe/model/dynamics.py`)."""
+    """Why a contact ended, if it was not merely lost: a code in `LOSSES` (`tippe/model/contact_dynamics.py`)."""
     own, state = scene.dynamics, state[:OWN]
     if scene.body.stem is None:
         return own.loss(state)

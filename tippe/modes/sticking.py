@@ -58,7 +58,7 @@ class StickSlipMode(AbstractBatchedMode):
         """The velocity of a rolling top follows from the other components of its state."""
         if not self.kind.rolls:
             return state
-        own = self.kind.both.rolling.carried_along(state[: self._size(state)])
+        own = self.kind.stick_slip.rolling.carried_along(state[: self._size(state)])
         return jnp.concatenate([own, state[self._size(state) :]])
 
     def between(self, motion: tuple[Onset, Array], passed: Float[Array, " times"]) -> Float[Array, "components times"]:
@@ -67,7 +67,7 @@ class StickSlipMode(AbstractBatchedMode):
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Stick, slip, or end if the contact is lost. Counts the changes from slip to rolling."""
-        slipping = self._under(self.kind.both.slipping, state)
+        slipping = self._under(self.kind.stick_slip.slipping, state)
         change = self.kind.ended(state, self._size(state), lambda at: slipping.field(left, at), self.scales, left)
         onset, length = change.onset, change.onset.length
         began = -change.wait / jnp.where(length > 0.0, length, 1.0)
@@ -101,7 +101,7 @@ class StickSlipMode(AbstractBatchedMode):
         """The function whose fall to zero ends a run."""
         if self.spin is None:
             return state[COS_THETA] - self.cos_angle
-        return self.kind.both.normal_spin(state[: self._size(state)]) / self.spin
+        return self.kind.stick_slip.normal_spin(state[: self._size(state)]) / self.spin
 
     def _size(self, state: Float[Array, "components ..."]) -> int:
         """Number of components in the equations of motion."""
@@ -139,18 +139,18 @@ def modes(
     - `tolerance`: relative tolerance of the integration; `last`: whether the last crossing counts.
     - `passive`, `size`: as for `StickSlipMode`.
     """
-    both = problem.dynamics
-    assert isinstance(both, StickSlip)
-    kinds = (ContactMode(both, jnp.asarray(tolerance, float), rolls) for rolls in (False, True))
+    stick_slip = problem.dynamics
+    assert isinstance(stick_slip, StickSlip)
+    kinds = (ContactMode(stick_slip, jnp.asarray(tolerance, float), rolls) for rolls in (False, True))
     options = (problem.cos_angle, problem.scales, last, passive, size, problem.spin)
     both_modes = tuple(StickSlipMode(kind, *options) for kind in kinds)
-    return both_modes, _first_mode(both, problem.states)
+    return both_modes, _first_mode(stick_slip, problem.states)
 
 
 @compiled_setup
-def _first_mode(both: StickSlip, states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+def _first_mode(stick_slip: StickSlip, states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
     """The index of the mode in which each cell starts."""
-    return jnp.where(both.slip_speed(states) <= AT_REST * both.speed, ROLLING, SLIPPING)
+    return jnp.where(stick_slip.slip_speed(states) <= AT_REST * stick_slip.speed, ROLLING, SLIPPING)
 
 
 def contact_modes(

@@ -25,7 +25,7 @@ from ..model.scene import Scene
 def permitted(
     structure: Any, unchecked: bool, leaves: Sequence[Float[Array, "..."]]
 ) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, ""]]:
-    """Which cells have legal numbers; the horizons, 0 for the others; and the tolerance of the ensemble.
+    """A mask of the cells with legal numbers; the horizons, 0 for all other cells; and the tolerance of the ensemble.
 
     The whole ensemble has a single tolerance: the smallest of a batch.
 
@@ -33,14 +33,14 @@ def permitted(
     `unchecked`: whether some leaves were traced, so that earlier checks ignored them.
     """
     scene, launch, angle, t1, tolerance = jax.tree.unflatten(structure, leaves)
-    may = jnp.asarray(True)
+    is_legal = jnp.asarray(True)
     if unchecked:
         bounds = (*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch), *event_bounds(angle))
-        may = legal(bounds)
+        is_legal = legal(bounds)
         if angle is None:
-            may = may & (scene.dynamics.normal_spin(scene.state(launch)) != 0.0)
-        may, t1, tolerance = legal_run(may, t1, tolerance)
-    return may, t1, jnp.min(tolerance)
+            is_legal = is_legal & (scene.dynamics.normal_spin(scene.state(launch)) != 0.0)
+        is_legal, t1, tolerance = legal_run(is_legal, t1, tolerance)
+    return is_legal, t1, jnp.min(tolerance)
 
 
 # One program if the function is called on its own, instead of one for every comparison.
@@ -111,7 +111,7 @@ def check_reversible(launch: Launch, values: dict[str, Any]) -> None:
     """
     spin = values.get("launch.spin", launch.spin)
     if launch.angular_velocity is None and not is_traced(spin) and np.any(np.asarray(spin) == 0.0):
-        raise ValueError("spin = 0.0 must not be zero: the time of reversal is that of a spin that changes its sign")
+        raise ValueError("spin = 0.0 must not be zero: a spin of zero cannot reverse")
 
 
 def check_event(angle: Any, crossing: Any, known: tuple[str, ...] = ("first", "last")) -> None:

@@ -1,4 +1,4 @@
-"""The energy of runs as a check: without a drive, energy never grows, and it decreases by the work of friction."""
+"""Check runs by their energy: without a drive, energy never grows, and it decreases by the work of friction."""
 
 import dataclasses
 from typing import Any

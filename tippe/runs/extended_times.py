@@ -38,13 +38,16 @@ def extended_inversion_time(
     angle: Float[ArrayLike, ""] = 0.95 * math.pi,
     tolerance: float | Float[Array, ""] = 1e-8,
 ) -> Float[Array, ""]:
-    """Inversion time, continued beyond the horizon so that a loss function is finite everywhere and its slope leads
-    back to inversion. If a top has not inverted and is at theta at `t1` or at its loss of contact, the result is t1 (1
-    + log(angle / theta) / C), C = log(angle / theta at the launch), at least 1. This is a penalty, not a prediction.
-    For theta that grows as exp(s t), as it does from small angles, the penalty is linear in the rate s, and continues
-    the time C / s with the same value and slope at `t1`. The function works under `jit`, `vmap`, `grad`, `jvp` and
-    their compositions; the derivative is that of the event's time (implicit function theorem) and of the penalty, with
-    respect to every number except `t1` and `tolerance`.
+    """Inversion time, continued beyond the horizon, for loss functions: the result is finite everywhere, and its slope
+    leads back to inversion.
+
+    If a top has not inverted, and is at theta at `t1` or when it loses contact, the result is
+    t1 (1 + log(angle / theta) / C) with C = log(angle / theta at the launch), at least 1. This is a penalty, not a
+    prediction. Where theta grows as exp(s t), as it does from small angles, the penalty is linear in the rate s. It then
+    continues the time C / s with the same value and slope at `t1`.
+
+    The function works under `jit`, `vmap`, `grad`, `jvp` and their compositions. The derivatives of the time (implicit
+    function theorem) and of the penalty are with respect to every number except `t1` and `tolerance`.
 
     **Arguments:**
 
@@ -55,7 +58,7 @@ def extended_inversion_time(
 
     **Raises:** `ValueError` for arguments out of range, and for a scene with `contact="hybrid"` or `SetValuedCoulomb`.
 
-    **Example:** this top does not invert by 3 s, and counts as one that inverts later.
+    **Example:** this top does not invert by 3 s, so the result is a later time.
 
     >>> import tippe
     >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=3.0e-6, I3=3.2e-6)
@@ -114,7 +117,7 @@ class ExtendedSolve(AbstractDifferentiableSolve):
         nested: bool = False,
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
         """The extended times of every cell, and their derivatives along tangents (as of `VariationalProblem`)."""
-        may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
+        is_legal, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         varied = VariationalProblem(problem, tangents, True)
         # A fit may try parameters that are far off.
         settings = Settings(tolerance, max_steps=MOST_STEPS)
@@ -132,7 +135,7 @@ class ExtendedSolve(AbstractDifferentiableSolve):
             whole = greatest(_e_folds(problem.states, angle), 1.0)
             return jnp.where(crossed, time, t1 * (1.0 + missing / whole))
 
-        good = may & (outcome.status != FAILED)
+        good = is_legal & (outcome.status != FAILED)
         times = jnp.where(good, extended(problem, state), jnp.nan)
         slopes = [
             jnp.where(good, eqx.filter_jvp(extended, (problem, state), moved)[1], jnp.nan)

@@ -44,23 +44,25 @@ STATUS = {
 class HybridTrajectory(AbstractTrajectory):
     """A run through contacts, flights and impacts; vectors are arrays (times, 3) in the fixed frame (x, y, z).
 
-    The run ends at `end_time`. `status` is "completed", "jammed" (as in `Trajectory`), "failed" or "unresolved";
-    `print(run)` states why a run is unresolved. The possible reasons are more than 10 000 flights in a row or 2000
-    contacts; a flight that does not end at the arena; an energy that grows or does not balance, by more than 1e4 times
-    the tolerance, relative to the energy; and, for a top with a stem, contact of sphere and stem at once: on the level
-    plane with so much friction that the forces are not determined, or at rest on any other arena. `contact` is the
-    sphere that touches at each time: 0 for the top's sphere, 1 for the stem's, 2 for both, -1 for none. At the time of
-    an impact, values are those before the impact. `distance` is the distance of the top's own sphere from the plane [m]
-    with its rate [m/s]. `hops` has a row for each flight until `end_time`, with its start and end [s]; a table counts
-    only the flights before the inversion. Bounces that shrink by the restitution e are followed down to a speed of 1e-5
-    sqrt(g R); after that the top counts as in contact, although the remaining bounces would take e / (1 - e) of the
-    duration of the last bounce. `work` is the work of friction and of the impacts [J]. `stats` holds accepted and
-    rejected steps, the greatest drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in
-    impacts [J]. `rotation` and `angular_velocity` are those of `Trajectory`.
+    - `status`: "completed", "jammed" (as in `Trajectory`), "failed" or "unresolved"; the run ends at `end_time`.
+      `print(run)` states why a run is unresolved: more than 10 000 flights in a row or 2000 contacts; a flight that does
+      not end at the arena; an energy that grows or does not balance, by more than 1e4 times the tolerance, relative to
+      the energy; or, for a top with a stem, contact of sphere and stem at once, on the level plane with so much friction
+      that the forces are not determined, or at rest on any other arena.
+    - `contact`: the sphere that touches at each time: 0 for the top's sphere, 1 for the stem's, 2 for both, -1 for none.
+      At the time of an impact, values are those before the impact.
+    - `distance`: distance of the top's own sphere from the plane [m], and its rate [m/s].
+    - `hops`: start and end [s] of each flight until `end_time`, one row per flight; a table counts only the flights
+      before the inversion. When the speed of bounces has decreased to 1e-5 sqrt(g R), the top counts as in contact,
+      although the remaining bounces would take e / (1 - e) times as long as the last one (restitution e).
+    - `work`: work of friction and of the impacts [J].
+    - `stats`: accepted and rejected steps, the greatest drift of |e|, the greatest energy residual |E - E(0) - work| and
+      the energy lost in impacts [J].
+    - `rotation`, `angular_velocity`: as in `Trajectory`.
 
-    Inside a transformation `status` is the integer of the `Status`; `hops` is `None`, `stats["hops"]` counts the
-    flights. First derivatives with respect to the scene and the launch pass through flights and impacts. They are NaN
-    after a grazing event, because within the tolerance such an event may not happen.
+    Inside a transformation, `status` is the integer of the `Status`, `hops` is `None`, and `stats["hops"]` is the number
+    of flights. First derivatives with respect to the scene and the launch pass through flights and impacts. They are
+    NaN after a grazing event, because within the tolerance such an event may not happen.
 
     **Example:**
 

@@ -1,4 +1,4 @@
-"""The grid of launches and scenes of a table, from its arguments, checked."""
+"""Build and check the grid of launches and scenes of a table."""
 
 from collections import Counter
 from collections.abc import Collection
@@ -82,8 +82,8 @@ def launches(
     - `scattered`: whether the lists have equal length and are combined element by element: the k-th cell has the k-th
       element of each list.
 
-    **Returns:** "scene" and "launch" with the numbers that are not axes, for `with_numbers`; the axes, the last varying
-    fastest; and the units of numbers by their short names.
+    **Returns:** a dictionary with "scene" and "launch", in which only the numbers that are not axes have their values,
+    for `with_numbers`; the axes, the last varying fastest; and the units of numbers by their short names.
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis.
     """

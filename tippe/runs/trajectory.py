@@ -54,15 +54,15 @@ class Trajectory(AbstractTrajectory):
     centre of mass for other bodies; `contact` is the contact point, and `normal` the arena's normal there. `rotation`
     (times, 3, 3) rotates the body's axes to the fixed frame, and `angular_velocity` is its rate.
 
-    `status` is the word of a `Status`: "completed", "contact_lost", "failed", "jammed", "does_not_fit" or "unresolved"
-    (its energy grows, or does not balance, by more than 1e4 times the tolerance, relative to the energy); inside a
-    transformation, `status` is the integer. For numbers out of range, `status` is `Status.ILLEGAL`, and everything is
-    NaN. The run ends at `end_time`. The top does not fit where a curvature of the arena reaches that of the top's
-    sphere, which would then touch at other points, too. It is jammed if the equation for the normal force has no
-    solution, because friction pulls the top into the arena as strongly as the normal force pushes it out; this needs
-    strong friction, a large offset and a slip along the axis. `stats` holds accepted and rejected steps, the greatest
-    drift of |e| and the greatest energy residual |E - E(0) - work of friction| [J]; with `SetValuedCoulomb` also
-    `sticks`, the number of changes from slip to rolling.
+    - `status`: the word of a `Status`; inside a transformation, its integer. The run ends at `end_time`.
+      "does_not_fit": a curvature of the arena reaches that of the top's sphere, which would then touch at other points,
+      too. "jammed": the equation for the normal force has no solution, because friction pulls the top into the arena as
+      strongly as the normal force pushes it out; this needs strong friction, a large offset and a slip along the axis.
+      "unresolved": the energy grows, or does not balance, by more than 1e4 times the tolerance, relative to the energy.
+      For numbers out of range, `status` is `Status.ILLEGAL`, and all results are NaN.
+    - `stats`: accepted and rejected steps, the greatest drift of |e| and the greatest energy residual
+      |E - E(0) - work of friction| [J]; with `SetValuedCoulomb`, also `sticks`, the number of changes from slip to
+      rolling.
 
     **Example:**
 
@@ -172,8 +172,8 @@ def simulate(
     - `times`: times of the result [s], increasing, within [0, t1]; by default those of the accepted steps. Outside
       transformations, times after the end of the run are omitted; `Trajectory.at` returns the run at other times.
     - `tolerance`: relative tolerance, in [1e-14, 1e-2]; absolute tolerances are `tolerance`/10 in units of `Scene.scales`.
-    - `solver`: any adaptive solver of Diffrax for ordinary differential equations; by default `Dopri8()`, or inside
-      transformations without `adjoint` `nonholonomic.integration.Oscillatory8()`.
+    - `solver`: any adaptive solver of Diffrax for ordinary differential equations; by default `Dopri8()`; inside
+      transformations without an `adjoint`, `nonholonomic.integration.Oscillatory8()`.
     - `adjoint`: an adjoint method of Diffrax, such as `RecursiveCheckpointAdjoint()`, with which Diffrax integrates a
       traced run. This is cheaper for a loss function with many parameters, but can miss a loss of contact shorter than
       a step. By default, this package computes forward and reverse derivatives, at the cost of about one run for each
@@ -240,14 +240,14 @@ def _legal_or_nan(
         # This raises the error that explains the problem.
         return _traced(scene, launch, times, t1, settings, adjoint)
     bounds = (*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch))
-    may, t1, tolerance = legal_run(legal(bounds), t1, settings.tolerance, times)
+    is_legal, t1, tolerance = legal_run(legal(bounds), t1, settings.tolerance, times)
     settings = settings.with_tolerance(tolerance)
     if adjoint is not None:
         # An illegal run has zero length, but Diffrax would differentiate it.
-        scene, launch = nan_unless(may, (scene, launch))
+        scene, launch = nan_unless(is_legal, (scene, launch))
     trajectory = _traced(scene, launch, times, t1, settings, adjoint)
-    status = jnp.where(may, trajectory.status, int(Status.ILLEGAL))
-    return eqx.tree_at(lambda run: (run.t, run.status), nan_unless(may, trajectory), (times, status))
+    status = jnp.where(is_legal, trajectory.status, int(Status.ILLEGAL))
+    return eqx.tree_at(lambda run: (run.t, run.status), nan_unless(is_legal, trajectory), (times, status))
 
 
 def _traced(

@@ -9,6 +9,7 @@ import pytest
 from close import assert_close
 
 import nonholonomic.derivatives._adjoint as adjoint
+import nonholonomic.derivatives._periods as periods
 import nonholonomic.derivatives.slopes as slopes
 from nonholonomic.derivatives import tangents_of
 from nonholonomic.integration import CROSSED, LEFT_DOMAIN, AbstractProblem, Settings
@@ -124,12 +125,16 @@ def test_padding_and_cells_beyond_the_event_have_no_slope(cells):
         assert_close(slope, np.where(run & (heights > 0.5), expected_slope, 0.0), rtol=1e-7)
 
 
-@pytest.mark.parametrize("kept", [2, pytest.param(5, marks=pytest.mark.slow)])
-def test_runs_longer_than_what_is_kept_are_repeated(kept, monkeypatch):
-    """Periods of two iterations, of which the starts of a few are kept: the slopes are the same to the last digit."""
+@pytest.mark.parametrize(
+    ("kept", "steps"), [(2, 1), pytest.param(5, 4, marks=pytest.mark.slow), pytest.param(64, 4, marks=pytest.mark.slow)]
+)
+def test_runs_longer_than_what_is_kept_are_repeated(kept, steps, monkeypatch):
+    """Periods of two iterations, of which the starts of a few are kept, and the steps of the latest ones: the slopes are
+    the same to the last digit."""
     _, single_pass, _ = found_and_expected(solver=diffrax.Dopri8())
     monkeypatch.setattr(adjoint.StepRecorder, "period", 2)
-    monkeypatch.setattr(adjoint, "KEPT", kept)
+    monkeypatch.setattr(periods, "KEPT", kept)
+    monkeypatch.setattr(periods, "STEPS_KEPT", steps)
     _, segments, expected = found_and_expected(solver=diffrax.Dopri8())
     for whole_slope, segment_slope, expected_slope in zip(single_pass, segments, expected, strict=True):
         assert_close(whole_slope, segment_slope, rtol=1e-12)
@@ -138,15 +143,15 @@ def test_runs_longer_than_what_is_kept_are_repeated(kept, monkeypatch):
 
 def test_the_starts_that_are_kept_are_spread_out(monkeypatch):
     """Of two hundred starts eight are kept: the first and the last always, the others with no gap above half of the run."""
-    monkeypatch.setattr(adjoint, "KEPT", 8)
-    checkpoints = adjoint.Checkpoints.of(jnp.zeros(()))
-    for index in range(1, 200):
-        checkpoints = checkpoints.added(jnp.asarray(index), jnp.asarray(float(index)), jnp.asarray(True))
+    monkeypatch.setattr(periods, "KEPT", 8)
+    checkpoints = periods.Checkpoints.none(jnp.zeros(()))
+    for index in range(200):
+        checkpoints = checkpoints.added(jnp.asarray(index), jnp.asarray(float(index)))
     indices = np.asarray(checkpoints.index)
     assert (indices[0], indices[-1], int(checkpoints.depth)) == (0, 199, 8)
     assert (np.diff(indices) > 0).all()
     assert np.diff(indices).max() <= 100
-    assert_close(np.asarray(checkpoints.progress)[np.asarray(checkpoints.slot)], indices)
+    assert_close(np.asarray(checkpoints.periods)[np.asarray(checkpoints.slot)], indices)
 
 
 class AtRest(AbstractProblem):
