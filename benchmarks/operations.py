@@ -9,7 +9,9 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn
 from jax.interpreters.partial_eval import dce_jaxpr
 
-from nonholonomic.integration import AbstractProblem, LaneScheduler, LaneState, Settings, try_step
+from nonholonomic.integration import AbstractProblem, LaneState, Settings
+from nonholonomic.integration.scheduler import LaneScheduler
+from nonholonomic.integration.step import try_step
 
 #: Primitives that count as one operation per number of the result.
 ARITHMETIC = (

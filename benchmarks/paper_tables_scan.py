@@ -65,7 +65,7 @@ def logarithms(numbers: np.ndarray) -> np.ndarray:
 
 
 def scene_and_launch(
-    numbers: np.ndarray, table: paper.Table, theta: np.ndarray, law: str
+    numbers: np.ndarray, table: paper.PrintedTable, theta: np.ndarray, law: str
 ) -> tuple[tippe.Scene, tippe.Launch]:
     """Scene and launch of one set (8,) or of many (8, cells)."""
     mass, radius, alpha, gamma, inertia, ratio, azimuth, slip_speed = numbers
@@ -81,7 +81,7 @@ def scene_and_launch(
 
 
 def rows(
-    numbers: np.ndarray, table: paper.Table, theta: np.ndarray, options: argparse.Namespace
+    numbers: np.ndarray, table: paper.PrintedTable, theta: np.ndarray, options: argparse.Namespace
 ) -> tuple[np.ndarray, np.ndarray]:
     """Time and status code of every set with every inclination, each (sets, inclinations)."""
     shape = len(numbers), len(theta)
@@ -103,13 +103,13 @@ def rows(
     return np.where(status == CROSSED, time_, np.inf).reshape(shape), status.reshape(shape)
 
 
-def inclinations_and_times(table: paper.Table) -> tuple[np.ndarray, np.ndarray]:
+def inclinations_and_times(table: paper.PrintedTable) -> tuple[np.ndarray, np.ndarray]:
     """The inclinations of a table [rad] and its times [s], infinite where not reversed."""
     times = [np.inf if row.time is None else row.time for row in table.rows]
     return np.array([row.theta for row in table.rows]), np.array(times)
 
 
-def run(numbers: np.ndarray, table: paper.Table, options: argparse.Namespace) -> Rows:
+def run(numbers: np.ndarray, table: paper.PrintedTable, options: argparse.Namespace) -> Rows:
     """Run the rows of a table for every set; those that must reverse come first, one at a time."""
     theta, wanted = inclinations_and_times(table)
     reversing = np.isfinite(wanted)
@@ -125,7 +125,7 @@ def run(numbers: np.ndarray, table: paper.Table, options: argparse.Namespace) ->
     return Rows(inversion_times, pattern, pattern & ~np.any(lost, axis=1), failed)
 
 
-def worst_error(runs: Rows, table: paper.Table, wanted_sets: np.ndarray) -> np.ndarray:
+def worst_error(runs: Rows, table: paper.PrintedTable, wanted_sets: np.ndarray) -> np.ndarray:
     """Largest error of the times of a set [s], infinite for unwanted sets."""
     _, wanted = inclinations_and_times(table)
     reversing = np.isfinite(wanted)
@@ -134,7 +134,7 @@ def worst_error(runs: Rows, table: paper.Table, wanted_sets: np.ndarray) -> np.n
     return np.where(wanted_sets, error, np.inf)
 
 
-def scan(table: paper.Table, options: argparse.Namespace) -> None:
+def scan(table: paper.PrintedTable, options: argparse.Namespace) -> None:
     """Draw, run, count, refine and print."""
     begin, rng = time.perf_counter(), np.random.default_rng(options.seed)
     numbers = draw(rng, options.sets)
@@ -156,7 +156,7 @@ def scan(table: paper.Table, options: argparse.Namespace) -> None:
 
 
 def refine(
-    rng: np.random.Generator, numbers: np.ndarray, runs: Rows, table: paper.Table, options: argparse.Namespace
+    rng: np.random.Generator, numbers: np.ndarray, runs: Rows, table: paper.PrintedTable, options: argparse.Namespace
 ) -> tuple[np.ndarray, Rows]:
     """Vary the best sets round by round, keeping those that stay best; the range shrinks by a tenth each round."""
     scale = HIGH - LOW

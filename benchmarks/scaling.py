@@ -30,7 +30,8 @@ from peak import peak
 from scenes import TOP
 
 import tippe
-from nonholonomic.integration import Settings, lanes_for, solve_ensemble
+from nonholonomic.integration import Settings, solve_ensemble
+from nonholonomic.integration.settings import lanes_for
 from nonholonomic.sweeps import running
 from tippe.modes.inversion_problem import InversionProblem
 

@@ -29,7 +29,7 @@ import numpy as np
 from measure import machine, one_core, table, timed
 
 import tippe
-from nonholonomic.integration import ABSOLUTE
+from nonholonomic.integration.settings import ABSOLUTE
 from nonholonomic.xla_cpu import compiled_alone
 
 HORIZON, TOLERANCE, TIGHT, SPIN, MU = 10.0, 1e-9, 1e-13, 100.0, 0.3

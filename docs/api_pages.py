@@ -85,7 +85,18 @@ PAGES = {
     "derivatives": Page(
         "Times, derivatives and stability",
         "Differentiable inversion times, Lyapunov exponents and steady states.",
-        of("tippe", "inversion_time reversal_time extended_inversion_time lyapunov_exponent LyapunovExponent steady"),
+        [
+            *of(
+                "tippe",
+                "inversion_time reversal_time extended_inversion_time lyapunov_exponent LyapunovExponent steady",
+            ),
+            *of(
+                "tippe.steady",
+                "group proportions folds upright_critical_spin inverted_critical_spin jellett_thresholds standing_state "
+                "standing_matrix growth_rate Tumbling tumbling tumbling_is_stable effective_energy tumbling_angles "
+                "tumbling_state quarter_turn tumbling_matrix",
+            ),
+        ],
     ),
     "fitting": Page(
         "Fitting",
@@ -113,7 +124,7 @@ PAGES = {
                 "solve_ensemble traced_solve_ensemble solve_with_samples Outcome "
                 "crossing_time LaneState solve_by_diffrax follow DenseSolution padded sample explicit_tableau legal_run "
                 "run_bounds tolerance_bound require_run require_times require_adaptive require_adjoint few_trials halved "
-                "sign_changes",
+                "sign_changes Oscillatory8",
             ),
             "nonholonomic.hybrid",
             *of(
@@ -139,7 +150,7 @@ PAGES = {
                 "nonholonomic.identification",
                 "AbstractRecording Quantities as_quantity read_columns model_times predicted AbstractDataModel scene_unknowns "
                 "free_numbers search_options as_sources fit_data identify Identification Measurements joined of_data "
-                "series_units LogDensity",
+                "series_units LogDensity sample Draws",
             ),
         ],
     ),
@@ -206,7 +217,7 @@ MEMBERS = {
 
 
 def public(package: str) -> list[str]:
-    """The names that the `__init__.py` of a package exports."""
+    """The names that the `__init__.py` of a package or of a room exports."""
     text = inspect.getsource(importlib.import_module(package))
     return sorted(set(re.findall(r"import (?!__)(\w+) as \1$", text, re.M)), key=str.lower)
 
@@ -218,10 +229,10 @@ def resolve(dotted: str) -> Any:
 
 
 def missing() -> list[str]:
-    """Public names that are on no page, neither themselves nor another name of the same object."""
+    """Exported names that are on no page, neither themselves nor another name of the same object."""
     shown = {id(resolve(name)) for page in PAGES.values() for name in page.names}
-    every = [f"{package}.{name}" for package in PACKAGES for name in public(package)]
-    return [name for name in every if id(resolve(name)) not in shown]
+    every = [f"{home}.{name}" for home in (*PACKAGES, "tippe.steady", *ENGINE_ROOMS) for name in public(home)]
+    return [name for name in every if name not in CONSTANTS and id(resolve(name)) not in shown]
 
 
 def text(page: Page) -> str:

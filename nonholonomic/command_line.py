@@ -1,4 +1,4 @@
-"""What the command lines share: how they start, what they print at the end, and that Ctrl-C ends them with one line."""
+"""Shared code of the command lines: how they start, what they print at the end, and how Ctrl-C ends them."""
 
 import gc
 import os

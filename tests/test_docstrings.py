@@ -8,7 +8,6 @@ import importlib
 import inspect
 import re
 import tempfile
-from types import ModuleType
 from typing import Any
 
 import jax
@@ -26,15 +25,9 @@ FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 
 def public(package: str) -> dict[str, Any]:
-    """What a package hands out: the names that its `__init__.py` imports as themselves."""
+    """What a package or a room hands out: the names that its `__init__.py` imports as themselves."""
     module = importlib.import_module(package)
     return {name: getattr(module, name) for name in re.findall(r"import (\w+) as \1$", inspect.getsource(module), re.M)}
-
-
-def members(module: ModuleType) -> dict[str, Any]:
-    """What the manual tells of a module that is handed out as a whole: what is defined there."""
-    own = {name: value for name, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__}
-    return {name: value for name, value in own.items() if callable(value) and not name.startswith("_")}
 
 
 #: What is handed out, once each, under its first name.
@@ -55,7 +48,7 @@ MEMBERS = [
     (f"{home}.{name}", value, module)
     for home, module in NAMES.values()
     if inspect.ismodule(module)
-    for name, value in members(module).items()
+    for name, value in public(module.__name__).items()
 ]
 
 

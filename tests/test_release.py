@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 import nonholonomic
 import stroller
 import tippe
-from nonholonomic.sweeps import versions
+from nonholonomic.sweeps.tasks import versions
 from nonholonomic.validation import Bound, as_number
 from tippe.model.body import AbstractBody, AbstractMeridian, ContactGeometry
 from tippe.model.contact_load import Slip

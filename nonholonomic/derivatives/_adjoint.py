@@ -19,24 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..integration import (
-    RUNNING,
-    AbstractProblem,
-    AbstractRecorder,
-    InLanes,
-    Lanes,
-    LaneScheduler,
-    LaneState,
-    Outcome,
-    Progress,
-    Settings,
-    Stages,
-    States,
-    length_to_try,
-    moved_state,
-    over_stages,
-    try_step,
-)
+from ..integration import RUNNING, AbstractProblem, Lanes, LaneState, Outcome, Settings, States
+from ..integration.runge_kutta import Stages, moved_state, over_stages
+from ..integration.scheduler import AbstractRecorder, InLanes, LaneScheduler, Progress
+from ..integration.step import length_to_try, try_step
 from ..xla_cpu import uncounted, written_by_component, written_in_place
 from ._periods import Checkpoints, LatestSteps, Period, StepRecord, read
 from .variation import VariationalProblem
@@ -67,12 +53,12 @@ class StepRecorder(AbstractRecorder):
 
 
 class Backward(NamedTuple):
-    """State of the passes forward and backward.
+    """State of the forward pass and of the backward pass.
 
-    `ahead` holds the lanes at the start of the next period to compute, and `number` its number. The pass backward takes
-    the period before `needed` next. `adjoint` holds, for the cell in each lane, the derivatives of the measured quantity:
-    the first rows are those with respect to the state, the others those with respect to the parameters. `gradient` holds
-    the derivatives of every cell with respect to its initial state.
+    `ahead` holds the lanes at the start of the next period to compute, and `number` its number. The backward pass takes
+    the period before `needed` next. `adjoint` holds, for the cell in each lane, the derivatives of the measured
+    quantity: the first rows are those with respect to the state, the others those with respect to the parameters.
+    `gradient` holds the derivatives of every cell with respect to its initial state.
     """
 
     ahead: Progress

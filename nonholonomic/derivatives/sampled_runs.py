@@ -16,12 +16,12 @@ from ..integration import (
     REACHED_END,
     AbstractProblem,
     CoreProblem,
-    SampledSolution,
     Settings,
-    event_time,
     sample,
     solve_with_samples,
 )
+from ..integration.dense import SampledSolution
+from ..integration.problem import event_time
 from .differentiable import tangents_by
 from .lyapunov import probed
 from .sampling import AbstractSampling, ProblemSpec, solve_for_samples

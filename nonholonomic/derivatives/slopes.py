@@ -16,16 +16,9 @@ from jax.extend.core import Literal
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
-from ..integration import (
-    CROSSED,
-    REACHED_END,
-    AbstractProblem,
-    LaneScheduler,
-    LaneState,
-    Outcome,
-    Settings,
-    with_crossing_times,
-)
+from ..integration import CROSSED, REACHED_END, AbstractProblem, LaneState, Outcome, Settings
+from ..integration.ensemble import with_crossing_times
+from ..integration.scheduler import LaneScheduler
 from ..xla_cpu import compiled_alone
 from ._adjoint import solve_with_adjoint
 from .variation import VariationalProblem, in_groups, slopes_by_variations

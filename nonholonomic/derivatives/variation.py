@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..integration import AbstractProblem, LaneScheduler, Outcome, crossing_time
+from ..integration import AbstractProblem, Outcome, crossing_time
+from ..integration.scheduler import LaneScheduler
 
 #: Number of tangents that are integrated together. Two together take 0.6 to 1.0 times as long as two in turn, and an
 #: eighth longer to compile; four together take 1.1 times as long as two pairs.

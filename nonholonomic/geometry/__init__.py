@@ -11,12 +11,10 @@ from .carried_frame import place_named as place_named
 from .carried_frame import room_bounds as room_bounds
 from .cylinder import Cylinder as Cylinder
 from .frames import AbstractFrame as AbstractFrame
-from .frames import CylinderFrame as CylinderFrame
 from .frames import FrameMotion as FrameMotion
 from .frames import PlaneFrame as PlaneFrame
-from .frames import SphereFrame as SphereFrame
 from .frames import Tangent as Tangent
-from .frames import carried as carried
+from .frames import rate_in_frame as rate_in_frame
 from .function import as_function as as_function
 from .graph import Graph as Graph
 from .graph import Paraboloid as Paraboloid
@@ -30,7 +28,6 @@ from .quadric import Sphere as Sphere
 from .quadric import Spheroid as Spheroid
 from .surface import CLOSED as CLOSED
 from .surface import AbstractSurface as AbstractSurface
-from .surface import BallGap as BallGap
 from .surface import Place as Place
 from .torus import Torus as Torus
 from .vector import Component as Component

@@ -38,7 +38,7 @@ from .vector import Component, Vector, cross, dot, scale, sum_vectors, tangents,
 
 
 def place_named(surface: AbstractSurface, place: Place) -> Place:
-    """Convert a place whose eta counts from the lowest point of a closed surface to a place for `surface.chart`.
+    """Convert a place whose eta is measured from the lowest point of a closed surface to a place for `surface.chart`.
 
     **Arguments:** `place`: numbers named by `surface.coordinates`, or (x, y, z).
     """
@@ -138,8 +138,8 @@ class CarriedFrame(AbstractFrame):
 
     def convex_motion(self, place: Place, velocity: Tangent, radii: TangentOperator) -> tuple[FrameMotion, Tangent]:
         axes, shape = self._bent(place)
-        foot_velocity, turning, room = contact_velocity(shape, radii, velocity)
-        return self._moved(place[:3], axes, foot_velocity, turning, room), foot_velocity
+        foot_velocity, frame_rate, room = contact_velocity(shape, radii, velocity)
+        return self._moved(place[:3], axes, foot_velocity, frame_rate, room), foot_velocity
 
     def _bent(self, place: Place) -> tuple[tuple[Fixed, Fixed, Fixed], TangentOperator]:
         """The vectors t1, t2 and n in the surface's axes, and the shape operator of the arena."""
@@ -151,11 +151,11 @@ class CarriedFrame(AbstractFrame):
         return (t1, t2, n), stored(*self._shape(place[:3], t1, t2))
 
     def _moved(
-        self, foot: Fixed, axes: tuple[Fixed, Fixed, Fixed], velocity: Tangent, turning: Tangent, room: Component
+        self, foot: Fixed, axes: tuple[Fixed, Fixed, Fixed], velocity: Tangent, frame_rate: Tangent, room: Component
     ) -> FrameMotion:
         """The motion of the frame. **Arguments:** `velocity`: velocity of the foot, along the axes."""
         t1, t2, n = axes
-        o1, o2, *up = stored(*turning, *self._seen(t1, t2, n))
+        o1, o2, *up = stored(*frame_rate, *self._seen(t1, t2, n))
         back = -self.pull * self.side * self.surface.offset(foot)
         moved = sum_vectors(scale(velocity[0], t1), scale(velocity[1], t2), scale(back, n))
         return FrameMotion((o1, o2), vector_of(up), (*moved, *scale(o1, n)), room)
@@ -180,7 +180,7 @@ class CarriedFrame(AbstractFrame):
     def height(self, place: Place) -> Component:
         return self.surface.elevation(place[:3]) + self.distance * dot(self.normal(place[:3]), self.up)
 
-    def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
+    def cyclic_rate(self, cyclic: Place, velocity: Tangent, frame_rate: Tangent) -> Place:
         return ()
 
     def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:

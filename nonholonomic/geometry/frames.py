@@ -3,7 +3,7 @@
 The ball touches the surface at its foot; its centre is at a distance R from there along n, on the parallel surface.
 With V the velocity of the centre, the frame turns as t1' = o1 n, t2' = o2 n, n' = -(o1 t1 + o2 t2), where (o1, o2) = S
 V and S is the shape operator of the parallel surface, positive where it is concave towards the ball. The frame does not
-turn about n, so the components of a fixed vector change as `carried` states.
+turn about n, so the components of a fixed vector change as `rate_in_frame` states.
 
 The frame of a convex body of any shape moves with its contact point: R = 0, and V is that point's velocity along the surface
 (`AbstractFrame.convex_motion`).
@@ -33,10 +33,10 @@ TangentOperator = tuple[Component, Component, Component]
 Fixed = tuple[Any, Any, Any]
 
 
-def carried(vector: tuple[Component, ...], turning: Tangent) -> tuple[Component, ...]:
+def rate_in_frame(vector: tuple[Component, ...], frame_rate: Tangent) -> tuple[Component, ...]:
     """Rate of the components of a fixed vector in a moving frame with t1' = o1 n, t2' = o2 n, n' = -(o1 t1 + o2 t2)."""
-    along_normal = dot(turning, vector[:2])
-    return (multiply(turning[0], vector[2]), multiply(turning[1], vector[2]), subtract(None, along_normal))
+    along_normal = dot(frame_rate, vector[:2])
+    return (multiply(frame_rate[0], vector[2]), multiply(frame_rate[1], vector[2]), subtract(None, along_normal))
 
 
 def contact_velocity(
@@ -58,20 +58,20 @@ def contact_velocity(
     determinant = subtract(A11 * A22, multiply(B12, B21))
     q1 = add(multiply(A22, V1), multiply(B12, V2)) / determinant
     q2 = add(multiply(A11, V2), multiply(B21, V1)) / determinant
-    turning = add(multiply(S11, q1), multiply(S12, q2)), add(multiply(S12, q1), multiply(S22, q2))
+    frame_rate = add(multiply(S11, q1), multiply(S12, q2)), add(multiply(S12, q1), multiply(S22, q2))
     # H S has real eigenvalues k; both values 1 - k are positive if these are.
-    return (q1, q2), turning, least(determinant, 0.5 * (A11 + A22))
+    return (q1, q2), frame_rate, least(determinant, 0.5 * (A11 + A22))
 
 
 class FrameMotion(NamedTuple):
     """The motion of a frame while the ball moves.
 
-    - `turning`: (o1, o2) = S V [rad/s]; `vertical`: the upward vertical in the frame.
+    - `frame_rate`: (o1, o2) = S V [rad/s]; `vertical`: the upward vertical in the frame.
     - `place_rate`: rate of the place.
     - `room`: positive where the ball fits, 1 where the surface is flat; `None` if it fits everywhere.
     """
 
-    turning: Tangent
+    frame_rate: Tangent
     vertical: Vector
     place_rate: Place
     room: Component = None
@@ -120,7 +120,7 @@ class AbstractFrame(eqx.Module):
         point."""
 
     @abc.abstractmethod
-    def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
+    def cyclic_rate(self, cyclic: Place, velocity: Tangent, frame_rate: Tangent) -> Place:
         """Rate of change of `cyclic`."""
 
     @abc.abstractmethod
@@ -173,7 +173,7 @@ class PlaneFrame(AbstractFrame):
             return self.distance
         return self.slope[0] * place[0] + self.slope[1] * self.distance
 
-    def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
+    def cyclic_rate(self, cyclic: Place, velocity: Tangent, frame_rate: Tangent) -> Place:
         return velocity[2 - len(cyclic) :]
 
     def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
@@ -238,8 +238,8 @@ class CylinderFrame(AbstractFrame):
         # The lowest point is at the distance of the radius below the axis, on either side.
         return self._side * (self.radius + self.distance) - self.radius * place[1]
 
-    def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
-        return (turning[0], velocity[1])
+    def cyclic_rate(self, cyclic: Place, velocity: Tangent, frame_rate: Tangent) -> Place:
+        return (frame_rate[0], velocity[1])
 
     def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
         return cyclic[0]
@@ -284,8 +284,8 @@ class SphereFrame(AbstractFrame):
         return (1.0, 1.0, 1.0)
 
     def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
-        turning = (velocity[0] / self.radius, velocity[1] / self.radius)
-        return FrameMotion(turning, self.vertical(place), carried(place, turning))
+        frame_rate = (velocity[0] / self.radius, velocity[1] / self.radius)
+        return FrameMotion(frame_rate, self.vertical(place), rate_in_frame(place, frame_rate))
 
     def convex_motion(self, place: Place, velocity: Tangent, radii: TangentOperator) -> tuple[FrameMotion, Tangent]:
         curvature = 1.0 / self.radius
@@ -298,8 +298,8 @@ class SphereFrame(AbstractFrame):
     def height(self, place: Place) -> Component:
         return self._side * (self.radius + self.distance) - self.radius * place[2]
 
-    def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
-        return carried(cyclic, turning)
+    def cyclic_rate(self, cyclic: Place, velocity: Tangent, frame_rate: Tangent) -> Place:
+        return rate_in_frame(cyclic, frame_rate)
 
     def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
         return jnp.arctan2(planar_length(place[0], place[1]), self._side * place[2])

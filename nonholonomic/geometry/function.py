@@ -133,7 +133,7 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module
         shown = ", ".join(map(str, results))
         raise ValueError(f"{name} = {value!r} must return one number for numbers {', '.join(arguments)}, not {shown}")
     if isinstance(value, eqx.Module):
-        # A function of numbers in each lane has as many results.
+        # If the parameters have one number per lane, so have the results.
         arrays = results[0].shape == () and len(shapes) > 1 and not isinstance(value, Held)
         return Held.of(value) if arrays else value
     closes_over = any(is_traced(constant) for constant in traced.consts)

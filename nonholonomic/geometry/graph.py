@@ -84,9 +84,9 @@ class Paraboloid(AbstractOpen):
     def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
         x, y, _ = position
         per_length, normal = 1.0 / jnp.sqrt(x * x + y * y + self.p * self.p), self.normal(position)
-        turning = (-velocity[0], -velocity[1], None)
-        along = scale(subtract(None, dot(normal, turning)), normal)
-        rate = scale(per_length, sum_vectors(turning, along))
+        gradient_rate = (-velocity[0], -velocity[1], None)
+        along = scale(subtract(None, dot(normal, gradient_rate)), normal)
+        rate = scale(per_length, sum_vectors(gradient_rate, along))
         return (rate[0], rate[1], rate[2])
 
     def gaussian_curvature(self, position: Vector) -> Component:

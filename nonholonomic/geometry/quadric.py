@@ -46,9 +46,9 @@ class AbstractQuadric(AbstractSurface):
 
     def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
         gradient, normal = self.gradient(position), self.normal(position)
-        turning = self.gradient(velocity)
-        along = scale(subtract(None, dot(normal, turning)), normal)
-        return scale(1.0 / jnp.sqrt(dot(gradient, gradient)), sum_vectors(turning, along))
+        gradient_rate = self.gradient(velocity)
+        along = scale(subtract(None, dot(normal, gradient_rate)), normal)
+        return scale(1.0 / jnp.sqrt(dot(gradient, gradient)), sum_vectors(gradient_rate, along))
 
     def bending(self, position: Vector, a: Vector, b: Vector) -> tuple[Component, Component, Component]:
         # The gradient's size changes the normal only along n, which is perpendicular to a and b.

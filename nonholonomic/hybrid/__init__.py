@@ -42,9 +42,6 @@ derivatives. A run that is not over after `MOST_ROUNDS` modes is `UNRESOLVED`; `
 
 from .ensemble import MOST_ROUNDS as MOST_ROUNDS
 from .ensemble import HybridOutcome as HybridOutcome
-from .ensemble import after_reset as after_reset
-from .ensemble import after_solve as after_solve
-from .ensemble import at_start as at_start
 from .ensemble import solve_hybrid as solve_hybrid
 from .ensemble import traced_solve_hybrid as traced_solve_hybrid
 from .mode import AbstractBatchedMode as AbstractBatchedMode
@@ -55,8 +52,7 @@ from .path import BETWEEN as BETWEEN
 from .path import HybridPath as HybridPath
 from .path import Segment as Segment
 from .path import solve_hybrid_dense as solve_hybrid_dense
-from .saltation import Slopes as Slopes
-from .saltation import solve_hybrid_with_tangents as solve_hybrid_with_tangents
-from .saltation import traced_solve_hybrid_with_tangents as traced_solve_hybrid_with_tangents
 from .samples import HybridSamples as HybridSamples
 from .samples import hybrid_samples as hybrid_samples
+from .tangents import solve_hybrid_with_tangents as solve_hybrid_with_tangents
+from .tangents import traced_solve_hybrid_with_tangents as traced_solve_hybrid_with_tangents

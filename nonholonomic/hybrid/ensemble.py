@@ -20,11 +20,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..integration.ensemble import solve_ensemble, traced_solve_ensemble
-from ..integration.problem import AbstractProblem
-from ..integration.scheduler import Numbers, Outcome
-from ..integration.settings import Settings
-from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
+from ..integration import (
+    FAILED,
+    LEFT_DOMAIN,
+    REACHED_END,
+    RUNNING,
+    UNRESOLVED,
+    AbstractProblem,
+    Outcome,
+    Settings,
+    solve_ensemble,
+    traced_solve_ensemble,
+)
+from ..integration.scheduler import Numbers
 from ..xla_cpu import compiled_quickly, greatest
 from .mode import AbstractBatchedMode, Transition, mode_of_cells
 
@@ -52,7 +60,7 @@ class HybridOutcome(NamedTuple, Generic[Numbers]):
     counts: Int[Numbers, "counters cells"]
 
 
-#: The `HybridOutcome` of some runs, and what else is kept of them.
+#: The `HybridOutcome` of some runs, and further data that is kept of them.
 Carry = tuple[Any, ...]
 
 #: (the indices of some modes, carry, a mask of cells in these modes) -> the carry after these cells have advanced.

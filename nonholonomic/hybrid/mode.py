@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float, Int
 
-from ..integration.problem import AbstractProblem
+from ..integration import AbstractProblem
 from ..integration.scheduler import Numbers
 
 

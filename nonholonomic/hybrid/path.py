@@ -10,11 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..integration.dense import PIECE_OF_MODE, DenseSolution, follow, padded
-from ..integration.problem import AbstractProblem
-from ..integration.scheduler import Outcome
-from ..integration.settings import Settings
-from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED
+from ..integration import (
+    FAILED,
+    LEFT_DOMAIN,
+    REACHED_END,
+    UNRESOLVED,
+    AbstractProblem,
+    DenseSolution,
+    Outcome,
+    Settings,
+    follow,
+    padded,
+)
+from ..integration.dense import PIECE_OF_MODE
 from ..xla_cpu import compiled_quickly
 from .ensemble import Carry, after_reset, after_solve, at_start, host_rounds
 from .mode import AbstractBatchedMode, Transition

@@ -16,29 +16,23 @@ tolerance, the event is grazing and the derivative has no correct digits; `GRAZI
 
 import math
 from collections.abc import Callable
-from typing import Any, Generic, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
-from ..derivatives.slopes import tangents_of
-from ..derivatives.variation import VariationalProblem, in_groups, where_active
+from ..derivatives import VariationalProblem, tangents_of
+from ..derivatives.variation import where_active
 from ..integration import (
-    CROSSED,
-    REACHED_END,
     AbstractPassive,
     AbstractProblem,
     ExtendedProblem,
     Lanes,
-    Settings,
     States,
 )
-from ..integration.scheduler import Numbers
-from .ensemble import HybridOutcome, solve_hybrid, traced_solve_hybrid
 from .mode import AbstractBatchedMode, Transition
 
 #: An event is grazing if a relative change of the numbers by the tolerance, or an error of the state that the tolerance
@@ -81,7 +75,7 @@ class VariationalMode(AbstractBatchedMode):
 
     def problem(self, state: Float[Array, "components cells"]) -> VariationalProblem:
         at, *variations = self.parts(state)
-        numbers, build = self._moving()
+        numbers, build = self._active_numbers()
 
         def clocked(state: Float[Array, "components cells"], *numbers: Array) -> ExtendedProblem:
             began = state[-1:]
@@ -95,54 +89,45 @@ class VariationalMode(AbstractBatchedMode):
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """The reset map of the mode itself, with variations. The last row of the counters counts grazing events."""
-        return self.left_behind(state, left, lambda mode, record, left: ())[0]
+        return self.reset_with_path(state, left, lambda mode, record, left: ())[0]
 
-    def left_behind(
-        self, state: Float[Array, "components cells"], left: Float[Array, " cells"], seen: Callable[..., Any]
+    def reset_with_path(
+        self, state: Float[Array, "components cells"], left: Float[Array, " cells"], read_path: Callable[..., Any]
     ) -> tuple[Transition, Any, Any]:
         """The transition by the mode's `reset_map`, and numbers computed from its path.
 
-        **Arguments:** `seen`: function of the mode, the `TransitionPath` and `left` that returns a tree of numbers.
+        **Arguments:** `read_path`: function of the mode, the `TransitionPath` and `left` that returns a tree of numbers.
 
         **Returns:** the `Transition`; the numbers; and their variations, with the tangents first.
         """
         at, *variations = self.parts(state)
-        at, lasted, count = at[:-1], at[-1], len(variations)
-        numbers, build = self._moving()
-        still = [jnp.zeros_like(number) for number in numbers]
-        rates = self.mode.problem(at).field(lasted, at)
-
-        def met(at: Float[Array, "components cells"], *numbers: Array) -> tuple[Array, Array]:
-            problem = build(*numbers).problem(at)
-            return jax.jvp(lambda at: problem.domain_margin(lasted, at), (at,), (problem.field(lasted, at),))
-
-        # The last two tangents are an error of the state, and a tangent along time.
+        at, duration, count = at[:-1], at[-1], len(variations)
+        numbers, build = self._active_numbers()
+        unmoved = [jnp.zeros_like(number) for number in numbers]
+        rates = self.mode.problem(at).field(duration, at)
+        # The last tangent is an error of the state.
         along = [(variation[:-1], *moved) for variation, moved in zip(variations, self._rates(), strict=True)]
-        along += [(self._error(at, lasted, rates), *still), (rates, *still)]
-        (_, rate), (domain_margins, changes) = _along(met, (at, *numbers), along)
-        # A mode that ended when it began has not reached its event.
-        happened = (lasted > 0.0) & (rate != 0.0)
-        safe = jnp.where(happened, rate, 1.0)
-        later = jnp.where(happened, -domain_margins[:-1] / safe, 0.0)
-        log_rates = jnp.where(happened, (changes[:-1] + changes[-1] * later) / safe, 0.0)
+        along.append((self._error(at, duration, rates), *unmoved))
+        delays, log_rates = self._delays(at, duration, [*along, (rates, *unmoved)])
 
-        def passed(at: Float[Array, "components cells"], left: Float[Array, " cells"], *numbers: Array) -> Any:
+        def reset(at: Float[Array, "components cells"], left: Float[Array, " cells"], *numbers: Array) -> Any:
             mode = build(*numbers)
             transition = mode.reset_map(at, left)
             inside = jnp.zeros_like(left) if transition.log_rates is None else transition.log_rates
-            path = seen(mode, transition.record, left)
+            path = read_path(mode, transition.record, left)
             return (transition.state, transition.elapsed, inside, path), transition._replace(
                 record=None, log_rates=None
             )
 
         begins = (
-            jnp.concatenate([*[variation[None, -1] for variation in variations], jnp.zeros_like(lasted)[None]]) + later
+            jnp.concatenate([*[variation[None, -1] for variation in variations], jnp.zeros_like(duration)[None]])
+            + delays
         )
         after_event = [
             (moved[0] + shift * rates, -begin, *moved[1:])
-            for moved, shift, begin in zip(along[:-1], later, begins, strict=True)
+            for moved, shift, begin in zip(along, delays, begins, strict=True)
         ]
-        values, moved, transition = _along(passed, (at, left, *numbers), after_event, has_aux=True)
+        values, moved, transition = _along(reset, (at, left, *numbers), after_event, has_aux=True)
         states, elapsed, inside, changes = moved
         new_variations = jnp.concatenate([states, (begins + elapsed)[:, None]], axis=1)[:count]
         log_rates = jnp.max(jnp.abs(log_rates + inside), axis=0)
@@ -150,26 +135,46 @@ class VariationalMode(AbstractBatchedMode):
         grazes = ~finite | (self.tolerance * log_rates > GRAZING)
         # The run itself is valid, so variations without correct digits must not end the run.
         new_variations = jnp.where(finite, new_variations, 0.0)
-        whole = jnp.concatenate([transition.state, jnp.zeros_like(lasted)[None], *new_variations])
+        whole = jnp.concatenate([transition.state, jnp.zeros_like(duration)[None], *new_variations])
         transition = transition._replace(
             state=whole, counts=jnp.concatenate([transition.counts, grazes.astype(int)[None]])
         )
         return transition, values[-1], jax.tree.map(lambda change: change[:count], changes)
 
-    def seen(
+    def _delays(
+        self, at: Float[Array, "components cells"], duration: Float[Array, " cells"], along: list[tuple[Array, ...]]
+    ) -> tuple[Float[Array, "tangents cells"], Float[Array, "tangents cells"]]:
+        """The variations of the time at which the mode ends, and of the logarithm of the rate of its margin there.
+
+        **Arguments:** `along`: the tangents, followed by the tangent along time, which has no variations of its own.
+        """
+        numbers, build = self._active_numbers()
+
+        def margin_and_rate(at: Float[Array, "components cells"], *numbers: Array) -> tuple[Array, Array]:
+            problem = build(*numbers).problem(at)
+            return jax.jvp(lambda at: problem.domain_margin(duration, at), (at,), (problem.field(duration, at),))
+
+        (_, rate), (domain_margins, changes) = _along(margin_and_rate, (at, *numbers), along)
+        # A mode that ended when it began has not reached its event.
+        happened = (duration > 0.0) & (rate != 0.0)
+        safe = jnp.where(happened, rate, 1.0)
+        delays = jnp.where(happened, -domain_margins[:-1] / safe, 0.0)
+        return delays, jnp.where(happened, (changes[:-1] + changes[-1] * delays) / safe, 0.0)
+
+    def output_rows(
         self, state: Float[Array, "components times"]
     ) -> tuple[Float[Array, "shown times"], Float[Array, "tangents shown times"]]:
         """The output rows of a single run's states, and their variation at fixed times."""
         at, *variations = self.parts(state)
-        at, lasted = at[:-1], at[-1]
-        numbers, build = self._moving()
+        at, duration = at[:-1], at[-1]
+        numbers, build = self._active_numbers()
 
         def shown(at: Float[Array, "components times"], *numbers: Array) -> Float[Array, "shown times"]:
             return build(*numbers).shown(at)
 
         if not variations:
             return shown(at), jnp.zeros((0, *shown(at).shape))
-        rates = self.mode.problem(at).field(lasted, at)
+        rates = self.mode.problem(at).field(duration, at)
         # If the mode begins later, the state has advanced less at the same time.
         along = [
             (variation[:-1] - rates * variation[-1], *moved)
@@ -180,7 +185,7 @@ class VariationalMode(AbstractBatchedMode):
     def slopes(self, state: Float[Array, "components cells"]) -> Float[Array, "tangents cells"]:
         """The derivative of the time of the event at which runs have ended in this mode, or in the transition to it."""
         at, *variations = self.parts(state)
-        numbers, build = self._moving()
+        numbers, build = self._active_numbers()
 
         def time(at: Float[Array, "components cells"], began: Float[Array, " cells"], *numbers: Array) -> Any:
             problem = build(*numbers).problem(at)
@@ -191,10 +196,10 @@ class VariationalMode(AbstractBatchedMode):
             rates = problem.field(began, at)
             value, rate = stop_gradient(jax.jvp(problem.event_function, (at,), (rates,)))
             rest = -value / jnp.where(rate == 0.0, jnp.inf, rate)
-            at = at + jnp.where(jnp.abs(rest) < NEARLY * lasted, rest, 0.0) * rates
+            at = at + jnp.where(jnp.abs(rest) < NEARLY * duration, rest, 0.0) * rates
             return began + delay(problem.event_function, at, problem.field(began, at))
 
-        lasted, point = at[-1], (at[:-1], jnp.zeros_like(at[-1]), *numbers)
+        duration, point = at[-1], (at[:-1], jnp.zeros_like(at[-1]), *numbers)
         tangents = [
             (variation[:-1], variation[-1], *rates) for variation, rates in zip(variations, self._rates(), strict=True)
         ]
@@ -207,18 +212,18 @@ class VariationalMode(AbstractBatchedMode):
     def _error(
         self,
         at: Float[Array, "components cells"],
-        lasted: Float[Array, " cells"],
+        duration: Float[Array, " cells"],
         rates: Float[Array, "components cells"],
     ) -> Float[Array, "components cells"]:
         """The error of the state at the end of the mode, divided by the tolerance, from the change of the state and
         from the magnitudes.
         """
-        sizes = jnp.minimum(self.mode.problem(at).start()[1], jnp.abs(rates) * lasted)
+        sizes = jnp.minimum(self.mode.problem(at).start()[1], jnp.abs(rates) * duration)
         # Shares of both signs that are unlikely to cancel.
         shares = [(-1.0) ** k * (0.5 + math.modf(0.618 * k)[0]) for k in range(len(sizes))]
         return jnp.asarray(shares)[:, None] * sizes
 
-    def _moving(self) -> tuple[list[Array], Any]:
+    def _active_numbers(self) -> tuple[list[Array], Any]:
         """The mode's active numbers, and the mode as a function of them."""
         if not self.tangents:
             return [], lambda: self.mode
@@ -246,128 +251,6 @@ def _along(function: Any, point: tuple[Array, ...], tangents: list[tuple[Array, 
     # The function itself is computed once, whatever the number of tangents.
     stacked = jax.tree.map(lambda *moved: jnp.stack(moved), *tangents)
     return jax.vmap(along, out_axes=(None, 0, None) if has_aux else (None, 0))(stacked)
-
-
-class Slopes(NamedTuple, Generic[Numbers]):
-    """Derivatives of the times of the events at which runs ended, (tangents, cells); and a mask of those that are NaN
-    because an earlier event was `grazing`, so that the derivative would have no correct digits.
-    """
-
-    slopes: Float[Numbers, "tangents cells"]
-    grazing: Bool[Numbers, " cells"]
-
-
-def solve_hybrid_with_tangents(
-    modes: tuple[AbstractBatchedMode, ...],
-    tangents: tuple[tuple[tuple[Any, ...], Any], ...],
-    mode: Int[np.ndarray, " cells"],
-    state: Float[np.ndarray, "components cells"],
-    t1: float | Float[np.ndarray, "..."],
-    cells: int,
-    settings: Settings,
-    *,
-    counters: int,
-    ends_on_event: bool = True,
-) -> tuple[HybridOutcome[np.ndarray], Slopes[np.ndarray]]:
-    """Run every cell through its modes to its event, and differentiate the event's time along tangents.
-
-    **Arguments:** as for `solve_hybrid`, and
-
-    - `tangents`: pairs of the tangents of the modes and the tangent of the states, with `None` for leaves that do not
-      move.
-    - `ends_on_event`: whether runs end on the event; otherwise they end at `t1`, which then counts as the event's time.
-
-    **Returns:** the `HybridOutcome`, and the `Slopes`, 0 where there is no event or the event is at the start.
-    Source: implicit function theorem at the event, saltation at every change of mode.
-
-    **Example:** the derivative with respect to the restitution.
-
-    >>> from nonholonomic.hybrid import solve_hybrid_with_tangents
-    >>> tangents = (((Bounce(jnp.ones(2)),), None),)
-    >>> _, sensitivities = solve_hybrid_with_tangents(modes, tangents, first, start, 5.0, 2, settings, counters=1)
-    >>> print(sensitivities.slopes.round(6))  # the time of the fall
-    [[0.451524 0.451524]]
-    """
-    varied = variational_modes(modes, tangents, settings.tolerance, ends_on_event)
-    start, n_blocks = np.asarray(variational_start(jnp.asarray(state), tangents)), 1 + len(tangents)
-    ended = solve_hybrid(varied, mode, start, t1, cells, settings, counters=counters + 1, n_blocks=n_blocks)
-    slopes = [np.asarray(_slopes(varied_mode, jnp.asarray(ended.state))) for varied_mode in varied]
-    event_time = ended.crossing_time if ends_on_event else np.broadcast_to(t1, len(mode))
-    return _own(ended, len(state)), _known(np, ended, _of_mode(np, ended, slopes), event_time, ends_on_event)
-
-
-def traced_solve_hybrid_with_tangents(
-    modes: tuple[AbstractBatchedMode, ...],
-    tangents: tuple[tuple[tuple[Any, ...], Any], ...],
-    mode: Int[Array, " cells"],
-    state: Float[Array, "components cells"],
-    t1: Float[Array, "..."],
-    cells: int,
-    settings: Settings,
-    *,
-    counters: int,
-    ends_on_event: bool = True,
-) -> tuple[HybridOutcome[Array], Slopes[Array]]:
-    """`solve_hybrid_with_tangents` inside other transformed functions; arguments and results are traced.
-
-    **Example:** as for `solve_hybrid_with_tangents`.
-
-    >>> from nonholonomic.hybrid import traced_solve_hybrid_with_tangents
-    >>> tangents, options = (((Bounce(jnp.ones(2)),), None),), (jnp.asarray(first), jnp.asarray(start), 5.0, 2, settings)
-    >>> _, sensitivities = traced_solve_hybrid_with_tangents(modes, tangents, *options, counters=1)
-    >>> print(sensitivities.slopes.round(6))
-    [[0.451524 0.451524]]
-    """
-
-    def run(group: tuple[Any, ...]) -> tuple[tuple[HybridOutcome[Array], Array], list[Float[Array, " cells"]]]:
-        varied = variational_modes(modes, group, settings.tolerance, ends_on_event)
-        start, n_blocks = variational_start(state, group), 1 + len(group)
-        ended = traced_solve_hybrid(varied, mode, start, t1, cells, settings, counters=counters + 1, n_blocks=n_blocks)
-        slopes = _of_mode(jnp, ended, [varied_mode.slopes(ended.state) for varied_mode in varied])
-        event_time = ended.crossing_time if ends_on_event else jnp.broadcast_to(t1, mode.shape)
-        known = _known(jnp, ended, slopes, event_time, ends_on_event)
-        return (_own(ended, len(state)), known.grazing), list(known.slopes)
-
-    (outcome, grazing), slopes = in_groups(run, tangents)
-    return outcome, Slopes(jnp.stack(slopes), grazing)
-
-
-def _known(
-    xp: Any,
-    ended: HybridOutcome[Numbers],
-    slopes: Float[Numbers, "tangents cells"],
-    event_time: Float[Numbers, " cells"],
-    ends_on_event: bool,
-) -> Slopes[Numbers]:
-    """The derivatives of the times of events, where these happened and the derivatives have correct digits."""
-    # An event at the start has a fixed time, whatever the tangent.
-    happened = xp.isfinite(event_time) & (event_time > 0.0)
-    # With its variations a run takes other steps: where it does not reach the event, it has no derivative.
-    arrived = ended.status == (CROSSED if ends_on_event else REACHED_END)
-    grazing = happened & ((ended.counts[-1] > 0) | ~arrived)
-    return Slopes(xp.where(happened, xp.where(grazing, xp.nan, slopes), 0.0), grazing)
-
-
-def _own(ended: HybridOutcome[Numbers], size: int) -> HybridOutcome[Numbers]:
-    """A hybrid outcome without its variations."""
-    return ended._replace(state=ended.state[:size], counts=ended.counts[:-1])
-
-
-def _of_mode(xp: Any, ended: HybridOutcome[Numbers], slopes: list[Float[Numbers, "tangents cells"]]) -> Any:
-    """Select, for each cell, the derivatives of its mode.
-
-    A run that has ended between two modes is in neither. Its event is the end of the previous mode, whose variation is
-    the last row.
-    """
-    of_cells = xp.reshape(ended.state, (1 + len(slopes[0]), -1, len(ended.mode)))[1:, -1]
-    for number, of_mode in enumerate(slopes):
-        of_cells = xp.where(ended.mode == number, of_mode, of_cells)
-    return of_cells
-
-
-@eqx.filter_jit
-def _slopes(varied: VariationalMode, state: Float[Array, "components cells"]) -> Float[Array, "tangents cells"]:
-    return varied.slopes(state)
 
 
 def variational_modes(

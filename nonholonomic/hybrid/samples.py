@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..derivatives.differentiable import tangents_by
+from ..derivatives import in_groups, tangents_by
 from ..derivatives.sampling import AbstractSampling, ProblemSpec, solve_for_samples
-from ..derivatives.variation import in_groups
 from ..integration import REACHED_END, Settings, solve_with_samples
 from ..xla_cpu import greatest
 from .ensemble import Carry, HybridOutcome, after_reset, after_solve, at_start, traced_rounds
@@ -123,7 +122,7 @@ class HybridSampling(AbstractSampling):
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> HybridSamples:
         numbers, (*horizon, tolerance), spec = self._sorted(leaves)
         settings = spec.settings.with_tolerance(tolerance)
-        samples, _ = _follow(spec.built(numbers, tolerance), (), horizon, settings, self.counters)
+        samples, _ = _sampled_with_tangents(spec.built(numbers, tolerance), (), horizon, settings, self.counters)
         return jax.tree.map(lambda part: part[None], samples)
 
     def value_and_tangents(
@@ -142,7 +141,7 @@ class HybridSampling(AbstractSampling):
         built, tangents, gather = tangents_by(build, active, numbers, None)
 
         def run(group: tuple[Any, ...]) -> tuple[HybridSamples, list[HybridSamples]]:
-            return _follow(
+            return _sampled_with_tangents(
                 built, tuple((tangent[0], tangent[2]) for tangent in group), horizon, settings, self.counters
             )
 
@@ -150,14 +149,14 @@ class HybridSampling(AbstractSampling):
         return jax.tree.map(lambda part: part[None], (samples, gather(slopes)))
 
 
-def _follow(
+def _sampled_with_tangents(
     built: Any, tangents: tuple[Any, ...], horizon: Sequence[Array], settings: Settings, counters: int
 ) -> tuple[HybridSamples, list[HybridSamples]]:
     """The run, and its derivative along each tangent."""
     (modes, first, state), (times, t1) = built, horizon
     varied, start = variational_modes(modes, tangents, settings.tolerance, False), variational_start(state, tangents)
-    ended, filled = _followed(varied, first, start, times, t1, settings, counters)
-    return _found(ended, filled, times, len(state), len(tangents))
+    ended, filled = _rounds_with_samples(varied, first, start, times, t1, settings, counters)
+    return _as_samples(ended, filled, times, len(state), len(tangents))
 
 
 class Filled(NamedTuple):
@@ -179,7 +178,7 @@ class Filled(NamedTuple):
         return self._replace(shown=shown, variations=variations, number=jnp.where(at, number, self.number))
 
 
-def _followed(
+def _rounds_with_samples(
     modes: tuple[VariationalMode, ...],
     first: Array,
     state: Float[Array, "components 1"],
@@ -198,7 +197,7 @@ def _followed(
         def solved() -> Carry:
             run, filled = carry
             at = run.mode[0]
-            mode = selected(modes, numbers, at)
+            mode = mode_numbered(modes, numbers, at)
             # In a batch, all runs take this branch; runs in another mode spend no time in this one.
             since, left = times - run.end_time, jnp.where(active, greatest(t1 - run.end_time, 0.0), 0.0)
             outcome, samples = solve_with_samples(
@@ -206,20 +205,20 @@ def _followed(
             )
             after = after_solve(jnp, run, outcome, t1)
             inside = (since >= 0.0) & (times <= after.end_time)
-            return after, filled.with_samples(inside, mode.seen(samples[0].T), at)
+            return after, filled.with_samples(inside, mode.output_rows(samples[0].T), at)
 
         return jax.lax.cond(active[0], solved, lambda: carry)
 
     def reset(numbers: Sequence[int], carry: Carry, lost: Bool[Array, " 1"]) -> Carry:
-        def seen(mode: AbstractBatchedMode, record: TransitionPath | None, left: Float[Array, " 1"]) -> Any:
+        def rows_on_path(mode: AbstractBatchedMode, record: TransitionPath | None, left: Float[Array, " 1"]) -> Any:
             # If the event happens later, less time passes from the event to a fixed time, and to the horizon.
-            return None if record is None else _on_the_way(mode, record, times - t1 + left)
+            return None if record is None else _rows_in_transition(mode, record, times - t1 + left)
 
-        def passed() -> Carry:
+        def after_transition() -> Carry:
             run, filled = carry
             left = greatest(t1 - run.end_time, 0.0)
-            mode = selected(modes, numbers, run.mode[0])
-            transition, shown, variations = mode.left_behind(run.state, left, seen)
+            mode = mode_numbered(modes, numbers, run.mode[0])
+            transition, shown, variations = mode.reset_with_path(run.state, left, rows_on_path)
             after = after_reset(jnp, run, transition, t1)
             if shown is not None:
                 inside = (times > run.end_time) & (times <= after.end_time)
@@ -228,12 +227,12 @@ def _followed(
             grazed = jnp.where(grazes, jnp.minimum(filled.grazed, run.end_time[0]), filled.grazed)
             return after, filled._replace(grazed=grazed)
 
-        return jax.lax.cond(lost[0], passed, lambda: carry)
+        return jax.lax.cond(lost[0], after_transition, lambda: carry)
 
-    return traced_rounds((at_start(jnp, first, state, 1, counters + 1), empty), alike(modes), solve, reset)
+    return traced_rounds((at_start(jnp, first, state, 1, counters + 1), empty), program_groups(modes), solve, reset)
 
 
-def alike(modes: tuple[AbstractBatchedMode, ...]) -> list[tuple[int, ...]]:
+def program_groups(modes: tuple[AbstractBatchedMode, ...]) -> list[tuple[int, ...]]:
     """The indices of the modes, in groups. The modes of a group differ only in the values of their arrays, so they
     share a program."""
     groups: list[list[int]] = []
@@ -252,8 +251,8 @@ def _shape(mode: AbstractBatchedMode) -> Any:
     return jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)) if eqx.is_array(leaf) else leaf, mode)
 
 
-def selected(modes: tuple[VariationalMode, ...], numbers: Sequence[int], at: Array) -> VariationalMode:
-    """The mode numbered `at` in a group of modes that are `alike`."""
+def mode_numbered(modes: tuple[VariationalMode, ...], numbers: Sequence[int], at: Array) -> VariationalMode:
+    """The mode numbered `at` in one of the `program_groups`."""
     mode = modes[numbers[0]]
     for number in numbers[1:]:
 
@@ -264,7 +263,7 @@ def selected(modes: tuple[VariationalMode, ...], numbers: Sequence[int], at: Arr
     return mode
 
 
-def _on_the_way(
+def _rows_in_transition(
     mode: AbstractBatchedMode, record: TransitionPath, since: Float[Array, " times"]
 ) -> Float[Array, "shown times"]:
     """The output rows some times [s] after the end of a mode; meaningless after the last stretch."""
@@ -275,7 +274,7 @@ def _on_the_way(
     return mode.between(motions, jnp.where(jnp.isfinite(began), since - began, 0.0))
 
 
-def _found(
+def _as_samples(
     ended: HybridOutcome[Array], filled: Filled, times: Float[Array, " times"], size: int, count: int
 ) -> tuple[HybridSamples, list[HybridSamples]]:
     """The samples, and their derivative along each tangent."""

@@ -66,4 +66,3 @@ from .sampling import Draws as Draws
 from .sampling import sample as sample
 from .unknown import Free as Free
 from .verdict import FitWarning as FitWarning
-from .verdict import Verdict as Verdict

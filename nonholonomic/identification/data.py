@@ -18,7 +18,7 @@ EACH = "data[*]."
 
 
 def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], Int[np.ndarray, " n"]]:
-    """The joined measurements of several sets of data, their labels, and a mask of the predictions that were measured.
+    """The joined measurements of several sets of data, their labels, and the indices of the predictions that were measured.
 
     **Arguments:** `data`: sets of data, each with the attributes `measurements`, `labels`, `seen`, and `size` (the
     number of its predictions).

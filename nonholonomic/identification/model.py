@@ -1,4 +1,4 @@
-"""What fits of tops, strollers and users' systems share: sets of data, their predictions, and the search.
+"""Common parts of the fits of tops, strollers and users' systems: sets of data, their predictions, and the search.
 
 Each of these fits adds the names of its parameters and the prediction of a set of data.
 """
@@ -23,7 +23,7 @@ Values = dict[str, Float[Array, " rows"]]
 class AbstractDataModel(eqx.Module):
     """Predictions of several sets of data, in the form that `identify` expects.
 
-    `seen`: mask of the predictions that were measured.
+    `seen`: indices of the predictions that were measured.
 
     **Example:** the predictions of the subpackage's example.
 
@@ -100,7 +100,7 @@ def fit_data(
 ) -> Identification:
     """Fit a model to sets of data.
 
-    **Arguments:** `build`: function from the mask of measured predictions to the model; `search`: `search_options`; the
+    **Arguments:** `build`: function from the indices of measured predictions to the model; `search`: `search_options`; the
     others as for `identify`.
 
     **Returns:** an `Identification`.

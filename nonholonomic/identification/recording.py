@@ -153,7 +153,7 @@ class AbstractRecording(eqx.Module):
 
     @property
     def seen(self) -> np.ndarray:
-        """Mask of the samples that are not missing, ordered by time."""
+        """Indices of the samples that are not missing, ordered by time."""
         return np.flatnonzero(~np.isnan(np.asarray(self.value).reshape(-1)))
 
     @property

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from ..parameters import full_name, text_as_html
 from ..progress import status_line
 from ..validation import require_package
+from ..views import draw_fit
 from .levenberg_marquardt import minimise
 from .likelihood import Measurements
 from .problem import Linearised, Problem, linearise
@@ -193,8 +194,6 @@ class Identification:
         **Returns:** a matplotlib figure.
         """
         require_package("matplotlib", "plot", "plot")
-        from ..views import draw_fit
-
         return draw_fit(self)
 
     def _place(self, name: str) -> int:

@@ -137,10 +137,10 @@ def legal_run(
     >>> print(legal, t1, tolerance)
     False 0.0 0.01
     """
-    may = jnp.asarray(others) & legal(run_bounds(t1, tolerance))
+    is_legal = jnp.asarray(others) & legal(run_bounds(t1, tolerance))
     if times is not None:
-        may = jnp.all(may & jnp.all(legal(times_bounds(times, t1)))) & jnp.all(jnp.diff(times) > 0.0)
-    return may, jnp.where(may, t1, 0.0), jnp.where(may, tolerance, LOOSEST)
+        is_legal = jnp.all(is_legal & jnp.all(legal(times_bounds(times, t1)))) & jnp.all(jnp.diff(times) > 0.0)
+    return is_legal, jnp.where(is_legal, t1, 0.0), jnp.where(is_legal, tolerance, LOOSEST)
 
 
 def require_run(scene: Any, launch: Any, t1: Any, tolerance: Any, kinds: tuple[type, type], lists: str) -> None:

@@ -30,4 +30,3 @@ from .table import Table as Table
 from .tabular import Quantity as Quantity
 from .tabular import Tabular as Tabular
 from .tabular import run_table as run_table
-from .tasks import versions as versions

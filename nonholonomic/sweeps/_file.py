@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..integration import FORMER_WORDS
+from ..integration.status import FORMER_WORDS
 from .layout import PENDING, UNREACHED, Layout, Values, boxes
 
 if TYPE_CHECKING:

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..parameters import as_html, readable_unit
 from ..validation import as_path, require_package
+from ..views import draw_table
 from ._chunks import unfinished
 from ._file import HELD, LONG_NAMES, Stored, StoredVariables, coded, replacing, write_file
 from .digits import concise_strings
@@ -258,8 +259,6 @@ class Table(eqx.Module):
         **Raises:** `ValueError` for a variable that is not numeric, an unknown axis, or a table of one cell.
         """
         require_package("matplotlib", "plot", "plot")
-        from ..views import draw_table
-
         if not isinstance(at, dict | None):
             raise ValueError(f"at = {at!r} must be a dictionary, name of an axis -> its value")
         return draw_table(self, variable, at or {}, log, ax)

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from ..parameters import likely, readable_unit, text_as_html
 from ..validation import require_package
+from ..views import draw_portrait
 from .layout import Values
 from .table import Table
 from .tasks import versions
@@ -136,8 +137,6 @@ class Tabular(abc.ABC):
         **Raises:** `ValueError` for an unknown variable.
         """
         require_package("matplotlib", "plot", "portrait")
-        from ..views import draw_portrait
-
         across, up = self.portrait_axes
         return draw_portrait(self.to_table(), across if x is None else x, up if y is None else y, ax)
 

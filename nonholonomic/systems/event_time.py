@@ -148,14 +148,14 @@ class SmoothEvent(AbstractDifferentiableSolve):
         """
         *_, t1, tolerance = leaves
         finite = jnp.isfinite(jnp.asarray(sum(self.of_leaves(leaves).start)))
-        may, t1, tolerance = legal_run(finite, t1, tolerance)
-        return may, t1, self.settings.with_tolerance(jnp.min(tolerance))
+        is_legal, t1, tolerance = legal_run(finite, t1, tolerance)
+        return is_legal, t1, self.settings.with_tolerance(jnp.min(tolerance))
 
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
-        may, t1, settings = self.permitted(leaves)
+        is_legal, t1, settings = self.permitted(leaves)
         problem = self.of_leaves(leaves).problem(cells)
         outcome, _ = traced_solve_ensemble(problem, t1, jnp.asarray(cells), settings, one_kernel=True)
-        return _named(may, outcome)
+        return _named(is_legal, outcome)
 
     def value_and_tangents(
         self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
@@ -163,12 +163,12 @@ class SmoothEvent(AbstractDifferentiableSolve):
         def build(movable: tuple[Array, ...], cells: int | None) -> Any:
             return self.of_leaves((*movable, *leaves[self.movable :])).problem(cells)
 
-        may, t1, settings = self.permitted(leaves)
+        is_legal, t1, settings = self.permitted(leaves)
         problem, tangents, gather = tangents_by(build, active, leaves[: self.movable], cells)
         outcome, slopes = traced_solve_ensemble_with_tangents(
             problem, tangents, t1, jnp.asarray(cells), settings, one_kernel=not nested
         )
-        time = _named(may, outcome)
+        time = _named(is_legal, outcome)
         return time, [jnp.where(jnp.isinf(time), 0.0, slope + 0.0 * time) for slope in gather(slopes)]
 
 
@@ -176,9 +176,9 @@ class HybridEvent(SmoothEvent):
     """Event times of cells whose runs have resets."""
 
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
-        may, t1, settings = self.permitted(leaves)
+        is_legal, t1, settings = self.permitted(leaves)
         modes, first, states = self.of_leaves(leaves).modes(cells)
-        return _named(may, traced_solve_hybrid(modes, first, states, t1, cells, settings, counters=1))
+        return _named(is_legal, traced_solve_hybrid(modes, first, states, t1, cells, settings, counters=1))
 
     def value_and_tangents(
         self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
@@ -192,19 +192,19 @@ class HybridEvent(SmoothEvent):
             assert cells is not None
             return self.of_leaves((*movable, *leaves[self.movable :])).modes(cells)
 
-        may, t1, settings = self.permitted(leaves)
+        is_legal, t1, settings = self.permitted(leaves)
         (modes, first, states), tangents, gather = tangents_by(build, active, leaves[: self.movable], cells)
 
         moved = tuple((tangent[0], tangent[2]) for tangent in tangents)
         outcome, sensitivities = traced_solve_hybrid_with_tangents(
             modes, moved, first, states, t1, cells, settings, counters=1
         )
-        time = _named(may, outcome)
+        time = _named(is_legal, outcome)
         return time, [jnp.where(jnp.isinf(time), 0.0, slope + 0.0 * time) for slope in gather([*sensitivities.slopes])]
 
 
-def _named(may: Bool[Array, "..."], ended: Outcome | HybridOutcome) -> Float[Array, " cells"]:
+def _named(is_legal: Bool[Array, "..."], ended: Outcome | HybridOutcome) -> Float[Array, " cells"]:
     """The event times: infinite if there is no event, NaN if the run could not be finished."""
     time = jnp.where(ended.status == CROSSED, ended.crossing_time, jnp.inf)
     failed = (ended.status == FAILED) | (ended.status == UNRESOLVED)
-    return jnp.where(may & ~failed, time, jnp.nan)
+    return jnp.where(is_legal & ~failed, time, jnp.nan)

@@ -90,8 +90,8 @@ def _sampled(
 ) -> Trajectory:
     """The run, or NaN and "failed" if a traced number is out of range."""
     cells = run.cells
-    may, horizon, tolerance = legal_run(True, t1, settings.tolerance, times)
-    settings, at = settings.with_tolerance(tolerance), jnp.where(may, times, 0.0)
+    is_legal, horizon, tolerance = legal_run(True, t1, settings.tolerance, times)
+    settings, at = settings.with_tolerance(tolerance), jnp.where(is_legal, times, 0.0)
     if cells.form.traits.smooth:
         samples = sampled_run(_problem, cells, at, horizon, settings)
         states, reached = samples.states, jnp.all(jnp.isfinite(samples.states), axis=1)
@@ -105,16 +105,16 @@ def _sampled(
             samples.counts[0],
         )
         status, steps = samples.status, samples.steps
-    states = jax.vmap(run.shown)(nan_unless(may, states))
+    states = jax.vmap(run.shown)(nan_unless(is_legal, states))
     return Trajectory(
         t=times,
         state=states,
         mode=mode.astype(int),
-        end_time=nan_unless(may, samples.end_time),
+        end_time=nan_unless(is_legal, samples.end_time),
         switches=switches.astype(int),
         steps=steps.astype(int),
         rejected=samples.rejected.astype(int),
-        code=jnp.where(may, status, FAILED).astype(int),
+        code=jnp.where(is_legal, status, FAILED).astype(int),
         names=run.names,
     )
 

@@ -1,4 +1,5 @@
-"""Pictures, animations and pages of the results of other subpackages. No computation needs this subpackage."""
+"""Pictures, animations and pages of results. The subpackages above compute the results, and use these functions to draw
+them."""
 
 from .arena import arena as arena
 from .fit import draw_fit as draw_fit
@@ -11,15 +12,11 @@ from .meshes import wheel as wheel
 from .page import NO_VIEW as NO_VIEW
 from .page import Page as Page
 from .page import can_view as can_view
-from .page import data_script as data_script
-from .page import json_script as json_script
 from .page import page as page
 from .page import picture_as_html as picture_as_html
-from .page import script as script
 from .page import table_as_html as table_as_html
 from .plot import draw_portrait as draw_portrait
 from .plot import draw_table as draw_table
-from .plot import new_figure as new_figure
 from .stage import COLOURS as COLOURS
 from .stage import DARK as DARK
 from .stage import PALE as PALE

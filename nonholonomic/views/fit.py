@@ -1,17 +1,39 @@
 """The picture of a fit: data and model, residuals, profile likelihoods and correlations (needs matplotlib)."""
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from ..identification import Identification
 
 #: Greatest number of drawn profiles, and the rise of -2 log likelihood at the end of a 95 % interval.
 MOST_PROFILES, INTERVAL = 6, 3.84
 
 
-def draw_fit(fit: "Identification") -> Any:
+class Fit(Protocol):
+    """The parts of an `identification.Identification` that its picture shows."""
+
+    @property
+    def estimates(self) -> Mapping[str, float]: ...
+
+    @property
+    def standard_errors(self) -> Mapping[str, float]: ...
+
+    @property
+    def measurements(self) -> Any: ...
+
+    @property
+    def residuals(self) -> Sequence[Any]: ...
+
+    @property
+    def correlation(self) -> np.ndarray: ...
+
+    @property
+    def verdict(self) -> Any: ...
+
+    def profile(self, name: str) -> Any: ...
+
+
+def draw_fit(fit: Fit) -> Any:
     """Draw a fit: measurements and predictions, residuals in units of the errors, profile likelihoods of the determined
     parameters (with their parabolas dashed), and correlations.
 
@@ -29,23 +51,23 @@ def draw_fit(fit: "Identification") -> Any:
     for k, name in enumerate(profiled):
         _draw_profile(fit, name, figure.add_subplot(grid[2, k]))
     _draw_correlation(fit, names, figure.add_subplot(grid[2, lower - 1]))
-    figure.suptitle("; ".join(fit.verdict.concerns) or "nothing speaks against this fit", fontsize=9, wrap=True)
+    figure.suptitle("; ".join(fit.verdict.concerns) or "no concerns about this fit", fontsize=9, wrap=True)
     return figure
 
 
-def _series(fit: "Identification") -> list[np.ndarray]:
+def _series(fit: Fit) -> list[np.ndarray]:
     """The indices of the measurements of each series."""
     numbers = np.asarray(fit.measurements.series)
     return [np.flatnonzero(numbers == number) for number in np.unique(numbers)]
 
 
-def _abscissa(fit: "Identification") -> tuple[np.ndarray, str]:
+def _abscissa(fit: Fit) -> tuple[np.ndarray, str]:
     """The abscissa of every measurement: its time, if it has one."""
     times = np.asarray(fit.measurements.time)
     return (times, "time since the first sample [s]") if np.any(times) else (np.arange(len(times)), "measurement")
 
 
-def _draw_data(fit: "Identification", axes: Any) -> None:
+def _draw_data(fit: Fit, axes: Any) -> None:
     places, label = _abscissa(fit)
     rows = fit.residuals
     value = np.array([row.value if np.isfinite(row.value) else row.upper for row in rows])
@@ -64,7 +86,7 @@ def _draw_data(fit: "Identification", axes: Any) -> None:
     axes.legend(fontsize=8)
 
 
-def _draw_residuals(fit: "Identification", axes: Any) -> None:
+def _draw_residuals(fit: Fit, axes: Any) -> None:
     places, label = _abscissa(fit)
     residual = np.array([row.residual for row in fit.residuals])
     for k, indices in enumerate(_series(fit)):
@@ -74,7 +96,7 @@ def _draw_residuals(fit: "Identification", axes: Any) -> None:
     axes.set_ylabel("residual / error")
 
 
-def _draw_profile(fit: "Identification", name: str, axes: Any) -> None:
+def _draw_profile(fit: Fit, name: str, axes: Any) -> None:
     profile = fit.profile(name)
     deviations = (profile.values - fit.estimates[name]) / fit.standard_errors[name]
     axes.plot(profile.values, profile.deviance, ".-")
@@ -85,7 +107,7 @@ def _draw_profile(fit: "Identification", name: str, axes: Any) -> None:
     axes.set_ylabel("-2 log likelihood, profiled")
 
 
-def _draw_correlation(fit: "Identification", names: list[str], axes: Any) -> None:
+def _draw_correlation(fit: Fit, names: list[str], axes: Any) -> None:
     image = axes.imshow(fit.correlation, vmin=-1.0, vmax=1.0, cmap="RdBu")
     short = [name.rsplit(".", 1)[-1] for name in names]
     axes.set_xticks(range(len(names)), short, rotation=90, fontsize=8)

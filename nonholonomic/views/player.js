@@ -1,4 +1,4 @@
-// Plays runs on stages: unpacks what Python wrote, sets poses for a time, and has the controls of time and camera.
+// The player: unpacks the data from Python, sets the poses at a time, and contains the controls of time and camera.
 "use strict";
 window.views = window.views || {};
 (() => {
@@ -6,7 +6,7 @@ window.views = window.views || {};
   const bytes = (coded) => Uint8Array.from(atob(coded), (letter) => letter.charCodeAt(0));
   const inflated = (coded) => new Response(new Blob([bytes(coded)]).stream().pipeThrough(new DecompressionStream("deflate")));
 
-  // Floats came byte plane by byte plane, whole numbers as differences: both are shorter so when deflated.
+  // Floats are stored byte plane by byte plane, and whole numbers as differences, because both then compress better.
   async function arrays() {
     const planes = new Uint8Array(await (await inflated(text("floats"))).arrayBuffer()), count = planes.length / 4;
     const joined = new Uint8Array(planes.length);
@@ -31,7 +31,7 @@ window.views = window.views || {};
         ...run,
         times: floats(run.times),
         normal: floats(run.normal),
-        bodies: run.bodies.map((one) => ({ ...one, position: floats(one.position), turning: floats(one.turning), meshes: one.meshes.map(mesh) })),
+        bodies: run.bodies.map((one) => ({ ...one, position: floats(one.position), orientation: floats(one.orientation), meshes: one.meshes.map(mesh) })),
         traces: run.traces.map((one) => ({ ...one, points: floats(one.points), about: one.about && floats(one.about) })),
         arrows: run.arrows.map((one) => ({ ...one, start: floats(one.start), vector: floats(one.vector) })),
         curves: run.curves.map((one) => ({ ...one, values: floats(one.values) })),
@@ -41,7 +41,7 @@ window.views = window.views || {};
 
   const point = (values, [k, part]) =>
     [0, 1, 2].map((c) => (values.length > 3 ? (1 - part) * values[3 * k + c] + part * values[3 * k + 3 + c] : values[c]));
-  function turning(values, [k, part]) {
+  function orientation(values, [k, part]) {
     const a = values.subarray(4 * k, 4 * k + 4), b = values.length > 4 ? values.subarray(4 * k + 4, 4 * k + 8) : a;
     let cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3];
     const sign = cosine < 0 ? -1 : 1;
@@ -98,7 +98,7 @@ window.views = window.views || {};
         toggle(one, shown);
         return element("span", one);
       };
-      // Traces of several runs have the runs' colours, which are told beside their names.
+      // Traces of several runs have the colours of the runs, which the caption explains beside the names of the runs.
       fact.runs[0].traces.forEach((trace, k) => chip("traces", fact.runs.length > 1 ? { ...trace, colour: "#6b7280" } : trace, k));
       stage.values = fact.runs[0].arrows.map((arrow, k) => chip("arrows", arrow, k));
       return stage;
@@ -136,10 +136,10 @@ window.views = window.views || {};
         act();
       });
     }
-    // A picture further at the speed chosen.
+    // Time between two frames at the selected speed.
     frame() { return Number(this.speeds.value) / 25; }
 
-    // Replace what is shown of a run: arrays as Python writes them; those left out stay.
+    // Replace the displayed data of a run by arrays in the form that Python writes; omitted arrays do not change.
     setRun(s, r, run) {
       const stage = this.stages[s], fact = stage.fact.runs[r];
       const merged = (name) => run[name] && run[name].forEach((one, k) => Object.assign(fact[name][k], one));
@@ -154,7 +154,7 @@ window.views = window.views || {};
     show(stage, r, time) {
       const run = stage.fact.runs[r], at = views.place(run.times, time), count = at[0] + at[1];
       stage.setNormal(r, point(run.normal, at));
-      run.bodies.forEach((body, k) => stage.setPose(r, k, point(body.position, at), turning(body.turning, at)));
+      run.bodies.forEach((body, k) => stage.setPose(r, k, point(body.position, at), orientation(body.orientation, at)));
       run.traces.forEach((trace, k) => stage.setTrace(r, k, Math.round(count), trace.about && point(trace.about, at)));
       run.arrows.forEach((arrow, k) => stage.setArrow(r, k, point(arrow.start, at), point(arrow.vector, at)));
       return point(run.bodies[0].position, at);
@@ -204,7 +204,7 @@ window.views = window.views || {};
       };
       requestAnimationFrame(round);
     }
-    // Play once, as soon as the stages are seen, for those who have not asked for less motion.
+    // Play once when the stages become visible, unless the reader's system requests reduced motion.
     autoplay() {
       if (matchMedia("(prefers-reduced-motion: reduce)").matches) return;
       const watch = new IntersectionObserver((entries) => {

@@ -2,14 +2,12 @@
 
 import functools
 import io
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any, Protocol
 
 import numpy as np
 
 from ..parameters import likely, readable_unit
-
-if TYPE_CHECKING:
-    from ..sweeps import Table
 
 #: Colours of map cells without a finite value, one for each status.
 GREYS = ("0.85", "0.7", "0.55", "0.4", "0.25")
@@ -19,6 +17,34 @@ QUANTILES = (0.02, 0.98)
 
 #: An axis with at most this many values is drawn as one line per value.
 MOST_LINES = 8
+
+
+class Labelled(Protocol):
+    """The parts of a `sweeps.Table` that its plots use."""
+
+    @property
+    def coords(self) -> Mapping[str, np.ndarray]: ...
+
+    @property
+    def variables(self) -> Mapping[str, np.ndarray]: ...
+
+    @property
+    def units(self) -> Mapping[str, str]: ...
+
+    @property
+    def inner(self) -> Mapping[str, tuple[str, ...]]: ...
+
+    @property
+    def long_names(self) -> Mapping[str, str]: ...
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+
+    def __getitem__(self, name: str) -> np.ndarray: ...
+
+    def dims(self, variable: str) -> tuple[str, ...]: ...
+
+    def label(self, name: str) -> str: ...
 
 
 @functools.cache
@@ -50,7 +76,7 @@ def _drawing(ax: Any, *size: float) -> tuple[Any, Any]:
 
 
 def draw_table(
-    table: "Table", variable: str | None = None, at: dict[str, float] | None = None, log: bool = False, ax: Any = None
+    table: Labelled, variable: str | None = None, at: dict[str, float] | None = None, log: bool = False, ax: Any = None
 ) -> Any:
     """Draw a variable over the grid of a table: lines over the first axis, or a map of the first two.
 
@@ -92,14 +118,14 @@ def draw_table(
     return drawing if figure is None else figure
 
 
-def _first_number(table: "Table") -> str:
+def _first_number(table: Labelled) -> str:
     names = [name for name, values in table.variables.items() if values.dtype.kind != "U"]
     if not names:
         raise ValueError("the table has no numeric variable to draw")
     return names[0]
 
 
-def _drawn(table: "Table", variable: str, at: dict[str, float]) -> tuple[list[str], dict[str, int]]:
+def _drawn(table: Labelled, variable: str, at: dict[str, float]) -> tuple[list[str], dict[str, int]]:
     """The one or two dimensions to draw over, and the indices at which the others are cut."""
     dims = table.dims(variable)
     cut = {}
@@ -127,14 +153,14 @@ def _slice(values: Any, dims: tuple[str, ...], names: list[str], cut: dict[str, 
     return values[tuple(cut.get(name, slice(None)) for name in dims)].transpose([left.index(name) for name in names])
 
 
-def _cut_text(table: "Table", name: str, place: int) -> str:
+def _cut_text(table: Labelled, name: str, place: int) -> str:
     """A coordinate's value as text: "θ(0) = 0.1 rad"."""
     value = table.coords[name][place]
     text = str(value) if isinstance(value, str) else f"{value:.4g}"
     return f"{table.long_names.get(name, name)} = {text} {readable_unit(table.units.get(name, '1'))}".rstrip()
 
 
-def _draw_lines(drawing: Any, table: "Table", names: list[str], lines: Any) -> None:
+def _draw_lines(drawing: Any, table: Labelled, names: list[str], lines: Any) -> None:
     marker = "o-" if len(lines) <= 100 else "-"
     for column, line in enumerate(lines.T):
         label = _cut_text(table, names[1], column) if len(names) > 1 else None
@@ -143,7 +169,7 @@ def _draw_lines(drawing: Any, table: "Table", names: list[str], lines: Any) -> N
         drawing.legend()
 
 
-def _draw_map(drawing: Any, table: "Table", names: list[str], shown: Any, label: str, log: bool) -> None:
+def _draw_map(drawing: Any, table: Labelled, names: list[str], shown: Any, label: str, log: bool) -> None:
     from matplotlib.colors import LogNorm, Normalize
 
     known = shown[np.isfinite(shown) & (shown > 0.0)] if log else shown[np.isfinite(shown)]
@@ -166,7 +192,7 @@ def _plain_numbers(axis: Any) -> None:
         axis.set_minor_formatter("{x:g}" if high < 10.0 * low else "")
 
 
-def _mark_words(drawing: Any, table: "Table", names: list[str], words: Any) -> None:
+def _mark_words(drawing: Any, table: Labelled, names: list[str], words: Any) -> None:
     """Paint cells without a value in the grey of their status."""
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
@@ -182,7 +208,7 @@ def _mark_words(drawing: Any, table: "Table", names: list[str], words: Any) -> N
         drawing.legend(handles=patches, loc="upper right")
 
 
-def draw_portrait(table: "Table", x: str, y: str, ax: Any = None) -> Any:
+def draw_portrait(table: Labelled, x: str, y: str, ax: Any = None) -> Any:
     """Draw one variable of a run's table against another, with a dot at the start.
 
     **Arguments:**
@@ -207,7 +233,7 @@ def draw_portrait(table: "Table", x: str, y: str, ax: Any = None) -> Any:
     return drawing if figure is None else figure
 
 
-def _column(table: "Table", argument: str, name: str) -> tuple[Any, str]:
+def _column(table: Labelled, argument: str, name: str) -> tuple[Any, str]:
     """A variable, or one of its components, with its label."""
     variable, _, component = name.partition(".")
     dims = table.inner.get(variable, ())

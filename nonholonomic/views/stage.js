@@ -1,15 +1,15 @@
-// One stage: an arena and bodies in three dimensions, drawn by three.js. It knows poses, not times; player.js sets them.
+// One stage: an arena and bodies in three dimensions, drawn by three.js. It knows poses, not times; player.js sets the poses.
 "use strict";
 window.views = window.views || {};
 (() => {
   const { sqrt, cos, max, min, hypot } = Math;
-  //: Corners whose normals differ by less are drawn as a smooth surface [cosine].
+  //: Faces are drawn as one smooth surface if the cosine of the angle between their normals is above this.
   const CREASE = cos(0.8);
-  //: Least height of the camera over the tangent plane, over its distance: it cannot look from under the floor.
+  //: Least height of the camera above the tangent plane, divided by its distance, so that it cannot look from below.
   const LOWEST = 0.06;
   const element = (kind, parent, properties = {}) => parent.appendChild(Object.assign(document.createElement(kind), properties));
 
-  // Meshes of one body as corners with normals: those of the triangles around a corner, averaged where no edge is sharp.
+  // The meshes of one body as corners with normals, averaged over the triangles around a corner except at sharp edges.
   function creased(meshes) {
     const faces = new Map(), parts = [];
     for (const { vertices, triangles } of meshes) {
@@ -45,7 +45,7 @@ window.views = window.views || {};
   }
 
   class Stage {
-    // `fact`: what Python wrote of a stage, its arrays unpacked; `box`: an element that it fills.
+    // `fact`: the data of a stage from Python, with unpacked arrays; `box`: the element that the stage fills.
     constructor(THREE, box, fact) {
       Object.assign(this, { THREE, box, fact, size: fact.size, focus: null, span: 1 });
       this.renderer = new THREE.WebGLRenderer({ antialias: true });
@@ -92,7 +92,7 @@ window.views = window.views || {};
       if (normals) geometry.setAttribute("normal", new THREE.BufferAttribute(normals, 3));
       return geometry;
     }
-    // Drawn from the side of the room only, so that a wall between camera and body hides nothing.
+    // Draw only the front of the surface, so that a wall between camera and body hides nothing.
     arena({ vertices, triangles, colour, lines }) {
       const { THREE } = this, geometry = this.geometry({ positions: vertices });
       geometry.setIndex(new THREE.BufferAttribute(triangles, 1));
@@ -140,7 +140,7 @@ window.views = window.views || {};
       trace.line.geometry = new this.THREE.LineGeometry();
       trace.line.geometry.setPositions(points.length > 3 ? points : [...points, ...points]);
     }
-    // A shaft one unit long, which is scaled, and a tip; what is seen through the body has a ball where it starts.
+    // A shaft of length one, which is scaled, and a tip; an arrow that is visible through the body has a ball at its start.
     arrow({ colour, width, through, unit, scale, limit, shown }) {
       const { THREE, scene } = this, group = new THREE.Group(), head = 5 * width;
       const material = new THREE.MeshPhongMaterial({ color: colour, specular: 0, depthTest: !through, transparent: through });
@@ -159,7 +159,7 @@ window.views = window.views || {};
       return { group, shaft, tip, head, unit, scale, limit: limit ?? Infinity, label, shown, size: 0 };
     }
 
-    // Setters: what a player, or a live simulation, calls.
+    // Setters, for the player or a live simulation.
     setPose(run, body, position, quaternion) {
       const group = this.runs[run].bodies[body];
       group.position.set(...position);
@@ -185,10 +185,10 @@ window.views = window.views || {};
       arrow.length = length;
     }
     setNormal(run, normal) { this.runs[run].normal = normal; }
-    // Of all runs: `kind` is "arrows" or "traces".
+    // Show or hide an item of all runs; `kind` is "arrows" or "traces".
     show(kind, number, shown) { for (const run of this.runs) run[kind][number].shown = shown; }
 
-    // Where the bodies are, and how far apart; a camera that follows keeps its place relative to them.
+    // Point the camera at the bodies; a camera that follows keeps its position relative to them.
     look(points, follow) {
       const focus = [0, 1, 2].map((c) => points.reduce((sum, point) => sum + point[c], 0) / points.length);
       const apart = max(...points.map((point) => hypot(...point.map((x, c) => x - focus[c]))));
@@ -205,7 +205,7 @@ window.views = window.views || {};
       if (wanted > 1.2 * this.reach || wanted < 0.6 * this.reach) this.shadowOver(wanted);
       const near = this.runs.map((run) => run.bodies[0].position).every((place, k, all) => place.distanceTo(all[0]) < this.size);
       this.runs.forEach(({ bodies }, k) => bodies.forEach((group) => group.children.forEach(({ material }) => {
-        // Bodies in one place are told apart: all but the first are seen through.
+        // To distinguish bodies at the same place, make all but the first transparent.
         Object.assign(material, { transparent: k > 0 && near, opacity: k > 0 && near ? 0.5 : 1 });
       })));
     }
@@ -216,7 +216,7 @@ window.views = window.views || {};
       if (this.focus) this.recentre();
       this.controls.update();
     }
-    // The first view's direction and distance, about the place where the bodies are now.
+    // Return to the direction and distance of the first view, about the present place of the bodies.
     recentre() {
       const [place, target] = this.fact.camera;
       if (!this.fact.follow) return;
@@ -226,26 +226,26 @@ window.views = window.views || {};
     }
     fromAbove() {
       const { camera, controls } = this, distance = camera.position.distanceTo(controls.target), normal = this.runs[0].normal;
-      // Not along `up` itself, where the camera could turn either way.
+      // Not exactly along `up`, where the rotation of the camera is undetermined.
       const tilted = new this.THREE.Vector3(...normal).add(new this.THREE.Vector3(0, -0.02, 0)).normalize();
       camera.position.copy(controls.target).addScaledVector(tilted, distance);
       controls.update();
       this.render();
     }
 
-    // Fit the picture to its box. Until lines know how many pixels there are, each is as wide as the picture.
+    // Fit the picture to its box. Lines need the number of pixels; without it, each line is as wide as the picture.
     fit() {
       const { clientWidth: width, clientHeight: height } = this.box;
       if (!width || !height) return false;
       this.renderer.setSize(width, height);
       for (const { traces } of this.runs) for (const { line } of traces) line.material.resolution.set(width, height);
       this.camera.aspect = width / height;
-      // In a narrow picture as much is seen across as is seen up and down in a square one.
+      // A narrow picture shows as much horizontally as a square picture shows vertically.
       this.camera.fov = 2 * Math.atan(Math.tan((this.fact.angle * Math.PI) / 360) / min(1, this.camera.aspect)) * 180 / Math.PI;
       this.camera.updateProjectionMatrix();
       return true;
     }
-    // Keep the camera over the floor on which the first body is.
+    // Keep the camera above the floor below the first body.
     aboveTheFloor() {
       if (!this.focus) return;
       const { camera, controls } = this, normal = new this.THREE.Vector3(...this.runs[0].normal);
@@ -269,7 +269,7 @@ window.views = window.views || {};
       this.renderer.render(scene, camera);
       this.write();
     }
-    // Names of bodies, and the forces' newtons, where they are on the screen.
+    // Write the names of bodies, and the sizes of forces in newtons, at their places on the screen.
     write() {
       const { camera, box, THREE } = this, width = box.clientWidth, height = box.clientHeight;
       const onScreen = (point) => {
@@ -293,7 +293,7 @@ window.views = window.views || {};
         }
       });
     }
-    // The matrix of a body in the scene, column after column.
+    // The matrix of a body in the scene, column by column.
     matrix(run, body) {
       const group = this.runs[run].bodies[body];
       group.updateMatrixWorld(true);

@@ -25,7 +25,7 @@ class Body(NamedTuple):
 
     name: str
     position: Points
-    turning: Float[np.ndarray, "times 4"]
+    orientation: Float[np.ndarray, "times 4"]
     meshes: tuple[Mesh, ...]
 
 
@@ -158,9 +158,9 @@ def turned(rotation: Float[np.ndarray, "times 3 3"]) -> Float[np.ndarray, "times
     return axis / np.linalg.norm(axis, axis=-1, keepdims=True)
 
 
-def matrices(turning: Float[np.ndarray, "times 4"]) -> Float[np.ndarray, "times 3 3"]:
+def matrices(orientation: Float[np.ndarray, "times 4"]) -> Float[np.ndarray, "times 3 3"]:
     """Rotation matrices of quaternions (x, y, z, w)."""
-    x, y, z, w = turning.T
+    x, y, z, w = orientation.T
     rows = (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
         (2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)),

@@ -5,7 +5,7 @@ window.views = window.views || {};
   const digits = (v, count = 4) =>
     v === 0 ? "0" : Math.abs(v) < 1e-3 || Math.abs(v) >= 1e5 ? v.toExponential(2) : v.toPrecision(count);
 
-  // Where a time lies among the times of a run: the index before it, and how far it is towards the next.
+  // The place of a time among the times of a run: the index before it, and the fraction of the interval after that index.
   function place(times, time) {
     let low = 0, high = times.length - 1;
     if (high < 1 || time <= times[0]) return [0, 0];
@@ -17,7 +17,7 @@ window.views = window.views || {};
     return [low, (time - times[low]) / (times[high] - times[low])];
   }
 
-  // The value there, on the straight line that is drawn, as bodies and arrows are; beside a gap the nearer value.
+  // The value at a place, interpolated linearly like bodies and arrows; beside a gap, the nearer value.
   function valueAt(values, [k, part]) {
     const before = values[k], after = values[Math.min(k + 1, values.length - 1)], v = (1 - part) * before + part * after;
     return Number.isFinite(v) ? v : part < 0.5 ? before : after;
@@ -26,7 +26,7 @@ window.views = window.views || {};
   const LEFT = 58, FOOT = 4;
 
   class Strips {
-    // `runs()`: those with their `times`, `colour` and `curves`; `seek(time)`: called where somebody points and clicks.
+    // `runs()`: returns the runs, with `times`, `colour` and `curves`; `seek(time)`: called when the reader clicks at a time.
     constructor(parent, runs, seek) {
       Object.assign(this, { runs, seek, now: 0, pointed: null });
       const labels = [...new Set(runs().flatMap((run) => run.curves.map((curve) => curve.label)))];
@@ -49,7 +49,7 @@ window.views = window.views || {};
       this.refresh();
       new ResizeObserver(() => { this.strips.forEach((strip) => { strip.pale = null; }); this.draw(this.now); }).observe(parent);
     }
-    // Read the runs anew: their values or times have changed.
+    // Read the runs again after their values or times have changed.
     refresh() {
       const runs = this.runs();
       this.duration = Math.max(...runs.map((run) => run.times[run.times.length - 1]));
@@ -58,7 +58,7 @@ window.views = window.views || {};
           .map((curve) => ({ times: run.times, values: curve.values, colour: run.colour })));
         let low = Infinity, high = -Infinity;
         for (const curve of strip.curves) for (const v of curve.values) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); }
-        // What is constant but for round-off is drawn as a constant.
+        // Draw values that are constant except for round-off as a constant.
         const least = 1e-3 * Math.max(Math.abs(low), Math.abs(high)) || 1;
         if (!(high - low > least)) { low -= least; high += least; }
         Object.assign(strip, { low, high, pale: null });

@@ -125,8 +125,8 @@ class Dynamics(eqx.Module):
         gauge = 1.0 / jnp.sqrt(self.inertia(d, lead, sine, cosine))
         wheel = P * gauge
         velocity = scale(wheel * cosine, d)
-        turning = surface.normal_rate(r, velocity)
-        normal_force = self.normal_force(n, turning, velocity)
+        normal_rate = surface.normal_rate(r, velocity)
+        normal_force = self.normal_force(n, normal_rate, velocity)
         front_speed = multiply(wheel, lead)
         yaw_rate = front_speed * sine / body.wheelbase
         motion = Motion(
@@ -144,7 +144,7 @@ class Dynamics(eqx.Module):
             momentum=P,
             fork_rate=fork_rate,
             normal=n,
-            normal_rate=turning,
+            normal_rate=normal_rate,
             direction=d,
             velocity=velocity,
             left=scale(side, cross(n, d)),
@@ -156,10 +156,10 @@ class Dynamics(eqx.Module):
             front_load=multiply(normal_force, share),
         )
 
-    def normal_force(self, normal: Vector, turning: Vector, velocity: Vector) -> Component:
+    def normal_force(self, normal: Vector, normal_rate: Vector, velocity: Vector) -> Component:
         """Normal force [N] of the ground, which carries the weight and bends the path."""
         weight = multiply(self.side, self.body.mass * self.gravity, dot(normal, self.up))
-        return subtract(weight, multiply(self.side, self.body.mass, dot(turning, velocity)))
+        return subtract(weight, multiply(self.side, self.body.mass, dot(normal_rate, velocity)))
 
     def forces(self, t: Float[Array, "..."], geometry: Geometry, controls: Input | None) -> Forces:
         """The forces of the input and of friction at a time [s]."""
@@ -197,8 +197,8 @@ class Dynamics(eqx.Module):
         # normal.
         across = cross(g.normal, e)
         swing = multiply(weight, body.centre, self.side, dot(across, self.up))
-        turning = subtract(drag.yaw, add(multiply(self.absolute, torque), swing))
-        pushing = add(multiply(g.cosine, add(forces.drive, drag.rear)), drag.front, multiply(arm, turning))
+        yaw_torque = subtract(drag.yaw, add(multiply(self.absolute, torque), swing))
+        pushing = add(multiply(g.cosine, add(forces.drive, drag.rear)), drag.front, multiply(arm, yaw_torque))
         falling = multiply(weight, g.cosine, dot(g.direction, self.up))
         momentum_rate = multiply(g.gauge, subtract(multiply(g.lead, pushing), falling))
         heading_rate = self.heading.rate(e, g.normal, g.normal_rate, g.motion.yaw_rate, self.side)

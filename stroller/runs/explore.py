@@ -32,10 +32,10 @@ from ..model.input import Input
 from ..model.launch import Launch
 from ..model.scene import DRIVES, Scene
 from .checks import check_run
-from .ride import Ride, RideProblem, RideSpec, Stats, as_module
+from .ride import RideProblem, as_module
 from .simulate import simulate
 from .table import LONG_NAMES, UNITS
-from .trajectory import read_off
+from .trajectory import quantities_of
 from .view import RADIUS, TRACK
 
 Numbers = Float[Array, " numbers"]
@@ -43,6 +43,9 @@ Numbers = Float[Array, " numbers"]
 #: The tolerance in the page, and that of the runs that determine the drawn part of the ground.
 TOLERANCE = 1e-7
 DRAWN = 1e-5
+
+#: The quantities of a ride that the page draws.
+SHOWN = ("position", "direction", "steering", "speed", "front_speed", "energy", "normal_force", "side_force")
 
 #: Greatest number of steps of a run in the page; they take some hundred milliseconds.
 MOST_STEPS_OF_A_PAGE = 50_000
@@ -118,12 +121,13 @@ def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float, input:
         return replaced["scene"], replaced["launch"], replaced.get("input", controls)
 
     def moment(values: Numbers, problem: "RollingRide", lane: LaneState) -> Frame:
-        return frame(*modules(values), problem, lane)
+        scene, _, controls = modules(values)
+        return frame(scene, controls, lane)
 
-    asked = {"outcome": lambda values, problem, lane: outcome(problem, lane)}
+    readings = {"outcome": lambda values, problem, lane: outcome(problem, lane)}
     # On a plane, contact is never lost, so no event is needed.
     watched = not isinstance(roots["scene"].surface, Plane)
-    ride = Simulator(lambda values: RideProblem.of(*modules(values), 1, watched), t1, settings, asked, watched)
+    ride = Simulator(lambda values: RideProblem.of(*modules(values), 1, watched), t1, settings, readings, watched)
     return LiveRun(
         title=f"Stroller on a {type(roots['scene'].surface).__name__.lower()}",
         sliders=knobs,
@@ -198,17 +202,17 @@ def stage(runs: list[dict[str, Any]], t1: float, controls: Any) -> Stage:
     return first._replace(arena=arena(runs[0]["scene"].surface, points, first.arena.normal, 3.0 * length, length))
 
 
-def frame(scene: Scene, launch: Launch, controls: Input | None, problem: RollingRide, lane: LaneState) -> Frame:
+def frame(scene: Scene, controls: Input | None, lane: LaneState) -> Frame:
     """The drawn quantities of a stroller at one time, in the order of `view.show`."""
-    spec = RideSpec.of(Ride(scene, launch, controls, jnp.zeros(()), Settings(TOLERANCE), None))
-    run = read_off(spec, lane.time, lane.state[:-3], Stats(jnp.zeros(()), jnp.zeros(()), jnp.asarray(True)))
-    length, position, heading = scene.body.wheelbase, run.position[0], run.direction[0]
+    arrays = quantities_of(scene, controls, lane.time, lane.state[:-3])
+    drawn = {name: arrays[name][0] for name in SHOWN}
+    length, position, heading = scene.body.wheelbase, drawn["position"], drawn["direction"]
     normal = scene.surface.sign(scene.side, DRIVES) * fixed_normal(scene, position)
     x = heading / jnp.linalg.norm(heading)
     y = jnp.cross(normal, x)
     y = y / jnp.linalg.norm(y)
     z = jnp.cross(x, y)
-    cosine, sine = jnp.cos(run.steering[0]), jnp.sin(run.steering[0])
+    cosine, sine = jnp.cos(drawn["steering"]), jnp.sin(drawn["steering"])
     forward, left = cosine * x + sine * y, cosine * y - sine * x
     radius, half = RADIUS * length, 0.5 * TRACK * length
     axle, front = position + radius * z, position + length * x + radius * z
@@ -224,12 +228,12 @@ def frame(scene: Scene, launch: Launch, controls: Input | None, problem: Rolling
         ),
         traces=((contacts[0], None), (contacts[1], None)),
         arrows=(
-            (axle - 1.4 * half * y, run.normal_force[0] * z),
-            (contacts[0], run.side_force[0, 0] * y),
-            (contacts[1], run.side_force[0, 1] * left),
+            (axle - 1.4 * half * y, drawn["normal_force"] * z),
+            (contacts[0], drawn["side_force"][0] * y),
+            (contacts[1], drawn["side_force"][1] * left),
         ),
-        curves=(run.speed[0], run.steering[0], run.energy[0], run.normal_force[0]),
-        turning_rate=jnp.maximum(jnp.abs(run.speed[0]), jnp.abs(run.front_speed[0])) / radius,
+        curves=(drawn["speed"], drawn["steering"], drawn["energy"], drawn["normal_force"]),
+        turning_rate=jnp.maximum(jnp.abs(drawn["speed"]), jnp.abs(drawn["front_speed"])) / radius,
     )
 
 

@@ -114,16 +114,18 @@ _sampled = eqx.filter_jit(functools.partial(traced_ride, adjoint=None))
 def _legal_or_nan(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None) -> Trajectory:
     """The run, or NaN and `finished` false if a traced number is out of range."""
     starts = ride.scene.may_start(ride.launch, ride.input)
-    may, t1, tolerance = legal_run(starts, ride.t1, ride.settings.tolerance, times)
+    is_legal, t1, tolerance = legal_run(starts, ride.t1, ride.settings.tolerance, times)
     begun, run_times = ride._replace(settings=ride.settings.with_tolerance(tolerance)), times
     if ride.grid is None:
-        begun, run_times = begun._replace(t1=t1), jnp.where(may, times, 0.0)
+        begun, run_times = begun._replace(t1=t1), jnp.where(is_legal, times, 0.0)
     if adjoint is not None:
         # A run with illegal numbers never begins, but Diffrax would differentiate it.
-        begun = begun._replace(**nan_unless(may, {"scene": ride.scene, "launch": ride.launch, "input": ride.input}))
+        begun = begun._replace(
+            **nan_unless(is_legal, {"scene": ride.scene, "launch": ride.launch, "input": ride.input})
+        )
     run = read_off(RideSpec.of(ride), run_times, *traced_ride(begun, run_times, adjoint))
-    stats = run.stats._replace(finished=run.stats.finished & may)
-    return eqx.tree_at(lambda trajectory: (trajectory.t, trajectory.stats), nan_unless(may, run), (times, stats))
+    stats = run.stats._replace(finished=run.stats.finished & is_legal)
+    return eqx.tree_at(lambda trajectory: (trajectory.t, trajectory.stats), nan_unless(is_legal, run), (times, stats))
 
 
 def _evenly_spaced(t1: Float[Array, ""]) -> Float[Array, " times"]:

@@ -202,9 +202,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         ]
         error = float(jnp.max(self.wheelbase_error))
         if error > 0.0:
-            lines.append(
-                f"  wheelbase       relative error of its effect up to {error:.1e}: the ground is curved over its length"
-            )
+            lines.append(f"  wheelbase       relative error up to {error:.1e}, because the ground is curved")
         if np.isfinite(self.contact_lost_at):
             lines.append(f"  contact lost    at {self.contact_lost_at:.6g} s; after that the ground would have to pull")
         if np.isfinite(self.rank_lost_at):
@@ -231,13 +229,13 @@ def side_slip(scene: Scene, rate: State, state: State) -> tuple[Float[Array, "..
 
     g = dynamics.geometry(state)
     velocity = dynamics.unpack(rate)[0]
-    turning = padded(jax.jvp(heading_components, (state,), (rate,))[1])
+    heading_rate = padded(jax.jvp(heading_components, (state,), (rate,))[1])
     if scene.heading == "projected":
         along, left = g.motion.heading, (-g.motion.heading[1], g.motion.heading[0], None)
     else:
         along, left = g.direction, g.left
     sideways = sum_vectors(scale(-g.sine, along), scale(g.cosine, left))
-    front = sum_vectors(velocity, scale(multiply(body.wheelbase, dot(turning, left)), left))
+    front = sum_vectors(velocity, scale(multiply(body.wheelbase, dot(heading_rate, left)), left))
     return dot(velocity, left), dot(front, sideways)
 
 
@@ -262,7 +260,14 @@ def read_off(
     stats: Stats,
 ) -> Trajectory:
     """The trajectory of the given states at the given times."""
-    scene, controls = spec.ride.scene, spec.ride.input
+    arrays = quantities_of(spec.ride.scene, spec.ride.input, t, states)
+    return Trajectory(**arrays, stats=stats, spec=spec, steps=None)
+
+
+def quantities_of(
+    scene: Scene, controls: Input | None, t: Float[Array, " times"], states: Float[Array, "components times"]
+) -> dict[str, Any]:
+    """The quantities of a `Trajectory`, by name, of the given states at the given times."""
     dynamics, surface = scene.dynamics, scene.surface
     integrated, states = states, scene.dynamics.righted(states)
     g = dynamics.geometry(states)
@@ -276,7 +281,7 @@ def read_off(
     def columns(*components):
         return jnp.stack([spread(component, like) for component in components], axis=-1)
 
-    return Trajectory(
+    return dict(
         t=t,
         place=columns(*place),
         position=columns(*surface.in_fixed_frame(motion.position)),
@@ -296,7 +301,4 @@ def read_off(
         constraint=columns(*side_slip(scene, dynamics.field(t, states, controls), states)),
         departure=spread(surface.offset(motion.position), like),
         state=integrated.T,
-        stats=stats,
-        spec=spec,
-        steps=None,
     )

@@ -113,7 +113,7 @@ def show(run: Any, number: int, name: str) -> Show:
         normal,
         SIZE * length,
         (
-            Body("frame", axle, _turning(x, y, z), frame(length, colour)),
+            Body("frame", axle, _orientation(x, y, z), frame(length, colour)),
             Body("left wheel", axle + half * y, _rolling(x, y, z, rolled["left"]), rear),
             Body("right wheel", axle - half * y, _rolling(x, y, z, rolled["right"]), rear),
             Body("front wheel", front, _rolling(forward, left, z, ahead), wheel(radius, WIDTH * length, (DARK, PALE))),
@@ -185,14 +185,14 @@ def frame(length: float, colour: int) -> tuple[Mesh, ...]:
     )
 
 
-def _turning(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+def _orientation(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     return turned(np.stack([x, y, z], axis=-1))
 
 
 def _rolling(x: np.ndarray, y: np.ndarray, z: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """A rotation about y by an angle, forwards."""
     cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    return _turning(cosine * x - sine * z, y, sine * x + cosine * z)
+    return _orientation(cosine * x - sine * z, y, sine * x + cosine * z)
 
 
 def _integral(times: np.ndarray, rate: np.ndarray) -> np.ndarray:

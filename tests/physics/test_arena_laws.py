@@ -147,7 +147,7 @@ def test_what_changes_and_what_stays(name):
     law = tippe.Rolling(by_lanes(1e-3, 0.0, 0.0), 2.0, tippe.Contensou(by_lanes(0.3, 0.0, 0.0), 2e-3, 0.05))
     scene, where, state = Start.at_random(ARENAS[name], body, law)
     motion = scene.dynamics.motion(state)
-    rates = (scene.field(state), scene.frame.cyclic_rate(where[1], motion.velocity, motion.turning))
+    rates = (scene.field(state), scene.frame.cyclic_rate(where[1], motion.velocity, motion.frame_rate))
     quantities, rate = jax.jvp(lambda *arguments: quantities_of(scene, *arguments), (state, where[1]), rates)
     rubs, balls = by_lanes(1, 0, 0) > 0, by_lanes(0, 0, 1) > 0
 
@@ -211,7 +211,7 @@ def forces(arena, spread):
     scene, where, state = Start.at_random(arena, rutstam_top(), law, spread)
     motion = scene.dynamics.motion(state)
     vectors = ((None, None, motion.normal_force), (*motion.friction.force, None), motion.friction.torque)
-    turning = (*motion.turning, None)
+    turning = (*motion.frame_rate, None)
     return [np.asarray(in_space(scene, where, vector)) for vector in (*vectors, turning)]
 
 

@@ -126,7 +126,7 @@ def test_the_forms_of_their_own_move_as_the_general_one(name):
         @jax.jit
         def rate(y, dynamics=dynamics, frame=frame, size=size):
             motion = dynamics.motion(y[:size])
-            riding = frame.cyclic_rate(tuple(y[size:]), motion.velocity, motion.turning)
+            riding = frame.cyclic_rate(tuple(y[size:]), motion.velocity, motion.frame_rate)
             return jnp.stack([0.0 * y[0] if part is None else part for part in (*motion.rate, *riding)])
 
         y = solve_ivp(lambda _, y, rate=rate: np.asarray(rate(y)), (0.0, 0.3), y, "DOP853", rtol=1e-12, atol=1e-14).y[

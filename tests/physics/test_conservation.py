@@ -66,7 +66,7 @@ def test_rates_of_energy_and_jellett_at_random_states(arena, law):
     assert np.all(np.asarray(scene.friction_power(states)) * np.sign(scene.normal_force(states)) <= 0.0)
     _, jellett_rate = jax.jvp(scene.jellett, (states,), (rates,))
     motion = scene.dynamics.motion(states)
-    turning = [jnp.zeros(200) if part is None else part for part in motion.turning]
+    turning = [jnp.zeros(200) if part is None else part for part in motion.frame_rate]
     expected = -scene.body.radius * (turning[0] * states[5] + turning[1] * states[6])
     torque = jnp.stack([jnp.zeros(200) if part is None else part for part in motion.friction.torque])
     arm = jnp.asarray([[0.0], [0.0], [1.0]]) * scene.body.radius - scene.body.offset * states[2:5]

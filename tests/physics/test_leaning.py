@@ -17,8 +17,7 @@ import tippe
 from tippe.model.state import angular_velocity
 from tippe.modes.free_body import FreeBody, as_free_body, balls, gap_rate, jellett
 from tippe.modes.free_body import energy as energy_of
-from tippe.modes.leaning import BOTH, at_rest
-from tippe.modes.sliding import leaning
+from tippe.modes.leaning import BOTH, LeaningDynamics, at_rest
 
 REFERENCE = list(csv.DictReader(Path(__file__).with_name("hop_reference.csv").read_text().splitlines()))
 
@@ -54,8 +53,8 @@ def test_forces_and_accelerations(law):
     case = Case(**{**CASES[SHORT].__dict__, **law})
     scene = scene_of(case)
     states = leaning_states(scene.body, 20, 1)
-    motion = leaning(scene).motion(jnp.asarray(states))
-    rates = np.asarray(leaning(scene).field(jnp.asarray(states)))
+    motion = LeaningDynamics.of(scene).motion(jnp.asarray(states))
+    rates = np.asarray(LeaningDynamics.of(scene).field(jnp.asarray(states)))
     for i, state in enumerate(states_of_the_reference(scene, states).T):
         forces, u_dot, w_dot = contact(case, state, case.balls)
         e, w = state[6:9], state[9:]
@@ -77,7 +76,9 @@ def test_the_contacts_that_hold():
     case = CASES[FALLS_BACK]
     scene = scene_of(case)
     states = leaning_states(scene.body, 200, 2)
-    _, number, definite = leaning(scene).settled(as_free_body(scene.body, balls(scene.body)[0], jnp.asarray(states)))
+    _, number, definite = LeaningDynamics.of(scene).settled(
+        as_free_body(scene.body, balls(scene.body)[0], jnp.asarray(states))
+    )
     assert np.asarray(definite).all()
     outcomes = []
     for state, chosen in zip(states_of_the_reference(scene, states).T, np.asarray(number), strict=True):
@@ -102,7 +103,9 @@ def test_friction_without_an_answer():
     case = Case(**{**CASES[FALLS_BACK].__dict__, "mu": 2.0, "slip_speed": 1e-3})
     scene = scene_of(case)
     states = leaning_states(scene.body, 200, 3)
-    _, _, definite = leaning(scene).settled(as_free_body(scene.body, balls(scene.body)[0], jnp.asarray(states)))
+    _, _, definite = LeaningDynamics.of(scene).settled(
+        as_free_body(scene.body, balls(scene.body)[0], jnp.asarray(states))
+    )
     for state, fine in zip(states_of_the_reference(scene, states).T, np.asarray(definite), strict=True):
         assert fine == (determinant(case, state) > 0.0)
     assert not np.asarray(definite).all()
@@ -156,7 +159,7 @@ def test_the_end_of_rocking():
         before = FreeBody((*free.velocity[:2], -mode_segments.offset * turned), free.height, free.axis, momentum)
         assert_close(gap_rate(scene.body, strikes, before), -1e-6, rtol=1e-9)
         assert_close(gap_rate(scene.body, mode_segments, before), 0.0, atol=1e-15)
-        after, takes = leaning(scene).stopped(before)
+        after, takes = LeaningDynamics.of(scene).stopped(before)
         assert_close([gap_rate(scene.body, ball, after) for ball in spheres], 0.0, atol=1e-15)
         gained = energy_of(scene.body, 9.81, after) - energy_of(scene.body, 9.81, before)
         assert np.all(np.asarray(gained)[np.asarray(takes)] < 0.0)
@@ -212,7 +215,7 @@ def test_while_it_leans(ride):
     for ball in balls(ride.scene.body):
         assert_close(gap_rate(ride.scene.body, ball, free), 0.0, atol=1e-11)
     weight = 6e-3 * 9.81
-    forces = np.stack(leaning(ride.scene).motion(jnp.asarray(ride.states[:, on_both])).normal_forces)
+    forces = np.stack(LeaningDynamics.of(ride.scene).motion(jnp.asarray(ride.states[:, on_both])).normal_forces)
     assert forces.min() > -2e-8 * weight
     assert_close(ride.normal_force[on_both], forces.sum(axis=0), rtol=1e-14)
     assert np.max(np.diff(ride.energy)) < 1e-12 * ride.energy[0]

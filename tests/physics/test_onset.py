@@ -8,7 +8,7 @@ from close import assert_close
 from tops import rutstam_top
 
 import tippe
-from tippe.model.slip_onset import begin
+from tippe.model.slip_onset import slip_onset
 
 #: A top that rolls in a sphere, its grip just gone: velocity, axis, angular momentum, the vertical in its frame.
 ROLLING = np.array(
@@ -37,7 +37,7 @@ def beginning(scene, start, scales, tolerance):
     """A slip's beginning from a contact at rest, and the slip's velocity at its middle and end."""
     stick_slip = scene.dynamics
     state = stick_slip.stopped(start)
-    onset = begin(
+    onset = slip_onset(
         stick_slip.slipping,
         stick_slip.rolling,
         stick_slip.mu,
@@ -56,8 +56,8 @@ def begun(scene, launch, start):
     """The beginning at a tolerance of 1e-9, with its slips, after a comparison with that at 1e-11."""
     scales, start = scene.scales(launch), jnp.asarray(start)
     (long, slips), (short, _) = (beginning(scene, start, scales, jnp.asarray(tol)) for tol in (1e-9, 1e-11))
-    assert bool(long.found)
-    assert bool(short.found)
+    assert bool(long.converged)
+    assert bool(short.converged)
     assert float(long.length) > float(short.length) > 1e-4
     assert_close(long.at(short.length / long.length) / scales, short.end / scales, atol=1e-10)
     return long, *slips

@@ -183,7 +183,7 @@ def test_what_is_drawn_stands_on_the_plane(run):
     assert_close((((corners + np.array(CENTRE)) / SHAPE) ** 2).sum(axis=1), 1.0, atol=1e-12)
     lowest = [
         (corners @ turning.T + position)[:, 2].min()
-        for position, turning in zip(body.position[::50], matrices(body.turning[::50]), strict=True)
+        for position, turning in zip(body.position[::50], matrices(body.orientation[::50]), strict=True)
     ]
     assert min(lowest) > -1e-9
     assert max(lowest) < 1e-3

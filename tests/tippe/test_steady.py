@@ -244,3 +244,52 @@ def test_no_steady_tumbling_where_the_lever_is_negative_or_the_arena_is_curved()
         steady.tumbling(scene(0.3, 0.6), 0.1)
     with pytest.raises(ValueError, match="must be a Plane"):
         steady.tumbling(scene(0.3, 0.94, surface=tippe.Cylinder(0.3)), 1.0)
+
+
+TOP_SCENE = scene(0.3, 0.94)
+SEVERAL = tippe.Top(0.02, 0.02, jnp.array([0.006, 0.005]), 3e-6, 3.2e-6)
+RIGID = tippe.Ellipsoid(0.1, (0.02, 0.02, 0.03), (0.0, 0.0, 0.0), np.diag([1e-5, 1e-5, 2e-5]))
+
+REFUSED = {
+    "no body": (lambda: steady.group(0.3), "body = 0.3 must be a Top"),
+    "several tops": (lambda: steady.folds(SEVERAL), r"body\.offset must be one number, not of shape \(2,\).*jax\.vmap"),
+    "a traced top": (lambda: jax.jit(steady.group)(TOP_SCENE.body), "inside jit.*use steady.proportions"),
+    "no scene": (lambda: steady.jellett_thresholds(TOP_SCENE.body), r"scene = Top\(.*must be a Scene"),
+    "another body": (
+        lambda: steady.standing_state(tippe.Scene(RIGID), 10.0),
+        "body = Ellipsoid must be a body of revolution, such as a Top",
+    ),
+    "a word for the spin": (lambda: steady.standing_state(TOP_SCENE, "fast"), "spin = 'fast' is not a number"),
+    "several spins": (
+        lambda: steady.standing_matrix(TOP_SCENE, [10.0, 20.0]),
+        r"spin must be one number, not of shape \(2,\).*jax\.vmap",
+    ),
+    "a word for a flag": (
+        lambda: steady.standing_matrix(TOP_SCENE, 10.0, "upright"),
+        "inverted = 'upright' must be True or False",
+    ),
+    "degrees": (lambda: steady.tumbling(TOP_SCENE, 45.0), r"theta = 45\.0 must be at most 3\.14.*np\.radians\(45\.0\)"),
+    "degrees of an energy": (lambda: steady.effective_energy(TOP_SCENE, 45.0, 1e-6), r"np\.radians\(45\.0\)"),
+    "a slope": (
+        lambda: steady.tumbling_is_stable(scene(0.3, 0.94, surface=tippe.Plane(0.1)), 1.0),
+        r"surface = Plane\(tilt=0\.1 rad\) must be a Plane without tilt",
+    ),
+    "no constant": (lambda: steady.tumbling_angles(TOP_SCENE, np.nan), "jellett = nan must be finite"),
+    "too few samples": (
+        lambda: steady.tumbling_angles(TOP_SCENE, 1e-6, samples=2),
+        "samples = 2 must be a whole number",
+    ),
+    "no motion": (lambda: steady.tumbling_matrix(TOP_SCENE, 1.0), r"motion = 1\.0 must be a Tumbling, as tumbling\("),
+    "the state of another arena": (
+        lambda: steady.quarter_turn(np.zeros(10)),
+        r"state of shape \(10,\) must have the 8",
+    ),
+    "no matrix": (lambda: steady.growth_rate(np.ones(3)), r"matrix must be square, not of shape \(3,\)"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_an_illegal_argument_is_refused_with_its_name_and_a_fix(name):
+    call, message = REFUSED[name]
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -116,7 +116,7 @@ class InversionTimes(eqx.Module):
 
     @property
     def seen(self) -> np.ndarray:
-        """Mask of the measured predictions, which are all predictions."""
+        """Indices of the measured predictions, which are all predictions."""
         return np.arange(self.size)
 
     @property

@@ -6,83 +6,40 @@ part of it.
 """
 
 import dataclasses
-from typing import NamedTuple, Self
+from typing import Self
 
-import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from nonholonomic.geometry import (
     AbstractFrame,
-    Component,
-    Tangent,
     Vector,
     add,
-    carried,
     cross,
     dot,
     multiply,
+    rate_in_frame,
     scale,
-    stacked,
     subtract,
     sum_vectors,
 )
-from nonholonomic.integration import Status
-from nonholonomic.xla_cpu import least, stored
+from nonholonomic.xla_cpu import stored
 
 from .body import AbstractBody, AbstractMeridian
-from .contact_load import ContactLoad, Slip
+from .contact_dynamics import AbstractContactDynamics, Motion
+from .contact_load import Slip
 from .friction import AbstractFriction
 from .state import parts
 
 #: The cosine of no angle, for runs without a target angle.
 NO_COSINE = -2.0
 
-#: Value of `Motion.painleve_factor` at which a contact counts as jammed. N grows as its inverse, and the factor falls
-#: to zero as the square root of the remaining time, so a run ends too early by about 1e-4 s times the square of this
-#: value. In `tests/physics/test_strong_friction.py`, this is 1e-12 s, and 1e-10 s with ten times the value; there, the
-#: error of theta is 5e-13, and that of velocities 1e-4.
-JAMMED = 1e-4
-
-#: Value of `Motion.room` at which the ball no longer fits, because a curvature of the arena reaches 1/R. There the foot
-#: moves as the square root of the remaining time, so a run ends too early by about 0.1 s times the square of this
-#: value.
-FITS = 1e-4
-
 #: Rate of a frame that turns with an inverting top, as a fraction of L_n / I1 (`Dynamics.turning`). Among 0.5, 0.7,
 #: 0.85 and 1, this is the fastest at equal error, or close to it, in five scenes on the plane: 1 to 2.6 times as fast
 #: as a frame at rest.
 TURNING = 0.7
 
-#: The ways in which a contact can end; the index is the code of the word.
-LOSSES = (Status.CONTACT_LOST, Status.JAMMED, Status.DOES_NOT_FIT)
 
-
-class Motion(NamedTuple):
-    """The result of the equations of motion for one state, with all vectors in the moving frame.
-
-    `painleve_factor` is the factor of N in its equation, 1 + m a A in `tippe.md`, section 2: 1 without an offset, and 0
-    if friction pulls the top down as strongly as N pushes it up. `velocity` is that of the point with which the frame
-    moves. `room` is positive where the ball fits, `None` if it fits everywhere.
-    """
-
-    rate: tuple[Component, ...]
-    normal_force: Float[Array, "..."]
-    friction: ContactLoad
-    slip: Slip
-    velocity: Tangent
-    turning: Tangent
-    spin_momentum: Float[Array, "..."]
-    painleve_factor: Float[Array, "..."]
-    room: Component
-
-    @property
-    def friction_power(self) -> Component:
-        """Power of friction N (f.v_s + tau.w) [W], at most 0; `None` without friction."""
-        return multiply(self.normal_force, self.friction.power(self.slip))
-
-
-class Dynamics(eqx.Module):
+class Dynamics(AbstractContactDynamics):
     """A scene, with precomputed combinations of its numbers that every evaluation needs.
 
     `turns` is the additional rate of the frame about n, as a fraction of L_n / I1; `None` if there is none.
@@ -116,6 +73,10 @@ class Dynamics(eqx.Module):
             per_transverse=1.0 / body.I1,
             axial_excess=1.0 / body.I3 - 1.0 / body.I1,
         )
+
+    @property
+    def weight(self) -> Float[Array, "..."]:
+        return self.mass * self.gravity
 
     def turning(self, turns: Float[Array, "..."]) -> Self:
         """The same equations in a frame that turns about n, for an arena on which all directions across n are
@@ -181,37 +142,14 @@ class Dynamics(eqx.Module):
         u3 = multiply(-a, e_dot[2]) if o != (None, None) else None
         u1_dot = add(multiply(thrust, f1), multiply(-self.gravity, up[0]), multiply(o[0], u3))
         u2_dot = add(multiply(thrust, f2), multiply(-self.gravity, up[1]), multiply(o[1], u3))
-        e_dot = sum_vectors(e_dot, carried(e, o))
-        L_dot = sum_vectors(scale(N, (M1, M2, M3)), carried(L, o))
+        e_dot = sum_vectors(e_dot, rate_in_frame(e, o))
+        L_dot = sum_vectors(scale(N, (M1, M2, M3)), rate_in_frame(L, o))
         if self.turns is not None:
             turn = self.turns * self.per_transverse * L[2]
             u1_dot, u2_dot = add(u1_dot, turn * u2), subtract(u2_dot, turn * u1)
             e_dot, L_dot = sum_vectors(e_dot, turned(e, turn)), sum_vectors(L_dot, turned(L, turn))
         rate = (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate)
         return Motion(rate, N, friction, slip, path, o, spin_momentum, painleve_factor, room)
-
-    def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-        """Rate of change of the state, (components, ...)."""
-        return stacked(self.motion(state).rate, state)
-
-    def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """Positive while the contact persists and Coulomb's law has a solution: the least of `margins`."""
-        return least(*self.margins(state))
-
-    def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
-        """How a contact with zero margin has ended: a code in `LOSSES`."""
-        lost, *others = self.margins(state)
-        # At the located end, the margin is round-off of either sign; if another margin has vanished, N is many times
-        # the weight.
-        return len(others) - jnp.argmin(jnp.stack([*others[::-1], jnp.maximum(lost, 0.0)]), axis=0)
-
-    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
-        """The margin for each of `LOSSES`: the normal force as a fraction of the weight, plus a round-off allowance for
-        a start with N = 0; the excess of the Painlevé factor over `JAMMED`; and the excess of the room over `FITS`, if
-        the arena has places where the ball does not fit."""
-        motion = self.motion(state)
-        lost, jammed = motion.normal_force / (self.mass * self.gravity) + 1e-12, motion.painleve_factor - JAMMED
-        return (lost, jammed) if motion.room is None else (lost, jammed, motion.room - FITS)
 
 
 def turned(vector: Vector, rate: Float[Array, "..."]) -> Vector:

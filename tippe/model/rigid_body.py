@@ -87,8 +87,8 @@ class Ellipsoid(AbstractRigidBody):
     curved arena, a run ends with the status "does_not_fit" where the body is not more strongly curved than the arena;
     the program does not notice a second contact elsewhere. The part of the surface that never touches the arena does
     not matter: half an ellipsoid, such as a boat, moves like the whole ellipsoid. At a `Launch`, the body's axes x, y
-    and z are those of the arena (t1, t2, n), turned by theta about a horizontal axis so that z leans in the direction
-    `azimuth`. `spin` is the angular velocity about z.
+    and z are those of the arena (t1, t2, n), turned by theta about a tangent of the arena so that z leans in the
+    direction `azimuth`. `spin` is the angular velocity about z.
 
     **Arguments:**
 

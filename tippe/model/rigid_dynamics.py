@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from nonholonomic.geometry import (
     AbstractFrame,
@@ -30,20 +30,19 @@ from nonholonomic.geometry import (
     Tangent,
     Vector,
     add,
-    carried,
     cross,
     dot,
     multiply,
+    rate_in_frame,
     scale,
-    stacked,
     subtract,
     sum_vectors,
     vector_of,
 )
-from nonholonomic.xla_cpu import least, stored
+from nonholonomic.xla_cpu import stored
 
+from .contact_dynamics import AbstractContactDynamics, Motion
 from .contact_load import ContactLoad, Slip
-from .dynamics import FITS, JAMMED, Motion
 from .friction import AbstractFriction, NoSlip, length
 from .inertia import SymmetricMatrix
 from .launch import Launch
@@ -55,7 +54,7 @@ class Attitude(NamedTuple):
     """The attitude and rotation of a body, and its contact point.
 
     - `axes`: the body's axes x, y and z in the frame (t1, t2, n).
-    - `normal`, `momentum`, `turning`: n, angular momentum and angular velocity in the body's axes.
+    - `normal`, `momentum`, `angular_velocity`: n, angular momentum and angular velocity in the body's axes.
     - `lever`: the vector r from the centre of mass to the contact [m] in the body's axes.
     - `fixed_rates`: rates of change of the components of n and of r if n is fixed, as on a plane.
     """
@@ -63,7 +62,7 @@ class Attitude(NamedTuple):
     axes: tuple[Vector, Vector, Vector]
     normal: Vector
     momentum: Vector
-    turning: Vector
+    angular_velocity: Vector
     lever: Vector
     fixed_rates: tuple[Vector, Vector]
 
@@ -75,7 +74,7 @@ class Attitude(NamedTuple):
     @property
     def axis_rates(self) -> tuple[Vector, Vector]:
         """Rates of change of the body's axes x and z, which turn with it."""
-        (x, y, z), (w1, w2, w3) = self.axes, self.turning
+        (x, y, z), (w1, w2, w3) = self.axes, self.angular_velocity
         return vector_of(w3 * b - w2 * c for b, c in zip(y, z, strict=True)), vector_of(
             w2 * a - w1 * b for a, b in zip(x, y, strict=True)
         )
@@ -98,7 +97,7 @@ class ContactMotion(NamedTuple):
     frame: FrameMotion
 
 
-class AbstractRigidDynamics(eqx.Module):
+class AbstractRigidDynamics(AbstractContactDynamics):
     """A scene with a rigid body, with the precomputed combinations of its numbers; in place of `Dynamics`."""
 
     frame: eqx.AbstractVar[AbstractFrame]
@@ -110,6 +109,10 @@ class AbstractRigidDynamics(eqx.Module):
     def mass(self) -> Float[Array, "..."]:
         """Mass of the body [kg]."""
         return self.body.mass
+
+    @property
+    def weight(self) -> Float[Array, "..."]:
+        return self.body.mass * self.gravity
 
     @property
     def size(self) -> Float[Array, "..."]:
@@ -125,26 +128,6 @@ class AbstractRigidDynamics(eqx.Module):
         **Returns:** a `Motion`, whose `spin_momentum` is the angular velocity about the body's z axis.
         """
 
-    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
-        """Like `Dynamics.margins`."""
-        motion = self.motion(state)
-        lost, jammed = motion.normal_force / (self.body.mass * self.gravity) + 1e-12, motion.painleve_factor - JAMMED
-        return (lost, jammed) if motion.room is None else (lost, jammed, motion.room - FITS)
-
-    def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-        """Rate of change of the state, (components, ...)."""
-        return stacked(self.motion(state).rate, state)
-
-    def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """The least of `margins`."""
-        return least(*self.margins(state))
-
-    def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
-        """How a contact with zero margin has ended: a code in `LOSSES`."""
-        lost, *others = self.margins(state)
-        # As in `Dynamics.loss`.
-        return len(others) - jnp.argmin(jnp.stack([*others[::-1], jnp.maximum(lost, 0.0)]), axis=0)
-
     def attitude(self, state: Float[Array, "components ..."]) -> Attitude:
         """The attitude and rotation of the body, and its contact point."""
         _, e, L, place = parts(state)
@@ -152,10 +135,10 @@ class AbstractRigidDynamics(eqx.Module):
         axes = (c, cross(e, c), e)
         n = vector_of(axis[2] for axis in axes)
         momentum = vector_of(dot(L, axis) for axis in axes)
-        turning = vector_of(stored(*self.inverse.times(momentum)))
-        normal_rate = cross(n, turning)
+        angular_velocity = vector_of(stored(*self.inverse.times(momentum)))
+        normal_rate = cross(n, angular_velocity)
         lever, lever_rate = self.body.contact(n, normal_rate)
-        return Attitude(axes, n, momentum, turning, lever, (normal_rate, lever_rate))
+        return Attitude(axes, n, momentum, angular_velocity, lever, (normal_rate, lever_rate))
 
     def contact_motion(self, place: Place, attitude: Attitude, slip: Tangent) -> ContactMotion:
         """The motion of the contact point. **Arguments:** `place`: place of the frame; `slip`: velocity v along the
@@ -171,14 +154,14 @@ class AbstractRigidDynamics(eqx.Module):
         H11, H12, H22, *along = stored(-first[0], -first[1], -second[1], *along)
         frame, path = self.frame.convex_motion(place, (along[0], along[1]), (H11, H12, H22))
         path = stored(*path)
-        turned = attitude.in_body((subtract(None, frame.turning[0]), subtract(None, frame.turning[1]), None))
+        turned = attitude.in_body((subtract(None, frame.frame_rate[0]), subtract(None, frame.frame_rate[1]), None))
         moved = attitude.in_body((subtract(path[0], slip[0]), subtract(path[1], slip[1]), None))
         return ContactMotion(vector_of(sum_vectors(normal_rate, turned)), moved, path, frame)
 
     def angular_velocity(self, state: Float[Array, "components ..."]) -> Vector:
         """Angular velocity of the body in the frame [rad/s]."""
         attitude = self.attitude(state)
-        return attitude.in_frame(attitude.turning)
+        return attitude.in_frame(attitude.angular_velocity)
 
     def mass_from_contact(self, state: Float[Array, "components ..."]) -> Vector:
         """Vector from the contact to the centre of mass [m], in the frame."""
@@ -189,15 +172,15 @@ class AbstractRigidDynamics(eqx.Module):
         """Kinetic energy plus weight times the height of the centre of mass [J]."""
         (u1, u2), _, _, place = parts(self.carried_along(state))
         attitude, place = self.attitude(state), place[:-3]
-        rising = -dot(attitude.turning, cross(attitude.lever, attitude.normal))
-        rotation = 0.5 * dot(attitude.turning, attitude.momentum)
+        rising = -dot(attitude.angular_velocity, cross(attitude.lever, attitude.normal))
+        rotation = 0.5 * dot(attitude.angular_velocity, attitude.momentum)
         height = add(self.frame.height(place), dot(self.mass_from_contact(state), self.frame.vertical(place)))
         return self.body.mass * (0.5 * (u1**2 + u2**2 + rising**2) + self.gravity * height) + rotation
 
     def normal_spin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Angular velocity about the arena's normal [rad/s]."""
         attitude = self.attitude(state)
-        return dot(attitude.turning, attitude.normal)
+        return dot(attitude.angular_velocity, attitude.normal)
 
     def carried_rates(
         self,
@@ -218,15 +201,15 @@ class AbstractRigidDynamics(eqx.Module):
         x_rate, z_rate = attitude.axis_rates
         u1_dot = add(push[0], multiply(-self.gravity, up[0]), multiply(o[0], rise))
         u2_dot = add(push[1], multiply(-self.gravity, up[1]), multiply(o[1], rise))
-        e_dot, L_dot = sum_vectors(z_rate, carried(e, o)), sum_vectors(torque, carried(L, o))
-        return (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate, *sum_vectors(x_rate, carried(place[-3:], o)))
+        e_dot, L_dot = sum_vectors(z_rate, rate_in_frame(e, o)), sum_vectors(torque, rate_in_frame(L, o))
+        return (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate, *sum_vectors(x_rate, rate_in_frame(place[-3:], o)))
 
     def start(
-        self, launch: Launch, place: tuple[Float[Array, "..."], ...], axis: Vector, turning: Vector
+        self, launch: Launch, place: tuple[Float[Array, "..."], ...], axis: Vector, angular_velocity: Vector
     ) -> Float[Array, "components ..."]:
         """The state at the start of a run.
 
-        **Arguments:** `place`: place of the frame; `axis`, `turning`: axis e and angular velocity [rad/s], in the
+        **Arguments:** `place`: place of the frame; `axis`, `angular_velocity`: axis e and angular velocity [rad/s], in the
         frame.
         """
         zero = jnp.zeros_like(launch.theta)
@@ -235,7 +218,7 @@ class AbstractRigidDynamics(eqx.Module):
         fall = 1.0 - axis[2]
         c = (1.0 - fall * x * x, -fall * x * y, -axis[0])
         axes = (c, cross(axis, c), axis)
-        momentum = self.body.inertia.tensor.times(vector_of(dot(turning, axis) for axis in axes))
+        momentum = self.body.inertia.tensor.times(vector_of(dot(angular_velocity, axis) for axis in axes))
         x, y, z = (scale(part, axis) for part, axis in zip(momentum, axes, strict=True))
         state = joined(launch.velocity or (zero, zero), axis, sum_vectors(x, y, z), place, c)
         return self.carried_along(state)
@@ -245,7 +228,7 @@ class AbstractRigidDynamics(eqx.Module):
         return state
 
 
-class SlippingDynamics(AbstractRigidDynamics):
+class RigidSlipping(AbstractRigidDynamics):
     """The equations of motion under a friction law that determines the force from the slip."""
 
     frame: AbstractFrame
@@ -263,11 +246,14 @@ class SlippingDynamics(AbstractRigidDynamics):
         """
         (u1, u2), _, _, place = parts(state)
         attitude = self.attitude(state)
-        r, swing = attitude.in_frame(attitude.lever), attitude.in_frame(cross(attitude.turning, attitude.lever))
+        r, swing = (
+            attitude.in_frame(attitude.lever),
+            attitude.in_frame(cross(attitude.angular_velocity, attitude.lever)),
+        )
         slip_x, slip_y = stored(u1 + swing[0], u2 + swing[1])
         contact = self.contact_motion(place[:-3], attitude, (slip_x, slip_y))
         o, up, _, room = contact.frame
-        slip = Slip(slip_x, slip_y, attitude.in_frame(attitude.turning))
+        slip = Slip(slip_x, slip_y, attitude.in_frame(attitude.angular_velocity))
         friction = self.friction.per_normal_force(slip)
         f1, f2 = friction.force
         moment = vector_of(stored(*sum_vectors(cross(r, (f1, f2, 1.0)), friction.torque)))
@@ -276,7 +262,9 @@ class SlippingDynamics(AbstractRigidDynamics):
         rise = cross(lever, normal)
         arm = self.inverse.times(rise)
         moved = sum_vectors(cross(contact.lever_rate, normal), cross(lever, contact.normal_rate))
-        bend = dot(arm, cross(attitude.momentum, attitude.turning)) + dot(attitude.turning, vector_of(moved))
+        bend = dot(arm, cross(attitude.momentum, attitude.angular_velocity)) + dot(
+            attitude.angular_velocity, vector_of(moved)
+        )
         mass = self.body.mass
         painleve_factor = 1.0 + mass * dot(arm, attitude.in_body(moment))
         pull = add(multiply(self.gravity, up[2]), dot((u1, u2), o))
@@ -284,12 +272,12 @@ class SlippingDynamics(AbstractRigidDynamics):
 
         thrust = N * self.per_mass
         push = (multiply(thrust, f1), multiply(thrust, f2))
-        u3 = None if o == (None, None) else -dot(attitude.turning, rise)
+        u3 = None if o == (None, None) else -dot(attitude.angular_velocity, rise)
         rates = self.carried_rates(state, attitude, contact, push, u3, scale(N, moment))
-        return Motion(rates, N, friction, slip, contact.along, o, attitude.turning[2], painleve_factor, room)
+        return Motion(rates, N, friction, slip, contact.along, o, attitude.angular_velocity[2], painleve_factor, room)
 
 
-class RollingDynamics(AbstractRigidDynamics):
+class RigidRolling(AbstractRigidDynamics):
     """The equations of motion of a body whose contact point is at rest: the nonholonomic constraint itself.
 
     The velocity follows from attitude and angular momentum; its two components in the state are integrated but not
@@ -312,14 +300,14 @@ class RollingDynamics(AbstractRigidDynamics):
         (J + m (r^2 - r r^T)) w' = L x w + m r x (r' x w + g z), and F = m (r' x w + r x w' + g z).
         """
         place, attitude = parts(state).place, self.attitude(state)
-        m, r, w = self.body.mass, attitude.lever, attitude.turning
+        m, r, w = self.body.mass, attitude.lever, attitude.angular_velocity
         contact = self.contact_motion(place[:-3], attitude, (None, None))
         o, up, _, room = contact.frame
         r_dot = sum_vectors(contact.lever_rate, cross(w, r))
-        turning = sum_vectors(cross(vector_of(r_dot), w), scale(self.gravity, attitude.in_body(up)))
-        torque = sum_vectors(cross(attitude.momentum, w), scale(m, cross(r, vector_of(turning))))
+        steady_push = sum_vectors(cross(vector_of(r_dot), w), scale(self.gravity, attitude.in_body(up)))
+        torque = sum_vectors(cross(attitude.momentum, w), scale(m, cross(r, vector_of(steady_push))))
         w_dot = self._about_contact(r).solve(vector_of(stored(*torque)))
-        reaction = attitude.in_frame(vector_of(scale(m, sum_vectors(turning, cross(r, w_dot)))))
+        reaction = attitude.in_frame(vector_of(scale(m, sum_vectors(steady_push, cross(r, w_dot)))))
         F = vector_of(stored(*reaction))
 
         push = (F[0] / m, F[1] / m)
@@ -355,7 +343,7 @@ class RollingDynamics(AbstractRigidDynamics):
         """As `rolling.RollingDynamics.with_slip`."""
         (u1, u2), e, _, place = parts(state)
         attitude = self.attitude(state)
-        r, w, m = attitude.lever, attitude.turning, self.body.mass
+        r, w, m = attitude.lever, attitude.angular_velocity, self.body.mass
         # In the body's axes: the velocity u of the centre of mass, and v.
         u = attitude.in_body((u1, u2, -dot(w, cross(r, attitude.normal))))
         v = attitude.in_body((slip.x, slip.y, None))
@@ -364,8 +352,8 @@ class RollingDynamics(AbstractRigidDynamics):
         u = attitude.in_frame(vector_of(sum_vectors(cross(r, w), v)))
         return joined(u[:2], e, attitude.in_frame(self.body.inertia.tensor.times(w)), place)
 
-    def blow(self, state: Float[Array, "components ..."], axis: int) -> tuple[Component, ...]:
-        """As `rolling.RollingDynamics.blow`."""
+    def unit_impulse(self, state: Float[Array, "components ..."], axis: int) -> tuple[Component, ...]:
+        """As `rolling.RollingDynamics.unit_impulse`."""
         attitude = self.attitude(state)
         v = vector_of(part[axis] for part in attitude.axes)
         w = self._about_contact(attitude.lever).solve(vector_of(scale(self.body.mass, cross(attitude.lever, v))))
@@ -380,7 +368,7 @@ class RollingDynamics(AbstractRigidDynamics):
     def carried_along(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """The state with the velocity r x w of the centre of mass."""
         attitude = self.attitude(state)
-        u = attitude.in_frame(cross(attitude.lever, attitude.turning))
+        u = attitude.in_frame(cross(attitude.lever, attitude.angular_velocity))
         return state.at[:2].set(jnp.stack(jnp.broadcast_arrays(*u[:2], state[0])[:2]))
 
 
@@ -390,5 +378,5 @@ def rigid_dynamics(
     """The equations of motion of a body on an arena; arguments as for `Dynamics.of`."""
     inverse = body.inertia.tensor.inverse
     if isinstance(friction, NoSlip):
-        return RollingDynamics(frame, body, gravity, inverse)
-    return SlippingDynamics(frame, body, gravity, inverse, friction, 1.0 / body.mass)
+        return RigidRolling(frame, body, gravity, inverse)
+    return RigidSlipping(frame, body, gravity, inverse, friction, 1.0 / body.mass)

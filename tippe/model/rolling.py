@@ -15,10 +15,10 @@ from nonholonomic.geometry import (
     Tangent,
     Vector,
     add,
-    carried,
     cross,
     dot,
     multiply,
+    rate_in_frame,
     scale,
     stacked,
     subtract,
@@ -26,8 +26,8 @@ from nonholonomic.geometry import (
 )
 from nonholonomic.xla_cpu import stored
 
+from .contact_dynamics import Motion
 from .contact_load import ContactLoad, Slip
-from .dynamics import Motion
 from .friction import length
 from .state import AXIS, angular_velocity, joined, parts
 from .top import Top
@@ -116,16 +116,16 @@ class RollingDynamics(eqx.Module):
         r_dot = sum_vectors(scale(a, e_dot), scale(R, (*o, None)))
         u = cross(r, w)
 
-        turning = sum_vectors(cross(r_dot, w), scale(self.gravity, up))
-        torque = sum_vectors(scale(m, cross(r, turning)), cross(L, w))
+        steady_push = sum_vectors(cross(r_dot, w), scale(self.gravity, up))
+        torque = sum_vectors(scale(m, cross(r, steady_push)), cross(L, w))
         w_dot = self._over_inertia(e, r, torque)
-        push = sum_vectors(turning, cross(r, w_dot))
+        push = sum_vectors(steady_push, cross(r, w_dot))
 
         u1_dot = add(push[0], multiply(-self.gravity, up[0]), multiply(o[0], u[2]))
         u2_dot = add(push[1], multiply(-self.gravity, up[1]), multiply(o[1], u[2]))
         F = scale(m, push)
-        e_dot = sum_vectors(e_dot, carried(e, o))
-        L_dot = sum_vectors(cross(r, F), carried(L, o))
+        e_dot = sum_vectors(e_dot, rate_in_frame(e, o))
+        L_dot = sum_vectors(cross(r, F), rate_in_frame(L, o))
         rate = (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate)
         still = jnp.zeros_like(F[2])
         load = ContactLoad((F[0] / F[2], F[1] / F[2]))
@@ -163,7 +163,7 @@ class RollingDynamics(eqx.Module):
         axis = state[AXIS]
         return state.at[AXIS].set(axis / jnp.sqrt(jnp.sum(axis * axis, axis=0)))
 
-    def blow(self, state: Float[Array, "components ..."], axis: int) -> tuple[Component, ...]:
+    def unit_impulse(self, state: Float[Array, "components ..."], axis: int) -> tuple[Component, ...]:
         """The impulse at the contact that changes the velocity of the contact point by 1 m/s along an axis of the arena
         [N s].
 

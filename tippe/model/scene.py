@@ -31,14 +31,15 @@ from nonholonomic.geometry import (
     vector_of,
 )
 from nonholonomic.parameters import numbers
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require_all, require_kind, uncalled
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require_all
 
 from .body import AbstractBody
 from .dynamics import TURNING, Dynamics
-from .friction import A_LAW, AbstractFriction, Frictionless, NoSlip
+from .friction import AbstractFriction, Frictionless, NoSlip
 from .launch import Launch
 from .rigid_body import AbstractRigidBody
 from .rigid_dynamics import AbstractRigidDynamics, rigid_dynamics
+from .scene_checks import check_parts
 from .state import angular_velocity, inclination, joined, parts
 from .stick_slip import StickSlip
 from .top import Top
@@ -111,47 +112,7 @@ class Scene(Bounded, Generic[Body]):
     side: str | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        if not isinstance(self.body, AbstractBody | AbstractRigidBody):
-            kinds = f"a Top, a SpheroidBody, a ConvexBody, an Ellipsoid or a RigidBody{uncalled(self.body)}"
-            raise ValueError(f"body = {self.body!r} must be {kinds}")
-        require_kind(self.surface, "surface", AbstractSurface, ", such as tippe.Plane() or tippe.Cylinder(0.3)")
-        require_kind(self.friction, "friction", AbstractFriction, A_LAW)
-        # This raises an error if the surface has no such side.
-        self.surface.sign(self.side, "inside")
-        if self.contact not in ("stop", "hybrid"):
-            raise ValueError(f"contact = {self.contact!r} must be 'stop' or 'hybrid'")
-        if self.restitution is not None and self.contact == "stop":
-            raise ValueError(f"restitution = {self.restitution!r} must be omitted for contact = 'stop'")
-        if isinstance(self.friction, NoSlip) and not isinstance(self.body, AbstractRigidBody):
-            raise ValueError(
-                f"friction = NoSlip() must be another law for a {type(self.body).__name__}, such as Coulomb; describe the body "
-                "as an Ellipsoid or a RigidBody to roll it"
-            )
-        if not isinstance(self.body, Top):
-            self._check_convex()
-            return
-        if self.friction.set_valued and self.body.stem is not None:
-            raise ValueError(
-                f"friction = {self.friction!r} must be a law with a single mode for a top with a stem, such as Coulomb: "
-                "with two contacts it is undetermined which one sticks"
-            )
-        if self.contact == "stop" and self.body.stem is not None:
-            raise ValueError("contact = 'stop' must be 'hybrid' for a top with a stem")
-
-    def _check_convex(self) -> None:
-        """Raise `ValueError` for options that need a sphere, whose contact follows from the place of its centre."""
-        kind = type(self.body).__name__
-        kind = f"an {kind}" if kind[0] in "AEIOU" else f"a {kind}"
-        if not isinstance(self.surface, Plane) and isinstance(self.body, AbstractBody):
-            others = "a Top runs on any arena, as an Ellipsoid or a RigidBody does"
-            raise ValueError(f"surface = {self.surface!r} must be a Plane for {kind}; {others}")
-        if self.contact != "stop":
-            raise ValueError(f"contact = {self.contact!r} must be 'stop' for {kind}; only a Top can fly")
-        if self.friction.set_valued and isinstance(self.body, AbstractBody):
-            raise ValueError(
-                f"friction = {self.friction!r} must be a law with a single mode for {kind}, such as Coulomb; describe the body "
-                "as an Ellipsoid or a RigidBody to stick and slip"
-            )
+        check_parts(self)
 
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.gravity, "gravity", above=0.0)
@@ -232,7 +193,7 @@ class Scene(Bounded, Generic[Body]):
         alike = self.level and self.friction.isotropic
         if not (isinstance(equations, Dynamics) and isinstance(body, Top)) or not alike:
             return equations
-        # Tops of group I (`steady.py`) soon stand upright, with the axis close to L; in a turning frame, both would
+        # Tops of group I (`tippe/steady/`) soon stand upright, with the axis close to L; in a turning frame, both would
         # move.
         may_invert = 1.0 - body.offset / body.radius < body.I1 / body.I3
         return equations.turning(jax.lax.stop_gradient(jnp.where(may_invert, TURNING, 0.0)))
@@ -284,14 +245,14 @@ class Scene(Bounded, Generic[Body]):
         body, sine, zero = self.body, jnp.sin(launch.theta), jnp.zeros_like(launch.theta)
         e = (sine * jnp.cos(launch.azimuth), sine * jnp.sin(launch.azimuth), jnp.cos(launch.theta))
         if isinstance(body, AbstractRigidBody):
-            turning = sum_vectors(scale(launch.spin, e), launch.angular_velocity or (None, None, None))
-            return self._rigid_dynamics.start(launch, self.start(launch)[0], e, vector_of(turning))
+            w = sum_vectors(scale(launch.spin, e), launch.angular_velocity or (None, None, None))
+            return self._rigid_dynamics.start(launch, self.start(launch)[0], e, vector_of(w))
         L, u = scale(body.I3 * launch.spin, e), launch.velocity or (zero, zero)
         if launch.angular_velocity is not None:
-            turning = vector_of(launch.angular_velocity)
-            along = dot(turning, e)
-            L = sum_vectors(L, scale(body.I1, turning), scale((body.I3 - body.I1) * along, e))
-            u = sum_vectors(u, scale(multiply(-1.0, body.offset_of_path), cross(turning, e)[:2]))
+            w = vector_of(launch.angular_velocity)
+            along = dot(w, e)
+            L = sum_vectors(L, scale(body.I1, w), scale((body.I3 - body.I1) * along, e))
+            u = sum_vectors(u, scale(multiply(-1.0, body.offset_of_path), cross(w, e)[:2]))
         return joined(u, e, L, self.start(launch)[0])
 
     def scales(self, launch: Launch) -> Float[Array, "components ..."]:
@@ -310,8 +271,8 @@ class Scene(Bounded, Generic[Body]):
         I1, I3 = self._moments
         momentum = jnp.maximum(I3 * jnp.abs(launch.spin), I1 * rate)
         if launch.angular_velocity is not None:
-            turning = launch.angular_velocity
-            momentum = jnp.maximum(momentum, I1 * jnp.sqrt(dot(turning, turning)))
+            w = launch.angular_velocity
+            momentum = jnp.maximum(momentum, I1 * jnp.sqrt(dot(w, w)))
         place = scale(ones, self.frame.place_scales(self.body.size))
         tilt = jnp.sin(launch.theta) / NEARLY_UPRIGHT
         # A top that stands exactly upright has no growth to resolve.

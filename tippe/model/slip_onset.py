@@ -30,8 +30,7 @@ from nonholonomic.xla_cpu import greatest
 from .contact_load import Slip
 from .dynamics import Dynamics
 from .friction import length
-from .rigid_dynamics import RollingDynamics as RigidRolling
-from .rigid_dynamics import SlippingDynamics
+from .rigid_dynamics import RigidRolling, RigidSlipping
 from .rolling import RollingDynamics
 
 #: Stages of the step. In powers of the step's length, the error of the step is of order `STAGES` + 1, and the estimate
@@ -75,13 +74,13 @@ class Onset(eqx.Module):
 
     - `start`: the state at the onset, (components, ...); `length`: its duration [s].
     - `rates`: rates of the state at the step's stages, (components, stages, ...).
-    - `found`: whether the step reached the tolerance.
+    - `converged`: whether the step reached the tolerance.
     """
 
     start: Float[Array, "components ..."]
     length: Float[Array, "..."]
     rates: Float[Array, "components stages ..."]
-    found: Bool[Array, "..."]
+    converged: Bool[Array, "..."]
 
     def at(self, fraction: Float[Array, "..."]) -> Float[Array, "components ..."]:
         """The state after a fraction of the step."""
@@ -90,7 +89,7 @@ class Onset(eqx.Module):
 
     def of_components(self, chosen: slice) -> "Onset":
         """The same step of some components alone."""
-        return Onset(self.start[chosen], self.length, self.rates[chosen], self.found)
+        return Onset(self.start[chosen], self.length, self.rates[chosen], self.converged)
 
     def falls_to_zero(
         self, event: Callable[[Float[Array, "components ..."]], Float[Array, "..."]], first: Float[Array, "..."]
@@ -113,13 +112,13 @@ class Onset(eqx.Module):
 
     @property
     def end(self) -> Float[Array, "components ..."]:
-        """The state at the end of the step, NaN if no step was found."""
+        """The state at the end of the step, NaN if the step did not converge."""
         moved = self.start + self.length * jnp.einsum("s,cs...->c...", WEIGHTS[-1], self.rates)
-        return jnp.where(self.found, moved, jnp.nan)
+        return jnp.where(self.converged, moved, jnp.nan)
 
 
-def begin(
-    slipping: Dynamics | SlippingDynamics,
+def slip_onset(
+    slipping: Dynamics | RigidSlipping,
     rolling: RollingDynamics | RigidRolling,
     mu: Float[Array, "..."],
     field: Callable[[Float[Array, "components ..."]], Float[Array, "components ..."]],
@@ -152,8 +151,8 @@ def begin(
 
         def newton(_, carry):
             v, moved, _, _ = carry
-            struck = rolling.with_slip(moved[:size], Slip(v[0], v[1]))
-            rates = field(jnp.concatenate([struck, moved[size:]]))
+            slipping_state = rolling.with_slip(moved[:size], Slip(v[0], v[1]))
+            rates = field(jnp.concatenate([slipping_state, moved[size:]]))
             moved = state[:, None] + age * jnp.einsum("js,cs...->cj...", WEIGHTS, rates)
             slip = slipping.motion(moved[:size]).slip
             change = contact.correction(age, v, jnp.stack([slip.x, slip.y]) - v)
@@ -173,7 +172,7 @@ def begin(
         # The scales of a launch that is upright up to round-off are nearly zero.
         sizes = jnp.maximum(scales, jnp.max(jnp.abs(moved), axis=1))
         error = jnp.maximum(jnp.max((highest / sizes)[:size], axis=0), unsettled)
-        # The contact must persist, or the slip would miss its loss.
+        # The contact must persist, or this step would miss a loss of contact.
         lost = jnp.min(slipping.contact_margin(moved[:size]), axis=0) <= 0.0
         error = jnp.where(jnp.isfinite(error) & ~lost, error, jnp.inf)
         converged = error <= jnp.maximum(tolerance, ROUNDING)
@@ -224,7 +223,7 @@ class _Contact(eqx.Module):
         d = jnp.stack([-F1 / force, -F2 / force])
 
         # The impulses that give the contact unit velocities: P_t = M^-1 v and P_n = -n . P_t.
-        (a, b, f), (_, c, h) = rolling.blow(state, 0), rolling.blow(state, 1)
+        (a, b, f), (_, c, h) = rolling.unit_impulse(state, 0), rolling.unit_impulse(state, 1)
         determinant = a * c - b * b
         lifted = jnp.stack([b * h - c * f, b * f - a * h]) / determinant
         yields = d[0] * (a * d[0] + b * d[1] + mu * f) + d[1] * (b * d[0] + c * d[1] + mu * h)

@@ -17,17 +17,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.geometry import AbstractFrame, stacked
-from nonholonomic.xla_cpu import greatest, least
+from nonholonomic.geometry import AbstractFrame
+from nonholonomic.xla_cpu import greatest
 
+from .contact_dynamics import FITS, AbstractDynamics, Motion
 from .contact_load import Slip
-from .dynamics import FITS, Dynamics, Motion
+from .dynamics import Dynamics
 from .friction import AbstractFriction, Frictionless, SetValuedCoulomb, length
 from .rigid_body import AbstractRigidBody
-from .rigid_dynamics import RollingDynamics as RigidRolling
-from .rigid_dynamics import SlippingDynamics
+from .rigid_dynamics import RigidRolling, RigidSlipping
 from .rolling import RollingDynamics
-from .slip_onset import Onset, begin
+from .slip_onset import Onset, slip_onset
 from .top import Top
 
 #: The remaining sliding distance at which a slip is stopped, over the tolerance and the radius. The error of the state
@@ -44,7 +44,7 @@ AT_REST = 1e-10
 ROUNDING = 1e-13
 
 
-class StickSlip(eqx.Module):
+class StickSlip(AbstractDynamics):
     """The equations of motion of a scene with `SetValuedCoulomb`, in place of `Dynamics`.
 
     A state whose contact is at rest rolls; any other state slips.
@@ -53,7 +53,7 @@ class StickSlip(eqx.Module):
     - `mu`: coefficient of friction [1].
     """
 
-    slipping: Dynamics | SlippingDynamics
+    slipping: Dynamics | RigidSlipping
     rolling: RollingDynamics | RigidRolling
     mu: Float[Array, "..."]
 
@@ -72,7 +72,7 @@ class StickSlip(eqx.Module):
         assert isinstance(friction, SetValuedCoulomb)
         if isinstance(body, AbstractRigidBody):
             shared = (frame, body, gravity, body.inertia.tensor.inverse)
-            return cls(SlippingDynamics(*shared, friction, 1.0 / body.mass), RigidRolling(*shared), friction.mu)
+            return cls(RigidSlipping(*shared, friction, 1.0 / body.mass), RigidRolling(*shared), friction.mu)
         slipping = Dynamics.of(body, frame, friction, gravity)
         return cls(slipping, RollingDynamics.of(body, frame, gravity), friction.mu)
 
@@ -98,14 +98,6 @@ class StickSlip(eqx.Module):
         slips = self.slip_speed(state) > AT_REST * self.speed
         kinds = (self.slipping.motion(state), self.rolling.motion(state))
         return jax.tree.map(lambda slipping, rolling: jnp.where(slips, slipping, rolling), *kinds)
-
-    def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-        """Rate of change of the state, (components, ...)."""
-        return stacked(self.motion(state).rate, state)
-
-    def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """The least of `margins`."""
-        return least(*self.margins(state))
 
     def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
         """Normal force as a fraction of the weight, plus a round-off allowance for a start with N = 0 exactly; and the
@@ -166,61 +158,53 @@ class Change(NamedTuple):
     elapsed: Float[Array, "..."]
 
 
-class ContactMode(eqx.Module):
+class ContactMode(AbstractDynamics):
     """One of the two kinds of motion of a `StickSlip`, in place of `Dynamics`; its contact margin falls to zero at its
     end.
 
-    - `both`: the scene's equations; `tolerance`: relative tolerance of the integration.
+    - `stick_slip`: the equations of the scene; `tolerance`: relative tolerance of the integration.
     - `rolls`: whether the top rolls or slips.
     """
 
-    both: StickSlip
+    stick_slip: StickSlip
     tolerance: Float[Array, ""]
     rolls: bool = eqx.field(static=True)
 
     @property
     def frame(self) -> AbstractFrame:
         """The frame of the body on the arena."""
-        return self.both.frame
+        return self.stick_slip.frame
 
     def motion(self, state: Float[Array, "components ..."]) -> Motion:
         """The equations of motion of this kind."""
-        return (self.both.rolling if self.rolls else self.both.slipping).motion(state)
-
-    def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-        """Rate of change of the state, (components, ...)."""
-        return stacked(self.motion(state).rate, state)
-
-    def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """Positive while this kind of motion lasts. Rolling leaves the friction cone before the normal force
-        vanishes."""
-        return least(*self.margins(state))
+        return (self.stick_slip.rolling if self.rolls else self.stick_slip.slipping).motion(state)
 
     def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
-        """The smooth functions whose least value is the contact margin."""
+        """Positive while this kind of motion lasts. Rolling leaves the friction cone before the normal force
+        vanishes."""
         if self.rolls:
-            grip, room = self.both.grip_left(state), self.both.rolling.motion(state).room
+            grip, room = self.stick_slip.grip_left(state), self.stick_slip.rolling.motion(state).room
             return (grip,) if room is None else (grip, room - FITS)
-        return (*self.both.slipping.margins(state), self.slip_left(state))
+        return (*self.stick_slip.slipping.margins(state), self.slip_left(state))
 
     def normal_spin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """As `StickSlip.normal_spin`."""
-        return self.both.normal_spin(state)
+        return self.stick_slip.normal_spin(state)
 
     def slip_left(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Excess of the slip speed over the speed at which a slip ends, in units of sqrt(g R). A slip that grows does
         not end."""
         speed, change = self._slowing(state)
-        way = LEFT * self.tolerance * self.both.rolling.size
-        return (speed - jnp.sqrt(2.0 * way * greatest(-change, 0.0))) / self.both.speed
+        way = LEFT * self.tolerance * self.stick_slip.rolling.size
+        return (speed - jnp.sqrt(2.0 * way * greatest(-change, 0.0))) / self.stick_slip.speed
 
     def _slowing(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """The slip's speed [m/s] and its rate."""
-        return jax.jvp(self.both.slip_speed, (state,), (self.both.slipping.field(state),))
+        return jax.jvp(self.stick_slip.slip_speed, (state,), (self.stick_slip.slipping.field(state),))
 
     def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
         """How a contact with zero margin has ended: a code in `LOSSES`."""
-        return self.both.loss(state)
+        return self.stick_slip.loss(state)
 
     def ended(
         self,
@@ -238,28 +222,30 @@ class ContactMode(eqx.Module):
         - `slipping`: rate of the whole state during slip; `scales`: its magnitudes.
         - `left`: time [s] to the horizon; the beginning of a slip is not longer.
         """
-        both, own, rest = self.both, state[:size], state[size:]
-        still = both.stopped(own)
+        stick_slip, own, rest = self.stick_slip, state[:size], state[size:]
+        still = stick_slip.stopped(own)
         nothing = jnp.zeros_like(own[0])
         if self.rolls:
             holds = nothing > 0.0
             # The mode ended because of the grip or the room, or there was no contact to begin with, as after an impact.
-            room, lost = both.rolling.motion(own).room, both.lifts_off(still)
-            lost = lost if room is None else lost | (room - FITS <= both.grip_left(own))
+            room, lost = stick_slip.rolling.motion(own).room, stick_slip.lifts_off(still)
+            lost = lost if room is None else lost | (room - FITS <= stick_slip.grip_left(own))
             wait = nothing
         else:
-            holds = both.rolling.grip(still, both.mu) >= 0.0
-            lost = both.slipping.contact_margin(own) <= self.slip_left(own)
+            holds = stick_slip.rolling.grip(still, stick_slip.mu) >= 0.0
+            lost = stick_slip.slipping.contact_margin(own) <= self.slip_left(own)
             # A slip that only reverses continues through zero, which it reaches in its remaining time.
             speed, change = self._slowing(own)
             slows = change < 0.0
             wait = jnp.where(slows & ~holds & ~lost, -speed / jnp.where(slows, change, 1.0), 0.0)
             wait = jnp.minimum(wait, left)
-            still = still + wait * both.rolling.field(still + 0.5 * wait * both.rolling.field(still))
+            still = still + wait * stick_slip.rolling.field(still + 0.5 * wait * stick_slip.rolling.field(still))
             rest = rest + wait * slipping(state)[size:]
         whole = jnp.concatenate([still, rest])
         slips = ~(holds | lost)
         most = jnp.where(slips, left - wait, 0.0)
-        onset = begin(both.slipping, both.rolling, both.mu, slipping, whole, size, scales, most, self.tolerance)
+        onset = slip_onset(
+            stick_slip.slipping, stick_slip.rolling, stick_slip.mu, slipping, whole, size, scales, most, self.tolerance
+        )
         after = jnp.where(slips, onset.end, jnp.where(lost, state, whole))
         return Change(after, holds, lost, onset, wait, wait + jnp.where(slips, onset.length, 0.0))

@@ -180,7 +180,7 @@ def gap_margin(scene: Scene[Top], flying: FlightState, ball: Ball, rounding: flo
     return ground.gap / body.radius + still_parting(rate, scene.gravity, body.radius, rounding)
 
 
-class Flight(AbstractProblem):
+class FlightProblem(AbstractProblem):
     """Flying until theta reaches an angle or a sphere is back at the arena; `falls` is the acceleration [m/s^2]."""
 
     scene: Scene[Top]
@@ -194,8 +194,8 @@ class Flight(AbstractProblem):
 
     def field(self, time, state):
         flying, body = flight_state(state), self.scene.body
-        turning = axis_rate(body, flying.axis, flying.momentum)
-        return stacked((*flying.velocity, *self.falls, *turning, None, None, None, None, None), state)
+        e_dot = axis_rate(body, flying.axis, flying.momentum)
+        return stacked((*flying.velocity, *self.falls, *e_dot, None, None, None, None, None), state)
 
     def event_function(self, state):
         return cosine(self.scene, flight_state(state)) - self.cos_angle
@@ -215,14 +215,14 @@ class QuadraturesInFlight(AbstractPassive):
 
     def rates(self, problem, time, state, passive):
         flying = flight_state(state)
-        turning = axis_rate(self.body, flying.axis, flying.momentum)
+        e_dot = axis_rate(self.body, flying.axis, flying.momentum)
         spin = dot(flying.momentum, flying.axis) / self.body.I3
         c = vector_of(passive[:3])
-        rates = (*c_rate(c, flying.axis, dot(turning, c)), spin, None)
+        rates = (*c_rate(c, flying.axis, dot(e_dot, c)), spin, None)
         return jnp.concatenate([problem.field(time, state), stacked(rates, passive)])
 
 
-class Slide(AbstractFlyingMode):
+class ArenaSlide(AbstractFlyingMode):
     """Sliding on the arena."""
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
@@ -275,13 +275,13 @@ class Fly(AbstractFlyingMode):
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         return self.extended(self.flight(state), QuadraturesInFlight(self.scene.body), state)
 
-    def flight(self, state: Float[Array, "components cells"]) -> Flight:
+    def flight(self, state: Float[Array, "components cells"]) -> FlightProblem:
         """The motion in flight from given states."""
         velocity, momentum = self.scales[0], self.scales[7]
         ones = jnp.ones_like(velocity)
         rows = [ones * self.scene.body.radius] * 3 + [velocity] * 3 + [ones] * 3 + [momentum] * 3 + [ones] * 2
         falls = scale(-1.0 * self.scene.gravity, self.scene.surface.up)
-        return Flight(self.scene, self.cos_angle, state[:OWN], jnp.stack(rows), falls)
+        return FlightProblem(self.scene, self.cos_angle, state[:OWN], jnp.stack(rows), falls)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         flying = flight_state(state)
@@ -302,16 +302,16 @@ class Fly(AbstractFlyingMode):
         rebounds = bounce * speed > CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
         bounce = jnp.where(rebounds, bounce, 0.0)
         if isinstance(scene.friction, SetValuedCoulomb):
-            struck, fails = resolve_coulomb_impact(scene.body, scene.friction, ball, free, bounce)
+            after_impact, fails = resolve_coulomb_impact(scene.body, scene.friction, ball, free, bounce)
         else:
-            struck, fails = resolve_impact(scene.body, scene.friction, ball, free, bounce)
+            after_impact, fails = resolve_impact(scene.body, scene.friction, ball, free, bounce)
         # If the landing was located slightly below the arena, the next flight would end where it begins.
         lifted = vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2])))
-        after = jnp.where(rebounds, in_flight(lifted, ground.axes, struck), in_contact(ground, struck))
+        after = jnp.where(rebounds, in_flight(lifted, ground.axes, after_impact), in_contact(ground, after_impact))
         if self.with_quadratures:
             across = vector_of(state[OWN + k] for k in range(3))
             across = jnp.where(rebounds, jnp.stack(across), jnp.stack(to_frame(across, ground.axes)))
-            gained = energy(scene.body, 0.0, struck) - energy(scene.body, 0.0, free)
+            gained = energy(scene.body, 0.0, after_impact) - energy(scene.body, 0.0, free)
             after = jnp.concatenate([after, across, state[OWN + 3 :].at[1].add(gained)])
         return Transition(
             mode=jnp.where(rebounds, FLYING, SLIDING),
@@ -328,4 +328,4 @@ def modes(
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `sliding.modes`."""
     arguments = (scene, problem.scales, problem.cos_angle, with_quadratures)
-    return (Slide(*arguments), Fly(*arguments)), jnp.zeros(problem.states.shape[1:], int)
+    return (ArenaSlide(*arguments), Fly(*arguments)), jnp.zeros(problem.states.shape[1:], int)

@@ -73,7 +73,7 @@ def _above_the_ground(
 
 
 def loss(scene: Scene[Top], state: Float[Array, "components ..."]) -> Int[Array, "..."]:
-    """Why a contact ended, if it was not merely lost: a code in `LOSSES` (`tippe/model/dynamics.py`)."""
+    """Why a contact ended, if it was not merely lost: a code in `LOSSES` (`tippe/model/contact_dynamics.py`)."""
     own, state = scene.dynamics, state[:OWN]
     if scene.body.stem is None:
         return own.loss(state)

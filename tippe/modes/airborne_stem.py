@@ -28,7 +28,7 @@ from .airborne import (
     SLIDING,
     STRIKING,
     Below,
-    Flight,
+    FlightProblem,
     FlightState,
     Fly,
     QuadraturesInFlight,
@@ -149,10 +149,10 @@ class SlideOnOne(AbstractFlyingMode):
         )
 
 
-class FlightToBlow(AbstractProblem):
+class FlightToImpact(AbstractProblem):
     """A flight; where a sphere is already at the arena (`strikes`), the flight ends at once."""
 
-    flight: Flight
+    flight: FlightProblem
     strikes: Bool[Array, ""]
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
@@ -180,7 +180,7 @@ class FlyBoth(Fly):
     strikes: Bool[Array, ""]
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
-        problem = FlightToBlow(self.flight(state), self.strikes)
+        problem = FlightToImpact(self.flight(state), self.strikes)
         return self.extended(problem, QuadraturesInFlight(self.scene.body), state)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
@@ -195,7 +195,7 @@ class FlyBoth(Fly):
         number = (stem < main).astype(int)
         own, other = own_and_other(scene, number)
         ground = landing_site(scene, flying, own)
-        astray = missed(scene, ground, own)
+        misses = missed(scene, ground, own)
         # If the landing was located slightly below the arena, the next mode would end where it begins.
         flying = flying._replace(place=vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2]))))
         ground = ground._replace(gap=zero)
@@ -215,7 +215,7 @@ class FlyBoth(Fly):
             mode=jnp.where(impact.throws, STRIKING, jnp.where(impact.rebounds, FLYING, slides)),
             state=after,
             elapsed=zero,
-            status=jnp.where(astray | impact.rests, UNRESOLVED, jnp.where(impact.fails, FAILED, RUNNING)),
+            status=jnp.where(misses | impact.rests, UNRESOLVED, jnp.where(impact.fails, FAILED, RUNNING)),
             crossing_time=jnp.full_like(zero, jnp.inf),
             counts=(impact.rebounds & ~impact.throws).astype(int)[None],
         )

@@ -52,7 +52,7 @@ class Touch(AbstractFlyingMode):
         transition = self.contact_state.reset_map(state, left)
         whole = transition.state
         if self.kind.rolls:
-            whole = jnp.concatenate([self.kind.both.rolling.carried_along(whole[:OWN]), whole[OWN:]])
+            whole = jnp.concatenate([self.kind.stick_slip.rolling.carried_along(whole[:OWN]), whole[OWN:]])
         flies = (transition.status == LEFT_DOMAIN) & (self.kind.loss(whole[:OWN]) == 0)
         mode = jnp.where(transition.mode == sticking.ROLLING, ROLLING, SLIPPING)
         return transition._replace(
@@ -68,9 +68,9 @@ class Land(Fly):
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Strike the arena; rebound, or slip or roll on."""
-        transition, both = super().reset_map(state, left), self.scene.dynamics
-        assert isinstance(both, StickSlip)
-        rests = both.slip_speed(transition.state[:OWN]) <= AT_REST * both.speed
+        transition, stick_slip = super().reset_map(state, left), self.scene.dynamics
+        assert isinstance(stick_slip, StickSlip)
+        rests = stick_slip.slip_speed(transition.state[:OWN]) <= AT_REST * stick_slip.speed
         mode = jnp.where(rests, ROLLING, SLIPPING)
         counts = jnp.concatenate([transition.counts, jnp.zeros_like(transition.counts)])
         return transition._replace(mode=jnp.where(transition.mode == FLYING, FLYING, mode), counts=counts)
@@ -80,13 +80,13 @@ def modes(
     scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `sliding.modes`."""
-    both, arguments = problem.dynamics, (scene, problem.scales, problem.cos_angle, with_quadratures)
-    assert isinstance(both, StickSlip)
+    stick_slip, arguments = problem.dynamics, (scene, problem.scales, problem.cos_angle, with_quadratures)
+    assert isinstance(stick_slip, StickSlip)
     slips, rolls = (
-        Touch(*arguments, ContactMode(both, jnp.asarray(tolerance, float), rolls_first), last)
+        Touch(*arguments, ContactMode(stick_slip, jnp.asarray(tolerance, float), rolls_first), last)
         for rolls_first in (False, True)
     )
-    rests = both.slip_speed(problem.states[:OWN]) <= AT_REST * both.speed
+    rests = stick_slip.slip_speed(problem.states[:OWN]) <= AT_REST * stick_slip.speed
     return (slips, Land(*arguments), rolls), jnp.where(rests, ROLLING, SLIPPING)
 
 

@@ -2,7 +2,7 @@
 
 As in `impact.py` the normal impulse p replaces time, and the contact's velocity changes by the constant matrix W. While
 the contact slips, the tangential impulse grows by -mu v / |v|, whose direction has no limit where a slip stops. With
-the slip distance s as the independent variable, ds = dp / |v|, nothing is singular, v' = |v| W_n - mu W_t v, and a slip
+the slip distance s as the independent variable, ds = dp / |v|, nothing is singular: v' = |v| W_n - mu W_t v, and a slip
 that stops decays exponentially in s.
 
 After a stop, the tangential impulse per unit of p is the f with |f| <= mu that minimises f.W_tt f / 2 + f.W_tn: v then
@@ -47,9 +47,9 @@ class Skid(AbstractProblem):
 
     def velocity(self, state: Float[Array, "3 cells"]) -> Vector:
         """Velocity of the contact point [m/s]."""
-        meets, blow = self.impact.approach, self.impact.blow(state[2], state[:2])
-        changes = tuple(dot(column, blow.force) for column in meets.response)
-        return sum_vectors(meets.velocity, changes)
+        contact, impulse = self.impact.approach, self.impact.impulse(state[2], state[:2])
+        changes = tuple(dot(column, impulse.force) for column in contact.response)
+        return sum_vectors(contact.velocity, changes)
 
     def start(self) -> tuple[Float[Array, "3 cells"], Float[Array, "3 cells"]]:
         none = jnp.zeros((3, *self.pace.shape))
@@ -77,9 +77,9 @@ def resolve_coulomb_impact(
 
     **Arguments, returns:** as for `resolve_impact`; this is its limit for a slip speed of 0.
     """
-    meets = approach(body, ball, free)
-    impact = Impact(body, friction, meets, ball.radius, (1.0 + restitution) * greatest(-meets.velocity[2], 0.0))
-    pace = greatest(length(*meets.velocity[:2]), impact.speed)
+    contact = approach(body, ball, free)
+    impact = Impact(body, friction, contact, ball.radius, (1.0 + restitution) * greatest(-contact.velocity[2], 0.0))
+    pace = greatest(length(*contact.velocity[:2]), impact.speed)
     skid = Skid(impact, friction.mu, pace)
     settings = Settings(TOLERANCE, diffrax.Dopri5(), absolute=0.1, max_steps=MOST_STEPS)
     outcome, _ = traced_solve_ensemble(skid, jnp.asarray(LARGEST), jnp.asarray(pace.shape[0]), settings)
@@ -90,16 +90,16 @@ def resolve_coulomb_impact(
     step = -left / jnp.where(slope == 0.0, 1.0, slope)
     step = jnp.where(jnp.abs(step) < 1e-6, step, 0.0)
     state = jnp.where(stops, outcome.state, outcome.state + step * rates)
-    blow = impact.blow(state[2], state[:2])
-    remaining = _onward(impact, friction.mu, blow.force)
-    force = vector_of(jnp.where(stops, a + b, a) for a, b in zip(blow.force, remaining, strict=True))
-    return apply_impulse(body, meets, free, ContactImpulse(force, None)), outcome.status != LEFT_DOMAIN
+    impulse = impact.impulse(state[2], state[:2])
+    remaining = _remaining_impulse(impact, friction.mu, impulse.force)
+    force = vector_of(jnp.where(stops, a + b, a) for a, b in zip(impulse.force, remaining, strict=True))
+    return apply_impulse(body, contact, free, ContactImpulse(force, None)), outcome.status != LEFT_DOMAIN
 
 
-def _onward(impact: Impact, mu: Float[Array, "..."], blow: Vector) -> Vector:
+def _remaining_impulse(impact: Impact, mu: Float[Array, "..."], impulse: Vector) -> Vector:
     """The impulse [N s] from the stop of the slip to the end of the impact."""
-    meets = impact.approach
-    W = meets.response
+    contact = impact.approach
+    W = contact.response
     a, b, c = W[0][0], W[0][1], W[1][1]
     f1, f2 = sticking_force((a, b, c), (W[0][2], W[1][2]), mu)
 
@@ -107,21 +107,21 @@ def _onward(impact: Impact, mu: Float[Array, "..."], blow: Vector) -> Vector:
         return tuple(dot(column, force) for column in W)
 
     # Where the contact sticks, the impulse first removes the remaining slip.
-    v1, v2, _ = sum_vectors(meets.velocity, change(blow))
+    v1, v2, _ = sum_vectors(contact.velocity, change(impulse))
     sticks, determinant = f1 * f1 + f2 * f2 < mu * mu, a * c - b * b
     rest = (
         jnp.where(sticks, (b * v2 - c * v1) / determinant, 0.0),
         jnp.where(sticks, (b * v1 - a * v2) / determinant, 0.0),
     )
-    blow = sum_vectors(blow, (*rest, None))
-    velocity, along = sum_vectors(meets.velocity, change(blow)), (f1, f2, jnp.ones_like(f1))
+    impulse = sum_vectors(impulse, (*rest, None))
+    velocity, along = sum_vectors(contact.velocity, change(impulse)), (f1, f2, jnp.ones_like(f1))
     # The impact ends as in `Impact.domain_margin`: the normal velocity is linear in the impulse, and the energy is
     # quadratic.
     gains = change(along)
-    wanted = greatest((meets.velocity[2] + impact.gained - velocity[2]) / gains[2], 0.0)
+    wanted = greatest((contact.velocity[2] + impact.gained - velocity[2]) / gains[2], 0.0)
     compressed = greatest(-velocity[2], 0.0) / gains[2]
     power, stiff = dot(along, velocity), dot(along, gains)
-    gain = least(dot(blow, meets.velocity) + 0.5 * dot(blow, change(blow)), 0.0)
+    gain = least(dot(impulse, contact.velocity) + 0.5 * dot(impulse, change(impulse)), 0.0)
     restored = (-power + jnp.sqrt(power * power - 2.0 * gain * stiff)) / stiff
     return sum_vectors(scale(least(wanted, greatest(compressed, restored)), along), (*rest, None))
 

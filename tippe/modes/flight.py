@@ -94,9 +94,9 @@ def cone(body: Top, free: FreeBody) -> Cone:
 
 def flown(body: Top, gravity: Float[Array, "..."], free: FreeBody, time: Float[Array, "..."]) -> FreeBody:
     """A free body after a time [s]."""
-    turning = cone(body, free)
-    angle = turning.rate * time
-    turned = (turning.along, scale(jnp.cos(angle), turning.across), scale(jnp.sin(angle), turning.ahead))
+    precession = cone(body, free)
+    angle = precession.rate * time
+    turned = (precession.along, scale(jnp.cos(angle), precession.across), scale(jnp.sin(angle), precession.ahead))
     u1, u2, u3 = free.velocity
     height = free.height + time * (u3 - 0.5 * gravity * time)
     return FreeBody((u1, u2, u3 - gravity * time), height, sum_vectors(*turned), free.momentum)
@@ -168,16 +168,16 @@ def _descent(
     touching: Bool[Array, " cells"],
 ) -> Descent:
     """The distance of a sphere from the plane in flight."""
-    turning = cone(body, free)
+    precession = cone(body, free)
     start = jnp.where(touching, 0.0, greatest(gap(ball, free), 0.0))
     speed = gap_rate(body, ball, free)
     speed = jnp.where(at_rest, 0.0, jnp.where(touching, greatest(speed, 0.0), speed))
-    cosine, sine = ball.offset * turning.across[2], ball.offset * turning.ahead[2]
+    cosine, sine = ball.offset * precession.across[2], ball.offset * precession.ahead[2]
     # Where the normal force vanishes, the distance has no curvature: the remainder is round-off, and may only rise.
-    unbent = -gravity / jnp.maximum(turning.rate**2, jnp.finfo(cosine.dtype).tiny)
+    unbent = -gravity / jnp.maximum(precession.rate**2, jnp.finfo(cosine.dtype).tiny)
     cosine = jnp.where(at_rest, jnp.minimum(cosine, unbent), cosine)
     gravity = jnp.broadcast_to(gravity, start.shape)
-    return Descent(start, speed, gravity, turning.rate, cosine, sine)
+    return Descent(start, speed, gravity, precession.rate, cosine, sine)
 
 
 def landing(descent: Descent, most: Cells) -> tuple[Cells, Bool[Array, " cells"]]:
@@ -258,12 +258,12 @@ def angle_reached(body: Top, free: FreeBody, cos_angle: Float[Array, "..."], unt
 
     Along the normal the axis is a constant plus a cosine, so the times are known in closed form.
     """
-    turning = cone(body, free)
-    height = jnp.hypot(turning.across[2], turning.ahead[2])
-    part = (cos_angle - turning.along[2]) / jnp.maximum(height, jnp.finfo(until.dtype).tiny)
-    crosses = (jnp.abs(part) < 1.0) & (turning.rate > 0.0)
-    angle = jnp.arctan2(turning.ahead[2], turning.across[2]) + jnp.arccos(jnp.clip(part, -1.0, 1.0))
-    turn, rate = 2.0 * jnp.pi, jnp.where(turning.rate > 0.0, turning.rate, 1.0)
+    precession = cone(body, free)
+    height = jnp.hypot(precession.across[2], precession.ahead[2])
+    part = (cos_angle - precession.along[2]) / jnp.maximum(height, jnp.finfo(until.dtype).tiny)
+    crosses = (jnp.abs(part) < 1.0) & (precession.rate > 0.0)
+    angle = jnp.arctan2(precession.ahead[2], precession.across[2]) + jnp.arccos(jnp.clip(part, -1.0, 1.0))
+    turn, rate = 2.0 * jnp.pi, jnp.where(precession.rate > 0.0, precession.rate, 1.0)
     angle = jnp.mod(angle, turn)
     if last:
         angle = angle + turn * jnp.floor((rate * until - angle) / turn)

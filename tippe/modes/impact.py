@@ -61,14 +61,14 @@ class Approach(NamedTuple):
     [m/s].
 
     `response` is the symmetric matrix W with (change of that velocity) = W (impulse) [1/kg], as three columns. `axis`
-    and `turning` are the axis and the angular velocity [rad/s] of the body.
+    and `angular_velocity` are the axis and the angular velocity [rad/s] of the body.
     """
 
     arm: Vector
     velocity: Vector
     response: tuple[Vector, Vector, Vector]
     axis: Vector
-    turning: Vector
+    angular_velocity: Vector
 
 
 class ContactImpulse(NamedTuple):
@@ -97,35 +97,35 @@ class Impact(AbstractProblem):
         """Speed along the normal before the impact [m/s], positive because it is the unit of the impulses."""
         return greatest(jnp.abs(self.approach.velocity[2]), 1e-12)
 
-    def blow(self, normal: Cells, state: Float[Array, "rows cells"]) -> ContactImpulse:
+    def impulse(self, normal: Cells, state: Float[Array, "rows cells"]) -> ContactImpulse:
         """The impulses at a stage of the impact."""
         unit = self.speed / self.approach.response[2][2]
         force = (state[0] * unit, state[1] * unit, normal * unit)
         return ContactImpulse(force, tuple(row * unit * self.radius for row in state[2:]) or None)
 
-    def changes(self, blow: ContactImpulse) -> tuple[Vector, Vector]:
+    def changes(self, impulse: ContactImpulse) -> tuple[Vector, Vector]:
         """Changes of the velocity of the contact point [m/s] and of the angular velocity [rad/s] by an impulse."""
-        meets, torque = self.approach, cross(self.approach.arm, blow.force)
-        velocity = tuple(dot(column, blow.force) for column in meets.response)
-        if blow.torque is not None:
-            turned = angular_velocity(self.body, meets.axis, blow.torque)
-            velocity = sum_vectors(velocity, cross(turned, meets.arm))
-            torque = sum_vectors(torque, blow.torque)
-        return velocity, angular_velocity(self.body, meets.axis, torque)
+        contact, torque = self.approach, cross(self.approach.arm, impulse.force)
+        velocity = tuple(dot(column, impulse.force) for column in contact.response)
+        if impulse.torque is not None:
+            turned = angular_velocity(self.body, contact.axis, impulse.torque)
+            velocity = sum_vectors(velocity, cross(turned, contact.arm))
+            torque = sum_vectors(torque, impulse.torque)
+        return velocity, angular_velocity(self.body, contact.axis, torque)
 
-    def load(self, velocity: Vector, turning: Vector) -> ContactLoad:
+    def load(self, velocity: Vector, w: Vector) -> ContactLoad:
         """Friction force and torque per unit normal impulse."""
-        drilling = turning[2] if self.friction.uses_spin else None
-        return self.friction.per_normal_force(Slip(velocity[0], velocity[1], (turning[0], turning[1], drilling)))
+        drilling = w[2] if self.friction.uses_spin else None
+        return self.friction.per_normal_force(Slip(velocity[0], velocity[1], (w[0], w[1], drilling)))
 
     def start(self) -> tuple[Float[Array, "rows cells"], Float[Array, "rows cells"]]:
-        turns = self.load(self.approach.velocity, self.approach.turning).torque != (None, None, None)
+        turns = self.load(self.approach.velocity, self.approach.angular_velocity).torque != (None, None, None)
         none = jnp.zeros((5 if turns else 2, *self.gained.shape))
         return none, jnp.ones_like(none)
 
     def field(self, time: Cells, state: Float[Array, "rows cells"]) -> Float[Array, "rows cells"]:
-        meets, (velocity, turning) = self.approach, self.changes(self.blow(time, state))
-        load = self.load(sum_vectors(meets.velocity, velocity), sum_vectors(meets.turning, turning))
+        contact, (velocity, w) = self.approach, self.changes(self.impulse(time, state))
+        load = self.load(sum_vectors(contact.velocity, velocity), sum_vectors(contact.angular_velocity, w))
         torque = scale(1.0 / self.radius, load.torque) if len(state) > 2 else ()
         rows = [jnp.zeros_like(time) if component is None else component for component in (*load.force, *torque)]
         return jnp.stack(jnp.broadcast_arrays(*rows, time)[:-1])
@@ -134,15 +134,15 @@ class Impact(AbstractProblem):
         return None
 
     def domain_margin(self, time: Cells, state: Float[Array, "rows cells"]) -> Cells:
-        blow, response = self.blow(time, state), self.approach.response
-        change, turned = self.changes(blow)
+        impulse, response = self.impulse(time, state), self.approach.response
+        change, turned = self.changes(impulse)
         missing = (self.gained - change[2]) / self.speed
         # In compression, the sphere still approaches; in restitution, the margin is the dissipated energy that need not
         # be returned.
         approaches = -(self.approach.velocity[2] + change[2]) / self.speed
-        gain = dot(blow.force, self.approach.velocity) + 0.5 * dot(blow.force, change)
-        if blow.torque is not None:
-            gain = gain + dot(blow.torque, self.approach.turning) + 0.5 * dot(blow.torque, turned)
+        gain = dot(impulse.force, self.approach.velocity) + 0.5 * dot(impulse.force, change)
+        if impulse.torque is not None:
+            gain = gain + dot(impulse.torque, self.approach.angular_velocity) + 0.5 * dot(impulse.torque, turned)
         short = -gain * response[2][2] / self.speed**2
         return least(missing, jnp.where(approaches > short, approaches, short))
 
@@ -154,7 +154,7 @@ class Impact(AbstractProblem):
         left, slope = jax.jvp(self.domain_margin, (time, state), (jnp.ones_like(time), self.field(time, state)))
         step = -left / jnp.where(slope == 0.0, 1.0, slope)
         step = jnp.where(jnp.abs(step) < 1e-6, step, 0.0)
-        return self.blow(time + step, state + step * self.field(time, state))
+        return self.impulse(time + step, state + step * self.field(time, state))
 
 
 def approach(body: Top, ball: Ball, free: FreeBody) -> Approach:
@@ -167,8 +167,8 @@ def approach(body: Top, ball: Ball, free: FreeBody) -> Approach:
         ball.offset * free.axis[1],
         ball.offset * free.axis[2] - ball.radius,
     )
-    turning = angular_velocity(body, free.axis, free.momentum)
-    velocity = sum_vectors(free.velocity, cross(turning, arm))
+    w = angular_velocity(body, free.axis, free.momentum)
+    velocity = sum_vectors(free.velocity, cross(w, arm))
     zero, unit = jnp.zeros_like(arm[0]), jnp.ones_like(arm[0])
 
     def gained(impulse: Vector) -> Vector:
@@ -176,7 +176,7 @@ def approach(body: Top, ball: Ball, free: FreeBody) -> Approach:
         return sum_vectors(scale(1.0 / body.mass, impulse), cross(turned, arm))
 
     response = (gained((unit, zero, zero)), gained((zero, unit, zero)), gained((zero, zero, unit)))
-    return Approach(arm, velocity, response, free.axis, turning)
+    return Approach(arm, velocity, response, free.axis, w)
 
 
 def resolve_impact(
@@ -195,9 +195,9 @@ def resolve_impact(
 
     **Returns:** the body after the impact; and whether the impact could not be computed (`MOST_STEPS`, `LARGEST`).
     """
-    meets = approach(body, ball, free)
-    gained = (1.0 + restitution) * greatest(-meets.velocity[2], 0.0)
-    problem = Impact(body, friction, meets, ball.radius, gained)
+    contact = approach(body, ball, free)
+    gained = (1.0 + restitution) * greatest(-contact.velocity[2], 0.0)
+    problem = Impact(body, friction, contact, ball.radius, gained)
     cells = gained.shape[0]
     outcome, _ = traced_solve_ensemble(
         problem,
@@ -206,14 +206,14 @@ def resolve_impact(
         Settings(TOLERANCE, diffrax.Dopri5(), absolute=1.0, max_steps=MOST_STEPS),
     )
     return apply_impulse(
-        body, meets, free, problem.ended(outcome.end_time, outcome.state)
+        body, contact, free, problem.ended(outcome.end_time, outcome.state)
     ), outcome.status != LEFT_DOMAIN
 
 
-def apply_impulse(body: Top, meets: Approach, free: FreeBody, blow: ContactImpulse) -> FreeBody:
+def apply_impulse(body: Top, contact: Approach, free: FreeBody, impulse: ContactImpulse) -> FreeBody:
     """A free body after an impulse at its contact."""
-    velocity = sum_vectors(free.velocity, scale(1.0 / body.mass, blow.force))
-    momentum = sum_vectors(free.momentum, cross(meets.arm, blow.force))
-    if blow.torque is not None:
-        momentum = sum_vectors(momentum, blow.torque)
+    velocity = sum_vectors(free.velocity, scale(1.0 / body.mass, impulse.force))
+    momentum = sum_vectors(free.momentum, cross(contact.arm, impulse.force))
+    if impulse.torque is not None:
+        momentum = sum_vectors(momentum, impulse.torque)
     return FreeBody(velocity, free.height, free.axis, momentum)

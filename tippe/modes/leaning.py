@@ -21,15 +21,15 @@ forces vanishes before that.
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.geometry import Component, add, cross, dot, multiply, scale, stacked, subtract, sum_vectors
-from nonholonomic.xla_cpu import least
+from nonholonomic.geometry import Component, add, cross, dot, multiply, scale, subtract, sum_vectors
 
+from ..model.contact_dynamics import AbstractDynamics
 from ..model.contact_load import Slip
 from ..model.friction import AbstractFriction
+from ..model.scene import Scene
 from ..model.state import angular_velocity, parts
 from ..model.top import Top
 from .free_body import FreeBody, axis_rate, balls, contact_state, gap_rate
@@ -64,7 +64,7 @@ class LeaningMotion(NamedTuple):
     definiteness: Float[Array, "..."]
 
 
-class LeaningDynamics(eqx.Module):
+class LeaningDynamics(AbstractDynamics):
     """The equations of motion of a top with a stem while both of its spheres touch the plane.
 
     The state has the layout of `tippe/model/dynamics.py`. Its cos theta is constant to the bit; the part of L along
@@ -74,6 +74,11 @@ class LeaningDynamics(eqx.Module):
     body: Top
     friction: AbstractFriction
     gravity: Float[Array, "..."]
+
+    @classmethod
+    def of(cls, scene: Scene[Top]) -> "LeaningDynamics":
+        """The equations for the top of a scene."""
+        return cls(scene.body, scene.friction, scene.gravity)
 
     def motion(self, state: Float[Array, "components ..."]) -> LeaningMotion:
         """Evaluate the equations of motion.
@@ -93,9 +98,9 @@ class LeaningDynamics(eqx.Module):
         precession = (p - c * along) / I1
         rolling = along / I1 + (1.0 / I3 - 1.0 / I1) * b
 
-        turning = (rolling * e[0], rolling * e[1], rolling * c + precession if self.friction.uses_spin else None)
+        w = (rolling * e[0], rolling * e[1], rolling * c + precession if self.friction.uses_spin else None)
         velocities = [sum_vectors(u, scale(rolling * R + precession * a, across)) for a, R in spheres]
-        slips = [Slip(x, y, turning) for x, y in velocities]
+        slips = [Slip(x, y, w) for x, y in velocities]
         loads = [self.friction.per_normal_force(slip) for slip in slips]
         height = spheres[0].radius - spheres[0].offset * c
         m_0, m_1 = (
@@ -118,14 +123,6 @@ class LeaningDynamics(eqx.Module):
         power = dot(normal, tuple(load.power(slip) for load, slip in zip(loads, slips, strict=True)))
         stiff = (m_1 - m_0) / ((spheres[1].offset - spheres[0].offset) * sine2)
         return LeaningMotion(rate, normal, power, b, stiff)
-
-    def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-        """Rate of change of the state, (8, ...)."""
-        return stacked(self.motion(state).rate, state)
-
-    def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """The smaller of `margins`."""
-        return least(*self.margins(state))
 
     def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
         """Both normal forces as fractions of the weight, plus `HOLDS`."""

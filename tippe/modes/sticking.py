@@ -58,7 +58,7 @@ class StickSlipMode(AbstractBatchedMode):
         """The velocity of a rolling top follows from the other components of its state."""
         if not self.kind.rolls:
             return state
-        own = self.kind.both.rolling.carried_along(state[: self._size(state)])
+        own = self.kind.stick_slip.rolling.carried_along(state[: self._size(state)])
         return jnp.concatenate([own, state[self._size(state) :]])
 
     def between(self, motion: tuple[Onset, Array], passed: Float[Array, " times"]) -> Float[Array, "components times"]:
@@ -67,7 +67,7 @@ class StickSlipMode(AbstractBatchedMode):
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Stick, slip, or end if the contact is lost. Counts the changes from slip to rolling."""
-        slipping = self._under(self.kind.both.slipping, state)
+        slipping = self._under(self.kind.stick_slip.slipping, state)
         change = self.kind.ended(state, self._size(state), lambda at: slipping.field(left, at), self.scales, left)
         onset, length = change.onset, change.onset.length
         began = -change.wait / jnp.where(length > 0.0, length, 1.0)
@@ -80,17 +80,20 @@ class StickSlipMode(AbstractBatchedMode):
             # The impulse that stops a slip changes the spin, too.
             crosses = falls & ~change.lost
             fraction = onset.falls_to_zero(self._event, began)
-        crossing = change.wait + fraction * length
+        # Only a launch beyond the event, from which the top slips at once, gets here beyond it.
+        beyond = (self._event(state) <= 0.0) & (not self.last)
+        crossing = jnp.where(beyond, 0.0, change.wait + fraction * length)
+        crosses |= beyond
         ends = crosses & (not self.last)
         status = jnp.where(change.elapsed >= left, REACHED_END, RUNNING)
         status = jnp.where(change.lost, LEFT_DOMAIN, jnp.where(ends, CROSSED, status))
         return Transition(
-            mode=jnp.where(change.rolls, ROLLING, SLIPPING),
-            state=jnp.where(ends, onset.at(fraction), change.state),
+            mode=jnp.where(beyond, int(self.kind.rolls), jnp.where(change.rolls, ROLLING, SLIPPING)),
+            state=jnp.where(beyond, state, jnp.where(ends, onset.at(fraction), change.state)),
             elapsed=jnp.where(ends, crossing, change.elapsed),
             status=status,
             crossing_time=jnp.where(crosses, crossing, jnp.inf),
-            counts=(change.rolls & ~change.lost & (not self.kind.rolls)).astype(int)[None],
+            counts=(change.rolls & ~change.lost & ~beyond & (not self.kind.rolls)).astype(int)[None],
             record=None if self.passive is None else _recorded(change),
         )
 
@@ -98,7 +101,7 @@ class StickSlipMode(AbstractBatchedMode):
         """The function whose fall to zero ends a run."""
         if self.spin is None:
             return state[COS_THETA] - self.cos_angle
-        return self.kind.both.normal_spin(state[: self._size(state)]) / self.spin
+        return self.kind.stick_slip.normal_spin(state[: self._size(state)]) / self.spin
 
     def _size(self, state: Float[Array, "components ..."]) -> int:
         """Number of components in the equations of motion."""
@@ -136,18 +139,18 @@ def modes(
     - `tolerance`: relative tolerance of the integration; `last`: whether the last crossing counts.
     - `passive`, `size`: as for `StickSlipMode`.
     """
-    both = problem.dynamics
-    assert isinstance(both, StickSlip)
-    kinds = (ContactMode(both, jnp.asarray(tolerance, float), rolls) for rolls in (False, True))
+    stick_slip = problem.dynamics
+    assert isinstance(stick_slip, StickSlip)
+    kinds = (ContactMode(stick_slip, jnp.asarray(tolerance, float), rolls) for rolls in (False, True))
     options = (problem.cos_angle, problem.scales, last, passive, size, problem.spin)
     both_modes = tuple(StickSlipMode(kind, *options) for kind in kinds)
-    return both_modes, _first_mode(both, problem.states)
+    return both_modes, _first_mode(stick_slip, problem.states)
 
 
 @compiled_setup
-def _first_mode(both: StickSlip, states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+def _first_mode(stick_slip: StickSlip, states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
     """The index of the mode in which each cell starts."""
-    return jnp.where(both.slip_speed(states) <= AT_REST * both.speed, ROLLING, SLIPPING)
+    return jnp.where(stick_slip.slip_speed(states) <= AT_REST * stick_slip.speed, ROLLING, SLIPPING)
 
 
 def contact_modes(

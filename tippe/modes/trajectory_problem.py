@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import Component, Tangent, Vector, carried, cross, dot, scale, stacked, sum_vectors
+from nonholonomic.geometry import Component, Tangent, Vector, cross, dot, rate_in_frame, scale, stacked, sum_vectors
 from nonholonomic.integration import AbstractPassive, ExtendedProblem
 from nonholonomic.xla_cpu import compiled_setup
 
@@ -42,20 +42,20 @@ class Quadratures(AbstractPassive):
     ) -> Float[Array, "components ..."]:
         dynamics, (u, e, L, _) = problem.dynamics, parts(state)
         motion, (*path, c1, c2, c3, _, _) = dynamics.motion(state), passive
-        c, turning = (c1, c2, c3), (None, None) if self.of_mass else motion.turning
-        path_rate = u if self.of_mass else dynamics.frame.cyclic_rate(tuple(path), motion.velocity, turning)
+        c, frame_rate = (c1, c2, c3), (None, None) if self.of_mass else motion.frame_rate
+        path_rate = u if self.of_mass else dynamics.frame.cyclic_rate(tuple(path), motion.velocity, frame_rate)
         # In a frame that turns, the components of the axis have another rate than the axis.
         if self.of_mass or not isinstance(dynamics, Dynamics):
-            falls = dot(sum_vectors(motion.rate[2:5], scale(-1.0, carried(e, turning))), c)
+            falls = dot(sum_vectors(motion.rate[2:5], scale(-1.0, rate_in_frame(e, frame_rate))), c)
         else:
             falls = dot(cross(L, e), c) * dynamics.per_transverse
-        rates = (*path_rate, *c_rate(c, e, falls, turning), motion.spin_momentum / self.axial)
+        rates = (*path_rate, *c_rate(c, e, falls, frame_rate), motion.spin_momentum / self.axial)
         return stacked((*motion.rate, *rates, motion.friction_power), state)
 
 
-def c_rate(c: Vector, axis: Vector, falls: Component, turning: Tangent = (None, None)) -> tuple[Component, ...]:
+def c_rate(c: Vector, axis: Vector, falls: Component, frame_rate: Tangent = (None, None)) -> tuple[Component, ...]:
     """c' = (e x e') x c = -(e'.c) e, with `falls` = e'.c [1/s], in a frame that turns at a rate [rad/s]."""
-    return sum_vectors(scale(-falls, axis), carried(c, turning))
+    return sum_vectors(scale(-falls, axis), rate_in_frame(c, frame_rate))
 
 
 def trajectory_problem(modules: tuple[Scene, Launch], cells: int | None = None) -> TrajectoryProblem:

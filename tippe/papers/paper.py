@@ -34,7 +34,7 @@ class Row(NamedTuple):
     time: float | None
 
 
-class Table(NamedTuple):
+class PrintedTable(NamedTuple):
     """Table 2 or 3, whose rows differ only in the inclination.
 
     - `eta`: place at the start [rad].
@@ -48,11 +48,11 @@ class Table(NamedTuple):
 
 
 THETAS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, float(jnp.pi) / 2.0)
-TABLE_2 = Table(0.0, 0.3, tuple(map(Row, THETAS, (25.0, 22.0, *(None,) * 7))))
-TABLE_3 = Table(float(jnp.pi) / 2.0, 0.3, tuple(map(Row, THETAS, (23.0, 19.0, 20.0, 22.0, *(None,) * 5))))
+TABLE_2 = PrintedTable(0.0, 0.3, tuple(map(Row, THETAS, (25.0, 22.0, *(None,) * 7))))
+TABLE_3 = PrintedTable(float(jnp.pi) / 2.0, 0.3, tuple(map(Row, THETAS, (23.0, 19.0, 20.0, 22.0, *(None,) * 5))))
 
 
-def launch(table: Table, row: Row, body: Top) -> Launch:
+def launch(table: PrintedTable, row: Row, body: Top) -> Launch:
     """The launch of a row, with the spin from beta1 = I3 omega3 at t = 0 and everything else at rest."""
     return Launch(row.theta, BETA1 / body.I3, eta=table.eta)
 

@@ -34,7 +34,7 @@ from ..model.top import Top
 from ..runs.plot import Panel, draw_launches
 from ..runs.table import inversion_table
 from ..runs.trajectory import simulate
-from ..runs.view import Motion, stages
+from ..runs.view import DrawnMotion, stages
 from . import paper
 
 #: The arenas by name, and their numbers.
@@ -62,11 +62,11 @@ def parser() -> argparse.ArgumentParser:
     command = argparse.ArgumentParser(
         prog="python -m tippe --paper",
         description="Inversion times of a tippe top inside a cylinder (the paper's Tables 2 and 3) and on the plane. "
-        "Prints them beside the printed ones, writes an HDF5 table for each arena and a picture of theta(t).",
+        "Prints them beside the published times, writes an HDF5 table for each arena and a picture of theta(t).",
         formatter_class=Help,
     )
     command.add_argument("--version", action="version", version=f"nonholonomic {__version__}")
-    top = command.add_argument_group("the top (the paper's Table 1 lost its numbers: these are Rutstam's)")
+    top = command.add_argument_group("the top (the numbers of the paper's Table 1 are lost; these are Rutstam's)")
     top.add_argument("--mass", type=float, default=0.02, help="mass [kg]")
     top.add_argument("--radius", type=float, default=0.02, help="radius R of the sphere [m]")
     top.add_argument("--offset", type=float, default=0.006, help="distance of the centre of mass from the centre [m]")
@@ -227,7 +227,7 @@ def described(options: argparse.Namespace) -> list[str]:
         f"Top: m = {float(body.mass):g} kg, R = {float(body.radius):g} m, a = {float(body.offset):g} m, "
         f"I1 = {float(body.I1):.4g}, I3 = {float(body.I3):.4g} kg m^2; friction {_friction(scene.friction)}; "
         f"cylinder {options.cylinder_radius:g} m.",
-        "The paper's Table 1 lost its numbers, so this top is a declared one (Rutstam's): compare trends, not digits.",
+        "The numbers of the paper's Table 1 are lost, so we use Rutstam's top: compare trends, not digits.",
         f"-: not inverted within {options.t1:g} s.",
     ]
 
@@ -240,12 +240,12 @@ def _friction(law: AbstractFriction) -> str:
 
 
 @compiled_quickly
-def moving(scene: Scene[Top], launches: Launch, times: Any, tolerance: Any) -> Motion:
+def moving(scene: Scene[Top], launches: Launch, times: Any, tolerance: Any) -> DrawnMotion:
     """The drawn quantities of every launch at the given times, in one batched run."""
-    return jax.vmap(lambda launch: Motion.of(simulate(scene, launch, times[-1], times, tolerance)))(launches)
+    return jax.vmap(lambda launch: DrawnMotion.of(simulate(scene, launch, times[-1], times, tolerance)))(launches)
 
 
-def drawn(options: argparse.Namespace, t1: float) -> tuple[Any, dict[str, Motion]]:
+def drawn(options: argparse.Namespace, t1: float) -> tuple[Any, dict[str, DrawnMotion]]:
     """The times of the plot, up to `t1` [s], and the drawn quantities of every launch in each arena.
 
     All numbers are arrays: another Python number would compile a new program, so the picture and the page could not
@@ -253,7 +253,7 @@ def drawn(options: argparse.Namespace, t1: float) -> tuple[Any, dict[str, Motion
     """
     arenas, times = scenes(options), np.linspace(0.0, t1, SAMPLES)
     tolerance = np.asarray(options.tolerance)
-    with Progress(len(arenas), "arena", "compiling what is drawn"), ThreadPoolExecutor(2) as threads:
+    with Progress(len(arenas), "arena", "compiling the drawing"), ThreadPoolExecutor(2) as threads:
         runs = threads.map(lambda scene: moving(scene, starts(options, scene)[1], times, tolerance), arenas.values())
         return times, dict(zip(arenas, runs, strict=True))
 
@@ -292,7 +292,7 @@ def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[Sta
     (_, runs), groups = drawn(options, last), []
     for arena, scene in scenes(options).items():
         name = f"{shown_name(options, arena)}, θ(0) = {options.theta[row]:.4g} rad"
-        groups.append([(name, scene, Motion(*(np.asarray(part)[row] for part in runs[arena])))])
+        groups.append([(name, scene, DrawnMotion(*(np.asarray(part)[row] for part in runs[arena])))])
     return stages(groups)
 
 

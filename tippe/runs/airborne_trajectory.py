@@ -1,4 +1,4 @@
-"""One run through contacts, flights and impacts, with its path, where flights are integrated."""
+"""One run through contacts, flights and impacts, with its path, in scenes whose flights are integrated numerically."""
 
 import dataclasses
 from typing import Any
@@ -13,7 +13,8 @@ from nonholonomic.hybrid import BETWEEN, Segment, hybrid_samples, solve_hybrid_d
 from nonholonomic.integration import Settings, Status
 from nonholonomic.xla_cpu import compiled_setup
 
-from ..model.dynamics import LOSSES, NO_COSINE, Motion
+from ..model.contact_dynamics import LOSSES, Motion
+from ..model.dynamics import NO_COSINE
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.state import parts

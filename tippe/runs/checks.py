@@ -33,14 +33,14 @@ def permitted(
     `unchecked`: whether some leaves were traced, so that earlier checks ignored them.
     """
     scene, launch, angle, t1, tolerance = jax.tree.unflatten(structure, leaves)
-    may = jnp.asarray(True)
+    is_legal = jnp.asarray(True)
     if unchecked:
         bounds = (*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch), *event_bounds(angle))
-        may = legal(bounds)
+        is_legal = legal(bounds)
         if angle is None:
-            may = may & (scene.dynamics.normal_spin(scene.state(launch)) != 0.0)
-        may, t1, tolerance = legal_run(may, t1, tolerance)
-    return may, t1, jnp.min(tolerance)
+            is_legal = is_legal & (scene.dynamics.normal_spin(scene.state(launch)) != 0.0)
+        is_legal, t1, tolerance = legal_run(is_legal, t1, tolerance)
+    return is_legal, t1, jnp.min(tolerance)
 
 
 # One program if the function is called on its own, instead of one for every comparison.

@@ -39,7 +39,7 @@ from nonholonomic.views.explore import (
     sliders_of,
 )
 
-from ..model.dynamics import LOSSES
+from ..model.contact_dynamics import LOSSES
 from ..model.friction import NoSlip
 from ..model.launch import Launch
 from ..model.rigid_body import AbstractRigidBody
@@ -53,7 +53,7 @@ from .flight_trajectory import HybridTrajectory, level_modes
 from .launches import LONG_NAMES, UNITS
 from .quantities import OF_RIGID_BODIES, QUANTITIES
 from .trajectory import Trajectory, simulate
-from .view import AXIS, BESIDE, Motion, aside, curve_of_rotation, show
+from .view import AXIS, BESIDE, DrawnMotion, aside, curve_of_rotation, show
 
 Numbers = Float[Array, " numbers"]
 
@@ -146,8 +146,8 @@ def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float
 
     def allowed(values: Numbers) -> Bool[Array, ""]:
         scene, launch = modules(values)
-        may = jnp.all(legal((*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch))))
-        return may & (scene.dynamics.normal_spin(scene.state(launch)) != 0.0) if reverses(scene) else may
+        is_legal = jnp.all(legal((*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch))))
+        return is_legal & (scene.dynamics.normal_spin(scene.state(launch)) != 0.0) if reverses(scene) else is_legal
 
     settings, quantities = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE), QUANTITIES | OF_RIGID_BODIES
     answer, motion = (hybrid_simulators if flies(scene) else smooth_simulators)(modules, float(t1), settings)
@@ -174,9 +174,9 @@ def smooth_simulators(
     def moment(values: Numbers, problem: TrajectoryProblem, lane: LaneState) -> Frame:
         return smooth_frame(modules(values)[0], problem, lane)
 
-    asked = {"outcome": lambda values, problem, lane: outcome(problem, lane)}
+    readings = {"outcome": lambda values, problem, lane: outcome(problem, lane)}
     return (
-        Simulator(lambda values: event_problem(*modules(values)), t1, settings, asked),
+        Simulator(lambda values: event_problem(*modules(values)), t1, settings, readings),
         Simulator(lambda values: trajectory_problem(modules(values), 1), t1, settings, {"frame": moment}),
     )
 
@@ -209,9 +209,9 @@ def hybrid_simulators(
     def moment(values: Numbers, number: Any, rows: Any, time: Any) -> Frame:
         return hybrid_frame(modules(values)[0], number, rows, time)
 
-    asked = {"outcome": lambda values, runs: hybrid_outcome(runs)}
+    readings = {"outcome": lambda values, runs: hybrid_outcome(runs)}
     return (
-        HybridSimulator(to_inversion, t1, settings, 1, asked),
+        HybridSimulator(to_inversion, t1, settings, 1, readings),
         HybridSimulator(lambda values: level_modes(modules(values), TOLERANCE), t1, settings, 1, {}, moment),
     )
 
@@ -294,7 +294,7 @@ def stage_of_runs(scene: Scene, launch: Launch, knobs: tuple[Slider, ...], t1: f
 
 def stage_at_start(scene: Scene[Top], launch: Launch, t1: float) -> Stage:
     """A top on a level plane at its launch; the page replaces it by a simulated run before it is visible."""
-    start = Motion(*(np.repeat(np.asarray(part), 2, axis=0) for part in _motion_at_start(scene, launch)))
+    start = DrawnMotion(*(np.repeat(np.asarray(part), 2, axis=0) for part in _motion_at_start(scene, launch)))
     drawn, size = show(scene, start._replace(times=np.array([0.0, 1.0])), 0, ""), float(scene.body.size)
     # Slips grow as the top rises; a slip at half the speed of the equator gets the longest arrow.
     normal_force, slip, *others = drawn.arrows
@@ -307,12 +307,12 @@ def stage_at_start(scene: Scene[Top], launch: Launch, t1: float) -> Stage:
 
 
 @eqx.filter_jit
-def _motion_at_start(scene: Scene[Top], launch: Launch) -> Motion[Array]:
+def _motion_at_start(scene: Scene[Top], launch: Launch) -> DrawnMotion[Array]:
     modes, number, state = level_modes((scene, launch), TOLERANCE)
     assert isinstance(modes[0], Slide)
     # The other tops stand on their stem.
     rows = dataclasses.replace(modes[0], number=number).shown(state)
-    return Motion.of(hybrid_run(scene, number, rows, jnp.zeros(1)))
+    return DrawnMotion.of(hybrid_run(scene, number, rows, jnp.zeros(1)))
 
 
 def smooth_frame(scene: Scene, problem: TrajectoryProblem, lane: LaneState) -> Frame:
@@ -339,7 +339,7 @@ def hybrid_run(
 
 def frame(scene: Scene, run: Any) -> Frame:
     """The drawn quantities of a top for a run with a single time, in the order of `view.show`."""
-    motion = Motion(*(part[0] for part in Motion.of(run)))
+    motion = DrawnMotion(*(part[0] for part in DrawnMotion.of(run)))
     radius = scene.body.size
     lifted = motion.contact + 0.02 * radius * motion.normal
     offset = scene.body.offset if isinstance(scene.body, Top) else 0.0

@@ -117,7 +117,7 @@ class ExtendedSolve(AbstractDifferentiableSolve):
         nested: bool = False,
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
         """The extended times of every cell, and their derivatives along tangents (as of `VariationalProblem`)."""
-        may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
+        is_legal, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         varied = VariationalProblem(problem, tangents, True)
         # A fit may try parameters that are far off.
         settings = Settings(tolerance, max_steps=MOST_STEPS)
@@ -135,7 +135,7 @@ class ExtendedSolve(AbstractDifferentiableSolve):
             whole = greatest(_e_folds(problem.states, angle), 1.0)
             return jnp.where(crossed, time, t1 * (1.0 + missing / whole))
 
-        good = may & (outcome.status != FAILED)
+        good = is_legal & (outcome.status != FAILED)
         times = jnp.where(good, extended(problem, state), jnp.nan)
         slopes = [
             jnp.where(good, eqx.filter_jvp(extended, (problem, state), moved)[1], jnp.nan)

@@ -154,15 +154,15 @@ class InversionSolve(AbstractDifferentiableSolve):
         return jnp.isinf(value)
 
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
-        may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
+        is_legal, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         inversions = self._inversions((*leaves[: self.movable], tolerance), cells)
         outcome = inversions.solve(t1, cells, self.settings.with_tolerance(tolerance), traced())
-        return self._times(leaves, may, tolerance, inversions, outcome, [])[0]
+        return self._times(leaves, is_legal, tolerance, inversions, outcome, [])[0]
 
     def value_and_tangents(
         self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
-        may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
+        is_legal, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         # Cells are independent, so varying a parameter in all of them at once gives each its own derivative.
         moving = (*leaves[: self.movable], tolerance)
         inversions, tangents, gather = tangents_by(self._inversions, active, moving, cells)
@@ -173,7 +173,7 @@ class InversionSolve(AbstractDifferentiableSolve):
             )
         settings, solvers = self.settings.with_tolerance(tolerance), traced(one_kernel=not nested)
         outcome, slopes, _ = inversions.solve_with_tangents(tangents, t1, cells, settings, solvers)
-        return self._times(leaves, may, tolerance, inversions, outcome, gather([*slopes]))
+        return self._times(leaves, is_legal, tolerance, inversions, outcome, gather([*slopes]))
 
     def _modules(self, leaves: Sequence[Array]) -> Any:
         """Scene, launch, angle, horizon and tolerance; `None` for omitted leaves at the end."""
@@ -190,7 +190,7 @@ class InversionSolve(AbstractDifferentiableSolve):
     def _times(
         self,
         leaves: Sequence[Array],
-        may: Bool[Array, "..."],
+        is_legal: Bool[Array, "..."],
         tolerance: Float[Array, ""],
         inversions: Inversions,
         outcome: Outcome | HybridOutcome,
@@ -199,6 +199,6 @@ class InversionSolve(AbstractDifferentiableSolve):
         """The times of inversion and their derivatives: infinite and 0 where there is none, NaN where the run failed."""
         outcome = checked(self._modules(leaves)[0], inversions.problem, outcome, tolerance)
         inverted = is_inverted(outcome, inversions.problem, self.last)
-        good = may & (outcome.status != FAILED) & (outcome.status != UNRESOLVED)
+        good = is_legal & (outcome.status != FAILED) & (outcome.status != UNRESOLVED)
         time = jnp.where(good, jnp.where(inverted, outcome.crossing_time, jnp.inf), jnp.nan)
         return time, [jnp.where(good, jnp.where(inverted, slope, 0.0), jnp.nan) for slope in slopes]

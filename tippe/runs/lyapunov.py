@@ -15,7 +15,8 @@ from nonholonomic.integration import LEFT_DOMAIN, REACHED_END, Settings, explici
 from nonholonomic.progress import status_line
 from nonholonomic.validation import require, require_kind
 
-from ..model.dynamics import LOSSES, NO_COSINE
+from ..model.contact_dynamics import LOSSES
+from ..model.dynamics import NO_COSINE
 from ..model.launch import Launch
 from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene

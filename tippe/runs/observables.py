@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.geometry import Component, Vector, carried, dot, scale, stacked, sum_vectors
+from nonholonomic.geometry import Component, Vector, dot, rate_in_frame, scale, stacked, sum_vectors
 from nonholonomic.hybrid import HybridPath
 from nonholonomic.integration import DenseSolution, Status, few_trials, padded
 from nonholonomic.progress import status_line
@@ -178,7 +178,7 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         rate = stacked(motion.rate, self.states)
         beside, change = jax.jvp(self.scene.path_from_frame, (self.states,), (rate,))
         # The frame turns while the components of the vector change.
-        turned = scale(-1.0, carried(beside, motion.turning))
+        turned = scale(-1.0, rate_in_frame(beside, motion.frame_rate))
         return self._fixed(sum_vectors((*motion.velocity, self.above[1]), change, turned))
 
     @of_each_run

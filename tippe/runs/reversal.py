@@ -10,14 +10,14 @@ from jaxtyping import Array, Float
 from nonholonomic.integration import DEFAULT_MAX_STEPS, Settings, explicit_tableau
 from nonholonomic.progress import status_line
 from nonholonomic.sweeps import Table
-from nonholonomic.validation import require_flag, require_kind, require_outside
+from nonholonomic.validation import require_kind, require_outside
 
 from ..model.launch import Launch
 from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
 from .checks import check_reversible, check_run
 from .inversion_time import first_or_last_time
-from .table import event_table
+from .table import TableOptions, event_table
 
 
 @status_line("simulating")
@@ -115,11 +115,9 @@ def reversal_table(
     require_outside((scene, theta, spin, azimuth, mu, axes, t1), "reversal_table", "reversal_time")
     require_kind(scene, "scene", Scene)
     require_rigid(scene)
-    require_flag(errors, "errors")
-    require_flag(scattered, "scattered")
     launch_values = {"theta": theta, "mu": mu, "spin": spin, "azimuth": azimuth}
-    options = (solver, "ensemble", scattered, errors, sensitivities, path, progress, executor, max_steps)
-    return event_table(scene, launch_values, axes, t1, None, tolerance, "first", *options)
+    options = TableOptions(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
+    return event_table(scene, launch_values, axes, t1, None, options)
 
 
 def require_rigid(scene: Scene) -> None:
@@ -127,5 +125,6 @@ def require_rigid(scene: Scene) -> None:
     if not isinstance(scene.body, AbstractRigidBody):
         kind = type(scene.body).__name__
         raise ValueError(
-            f"body = {kind} must be an Ellipsoid or a RigidBody for times of reversal: a body of revolution keeps its sense"
+            f"body = {kind} must be an Ellipsoid or a RigidBody for times of reversal: a body of revolution keeps its "
+            "sense of rotation"
         )

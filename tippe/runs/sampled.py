@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from nonholonomic.derivatives import sampled_run, sampled_run_by_diffrax
 from nonholonomic.integration import FAILED, LEFT_DOMAIN, Settings, Status
 
-from ..model.dynamics import LOSSES
+from ..model.contact_dynamics import LOSSES
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..modes.trajectory_problem import TrajectoryProblem, trajectory_problem
@@ -32,7 +32,7 @@ def ended(
     return jnp.where(failed, int(Status.FAILED), ended)
 
 
-class Found(NamedTuple):
+class SampledContact(NamedTuple):
     """The samples of a run: `states`, and `quadratures` (the other components of a `TrajectoryProblem`), are NaN after
     the end; `status` is a `Status` as a float."""
 
@@ -51,7 +51,7 @@ def sampled(
     t1: Float[Array, ""],
     settings: Settings,
     adjoint: diffrax.AbstractAdjoint | None,
-) -> Found:
+) -> SampledContact:
     """Simulate one launch inside a transformation and sample it.
 
     **Arguments:** as for `simulate`.
@@ -64,4 +64,6 @@ def sampled(
     codes = (samples.status == LEFT_DOMAIN, samples.status == FAILED)
     status = ended(run, scene, samples.end_state, *codes, settings.tolerance)
     assert samples.quadratures is not None
-    return Found(samples.states.T, samples.quadratures.T, samples.end_time, status, samples.accepted, samples.rejected)
+    return SampledContact(
+        samples.states.T, samples.quadratures.T, samples.end_time, status, samples.accepted, samples.rejected
+    )

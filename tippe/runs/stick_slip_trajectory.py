@@ -17,5 +17,5 @@ def solve_stick_slip_dense(run: TrajectoryProblem, t1: float, settings: Settings
 
     **Returns:** a `HybridPath`, whose counts include the changes from slip to rolling.
     """
-    both, first, state = contact_modes(run, settings.tolerance)
-    return solve_hybrid_dense(both, int(first[0]), state[:, 0], t1, settings, counters=1)
+    modes, first, state = contact_modes(run, settings.tolerance)
+    return solve_hybrid_dense(modes, int(first[0]), state[:, 0], t1, settings, counters=1)

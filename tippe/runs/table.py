@@ -124,19 +124,31 @@ def inversion_table(
     """
     require_outside((scene, theta, spin, eta, mu, azimuth, axes, t1, angle), "inversion_table", "inversion_time")
     check_event(angle, crossing, ("first", "last", "both"))
-    require_flag(errors, "errors")
-    require_flag(scattered, "scattered")
     if method not in ("ensemble", "diffrax"):
         raise ValueError(f"method = {method!r} must be 'ensemble' or 'diffrax'")
     if method == "diffrax" and sensitivities:
         raise ValueError("method = 'diffrax' must be 'ensemble' for sensitivities")
     if crossing == "both" and sensitivities:
-        raise ValueError("crossing = 'both' must be 'first' or 'last' for sensitivities, which are of one time")
+        raise ValueError("crossing = 'both' must be 'first' or 'last' for sensitivities, which differentiate one time")
     if method == "diffrax" and crossing != "first":
         raise ValueError(f"crossing = {crossing!r} must be 'first' for method = 'diffrax'")
     launch_values = {"theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
-    options = (solver, method, scattered, errors, sensitivities, path, progress, executor, max_steps)
-    return event_table(scene, launch_values, axes, t1, angle, tolerance, crossing, *options)
+    options = TableOptions(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
+    return event_table(scene, launch_values, axes, t1, angle, options, crossing, method)
+
+
+class TableOptions(NamedTuple):
+    """The options of every table of times; see `inversion_table`."""
+
+    tolerance: float
+    solver: diffrax.AbstractERK | None
+    max_steps: int
+    scattered: bool
+    errors: bool
+    sensitivities: Sequence[str]
+    path: Any
+    progress: bool
+    executor: Executor | None
 
 
 def event_table(
@@ -145,28 +157,22 @@ def event_table(
     axes: dict[str, Any] | None,
     t1: float,
     angle: float | None,
-    tolerance: float,
-    crossing: str,
-    solver: diffrax.AbstractERK | None,
-    method: str,
-    scattered: bool,
-    errors: bool,
-    sensitivities: Sequence[str],
-    path: Any,
-    progress: bool,
-    executor: Executor | None,
-    max_steps: int,
+    options: TableOptions,
+    crossing: str = "first",
+    method: str = "ensemble",
 ) -> Table:
     """The table of the times at which theta reaches an angle or, without an angle, the spin about the normal reverses.
 
     **Arguments:** as for `inversion_table`; `launch_values`: name of a launch's parameter, or "mu" -> a number or a
     list.
     """
+    tolerance, solver, max_steps, scattered, errors, sensitivities, *_ = options
+    require_flag(errors, "errors")
+    require_flag(scattered, "scattered")
     roots, grid, units = launches(scene, launch_values, axes, t1, tolerance, scattered=scattered)
     require_whole(max_steps, "max_steps", 1)
     settings = Settings(tolerance, solver, max_steps=int(max_steps))
-    integrator = settings.for_single_runs if method == "diffrax" else settings.for_lanes
-    explicit_tableau(integrator)
+    explicit_tableau(settings.for_single_runs if method == "diffrax" else settings.for_lanes)
     paths = sensitivity_names(roots, sensitivities)
     run_kind = run_kind_of(scene) if angle is not None else reversal_kind_of(scene)
     if paths:
@@ -175,38 +181,46 @@ def event_table(
         raise ValueError(
             "method = 'diffrax' does not support runs of several modes: contact = 'hybrid' or SetValuedCoulomb"
         )
-    looked_at = {axis.number: axis.values for axis in grid}
+    axis_values = {axis.number: axis.values for axis in grid}
     if angle is None:
-        check_reversible(roots["launch"], looked_at)
+        check_reversible(roots["launch"], axis_values)
     else:
-        warn_if_it_cannot_invert(scene, roots["launch"], looked_at.get("launch.theta", roots["launch"].theta))
+        warn_if_it_cannot_invert(scene, roots["launch"], axis_values.get("launch.theta", roots["launch"].theta))
         angle = float(angle)
     runs = InversionRuns(run_kind, float(t1), angle, crossing, settings, method, paths)
     job = InversionJob(runs, roots, errors)
-
-    event = {"event": "reversal"} if angle is None else {"angle": angle}
-    request = {"t1": float(t1), **event, "tolerance": float(tolerance), "crossing": crossing}
-    request = described(roots, grid) | request | {"solver": type(integrator).__name__, "method": method}
-    variables = runs.variables
-    if max_steps != DEFAULT_MAX_STEPS:
-        request |= {"max_steps": int(max_steps)}
-    if errors:
-        request |= {"errors": True}
-        variables = variables | runs.error_variables
-    if paths:
-        request |= {"sensitivities": paths}
-        variables = variables | sensitivity_variables(paths, units, "reversal" if angle is None else "inversion")
+    request = described(roots, grid) | request_of(runs, options)
+    variables = runs.variables | (runs.error_variables if errors else {})
+    variables |= sensitivity_variables(paths, units, "reversal" if angle is None else "inversion")
     if scattered:
         columns = rows(grid)
         request |= {"cells": digest(columns)}
         variables = {axis.name: Variable(axis.unit, np.float64, long_name=axis.long_name) for axis in grid} | variables
         job = ScatteredJob(job, columns, {axis.number: axis.name for axis in grid})
         grid = [Axis("cell", "cell", "1", np.arange(len(grid[0].values)), "cell")]
-    table = sweep(job, grid, variables, request, path=path, progress=progress, executor=executor)
+    running = {"path": options.path, "progress": options.progress, "executor": options.executor}
+    table = sweep(job, grid, variables, request, **running)
     warn_of_long_runs(table, float(t1), max_steps)
     if run_kind.smooth:
         warn_of_unresolved_runs(table, run_kind)
     return table
+
+
+def request_of(runs: InversionRuns, options: TableOptions) -> dict[str, Any]:
+    """The request for a table as plain data, without the scene and the launch."""
+    settings = runs.settings
+    integrator = settings.for_single_runs if runs.method == "diffrax" else settings.for_lanes
+    event = {"event": "reversal"} if runs.angle is None else {"angle": runs.angle}
+    request = {"t1": runs.t1, **event, "tolerance": float(options.tolerance), "crossing": runs.crossing}
+    request |= {"solver": type(integrator).__name__, "method": runs.method}
+    # Requests of earlier versions, with which a table may resume, lack these unless they were set.
+    if options.max_steps != DEFAULT_MAX_STEPS:
+        request |= {"max_steps": int(options.max_steps)}
+    if options.errors:
+        request |= {"errors": True}
+    if runs.slopes_by:
+        request |= {"sensitivities": runs.slopes_by}
+    return request
 
 
 def warn_of_long_runs(table: Table, t1: float, most: int) -> None:
@@ -258,7 +272,7 @@ class InversionJob(NamedTuple):
 
 
 class ScatteredJob(NamedTuple):
-    """A job whose cells are the rows of columns; the columns are among the results.
+    """A job whose cells are listed in columns, one row per cell. The results include the columns.
 
     `columns`: full name of a number -> its value in every cell; `names`: full name -> name of the variable.
     """

@@ -240,14 +240,14 @@ def _legal_or_nan(
         # This raises the error that explains the problem.
         return _traced(scene, launch, times, t1, settings, adjoint)
     bounds = (*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch))
-    may, t1, tolerance = legal_run(legal(bounds), t1, settings.tolerance, times)
+    is_legal, t1, tolerance = legal_run(legal(bounds), t1, settings.tolerance, times)
     settings = settings.with_tolerance(tolerance)
     if adjoint is not None:
         # An illegal run has zero length, but Diffrax would differentiate it.
-        scene, launch = nan_unless(may, (scene, launch))
+        scene, launch = nan_unless(is_legal, (scene, launch))
     trajectory = _traced(scene, launch, times, t1, settings, adjoint)
-    status = jnp.where(may, trajectory.status, int(Status.ILLEGAL))
-    return eqx.tree_at(lambda run: (run.t, run.status), nan_unless(may, trajectory), (times, status))
+    status = jnp.where(is_legal, trajectory.status, int(Status.ILLEGAL))
+    return eqx.tree_at(lambda run: (run.t, run.status), nan_unless(is_legal, trajectory), (times, status))
 
 
 def _traced(

@@ -59,7 +59,7 @@ BLACK, TEAL, PINK = 0x23262B, 0x008C95, 0xC2378E
 Numbers = TypeVar("Numbers", Array, np.ndarray)
 
 
-class Motion(NamedTuple, Generic[Numbers]):
+class DrawnMotion(NamedTuple, Generic[Numbers]):
     """The drawn quantities of a run: vectors in the fixed frame, (times, 3), and the rotation from the body to this
     frame."""
 
@@ -78,7 +78,7 @@ class Motion(NamedTuple, Generic[Numbers]):
     angular_momentum: Float[Numbers, "times 3"]
 
     @staticmethod
-    def of(run: Any) -> "Motion[Array]":
+    def of(run: Any) -> "DrawnMotion[Array]":
         """The motion of one run, inside or outside of transformations."""
         body, slip = run.scene.body, run.slip
         zero = jnp.zeros_like(run.t)
@@ -87,13 +87,13 @@ class Motion(NamedTuple, Generic[Numbers]):
         if isinstance(body, Top) and body.stem is not None:
             stem = position + (body.stem.offset - body.offset) * axis - body.stem.radius * normal
             contact = jnp.where((run.contact == 1)[:, None], stem, contact)
-        turning = run.angular_velocity
+        w = run.angular_velocity
         if isinstance(body, AbstractRigidBody):
             momentum = run.angular_momentum
         else:
-            along = jnp.sum(turning * axis, axis=-1, keepdims=True)
-            momentum = body.I1 * turning + (body.I3 - body.I1) * along * axis
-        return Motion(
+            along = jnp.sum(w * axis, axis=-1, keepdims=True)
+            momentum = body.I1 * w + (body.I3 - body.I1) * along * axis
+        return DrawnMotion(
             run.t,
             position,
             axis,
@@ -105,13 +105,13 @@ class Motion(NamedTuple, Generic[Numbers]):
             run.energy,
             run.jellett,
             run.normal_force,
-            turning,
+            w,
             momentum,
         )
 
 
-_motion = eqx.filter_jit(Motion.of)
-_turning = eqx.filter_jit(lambda run: jnp.linalg.norm(run.angular_velocity, axis=-1))
+_motion = eqx.filter_jit(DrawnMotion.of)
+_rotation_rate = eqx.filter_jit(lambda run: jnp.linalg.norm(run.angular_velocity, axis=-1))
 
 
 def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
@@ -124,23 +124,23 @@ def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     return stages([named] if overlaid else [[run] for run in named])
 
 
-def motion(run: Any) -> Motion[np.ndarray]:
+def motion(run: Any) -> DrawnMotion[np.ndarray]:
     """The motion of one run. If the run can be evaluated between its times, the times are close enough to show the
     rotation."""
     if run.dense is not None:
         times = np.asarray(run.t)
         # The angle about the axis is not enough: half-way up, a top turns about other directions equally fast.
-        turned_by = np.trapezoid(np.asarray(_turning(run.padded()))[: len(times)], times)
+        turned_by = np.trapezoid(np.asarray(_rotation_rate(run.padded()))[: len(times)], times)
         frames = int(np.clip(turned_by / TURN_PER_FRAME, LEAST_FRAMES, MOST_FRAMES))
         run = run.at(np.linspace(0.0, float(run.end_time), frames))
     count = len(run.t)
-    return Motion(*(np.asarray(part)[:count] for part in _motion(run.padded())))
+    return DrawnMotion(*(np.asarray(part)[:count] for part in _motion(run.padded())))
 
 
-def show(scene: Scene, motion: Motion[np.ndarray], number: int, name: str) -> Show:
+def show(scene: Scene, motion: DrawnMotion[np.ndarray], number: int, name: str) -> Show:
     """The drawing of one run, the `number`-th of its stage."""
     body, colour = scene.body, COLOURS[number % len(COLOURS)]
-    motion = Motion(*(np.asarray(part)[np.isfinite(motion.theta)] for part in motion))
+    motion = DrawnMotion(*(np.asarray(part)[np.isfinite(motion.theta)] for part in motion))
     radius, weight = float(body.size), float(body.mass * scene.gravity)
     lifted = motion.contact + 0.02 * radius * motion.normal
     return Show(
@@ -164,7 +164,7 @@ def show(scene: Scene, motion: Motion[np.ndarray], number: int, name: str) -> Sh
     )
 
 
-def curve_of_rotation(scene: Scene, motion: Motion[Any]) -> tuple[str, Any]:
+def curve_of_rotation(scene: Scene, motion: DrawnMotion[Any]) -> tuple[str, Any]:
     """Label and values of the curve of the rotation: Jellett's quantity, or, for a body of any shape and inertia, the spin
     about the normal."""
     if isinstance(scene.body, AbstractRigidBody):
@@ -172,7 +172,7 @@ def curve_of_rotation(scene: Scene, motion: Motion[Any]) -> tuple[str, Any]:
     return QUANTITIES["jellett"].label, motion.jellett
 
 
-def arrows(motion: Motion[np.ndarray], offset: float, radius: float, weight: float) -> tuple[Arrow, ...]:
+def arrows(motion: DrawnMotion[np.ndarray], offset: float, radius: float, weight: float) -> tuple[Arrow, ...]:
     """Forces and slip at the contact, weight, angular velocity and momentum at the centre of mass."""
     lifted = motion.contact + 0.02 * radius * motion.normal
     # Inside the sphere it would be invisible.
@@ -198,7 +198,7 @@ def arrows(motion: Motion[np.ndarray], offset: float, radius: float, weight: flo
     return tuple(drawn)
 
 
-def stages(groups: list[list[tuple[str, Scene, Motion]]]) -> list[Stage]:
+def stages(groups: list[list[tuple[str, Scene, DrawnMotion]]]) -> list[Stage]:
     """A stage for each group of runs on a common arena, with their names; all runs have different colours."""
     all_stages, number = [], 0
     for group in groups:

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import carried
+from nonholonomic.geometry import rate_in_frame
 
 from ..model.contact_load import Slip
 from ..model.scene import Scene
@@ -40,7 +40,7 @@ def across(scene: Scene[Top]) -> Across:
 
     **Raises:** `ValueError` for an arena that is curved in both directions.
     """
-    curvature, along = scene.frame.frame_motion(scene.frame.at_angle(0.0)[0], (1.0, 0.0)).turning
+    curvature, along = scene.frame.frame_motion(scene.frame.at_angle(0.0)[0], (1.0, 0.0)).frame_rate
     if along is not None:
         raise ValueError(f"surface = {scene.surface!r} must be a Plane or a Cylinder for these coordinates")
     return Across(1.0, 0.0) if curvature is None else Across(1.0 / curvature, 1.0)
@@ -61,8 +61,10 @@ def from_vector_state(scene: Scene[Top], state: Float[Array, " components"]) -> 
     e, L = state[AXIS], state[MOMENTUM]
     spinning = jnp.cross(L, e) / scene.body.I1
     velocity = state[VELOCITY] + scene.body.offset * spinning[:2]
-    turning = scene.frame.frame_motion(tuple(state[PLACE]), (velocity[0], velocity[1])).turning
-    seen = jnp.stack([a if b is None else a + b for a, b in zip(spinning, carried(tuple(e), turning), strict=True)])
+    turning = scene.frame.frame_motion(tuple(state[PLACE]), (velocity[0], velocity[1])).frame_rate
+    seen = jnp.stack(
+        [a if b is None else a + b for a, b in zip(spinning, rate_in_frame(tuple(e), turning), strict=True)]
+    )
 
     def angles(axis):
         return jnp.stack([jnp.arctan2(jnp.hypot(axis[0], axis[1]), axis[2]), jnp.arctan2(axis[1], axis[0])])

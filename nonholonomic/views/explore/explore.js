@@ -1,4 +1,4 @@
-// Sliders that simulate anew while they move: the answer in words, the run for the player, the map, the page's address.
+// Sliders that simulate again while they move: the result as text, the run for the player, the map, and the page's address.
 "use strict";
 (async () => {
   const { facts, answer, motion, allowed } = window.live, { sliders, words, layout } = facts;
@@ -21,7 +21,7 @@
     return { input, shown, title };
   });
 
-  // The run as the player takes it, in so many frames.
+  // The run in the form for the player, with at most `most` frames.
   function recorded(most) {
     const run = moves.trajectory(values, "frame"), first = run.read([0])[0];
     const frames = Math.round(Math.min(most, Math.max(300, (run.end * first[first.length - 1]) / 0.4)));
@@ -37,7 +37,7 @@
     return {
       times,
       normal: take(3),
-      bodies: list(layout.bodies, () => ({ position: take(3), turning: take(4) })),
+      bodies: list(layout.bodies, () => ({ position: take(3), orientation: take(4) })),
       traces: list(layout.traces.length, (k) => ({ points: take(3), about: layout.traces[k] ? take(3) : null })),
       arrows: list(layout.arrows, () => ({ start: take(3), vector: take(3) })),
       curves: list(layout.curves, () => ({ values: take(1) })),
@@ -57,14 +57,14 @@
       `<span class="word">${Number.isFinite(found) ? word : "&nbsp;"}</span><dl>${rows.join("")}</dl>`;
     median = [...median, took].slice(-51);
     const middle = [...median].sort((a, b) => a - b)[median.length >> 1];
-    document.getElementById("timing").textContent = `Integrated in your browser in ${middle.toFixed(1)} ms, by the equations and the method of the tables.`;
+    document.getElementById("timing").textContent = `Integrated in your browser in ${middle.toFixed(1)} ms, with the equations and the method of the tables.`;
   }
 
-  // Simulates what the sliders say: `most` frames, fewer while a knob moves.
+  // Simulate the run of the sliders, with at most `most` frames; there are fewer while a slider moves.
   function simulate(most) {
     const began = performance.now();
     if (!allowed(values, [])[0]) {
-      result.innerHTML = "<strong>not possible</strong><span>These numbers do not fit together: there is no such top or arena.</span>";
+      result.innerHTML = "<strong>not possible</strong><span>These values do not fit together: there is no such top or arena.</span>";
       return;
     }
     asks.run(values);
@@ -92,12 +92,12 @@
     requestAnimationFrame(() => { waiting = false; simulate(400); });
   }
 
-  // The page's address names the sliders, so that a copied link opens the same run.
+  // Write the slider values into the page's address, so that a copied link opens the same run.
   const short = (value) => String(Number(value.toPrecision(8)));
   function remember() {
     const address = values.every((value, k) => value === initial[k]) ? "" : new URLSearchParams(sliders.map((slider, k) => [slider.name, short(values[k])]));
-    // A page within a page may have no address to be changed.
-    try { history.replaceState(null, "", `#${address}`); } catch (error) { /* It is only not linkable. */ }
+    // The address of a page inside another page may not be changeable.
+    try { history.replaceState(null, "", `#${address}`); } catch (error) { /* The run then has no link. */ }
   }
   function fromAddress() {
     const named = new URLSearchParams(location.hash.slice(1));

@@ -12,24 +12,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ...hybrid import (
-    MOST_ROUNDS,
-    AbstractBatchedMode,
-    AbstractHoppingMode,
-    HybridOutcome,
-    after_reset,
-    after_solve,
-    at_start,
-)
-from ...integration import (
-    LEFT_DOMAIN,
-    RUNNING,
-    UNRESOLVED,
-    LaneScheduler,
-    Settings,
-    outcome_of,
-    with_crossing_times,
-)
+from ...hybrid import MOST_ROUNDS, AbstractBatchedMode, AbstractHoppingMode, HybridOutcome
+from ...hybrid.ensemble import after_reset, after_solve, at_start
+from ...integration import LEFT_DOMAIN, RUNNING, UNRESOLVED, Settings
+from ...integration.ensemble import with_crossing_times
+from ...integration.scheduler import LaneScheduler, outcome_of
 from .simulator import Functions, Numbers, Stepper, as_object, offsets_of, size_of
 
 Start = tuple[tuple[AbstractBatchedMode, ...], Int[Array, "1"], Float[Array, "components 1"]]

@@ -1,5 +1,5 @@
-// The loops over steps and stages, rounds and flights. All else is generated from Python (`simulator.py`, `hybrid_simulator.py`) and
-// stands in `model`: the equations, the coefficients of the Runge-Kutta pair, the first step, step-size control, the location of
+// The loops over steps and stages, rounds and flights. Everything else is generated from Python (`simulator.py`,
+// `hybrid_simulator.py`) and is in `model`: the equations, the coefficients of the Runge-Kutta pair, the first step, step-size control, the location of
 // events, and what happens between the modes.
 "use strict";
 
@@ -11,13 +11,13 @@ function integrator(model) {
     const start = new Float64Array(model.constants + at.size);
     const rates = Array.from({ length: stages + 2 }, () => new Float64Array(n));
     const [there, time, length, number] = [new Float64Array(n), new Float64Array(1), new Float64Array(1), [1]];
-    // As a `Step` of Python: state, rate, error, the least of margins and event function at the end, where one was negative before,
-    // and the margins at the start, at the stages that are looked at, and at the end.
+    // Like `Step` in Python: state, rate, error, the least of margins and event function at the end, the first place at which one of
+    // them was negative, and the margins at the start, at the checked stages and at the end.
     const m = model.margins_count, rows = model.looks.length + 2, tried = new Float64Array(3 * n + 2 + rows * m);
     const [end, last, error] = [0, 1, 2].map((k) => tried.subarray(k * n, (k + 1) * n));
     const margins = Array.from({ length: rows }, (_, k) => tried.subarray(3 * n + 2 + k * m, 3 * n + 2 + (k + 1) * m));
 
-    // There = state + length * (weights . rates).
+    // there = state + length * (weights . rates)
     function move(there, state, length, weights) {
       for (let k = 0; k < n; k++) {
         let sum = 0;
@@ -28,13 +28,13 @@ function integrator(model) {
     const none = new Float64Array(n);
     const value = (function_, ...inputs) => (number.length = 0, function_(...inputs, number), number.length ? number[0] : Infinity);
 
-    // The least of the margins, which are written into a row, and of the event function.
+    // Write the margins into a row, and return the least of them and of the event function.
     function least(row, time, state, rate, side) {
       model.margins(constants, time, state, margins[row]);
       return Math.min(...margins[row], side * value(model.crossing, constants, state, rate));
     }
 
-    // One step from a state at a time, whose rate is known, written into `tried`; only its end where nobody watches for events.
+    // Write one step from a state with a known rate into `tried`; without `watches`, compute only the end of the step.
     function step(from, state, rate, side, length, watches = true) {
       rates[0].set(rate);
       let negative = 2;
@@ -56,7 +56,7 @@ function integrator(model) {
       tried[3 * n + 1] = negative;
     }
 
-    // Runs from the start that `inputs` say to an end; `record` is called with each step that is taken.
+    // Run from the start given by `inputs` to the end of the run; `record` is called for every accepted step.
     function run(inputs, record) {
       model.begin(...inputs, start);
       constants.set(start.subarray(0, model.constants));
@@ -73,7 +73,7 @@ function integrator(model) {
       }
     }
 
-    // The state at a time within a step that was recorded, by a shorter step from where it begins.
+    // The state at a time within a recorded step, by a shorter step from the same start.
     function within(one, wanted) {
       constants.set(one.constants);
       step(one.time, one.state, one.rate, 1, wanted - one.time, false);
@@ -82,7 +82,7 @@ function integrator(model) {
     return { run, within, constants, lane };
   }
 
-  // What is read off a run at growing times within it, from its pieces in order, each with the `time` at which it begins.
+  // Read a run at increasing times, from its pieces in order; each piece has the `time` at which it begins.
   function reader(pieces, read) {
     return (times) => {
       let k = 0;
@@ -96,7 +96,7 @@ function integrator(model) {
   function smooth() {
     const motion = stepper(model), { constants, lane } = motion, at = model.lane;
     const run = (values, record) => (motion.run([values], record), lane);
-    // A run with its steps kept.
+    // A run with all its steps.
     function trajectory(values, reading) {
       const steps = [];
       run(values, (one) => steps.push(one));
@@ -113,7 +113,7 @@ function integrator(model) {
     return { run, trajectory, read: (name, values) => model[name](values, constants, lane, []) };
   }
 
-  // Runs through modes: round by round a mode is integrated to its end, and its transition leads to the next one.
+  // Runs through several modes: each round integrates one mode to its end, and its transition leads to the next mode.
   function hybrid() {
     const kinds = model.kinds.map((kind) => ({ ...kind, motion: stepper(kind) })), at = model.runs, runs = new Float64Array(at.size);
 
@@ -133,7 +133,7 @@ function integrator(model) {
       return runs;
     }
 
-    // The transition at the end of a mode: at once, or through flights with an impact at the end of each.
+    // The transition at the end of a mode: instantaneous, or through flights that end with impacts.
     function leave(kind, values, record) {
       if (kind.reset) { kind.reset(values, runs, runs); return; }
       const before = runs.slice(), began = runs[at.end_time];

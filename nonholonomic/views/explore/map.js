@@ -9,7 +9,7 @@ function makeMap(box, live, integrator, choose) {
     does_not_fit: "#7b4fa3", unresolved: "#c8412b", rank_lost: "#7b4fa3", illegal: "#ffffff" };
   const stops = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
 
-  // Every cell once, those of the coarsest grid first.
+  // Every cell once, beginning with the cells of the coarsest grid.
   const cells = levels.flatMap((level, k) => {
     const found = [];
     for (let y = 0; y < up; y += level) for (let x = 0; x < across; x += level)
@@ -18,7 +18,7 @@ function makeMap(box, live, integrator, choose) {
   });
   let values = sliders.map((slider) => slider.value), axes = [0, Math.min(1, sliders.length - 1)], results = [], round = 0, next = 0;
 
-  // A program of its own for each worker, from the page's own text, so that it works from disk.
+  // Each worker gets a program made from the page's own text, so that the page works from disk.
   const text = (part) => typeof part === "function" ? String(part) : Array.isArray(part) ? `[${part.map(text)}]`
     : part && typeof part === "object" ? `{${Object.entries(part).map(([key, inner]) => `${key}: ${text(inner)}`)}}` : JSON.stringify(part);
   const program = `${integrator}
@@ -31,7 +31,7 @@ function makeMap(box, live, integrator, choose) {
     const count = Math.max(1, Math.min(4, (navigator.hardwareConcurrency || 2) - 1));
     for (let k = 0; k < count; k++) workers.push(new Worker(address));
   } catch (error) {
-    legend.textContent = "This browser allows a page on disk no workers, so there is no map.";
+    legend.textContent = "There is no map, because this browser does not allow workers for pages on disk.";
   }
   const place = (slider, part) => slider.low + part * (slider.high - slider.low);
   const at = (cell) => values.map((value, k) => k === axes[1] ? place(sliders[k], (cell.y + 0.5) / up)
@@ -81,7 +81,7 @@ function makeMap(box, live, integrator, choose) {
       if (!results[k]) return;
       const [status, value] = results[k];
       pen.fillStyle = Number.isFinite(value) ? colour(high > low ? (value - low) / (high - low) : 0.5) : colours[words[status]] || "#ffffff";
-      // Towards its own side of the next pixel, so that no seams are seen.
+      // Round to whole pixels, so that there are no visible seams.
       const [x0, x1] = [cell.x, Math.min(across, cell.x + cell.level)].map((x) => Math.round(left + (x / across) * w));
       const [y0, y1] = [cell.y, Math.min(up, cell.y + cell.level)].map((y) => Math.round(2 + h - (y / up) * h));
       pen.fillRect(x0, y1, x1 - x0, y0 - y1);
@@ -117,7 +117,7 @@ function makeMap(box, live, integrator, choose) {
     legend.innerHTML = entries.join("");
   }
 
-  // The map is begun anew where another slider than those along its axes has moved.
+  // Start the map again if a slider that is not one of its axes has moved.
   function update(now, force = false) {
     const other = force || now.some((value, k) => value !== values[k] && !axes.includes(k));
     values = [...now];
@@ -138,7 +138,7 @@ function makeMap(box, live, integrator, choose) {
     select.hidden = sliders.length < 2;
     select.addEventListener("change", () => {
       const wanted = Number(select.value), other = axes[1 - k];
-      // Both axes alike would be a line: they change places instead.
+      // Two equal axes would give a line, so exchange them instead.
       const [first, second] = k === 0 ? [wanted, wanted === other ? axes[0] : other] : [wanted === other ? axes[1] : other, wanted];
       setAxes(first, second);
     });

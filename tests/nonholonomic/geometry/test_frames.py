@@ -17,11 +17,11 @@ from nonholonomic.geometry import (
     Spheroid,
     Torus,
     add,
-    carried,
     cross,
     dot,
     frame_of,
     multiply,
+    rate_in_frame,
     scale,
     subtract,
 )
@@ -65,7 +65,7 @@ def moved(frame, start, velocity, time, steps=200):
 
     def rate(point):
         frame_motion = frame.frame_motion(point[0], velocity)
-        return frame_motion.place_rate, frame.cyclic_rate(point[1], velocity, frame_motion.turning)
+        return frame_motion.place_rate, frame.cyclic_rate(point[1], velocity, frame_motion.frame_rate)
 
     def step(point, _):
         k1 = rate(point)
@@ -91,10 +91,10 @@ def test_the_frame_is_orthonormal_and_turns_as_stated(name):
     assert_close(axes @ axes.T, np.eye(3), atol=1e-10)
     assert_close(np.linalg.det(axes), 1.0, atol=1e-10)
     frame_motion = frame.frame_motion(place, velocity)
-    rates = (frame_motion.place_rate, frame.cyclic_rate(cyclic, velocity, frame_motion.turning))
+    rates = (frame_motion.place_rate, frame.cyclic_rate(cyclic, velocity, frame_motion.frame_rate))
     _, position_rate = jax.jvp(lambda *point: jnp.stack(frame.position(*point)), (place, cyclic), rates)
     assert_close(position_rate, 0.3 * axes[0] - 0.2 * axes[1], atol=1e-9)
-    o1, o2 = numbers(frame_motion.turning)
+    o1, o2 = numbers(frame_motion.frame_rate)
     for axis, expected in enumerate((o1 * axes[2], o2 * axes[2], -(o1 * axes[0] + o2 * axes[1]))):
         _, rate = jax.jvp(lambda *point, axis=axis: jnp.stack(frame.axes(*point)[axis]), (place, cyclic), rates)
         assert_close(rate, expected, atol=1e-9)
@@ -121,7 +121,7 @@ def test_a_frame_of_its_own_is_the_carried_one_in_fewer_numbers(name):
                 [
                     np.ravel(np.array(frame.axes(*arrival), dtype=float)),
                     np.ravel(np.array(frame.position(*arrival), dtype=float)),
-                    numbers(frame_motion.turning),
+                    numbers(frame_motion.frame_rate),
                     numbers(frame_motion.vertical),
                     [height],
                 ]
@@ -189,7 +189,7 @@ def test_a_carried_frame_starts_with_the_axes_of_the_frame_of_its_own(name):
 
 def test_a_fixed_vector_keeps_its_length_in_a_turning_frame():
     vector, turning = (1.0, 2.0, 3.0), (0.4, -0.7)
-    assert_close(dot(carried(vector, turning), vector), 0.0, atol=1e-15)
+    assert_close(dot(rate_in_frame(vector, turning), vector), 0.0, atol=1e-15)
 
 
 def test_exact_zeros_cost_nothing():

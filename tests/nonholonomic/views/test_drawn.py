@@ -62,7 +62,7 @@ def rolling(surface=None) -> Stage:
     position = np.stack([radius * times, zero, zero + radius], axis=-1)
     foot = position * [1.0, 1.0, 0.0]
     body = Body("ball", position, turned(rotation), ball(radius, (0xC8412B, 0xF4E9D2)))
-    np.testing.assert_allclose(matrices(body.turning), rotation, atol=1e-14)
+    np.testing.assert_allclose(matrices(body.orientation), rotation, atol=1e-14)
     show = Show(
         "a ball",
         0xC8412B,
@@ -140,7 +140,7 @@ def test_a_page_holds_its_numbers_in_single_precision():
     assert fact == facts["stages"][1]["runs"][0]
     for (begin, length), values in (
         (fact["times"], show.times),
-        (fact["bodies"][0]["turning"], show.bodies[0].turning),
+        (fact["bodies"][0]["orientation"], show.bodies[0].orientation),
         (fact["arrows"][0]["vector"], show.arrows[0].vector),
     ):
         np.testing.assert_allclose(floats[begin : begin + length], values.ravel(), rtol=1e-6, atol=1e-12)

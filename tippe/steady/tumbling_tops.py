@@ -1,0 +1,181 @@
+"""Tumbling tops on the plane: the motion, its stability, its energy and its state."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from nonholonomic.integration import sign_changes
+from nonholonomic.validation import as_number, require, require_kind, require_whole
+
+from ..model.scene import Scene
+from ..model.state import joined, parts
+from ..model.top import Top
+from .checks import require_inclination, require_one_scene, require_plane
+from .groups import proportions
+
+
+class Tumbling(NamedTuple):
+    """A steady precession on the plane, in which the centre of mass is at rest and the contact point does not slip.
+
+    - `theta`: inclination [rad].
+    - `precession`: phi' [rad/s].
+    - `spin`: omega3 [rad/s].
+    - `jellett`: Jellett's constant [kg m^3/s].
+
+    **Example:** with the scene of the module.
+
+    >>> motion = steady.tumbling(scene, 1.0)
+    >>> print(f"it turns about its axis at {motion.spin:.2f} rad/s")
+    it turns about its axis at 8.95 rad/s
+    """
+
+    theta: Float[Array, "..."]
+    precession: Float[Array, "..."]
+    spin: Float[Array, "..."]
+    jellett: Float[Array, "..."]
+
+
+def tumbling(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> Tumbling:
+    """The tumbling top at an inclination; of the two solutions, the one with positive phi'.
+
+    phi'^2 = m g a / D, omega3 = (cos - alpha) phi', J = R G phi', with D = I3 (alpha - cos) + I1 cos and
+    G = I1 sin^2 + I3 (cos - alpha)^2 (Rutstam 2012, eq. 2.8).
+
+    **Arguments:**
+
+    - `scene`: a `Scene` on the plane.
+    - `theta`: inclination [rad] with D > 0, which holds for every inclination in group II.
+
+    **Raises:** `ValueError` if the arena is not a plane, or if no tumbling top exists at the inclination.
+
+    **Example:** with the scene of the module.
+
+    >>> print(f"{steady.tumbling(scene, 2.0).precession:.2f} rad/s")
+    33.55 rad/s
+    """
+    require_plane(scene)
+    theta = as_number(theta)
+    require_inclination(theta)
+    lever, inertia = _lever_and_inertia(scene, theta)
+    require(lever, "I3 (alpha - cos(theta)) + I1 cos(theta)", above=0.0, why="no tumbling top at this inclination")
+    alpha, _ = proportions(scene.body)
+    precession = jnp.sqrt(scene.body.mass * scene.gravity * scene.body.offset / lever)
+    spin = (jnp.cos(theta) - alpha) * precession
+    return Tumbling(theta, precession, spin, scene.body.radius * inertia * precession)
+
+
+def tumbling_is_stable(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
+    """Whether the tumbling top is stable: J^2 grows with theta, that is, 4 D^2 + G (I1 - I3) > 0.
+
+    **Example:** with the scene of the module.
+
+    >>> bool(steady.tumbling_is_stable(scene, 1.0))
+    True
+    """
+    require_plane(scene)
+    require_inclination(theta)
+    lever, inertia = _lever_and_inertia(scene, theta)
+    return 4.0 * lever**2 + inertia * (scene.body.I1 - scene.body.I3) > 0.0
+
+
+def effective_energy(
+    scene: Scene[Top], theta: Float[ArrayLike, "..."], jellett: Float[ArrayLike, "..."]
+) -> Float[Array, "..."]:
+    """Least energy [J] of a top with the given inclination and Jellett's constant: J^2 / (2 R^2 G) + m g (R - a cos).
+
+    Its extrema over theta are the steady motions, and its minima are the stable motions.
+
+    **Example:** with the scene of the module.
+
+    >>> motion = steady.tumbling(scene, 1.0)
+    >>> print(f"{1e3 * steady.effective_energy(scene, 1.0, motion.jellett):.3f} mJ")
+    4.886 mJ
+    """
+    require_plane(scene)
+    require_inclination(theta)
+    require(jellett, "jellett")
+    body = scene.body
+    _, inertia = _lever_and_inertia(scene, theta)
+    height = body.radius - body.offset * jnp.cos(theta)
+    return as_number(jellett) ** 2 / (2.0 * body.radius**2 * inertia) + body.mass * scene.gravity * height
+
+
+def tumbling_angles(scene: Scene[Top], jellett: float, samples: int = 2001) -> list[float]:
+    """Every inclination [rad] at which a tumbling top has the given Jellett's constant, in increasing order.
+
+    **Arguments:**
+
+    - `scene`: a `Scene` on the plane with concrete numbers.
+    - `jellett`: Jellett's constant [kg m^3/s], of either sign.
+    - `samples`: number of grid points for finding brackets; each bracket is then bisected.
+
+    **Example:** with the scene of the module.
+
+    >>> jellett = steady.tumbling(scene, 1.0).jellett
+    >>> print([round(theta, 3) for theta in steady.tumbling_angles(scene, float(jellett))])
+    [1.0]
+    """
+    require_plane(scene)
+    require(jellett, "jellett")
+    require_one_scene(scene, jellett=jellett)
+    require_whole(samples, "samples", 4)
+    grid = jnp.linspace(0.0, jnp.pi, samples)
+
+    def slope(theta):
+        return jax.vmap(jax.grad(lambda angle: effective_energy(scene, angle, jellett)))(theta) / jnp.sin(theta)
+
+    return [float(root) for root in sign_changes(slope, grid[1:-1])]
+
+
+def tumbling_state(scene: Scene[Top], motion: Tumbling) -> Float[Array, " 8"]:
+    """State of the vector form of a tumbling top whose axis leans towards t1.
+
+    **Example:** with the scene of the module.
+
+    >>> motion = steady.tumbling(scene, 1.0)
+    >>> print(f"{1e3 * scene.energy(steady.tumbling_state(scene, motion)):.3f} mJ")
+    4.886 mJ
+    """
+    require_motion(scene, motion)
+    body, s, c = scene.body, jnp.sin(motion.theta), jnp.cos(motion.theta)
+    zero = jnp.zeros_like(s)
+    across, along = -body.I1 * motion.precession * s, body.I3 * motion.spin
+    return joined((zero, zero), (s, zero, c), (across * c + along * s, zero, -across * s + along * c))
+
+
+def quarter_turn(state: Float[Array, " 8"]) -> Float[Array, " 8"]:
+    """Rate of a state on the plane if everything turns about the vertical at 1 rad/s.
+
+    **Example:** with the scene of the module.
+
+    >>> motion = steady.tumbling(scene, 1.0)
+    >>> state = steady.tumbling_state(scene, motion)
+    >>> change = scene.field(state) - motion.precession * steady.quarter_turn(state)
+    >>> bool(abs(change).max() < 1e-12)
+    True
+    """
+    if len(np.shape(state)) == 0 or np.shape(state)[0] != 8:
+        raise ValueError(
+            f"state of shape {np.shape(state)} must have the 8 components of a top on the plane along its first axis, as "
+            "tumbling_state has"
+        )
+    (u1, u2), (e1, e2, _), (L1, L2, _), _ = parts(state)
+    zero = jnp.zeros_like(u1)
+    return joined((-u2, u1), (-e2, e1, zero), (-L2, L1, zero))
+
+
+def require_motion(scene: Scene[Top], motion: Tumbling) -> None:
+    """Raise `ValueError` unless this is a scene on the plane and a motion from `tumbling`."""
+    require_plane(scene)
+    require_kind(motion, "motion", Tumbling, ", as tumbling(scene, theta) returns it")
+
+
+def _lever_and_inertia(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> tuple[Array, Array]:
+    """D = I3 (alpha - cos) + I1 cos and G = I1 sin^2 + I3 (cos - alpha)^2 [kg m^2]."""
+    alpha, _ = proportions(scene.body)
+    s, c = jnp.sin(theta), jnp.cos(theta)
+    lever = scene.body.I3 * (alpha - c) + scene.body.I1 * c
+    return lever, scene.body.I1 * s**2 + scene.body.I3 * (c - alpha) ** 2
