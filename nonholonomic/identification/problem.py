@@ -121,7 +121,8 @@ def _differences(problem: Problem, step: float, coordinates: Rows) -> tuple[np.n
 def predictions_and_slopes(problem: Problem, coordinates: Rows, asked: Any = None) -> tuple[np.ndarray, np.ndarray]:
     """Predictions and their slopes, for every row of coordinates.
 
-    **Arguments:** `coordinates`: (rows, unknowns); `asked`: (rows,), which rows are needed, by default all.
+    **Arguments:** `coordinates`: (rows, unknowns); `asked`: (rows,), a mask of the rows that are needed, by default
+    all.
 
     **Returns:** (rows, n) and (rows, n, unknowns); NaN and 0 for rows that are not needed.
     """

@@ -39,7 +39,7 @@ LEARNING, PROPOSING = 0.35, 0.75
 
 #: Learning ends when the polynomials predict the log density of a round's runs with this standard deviation, at which
 #: nine tenths of the proposals are accepted; and the least and greatest number of rounds.
-FORETOLD, LEAST, ROUNDS = 0.3, 2, 6
+PREDICTED, LEAST, ROUNDS = 0.3, 2, 6
 
 
 class Draws(NamedTuple):
@@ -133,11 +133,11 @@ def sample(
     with Progress(warmup + draws, "step", shown=progress) as shown:
         surrogate, walk, runs = learn(Surrogate.around(density, centre, covariance), chains, random)
         surrogate = surrogate.to_power(PROPOSING)
-        at, log_density = _seen(surrogate, walk.points)
+        at, log_density = _with_ratio(surrogate, walk.points)
         shown.begin()
         for step in range(warmup + draws):
             ahead = _walked(surrogate, _key(random), walk, jnp.asarray(False))
-            tried, proposed_log_density = _seen(surrogate, ahead.points)
+            tried, proposed_log_density = _with_ratio(surrogate, ahead.points)
             taken = np.log(random.uniform(size=chains)) < proposed_log_density - log_density
             at, log_density = np.where(taken[:, None], tried, at), np.where(taken, proposed_log_density, log_density)
             walk = walk._replace(points=jnp.where(taken[:, None], ahead.points, walk.points))
@@ -173,12 +173,15 @@ def learn(surrogate: Surrogate, chains: int, random: np.random.Generator) -> tup
         chosen = random.permutation(drawn)[:runs]
         predicted = np.asarray(_predicted(density, chosen))
         true = np.asarray(_log_density(density, chosen, predicted))
-        if turn >= LEAST and np.std(true - _log_density(density, chosen, _foretold(surrogate, chosen))) < FORETOLD:
+        if (
+            turn >= LEAST
+            and np.std(true - _log_density(density, chosen, _surrogate_predicted(surrogate, chosen))) < PREDICTED
+        ):
             break
         pool.append((chosen, predicted, true))
         surrogate = surrogate.learned(*(np.concatenate(parts) for parts in zip(*pool, strict=True)))
         if turn > 0:
-            surrogate, points = surrogate.among(drawn)
+            surrogate, points = surrogate.recentred(drawn)
         # Convert to arrays, because a Python number would become a constant of the program.
         adaptation = jax.tree.map(np.asarray, begin(1.0 / len(surrogate.centre) ** 0.25))
         walk, path = Walk(jnp.asarray(points[-chains:]), adaptation), []
@@ -195,19 +198,19 @@ def _key(random: np.random.Generator) -> Array:
     return jax.random.key(int(random.integers(2**31)))
 
 
-def _seen(
+def _with_ratio(
     surrogate: Surrogate, points: Float[Array, "chains unknowns"]
 ) -> tuple[Float[np.ndarray, "chains unknowns"], Float[np.ndarray, " chains"]]:
     """The coordinates of some points, and the log ratio of the posterior to the surrogate's proposal density there."""
     density, coordinates = surrogate.density, np.asarray(_at(surrogate, points))
     true = _log_density(density, coordinates, _predicted(density, coordinates))
-    foretold = _log_density(density, coordinates, _foretold(surrogate, coordinates))
-    return coordinates, np.asarray(true - surrogate.power * foretold)
+    surrogate_value = _log_density(density, coordinates, _surrogate_predicted(surrogate, coordinates))
+    return coordinates, np.asarray(true - surrogate.power * surrogate_value)
 
 
 # Compiled functions also accept NumPy arrays.
 _predicted: Callable[..., Array] = eqx.filter_jit(LogDensity.predict)
-_foretold: Callable[..., Array] = eqx.filter_jit(Surrogate.predict)
+_surrogate_predicted: Callable[..., Array] = eqx.filter_jit(Surrogate.predict)
 _at: Callable[..., Array] = eqx.filter_jit(Surrogate.at)
 
 

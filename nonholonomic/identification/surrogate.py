@@ -110,7 +110,7 @@ class Surrogate(eqx.Module):
         coefficients, *_ = np.linalg.lstsq(terms * weights[:, None], predictions[known] * weights[:, None])
         return eqx.tree_at(lambda surrogate: surrogate.coefficients, self, jnp.asarray(coefficients))
 
-    def among(
+    def recentred(
         self, coordinates: Float[np.ndarray, "draws unknowns"]
     ) -> tuple["Surrogate", Float[np.ndarray, "draws unknowns"]]:
         """A surrogate whose points are adapted to the given draws: in the new points, the distribution of the draws is
