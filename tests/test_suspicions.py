@@ -41,6 +41,11 @@ SUSPECTED = {
         lambda: tippe.inversion_time(TOP, tippe.Launch(0.0, 155.0), 1.0),
         "theta = 0.0 is exactly upright, where a top stays forever",
     ),
+    "some inverted already": (
+        lambda: tippe.inversion_table(TOP, theta=[1.0, 2.0, 3.0], spin=155.0, t1=1.0),
+        "theta = 3 rad is not below the angle to be reached, 2.985 rad: the top is inverted from the start; "
+        "was theta in degrees? 3 degrees are 0.05236 rad",
+    ),
     "some exactly upright": (
         lambda: tippe.inversion_table(TOP, theta=[0.0, 0.1], spin=155.0, t1=1.0),
         "theta = 0.0 is exactly upright, where a top stays forever",
