@@ -185,9 +185,9 @@ class RigidBody(AbstractRigidBody):
     ...     return 0.02 * jnp.sqrt(jnp.sum(direction**2)) + 0.006 * direction[2]
     >>> top = tippe.RigidBody(0.02, [[2.94e-6, 0, 0], [0, 3.06e-6, 0], [0, 0, 3.2e-6]], support)
     >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
-    >>> time = tippe.inversion_time(scene, tippe.Launch(0.1, 155.0), t1=8.0, tolerance=1e-6)
-    >>> print(f"{time:.1f} s")
-    5.9 s
+    >>> start = scene.state(tippe.Launch(0.1, 155.0))
+    >>> print(f"{1e3 * scene.energy(start):.1f} mJ, {scene.normal_force(start):.3f} N")
+    41.2 mJ, 0.196 N
 
     ```
     """
