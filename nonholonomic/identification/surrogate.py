@@ -105,7 +105,7 @@ class Surrogate(eqx.Module):
         predictions = predictions - np.asarray(self.density.measurements.whole_periods(predictions - middle))
         below = np.max(log_densities[known]) - log_densities[known]
         weights = 1.0 / np.sqrt(1.0 + below / len(self.centre))
-        # By NumPy: the number of runs grows from round to round.
+        # Use NumPy, because the number of runs grows from round to round.
         terms = self._terms(np, coordinates[known])
         coefficients, *_ = np.linalg.lstsq(terms * weights[:, None], predictions[known] * weights[:, None])
         return eqx.tree_at(lambda surrogate: surrogate.coefficients, self, jnp.asarray(coefficients))

@@ -78,8 +78,8 @@ def missed_loss(
     lowest = jnp.minimum(inside, at_end)
     spread = functools.reduce(jnp.maximum, values) - lowest
     suspect = free & (lowest < jnp.where(inside < at_end, SUSPECT_INSIDE, SUSPECT_AT_END) * spread)
-    # A mode that begins on its margin has no zero before it: where the margin rises from there without a slope, the
-    # parabola may fall at first.
+    # Where a mode begins with a margin of 0, this zero does not end the mode. If the margin rises from there with slope
+    # 0, the parabola may fall at first.
     suspect &= values[0] > ON_MARGIN
 
     def first_minimum() -> Lanes:
@@ -113,8 +113,9 @@ def _least_minimum(
     values: list[Float[Array, "margins lanes"]],
     lowest: Float[Array, "margins lanes"],
 ) -> tuple[Float[Array, "margins lanes"], Float[Array, "margins lanes"]]:
-    """Place and value of the minimum of the parabola through three neighbouring places: the least value and those beside
-    it, or the three at the end of the step where the least value is. The place is 2 if the parabola has no minimum.
+    """Place and value of the minimum of the parabola through three neighbouring places: the place of the least value
+    and its neighbours; if the least value is at an end of the step, the three places at that end. The place is 2 if the
+    parabola has no minimum.
 
     Other minima are found later, because the step then ends at this one and is checked again.
     """

@@ -80,7 +80,7 @@ class StickSlipMode(AbstractBatchedMode):
             # The impulse that stops a slip changes the spin, too.
             crosses = falls & ~change.lost
             fraction = onset.falls_to_zero(self._event, began)
-        # Only a launch beyond the event, from which the top slips at once, gets here beyond it.
+        # Only a launch beyond the event, from which the top slips at once, reaches this point beyond the event.
         beyond = (self._event(state) <= 0.0) & (not self.last)
         crossing = jnp.where(beyond, 0.0, change.wait + fraction * length)
         crosses |= beyond
