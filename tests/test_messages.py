@@ -207,6 +207,8 @@ def test_an_unknown_quantity_of_a_run_is_answered_by_a_likely_one():
     ):
         _ = run_of_nothing().thetadot
     assert not hasattr(run_of_nothing(), "_repr_png_")
+    with pytest.raises(AttributeError, match=r"did you mean 'theta'\?"):
+        _ = run_of_nothing().tetha
 
 
 def test_an_error_within_a_quantity_of_a_run_is_not_hidden():

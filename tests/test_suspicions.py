@@ -12,6 +12,7 @@ import pytest
 from never_run import LAUNCH, TOP, run_of_nothing
 from tops import rutstam_top
 
+import stroller
 import tippe
 from nonholonomic.integration import Settings
 from tippe.runs.table import warn_of_long_runs
@@ -21,6 +22,18 @@ pytestmark = pytest.mark.newest
 SUSPECTED = {
     "rpm": (lambda: tippe.Launch(0.1, 1500.0), "was it in rpm? 1500 rpm are 157.1 rad/s"),
     "rpm of some": (lambda: tippe.Launch(0.1, [150.0, -1200.0]), "spin = 1200 rad/s is 1.15e+04 revolutions a minute"),
+    "a heading in degrees": (
+        lambda: stroller.Launch((0.0, 0.0), 90.0, 1.0),
+        "heading = 90 rad is large: was it in degrees? 90 degrees are 1.571 rad",
+    ),
+    "a steering angle in degrees": (
+        lambda: stroller.Launch((0.0, 0.0), 0.0, 1.0, steering=[0.1, -30.0]),
+        "steering = 30 rad is large: was it in degrees? 30 degrees are 0.5236 rad",
+    ),
+    "a density in g/cm^3": (
+        lambda: tippe.Top.turned(0.02, 0.7, cut=0.015, stem_radius=0.005, stem_length=0.012),
+        "density = 0.7 kg/m^3 is less than that of balsa wood, 100 kg/m^3: was it in g/cm^3? 0.7 g/cm^3 are 700 kg/m^3",
+    ),
     "a cylinder in mm": (
         lambda: tippe.Scene(rutstam_top(), tippe.Cylinder(300.0)),
         "surface.radius = 300 m is larger than a room: was it in mm?",
@@ -40,6 +53,11 @@ SUSPECTED = {
     "exactly upright": (
         lambda: tippe.inversion_time(TOP, tippe.Launch(0.0, 155.0), 1.0),
         "theta = 0.0 is exactly upright, where a top stays forever",
+    ),
+    "some inverted already": (
+        lambda: tippe.inversion_table(TOP, theta=[1.0, 2.0, 3.0], spin=155.0, t1=1.0),
+        "theta = 3 rad is not below the angle to be reached, 2.985 rad: the top is inverted from the start; "
+        "was theta in degrees? 3 degrees are 0.05236 rad",
     ),
     "some exactly upright": (
         lambda: tippe.inversion_table(TOP, theta=[0.0, 0.1], spin=155.0, t1=1.0),
@@ -75,6 +93,7 @@ def test_what_is_legal_and_likely_a_mistake_is_warned_of(name, nothing_runs):
 def test_what_is_usual_is_not_suspected(nothing_runs):
     tippe.Launch(0.1, [-900.0, 900.0])
     tippe.Scene(rutstam_top(), tippe.Cylinder(10.0))
+    stroller.Launch((0.0, 0.0), 7.0, 1.0, steering=-1.5)
     assert tippe.inversion_time(TOP, LAUNCH, 1.0) == jnp.inf
     # A push tips it.
     tippe.inversion_time(TOP, tippe.Launch(0.0, 155.0, velocity=(0.1, 0.0)), 1.0)

@@ -71,12 +71,8 @@ class Draws(NamedTuple):
         cls, density: LogDensity, coordinates: Float[np.ndarray, "chains draws unknowns"], accepted: float, runs: int
     ) -> "Draws":
         """Draws at given coordinates, with diagnostics."""
-        from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
-
         values = {name: np.asarray(value) for name, value in density.values(jnp.asarray(coordinates)).items()}
-        draws = map(
-            np.asarray, (measure(coordinates) for measure in (potential_scale_reduction, effective_sample_size))
-        )
+        draws = map(np.asarray, _diagnosed(coordinates))
         # For a single unknown, these are numbers instead of lists.
         named = (dict(zip(density.names, numbers.reshape(-1).tolist(), strict=True)) for numbers in draws)
         return cls(values, coordinates, *named, accepted=accepted, runs=runs, units=density.units)
@@ -172,7 +168,7 @@ def learn(surrogate: Surrogate, chains: int, random: np.random.Generator) -> tup
     surrogate, density, runs = surrogate.to_power(LEARNING), surrogate.density, surrogate.runs_a_round
     begin = dual_averaging_adaptation(ACCEPTED)[0]
     points = random.normal(size=(runs, len(surrogate.centre)))
-    drawn, pool = np.asarray(surrogate.at(jnp.asarray(points))), []
+    drawn, pool = np.asarray(_at(surrogate, points)), []
     for turn in range(ROUNDS):
         chosen = random.permutation(drawn)[:runs]
         predicted = np.asarray(_predicted(density, chosen))
@@ -191,7 +187,7 @@ def learn(surrogate: Surrogate, chains: int, random: np.random.Generator) -> tup
         walk, path = Walk(jnp.asarray(points[-chains:]), adaptation), []
         for _ in range(-(-2 * runs // chains)):
             walk = _walked(surrogate, _key(random), walk, jnp.asarray(True))
-            path.append(np.asarray(surrogate.at(walk.points)))
+            path.append(np.asarray(_at(surrogate, walk.points)))
         # Discard the first half as warm-up.
         drawn = np.concatenate(path[len(path) // 2 :])
     return surrogate, walk, runs * (1 + turn)
@@ -206,7 +202,7 @@ def _with_ratio(
     surrogate: Surrogate, points: Float[Array, "chains unknowns"]
 ) -> tuple[Float[np.ndarray, "chains unknowns"], Float[np.ndarray, " chains"]]:
     """The coordinates of some points, and the log ratio of the posterior to the surrogate's proposal density there."""
-    density, coordinates = surrogate.density, np.asarray(surrogate.at(points))
+    density, coordinates = surrogate.density, np.asarray(_at(surrogate, points))
     true = _log_density(density, coordinates, _predicted(density, coordinates))
     surrogate_value = _log_density(density, coordinates, _surrogate_predicted(surrogate, coordinates))
     return coordinates, np.asarray(true - surrogate.power * surrogate_value)
@@ -215,6 +211,15 @@ def _with_ratio(
 # Compiled functions also accept NumPy arrays.
 _predicted: Callable[..., Array] = eqx.filter_jit(LogDensity.predict)
 _surrogate_predicted: Callable[..., Array] = eqx.filter_jit(Surrogate.predict)
+_at: Callable[..., Array] = eqx.filter_jit(Surrogate.at)
+
+
+@jax.jit
+def _diagnosed(coordinates: Float[Array | np.ndarray, "chains draws unknowns"]) -> tuple[Array, Array]:
+    """The potential scale reduction and the effective sample size of every unknown."""
+    from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
+
+    return potential_scale_reduction(coordinates), effective_sample_size(coordinates)
 
 
 @eqx.filter_jit

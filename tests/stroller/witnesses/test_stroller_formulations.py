@@ -153,8 +153,15 @@ class UnitSpeed(Chart):
         return fields.at[:, 0].divide(jnp.cos(q[3]))
 
 
-@pytest.mark.parametrize("ground", ["plane", "intrinsic outside"])
-@pytest.mark.parametrize("fork", ["relative", "absolute"])
+@pytest.mark.parametrize(
+    ("ground", "fork"),
+    [
+        ("plane", "relative"),
+        ("intrinsic outside", "absolute"),
+        pytest.param("plane", "absolute", marks=pytest.mark.slow),
+        pytest.param("intrinsic outside", "relative", marks=pytest.mark.slow),
+    ],
+)
 def test_coefficients_of_the_constrained_connection(ground, fork):
     """Section 6, F3: Gamma^1_21 = M' / (2M), alone with a relative fork; Gamma^2_21 besides with an absolute one."""
     chart = UnitSpeed(Scene(BODY, fork=fork, **GROUNDS[ground]))
