@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.hybrid import AbstractHoppingMode, Transition, TransitionPath
-from nonholonomic.integration import RUNNING, UNRESOLVED, AbstractProblem
+from nonholonomic.integration import CROSSED, RUNNING, UNRESOLVED, AbstractProblem
 from nonholonomic.xla_cpu import compiled_setup, least
 
 from ..model.dynamics import Dynamics
@@ -140,7 +140,7 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
         # A launch beyond the angle and without contact ends at once.
         beyond = start.open & (state[COS_THETA] <= self.cos_angle) & (not self.last)
         ended = start._replace(status=jnp.full_like(start.status, CROSSED), open=~beyond, crossing_time=start.elapsed)
-        start = _where(beyond, ended, start)
+        start = select(beyond, ended, start)
         return start._replace(quadratures=state[OWN:]) if self.with_quadratures else start
 
     def hop(self, air: Air, left: Cells) -> tuple[Air, Air]:
