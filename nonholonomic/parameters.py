@@ -70,7 +70,9 @@ def full_name(argument: str, name: str, known: list[str]) -> str:
     """
     meant = _meant(name, known)
     if len(meant) != 1:
-        what = f"could be {' or '.join(meant)}" if meant else f"must be one of {', '.join(known)}{likely(name, known)}"
+        ends = [whole.rsplit(".", 1)[-1] for whole in known]
+        hint = likely(str(name).rsplit(".", 1)[-1], ends)
+        what = f"could be {' or '.join(meant)}" if meant else f"must be one of {', '.join(known)}{hint}"
         raise ValueError(f"{argument}: {name!r} {what}")
     return meant[0]
 
@@ -109,7 +111,9 @@ def _unknown_axis(name: str, known: list[str]) -> ValueError:
 
 def likely(name: Any, known: Iterable[str]) -> str:
     """The known name that resembles an unknown one, as an addition to a message; empty if there is none."""
-    close = difflib.get_close_matches(str(name), list(known), 1)
+    names = list(known)
+    swapped = [other for other in names if sorted(other) == sorted(str(name))]
+    close = swapped or difflib.get_close_matches(str(name), names, 1)
     return f"; did you mean {close[0]!r}?" if close else ""
 
 

@@ -80,8 +80,8 @@ def parser() -> argparse.ArgumentParser:
     command = argparse.ArgumentParser(
         prog="python -m stroller",
         description="Rides of a stroller on a plane and inside a spheroid, or on the surfaces named, with and without "
-        "friction, steered to and fro and pulled. Prints the energy audit of both integrators, writes an HDF5 file and a "
-        "picture.",
+        "friction, steered alternately left and right, and pulled. Prints the energy audit of both integrators, writes an "
+        "HDF5 file and a picture.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     command.add_argument("--version", action="version", version=f"nonholonomic {__version__}")
@@ -155,7 +155,7 @@ def audit(name: str, runs: dict[str, Trajectory]) -> list[str]:
 def tolerance_curve(options: argparse.Namespace, helm: Helm) -> list[str]:
     """The largest energy residual over the tolerance of Dopri8, for the last ride."""
     (ground, ride), (scene, launch) = list(scenes(options).items())[-1]
-    lines = [f"Dopri8 {ground}, {ride}: residual [J] of energy against work over the tolerance"]
+    lines = [f"Dopri8 {ground}, {ride}: largest residual [J] of energy minus work, by tolerance"]
     for tolerance in TOLERANCES:
         run = simulate(scene, launch, options.t1, helm, tolerance=tolerance)
         residual = float(jnp.max(jnp.abs(run.energy_residual)))

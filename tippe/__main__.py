@@ -51,9 +51,9 @@ def parser() -> argparse.ArgumentParser:
     """The options of the main job."""
     command = argparse.ArgumentParser(
         prog="python -m tippe",
-        description="A tippe top turns over, through flights and onto its stem: inversion times over the inclination and the "
-        "friction, on a table and in a cylinder, in one batched call each; a picture, and a page in which the top climbs onto "
-        "its stem. `python -m tippe --paper --help` has the tables of the papers.",
+        description="A tippe top turns over, through flights and onto its stem. Computes inversion times over the inclination "
+        "and the friction, on a table and in a cylinder. Writes HDF5 tables, a picture, and a page on which the top climbs "
+        "onto its stem. `python -m tippe --paper --help` describes the tables of the papers.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     command.add_argument("--version", action="version", version=f"nonholonomic {__version__}")
@@ -215,7 +215,7 @@ def picture(options: argparse.Namespace, times: Any, theta: Any, end: float) -> 
         times, theta = np.insert(times, after, end), np.insert(theta, after, INVERTED)
     panel = Panel(title, times, theta[None], theta[:1], np.array([end if end <= times[-1] else np.inf]), joined=False)
     return draw_launches(
-        [panel], INVERTED, "large, for the first time above the dashed angle; small, runs to these times"
+        [panel], INVERTED, "large dots: first time above the dashed angle; small dots: runs to these times"
     )
 
 

@@ -53,12 +53,12 @@ class StepRecorder(AbstractRecorder):
 
 
 class Backward(NamedTuple):
-    """State of the passes forward and backward.
+    """State of the forward pass and of the backward pass.
 
-    `ahead` holds the lanes at the start of the next period to compute, and `number` its number. The pass backward takes
-    the period before `needed` next. `adjoint` holds, for the cell in each lane, the derivatives of the measured quantity:
-    the first rows are those with respect to the state, the others those with respect to the parameters. `gradient` holds
-    the derivatives of every cell with respect to its initial state.
+    `ahead` holds the lanes at the start of the next period to compute, and `number` its number. The backward pass takes
+    the period before `needed` next. `adjoint` holds, for the cell in each lane, the derivatives of the measured
+    quantity: the first rows are those with respect to the state, the others those with respect to the parameters.
+    `gradient` holds the derivatives of every cell with respect to its initial state.
     """
 
     ahead: Progress

@@ -62,7 +62,7 @@ class Checkpoints(NamedTuple):
         return self._replace(depth=self.depth - 1)
 
     def added(self, index: Int[Array, ""], period: Period) -> "Checkpoints":
-        """The periods with another one; if all slots are full, without the one whose neighbours are closest."""
+        """Add a period; if all slots are full, drop the period whose neighbours are closest."""
         position = jnp.arange(KEPT)
         full = self.depth == KEPT
         following = jnp.where(position == KEPT - 1, index, jnp.roll(self.index, -1))
@@ -94,7 +94,7 @@ class LatestSteps(NamedTuple):
         return cls(jnp.zeros((), int), room)
 
     def added(self, first: Int[Array, ""], steps: StepRecord) -> "LatestSteps":
-        """With the steps of a period that begins with iteration number `first`."""
+        """Add the steps of a period that begins with iteration number `first`."""
         period = len(steps.length)
         size = len(self.ring.length) - period
 

@@ -38,7 +38,7 @@ from .vector import Component, Vector, cross, dot, scale, sum_vectors, tangents,
 
 
 def place_named(surface: AbstractSurface, place: Place) -> Place:
-    """Convert a place whose eta counts from the lowest point of a closed surface to a place for `surface.chart`.
+    """Convert a place whose eta is measured from the lowest point of a closed surface to a place for `surface.chart`.
 
     **Arguments:** `place`: numbers named by `surface.coordinates`, or (x, y, z).
     """

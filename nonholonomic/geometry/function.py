@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import eval_jaxpr
 from jaxtyping import Array, Float
 
-from ..validation import as_number, is_traced
+from ..validation import UNTRACEABLE, as_number, is_traced
 
 
 class Plain(eqx.Module):
@@ -123,10 +123,7 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module
     try:
         traced = jax.make_jaxpr(value)(*zeros)
     except jax.errors.JAXTypeError as error:
-        raise ValueError(
-            f"{name} = {value!r} cannot be traced by JAX: write it with jax.numpy in place of numpy and math, and with "
-            "jnp.where in place of `if`"
-        ) from error
+        raise ValueError(f"{name} = {value!r} {UNTRACEABLE}") from error
     except TypeError as error:
         raise ValueError(f"{name} = {value!r} must be a function of ({', '.join(arguments)}): {error}") from error
     # The parameters of a module may have one value per lane.

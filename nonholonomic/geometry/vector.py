@@ -27,7 +27,7 @@ def none_if_zero(value: Any) -> Any:
     if value is None:
         return None
     number = as_number(value)
-    # An empty list stays, for the module to reject.
+    # An empty list stays unchanged, so that the module rejects it.
     return None if not is_traced(number) and np.size(number) and np.all(np.asarray(number) == 0.0) else number
 
 

@@ -60,7 +60,7 @@ class HybridOutcome(NamedTuple, Generic[Numbers]):
     counts: Int[Numbers, "counters cells"]
 
 
-#: The `HybridOutcome` of some runs, and what else is kept of them.
+#: The `HybridOutcome` of some runs, and further data that is kept of them.
 Carry = tuple[Any, ...]
 
 #: (the indices of some modes, carry, a mask of cells in these modes) -> the carry after these cells have advanced.

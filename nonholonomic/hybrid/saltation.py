@@ -146,7 +146,7 @@ class VariationalMode(AbstractBatchedMode):
     ) -> tuple[Float[Array, "tangents cells"], Float[Array, "tangents cells"]]:
         """The variations of the time at which the mode ends, and of the logarithm of the rate of its margin there.
 
-        **Arguments:** `along`: the tangents, and behind them the tangent along time, which has no variations of its own.
+        **Arguments:** `along`: the tangents, followed by the tangent along time, which has no variations of its own.
         """
         numbers, build = self._active_numbers()
 

@@ -153,12 +153,19 @@ class Measurements(eqx.Module):
         off = off - self.whole_periods(off)
         return off / self.error
 
-    def information(self, prediction: Float[Array | np.ndarray, "... n"]) -> Float[Array, "... n"]:
+    def residuals_and_slopes(
+        self, prediction: Float[Array | np.ndarray, "... n"]
+    ) -> tuple[Float[Array, "... n"], Float[Array, "... n"]]:
+        """The residuals, and their slopes with respect to the predictions."""
+        return jax.jvp(self.residuals, (prediction,), (jnp.ones_like(prediction),))
+
+    def roots_of_information(
+        self, prediction: Float[Array | np.ndarray, "... n"], slope: Float[Array, "... n"]
+    ) -> Float[Array, "... n"]:
         """Square roots of Fisher's information about the predictions, from the expected curvature, for standard errors:
         1 / error for Gaussian errors, sqrt((nu + 1) / (nu + 3)) / error for Student's t; the slope of the residual for
         limits.
         """
-        _, slope = jax.jvp(self.residuals, (prediction,), (jnp.ones_like(prediction),))
         heavy = jnp.isfinite(self.student)
         freedom = jnp.where(heavy, self.student, 1.0)
         expected = jnp.where(heavy, jnp.sqrt((freedom + 1.0) / (freedom + 3.0)), 1.0) / self.error

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..integration import padded
 from .likelihood import Measurements
 from .unknown import Free, Unknown
 
@@ -120,7 +121,8 @@ def _differences(problem: Problem, step: float, coordinates: Rows) -> tuple[np.n
 def predictions_and_slopes(problem: Problem, coordinates: Rows, asked: Any = None) -> tuple[np.ndarray, np.ndarray]:
     """Predictions and their slopes, for every row of coordinates.
 
-    **Arguments:** `coordinates`: (rows, unknowns); `asked`: (rows,), which rows are needed, by default all.
+    **Arguments:** `coordinates`: (rows, unknowns); `asked`: (rows,), a mask of the rows that are needed, by default
+    all.
 
     **Returns:** (rows, n) and (rows, n, unknowns); NaN and 0 for rows that are not needed.
     """
@@ -152,20 +154,31 @@ def linearise(problem: Problem, coordinates: Any, measurements: Measurements, as
     wanted = (len(coordinates), measurements.value.shape[-1])
     if prediction.shape != wanted:
         raise ValueError(f"model must predict {wanted} for {wanted[0]} sets, not {prediction.shape}")
-    residual, by_prediction, root = map(np.asarray, _residuals(measurements, prediction))
+    residual, by_prediction, root = _compared(measurements, prediction)
     prior, by_coordinate = map(np.asarray, _priors(problem.unknowns, jnp.asarray(coordinates, float)))
     return Linearised(
         prediction, residual, by_prediction[..., None] * slopes, root[..., None] * slopes, prior, by_coordinate
     )
 
 
+def _compared(measurements: Measurements, prediction: Float[np.ndarray, "rows n"]) -> list[np.ndarray]:
+    """Residuals, their slopes with respect to the predictions, and the roots of the expected information.
+
+    All are element by element. One padded list of numbers lets one program serve fits of many sizes.
+    """
+
+    def listed(values: Any) -> np.ndarray:
+        values = np.broadcast_to(np.asarray(values), prediction.shape).ravel()
+        return padded(values, values.size)
+
+    results = _residuals(jax.tree.map(listed, measurements), listed(prediction))
+    return [np.asarray(values)[: prediction.size].reshape(prediction.shape) for values in results]
+
+
 @eqx.filter_jit
-def _residuals(
-    measurements: Measurements, prediction: Float[Array | np.ndarray, "rows n"]
-) -> tuple[Array, Array, Array]:
-    """Residuals, their slopes with respect to the predictions, and the roots of the expected information."""
-    residual, slope = jax.jvp(measurements.residuals, (prediction,), (jnp.ones_like(prediction),))
-    return residual, slope, measurements.information(prediction)
+def _residuals(measurements: Measurements, prediction: Float[np.ndarray, " n"]) -> tuple[Array, Array, Array]:
+    residual, slope = measurements.residuals_and_slopes(prediction)
+    return residual, slope, measurements.roots_of_information(prediction, slope)
 
 
 @eqx.filter_jit

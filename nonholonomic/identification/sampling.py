@@ -34,12 +34,12 @@ ACCEPTED, DOUBLINGS = 0.8, 8
 MOVES = 16
 
 #: Powers of the surrogate for learning and for proposals: a surrogate that decreases faster than the posterior would
-#: never propose its tails, and never leave them.
+#: never propose points in the tails of the posterior, and a chain would never leave them.
 LEARNING, PROPOSING = 0.35, 0.75
 
 #: Learning ends when the polynomials predict the log density of a round's runs with this standard deviation, at which
 #: nine tenths of the proposals are accepted; and the least and greatest number of rounds.
-FORETOLD, LEAST, ROUNDS = 0.3, 2, 6
+PREDICTED, LEAST, ROUNDS = 0.3, 2, 6
 
 
 class Draws(NamedTuple):
@@ -71,12 +71,8 @@ class Draws(NamedTuple):
         cls, density: LogDensity, coordinates: Float[np.ndarray, "chains draws unknowns"], accepted: float, runs: int
     ) -> "Draws":
         """Draws at given coordinates, with diagnostics."""
-        from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
-
         values = {name: np.asarray(value) for name, value in density.values(jnp.asarray(coordinates)).items()}
-        draws = map(
-            np.asarray, (measure(coordinates) for measure in (potential_scale_reduction, effective_sample_size))
-        )
+        draws = map(np.asarray, _diagnosed(coordinates))
         # For a single unknown, these are numbers instead of lists.
         named = (dict(zip(density.names, numbers.reshape(-1).tolist(), strict=True)) for numbers in draws)
         return cls(values, coordinates, *named, accepted=accepted, runs=runs, units=density.units)
@@ -120,7 +116,7 @@ def sample(
     **Raises:** `ValueError` for numbers out of range and a covariance that is not finite and positive; `ModuleNotFoundError`
     without BlackJAX.
 
-    **Example:** the posterior of the room's example.
+    **Example:** the posterior of the subpackage's example.
 
     >>> from nonholonomic.identification import LogDensity, sample
     >>> density = LogDensity.of(Model(scene, data, jnp.arange(3)), data[0].measurements, free)
@@ -137,11 +133,11 @@ def sample(
     with Progress(warmup + draws, "step", shown=progress) as shown:
         surrogate, walk, runs = learn(Surrogate.around(density, centre, covariance), chains, random)
         surrogate = surrogate.to_power(PROPOSING)
-        at, log_density = _seen(surrogate, walk.points)
+        at, log_density = _with_ratio(surrogate, walk.points)
         shown.begin()
         for step in range(warmup + draws):
             ahead = _walked(surrogate, _key(random), walk, jnp.asarray(False))
-            tried, proposed_log_density = _seen(surrogate, ahead.points)
+            tried, proposed_log_density = _with_ratio(surrogate, ahead.points)
             taken = np.log(random.uniform(size=chains)) < proposed_log_density - log_density
             at, log_density = np.where(taken[:, None], tried, at), np.where(taken, proposed_log_density, log_density)
             walk = walk._replace(points=jnp.where(taken[:, None], ahead.points, walk.points))
@@ -172,23 +168,26 @@ def learn(surrogate: Surrogate, chains: int, random: np.random.Generator) -> tup
     surrogate, density, runs = surrogate.to_power(LEARNING), surrogate.density, surrogate.runs_a_round
     begin = dual_averaging_adaptation(ACCEPTED)[0]
     points = random.normal(size=(runs, len(surrogate.centre)))
-    drawn, pool = np.asarray(surrogate.at(jnp.asarray(points))), []
+    drawn, pool = np.asarray(_at(surrogate, points)), []
     for turn in range(ROUNDS):
         chosen = random.permutation(drawn)[:runs]
         predicted = np.asarray(_predicted(density, chosen))
         true = np.asarray(_log_density(density, chosen, predicted))
-        if turn >= LEAST and np.std(true - _log_density(density, chosen, _foretold(surrogate, chosen))) < FORETOLD:
+        if (
+            turn >= LEAST
+            and np.std(true - _log_density(density, chosen, _surrogate_predicted(surrogate, chosen))) < PREDICTED
+        ):
             break
         pool.append((chosen, predicted, true))
         surrogate = surrogate.learned(*(np.concatenate(parts) for parts in zip(*pool, strict=True)))
         if turn > 0:
-            surrogate, points = surrogate.among(drawn)
+            surrogate, points = surrogate.recentred(drawn)
         # Convert to arrays, because a Python number would become a constant of the program.
         adaptation = jax.tree.map(np.asarray, begin(1.0 / len(surrogate.centre) ** 0.25))
         walk, path = Walk(jnp.asarray(points[-chains:]), adaptation), []
         for _ in range(-(-2 * runs // chains)):
             walk = _walked(surrogate, _key(random), walk, jnp.asarray(True))
-            path.append(np.asarray(surrogate.at(walk.points)))
+            path.append(np.asarray(_at(surrogate, walk.points)))
         # Discard the first half as warm-up.
         drawn = np.concatenate(path[len(path) // 2 :])
     return surrogate, walk, runs * (1 + turn)
@@ -199,19 +198,28 @@ def _key(random: np.random.Generator) -> Array:
     return jax.random.key(int(random.integers(2**31)))
 
 
-def _seen(
+def _with_ratio(
     surrogate: Surrogate, points: Float[Array, "chains unknowns"]
 ) -> tuple[Float[np.ndarray, "chains unknowns"], Float[np.ndarray, " chains"]]:
     """The coordinates of some points, and the log ratio of the posterior to the surrogate's proposal density there."""
-    density, coordinates = surrogate.density, np.asarray(surrogate.at(points))
+    density, coordinates = surrogate.density, np.asarray(_at(surrogate, points))
     true = _log_density(density, coordinates, _predicted(density, coordinates))
-    foretold = _log_density(density, coordinates, _foretold(surrogate, coordinates))
-    return coordinates, np.asarray(true - surrogate.power * foretold)
+    surrogate_value = _log_density(density, coordinates, _surrogate_predicted(surrogate, coordinates))
+    return coordinates, np.asarray(true - surrogate.power * surrogate_value)
 
 
 # Compiled functions also accept NumPy arrays.
 _predicted: Callable[..., Array] = eqx.filter_jit(LogDensity.predict)
-_foretold: Callable[..., Array] = eqx.filter_jit(Surrogate.predict)
+_surrogate_predicted: Callable[..., Array] = eqx.filter_jit(Surrogate.predict)
+_at: Callable[..., Array] = eqx.filter_jit(Surrogate.at)
+
+
+@jax.jit
+def _diagnosed(coordinates: Float[Array | np.ndarray, "chains draws unknowns"]) -> tuple[Array, Array]:
+    """The potential scale reduction and the effective sample size of every unknown."""
+    from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
+
+    return potential_scale_reduction(coordinates), effective_sample_size(coordinates)
 
 
 @eqx.filter_jit

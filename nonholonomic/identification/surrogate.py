@@ -83,7 +83,7 @@ class Surrogate(eqx.Module):
 
     def predict(self, coordinates: Float[Array, "... unknowns"]) -> Float[Array, "... n"]:
         """The predictions of the polynomials."""
-        return self._terms(coordinates) @ self.coefficients
+        return self._terms(jnp, coordinates) @ self.coefficients
 
     def __call__(self, point: Float[Array, " unknowns"]) -> Float[Array, ""]:
         coordinates = self.at(point)
@@ -105,11 +105,12 @@ class Surrogate(eqx.Module):
         predictions = predictions - np.asarray(self.density.measurements.whole_periods(predictions - middle))
         below = np.max(log_densities[known]) - log_densities[known]
         weights = 1.0 / np.sqrt(1.0 + below / len(self.centre))
-        terms = np.asarray(self._terms(jnp.asarray(coordinates[known])))
+        # Use NumPy, because the number of runs grows from round to round.
+        terms = self._terms(np, coordinates[known])
         coefficients, *_ = np.linalg.lstsq(terms * weights[:, None], predictions[known] * weights[:, None])
         return eqx.tree_at(lambda surrogate: surrogate.coefficients, self, jnp.asarray(coefficients))
 
-    def among(
+    def recentred(
         self, coordinates: Float[np.ndarray, "draws unknowns"]
     ) -> tuple["Surrogate", Float[np.ndarray, "draws unknowns"]]:
         """A surrogate whose points are adapted to the given draws: in the new points, the distribution of the draws is
@@ -140,10 +141,11 @@ class Surrogate(eqx.Module):
         """The surrogate with another power of the density."""
         return eqx.tree_at(lambda surrogate: surrogate.power, self, jnp.asarray(power))
 
-    def _terms(self, coordinates: Float[Array, "... unknowns"]) -> Float[Array, "... terms"]:
-        x = (coordinates[..., : len(self.origin)] - self.origin) @ self.scale.T
-        ones = jnp.ones_like(x[..., :1])
-        return jnp.prod(jnp.concatenate([ones, x], axis=-1)[..., _factors(len(self.origin))], axis=-1)
+    def _terms(self, xp: Any, coordinates: Float[Any, "... unknowns"]) -> Float[Any, "... terms"]:
+        """The terms of the polynomials. **Arguments:** `xp`: `numpy` or `jax.numpy`."""
+        x = (coordinates[..., : len(self.origin)] - xp.asarray(self.origin)) @ xp.asarray(self.scale).T
+        ones = xp.ones_like(x[..., :1])
+        return xp.prod(xp.concatenate([ones, x], axis=-1)[..., _factors(len(self.origin))], axis=-1)
 
 
 def _factors(numbers: int) -> np.ndarray:

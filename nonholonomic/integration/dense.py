@@ -24,6 +24,9 @@ PIECE = 2048
 #: 7 ms and 0.4 MB.
 PIECE_OF_MODE = 128
 
+#: Least number of times at which a program evaluates a run: few runs are so long that more sizes are worth a compilation.
+LEAST_PADDED = 256
+
 #: Places in every step at which the domain margin is checked, besides the ends of the step.
 LOOKS = np.arange(1, 8) / 8.0
 
@@ -60,17 +63,17 @@ class DenseSolution(NamedTuple):
 
 
 def padded(values: Float[np.ndarray, "... times"], least: int) -> Float[np.ndarray, "... more"]:
-    """Values padded to a power of two of at least `least` by repeating the last one, so that one program serves many
-    sizes.
+    """Values padded to a power of two of at least `least` and `LEAST_PADDED` by repeating the last one, so that one
+    program serves many sizes.
 
     **Example:**
 
     >>> import numpy as np
     >>> from nonholonomic.integration import padded
-    >>> padded(np.array([1.0, 2.0, 3.0]), least=3)
-    array([1., 2., 3., 3.])
+    >>> padded(np.array([1.0, 2.0, 3.0]), least=300).shape
+    (512,)
     """
-    more = (1 << (least - 1).bit_length()) - values.shape[-1]
+    more = (1 << (max(least, LEAST_PADDED) - 1).bit_length()) - values.shape[-1]
     return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, more)], mode="edge")
 
 

@@ -6,6 +6,7 @@ negative there, its zero is located like any other. Otherwise the shorter step i
 rest.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .runge_kutta import Lanes, States, Step, weighted_sum
+from .runge_kutta import Lanes, States, Step
 
 #: A minimum of the event function within a step is checked if its estimate is below this fraction of the values at both
 #: ends. With a tenth of this value, one of 1279 first crossings in a cylinder is missed at a tolerance of 1e-7, and
@@ -26,11 +27,11 @@ DIP = 0.2
 #: lies at an end. For a parabola whose minimum is midway between two places, the fractions are 0.1 and 0.014.
 SUSPECT_INSIDE, SUSPECT_AT_END = 0.15, 0.05
 
-#: The error of the polynomial through the known values of a margin, midway in the step, as a fraction of the margin's range.
+#: The error of the parabola through known values of a margin, midway in the step, as a fraction of the margin's range.
 SCATTER = 0.05
 
-#: A margin that changes by less in a step is round-off and has no minimum.
-FLAT = 1e-10
+#: A smaller margin at the start of a step is round-off: the mode begins on its margin.
+ON_MARGIN = 1e-10
 
 
 def missed_double_root(
@@ -62,7 +63,7 @@ def missed_loss(
 ) -> Lanes:
     """Fraction of a step at which a margin may first fall below zero and return; 2 if nowhere.
 
-    This is the minimum of the polynomial through the known values, if its error may hide a zero.
+    This is the minimum of the parabola through the least known value and its neighbours, if the error may hide a zero.
 
     **Arguments:**
 
@@ -72,23 +73,20 @@ def missed_loss(
     """
     if margins is None or len(places) < 3:
         return jnp.full(free.shape, 2.0)
-    inside, at_end = jnp.min(margins[1:-1], axis=0), jnp.minimum(margins[0], margins[-1])
+    values = list(jnp.unstack(margins))
+    inside, at_end = functools.reduce(jnp.minimum, values[1:-1]), jnp.minimum(values[0], values[-1])
     lowest = jnp.minimum(inside, at_end)
-    spread = jnp.max(margins, axis=0) - lowest
-    suspect = (lowest < jnp.where(inside < at_end, SUSPECT_INSIDE, SUSPECT_AT_END) * spread) & (spread > FLAT) & free
+    spread = functools.reduce(jnp.maximum, values) - lowest
+    suspect = free & (lowest < jnp.where(inside < at_end, SUSPECT_INSIDE, SUSPECT_AT_END) * spread)
     # Where a mode begins with a margin of 0, this zero does not end the mode. If the margin rises from there with slope
-    # 0, the polynomial may fall at first.
-    suspect &= margins[0] > FLAT
+    # 0, the parabola may fall at first.
+    suspect &= values[0] > ON_MARGIN
 
     def first_minimum() -> Lanes:
-        # Only the least of several margins is searched. The step then ends at its minimum, and the others are checked
-        # again.
-        known, width = _least_of(suspect, lowest, margins, spread)
-        low, fall, high, rise, begin, end = _first_valley(places, list(known))
-        part, least = _minimum(low, fall * (end - begin), high, rise * (end - begin))
-        place = begin + part * (end - begin)
-        error = SCATTER * width * 4.0 * place * (1.0 - place)
-        return jnp.where(jnp.any(suspect, axis=0) & (part < 1.0) & (least < error), place, 2.0)
+        place, least = _least_minimum(places, values, lowest)
+        error = SCATTER * spread * 4.0 * place * (1.0 - place)
+        dips = suspect & (place > 0.0) & (place < 1.0) & (least < error)
+        return jnp.min(jnp.where(dips, place, 2.0), axis=0)
 
     # A branch, because few steps come near a zero.
     return jax.lax.cond(jnp.any(suspect), first_minimum, lambda: jnp.full(free.shape, 2.0))
@@ -110,35 +108,30 @@ def _minimum(
     return jnp.where((fall < 0.0) & (rise > 0.0), at, 2.0), least
 
 
-def _least_of(
-    suspect: Bool[Array, "margins lanes"],
+def _least_minimum(
+    places: Float[np.ndarray, " places"],
+    values: list[Float[Array, "margins lanes"]],
     lowest: Float[Array, "margins lanes"],
-    margins: Float[Array, "places margins lanes"],
-    spread: Float[Array, "margins lanes"],
-) -> tuple[Float[Array, "places lanes"], Lanes]:
-    """The values, and their range, of the suspect margin with the least known value in each lane."""
-    rank, known, width = jnp.where(suspect[0], lowest[0], jnp.inf), margins[:, 0], spread[0]
-    for k in range(1, len(lowest)):
-        lower = suspect[k] & (lowest[k] < rank)
-        rank, known = jnp.where(lower, lowest[k], rank), jnp.where(lower, margins[:, k], known)
-        width = jnp.where(lower, spread[k], width)
-    return known, width
+) -> tuple[Float[Array, "margins lanes"], Float[Array, "margins lanes"]]:
+    """Place and value of the minimum of the parabola through three neighbouring places: the place of the least value
+    and its neighbours; if the least value is at an end of the step, the three places at that end. The place is 2 if the
+    parabola has no minimum.
 
-
-def _first_valley(places: Float[np.ndarray, " places"], values: list[Lanes]) -> tuple[Lanes, ...]:
-    """The first two neighbouring places between which the polynomial through all values has a minimum.
-
-    **Returns:** value and slope at the first place, value and slope at the second, and the two places. If there is no
-    minimum, these are the first two places, between which the slope does not change from falling to rising.
+    Other minima are found later, because the step then ends at this one and is checked again.
     """
-    powers = np.arange(len(places))
-    weights = (powers * places[:, None] ** np.maximum(powers - 1, 0)) @ np.linalg.inv(places[:, None] ** powers)
-    slopes = [weighted_sum(row, values) for row in weights]
-    valley: Any = (values[0], slopes[0], values[1], slopes[1], places[0], places[1])
-    earlier = (slopes[0] < 0.0) & (slopes[1] > 0.0)
-    for k in range(1, len(places) - 1):
-        turns = (slopes[k] < 0.0) & (slopes[k + 1] > 0.0) & ~earlier
-        later = (values[k], slopes[k], values[k + 1], slopes[k + 1], places[k], places[k + 1])
-        valley = tuple(jnp.where(turns, new, old) for new, old in zip(later, valley, strict=True))
-        earlier |= turns
-    return valley
+    gaps = np.diff(places)
+    # Divisions cost as much as everything else here, so they are left to constants.
+    slopes = [(after - before) * (1.0 / gap) for before, after, gap in zip(values[:-1], values[1:], gaps, strict=True)]
+
+    def about(k: int) -> tuple[Any, ...]:
+        return slopes[k - 1], slopes[k], values[k], places[k], gaps[k - 1], 1.0 / (gaps[k - 1] + gaps[k])
+
+    chosen = about(len(places) - 2)
+    for k in range(len(places) - 3, 0, -1):
+        earlier = functools.reduce(jnp.minimum, values[: k + 1]) <= lowest
+        chosen = tuple(jnp.where(earlier, new, old) for new, old in zip(about(k), chosen, strict=True))
+    before, after, middle, place, gap, per_length = chosen
+    bend = (after - before) * per_length
+    slope = before + bend * gap
+    shift = 0.5 * slope / jnp.where(bend > 0.0, bend, 1.0)
+    return jnp.where(bend > 0.0, place - shift, 2.0), middle - 0.5 * slope * shift

@@ -222,8 +222,8 @@ def first_length(
     atol: States,
     n_blocks: int,
 ) -> Lanes:
-    """Length of the first step [s] (Hairer, Norsett and Wanner, Solving ODEs I, section II.4), in the motion's own
-    unit.
+    """Length of the first step [s] (Hairer, Norsett and Wanner, Solving ODEs I, section II.4), in the motion's own unit
+    of time.
 
     The comparison of |y'| with |y''| in their formula depends on the unit of time; Diffrax uses seconds. Here the unit
     is |y|/|y'|, so that motions that differ only in scale are integrated alike. If the state has several blocks

@@ -138,7 +138,8 @@ class Table(eqx.Module):
         """The table as a `pandas.DataFrame` (needs pandas): one row per cell, one column per axis and variable.
 
         If variables have additional dimensions, such as "time", there is a row for each point along these dimensions,
-        and the other variables are repeated. `attrs["units"]` contains the units.
+        and the other variables are repeated. Each component of a vector is a column, such as "position.x".
+        `attrs["units"]` contains the units.
 
         **Raises:** `ModuleNotFoundError`, with the command that installs it, if pandas is missing.
 
@@ -158,7 +159,9 @@ class Table(eqx.Module):
         require_package("pandas", "pandas", "to_dataframe")
         import pandas
 
-        dims = [*axes_of(self.coords, self.inner), *dict.fromkeys(dim for dims in self.inner.values() for dim in dims)]
+        inner = dict.fromkeys(dim for dims in self.inner.values() for dim in dims)
+        named = {dim for dim in inner if np.asarray(self.coords[dim]).dtype.kind == "U"}
+        dims = [*axes_of(self.coords, self.inner), *(dim for dim in inner if dim not in named)]
         shape = tuple(len(self.coords[dim]) for dim in dims)
 
         def column(values: Values, own: tuple[str, ...]) -> Values:
@@ -166,10 +169,18 @@ class Table(eqx.Module):
             spread = np.expand_dims(values, [k for k, dim in enumerate(dims) if dim not in own])
             return np.broadcast_to(spread, shape).reshape(-1)
 
-        columns = {dim: column(self.coords[dim], (dim,)) for dim in dims}
-        columns |= {name: column(self.variables[name], self.dims(name)) for name in self.variables}
+        columns, units = {dim: column(self.coords[dim], (dim,)) for dim in dims}, dict(self.units)
+        for name in self.variables:
+            own = self.dims(name)
+            for index in np.ndindex(*(len(self.coords[dim]) if dim in named else 1 for dim in own)):
+                parts = [str(self.coords[dim][k]) for dim, k in zip(own, index, strict=True) if dim in named]
+                at = tuple(k if dim in named else slice(None) for dim, k in zip(own, index, strict=True))
+                whole = ".".join([name, *parts])
+                columns[whole] = column(self.variables[name][at], tuple(dim for dim in own if dim not in named))
+                if name in units:
+                    units[whole] = units[name]
         frame = pandas.DataFrame(columns)
-        frame.attrs["units"] = dict(self.units)
+        frame.attrs["units"] = {name: unit for name, unit in units.items() if name in columns}
         return frame
 
     def save(self, path: Any) -> None:

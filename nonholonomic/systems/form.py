@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..validation import UNTRACEABLE
 from .mode import Hybrid, State
 from .tracing import depends_on_first, is_elementary, spelled_out
 
@@ -120,8 +121,8 @@ def _traits(form: Form) -> Traits:
     ends, resets, within, others = [], [], [], []
     for k in range(form.modes):
         _require_shape(form, "field", k, (form.size,))
-        ends.append(jax.eval_shape(form.function("margin", k), *form.arguments) is not None)
-        reset = jax.eval_shape(form.function("reset", k), *form.arguments) if ends[k] else None
+        ends.append(_result(form, "margin", k) is not None)
+        reset = _result(form, "reset", k) if ends[k] else None
         resets.append(reset is not None)
         within.append(form.function("field", k))
         if ends[k]:
@@ -142,16 +143,27 @@ def _traits(form: Form) -> Traits:
     return Traits(timed, is_elementary(spelled_out(seen(within)), t, y, *numbers), tuple(ends), tuple(resets))
 
 
+def _name(name: str, mode: int) -> str:
+    return f"{name if name == 'event' else f'modes[{mode}].{name}'}(t, y)"
+
+
+def _result(form: Form, name: str, mode: int) -> Any:
+    """The shape and type that a function returns."""
+    try:
+        return jax.eval_shape(form.function(name, mode), *form.arguments)
+    except jax.errors.JAXTypeError as error:
+        raise ValueError(f"{_name(name, mode)} {UNTRACEABLE}") from error
+
+
 def _require_shape(form: Form, name: str, mode: int, shape: tuple[int, ...]) -> None:
     """Raise `ValueError` unless a function returns an array of floats of a shape."""
-    what = name if name == "event" else f"modes[{mode}].{name}"
-    result = jax.eval_shape(form.function(name, mode), *form.arguments)
+    what, result = _name(name, mode), _result(form, name, mode)
     if not hasattr(result, "shape") or result.shape != shape:
-        wanted = "one number" if shape == () else f"an array of shape {shape}, like the state"
+        wanted = "one number" if shape == () else f"an array of shape {shape}, like the start"
         got = f"an array of shape {result.shape}" if hasattr(result, "shape") else repr(result)
-        raise ValueError(f"{what}(t, y) must return {wanted}, not {got}; jnp.array([...]) makes an array of numbers")
+        raise ValueError(f"{what} must return {wanted}, not {got}; jnp.array([...]) makes an array of numbers")
     if not jnp.issubdtype(result.dtype, jnp.floating):
-        raise ValueError(f"{what}(t, y) must return floats, not {result.dtype}: it must be smooth")
+        raise ValueError(f"{what} must return floats, not {result.dtype}: it must be smooth")
 
 
 def _require_pair(form: Form, mode: int, result: Any) -> None:

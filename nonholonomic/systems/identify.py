@@ -27,9 +27,9 @@ from ..integration import tolerance_bound
 from ..progress import status_line
 from ..validation import as_number, as_number_or_none
 from .mode import Hybrid
-from .numbers import Named, check_again
+from .numbers import Named, check_again, require_apart
 from .simulate import simulate
-from .system import System, check_run
+from .system import System, check_run, run_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,10 +132,10 @@ def identify(
     - `system`: a `Hybrid`, or an `AbstractSystem`, with the values of the parameters that are not free.
     - `data`: a `Recording`, or a list of several to be fitted together.
     - `free`: full name of a parameter -> a `nonholonomic.Free` or only the start value. Examples of names are
-      `"system.modes[0].drag"`, or `"drag"` if no other name ends so, `"start[0]"`, `"start.q[0]"` and `"t0"`, the
-      reading of a recording's clock at the start. `"start[0]"` and `"t0"` are the same in all recordings;
-      `"data[1].start[0]"` belongs to the second recording, and `"data[*].t0"` is a separate parameter for each. In
-      systems with resets, `"t0"` cannot be free.
+      `"system.modes[0].drag"`, or `"drag"` if no other name ends so, `"modes[*].drag"` for all modes that have a drag,
+      `"start[0]"`, `"start.q[0]"` and `"t0"`, the reading of a recording's clock at the start. `"start[0]"` and `"t0"`
+      are the same in all recordings; `"data[1].start[0]"` belongs to the second recording, and `"data[*].t0"` is a
+      separate parameter for each. In systems with resets, `"t0"` cannot be free.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
     - `tolerance`: relative tolerance of the integration.
 
@@ -164,18 +164,22 @@ def identify(
     data = as_sources(data, Recording, "a nonholonomic.Recording")
     for recording in data:
         check_run(system, recording.launch, recording.times[-1], tolerance)
+        names = run_of(system, recording.launch, None).names
+        if not set(recording.columns) <= set(names):
+            raise ValueError(f"quantity = {recording.quantity!r} must name components of the state: {', '.join(names)}")
     tolerance_bound(tolerance).require()
     if isinstance(system, Hybrid):
         system = dataclasses.replace(system, event=None)
     named = [numbers_of(system, recording) for recording in data]
     own = [[name for name in numbers.movable if name.startswith("start")] + ["t0"] for numbers in named]
-    known = [name for name in named[0].movable if name.startswith("system")]
+    known = [name for name in named[0].known if name.startswith("system")]
 
     def check(values: dict[str, float]) -> None:
         check_again(named[0].tree(named[0].replaced({name: jnp.asarray(value) for name, value in values.items()})))
 
     with status_line("fitting", progress):
         unknowns = free_numbers(free, known, own, check)
+        require_apart("free", unknowns)
         return fit_data(
             lambda seen: SystemModel(system=system, data=data, seen=jnp.asarray(seen), tolerance=tolerance),
             data,

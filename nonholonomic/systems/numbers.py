@@ -1,7 +1,12 @@
-"""The numbers of a user's system by name: `"system.modes[0].drag"`, `"start[1]"`, `"start.q[0]"`, `"event.level"`."""
+"""The numbers of a user's system by name: `"system.modes[0].drag"`, `"start[1]"`, `"start.q[0]"`, `"event.level"`.
 
+`"system.modes[*].drag"` is one number for all modes that have it.
+"""
+
+import dataclasses
 import math
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,25 +16,28 @@ import numpy as np
 from jax.tree_util import DictKey, GetAttrKey, KeyPath, SequenceKey
 from jaxtyping import Array
 
+from ..parameters import full_name
 from .form import is_number
 
 
 class Named(NamedTuple):
     """The numbers of a tree, one by one, and the tree as a function of these numbers.
 
-    `names` and `values`: names and values of the numbers, in the same order; `shapes`: the shapes of the arrays that
-    contain the numbers.
+    `names` and `values`: names and values of the numbers, in the same order; `places`: the index of the number at each
+    place in the tree; `shapes`: the shapes of the arrays that contain the numbers.
     """
 
     names: tuple[str, ...]
     values: tuple[Array, ...]
+    places: tuple[int, ...]
     shapes: tuple[tuple[int, ...], ...]
     structure: Any
     rest: Any
 
     @classmethod
-    def of(cls, tree: dict[str, Any]) -> "Named":
-        """The numbers of several named trees."""
+    def of(cls, tree: dict[str, Any], shared: Iterable[str] = ()) -> "Named":
+        """The numbers of several named trees. **Arguments:** `shared`: names such as `"system.modes[*].drag"`, each of
+        which becomes one number, with the value in the first of the modes."""
         numbers, rest = eqx.partition(tree, is_number)
         leaves, structure = jax.tree_util.tree_flatten_with_path(numbers)
         names, values, shapes = [], [], []
@@ -39,25 +47,61 @@ class Named(NamedTuple):
             names += [name + "".join(f"[{k}]" for k in index) for index in np.ndindex(array.shape)]
             values += [jnp.asarray(array[index]) for index in np.ndindex(array.shape)]
             shapes.append(array.shape)
-        return cls(tuple(names), tuple(values), tuple(shapes), structure, rest)
+        whole = [_of_all_modes(name) if _of_all_modes(name) in shared else name for name in names]
+        first = {name: k for k, name in reversed(list(enumerate(whole)))}
+        kept = sorted(first.values())
+        places = tuple(kept.index(first[name]) for name in whole)
+        return cls(
+            tuple(whole[k] for k in kept), tuple(values[k] for k in kept), places, tuple(shapes), structure, rest
+        )
 
     def tree(self, values: tuple[Array, ...]) -> dict[str, Any]:
         """The trees for other values of the numbers."""
         leaves, begin = [], 0
         for shape in self.shapes:
-            end = begin + math.prod(shape)
-            leaves.append(jnp.stack(values[begin:end]).reshape(shape) if shape else values[begin])
-            begin = end
+            part = [values[k] for k in self.places[begin : begin + math.prod(shape)]]
+            leaves.append(jnp.stack(part).reshape(shape) if shape else part[0])
+            begin += len(part)
         return eqx.combine(jax.tree.unflatten(self.structure, leaves), self.rest)
 
     def replaced(self, changes: dict[str, Any]) -> tuple[Array, ...]:
-        """The numbers with replacements, by name."""
-        return tuple(changes.get(name, value) for name, value in zip(self.names, self.values, strict=True))
+        """The numbers with replacements, by name; a name such as `"system.modes[*].drag"` replaces several."""
+        return tuple(
+            changes.get(name, changes.get(_of_all_modes(name), value))
+            for name, value in zip(self.names, self.values, strict=True)
+        )
 
     @property
     def movable(self) -> list[str]:
         """The names of the numbers that are floats, which can be varied."""
         return [name for name, value in zip(self.names, self.values, strict=True) if eqx.is_inexact_array(value)]
+
+    @property
+    def known(self) -> list[str]:
+        """The names of the numbers that can be varied, one by one or in all modes that have them."""
+        whole = [_of_all_modes(name) for name in self.movable]
+        return [*self.movable, *dict.fromkeys(name for name in whole if whole.count(name) > 1)]
+
+    def full_name(self, argument: str, name: str) -> str:
+        """The full name for a name, as in `nonholonomic.parameters.full_name`.
+
+        **Raises:** `ValueError` for an unknown or ambiguous name, with a hint for an attribute that is no float.
+        """
+        try:
+            return full_name(argument, name, self.known)
+        except ValueError as error:
+            raise ValueError(f"{error}{self._undeclared(name)}") from None
+
+    def _undeclared(self, name: str) -> str:
+        """A hint for the name of an attribute that is an integer, or that has no type in its class."""
+        end = name.rsplit(".", 1)[-1]
+        for module in _modules(self.tree(self.values)):
+            value = getattr(module, end, None)
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                if end in {field.name for field in dataclasses.fields(module)}:
+                    return f"; {end} = {value} is an integer: write {float(value)}" if isinstance(value, int) else ""
+                return f"; declare it with its type in {type(module).__name__}: {end}: float = {float(value)}"
+        return ""
 
 
 def _name(path: KeyPath) -> str:
@@ -73,6 +117,18 @@ def _name(path: KeyPath) -> str:
     return "".join(parts).removeprefix(".")
 
 
+def _of_all_modes(name: str) -> str:
+    """The name of a number for all modes that have it."""
+    return re.sub(r"\bmodes\[\d+\]", "modes[*]", name)
+
+
+def require_apart(argument: str, names: Iterable[str]) -> None:
+    """Raise `ValueError` if a number is named both alone and for all modes."""
+    for name in names:
+        if name != _of_all_modes(name) in names:
+            raise ValueError(f"{argument}: {name!r} is named twice, alone and for all modes")
+
+
 def short_names(names: list[str]) -> dict[str, str]:
     """For each full name, the part after its last dot, in the form `start_0`; if several names end alike, the whole
     name."""
@@ -81,7 +137,7 @@ def short_names(names: list[str]) -> dict[str, str]:
 
 
 def _plain(name: str) -> str:
-    return name.replace("[", "_").replace("]", "").replace(".", "_")
+    return name.replace("[*]", "").replace("[", "_").replace("]", "").replace(".", "_")
 
 
 def has_checks(tree: Any) -> bool:

@@ -25,13 +25,12 @@ from ..integration import (
     explicit_tableau,
     solve_ensemble,
 )
-from ..parameters import full_name
 from ..sweeps import Table, Variable, axis, chunk_for, size_of
 from ..sweeps import sweep as computed
 from ..validation import as_number
 from .engine import Cells
 from .mode import Event, Hybrid
-from .numbers import Named, check_again, has_checks, short_names
+from .numbers import Named, check_again, has_checks, require_apart, short_names
 from .system import Run, System, check_run, run_of
 from .tracing import dependent_outputs
 
@@ -67,7 +66,8 @@ def sweep(
     - `axes`: full name of a parameter -> values, such as `{"system.modes[0].drag": [0.1, 0.2], "start[1]": [0.0,
       1.0]}`; the end of a name is enough if it is unique. The start of an `AbstractSystem` has the names `"start.q[0]"`
       and `"start.rate[0]"`, and parameters of an event that is an `equinox.Module` have names such as `"event.level"`
-      or `"system.event.level"`. The first axis varies slowest.
+      or `"system.event.level"`. `"modes[*].drag"` gives all modes that have a drag the same value. The first axis varies
+      slowest.
     - `sensitivities`: names of the parameters with respect to which the times are differentiated.
     - `path`: HDF5 file to write, chunk by chunk. Repeat the same call to resume an interrupted sweep.
     - `progress`: whether to show progress, on a terminal or in a notebook.
@@ -110,9 +110,12 @@ def sweep(
         system, event = dataclasses.replace(system, event=event), None
     mechanical = isinstance(system, AbstractSystem)
     begin = dict(zip(("q", "rate"), map(as_number, start), strict=True)) if mechanical else as_number(start)
-    named = Named.of({"system": system, "start": begin, "event": event})
-    full = {full_name("axes", name, named.movable): values for name, values in axes.items()}
-    by = [full_name("sensitivities", name, named.movable) for name in sensitivities]
+    tree = {"system": system, "start": begin, "event": event}
+    named = Named.of(tree)
+    full = {named.full_name("axes", name): values for name, values in axes.items()}
+    by = [named.full_name("sensitivities", name) for name in sensitivities]
+    require_apart("axes and sensitivities", [*full, *by])
+    named = Named.of(tree, [*full, *by])
     shorts = short_names([*full, *(name for name in by if name not in full)])
     grid = [axis(shorts[name], name, "1", values) for name, values in full.items()]
     for grid_axis in grid if has_checks(system) or has_checks(event) else ():
@@ -159,13 +162,13 @@ class SweepJob(NamedTuple):
     by: tuple[str, ...]
 
     @classmethod
-    def of(cls, tree: dict[str, Any], *rest: Any) -> "SweepJob":
-        """The job for a system, start and event."""
-        return cls(Named.of(tree), *rest)
+    def of(cls, tree: dict[str, Any], shared: tuple[str, ...], *rest: Any) -> "SweepJob":
+        """The job for a system, start and event. **Arguments:** `shared`: as for `Named.of`."""
+        return cls(Named.of(tree, shared), *rest)
 
     def __reduce__(self) -> Any:
         # The structure of a tree with a user's classes cannot be pickled, but the tree can.
-        return SweepJob.of, (self.named.tree(self.named.values), *self[1:])
+        return SweepJob.of, (self.named.tree(self.named.values), self.named.names, *self[1:])
 
     def variables(self, run: Run, shorts: dict[str, str]) -> dict[str, Variable]:
         """The variables of the table."""

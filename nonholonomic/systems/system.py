@@ -4,13 +4,14 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..formulations import AbstractFormulation, AbstractSystem, Hamel, Lagrange
 from ..integration import run_bounds
-from ..validation import as_number, is_traced, require, require_all
+from ..validation import UNTRACEABLE, as_number, is_traced, require, require_all
 from .engine import Cells
 from .form import Form
 from .mode import AbstractMode, Event, Hybrid, State
@@ -116,17 +117,40 @@ def _check_vector(value: Any, name: str, size: int | None) -> None:
         raise ValueError(f"{name} must be of shape {shape}, not {np.shape(value)}; jax.vmap or sweep runs many")
 
 
+def _check_mechanical_functions(system: AbstractSystem) -> None:
+    """Raise `ValueError` that names a function of a system that JAX cannot trace or that returns a wrong shape."""
+    n = system.dimension
+    t, q = (jax.ShapeDtypeStruct(shape, jnp.result_type(float)) for shape in ((), (n,)))
+    functions = {
+        "metric(q)": (system.metric, (q,), f"of shape ({n}, {n})", lambda shape: shape == (n, n)),
+        "potential(q)": (system.potential, (q,), "one number", lambda shape: shape == ()),
+        "constraints(q)": (
+            system.constraints,
+            (q,),
+            f"of shape (k, {n}), a row for each constraint",
+            lambda shape: len(shape) == 2 and shape[1] == n,
+        ),
+        "frame(q)": (system.frame, (q,), f"of shape ({n}, {n})", lambda shape: shape == (n, n)),
+        "force(t, q, rate)": (system.force, (t, q, q), f"of shape ({n},)", lambda shape: shape in ((), (1,), (n,))),
+    }
+    for name, (function, arguments, wanted, fits) in functions.items():
+        try:
+            result = jax.eval_shape(function, *arguments)
+        except jax.errors.JAXTypeError as error:
+            raise ValueError(f"{name} {UNTRACEABLE}") from error
+        shape = getattr(result, "shape", None)
+        if shape is None or not fits(shape):
+            raise ValueError(f"{name} must be {wanted}, not {result if shape is None else shape}")
+
+
 def _check_mechanical_start(system: AbstractSystem, start: Any) -> None:
     if not isinstance(start, tuple | list) or len(start) != 2:
         raise ValueError(f"start = {start!r} must be a pair (q, rate) of coordinates and their rates")
     for name, part in zip(("q", "rate"), start, strict=True):
         _check_vector(part, f"start: {name}", system.dimension)
+    _check_mechanical_functions(system)
     q, rate = (as_number(part) for part in start)
     constraints = system.constraints(q)
-    if constraints.shape[1:] != q.shape:
-        raise ValueError(
-            f"constraints(q) must be of shape (k, {q.size}), a row for each constraint, not {constraints.shape}"
-        )
     if not constraints.size:
         return
     violation, frame = constraints @ rate, constraints @ system.frame(q)[:, : system.freedom]

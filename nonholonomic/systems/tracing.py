@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.extend.core import Jaxpr, Literal
 from jaxtyping import Array
 
-from ..validation import is_traced
+from ..validation import UNTRACEABLE, is_traced
 
 #: Operations that XLA compiles into a single kernel on a CPU, forwards and backwards. A function with other operations,
 #: such as LAPACK calls, scatters and sorts, is not compiled into a single kernel.
@@ -129,8 +129,11 @@ def _reached(jaxpr: Jaxpr, inputs: Sequence[Any]) -> list[bool]:
     return [not isinstance(variable, Literal) and variable in reached for variable in jaxpr.outvars]
 
 
-def with_own_numbers(function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
-    """The function itself or, if it closes over traced numbers (such as those of an enclosing `jax.grad`), a module
-    that contains these numbers."""
-    consts = jax.make_jaxpr(function)(*args).consts
-    return eqx.filter_closure_convert(function, *args) if any(is_traced(const) for const in consts) else function
+def with_own_numbers(event: Callable[..., Any], *args: Any) -> Callable[..., Any]:
+    """The event itself or, if it closes over traced numbers (such as those of an enclosing `jax.grad`), a module that
+    contains these numbers."""
+    try:
+        consts = jax.make_jaxpr(event)(*args).consts
+    except jax.errors.JAXTypeError as error:
+        raise ValueError(f"event(t, y) {UNTRACEABLE}") from error
+    return eqx.filter_closure_convert(event, *args) if any(is_traced(const) for const in consts) else event

@@ -14,6 +14,12 @@ from ..validation import is_traced
 #: The words for how a run without an event ends, by code.
 WORDS = {REACHED_END: "completed", LEFT_DOMAIN: "stopped", FAILED: "failed", UNRESOLVED: "unresolved"}
 
+#: Why a run ended early, by its word.
+REASONS = {
+    "failed": "a function may return NaN or infinity there, or reset the index of no mode",
+    "unresolved": "resets followed one another without end; add a mode for rest, or start where the margin is positive",
+}
+
 
 class Trajectory(Tabular, eqx.Module):
     """A run of your own system at given times. The times are the first axis of the arrays; `jax.vmap` adds an axis
@@ -100,5 +106,13 @@ class Trajectory(Tabular, eqx.Module):
         return own if figure is None else figure
 
     def __str__(self) -> str:
-        shape = "x".join(map(str, jnp.shape(self.state)))
-        return f"Trajectory(status={self.status}, state of shape {shape}, {', '.join(self.names)})"
+        if is_traced(self.code) or np.ndim(self.t) != 1:
+            shape = "x".join(map(str, jnp.shape(self.state)))
+            return f"Trajectory(status={self.status}, state of shape {shape}, {', '.join(self.names)})"
+        table = str(self.to_table()).splitlines()[1 : 1 + len(self.names)]
+        lines = [f"Trajectory of {np.size(self.t)} times, {self.status} at {float(self.end_time):.6g} s", *table]
+        lines.append(f"  resets: {int(self.switches)}")
+        lines.append(f"  steps: {int(self.steps)}, of which {int(self.rejected)} rejected")
+        if self.status in REASONS:
+            lines.append(f"  {REASONS[self.status]}")
+        return "\n".join(lines)

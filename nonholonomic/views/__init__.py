@@ -1,4 +1,5 @@
-"""Pictures, animations and pages of results. The subpackages above compute the results and draw them by these functions."""
+"""Pictures, animations and pages of results. The subpackages above compute the results, and use these functions to draw
+them."""
 
 from .arena import arena as arena
 from .fit import draw_fit as draw_fit

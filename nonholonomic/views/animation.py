@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .arena import FINE
-from .page import ANGLE, among, view_from
+from .page import ANGLE, centre_and_extent, view_from
 from .plot import new_figure
 from .stage import Show, Stage, css, finite, matrices, nearest
 
@@ -117,7 +117,7 @@ class _Space:
         place, middle = np.array(camera[:3]), np.array(camera[3:6])
         away = place - middle
         distance = np.linalg.norm(away)
-        self.apart = among(np.stack([show.bodies[0].position[0] for show in stage.shows]))[1]
+        self.extent = centre_and_extent(np.stack([show.bodies[0].position[0] for show in stage.shows]))[1]
         self.reach, self.middle = 0.8 * distance * np.tan(np.radians(ANGLE) / 2.0), middle
         axes.view_init(np.degrees(np.arcsin(away[2] / distance)), np.degrees(np.arctan2(away[1], away[0])))
         axes.set_axis_off()
@@ -152,8 +152,10 @@ class _Space:
         middle, reach = self.middle, self.reach
         if self.follow:
             shown = zip(self.stage.shows, self.frames, strict=True)
-            middle, apart = among(np.stack([show.bodies[0].position[frames[frame]] for show, frames in shown]))
-            reach += apart - self.apart
+            middle, extent = centre_and_extent(
+                np.stack([show.bodies[0].position[frames[frame]] for show, frames in shown])
+            )
+            reach += extent - self.extent
         for axis, centre in zip("xyz", middle, strict=True):
             getattr(self.axes, f"set_{axis}lim")(centre - reach, centre + reach)
         within = np.linalg.norm(self.tiles.mean(axis=1) - middle, axis=-1) < 1.6 * reach

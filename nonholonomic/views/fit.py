@@ -51,7 +51,7 @@ def draw_fit(fit: Fit) -> Any:
     for k, name in enumerate(profiled):
         _draw_profile(fit, name, figure.add_subplot(grid[2, k]))
     _draw_correlation(fit, names, figure.add_subplot(grid[2, lower - 1]))
-    figure.suptitle("; ".join(fit.verdict.concerns) or "nothing speaks against this fit", fontsize=9, wrap=True)
+    figure.suptitle("; ".join(fit.verdict.concerns) or "no concerns about this fit", fontsize=9, wrap=True)
     return figure
 
 

@@ -268,7 +268,7 @@ def _size(stage: Stage) -> float:
     return max(show.size for show in stage.shows)
 
 
-def among(points: Float[np.ndarray, "points 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
+def centre_and_extent(points: Float[np.ndarray, "points 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
     """The centre of points, and their distance from the centre."""
     middle = points.mean(axis=0)
     return middle, float(np.linalg.norm(points - middle, axis=-1).max())
@@ -284,8 +284,8 @@ def view_from(stage: Stage) -> tuple[list[float], bool]:
     reach = np.linalg.norm(points - middle, axis=-1).max()
     follow = stage.follows or bool(reach > 4.0 * size)
     if follow:
-        middle, apart = among(np.stack([path[0] for path in paths]))
-        reach = 1.1 * size + apart
+        middle, extent = centre_and_extent(np.stack([path[0] for path in paths]))
+        reach = 1.1 * size + extent
     normal = stage.arena.normal
     aside = np.array([0.35, -1.0, 0.0])
     aside = aside - (aside @ normal) * normal

@@ -1,12 +1,18 @@
 """Launches: how a ride starts."""
 
+import math
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
+import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.validation import Bound, Bounded, as_number, shown
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, shown
+
+#: Largest usual angles [rad]: a front wheel that turns by half a turn, and a heading after two turns.
+USUAL = {"steering": math.pi, "heading": 4.0 * math.pi}
 
 
 def as_place(value: Any) -> Any:
@@ -63,6 +69,19 @@ class Launch(Bounded):
     def __check_init__(self):
         if not (isinstance(self.place, tuple) and len(self.place) in (2, 3)):
             raise ValueError(f"place = {shown(self.place)} must be a pair of numbers, or (x, y, z) [m]")
+
+    def suspicion(self) -> str | None:
+        for name, usual in USUAL.items():
+            value = getattr(self, name)
+            if is_traced(value) or not isinstance(value, jax.Array) or value.size == 0:
+                continue
+            largest = float(np.max(np.abs(value)))
+            if largest > usual:
+                return (
+                    f"{name} = {largest:g} rad is large: was it in degrees? "
+                    f"{largest:g} degrees are {math.radians(largest):.4g} rad"
+                )
+        return None
 
     def bounds(self) -> Iterator[Bound]:
         for k, number in enumerate(self.place):

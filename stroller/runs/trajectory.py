@@ -202,9 +202,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         ]
         error = float(jnp.max(self.wheelbase_error))
         if error > 0.0:
-            lines.append(
-                f"  wheelbase       relative error of its effect up to {error:.1e}: the ground is curved over its length"
-            )
+            lines.append(f"  wheelbase       relative error up to {error:.1e}, because the ground is curved")
         if np.isfinite(self.contact_lost_at):
             lines.append(f"  contact lost    at {self.contact_lost_at:.6g} s; after that the ground would have to pull")
         if np.isfinite(self.rank_lost_at):

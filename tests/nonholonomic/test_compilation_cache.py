@@ -5,6 +5,7 @@ import json
 import logging
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import threading
@@ -67,31 +68,67 @@ def damaged(content):
     return {"empty": b"", "cut": content[:middle], "one bit turned": turned, "noise": os.urandom(len(content))}
 
 
-def test_a_bad_entry_costs_a_compilation_and_nothing_else(tmp_path):
-    first, _ = run(SMALL, tmp_path)
-    folder = tmp_path / "nonholonomic" / environment_name()
-    (entry,) = folder.glob("*-cache")
-    for k, (way, content) in enumerate(damaged(entry.read_bytes()).items()):
-        entry.write_bytes(content)
+@pytest.fixture(scope="module")
+def small_home(tmp_path_factory):
+    """A home in which a process has left the compiled `SMALL`, and what it told."""
+    home = tmp_path_factory.mktemp("home")
+    return home, run(SMALL, home)[0]
+
+
+@pytest.fixture
+def home(small_home, tmp_path):
+    """A copy of that home."""
+    return shutil.copytree(small_home[0], tmp_path / "home")
+
+
+#: What a process does with an entry that is damaged in several ways, one after the other, and tells of each.
+WITH_DAMAGES = """
+import os, pathlib
+from jax.experimental.compilation_cache import compilation_cache
+def hits(): return counts["/jax/compilation_cache/cache_hits"]
+told = []
+for k, content in enumerate(sorted(pathlib.Path({contents!r}).iterdir())):
+    if k:
+        # As a process does that starts now.
+        (entry,) = folder.glob("*-cache")
+        entry.write_bytes(content.read_bytes())
         if k % 2:
             # As from a copy that kept the times.
             os.utime(entry, (0, 0))
-        mended, message = run(SMALL, tmp_path)
-        assert (mended["result"], mended["found"], message) == (first["result"], 0, ""), way
-    assert run(SMALL, tmp_path)[0]["found"] == 1
+        jax.clear_caches()
+        compilation_cache.reset_cache()
+        nonholonomic.enable_compilation_cache(folder.parent)
+    before = hits()
+    {program}
+    told.append([content.name, result, hits() - before])
+result = told
+"""
 
 
-def test_an_entry_that_is_cut_while_it_is_used_costs_a_compilation_too(tmp_path):
-    run(SMALL, tmp_path)
+def test_a_bad_entry_costs_a_compilation_and_nothing_else(home, small_home, tmp_path):
+    (entry,) = (home / "nonholonomic" / environment_name()).glob("*-cache")
+    contents = tmp_path / "contents"
+    contents.mkdir()
+    ways = damaged(entry.read_bytes())
+    for k, (way, content) in enumerate(ways.items()):
+        (contents / f"{k} {way}").write_bytes(content)
+    entry.write_bytes(next(iter(ways.values())))
+    answer, message = run(WITH_DAMAGES.format(contents=str(contents), program=SMALL), home)
+    result = small_home[1]["result"]
+    assert answer["result"] == [[f"{k} {way}", result, 0] for k, way in enumerate(ways)]
+    assert message == ""
+    assert run(SMALL, home)[0]["found"] == 1
+
+
+def test_an_entry_that_is_cut_while_it_is_used_costs_a_compilation_too(home):
     cut = f"import pathlib\nfor entry in pathlib.Path(folder).glob('*-cache'): entry.write_bytes(b'')\n{SMALL}"
-    answer, message = run(cut, tmp_path)
+    answer, message = run(cut, home)
     assert (answer["result"], answer["found"], message) == (14.0, 0, "")
 
 
-def test_other_flags_have_another_folder(tmp_path):
-    first, _ = run(SMALL, tmp_path)
+def test_other_flags_have_another_folder(small_home, tmp_path):
     second, _ = run(SMALL, tmp_path, XLA_FLAGS="--xla_cpu_enable_fast_min_max=true")
-    assert first["folder"] != second["folder"]
+    assert os.path.relpath(small_home[1]["folder"], small_home[0]) != os.path.relpath(second["folder"], tmp_path)
 
 
 @pytest.mark.parametrize("forbidden", [False, True])

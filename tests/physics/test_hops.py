@@ -132,6 +132,17 @@ def ride() -> tippe.HybridTrajectory:
     return tippe.simulate(scene, tippe.Launch(0.1, 250.0), 4.0, tolerance=1e-10)
 
 
+def test_a_launch_beyond_the_angle_without_contact_is_inverted_at_the_start():
+    """The spin about t1 pulls the top off the plane; it flies, and theta falls below the angle and returns."""
+    scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3), contact="hybrid")
+    axes = {"launch.angular_velocity[0]": [0.0, 60.0]}
+    table = tippe.inversion_table(scene, theta=2.9, spin=0.0, t1=0.5, angle=2.5, tolerance=1e-6, axes=axes)
+    assert list(table.status) == ["inverted", "inverted"]
+    assert list(table.time) == [0.0, 0.0]
+    assert list(table["hops"]) == [0, 0]
+    assert_close(table.end_theta, 2.9, atol=1e-12)
+
+
 def test_the_top_goes_over_to_its_stem(ride):
     assert ride.status == "completed"
     assert set(ride.contact) == {-1, 0, 1}

@@ -263,6 +263,15 @@ def test_a_launch_on_the_stem_slips_off_a_slope(surface, launch):
     assert run.stats["energy_residual"] < 1e-9
 
 
+def test_a_launch_beyond_the_angle_from_which_the_top_slips_at_once_is_inverted_at_the_start():
+    """At rest on a steep wall, as under smooth laws; 5.7 ms later the slip has begun."""
+    scene = tippe.Scene(rutstam_top(), tippe.Sphere(0.2), tippe.SetValuedCoulomb(0.3))
+    table = tippe.inversion_table(scene, theta=[0.1, 3.0], spin=0.0, eta=1.2, t1=0.02, tolerance=1e-6)
+    assert list(table.status) == ["not_inverted", "inverted"]
+    assert list(table.time) == [np.inf, 0.0]
+    assert (table.end_time[1], table.end_theta[1], table["sticks"][1]) == (0.0, pytest.approx(3.0, abs=1e-12), 0)
+
+
 def test_a_slip_begins_where_errors_have_taken_the_axis_off_unit_length():
     """A top that the step controller lost at .443 s, after rolling, at |e| - 1 = 3e-7."""
     top = tippe.Top(0.016689, 0.0138854, 0.0009348046138502779, 9.319925953256214e-07, 1.136765490128233e-06)

@@ -24,6 +24,38 @@ class Ball(AbstractMode):
         return jnp.array([0.0, -self.restitution * y[1], y[2] + 1.0]), 0
 
 
+class Stick(AbstractMode):
+    """A block at rest on a belt: place and velocity; it slips where the spring pulls more than friction holds."""
+
+    grip: float = 1.0
+    belt: float = 0.5
+
+    def field(self, t, y):
+        return jnp.array([self.belt, 0.0])
+
+    def margin(self, t, y):
+        return self.grip - y[0]
+
+    def reset(self, t, y):
+        return y, 1
+
+
+class Slip(AbstractMode):
+    """It slips back under the spring x'' = -x + friction, until its velocity is that of the belt again."""
+
+    friction: float = 1.0
+    belt: float = 0.5
+
+    def field(self, t, y):
+        return jnp.array([y[1], self.friction - y[0]])
+
+    def margin(self, t, y):
+        return self.belt - y[1]
+
+    def reset(self, t, y):
+        return jnp.array([y[0], self.belt]), 0
+
+
 class Bounces(eqx.Module):
     """An event: so many bounces. The count jumps over zero."""
 

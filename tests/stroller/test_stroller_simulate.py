@@ -41,14 +41,17 @@ def reference():
     return stroller.simulate(FULL, LAUNCH, 10.0, push, times=jnp.linspace(0.0, 10.0, 11), tolerance=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("side", "fork"), [("inside", "absolute"), pytest.param("outside", "relative", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("side", "fork"), [("inside", "absolute"), ("outside", "relative")])
 def test_midpoint_rule_balances_energy_to_round_off(side, fork):
     """Section 10b: 20 000 steps with friction and drive leave less than 1e-11 J, and the constraints at 1e-12 m/s."""
     scene = Scene(BODY, Spheroid(2.0, 1.1), Damping(0.3, 0.2, 0.1, 0.15), side=side, fork=fork)
     run = stroller.simulate(scene, LAUNCH, 200.0, push, solver=ImplicitMidpoint(0.01))
     assert int(run.stats.steps) == 20_000
+    assert_exact_balance(run)
+
+
+def assert_exact_balance(run):
     assert bool(run.stats.finished)
     assert float(jnp.max(jnp.abs(run.work))) > 1.0
     np.testing.assert_allclose(run.energy_residual, 0.0, atol=1e-11)
@@ -56,24 +59,30 @@ def test_midpoint_rule_balances_energy_to_round_off(side, fork):
     np.testing.assert_allclose(run.departure, 0.0, atol=2e-13)
 
 
-def test_midpoint_rule_is_of_second_order(reference):
-    """Halving the step divides the error by four."""
+def midpoint_ride(times, step):
+    """A ride of 500 steps with 11 times, so that one program serves all."""
+    run = stroller.simulate(FULL, LAUNCH, times[-1], push, times=times, solver=ImplicitMidpoint(step))
+    assert int(run.stats.steps) == 500
+    return run
+
+
+def test_midpoint_rule_is_of_second_order_and_balances_energy(reference):
+    """Halving the step divides the error by four; 500 steps leave energy and constraints at round-off."""
     errors = []
-    # As many steps in both, so that one program serves.
     for step, end in ((0.02, 10.0), (0.01, 5.0)):
-        run = stroller.simulate(
-            FULL, LAUNCH, end, push, times=jnp.linspace(0.0, end, 11), solver=ImplicitMidpoint(step)
-        )
+        run = midpoint_ride(np.linspace(0.0, end, 11), step)
         at = int(jnp.searchsorted(run.t, 3.0 - 1e-9))
         errors.append(float(jnp.linalg.norm(run.position[at] - reference.position[3])))
+        assert_exact_balance(run)
     np.testing.assert_allclose(errors[0] / errors[1], 4.0, rtol=0.03)
 
 
 def test_midpoint_steps_end_on_the_times_asked_for():
-    run = stroller.simulate(FULL, LAUNCH, 1.0, push, times=[0.0, 0.333, 1.0], solver=ImplicitMidpoint(0.1))
-    np.testing.assert_allclose(run.t, [0.0, 0.333, 1.0], rtol=1e-15)
-    assert int(run.stats.steps) == 4 + 7
-    np.testing.assert_allclose(run.energy_residual, 0.0, atol=1e-13)
+    times = [0.0, 0.333, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.98]
+    assert [np.ceil(gap / 0.02 - 1e-9) for gap in np.diff(times)] == [17, 34, *[50] * 7, 99]
+    run = midpoint_ride(times, 0.02)
+    np.testing.assert_allclose(run.t, times, rtol=1e-15)
+    np.testing.assert_allclose(run.energy_residual, 0.0, atol=1e-12)
 
 
 def test_a_batch_of_implicit_rides_compiles_without_a_complaint(capfd):

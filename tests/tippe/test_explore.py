@@ -158,6 +158,14 @@ def test_it_shows_the_time_of_the_launch_and_the_run(browser, page, rutstam_scen
     np.testing.assert_allclose(np.linalg.norm(rows[:, 6:10], axis=1), 1.0, atol=1e-15)
 
 
+def test_angles_and_spins_have_their_familiar_units(browser, page):
+    """Like the launches that teachers describe: degrees, and revolutions per minute."""
+    browser.execute_script("live.set([0.209440, 157.0796])")
+    texts = "return [...document.querySelectorAll('#knobs output')].map((one) => one.textContent)"
+    shown = browser.execute_script(texts)
+    assert shown == ["0.209 rad = 12.0°", "157 rad/s = 1500 rpm"]
+
+
 def test_a_slider_simulates_anew(browser, page, rutstam_scene):
     reset(browser)
     browser.execute_script(

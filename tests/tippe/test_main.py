@@ -22,7 +22,7 @@ SMALL = ["--paper", "--theta", "0.1", "0.3", "--eta", "0", "--t1", "12", "--tole
 def test_the_papers_tables_are_printed_written_and_drawn(tmp_path, capsys):
     assert main([*SMALL, "--out", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr().out
-    assert "Table 1 lost its numbers" in printed
+    assert "numbers of the paper's Table 1 are lost" in printed
     assert "first [s]" in printed
     assert "9.98" in printed
     assert (tmp_path / "out" / "theta.png").read_bytes().startswith(b"\x89PNG")

@@ -37,8 +37,8 @@ def drive(law: Any) -> str | None:
     drills = f" and a turning of {turning[worst]:g} rad/s" if law.uses_spin and turning[worst] else ""
     return (
         f"friction = {one_line(law)} drives the top: at a slip of ({x[worst]:.3g}, {y[worst]:.3g}) m/s{drills} its power is "
-        f"{power[worst]:.3g} W per newton of normal force, and friction has none above 0. Is a sign wrong? A run whose energy "
-        "grows ends as 'unresolved'. For a level belt, give Launch the velocity relative to it"
+        f"{power[worst]:.3g} W per newton of normal force, but the power of friction is never positive. Is a sign wrong? A run "
+        "whose energy grows ends as 'unresolved'. For a level belt, give Launch the velocity relative to it"
     )
 
 

@@ -330,7 +330,7 @@ class SetValuedCoulomb(AbstractFriction):
     """Exact Coulomb friction without a slip speed: F = -mu N v_s / |v_s| while the contact slips, and any force along
     the arena up to mu N while it sticks (`tippe.md`, section 3).
 
-    A run consists of modes. During a slip, the force has its full size. When the slip stops, the top rolls, with the
+    A run consists of modes. During a slip, the force is mu N. When the slip stops, the top rolls, with the
     equations of `tippe/model/rolling.py`, if the required force is within the friction cone, and slips again when the
     required force leaves the cone. Rolling conserves the energy. With `contact="hybrid"`, a top without a stem
     flies when contact is lost, and slips, rolls or rebounds after an impact (`tippe/modes/airborne_stick_slip.py`).

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from nonholonomic.geometry import Vector, dot, scale, sum_vectors, vector_of
 from nonholonomic.systems.components import TooLarge, by_components
 from nonholonomic.systems.tracing import with_own_numbers
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced
+from nonholonomic.validation import UNTRACEABLE, Bound, Bounded, as_number, is_traced
 
 from .inertia import Inertia
 from .launch import as_numbers
@@ -87,8 +87,8 @@ class Ellipsoid(AbstractRigidBody):
     curved arena, a run ends with the status "does_not_fit" where the body is not more strongly curved than the arena;
     the program does not notice a second contact elsewhere. The part of the surface that never touches the arena does
     not matter: half an ellipsoid, such as a boat, moves like the whole ellipsoid. At a `Launch`, the body's axes x, y
-    and z are those of the arena (t1, t2, n), turned by theta about a horizontal axis so that z leans in the direction
-    `azimuth`. `spin` is the angular velocity about z.
+    and z are those of the arena (t1, t2, n), turned by theta about a tangent of the arena so that z leans in the
+    direction `azimuth`. `spin` is the angular velocity about z.
 
     **Arguments:**
 
@@ -185,9 +185,9 @@ class RigidBody(AbstractRigidBody):
     ...     return 0.02 * jnp.sqrt(jnp.sum(direction**2)) + 0.006 * direction[2]
     >>> top = tippe.RigidBody(0.02, [[2.94e-6, 0, 0], [0, 3.06e-6, 0], [0, 0, 3.2e-6]], support)
     >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
-    >>> time = tippe.inversion_time(scene, tippe.Launch(0.1, 155.0), t1=8.0, tolerance=1e-6)
-    >>> print(f"{time:.1f} s")
-    5.9 s
+    >>> start = scene.state(tippe.Launch(0.1, 155.0))
+    >>> print(f"{1e3 * scene.energy(start):.1f} mJ, {scene.normal_force(start):.3f} N")
+    41.2 mJ, 0.196 N
 
     ```
     """
@@ -286,10 +286,7 @@ def as_support(value: Any) -> eqx.Module:
     try:
         result = jax.eval_shape(value, direction)
     except jax.errors.JAXTypeError as error:
-        raise ValueError(
-            f"support = {value!r} cannot be traced by JAX: write it with jax.numpy in place of numpy and math, and with "
-            "jnp.where in place of `if`"
-        ) from error
+        raise ValueError(f"support = {value!r} {UNTRACEABLE}") from error
     except (TypeError, IndexError) as error:
         raise ValueError(f"support = {value!r} must be a function of a direction (3,): {error}") from error
     if getattr(result, "shape", None) != () or not jnp.issubdtype(result.dtype, jnp.floating):

@@ -31,14 +31,15 @@ from nonholonomic.geometry import (
     vector_of,
 )
 from nonholonomic.parameters import numbers
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require_all, require_kind, uncalled
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require_all
 
 from .body import AbstractBody
 from .dynamics import TURNING, Dynamics
-from .friction import A_LAW, AbstractFriction, Frictionless, NoSlip
+from .friction import AbstractFriction, Frictionless, NoSlip
 from .launch import Launch
 from .rigid_body import AbstractRigidBody
 from .rigid_dynamics import AbstractRigidDynamics, rigid_dynamics
+from .scene_checks import check_parts
 from .state import angular_velocity, inclination, joined, parts
 from .stick_slip import StickSlip
 from .top import Top
@@ -111,47 +112,7 @@ class Scene(Bounded, Generic[Body]):
     side: str | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        if not isinstance(self.body, AbstractBody | AbstractRigidBody):
-            kinds = f"a Top, a SpheroidBody, a ConvexBody, an Ellipsoid or a RigidBody{uncalled(self.body)}"
-            raise ValueError(f"body = {self.body!r} must be {kinds}")
-        require_kind(self.surface, "surface", AbstractSurface, ", such as tippe.Plane() or tippe.Cylinder(0.3)")
-        require_kind(self.friction, "friction", AbstractFriction, A_LAW)
-        # This raises an error if the surface has no such side.
-        self.surface.sign(self.side, "inside")
-        if self.contact not in ("stop", "hybrid"):
-            raise ValueError(f"contact = {self.contact!r} must be 'stop' or 'hybrid'")
-        if self.restitution is not None and self.contact == "stop":
-            raise ValueError(f"restitution = {self.restitution!r} must be omitted for contact = 'stop'")
-        if isinstance(self.friction, NoSlip) and not isinstance(self.body, AbstractRigidBody):
-            raise ValueError(
-                f"friction = NoSlip() must be another law for a {type(self.body).__name__}, such as Coulomb; describe the body "
-                "as an Ellipsoid or a RigidBody to roll it"
-            )
-        if not isinstance(self.body, Top):
-            self._check_convex()
-            return
-        if self.friction.set_valued and self.body.stem is not None:
-            raise ValueError(
-                f"friction = {self.friction!r} must be a law with a single mode for a top with a stem, such as Coulomb: "
-                "with two contacts it is undetermined which one sticks"
-            )
-        if self.contact == "stop" and self.body.stem is not None:
-            raise ValueError("contact = 'stop' must be 'hybrid' for a top with a stem")
-
-    def _check_convex(self) -> None:
-        """Raise `ValueError` for options that need a sphere, whose contact follows from the place of its centre."""
-        kind = type(self.body).__name__
-        kind = f"an {kind}" if kind[0] in "AEIOU" else f"a {kind}"
-        if not isinstance(self.surface, Plane) and isinstance(self.body, AbstractBody):
-            others = "a Top runs on any arena, as an Ellipsoid or a RigidBody does"
-            raise ValueError(f"surface = {self.surface!r} must be a Plane for {kind}; {others}")
-        if self.contact != "stop":
-            raise ValueError(f"contact = {self.contact!r} must be 'stop' for {kind}; only a Top can fly")
-        if self.friction.set_valued and isinstance(self.body, AbstractBody):
-            raise ValueError(
-                f"friction = {self.friction!r} must be a law with a single mode for {kind}, such as Coulomb; describe the body "
-                "as an Ellipsoid or a RigidBody to stick and slip"
-            )
+        check_parts(self)
 
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.gravity, "gravity", above=0.0)

@@ -1,5 +1,6 @@
 """The body: an eccentric sphere whose mass is symmetric about the axis through its two centres."""
 
+import warnings
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
@@ -18,6 +19,8 @@ from .turned import Shape
 #: Units that are often used for moments of inertia by mistake, in kg m^2.
 INERTIAS = {"kg cm^2": 1e-4, "kg mm^2": 1e-6, "g cm^2": 1e-7, "g mm^2": 1e-9}
 
+#: Least density of the material of a turned top that is not suspicious [kg/m^3].
+LEAST_DENSITY = 50.0
 #: The radius [m] above which another unit is suspected, and the plausible range of I1 / (m R^2).
 GREATEST_RADIUS = 1.0
 RATIOS = (0.1, 2.0)
@@ -145,6 +148,14 @@ class Top(AbstractBody):
         ```
         """
         require(density, "density", above=0.0)
+        if not is_traced(density) and np.any(np.asarray(density) < LEAST_DENSITY):
+            least = float(np.min(density))
+            warnings.warn(
+                f"density = {least:g} kg/m^3 is less than that of balsa wood, 100 kg/m^3: was it in g/cm^3? "
+                f"{least:g} g/cm^3 are {1e3 * least:g} kg/m^3",
+                UserWarning,
+                stacklevel=2,
+            )
         lengths = {"radius": radius, "cut": cut, "stem_radius": stem_radius, "stem_length": stem_length}
         shape = Shape.checked(lengths | {"hole_radius": hole_radius, "hole_depth": hole_depth})
         moments = shape.moments

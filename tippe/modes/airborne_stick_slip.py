@@ -67,7 +67,7 @@ class Land(Fly):
     """Flying over the arena, to a contact that slips or rolls."""
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """Strike the arena; rebound, or slip or roll on."""
+        """Strike the arena; then rebound, or continue to slip or roll."""
         transition, stick_slip = super().reset_map(state, left), self.scene.dynamics
         assert isinstance(stick_slip, StickSlip)
         rests = stick_slip.slip_speed(transition.state[:OWN]) <= AT_REST * stick_slip.speed

@@ -1,4 +1,5 @@
-"""What follows a lost contact on the level plane: flights in closed form and impacts, until a sphere stays on the plane."""
+"""The motion after a loss of contact on the level plane: flights in closed form and impacts, until a sphere stays on
+the plane."""
 
 from typing import Any, NamedTuple
 

@@ -2,7 +2,7 @@
 
 As in `impact.py` the normal impulse p replaces time, and the contact's velocity changes by the constant matrix W. While
 the contact slips, the tangential impulse grows by -mu v / |v|, whose direction has no limit where a slip stops. With
-the slip distance s as the independent variable, ds = dp / |v|, nothing is singular, v' = |v| W_n - mu W_t v, and a slip
+the slip distance s as the independent variable, ds = dp / |v|, nothing is singular: v' = |v| W_n - mu W_t v, and a slip
 that stops decays exponentially in s.
 
 After a stop, the tangential impulse per unit of p is the f with |f| <= mu that minimises f.W_tt f / 2 + f.W_tn: v then

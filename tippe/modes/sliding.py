@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.hybrid import AbstractHoppingMode, Transition, TransitionPath
-from nonholonomic.integration import RUNNING, UNRESOLVED, AbstractProblem
+from nonholonomic.integration import CROSSED, RUNNING, UNRESOLVED, AbstractProblem
 from nonholonomic.xla_cpu import compiled_setup, least
 
 from ..model.dynamics import Dynamics
@@ -137,6 +137,10 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
 
     def lost(self, state: Float[Array, "components cells"]) -> Air:
         start = lost_contact(self.scene, self.number, state)
+        # A launch beyond the angle and without contact ends at once.
+        beyond = start.open & (state[COS_THETA] <= self.cos_angle) & (not self.last)
+        ended = start._replace(status=jnp.full_like(start.status, CROSSED), open=~beyond, crossing_time=start.elapsed)
+        start = select(beyond, ended, start)
         return start._replace(quadratures=state[OWN:]) if self.with_quadratures else start
 
     def hop(self, air: Air, left: Cells) -> tuple[Air, Air]:

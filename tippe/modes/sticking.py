@@ -80,17 +80,20 @@ class StickSlipMode(AbstractBatchedMode):
             # The impulse that stops a slip changes the spin, too.
             crosses = falls & ~change.lost
             fraction = onset.falls_to_zero(self._event, began)
-        crossing = change.wait + fraction * length
+        # Only a launch beyond the event, from which the top slips at once, reaches this point beyond the event.
+        beyond = (self._event(state) <= 0.0) & (not self.last)
+        crossing = jnp.where(beyond, 0.0, change.wait + fraction * length)
+        crosses |= beyond
         ends = crosses & (not self.last)
         status = jnp.where(change.elapsed >= left, REACHED_END, RUNNING)
         status = jnp.where(change.lost, LEFT_DOMAIN, jnp.where(ends, CROSSED, status))
         return Transition(
-            mode=jnp.where(change.rolls, ROLLING, SLIPPING),
-            state=jnp.where(ends, onset.at(fraction), change.state),
+            mode=jnp.where(beyond, int(self.kind.rolls), jnp.where(change.rolls, ROLLING, SLIPPING)),
+            state=jnp.where(beyond, state, jnp.where(ends, onset.at(fraction), change.state)),
             elapsed=jnp.where(ends, crossing, change.elapsed),
             status=status,
             crossing_time=jnp.where(crosses, crossing, jnp.inf),
-            counts=(change.rolls & ~change.lost & (not self.kind.rolls)).astype(int)[None],
+            counts=(change.rolls & ~change.lost & ~beyond & (not self.kind.rolls)).astype(int)[None],
             record=None if self.passive is None else _recorded(change),
         )
 

@@ -62,11 +62,11 @@ def parser() -> argparse.ArgumentParser:
     command = argparse.ArgumentParser(
         prog="python -m tippe --paper",
         description="Inversion times of a tippe top inside a cylinder (the paper's Tables 2 and 3) and on the plane. "
-        "Prints them beside the printed ones, writes an HDF5 table for each arena and a picture of theta(t).",
+        "Prints them beside the published times, writes an HDF5 table for each arena and a picture of theta(t).",
         formatter_class=Help,
     )
     command.add_argument("--version", action="version", version=f"nonholonomic {__version__}")
-    top = command.add_argument_group("the top (the paper's Table 1 lost its numbers: these are Rutstam's)")
+    top = command.add_argument_group("the top (the numbers of the paper's Table 1 are lost; these are Rutstam's)")
     top.add_argument("--mass", type=float, default=0.02, help="mass [kg]")
     top.add_argument("--radius", type=float, default=0.02, help="radius R of the sphere [m]")
     top.add_argument("--offset", type=float, default=0.006, help="distance of the centre of mass from the centre [m]")
@@ -227,7 +227,7 @@ def described(options: argparse.Namespace) -> list[str]:
         f"Top: m = {float(body.mass):g} kg, R = {float(body.radius):g} m, a = {float(body.offset):g} m, "
         f"I1 = {float(body.I1):.4g}, I3 = {float(body.I3):.4g} kg m^2; friction {_friction(scene.friction)}; "
         f"cylinder {options.cylinder_radius:g} m.",
-        "The paper's Table 1 lost its numbers, so this top is a declared one (Rutstam's): compare trends, not digits.",
+        "The numbers of the paper's Table 1 are lost, so we use Rutstam's top: compare trends, not digits.",
         f"-: not inverted within {options.t1:g} s.",
     ]
 
@@ -253,7 +253,7 @@ def drawn(options: argparse.Namespace, t1: float) -> tuple[Any, dict[str, DrawnM
     """
     arenas, times = scenes(options), np.linspace(0.0, t1, SAMPLES)
     tolerance = np.asarray(options.tolerance)
-    with Progress(len(arenas), "arena", "compiling what is drawn"), ThreadPoolExecutor(2) as threads:
+    with Progress(len(arenas), "arena", "compiling the drawing"), ThreadPoolExecutor(2) as threads:
         runs = threads.map(lambda scene: moving(scene, starts(options, scene)[1], times, tolerance), arenas.values())
         return times, dict(zip(arenas, runs, strict=True))
 

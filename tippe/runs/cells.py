@@ -103,7 +103,7 @@ class InversionRuns(NamedTuple):
 
     @property
     def error_variables(self) -> dict[str, Variable]:
-        """The table's variables that describe the accuracy of others (`time_error.py`)."""
+        """The table's variables that describe the accuracy of other variables (`time_error.py`)."""
         bounds = dict.fromkeys((*self.times, "end_time"), "s") | {"end_theta": "rad"}
         variables = {
             name: Variable(unit, np.float64, long_name=f"error of the {NAMES[name]}") for name, unit in bounds.items()

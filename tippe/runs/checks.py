@@ -64,10 +64,11 @@ def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str = LIS
     scene.check_start(launch)
 
 
-def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any) -> None:
-    """Warn if the scene has no friction, or if the top stands exactly upright on a level plane.
+def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, angle: Any) -> None:
+    """Warn if the scene has no friction, or if the top stands exactly upright on a level plane or is inverted already.
 
-    **Arguments:** `launch`: its theta is ignored; `theta`: one angle or several [rad].
+    **Arguments:** `launch`: its theta is ignored; `theta`: one angle or several [rad]; `angle`: the angle to be
+    reached.
     """
     if isinstance(scene.friction, Frictionless):
         warnings.warn(
@@ -76,10 +77,18 @@ def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any) -> None:
             UserWarning,
             stacklevel=4,
         )
-    if isinstance(scene.body, AbstractRigidBody):
+    if isinstance(scene.body, AbstractRigidBody) or is_traced(theta) or is_traced(angle):
         return
+    if np.any(np.asarray(theta) >= angle):
+        start = np.max(np.asarray(theta))
+        warnings.warn(
+            f"theta = {start:g} rad is not below the angle to be reached, {angle:.4g} rad: the top "
+            f"is inverted from the start; was theta in degrees? {start:g} degrees are {math.radians(start):.4g} rad",
+            UserWarning,
+            stacklevel=4,
+        )
     at_rest = launch.velocity is None and launch.angular_velocity is None
-    if scene.level and at_rest and not is_traced(theta) and np.any(np.asarray(theta) == 0.0):
+    if scene.level and at_rest and np.any(np.asarray(theta) == 0.0):
         warnings.warn(
             "theta = 0.0 is exactly upright, where a top stays forever: launch it at a small angle, such as 0.01 rad",
             UserWarning,

@@ -81,7 +81,7 @@ def inversion_time(
     check_event(angle, crossing)
     settings = Settings(tolerance, solver)
     explicit_tableau(settings.for_lanes)
-    warn_if_it_cannot_invert(scene, launch, launch.theta)
+    warn_if_it_cannot_invert(scene, launch, launch.theta, angle)
     return first_or_last_time(scene, launch, t1, as_number(angle), crossing, settings)
 
 

@@ -185,8 +185,9 @@ def event_table(
     if angle is None:
         check_reversible(roots["launch"], axis_values)
     else:
-        warn_if_it_cannot_invert(scene, roots["launch"], axis_values.get("launch.theta", roots["launch"].theta))
         angle = float(angle)
+        theta = axis_values.get("launch.theta", roots["launch"].theta)
+        warn_if_it_cannot_invert(scene, roots["launch"], theta, angle)
     runs = InversionRuns(run_kind, float(t1), angle, crossing, settings, method, paths)
     job = InversionJob(runs, roots, errors)
     request = described(roots, grid) | request_of(runs, options)

@@ -10,6 +10,11 @@
 
   const digits = (number, count = 4) => !Number.isFinite(number) ? "–" : number === 0 ? "0"
     : Math.abs(number) < 1e-3 || Math.abs(number) >= 1e5 ? number.toExponential(count - 1) : number.toPrecision(count);
+  // A value with its unit, and in degrees or revolutions per minute.
+  function withUnit(value, { name, unit }) {
+    const other = unit === "rad" ? `${digits((180 * value) / Math.PI, 3)}°` : name.endsWith("spin") ? `${Math.round((30 * value) / Math.PI)} rpm` : "";
+    return `${digits(value, 3)} ${unit}${other && ` = ${other}`}`;
+  }
   const knobs = sliders.map((slider, k) => {
     const label = element("label", document.getElementById("knobs")), title = element("span", label, { textContent: slider.label });
     const shown = element("output", label);
@@ -79,9 +84,9 @@
   function set(wanted, source = null) {
     values = wanted.map((value, k) => Math.min(sliders[k].high, Math.max(sliders[k].low, value)));
     knobs.forEach(({ input, shown }, k) => {
-      const { low, high, unit } = sliders[k];
+      const { low, high } = sliders[k];
       if (input !== source) input.value = (1000 * (values[k] - low)) / (high - low);
-      shown.textContent = `${digits(values[k], 3)} ${unit}`;
+      shown.textContent = withUnit(values[k], sliders[k]);
       input.setAttribute("aria-valuetext", shown.textContent);
     });
     map.update(values);

@@ -47,28 +47,38 @@ def time_of_decay(rate, height, growth):
     return (jnp.sqrt(1.0 + 2.0 * growth * jnp.log(2.0 * height) / rate) - 1.0) / growth
 
 
-def found_and_expected(names=MANY, patience=1e3, heights=HEIGHTS, cells=100, **options):
+def solve(point, tangents, patience, cells, solver, **options):
+    def build(*numbers):
+        return Decays(*numbers, patience)
+
+    arguments = (jnp.asarray(50.0), cells, Settings(1e-11, solver))
+    directions = tangents_of(build, point, tangents)
+    return slopes.ensemble_solve_with_tangents(
+        build(*point), directions, *arguments, **({"one_kernel": True} | options)
+    )
+
+
+#: Runs that differ in patience, heights and cells share a program.
+compiled_solve = eqx.filter_jit(solve)
+gradients = jax.jit(jax.vmap(jax.grad(time_of_decay, (0, 1, 2)), (0, 0, None)))
+
+
+def found_and_expected(names=MANY, patience=1e3, heights=HEIGHTS, cells=100, run=compiled_solve, **options):
     """Outcome, slopes by the named numbers, and what they should be; rate and height differ from cell to cell."""
     point = (jnp.asarray(RATES), jnp.asarray(heights), jnp.asarray(0.7))
     tangents = [
         tuple(jnp.full_like(component, name == moved) for component, moved in zip(point, MOVED, strict=True))
         for name in names
     ]
-
-    @eqx.filter_jit
-    def run(point, tangents):
-        def build(*numbers):
-            return Decays(*numbers, jnp.asarray(patience))
-
-        arguments = (jnp.asarray(50.0), jnp.asarray(cells), Settings(1e-11, options.pop("solver", diffrax.Dopri8())))
-        directions = tangents_of(build, point, tangents)
-        return slopes.ensemble_solve_with_tangents(
-            build(*point), directions, *arguments, **({"one_kernel": True} | options)
-        )
-
-    outcome, derivatives = run(point, tangents)
-    every = jax.vmap(jax.grad(time_of_decay, (0, 1, 2)), (0, 0, None))(*point)
+    options = {"solver": diffrax.Dopri8()} | options
+    outcome, derivatives = run(point, tangents, jnp.asarray(patience), jnp.asarray(cells), **options)
+    every = gradients(*point)
     return outcome, derivatives, [every[MOVED.index(name)] for name in names]
+
+
+def compiled_anew():
+    """`solve`, traced with what has been patched."""
+    return eqx.filter_jit(lambda *arguments, **options: solve(*arguments, **options))
 
 
 @pytest.mark.parametrize(
@@ -101,12 +111,12 @@ def test_few_directions_are_integrated_forward_and_many_backward(count, backward
         return adjoint.solve_with_adjoint(*arguments, **options)
 
     monkeypatch.setattr(slopes, "solve_with_adjoint", solve_with_adjoint)
-    jax.eval_shape(lambda: found_and_expected(MANY[:count], solver=diffrax.Dopri8())[1])
+    jax.eval_shape(lambda: found_and_expected(MANY[:count], run=solve)[1])
     assert bool(passes) is backward
 
 
 def test_a_cell_that_ends_otherwise_has_no_slope_and_leaves_the_others_theirs():
-    outcome, derivatives, expected = found_and_expected(patience=1.0, solver=diffrax.Dopri8())
+    outcome, derivatives, expected = found_and_expected(patience=1.0)
     late = np.asarray(time_of_decay(RATES, HEIGHTS, 0.7)) > 1.0
     assert 20 < late.sum() < 80
     assert (np.asarray(outcome.status) == np.where(late, LEFT_DOMAIN, CROSSED)).all()
@@ -118,7 +128,7 @@ def test_a_cell_that_ends_otherwise_has_no_slope_and_leaves_the_others_theirs():
 def test_padding_and_cells_beyond_the_event_have_no_slope(cells):
     """Some cells start beyond the event, and of the cells only some are run: fewer than lanes, and none."""
     heights = np.where(np.arange(100) % 3 == 0, 0.4, HEIGHTS)
-    outcome, derivatives, expected = found_and_expected(heights=heights, cells=cells, solver=diffrax.Dopri8())
+    outcome, derivatives, expected = found_and_expected(heights=heights, cells=cells)
     run = np.arange(100) < cells
     assert (np.asarray(outcome.status)[run] == CROSSED).all()
     for slope, expected_slope in zip(derivatives, expected, strict=True):
@@ -131,11 +141,11 @@ def test_padding_and_cells_beyond_the_event_have_no_slope(cells):
 def test_runs_longer_than_what_is_kept_are_repeated(kept, steps, monkeypatch):
     """Periods of two iterations, of which the starts of a few are kept, and the steps of the latest ones: the slopes are
     the same to the last digit."""
-    _, single_pass, _ = found_and_expected(solver=diffrax.Dopri8())
+    _, single_pass, _ = found_and_expected()
     monkeypatch.setattr(adjoint.StepRecorder, "period", 2)
     monkeypatch.setattr(periods, "KEPT", kept)
     monkeypatch.setattr(periods, "STEPS_KEPT", steps)
-    _, segments, expected = found_and_expected(solver=diffrax.Dopri8())
+    _, segments, expected = found_and_expected(run=compiled_anew())
     for whole_slope, segment_slope, expected_slope in zip(single_pass, segments, expected, strict=True):
         assert_close(whole_slope, segment_slope, rtol=1e-12)
         assert_close(segment_slope, expected_slope, rtol=1e-7)

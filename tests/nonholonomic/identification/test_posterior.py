@@ -165,7 +165,7 @@ def test_draws_are_from_a_density_that_the_surrogate_misses():
     posterior = sample(density, density.start, np.diag([0.1, 0.2]), progress=False)
     grid = np.stack(np.meshgrid(np.linspace(-1.5, 1.5, 101), np.linspace(-3.0, 2.0, 401), indexing="ij"), axis=-1)
     flat = jnp.asarray(grid.reshape(-1, 2))
-    logs = np.asarray(jax.vmap(density.of_prediction)(flat, density.predict(flat)))
+    logs = np.asarray(jax.jit(jax.vmap(lambda at: density.of_prediction(at, density.predict(at[None])[0])))(flat))
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     values = {name: np.asarray(value) for name, value in density.values(flat).items()}

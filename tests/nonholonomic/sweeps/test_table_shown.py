@@ -124,11 +124,13 @@ def test_a_table_goes_to_pandas_a_row_for_each_cell():
     assert frame.attrs["units"] == {"time": "s"}
     chosen = frame[(frame.theta == 0.2) & (frame.mu == 0.4)]
     assert (chosen.time.item(), chosen.status.item()) == (4.0, "inverted")
-    # What has dimensions of its own has a row for each of its points.
-    coords |= {"component": np.array(["x", "y"])}
-    slip = np.arange(12.0).reshape(2, 3, 2)
-    frame = Table(coords, {"time": time, "slip": slip}, {}, {}, inner={"slip": ("component",)}).to_dataframe()
+    # Points of an additional dimension are rows; components of a vector are columns.
+    coords |= {"at": np.array([0.0, 1.0]), "component": np.array(["x", "y"])}
+    slip, inner = np.arange(24.0).reshape(2, 3, 2, 2), {"slip": ("at", "component")}
+    frame = Table(coords, {"time": time, "slip": slip}, {"slip": "m s-1"}, {}, inner=inner).to_dataframe()
+    assert list(frame.columns) == ["theta", "mu", "at", "time", "slip.x", "slip.y"]
+    assert frame.attrs["units"] == {"slip.x": "m s-1", "slip.y": "m s-1"}
     assert len(frame) == 12
-    rows = frame[(frame.theta == 0.2) & (frame.mu == 0.5) & (frame.component == "y")]
-    assert (rows.time.item(), rows.slip.item()) == (5.0, 11.0)
+    rows = frame[(frame.theta == 0.2) & (frame.mu == 0.5) & (frame["at"] == 1.0)]
+    assert (rows.time.item(), rows["slip.x"].item(), rows["slip.y"].item()) == (5.0, 22.0, 23.0)
     assert len(Table({}, {"time": np.array(3.0)}, {}, {}).to_dataframe()) == 1

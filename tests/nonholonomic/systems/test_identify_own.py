@@ -4,9 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from close import assert_close
-from own_modes import Ball
+from own_modes import Ball, Sleigh, Slip, Stick
 
 from nonholonomic import Hybrid, Recording, identify, simulate
+from nonholonomic.systems.numbers import Named
 
 
 @pytest.mark.slow
@@ -18,3 +19,19 @@ def test_the_restitution_of_a_ball_from_its_heights():
     fit = identify(Hybrid([Ball(0.7)]), data, {"restitution": 0.75, "start[0]": 1.05}, progress=False)
     assert_close(fit.estimates["system.modes[0].restitution"], 0.8, rtol=1e-6)
     assert_close(fit.estimates["start[0]"], 1.0, rtol=1e-6)
+
+
+def test_a_quantity_that_the_system_does_not_have_is_named():
+    data = Recording((np.zeros(3), np.zeros(3)), [1.0], [0.0], 1.0)
+    with pytest.raises(ValueError, match="quantity = 'y0' must name components of the state: q0, q1, q2, rate0"):
+        identify(Sleigh(), data, {"ahead": 0.3})
+
+
+def test_one_number_of_all_modes_is_replaced_in_all():
+    named = Named.of({"system": Hybrid([Stick(), Slip()])})
+    assert "system.modes[*].belt" in named.known
+    changed = named.tree(named.replaced({"system.modes[*].belt": 0.7}))["system"]
+    assert [mode.belt for mode in changed.modes] == [0.7, 0.7]
+    data = Recording([0.0, 0.5], [1.0], [0.0], 1.0)
+    with pytest.raises(ValueError, match=r"'system.modes\[0\].belt' is named twice, alone and for all modes"):
+        identify(Hybrid([Stick(), Slip()]), data, {"modes[*].belt": 0.5, "modes[0].belt": 0.5})

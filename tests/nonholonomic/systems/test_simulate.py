@@ -1,11 +1,13 @@
 """Trajectories of users' own systems against closed forms, with their derivatives through resets."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from close import assert_close
-from own_modes import GRAVITY, Ball, Sleigh, bounce, final_turn
+from own_modes import GRAVITY, Ball, Sleigh, Slip, Stick, bounce, final_turn
 
 from nonholonomic import AbstractMode, Hybrid, simulate
 from nonholonomic.formulations import Hamel, Lagrange, Routhian
@@ -37,38 +39,6 @@ def test_a_ball_and_its_derivatives_through_two_bounces():
     slopes = jnp.stack([jnp.stack(jax.jacfwd(exact, (0, 1))(*point, float(time)), axis=-1) for time in TIMES])
     assert_close(states(*point)[:, :2], expected, atol=1e-13)
     assert_close(jnp.stack(jax.jacrev(states, (0, 1))(*point), axis=-1)[:, :2], slopes, atol=1e-11)
-
-
-class Stick(AbstractMode):
-    """A block at rest on a belt: place and velocity; it slips where the spring pulls more than friction holds."""
-
-    grip: float = 1.0
-    belt: float = 0.5
-
-    def field(self, t, y):
-        return jnp.array([self.belt, 0.0])
-
-    def margin(self, t, y):
-        return self.grip - y[0]
-
-    def reset(self, t, y):
-        return y, 1
-
-
-class Slip(AbstractMode):
-    """It slips back under the spring x'' = -x + friction, until its velocity is that of the belt again."""
-
-    friction: float = 1.0
-    belt: float = 0.5
-
-    def field(self, t, y):
-        return jnp.array([y[1], self.friction - y[0]])
-
-    def margin(self, t, y):
-        return self.belt - y[1]
-
-    def reset(self, t, y):
-        return jnp.array([y[0], self.belt]), 0
 
 
 def test_stick_and_slip_where_the_end_of_sticking_is_tangential():
@@ -106,6 +76,61 @@ def test_resets_without_end_are_unresolved():
     run = simulate(Hybrid([Ball(0.2)]), jnp.array([1.0, 0.0, 0.0]), 5.0, times=jnp.array([0.2, 4.0]))
     assert run.status in ("unresolved", "failed")
     assert np.isnan(run.state[1]).all()
+
+
+def test_a_printed_run_states_why_it_ended():
+    below = simulate(Hybrid([Ball()]), [-1.0, 0.0, 0.0], 1.0, times=[0.0, 1.0])
+    lines = str(below).splitlines()
+    assert lines[0] == "Trajectory of 2 times, unresolved at 0 s"
+    assert [line.split(":")[0].strip() for line in lines[1:6]] == ["y0", "y1", "y2", "resets", "steps"]
+    assert lines[6].strip().startswith("resets followed one another without end; add a mode for rest")
+    assert "without end" not in str(simulate(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.0, times=[0.0, 1.0]))
+
+
+def broken(kind, **functions):
+    """A mode or a system of which some functions are replaced."""
+    return type("Broken", (kind,), functions)()
+
+
+WRONG = {
+    "a branch in a field": (
+        lambda: Hybrid([broken(Ball, field=lambda self, t, y: y if y[0] > 0.0 else -y)]),
+        r"modes\[0\]\.field\(t, y\) cannot be traced by JAX: write it with jax.numpy",
+    ),
+    "numpy in a reset": (
+        lambda: Hybrid([broken(Ball, reset=lambda self, t, y: (np.sin(y), 0))]),
+        r"modes\[0\]\.reset\(t, y\) cannot be traced by JAX",
+    ),
+    "a metric of another size": (
+        lambda: broken(Sleigh, metric=lambda self, q: jnp.eye(2)),
+        r"metric\(q\) must be of shape \(3, 3\), not \(2, 2\)",
+    ),
+    "a potential that is a vector": (
+        lambda: broken(Sleigh, potential=lambda self, q: q**2),
+        r"potential\(q\) must be one number, not \(3,\)",
+    ),
+    "a force in a list": (
+        lambda: broken(Sleigh, force=lambda self, t, q, rate: [q[0]]),
+        r"force\(t, q, rate\) must be of shape \(3,\), not \[",
+    ),
+    "one constraint without a row": (
+        lambda: broken(Sleigh, constraints=lambda self, q: q),
+        r"constraints\(q\) must be of shape \(k, 3\), a row for each constraint, not \(3,\)",
+    ),
+    "math in a constraint": (
+        lambda: broken(Sleigh, constraints=lambda self, q: jnp.array([[math.sin(q[2]), 0.0, 0.0]])),
+        r"constraints\(q\) cannot be traced by JAX",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_function_is_named(name):
+    build, message = WRONG[name]
+    system = build()
+    start = np.array([1.0, 0.0, 0.0])
+    with pytest.raises(ValueError, match=message):
+        simulate(system, start if isinstance(system, Hybrid) else (start, start), 1.0)
 
 
 def test_the_sleigh_turns_to_its_final_heading():

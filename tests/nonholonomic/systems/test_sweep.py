@@ -2,12 +2,13 @@
 
 import pickle
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from close import assert_close
-from own_modes import GRAVITY, Ball, Bounces, Sleigh, bounce
+from own_modes import GRAVITY, Ball, Bounces, Sleigh, Slip, Stick, bounce
 
 import nonholonomic
 from nonholonomic import AbstractMode, Hybrid, sweep
@@ -60,6 +61,44 @@ def test_a_job_may_be_sent_to_another_process():
     assert_close(sent.named.values, job.named.values)
 
 
+class Middle(eqx.Module):
+    """An event: the block passes the middle of its oscillation."""
+
+    friction: float = 0.6
+
+    def __call__(self, t, y):
+        return y[0] - self.friction
+
+
+class Carried(Stick):
+    """The block, which starts to slip at the speed of the belt."""
+
+    def reset(self, t, y):
+        return jnp.array([y[0], self.belt]), 1
+
+
+def test_one_number_of_all_modes():
+    """The speed of the belt is a number of both modes. The block sticks for 1 / v, then moves on a circle."""
+
+    def expected(belt):
+        return 1.0 / belt + jnp.pi - jnp.arctan2(0.4, belt)
+
+    block, belts = Hybrid([Carried(), Slip(friction=0.6)], event=Middle()), np.array([0.4, 0.5])
+    axes = {"modes[*].belt": belts}
+    table = sweep(block, [0.0, 0.5], 20.0, axes=axes, sensitivities=["modes[*].belt"], progress=False)
+    assert_close(table.time, expected(belts), rtol=1e-9)
+    assert_close(table.time_by_belt, jax.vmap(jax.grad(expected))(belts), rtol=1e-7)
+    assert table.dims("time") == ("belt",)
+
+
+def test_one_number_of_all_modes_is_named_once():
+    block = Hybrid([Stick(), Slip()], event=Middle())
+    with pytest.raises(ValueError, match=r"could be .*modes\[0\].belt or .*modes\[1\].belt or .*modes\[\*\].belt"):
+        sweep(block, [0.0, 0.5], 1.0, axes={"belt": [0.5]})
+    with pytest.raises(ValueError, match=r"'system.modes\[1\].belt' is named twice, alone and for all modes"):
+        sweep(block, [0.0, 0.5], 1.0, axes={"modes[*].belt": [0.5], "modes[1].belt": [0.5]})
+
+
 def test_a_mechanical_system_has_a_table_over_its_start_and_numbers():
     """The sleigh keeps its energy (m v^2 + J w^2) / 2 in every cell, whatever it is."""
     axes = {"rate[2]": [0.5, 1.0], "ahead": [0.2, 0.3]}
@@ -73,8 +112,9 @@ def test_a_mechanical_system_has_a_table_over_its_start_and_numbers():
 
 
 class Checked(AbstractMode):
-    """A mode that checks its number."""
+    """A mode that checks its number, with a constant that is not declared."""
 
+    offset = 0.5
     rate: float
 
     def __check_init__(self):
@@ -91,6 +131,12 @@ def test_what_is_wrong_with_a_table_is_said_before_anything_compiles():
         sweep(system, [1.0], 1.0, axes={"rate": [1.0, -1.0]})
     with pytest.raises(ValueError, match=r"axes: 'drag' must be one of start\[0\], system.modes\[0\].rate"):
         sweep(system, [1.0], 1.0, axes={"drag": [1.0]})
+    with pytest.raises(ValueError, match="did you mean 'rate'"):
+        sweep(system, [1.0], 1.0, axes={"rte": [1.0]})
+    with pytest.raises(ValueError, match=r"rate = 1 is an integer: write 1\.0"):
+        sweep(Hybrid([Checked(1)]), [1.0], 1.0, axes={"rate": [1.0]})
+    with pytest.raises(ValueError, match=r"declare it with its type in Checked: offset: float = 0\.5"):
+        sweep(system, [1.0], 1.0, axes={"offset": [1.0]})
     with pytest.raises(ValueError, match="sensitivities are those of the event's time"):
         sweep(system, [1.0], 1.0, axes={}, sensitivities=["rate"])
 

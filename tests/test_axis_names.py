@@ -1,0 +1,102 @@
+"""The axes of a table, named by the ends of the full names of numbers."""
+
+import dataclasses
+import importlib
+import re
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import pytest
+from never_run import PRAM, RIDE, TOP
+from tops import rutstam_top
+
+import stroller
+import tippe
+from nonholonomic.parameters import numbers
+from tippe.runs.launches import launches
+
+pytestmark = pytest.mark.newest
+
+
+class Hill(eqx.Module):
+    """A ground whose numbers are an array."""
+
+    bends: jax.Array
+
+    def __call__(self, x, y):
+        return self.bends[0] * x * x + self.bends[1] * y * y
+
+
+def stem_top():
+    return dataclasses.replace(rutstam_top(), stem=tippe.Stem(0.005, 0.022))
+
+
+def axes_of(scene, axes):
+    _, grid, _ = launches(scene, {"theta": 0.1, "spin": 155.0, "mu": None}, axes, 1.0, 1e-9)
+    return {axis.name: axis.number for axis in grid}
+
+
+def test_an_axis_may_be_named_by_its_end():
+    stemmed = tippe.Scene(stem_top(), tippe.Cylinder(0.3), tippe.Coulomb(0.3, 0.01), contact="hybrid")
+    assert axes_of(stemmed, {"mu": [0.1, 0.2], "slip_speed": [0.1, 0.2], "restitution": [0.1, 0.2]}) == {
+        "mu": "scene.friction.mu",
+        "slip_speed": "scene.friction.slip_speed",
+        "restitution": "scene.restitution",
+    }
+    assert axes_of(TOP, {"offset": [0.005, 0.006], "tilt": [0.0, 0.1]}) == {
+        "offset": "scene.body.offset",
+        "tilt": "scene.surface.tilt",
+    }
+    assert axes_of(TOP, {"velocity[0]": [0.0, 0.1]}) == {"velocity_t1": "launch.velocity[0]"}
+    assert list(axes_of(stemmed, {"stem.offset": [0.022, 0.023]}).values()) == ["scene.body.stem.offset"]
+
+
+@pytest.mark.parametrize(
+    ("axes", "message"),
+    [
+        ({"ofset": [0.005]}, "unknown axis 'ofset': the numbers that can be varied are .*; did you mean 'offset'"),
+        ({"offset": [0.02, 0.021]}, "axes: 'offset' could be scene.body.offset or scene.body.stem.offset"),
+        ({"body.mass": [0.02], "mass": [0.02]}, "axes: 'scene.body.mass' is named twice"),
+        ({"theta": [0.1]}, "axes: 'launch.theta' has its own argument"),
+    ],
+)
+def test_an_axis_whose_name_means_nothing_or_too_much_is_refused(axes, message):
+    with pytest.raises(ValueError, match=message):
+        axes_of(tippe.Scene(stem_top(), friction=tippe.Viscous(0.3), contact="hybrid"), axes)
+
+
+def test_only_what_can_be_varied_is_suggested():
+    with pytest.raises(ValueError, match="unknown axis") as refused:
+        axes_of(TOP, {"colour": [1.0]})
+    suggested = re.findall(r"[\w.\[\]]+", str(refused.value).partition("varied are ")[2])
+    assert "scene.surface.tilt" in suggested
+    for name in suggested:
+        if name not in ("launch.theta", "launch.spin", "launch.eta", "launch.place[2]"):
+            assert axes_of(TOP, {name: [1e-3]}) if "body" not in name else name in numbers("scene", TOP)
+    with pytest.raises(ValueError, match="unknown axis 'colour'") as refused:
+        stroller.sweep(PRAM, RIDE, 1.0, axes={"colour": [1.0]})
+    names = re.findall(r"[\w.\[\]]+", str(refused.value).partition("varied are ")[2])
+    assert {"scene.body.centre", "launch.place[1]", "launch.speed"} <= set(names)
+    assert not {"scene.side", "scene.fork"} & set(names)
+
+
+def test_the_axes_of_rides_may_be_named_by_their_ends_too(monkeypatch):
+    table = importlib.import_module("stroller.runs.table")
+    monkeypatch.setattr(table, "computed", lambda job, grid, *_, **__: [axis.number for axis in grid])
+    assert stroller.sweep(PRAM, RIDE, 1.0, axes={"speed": [1.0, 2.0], "place[1]": [0.0, 1.0], "wheelbase": [0.6]}) == [
+        "launch.speed",
+        "launch.place[1]",
+        "scene.body.wheelbase",
+    ]
+    sprung = dataclasses.replace(PRAM, friction=stroller.Damping(1.0))
+    with pytest.raises(ValueError, match=r"axes: 'steering' could be scene\.friction\.steering or launch\.steering"):
+        stroller.sweep(sprung, RIDE, 1.0, axes={"steering": [0.1]})
+
+
+def test_what_the_function_of_a_ground_holds_may_be_lists_in_tables_too():
+    scene = tippe.Scene(rutstam_top(), tippe.Graph(Hill(jnp.array([0.05, 0.1]))), tippe.Viscous(0.3))
+    _, grid, _ = launches(scene, {"theta": 0.1, "spin": [100.0, 120.0]}, None, 1.0, 1e-9)
+    assert [axis.name for axis in grid] == ["spin"]
+    with pytest.raises(ValueError, match=r"scene\.gravity must be one number, not of shape"):
+        launches(eqx.tree_at(lambda s: s.gravity, scene, jnp.ones(2)), {"theta": 0.1, "spin": 1.0}, None, 1.0, 1e-9)

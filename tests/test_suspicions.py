@@ -1,0 +1,131 @@
+"""What is legal and likely a mistake: the warnings, and what they say."""
+
+import dataclasses
+import functools
+import importlib
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from never_run import LAUNCH, TOP, run_of_nothing
+from tops import rutstam_top
+
+import stroller
+import tippe
+from nonholonomic.integration import Settings
+from tippe.runs.table import warn_of_long_runs
+
+pytestmark = pytest.mark.newest
+
+SUSPECTED = {
+    "rpm": (lambda: tippe.Launch(0.1, 1500.0), "was it in rpm? 1500 rpm are 157.1 rad/s"),
+    "rpm of some": (lambda: tippe.Launch(0.1, [150.0, -1200.0]), "spin = 1200 rad/s is 1.15e+04 revolutions a minute"),
+    "a heading in degrees": (
+        lambda: stroller.Launch((0.0, 0.0), 90.0, 1.0),
+        "heading = 90 rad is large: was it in degrees? 90 degrees are 1.571 rad",
+    ),
+    "a steering angle in degrees": (
+        lambda: stroller.Launch((0.0, 0.0), 0.0, 1.0, steering=[0.1, -30.0]),
+        "steering = 30 rad is large: was it in degrees? 30 degrees are 0.5236 rad",
+    ),
+    "a density in g/cm^3": (
+        lambda: tippe.Top.turned(0.02, 0.7, cut=0.015, stem_radius=0.005, stem_length=0.012),
+        "density = 0.7 kg/m^3 is less than that of balsa wood, 100 kg/m^3: was it in g/cm^3? 0.7 g/cm^3 are 700 kg/m^3",
+    ),
+    "a cylinder in mm": (
+        lambda: tippe.Scene(rutstam_top(), tippe.Cylinder(300.0)),
+        "surface.radius = 300 m is larger than a room: was it in mm?",
+    ),
+    "a torus in cm": (
+        lambda: tippe.Scene(rutstam_top(), tippe.Torus(50.0, 20.0)),
+        "surface.ring = 50 m is larger than a room: was it in cm?",
+    ),
+    "no friction": (
+        lambda: tippe.inversion_time(tippe.Scene(rutstam_top()), LAUNCH, 1.0),
+        "friction = Frictionless(): without friction no top turns over",
+    ),
+    "no friction in a table": (
+        lambda: tippe.inversion_table(tippe.Scene(rutstam_top()), theta=[0.1], spin=155.0, t1=1.0),
+        "friction = Frictionless(): without friction no top turns over",
+    ),
+    "exactly upright": (
+        lambda: tippe.inversion_time(TOP, tippe.Launch(0.0, 155.0), 1.0),
+        "theta = 0.0 is exactly upright, where a top stays forever",
+    ),
+    "some inverted already": (
+        lambda: tippe.inversion_table(TOP, theta=[1.0, 2.0, 3.0], spin=155.0, t1=1.0),
+        "theta = 3 rad is not below the angle to be reached, 2.985 rad: the top is inverted from the start; "
+        "was theta in degrees? 3 degrees are 0.05236 rad",
+    ),
+    "some exactly upright": (
+        lambda: tippe.inversion_table(TOP, theta=[0.0, 0.1], spin=155.0, t1=1.0),
+        "theta = 0.0 is exactly upright, where a top stays forever",
+    ),
+}
+
+
+@pytest.fixture
+def nothing_runs(monkeypatch):
+    """What would run says that it was asked to."""
+    monkeypatch.setattr(
+        importlib.import_module("tippe.runs.inversion_time"), "differentiable_solve", lambda *_: jnp.inf
+    )
+    monkeypatch.setattr(
+        importlib.import_module("tippe.runs.table"), "sweep", lambda *_, **__: table_of_times([5.0], [9])
+    )
+
+
+def table_of_times(times, steps):
+    status = np.where(np.isfinite(times), "inverted", "failed")
+    columns = {"time": np.array(times), "steps": np.array(steps), "status": status}
+    return tippe.Table({"theta": np.ones(len(times))}, columns | {"end_time": np.arange(3.0, 3.0 + len(times))}, {}, {})
+
+
+@pytest.mark.parametrize("name", SUSPECTED)
+def test_what_is_legal_and_likely_a_mistake_is_warned_of(name, nothing_runs):
+    call, message = SUSPECTED[name]
+    with pytest.warns(UserWarning, match=re.escape(message)):
+        call()
+
+
+def test_what_is_usual_is_not_suspected(nothing_runs):
+    tippe.Launch(0.1, [-900.0, 900.0])
+    tippe.Scene(rutstam_top(), tippe.Cylinder(10.0))
+    stroller.Launch((0.0, 0.0), 7.0, 1.0, steering=-1.5)
+    assert tippe.inversion_time(TOP, LAUNCH, 1.0) == jnp.inf
+    # A push tips it.
+    tippe.inversion_time(TOP, tippe.Launch(0.0, 155.0, velocity=(0.1, 0.0)), 1.0)
+
+
+def test_a_table_says_which_horizon_was_too_long():
+    with pytest.warns(
+        UserWarning, match=r"1 of 3 runs have failed: t1 = 100000 s is too long: the run needs more than 2 000 000"
+    ):
+        warn_of_long_runs(table_of_times([1.0, np.inf, 2.0], [10, 2_000_000, 30]), 1e5, 2_000_000)
+
+
+@pytest.fixture
+def programs_of_its_own():
+    """No compiled program from before, and none for later: a limit that a test sets is compiled into the programs."""
+    jax.clear_caches()
+    yield
+    jax.clear_caches()
+
+
+@pytest.mark.usefixtures("programs_of_its_own")
+def test_a_time_that_takes_too_many_steps_is_an_error_that_says_how_many(monkeypatch):
+    for module in ("tippe.runs.inversion_time", "tippe.runs.cells"):
+        monkeypatch.setattr(importlib.import_module(module), "Settings", functools.partial(Settings, max_steps=40))
+    message = (
+        r"t1 = 100000 s is too long: the run needs more than 40 steps, which reached only 0\.\d+ s; take a shorter t1"
+    )
+    with pytest.raises(ValueError, match=message):
+        tippe.inversion_time(TOP, LAUNCH, 1e5, tolerance=1e-6)
+
+
+def test_a_run_that_lost_contact_says_what_flies_on():
+    lost = dataclasses.replace(run_of_nothing(), status="contact_lost")
+    assert "lost contact at 0 s" in str(lost)
+    assert "to continue through the flight, use a Scene with contact='hybrid'" in str(lost)
