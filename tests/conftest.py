@@ -43,7 +43,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 #: What a worker may hold after a module of tests [bytes] before it forgets its compiled programs; those that the next modules
 #: use too are read from the disk.
-MOST_MEMORY = 2_000_000_000
+MOST_MEMORY = 2_300_000_000
 
 # Tracing makes many long-lived objects, through which Python would look for cycles again and again.
 gc.set_threshold(100_000, 50, 100)

@@ -117,7 +117,7 @@ def test_sampling_says_what_it_does_after_its_last_step(monkeypatch):
     walk = module.Walk(np.zeros((4, 1)), None)
     monkeypatch.setattr(module.Surrogate, "around", lambda *_: None)
     monkeypatch.setattr(module, "learn", lambda *_: (SimpleNamespace(to_power=lambda power: None), walk, 1))
-    monkeypatch.setattr(module, "_seen", lambda *_: (np.zeros((4, 1)), np.zeros(4)))
+    monkeypatch.setattr(module, "_with_ratio", lambda *_: (np.zeros((4, 1)), np.zeros(4)))
     monkeypatch.setattr(module, "_walked", lambda *_: walk)
     monkeypatch.setattr(module.Draws, "of", waits)
     terminal = watched(monkeypatch)

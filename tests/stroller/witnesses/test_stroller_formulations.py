@@ -182,7 +182,7 @@ def test_reduced_bracket_of_the_plane():
     v, s, phi = 1.3, 0.8, 0.6
     q, rate = jnp.array([0.0, 0.0, 0.0, phi]), jnp.array([v, 0.0, v * jnp.tan(phi) / 0.7, s])
     formulation = ReducedBracket(chart)
-    state = formulation.state(q, rate)
+    state = jax.jit(lambda q, rate: formulation.state(q, rate))(q, rate)
     inertia = 1.7 + 0.4 * np.tan(phi) ** 2 / 0.49
     slope = 2.0 * 0.4 * np.tan(phi) / np.cos(phi) ** 2 / 0.49
     np.testing.assert_allclose(state[4:], [inertia * v, 0.05 * s], rtol=1e-14)
