@@ -119,7 +119,8 @@ def solve_with_adjoint(
     scheduler = LaneScheduler.of(probed, t1, cells, settings, one_kernel=one_kernel, n_blocks=2)
     rows = components + len(jax.tree.leaves(numbers))
 
-    recorder = StepRecorder()
+    start, recorder = scheduler.start(), StepRecorder()
+    record = jax.eval_shape(lambda: recorder.begin(start.lane_state, None))
 
     def is_ahead(run: Backward) -> Bool[Array, ""]:
         return uncounted(scheduler.unfinished(run.ahead) & (run.number < run.needed), run.number)
@@ -141,7 +142,7 @@ def solve_with_adjoint(
 
     def backward(run: Backward) -> Backward:
         number, (before, after) = run.kept.latest()
-        steps = run.latest.of_period(before.iterations, recorder.period)
+        steps = run.latest.of_period(before.iterations, len(record.length))
         count = after.iterations - before.iterations
         adjoint = _taken_back(scheduler, moving, measured, after.lane_state, steps, count, run.adjoint)
         # A cell that had made no step was at its start.
@@ -158,14 +159,12 @@ def solve_with_adjoint(
         kept, latest = run.kept.without_latest(), run.latest._replace(since=before.iterations)
         return run._replace(ahead=before, number=number, kept=kept, latest=latest)
 
-    start = scheduler.start()
-    steps = jax.eval_shape(lambda: recorder.begin(start.lane_state, None))
     run = Backward(
         ahead=start,
         number=jnp.zeros((), int),
         needed=jnp.asarray(jnp.iinfo(jnp.arange(0).dtype).max),
         kept=Checkpoints.none(Period(start, start)),
-        latest=LatestSteps.none(steps, size),
+        latest=LatestSteps.none(record, size),
         outcome=scheduler.empty(),
         adjoint=jnp.zeros((rows, scheduler.lanes), states.dtype),
         gradient=jnp.zeros((rows, size), states.dtype),

@@ -24,10 +24,9 @@ from ._adjoint import solve_with_adjoint
 from .variation import VariationalProblem, in_groups, slopes_by_variations
 
 #: Up to this many tangents are integrated forward, in pairs. The cost relative to a table without derivatives, at a
-#: tolerance of 1e-8, for 2, 3, 4 and 6 parameters, is on the plane 5.0, 7.3, 8.4, 15 forward and 7.8, 13, 7.4, 7.6
-#: backward (jax 0.10), or 4.6, 6.9, 8.4, 14 forward and 8.5, 11, 10, 11 backward (jax 0.12); in a cylinder 5.2, 8.5,
-#: 9.5, 16 forward and 9.4, 12, 10, 12 backward (jax 0.10). One parameter costs 2.8.
-MOST_FORWARD = 4
+#: tolerance of 1e-8, for 2, 3, 4 and 6 parameters, is on the plane 3.4, 6.4, 6.3, 9.6 forward and 5.0, 5.7, 5.6, 5.5
+#: backward, in a cylinder 3.6, 7.6, 7.6, 11 forward and 5.6, 6.8, 6.8, 7.6 backward (jax 0.10).
+MOST_FORWARD = 2
 
 
 def ensemble_solve_with_tangents(
@@ -114,8 +113,10 @@ def _slopes_by_adjoint(
 
 
 def _mixed(tangents: tuple[Any, ...]) -> Any:
-    """A mixture of some tangents, with shares that are unlikely to cancel."""
-    shares = [0.5 + math.modf(0.618 * k)[0] for k in range(len(tangents))]
+    """A mixture of some tangents, with shares that are unlikely to cancel. The mixture is about as large as each tangent,
+    so that steps are as short as for one tangent.
+    """
+    shares = [(0.5 + math.modf(0.618 * k)[0]) / len(tangents) for k in range(len(tangents))]
     return jax.tree.map(lambda *rates: sum(c * rate for c, rate in zip(shares, rates, strict=True)), *tangents)
 
 

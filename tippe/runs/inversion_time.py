@@ -40,9 +40,8 @@ def inversion_time(
     """Time at which theta reaches an angle; works under `jit`, `vmap`, `grad`, `jvp` and their compositions.
 
     The derivative comes from the implicit function theorem at the event; it is 0 if the result is infinite. Together
-    with derivatives, a time costs about three times as much for one parameter, five times for two, seven to ten times
-    for three or four, and eight to thirteen times for more (`nonholonomic/derivatives/slopes.py`). Second derivatives
-    use forward mode.
+    with derivatives, a time costs two to three times as much for one parameter, four times for two, and six to eight
+    times for more (`nonholonomic/derivatives/slopes.py`). Second derivatives use forward mode.
 
     **Arguments:**
 
