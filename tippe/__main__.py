@@ -208,15 +208,14 @@ def report(options: argparse.Namespace, arenas: dict[str, Table]) -> str:
 
 def picture(options: argparse.Namespace, times: Any, theta: Any, end: float) -> Any:
     """theta(t) of the displayed launch, which has turned over at `end` [s]."""
-    title = f"{options.top} top, {options.rpm:g} rpm, mu = {middle(options.mu):g}, on a table"
+    start = f"{options.rpm:g} rpm, θ(0) = {middle(options.theta):g}°"
+    title = f"{options.top} top, {start}, mu = {middle(options.mu):g}, on a table"
     if end <= times[-1]:
         # Between the times, theta may be above the angle only for a moment.
         after = np.searchsorted(times, end)
         times, theta = np.insert(times, after, end), np.insert(theta, after, INVERTED)
     panel = Panel(title, times, theta[None], theta[:1], np.array([end if end <= times[-1] else np.inf]), joined=False)
-    return draw_launches(
-        [panel], INVERTED, "large dots: first time above the dashed angle; small dots: runs to these times"
-    )
+    return draw_launches([panel], INVERTED, "the large one is the first time above the dashed angle")
 
 
 def write_page(options: argparse.Namespace, arenas: dict[str, Table], live: str, drawing: Path | None) -> Path:

@@ -1,5 +1,6 @@
 """`python -m tippe`, and `python -m tippe --paper`."""
 
+import argparse
 import dataclasses
 import json
 
@@ -139,3 +140,12 @@ def test_every_option_is_explained():
     printed = parser().format_help()
     for word in ("mass [kg]", "cylinder", "[rad/s]", "slip speed", "horizon", "Table 1"):
         assert word in printed
+
+
+def test_the_picture_of_one_launch_states_its_angle_and_fits_a_phone():
+    options = argparse.Namespace(top="wooden", rpm=1900.0, mu=[0.1, 0.3, 0.5], theta=[3.0, 12.0, 18.0])
+    times = np.linspace(0.0, 5.0, 11)
+    figure = job.picture(options, times, np.minimum(0.2 + times, 3.1), 2.8)
+    assert figure.axes[0].get_title() == "wooden top, 1900 rpm, θ(0) = 12°, mu = 0.3, on a table"
+    assert figure.axes[0].get_legend() is None
+    assert figure.get_figwidth() <= 8.0

@@ -35,7 +35,7 @@ def draw_launches(panels: list[Panel], angle: float, dots: str) -> Any:
     from matplotlib import colormaps
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13.0, 4.2), layout="constrained")
+    figure = Figure(figsize=(13.0 if len(panels) > 1 else 8.0, 4.2), layout="constrained")
     drawings = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for drawing, panel in zip(drawings, panels, strict=True):
         colours = colormaps["viridis"](np.linspace(0.0, 0.92, len(panel.starts)))
@@ -58,5 +58,6 @@ def draw_launches(panels: list[Panel], angle: float, dots: str) -> Any:
         drawing.set_yticks([0.0, np.pi / 2.0, np.pi], ["0", "π/2", "π"])
     drawings[0].set_ylabel("θ, angle from the normal to the stem [rad]")
     figure.suptitle(f"Dots: {dots}", fontsize=9, color="0.4")
-    drawings[-1].legend(title="θ(0) [rad]", loc="center left", bbox_to_anchor=(1.01, 0.5))
+    if len(panels[-1].starts) > 1:
+        drawings[-1].legend(title="θ(0) [rad]", loc="center left", bbox_to_anchor=(1.01, 0.5))
     return figure
