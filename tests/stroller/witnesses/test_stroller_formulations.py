@@ -50,7 +50,8 @@ def random_launches(scene, count):
     place = (spread(-2, 2), spread(-2, 2))
     if not isinstance(scene.surface, Plane):
         place = (spread(-3, 3), spread(0.15, 1.4) * random.choice([-1.0, 1.0], count))
-    steering = spread(-1.45, 1.45) + np.pi * random.choice([0.0, 1.0], count)
+    # The front wheel points forward or backward.
+    steering = np.angle(np.exp(1j * (spread(-1.45, 1.45) + np.pi * random.choice([0.0, 1.0], count))))
     return Launch(place, spread(-3, 3), spread(-2, 2), steering, spread(-2, 2))
 
 
