@@ -90,6 +90,8 @@ def started(folder: Path, *arguments: str) -> subprocess.Popen:
         env=environment,
         start_new_session=True,
         cwd=folder,
+        # These tests may themselves run in a background job, to which a shell does not send Ctrl-C.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
 
 
