@@ -184,8 +184,8 @@ class FlyBoth(Fly):
         return self.extended(problem, QuadraturesInFlight(self.scene.body), state)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """Strike the arena with the sphere that is there; rebound, or slide on that sphere if the rebound would be
-        slow.
+        """The impact of the sphere that touches the arena, after which the top rebounds, or slides on that sphere if
+        the rebound would be slow.
 
         If the impact throws the other sphere into the arena, the other sphere strikes next. Counts the flights that
         begin.

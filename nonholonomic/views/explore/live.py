@@ -70,7 +70,7 @@ def live_page(live: LiveRun, stage: Stage, speed: float = 1.0, below: str = "") 
     **Raises:** `ModuleNotFoundError` if the library for views is not installed; `ValueError` for equations that cannot be
     written in JavaScript.
     """
-    # Name and warning belong to a single run.
+    # The title and the warnings describe one run, but the sliders change the run.
     drawn = stage._replace(title="", shows=tuple(show._replace(note="") for show in stage.shows))
     scripts = [script(text) for text in (programs(live), _file("map.js"), _file("explore.js"))]
     return page(
