@@ -1,6 +1,7 @@
 """Systems that can be run: hybrid systems, and mechanical systems converted to hybrid ones."""
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -117,25 +118,35 @@ def _check_vector(value: Any, name: str, size: int | None) -> None:
         raise ValueError(f"{name} must be of shape {shape}, not {np.shape(value)}; jax.vmap or sweep runs many")
 
 
-def _check_mechanical_functions(system: AbstractSystem) -> None:
-    """Raise `ValueError` that names a function of a system that JAX cannot trace or that returns a wrong shape."""
-    n = system.dimension
-    t, q = (jax.ShapeDtypeStruct(shape, jnp.result_type(float)) for shape in ((), (n,)))
+@functools.lru_cache(maxsize=256)
+def _check_mechanical_functions(form: Form) -> None:
+    """Raise `ValueError` that names a function of a system that JAX cannot trace or that returns a wrong shape.
+
+    **Arguments:** `form`: that of a `Hybrid` of one `MechanicalMode`, so that a system with other numbers is not traced
+    again.
+    """
+    n = form.size // 2
+    numbers, t, _ = form.arguments
+    q = jax.ShapeDtypeStruct((n,), t.dtype)
     functions = {
-        "metric(q)": (system.metric, (q,), f"of shape ({n}, {n})", lambda shape: shape == (n, n)),
-        "potential(q)": (system.potential, (q,), "one number", lambda shape: shape == ()),
+        "metric(q)": ((q,), f"of shape ({n}, {n})", lambda shape: shape == (n, n)),
+        "potential(q)": ((q,), "one number", lambda shape: shape == ()),
         "constraints(q)": (
-            system.constraints,
             (q,),
             f"of shape (k, {n}), a row for each constraint",
             lambda shape: len(shape) == 2 and shape[1] == n,
         ),
-        "frame(q)": (system.frame, (q,), f"of shape ({n}, {n})", lambda shape: shape == (n, n)),
-        "force(t, q, rate)": (system.force, (t, q, q), f"of shape ({n},)", lambda shape: shape in ((), (1,), (n,))),
+        "frame(q)": ((q,), f"of shape ({n}, {n})", lambda shape: shape == (n, n)),
+        "force(t, q, rate)": ((t, q, q), f"of shape ({n},)", lambda shape: shape in ((), (1,), (n,))),
     }
-    for name, (function, arguments, wanted, fits) in functions.items():
+
+    def called(method: str, numbers: Any, *arguments: Any) -> Any:
+        mode: Any = form.system(numbers).modes[0]
+        return getattr(mode.formulation.system, method)(*arguments)
+
+    for name, (arguments, wanted, fits) in functions.items():
         try:
-            result = jax.eval_shape(function, *arguments)
+            result = jax.eval_shape(functools.partial(called, name.partition("(")[0]), numbers, *arguments)
         except jax.errors.JAXTypeError as error:
             raise ValueError(f"{name} {UNTRACEABLE}") from error
         shape = getattr(result, "shape", None)
@@ -148,7 +159,7 @@ def _check_mechanical_start(system: AbstractSystem, start: Any) -> None:
         raise ValueError(f"start = {start!r} must be a pair (q, rate) of coordinates and their rates")
     for name, part in zip(("q", "rate"), start, strict=True):
         _check_vector(part, f"start: {name}", system.dimension)
-    _check_mechanical_functions(system)
+    _check_mechanical_functions(Form.of(Hybrid([MechanicalMode(Lagrange(system))]), 2 * system.dimension)[0])
     q, rate = (as_number(part) for part in start)
     constraints = system.constraints(q)
     if not constraints.size:
