@@ -240,7 +240,6 @@ I is I₁ and J is Jellett's quantity λ.
 * With sliding friction the top has **no nonholonomic constraint**: the contact is holonomic, and friction is a force.
 * Jellett's quantity is constant on a plane, but **not in the cylinder**, where the paper uses its constancy in place of
   an equation of motion.
-* Friction changes the momentum β₁. Either β₁ or Jellett's quantity is constant, never both.
 * This package uses none of the paper's equations. The corrected equations agree with its vector form to 10⁻¹⁰.
 """
 
