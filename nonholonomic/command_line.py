@@ -60,15 +60,16 @@ def run_and_exit(main: Callable[[], int], program: str) -> NoReturn:
     sys.exit(status)
 
 
-def closing_lines(runs: int, started: float, written: Iterable[Any], page: str) -> str:
+def closing_lines(runs: int, started: float, written: Iterable[Any], page: str, read: bool = False) -> str:
     """The last lines of a command line.
 
     **Arguments:** `runs`: number of runs; `started`: the start of the call, by `time.perf_counter`; `written`: the
-    files; `page`: what the page shows, and its path.
+    files; `page`: what the page shows, and its path; `read`: whether all results are those of an earlier call.
     """
     duration = time.perf_counter() - started
     files = ", ".join(map(str, written))
-    return f"\n{runs} runs in {duration:.1f} s, compilation included. Wrote {files}.\n{page}"
+    included = "as computed earlier by the same command" if read else "compilation included"
+    return f"\n{runs} runs in {duration:.1f} s, {included}. Wrote {files}.\n{page}"
 
 
 def interruptible(main: Callable[[], int], program: str) -> int:

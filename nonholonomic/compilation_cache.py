@@ -13,9 +13,10 @@ import os
 import platform
 import uuid
 import warnings
+import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,9 @@ LOOKED_AT = ".looked_at"
 
 #: Values of an environment variable that switch a feature off.
 OFF = ("0", "off", "false", "no")
+
+#: Packages whose versions computed files depend on.
+PACKAGES = ("jax", "equinox", "diffrax", "numpy", "scipy", "h5py", "matplotlib", "jupyter-threejs-sage")
 
 #: Errors of writing without space: the disk is full, the user's quota is used up, or the file is too long.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -183,28 +187,54 @@ def sound(entry: bytes) -> bool:
     return True
 
 
-def kept_text(folder: Path | None, facts: Any, compute: Callable[[], str]) -> str:
-    """A text that takes seconds to compute, such as a page with sliders, stored beside the compiled programs.
+def kept_files(folder: Path | None, facts: Any, compute: Callable[[], dict[str, bytes]]) -> dict[str, bytes]:
+    """Files that take seconds to compute, such as a page with sliders, stored beside the compiled programs.
 
     **Arguments:** `folder`: that of `enable_compilation_cache`, or `None` to store nothing; `facts`: an object whose
-    `repr` contains everything that the text depends on, besides these packages.
+    `repr` contains everything that the files depend on, besides these packages, those in `PACKAGES`, the processor and the
+    settings of JAX; `compute`: computes the files, name -> contents.
     """
     if folder is None:
         return compute()
-    kept = hashlib.sha256(repr((facts, version("jax"), version("equinox"), version("diffrax"))).encode())
-    for path in sorted(_sources()):
-        kept.update(path.read_bytes())
-    path = folder / f"text-{kept.hexdigest()[:32]}"
+    path = _place(folder, facts)
     try:
-        return zlib.decompress(path.read_bytes()).decode()
-    except (OSError, zlib.error):
-        text = compute()
-    # Write the file as a whole, because another process may read it. A full disk must not stop the program.
+        with zipfile.ZipFile(path) as stored:
+            return {name: stored.read(name) for name in stored.namelist()}
+    except (OSError, zipfile.BadZipFile, zlib.error):
+        files = compute()
+    # Write the archive as a whole, because another process may read it. A full disk must not stop the program.
     with contextlib.suppress(OSError):
         written = path.with_name(f".{uuid.uuid4().hex}")
-        written.write_bytes(zlib.compress(text.encode(), 1))
+        with zipfile.ZipFile(written, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+            for name, contents in files.items():
+                archive.writestr(name, contents)
         os.replace(written, path)
-    return text
+    return files
+
+
+def are_kept(folder: Path | None, facts: Any) -> bool:
+    """Whether `kept_files` has stored the files of these facts."""
+    return folder is not None and _place(folder, facts).exists()
+
+
+def _place(folder: Path, facts: Any) -> Path:
+    """The archive of some files."""
+    settings: Any = jax.config
+    machine = (environment_name(), jax.default_backend(), str(jax.numpy.result_type(float)))
+    state = (facts, _versions(), machine, sorted(settings.values.items()))
+    kept = hashlib.sha256(repr(state).encode())
+    for path in sorted(_sources()):
+        kept.update(path.read_bytes())
+    return folder / f"files-{kept.hexdigest()[:32]}"
+
+
+def _versions() -> list[str]:
+    """The version of Python, and those of `PACKAGES`; none for a package that is not installed."""
+    installed = [platform.python_version()]
+    for package in PACKAGES:
+        with contextlib.suppress(PackageNotFoundError):
+            installed.append(f"{package} {version(package)}")
+    return installed
 
 
 def _sources() -> Iterator[Path]:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from nonholonomic import __version__
 from nonholonomic.command_line import closing_lines, run_and_exit
-from nonholonomic.compilation_cache import enable_compilation_cache
+from nonholonomic.compilation_cache import are_kept, enable_compilation_cache, kept_files
 from nonholonomic.geometry import CLOSED, AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.integration import ImplicitMidpoint
 from nonholonomic.progress import Progress, status_line
@@ -35,6 +35,13 @@ from .runs.trajectory import Trajectory
 from .runs.view import grouped
 
 RIDES = ("without friction", "with friction")
+
+#: The heading of the energy audit, and the name of its text among the computed files.
+HEADING = (
+    f"{'ride':38s} {'solver':10s} {'E start [J]':>12s} {'E end [J]':>12s} {'work [J]':>12s} "
+    f"{'residual':>10s} {'slip [m/s]':>10s} {'N min [N]':>10s} {'steps':>6s}  status"
+)
+AUDIT = "audit"
 
 #: Tolerances of the rides that show how the energy residual depends on the tolerance.
 TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
@@ -175,7 +182,7 @@ def audited(options: argparse.Namespace, helm: Helm, name: tuple[str, str]) -> t
 
 def table(options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory]) -> Table:
     """The rides as a table over ride and time."""
-    request = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
+    request = {name: value for name, value in vars(options).items() if name != "out"}
     names = ["_".join(name).replace(" ", "_") for name in rides]
     return table_of(list(rides.values()), names, request | {"ride": names})
 
@@ -203,6 +210,56 @@ def write_page(
     return path
 
 
+def simulated(options: argparse.Namespace) -> tuple[dict[tuple[str, str], Trajectory], list[str]]:
+    """The rides, and the lines of their audit, which are printed as the rides end."""
+    rides, audits, helm, asked = {}, [], Helm(options.force, options.steer, options.period), scenes(options)
+    # Compile in parallel, because the compiler uses little more than one core. The two rides of a ground share one program.
+    with Progress(len(asked) + 1, "ride") as counted, ThreadPoolExecutor(2) as threads:
+        counted.begin()
+        turns = {ground: Lock() for ground, _ in asked}
+
+        def in_turn(name: tuple[str, str]) -> tuple[Trajectory, list[str]]:
+            with turns[name[0]]:
+                return audited(options, helm, name)
+
+        futures = {name: threads.submit(in_turn, name) for name in sorted(asked, key=lambda name: RIDES.index(name[1]))}
+        curves = threads.submit(tolerance_curve, options, helm)
+        for name in asked:
+            rides[name], lines = futures[name].result()
+            audits += lines
+            with counted.aside():
+                print("\n".join(lines), flush=True)
+            counted.advance(1)
+        curve = ["", *curves.result()]
+        counted.advance(1)
+        with counted.aside():
+            print("\n".join(curve), flush=True)
+    return rides, [*audits, *curve]
+
+
+def computed(options: argparse.Namespace) -> dict[str, bytes]:
+    """Simulate the rides, print their audit, and write all files.
+
+    **Returns:** name -> contents of each file, and of the audit.
+    """
+    rides, audits = simulated(options)
+    with status_line("drawing"):
+        written, drawing = [options.out / "rides.h5"], None
+        table(options, rides).save(written[0])
+        if has_matplotlib():
+            drawing = options.out / "rides.png"
+            grounds = {ground: scene.surface for (ground, _), (scene, _) in scenes(options).items()}
+            draw_rides(grounds, rides).savefig(drawing, dpi=110)
+            written.append(drawing)
+        written.append(write_page(options, rides, [HEADING, *audits], drawing))
+    return {AUDIT: "\n".join(audits).encode()} | {path.name: path.read_bytes() for path in written}
+
+
+def has_matplotlib() -> bool:
+    """Whether pictures can be drawn."""
+    return find_spec("matplotlib") is not None
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the main job.
 
@@ -211,58 +268,26 @@ def main(arguments: list[str] | None = None) -> int:
     **Returns:** the exit status: 0, or 2 for input that cannot be used.
     """
     options = parser().parse_args(arguments)
-    enable_compilation_cache()
+    cache = enable_compilation_cache()
     started = time.perf_counter()
+    facts = "rides", sorted((name, repr(value)) for name, value in vars(options).items() if name != "out")
     try:
         require_folder(options.out, "--out")
-        heading = (
-            f"{'ride':38s} {'solver':10s} {'E start [J]':>12s} {'E end [J]':>12s} {'work [J]':>12s} "
-            f"{'residual':>10s} {'slip [m/s]':>10s} {'N min [N]':>10s} {'steps':>6s}  status"
-        )
-        rides, audits, helm, asked = {}, [], Helm(options.force, options.steer, options.period), scenes(options)
-        print(heading, flush=True)
-        # Compile in parallel, because the compiler uses little more than one core. The two rides of a ground share one program.
-        with Progress(len(asked) + 1, "ride") as counted, ThreadPoolExecutor(2) as threads:
-            counted.begin()
-            turns = {ground: Lock() for ground, _ in asked}
-
-            def in_turn(name: tuple[str, str]) -> tuple[Trajectory, list[str]]:
-                with turns[name[0]]:
-                    return audited(options, helm, name)
-
-            futures = {
-                name: threads.submit(in_turn, name) for name in sorted(asked, key=lambda name: RIDES.index(name[1]))
-            }
-            curves = threads.submit(tolerance_curve, options, helm)
-            for name in asked:
-                rides[name], lines = futures[name].result()
-                audits += lines
-                with counted.aside():
-                    print("\n".join(lines), flush=True)
-                counted.advance(1)
-            curve = curves.result()
-            counted.advance(1)
-            with counted.aside():
-                print("\n" + "\n".join(curve), flush=True)
-        with status_line("drawing") as line:
-            written, drawing = [options.out / "rides.h5"], None
-            table(options, rides).save(written[0])
-            if find_spec("matplotlib") is None:
-                with line.aside():
-                    print(
-                        "No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr
-                    )
-            else:
-                drawing = options.out / "rides.png"
-                grounds = {ground: scene.surface for (ground, _), (scene, _) in asked.items()}
-                draw_rides(grounds, rides).savefig(drawing, dpi=110)
-                written.append(drawing)
-            shown = write_page(options, rides, [heading, *audits, "", *curve], drawing)
+        print(HEADING, flush=True)
+        read = are_kept(cache, facts)
+        files = kept_files(cache, facts, lambda: computed(options))
+        if read:
+            print(files[AUDIT].decode())
+            for name in files.keys() - {AUDIT}:
+                (options.out / name).write_bytes(files[name])
     except (ValueError, OSError) as error:
         print(f"python -m stroller: {error}", file=sys.stderr)
         return 2
+    if not has_matplotlib():
+        print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
+    *written, shown = (options.out / name for name in ("rides.h5", "rides.png", "index.html") if name in files)
     see = f"To see it, open {shown}{'' if can_view() else f'. {NO_VIEW}'}"
-    print(closing_lines(2 * len(rides), started, written, see))
+    print(closing_lines(2 * len(scenes(options)), started, written, see, read))
     return 0
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from nonholonomic import __version__
 from nonholonomic.command_line import closing_lines, run_and_exit
-from nonholonomic.compilation_cache import enable_compilation_cache, kept_text
+from nonholonomic.compilation_cache import are_kept, enable_compilation_cache, kept_files
 from nonholonomic.geometry import Cylinder, Plane
 from nonholonomic.progress import Progress, status_line
 from nonholonomic.sweeps import Table, saved_cells
@@ -37,8 +37,8 @@ from .runs.theta_over_time import theta_over_time
 
 TOPS = {top.__name__: top for top in (presets.wooden, presets.rutstam, presets.cohen, presets.leine_glocker)}
 
-#: Times at which theta is drawn, and duration of the displayed run [s].
-SAMPLES, SHOWN = 256, 5.0
+#: Times at which theta is drawn, close enough to show nutation, and duration of the displayed run [s].
+SAMPLES, SHOWN = 2048, 5.0
 
 #: The page's title, and the placeholder for the contents below the top.
 TITLE, BELOW = "A tippe top climbs onto its stem", "<!-- below -->"
@@ -83,6 +83,17 @@ def scenes(options: argparse.Namespace) -> dict[str, Scene]:
     return {name: Scene(top, arena, law, contact="hybrid") for name, arena in arenas.items()}
 
 
+def remark(options: argparse.Namespace) -> str:
+    """An explanation of the times in the tables."""
+    counts = f"A top has turned over when theta first exceeds {math.degrees(INVERTED):.0f} deg."
+    if TOPS[options.top]().stem is None:
+        return counts
+    return (
+        f"{counts} Where a time is several times those beside it, the top climbs onto its stem as soon as they do, but with a "
+        "smaller theta, and then rises slowly."
+    )
+
+
 def middle(values: list[float]) -> float:
     """The middle one of some values."""
     return sorted(values)[len(values) // 2]
@@ -104,18 +115,38 @@ def described(options: argparse.Namespace) -> list[str]:
     ]
 
 
-def table(options: argparse.Namespace, arena: str) -> Table:
+def facts(options: argparse.Namespace, kind: str) -> Any:
+    """Everything that a kind of result depends on, besides these packages."""
+    return kind, sorted((name, repr(value)) for name, value in vars(options).items() if name != "out")
+
+
+def table(options: argparse.Namespace, arena: str, cache: Path | None) -> Table:
     """The table of an arena, written to its file."""
-    return inversion_table(
+    path = options.out / f"{arena}.h5"
+    compute = functools.partial(
+        inversion_table,
         scenes(options)[arena],
         theta=[float(Launch.degrees(theta, 0.0).theta) for theta in options.theta],
         spin=float(launch_shown(options).spin),
         mu=options.mu,
         t1=options.t1,
         tolerance=options.tolerance,
-        path=options.out / f"{arena}.h5",
+        path=path,
         progress=False,
     )
+
+    def computed() -> dict[str, bytes]:
+        compute()
+        return {path.name: path.read_bytes()}
+
+    # Another version may have computed the cells that are already in the folder.
+    if saved_cells(path) == 0:
+        contents = kept_files(cache, facts(options, arena), computed)[path.name]
+        if not path.exists():
+            written = path.with_suffix(".part")
+            written.write_bytes(contents)
+            written.replace(path)
+    return compute()
 
 
 def launch_shown(options: argparse.Namespace) -> Launch:
@@ -130,27 +161,31 @@ def sliders(options: argparse.Namespace) -> str:
     return live_page(live_run(*run, None, t1)._replace(title=TITLE), stage_at_start(*run, t1), 0.2, BELOW).html
 
 
-def computed(options: argparse.Namespace, folder: Path | None) -> tuple[dict[str, Table], Any, str]:
+def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str, Table], Any, str]:
     """The table of each arena, theta(t) of the displayed launch, and the page with sliders.
 
-    They are computed in parallel, because the compiler uses little more than one core.
+    They are computed in parallel, because the compiler uses little more than one core. **Arguments:** `cache`: folder for
+    results that later commands with the same options read.
     """
     times = np.linspace(0.0, min(SHOWN, options.t1), SAMPLES)
-    facts = sorted((name, repr(value)) for name, value in vars(options).items() if name != "out")
 
-    def angles() -> str:
+    def angles() -> dict[str, bytes]:
         run, axes = (scenes(options)["plane"], launch_shown(options)), ("launch.theta", "scene.friction.mu")
-        return json.dumps(theta_over_time(*run, times, options.tolerance, axes).tolist())
+        return {"theta": json.dumps(theta_over_time(*run, times, options.tolerance, axes).tolist()).encode()}
 
     def on_plane() -> tuple[Table, Any]:
         # Compute the table first, because the picture uses its programs.
-        plane = table(options, "plane")
-        return plane, json.loads(kept_text(folder, ("theta", facts), angles)) if has_matplotlib() else None
+        plane = table(options, "plane", cache)
+        if not has_matplotlib():
+            return plane, None
+        return plane, json.loads(kept_files(cache, facts(options, "theta"), angles)["theta"])
 
     def live() -> str:
-        return kept_text(folder, ("page", facts), functools.partial(sliders, options)) if can_view() else ""
+        if not can_view():
+            return ""
+        return kept_files(cache, facts(options, "page"), lambda: {"page": sliders(options).encode()})["page"].decode()
 
-    jobs = (functools.partial(table, options, "cylinder"), on_plane, live)
+    jobs = (functools.partial(table, options, "cylinder", cache), on_plane, live)
     threads = ThreadPoolExecutor(2)
     try:
         with Progress(len(jobs), "job", "compiling") as counted:
@@ -203,7 +238,7 @@ def report(options: argparse.Namespace, arenas: dict[str, Table]) -> str:
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines += ["", f"Time until it has turned over, {heading}"]
         lines += ["  ".join(entry.rjust(width) for entry, width in zip(row, widths, strict=True)) for row in rows]
-    return "\n".join(lines)
+    return "\n".join([*lines, "", remark(options)])
 
 
 def picture(options: argparse.Namespace, times: Any, theta: Any, end: float) -> Any:
@@ -214,8 +249,8 @@ def picture(options: argparse.Namespace, times: Any, theta: Any, end: float) -> 
         # Between the times, theta may be above the angle only for a moment.
         after = np.searchsorted(times, end)
         times, theta = np.insert(times, after, end), np.insert(theta, after, INVERTED)
-    panel = Panel(title, times, theta[None], theta[:1], np.array([end if end <= times[-1] else np.inf]), joined=False)
-    return draw_launches([panel], INVERTED, "the large one is the first time above the dashed angle")
+    panel = Panel(title, times, theta[None], theta[:1], np.array([end if end <= times[-1] else np.inf]))
+    return draw_launches([panel], INVERTED, "The dot is the first time above the dashed angle.")
 
 
 def write_page(options: argparse.Namespace, arenas: dict[str, Table], live: str, drawing: Path | None) -> Path:
@@ -224,7 +259,7 @@ def write_page(options: argparse.Namespace, arenas: dict[str, Table], live: str,
     below = ""
     for name, heading in headings(options).items():
         below += f"<h2>Time until it has turned over, {heading}</h2>" + table_as_html(rows_of(options, arenas[name]), 1)
-    below += "".join(f'<p class="note">{escape(line)}</p>' for line in described(options))
+    below += "".join(f'<p class="note">{escape(line)}</p>' for line in (remark(options), *described(options)))
     below += "" if drawing is None else "<h2>θ(t)</h2>" + picture_as_html(drawing)
     path = options.out / "index.html"
     html = live or page([], TITLE, 1.0, f'<p class="note">{NO_VIEW}</p>', BELOW).html
@@ -243,12 +278,13 @@ def main(arguments: list[str] | None = None) -> int:
     if "--paper" in arguments:
         return paper_tables.main([word for word in arguments if word != "--paper"])
     options = parser().parse_args(arguments)
-    folder = enable_compilation_cache()
+    cache = enable_compilation_cache()
     started = time.perf_counter()
     try:
         print("\n".join(described(options)), flush=True)
         require_folder(options.out, "--out")
-        arenas, shown, live = computed(options, folder)
+        read = all(are_kept(cache, facts(options, arena)) for arena in scenes(options))
+        arenas, shown, live = computed(options, cache)
         print(report(options, arenas), flush=True)
         with status_line("drawing") as line:
             written, drawing = [options.out / f"{arena}.h5" for arena in arenas], None
@@ -271,7 +307,7 @@ def main(arguments: list[str] | None = None) -> int:
         raise KeyboardInterrupt(saved(options)) from None
     cells = sum(table.status.size for table in arenas.values())
     see = f"To see the top climb onto its stem, open {path}{'' if can_view() else f'. {NO_VIEW}'}"
-    print(closing_lines(cells, started, written, see))
+    print(closing_lines(cells, started, written, see, read))
     return 0
 
 

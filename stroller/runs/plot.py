@@ -52,6 +52,8 @@ def draw_rides(grounds: dict[str, AbstractSurface], rides: dict[tuple[str, str],
 
 def _draw_ground(space: Any, ground: AbstractSurface, rides: dict[str, Trajectory]) -> None:
     """A wire frame of the ground as far as the rides go."""
+    from matplotlib.ticker import MaxNLocator
+
     places = np.concatenate([np.asarray(run.place) for run in rides.values()])
     first, second = (
         np.linspace(part.min() - 0.3, part.max() + 0.3, 13) if unit == "m" else np.linspace(-np.pi, np.pi, 49)
@@ -62,12 +64,16 @@ def _draw_ground(space: Any, ground: AbstractSurface, rides: dict[str, Trajector
     grid = tuple(np.meshgrid(first, second, indexing="ij"))
     x, y, z = (np.asarray(part) for part in ground.in_fixed_frame(ground.chart(grid)[0]))
     space.plot_wireframe(x, y, z, color="0.75", linewidth=0.4)
-    space.set_xlabel("x [m]")
-    space.set_ylabel("y [m]")
+    space.set_xlabel("x [m]", labelpad=8)
+    space.set_ylabel("y [m]", labelpad=8)
     space.set_zlabel("z [m]")
-    space.locator_params(nbins=4)
+    # As many ticks along each axis as there is room for.
+    spans = [np.ptp(part) for part in (x, y, z)]
+    for axis, span in zip((space.xaxis, space.yaxis, space.zaxis), spans, strict=True):
+        axis.set_major_locator(MaxNLocator(max(round(4.0 * span / max(spans)), 1)))
     # A plane has nearly no height to show.
-    if np.ptp(z) < 0.1 * max(np.ptp(x), np.ptp(y)):
+    if spans[2] < 0.1 * max(spans):
         space.set_zticks([])
         space.set_zlabel("")
-    space.set_aspect("equal")
+    # Equal scales, on all of the room that the labels leave.
+    space.set_box_aspect([np.ptp(ends) for ends in (space.get_xlim(), space.get_ylim(), space.get_zlim())], zoom=1.2)

@@ -15,8 +15,9 @@ import jax
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
+from nonholonomic import compilation_cache as cache
 from nonholonomic import enable_compilation_cache
-from nonholonomic.compilation_cache import LOOKED_AT, environment_name, kept_text
+from nonholonomic.compilation_cache import LOOKED_AT, are_kept, environment_name, kept_files
 
 pytestmark = pytest.mark.newest
 
@@ -214,16 +215,37 @@ def test_a_folder_that_was_chosen_before_stands(unset, tmp_path, caplog):
     assert jax.config.jax_persistent_cache_min_compile_time_secs == 0.7
 
 
-def test_a_text_is_kept_until_its_facts_change(tmp_path):
+def test_files_are_kept_until_their_facts_change(tmp_path, monkeypatch):
     calls = []
 
-    def compute() -> str:
+    def compute() -> dict[str, bytes]:
         calls.append(1)
-        return f"text {len(calls)}"
+        return {"a": b"file %d" % len(calls), "b": b""}
 
-    assert [kept_text(tmp_path, facts, compute) for facts in ("a", "a", "b")] == ["text 1", "text 1", "text 2"]
-    # A damaged file is written anew.
+    def first(folder, facts) -> str:
+        files = kept_files(folder, facts, compute)
+        assert files["b"] == b""
+        return files["a"].decode()
+
+    assert not are_kept(tmp_path, "a")
+    assert [first(tmp_path, facts) for facts in ("a", "a", "b")] == ["file 1", "file 1", "file 2"]
+    assert are_kept(tmp_path, "a")
+    # A damaged archive is written anew.
     for path in tmp_path.iterdir():
         path.write_bytes(b"half")
-    assert kept_text(tmp_path, "a", compute) == kept_text(tmp_path, "a", compute) == "text 3"
-    assert kept_text(None, "a", compute) == "text 4"
+    assert first(tmp_path, "a") == first(tmp_path, "a") == "file 3"
+    assert first(None, "a") == "file 4"
+    # Single precision, another version of JAX, other flags of the compiler, and other sources give other results.
+    with jax.enable_x64(False):
+        assert first(tmp_path, "a") == "file 5"
+    with monkeypatch.context() as changed:
+        changed.setattr(cache, "version", lambda package: "0.0")
+        assert first(tmp_path, "a") == "file 6"
+    with monkeypatch.context() as changed:
+        changed.setenv("XLA_FLAGS", "--xla_cpu_max_isa=AVX")
+        assert first(tmp_path, "a") == "file 7"
+    with monkeypatch.context() as changed:
+        changed.setattr(cache, "_sources", lambda: [tmp_path / LOOKED_AT])
+        (tmp_path / LOOKED_AT).write_text("source")
+        assert first(tmp_path, "a") == "file 8"
+    assert first(tmp_path, "a") == "file 3"

@@ -10,6 +10,7 @@ import xarray
 
 import stroller
 from stroller import Damping, Launch, Plane, Scene, Sphere, Spheroid, Steady, Stroller, Table
+from stroller import __main__ as job
 from stroller.__main__ import main
 from stroller.runs.table import named_axes
 
@@ -155,9 +156,12 @@ def test_bad_sweeps_are_refused(change, message):
 
 
 @pytest.mark.slow
-def test_main_job(tmp_path, capsys):
-    """`python -m stroller` prints an audit that closes and writes its file and picture."""
-    assert main(["--t1", "2", "--surface", "spheroid", "--out", str(tmp_path)]) == 0
+def test_main_job(tmp_path, capsys, monkeypatch):
+    """`python -m stroller` prints an audit that closes and writes its file and picture; the same command reads them."""
+    monkeypatch.setattr(job, "enable_compilation_cache", lambda: tmp_path / "kept")
+    (tmp_path / "kept").mkdir()
+    arguments = ["--t1", "2", "--surface", "spheroid"]
+    assert main([*arguments, "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
     audit = [line.split() for line in printed.splitlines() if "midpoint" in line]
     assert len(audit) == 2
@@ -172,6 +176,13 @@ def test_main_job(tmp_path, capsys):
         energy = stored["energy"].values
         np.testing.assert_allclose(energy, energy[:, :1] + stored["work"].values, atol=1e-8)
         assert float(jnp.max(stored["friction_power"].values[1])) < 0.0
+    monkeypatch.setattr(job, "computed", lambda options: {})
+    assert main([*arguments, "--out", str(tmp_path / "again")]) == 0
+    again = capsys.readouterr().out
+    assert again[: again.index("4 runs")] == printed[: printed.index("4 runs")]
+    assert "as computed earlier by the same command" in again
+    for name in ("rides.h5", "rides.png", "index.html"):
+        assert (tmp_path / "again" / name).read_bytes() == (tmp_path / name).read_bytes()
 
 
 def test_main_job_refuses_bad_input(tmp_path, capsys):

@@ -14,6 +14,7 @@ from nonholonomic.views import NO_VIEW
 from tippe import __main__ as job
 from tippe.__main__ import main
 from tippe.papers.tables import drawn, parser
+from tippe.runs.observables import INVERTED
 from tippe.runs.theta_over_time import theta_over_time
 
 SMALL = ["--paper", "--theta", "0.1", "0.3", "--eta", "0", "--t1", "12", "--tolerance", "1e-7"]
@@ -87,7 +88,53 @@ def test_the_wooden_top_turns_over_in_four_fifths_of_the_launches(tmp_path, caps
     for arena in ("plane", "cylinder"):
         table = tippe.Table.load(tmp_path / f"{arena}.h5")
         assert np.mean(table.status == "inverted") >= 0.8
-    assert "nan" not in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "nan" not in printed
+    assert "A top has turned over when theta first exceeds 171 deg. Where a time is several times" in printed
+    # Such a time, in the last cell of the cylinder: the top is on its stem as soon as the others, but below 171 deg.
+    assert table.time[-1, -1] > 3.0 * table.time[-2, -1]
+    scene = job.scenes(job.parser().parse_args(["--mu", "0.5"]))["cylinder"]
+    times = np.array([3.0, 6.0, 10.0])
+    theta = theta_over_time(scene, tippe.Launch.degrees(18, 1900), times, 1e-6, ("launch.theta", "scene.friction.mu"))
+    np.testing.assert_allclose(np.degrees(theta[:2]), [145.0, 161.0], atol=4.0)
+    assert theta[2] < INVERTED + 0.02
+
+
+def test_the_same_command_reads_its_results_in_another_folder(tmp_path, capsys, monkeypatch, rutstam_scene):
+    flying = dataclasses.replace(rutstam_scene, contact="hybrid")
+    monkeypatch.setattr(job, "scenes", lambda options: {"plane": flying, "cylinder": flying})
+    monkeypatch.setattr(job, "enable_compilation_cache", lambda: tmp_path)
+    arguments = ["--theta", "6", "18", "--mu", "0.2", "0.3", "--rpm", "1480", "--t1", "8"]
+    assert main([*arguments, "--out", str(tmp_path / "a")]) == 0
+    first = capsys.readouterr().out
+    assert "compilation included" in first
+
+    def none(*arguments, **keywords):
+        raise AssertionError("computed again")
+
+    for name in ("theta_over_time", "sliders"):
+        monkeypatch.setattr(job, name, none)
+    assert main([*arguments, "--out", str(tmp_path / "b")]) == 0
+    again = capsys.readouterr().out
+    assert "as computed earlier by the same command" in again
+    assert again[: again.index("8 runs")] == first[: first.index("8 runs")]
+    for name in ("plane.h5", "cylinder.h5", "index.html", "theta.png"):
+        assert (tmp_path / "b" / name).read_bytes() == (tmp_path / "a" / name).read_bytes()
+    # Other options are computed, and refused in a folder with other tables.
+    assert main([*arguments, "--tolerance", "1e-5", "--out", str(tmp_path / "b")]) == 2
+    assert "tolerance is 1e-06 in the file and 1e-05 here" in capsys.readouterr().err
+
+
+def test_cells_in_the_folder_are_not_kept(tmp_path, monkeypatch, rutstam_scene):
+    """Another version of the packages may have computed them."""
+    monkeypatch.setattr(job, "scenes", lambda options: {"plane": rutstam_scene})
+    options = job.parser().parse_args(["--theta", "6", "--mu", "0.3", "--out", str(tmp_path)])
+    job.table(options, "plane", None)
+    job.table(options, "plane", tmp_path)
+    assert not job.are_kept(tmp_path, job.facts(options, "plane"))
+    (tmp_path / "plane.h5").unlink()
+    job.table(options, "plane", tmp_path)
+    assert job.are_kept(tmp_path, job.facts(options, "plane"))
 
 
 def test_theta_over_time_is_that_of_the_run(rutstam_scene):

@@ -277,7 +277,7 @@ def picture(options: argparse.Namespace, by_arena: dict[str, Table]) -> Any:
             name = shown_name(options, arena)
             title = f"{name}, η(0) = {eta:.4g}" if counts_eta(scene) else name
             panels.append(Panel(title, times, shown[i], thetas, ends[:, i]))
-    return draw_launches(panels, options.angle, "above the dashed angle for good")
+    return draw_launches(panels, options.angle, "Dots: above the dashed angle for good")
 
 
 def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[Stage]:

@@ -39,7 +39,7 @@ _flight_loss = eqx.filter_jit(airborne_ends.loss)
 
 
 @eqx.filter_jit
-def _at_the_end(
+def at_the_end(
     scene: Scene,
     problem: InversionProblem,
     outcome: Outcome | HybridOutcome,
@@ -160,7 +160,7 @@ class InversionRuns(NamedTuple):
         tolerance: Float[Array, ""],
     ) -> dict[str, Any]:
         """The variables that describe how the runs ended, except the first of two times."""
-        ended, inverted, theta = _at_the_end(scene, problem, outcome, self.last, tolerance)
+        ended, inverted, theta = at_the_end(scene, problem, outcome, self.last, tolerance)
         others = [np.asarray(ended) == status for status in WORD_OF_STATUS]
         code = np.select([np.asarray(inverted), *others], [0, *WORD_OF_STATUS.values()], 1)
         lost = code == WORDS.index("contact_lost")

@@ -9,17 +9,14 @@ Values = Float[np.ndarray, "..."]
 
 
 class Panel(NamedTuple):
-    """One arena and place: its title, times [s], theta [rad] of every launch (launches, times), and theta(0).
-
-    If the times are too far apart to show nutation, `joined` is false, and no lines join the values.
-    """
+    """One arena and place: its title, times [s], theta [rad] of every launch (launches, times), theta(0), and the times
+    of the dots."""
 
     title: str
     times: Values
     theta: Values
     starts: Values
     ends: Values
-    joined: bool = True
 
 
 def draw_launches(panels: list[Panel], angle: float, dots: str) -> Any:
@@ -28,7 +25,7 @@ def draw_launches(panels: list[Panel], angle: float, dots: str) -> Any:
     **Arguments:**
 
     - `panels`: the panels; `ends` are the times [s] that get a dot, if finite.
-    - `angle`: angle [rad] that counts as inverted; `dots`: description of the dots.
+    - `angle`: angle [rad] that counts as inverted; `dots`: description of the dots, above the plot.
 
     **Returns:** a matplotlib figure.
     """
@@ -40,8 +37,7 @@ def draw_launches(panels: list[Panel], angle: float, dots: str) -> Any:
     for drawing, panel in zip(drawings, panels, strict=True):
         colours = colormaps["viridis"](np.linspace(0.0, 0.92, len(panel.starts)))
         for theta, start, end, colour in zip(panel.theta, panel.starts, panel.ends, colours, strict=True):
-            style = {"linewidth": 1.2} if panel.joined else {"linestyle": "", "marker": ".", "markersize": 4}
-            drawing.plot(panel.times, theta, color=colour, label=f"{start:.4g}", **style)
+            drawing.plot(panel.times, theta, color=colour, label=f"{start:.4g}", linewidth=1.2)
             if np.isfinite(end):
                 drawing.plot(
                     end,
@@ -57,7 +53,7 @@ def draw_launches(panels: list[Panel], angle: float, dots: str) -> Any:
         drawing.set_xlabel("time [s]")
         drawing.set_yticks([0.0, np.pi / 2.0, np.pi], ["0", "π/2", "π"])
     drawings[0].set_ylabel("θ, angle from the normal to the stem [rad]")
-    figure.suptitle(f"Dots: {dots}", fontsize=9, color="0.4")
+    figure.suptitle(dots, fontsize=9, color="0.4")
     if len(panels[-1].starts) > 1:
         drawings[-1].legend(title="θ(0) [rad]", loc="center left", bbox_to_anchor=(1.01, 0.5))
     return figure

@@ -1,5 +1,6 @@
 """theta over time of one launch with flights, from the programs of its table."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -7,33 +8,45 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from nonholonomic.integration import Settings
-from nonholonomic.parameters import numbers
+from nonholonomic.hybrid import HybridOutcome
+from nonholonomic.integration import REACHED_END, Settings
+from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.sweeps import chunk_for
 
 from ..model.launch import Launch
 from ..model.scene import Scene
-from .cells import InversionRuns
-from .run_kind import run_kind_of
+from ..modes.inversion_problem import InversionProblem
+from .cells import at_the_end
+from .inversion import Inversions
 
 
 def theta_over_time(
     scene: Scene, launch: Launch, times: Float[np.ndarray, " times"], tolerance: float, axes: Sequence[str]
 ) -> Float[np.ndarray, " times"]:
-    """theta [rad] of one launch at the given times, also in flight. A separate run ends at each time, and all runs are
-    cells of a table. A program that has computed a table therefore compiles nothing more for its plot, whereas
-    `simulate` compiles fifty programs.
+    """theta [rad] of one launch at the given increasing times, also in flight. A program that has computed a table
+    compiles nothing more for its plot, whereas `simulate` compiles fifty programs.
+
+    All cells of a table run this launch. Each cell runs to the first time of its own part of the times, and from there
+    from time to time.
 
     **Arguments:** `axes`: full names of the parameters along the axes of that table, such as "launch.theta".
     """
     roots = {"scene": scene, "launch": launch}
     values = {path: value for root, tree in roots.items() for path, value in numbers(root, tree).items()}
     size, settings = chunk_for(1), Settings(tolerance)
-    columns, blocks = {name: np.full(size, float(values[name])) for name in axes}, []
-    for first in range(0, len(times), size):
-        block = times[first : first + size]
-        # No inclination exceeds pi, so no run ends before its time.
-        horizons: Any = np.pad(block, (0, size - len(block)))
-        runs = InversionRuns(run_kind_of(scene), horizons, math.pi, "first", settings, "ensemble", [])
-        blocks.append(runs.results(roots, columns, len(block))["end_theta"][: len(block)])
-    return np.concatenate(blocks)
+    cells = with_numbers(roots, {name: np.full(size, float(values[name])) for name in axes})
+    # No inclination exceeds pi, so no run ends before its time.
+    problem = InversionProblem.of(cells["scene"], cells["launch"], math.pi, size)
+    runs = Inversions.of(cells["scene"], problem, settings.tolerance, False)
+    parts = -(-len(times) // size)
+    ends = np.pad(times, (0, size * parts - len(times)), mode="edge").reshape(size, parts)
+    rows, goes = [], np.ones(size, bool)
+    for spans in np.diff(ends, axis=1, prepend=0.0).T:
+        outcome: Any = runs.solve(spans, size, settings)
+        assert isinstance(outcome, HybridOutcome)
+        theta = np.asarray(at_the_end(cells["scene"], problem, outcome, False, settings.tolerance)[2])
+        rows.append(theta if not rows else np.where(goes, theta, rows[-1]))
+        goes &= outcome.status == REACHED_END
+        onward = dataclasses.replace(problem, states=outcome.state)
+        runs = dataclasses.replace(runs, problem=onward, first=outcome.mode)
+    return np.stack(rows, axis=1).ravel()[: len(times)]
