@@ -10,7 +10,7 @@ fixed, as in `variation.py`.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..integration import RUNNING, AbstractProblem, Lanes, LaneState, Outcome, Settings, States
 from ..integration.runge_kutta import Stages, moved_state, over_stages
-from ..integration.scheduler import AbstractRecorder, InLanes, LaneScheduler, Progress
+from ..integration.scheduler import AbstractRecorder, InLanes, LaneScheduler, SchedulerState
 from ..integration.step import length_to_try, try_step
 from ..xla_cpu import uncounted, written_by_component, written_in_place
 from ._periods import Checkpoints, LatestSteps, Period, StepRecord, read
@@ -61,7 +61,7 @@ class Backward(NamedTuple):
     `gradient` holds the derivatives of every cell with respect to its initial state.
     """
 
-    ahead: Progress
+    ahead: SchedulerState
     number: Int[Array, ""]
     needed: Int[Array, ""]
     kept: Checkpoints
@@ -98,8 +98,23 @@ def solve_with_adjoint(
 
     **Raises:** `ValueError` for a chosen leaf that has several components.
     """
-    states = problem.start()[0]
-    components, size = states.shape
+    components, size = problem.start()[0].shape
+    numbers, probed = _with_probe(problem, moving, probe, size)
+    # As many lanes as without the probe: the backward pass, which is the most expensive part, does not use the probe.
+    settings = dataclasses.replace(settings, lanes=settings.lanes_of(size))
+    scheduler = LaneScheduler.of(probed, t1, cells, settings, one_kernel=one_kernel, n_blocks=2)
+    passes = Passes(scheduler, moving, measured)
+    run = passes.start(components + len(jax.tree.leaves(numbers)))
+    run = jax.lax.while_loop(lambda run: uncounted(run.needed > 0, run.outcome.steps[0]), passes.there_and_back, run)
+    by_number = jax.tree.unflatten(jax.tree.structure(numbers), list(run.gradient[components:]))
+    return run.outcome._replace(state=run.outcome.state[:components]), run.gradient[:components], by_number
+
+
+def _with_probe(problem: VariationalProblem, moving: Any, probe: Any, size: int) -> tuple[Any, VariationalProblem]:
+    """The chosen parameters with one value per cell, and the problem with them and the probe.
+
+    **Arguments:** as for `solve_with_adjoint`; `size`: number of cells, padding included.
+    """
     numbers, rest = eqx.partition(problem, moving)
     for leaf in jax.tree.leaves(numbers):
         if jnp.shape(leaf) not in ((), (size,)):
@@ -113,65 +128,81 @@ def solve_with_adjoint(
         problem.problem,
         is_leaf=lambda rate: rate is None,
     )
-    probed = dataclasses.replace(problem, tangents=(probe,))
-    # As many lanes as without the probe: the backward pass, which is the most expensive part, does not use the probe.
-    settings = dataclasses.replace(settings, lanes=settings.lanes_of(size))
-    scheduler = LaneScheduler.of(probed, t1, cells, settings, one_kernel=one_kernel, n_blocks=2)
-    rows = components + len(jax.tree.leaves(numbers))
+    return numbers, dataclasses.replace(problem, tangents=(probe,))
 
-    start, recorder = scheduler.start(), StepRecorder()
-    record = jax.eval_shape(lambda: recorder.begin(start.lane_state, None))
 
-    def is_ahead(run: Backward) -> Bool[Array, ""]:
-        return uncounted(scheduler.unfinished(run.ahead) & (run.number < run.needed), run.number)
+@dataclasses.dataclass(frozen=True, eq=False)
+class Passes:
+    """The forward pass, which computes periods, and the backward pass, which carries derivatives through them.
 
-    def forward(run: Backward) -> Backward:
-        after, steps = scheduler.run(run.ahead, recorder)
-        return run._replace(
-            ahead=scheduler.refill(after),
-            number=run.number + 1,
-            kept=run.kept.added(run.number, Period(run.ahead, after)),
-            latest=run.latest.added(run.ahead.iterations, steps),
-            outcome=scheduler.store(run.outcome, after.lane_state),
+    `moving`, `measured`: as for `solve_with_adjoint`.
+    """
+
+    scheduler: LaneScheduler
+    moving: Any
+    measured: Measured
+
+    recorder: ClassVar[StepRecorder] = StepRecorder()
+
+    def start(self, rows: int) -> Backward:
+        """Both passes before the first period. **Arguments:** `rows`: number of rows of the derivatives."""
+        scheduler, start = self.scheduler, self.scheduler.start()
+        record = jax.eval_shape(lambda: self.recorder.begin(start.lane_state, None))
+        dtype = start.lane_state.state.dtype
+        return Backward(
+            ahead=start,
+            number=jnp.zeros((), int),
+            needed=jnp.asarray(jnp.iinfo(jnp.arange(0).dtype).max),
+            kept=Checkpoints.none(Period(start, start)),
+            latest=LatestSteps.none(record, scheduler.capacity),
+            outcome=scheduler.empty(),
+            adjoint=jnp.zeros((rows, scheduler.lanes), dtype),
+            gradient=jnp.zeros((rows, scheduler.capacity), dtype),
         )
 
-    def is_recorded(run: Backward) -> Bool[Array, ""]:
-        number, period = run.kept.latest()
-        recorded = (number == run.needed - 1) & (period.before.iterations >= run.latest.since)
-        return uncounted((run.kept.depth > 0) & recorded, run.number)
-
-    def backward(run: Backward) -> Backward:
-        number, (before, after) = run.kept.latest()
-        steps = run.latest.of_period(before.iterations, len(record.length))
-        count = after.iterations - before.iterations
-        adjoint = _taken_back(scheduler, moving, measured, after.lane_state, steps, count, run.adjoint)
-        # A cell that had made no step was at its start.
-        began = (before.lane_state.steps == 0) & (before.lane_state.cell < cells)
-        gradient = run.gradient.at[:, jnp.where(began, before.lane_state.cell, size)].set(adjoint, mode="drop")
-        return run._replace(needed=number, kept=run.kept.without_latest(), adjoint=adjoint, gradient=gradient)
-
-    def there_and_back(run: Backward) -> Backward:
-        run = jax.lax.while_loop(is_ahead, forward, run)
+    def there_and_back(self, run: Backward) -> Backward:
+        """Compute all periods up to the one that the backward pass needs, and take back those whose steps are kept."""
+        run = jax.lax.while_loop(self.is_ahead, self.forward, run)
         run = run._replace(needed=jnp.minimum(run.needed, run.number))
-        run = jax.lax.while_loop(is_recorded, backward, run)
+        run = jax.lax.while_loop(self.is_recorded, self.backward, run)
         # The steps before are gone: continue from the latest checkpoint.
         number, (before, _) = run.kept.latest()
         kept, latest = run.kept.without_latest(), run.latest._replace(since=before.iterations)
         return run._replace(ahead=before, number=number, kept=kept, latest=latest)
 
-    run = Backward(
-        ahead=start,
-        number=jnp.zeros((), int),
-        needed=jnp.asarray(jnp.iinfo(jnp.arange(0).dtype).max),
-        kept=Checkpoints.none(Period(start, start)),
-        latest=LatestSteps.none(record, size),
-        outcome=scheduler.empty(),
-        adjoint=jnp.zeros((rows, scheduler.lanes), states.dtype),
-        gradient=jnp.zeros((rows, size), states.dtype),
-    )
-    run = jax.lax.while_loop(lambda run: uncounted(run.needed > 0, run.outcome.steps[0]), there_and_back, run)
-    by_number = jax.tree.unflatten(jax.tree.structure(numbers), list(run.gradient[components:]))
-    return run.outcome._replace(state=run.outcome.state[:components]), run.gradient[:components], by_number
+    def is_ahead(self, run: Backward) -> Bool[Array, ""]:
+        """Whether a period before the needed one has not been computed."""
+        return uncounted(self.scheduler.unfinished(run.ahead) & (run.number < run.needed), run.number)
+
+    def forward(self, run: Backward) -> Backward:
+        """Compute the next period, and record its steps."""
+        after, steps = self.scheduler.run(run.ahead, self.recorder)
+        return run._replace(
+            ahead=self.scheduler.refill(after),
+            number=run.number + 1,
+            kept=run.kept.added(run.number, Period(run.ahead, after)),
+            latest=run.latest.added(run.ahead.iterations, steps),
+            outcome=self.scheduler.store(run.outcome, after.lane_state),
+        )
+
+    def is_recorded(self, run: Backward) -> Bool[Array, ""]:
+        """Whether the steps of the period that the backward pass takes next are kept."""
+        number, period = run.kept.latest()
+        recorded = (number == run.needed - 1) & (period.before.iterations >= run.latest.since)
+        return uncounted((run.kept.depth > 0) & recorded, run.number)
+
+    def backward(self, run: Backward) -> Backward:
+        """Carry the derivatives through the latest period."""
+        scheduler, (number, (before, after)) = self.scheduler, run.kept.latest()
+        assert self.recorder.period is not None
+        steps = run.latest.of_period(before.iterations, self.recorder.period)
+        count = after.iterations - before.iterations
+        adjoint = _taken_back(scheduler, self.moving, self.measured, after.lane_state, steps, count, run.adjoint)
+        # A cell that had made no step was at its start.
+        began = (before.lane_state.steps == 0) & (before.lane_state.cell < scheduler.cells)
+        cell = jnp.where(began, before.lane_state.cell, scheduler.capacity)
+        gradient = run.gradient.at[:, cell].set(adjoint, mode="drop")
+        return run._replace(needed=number, kept=run.kept.without_latest(), adjoint=adjoint, gradient=gradient)
 
 
 def _without_probe(lane_state: LaneState) -> LaneState:
