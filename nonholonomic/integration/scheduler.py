@@ -44,7 +44,7 @@ class Outcome(NamedTuple, Generic[Numbers]):
 
     **Example:** the outcome of the subpackage's example, whose runs end on the event.
 
-    >>> from nonholonomic.integration import CROSSED
+    >>> from nonholonomic.integration.status import CROSSED
     >>> print(outcome.status == CROSSED, outcome.state.shape)
     [ True  True  True] (1, 3)
     """

@@ -9,15 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.geometry import Plane
-from nonholonomic.integration import (
-    FAILED,
-    LEFT_DOMAIN,
-    AbstractPassive,
-    ExtendedProblem,
-    LaneState,
-    Settings,
-    Status,
-)
+from nonholonomic.integration import AbstractPassive, ExtendedProblem, LaneState, Settings
+from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, Status
 from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.progress import status_line
 from nonholonomic.validation import require_file

@@ -31,7 +31,8 @@ from nonholonomic.geometry import (
     vector_of,
 )
 from nonholonomic.hybrid import Transition
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, AbstractPassive, AbstractProblem
+from nonholonomic.integration import AbstractPassive, AbstractProblem
+from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED
 from nonholonomic.xla_cpu import compiled_setup, greatest
 
 from ..model.dynamics import Dynamics

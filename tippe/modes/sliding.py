@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.hybrid import AbstractHoppingMode, Transition, TransitionPath
-from nonholonomic.integration import CROSSED, RUNNING, UNRESOLVED, AbstractProblem
+from nonholonomic.integration import AbstractProblem
+from nonholonomic.integration.status import CROSSED, RUNNING, UNRESOLVED
 from nonholonomic.xla_cpu import compiled_setup, least
 
 from ..model.dynamics import Dynamics

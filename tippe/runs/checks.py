@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.integration import legal_run, require_run
+from nonholonomic.integration.checks import legal_run, require_run
 from nonholonomic.validation import IN_DEGREES, Bound, all_bounds, is_traced, legal, nan_unless, require
 from nonholonomic.xla_cpu import compiled_setup
 

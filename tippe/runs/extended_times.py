@@ -15,15 +15,9 @@ from nonholonomic.derivatives import (
     in_groups,
     tangents_by,
 )
-from nonholonomic.integration import (
-    CROSSED,
-    FAILED,
-    MOST_STEPS,
-    Lanes,
-    Settings,
-    crossing_time,
-    traced_solve_ensemble,
-)
+from nonholonomic.integration import Lanes, Settings, crossing_time, traced_solve_ensemble
+from nonholonomic.integration.settings import MOST_STEPS
+from nonholonomic.integration.status import CROSSED, FAILED
 from nonholonomic.progress import status_line
 from nonholonomic.validation import as_number, is_traced
 from nonholonomic.xla_cpu import greatest, least

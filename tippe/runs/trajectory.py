@@ -11,17 +11,9 @@ from jaxtyping import Array, Float
 
 from nonholonomic.geometry import scale, sum_vectors
 from nonholonomic.hybrid import HybridPath, solve_hybrid_dense
-from nonholonomic.integration import (
-    DenseSolution,
-    Settings,
-    Status,
-    explicit_tableau,
-    follow,
-    legal_run,
-    require_adaptive,
-    require_adjoint,
-    require_times,
-)
+from nonholonomic.integration import DenseSolution, Settings, explicit_tableau, follow
+from nonholonomic.integration.checks import legal_run, require_adaptive, require_adjoint, require_times
+from nonholonomic.integration.status import Status
 from nonholonomic.progress import status_line
 from nonholonomic.validation import (
     all_bounds,
