@@ -315,8 +315,8 @@ def step_taken_back(
             stage_time, numbers, tuple(jnp.unstack(read(stage_states, index=stage))), tuple(jnp.unstack(by_rate))
         )
         # If no step was made, values may not be finite.
-        term = jax.lax.optimization_barrier(jnp.where(length > 0.0, jnp.stack(gain), 0.0))
-        return written_in_place(by_stage, term[:components], at=stage + 1), total + gain
+        term = jax.lax.optimization_barrier(jnp.where(length > 0.0, jnp.stack(term), 0.0))
+        return written_in_place(by_stage, term[:components], at=stage + 1), total + term
 
     zero_state, ends = jnp.zeros_like(state), written_in_place(room, adjoint[:components], at=jnp.zeros((), int))
     room, total = over_stages(stages, stage_taken_back, (ends, jnp.zeros_like(adjoint)))
