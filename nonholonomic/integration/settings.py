@@ -117,7 +117,7 @@ def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
 
 
 def legal_run(
-    others_legal: Bool[Array, "..."] | bool,
+    others: Bool[Array, "..."] | bool,
     t1: Float[ArrayLike, "..."],
     tolerance: Float[ArrayLike, "..."],
     times: Any = None,
@@ -125,7 +125,7 @@ def legal_run(
     """Whether the traced numbers of a run are legal, and its horizon and tolerance. A run with illegal numbers might
     never end, so it gets the horizon 0, and the largest tolerance, which does not affect its batch.
 
-    **Arguments:** `others_legal`: whether all other numbers are legal. This function checks `t1`, `tolerance`, and the output
+    **Arguments:** `others`: whether all other numbers are legal. This function checks `t1`, `tolerance`, and the output
     `times` (times,), which must increase.
 
     **Returns:** whether the run is legal, its horizon and its tolerance.
@@ -137,7 +137,7 @@ def legal_run(
     >>> print(legal, t1, tolerance)
     False 0.0 0.01
     """
-    is_legal = jnp.asarray(others_legal) & legal(run_bounds(t1, tolerance))
+    is_legal = jnp.asarray(others) & legal(run_bounds(t1, tolerance))
     if times is not None:
         is_legal = jnp.all(is_legal & jnp.all(legal(times_bounds(times, t1)))) & jnp.all(jnp.diff(times) > 0.0)
     return is_legal, jnp.where(is_legal, t1, 0.0), jnp.where(is_legal, tolerance, LOOSEST)
@@ -178,9 +178,9 @@ def require_times(times: Any, t1: Any) -> None:
     require_increasing(times, "times")
 
 
-def require_adaptive(solver: Any, alternatives: str = "") -> None:
+def require_adaptive(solver: Any, others: str = "") -> None:
     """Raise `ValueError` unless the solver is `None` or a solver of Diffrax that estimates its errors and integrates a
-    single field (others add a stiff part or noise). **Arguments:** `alternatives`: further allowed solvers, for the message.
+    single field (others add a stiff part or noise). **Arguments:** `others`: further allowed solvers, for the message.
 
     **Example:**
 
@@ -193,7 +193,7 @@ def require_adaptive(solver: Any, alternatives: str = "") -> None:
     if solver is not None and not adaptive:
         raise ValueError(
             f"solver = {solver!r} must be an adaptive solver of Diffrax for ordinary differential equations, such as "
-            f"Dopri8(){alternatives}"
+            f"Dopri8(){others}"
         )
 
 

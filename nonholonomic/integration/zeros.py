@@ -21,13 +21,13 @@ MOST_TRIALS = 60
 
 
 def halved(
-    condition: Callable[[Float[Array, "..."]], Bool[Array, "..."]], low: Float[Array, "..."], high: Float[Array, "..."]
+    holds: Callable[[Float[Array, "..."]], Bool[Array, "..."]], low: Float[Array, "..."], high: Float[Array, "..."]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Find where a condition ceases to hold, by halving brackets; also inside transformations.
 
     **Arguments:**
 
-    - `condition`: true at `low` and false at `high`.
+    - `holds`: the condition, true at `low` and false at `high`.
     - `low`, `high`: the brackets, of any shape.
 
     **Returns:** the last value at which the condition holds, and the next value, at which it does not.
@@ -43,7 +43,7 @@ def halved(
     def halve(_, bracket):
         low, high = bracket
         middle = 0.5 * (low + high)
-        is_inside = condition(middle)
+        is_inside = holds(middle)
         return jnp.where(is_inside, middle, low), jnp.where(is_inside, high, middle)
 
     return jax.lax.fori_loop(0, HALVINGS, halve, (low, high))
