@@ -44,8 +44,8 @@ def padded(values: Float[np.ndarray, "... times"], least: int) -> Float[np.ndarr
     >>> padded(np.array([1.0, 2.0, 3.0]), least=300).shape
     (512,)
     """
-    more = (1 << (max(least, LEAST_PADDED) - 1).bit_length()) - values.shape[-1]
-    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, more)], mode="edge")
+    padding = (1 << (max(least, LEAST_PADDED) - 1).bit_length()) - values.shape[-1]
+    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, padding)], mode="edge")
 
 
 def forget_programs_if_many(most_memory: int = MOST_MEMORY) -> bool:

@@ -83,6 +83,6 @@ def lanes_for(cells: int, n_blocks: int = 1) -> int:
 
     On a CPU the lanes and their stages should fit the first caches; an accelerator needs tens of thousands of lanes.
     """
-    most = 64 if jax.default_backend() == "cpu" else 32768
-    alone = min(most, 1 << (cells - 1).bit_length())
-    return alone if n_blocks == 1 else max(8, 3 * alone // (2 * n_blocks))
+    max_lanes = 64 if jax.default_backend() == "cpu" else 32768
+    own_lanes = min(max_lanes, 1 << (cells - 1).bit_length())
+    return own_lanes if n_blocks == 1 else max(8, 3 * own_lanes // (2 * n_blocks))

@@ -43,8 +43,8 @@ def halved(
     def halve(_, bracket):
         low, high = bracket
         middle = 0.5 * (low + high)
-        inside = holds(middle)
-        return jnp.where(inside, middle, low), jnp.where(inside, high, middle)
+        is_inside = holds(middle)
+        return jnp.where(is_inside, middle, low), jnp.where(is_inside, high, middle)
 
     return jax.lax.fori_loop(0, HALVINGS, halve, (low, high))
 
@@ -100,11 +100,11 @@ def few_trials(
         if np.all(np.minimum(high - low, np.abs(guess - last)) <= LOCATED * np.maximum(high, 1.0)):
             break
         value = function(guess)
-        beyond = (value > 0.0) != (at_low > 0.0)
+        past_root = (value > 0.0) != (at_low > 0.0)
         with np.errstate(all="ignore"):
             fade_low, fade_high = 1.0 - value / at_high, 1.0 - value / at_low
         fade_low, fade_high = (np.where(fade > 0.0, fade, 0.5) for fade in (fade_low, fade_high))
         # The retained end is given less weight, so that it moves too in the next trial.
-        at_low, at_high = np.where(beyond, at_low * fade_low, value), np.where(beyond, value, at_high * fade_high)
-        low, high = np.where(beyond, low, guess), np.where(beyond, guess, high)
+        at_low, at_high = np.where(past_root, at_low * fade_low, value), np.where(past_root, value, at_high * fade_high)
+        low, high = np.where(past_root, low, guess), np.where(past_root, guess, high)
     return guess
