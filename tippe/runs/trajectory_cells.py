@@ -51,9 +51,9 @@ def _reader(
     def read_lane(scene: Scene, states: Float[Array, "iterations components"]) -> dict[str, Array]:
         # No quantity reads the spin angle or the work.
         missing = len(run.start()[0]) - 2 - states.shape[1]
-        nothing, end = jnp.zeros(len(states)), jnp.zeros(())
+        nothing = jnp.zeros(len(states))
         state, cyclic = jnp.split(jnp.pad(states.T, ((0, missing), (0, 0))), [run.leading])
-        trajectory = Trajectory(nothing, scene, state, cyclic, nothing, nothing, None, end, {}, None)
+        trajectory = Trajectory(nothing, scene, state, cyclic, nothing, nothing)
         return {name: getattr(trajectory, name) for name in names}
 
     def own_axis(leaf: Any) -> int | None:
