@@ -309,25 +309,41 @@ class Fly(AbstractFlyingMode):
         rebounds = bounce * speed > CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
         bounce = jnp.where(rebounds, bounce, 0.0)
         if isinstance(scene.friction, SetValuedCoulomb):
-            after_impact, fails = resolve_coulomb_impact(scene.body, scene.friction, ball, free, bounce)
+            after, fails = resolve_coulomb_impact(scene.body, scene.friction, ball, free, bounce)
         else:
-            after_impact, fails = resolve_impact(scene.body, scene.friction, ball, free, bounce)
+            after, fails = resolve_impact(scene.body, scene.friction, ball, free, bounce)
         # If the landing was located slightly below the arena, the next flight would end where it begins.
         lifted = vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2])))
-        after = jnp.where(rebounds, in_flight(lifted, ground.axes, after_impact), in_contact(ground, after_impact))
-        if self.with_quadratures:
-            across = vector_of(state[OWN + k] for k in range(3))
-            across = jnp.where(rebounds, jnp.stack(across), jnp.stack(to_frame(across, ground.axes)))
-            gained = energy(scene.body, 0.0, after_impact) - energy(scene.body, 0.0, free)
-            after = jnp.concatenate([after, across, state[OWN + 3 :].at[1].add(gained)])
         return Transition(
             mode=jnp.where(rebounds, FLYING, SLIDING),
-            state=after,
+            state=self.after_impact(state, lifted, ground, free, after, rebounds),
             elapsed=zero,
             status=jnp.where(missed(scene, ground, ball), UNRESOLVED, jnp.where(fails, FAILED, RUNNING)),
             crossing_time=jnp.full_like(zero, jnp.inf),
             counts=rebounds.astype(int)[None],
         )
+
+    def after_impact(
+        self,
+        state: Float[Array, "components cells"],
+        place: Vector,
+        ground: Below,
+        before: FreeBody,
+        after: FreeBody,
+        flies: Bool[Array, " cells"],
+    ) -> Float[Array, "components cells"]:
+        """The state after an impact, including passive quadratures.
+
+        **Arguments:** `state`: the state in flight before it; `place`: the centre of mass; `ground`: the arena below the
+        sphere that strikes; `before`, `after`: the body; `flies`: whether the top flies off, or is in contact.
+        """
+        own = jnp.where(flies, in_flight(place, ground.axes, after), in_contact(ground, after))
+        if not self.with_quadratures:
+            return own
+        across = vector_of(state[OWN + k] for k in range(3))
+        across = jnp.where(flies, jnp.stack(across), jnp.stack(to_frame(across, ground.axes)))
+        gained = energy(self.scene.body, 0.0, after) - energy(self.scene.body, 0.0, before)
+        return jnp.concatenate([own, across, state[OWN + 3 :].at[1].add(gained)])
 
 
 def modes(

@@ -38,16 +38,13 @@ from .airborne import (
     flight_state,
     from_frame,
     gap_margin,
-    in_contact,
-    in_flight,
     landing_site,
     lift_off,
     missed,
     standing,
-    to_frame,
 )
 from .flying_mode import AbstractFlyingMode
-from .free_body import Ball, FreeBody, balls, energy, gap_rate
+from .free_body import Ball, FreeBody, balls, gap_rate
 from .impact import CLOSING_SPEED, TOUCHING, resolve_impact
 from .inversion_problem import InversionProblem
 from .trajectory_problem import Quadratures
@@ -165,21 +162,13 @@ class FlyBoth(Fly):
         # If the landing was located slightly below the arena, the next mode would end where it begins.
         flying = flying._replace(place=vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2]))))
         ground = ground._replace(gap=zero)
-        impact = resolve_arena_impact(scene, flying, ground, own, other)
+        free = as_free_body(scene, flying, ground, own)
+        impact = resolve_arena_impact(scene, flying, ground, free, own, other)
         flies = impact.rebounds | impact.throws
-        after = in_flight(flying.place, ground.axes, impact.free)
-        after = jnp.where(flies, after, in_contact(ground, impact.free))
-        if self.with_quadratures:
-            across = vector_of(state[OWN + k] for k in range(3))
-            across = jnp.where(flies, jnp.stack(across), jnp.stack(to_frame(across, ground.axes)))
-            gained = energy(scene.body, 0.0, impact.free) - energy(
-                scene.body, 0.0, as_free_body(scene, flying, ground, own)
-            )
-            after = jnp.concatenate([after, across, state[OWN + 3 :].at[1].add(gained)])
         slides = jnp.where(number == 0, SLIDING, ON_STEM)
         return Transition(
             mode=jnp.where(impact.throws, STRIKING, jnp.where(impact.rebounds, FLYING, slides)),
-            state=after,
+            state=self.after_impact(state, flying.place, ground, free, impact.free, flies),
             elapsed=zero,
             status=jnp.where(misses | impact.rests, UNRESOLVED, jnp.where(impact.fails, FAILED, RUNNING)),
             crossing_time=jnp.full_like(zero, jnp.inf),
@@ -202,14 +191,15 @@ class ArenaImpact(NamedTuple):
     fails: Bool[Array, " cells"]
 
 
-def resolve_arena_impact(scene: Scene[Top], flying: FlightState, ground: Below, own: Ball, other: Ball) -> ArenaImpact:
+def resolve_arena_impact(
+    scene: Scene[Top], flying: FlightState, ground: Below, free: FreeBody, own: Ball, other: Ball
+) -> ArenaImpact:
     """The impact of one sphere on the tangent plane at its foot; a slow rebound closes the contact.
 
-    **Arguments:** `flying`: the top, whose sphere `own` is at the arena; `ground`: the arena below this sphere;
-    `other`: the other sphere.
+    **Arguments:** `flying`: the top, whose sphere `own` is at the arena; `ground`: the arena below this sphere; `free`:
+    the top above this ground; `other`: the other sphere.
     """
     body, closing = scene.body, CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
-    free = as_free_body(scene, flying, ground, own)
     speed = greatest(-gap_rate(body, own, free), 0.0)
     bounce = jnp.zeros_like(speed) if scene.restitution is None else scene.restitution
     rebounds = bounce * speed > closing
