@@ -26,9 +26,9 @@ def ended(
 ) -> Int[Array, "..."]:
     """The `Status` of a run that has ended, as an integer: unresolved if the run has gained energy (`energy.py`)."""
     state = state[: run.leading]
-    lost = jnp.array([int(status) for status in LOSSES])[run.problem.dynamics.loss(state)]
-    grown = has_grown(scene, scene.energy(run.problem.states), scene.energy(state), tolerance)
-    ended = jnp.where(grown, int(Status.UNRESOLVED), jnp.where(left_domain, lost, int(Status.COMPLETED)))
+    loss_codes = jnp.array([int(status) for status in LOSSES])[run.problem.dynamics.loss(state)]
+    energy_grew = has_grown(scene, scene.energy(run.problem.states), scene.energy(state), tolerance)
+    ended = jnp.where(energy_grew, int(Status.UNRESOLVED), jnp.where(left_domain, loss_codes, int(Status.COMPLETED)))
     return jnp.where(failed, int(Status.FAILED), ended)
 
 

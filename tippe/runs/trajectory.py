@@ -129,8 +129,8 @@ class Trajectory(AbstractTrajectory):
     @of_each_run
     def contact(self) -> Float[Array, "times 3"]:
         """The point at which the top touches the arena [m]."""
-        frame, where = self.scene.frame, (self._place, self._path)
-        foot = sum_vectors(frame.position(*where), scale(-frame.distance, frame.axes(*where)[2]))
+        frame, places = self.scene.frame, (self._place, self._path)
+        foot = sum_vectors(frame.position(*places), scale(-frame.distance, frame.axes(*places)[2]))
         return jnp.stack(foot, axis=-1)
 
     @of_each_run
@@ -211,18 +211,18 @@ def simulate(
         solve_flights_dense = simulate_hybrid if scene.flies_in_closed_form else simulate_airborne
         return solve_flights_dense(scene, launch, float(t1), times, settings)
     run = trajectory_problem((scene, launch))
-    through = solve_stick_slip_dense if scene.friction.set_valued else follow
-    path = through(run, float(t1), settings)
+    solve = solve_stick_slip_dense if scene.friction.set_valued else follow
+    path = solve(run, float(t1), settings)
     trajectory = _as_trajectory(scene, run, path, settings.tolerance)
     if times is None:
         return trajectory
-    reached = np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)]
-    if not reached.size:
+    times_reached = np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)]
+    if not times_reached.size:
         raise ValueError(
             f"times = {shown(times)} are all after the end of the run at {float(trajectory.end_time):.6g} s "
             f"({trajectory.status}): pass earlier times, or omit `times` to get those of the steps"
         )
-    return trajectory.at(reached)
+    return trajectory.at(times_reached)
 
 
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
@@ -292,7 +292,7 @@ def _as_trajectory(
     times, end, last = on_device(path.times, path.times[-1], states[:, -1])
     codes = (jnp.asarray(path.left_domain), jnp.asarray(path.failed))
     status = Status(int(_ended(run, scene, last, *codes, jnp.asarray(tolerance)))).word
-    sticks = {"sticks": int(path.counts[0])} if isinstance(path, HybridPath) else {}
+    counts = {"sticks": int(path.counts[0])} if isinstance(path, HybridPath) else {}
     lean, cyclic, spin_angle, work = on_device(*_parts(run.leading, states))
     trajectory = Trajectory(times, scene, lean, cyclic, spin_angle, work, status, end, {}, path)
-    return if_balanced(trajectory.with_stats(path, **sticks), tolerance)
+    return if_balanced(trajectory.with_stats(path, **counts), tolerance)
