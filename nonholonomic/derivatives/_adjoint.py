@@ -24,7 +24,7 @@ from ..integration.runge_kutta import Stages, moved_state, over_stages
 from ..integration.scheduler import AbstractRecorder, InLanes, LaneScheduler, Progress
 from ..integration.step import length_to_try, try_step
 from ..xla_cpu import uncounted, written_by_component, written_in_place
-from ._periods import Checkpoints, LatestSteps, Period, StepRecord, read
+from ._periods import Checkpoints, LatestSteps, StepRecord, read
 from .variation import VariationalProblem
 
 #: The quantity measured at the end of a run: (problem, lane state) -> a number per lane, differentiable with respect to
@@ -130,14 +130,14 @@ def solve_with_adjoint(
         return run._replace(
             frontier=scheduler.refill(lanes_after),
             number=run.number + 1,
-            checkpoints=run.checkpoints.added(run.number, Period(run.frontier, lanes_after)),
+            checkpoints=run.checkpoints.added(run.number, (run.frontier, lanes_after)),
             latest_steps=run.latest_steps.added(run.frontier.iterations, steps),
             outcome=scheduler.store(run.outcome, lanes_after.lane_state),
         )
 
     def is_recorded(run: Backward) -> Bool[Array, ""]:
-        number, period = run.checkpoints.latest()
-        recorded = (number == run.limit - 1) & (period.lanes_before.iterations >= run.latest_steps.first)
+        number, (lanes_before, _) = run.checkpoints.latest()
+        recorded = (number == run.limit - 1) & (lanes_before.iterations >= run.latest_steps.first)
         return uncounted((run.checkpoints.depth > 0) & recorded, run.number)
 
     def backward(run: Backward) -> Backward:
@@ -170,7 +170,7 @@ def solve_with_adjoint(
         frontier=start,
         number=jnp.zeros((), int),
         limit=jnp.asarray(jnp.iinfo(jnp.arange(0).dtype).max),
-        checkpoints=Checkpoints.none(Period(start, start)),
+        checkpoints=Checkpoints.none((start, start)),
         latest_steps=LatestSteps.none(record, size),
         outcome=scheduler.empty(),
         adjoint=jnp.zeros((rows, scheduler.lanes), states.dtype),

@@ -28,11 +28,8 @@ class StepRecord(NamedTuple):
     length: Float[Array, "iterations lanes"]
 
 
-class Period(NamedTuple):
-    """A period without its steps: the lanes before it, and after it but before their refill."""
-
-    lanes_before: Progress
-    lanes_after: Progress
+#: A period without its steps: the lanes before it, and after it but before their refill.
+Period = tuple[Progress, Progress]
 
 
 class Checkpoints(NamedTuple):

@@ -1,7 +1,6 @@
 """Find the times at which a quantity was zero during a run. To find a time within a step, the step is repeated with
 other lengths."""
 
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -29,20 +28,6 @@ CLOSER_LOOKS = 3
 CLOSEST = 1e-14
 
 
-class Between(NamedTuple):
-    """A watched quantity, minus a level, at any time of a run."""
-
-    spec: RideSpec
-    steps: Steps
-    name: str
-    level: float
-
-    def at(self, times: Lanes) -> Lanes:
-        """The quantity at the given times; NaN counts as beyond the level."""
-        value = watched(self.spec, self.steps.at(self.spec, times), self.name) - self.level
-        return np.where(np.isfinite(value), value, -np.inf)
-
-
 def watched(spec: RideSpec, states: States, name: str) -> Lanes:
     """A quantity in `WATCHED` at the given states."""
     return in_blocks(lambda state: _watched(spec, state), states)[WATCHED.index(name)]
@@ -61,18 +46,23 @@ def crossings(spec: RideSpec, steps: Steps, name: str, level: float) -> Float[np
     indices = np.flatnonzero(_may_cross(value))
     if indices.size == 0:
         return np.zeros(0)
-    quantity = Between(spec, steps, name, level)
+
+    def quantity(times: Lanes) -> Lanes:
+        """The quantity minus the level; NaN counts as beyond the level."""
+        value = watched(spec, steps.at(spec, times), name) - level
+        return np.where(np.isfinite(value), value, -np.inf)
+
     parts = np.arange(1, PARTS) / PARTS
     new = (time[indices] + parts[:, None] * (time[indices + 1] - time[indices])).ravel()
     for _ in range(1 + CLOSER_LOOKS):
-        time, value = np.concatenate([time, new]), np.concatenate([value, quantity.at(new)])
+        time, value = np.concatenate([time, new]), np.concatenate([value, quantity(new)])
         order = np.argsort(time, kind="stable")
         time, value = time[order], value[order]
         new = _nearest(time, value)
         if new.size == 0:
             break
     changes = np.flatnonzero((value[:-1] > 0.0) != (value[1:] > 0.0))
-    return few_trials(quantity.at, time[changes], time[changes + 1], value[changes], value[changes + 1])
+    return few_trials(quantity, time[changes], time[changes + 1], value[changes], value[changes + 1])
 
 
 def _may_cross(value: Float[np.ndarray, " steps"]) -> Bool[np.ndarray, " gaps"]:

@@ -272,8 +272,10 @@ def _traced(
     samples = sampled(scene, launch, times, t1, settings, adjoint)
     status = samples.status.astype(int)
     stats = {"accepted": samples.accepted.astype(int), "rejected": samples.rejected.astype(int)}
-    quadratures = (samples.quadratures[:-2], samples.quadratures[-2], samples.quadratures[-1])
-    return Trajectory(times, scene, samples.states, *quadratures, status, samples.end_time, stats, None)
+    assert samples.quadratures is not None
+    quadratures = samples.quadratures.T
+    parts = (samples.states.T, quadratures[:-2], quadratures[-2], quadratures[-1])
+    return Trajectory(times, scene, *parts, status, samples.end_time, stats, None)
 
 
 def _parts(lean: int, states: Any) -> tuple[Any, Any, Any, Any]:

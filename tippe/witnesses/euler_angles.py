@@ -24,15 +24,9 @@ from ..model.state import AXIS, MOMENTUM, PLACE, VELOCITY
 from ..model.top import Top
 
 
-class Across(NamedTuple):
-    """The coordinate across the arena: length [m] per unit, and turning angle [rad] of the frame per unit."""
-
-    metric: Float[Array, ""] | float
-    turning: float
-
-
-def across(scene: Scene[Top]) -> Across:
-    """Length and turning per unit of the coordinate across the arena: (1, 0) on a plane, (rho, 1) on a cylinder.
+def across(scene: Scene[Top]) -> tuple[Float[Array, ""] | float, float]:
+    """The length [m] and the turning angle [rad] of the frame per unit of the coordinate across the arena: (1, 0) on a
+    plane, (rho, 1) on a cylinder.
 
     **Arguments:**
 
@@ -43,7 +37,7 @@ def across(scene: Scene[Top]) -> Across:
     curvature, slope = scene.frame.frame_motion(scene.frame.at_angle(0.0)[0], (1.0, 0.0)).frame_rate
     if slope is not None:
         raise ValueError(f"surface = {scene.surface!r} must be a Plane or a Cylinder for these coordinates")
-    return Across(1.0, 0.0) if curvature is None else Across(1.0 / curvature, 1.0)
+    return (1.0, 0.0) if curvature is None else (1.0 / curvature, 1.0)
 
 
 def from_vector_state(scene: Scene[Top], state: Float[Array, " components"]) -> Float[Array, " 8"]:
