@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ..integration.scheduler import Progress
+from ..integration.scheduler import SchedulerState
 from ..xla_cpu import written_in_place
 
 #: Number of checkpoints. With more periods, some checkpoints are dropped and computed again from an earlier one. With
@@ -29,7 +29,7 @@ class StepRecord(NamedTuple):
 
 
 #: A period without its steps: the lanes before it, and after it but before their refill.
-Period = tuple[Progress, Progress]
+Period = tuple[SchedulerState, SchedulerState]
 
 
 class Checkpoints(NamedTuple):

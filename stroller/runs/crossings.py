@@ -1,13 +1,12 @@
 """Find the times at which a quantity was zero during a run. To find a time within a step, the step is repeated with
 other lengths."""
 
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.integration import few_trials
+from nonholonomic.integration.zeros import few_trials
 
 from ..model.dynamics import State
 from .ride import RideSpec
