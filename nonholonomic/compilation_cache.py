@@ -72,9 +72,9 @@ def enable_compilation_cache(folder: Any = None) -> Path | None:
     if is_off("NONHOLONOMIC_CACHE"):
         return None
     settings: Any = jax.config
-    chosen = settings.jax_compilation_cache_dir
-    if folder is None and chosen:
-        return Path(chosen)
+    cache_folder = settings.jax_compilation_cache_dir
+    if folder is None and cache_folder:
+        return Path(cache_folder)
     try:
         place = (user_folder() if folder is None else Path(folder)).expanduser() / environment_name()
         place.mkdir(parents=True, exist_ok=True)
@@ -83,7 +83,7 @@ def enable_compilation_cache(folder: Any = None) -> Path | None:
         # Log instead of warn: if warnings are errors, a cache must not stop a computation.
         _log.warning("compiled programs are not stored: %s", error)
         return None
-    if chosen != str(place):
+    if cache_folder != str(place):
         # JAX opens its folder only once.
         compilation_cache.reset_cache()
     settings.update("jax_compilation_cache_dir", str(place))
@@ -141,13 +141,13 @@ def remove_damaged(folder: Path) -> None:
     **Raises:** `OSError` if the folder cannot be written; a full disk is only logged.
     """
     looked_at = folder / LOOKED_AT
-    known = set(looked_at.read_bytes().split(b"\n")) if looked_at.exists() else set()
+    entries = set(looked_at.read_bytes().split(b"\n")) if looked_at.exists() else set()
     sound_lines = []
     for entry in folder.glob("*-cache"):
         # Another process may remove the entry, too.
         try:
             line = _line(entry)
-            if line in known or sound(entry.read_bytes()):
+            if line in entries or sound(entry.read_bytes()):
                 sound_lines.append(line)
             else:
                 entry.unlink()
@@ -191,19 +191,19 @@ def kept_text(folder: Path | None, facts: Any, compute: Callable[[], str]) -> st
     """
     if folder is None:
         return compute()
-    kept = hashlib.sha256(repr((facts, version("jax"), version("equinox"), version("diffrax"))).encode())
+    digest = hashlib.sha256(repr((facts, version("jax"), version("equinox"), version("diffrax"))).encode())
     for path in sorted(_sources()):
-        kept.update(path.read_bytes())
-    path = folder / f"text-{kept.hexdigest()[:32]}"
+        digest.update(path.read_bytes())
+    path = folder / f"text-{digest.hexdigest()[:32]}"
     try:
         return zlib.decompress(path.read_bytes()).decode()
     except (OSError, zlib.error):
         text = compute()
     # Write the file as a whole, because another process may read it. A full disk must not stop the program.
     with contextlib.suppress(OSError):
-        written = path.with_name(f".{uuid.uuid4().hex}")
-        written.write_bytes(zlib.compress(text.encode(), 1))
-        os.replace(written, path)
+        scratch = path.with_name(f".{uuid.uuid4().hex}")
+        scratch.write_bytes(zlib.compress(text.encode(), 1))
+        os.replace(scratch, path)
     return text
 
 

@@ -17,7 +17,7 @@ from nonholonomic.identification import (
     scene_unknowns,
     search_options,
 )
-from nonholonomic.integration import tolerance_bound
+from nonholonomic.integration.checks import tolerance_bound
 from nonholonomic.parameters import numbers
 from nonholonomic.progress import status_line
 from nonholonomic.validation import as_number, require_kind

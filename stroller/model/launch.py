@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced, shown
+from nonholonomic.validation import IN_DEGREES, Bound, Bounded, as_number, is_traced, shown
 
 #: Largest usual angles [rad]: a front wheel that turns by half a turn, and a heading after two turns.
 USUAL = {"steering": math.pi, "heading": 4.0 * math.pi}
@@ -77,10 +77,7 @@ class Launch(Bounded):
                 continue
             largest = float(np.max(np.abs(value)))
             if largest > usual:
-                return (
-                    f"{name} = {largest:g} rad is large: was it in degrees? "
-                    f"{largest:g} degrees are {math.radians(largest):.4g} rad"
-                )
+                return f"{name} = {largest:g} rad is large{IN_DEGREES.format(f'{largest:g}')}"
         return None
 
     def bounds(self) -> Iterator[Bound]:

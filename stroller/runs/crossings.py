@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.integration import few_trials
+from nonholonomic.integration.zeros import few_trials
 
 from ..model.dynamics import State
 from .ride import RideSpec

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.geometry import Plane
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, AbstractProblem, LaneState, Settings, Status
+from nonholonomic.integration import AbstractPassive, ExtendedProblem, LaneState, Settings
+from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, Status
 from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.progress import status_line
 from nonholonomic.validation import require_file
@@ -120,7 +121,7 @@ def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float, input:
         replaced = with_numbers(roots, {knob.path: value for knob, value in zip(knobs, values, strict=True)})
         return replaced["scene"], replaced["launch"], replaced.get("input", controls)
 
-    def moment(values: Numbers, problem: "RollingRide", lane: LaneState) -> Frame:
+    def moment(values: Numbers, problem: Any, lane: LaneState) -> Frame:
         scene, _, controls = modules(values)
         return frame(scene, controls, lane)
 
@@ -133,7 +134,7 @@ def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float, input:
         sliders=knobs,
         allowed=lambda values: modules(values)[0].may_start(modules(values)[1]),
         answer=Answer("distance from the start", "m", ride),
-        motion=Simulator(lambda values: RollingRide.of(*modules(values)), t1, settings, {"frame": moment}),
+        motion=Simulator(lambda values: rolling_ride(*modules(values)), t1, settings, {"frame": moment}),
         summaries=(Summary("speed", "m/s", 0), Summary("energy", "J", 2)),
     )
 
@@ -154,33 +155,22 @@ def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float
     }
 
 
-class RollingRide(AbstractProblem):
-    """A ride with the rolling angles of its left, right and front wheel."""
+class WheelAngles(AbstractPassive):
+    """The rolling angles of the left, the right and the front wheel of a ride."""
 
-    ride: RideProblem
-
-    @classmethod
-    def of(cls, scene: Scene, launch: Launch, controls: Input | None) -> "RollingRide":
-        """The problem of one cell."""
-        return cls(RideProblem.of(scene, launch, controls, 1, False))
-
-    def start(self) -> tuple[State, State]:
-        state, scales = self.ride.start()
-        return jnp.concatenate([state, jnp.zeros((3, 1))]), jnp.concatenate([scales, jnp.ones((3, 1))])
-
-    def field(self, time: Float[Array, "..."], state: State) -> State:
-        """The ride's field; each rear wheel, half a track from the middle, rolls as fast as the ground passes below it."""
-        length = self.ride.dynamics.body.wheelbase
-        motion = self.ride.dynamics.geometry(state[:-3]).motion
+    def rates(self, problem: Any, time: Float[Array, "..."], state: State, passive: State) -> State:
+        """Each rear wheel, half a track from the middle, rolls as fast as the ground passes below it."""
+        length = problem.dynamics.body.wheelbase
+        motion = problem.dynamics.geometry(state).motion
         aside = 0.5 * TRACK * length * motion.yaw_rate
         speeds = jnp.stack([motion.speed - aside, motion.speed + aside, motion.front_speed])
-        return jnp.concatenate([self.ride.field(time, state[:-3]), speeds / (RADIUS * length)])
+        return jnp.concatenate([problem.field(time, state), speeds / (RADIUS * length)])
 
-    def event_function(self, state: State) -> None:
-        return None
 
-    def domain_margin(self, time: Float[Array, "..."], state: State) -> Any:
-        return self.ride.domain_margin(time, state[:-3])
+def rolling_ride(scene: Scene, launch: Launch, controls: Input | None) -> ExtendedProblem[RideProblem]:
+    """A ride of one cell with the rolling angles of its wheels."""
+    ride = RideProblem.of(scene, launch, controls, 1, False)
+    return ExtendedProblem(ride, WheelAngles(), jnp.zeros((3, 1)), jnp.ones((3, 1)))
 
 
 def outcome(problem: RideProblem, lane: LaneState) -> tuple[Int[Array, ""], Float[Array, ""]]:

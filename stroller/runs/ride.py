@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.derivatives import SampledRun, sampled_run, sampled_run_by_diffrax
 from nonholonomic.geometry import Plane
-from nonholonomic.integration import REACHED_END, AbstractProblem, Settings
+from nonholonomic.integration import AbstractProblem, Settings
+from nonholonomic.integration.status import REACHED_END
 
 from ..model.dynamics import Dynamics, State
 from ..model.heading import Projected

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.integration import ImplicitMidpoint, Settings, legal_run, require_times
+from nonholonomic.integration import ImplicitMidpoint, Settings
+from nonholonomic.integration.checks import legal_run, require_times
 from nonholonomic.progress import status_line
 from nonholonomic.validation import as_known, is_traced, nan_unless
 

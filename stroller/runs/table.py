@@ -11,7 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import AbstractSurface, Plane
-from nonholonomic.integration import DEFAULT_MAX_STEPS, FAILED, LEFT_DOMAIN, Settings, explicit_tableau, solve_ensemble
+from nonholonomic.integration import Settings, explicit_tableau, solve_ensemble
+from nonholonomic.integration.settings import DEFAULT_MAX_STEPS
+from nonholonomic.integration.status import FAILED, LEFT_DOMAIN
 from nonholonomic.parameters import description, full_axes, numbers, with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, cells_to_check
 from nonholonomic.sweeps import sweep as computed

@@ -3,6 +3,7 @@ JAX's transformations."""
 
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -12,11 +13,13 @@ from nonholonomic.parameters import numbers, with_numbers
 
 from ..model.scene import Scene
 from ..runs.cells import InversionRuns
-from ..runs.extended_times import LEAST_ANGLE
+from ..runs.extended_times import beyond_horizon
 from ..runs.run_kind import run_kind_of
 from ..runs.trajectory import simulate
 from .inversion_times import InversionTimes
 from .recording import Recording
+
+_beyond_horizon = jax.jit(beyond_horizon)
 
 
 class HybridModel(NamedTuple):
@@ -79,9 +82,8 @@ class HybridModel(NamedTuple):
         runs = InversionRuns(run_kind_of(self.scene), t1, angle, "first", Settings(self.tolerance), "ensemble", [])
         count = launches * len(rows)
         variables = runs.results({"scene": self.scene, "launch": data.launch}, columns, count)
-        missing = np.log(angle / np.clip(np.asarray(variables["end_theta"]), LEAST_ANGLE, angle))
-        whole = np.maximum(np.log(angle / np.clip(columns["launch.theta"], LEAST_ANGLE, angle)), 1.0)
-        time = np.where(np.isfinite(variables["time"]), variables["time"], t1 * (1.0 + missing / whole))
+        later = np.asarray(_beyond_horizon(variables["end_theta"], columns["launch.theta"], angle, t1))
+        time = np.where(np.isfinite(variables["time"]), variables["time"], later)
         failed = np.asarray(variables["status"]) == runs.run_kind.words.index("failed")
         return np.where(failed, np.nan, time).reshape(len(rows), launches)
 

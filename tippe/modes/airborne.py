@@ -31,7 +31,8 @@ from nonholonomic.geometry import (
     vector_of,
 )
 from nonholonomic.hybrid import Transition
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, AbstractPassive, AbstractProblem
+from nonholonomic.integration import AbstractPassive, AbstractProblem
+from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED
 from nonholonomic.xla_cpu import compiled_setup, greatest
 
 from ..model.dynamics import Dynamics
@@ -181,13 +182,18 @@ def gap_margin(scene: Scene[Top], flying: FlightState, ball: Ball, rounding: flo
 
 
 class FlightProblem(AbstractProblem):
-    """Flying until theta reaches an angle or a sphere is back at the arena; `falls` is the acceleration [m/s^2]."""
+    """Flying until theta reaches an angle or a sphere is back at the arena.
+
+    - `falls`: acceleration [m/s^2].
+    - `strikes`: whether a sphere is already at the arena, so that the flight ends at once; `None` if it never is.
+    """
 
     scene: Scene[Top]
     cos_angle: Float[Array, "..."]
     states: Float[Array, "components cells"]
     scales: Float[Array, "components cells"]
     falls: Vector
+    strikes: Bool[Array, ""] | None = None
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales
@@ -205,7 +211,8 @@ class FlightProblem(AbstractProblem):
 
     def margins(self, time, state):
         flying = flight_state(state)
-        return tuple(gap_margin(self.scene, flying, ball) for ball in balls(self.scene.body))
+        margins = tuple(gap_margin(self.scene, flying, ball) for ball in balls(self.scene.body))
+        return margins if self.strikes is None else tuple(jnp.where(self.strikes, -1.0, part) for part in margins)
 
 
 class QuadraturesInFlight(AbstractPassive):
@@ -275,13 +282,13 @@ class Fly(AbstractFlyingMode):
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         return self.extended(self.flight(state), QuadraturesInFlight(self.scene.body), state)
 
-    def flight(self, state: Float[Array, "components cells"]) -> FlightProblem:
-        """The motion in flight from given states."""
+    def flight(self, state: Float[Array, "components cells"], strikes: Bool[Array, ""] | None = None) -> FlightProblem:
+        """The motion in flight from given states. **Arguments:** `strikes`: as for `FlightProblem`."""
         velocity, momentum = self.scales[0], self.scales[7]
         ones = jnp.ones_like(velocity)
         rows = [ones * self.scene.body.radius] * 3 + [velocity] * 3 + [ones] * 3 + [momentum] * 3 + [ones] * 2
         falls = scale(-1.0 * self.scene.gravity, self.scene.surface.up)
-        return FlightProblem(self.scene, self.cos_angle, state[:OWN], jnp.stack(rows), falls)
+        return FlightProblem(self.scene, self.cos_angle, state[:OWN], jnp.stack(rows), falls, strikes)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         flying = flight_state(state)

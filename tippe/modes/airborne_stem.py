@@ -10,12 +10,14 @@ as `UNRESOLVED`, because the equations of leaning are those of the plane (`leani
 import functools
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.geometry import scale, sum_vectors, vector_of
 from nonholonomic.hybrid import Transition
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, AbstractProblem
+from nonholonomic.integration import AbstractProblem
+from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED
 from nonholonomic.xla_cpu import compiled_setup, greatest
 
 from ..model.scene import Scene
@@ -28,7 +30,6 @@ from .airborne import (
     SLIDING,
     STRIKING,
     Below,
-    FlightProblem,
     FlightState,
     Fly,
     QuadraturesInFlight,
@@ -56,41 +57,29 @@ from .trajectory_problem import Quadratures
 OVERLAP = 1e-11
 
 
-class OneOfTwo(AbstractProblem):
+class OneOfTwo(InversionProblem):
     """Sliding on one of two spheres until theta reaches an angle, the contact ends, or the other sphere is at the
     arena.
 
-    `contact` is the sliding mode; `own` and `other` are the spheres; `on_stem` is true if the stem slides.
+    `own` and `other` are the spheres; `on_stem` is true if the stem slides.
     """
 
-    scene: Scene[Top]
-    contact: InversionProblem
-    own: Ball
-    other: Ball
-    on_stem: Bool[Array, ""]
-
-    @property
-    def dynamics(self) -> Any:
-        """The equations of motion of the sphere that slides."""
-        return self.contact.dynamics
-
-    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
-        return self.contact.start()
-
-    def field(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, "components cells"]:
-        return self.contact.field(time, state)
+    scene: Scene[Top] = eqx.field(kw_only=True)
+    own: Ball = eqx.field(kw_only=True)
+    other: Ball = eqx.field(kw_only=True)
+    on_stem: Bool[Array, ""] = eqx.field(kw_only=True)
 
     def event_function(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
         # theta is measured from the normal below the top's own sphere; if this sphere slides, the state contains
         # cos(theta).
         apart = _cosine_beside(self.scene, self.own, self.other, state)
-        return jnp.where(self.on_stem, apart, state[COS_THETA]) - self.contact.cos_angle
+        return jnp.where(self.on_stem, apart, state[COS_THETA]) - self.cos_angle
 
     def domain_margin(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
         return functools.reduce(jnp.minimum, self.margins(time, state))
 
     def margins(self, time: Any, state: Float[Array, "components cells"]) -> tuple[Float[Array, " cells"], ...]:
-        return (*self.contact.margins(time, state), clearance(self.scene, self.own, self.other, state))
+        return (*super().margins(time, state), clearance(self.scene, self.own, self.other, state))
 
 
 @compiled_setup
@@ -122,8 +111,8 @@ class SlideOnOne(AbstractFlyingMode):
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         own, other = self.spheres
-        contact = InversionProblem(standing(self.scene, own), self.cos_angle, state[:OWN], self.scales[:OWN])
-        problem = OneOfTwo(self.scene, contact, own, other, self.number == 1)
+        contact = (standing(self.scene, own), self.cos_angle, state[:OWN], self.scales[:OWN])
+        problem = OneOfTwo(*contact, scene=self.scene, own=own, other=other, on_stem=self.number == 1)
         return self.extended(problem, Quadratures(self.scene.body.I3), state)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
@@ -149,28 +138,6 @@ class SlideOnOne(AbstractFlyingMode):
         )
 
 
-class FlightToImpact(AbstractProblem):
-    """A flight; where a sphere is already at the arena (`strikes`), the flight ends at once."""
-
-    flight: FlightProblem
-    strikes: Bool[Array, ""]
-
-    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
-        return self.flight.start()
-
-    def field(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, "components cells"]:
-        return self.flight.field(time, state)
-
-    def event_function(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
-        return self.flight.event_function(state)
-
-    def domain_margin(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
-        return jnp.where(self.strikes, -1.0, self.flight.domain_margin(time, state))
-
-    def margins(self, time: Any, state: Float[Array, "components cells"]) -> tuple[Float[Array, " cells"], ...]:
-        return tuple(jnp.where(self.strikes, -1.0, margin) for margin in self.flight.margins(time, state))
-
-
 class FlyBoth(Fly):
     """Flying over the arena, with two spheres that can land; or the instant before an impact, if it `strikes`.
 
@@ -180,8 +147,7 @@ class FlyBoth(Fly):
     strikes: Bool[Array, ""]
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
-        problem = FlightToImpact(self.flight(state), self.strikes)
-        return self.extended(problem, QuadraturesInFlight(self.scene.body), state)
+        return self.extended(self.flight(state, self.strikes), QuadraturesInFlight(self.scene.body), state)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """The impact of the sphere that touches the arena, after which the top rebounds, or slides on that sphere if

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.hybrid import Transition
-from nonholonomic.integration import LEFT_DOMAIN, RUNNING, AbstractProblem
+from nonholonomic.integration import AbstractProblem
+from nonholonomic.integration.status import LEFT_DOMAIN, RUNNING
 
 from ..model.scene import Scene
 from ..model.stick_slip import AT_REST, ContactMode, StickSlip

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.geometry import dot
-from nonholonomic.integration import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
+from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
 from nonholonomic.xla_cpu import greatest
 
 from ..model.dynamics import Dynamics

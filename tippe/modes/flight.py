@@ -14,7 +14,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.geometry import Vector, cross, dot, scale, subtract, sum_vectors
-from nonholonomic.integration import halved
+from nonholonomic.integration.zeros import halved
 from nonholonomic.xla_cpu import greatest
 
 from ..model.top import Top

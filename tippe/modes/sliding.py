@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.hybrid import AbstractHoppingMode, Transition, TransitionPath
-from nonholonomic.integration import CROSSED, RUNNING, UNRESOLVED, AbstractProblem
+from nonholonomic.integration import AbstractProblem
+from nonholonomic.integration.status import CROSSED, RUNNING, UNRESOLVED
 from nonholonomic.xla_cpu import compiled_setup, least
 
 from ..model.dynamics import Dynamics
@@ -56,37 +57,20 @@ MOST_BOUNCES = 10_000
 SHOWN = 0.4
 
 
-class Sliding(AbstractProblem):
-    """Sliding until theta reaches an angle, a contact is lost or jams, or a sphere that does not touch the plane lands.
-
-    `own` is the sphere that slides, and `other` the other sphere; `None` without a stem.
+class SlidingOnOne(InversionProblem):
+    """Sliding on one of two spheres until theta reaches an angle, the contact is lost or jams, or the other sphere
+    lands.
     """
 
-    dynamics: Dynamics | LeaningDynamics
-    own: Ball | None
-    other: Ball | None
-    cos_angle: Float[Array, "..."]
-    states: Float[Array, "components cells"]
-    scales: Float[Array, "components cells"]
-
-    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
-        return self.states, self.scales
-
-    def field(self, time: Cells, state: Float[Array, "components cells"]) -> Float[Array, "components cells"]:
-        return self.dynamics.field(state)
-
-    def event_function(self, state: Float[Array, "components cells"]) -> Cells:
-        return state[COS_THETA] - self.cos_angle
+    own: Ball = eqx.field(kw_only=True)
+    other: Ball = eqx.field(kw_only=True)
 
     def domain_margin(self, time: Cells, state: Float[Array, "components cells"]) -> Cells:
         return least(*self.margins(time, state))
 
     def margins(self, time: Cells, state: Float[Array, "components cells"]) -> tuple[Cells, ...]:
-        margins = self.dynamics.margins(state)
-        if self.own is None or self.other is None:
-            return margins
         assert isinstance(self.dynamics, Dynamics)
-        return (*margins, clearance(self.dynamics, self.own, self.other, state))
+        return (*super().margins(time, state), clearance(self.dynamics, self.own, self.other, state))
 
 
 class Slide(AbstractFlyingMode, AbstractHoppingMode):
@@ -103,8 +87,8 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         own, other = own_and_other(balls(self.scene.body), self.number)
-        dynamics = standing_on(self.scene.dynamics, own)
-        problem = Sliding(dynamics, own, other, self.cos_angle, state[:OWN], self.scales[:OWN])
+        contact = (standing_on(self.scene.dynamics, own), self.cos_angle, state[:OWN], self.scales[:OWN])
+        problem = InversionProblem(*contact) if other is None else SlidingOnOne(*contact, own=own, other=other)
         return self.extended(problem, Quadratures(self.scene.body.I3, of_mass=True), state)
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
@@ -166,7 +150,8 @@ class Lean(AbstractFlyingMode):
     """Sliding on both spheres; numbered after the modes of the single spheres."""
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
-        problem = Sliding(LeaningDynamics.of(self.scene), None, None, self.cos_angle, state[:OWN], self.scales[:OWN])
+        dynamics: Any = LeaningDynamics.of(self.scene)
+        problem = InversionProblem(dynamics, self.cos_angle, state[:OWN], self.scales[:OWN])
         return self.extended(problem, Quadratures(self.scene.body.I3, of_mass=True), state)
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.hybrid import AbstractBatchedMode, Transition, TransitionPath
-from nonholonomic.integration import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING, AbstractProblem, ExtendedProblem
+from nonholonomic.integration import AbstractProblem, ExtendedProblem
+from nonholonomic.integration.status import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING
 from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.dynamics import NO_COSINE

@@ -10,7 +10,8 @@ from jaxtyping import Array, Float, Int
 
 from nonholonomic.geometry import scale, sum_vectors, vector_of
 from nonholonomic.hybrid import BETWEEN, Segment, hybrid_samples, solve_hybrid_dense
-from nonholonomic.integration import Settings, Status
+from nonholonomic.integration import Settings
+from nonholonomic.integration.status import Status
 from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.contact_dynamics import LOSSES, Motion

@@ -8,16 +8,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.hybrid import HybridOutcome
-from nonholonomic.integration import (
-    CROSSED,
-    FAILED,
-    LEFT_DOMAIN,
-    UNRESOLVED,
-    Outcome,
-    Settings,
-    Status,
-    solve_by_diffrax,
-)
+from nonholonomic.integration import Outcome, Settings, solve_by_diffrax
+from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED, Status
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Variable
 

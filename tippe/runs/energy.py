@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.integration import Status
+from nonholonomic.integration.status import Status
 
 from ..model.scene import Scene
 

@@ -11,16 +11,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.hybrid import HybridOutcome
-from nonholonomic.integration import (
-    CROSSED,
-    FAILED,
-    LEFT_DOMAIN,
-    UNRESOLVED,
-    LaneState,
-    Settings,
-    Status,
-    crossing_time,
-)
+from nonholonomic.integration import LaneState, Settings, crossing_time
+from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED, Status
 from nonholonomic.parameters import numbers, readable_unit, with_numbers
 from nonholonomic.progress import status_line
 from nonholonomic.validation import all_bounds, legal, require_file

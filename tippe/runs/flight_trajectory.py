@@ -16,7 +16,8 @@ from nonholonomic.hybrid import (
     hybrid_samples,
     solve_hybrid_dense,
 )
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED, Settings, Status
+from nonholonomic.integration import Settings
+from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED, Status
 from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.dynamics import NO_COSINE

@@ -22,16 +22,8 @@ from nonholonomic.hybrid import (
     traced_solve_hybrid,
     traced_solve_hybrid_with_tangents,
 )
-from nonholonomic.integration import (
-    CROSSED,
-    FAILED,
-    REACHED_END,
-    UNRESOLVED,
-    Outcome,
-    Settings,
-    solve_ensemble,
-    traced_solve_ensemble,
-)
+from nonholonomic.integration import Outcome, Settings, solve_ensemble, traced_solve_ensemble
+from nonholonomic.integration.status import CROSSED, FAILED, REACHED_END, UNRESOLVED
 
 from ..model.scene import Scene
 from ..modes.airborne_ends import on_the_ground

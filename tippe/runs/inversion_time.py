@@ -14,7 +14,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from nonholonomic.derivatives import AbstractDifferentiableSolve, differentiable_solve, tangents_by
 from nonholonomic.hybrid import HybridOutcome
-from nonholonomic.integration import FAILED, UNRESOLVED, Outcome, Settings, explicit_tableau
+from nonholonomic.integration import Outcome, Settings, explicit_tableau
+from nonholonomic.integration.status import FAILED, UNRESOLVED
 from nonholonomic.progress import status_line
 from nonholonomic.validation import as_number, is_traced
 

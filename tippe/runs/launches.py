@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from nonholonomic.integration import require_run
+from nonholonomic.integration.checks import require_run
 from nonholonomic.parameters import description, full_axes, numbers, with_numbers
 from nonholonomic.sweeps import Axis, axis, cells_to_check
 from nonholonomic.validation import require_kind

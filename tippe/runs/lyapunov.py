@@ -11,7 +11,9 @@ from jaxtyping import Array, Float, Int, Shaped
 
 from nonholonomic.derivatives import exponent_of, growth
 from nonholonomic.geometry import cross, vector_of
-from nonholonomic.integration import LEFT_DOMAIN, REACHED_END, Settings, explicit_tableau, tolerance_bound
+from nonholonomic.integration import Settings, explicit_tableau
+from nonholonomic.integration.checks import tolerance_bound
+from nonholonomic.integration.status import LEFT_DOMAIN, REACHED_END
 from nonholonomic.progress import status_line
 from nonholonomic.validation import require, require_kind
 

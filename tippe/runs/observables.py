@@ -12,9 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from nonholonomic.compiled_programs import padded
 from nonholonomic.geometry import Component, Vector, dot, rate_in_frame, scale, stacked, sum_vectors
 from nonholonomic.hybrid import HybridPath
-from nonholonomic.integration import DenseSolution, Status, few_trials, padded
+from nonholonomic.integration import DenseSolution
+from nonholonomic.integration.status import Status
+from nonholonomic.integration.zeros import few_trials
 from nonholonomic.progress import status_line
 from nonholonomic.sweeps import Table, Tabular
 from nonholonomic.validation import is_traced, require, require_increasing

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.derivatives import sampled_run, sampled_run_by_diffrax
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, Settings, Status
+from nonholonomic.integration import Settings
+from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, Status
 
 from ..model.contact_dynamics import LOSSES
 from ..model.launch import Launch

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import diffrax
 import numpy as np
 
-from nonholonomic.integration import DEFAULT_MAX_STEPS, Settings, explicit_tableau
+from nonholonomic.integration import Settings, explicit_tableau
+from nonholonomic.integration.settings import DEFAULT_MAX_STEPS
 from nonholonomic.sweeps import Axis, Table, Variable, sweep
 from nonholonomic.validation import as_number, require_flag, require_outside, require_whole
 

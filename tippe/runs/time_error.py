@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
-from nonholonomic.integration import TIGHTEST
+from nonholonomic.integration.checks import TIGHTEST
 
 #: Ratio of the tolerance of the first run to that of the second. With a pair of eighth order, the second run costs 1.8
 #: times as much as the first. The error of the second run is a hundredth of that of the first, so the difference of the

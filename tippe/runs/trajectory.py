@@ -10,18 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import scale, sum_vectors
-from nonholonomic.hybrid import HybridPath
-from nonholonomic.integration import (
-    DenseSolution,
-    Settings,
-    Status,
-    explicit_tableau,
-    follow,
-    legal_run,
-    require_adaptive,
-    require_adjoint,
-    require_times,
-)
+from nonholonomic.hybrid import HybridPath, solve_hybrid_dense
+from nonholonomic.integration import DenseSolution, Settings, explicit_tableau, follow
+from nonholonomic.integration.checks import legal_run, require_adaptive, require_adjoint, require_times
+from nonholonomic.integration.status import Status
 from nonholonomic.progress import status_line
 from nonholonomic.validation import (
     all_bounds,
@@ -36,6 +28,7 @@ from nonholonomic.xla_cpu import on_device
 from ..model.friction import length
 from ..model.launch import Launch
 from ..model.scene import Scene
+from ..modes.sticking import contact_modes
 from ..modes.trajectory_problem import TrajectoryProblem, trajectory_problem
 from .airborne_trajectory import sampled_airborne, simulate_airborne
 from .checks import check_run
@@ -43,7 +36,6 @@ from .energy import if_balanced, why_unbalanced
 from .flight_trajectory import HybridTrajectory, sampled_hybrid, simulate_hybrid
 from .observables import AbstractTrajectory, of_each_run
 from .sampled import ended, sampled
-from .stick_slip_trajectory import solve_stick_slip_dense
 
 
 class Trajectory(AbstractTrajectory):
@@ -211,8 +203,7 @@ def simulate(
         solve_flights_dense = simulate_hybrid if scene.flies_in_closed_form else simulate_airborne
         return solve_flights_dense(scene, launch, float(t1), times, settings)
     run = trajectory_problem((scene, launch))
-    through = solve_stick_slip_dense if scene.friction.set_valued else follow
-    path = through(run, float(t1), settings)
+    path = stick_slip_path(run, t1, settings) if scene.friction.set_valued else follow(run, float(t1), settings)
     trajectory = _as_trajectory(scene, run, path, settings.tolerance)
     if times is None:
         return trajectory
@@ -223,6 +214,12 @@ def simulate(
             f"({trajectory.status}): pass earlier times, or omit `times` to get those of the steps"
         )
     return trajectory.at(reached)
+
+
+def stick_slip_path(run: TrajectoryProblem, t1: float | Float[Array, ""], settings: Settings) -> HybridPath:
+    """One run in a scene with `SetValuedCoulomb`, mode by mode, until `t1` or until contact is lost."""
+    modes, first, state = contact_modes(run, settings.tolerance)
+    return solve_hybrid_dense(modes, int(first[0]), state[:, 0], float(t1), settings, counters=1)
 
 
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.geometry import Plane
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, CoreProblem, Outcome, Settings, solve_with_samples
+from nonholonomic.integration import CoreProblem, Outcome, Settings, solve_with_samples
+from nonholonomic.integration.status import FAILED, LEFT_DOMAIN
 from nonholonomic.xla_cpu import compiled_alone
 
 from ..model.launch import Launch

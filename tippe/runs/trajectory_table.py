@@ -7,7 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nonholonomic.integration import DEFAULT_MAX_STEPS, Settings, Status, require_times
+from nonholonomic.integration import Settings
+from nonholonomic.integration.checks import require_times
+from nonholonomic.integration.settings import DEFAULT_MAX_STEPS
+from nonholonomic.integration.status import Status
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, sweep
 from nonholonomic.validation import as_number, require, require_outside, require_whole

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.integration import sign_changes
+from nonholonomic.integration.zeros import sign_changes
 from nonholonomic.validation import as_number, require, require_kind, require_whole
 
 from ..model.scene import Scene

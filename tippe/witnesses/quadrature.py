@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.integration import halved
+from nonholonomic.integration.zeros import halved
 
 from ..model.scene import Scene
 from ..model.state import AXIS, MOMENTUM, VELOCITY
