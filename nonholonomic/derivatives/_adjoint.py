@@ -25,7 +25,7 @@ from ..integration.scheduler import AbstractRecorder, InLanes, LaneScheduler, Sc
 from ..integration.status import RUNNING
 from ..integration.step import length_to_try, try_step
 from ..xla_cpu import uncounted, written_by_component, written_in_place
-from ._periods import Checkpoints, LatestSteps, Period, StepRecord, read
+from ._periods import Checkpoints, LatestSteps, StepRecord, read
 from .variation import VariationalProblem
 
 #: The quantity measured at the end of a run: (problem, lane state) -> a number per lane, differentiable with respect to
@@ -154,7 +154,7 @@ class Passes:
             frontier=start,
             number=jnp.zeros((), int),
             limit=jnp.asarray(jnp.iinfo(jnp.arange(0).dtype).max),
-            checkpoints=Checkpoints.none(Period(start, start)),
+            checkpoints=Checkpoints.none((start, start)),
             latest_steps=LatestSteps.none(record, scheduler.capacity),
             outcome=scheduler.empty(),
             adjoint=jnp.zeros((rows, scheduler.lanes), dtype),
@@ -185,15 +185,15 @@ class Passes:
         return run._replace(
             frontier=self.scheduler.refill(lanes_after),
             number=run.number + 1,
-            checkpoints=run.checkpoints.added(run.number, Period(run.frontier, lanes_after)),
+            checkpoints=run.checkpoints.added(run.number, (run.frontier, lanes_after)),
             latest_steps=run.latest_steps.added(run.frontier.iterations, steps),
             outcome=self.scheduler.store(run.outcome, lanes_after.lane_state),
         )
 
     def is_recorded(self, run: Backward) -> Bool[Array, ""]:
         """Whether the steps of the period that the backward pass takes next are kept."""
-        number, period = run.checkpoints.latest()
-        recorded = (number == run.limit - 1) & (period.lanes_before.iterations >= run.latest_steps.first)
+        number, (lanes_before, _) = run.checkpoints.latest()
+        recorded = (number == run.limit - 1) & (lanes_before.iterations >= run.latest_steps.first)
         return uncounted((run.checkpoints.depth > 0) & recorded, run.number)
 
     def backward(self, run: Backward) -> Backward:

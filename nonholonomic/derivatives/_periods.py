@@ -28,11 +28,8 @@ class StepRecord(NamedTuple):
     length: Float[Array, "iterations lanes"]
 
 
-class Period(NamedTuple):
-    """A period without its steps: the lanes before it, and after it but before their refill."""
-
-    lanes_before: SchedulerState
-    lanes_after: SchedulerState
+#: A period without its steps: the lanes before it, and after it but before their refill.
+Period = tuple[SchedulerState, SchedulerState]
 
 
 class Checkpoints(NamedTuple):

@@ -71,13 +71,13 @@ class Launch(Bounded):
             raise ValueError(f"place = {shown(self.place)} must be a pair of numbers, or (x, y, z) [m]")
 
     def suspicion(self) -> str | None:
-        for name, usual in USUAL.items():
+        for name, limit in USUAL.items():
             value = getattr(self, name)
             if is_traced(value) or not isinstance(value, jax.Array) or value.size == 0:
                 continue
-            largest = float(np.max(np.abs(value)))
-            if largest > usual:
-                return f"{name} = {largest:g} rad is large{IN_DEGREES.format(f'{largest:g}')}"
+            magnitude = float(np.max(np.abs(value)))
+            if magnitude > limit:
+                return f"{name} = {magnitude:g} rad is large{IN_DEGREES.format(f'{magnitude:g}')}"
         return None
 
     def bounds(self) -> Iterator[Bound]:

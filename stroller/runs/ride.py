@@ -107,7 +107,7 @@ class RideSpec(eqx.Module):
     """A `Ride` that can leave a transformation: its numbers are leaves and everything else is static."""
 
     numbers: Any
-    rest: Any = eqx.field(static=True)
+    static: Any = eqx.field(static=True)
 
     @classmethod
     def of(cls, ride: Ride) -> "RideSpec":
@@ -117,7 +117,7 @@ class RideSpec(eqx.Module):
     @property
     def ride(self) -> Ride:
         """The ride."""
-        return eqx.combine(self.numbers, self.rest)
+        return eqx.combine(self.numbers, self.static)
 
 
 def as_module(controls: Input | None, scene: Scene, launch: Launch) -> Any:

@@ -53,10 +53,10 @@ WORD_OF_STATUS = {
 }
 
 
-def too_many_steps(t1: float, most: int, end: float) -> str:
+def too_many_steps(t1: float, max_steps: int, end: float) -> str:
     """Message for a run that needs more than the allowed steps."""
     return (
-        f"t1 = {t1:g} s is too long: the run needs more than {most:_} steps, which reached only {end:.4g} s; "
+        f"t1 = {t1:g} s is too long: the run needs more than {max_steps:_} steps, which reached only {end:.4g} s; "
         "take a shorter t1 or a larger tolerance"
     ).replace("_", " ")
 
@@ -155,12 +155,12 @@ class InversionRuns(NamedTuple):
     ) -> dict[str, Any]:
         """The variables that describe how the runs ended, except the first of two times."""
         ended, inverted, theta = _at_the_end(scene, problem, outcome, self.last, tolerance)
-        others = [np.asarray(ended) == status for status in WORD_OF_STATUS]
-        code = np.select([np.asarray(inverted), *others], [0, *WORD_OF_STATUS.values()], 1)
-        lost = code == WORDS.index("contact_lost")
-        if lost.any():
+        conditions = [np.asarray(ended) == status for status in WORD_OF_STATUS]
+        code = np.select([np.asarray(inverted), *conditions], [0, *WORD_OF_STATUS.values()], 1)
+        is_lost = code == WORDS.index("contact_lost")
+        if is_lost.any():
             words = np.array([WORDS.index(status.word) for status in LOSSES])
-            code = np.where(lost, words[self._loss(scene, jnp.asarray(outcome.state))], code)
+            code = np.where(is_lost, words[self._loss(scene, jnp.asarray(outcome.state))], code)
         counts = zip(self.run_kind.counts, outcome.counts, strict=True) if isinstance(outcome, HybridOutcome) else ()
         return {
             self.times[-1]: np.where(inverted, outcome.crossing_time, np.inf),
@@ -223,5 +223,7 @@ class ScatteredJob(NamedTuple):
 
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
         """The variables of some cells, of which only the first `count` are run."""
-        chosen = {number: values[columns["cell"]] for number, values in self.columns.items()}
-        return self.job(chosen, count) | {self.names[number]: values for number, values in chosen.items()}
+        values_of_columns = {number: values[columns["cell"]] for number, values in self.columns.items()}
+        return self.job(values_of_columns, count) | {
+            self.names[number]: values for number, values in values_of_columns.items()
+        }

@@ -120,26 +120,26 @@ class ExtendedSolve(AbstractDifferentiableSolve):
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
         """The extended times of every cell, and their derivatives along tangents (as of `VariationalProblem`)."""
         is_legal, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
-        varied = VariationalProblem(problem, tangents, True)
+        variational = VariationalProblem(problem, tangents, True)
         # A fit may try parameters that are far off.
         settings = Settings(tolerance, max_steps=MOST_STEPS)
         outcome, _ = traced_solve_ensemble(
-            varied, t1, jnp.asarray(cells), settings, one_kernel=not nested, n_blocks=1 + len(tangents)
+            variational, t1, jnp.asarray(cells), settings, one_kernel=not nested, n_blocks=1 + len(tangents)
         )
-        state, *variations = varied.parts(outcome.state)
-        crossed = outcome.status == CROSSED
+        state, *variations = variational.parts(outcome.state)
+        has_crossed = outcome.status == CROSSED
 
         def extended(problem: InversionProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
             # A cell that starts beyond the angle has reached it at time 0.
             time = jnp.where(outcome.end_time > 0.0, crossing_time(problem, outcome.end_time, state), 0.0)
             end, start = (inclination(parts(states).axis) for states in (state, problem.states))
-            return jnp.where(crossed, time, beyond_horizon(end, start, jnp.arccos(problem.cos_angle), t1))
+            return jnp.where(has_crossed, time, beyond_horizon(end, start, jnp.arccos(problem.cos_angle), t1))
 
-        good = is_legal & (outcome.status != FAILED)
-        times = jnp.where(good, extended(problem, state), jnp.nan)
+        is_good = is_legal & (outcome.status != FAILED)
+        times = jnp.where(is_good, extended(problem, state), jnp.nan)
         slopes = [
-            jnp.where(good, eqx.filter_jvp(extended, (problem, state), moved)[1], jnp.nan)
-            for moved in zip(tangents, variations, strict=True)
+            jnp.where(is_good, eqx.filter_jvp(extended, (problem, state), direction)[1], jnp.nan)
+            for direction in zip(tangents, variations, strict=True)
         ]
         return times, slopes
 

@@ -224,15 +224,17 @@ def request_of(runs: InversionRuns, options: TableOptions) -> dict[str, Any]:
     return request
 
 
-def warn_of_long_runs(table: Table, t1: float, most: int) -> None:
+def warn_of_long_runs(table: Table, t1: float, max_steps: int) -> None:
     """Warn of runs that needed more than the allowed steps. Tables whose variables stay in the file are not checked."""
     if not isinstance(table.variables, dict):
         return
-    long = (table.variables["status"] == "failed") & (table.variables["steps"] >= most)
-    if long.any():
-        end = float(np.min(table.variables["end_time"][long]))
+    is_long = (table.variables["status"] == "failed") & (table.variables["steps"] >= max_steps)
+    if is_long.any():
+        end = float(np.min(table.variables["end_time"][is_long]))
         warnings.warn(
-            f"{long.sum()} of {long.size} runs have failed: {too_many_steps(t1, most, end)}", UserWarning, stacklevel=3
+            f"{is_long.sum()} of {is_long.size} runs have failed: {too_many_steps(t1, max_steps, end)}",
+            UserWarning,
+            stacklevel=3,
         )
 
 
@@ -248,7 +250,7 @@ def warn_of_unresolved_runs(table: Table, run_kind: RunKind) -> None:
 
 def digest(columns: dict[str, Any]) -> str:
     """A checksum of the columns and their names."""
-    whole = hashlib.sha256()
+    digest = hashlib.sha256()
     for name, values in columns.items():
-        whole.update(name.encode() + np.ascontiguousarray(values, float).tobytes())
-    return whole.hexdigest()[:16]
+        digest.update(name.encode() + np.ascontiguousarray(values, float).tobytes())
+    return digest.hexdigest()[:16]

@@ -122,8 +122,8 @@ class Trajectory(AbstractTrajectory):
     @of_each_run
     def contact(self) -> Float[Array, "times 3"]:
         """The point at which the top touches the arena [m]."""
-        frame, where = self.scene.frame, (self._place, self._path)
-        foot = sum_vectors(frame.position(*where), scale(-frame.distance, frame.axes(*where)[2]))
+        frame, places = self.scene.frame, (self._place, self._path)
+        foot = sum_vectors(frame.position(*places), scale(-frame.distance, frame.axes(*places)[2]))
         return jnp.stack(foot, axis=-1)
 
     @of_each_run
@@ -208,13 +208,13 @@ def simulate(
     trajectory = _as_trajectory(scene, run, path, settings.tolerance)
     if times is None:
         return trajectory
-    reached = np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)]
-    if not reached.size:
+    times_reached = np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)]
+    if not times_reached.size:
         raise ValueError(
             f"times = {shown(times)} are all after the end of the run at {float(trajectory.end_time):.6g} s "
             f"({trajectory.status}): pass earlier times, or omit `times` to get those of the steps"
         )
-    return trajectory.at(reached)
+    return trajectory.at(times_reached)
 
 
 def stick_slip_path(run: TrajectoryProblem, t1: float | Float[Array, ""], settings: Settings) -> HybridPath:
@@ -270,8 +270,10 @@ def _traced(
     samples = sampled(scene, launch, times, t1, settings, adjoint)
     status = samples.status.astype(int)
     stats = {"accepted": samples.accepted.astype(int), "rejected": samples.rejected.astype(int)}
-    quadratures = (samples.quadratures[:-2], samples.quadratures[-2], samples.quadratures[-1])
-    return Trajectory(times, scene, samples.states, *quadratures, status, samples.end_time, stats)
+    assert samples.quadratures is not None
+    quadratures = samples.quadratures.T
+    parts = (samples.states.T, quadratures[:-2], quadratures[-2], quadratures[-1])
+    return Trajectory(times, scene, *parts, status, samples.end_time, stats)
 
 
 def parts_of(lean: int, states: Any) -> tuple[Any, Any, Any, Any]:
@@ -290,7 +292,7 @@ def _as_trajectory(
     times, end, last = on_device(path.times, path.times[-1], states[:, -1])
     codes = (jnp.asarray(path.left_domain), jnp.asarray(path.failed))
     status = Status(int(_ended(run, scene, last, *codes, jnp.asarray(tolerance)))).word
-    sticks = {"sticks": int(path.counts[0])} if isinstance(path, HybridPath) else {}
+    counts = {"sticks": int(path.counts[0])} if isinstance(path, HybridPath) else {}
     lean, cyclic, spin_angle, work = on_device(*parts_of(run.leading, states))
     trajectory = Trajectory(times, scene, lean, cyclic, spin_angle, work, status, end, {}, path)
-    return if_balanced(trajectory.with_stats(path, **sticks), tolerance)
+    return if_balanced(trajectory.with_stats(path, **counts), tolerance)
