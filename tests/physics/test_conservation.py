@@ -24,7 +24,7 @@ TORQUES = {
 ARENAS = {"plane": tippe.Plane(), "cylinder": tippe.Cylinder(0.3), "sphere": tippe.Sphere(0.3)}
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", [pytest.param(law, marks=pytest.mark.slow if law != "coulomb" else ()) for law in LAWS])
 def test_jelletts_constant_on_the_plane(law):
     """lambda is constant to 1e-9 over 30 s for every friction at the contact point, and |e| = 1 with it."""
     scene = tippe.Scene(rutstam_top(), tippe.Plane(), LAWS[law])

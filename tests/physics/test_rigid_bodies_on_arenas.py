@@ -135,6 +135,7 @@ def reversals(radii, spin, **options) -> tippe.Table:
     return tippe.reversal_table(scene, **start, axes=axes, t1=4.0, progress=False, **options)
 
 
+@pytest.mark.slow
 def test_reversals_in_bowls_and_how_contact_ends():
     """In a bowl of 10^8 m a rattleback reverses when it does on the plane, at 2.6846470 s. Where the bowl is more curved than
     the body, a run ends at once. A fast rattleback jumps."""

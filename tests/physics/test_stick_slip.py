@@ -263,6 +263,7 @@ def test_a_launch_on_the_stem_slips_off_a_slope(surface, launch):
     assert run.stats["energy_residual"] < 1e-9
 
 
+@pytest.mark.slow
 def test_a_launch_beyond_the_angle_from_which_the_top_slips_at_once_is_inverted_at_the_start():
     """At rest on a steep wall, as under smooth laws; 5.7 ms later the slip has begun."""
     scene = tippe.Scene(rutstam_top(), tippe.Sphere(0.2), tippe.SetValuedCoulomb(0.3))
