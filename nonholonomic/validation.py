@@ -24,8 +24,9 @@ from jaxtyping import Array, Bool, Float
 
 from .parameters import as_html, as_text, contents, in_lines, one_line
 
-#: Addition to the message about an angle above its bounds.
+#: Addition to the message about an angle that may be in degrees.
 IN_DEGREES = "; angles are in radians: did you mean np.radians({})?"
+
 #: What a message says about a user's function after `jax.errors.JAXTypeError`.
 UNTRACEABLE = (
     "cannot be traced by JAX: write it with jax.numpy in place of numpy and math, and with jnp.where in place of `if`"

@@ -53,7 +53,8 @@ MEMBERS = [
 
 
 #: The rooms of the engine, and the names in each that are handed out for fast models.
-ENGINE = {room: [name for name in PAGES["engine"].names if name.startswith(f"{room}.")] for room in ENGINE_ROOMS}
+NAMES_OF_ENGINE = [name for name in PAGES["engine"].names if not inspect.ismodule(resolve(name))]
+ENGINE = {room: [name for name in NAMES_OF_ENGINE if name.startswith(f"{room}.")] for room in ENGINE_ROOMS}
 
 
 def complaints(text: str, namespace: dict[str, Any], name: str = "example") -> str:

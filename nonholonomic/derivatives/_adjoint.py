@@ -10,7 +10,7 @@ fixed, as in `variation.py`.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -19,12 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..integration import RUNNING, AbstractProblem, Lanes, LaneState, Outcome, Settings, States
+from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, States
 from ..integration.runge_kutta import Stages, moved_state, over_stages
-from ..integration.scheduler import AbstractRecorder, InLanes, LaneScheduler, Progress
+from ..integration.scheduler import AbstractRecorder, InLanes, LaneScheduler, SchedulerState
+from ..integration.status import RUNNING
 from ..integration.step import length_to_try, try_step
 from ..xla_cpu import uncounted, written_by_component, written_in_place
-from ._periods import Checkpoints, LatestSteps, Period, StepRecord, read
+from ._periods import Checkpoints, LatestSteps, StepRecord, read
 from .variation import VariationalProblem
 
 #: The quantity measured at the end of a run: (problem, lane state) -> a number per lane, differentiable with respect to
@@ -36,7 +37,7 @@ class StepRecorder(AbstractRecorder):
     """Records where each step began, and its length."""
 
     # As many iterations as fit in the caches with their record; a period ends with a refill.
-    period = 128
+    period: ClassVar[int] = 128
     refill_cost = 2.0
 
     def begin(self, lane_state: LaneState, collected: None) -> StepRecord:
@@ -61,7 +62,7 @@ class Backward(NamedTuple):
     `gradient` holds the derivatives of every cell with respect to its initial state.
     """
 
-    frontier: Progress
+    frontier: SchedulerState
     number: Int[Array, ""]
     limit: Int[Array, ""]
     checkpoints: Checkpoints
@@ -98,8 +99,23 @@ def solve_with_adjoint(
 
     **Raises:** `ValueError` for a chosen leaf that has several components.
     """
-    states = problem.start()[0]
-    components, size = states.shape
+    components, size = problem.start()[0].shape
+    numbers, problem_with_probe = _with_probe(problem, moving, probe, size)
+    # As many lanes as without the probe: the backward pass, which is the most expensive part, does not use the probe.
+    settings = dataclasses.replace(settings, lanes=settings.lanes_of(size))
+    scheduler = LaneScheduler.of(problem_with_probe, t1, cells, settings, one_kernel=one_kernel, n_blocks=2)
+    passes = Passes(scheduler, moving, measured)
+    run = passes.start(components + len(jax.tree.leaves(numbers)))
+    run = jax.lax.while_loop(lambda run: uncounted(run.limit > 0, run.outcome.steps[0]), passes.there_and_back, run)
+    by_number = jax.tree.unflatten(jax.tree.structure(numbers), list(run.gradient[components:]))
+    return run.outcome._replace(state=run.outcome.state[:components]), run.gradient[:components], by_number
+
+
+def _with_probe(problem: VariationalProblem, moving: Any, probe: Any, size: int) -> tuple[Any, VariationalProblem]:
+    """The chosen parameters with one value per cell, and the problem with them and the probe.
+
+    **Arguments:** as for `solve_with_adjoint`; `size`: number of cells, padding included.
+    """
     numbers, static = eqx.partition(problem, moving)
     for leaf in jax.tree.leaves(numbers):
         if jnp.shape(leaf) not in ((), (size,)):
@@ -113,72 +129,85 @@ def solve_with_adjoint(
         problem.problem,
         is_leaf=lambda rate: rate is None,
     )
-    problem_with_probe = dataclasses.replace(problem, tangents=(probe,))
-    # As many lanes as without the probe: the backward pass, which is the most expensive part, does not use the probe.
-    settings = dataclasses.replace(settings, lanes=settings.lanes_of(size))
-    scheduler = LaneScheduler.of(problem_with_probe, t1, cells, settings, one_kernel=one_kernel, n_blocks=2)
-    rows = components + len(jax.tree.leaves(numbers))
+    return numbers, dataclasses.replace(problem, tangents=(probe,))
 
-    start, recorder = scheduler.start(), StepRecorder()
-    record = jax.eval_shape(lambda: recorder.begin(start.lane_state, None))
 
-    def is_ahead(run: Backward) -> Bool[Array, ""]:
-        return uncounted(scheduler.unfinished(run.frontier) & (run.number < run.limit), run.number)
+@dataclasses.dataclass(frozen=True, eq=False)
+class Passes:
+    """The forward pass, which computes periods, and the backward pass, which carries derivatives through them.
 
-    def forward(run: Backward) -> Backward:
-        lanes_after, steps = scheduler.run(run.frontier, recorder)
-        return run._replace(
-            frontier=scheduler.refill(lanes_after),
-            number=run.number + 1,
-            checkpoints=run.checkpoints.added(run.number, Period(run.frontier, lanes_after)),
-            latest_steps=run.latest_steps.added(run.frontier.iterations, steps),
-            outcome=scheduler.store(run.outcome, lanes_after.lane_state),
+    `moving`, `measured`: as for `solve_with_adjoint`.
+    """
+
+    scheduler: LaneScheduler
+    moving: Any
+    measured: Measured
+
+    recorder: ClassVar[StepRecorder] = StepRecorder()
+
+    def start(self, rows: int) -> Backward:
+        """Both passes before the first period. **Arguments:** `rows`: number of rows of the derivatives."""
+        scheduler, start = self.scheduler, self.scheduler.start()
+        record = jax.eval_shape(lambda: self.recorder.begin(start.lane_state, None))
+        dtype = start.lane_state.state.dtype
+        return Backward(
+            frontier=start,
+            number=jnp.zeros((), int),
+            limit=jnp.asarray(jnp.iinfo(jnp.arange(0).dtype).max),
+            checkpoints=Checkpoints.none((start, start)),
+            latest_steps=LatestSteps.none(record, scheduler.capacity),
+            outcome=scheduler.empty(),
+            adjoint=jnp.zeros((rows, scheduler.lanes), dtype),
+            gradient=jnp.zeros((rows, scheduler.capacity), dtype),
         )
 
-    def is_recorded(run: Backward) -> Bool[Array, ""]:
-        number, period = run.checkpoints.latest()
-        recorded = (number == run.limit - 1) & (period.lanes_before.iterations >= run.latest_steps.first)
-        return uncounted((run.checkpoints.depth > 0) & recorded, run.number)
-
-    def backward(run: Backward) -> Backward:
-        number, (lanes_before, lanes_after) = run.checkpoints.latest()
-        steps = run.latest_steps.of_period(lanes_before.iterations, len(record.length))
-        count = lanes_after.iterations - lanes_before.iterations
-        adjoint = _taken_back(scheduler, moving, measured, lanes_after.lane_state, steps, count, run.adjoint)
-        # A cell that had made no step was at its start.
-        at_its_start = (lanes_before.lane_state.steps == 0) & (lanes_before.lane_state.cell < cells)
-        gradient = run.gradient.at[:, jnp.where(at_its_start, lanes_before.lane_state.cell, size)].set(
-            adjoint, mode="drop"
-        )
-        return run._replace(
-            limit=number, checkpoints=run.checkpoints.without_latest(), adjoint=adjoint, gradient=gradient
-        )
-
-    def there_and_back(run: Backward) -> Backward:
-        run = jax.lax.while_loop(is_ahead, forward, run)
+    def there_and_back(self, run: Backward) -> Backward:
+        """Compute all periods up to the one that the backward pass needs, and take back those whose steps are kept."""
+        run = jax.lax.while_loop(self.is_ahead, self.forward, run)
         run = run._replace(limit=jnp.minimum(run.limit, run.number))
-        run = jax.lax.while_loop(is_recorded, backward, run)
+        run = jax.lax.while_loop(self.is_recorded, self.backward, run)
         # The steps before are gone: continue from the latest checkpoint.
         number, (lanes_before, _) = run.checkpoints.latest()
-        checkpoints, latest_steps = (
-            run.checkpoints.without_latest(),
-            run.latest_steps._replace(first=lanes_before.iterations),
+        return run._replace(
+            frontier=lanes_before,
+            number=number,
+            checkpoints=run.checkpoints.without_latest(),
+            latest_steps=run.latest_steps._replace(first=lanes_before.iterations),
         )
-        return run._replace(frontier=lanes_before, number=number, checkpoints=checkpoints, latest_steps=latest_steps)
 
-    run = Backward(
-        frontier=start,
-        number=jnp.zeros((), int),
-        limit=jnp.asarray(jnp.iinfo(jnp.arange(0).dtype).max),
-        checkpoints=Checkpoints.none(Period(start, start)),
-        latest_steps=LatestSteps.none(record, size),
-        outcome=scheduler.empty(),
-        adjoint=jnp.zeros((rows, scheduler.lanes), states.dtype),
-        gradient=jnp.zeros((rows, size), states.dtype),
-    )
-    run = jax.lax.while_loop(lambda run: uncounted(run.limit > 0, run.outcome.steps[0]), there_and_back, run)
-    by_number = jax.tree.unflatten(jax.tree.structure(numbers), list(run.gradient[components:]))
-    return run.outcome._replace(state=run.outcome.state[:components]), run.gradient[:components], by_number
+    def is_ahead(self, run: Backward) -> Bool[Array, ""]:
+        """Whether a period that the backward pass needs has not been computed."""
+        return uncounted(self.scheduler.unfinished(run.frontier) & (run.number < run.limit), run.number)
+
+    def forward(self, run: Backward) -> Backward:
+        """Compute the next period, and record its steps."""
+        lanes_after, steps = self.scheduler.run(run.frontier, self.recorder)
+        return run._replace(
+            frontier=self.scheduler.refill(lanes_after),
+            number=run.number + 1,
+            checkpoints=run.checkpoints.added(run.number, (run.frontier, lanes_after)),
+            latest_steps=run.latest_steps.added(run.frontier.iterations, steps),
+            outcome=self.scheduler.store(run.outcome, lanes_after.lane_state),
+        )
+
+    def is_recorded(self, run: Backward) -> Bool[Array, ""]:
+        """Whether the steps of the period that the backward pass takes next are kept."""
+        number, (lanes_before, _) = run.checkpoints.latest()
+        recorded = (number == run.limit - 1) & (lanes_before.iterations >= run.latest_steps.first)
+        return uncounted((run.checkpoints.depth > 0) & recorded, run.number)
+
+    def backward(self, run: Backward) -> Backward:
+        """Carry the derivatives through the latest period."""
+        scheduler, (number, (lanes_before, lanes_after)) = self.scheduler, run.checkpoints.latest()
+        steps = run.latest_steps.of_period(lanes_before.iterations, self.recorder.period)
+        count = lanes_after.iterations - lanes_before.iterations
+        adjoint = _taken_back(scheduler, self.moving, self.measured, lanes_after.lane_state, steps, count, run.adjoint)
+        # A cell that had made no step was at its start.
+        at_its_start = (lanes_before.lane_state.steps == 0) & (lanes_before.lane_state.cell < scheduler.cells)
+        cell = jnp.where(at_its_start, lanes_before.lane_state.cell, scheduler.capacity)
+        gradient = run.gradient.at[:, cell].set(adjoint, mode="drop")
+        checkpoints = run.checkpoints.without_latest()
+        return run._replace(limit=number, checkpoints=checkpoints, adjoint=adjoint, gradient=gradient)
 
 
 def _without_probe(lane_state: LaneState) -> LaneState:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ..integration.scheduler import Progress
+from ..integration.scheduler import SchedulerState
 from ..xla_cpu import written_in_place
 
 #: Number of checkpoints. With more periods, some checkpoints are dropped and computed again from an earlier one. With
@@ -28,11 +28,8 @@ class StepRecord(NamedTuple):
     length: Float[Array, "iterations lanes"]
 
 
-class Period(NamedTuple):
-    """A period without its steps: the lanes before it, and after it but before their refill."""
-
-    lanes_before: Progress
-    lanes_after: Progress
+#: A period without its steps: the lanes before it, and after it but before their refill.
+Period = tuple[SchedulerState, SchedulerState]
 
 
 class Checkpoints(NamedTuple):

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..integration import REACHED_END, RUNNING, AbstractProblem, Settings, solve_ensemble
+from ..integration import AbstractProblem, Settings, solve_ensemble
+from ..integration.status import REACHED_END, RUNNING
 from ..progress import Progress
 
 

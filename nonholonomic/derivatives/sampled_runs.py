@@ -10,18 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ..integration import (
-    FAILED,
-    LEFT_DOMAIN,
-    REACHED_END,
-    AbstractProblem,
-    CoreProblem,
-    Settings,
-    sample,
-    solve_with_samples,
-)
+from ..integration import AbstractProblem, CoreProblem, Settings, sample, solve_with_samples
 from ..integration.dense import SampledSolution
 from ..integration.problem import event_time
+from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END
 from .differentiable import tangents_by
 from .lyapunov import probed
 from .sampling import AbstractSampling, ProblemSpec, solve_for_samples

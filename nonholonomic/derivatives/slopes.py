@@ -16,9 +16,10 @@ from jax.extend.core import Literal
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
-from ..integration import CROSSED, REACHED_END, AbstractProblem, LaneState, Outcome, Settings
+from ..integration import AbstractProblem, LaneState, Outcome, Settings
 from ..integration.ensemble import with_crossing_times
 from ..integration.scheduler import LaneScheduler
+from ..integration.status import CROSSED, REACHED_END
 from ..xla_cpu import compiled_alone
 from ._adjoint import solve_with_adjoint
 from .variation import VariationalProblem, in_groups, slopes_by_variations

@@ -37,26 +37,13 @@ SETTLED = 1e-8
 UNSEEN = 1e-4
 
 
-class Quadratic(NamedTuple):
-    """The symmetric matrix ((a, b), (b, c)) and a vector (x, y), over lanes."""
-
-    a: Component
-    b: Component
-    c: Component
-    x: Component
-    y: Component
-
-    @property
-    def least_eigenvalue(self) -> Component:
-        """The lesser eigenvalue of the matrix."""
-        return 0.5 * (self.a + self.c) - jnp.sqrt((0.5 * (self.a - self.c)) ** 2 + self.b**2)
-
-    def solved(self) -> tuple[Component, Component]:
-        """Solution s of matrix times s = vector, with smaller eigenvalues raised to `LEAST_CURVATURE`."""
-        lift = jnp.maximum(LEAST_CURVATURE - jax.lax.stop_gradient(self.least_eigenvalue), 0.0)
-        a, c = self.a + lift, self.c + lift
-        per_determinant = 1.0 / (a * c - self.b * self.b)
-        return (c * self.x - self.b * self.y) * per_determinant, (a * self.y - self.b * self.x) * per_determinant
+def newton_step(a: Component, b: Component, c: Component, x: Component, y: Component) -> tuple[Component, Component]:
+    """Solution s of ((a, b), (b, c)) s = (x, y), with smaller eigenvalues raised to `LEAST_CURVATURE`."""
+    least_eigenvalue = 0.5 * (a + c) - jnp.sqrt((0.5 * (a - c)) ** 2 + b**2)
+    lift = jnp.maximum(LEAST_CURVATURE - jax.lax.stop_gradient(least_eigenvalue), 0.0)
+    a, c = a + lift, c + lift
+    per_determinant = 1.0 / (a * c - b * b)
+    return (c * x - b * y) * per_determinant, (a * y - b * x) * per_determinant
 
 
 class Descent(NamedTuple):
@@ -171,8 +158,7 @@ class AbstractLevel(AbstractSurface):
         starts = jnp.asarray(self.starts)
 
         def step(foot: Vector) -> tuple[Component, Component, Vector, Vector]:
-            t1, t2, quadratic = surface._about(place, foot)
-            return *quadratic.solved(), t1, t2
+            return surface._step_on_surface(place, foot)
 
         def in_sector(k: Any, nearest: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
             def start(i: Any, nearest: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
@@ -188,45 +174,44 @@ class AbstractLevel(AbstractSurface):
             return jnp.where(_square(place, new) < _square(place, vector_of(old)), _stacked(new), old)
 
         foot = vector_of(jax.lax.fori_loop(0, len(self.starts), in_sector, _stacked(first)))
-        t1, t2, quadratic = self._about(position, foot)
-        s1, s2 = quadratic.solved()
+        s1, s2, t1, t2 = self._step_on_surface(position, foot)
         return self.onto(vector_of(sum_vectors(foot, scale(s1, t1), scale(s2, t2))))
 
     def ball_gap(self, centre: Vector, radius: Component, side: float) -> BallGap:
         surface, place, size = _held(self), jax.lax.stop_gradient(centre), jax.lax.stop_gradient(radius)
 
         def step(normal: Vector) -> tuple[Component, Component, Vector, Vector]:
-            t1, t2, quadratic = surface._under(place, size, normal)
-            return *quadratic.solved(), t1, t2
+            return surface._step_on_ball(place, size, normal)
 
         def value(normal: Vector) -> Component:
             return surface.level(_lowered(place, size, normal))
 
         normal = descended(step, _unit, value, surface.normal(place), 1.0, 0.5)
-        t1, t2, quadratic = self._under(centre, radius, normal)
-        s1, s2 = quadratic.solved()
+        s1, s2, t1, t2 = self._step_on_ball(centre, radius, normal)
         normal = _unit(vector_of(sum_vectors(normal, scale(s1, t1), scale(s2, t2))))
         minimum = _lowered(centre, radius, normal)
         gap = self.offset(minimum)
         return BallGap(_lowered(minimum, gap, normal), normal, gap)
 
-    def _about(self, position: Vector, foot: Vector) -> tuple[Vector, Vector, Quadratic]:
-        """Two tangents at a foot, and the squared distance to a position along them: half its second derivatives, and
-        minus half its first derivatives."""
+    def _step_on_surface(self, position: Vector, foot: Vector) -> tuple[Component, Component, Vector, Vector]:
+        """Newton's step from a foot towards the least squared distance to a position, and the two tangents at the foot
+        for its components."""
         n = self.normal(foot)
         difference = vector_of(subtract(a, b) for a, b in zip(position, foot, strict=True))
         d, (t1, t2) = dot(difference, n), tangents(n)
         aa, ab, bb = self.bending(foot, t1, t2)
-        return t1, t2, Quadratic(1.0 + d * aa, d * ab, 1.0 + d * bb, dot(difference, t1), dot(difference, t2))
+        return *newton_step(1.0 + d * aa, d * ab, 1.0 + d * bb, dot(difference, t1), dot(difference, t2)), t1, t2
 
-    def _under(self, centre: Vector, radius: Component, normal: Vector) -> tuple[Vector, Vector, Quadratic]:
-        """Two tangents of a ball at its point opposite to a normal, and the function along them, per unit gradient and
-        radius: its second derivatives, and minus its first derivatives."""
+    def _step_on_ball(
+        self, centre: Vector, radius: Component, normal: Vector
+    ) -> tuple[Component, Component, Vector, Vector]:
+        """Newton's step from the point of a ball opposite to a normal towards the least value of the function, per unit
+        gradient and radius, and the two tangents there for its components."""
         minimum, (t1, t2) = _lowered(centre, radius, normal), tangents(normal)
         m = self.normal(minimum)
         aa, ab, bb = self.bending(minimum, t1, t2)
         cosine = dot(m, normal)
-        return t1, t2, Quadratic(cosine + radius * aa, radius * ab, cosine + radius * bb, dot(m, t1), dot(m, t2))
+        return *newton_step(cosine + radius * aa, radius * ab, cosine + radius * bb, dot(m, t1), dot(m, t2)), t1, t2
 
 
 def _held(surface: AbstractLevel) -> AbstractLevel:

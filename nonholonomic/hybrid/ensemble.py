@@ -20,19 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..integration import (
-    FAILED,
-    LEFT_DOMAIN,
-    REACHED_END,
-    RUNNING,
-    UNRESOLVED,
-    AbstractProblem,
-    Outcome,
-    Settings,
-    solve_ensemble,
-    traced_solve_ensemble,
-)
+from ..integration import AbstractProblem, Outcome, Settings, solve_ensemble, traced_solve_ensemble
 from ..integration.scheduler import Numbers
+from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
 from ..xla_cpu import compiled_quickly, greatest
 from .mode import AbstractBatchedMode, Transition, mode_of_cells
 
@@ -45,7 +35,7 @@ class HybridOutcome(NamedTuple, Generic[Numbers]):
 
     **Example:** as for `solve_hybrid`.
 
-    >>> from nonholonomic.integration import CROSSED
+    >>> from nonholonomic.integration.status import CROSSED
     >>> print(outcome.status == CROSSED, outcome.mode)
     [ True  True] [0 0]
     """

@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float
 
 from ..derivatives import in_groups, tangents_by
 from ..derivatives.sampling import AbstractSampling, ProblemSpec, solve_for_samples
-from ..integration import REACHED_END, Settings, solve_with_samples
+from ..integration import Settings, solve_with_samples
+from ..integration.status import REACHED_END
 from ..xla_cpu import greatest
 from .ensemble import Carry, HybridOutcome, after_reset, after_solve, at_start, traced_rounds
 from .mode import AbstractBatchedMode, TransitionPath

@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..derivatives import in_groups
-from ..integration import CROSSED, REACHED_END, Settings
+from ..integration import Settings
 from ..integration.scheduler import Numbers
+from ..integration.status import CROSSED, REACHED_END
 from .ensemble import HybridOutcome, solve_hybrid, traced_solve_hybrid
 from .mode import AbstractBatchedMode
 from .saltation import VariationalMode, variational_modes, variational_start

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..integration import padded
+from ..compiled_programs import padded
 from .likelihood import Measurements
 from .unknown import Free, Unknown
 

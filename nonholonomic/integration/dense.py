@@ -12,6 +12,7 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Bool, Float, Int
 
+from ..compiled_programs import padded
 from .problem import AbstractProblem
 from .settings import Settings
 from .zeros import halved
@@ -23,9 +24,6 @@ PIECE = 2048
 #: margin checked, for all steps of a segment. With 2048 a short flight of a top takes 37 ms and 5 MB, with 128 it takes
 #: 7 ms and 0.4 MB.
 PIECE_OF_MODE = 128
-
-#: Least number of times at which a program evaluates a run: few runs are so long that more sizes are worth a compilation.
-LEAST_PADDED = 256
 
 #: Places in every step at which the domain margin is checked, besides the ends of the step.
 LOOKS = np.arange(1, 8) / 8.0
@@ -58,21 +56,6 @@ class DenseSolution(NamedTuple):
             if mask.any():
                 states[:, mask] = np.asarray(_evaluate(segment, padded(times[mask], len(times)))).T[:, : mask.sum()]
         return states
-
-
-def padded(values: Float[np.ndarray, "... times"], least: int) -> Float[np.ndarray, "... more"]:
-    """Values padded to a power of two of at least `least` and `LEAST_PADDED` by repeating the last one, so that one
-    program serves many sizes.
-
-    **Example:**
-
-    >>> import numpy as np
-    >>> from nonholonomic.integration import padded
-    >>> padded(np.array([1.0, 2.0, 3.0]), least=300).shape
-    (512,)
-    """
-    padding = (1 << (max(least, LEAST_PADDED) - 1).bit_length()) - values.shape[-1]
-    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, padding)], mode="edge")
 
 
 @eqx.filter_jit

@@ -44,7 +44,7 @@ class Outcome(NamedTuple, Generic[Numbers]):
 
     **Example:** the outcome of the subpackage's example, whose runs end on the event.
 
-    >>> from nonholonomic.integration import CROSSED
+    >>> from nonholonomic.integration.status import CROSSED
     >>> print(outcome.status == CROSSED, outcome.state.shape)
     [ True  True  True] (1, 3)
     """
@@ -58,7 +58,7 @@ class Outcome(NamedTuple, Generic[Numbers]):
     rejected: Int[Numbers, " cells"]
 
 
-class Progress(NamedTuple):
+class SchedulerState(NamedTuple):
     """The lanes, the number of cells that have left the queue, and the number of iterations so far."""
 
     lane_state: LaneState
@@ -181,7 +181,7 @@ class LaneScheduler(eqx.Module):
         **Arguments:** `recorder`; `collected`: what the recorder has collected before the first step.
         """
 
-        def period(carry: tuple[Progress, Outcome, Any]) -> tuple[Progress, Outcome, Any]:
+        def period(carry: tuple[SchedulerState, Outcome, Any]) -> tuple[SchedulerState, Outcome, Any]:
             progress, outcome, collected = carry
             progress, record = self.run(progress, recorder, collected)
             refilled = self.refill(progress)
@@ -192,20 +192,22 @@ class LaneScheduler(eqx.Module):
         progress, outcome, collected = jax.lax.while_loop(lambda carry: self.unfinished(carry[0]), period, carry)
         return self.store(outcome, progress.lane_state), progress.iterations, collected
 
-    def start(self) -> Progress:
+    def start(self) -> SchedulerState:
         """The first cells, one in each lane."""
         lane_state = self._load(jnp.arange(self.lanes))
-        return Progress(lane_state, jnp.minimum(self.lanes, self.cells), jnp.zeros((), int))
+        return SchedulerState(lane_state, jnp.minimum(self.lanes, self.cells), jnp.zeros((), int))
 
-    def unfinished(self, progress: Progress) -> Bool[Array, ""]:
+    def unfinished(self, progress: SchedulerState) -> Bool[Array, ""]:
         """Whether a lane is running or a cell waiting."""
         return jnp.any(progress.lane_state.status == RUNNING) | (progress.loaded < self.cells)
 
-    def run(self, progress: Progress, recorder: AbstractRecorder, collected: Any = None) -> tuple[Progress, Any]:
+    def run(
+        self, progress: SchedulerState, recorder: AbstractRecorder, collected: Any = None
+    ) -> tuple[SchedulerState, Any]:
         """Advance the lanes by a period: until all have ended, the record is full, or a refill pays off while cells
         wait.
 
-        **Returns:** the `Progress`, and the record of the period.
+        **Returns:** the `SchedulerState`, and the record of the period.
         """
         in_lanes = self.in_lanes(progress.lane_state)
 
@@ -228,19 +230,19 @@ class LaneScheduler(eqx.Module):
             return jax.lax.while_loop(goes_on, step, (lane_state, recorder.begin(lane_state, collected), zero, zero))
 
         lane_state, record, _, count = self.in_kernel(loop)(progress.lane_state)
-        return Progress(lane_state, progress.loaded, progress.iterations + count), record
+        return SchedulerState(lane_state, progress.loaded, progress.iterations + count), record
 
     def in_kernel(self, loop: Callable[[Any], Any]) -> Callable[[Any], Any]:
         """A loop over steps, compiled into a single kernel if `one_kernel` is set."""
         return in_one_kernel(loop) if self.one_kernel and self.problem.fits_one_kernel else loop
 
-    def refill(self, progress: Progress) -> Progress:
+    def refill(self, progress: SchedulerState) -> SchedulerState:
         """Give every idle lane the next waiting cell."""
         lane_state, loaded, iterations = progress
         idle = lane_state.status != RUNNING
         fresh = self._load(jnp.where(idle, jnp.minimum(loaded + jnp.cumsum(idle) - 1, self.capacity), lane_state.cell))
         lane_state = jax.tree.map(lambda new, old: jnp.where(idle, new, old), fresh, lane_state)
-        return Progress(lane_state, jnp.minimum(loaded + jnp.sum(idle), self.cells), iterations)
+        return SchedulerState(lane_state, jnp.minimum(loaded + jnp.sum(idle), self.cells), iterations)
 
     def empty(self) -> Outcome:
         """An empty outcome of the right shapes."""

@@ -34,7 +34,7 @@ def halved(
 
     **Example:**
 
-    >>> from nonholonomic.integration import halved
+    >>> from nonholonomic.integration.zeros import halved
     >>> low, high = halved(lambda x: x**2 < 2.0, jnp.asarray(1.0), jnp.asarray(2.0))
     >>> print(f"{low:.6f}")
     1.414214
@@ -58,7 +58,7 @@ def sign_changes(
 
     **Example:**
 
-    >>> from nonholonomic.integration import sign_changes
+    >>> from nonholonomic.integration.zeros import sign_changes
     >>> print(sign_changes(jnp.cos, jnp.arange(0.5, 7.0)).round(6))
     [1.570796 4.712389]
     """
@@ -84,7 +84,7 @@ def few_trials(
     **Example:**
 
     >>> import numpy as np
-    >>> from nonholonomic.integration import few_trials
+    >>> from nonholonomic.integration.zeros import few_trials
     >>> low, high = np.array([1.0]), np.array([2.0])
     >>> few_trials(lambda x: x**2 - 2.0, low, high, low**2 - 2.0, high**2 - 2.0).round(6)
     array([1.414214])

@@ -16,7 +16,8 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from ..hybrid import AbstractBatchedMode, Transition
-from ..integration import CROSSED, FAILED, LEFT_DOMAIN, RUNNING, AbstractProblem, Lanes, States
+from ..integration import AbstractProblem, Lanes, States
+from ..integration.status import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
 from .components import TooLarge, by_components
 from .form import Form, OfRun
 from .mode import State

@@ -15,16 +15,9 @@ from ..derivatives import (
     traced_solve_ensemble_with_tangents,
 )
 from ..hybrid import HybridOutcome, traced_solve_hybrid, traced_solve_hybrid_with_tangents
-from ..integration import (
-    CROSSED,
-    FAILED,
-    UNRESOLVED,
-    Outcome,
-    Settings,
-    explicit_tableau,
-    legal_run,
-    traced_solve_ensemble,
-)
+from ..integration import Outcome, Settings, explicit_tableau, traced_solve_ensemble
+from ..integration.checks import legal_run
+from ..integration.status import CROSSED, FAILED, UNRESOLVED
 from ..progress import status_line
 from ..validation import as_number
 from .engine import Cells

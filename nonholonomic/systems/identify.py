@@ -23,7 +23,7 @@ from ..identification import (
     model_times,
     search_options,
 )
-from ..integration import tolerance_bound
+from ..integration.checks import tolerance_bound
 from ..progress import status_line
 from ..validation import as_number, as_number_or_none
 from .mode import Hybrid

@@ -12,7 +12,9 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from ..derivatives import sampled_run
 from ..hybrid import AbstractBatchedMode, hybrid_samples
-from ..integration import FAILED, Settings, explicit_tableau, legal_run, require_times
+from ..integration import Settings, explicit_tableau
+from ..integration.checks import legal_run, require_times
+from ..integration.status import FAILED
 from ..progress import status_line
 from ..validation import as_known, as_number, is_traced, nan_unless
 from .engine import Cells, ModeProblem

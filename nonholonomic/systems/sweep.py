@@ -15,16 +15,8 @@ from jaxtyping import Array
 from ..derivatives import solve_ensemble_with_tangents, tangent_scale, tangents_of
 from ..formulations import AbstractSystem
 from ..hybrid import HybridOutcome, solve_hybrid, solve_hybrid_with_tangents
-from ..integration import (
-    CROSSED,
-    FAILED,
-    LEFT_DOMAIN,
-    UNRESOLVED,
-    Outcome,
-    Settings,
-    explicit_tableau,
-    solve_ensemble,
-)
+from ..integration import Outcome, Settings, explicit_tableau, solve_ensemble
+from ..integration.status import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED
 from ..sweeps import Table, Variable, axis, chunk_for, size_of
 from ..sweeps import sweep as computed
 from ..validation import as_number

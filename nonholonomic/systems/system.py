@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..formulations import AbstractFormulation, AbstractSystem, Hamel, Lagrange
-from ..integration import run_bounds
+from ..integration.checks import run_bounds
 from ..validation import UNTRACEABLE, as_number, is_traced, require, require_all
 from .engine import Cells
 from .form import Form

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..integration import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED
+from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED
 from ..sweeps import Table, Tabular
 from ..validation import is_traced
 

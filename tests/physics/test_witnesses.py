@@ -72,7 +72,7 @@ def legal_cases(arena, friction):
 def from_vector_form(scene, state):
     """State and rate in Euler angles, by the chain rule from the vector form, with the normal force and the lengths."""
     chart, rate = jax.jvp(lambda s: euler_angles.from_vector_state(scene, s), (state,), (scene.field(state),))
-    metric = euler_angles.across(scene).metric * jnp.ones(())
+    metric = euler_angles.across(scene)[0] * jnp.ones(())
     return chart, rate[3:], scene.normal_force(state), jnp.stack([metric, 1.0, scene.body.radius])
 
 

@@ -13,7 +13,8 @@ from close import assert_close
 from tops import rutstam_top
 
 import tippe
-from nonholonomic.integration import CROSSED, Settings, solve_ensemble
+from nonholonomic.integration import Settings, solve_ensemble
+from nonholonomic.integration.status import CROSSED
 from tippe.modes.inversion_problem import InversionProblem
 
 

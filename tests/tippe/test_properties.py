@@ -12,7 +12,8 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import tippe
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, REACHED_END, Settings, solve_ensemble
+from nonholonomic.integration import Settings, solve_ensemble
+from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, REACHED_END
 from tippe.modes.inversion_problem import InversionProblem
 
 # Scenes are scaled beyond the size of any top.

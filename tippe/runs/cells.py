@@ -8,16 +8,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.hybrid import HybridOutcome
-from nonholonomic.integration import (
-    CROSSED,
-    FAILED,
-    LEFT_DOMAIN,
-    UNRESOLVED,
-    Outcome,
-    Settings,
-    Status,
-    solve_by_diffrax,
-)
+from nonholonomic.integration import Outcome, Settings, solve_by_diffrax
+from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED, Status
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Variable
 
@@ -59,10 +51,10 @@ WORD_OF_STATUS = {
 }
 
 
-def too_many_steps(t1: float, most: int, end: float) -> str:
+def too_many_steps(t1: float, max_steps: int, end: float) -> str:
     """Message for a run that needs more than the allowed steps."""
     return (
-        f"t1 = {t1:g} s is too long: the run needs more than {most:_} steps, which reached only {end:.4g} s; "
+        f"t1 = {t1:g} s is too long: the run needs more than {max_steps:_} steps, which reached only {end:.4g} s; "
         "take a shorter t1 or a larger tolerance"
     ).replace("_", " ")
 
@@ -161,12 +153,12 @@ class InversionRuns(NamedTuple):
     ) -> dict[str, Any]:
         """The variables that describe how the runs ended, except the first of two times."""
         ended, inverted, theta = _at_the_end(scene, problem, outcome, self.last, tolerance)
-        others = [np.asarray(ended) == status for status in WORD_OF_STATUS]
-        code = np.select([np.asarray(inverted), *others], [0, *WORD_OF_STATUS.values()], 1)
-        lost = code == WORDS.index("contact_lost")
-        if lost.any():
+        conditions = [np.asarray(ended) == status for status in WORD_OF_STATUS]
+        code = np.select([np.asarray(inverted), *conditions], [0, *WORD_OF_STATUS.values()], 1)
+        is_lost = code == WORDS.index("contact_lost")
+        if is_lost.any():
             words = np.array([WORDS.index(status.word) for status in LOSSES])
-            code = np.where(lost, words[self._loss(scene, jnp.asarray(outcome.state))], code)
+            code = np.where(is_lost, words[self._loss(scene, jnp.asarray(outcome.state))], code)
         counts = zip(self.run_kind.counts, outcome.counts, strict=True) if isinstance(outcome, HybridOutcome) else ()
         return {
             self.times[-1]: np.where(inverted, outcome.crossing_time, np.inf),

@@ -16,7 +16,8 @@ from nonholonomic.hybrid import (
     hybrid_samples,
     solve_hybrid_dense,
 )
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED, Settings, Status
+from nonholonomic.integration import Settings
+from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED, Status
 from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.dynamics import NO_COSINE
@@ -116,7 +117,7 @@ class HybridTrajectory(AbstractTrajectory):
         """The touching sphere; in flight, and if both touch, the top's own."""
         spheres = balls(self.scene.body)
         return Ball(
-            *(jnp.where(self.contact == 1, stem, own) for own, stem in zip(spheres[0], spheres[-1], strict=True))
+            *(jnp.where(self.contact == 1, stem, main) for main, stem in zip(spheres[0], spheres[-1], strict=True))
         )
 
     @of_each_run
@@ -128,8 +129,8 @@ class HybridTrajectory(AbstractTrajectory):
     def normal_force(self) -> Float[Array, " times"]:
         """Normal force [N]; 0 in flight. If both spheres touch, this is the sum of both forces, the weight."""
         motion = standing_on(self.scene.dynamics, self._ball).motion(self._states)
-        both = jnp.where(self.contact == BOTH, self.scene.body.mass * self.scene.gravity, motion.normal_force)
-        return jnp.where(self.contact < 0, 0.0, both)
+        total_force = jnp.where(self.contact == BOTH, self.scene.body.mass * self.scene.gravity, motion.normal_force)
+        return jnp.where(self.contact < 0, 0.0, total_force)
 
     @of_each_run
     def slip(self) -> Float[Array, "times 2"]:
@@ -147,10 +148,10 @@ class HybridTrajectory(AbstractTrajectory):
         )
 
     @staticmethod
-    def parts_of(shown: Float[Array | np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
+    def parts_of(rows: Float[Array | np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
         """State, cyclic coordinates, spin angle, work, and the distance with its rate, from the output rows of the
         modes."""
-        return shown[:8], shown[8:13], shown[13], shown[14], shown[15:]
+        return rows[:8], rows[8:13], rows[13], rows[14], rows[15:]
 
     @staticmethod
     def work_in(piece: Segment) -> float:
@@ -216,8 +217,10 @@ def simulate_hybrid(scene: Scene[Top], launch: Launch, t1: float, times: Any, se
 def sampled_hybrid(scene: Scene[Top], launch: Launch, times: Any, t1: Any, settings: Settings) -> HybridTrajectory:
     """Run one launch of a hybrid scene inside a transformation. **Arguments:** as for `simulate`, already checked."""
     samples = hybrid_samples(level_modes, (scene, launch), times, t1, settings, counters=1)
-    grown = has_grown_between(scene, level_modes((scene, launch), settings.tolerance), samples, energy_in, settings)
-    return sampled_flights(HybridTrajectory, scene, times, samples, jnp.asarray(int(Status.JAMMED)), grown)
+    energy_grew = has_grown_between(
+        scene, level_modes((scene, launch), settings.tolerance), samples, energy_in, settings
+    )
+    return sampled_flights(HybridTrajectory, scene, times, samples, jnp.asarray(int(Status.JAMMED)), energy_grew)
 
 
 def has_grown_between(scene: Scene[Top], built: Any, samples: HybridSamples, energies: Any, settings: Settings) -> Any:
@@ -227,8 +230,8 @@ def has_grown_between(scene: Scene[Top], built: Any, samples: HybridSamples, ene
     least and the greatest energy of a state in a mode.
     """
     _, first, state = built
-    after, _ = energies(scene, samples.end_state[:, None], samples.end_mode[None].astype(int))
-    return has_grown(scene, energies(scene, state, first)[1], after, settings.tolerance)[0]
+    end_energy, _ = energies(scene, samples.end_state[:, None], samples.end_mode[None].astype(int))
+    return has_grown(scene, energies(scene, state, first)[1], end_energy, settings.tolerance)[0]
 
 
 def sampled_flights(
@@ -237,16 +240,16 @@ def sampled_flights(
     times: Any,
     samples: HybridSamples,
     lost: Int[Array, ""],
-    grown: Bool[Array, ""],
+    energy_grew: Bool[Array, ""],
 ) -> Any:
     """A trajectory of the given class from samples. `lost` is the status code for a run that left its domain, and
-    `grown` whether the run has gained energy.
+    `energy_grew` whether the run has gained energy.
     """
     states, place, spin_angle, work, distance = kind.parts_of(samples.shown)
     # After the end, no sphere touches.
     number = jnp.where(jnp.isnan(samples.number), BETWEEN, samples.number).astype(int)
     ended = {code: jnp.asarray(int(status)) for code, status in STATUS.items()} | {LEFT_DOMAIN: lost}
-    ended |= {code: jnp.where(grown, int(Status.UNRESOLVED), ended[code]) for code in (REACHED_END, LEFT_DOMAIN)}
+    ended |= {code: jnp.where(energy_grew, int(Status.UNRESOLVED), ended[code]) for code in (REACHED_END, LEFT_DOMAIN)}
     status = sum(jnp.where(samples.status == code, index, 0) for code, index in ended.items())
     stats = {"accepted": samples.steps - samples.rejected, "rejected": samples.rejected, "hops": samples.counts[0]}
     stats = {name: count.astype(int) for name, count in stats.items()}
@@ -267,10 +270,10 @@ def flights_of(
 
     A run whose energy does not balance the work of friction and impacts ends as "unresolved".
     """
-    shown = path.times
-    states, place, spin_angle, work, distance = kind.parts_of(path.at(shown))
-    ends = (status, path.end_time, {}, path, distance, kind.touching(path.numbers(shown)), hops)
-    run = kind(shown, scene, states, place, spin_angle, work, *ends)
+    step_times = path.times
+    states, place, spin_angle, work, distance = kind.parts_of(path.at(step_times))
+    ends = (status, path.end_time, {}, path, distance, kind.touching(path.numbers(step_times)), hops)
+    run = kind(step_times, scene, states, place, spin_angle, work, *ends)
     in_contact = sum(kind.work_in(segment) for segment in path.segments)
     # The remaining work is that of the impacts.
     run = run.with_stats(path, impact_loss=float(in_contact - path.state[-1]))

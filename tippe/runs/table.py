@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import diffrax
 import numpy as np
 
-from nonholonomic.integration import DEFAULT_MAX_STEPS, Settings, explicit_tableau
+from nonholonomic.integration import Settings, explicit_tableau
+from nonholonomic.integration.settings import DEFAULT_MAX_STEPS
 from nonholonomic.sweeps import Axis, Table, Variable, sweep
 from nonholonomic.validation import as_number, require_flag, require_outside, require_whole
 
@@ -224,15 +225,17 @@ def request_of(runs: InversionRuns, options: TableOptions) -> dict[str, Any]:
     return request
 
 
-def warn_of_long_runs(table: Table, t1: float, most: int) -> None:
+def warn_of_long_runs(table: Table, t1: float, max_steps: int) -> None:
     """Warn of runs that needed more than the allowed steps. Tables whose variables stay in the file are not checked."""
     if not isinstance(table.variables, dict):
         return
-    long = (table.variables["status"] == "failed") & (table.variables["steps"] >= most)
-    if long.any():
-        end = float(np.min(table.variables["end_time"][long]))
+    is_long = (table.variables["status"] == "failed") & (table.variables["steps"] >= max_steps)
+    if is_long.any():
+        end = float(np.min(table.variables["end_time"][is_long]))
         warnings.warn(
-            f"{long.sum()} of {long.size} runs have failed: {too_many_steps(t1, most, end)}", UserWarning, stacklevel=3
+            f"{is_long.sum()} of {is_long.size} runs have failed: {too_many_steps(t1, max_steps, end)}",
+            UserWarning,
+            stacklevel=3,
         )
 
 
@@ -284,13 +287,15 @@ class ScatteredJob(NamedTuple):
 
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
         """The variables of some cells, of which only the first `count` are run."""
-        chosen = {number: values[columns["cell"]] for number, values in self.columns.items()}
-        return self.job(chosen, count) | {self.names[number]: values for number, values in chosen.items()}
+        values_of_columns = {number: values[columns["cell"]] for number, values in self.columns.items()}
+        return self.job(values_of_columns, count) | {
+            self.names[number]: values for number, values in values_of_columns.items()
+        }
 
 
 def digest(columns: dict[str, Any]) -> str:
     """A checksum of the columns and their names."""
-    whole = hashlib.sha256()
+    digest = hashlib.sha256()
     for name, values in columns.items():
-        whole.update(name.encode() + np.ascontiguousarray(values, float).tobytes())
-    return whole.hexdigest()[:16]
+        digest.update(name.encode() + np.ascontiguousarray(values, float).tobytes())
+    return digest.hexdigest()[:16]

@@ -14,9 +14,10 @@ from jaxtyping import Array, Float, Int
 
 from ...hybrid import MOST_ROUNDS, AbstractBatchedMode, AbstractHoppingMode, HybridOutcome
 from ...hybrid.ensemble import after_reset, after_solve, at_start
-from ...integration import LEFT_DOMAIN, RUNNING, UNRESOLVED, Settings
+from ...integration import Settings
 from ...integration.ensemble import with_crossing_times
 from ...integration.scheduler import LaneScheduler, outcome_of
+from ...integration.status import LEFT_DOMAIN, RUNNING, UNRESOLVED
 from .simulator import Functions, Numbers, Stepper, as_object, offsets_of, size_of
 
 Start = tuple[tuple[AbstractBatchedMode, ...], Int[Array, "1"], Float[Array, "components 1"]]

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ...integration import Status
+from ...integration.status import Status
 from ..page import Page, page, script
 from ..stage import Stage
 from .frame import Frame

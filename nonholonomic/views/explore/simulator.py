@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...integration import RUNNING, AbstractProblem, LaneState, Settings, explicit_tableau
+from ...integration import AbstractProblem, LaneState, Settings, explicit_tableau
 from ...integration.runge_kutta import Step, stages_to_look, watched_places
 from ...integration.scheduler import LaneScheduler
+from ...integration.status import RUNNING
 from ...integration.step import Control, after_step, length_to_try
 from .javascript import javascript
 

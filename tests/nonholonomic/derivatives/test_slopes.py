@@ -12,7 +12,8 @@ import nonholonomic.derivatives._adjoint as adjoint
 import nonholonomic.derivatives._periods as periods
 import nonholonomic.derivatives.slopes as slopes
 from nonholonomic.derivatives import tangents_of
-from nonholonomic.integration import CROSSED, LEFT_DOMAIN, AbstractProblem, Settings
+from nonholonomic.integration import AbstractProblem, Settings
+from nonholonomic.integration.status import CROSSED, LEFT_DOMAIN
 
 MOVED = ("rate", "height", "growth")
 #: So many that the runs are differentiated backward.

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import tippe
-from nonholonomic.integration import sign_changes
+from nonholonomic.integration.zeros import sign_changes
 from tippe import steady
 from tippe.witnesses import marginal
 
