@@ -41,7 +41,7 @@ def test_the_axis_keeps_its_length_without_projection(rutstam_scene):
 
 
 #: Whose rates of energy at random states are all that the ordinary run looks at.
-LONGER = (("coulomb", "cylinder"), ("coulomb", "sphere"), ("frictionless", "sphere"))
+LONGER = [("coulomb", "cylinder"), ("frictionless", "cylinder"), *((law, "sphere") for law in LAWS)]
 
 
 @pytest.mark.parametrize(

@@ -112,6 +112,7 @@ def run() -> tippe.Trajectory:
     return tippe.simulate(scene, tippe.Launch(0.02, 0.5, place=(0.0, 0.1)), t1=0.5)
 
 
+@pytest.mark.slow
 def test_a_run_in_a_cylinder(run):
     """The contact point is on the arena and at rest, the velocity is the position's rate, and the energy stays."""
     assert run.status == "completed"

@@ -248,11 +248,12 @@ def test_the_time_of_inversion_of_the_regularised_law_is_creep():
     assert_close(np.diff(table.time) / np.diff(1.0 / speeds), 0.05, rtol=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("surface", "launch"),
     [
         (tippe.Plane(0.9), tippe.Launch(np.pi, 0.0)),
-        pytest.param(tippe.Sphere(0.2), tippe.Launch(np.pi, 50.0, eta=1.2), marks=pytest.mark.slow),
+        (tippe.Sphere(0.2), tippe.Launch(np.pi, 50.0, eta=1.2)),
     ],
     ids=["plane", "sphere"],
 )

@@ -91,6 +91,7 @@ def test_the_browser_says_what_the_table_says(browser, arena, law):
     assert len(set(status)) > 1
 
 
+@pytest.mark.slow
 def test_the_browser_says_when_rattlebacks_reverse(browser):
     """The times of `reversal_table`, for both senses; the words are those of reversals, and a spin of 0 is not allowed."""
     live = live_run(rattleback(), tippe.Launch(0.02, -5.0), None, 4.0)

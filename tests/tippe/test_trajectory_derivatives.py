@@ -94,6 +94,7 @@ def test_diffrax_ends_the_run_there_too():
     assert_close(run.end_time, lost(200.0).end_time, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_every_number_of_the_launch_and_some_of_the_scene():
     """Reverse mode by many numbers at once, in groups, against differences."""
     scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Viscous(0.3))

@@ -30,6 +30,8 @@ HERE = Path(__file__).parent
 
 #: A cluster takes long to start. In the ordinary run, one worker without a cluster computes for a scheduler, which is killed.
 DASK = pytest.param("dask", marks=pytest.mark.slow)
+#: In the ordinary run, a pool of Python's computes until it breaks.
+POOL = pytest.param("pool", marks=pytest.mark.slow)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +77,7 @@ def by_threads():
         return tippe.inversion_table(TOP, **TIMES)
 
 
-@pytest.mark.parametrize("way", ["serial", "processes", DASK, "pool"])
+@pytest.mark.parametrize("way", ["serial", "processes", DASK, POOL])
 def test_whoever_computes_a_table_gets_the_same_bits(way, many_blocks, by_threads, request):
     """Four blocks, in one thread, in processes of ours, in Dask's, in a pool of Python's; the reference by all cores."""
     if way == "serial":
