@@ -21,7 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import tippe
-from nonholonomic.integration import CROSSED, FAILED, LEFT_DOMAIN, Settings, solve_ensemble
+from nonholonomic.integration import Settings, solve_ensemble
+from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN
 from tippe.modes.inversion_problem import InversionProblem
 from tippe.papers import paper
 

@@ -33,8 +33,10 @@ ENGINE_ROOMS = tuple(
 
 #: The public numbers and types of the engine; the docstrings of the rooms say what they mean.
 CONSTANTS = [
-    *of("nonholonomic.integration", "RUNNING REACHED_END CROSSED LEFT_DOMAIN FAILED UNRESOLVED"),
-    *of("nonholonomic.integration", "DEFAULT_MAX_STEPS MOST_STEPS TIGHTEST Lanes States"),
+    *of("nonholonomic.integration", "Lanes States"),
+    *of("nonholonomic.integration.status", "RUNNING REACHED_END CROSSED LEFT_DOMAIN FAILED UNRESOLVED"),
+    *of("nonholonomic.integration.settings", "DEFAULT_MAX_STEPS MOST_STEPS"),
+    "nonholonomic.integration.checks.TIGHTEST",
     *of("nonholonomic.hybrid", "MOST_ROUNDS BETWEEN"),
 ]
 
@@ -122,10 +124,16 @@ PAGES = {
                 "nonholonomic.integration",
                 "AbstractProblem CoreProblem AbstractPassive ExtendedProblem Settings "
                 "solve_ensemble traced_solve_ensemble solve_with_samples Outcome "
-                "crossing_time LaneState solve_by_diffrax follow DenseSolution padded sample explicit_tableau legal_run "
-                "run_bounds tolerance_bound require_run require_times require_adaptive require_adjoint few_trials halved "
-                "sign_changes Oscillatory8",
+                "crossing_time LaneState solve_by_diffrax follow DenseSolution sample explicit_tableau Oscillatory8",
             ),
+            "nonholonomic.integration.status",
+            "nonholonomic.integration.checks",
+            *of(
+                "nonholonomic.integration.checks",
+                "legal_run run_bounds tolerance_bound require_run require_times require_adaptive require_adjoint",
+            ),
+            "nonholonomic.integration.zeros",
+            *of("nonholonomic.integration.zeros", "few_trials halved sign_changes"),
             "nonholonomic.hybrid",
             *of(
                 "nonholonomic.hybrid",
@@ -240,8 +248,9 @@ def text(page: Page) -> str:
     its own."""
     introduction = re.sub(r"(:\w+:`[^`]+`)|(`[^`]+`)", lambda match: match[1] or f"`{match[2]}`", page.introduction)
     modules = [name for name in page.names if inspect.ismodule(resolve(name))]
-    sections = {module: [name for name in page.names if name.startswith(f"{module}.")] for module in modules}
-    outside = [name for name in page.names if name.rpartition(".")[0] not in sections]
+    inside = [name for name in page.names if name not in modules]
+    sections = {module: [name for name in inside if name.rpartition(".")[0] == module] for module in modules}
+    outside = [name for name in page.names if name in modules or name.rpartition(".")[0] not in modules]
     lines = [page.title, "=" * len(page.title), "", introduction, "", *summary(outside)]
     for name in outside:
         lines += entry(name)
@@ -262,7 +271,9 @@ def entry(name: str) -> list[str]:
     value = resolve(name)
     if inspect.ismodule(value):
         heading = f"``{name}``"
-        return [heading, "-" * len(heading), "", f".. automodule:: {name}", "   :members:", ""]
+        # The names of a room of the engine have entries of their own.
+        members = [] if name.startswith(ENGINE_ROOMS) else ["   :members:"]
+        return [heading, "-" * len(heading), "", f".. automodule:: {name}", *members, ""]
     if inspect.isclass(value):
         members = [f"   :members: {', '.join(MEMBERS[name].split())}"] if name in MEMBERS else []
         return [f".. autoclass:: {name}", *members, ""]

@@ -31,7 +31,7 @@ from .geometry import Spheroid as Spheroid
 from .geometry import Torus as Torus
 from .identification import FitWarning as FitWarning
 from .identification import Free as Free
-from .integration import Status as Status
+from .integration.status import Status as Status
 from .sweeps import Table as Table
 from .sweeps import local_processes as local_processes
 from .systems import AbstractMode as AbstractMode

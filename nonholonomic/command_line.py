@@ -23,7 +23,7 @@ def import_quietly() -> None:
 
     A `KeyboardInterrupt` would be lost if it arrived during garbage collection, where JAX calls back into Python.
     """
-    program, shown = sys.orig_argv[sys.orig_argv.index("-m") + 1], sys.excepthook
+    program, excepthook = sys.orig_argv[sys.orig_argv.index("-m") + 1], sys.excepthook
 
     def end(number: int, frame: Any) -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -37,7 +37,7 @@ def import_quietly() -> None:
         if issubclass(kind, KeyboardInterrupt):
             print(f"python -m {program}: interrupted", file=sys.stderr)
         else:
-            shown(kind, error, trace)
+            excepthook(kind, error, trace)
 
     sys.excepthook = hook
 
@@ -60,14 +60,14 @@ def run_and_exit(main: Callable[[], int], program: str) -> NoReturn:
     sys.exit(status)
 
 
-def closing_lines(runs: int, started: float, written: Iterable[Any], page: str, read: bool = False) -> str:
+def closing_lines(runs: int, start_time: float, paths: Iterable[Any], page: str, read: bool = False) -> str:
     """The last lines of a command line.
 
-    **Arguments:** `runs`: number of runs; `started`: the start of the call, by `time.perf_counter`; `written`: the
+    **Arguments:** `runs`: number of runs; `start_time`: the start of the call, by `time.perf_counter`; `paths`: the
     files; `page`: what the page shows, and its path; `read`: whether all results are those of an earlier call.
     """
-    duration = time.perf_counter() - started
-    files = ", ".join(map(str, written))
+    duration = time.perf_counter() - start_time
+    files = ", ".join(map(str, paths))
     included = "as computed earlier by the same command" if read else "compilation included"
     return f"\n{runs} runs in {duration:.1f} s, {included}. Wrote {files}.\n{page}"
 
@@ -86,12 +86,12 @@ def interruptible(main: Callable[[], int], program: str) -> int:
     """
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    watched, written = os.pipe()
-    os.set_blocking(written, False)
-    signal.set_wakeup_fd(written)
+    read_end, write_end = os.pipe()
+    os.set_blocking(write_end, False)
+    signal.set_wakeup_fd(write_end)
 
     def watch() -> None:
-        while signal.SIGINT not in os.read(watched, 64):
+        while signal.SIGINT not in os.read(read_end, 64):
             pass
         time.sleep(PATIENCE)
         _end(f"python -m {program}: interrupted; run the same command again to resume")

@@ -76,9 +76,9 @@ def enable_compilation_cache(folder: Any = None) -> Path | None:
     if is_off("NONHOLONOMIC_CACHE"):
         return None
     settings: Any = jax.config
-    chosen = settings.jax_compilation_cache_dir
-    if folder is None and chosen:
-        return Path(chosen)
+    cache_folder = settings.jax_compilation_cache_dir
+    if folder is None and cache_folder:
+        return Path(cache_folder)
     try:
         place = (user_folder() if folder is None else Path(folder)).expanduser() / environment_name()
         place.mkdir(parents=True, exist_ok=True)
@@ -87,7 +87,7 @@ def enable_compilation_cache(folder: Any = None) -> Path | None:
         # Log instead of warn: if warnings are errors, a cache must not stop a computation.
         _log.warning("compiled programs are not stored: %s", error)
         return None
-    if chosen != str(place):
+    if cache_folder != str(place):
         # JAX opens its folder only once.
         compilation_cache.reset_cache()
     settings.update("jax_compilation_cache_dir", str(place))
@@ -145,13 +145,13 @@ def remove_damaged(folder: Path) -> None:
     **Raises:** `OSError` if the folder cannot be written; a full disk is only logged.
     """
     looked_at = folder / LOOKED_AT
-    known = set(looked_at.read_bytes().split(b"\n")) if looked_at.exists() else set()
+    entries = set(looked_at.read_bytes().split(b"\n")) if looked_at.exists() else set()
     sound_lines = []
     for entry in folder.glob("*-cache"):
         # Another process may remove the entry, too.
         try:
             line = _line(entry)
-            if line in known or sound(entry.read_bytes()):
+            if line in entries or sound(entry.read_bytes()):
                 sound_lines.append(line)
             else:
                 entry.unlink()
@@ -204,11 +204,11 @@ def kept_files(folder: Path | None, facts: Any, compute: Callable[[], dict[str, 
         files = compute()
     # Write the archive as a whole, because another process may read it. A full disk must not stop the program.
     with contextlib.suppress(OSError):
-        written = path.with_name(f".{uuid.uuid4().hex}")
-        with zipfile.ZipFile(written, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        scratch = path.with_name(f".{uuid.uuid4().hex}")
+        with zipfile.ZipFile(scratch, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for name, contents in files.items():
                 archive.writestr(name, contents)
-        os.replace(written, path)
+        os.replace(scratch, path)
     return files
 
 
@@ -222,10 +222,10 @@ def _place(folder: Path, facts: Any) -> Path:
     settings: Any = jax.config
     machine = (environment_name(), jax.default_backend(), str(jax.numpy.result_type(float)))
     state = (facts, _versions(), machine, sorted(settings.values.items()))
-    kept = hashlib.sha256(repr(state).encode())
+    digest = hashlib.sha256(repr(state).encode())
     for path in sorted(_sources()):
-        kept.update(path.read_bytes())
-    return folder / f"files-{kept.hexdigest()[:32]}"
+        digest.update(path.read_bytes())
+    return folder / f"files-{digest.hexdigest()[:32]}"
 
 
 def _versions() -> list[str]:

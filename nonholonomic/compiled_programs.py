@@ -1,4 +1,4 @@
-"""Clear compiled programs from memory before they exhaust it.
+"""Keep the number of compiled programs small: one program for many sizes, and none kept until memory is exhausted.
 
 A program of a hybrid scene takes 60 to 180 MB and 200 to 800 memory mappings. Linux allows 65 530 mappings per process,
 and a compiler that gets no more mappings crashes the process.
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from .validation import is_traced
 
@@ -26,7 +27,25 @@ PART_OF_MAPPINGS = 0.5
 #: Below this memory [bytes] there cannot be that many mappings, so they are not counted; counting takes some ms.
 LITTLE_MEMORY = 1_000_000_000
 
+#: Least number of times at which a program evaluates a run: few runs are so long that more sizes are worth a compilation.
+LEAST_PADDED = 256
+
 _log = logging.getLogger(__name__)
+
+
+def padded(values: Float[np.ndarray, "... times"], least: int) -> Float[np.ndarray, "... more"]:
+    """Values padded to a power of two of at least `least` and `LEAST_PADDED` by repeating the last one, so that one
+    program serves many sizes.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from nonholonomic.compiled_programs import padded
+    >>> padded(np.array([1.0, 2.0, 3.0]), least=300).shape
+    (512,)
+    """
+    padding = (1 << (max(least, LEAST_PADDED) - 1).bit_length()) - values.shape[-1]
+    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, padding)], mode="edge")
 
 
 def forget_programs_if_many(most_memory: int = MOST_MEMORY) -> bool:

@@ -53,10 +53,12 @@ def with_numbers(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any
 
     **Raises:** `ValueError` for a name that matches no parameter.
     """
-    known = {name: number for root, tree in roots.items() for name, number in numbers(root, tree).items()}
+    values_of_names = {name: number for root, tree in roots.items() for name, number in numbers(root, tree).items()}
     for name in values:
-        if name not in known:
-            raise _unknown_axis(name, [known_name for known_name, number in known.items() if number is not None])
+        if name not in values_of_names:
+            raise _unknown_axis(
+                name, [known_name for known_name, number in values_of_names.items() if number is not None]
+            )
     return {root: _replaced(root, tree, values) for root, tree in roots.items()}
 
 
@@ -68,13 +70,13 @@ def full_name(argument: str, name: str, known: list[str]) -> str:
 
     **Raises:** `ValueError` for a name that matches no full name or several.
     """
-    meant = _meant(name, known)
-    if len(meant) != 1:
-        ends = [whole.rsplit(".", 1)[-1] for whole in known]
+    matches = _meant(name, known)
+    if len(matches) != 1:
+        ends = [candidate.rsplit(".", 1)[-1] for candidate in known]
         hint = likely(str(name).rsplit(".", 1)[-1], ends)
-        what = f"could be {' or '.join(meant)}" if meant else f"must be one of {', '.join(known)}{hint}"
-        raise ValueError(f"{argument}: {name!r} {what}")
-    return meant[0]
+        problem = f"could be {' or '.join(matches)}" if matches else f"must be one of {', '.join(known)}{hint}"
+        raise ValueError(f"{argument}: {name!r} {problem}")
+    return matches[0]
 
 
 def full_axes(axes: dict[str, Any], known: list[str]) -> dict[str, Any]:
@@ -89,10 +91,10 @@ def full_axes(axes: dict[str, Any], known: list[str]) -> dict[str, Any]:
     for name, values in axes.items():
         if not _meant(name, known):
             raise _unknown_axis(name, known)
-        whole = full_name("axes", name, known)
-        if whole in by_full_name:
-            raise ValueError(f"axes: {whole!r} is named twice")
-        by_full_name[whole] = values
+        full = full_name("axes", name, known)
+        if full in by_full_name:
+            raise ValueError(f"axes: {full!r} is named twice")
+        by_full_name[full] = values
     return by_full_name
 
 
@@ -102,33 +104,33 @@ def _meant(name: Any, known: list[str]) -> list[str]:
 
 
 def _unknown_axis(name: str, known: list[str]) -> ValueError:
-    short = {full.rsplit(".", 1)[-1]: full for full in known}
+    suffixes = {full.rsplit(".", 1)[-1]: full for full in known}
     return ValueError(
         f"unknown axis {name!r}: the numbers that can be varied are {', '.join(known)}"
-        f"{likely(name.rsplit('.', 1)[-1], short)}"
+        f"{likely(name.rsplit('.', 1)[-1], suffixes)}"
     )
 
 
 def likely(name: Any, known: Iterable[str]) -> str:
     """The known name that resembles an unknown one, as an addition to a message; empty if there is none."""
     names = list(known)
-    swapped = [other for other in names if sorted(other) == sorted(str(name))]
-    close = swapped or difflib.get_close_matches(str(name), names, 1)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    anagrams = [candidate for candidate in names if sorted(candidate) == sorted(str(name))]
+    matches = anagrams or difflib.get_close_matches(str(name), names, 1)
+    return f"; did you mean {matches[0]!r}?" if matches else ""
 
 
 def _replaced(name: str, tree: Any, values: dict[str, Any]) -> Any:
     changes = {}
     for field in dataclasses.fields(tree):
-        below, value = f"{name}.{field.name}", getattr(tree, field.name)
-        if below in values:
-            changes[field.name] = values[below]
+        path_of_field, value = f"{name}.{field.name}", getattr(tree, field.name)
+        if path_of_field in values:
+            changes[field.name] = values[path_of_field]
         elif isinstance(value, tuple):
-            parts = tuple(values.get(f"{below}[{k}]", part) for k, part in enumerate(value))
-            if any(f"{below}[{k}]" in values for k in range(len(value))):
+            parts = tuple(values.get(f"{path_of_field}[{k}]", part) for k, part in enumerate(value))
+            if any(f"{path_of_field}[{k}]" in values for k in range(len(value))):
                 changes[field.name] = parts
-        elif isinstance(value, eqx.Module) and any(path.startswith(below + ".") for path in values):
-            changes[field.name] = _replaced(below, value, values)
+        elif isinstance(value, eqx.Module) and any(path.startswith(path_of_field + ".") for path in values):
+            changes[field.name] = _replaced(path_of_field, value, values)
     return dataclasses.replace(tree, **changes) if changes else tree
 
 
@@ -159,15 +161,15 @@ _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 def readable_unit(unit: str) -> str:
     """A unit in common notation, "kg m²/s" for "kg m2 s-1"; an empty string for "1"."""
-    above, below = [], []
+    numerator, denominator = [], []
     for part in unit.split():
         match = re.fullmatch(r"([A-Za-z]+)(-?\d+)?", part)
         if match is not None:
             name, power = match[1], int(match[2] or 1)
-            (above if power > 0 else below).append(name + (str(abs(power)) if abs(power) > 1 else ""))
-    text = " ".join(above) or ("1" if below else "")
-    if below:
-        text += "/" + (below[0] if len(below) == 1 else f"({' '.join(below)})")
+            (numerator if power > 0 else denominator).append(name + (str(abs(power)) if abs(power) > 1 else ""))
+    text = " ".join(numerator) or ("1" if denominator else "")
+    if denominator:
+        text += "/" + (denominator[0] if len(denominator) == 1 else f"({' '.join(denominator)})")
     return re.sub(r"(?<=[A-Za-z])\d+", lambda power: power[0].translate(_SUPERSCRIPTS), text)
 
 
@@ -177,10 +179,10 @@ def as_text(value: Any, unit: str = "1") -> str:
         return repr(value)
     if isinstance(value, Tracer):
         return f"traced {value.aval.str_short()}"
-    behind = readable_unit(unit)
-    behind = f" {behind}" if behind else ""
+    suffix = readable_unit(unit)
+    suffix = f" {suffix}" if suffix else ""
     if isinstance(value, tuple):
-        return f"({', '.join(as_text(part) for part in value)}){behind}"
+        return f"({', '.join(as_text(part) for part in value)}){suffix}"
     if isinstance(value, jax.Array | np.ndarray | float) and np.asarray(value).dtype.kind in "fiu":
         numbers = np.asarray(value)
         values = numbers.ravel()
@@ -188,7 +190,7 @@ def as_text(value: Any, unit: str = "1") -> str:
             text = ", ".join(f"{number:.6g}" for number in values)
         else:
             text = f"{values[0]:.6g}, {values[1]:.6g}, ..., {values[-1]:.6g}, {values.size} numbers"
-        return (text if numbers.ndim == 0 else f"[{text}]") + behind
+        return (text if numbers.ndim == 0 else f"[{text}]") + suffix
     return getattr(value, "__qualname__", None) or repr(value)
 
 
@@ -217,9 +219,10 @@ def distinguishing_labels(starts: list[str], *groups: list[Any]) -> list[str]:
 
     **Returns:** the labels. Equal labels are numbered.
     """
-    apart = [differences(group) for group in groups]
+    differences_of_groups = [differences(group) for group in groups]
     names = [
-        ", ".join([start, *(part for difference in apart for part in difference[k])]) for k, start in enumerate(starts)
+        ", ".join([start, *(part for difference in differences_of_groups for part in difference[k])])
+        for k, start in enumerate(starts)
     ]
     return [
         name if names.count(name) == 1 else f"{name} ({names[: k + 1].count(name)})" for k, name in enumerate(names)
@@ -239,7 +242,7 @@ def differences(modules: list[Any]) -> list[list[str]]:
             unit = getattr(modules[0], "units", {}).get(field.name, "1")
             texts = [as_text(value, unit) for value in values]
             parts = [[f"{field.name} {text}"] if len(set(texts)) > 1 else [] for text in texts]
-        labels = [before + part for before, part in zip(labels, parts, strict=True)]
+        labels = [label + part for label, part in zip(labels, parts, strict=True)]
     return labels
 
 
@@ -252,5 +255,5 @@ def as_html(title: str, rows: list[tuple[str, ...]]) -> str:
 
 def text_as_html(text: str) -> str:
     """A text whose first line is a title, as HTML for a notebook."""
-    title, _, rest = text.partition("\n")
-    return f"<div><b>{html.escape(title)}</b><pre>{html.escape(rest)}</pre></div>"
+    title, _, body = text.partition("\n")
+    return f"<div><b>{html.escape(title)}</b><pre>{html.escape(body)}</pre></div>"

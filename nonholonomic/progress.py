@@ -161,11 +161,11 @@ class _Line:
         shown = [speaker for speaker in self.speakers if speaker._shown and time.time() - speaker._start >= INTERVAL]
         if not shown:
             return
-        told = next((speaker for speaker in reversed(shown) if speaker._total is not None), shown[0])
-        for other in shown:
-            if other is not told:
-                other._clear()
-        told._show()
+        owner = next((speaker for speaker in reversed(shown) if speaker._total is not None), shown[0])
+        for hidden_speaker in shown:
+            if hidden_speaker is not owner:
+                hidden_speaker._clear()
+        owner._show()
 
 
 _LINE = _Line()

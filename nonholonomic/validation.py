@@ -24,8 +24,9 @@ from jaxtyping import Array, Bool, Float
 
 from .parameters import as_html, as_text, contents, in_lines, one_line
 
-#: Addition to the message about an angle above its bounds.
+#: Addition to the message about an angle that may be in degrees.
 IN_DEGREES = "; angles are in radians: did you mean np.radians({})?"
+
 #: What a message says about a user's function after `jax.errors.JAXTypeError`.
 UNTRACEABLE = (
     "cannot be traced by JAX: write it with jax.numpy in place of numpy and math, and with jnp.where in place of `if`"
@@ -148,11 +149,13 @@ def require_kind(value: Any, name: str, kind: type, example: str = "") -> None:
     """
     if isinstance(value, kind):
         return
-    wanted = kind.__name__.removeprefix("Abstract")
-    if type(value).__name__ == wanted:
-        theirs, ours = (either.__module__.partition(".")[0] for either in (type(value), kind))
-        raise ValueError(f"{name} is a {theirs}.{wanted} and must be a {ours}.{wanted}: each package has its own")
-    raise ValueError(f"{name} = {value!r} must be a {wanted}{example}{uncalled(value)}")
+    kind_name = kind.__name__.removeprefix("Abstract")
+    if type(value).__name__ == kind_name:
+        package_of_value, package_of_kind = (type_.__module__.partition(".")[0] for type_ in (type(value), kind))
+        raise ValueError(
+            f"{name} is a {package_of_value}.{kind_name} and must be a {package_of_kind}.{kind_name}: each package has its own"
+        )
+    raise ValueError(f"{name} = {value!r} must be a {kind_name}{example}{uncalled(value)}")
 
 
 def uncalled(value: Any) -> str:
@@ -199,12 +202,12 @@ def require_increasing(values: Any, name: str) -> None:
         )
     if is_traced(values):
         return
-    known = np.asarray(values)
-    wrong = np.flatnonzero(~(np.diff(known) > 0.0))
-    if wrong.size:
-        k = int(wrong[0]) + 1
+    numbers = np.asarray(values)
+    positions = np.flatnonzero(~(np.diff(numbers) > 0.0))
+    if positions.size:
+        k = int(positions[0]) + 1
         raise ValueError(
-            f"{name}[{k}] = {shown(known[k])} must be greater than {name}[{k - 1}] = {shown(known[k - 1])}: "
+            f"{name}[{k}] = {shown(numbers[k])} must be greater than {name}[{k - 1}] = {shown(numbers[k - 1])}: "
             f"{name} must increase"
         )
 

@@ -78,7 +78,7 @@ def stored(*values: Float[Array, "..."] | None) -> tuple[Any, ...]:
 
 
 def written_in_place(
-    whole: Float[Array, "stack ..."], entry: Float[Array, "..."], at: Int[Array, ""]
+    stack: Float[Array, "stack ..."], entry: Float[Array, "..."], at: Int[Array, ""]
 ) -> Float[Array, "stack ..."]:
     """A stack of arrays with one of them replaced, in place.
 
@@ -87,11 +87,11 @@ def written_in_place(
     that call.
     """
     start = (at, *(0 for _ in entry.shape))
-    return jax.lax.dynamic_update_slice(whole, entry[None], start, allow_negative_indices=False)
+    return jax.lax.dynamic_update_slice(stack, entry[None], start, allow_negative_indices=False)
 
 
 def written_by_component(
-    whole: Float[Array, "stack components lanes"], entry: Float[Array, "components lanes"], at: Int[Array, ""]
+    stack: Float[Array, "stack components lanes"], entry: Float[Array, "components lanes"], at: Int[Array, ""]
 ) -> Float[Array, "stack components lanes"]:
     """`written_in_place` for every component separately, from where it is computed.
 
@@ -99,11 +99,11 @@ def written_by_component(
     removed when XLA fuses a concatenation with the update that it is for.
     """
     for row, component in enumerate(entry):
-        whole = jax.lax.dynamic_update_slice(whole, component[None, None], (at, row, 0), allow_negative_indices=False)
-    return whole
+        stack = jax.lax.dynamic_update_slice(stack, component[None, None], (at, row, 0), allow_negative_indices=False)
+    return stack
 
 
-def uncounted(going: Bool[Array, ""], carried: Int[Array, ""]) -> Bool[Array, ""]:
+def uncounted(is_running: Bool[Array, ""], carried: Int[Array, ""]) -> Bool[Array, ""]:
     """The condition of a loop, joined with a loop variable that is never negative.
 
     XLA tries to count the iterations of a loop whose condition reads a single loop variable. To do so, XLA copies
@@ -111,7 +111,7 @@ def uncounted(going: Bool[Array, ""], carried: Int[Array, ""]) -> Bool[Array, ""
     This takes a twelfth of the time to compile derivatives with respect to several numbers. XLA does not do this for
     conditions that read two variables. This can be removed when XLA looks at how the variable changes before it copies.
     """
-    return going & (carried >= 0)
+    return is_running & (carried >= 0)
 
 
 def least(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
@@ -174,7 +174,7 @@ def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
         return function
 
     def called(argument: Any) -> Any:
-        plain = jax.make_jaxpr(jnp.negative)(0.0).jaxpr.eqns[0].ctx
+        context = jax.make_jaxpr(jnp.negative)(0.0).jaxpr.eqns[0].ctx
         # The attributes also prevent XLA from fusing small functions inside, such as `where`, into everything that uses
         # them.
         with set_xla_metadata(**_ATTRIBUTES):
@@ -182,7 +182,7 @@ def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
         # The values that the function closes over become its first arguments.
         inputs = [*closed.jaxpr.constvars, *closed.jaxpr.invars]
         program = closed.jaxpr.replace(constvars=[], invars=inputs)
-        results = _kernel.bind(*closed.consts, *jax.tree.leaves(argument), program=program, plain=plain)
+        results = _kernel.bind(*closed.consts, *jax.tree.leaves(argument), program=program, context=context)
         return jax.tree.unflatten(jax.tree.structure(shape), results)
 
     return called
@@ -190,14 +190,14 @@ def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 _ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
 
-#: A program with the attributes in all of its equations; `plain` is the context of an equation without them.
+#: A program with the attributes in all of its equations; `context` is the context of an equation without them.
 _kernel = Primitive("in_one_kernel")
 _kernel.multiple_results = True
-_kernel.def_impl(lambda *arguments, **rest: jax.jit(functools.partial(_kernel.bind, **rest))(*arguments))
-_kernel.def_abstract_eval(lambda *arguments, program, plain: [variable.aval for variable in program.outvars])
+_kernel.def_impl(lambda *arguments, **parameters: jax.jit(functools.partial(_kernel.bind, **parameters))(*arguments))
+_kernel.def_abstract_eval(lambda *arguments, program, context: [variable.aval for variable in program.outvars])
 
 
-def _called_as_one(*arguments: Array, program: Jaxpr, plain: Any) -> list[Array]:
+def _called_as_one(*arguments: Array, program: Jaxpr, context: Any) -> list[Array]:
     """The program as a function that is not inlined."""
 
     def looking_at_all(*arguments: Any) -> Any:
@@ -211,36 +211,38 @@ def _called_as_one(*arguments: Array, program: Jaxpr, plain: Any) -> list[Array]
     return results
 
 
-def _inlined(*arguments: Array, program: Jaxpr, plain: Any) -> list[Array]:
+def _inlined(*arguments: Array, program: Jaxpr, context: Any) -> list[Array]:
     """The program without the attributes."""
-    return jaxpr_as_fun(ClosedJaxpr(_without_attributes(program, plain), ()))(*arguments)
+    return jaxpr_as_fun(ClosedJaxpr(_without_attributes(program, context), ()))(*arguments)
 
 
-def _without_attributes(program: Any, plain: Any) -> Any:
+def _without_attributes(program: Any, context: Any) -> Any:
     """A program with plain contexts in its equations and those of the programs inside; other values unchanged."""
     if type(program) in (tuple, list):
-        return type(program)(_without_attributes(part, plain) for part in program)
+        return type(program)(_without_attributes(part, context) for part in program)
     # Since JAX 0.12, a `ClosedJaxpr` is a `Jaxpr`.
     if isinstance(program, ClosedJaxpr) and program.jaxpr is not program:
-        return program.replace(jaxpr=_without_attributes(program.jaxpr, plain))
+        return program.replace(jaxpr=_without_attributes(program.jaxpr, context))
     if not isinstance(program, Jaxpr):
         return program
     equations = [
-        part.replace(ctx=plain, params={name: _without_attributes(value, plain) for name, value in part.params.items()})
+        part.replace(
+            ctx=context, params={name: _without_attributes(value, context) for name, value in part.params.items()}
+        )
         for part in program.eqns
     ]
     return program.replace(eqns=equations)
 
 
-def _without_unused(used: list[bool], *others: Any) -> tuple[list[bool], Any]:
+def _without_unused(use: list[bool], *arguments: Any) -> tuple[list[bool], Any]:
     """The equation with a program without unused computations, as JAX 0.12 prunes its own."""
     # Since JAX 0.12, a list of inputs comes before the equation.
-    equation = others[-1]
-    if not any(used):
+    equation = arguments[-1]
+    if not any(use):
         return [False] * len(equation.invars), None
     program = equation.params["program"]
-    kept, _ = partial_eval.dce_jaxpr(program, [True] * len(program.outvars), instantiate=True)
-    return [True] * len(equation.invars), equation.replace(params={**equation.params, "program": kept})
+    used_program, _ = partial_eval.dce_jaxpr(program, [True] * len(program.outvars), instantiate=True)
+    return [True] * len(equation.invars), equation.replace(params={**equation.params, "program": used_program})
 
 
 partial_eval.dce_rules[_kernel] = _without_unused

@@ -13,7 +13,7 @@ from nonholonomic.geometry import Spheroid as Spheroid
 from nonholonomic.geometry import Torus as Torus
 from nonholonomic.identification import Free as Free
 from nonholonomic.integration import ImplicitMidpoint as ImplicitMidpoint
-from nonholonomic.integration import Status as Status
+from nonholonomic.integration.status import Status as Status
 
 from . import presets as presets
 from .fit.identify import identify as identify

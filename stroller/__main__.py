@@ -78,8 +78,8 @@ class Helm(eqx.Module):
         require(self.period, "period", above=0.0)
 
     def __call__(self, t: Any, motion: Any) -> tuple[Any, Any]:
-        wanted = self.angle * jnp.sin(2.0 * jnp.pi * t / self.period)
-        return self.force, 1.0 * (wanted - motion.steering) - 0.3 * motion.steering_rate
+        target = self.angle * jnp.sin(2.0 * jnp.pi * t / self.period)
+        return self.force, 1.0 * (target - motion.steering) - 0.3 * motion.steering_rate
 
 
 def parser() -> argparse.ArgumentParser:
@@ -137,10 +137,10 @@ def scenes(options: argparse.Namespace) -> dict[tuple[str, str], tuple[Scene, La
         surface = ground.build(options)
         two_sided = "inside" in surface.sides
         side = options.side if two_sided else None
-        where = f"{side} the {name}" if two_sided else name
+        place_name = f"{side} the {name}" if two_sided else name
         launch = Launch(ground.top if side == "outside" else ground.place, ground.heading, options.speed)
         for ride, law in laws.items():
-            rides[where, ride] = (Scene(body, surface, law, options.gravity, side=side, fork=options.fork), launch)
+            rides[place_name, ride] = (Scene(body, surface, law, options.gravity, side=side, fork=options.fork), launch)
     return rides
 
 
@@ -152,9 +152,9 @@ def audit(name: str, runs: dict[str, Trajectory]) -> list[str]:
         numbers = (float(run.energy[0]), float(run.energy[-1]), float(run.work[-1]))
         columns = " ".join(f"{number:12.6f}" for number in numbers)
         steps = int(run.stats.steps)
-        least = float(jnp.min(run.normal_force))
+        min_force = float(jnp.min(run.normal_force))
         lines.append(
-            f"{name:38s} {solver:10s} {columns} {residual:10.1e} {slip:10.1e} {least:10.3f} {steps:6d}  {run.status}"
+            f"{name:38s} {solver:10s} {columns} {residual:10.1e} {slip:10.1e} {min_force:10.3f} {steps:6d}  {run.status}"
         )
     return lines
 
@@ -195,44 +195,46 @@ def write_page(
     groups: dict[str, list[tuple[int, Trajectory]]] = {}
     for number, ((ground, _), run) in enumerate(rides.items()):
         groups.setdefault(ground, []).append((number, run))
-    drawn = []
+    viewed = []
     if can_view():
         # The title of the stage names the ground of both rides; the name of each ride is beside it.
-        drawn = [
+        viewed = [
             stage._replace(title=ground)
             for ground, stage in zip(groups, grouped(list(groups.values()), [ride for _, ride in rides]), strict=True)
         ]
-    above = "" if drawn else f'<p class="note">{NO_VIEW}</p>'
-    below = "<h2>Energy against work</h2><pre>" + escape("\n".join(words)) + "</pre>"
-    below += "" if drawing is None else "<h2>Paths, speeds, energies, side forces</h2>" + picture_as_html(drawing)
+    note = "" if viewed else f'<p class="note">{NO_VIEW}</p>'
+    sections = "<h2>Energy against work</h2><pre>" + escape("\n".join(words)) + "</pre>"
+    sections += "" if drawing is None else "<h2>Paths, speeds, energies, side forces</h2>" + picture_as_html(drawing)
     path = options.out / "index.html"
-    page(drawn, "Rides of a stroller", 1.0, above, below).save(path)
+    page(viewed, "Rides of a stroller", 1.0, note, sections).save(path)
     return path
 
 
 def simulated(options: argparse.Namespace) -> tuple[dict[tuple[str, str], Trajectory], list[str]]:
     """The rides, and the lines of their audit, which are printed as the rides end."""
-    rides, audits, helm, asked = {}, [], Helm(options.force, options.steer, options.period), scenes(options)
+    rides, audits, helm, scenes_to_run = {}, [], Helm(options.force, options.steer, options.period), scenes(options)
     # Compile in parallel, because the compiler uses little more than one core. The two rides of a ground share one program.
-    with Progress(len(asked) + 1, "ride") as counted, ThreadPoolExecutor(2) as threads:
-        counted.begin()
-        turns = {ground: Lock() for ground, _ in asked}
+    with Progress(len(scenes_to_run) + 1, "ride") as display, ThreadPoolExecutor(2) as threads:
+        display.begin()
+        locks = {ground: Lock() for ground, _ in scenes_to_run}
 
         def in_turn(name: tuple[str, str]) -> tuple[Trajectory, list[str]]:
-            with turns[name[0]]:
+            with locks[name[0]]:
                 return audited(options, helm, name)
 
-        futures = {name: threads.submit(in_turn, name) for name in sorted(asked, key=lambda name: RIDES.index(name[1]))}
+        futures = {
+            name: threads.submit(in_turn, name) for name in sorted(scenes_to_run, key=lambda name: RIDES.index(name[1]))
+        }
         curves = threads.submit(tolerance_curve, options, helm)
-        for name in asked:
+        for name in scenes_to_run:
             rides[name], lines = futures[name].result()
             audits += lines
-            with counted.aside():
+            with display.aside():
                 print("\n".join(lines), flush=True)
-            counted.advance(1)
+            display.advance(1)
         curve = ["", *curves.result()]
-        counted.advance(1)
-        with counted.aside():
+        display.advance(1)
+        with display.aside():
             print("\n".join(curve), flush=True)
     return rides, [*audits, *curve]
 
@@ -244,15 +246,15 @@ def computed(options: argparse.Namespace) -> dict[str, bytes]:
     """
     rides, audits = simulated(options)
     with status_line("drawing"):
-        written, drawing = [options.out / "rides.h5"], None
-        table(options, rides).save(written[0])
+        paths, drawing = [options.out / "rides.h5"], None
+        table(options, rides).save(paths[0])
         if has_matplotlib():
             drawing = options.out / "rides.png"
             grounds = {ground: scene.surface for (ground, _), (scene, _) in scenes(options).items()}
             draw_rides(grounds, rides).savefig(drawing, dpi=110)
-            written.append(drawing)
-        written.append(write_page(options, rides, [HEADING, *audits], drawing))
-    return {AUDIT: "\n".join(audits).encode()} | {path.name: path.read_bytes() for path in written}
+            paths.append(drawing)
+        paths.append(write_page(options, rides, [HEADING, *audits], drawing))
+    return {AUDIT: "\n".join(audits).encode()} | {path.name: path.read_bytes() for path in paths}
 
 
 def has_matplotlib() -> bool:
@@ -269,7 +271,7 @@ def main(arguments: list[str] | None = None) -> int:
     """
     options = parser().parse_args(arguments)
     cache = enable_compilation_cache()
-    started = time.perf_counter()
+    start_time = time.perf_counter()
     facts = "rides", sorted((name, repr(value)) for name, value in vars(options).items() if name != "out")
     try:
         require_folder(options.out, "--out")
@@ -285,9 +287,9 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     if not has_matplotlib():
         print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
-    *written, shown = (options.out / name for name in ("rides.h5", "rides.png", "index.html") if name in files)
-    see = f"To see it, open {shown}{'' if can_view() else f'. {NO_VIEW}'}"
-    print(closing_lines(2 * len(scenes(options)), started, written, see, read))
+    *paths, page_path = (options.out / name for name in ("rides.h5", "rides.png", "index.html") if name in files)
+    see = f"To see it, open {page_path}{'' if can_view() else f'. {NO_VIEW}'}"
+    print(closing_lines(2 * len(scenes(options)), start_time, paths, see, read))
     return 0
 
 

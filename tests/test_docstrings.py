@@ -53,7 +53,8 @@ MEMBERS = [
 
 
 #: The rooms of the engine, and the names in each that are handed out for fast models.
-ENGINE = {room: [name for name in PAGES["engine"].names if name.startswith(f"{room}.")] for room in ENGINE_ROOMS}
+NAMES_OF_ENGINE = [name for name in PAGES["engine"].names if not inspect.ismodule(resolve(name))]
+ENGINE = {room: [name for name in NAMES_OF_ENGINE if name.startswith(f"{room}.")] for room in ENGINE_ROOMS}
 
 
 def complaints(text: str, namespace: dict[str, Any], name: str = "example") -> str:
@@ -115,7 +116,13 @@ def test_the_public_names_are_those_that_people_use():
     assert len(names) > 40
 
 
-@pytest.mark.parametrize("room", ENGINE)
+#: The rooms of which other tests of the ordinary run go through the same programs.
+TESTED = ("nonholonomic.hybrid", "nonholonomic.derivatives", "nonholonomic.identification")
+
+
+@pytest.mark.parametrize(
+    "room", [pytest.param(room, marks=pytest.mark.slow if room in TESTED else ()) for room in ENGINE]
+)
 def test_the_examples_of_the_engine_give_what_they_say(room):
     """They go on from the example of their room."""
     namespace: dict[str, Any] = {}

@@ -24,11 +24,11 @@ SUSPECTED = {
     "rpm of some": (lambda: tippe.Launch(0.1, [150.0, -1200.0]), "spin = 1200 rad/s is 1.15e+04 revolutions a minute"),
     "a heading in degrees": (
         lambda: stroller.Launch((0.0, 0.0), 90.0, 1.0),
-        "heading = 90 rad is large: was it in degrees? 90 degrees are 1.571 rad",
+        "heading = 90 rad is large; angles are in radians: did you mean np.radians(90)?",
     ),
     "a steering angle in degrees": (
         lambda: stroller.Launch((0.0, 0.0), 0.0, 1.0, steering=[0.1, -30.0]),
-        "steering = 30 rad is large: was it in degrees? 30 degrees are 0.5236 rad",
+        "steering = 30 rad is large; angles are in radians: did you mean np.radians(30)?",
     ),
     "a density in g/cm^3": (
         lambda: tippe.Top.turned(0.02, 0.7, cut=0.015, stem_radius=0.005, stem_length=0.012),
@@ -57,7 +57,7 @@ SUSPECTED = {
     "some inverted already": (
         lambda: tippe.inversion_table(TOP, theta=[1.0, 2.0, 3.0], spin=155.0, t1=1.0),
         "theta = 3 rad is not below the angle to be reached, 2.985 rad: the top is inverted from the start; "
-        "was theta in degrees? 3 degrees are 0.05236 rad",
+        "angles are in radians: did you mean np.radians(3)?",
     ),
     "some exactly upright": (
         lambda: tippe.inversion_table(TOP, theta=[0.0, 0.1], spin=155.0, t1=1.0),

@@ -13,7 +13,7 @@ from nonholonomic.geometry import Spheroid as Spheroid
 from nonholonomic.geometry import Torus as Torus
 from nonholonomic.identification import FitWarning as FitWarning
 from nonholonomic.identification import Free as Free
-from nonholonomic.integration import Status as Status
+from nonholonomic.integration.status import Status as Status
 from nonholonomic.sweeps import Table as Table
 
 from . import presets as presets

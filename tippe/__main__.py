@@ -143,9 +143,9 @@ def table(options: argparse.Namespace, arena: str, cache: Path | None) -> Table:
     if saved_cells(path) == 0:
         contents = kept_files(cache, facts(options, arena), computed)[path.name]
         if not path.exists():
-            written = path.with_suffix(".part")
-            written.write_bytes(contents)
-            written.replace(path)
+            scratch = path.with_suffix(".part")
+            scratch.write_bytes(contents)
+            scratch.replace(path)
     return compute()
 
 
@@ -188,12 +188,12 @@ def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str,
     jobs = (functools.partial(table, options, "cylinder", cache), on_plane, live)
     threads = ThreadPoolExecutor(2)
     try:
-        with Progress(len(jobs), "job", "compiling") as counted:
-            counted.begin()
+        with Progress(len(jobs), "job", "compiling") as display:
+            display.begin()
             futures: list[Any] = [threads.submit(job) for job in jobs]
             for future in as_completed(futures):
                 future.result()
-                counted.advance(1)
+                display.advance(1)
     finally:
         # After Ctrl-C, the process ends while the compiler is working, which nothing can interrupt.
         threads.shutdown(wait=False, cancel_futures=True)
@@ -247,8 +247,8 @@ def picture(options: argparse.Namespace, times: Any, theta: Any, end: float) -> 
     title = f"{options.top} top, {start}, mu = {middle(options.mu):g}, on a table"
     if end <= times[-1]:
         # Between the times, theta may be above the angle only for a moment.
-        after = np.searchsorted(times, end)
-        times, theta = np.insert(times, after, end), np.insert(theta, after, INVERTED)
+        index = np.searchsorted(times, end)
+        times, theta = np.insert(times, index, end), np.insert(theta, index, INVERTED)
     panel = Panel(title, times, theta[None], theta[:1], np.array([end if end <= times[-1] else np.inf]))
     return draw_launches([panel], INVERTED, "The dot is the first time above the dashed angle.")
 
@@ -256,14 +256,16 @@ def picture(options: argparse.Namespace, times: Any, theta: Any, end: float) -> 
 def write_page(options: argparse.Namespace, arenas: dict[str, Table], live: str, drawing: Path | None) -> Path:
     """Write the page of the main job: the top with sliders if three.js is installed, the tables, and the plot, if
     any."""
-    below = ""
+    sections = ""
     for name, heading in headings(options).items():
-        below += f"<h2>Time until it has turned over, {heading}</h2>" + table_as_html(rows_of(options, arenas[name]), 1)
-    below += "".join(f'<p class="note">{escape(line)}</p>' for line in (remark(options), *described(options)))
-    below += "" if drawing is None else "<h2>θ(t)</h2>" + picture_as_html(drawing)
+        sections += f"<h2>Time until it has turned over, {heading}</h2>" + table_as_html(
+            rows_of(options, arenas[name]), 1
+        )
+    sections += "".join(f'<p class="note">{escape(line)}</p>' for line in (remark(options), *described(options)))
+    sections += "" if drawing is None else "<h2>θ(t)</h2>" + picture_as_html(drawing)
     path = options.out / "index.html"
     html = live or page([], TITLE, 1.0, f'<p class="note">{NO_VIEW}</p>', BELOW).html
-    Page(html.replace(BELOW, below)).save(path)
+    Page(html.replace(BELOW, sections)).save(path)
     return path
 
 
@@ -279,16 +281,16 @@ def main(arguments: list[str] | None = None) -> int:
         return paper_tables.main([word for word in arguments if word != "--paper"])
     options = parser().parse_args(arguments)
     cache = enable_compilation_cache()
-    started = time.perf_counter()
+    start_time = time.perf_counter()
     try:
         print("\n".join(described(options)), flush=True)
         require_folder(options.out, "--out")
         read = all(are_kept(cache, facts(options, arena)) for arena in scenes(options))
-        arenas, shown, live = computed(options, cache)
+        arenas, samples, live = computed(options, cache)
         print(report(options, arenas), flush=True)
         with status_line("drawing") as line:
-            written, drawing = [options.out / f"{arena}.h5" for arena in arenas], None
-            if shown is None:
+            paths, drawing = [options.out / f"{arena}.h5" for arena in arenas], None
+            if samples is None:
                 with line.aside():
                     print(
                         "No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr
@@ -297,8 +299,8 @@ def main(arguments: list[str] | None = None) -> int:
                 drawing = options.out / "theta.png"
                 middle_cell = options.theta.index(middle(options.theta)), options.mu.index(middle(options.mu))
                 end = float(arenas["plane"].time[middle_cell])
-                picture(options, shown[0], shown[1], end).savefig(drawing, dpi=130)
-                written.append(drawing)
+                picture(options, samples[0], samples[1], end).savefig(drawing, dpi=130)
+                paths.append(drawing)
             path = write_page(options, arenas, live, drawing)
     except (ValueError, OSError) as error:
         print(f"python -m tippe: {error}", file=sys.stderr)
@@ -307,7 +309,7 @@ def main(arguments: list[str] | None = None) -> int:
         raise KeyboardInterrupt(saved(options)) from None
     cells = sum(table.status.size for table in arenas.values())
     see = f"To see the top climb onto its stem, open {path}{'' if can_view() else f'. {NO_VIEW}'}"
-    print(closing_lines(cells, started, written, see, read))
+    print(closing_lines(cells, start_time, paths, see, read))
     return 0
 
 

@@ -10,7 +10,7 @@ fixed, as in `variation.py`.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -19,12 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..integration import RUNNING, AbstractProblem, Lanes, LaneState, Outcome, Settings, States
+from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, States
 from ..integration.runge_kutta import Stages, moved_state, over_stages
-from ..integration.scheduler import AbstractRecorder, InLanes, LaneScheduler, Progress
+from ..integration.scheduler import AbstractRecorder, InLanes, LaneScheduler, SchedulerState
+from ..integration.status import RUNNING
 from ..integration.step import length_to_try, try_step
 from ..xla_cpu import uncounted, written_by_component, written_in_place
-from ._periods import Checkpoints, LatestSteps, Period, StepRecord, read
+from ._periods import Checkpoints, LatestSteps, StepRecord, read
 from .variation import VariationalProblem
 
 #: The quantity measured at the end of a run: (problem, lane state) -> a number per lane, differentiable with respect to
@@ -36,7 +37,7 @@ class StepRecorder(AbstractRecorder):
     """Records where each step began, and its length."""
 
     # As many iterations as fit in the caches with their record; a period ends with a refill.
-    period = 128
+    period: ClassVar[int] = 128
     refill_cost = 2.0
 
     def begin(self, lane_state: LaneState, collected: None) -> StepRecord:
@@ -46,26 +47,26 @@ class StepRecorder(AbstractRecorder):
     def step(
         self, in_lanes: InLanes, lane_state: LaneState, record: StepRecord, iteration: Int[Array, ""]
     ) -> tuple[LaneState, StepRecord]:
-        after = try_step(*in_lanes, lane_state)
-        length = jnp.where(after.time > lane_state.time, length_to_try(in_lanes[1], lane_state), 0.0)
+        next_state = try_step(*in_lanes, lane_state)
+        length = jnp.where(next_state.time > lane_state.time, length_to_try(in_lanes[1], lane_state), 0.0)
         entry = StepRecord(lane_state.time, _without_probe(lane_state).state, length)
-        return after, jax.tree.map(functools.partial(written_in_place, at=iteration), record, entry)
+        return next_state, jax.tree.map(functools.partial(written_in_place, at=iteration), record, entry)
 
 
 class Backward(NamedTuple):
     """State of the forward pass and of the backward pass.
 
-    `ahead` holds the lanes at the start of the next period to compute, and `number` its number. The backward pass takes
-    the period before `needed` next. `adjoint` holds, for the cell in each lane, the derivatives of the measured
+    `frontier` holds the lanes at the start of the next period to compute, and `number` its number. The backward pass takes
+    the period before number `limit` next. `adjoint` holds, for the cell in each lane, the derivatives of the measured
     quantity: the first rows are those with respect to the state, the others those with respect to the parameters.
     `gradient` holds the derivatives of every cell with respect to its initial state.
     """
 
-    ahead: Progress
+    frontier: SchedulerState
     number: Int[Array, ""]
-    needed: Int[Array, ""]
-    kept: Checkpoints
-    latest: LatestSteps
+    limit: Int[Array, ""]
+    checkpoints: Checkpoints
+    latest_steps: LatestSteps
     outcome: Outcome
     adjoint: Float[Array, "rows lanes"]
     gradient: Float[Array, "rows cells"]
@@ -98,14 +99,29 @@ def solve_with_adjoint(
 
     **Raises:** `ValueError` for a chosen leaf that has several components.
     """
-    states = problem.start()[0]
-    components, size = states.shape
-    numbers, rest = eqx.partition(problem, moving)
+    components, size = problem.start()[0].shape
+    numbers, problem_with_probe = _with_probe(problem, moving, probe, size)
+    # As many lanes as without the probe: the backward pass, which is the most expensive part, does not use the probe.
+    settings = dataclasses.replace(settings, lanes=settings.lanes_of(size))
+    scheduler = LaneScheduler.of(problem_with_probe, t1, cells, settings, one_kernel=one_kernel, n_blocks=2)
+    passes = Passes(scheduler, moving, measured)
+    run = passes.start(components + len(jax.tree.leaves(numbers)))
+    run = jax.lax.while_loop(lambda run: uncounted(run.limit > 0, run.outcome.steps[0]), passes.there_and_back, run)
+    by_number = jax.tree.unflatten(jax.tree.structure(numbers), list(run.gradient[components:]))
+    return run.outcome._replace(state=run.outcome.state[:components]), run.gradient[:components], by_number
+
+
+def _with_probe(problem: VariationalProblem, moving: Any, probe: Any, size: int) -> tuple[Any, VariationalProblem]:
+    """The chosen parameters with one value per cell, and the problem with them and the probe.
+
+    **Arguments:** as for `solve_with_adjoint`; `size`: number of cells, padding included.
+    """
+    numbers, static = eqx.partition(problem, moving)
     for leaf in jax.tree.leaves(numbers):
         if jnp.shape(leaf) not in ((), (size,)):
             raise ValueError(f"moving: a number must be a scalar or ({size},), not of shape {jnp.shape(leaf)}")
     numbers = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (size,)), numbers)
-    problem = eqx.combine(numbers, rest)
+    problem = eqx.combine(numbers, static)
     # The chosen parameters now have one value per cell, so their rates must, too.
     probe = jax.tree.map(
         lambda rate, number: None if rate is None else jnp.broadcast_to(rate, jnp.shape(number)),
@@ -113,65 +129,85 @@ def solve_with_adjoint(
         problem.problem,
         is_leaf=lambda rate: rate is None,
     )
-    probed = dataclasses.replace(problem, tangents=(probe,))
-    # As many lanes as without the probe: the backward pass, which is the most expensive part, does not use the probe.
-    settings = dataclasses.replace(settings, lanes=settings.lanes_of(size))
-    scheduler = LaneScheduler.of(probed, t1, cells, settings, one_kernel=one_kernel, n_blocks=2)
-    rows = components + len(jax.tree.leaves(numbers))
+    return numbers, dataclasses.replace(problem, tangents=(probe,))
 
-    start, recorder = scheduler.start(), StepRecorder()
-    record = jax.eval_shape(lambda: recorder.begin(start.lane_state, None))
 
-    def is_ahead(run: Backward) -> Bool[Array, ""]:
-        return uncounted(scheduler.unfinished(run.ahead) & (run.number < run.needed), run.number)
+@dataclasses.dataclass(frozen=True, eq=False)
+class Passes:
+    """The forward pass, which computes periods, and the backward pass, which carries derivatives through them.
 
-    def forward(run: Backward) -> Backward:
-        after, steps = scheduler.run(run.ahead, recorder)
-        return run._replace(
-            ahead=scheduler.refill(after),
-            number=run.number + 1,
-            kept=run.kept.added(run.number, Period(run.ahead, after)),
-            latest=run.latest.added(run.ahead.iterations, steps),
-            outcome=scheduler.store(run.outcome, after.lane_state),
+    `moving`, `measured`: as for `solve_with_adjoint`.
+    """
+
+    scheduler: LaneScheduler
+    moving: Any
+    measured: Measured
+
+    recorder: ClassVar[StepRecorder] = StepRecorder()
+
+    def start(self, rows: int) -> Backward:
+        """Both passes before the first period. **Arguments:** `rows`: number of rows of the derivatives."""
+        scheduler, start = self.scheduler, self.scheduler.start()
+        record = jax.eval_shape(lambda: self.recorder.begin(start.lane_state, None))
+        dtype = start.lane_state.state.dtype
+        return Backward(
+            frontier=start,
+            number=jnp.zeros((), int),
+            limit=jnp.asarray(jnp.iinfo(jnp.arange(0).dtype).max),
+            checkpoints=Checkpoints.none((start, start)),
+            latest_steps=LatestSteps.none(record, scheduler.capacity),
+            outcome=scheduler.empty(),
+            adjoint=jnp.zeros((rows, scheduler.lanes), dtype),
+            gradient=jnp.zeros((rows, scheduler.capacity), dtype),
         )
 
-    def is_recorded(run: Backward) -> Bool[Array, ""]:
-        number, period = run.kept.latest()
-        recorded = (number == run.needed - 1) & (period.before.iterations >= run.latest.since)
-        return uncounted((run.kept.depth > 0) & recorded, run.number)
-
-    def backward(run: Backward) -> Backward:
-        number, (before, after) = run.kept.latest()
-        steps = run.latest.of_period(before.iterations, len(record.length))
-        count = after.iterations - before.iterations
-        adjoint = _taken_back(scheduler, moving, measured, after.lane_state, steps, count, run.adjoint)
-        # A cell that had made no step was at its start.
-        began = (before.lane_state.steps == 0) & (before.lane_state.cell < cells)
-        gradient = run.gradient.at[:, jnp.where(began, before.lane_state.cell, size)].set(adjoint, mode="drop")
-        return run._replace(needed=number, kept=run.kept.without_latest(), adjoint=adjoint, gradient=gradient)
-
-    def there_and_back(run: Backward) -> Backward:
-        run = jax.lax.while_loop(is_ahead, forward, run)
-        run = run._replace(needed=jnp.minimum(run.needed, run.number))
-        run = jax.lax.while_loop(is_recorded, backward, run)
+    def there_and_back(self, run: Backward) -> Backward:
+        """Compute all periods up to the one that the backward pass needs, and take back those whose steps are kept."""
+        run = jax.lax.while_loop(self.is_ahead, self.forward, run)
+        run = run._replace(limit=jnp.minimum(run.limit, run.number))
+        run = jax.lax.while_loop(self.is_recorded, self.backward, run)
         # The steps before are gone: continue from the latest checkpoint.
-        number, (before, _) = run.kept.latest()
-        kept, latest = run.kept.without_latest(), run.latest._replace(since=before.iterations)
-        return run._replace(ahead=before, number=number, kept=kept, latest=latest)
+        number, (lanes_before, _) = run.checkpoints.latest()
+        return run._replace(
+            frontier=lanes_before,
+            number=number,
+            checkpoints=run.checkpoints.without_latest(),
+            latest_steps=run.latest_steps._replace(first=lanes_before.iterations),
+        )
 
-    run = Backward(
-        ahead=start,
-        number=jnp.zeros((), int),
-        needed=jnp.asarray(jnp.iinfo(jnp.arange(0).dtype).max),
-        kept=Checkpoints.none(Period(start, start)),
-        latest=LatestSteps.none(record, size),
-        outcome=scheduler.empty(),
-        adjoint=jnp.zeros((rows, scheduler.lanes), states.dtype),
-        gradient=jnp.zeros((rows, size), states.dtype),
-    )
-    run = jax.lax.while_loop(lambda run: uncounted(run.needed > 0, run.outcome.steps[0]), there_and_back, run)
-    by_number = jax.tree.unflatten(jax.tree.structure(numbers), list(run.gradient[components:]))
-    return run.outcome._replace(state=run.outcome.state[:components]), run.gradient[:components], by_number
+    def is_ahead(self, run: Backward) -> Bool[Array, ""]:
+        """Whether a period that the backward pass needs has not been computed."""
+        return uncounted(self.scheduler.unfinished(run.frontier) & (run.number < run.limit), run.number)
+
+    def forward(self, run: Backward) -> Backward:
+        """Compute the next period, and record its steps."""
+        lanes_after, steps = self.scheduler.run(run.frontier, self.recorder)
+        return run._replace(
+            frontier=self.scheduler.refill(lanes_after),
+            number=run.number + 1,
+            checkpoints=run.checkpoints.added(run.number, (run.frontier, lanes_after)),
+            latest_steps=run.latest_steps.added(run.frontier.iterations, steps),
+            outcome=self.scheduler.store(run.outcome, lanes_after.lane_state),
+        )
+
+    def is_recorded(self, run: Backward) -> Bool[Array, ""]:
+        """Whether the steps of the period that the backward pass takes next are kept."""
+        number, (lanes_before, _) = run.checkpoints.latest()
+        recorded = (number == run.limit - 1) & (lanes_before.iterations >= run.latest_steps.first)
+        return uncounted((run.checkpoints.depth > 0) & recorded, run.number)
+
+    def backward(self, run: Backward) -> Backward:
+        """Carry the derivatives through the latest period."""
+        scheduler, (number, (lanes_before, lanes_after)) = self.scheduler, run.checkpoints.latest()
+        steps = run.latest_steps.of_period(lanes_before.iterations, self.recorder.period)
+        count = lanes_after.iterations - lanes_before.iterations
+        adjoint = _taken_back(scheduler, self.moving, self.measured, lanes_after.lane_state, steps, count, run.adjoint)
+        # A cell that had made no step was at its start.
+        at_its_start = (lanes_before.lane_state.steps == 0) & (lanes_before.lane_state.cell < scheduler.cells)
+        cell = jnp.where(at_its_start, lanes_before.lane_state.cell, scheduler.capacity)
+        gradient = run.gradient.at[:, cell].set(adjoint, mode="drop")
+        checkpoints = run.checkpoints.without_latest()
+        return run._replace(limit=number, checkpoints=checkpoints, adjoint=adjoint, gradient=gradient)
 
 
 def _without_probe(lane_state: LaneState) -> LaneState:
@@ -202,9 +238,9 @@ def _taken_back(
         adjoint = jnp.where(ended, _at_the_end(problem, moving, measured, lane_state), adjoint)
 
         def step(carry: Any) -> Any:
-            index, *along = carry
-            step_record = jax.tree.map(functools.partial(read, at=index - 1), record)
-            return index - 1, *step_taken_back(weights, problem, moving, *step_record, *along)
+            index, *sums = carry
+            step_record = jax.tree.map(functools.partial(read, index=index - 1), record)
+            return index - 1, *step_taken_back(weights, problem, moving, *step_record, *sums)
 
         room = jnp.zeros((1 + len(weights.fractions), *lane_state.state.shape), adjoint.dtype)
         return jax.lax.while_loop(lambda carry: carry[0] > 0, step, (count, adjoint, room))[1]
@@ -216,10 +252,10 @@ def _at_the_end(
     problem: AbstractProblem, moving: Any, measured: Measured, lane_state: LaneState
 ) -> Float[Array, "rows lanes"]:
     """The derivatives of the measured quantity with respect to the final state and the parameters."""
-    numbers, rest = eqx.partition(problem, moving)
+    numbers, static = eqx.partition(problem, moving)
 
     def value(numbers: Any, state: States) -> Lanes:
-        return measured(eqx.combine(numbers, rest), lane_state._replace(state=state))
+        return measured(eqx.combine(numbers, static), lane_state._replace(state=state))
 
     by_number, by_state = jax.vjp(value, numbers, lane_state.state)[1](jnp.ones_like(lane_state.time))
     return jnp.concatenate([by_state, *(row[None] for row in jax.tree.leaves(by_number))])
@@ -245,8 +281,8 @@ class Weights(NamedTuple):
         stages = len(fractions)
         shares = np.zeros((stages, 1 + stages))
         shares[:, 0] = weights
-        for after, row in enumerate(rows, start=1):
-            shares[: len(row), 1 + after] = row
+        for stage, row in enumerate(rows, start=1):
+            shares[: len(row), 1 + stage] = row
         return cls(fractions, tuple(rows), shares)
 
 
@@ -275,36 +311,42 @@ def step_taken_back(
 
     **Returns:** the derivatives at the start, and the working memory for reuse.
     """
-    numbers, rest = eqx.partition(problem, moving)
+    numbers, static = eqx.partition(problem, moving)
     components, stages = state.shape[0], len(weights.fractions)
     fractions = jnp.asarray(weights.fractions)
 
     def stage_made(stage: Int[Array, ""], carry: tuple[Stages, Stages]) -> tuple[Stages, Stages]:
-        along, rates = carry
-        rate = problem.field(time + fractions[stage] * length, read(along, at=stage))
+        stage_states, rates = carry
+        rate = problem.field(time + fractions[stage] * length, read(stage_states, index=stage))
         rates = written_by_component(rates, rate, at=stage)
-        return written_in_place(along, moved_state(stage, weights.rows, state, length, rates), at=stage + 1), rates
+        return written_in_place(
+            stage_states, moved_state(stage, weights.rows, state, length, rates), at=stage + 1
+        ), rates
 
-    none = jnp.zeros((stages, *state.shape), state.dtype)
-    begun = written_in_place(none, state, at=jnp.zeros((), int)), none[1:]
-    along, _ = over_stages(stages - 1, stage_made, begun)
+    zeros = jnp.zeros((stages, *state.shape), state.dtype)
+    initial_stages = written_in_place(zeros, state, at=jnp.zeros((), int)), zeros[1:]
+    stage_states, _ = over_stages(stages - 1, stage_made, initial_stages)
 
-    def pull(at: Lanes, numbers: Any, parts: tuple[Lanes, ...], by_rate: tuple[Lanes, ...]) -> tuple[Lanes, ...]:
+    def pull(
+        stage_time: Lanes, numbers: Any, parts: tuple[Lanes, ...], by_rate: tuple[Lanes, ...]
+    ) -> tuple[Lanes, ...]:
         def field(numbers: Any, parts: tuple[Lanes, ...]) -> States:
-            return eqx.combine(numbers, rest).field(at, parts)
+            return eqx.combine(numbers, static).field(stage_time, parts)
 
         by_number, by_part = jax.vjp(field, numbers, parts)[1](jnp.stack(by_rate))
         return (*by_part, *jax.tree.leaves(by_number))
 
-    def stage_taken_back(done: Int[Array, ""], carry: Any) -> Any:
-        stage, (by_stage, total) = stages - 1 - done, carry
-        by_rate = jax.lax.optimization_barrier(moved_state(stage, weights.shares, nothing, length, by_stage))
-        at = time + fractions[stage] * length
-        pulled = pull(at, numbers, tuple(jnp.unstack(read(along, at=stage))), tuple(jnp.unstack(by_rate)))
+    def stage_taken_back(count: Int[Array, ""], carry: Any) -> Any:
+        stage, (by_stage, total) = stages - 1 - count, carry
+        by_rate = jax.lax.optimization_barrier(moved_state(stage, weights.shares, zero_state, length, by_stage))
+        stage_time = time + fractions[stage] * length
+        term = pull(
+            stage_time, numbers, tuple(jnp.unstack(read(stage_states, index=stage))), tuple(jnp.unstack(by_rate))
+        )
         # If no step was made, values may not be finite.
-        pulled = jax.lax.optimization_barrier(jnp.where(length > 0.0, jnp.stack(pulled), 0.0))
-        return written_in_place(by_stage, pulled[:components], at=stage + 1), total + pulled
+        term = jax.lax.optimization_barrier(jnp.where(length > 0.0, jnp.stack(term), 0.0))
+        return written_in_place(by_stage, term[:components], at=stage + 1), total + term
 
-    nothing, ends = jnp.zeros_like(state), written_in_place(room, adjoint[:components], at=jnp.zeros((), int))
+    zero_state, ends = jnp.zeros_like(state), written_in_place(room, adjoint[:components], at=jnp.zeros((), int))
     room, total = over_stages(stages, stage_taken_back, (ends, jnp.zeros_like(adjoint)))
     return adjoint + total, room

@@ -29,12 +29,12 @@ class Request:
     - `solve`: an `AbstractDifferentiableSolve`.
     - `active`: indices of the leaves with respect to which to differentiate, as for `value_and_tangents`; `None` for
       the primal alone.
-    - `wanted`: indices of the parts of the output tree to compute, all if `None`; parts that are `None` count.
+    - `selection`: indices of the parts of the output tree to compute, all if `None`; parts that are `None` count.
     """
 
     solve: Any
     active: tuple[int, ...] | None = None
-    wanted: tuple[int, ...] | None = None
+    selection: tuple[int, ...] | None = None
 
     def tree(self, cells: int, *leaves: Float[Array, "..."]) -> Any:
         """The primal of some cells, with its derivatives if there are active leaves; a tree of arrays, the cells first."""
@@ -43,10 +43,10 @@ class Request:
         return self.solve.value_and_tangents(self.active, False, cells, *leaves)
 
     def parts(self, cells: int, *leaves: Float[Array, "..."]) -> list[Array]:
-        """The wanted parts that are not `None`."""
+        """The selected parts that are not `None`."""
         parts = _flat(self.tree(cells, *leaves))[0]
-        kept = parts if self.wanted is None else [parts[k] for k in self.wanted]
-        return [part for part in kept if part is not None]
+        selected = parts if self.selection is None else [parts[k] for k in self.selection]
+        return [part for part in selected if part is not None]
 
 
 def solve_one(request: Request, *leaves: Float[Array, "..."]) -> Any:
@@ -57,8 +57,10 @@ def solve_one(request: Request, *leaves: Float[Array, "..."]) -> Any:
     shapes, structure = _flat(jax.eval_shape(functools.partial(_compiled_tree, request.solve, request.active), *leaves))
     present = [k for k, shape in enumerate(shapes) if shape is not None]
     kinds = tuple(ShapedArray(shapes[k].shape[1:], shapes[k].dtype) for k in present)
-    request = dataclasses.replace(request, wanted=tuple(present))
-    outputs = iter(_solve_cells.bind(*leaves, request=request, cells=1, own=(False,) * len(leaves), kinds=kinds))
+    request = dataclasses.replace(request, selection=tuple(present))
+    outputs = iter(
+        _solve_cells.bind(*leaves, request=request, cells=1, batch_flags=(False,) * len(leaves), kinds=kinds)
+    )
     return jax.tree.unflatten(structure, [None if shape is None else next(outputs)[0] for shape in shapes])
 
 
@@ -69,13 +71,13 @@ def _compiled_tree(solve: Any, active: tuple[int, ...] | None, *leaves: Float[Ar
 
 
 def _parts(
-    solve: Any, active: tuple[int, ...] | None, wanted: tuple[int, ...], cells: int, leaves: list[Array]
+    solve: Any, active: tuple[int, ...] | None, selection: tuple[int, ...], cells: int, leaves: list[Array]
 ) -> list[Array]:
     """`Request.parts` as one program, which serves all equal solves, whatever the values of the leaves.
 
     Otherwise, outside `jit`, each operation would be a separate program, and every call would compile its loops again.
     """
-    return Request(solve, active, wanted).parts(cells, *leaves)
+    return Request(solve, active, selection).parts(cells, *leaves)
 
 
 #: For one run: a hybrid scene compiles in half the time, with a third of the memory and of the mappings (289 instead of
@@ -89,26 +91,28 @@ def _flat(tree: Any) -> tuple[list[Any], Any]:
     return jax.tree.flatten(tree, is_leaf=lambda part: part is None)
 
 
-#: The parts that a `Request` wants of a number of cells. `own` marks the leaves that have a value per cell; `kinds`
+#: The parts that a `Request` wants of a number of cells. `batch_flags` marks the leaves that have a value per cell; `kinds`
 #: holds the shapes and dtypes of the parts of one cell.
 _solve_cells = Primitive("solve_cells")
 _solve_cells.multiple_results = True
 
 
 @_solve_cells.def_impl
-def _run(*leaves: Array, request: Request, cells: int, own: Any, kinds: Any) -> list[Array]:
+def _run(*leaves: Array, request: Request, cells: int, batch_flags: Any, kinds: Any) -> list[Array]:
     # Python numbers would become part of the program.
     arrays = [leaf if isinstance(leaf, jax.Array) else jax.device_put(np.asarray(leaf)) for leaf in leaves]
     compiled = _parts_of_one if cells == 1 else _parts_of_many
-    return compiled(request.solve, request.active, request.wanted, cells, arrays)
+    return compiled(request.solve, request.active, request.selection, cells, arrays)
 
 
 @_solve_cells.def_abstract_eval
-def _shaped(*leaves: Any, request: Request, cells: int, own: Any, kinds: tuple[ShapedArray, ...]) -> list[ShapedArray]:
+def _shaped(
+    *leaves: Any, request: Request, cells: int, batch_flags: Any, kinds: tuple[ShapedArray, ...]
+) -> list[ShapedArray]:
     return [ShapedArray((cells, *kind.shape), kind.dtype) for kind in kinds]
 
 
-def _traced(*leaves: Array, request: Request, cells: int, own: Any, kinds: Any) -> list[Array]:
+def _traced(*leaves: Array, request: Request, cells: int, batch_flags: Any, kinds: Any) -> list[Array]:
     return request.parts(cells, *leaves)
 
 
@@ -116,40 +120,42 @@ mlir.register_lowering(_solve_cells, mlir.lower_fun(_traced, multiple_results=Tr
 
 
 def _batched(
-    leaves: tuple[Array, ...], axes: Any, *, request: Request, cells: int, own: tuple[bool, ...], kinds: Any
+    leaves: tuple[Array, ...], axes: Any, *, request: Request, cells: int, batch_flags: tuple[bool, ...], kinds: Any
 ) -> tuple[list[Array], list[int]]:
     """Merge a batch of ensembles into one ensemble."""
     size = next(leaf.shape[axis] for leaf, axis in zip(leaves, axes, strict=True) if axis is not None)
     if size == 0:
         return [jnp.zeros((0, cells, *kind.shape), kind.dtype) for kind in kinds], [0] * len(kinds)
 
-    def joined(leaf: Array, has_own: bool, axis: Any) -> Array:
+    def joined(leaf: Array, has_batch: bool, axis: Any) -> Array:
         if axis is None:
-            return jnp.tile(leaf, (size,) + (1,) * (leaf.ndim - 1)) if has_own else leaf
+            return jnp.tile(leaf, (size,) + (1,) * (leaf.ndim - 1)) if has_batch else leaf
         leaf = jnp.moveaxis(leaf, axis, 0)
-        return leaf.reshape(size * cells, *leaf.shape[2:]) if has_own else jnp.repeat(leaf, cells, axis=0)
+        return leaf.reshape(size * cells, *leaf.shape[2:]) if has_batch else jnp.repeat(leaf, cells, axis=0)
 
-    either = tuple(has or axis is not None for has, axis in zip(own, axes, strict=True))
-    whole = map(joined, leaves, own, axes)
-    outputs = _solve_cells.bind(*whole, request=request, cells=size * cells, own=either, kinds=kinds)
+    merged_flags = tuple(flag or axis is not None for flag, axis in zip(batch_flags, axes, strict=True))
+    merged_leaves = map(joined, leaves, batch_flags, axes)
+    outputs = _solve_cells.bind(
+        *merged_leaves, request=request, cells=size * cells, batch_flags=merged_flags, kinds=kinds
+    )
     return [part.reshape(size, cells, *part.shape[1:]) for part in outputs], [0] * len(outputs)
 
 
 batching.primitive_batchers[_solve_cells] = _batched
 
 
-def _only_read(read: list[bool], *others: Any) -> tuple[list[bool], Any]:
+def _only_read(use: list[bool], *arguments: Any) -> tuple[list[bool], Any]:
     """The operation restricted to the parts that are used."""
     # Since JAX 0.12, a list of inputs comes before the equation.
-    equation = others[-1]
-    if not any(read):
+    equation = arguments[-1]
+    if not any(use):
         return [False] * len(equation.invars), None
     request, kinds = equation.params["request"], equation.params["kinds"]
-    wanted = tuple(k for k, is_read in zip(request.wanted, read, strict=True) if is_read)
-    smaller = Request(request.solve.for_parts(wanted), request.active, wanted)
-    kept = tuple(kind for kind, is_read in zip(kinds, read, strict=True) if is_read)
-    outputs = [variable for variable, is_read in zip(equation.outvars, read, strict=True) if is_read]
-    new = equation.replace(outvars=outputs, params={**equation.params, "request": smaller, "kinds": kept})
+    selection = tuple(k for k, is_used in zip(request.selection, use, strict=True) if is_used)
+    used_request = Request(request.solve.for_parts(selection), request.active, selection)
+    used_kinds = tuple(kind for kind, is_used in zip(kinds, use, strict=True) if is_used)
+    outputs = [variable for variable, is_used in zip(equation.outvars, use, strict=True) if is_used]
+    new = equation.replace(outvars=outputs, params={**equation.params, "request": used_request, "kinds": used_kinds})
     return [True] * len(equation.invars), new
 
 

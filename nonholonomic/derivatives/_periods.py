@@ -9,15 +9,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ..integration.scheduler import Progress
+from ..integration.scheduler import SchedulerState
 from ..xla_cpu import written_in_place
 
 #: Number of checkpoints. With more periods, some checkpoints are dropped and computed again from an earlier one. With
 #: the 64 lanes of a CPU the checkpoints take 3 MB, with the 32768 of an accelerator 1.5 GB.
-KEPT = 64
+SLOTS = 64
 
 #: Number of steps that are kept for each cell, on average, and the memory [bytes] that all of them may take.
-STEPS_KEPT, MOST_KEPT = 1024, {"cpu": 1 << 26}
+STEPS_KEPT, MAX_BYTES = 1024, {"cpu": 1 << 26}
 
 
 class StepRecord(NamedTuple):
@@ -28,11 +28,8 @@ class StepRecord(NamedTuple):
     length: Float[Array, "iterations lanes"]
 
 
-class Period(NamedTuple):
-    """A period without its steps: the lanes before it, and after it but before their refill."""
-
-    before: Progress
-    after: Progress
+#: A period without its steps: the lanes before it, and after it but before their refill.
+Period = tuple[SchedulerState, SchedulerState]
 
 
 class Checkpoints(NamedTuple):
@@ -47,15 +44,15 @@ class Checkpoints(NamedTuple):
     periods: Period
 
     @classmethod
-    def none(cls, like: Period) -> "Checkpoints":
-        """No periods. **Arguments:** `like`: a period, for the shapes."""
-        room = jax.tree.map(lambda leaf: jnp.zeros((KEPT, *leaf.shape), leaf.dtype), like)
-        return cls(jnp.zeros((), int), jnp.zeros(KEPT, int), jnp.arange(KEPT), room)
+    def none(cls, example: Period) -> "Checkpoints":
+        """No periods. **Arguments:** `example`: a period, for the shapes."""
+        room = jax.tree.map(lambda leaf: jnp.zeros((SLOTS, *leaf.shape), leaf.dtype), example)
+        return cls(jnp.zeros((), int), jnp.zeros(SLOTS, int), jnp.arange(SLOTS), room)
 
     def latest(self) -> tuple[Int[Array, ""], Period]:
         """The latest period, and its number."""
         last = self.depth - 1
-        return self.index[last], jax.tree.map(functools.partial(read, at=self.slot[last]), self.periods)
+        return self.index[last], jax.tree.map(functools.partial(read, index=self.slot[last]), self.periods)
 
     def without_latest(self) -> "Checkpoints":
         """All but the latest period."""
@@ -63,34 +60,34 @@ class Checkpoints(NamedTuple):
 
     def added(self, index: Int[Array, ""], period: Period) -> "Checkpoints":
         """Add a period; if all slots are full, drop the period whose neighbours are closest."""
-        position = jnp.arange(KEPT)
-        full = self.depth == KEPT
-        following = jnp.where(position == KEPT - 1, index, jnp.roll(self.index, -1))
+        position = jnp.arange(SLOTS)
+        is_full = self.depth == SLOTS
+        following = jnp.where(position == SLOTS - 1, index, jnp.roll(self.index, -1))
         gap = jnp.where(position == 0, jnp.iinfo(self.index.dtype).max, following - jnp.roll(self.index, 1))
-        forgotten = jnp.where(full, jnp.argmin(gap), self.depth)
-        free = self.slot[forgotten]
-        moves = full & (position >= forgotten)
-        to = jnp.minimum(self.depth, KEPT - 1)
-        indices = jnp.where(moves, jnp.roll(self.index, -1), self.index).at[to].set(index)
-        slots = jnp.where(moves, jnp.roll(self.slot, -1), self.slot).at[to].set(free)
+        victim = jnp.where(is_full, jnp.argmin(gap), self.depth)
+        free = self.slot[victim]
+        shifts = is_full & (position >= victim)
+        end = jnp.minimum(self.depth, SLOTS - 1)
+        indices = jnp.where(shifts, jnp.roll(self.index, -1), self.index).at[end].set(index)
+        slots = jnp.where(shifts, jnp.roll(self.slot, -1), self.slot).at[end].set(free)
         room = jax.tree.map(functools.partial(written_in_place, at=free), self.periods, period)
-        return Checkpoints(jnp.minimum(self.depth + 1, KEPT), indices, slots, room)
+        return Checkpoints(jnp.minimum(self.depth + 1, SLOTS), indices, slots, room)
 
 
 class LatestSteps(NamedTuple):
-    """The steps of all iterations from number `since` on, in a ring with room for a period beyond its end."""
+    """The steps of all iterations from number `first` on, in a ring with room for a period beyond its end."""
 
-    since: Int[Array, ""]
+    first: Int[Array, ""]
     ring: StepRecord
 
     @classmethod
-    def none(cls, like: StepRecord, cells: int) -> "LatestSteps":
-        """No steps. **Arguments:** `like`: the steps of a period, for the shapes; `cells`: number of cells."""
-        period, lanes = like.length.shape
-        each = sum(leaf.dtype.itemsize * leaf.size for leaf in like) // period
-        most = MOST_KEPT.get(jax.default_backend(), 1 << 31) // each
-        size = period + max(period, min(most, STEPS_KEPT * -(-cells // lanes)))
-        room = StepRecord(*(jnp.zeros((size, *leaf.shape[1:]), leaf.dtype) for leaf in like))
+    def none(cls, example: StepRecord, cells: int) -> "LatestSteps":
+        """No steps. **Arguments:** `example`: the steps of a period, for the shapes; `cells`: number of cells."""
+        period, lanes = example.length.shape
+        bytes_of_step = sum(leaf.dtype.itemsize * leaf.size for leaf in example) // period
+        max_steps = MAX_BYTES.get(jax.default_backend(), 1 << 31) // bytes_of_step
+        size = period + max(period, min(max_steps, STEPS_KEPT * -(-cells // lanes)))
+        room = StepRecord(*(jnp.zeros((size, *leaf.shape[1:]), leaf.dtype) for leaf in example))
         return cls(jnp.zeros((), int), room)
 
     def added(self, first: Int[Array, ""], steps: StepRecord) -> "LatestSteps":
@@ -98,18 +95,18 @@ class LatestSteps(NamedTuple):
         period = len(steps.length)
         size = len(self.ring.length) - period
 
-        def written(whole: Array, rows: Array) -> Array:
-            return jax.lax.dynamic_update_slice_in_dim(whole, rows, first % size, 0)
+        def written(stack: Array, rows: Array) -> Array:
+            return jax.lax.dynamic_update_slice_in_dim(stack, rows, first % size, 0)
 
-        since = jnp.maximum(self.since, first + period - size)
-        return LatestSteps(since, jax.tree.map(written, self.ring, steps))
+        oldest = jnp.maximum(self.first, first + period - size)
+        return LatestSteps(oldest, jax.tree.map(written, self.ring, steps))
 
     def of_period(self, first: Int[Array, ""], period: int) -> StepRecord:
         """The steps of a period that begins with iteration number `first`."""
-        at = first % (len(self.ring.length) - period)
-        return jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, at, period), self.ring)
+        start = first % (len(self.ring.length) - period)
+        return jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, period), self.ring)
 
 
-def read(whole: Array, at: Int[Array, ""]) -> Array:
+def read(stack: Array, index: Int[Array, ""]) -> Array:
     """One of the arrays stacked in another."""
-    return jax.lax.dynamic_index_in_dim(whole, at, 0, keepdims=False)
+    return jax.lax.dynamic_index_in_dim(stack, index, 0, keepdims=False)

@@ -91,9 +91,9 @@ def differentiable_solve(solve: AbstractDifferentiableSolve, *leaves: Float[Arra
             value = primal(*leaves)
             return value, jax.tree.map(jnp.zeros_like, value)
         value, slopes = _value_and_tangents(solve, active)(*leaves)
-        moved = [tangents[i] for i in active]
+        active_tangents = [tangents[i] for i in active]
         # Derivatives are `None` where the primal has an array that is not differentiated.
-        return value, jax.tree.map(lambda part, *by: _change(solve, part, by, moved), value, *slopes)
+        return value, jax.tree.map(lambda part, *rates: _change(solve, part, rates, active_tangents), value, *slopes)
 
     return primal(*_canonical(leaves))
 
@@ -108,16 +108,16 @@ def _canonical(leaves: tuple[Any, ...]) -> list[Any]:
 def _change(solve: AbstractDifferentiableSolve, value: Array, slopes: tuple[Any, ...], tangents: list[Array]) -> Any:
     if slopes[0] is None:
         return jax.custom_derivatives.zero_from_primal(value, symbolic_zeros=True)
-    none = solve.absent(value)
+    is_absent = solve.absent(value)
 
     def share(slope: Array, tangent: Array) -> Array:
         # Selected before and after, so that an infinite tangent or cotangent of an absent output is dropped, not
         # multiplied.
-        kept = jnp.where(jnp.all(none), 0.0, tangent)
-        product = slope * kept
+        factor = jnp.where(jnp.all(is_absent), 0.0, tangent)
+        product = slope * factor
         # Where the derivative is zero, a NaN cotangent, such as that of theta at the pole, has no effect.
         product = jnp.where(slope == 0.0, 0.0, product).sum(axis=tuple(range(jnp.ndim(value), jnp.ndim(product))))
-        return jnp.where(none, 0.0, product)
+        return jnp.where(is_absent, 0.0, product)
 
     return sum(share(slope, tangent) for slope, tangent in zip(slopes, tangents, strict=True))
 
@@ -180,11 +180,11 @@ def tangents_by(
     [1. 2.]
     """
 
-    def moved(*moving: Array) -> Any:
-        every = list(leaves)
+    def rebuilt(*moving: Array) -> Any:
+        arguments = list(leaves)
         for i, leaf in zip(active, moving, strict=True):
-            every[i] = leaf
-        return build(tuple(every), cells)
+            arguments[i] = leaf
+        return build(tuple(arguments), cells)
 
     point = tuple(leaves[i] for i in active)
     sizes = [tangent_scale(leaf) for leaf in point]
@@ -214,7 +214,7 @@ def tangents_by(
                 for size, entries_of_leaf in zip(sizes, by_leaf, strict=True)
             ]
 
-    return moved(*point), tangents_of(moved, point, tangents), gather
+    return rebuilt(*point), tangents_of(rebuilt, point, tangents), gather
 
 
 def _by_entries(size: Array, *parts: Array) -> Array:

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..integration import REACHED_END, RUNNING, AbstractProblem, Settings, solve_ensemble
+from ..integration import AbstractProblem, Settings, solve_ensemble
+from ..integration.status import REACHED_END, RUNNING
 from ..progress import Progress
 
 
@@ -33,13 +34,13 @@ class VariedProblem(AbstractProblem):
     magnitudes: Float[Array, "components cells"]
 
     def start(self) -> tuple[Float[Array, "all cells"], Float[Array, "all cells"]]:
-        ones = jnp.ones((self.states.shape[0] - len(self.magnitudes), *self.states.shape[1:]))
-        return self.states, jnp.concatenate([self.magnitudes, ones])
+        unit_scales = jnp.ones((self.states.shape[0] - len(self.magnitudes), *self.states.shape[1:]))
+        return self.states, jnp.concatenate([self.magnitudes, unit_scales])
 
     def field(self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]) -> Float[Array, "all lanes"]:
         size = len(self.magnitudes)
         y, w = state[:size], state[size:-1]
-        rate, carried = jax.jvp(lambda at: self.problem.field(time, at), (y,), (w * self.magnitudes,))
+        rate, carried = jax.jvp(lambda point: self.problem.field(time, point), (y,), (w * self.magnitudes,))
         carried = carried / self.magnitudes
         growth = jnp.sum(w * carried, axis=0) / jnp.sum(w * w, axis=0)
         return jnp.concatenate([rate, carried - growth * w, growth[None]])
@@ -117,11 +118,11 @@ def growth(
     stretch, direction = jnp.asarray(t1 / stretches), tangents / magnitudes
     logarithms, end_time, status = [], np.zeros(cells), np.full(cells, RUNNING)
     steps, state = np.zeros(cells, int), np.asarray(start)
-    with Progress(stretches, "stretch") as shown:
+    with Progress(stretches, "stretch") as display:
         for number in range(stretches):
             unit = direction / jnp.linalg.norm(direction, axis=0)
-            varied = VariedProblem(problem, jnp.concatenate([start, unit, jnp.zeros((1, cells))]), magnitudes)
-            outcome, _ = solve_ensemble(varied, stretch, jnp.asarray(cells), settings)
+            variational = VariedProblem(problem, jnp.concatenate([start, unit, jnp.zeros((1, cells))]), magnitudes)
+            outcome, _ = solve_ensemble(variational, stretch, jnp.asarray(cells), settings)
             alive = (status == RUNNING) | (status == REACHED_END)
             logarithms.append(np.where(alive, outcome.state[-1], 0.0))
             end_time += np.where(alive, outcome.end_time, 0.0)
@@ -131,9 +132,9 @@ def growth(
             state = np.where(alive, start, state)
             # The first interval compiles.
             if number == 0:
-                shown.begin(1)
+                display.begin(1)
             else:
-                shown.advance(1)
+                display.advance(1)
     return Growth(np.stack(logarithms), status, end_time, state, steps)
 
 

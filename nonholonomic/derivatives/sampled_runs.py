@@ -10,18 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ..integration import (
-    FAILED,
-    LEFT_DOMAIN,
-    REACHED_END,
-    AbstractProblem,
-    CoreProblem,
-    Settings,
-    sample,
-    solve_with_samples,
-)
+from ..integration import AbstractProblem, CoreProblem, Settings, sample, solve_with_samples
 from ..integration.dense import SampledSolution
 from ..integration.problem import event_time
+from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END
 from .differentiable import tangents_by
 from .lyapunov import probed
 from .sampling import AbstractSampling, ProblemSpec, solve_for_samples
@@ -117,15 +109,15 @@ def _at_times(
 
 @_at_times.def_jvp
 def _later(primals: Any, tangents: Any) -> Any:
-    (samples, leading, times, modules, build), (moved, _, later, *_) = primals, tangents
-    moved = jnp.zeros_like(samples) if moved is None else moved
-    if later is None:
-        return samples, moved
+    (samples, leading, times, modules, build), (sample_rates, _, time_rates, *_) = primals, tangents
+    sample_rates = jnp.zeros_like(samples) if sample_rates is None else sample_rates
+    if time_rates is None:
+        return samples, sample_rates
     problem, size = build(modules, None), samples.shape[-1]
-    whole = core_problem(problem) if leading is None else problem
+    full_problem = core_problem(problem) if leading is None else problem
     states = samples if leading is None else jnp.concatenate([leading, samples], axis=-1)
-    rates = jax.vmap(whole.field)(times, states)[:, -size:]
-    return samples, moved + jnp.where(jnp.isfinite(rates), rates * later[:, None], 0.0)
+    rates = jax.vmap(full_problem.field)(times, states)[:, -size:]
+    return samples, sample_rates + jnp.where(jnp.isfinite(rates), rates * time_rates[:, None], 0.0)
 
 
 def core_problem(problem: AbstractProblem) -> AbstractProblem:
@@ -170,8 +162,8 @@ def sampled_run_by_diffrax(
     """
     size = len(problem.start()[0])
     leading = size if problem.leading is None else problem.leading
-    whole = probed(problem) if grid is None else problem
-    path = sample(whole, times, t1, settings, grid=grid, adjoint=adjoint)
+    full_problem = probed(problem) if grid is None else problem
+    path = sample(full_problem, times, t1, settings, grid=grid, adjoint=adjoint)
     status, *counts = (part.astype(float) for part in (_status(path, t1), path.accepted, path.rejected))
     states = parted(problem, path.states[:size].T)
     return SampledRun(*states, path.end_time, path.end_state[:leading], status, *counts)
@@ -183,16 +175,16 @@ def _status(path: SampledSolution, t1: Float[Array, ""]) -> Int[Array, ""]:
 
 
 class BlockSampling(AbstractSampling):
-    """Samples by an ensemble solve, with passive quadratures or, if `alone`, without them."""
+    """Samples by an ensemble solve, with passive quadratures or, if `core_only`, without them."""
 
     movable: int
     spec: ProblemSpec
     places: Any = eqx.field(static=True)
-    alone: bool = eqx.field(static=True, default=False)
+    core_only: bool = eqx.field(static=True, default=False)
 
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
         build, numbers, arguments, settings = self._builder(leaves)
-        return _march(VariationalProblem(build(numbers, cells), (), False), arguments, settings)[0]
+        return _samples_and_slopes(VariationalProblem(build(numbers, cells), (), False), arguments, settings)[0]
 
     def value_and_tangents(
         self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
@@ -201,7 +193,7 @@ class BlockSampling(AbstractSampling):
         problem, tangents, gather = tangents_by(build, active, numbers, cells)
 
         def run(group: tuple[Any, ...]) -> tuple[SampledRun, list[SampledRun]]:
-            return _march(VariationalProblem(problem, group, False), arguments, settings, not nested)
+            return _samples_and_slopes(VariationalProblem(problem, group, False), arguments, settings, not nested)
 
         samples, slopes = in_groups(run, tangents)
         return samples, gather(slopes)
@@ -209,7 +201,7 @@ class BlockSampling(AbstractSampling):
     def for_parts(self, wanted: tuple[int, ...]) -> Self:
         fields = SampledRun._fields
         quadratures = any(fields[part % len(fields)] == "quadratures" for part in wanted)
-        return self if quadratures else dataclasses.replace(self, alone=True)
+        return self if quadratures else dataclasses.replace(self, core_only=True)
 
     def _builder(self, leaves: tuple[Array, ...]) -> tuple[Callable[..., AbstractProblem], Any, Any, Settings]:
         """A function (the modules' numbers, cells) -> problem; the modules' numbers; times, horizon and tolerance; the
@@ -218,59 +210,59 @@ class BlockSampling(AbstractSampling):
 
         def build(numbers: tuple[Array, ...], cells: int | None) -> AbstractProblem:
             problem = spec.built(numbers, cells)
-            return core_problem(problem) if self.alone else problem
+            return core_problem(problem) if self.core_only else problem
 
         return build, numbers, arguments, spec.settings
 
 
 @eqx.filter_jit
-def _march(
-    varied: VariationalProblem, arguments: tuple[Array, Array, Array], settings: Settings, one_kernel: bool = True
+def _samples_and_slopes(
+    variational: VariationalProblem, arguments: tuple[Array, Array, Array], settings: Settings, one_kernel: bool = True
 ) -> tuple[SampledRun, list[SampledRun]]:
     """The samples of the cells, and their derivative along each tangent."""
     times, t1, tolerance = arguments
     outcome, samples = solve_with_samples(
-        varied,
+        variational,
         times if times.ndim == 1 else times.T,
         t1,
-        jnp.asarray(varied.problem.start()[0].shape[1]),
+        jnp.asarray(variational.problem.start()[0].shape[1]),
         # One tolerance serves the whole ensemble: the smallest of the batch.
         settings.with_tolerance(jnp.min(tolerance)),
-        n_blocks=1 + len(varied.tangents),
+        n_blocks=1 + len(variational.tangents),
         one_kernel=one_kernel,
     )
     counts = (outcome.steps - outcome.rejected, outcome.rejected)
-    return _found(varied, samples, (outcome.end_time, outcome.state, outcome.status), counts)
+    return _found(variational, samples, (outcome.end_time, outcome.state, outcome.status), counts)
 
 
 def _found(
-    varied: VariationalProblem,
+    variational: VariationalProblem,
     samples: Float[Array, "*cells times components"],
     ends: tuple[Float[Array, "*cells"], Float[Array, "components *cells"], Int[Array, "*cells"]],
     counts: tuple[Int[Array, "*cells"], Int[Array, "*cells"]],
 ) -> tuple[SampledRun, list[SampledRun]]:
     """The samples and their derivative along each tangent, given the time, the state and the status at which the runs
     ended."""
-    states, *variations = jnp.split(samples, 1 + len(varied.tangents), axis=-1)
+    states, *variations = jnp.split(samples, 1 + len(variational.tangents), axis=-1)
     time, end, status = ends
-    end, *end_variations = varied.parts(end)
+    end, *end_variations = variational.parts(end)
 
     def end_time(problem: AbstractProblem, state: Float[Array, "components *cells"]) -> Float[Array, "*cells"]:
-        return event_time(problem, lambda at: problem.domain_margin(time, at), time, state)
+        return event_time(problem, lambda point: problem.domain_margin(time, point), time, state)
 
     def slope(direction: Any, variation: Array, at_end: Array) -> SampledRun:
-        if varied.problem.domain_margin(time, end) is None:
-            later = jnp.zeros_like(time)
+        if variational.problem.domain_margin(time, end) is None:
+            end_delay = jnp.zeros_like(time)
         else:
-            later = eqx.filter_jvp(end_time, (varied.problem, end), (direction, at_end))[1]
-            later = jnp.where((status == LEFT_DOMAIN) & (time > 0.0), later, 0.0)
-        changes = parted(varied.problem, jnp.where(jnp.isnan(states), 0.0, variation))
-        return SampledRun(*changes, later, *NOT_DIFFERENTIATED)
+            end_delay = eqx.filter_jvp(end_time, (variational.problem, end), (direction, at_end))[1]
+            end_delay = jnp.where((status == LEFT_DOMAIN) & (time > 0.0), end_delay, 0.0)
+        changes = parted(variational.problem, jnp.where(jnp.isnan(states), 0.0, variation))
+        return SampledRun(*changes, end_delay, *NOT_DIFFERENTIATED)
 
-    slopes = [slope(*parts) for parts in zip(varied.tangents, variations, end_variations, strict=True)]
+    slopes = [slope(*parts) for parts in zip(variational.tangents, variations, end_variations, strict=True)]
     numbers = (part.astype(float) for part in (status, *counts))
-    end, _ = parted(varied.problem, jnp.moveaxis(end, 0, -1))
-    return SampledRun(*parted(varied.problem, states), time, end, *numbers), slopes
+    end, _ = parted(variational.problem, jnp.moveaxis(end, 0, -1))
+    return SampledRun(*parted(variational.problem, states), time, end, *numbers), slopes
 
 
 class SingleSampling(AbstractSampling):
@@ -301,10 +293,10 @@ class SingleSampling(AbstractSampling):
 
 
 def _follow(
-    varied: VariationalProblem, arguments: tuple[Array, Array, Array], spec: ProblemSpec
+    variational: VariationalProblem, arguments: tuple[Array, Array, Array], spec: ProblemSpec
 ) -> tuple[SampledRun, list[SampledRun]]:
     """The samples of a run, and their derivative along each tangent."""
     times, t1, tolerance = arguments
-    path = sample(varied, times, t1, spec.settings.with_tolerance(tolerance), grid=spec.grid)
+    path = sample(variational, times, t1, spec.settings.with_tolerance(tolerance), grid=spec.grid)
     ends = (path.end_time, path.end_state, _status(path, t1))
-    return _found(varied, path.states.T, ends, (path.accepted, path.rejected))
+    return _found(variational, path.states.T, ends, (path.accepted, path.rejected))

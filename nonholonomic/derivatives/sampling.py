@@ -41,8 +41,8 @@ class AbstractSampling(AbstractDifferentiableSolve):
 
     def _sorted(self, leaves: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, Array, Array], ProblemSpec]:
         """Split the leaves into the modules' numbers; times, horizon and tolerance; and the whole spec."""
-        numbers, (times, t1, tolerance, *held) = leaves[: self.movable], leaves[self.movable :]
-        return numbers, (times, t1, tolerance), eqx.combine(self.spec, jax.tree.unflatten(self.places, held))
+        numbers, (times, t1, tolerance, *arrays_of_spec) = leaves[: self.movable], leaves[self.movable :]
+        return numbers, (times, t1, tolerance), eqx.combine(self.spec, jax.tree.unflatten(self.places, arrays_of_spec))
 
 
 def solve_for_samples(
@@ -60,11 +60,13 @@ def solve_for_samples(
     returns the problem, given the modules and an extra argument of the solve (the function is compared by identity);
     other arguments as for `sampled_run`.
     """
-    numbers, rest = eqx.partition(modules, eqx.is_inexact_array)
+    numbers, static = eqx.partition(modules, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(numbers)
     # Arrays, such as those of the solver, may be traced, so they belong to the leaves.
-    arrays, spec = eqx.partition(ProblemSpec(build, structure, rest, settings.with_tolerance(None), grid), eqx.is_array)
-    held, places = jax.tree.flatten(arrays)
+    arrays, spec = eqx.partition(
+        ProblemSpec(build, structure, static, settings.with_tolerance(None), grid), eqx.is_array
+    )
+    arrays_of_spec, places = jax.tree.flatten(arrays)
     return differentiable_solve(
-        sampling(len(leaves), spec, places), *leaves, times, as_number(t1), settings.tolerance, *held
+        sampling(len(leaves), spec, places), *leaves, times, as_number(t1), settings.tolerance, *arrays_of_spec
     )

@@ -16,9 +16,10 @@ from jax.extend.core import Literal
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
-from ..integration import CROSSED, REACHED_END, AbstractProblem, LaneState, Outcome, Settings
+from ..integration import AbstractProblem, LaneState, Outcome, Settings
 from ..integration.ensemble import with_crossing_times
 from ..integration.scheduler import LaneScheduler
+from ..integration.status import CROSSED, REACHED_END
 from ..xla_cpu import compiled_alone
 from ._adjoint import solve_with_adjoint
 from .variation import VariationalProblem, in_groups, slopes_by_variations
@@ -64,26 +65,26 @@ def ensemble_solve_with_tangents(
     """
     horizon = t1
     if nonterminal:
-        whole = LaneScheduler.of(problem, t1, cells, settings, nonterminal=True, one_kernel=one_kernel)
-        outcome = whole.outcome()[0]
+        scheduler = LaneScheduler.of(problem, t1, cells, settings, nonterminal=True, one_kernel=one_kernel)
+        outcome = scheduler.outcome()[0]
         # The derivatives need the run only up to the event, whose time is now known.
         horizon = jnp.where(jnp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
     options = (not nonterminal, horizon, cells, settings)
 
-    def along(group: tuple[Any, ...]) -> tuple[Outcome, list[Float[Array, " cells"]]]:
+    def with_group(group: tuple[Any, ...]) -> tuple[Outcome, list[Float[Array, " cells"]]]:
         return slopes_by_variations(problem, group, *options, one_kernel=one_kernel)
 
     if one_kernel and problem.fits_one_kernel and len(tangents) > MOST_FORWARD:
         ended, slopes = _slopes_by_adjoint(problem, tangents, *options)
     else:
-        ended, slopes = in_groups(along, tangents)
+        ended, slopes = in_groups(with_group, tangents)
     if not nonterminal:
         outcome = with_crossing_times(problem, ended)
     # An event at the start has a fixed time, whatever the tangent.
-    happened = jnp.isfinite(outcome.crossing_time) & (ended.end_time > 0.0)
+    has_delay = jnp.isfinite(outcome.crossing_time) & (ended.end_time > 0.0)
     # With its variations a run takes other steps: where it does not reach the event, it has no derivative.
     arrived = ended.status == (REACHED_END if nonterminal else CROSSED)
-    return outcome, [jnp.where(happened, jnp.where(arrived, slope, jnp.nan), 0.0) for slope in slopes]
+    return outcome, [jnp.where(has_delay, jnp.where(arrived, slope, jnp.nan), 0.0) for slope in slopes]
 
 
 def _slopes_by_adjoint(
@@ -120,13 +121,13 @@ def _mixed(tangents: tuple[Any, ...]) -> Any:
     return jax.tree.map(lambda *rates: sum(c * rate for c, rate in zip(shares, rates, strict=True)), *tangents)
 
 
-def _event_time(varied: VariationalProblem, lane_state: LaneState) -> Float[Array, " lanes"]:
+def _event_time(variational: VariationalProblem, lane_state: LaneState) -> Float[Array, " lanes"]:
     """Zero of the event function for lanes that have ended on the event (implicit function theorem).
 
     First order, unlike `crossing_time`: the event is located to 1e-10 of a step, and its time is not differentiated
     again.
     """
-    crossing, rate = varied.problem.event_function, varied.problem.field(lane_state.time, lane_state.state)
+    crossing, rate = variational.problem.event_function, variational.problem.field(lane_state.time, lane_state.state)
     fall = stop_gradient(jax.jvp(crossing, (stop_gradient(lane_state.state),), (rate,))[1])
     value = crossing(lane_state.state)
     assert value is not None
@@ -143,13 +144,13 @@ def _moving(problem: AbstractProblem, direction: Any) -> Any:
         return rebuilt.field(jnp.zeros_like(states[0]), states), rebuilt.event_function(states)
 
     closed = jax.make_jaxpr(seen)(*leaves)
-    needed = set(closed.jaxpr.outvars)
+    dependencies = set(closed.jaxpr.outvars)
     for equation in reversed(closed.jaxpr.eqns):
-        if not needed.isdisjoint(equation.outvars):
-            needed |= {variable for variable in equation.invars if not isinstance(variable, Literal)}
-    used = jax.tree.unflatten(structure, [variable in needed for variable in closed.jaxpr.invars])
+        if not dependencies.isdisjoint(equation.outvars):
+            dependencies |= {variable for variable in equation.invars if not isinstance(variable, Literal)}
+    is_dependency = jax.tree.unflatten(structure, [variable in dependencies for variable in closed.jaxpr.invars])
     return jax.tree.map(
-        lambda rate, is_used: is_used and rate is not None, direction, used, is_leaf=lambda rate: rate is None
+        lambda rate, is_used: is_used and rate is not None, direction, is_dependency, is_leaf=lambda rate: rate is None
     )
 
 
@@ -188,9 +189,9 @@ def tangents_of(
         # A problem may also hold functions.
         return eqx.filter(build(*numbers), eqx.is_inexact_array)
 
-    reached = _reached(jax.make_jaxpr(built)(*numbers))
+    dependents = _reached(jax.make_jaxpr(built)(*numbers))
     structure = jax.tree.structure(jax.eval_shape(built, *numbers))
-    moving = jax.tree.unflatten(structure, reached)
+    moving = jax.tree.unflatten(structure, dependents)
     changes = [jax.jvp(built, numbers, tangent)[1] for tangent in tangents]
     return tuple(eqx.filter(change, moving) for change in changes)
 

@@ -18,7 +18,7 @@ from ..integration.scheduler import LaneScheduler
 
 #: Number of tangents that are integrated together. Two together take 0.6 to 1.0 times as long as two in turn, and an
 #: eighth longer to compile; four together take 1.1 times as long as two pairs.
-TOGETHER = 2
+GROUP = 2
 
 
 def tangent_scale(number: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -66,24 +66,26 @@ class VariationalProblem(AbstractProblem):
         states, scales = self.problem.start()
 
         def variation(direction: Any) -> Float[Array, "components cells"]:
-            moved = eqx.filter_jvp(lambda problem: problem.start()[0], (self.problem,), (direction,))[1]
-            return jnp.zeros_like(states) if moved is None else moved
+            change = eqx.filter_jvp(lambda problem: problem.start()[0], (self.problem,), (direction,))[1]
+            return jnp.zeros_like(states) if change is None else change
 
         variations = [variation(direction) for direction in self.tangents]
         return jnp.concatenate([states, *variations]), jnp.concatenate([scales] * (1 + len(variations)))
 
     def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        at, *variations = self.parts(state)
+        point, *variations = self.parts(state)
         if not variations:
-            return self.problem.field(time, at)
+            return self.problem.field(time, point)
         moving = where_active(self.problem, self.tangents[0])
 
-        def rate(moving: Any, at: Float[Array, "components lanes"]) -> Float[Array, "components lanes"]:
-            return eqx.combine(moving, self.problem).field(time, at)
+        def rate(moving: Any, point: Float[Array, "components lanes"]) -> Float[Array, "components lanes"]:
+            return eqx.combine(moving, self.problem).field(time, point)
 
         # Linearised once: the rate is computed once, and the tangents share common subexpressions.
-        rates, change = jax.linearize(rate, moving, at)
-        return jnp.concatenate([rates, *(change(*moved) for moved in zip(self.tangents, variations, strict=True))])
+        rates, change = jax.linearize(rate, moving, point)
+        return jnp.concatenate(
+            [rates, *(change(*direction) for direction in zip(self.tangents, variations, strict=True))]
+        )
 
     def event_function(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"] | None:
         return self.problem.event_function(self.parts(state)[0]) if self.ends_on_event else None
@@ -113,17 +115,18 @@ def slopes_by_variations(
 
     **Returns:** the `Outcome`, without crossing times, and for each tangent the derivative of the event's time.
     """
-    varied = VariationalProblem(problem, tangents, ends_on_event)
+    variational = VariationalProblem(problem, tangents, ends_on_event)
     # The variations take part in step-size control: the state alone may be at rest while its tangent is not, and the
     # steps would become too long for the tangent.
-    ended, _ = LaneScheduler.of(varied, *options, n_blocks=1 + len(tangents), one_kernel=one_kernel).outcome()
-    state, *variations = varied.parts(ended.state)
+    ended, _ = LaneScheduler.of(variational, *options, n_blocks=1 + len(tangents), one_kernel=one_kernel).outcome()
+    state, *variations = variational.parts(ended.state)
 
     def event_time(problem: AbstractProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
         return crossing_time(problem, ended.end_time, state)
 
     slopes = [
-        eqx.filter_jvp(event_time, (problem, state), moved)[1] for moved in zip(tangents, variations, strict=True)
+        eqx.filter_jvp(event_time, (problem, state), direction)[1]
+        for direction in zip(tangents, variations, strict=True)
     ]
     return ended._replace(state=state), slopes
 
@@ -146,16 +149,16 @@ def in_groups(run: Callable[..., tuple[Any, list[Any]]], tangents: tuple[Any, ..
     >>> [float(slope) for slope in slopes]
     [2.0, 4.0, 6.0]
     """
-    if len(tangents) <= TOGETHER:
+    if len(tangents) <= GROUP:
         return run(tangents)
     # The last group is padded with zero tangents.
-    empty = -len(tangents) % TOGETHER
+    empty = -len(tangents) % GROUP
     padded = [*tangents, *[jax.tree.map(jnp.zeros_like, tangents[0])] * empty]
-    stacked = [jax.tree.map(lambda *rates: jnp.stack(rates), *padded[k::TOGETHER]) for k in range(TOGETHER)]
-    results, slopes = jax.lax.map(lambda group: run(tuple(group)), stacked)
-    groups = range(len(padded) // TOGETHER)
-    each = [jax.tree.map(operator.itemgetter(group), slope) for group in groups for slope in slopes]
-    return jax.tree.map(lambda leaf: leaf[0], results), each[: len(tangents)]
+    stacks = [jax.tree.map(lambda *rates: jnp.stack(rates), *padded[k::GROUP]) for k in range(GROUP)]
+    results, slopes = jax.lax.map(lambda group: run(tuple(group)), stacks)
+    groups = range(len(padded) // GROUP)
+    tangent_slopes = [jax.tree.map(operator.itemgetter(group), slope) for group in groups for slope in slopes]
+    return jax.tree.map(lambda leaf: leaf[0], results), tangent_slopes[: len(tangents)]
 
 
 def where_active(problem: Any, direction: Any) -> Any:

@@ -20,8 +20,8 @@ def lie_brackets(fields: Callable[[Coordinates], Float[Array, "n m"]], q: Coordi
     - `fields`: function of the coordinates (n,) that returns m fields as the columns of an (n, m) array.
     - `q`: coordinates at which to evaluate, (n,).
     """
-    along = jnp.einsum("ibk,ka->iab", jax.jacfwd(fields)(q), fields(q))
-    return along - jnp.swapaxes(along, 1, 2)
+    derivatives = jnp.einsum("ibk,ka->iab", jax.jacfwd(fields)(q), fields(q))
+    return derivatives - jnp.swapaxes(derivatives, 1, 2)
 
 
 def structure_constants(frame: Frame, q: Coordinates) -> Float[Array, "n n n"]:

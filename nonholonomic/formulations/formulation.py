@@ -129,10 +129,10 @@ class Routhian(AbstractSystem):
         return q, rate.at[self.cyclic].set((self.momentum - row @ rate) / row[self.cyclic])
 
     def metric(self, q: Coordinates) -> Float[Array, "m m"]:
-        whole = self.full.metric(jnp.insert(q, self.cyclic, 0.0))
-        kept = np.delete(np.arange(len(whole)), self.cyclic)
-        column = whole[kept, self.cyclic]
-        return whole[np.ix_(kept, kept)] - jnp.outer(column, column) / whole[self.cyclic, self.cyclic]
+        full_metric = self.full.metric(jnp.insert(q, self.cyclic, 0.0))
+        free = np.delete(np.arange(len(full_metric)), self.cyclic)
+        column = full_metric[free, self.cyclic]
+        return full_metric[np.ix_(free, free)] - jnp.outer(column, column) / full_metric[self.cyclic, self.cyclic]
 
     def lagrangian(self, q: Coordinates, rate: Coordinates) -> Float[Array, ""]:
         q, rate = self.complete(q, rate)
@@ -212,10 +212,10 @@ class Multipliers(AbstractFormulation):
         """The state (q, p), with p projected on the constraints; warns if a concrete velocity violates them."""
         violation = self.system.constraints(q) @ rate
         if not is_traced(violation) and violation.size:
-            worst = float(jnp.max(jnp.abs(violation)) / jnp.maximum(jnp.max(jnp.abs(rate)), 1e-300))
-            if worst > START_TOLERANCE:
+            violation_ratio = float(jnp.max(jnp.abs(violation)) / jnp.maximum(jnp.max(jnp.abs(rate)), 1e-300))
+            if violation_ratio > START_TOLERANCE:
                 warnings.warn(
-                    f"the velocity violates the constraints by a relative {worst:.1e} and is projected onto them",
+                    f"the velocity violates the constraints by a relative {violation_ratio:.1e} and is projected onto them",
                     stacklevel=2,
                 )
         return jnp.concatenate([q, self.projected(q, self.system.metric(q) @ rate)])
@@ -233,8 +233,8 @@ class Multipliers(AbstractFormulation):
         G, swell = jax.jvp(system.metric, (q,), (rate,))
         free = jax.grad(system.lagrangian)(q, rate) + system.force(t, q, rate) - swell @ rate
         per_mass = solve(G, jnp.column_stack([W.T, free]), positive=True)
-        wanted = bend @ rate + W @ per_mass[:, -1] + self.baumgarte * (W @ rate)
-        return -solve(W @ per_mass[:, :-1], wanted, positive=True)
+        acceleration = bend @ rate + W @ per_mass[:, -1] + self.baumgarte * (W @ rate)
+        return -solve(W @ per_mass[:, :-1], acceleration, positive=True)
 
     def field(self, t: Float[ArrayLike, ""], state: Float[Array, " state"], args=None) -> Float[Array, " state"]:
         q, rate = self.split(state)
@@ -282,8 +282,8 @@ class Hamel(AbstractFormulation):
         swell = jax.jvp(lambda q: momentum(q, u), (q,), (rate,))[1]
         inertia = jax.jacfwd(momentum, argnums=1)(q, u)[:free, :free]
         # c^k_ji p_k is the bracket [E_j, E_i] paired with dL/dq', of which p_k is the part along E_k.
-        along = jax.grad(system.lagrangian, argnums=1)(q, rate)
-        gyroscopic = jnp.einsum("kji,j,k->i", lie_brackets(system.frame, q), u, along)
+        gradient = jax.grad(system.lagrangian, argnums=1)(q, rate)
+        gyroscopic = jnp.einsum("kji,j,k->i", lie_brackets(system.frame, q), u, gradient)
         forces = E.T @ (jax.grad(lagrangian)(q, u) + system.force(t, q, rate)) + gyroscopic - swell
         return jnp.concatenate([rate, solve(inertia, forces[:free], positive=True)])
 
@@ -316,14 +316,14 @@ class ConstrainedConnection(AbstractVelocityFormulation):
     def forbidden(self, q: Coordinates) -> Float[Array, "n n"]:
         """Projector Q = G^-1 W^T (W G^-1 W^T)^-1 W on the directions orthogonal to the allowed ones."""
         W = self.system.constraints(q)
-        raised = solve(self.system.metric(q), W.T, positive=True)
-        return raised @ solve(W @ raised, W, positive=True)
+        vectors = solve(self.system.metric(q), W.T, positive=True)
+        return vectors @ solve(W @ vectors, W, positive=True)
 
     def christoffel(self, q: Coordinates) -> Float[Array, "n n n"]:
         """Christoffel symbols Gamma^i_jk of the kinetic metric, at [i, j, k]."""
         slope = jax.jacfwd(self.system.metric)(q)
-        lowered = 0.5 * (slope + slope.swapaxes(1, 2) - jnp.moveaxis(slope, 2, 0))
-        return solve(self.system.metric(q), lowered.reshape(q.size, -1), positive=True).reshape(lowered.shape)
+        christoffel = 0.5 * (slope + slope.swapaxes(1, 2) - jnp.moveaxis(slope, 2, 0))
+        return solve(self.system.metric(q), christoffel.reshape(q.size, -1), positive=True).reshape(christoffel.shape)
 
     def connection(self, q: Coordinates) -> Float[Array, "n n n"]:
         """Coefficients Gamma^D i_jk = Gamma^i_jk + (nabla_j Q)^i_k of the constrained connection, at [i, j, k]."""

@@ -58,8 +58,8 @@ def frame_of(
         slope = None if surface.tilt is None else (jnp.sin(surface.tilt), jnp.cos(surface.tilt))
         return PlaneFrame(distance, slope)
     if isinstance(surface, Cylinder | Sphere):
-        own = CylinderFrame if isinstance(surface, Cylinder) else SphereFrame
-        return own(-side * surface.radius - distance, distance, side < 0.0)
+        kind = CylinderFrame if isinstance(surface, Cylinder) else SphereFrame
+        return kind(-side * surface.radius - distance, distance, side < 0.0)
     return CarriedFrame.of(surface, distance, pull, side)
 
 
@@ -156,9 +156,9 @@ class CarriedFrame(AbstractFrame):
         """The motion of the frame. **Arguments:** `velocity`: velocity of the foot, along the axes."""
         t1, t2, n = axes
         o1, o2, *up = stored(*frame_rate, *self._seen(t1, t2, n))
-        back = -self.pull * self.side * self.surface.offset(foot)
-        moved = sum_vectors(scale(velocity[0], t1), scale(velocity[1], t2), scale(back, n))
-        return FrameMotion((o1, o2), vector_of(up), (*moved, *scale(o1, n)), room)
+        pull_back = -self.pull * self.side * self.surface.offset(foot)
+        carried = sum_vectors(scale(velocity[0], t1), scale(velocity[1], t2), scale(pull_back, n))
+        return FrameMotion((o1, o2), vector_of(up), (*carried, *scale(o1, n)), room)
 
     def _shape(self, foot: Fixed, t1: Fixed, t2: Fixed) -> TangentOperator:
         """The shape operator of the arena, n' = -S_a q', as (S11, S12, S22)."""

@@ -46,10 +46,14 @@ class Cylinder(AbstractSurface):
         return (multiply(per_length, position[0]), None, multiply(per_length, position[2]))
 
     def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
-        normal, across = self.normal(position), (velocity[0], None, velocity[2])
-        away = scale(subtract(None, dot(normal, across)), normal)
+        normal, radial_velocity = self.normal(position), (velocity[0], None, velocity[2])
+        correction = scale(subtract(None, dot(normal, radial_velocity)), normal)
         per_length = 1.0 / _across(position)
-        return (multiply(per_length, add(velocity[0], away[0])), None, multiply(per_length, add(velocity[2], away[2])))
+        return (
+            multiply(per_length, add(velocity[0], correction[0])),
+            None,
+            multiply(per_length, add(velocity[2], correction[2])),
+        )
 
     def elevation(self, position: Vector) -> Component:
         return position[2] + self.radius
@@ -68,10 +72,10 @@ class Cylinder(AbstractSurface):
         return (position[1], jnp.arctan2(position[0], -position[2]))
 
     def charted(self, place: Place) -> tuple[Vector, Vector, Vector]:
-        along, eta = place
+        axial, eta = place
         sine, cosine, zero = jnp.sin(eta), jnp.cos(eta), jnp.zeros_like(eta)
         return (
-            (self.radius * sine, along, -self.radius * cosine),
+            (self.radius * sine, axial, -self.radius * cosine),
             (zero, jnp.ones_like(eta), zero),
             (cosine, zero, sine),
         )

@@ -188,8 +188,8 @@ class PlaneFrame(AbstractFrame):
 
     def position(self, place: Place, cyclic: Place) -> Fixed:
         x, y = (*place, *cyclic)
-        along, across, normal = self.axes(place, cyclic)
-        return sum_vectors(scale(x, along), scale(y, across), scale(self.distance, normal))
+        t1, t2, normal = self.axes(place, cyclic)
+        return sum_vectors(scale(x, t1), scale(y, t2), scale(self.distance, normal))
 
 
 class CylinderFrame(AbstractFrame):
@@ -227,8 +227,8 @@ class CylinderFrame(AbstractFrame):
         return FrameMotion((rate, None), self.vertical(place), (multiply(rate, cosine), -multiply(rate, sine)))
 
     def convex_motion(self, place: Place, velocity: Tangent, radii: TangentOperator) -> tuple[FrameMotion, Tangent]:
-        along, _, room = contact_velocity((1.0 / self.radius, None, None), radii, velocity)
-        return self.frame_motion(place, along)._replace(room=room), along
+        contact_rate, _, room = contact_velocity((1.0 / self.radius, None, None), radii, velocity)
+        return self.frame_motion(place, contact_rate)._replace(room=room), contact_rate
 
     def vertical(self, place: Place) -> Vector:
         sine, cosine = place
@@ -289,8 +289,8 @@ class SphereFrame(AbstractFrame):
 
     def convex_motion(self, place: Place, velocity: Tangent, radii: TangentOperator) -> tuple[FrameMotion, Tangent]:
         curvature = 1.0 / self.radius
-        along, _, room = contact_velocity((curvature, None, curvature), radii, velocity)
-        return self.frame_motion(place, along)._replace(room=room), along
+        contact_rate, _, room = contact_velocity((curvature, None, curvature), radii, velocity)
+        return self.frame_motion(place, contact_rate)._replace(room=room), contact_rate
 
     def vertical(self, place: Place) -> Vector:
         return (place[0], place[1], place[2])

@@ -102,11 +102,11 @@ def spread(arrays: Sequence[Array]) -> tuple[Array, ...]:
 
 def gathered(numbers: Sequence[Array], shapes: Sequence[tuple[int, ...]]) -> list[Array]:
     """The arrays with the given shapes, from their `spread` numbers."""
-    arrays, begin = [], 0
+    arrays, first = [], 0
     for shape in shapes:
-        end = begin + math.prod(shape)
-        arrays.append(jnp.stack(numbers[begin:end]).reshape(shape) if shape else numbers[begin])
-        begin = end
+        end = first + math.prod(shape)
+        arrays.append(jnp.stack(numbers[first:end]).reshape(shape) if shape else numbers[first])
+        first = end
     return arrays
 
 
@@ -130,8 +130,10 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module
     shapes = {(), *(leaf.shape for leaf in jax.tree.leaves(value) if eqx.is_array(leaf))}
     results = traced.out_avals
     if len(results) != 1 or results[0].shape not in shapes or not jnp.issubdtype(results[0].dtype, jnp.floating):
-        shown = ", ".join(map(str, results))
-        raise ValueError(f"{name} = {value!r} must return one number for numbers {', '.join(arguments)}, not {shown}")
+        names_of_results = ", ".join(map(str, results))
+        raise ValueError(
+            f"{name} = {value!r} must return one number for numbers {', '.join(arguments)}, not {names_of_results}"
+        )
     if isinstance(value, eqx.Module):
         # If the parameters have one number per lane, so have the results.
         arrays = results[0].shape == () and len(shapes) > 1 and not isinstance(value, Held)

@@ -85,8 +85,8 @@ class Paraboloid(AbstractOpen):
         x, y, _ = position
         per_length, normal = 1.0 / jnp.sqrt(x * x + y * y + self.p * self.p), self.normal(position)
         gradient_rate = (-velocity[0], -velocity[1], None)
-        along = scale(subtract(None, dot(normal, gradient_rate)), normal)
-        rate = scale(per_length, sum_vectors(gradient_rate, along))
+        correction = scale(subtract(None, dot(normal, gradient_rate)), normal)
+        rate = scale(per_length, sum_vectors(gradient_rate, correction))
         return (rate[0], rate[1], rate[2])
 
     def gaussian_curvature(self, position: Vector) -> Component:
@@ -107,8 +107,8 @@ class Paraboloid(AbstractOpen):
         def fallen(s: Component, r: Component, rise: Component, bend: Component) -> Component:
             return s - ((bend * s * s + rise) * s - r) / (3.0 * bend * s * s + rise)
 
-        held = jax.lax.stop_gradient((r, rise, bend))
-        s = jax.lax.fori_loop(0, NEWTON_STEPS, lambda _, s: fallen(s, *held), _above_the_root(*held))
+        constants = jax.lax.stop_gradient((r, rise, bend))
+        s = jax.lax.fori_loop(0, NEWTON_STEPS, lambda _, s: fallen(s, *constants), _above_the_root(*constants))
         s = fallen(s, r, rise, bend)
         # On the axis, above the centre of curvature, all directions are equally near.
         part, x = s / r, x + jnp.where(square == 0.0, TINY, 0.0)

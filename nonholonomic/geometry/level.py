@@ -37,32 +37,19 @@ SETTLED = 1e-8
 UNSEEN = 1e-4
 
 
-class Quadratic(NamedTuple):
-    """The symmetric matrix ((a, b), (b, c)) and a vector (x, y), over lanes."""
-
-    a: Component
-    b: Component
-    c: Component
-    x: Component
-    y: Component
-
-    @property
-    def least_eigenvalue(self) -> Component:
-        """The lesser eigenvalue of the matrix."""
-        return 0.5 * (self.a + self.c) - jnp.sqrt((0.5 * (self.a - self.c)) ** 2 + self.b**2)
-
-    def solved(self) -> tuple[Component, Component]:
-        """Solution s of matrix times s = vector, with smaller eigenvalues raised to `LEAST_CURVATURE`."""
-        raised = jnp.maximum(LEAST_CURVATURE - jax.lax.stop_gradient(self.least_eigenvalue), 0.0)
-        a, c = self.a + raised, self.c + raised
-        per_determinant = 1.0 / (a * c - self.b * self.b)
-        return (c * self.x - self.b * self.y) * per_determinant, (a * self.y - self.b * self.x) * per_determinant
+def newton_step(a: Component, b: Component, c: Component, x: Component, y: Component) -> tuple[Component, Component]:
+    """Solution s of ((a, b), (b, c)) s = (x, y), with smaller eigenvalues raised to `LEAST_CURVATURE`."""
+    least_eigenvalue = 0.5 * (a + c) - jnp.sqrt((0.5 * (a - c)) ** 2 + b**2)
+    lift = jnp.maximum(LEAST_CURVATURE - jax.lax.stop_gradient(least_eigenvalue), 0.0)
+    a, c = a + lift, c + lift
+    per_determinant = 1.0 / (a * c - b * b)
+    return (c * x - b * y) * per_determinant, (a * y - b * x) * per_determinant
 
 
 class Descent(NamedTuple):
     """The state of a search: a vector, its value, the longest step allowed next, and whether the search has ended."""
 
-    at: Float[Array, "3 ..."]
+    point: Float[Array, "3 ..."]
     value: Float[Array, "..."]
     reach: Float[Array, "..."]
     ended: Bool[Array, "..."]
@@ -91,29 +78,29 @@ def descended(
 
     def descend(carry: tuple[Descent, Any]) -> tuple[Descent, Any]:
         descent, count = carry
-        at = vector_of(descent.at)
-        s1, s2, t1, t2 = step(at)
+        point = vector_of(descent.point)
+        s1, s2, t1, t2 = step(point)
         length = jnp.sqrt(s1 * s1 + s2 * s2)
         cut = jnp.minimum(1.0, descent.reach / jnp.where(length > 0.0, length, 1.0))
-        moved = onto(vector_of(sum_vectors(at, scale(cut * s1, t1), scale(cut * s2, t2))))
-        after = value(moved)
-        better = (after <= descent.value) | (length <= UNSEEN * size)
-        taken = better & ~descent.ended
+        trial = onto(vector_of(sum_vectors(point, scale(cut * s1, t1), scale(cut * s2, t2))))
+        trial_value = value(trial)
+        improves = (trial_value <= descent.value) | (length <= UNSEEN * size)
+        accepted = improves & ~descent.ended
         # NaN ends the search, too.
         ended = descent.ended | ~(length > SETTLED * size)
         new = Descent(
-            at=jnp.where(taken, _stacked(moved), descent.at),
-            value=jnp.where(taken, after, descent.value),
-            reach=jnp.where(better, 2.0, 0.25) * descent.reach,
+            point=jnp.where(accepted, _stacked(trial), descent.point),
+            value=jnp.where(accepted, trial_value, descent.value),
+            reach=jnp.where(improves, 2.0, 0.25) * descent.reach,
             ended=ended,
         )
         return new, count + 1
 
     first = _stacked(start)
     zero = jnp.zeros_like(first[0])
-    begin = Descent(first, value(start) + zero, reach + zero, zero > 0.0)
-    lowest, _ = jax.lax.while_loop(going_on, descend, (begin, jnp.zeros((), int)))
-    return vector_of(lowest.at)
+    initial = Descent(first, value(start) + zero, reach + zero, zero > 0.0)
+    minimum, _ = jax.lax.while_loop(going_on, descend, (initial, jnp.zeros((), int)))
+    return vector_of(minimum.point)
 
 
 class AbstractLevel(AbstractSurface):
@@ -143,8 +130,8 @@ class AbstractLevel(AbstractSurface):
         return scale(1.0 / jnp.sqrt(dot(gradient, gradient)), gradient)
 
     def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
-        together = jnp.broadcast_arrays(*position, *velocity)
-        return jax.jvp(self.normal, (vector_of(together[:3]),), (vector_of(together[3:]),))[1]
+        numbers = jnp.broadcast_arrays(*position, *velocity)
+        return jax.jvp(self.normal, (vector_of(numbers[:3]),), (vector_of(numbers[3:]),))[1]
 
     def bending(self, position: Vector, a: Vector, b: Vector) -> tuple[Component, Component, Component]:
         # The gradient's size changes the normal only along n, which is perpendicular to a and b.
@@ -159,74 +146,72 @@ class AbstractLevel(AbstractSurface):
 
     def onto(self, position: Vector) -> Vector:
         for _ in range(2):
-            away = scale(self.offset(position), self.normal(position))
-            position = vector_of(subtract(a, b) for a, b in zip(position, away, strict=True))
+            difference = scale(self.offset(position), self.normal(position))
+            position = vector_of(subtract(a, b) for a, b in zip(position, difference, strict=True))
         return position
 
     def nearest(self, position: Vector) -> Vector:
         surface, place = _held(self), jax.lax.stop_gradient(position)
         # A start that is off the surface, on the position's side, could be nearer than every point of the surface.
         first = surface.onto(surface.onto(place))
-        within = jnp.sqrt(_square(place, first))
+        distance = jnp.sqrt(_square(place, first))
         starts = jnp.asarray(self.starts)
 
         def step(foot: Vector) -> tuple[Component, Component, Vector, Vector]:
-            t1, t2, quadratic = surface._about(place, foot)
-            return *quadratic.solved(), t1, t2
+            return surface._step_on_surface(place, foot)
 
         def in_sector(k: Any, nearest: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
             def start(i: Any, nearest: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
-                about = vector_of(x + within * starts[k, i, axis] for axis, x in enumerate(place))
-                return nearer(nearest, surface.onto(about))
+                start_point = vector_of(x + distance * starts[k, i, axis] for axis, x in enumerate(place))
+                return nearer(nearest, surface.onto(start_point))
 
-            begin = vector_of(jax.lax.fori_loop(0, self.starts.shape[1], start, _stacked(first)))
-            begin = surface.onto(surface.onto(begin))
-            searched = (step, surface.onto, lambda foot: _square(place, foot), begin, within, 0.25 * within)
+            initial = vector_of(jax.lax.fori_loop(0, self.starts.shape[1], start, _stacked(first)))
+            initial = surface.onto(surface.onto(initial))
+            searched = (step, surface.onto, lambda foot: _square(place, foot), initial, distance, 0.25 * distance)
             return nearer(nearest, descended(*searched))
 
         def nearer(old: Float[Array, "3 ..."], new: Vector) -> Float[Array, "3 ..."]:
             return jnp.where(_square(place, new) < _square(place, vector_of(old)), _stacked(new), old)
 
         foot = vector_of(jax.lax.fori_loop(0, len(self.starts), in_sector, _stacked(first)))
-        t1, t2, quadratic = self._about(position, foot)
-        s1, s2 = quadratic.solved()
+        s1, s2, t1, t2 = self._step_on_surface(position, foot)
         return self.onto(vector_of(sum_vectors(foot, scale(s1, t1), scale(s2, t2))))
 
     def ball_gap(self, centre: Vector, radius: Component, side: float) -> BallGap:
         surface, place, size = _held(self), jax.lax.stop_gradient(centre), jax.lax.stop_gradient(radius)
 
         def step(normal: Vector) -> tuple[Component, Component, Vector, Vector]:
-            t1, t2, quadratic = surface._under(place, size, normal)
-            return *quadratic.solved(), t1, t2
+            return surface._step_on_ball(place, size, normal)
 
         def value(normal: Vector) -> Component:
             return surface.level(_lowered(place, size, normal))
 
         normal = descended(step, _unit, value, surface.normal(place), 1.0, 0.5)
-        t1, t2, quadratic = self._under(centre, radius, normal)
-        s1, s2 = quadratic.solved()
+        s1, s2, t1, t2 = self._step_on_ball(centre, radius, normal)
         normal = _unit(vector_of(sum_vectors(normal, scale(s1, t1), scale(s2, t2))))
-        lowest = _lowered(centre, radius, normal)
-        gap = self.offset(lowest)
-        return BallGap(_lowered(lowest, gap, normal), normal, gap)
+        minimum = _lowered(centre, radius, normal)
+        gap = self.offset(minimum)
+        return BallGap(_lowered(minimum, gap, normal), normal, gap)
 
-    def _about(self, position: Vector, foot: Vector) -> tuple[Vector, Vector, Quadratic]:
-        """Two tangents at a foot, and the squared distance to a position along them: half its second derivatives, and
-        minus half its first derivatives."""
+    def _step_on_surface(self, position: Vector, foot: Vector) -> tuple[Component, Component, Vector, Vector]:
+        """Newton's step from a foot towards the least squared distance to a position, and the two tangents at the foot
+        for its components."""
         n = self.normal(foot)
-        away = vector_of(subtract(a, b) for a, b in zip(position, foot, strict=True))
-        d, (t1, t2) = dot(away, n), tangents(n)
+        difference = vector_of(subtract(a, b) for a, b in zip(position, foot, strict=True))
+        d, (t1, t2) = dot(difference, n), tangents(n)
         aa, ab, bb = self.bending(foot, t1, t2)
-        return t1, t2, Quadratic(1.0 + d * aa, d * ab, 1.0 + d * bb, dot(away, t1), dot(away, t2))
+        return *newton_step(1.0 + d * aa, d * ab, 1.0 + d * bb, dot(difference, t1), dot(difference, t2)), t1, t2
 
-    def _under(self, centre: Vector, radius: Component, normal: Vector) -> tuple[Vector, Vector, Quadratic]:
-        """Two tangents of a ball at its point opposite to a normal, and the function along them, per unit gradient and
-        radius: its second derivatives, and minus its first derivatives."""
-        lowest, (t1, t2) = _lowered(centre, radius, normal), tangents(normal)
-        m = self.normal(lowest)
-        aa, ab, bb = self.bending(lowest, t1, t2)
-        along = dot(m, normal)
-        return t1, t2, Quadratic(along + radius * aa, radius * ab, along + radius * bb, dot(m, t1), dot(m, t2))
+    def _step_on_ball(
+        self, centre: Vector, radius: Component, normal: Vector
+    ) -> tuple[Component, Component, Vector, Vector]:
+        """Newton's step from the point of a ball opposite to a normal towards the least value of the function, per unit
+        gradient and radius, and the two tangents there for its components."""
+        minimum, (t1, t2) = _lowered(centre, radius, normal), tangents(normal)
+        m = self.normal(minimum)
+        aa, ab, bb = self.bending(minimum, t1, t2)
+        cosine = dot(m, normal)
+        return *newton_step(cosine + radius * aa, radius * ab, cosine + radius * bb, dot(m, t1), dot(m, t2)), t1, t2
 
 
 def _held(surface: AbstractLevel) -> AbstractLevel:
@@ -239,8 +224,8 @@ def _stacked(vector: Vector) -> Float[Array, "3 ..."]:
 
 
 def _square(a: Vector, b: Vector) -> Component:
-    away = vector_of(subtract(x, y) for x, y in zip(a, b, strict=True))
-    return dot(away, away)
+    difference = vector_of(subtract(x, y) for x, y in zip(a, b, strict=True))
+    return dot(difference, difference)
 
 
 def _unit(vector: Vector) -> Vector:

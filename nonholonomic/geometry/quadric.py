@@ -83,8 +83,8 @@ class AbstractQuadric(AbstractSurface):
         yield from super().place_bounds(place, size)
         if len(place) == 2:
             limit = math.pi / 2.0 + 1e-12
-            why = "reduced latitude, from -pi/2 to pi/2"
-            yield Bound(place[1], "place[1]", at_least=-limit, at_most=limit, why=why, unit="rad")
+            reason = "reduced latitude, from -pi/2 to pi/2"
+            yield Bound(place[1], "place[1]", at_least=-limit, at_most=limit, why=reason, unit="rad")
 
 
 class Sphere(AbstractQuadric):
@@ -190,18 +190,18 @@ class Spheroid(AbstractQuadric):
         x, y, z = position
         # Where the nearest points in all directions are equally near, take the point in the direction of growing
         # coordinates.
-        across, along = jnp.sqrt(jnp.maximum(x * x + y * y, TINY * TINY)), jnp.maximum(jnp.abs(z), TINY)
-        least = jnp.minimum(equatorial, polar)
-        numbers = (equatorial * across, polar * along, equatorial**2 - least**2, polar**2 - least**2)
+        radial, axial = jnp.sqrt(jnp.maximum(x * x + y * y, TINY * TINY)), jnp.maximum(jnp.abs(z), TINY)
+        minor = jnp.minimum(equatorial, polar)
+        numbers = (equatorial * radial, polar * axial, equatorial**2 - minor**2, polar**2 - minor**2)
 
         def closer(s: Component, u: Component, v: Component, p: Component, q: Component) -> Component:
             a, b = u / (s + p), v / (s + q)
             square = a * a + b * b
             return s + square * (jnp.sqrt(square) - 1.0) / (a * a / (s + p) + b * b / (s + q))
 
-        u, v, p, q = held = jax.lax.stop_gradient(numbers)
-        s = jax.lax.fori_loop(0, NEWTON_STEPS, lambda _, s: closer(s, *held), jnp.maximum(u - p, v - q))
+        u, v, p, q = constants = jax.lax.stop_gradient(numbers)
+        s = jax.lax.fori_loop(0, NEWTON_STEPS, lambda _, s: closer(s, *constants), jnp.maximum(u - p, v - q))
         s = closer(s, *numbers)
-        outwards, upwards = equatorial**2 / (s + numbers[2]), polar**2 / (s + numbers[3])
+        radial_factor, axial_factor = equatorial**2 / (s + numbers[2]), polar**2 / (s + numbers[3])
         x = x + jnp.where((x == 0.0) & (y == 0.0), TINY, 0.0)
-        return (outwards * x, outwards * y, upwards * (z + jnp.where(z == 0.0, TINY, 0.0)))
+        return (radial_factor * x, radial_factor * y, axial_factor * (z + jnp.where(z == 0.0, TINY, 0.0)))

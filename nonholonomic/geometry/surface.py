@@ -115,9 +115,9 @@ class AbstractSurface(Bounded):
         foot = self.nearest(centre)
         foot = tuple(0.0 * centre[0] if part is None else part for part in foot)
         normal = scale(side, self.normal(foot))
-        away = tuple(subtract(a, b) for a, b in zip(centre, foot, strict=True))
+        difference = tuple(subtract(a, b) for a, b in zip(centre, foot, strict=True))
         return BallGap(
-            (foot[0], foot[1], foot[2]), (normal[0], normal[1], normal[2]), subtract(dot(away, normal), radius)
+            (foot[0], foot[1], foot[2]), (normal[0], normal[1], normal[2]), subtract(dot(difference, normal), radius)
         )
 
     def offset(self, position: Vector) -> Component:
@@ -127,8 +127,8 @@ class AbstractSurface(Bounded):
     def distance(self, position: Vector) -> Component:
         """Distance [m] of a position from the surface, positive on the side to which n points."""
         foot = self.nearest(position)
-        away = (subtract(position[0], foot[0]), subtract(position[1], foot[1]), subtract(position[2], foot[2]))
-        return dot(away, self.normal(foot))
+        difference = (subtract(position[0], foot[0]), subtract(position[1], foot[1]), subtract(position[2], foot[2]))
+        return dot(difference, self.normal(foot))
 
     @abc.abstractmethod
     def place_at(self, position: Vector) -> Place:
@@ -162,10 +162,12 @@ class AbstractSurface(Bounded):
             three = "" if count == 3 else " or (x [m], y [m], z [m])"
             raise ValueError(f"place = {place!r} must be ({names}){three} on a {type(self).__name__}")
         if len(place) == 3:
-            off = self.offset(self.in_own_axes((place[0], place[1], place[2])))
-            most = ROUND_OFF * (size + jnp.sqrt(place[0] ** 2 + place[1] ** 2 + place[2] ** 2))
-            why = "of the place from the surface, in metres: the place must be on the surface up to round-off"
-            yield Bound(0.0 if off is None else off, "distance", at_least=-most, at_most=most, why=why)
+            distance = self.offset(self.in_own_axes((place[0], place[1], place[2])))
+            tolerance = ROUND_OFF * (size + jnp.sqrt(place[0] ** 2 + place[1] ** 2 + place[2] ** 2))
+            reason = "of the place from the surface, in metres: the place must be on the surface up to round-off"
+            yield Bound(
+                0.0 if distance is None else distance, "distance", at_least=-tolerance, at_most=tolerance, why=reason
+            )
 
     def sign(self, side: str | None, closed: str) -> float:
         """1.0 if n points to the side where the body is, else -1.0.

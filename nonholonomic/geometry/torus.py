@@ -53,19 +53,19 @@ class Torus(AbstractSurface):
         return (part * x, part * y, z)
 
     def normal(self, position: Vector) -> Vector:
-        across = self.from_middle(position)
-        return scale(1.0 / jnp.sqrt(dot(across, across)), across)
+        spoke = self.from_middle(position)
+        return scale(1.0 / jnp.sqrt(dot(spoke, spoke)), spoke)
 
     def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
-        (x, y, _), across = position, self.from_middle(position)
+        (x, y, _), spoke = position, self.from_middle(position)
         per_axis = 1.0 / (x * x + y * y)
         # The nearest point of the circle moves along it at this rate about the axis.
         turn = self.ring * (x * velocity[1] - y * velocity[0]) * per_axis * jnp.sqrt(per_axis)
         moving = (velocity[0] + y * turn, velocity[1] - x * turn, velocity[2])
-        per_length = 1.0 / jnp.sqrt(dot(across, across))
-        normal = scale(per_length, across)
-        along = scale(subtract(None, dot(normal, moving)), normal)
-        return scale(per_length, sum_vectors(moving, along))
+        per_length = 1.0 / jnp.sqrt(dot(spoke, spoke))
+        normal = scale(per_length, spoke)
+        correction = scale(subtract(None, dot(normal, moving)), normal)
+        return scale(per_length, sum_vectors(moving, correction))
 
     def elevation(self, position: Vector) -> Component:
         return position[2] + self.tube
@@ -76,13 +76,13 @@ class Torus(AbstractSurface):
         return (1.0 - self.ring / from_axis) / self.tube**2
 
     def nearest(self, position: Vector) -> Vector:
-        away = scale(subtract(None, self.distance(position)), self.normal(position))
-        foot = sum_vectors(position, away)
+        correction = scale(subtract(None, self.distance(position)), self.normal(position))
+        foot = sum_vectors(position, correction)
         return (foot[0], foot[1], foot[2])
 
     def distance(self, position: Vector) -> Component:
-        across = self.from_middle(position)
-        return jnp.sqrt(dot(across, across)) - self.tube
+        spoke = self.from_middle(position)
+        return jnp.sqrt(dot(spoke, spoke)) - self.tube
 
     def place_at(self, position: Vector) -> Place:
         x, y, z = position

@@ -88,10 +88,10 @@ def sum_vectors(*vectors: tuple[Component, ...]) -> tuple[Component, ...]:
     return tuple(add(*components) for components in zip(*vectors, strict=True))
 
 
-def stacked(vector: tuple[Component, ...], like: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-    """The components along axis 0, in the shape of the components of `like`, with zeros for those that vanish
+def stacked(vector: tuple[Component, ...], example: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+    """The components along axis 0, in the shape of the components of `example`, with zeros for those that vanish
     identically."""
-    zero = jnp.zeros_like(like[0])
+    zero = jnp.zeros_like(example[0])
     return jnp.stack([zero if part is None else jnp.broadcast_to(part, zero.shape) for part in vector])
 
 
@@ -105,7 +105,7 @@ def tangents(normal: Vector) -> tuple[Vector, Vector]:
     return t1, cross(normal, t1)
 
 
-def _projected(vector: Vector, used: Component) -> Vector:
+def _projected(vector: Vector, component: Component) -> Vector:
     """The vector at unit length; where it is not used, a finite vector with finite derivatives."""
-    square = jnp.where(used, dot(vector, vector), 1.0)
+    square = jnp.where(component, dot(vector, vector), 1.0)
     return scale(1.0 / jnp.sqrt(square), vector)

@@ -13,7 +13,8 @@ derivatives. A run that is not over after `MOST_ROUNDS` modes is `UNRESOLVED`; `
 >>> import jax.numpy as jnp
 >>> import numpy as np
 >>> from nonholonomic.hybrid import AbstractBatchedMode, Transition, solve_hybrid
->>> from nonholonomic.integration import RUNNING, AbstractProblem, Settings
+>>> from nonholonomic.integration import AbstractProblem, Settings
+>>> from nonholonomic.integration.status import RUNNING
 >>> class Fall(AbstractProblem):
 ...     state: jax.Array  # height and velocity, (2, cells), or (2,) for a single run
 ...     direction_decides = True  # a ball that starts on the ground and rises has not left the mode

@@ -20,19 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..integration import (
-    FAILED,
-    LEFT_DOMAIN,
-    REACHED_END,
-    RUNNING,
-    UNRESOLVED,
-    AbstractProblem,
-    Outcome,
-    Settings,
-    solve_ensemble,
-    traced_solve_ensemble,
-)
+from ..integration import AbstractProblem, Outcome, Settings, solve_ensemble, traced_solve_ensemble
 from ..integration.scheduler import Numbers
+from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
 from ..xla_cpu import compiled_quickly, greatest
 from .mode import AbstractBatchedMode, Transition, mode_of_cells
 
@@ -45,7 +35,7 @@ class HybridOutcome(NamedTuple, Generic[Numbers]):
 
     **Example:** as for `solve_hybrid`.
 
-    >>> from nonholonomic.integration import CROSSED
+    >>> from nonholonomic.integration.status import CROSSED
     >>> print(outcome.status == CROSSED, outcome.mode)
     [ True  True] [0 0]
     """
@@ -71,14 +61,14 @@ def at_start(
     xp: Any, mode: Int[Numbers, " cells"], state: Float[Numbers, "components cells"], cells: int, counters: int
 ) -> HybridOutcome[Numbers]:
     """All cells at their start, the first `cells` of them running. **Arguments:** `xp`: `numpy` or `jax.numpy`."""
-    none = xp.zeros(mode.shape, int)
+    zeros = xp.zeros(mode.shape, int)
     return HybridOutcome(
-        status=none + xp.where(xp.arange(len(mode)) < cells, RUNNING, REACHED_END),
+        status=zeros + xp.where(xp.arange(len(mode)) < cells, RUNNING, REACHED_END),
         crossing_time=xp.full(mode.shape, xp.inf),
         end_time=xp.zeros(mode.shape),
         state=state,
-        steps=none,
-        rejected=none,
+        steps=zeros,
+        rejected=zeros,
         mode=mode,
         counts=xp.zeros((counters, len(mode)), int),
     )
@@ -93,9 +83,9 @@ def one_round(carry: Carry, groups: Sequence[Sequence[int]], solve: Advance, res
     - `solve`, `reset`: advance the cells to the end of their mode, and through the reset map.
     """
     # A cell that changes its mode during the round waits for the next round.
-    before = carry[0].mode
+    mode_before = carry[0].mode
     for numbers in groups:
-        active = functools.reduce(operator.or_, (before == number for number in numbers))
+        active = functools.reduce(operator.or_, (mode_before == number for number in numbers))
         active = active & (carry[0].status == RUNNING)
         carry = solve(numbers, carry, active)
         carry = reset(numbers, carry, active & (carry[0].status == LEFT_DOMAIN))
@@ -123,8 +113,8 @@ def traced_rounds(carry: Carry, groups: Sequence[Sequence[int]], solve: Advance,
     def advance(carry: tuple[Carry, Int[Array, ""]]) -> tuple[Carry, Int[Array, ""]]:
         return one_round(carry[0], groups, solve, reset), carry[1] + 1
 
-    (runs, *others), _ = jax.lax.while_loop(under_way, advance, (carry, jnp.zeros((), int)))
-    return (finished(jnp, runs), *others)
+    (runs, *records), _ = jax.lax.while_loop(under_way, advance, (carry, jnp.zeros((), int)))
+    return (finished(jnp, runs), *records)
 
 
 def finished(xp: Any, runs: HybridOutcome[Numbers]) -> HybridOutcome[Numbers]:
@@ -141,13 +131,13 @@ def after_solve(
     xp: Any, runs: HybridOutcome[Numbers], outcome: Outcome[Numbers], t1: Float[Numbers, " cells"]
 ) -> HybridOutcome[Numbers]:
     """Update the cells after an ensemble solve that ended as in `outcome`. **Arguments:** `xp`: `numpy` or `jax.numpy`."""
-    began = runs.end_time
+    start_time = runs.end_time
     # A cell that enters a mode beyond the event passed the event earlier, unless it started there.
-    passed = xp.isfinite(outcome.crossing_time) & ((outcome.crossing_time > 0.0) | xp.isinf(runs.crossing_time))
+    has_event = xp.isfinite(outcome.crossing_time) & ((outcome.crossing_time > 0.0) | xp.isinf(runs.crossing_time))
     return HybridOutcome(
         status=outcome.status,
-        crossing_time=xp.where(passed, began + outcome.crossing_time, runs.crossing_time),
-        end_time=xp.where(outcome.status == REACHED_END, t1, began + outcome.end_time),
+        crossing_time=xp.where(has_event, start_time + outcome.crossing_time, runs.crossing_time),
+        end_time=xp.where(outcome.status == REACHED_END, t1, start_time + outcome.end_time),
         state=outcome.state,
         steps=runs.steps + outcome.steps,
         rejected=runs.rejected + outcome.rejected,
@@ -160,12 +150,12 @@ def after_reset(
     xp: Any, runs: HybridOutcome[Numbers], transition: Transition[Numbers], t1: Float[Numbers, " cells"]
 ) -> HybridOutcome[Numbers]:
     """Update the cells after the transition to the next mode. **Arguments:** as for `after_solve`."""
-    passed = xp.isfinite(transition.crossing_time)
+    has_event = xp.isfinite(transition.crossing_time)
     # Non-finite states would never finish.
     sound = xp.isfinite(transition.state).all(axis=0) & xp.isfinite(transition.elapsed)
     return HybridOutcome(
         status=xp.where(sound, transition.status, FAILED),
-        crossing_time=xp.where(passed, runs.end_time + transition.crossing_time, runs.crossing_time),
+        crossing_time=xp.where(has_event, runs.end_time + transition.crossing_time, runs.crossing_time),
         end_time=xp.where(transition.status == REACHED_END, t1, runs.end_time + transition.elapsed),
         state=transition.state,
         steps=runs.steps,
@@ -240,21 +230,21 @@ def solve_hybrid(
         return _reset_map(mode, cell, state, left)
 
     def advanced(
-        program: Callable[..., Any], after: Any, numbers: Sequence[int], carry: Carry, mask: Bool[np.ndarray, " cells"]
+        program: Callable[..., Any], update: Any, numbers: Sequence[int], carry: Carry, mask: Bool[np.ndarray, " cells"]
     ) -> Carry:
         (runs,), selected = carry, np.flatnonzero(mask)
         if not selected.size:
             return carry
         result = program(modes[numbers[0]], selected.size, *_gathered(runs, selected, t1))
         result = jax.tree.map(lambda values: np.asarray(values)[..., : selected.size], result)
-        new = after(np, runs_of_cells(runs, selected), result, t1[selected])
+        new = update(np, runs_of_cells(runs, selected), result, t1[selected])
         return (HybridOutcome(*(_with(*values, selected) for values in zip(runs, new, strict=True))),)
 
     if cells == 0:
         # Compile all programs by running no cells: two at once, because the compiler uses little more than one core.
-        gathered = _gathered(runs, np.arange(0), t1)
+        inputs = _gathered(runs, np.arange(0), t1)
         with ThreadPoolExecutor(2) as threads:
-            list(threads.map(lambda call: call[0](call[1], 0, *gathered), itertools.product((solve, reset), modes)))
+            list(threads.map(lambda call: call[0](call[1], 0, *inputs), itertools.product((solve, reset), modes)))
     programs = (functools.partial(advanced, solve, after_solve), functools.partial(advanced, reset, after_reset))
     return host_rounds((runs,), [(number,) for number in range(len(modes))], *programs, most_rounds)[0]
 
@@ -318,13 +308,13 @@ def traced_solve_hybrid(
         return jax.lax.cond(jnp.any(active), solved, lambda: carry)
 
     def reset(numbers: Sequence[int], carry: Carry, lost: Bool[Array, " cells"]) -> Carry:
-        def passed() -> Carry:
+        def after_transition() -> Carry:
             (runs,), cell = carry, padded(lost)
             left = greatest(t1[cell] - runs.end_time[cell], 0.0)
             transition = mode_of_cells(modes[numbers[0]], cell).reset_map(runs.state[:, cell], left)
             return (chosen(lost, after_reset(jnp, runs, transition, t1), runs),)
 
-        return jax.lax.cond(jnp.any(lost), passed, lambda: carry)
+        return jax.lax.cond(jnp.any(lost), after_transition, lambda: carry)
 
     groups = [(number,) for number in range(len(modes))]
     (runs,) = traced_rounds((at_start(jnp, mode, state, cells, counters),), groups, solve, reset)

@@ -10,19 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..integration import (
-    FAILED,
-    LEFT_DOMAIN,
-    REACHED_END,
-    UNRESOLVED,
-    AbstractProblem,
-    DenseSolution,
-    Outcome,
-    Settings,
-    follow,
-    padded,
-)
+from ..compiled_programs import padded
+from ..integration import AbstractProblem, DenseSolution, Outcome, Settings, follow
 from ..integration.dense import PIECE_OF_MODE
+from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED
 from ..xla_cpu import compiled_quickly
 from .ensemble import Carry, after_reset, after_solve, at_start, host_rounds
 from .mode import AbstractBatchedMode, Transition
@@ -54,10 +45,10 @@ class Segment(NamedTuple):
 
     def at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "shown times"]:
         """The output rows at times within the segment."""
-        passed = np.maximum(times - self.begin, 0.0)
+        elapsed = np.maximum(times - self.begin, 0.0)
         if self.number == BETWEEN:
-            return np.asarray(_between(self.mode, self.motion, jnp.asarray(np.minimum(passed, self.end - self.begin))))
-        return np.asarray(_shown(self.mode, jnp.asarray(self.motion.at(np.minimum(passed, self.motion.times[-1])))))
+            return np.asarray(_between(self.mode, self.motion, jnp.asarray(np.minimum(elapsed, self.end - self.begin))))
+        return np.asarray(_shown(self.mode, jnp.asarray(self.motion.at(np.minimum(elapsed, self.motion.times[-1])))))
 
 
 class HybridPath(NamedTuple):
@@ -116,15 +107,15 @@ class HybridPath(NamedTuple):
         """The output rows at the given times, which must lie within the run; at the end of a segment, before the reset."""
         if not len(times):
             return self.segments[0].at(np.zeros(1))[:, :0]
-        where, by_segment = self._where(times), []
-        for index in np.unique(where):
-            indices = np.flatnonzero(where == index)
+        segment_indices, by_segment = self._where(times), []
+        for index in np.unique(segment_indices):
+            indices = np.flatnonzero(segment_indices == index)
             # Padded to one length, so that one program serves all segments.
             by_segment.append((indices, self.segments[index].at(padded(times[indices], len(times)))[:, : indices.size]))
-        shown = np.empty((len(by_segment[0][1]), len(times)))
+        output = np.empty((len(by_segment[0][1]), len(times)))
         for indices, values in by_segment:
-            shown[:, indices] = values
-        return shown
+            output[:, indices] = values
+        return output
 
     def _where(self, times: Float[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
         ends = np.array([segment.end for segment in self.segments])
@@ -134,8 +125,8 @@ class HybridPath(NamedTuple):
 @eqx.filter_jit
 def _problem(mode: AbstractBatchedMode, state: Float[Array | np.ndarray, " components"]) -> AbstractProblem:
     """The motion in a mode of one cell, as a problem without an axis of cells."""
-    lone = jax.tree.map(lambda leaf: leaf[..., 0] if eqx.is_array(leaf) and leaf.ndim else leaf, mode)
-    return lone.problem(state)
+    mode_of_cell = jax.tree.map(lambda leaf: leaf[..., 0] if eqx.is_array(leaf) and leaf.ndim else leaf, mode)
+    return mode_of_cell.problem(state)
 
 
 @compiled_quickly
@@ -149,8 +140,8 @@ def _shown(mode: AbstractBatchedMode, states: Float[Array, "components times"]) 
 
 
 @eqx.filter_jit
-def _between(mode: AbstractBatchedMode, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "shown times"]:
-    return mode.between(motion, passed)
+def _between(mode: AbstractBatchedMode, motion: Any, elapsed: Float[Array, " times"]) -> Float[Array, "shown times"]:
+    return mode.between(motion, elapsed)
 
 
 def solve_hybrid_dense(
@@ -195,18 +186,22 @@ def solve_hybrid_dense(
     def solve(numbers: Sequence[int], carry: Carry, active: Bool[np.ndarray, "1"]) -> Carry:
         if not active[0]:
             return carry
-        (runs, segments), (number,), mode, begin = carry, numbers, modes[numbers[0]], float(carry[0].end_time[0])
-        left = dataclasses.replace(settings, max_steps=settings.max_steps - int(runs.steps[0]))
-        path = follow(_problem(mode, jnp.asarray(runs.state[:, 0])), t1 - begin, left, piece=PIECE_OF_MODE)
-        stay = Segment(begin, begin + float(path.times[-1]), number, mode, path, begin + path.times[1:])
-        return after_solve(np, runs, _outcome(path), np.full(1, t1)), [*segments, stay]
+        (runs, segments), (number,), mode, start_time = carry, numbers, modes[numbers[0]], float(carry[0].end_time[0])
+        mode_settings = dataclasses.replace(settings, max_steps=settings.max_steps - int(runs.steps[0]))
+        path = follow(
+            _problem(mode, jnp.asarray(runs.state[:, 0])), t1 - start_time, mode_settings, piece=PIECE_OF_MODE
+        )
+        segment = Segment(
+            start_time, start_time + float(path.times[-1]), number, mode, path, start_time + path.times[1:]
+        )
+        return after_solve(np, runs, _outcome(path), np.full(1, t1)), [*segments, segment]
 
     def reset(numbers: Sequence[int], carry: Carry, lost: Bool[np.ndarray, "1"]) -> Carry:
         if not lost[0]:
             return carry
-        (runs, segments), mode, begin = carry, modes[numbers[0]], float(carry[0].end_time[0])
-        transition = _leave(mode, jnp.asarray(runs.state[:, 0]), jnp.asarray(t1 - begin))
-        segments = segments + _way(mode, transition, begin)
+        (runs, segments), mode, start_time = carry, modes[numbers[0]], float(carry[0].end_time[0])
+        transition = _leave(mode, jnp.asarray(runs.state[:, 0]), jnp.asarray(t1 - start_time))
+        segments = segments + _way(mode, transition, start_time)
         # NumPy slices these arrays, because JAX would compile every slice.
         transition = jax.tree.map(np.asarray, transition._replace(record=None))
         return after_reset(np, runs, transition, np.full(1, t1)), segments
@@ -224,21 +219,21 @@ def solve_hybrid_dense(
 def _outcome(path: DenseSolution) -> Outcome[np.ndarray]:
     """How the motion in a mode ended, as for an ensemble of one cell."""
     status = FAILED if path.failed else LEFT_DOMAIN if path.left_domain else REACHED_END
-    never, steps = np.full(1, np.inf), path.accepted + path.rejected
+    no_crossing, steps = np.full(1, np.inf), path.accepted + path.rejected
     ending = (np.asarray(path.times[-1:]), np.asarray(path.states[:, -1:]))
-    return Outcome(np.full(1, status), never, never, *ending, np.full(1, steps), np.full(1, path.rejected))
+    return Outcome(np.full(1, status), no_crossing, no_crossing, *ending, np.full(1, steps), np.full(1, path.rejected))
 
 
-def _way(mode: AbstractBatchedMode, transition: Transition, begin: float) -> list[Segment]:
+def _way(mode: AbstractBatchedMode, transition: Transition, start: float) -> list[Segment]:
     """The segments of a transition that begins at a time [s]."""
     if transition.record is None:
         return []
     ends = np.asarray(transition.record.ends)[:, 0]
-    ends, segments = begin + ends[np.isfinite(ends)], []
+    ends, segments = start + ends[np.isfinite(ends)], []
     motions, parts = jax.tree.map(np.asarray, (transition.record.motions, transition.record.shown))
     for index, end in enumerate(ends):
-        begin = float(ends[index - 1]) if index else begin
+        start = float(ends[index - 1]) if index else start
         motion = jax.tree.map(lambda leaf, index=index: leaf[index].copy(), motions)
-        shown = begin + (end - begin) * np.linspace(0.0, 1.0, int(parts[index, 0]) + 1)[1:]
-        segments.append(Segment(begin, float(end), BETWEEN, mode, motion, shown))
+        output_times = start + (end - start) * np.linspace(0.0, 1.0, int(parts[index, 0]) + 1)[1:]
+        segments.append(Segment(start, float(end), BETWEEN, mode, motion, output_times))
     return segments

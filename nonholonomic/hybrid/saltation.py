@@ -74,16 +74,16 @@ class VariationalMode(AbstractBatchedMode):
     ends_on_event: bool = eqx.field(static=True)
 
     def problem(self, state: Float[Array, "components cells"]) -> VariationalProblem:
-        at, *variations = self.parts(state)
+        primal, *variations = self.parts(state)
         numbers, build = self._active_numbers()
 
         def clocked(state: Float[Array, "components cells"], *numbers: Array) -> ExtendedProblem:
-            began = state[-1:]
+            start_time = state[-1:]
             return ExtendedProblem(
-                build(*numbers).problem(state[:-1]), Clock(), began, jnp.full_like(began, UNMEASURED)
+                build(*numbers).problem(state[:-1]), Clock(), start_time, jnp.full_like(start_time, UNMEASURED)
             )
 
-        point = (with_row(at[:-1], jnp.zeros_like(at[-1])), *numbers)
+        point = (with_row(primal[:-1], jnp.zeros_like(primal[-1])), *numbers)
         tangents = [(variation, *rates) for variation, rates in zip(variations, self._rates(), strict=True)]
         return VariationalProblem(clocked(*point), tangents_of(clocked, point, tangents), self.ends_on_event)
 
@@ -100,106 +100,113 @@ class VariationalMode(AbstractBatchedMode):
 
         **Returns:** the `Transition`; the numbers; and their variations, with the tangents first.
         """
-        at, *variations = self.parts(state)
-        at, duration, count = at[:-1], at[-1], len(variations)
+        primal, *variations = self.parts(state)
+        primal, duration, count = primal[:-1], primal[-1], len(variations)
         numbers, build = self._active_numbers()
-        unmoved = [jnp.zeros_like(number) for number in numbers]
-        rates = self.mode.problem(at).field(duration, at)
+        zero_rates = [jnp.zeros_like(number) for number in numbers]
+        rates = self.mode.problem(primal).field(duration, primal)
         # The last tangent is an error of the state.
-        along = [(variation[:-1], *moved) for variation, moved in zip(variations, self._rates(), strict=True)]
-        along.append((self._error(at, duration, rates), *unmoved))
-        delays, log_rates = self._delays(at, duration, [*along, (rates, *unmoved)])
+        directions = [
+            (variation[:-1], *direction) for variation, direction in zip(variations, self._rates(), strict=True)
+        ]
+        directions.append((self._error(primal, duration, rates), *zero_rates))
+        delays, log_rates = self._delays(primal, duration, [*directions, (rates, *zero_rates)])
 
-        def reset(at: Float[Array, "components cells"], left: Float[Array, " cells"], *numbers: Array) -> Any:
+        def reset(primal: Float[Array, "components cells"], left: Float[Array, " cells"], *numbers: Array) -> Any:
             mode = build(*numbers)
-            transition = mode.reset_map(at, left)
-            inside = jnp.zeros_like(left) if transition.log_rates is None else transition.log_rates
+            transition = mode.reset_map(primal, left)
+            reset_log_rates = jnp.zeros_like(left) if transition.log_rates is None else transition.log_rates
             path = read_path(mode, transition.record, left)
-            return (transition.state, transition.elapsed, inside, path), transition._replace(
+            return (transition.state, transition.elapsed, reset_log_rates, path), transition._replace(
                 record=None, log_rates=None
             )
 
-        begins = (
+        start_delays = (
             jnp.concatenate([*[variation[None, -1] for variation in variations], jnp.zeros_like(duration)[None]])
             + delays
         )
         after_event = [
-            (moved[0] + shift * rates, -begin, *moved[1:])
-            for moved, shift, begin in zip(along, delays, begins, strict=True)
+            (direction[0] + shift * rates, -start_delay, *direction[1:])
+            for direction, shift, start_delay in zip(directions, delays, start_delays, strict=True)
         ]
-        values, moved, transition = _along(reset, (at, left, *numbers), after_event, has_aux=True)
-        states, elapsed, inside, changes = moved
-        new_variations = jnp.concatenate([states, (begins + elapsed)[:, None]], axis=1)[:count]
-        log_rates = jnp.max(jnp.abs(log_rates + inside), axis=0)
+        values, changes_after, transition = _along(reset, (primal, left, *numbers), after_event, has_aux=True)
+        states, elapsed, reset_log_rates, changes = changes_after
+        new_variations = jnp.concatenate([states, (start_delays + elapsed)[:, None]], axis=1)[:count]
+        log_rates = jnp.max(jnp.abs(log_rates + reset_log_rates), axis=0)
         finite = jnp.isfinite(new_variations).all(axis=(0, 1)) & jnp.isfinite(log_rates)
         grazes = ~finite | (self.tolerance * log_rates > GRAZING)
         # The run itself is valid, so variations without correct digits must not end the run.
         new_variations = jnp.where(finite, new_variations, 0.0)
-        whole = jnp.concatenate([transition.state, jnp.zeros_like(duration)[None], *new_variations])
+        extended_state = jnp.concatenate([transition.state, jnp.zeros_like(duration)[None], *new_variations])
         transition = transition._replace(
-            state=whole, counts=jnp.concatenate([transition.counts, grazes.astype(int)[None]])
+            state=extended_state, counts=jnp.concatenate([transition.counts, grazes.astype(int)[None]])
         )
         return transition, values[-1], jax.tree.map(lambda change: change[:count], changes)
 
     def _delays(
-        self, at: Float[Array, "components cells"], duration: Float[Array, " cells"], along: list[tuple[Array, ...]]
+        self,
+        primal: Float[Array, "components cells"],
+        duration: Float[Array, " cells"],
+        directions: list[tuple[Array, ...]],
     ) -> tuple[Float[Array, "tangents cells"], Float[Array, "tangents cells"]]:
         """The variations of the time at which the mode ends, and of the logarithm of the rate of its margin there.
 
-        **Arguments:** `along`: the tangents, followed by the tangent along time, which has no variations of its own.
+        **Arguments:** `directions`: the tangents, followed by the tangent along time, which has no variations of its own.
         """
         numbers, build = self._active_numbers()
 
-        def margin_and_rate(at: Float[Array, "components cells"], *numbers: Array) -> tuple[Array, Array]:
-            problem = build(*numbers).problem(at)
-            return jax.jvp(lambda at: problem.domain_margin(duration, at), (at,), (problem.field(duration, at),))
+        def margin_and_rate(primal: Float[Array, "components cells"], *numbers: Array) -> tuple[Array, Array]:
+            problem = build(*numbers).problem(primal)
+            return jax.jvp(
+                lambda primal: problem.domain_margin(duration, primal), (primal,), (problem.field(duration, primal),)
+            )
 
-        (_, rate), (domain_margins, changes) = _along(margin_and_rate, (at, *numbers), along)
+        (_, rate), (domain_margins, changes) = _along(margin_and_rate, (primal, *numbers), directions)
         # A mode that ended when it began has not reached its event.
-        happened = (duration > 0.0) & (rate != 0.0)
-        safe = jnp.where(happened, rate, 1.0)
-        delays = jnp.where(happened, -domain_margins[:-1] / safe, 0.0)
-        return delays, jnp.where(happened, (changes[:-1] + changes[-1] * delays) / safe, 0.0)
+        has_delay = (duration > 0.0) & (rate != 0.0)
+        safe = jnp.where(has_delay, rate, 1.0)
+        delays = jnp.where(has_delay, -domain_margins[:-1] / safe, 0.0)
+        return delays, jnp.where(has_delay, (changes[:-1] + changes[-1] * delays) / safe, 0.0)
 
     def output_rows(
         self, state: Float[Array, "components times"]
     ) -> tuple[Float[Array, "shown times"], Float[Array, "tangents shown times"]]:
         """The output rows of a single run's states, and their variation at fixed times."""
-        at, *variations = self.parts(state)
-        at, duration = at[:-1], at[-1]
+        primal, *variations = self.parts(state)
+        primal, duration = primal[:-1], primal[-1]
         numbers, build = self._active_numbers()
 
-        def shown(at: Float[Array, "components times"], *numbers: Array) -> Float[Array, "shown times"]:
-            return build(*numbers).shown(at)
+        def output(primal: Float[Array, "components times"], *numbers: Array) -> Float[Array, "shown times"]:
+            return build(*numbers).shown(primal)
 
         if not variations:
-            return shown(at), jnp.zeros((0, *shown(at).shape))
-        rates = self.mode.problem(at).field(duration, at)
+            return output(primal), jnp.zeros((0, *output(primal).shape))
+        rates = self.mode.problem(primal).field(duration, primal)
         # If the mode begins later, the state has advanced less at the same time.
-        along = [
-            (variation[:-1] - rates * variation[-1], *moved)
-            for variation, moved in zip(variations, self._rates(), strict=True)
+        directions = [
+            (variation[:-1] - rates * variation[-1], *rates_of_numbers)
+            for variation, rates_of_numbers in zip(variations, self._rates(), strict=True)
         ]
-        return _along(shown, (at, *numbers), along)
+        return _along(output, (primal, *numbers), directions)
 
     def slopes(self, state: Float[Array, "components cells"]) -> Float[Array, "tangents cells"]:
         """The derivative of the time of the event at which runs have ended in this mode, or in the transition to it."""
-        at, *variations = self.parts(state)
+        primal, *variations = self.parts(state)
         numbers, build = self._active_numbers()
 
-        def time(at: Float[Array, "components cells"], began: Float[Array, " cells"], *numbers: Array) -> Any:
-            problem = build(*numbers).problem(at)
-            if problem.event_function(at) is None:
-                return began
+        def time(primal: Float[Array, "components cells"], start_time: Float[Array, " cells"], *numbers: Array) -> Any:
+            problem = build(*numbers).problem(primal)
+            if problem.event_function(primal) is None:
+                return start_time
             # The event was located to a small fraction of a step, and the variations also change over the remaining
             # time.
-            rates = problem.field(began, at)
-            value, rate = stop_gradient(jax.jvp(problem.event_function, (at,), (rates,)))
-            rest = -value / jnp.where(rate == 0.0, jnp.inf, rate)
-            at = at + jnp.where(jnp.abs(rest) < NEARLY * duration, rest, 0.0) * rates
-            return began + delay(problem.event_function, at, problem.field(began, at))
+            rates = problem.field(start_time, primal)
+            value, rate = stop_gradient(jax.jvp(problem.event_function, (primal,), (rates,)))
+            remainder = -value / jnp.where(rate == 0.0, jnp.inf, rate)
+            primal = primal + jnp.where(jnp.abs(remainder) < NEARLY * duration, remainder, 0.0) * rates
+            return start_time + delay(problem.event_function, primal, problem.field(start_time, primal))
 
-        duration, point = at[-1], (at[:-1], jnp.zeros_like(at[-1]), *numbers)
+        duration, point = primal[-1], (primal[:-1], jnp.zeros_like(primal[-1]), *numbers)
         tangents = [
             (variation[:-1], variation[-1], *rates) for variation, rates in zip(variations, self._rates(), strict=True)
         ]
@@ -211,14 +218,14 @@ class VariationalMode(AbstractBatchedMode):
 
     def _error(
         self,
-        at: Float[Array, "components cells"],
+        primal: Float[Array, "components cells"],
         duration: Float[Array, " cells"],
         rates: Float[Array, "components cells"],
     ) -> Float[Array, "components cells"]:
         """The error of the state at the end of the mode, divided by the tolerance, from the change of the state and
         from the magnitudes.
         """
-        sizes = jnp.minimum(self.mode.problem(at).start()[1], jnp.abs(rates) * duration)
+        sizes = jnp.minimum(self.mode.problem(primal).start()[1], jnp.abs(rates) * duration)
         # Shares of both signs that are unlikely to cancel.
         shares = [(-1.0) ** k * (0.5 + math.modf(0.618 * k)[0]) for k in range(len(sizes))]
         return jnp.asarray(shares)[:, None] * sizes
@@ -271,5 +278,5 @@ def variational_start(
 ) -> Float[Array, "more cells"]:
     """Initial states with their clocks, followed by the variations of both."""
     zero = jnp.zeros_like(state[0])
-    moved = [jnp.zeros_like(state) if direction[1] is None else direction[1] for direction in tangents]
-    return jnp.concatenate([with_row(part, zero) for part in (state, *moved)])
+    variations = [jnp.zeros_like(state) if direction[1] is None else direction[1] for direction in tangents]
+    return jnp.concatenate([with_row(part, zero) for part in (state, *variations)])

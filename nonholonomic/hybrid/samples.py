@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float
 
 from ..derivatives import in_groups, tangents_by
 from ..derivatives.sampling import AbstractSampling, ProblemSpec, solve_for_samples
-from ..integration import REACHED_END, Settings, solve_with_samples
+from ..integration import Settings, solve_with_samples
+from ..integration.status import REACHED_END
 from ..xla_cpu import greatest
 from .ensemble import Carry, HybridOutcome, after_reset, after_solve, at_start, traced_rounds
 from .mode import AbstractBatchedMode, TransitionPath
@@ -154,9 +155,12 @@ def _sampled_with_tangents(
 ) -> tuple[HybridSamples, list[HybridSamples]]:
     """The run, and its derivative along each tangent."""
     (modes, first, state), (times, t1) = built, horizon
-    varied, start = variational_modes(modes, tangents, settings.tolerance, False), variational_start(state, tangents)
-    ended, filled = _rounds_with_samples(varied, first, start, times, t1, settings, counters)
-    return _as_samples(ended, filled, times, len(state), len(tangents))
+    variational, start = (
+        variational_modes(modes, tangents, settings.tolerance, False),
+        variational_start(state, tangents),
+    )
+    ended, output = _rounds_with_samples(variational, first, start, times, t1, settings, counters)
+    return _as_samples(ended, output, times, len(state), len(tangents))
 
 
 class Filled(NamedTuple):
@@ -167,15 +171,15 @@ class Filled(NamedTuple):
     shown: Float[Array, "shown times"]
     variations: Float[Array, "tangents shown times"]
     number: Float[Array, " times"]
-    grazed: Float[Array, ""]
+    grazing_time: Float[Array, ""]
 
-    def with_samples(self, at: Bool[Array, " times"], output: tuple[Array, Array], number: Array | int) -> "Filled":
+    def with_samples(self, mask: Bool[Array, " times"], output: tuple[Array, Array], number: Array | int) -> "Filled":
         """Fill in missing samples."""
-        at = at & jnp.isnan(self.number)
-        shown, variations = (
-            jnp.where(at, new, old) for new, old in zip(output, (self.shown, self.variations), strict=True)
+        mask = mask & jnp.isnan(self.number)
+        rows, variations = (
+            jnp.where(mask, new, old) for new, old in zip(output, (self.shown, self.variations), strict=True)
         )
-        return self._replace(shown=shown, variations=variations, number=jnp.where(at, number, self.number))
+        return self._replace(shown=rows, variations=variations, number=jnp.where(mask, number, self.number))
 
 
 def _rounds_with_samples(
@@ -189,23 +193,23 @@ def _rounds_with_samples(
 ) -> Carry:
     """Run round by round, as in `traced_solve_hybrid`, with samples of every mode and of the transition to the next."""
     count = len(modes[0].tangents)
-    own = VariationalMode.parts(modes[0], state)[0][:-1]
-    missing = jnp.full((len(jax.eval_shape(modes[0].mode.shown, own)), len(times)), jnp.nan)
+    core_state = VariationalMode.parts(modes[0], state)[0][:-1]
+    missing = jnp.full((len(jax.eval_shape(modes[0].mode.shown, core_state)), len(times)), jnp.nan)
     empty = Filled(missing, jnp.zeros((count, *missing.shape)), missing[0], jnp.full((), jnp.inf))
 
     def solve(numbers: Sequence[int], carry: Carry, active: Bool[Array, " 1"]) -> Carry:
         def solved() -> Carry:
-            run, filled = carry
-            at = run.mode[0]
-            mode = mode_numbered(modes, numbers, at)
+            run, output = carry
+            number = run.mode[0]
+            mode = mode_numbered(modes, numbers, number)
             # In a batch, all runs take this branch; runs in another mode spend no time in this one.
-            since, left = times - run.end_time, jnp.where(active, greatest(t1 - run.end_time, 0.0), 0.0)
+            times_in_mode, left = times - run.end_time, jnp.where(active, greatest(t1 - run.end_time, 0.0), 0.0)
             outcome, samples = solve_with_samples(
-                mode.problem(run.state), since, left, jnp.asarray(1), settings, n_blocks=1 + count
+                mode.problem(run.state), times_in_mode, left, jnp.asarray(1), settings, n_blocks=1 + count
             )
-            after = after_solve(jnp, run, outcome, t1)
-            inside = (since >= 0.0) & (times <= after.end_time)
-            return after, filled.with_samples(inside, mode.output_rows(samples[0].T), at)
+            run_after = after_solve(jnp, run, outcome, t1)
+            is_inside = (times_in_mode >= 0.0) & (times <= run_after.end_time)
+            return run_after, output.with_samples(is_inside, mode.output_rows(samples[0].T), number)
 
         return jax.lax.cond(active[0], solved, lambda: carry)
 
@@ -215,17 +219,17 @@ def _rounds_with_samples(
             return None if record is None else _rows_in_transition(mode, record, times - t1 + left)
 
         def after_transition() -> Carry:
-            run, filled = carry
+            run, output = carry
             left = greatest(t1 - run.end_time, 0.0)
             mode = mode_numbered(modes, numbers, run.mode[0])
-            transition, shown, variations = mode.reset_with_path(run.state, left, rows_on_path)
-            after = after_reset(jnp, run, transition, t1)
-            if shown is not None:
-                inside = (times > run.end_time) & (times <= after.end_time)
-                filled = filled.with_samples(inside, (shown, variations), BETWEEN)
-            grazes = after.counts[-1, 0] > run.counts[-1, 0]
-            grazed = jnp.where(grazes, jnp.minimum(filled.grazed, run.end_time[0]), filled.grazed)
-            return after, filled._replace(grazed=grazed)
+            transition, rows, variations = mode.reset_with_path(run.state, left, rows_on_path)
+            run_after = after_reset(jnp, run, transition, t1)
+            if rows is not None:
+                is_inside = (times > run.end_time) & (times <= run_after.end_time)
+                output = output.with_samples(is_inside, (rows, variations), BETWEEN)
+            grazes = run_after.counts[-1, 0] > run.counts[-1, 0]
+            grazing_time = jnp.where(grazes, jnp.minimum(output.grazing_time, run.end_time[0]), output.grazing_time)
+            return run_after, output._replace(grazing_time=grazing_time)
 
         return jax.lax.cond(lost[0], after_transition, lambda: carry)
 
@@ -251,40 +255,44 @@ def _shape(mode: AbstractBatchedMode) -> Any:
     return jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)) if eqx.is_array(leaf) else leaf, mode)
 
 
-def mode_numbered(modes: tuple[VariationalMode, ...], numbers: Sequence[int], at: Array) -> VariationalMode:
-    """The mode numbered `at` in one of the `program_groups`."""
+def mode_numbered(modes: tuple[VariationalMode, ...], numbers: Sequence[int], selected: Array) -> VariationalMode:
+    """The mode numbered `selected` in one of the `program_groups`."""
     mode = modes[numbers[0]]
     for number in numbers[1:]:
 
         def leaf(old: Any, new: Any, number: int = number) -> Any:
-            return old if old is new or not eqx.is_array(old) else jnp.where(at == number, new, old)
+            return old if old is new or not eqx.is_array(old) else jnp.where(selected == number, new, old)
 
         mode = jax.tree.map(leaf, mode, modes[number])
     return mode
 
 
 def _rows_in_transition(
-    mode: AbstractBatchedMode, record: TransitionPath, since: Float[Array, " times"]
+    mode: AbstractBatchedMode, record: TransitionPath, times_in_mode: Float[Array, " times"]
 ) -> Float[Array, "shown times"]:
     """The output rows some times [s] after the end of a mode; meaningless after the last stretch."""
     ends = record.ends[:, 0]
-    stretch = jnp.minimum(jnp.searchsorted(jax.lax.stop_gradient(ends), jax.lax.stop_gradient(since)), len(ends) - 1)
-    began = jnp.where(stretch > 0, ends[jnp.maximum(stretch - 1, 0)], 0.0)
+    stretch = jnp.minimum(
+        jnp.searchsorted(jax.lax.stop_gradient(ends), jax.lax.stop_gradient(times_in_mode)), len(ends) - 1
+    )
+    start_time = jnp.where(stretch > 0, ends[jnp.maximum(stretch - 1, 0)], 0.0)
     motions = jax.tree.map(lambda leaf: jnp.moveaxis(leaf[stretch][..., 0], 0, -1), record.motions)
-    return mode.between(motions, jnp.where(jnp.isfinite(began), since - began, 0.0))
+    return mode.between(motions, jnp.where(jnp.isfinite(start_time), times_in_mode - start_time, 0.0))
 
 
 def _as_samples(
-    ended: HybridOutcome[Array], filled: Filled, times: Float[Array, " times"], size: int, count: int
+    ended: HybridOutcome[Array], output: Filled, times: Float[Array, " times"], size: int, count: int
 ) -> tuple[HybridSamples, list[HybridSamples]]:
     """The samples, and their derivative along each tangent."""
-    end_time, status, grazed = ended.end_time[0], ended.status[0], ended.counts[-1, 0] > 0
-    late = jnp.where(times > filled.grazed, jnp.nan, 0.0)
+    end_time, status, grazes = ended.end_time[0], ended.status[0], ended.counts[-1, 0] > 0
+    invalid = jnp.where(times > output.grazing_time, jnp.nan, 0.0)
     # The variation of the time follows that of the state; a horizon does not move.
-    later = [ended.state[k * (size + 1) + size, 0] for k in range(1, count + 1)]
-    later = [jnp.where(status == REACHED_END, 0.0, jnp.where(grazed, jnp.nan, delay)) for delay in later]
+    delays = [ended.state[k * (size + 1) + size, 0] for k in range(1, count + 1)]
+    delays = [jnp.where(status == REACHED_END, 0.0, jnp.where(grazes, jnp.nan, delay)) for delay in delays]
     numbers = (ended.mode[0], status, ended.steps[0], ended.rejected[0], ended.counts[:-1, 0])
-    others = (part.astype(float) for part in numbers)
-    samples = HybridSamples(filled.shown, filled.number, end_time, ended.state[:size, 0], *others)
-    slopes = [HybridSamples(filled.variations[k] + late, UNCHANGED, later[k], *(UNCHANGED,) * 6) for k in range(count)]
+    counters_and_codes = (part.astype(float) for part in numbers)
+    samples = HybridSamples(output.shown, output.number, end_time, ended.state[:size, 0], *counters_and_codes)
+    slopes = [
+        HybridSamples(output.variations[k] + invalid, UNCHANGED, delays[k], *(UNCHANGED,) * 6) for k in range(count)
+    ]
     return samples, slopes

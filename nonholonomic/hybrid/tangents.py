@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..derivatives import in_groups
-from ..integration import CROSSED, REACHED_END, Settings
+from ..integration import Settings
 from ..integration.scheduler import Numbers
+from ..integration.status import CROSSED, REACHED_END
 from .ensemble import HybridOutcome, solve_hybrid, traced_solve_hybrid
 from .mode import AbstractBatchedMode
 from .saltation import VariationalMode, variational_modes, variational_start
@@ -57,10 +58,10 @@ def solve_hybrid_with_tangents(
     >>> print(sensitivities.slopes.round(6))  # the time of the fall
     [[0.451524 0.451524]]
     """
-    varied = variational_modes(modes, tangents, settings.tolerance, ends_on_event)
+    variational = variational_modes(modes, tangents, settings.tolerance, ends_on_event)
     start, n_blocks = np.asarray(variational_start(jnp.asarray(state), tangents)), 1 + len(tangents)
-    ended = solve_hybrid(varied, mode, start, t1, cells, settings, counters=counters + 1, n_blocks=n_blocks)
-    slopes = [np.asarray(_slopes(varied_mode, jnp.asarray(ended.state))) for varied_mode in varied]
+    ended = solve_hybrid(variational, mode, start, t1, cells, settings, counters=counters + 1, n_blocks=n_blocks)
+    slopes = [np.asarray(_slopes(varied_mode, jnp.asarray(ended.state))) for varied_mode in variational]
     event_time = ended.crossing_time if ends_on_event else np.broadcast_to(t1, len(mode))
     return _without_variations(ended, len(state)), _where_defined(
         np, ended, _of_mode(np, ended, slopes), event_time, ends_on_event
@@ -91,13 +92,15 @@ def traced_solve_hybrid_with_tangents(
     """
 
     def run(group: tuple[Any, ...]) -> tuple[tuple[HybridOutcome[Array], Array], list[Float[Array, " cells"]]]:
-        varied = variational_modes(modes, group, settings.tolerance, ends_on_event)
+        variational = variational_modes(modes, group, settings.tolerance, ends_on_event)
         start, n_blocks = variational_start(state, group), 1 + len(group)
-        ended = traced_solve_hybrid(varied, mode, start, t1, cells, settings, counters=counters + 1, n_blocks=n_blocks)
-        slopes = _of_mode(jnp, ended, [varied_mode.slopes(ended.state) for varied_mode in varied])
+        ended = traced_solve_hybrid(
+            variational, mode, start, t1, cells, settings, counters=counters + 1, n_blocks=n_blocks
+        )
+        slopes = _of_mode(jnp, ended, [varied_mode.slopes(ended.state) for varied_mode in variational])
         event_time = ended.crossing_time if ends_on_event else jnp.broadcast_to(t1, mode.shape)
-        known = _where_defined(jnp, ended, slopes, event_time, ends_on_event)
-        return (_without_variations(ended, len(state)), known.grazing), list(known.slopes)
+        mask = _where_defined(jnp, ended, slopes, event_time, ends_on_event)
+        return (_without_variations(ended, len(state)), mask.grazing), list(mask.slopes)
 
     (outcome, grazing), slopes = in_groups(run, tangents)
     return outcome, Slopes(jnp.stack(slopes), grazing)
@@ -112,11 +115,11 @@ def _where_defined(
 ) -> Slopes[Numbers]:
     """The derivatives of the times of events, where these happened and the derivatives have correct digits."""
     # An event at the start has a fixed time, whatever the tangent.
-    happened = xp.isfinite(event_time) & (event_time > 0.0)
+    has_event = xp.isfinite(event_time) & (event_time > 0.0)
     # With its variations a run takes other steps: where it does not reach the event, it has no derivative.
     arrived = ended.status == (CROSSED if ends_on_event else REACHED_END)
-    grazing = happened & ((ended.counts[-1] > 0) | ~arrived)
-    return Slopes(xp.where(happened, xp.where(grazing, xp.nan, slopes), 0.0), grazing)
+    grazing = has_event & ((ended.counts[-1] > 0) | ~arrived)
+    return Slopes(xp.where(has_event, xp.where(grazing, xp.nan, slopes), 0.0), grazing)
 
 
 def _without_variations(ended: HybridOutcome[Numbers], size: int) -> HybridOutcome[Numbers]:
@@ -137,5 +140,5 @@ def _of_mode(xp: Any, ended: HybridOutcome[Numbers], slopes: list[Float[Numbers,
 
 
 @eqx.filter_jit
-def _slopes(varied: VariationalMode, state: Float[Array, "components cells"]) -> Float[Array, "tangents cells"]:
-    return varied.slopes(state)
+def _slopes(variational: VariationalMode, state: Float[Array, "components cells"]) -> Float[Array, "tangents cells"]:
+    return variational.slopes(state)

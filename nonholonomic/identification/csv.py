@@ -73,16 +73,16 @@ def read_columns(path: Any, columns: Any, fps: float | None, error: Any, quantit
             raise ValueError(f"columns: {name!r} must be a single column: time, frame, {', '.join(quantities.units)}")
     times = _times(table, columns, fps, path)
     value = np.stack([_column(table, name, columns[name], quantities.units[name], path) for name in names], axis=1)
-    good = np.isfinite(times) & np.any(np.isfinite(value), axis=1)
+    mask = np.isfinite(times) & np.any(np.isfinite(value), axis=1)
     errors = None
     if error is not None:
         if not isinstance(error, Mapping) or set(error) != set(names):
             raise ValueError(f"error = {error!r} must be a dictionary with {', '.join(names)}, or None")
         units = quantities.units
-        errors = np.stack([_errors(table, name, error[name], units[name], path) for name in names], axis=1)[good]
+        errors = np.stack([_errors(table, name, error[name], units[name], path) for name in names], axis=1)[mask]
     if len(names) == 1:
-        return Read(times[good], value[good, 0], None if errors is None else errors[:, 0], names[0])
-    return Read(times[good], value[good], errors, names)
+        return Read(times[mask], value[mask, 0], None if errors is None else errors[:, 0], names[0])
+    return Read(times[mask], value[mask], errors, names)
 
 
 def _table(path: Path) -> dict[str, list[str]]:
@@ -143,10 +143,10 @@ def _parts(name: str, header_and_unit: Any, si: str) -> tuple[Any, float]:
     if not isinstance(header_and_unit, tuple) or len(header_and_unit) != 2:
         raise ValueError(f"columns: {name!r} = {header_and_unit!r} must be (header, unit), such as ('tilt', 'deg')")
     first, unit = header_and_unit
-    known = UNITS[si]
+    factors = UNITS[si]
     if isinstance(unit, str):
-        if unit not in known:
-            raise ValueError(f"unit of {name} = {unit!r} must be one of {', '.join(known)}, or a number of {si}")
-        return first, known[unit]
+        if unit not in factors:
+            raise ValueError(f"unit of {name} = {unit!r} must be one of {', '.join(factors)}, or a number of {si}")
+        return first, factors[unit]
     require(unit, f"unit of {name}")
     return first, float(unit)

@@ -33,9 +33,9 @@ def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], Int[np
     labels = tuple(
         f"{i + 1}: {label}" if len(data) > 1 else label for i, source in enumerate(data) for label in source.labels
     )
-    before = np.cumsum([0, *(source.size for source in data)])
-    seen = np.concatenate([first + source.seen for first, source in zip(before, data, strict=False)])
-    return likelihood.joined([source.measurements for source in data]), labels, seen
+    offsets = np.cumsum([0, *(source.size for source in data)])
+    indices = np.concatenate([first + source.seen for first, source in zip(offsets, data, strict=False)])
+    return likelihood.joined([source.measurements for source in data]), labels, indices
 
 
 def series_units(data: tuple[Any, ...]) -> tuple[str, ...]:
@@ -62,8 +62,10 @@ def of_data(parameters: dict[str, Any], k: int) -> dict[str, Any]:
     """
     prefix = f"data[{k}]."
     shared = {name: value for name, value in parameters.items() if not name.startswith("data[")}
-    own = {name.removeprefix(prefix): value for name, value in parameters.items() if name.startswith(prefix)}
-    return shared | own
+    parameters_of_data = {
+        name.removeprefix(prefix): value for name, value in parameters.items() if name.startswith(prefix)
+    }
+    return shared | parameters_of_data
 
 
 def scene_unknowns(free: Any, scene: Any, launch: Any, shared: list[str], own: list[list[str]]) -> dict[str, Free]:
@@ -117,10 +119,10 @@ def free_numbers(
     >>> list(free_numbers({"rate": 1.5}, ["scene.rate"], [["t0"]], lambda values: None))
     ['scene.rate']
     """
-    known = [*shared, *dict.fromkeys(itertools.chain(*own))]
+    candidates = [*shared, *dict.fromkeys(itertools.chain(*own))]
     unknowns: dict[str, Free] = {}
-    for short, unknown in as_free(free).items():
-        for name in _full_names(short, known, own):
+    for name_or_suffix, unknown in as_free(free).items():
+        for name in _full_names(name_or_suffix, candidates, own):
             if name in unknowns:
                 raise ValueError(f"free: {name!r} is named twice")
             unknowns[name] = unknown
@@ -138,12 +140,16 @@ def free_numbers(
     return as_free(unknowns, lower)
 
 
-def _full_names(short: str, known: list[str], own: list[list[str]]) -> list[str]:
+def _full_names(name_or_suffix: str, candidates: list[str], names_of_data: list[list[str]]) -> list[str]:
     """The full names that a name matches."""
-    if not str(short).startswith("data["):
-        return [full_name("free", short, known)]
-    if short.startswith(EACH):
-        every = list(dict.fromkeys(name for names in own for name in names))
-        name = full_name("free", short.removeprefix(EACH), every)
-        return [f"data[{k}].{name}" for k, names in enumerate(own) if name in names]
-    return [full_name("free", short, [f"data[{k}].{name}" for k, names in enumerate(own) for name in names])]
+    if not str(name_or_suffix).startswith("data["):
+        return [full_name("free", name_or_suffix, candidates)]
+    if name_or_suffix.startswith(EACH):
+        all_names = list(dict.fromkeys(name for names in names_of_data for name in names))
+        name = full_name("free", name_or_suffix.removeprefix(EACH), all_names)
+        return [f"data[{k}].{name}" for k, names in enumerate(names_of_data) if name in names]
+    return [
+        full_name(
+            "free", name_or_suffix, [f"data[{k}].{name}" for k, names in enumerate(names_of_data) for name in names]
+        )
+    ]

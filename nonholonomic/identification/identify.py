@@ -84,8 +84,8 @@ def identify(
         raise ValueError(f"labels must be {count}, one for each measurement, not {len(labels)}")
     problem = Problem(model, tuple(unknowns.items()), step)
     with status_line("fitting", progress):
-        begins = draw_starts(unknowns, starts, spread, seed)
-        ends, at_ends = _fitted(problem, begins, measurements, max_steps, progress)
+        start_points = draw_starts(unknowns, starts, spread, seed)
+        ends, at_ends = _fitted(problem, start_points, measurements, max_steps, progress)
         for _ in range(ROUNDS if np.any(np.asarray(measurements.estimated)) else 0):
             best = int(np.argmin(at_ends.deviance))
             errors = estimated_errors(measurements, at_ends.prediction[best], len(unknowns))
@@ -98,44 +98,46 @@ def identify(
                 break
         if not np.any(np.isfinite(at_ends.prediction)):
             raise ValueError("model: no start led to finite predictions")
-        result = summarise(problem, measurements, labels, begins, ends.coordinates, ends.converged, at_ends)
+        result = summarise(problem, measurements, labels, start_points, ends.coordinates, ends.converged, at_ends)
     if not result.verdict.good:
         warnings.warn("; ".join(result.verdict.concerns), FitWarning, stacklevel=2)
     return result
 
 
 def _fitted(
-    problem: Problem, begins: Any, measurements: Measurements, max_steps: int, progress: bool
+    problem: Problem, start_points: Any, measurements: Measurements, max_steps: int, progress: bool
 ) -> tuple[Ends, Linearised]:
     """The ends of the fits. Recordings are also fitted in stages, to longer and longer parts; the better of the two
     ends counts.
 
     Predicted late samples can be wrong by whole turns, and would then lead to another minimum.
     """
-    ends = minimise(problem, begins, measurements, max_steps=max_steps, progress=progress)
+    ends = minimise(problem, start_points, measurements, max_steps=max_steps, progress=progress)
     at_ends = linearise(problem, ends.coordinates, measurements)
-    longest = float(np.max(np.asarray(measurements.time)))
-    if not longest > 0.0:
+    duration = float(np.max(np.asarray(measurements.time)))
+    if not duration > 0.0:
         return ends, at_ends
-    at = begins
+    coordinates = start_points
     for part in PARTS:
-        early_measurements = down_weighted(measurements, part * longest)
-        at = minimise(problem, at, early_measurements, max_steps=max_steps, progress=progress).coordinates
-    others = minimise(problem, at, measurements, max_steps=max_steps, progress=progress)
-    by_parts = linearise(problem, others.coordinates, measurements)
-    better = by_parts.deviance < at_ends.deviance
+        early_measurements = down_weighted(measurements, part * duration)
+        coordinates = minimise(
+            problem, coordinates, early_measurements, max_steps=max_steps, progress=progress
+        ).coordinates
+    ends_by_parts = minimise(problem, coordinates, measurements, max_steps=max_steps, progress=progress)
+    by_parts = linearise(problem, ends_by_parts.coordinates, measurements)
+    improves = by_parts.deviance < at_ends.deviance
 
     def chosen(new: Any, old: Any) -> Any:
-        return np.where(better.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
+        return np.where(improves.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
 
-    return jax.tree.map(chosen, others, ends), jax.tree.map(chosen, by_parts, at_ends)
+    return jax.tree.map(chosen, ends_by_parts, ends), jax.tree.map(chosen, by_parts, at_ends)
 
 
 def check_search(starts: Any, spread: Any, seed: Any, max_steps: Any, progress: Any) -> None:
     """Raise `ValueError` unless the arguments are legal for `identify`; a model checks them before it prepares its
     data."""
-    for name, value, least in (("starts", starts, 1), ("seed", seed, 0), ("max_steps", max_steps, 1)):
-        require_whole(value, name, least)
+    for name, value, lower in (("starts", starts, 1), ("seed", seed, 0), ("max_steps", max_steps, 1)):
+        require_whole(value, name, lower)
     require(spread, "spread", above=1.0)
     require_flag(progress, "progress")
 

@@ -59,7 +59,7 @@ def minimise(
     starts: Any,
     measurements: Measurements,
     *,
-    held: int | None = None,
+    fixed: int | None = None,
     max_steps: int = 60,
     progress: bool = False,
 ) -> Ends:
@@ -70,22 +70,22 @@ def minimise(
     - `problem`: the `Problem`.
     - `starts`: coordinates, (rows, unknowns).
     - `measurements`: (n,), the same for all rows, or (rows, n).
-    - `held`: index of an unknown that keeps its start value, or `None`.
+    - `fixed`: index of an unknown that keeps its start value, or `None`.
     - `max_steps`: a row that needs more steps has not converged.
     - `progress`: whether to show, on a terminal or in a notebook, how many rows are done.
 
     **Returns:** the `Ends`.
     """
-    at = np.array(starts, float)
-    rows, unknowns = at.shape
+    coordinates = np.array(starts, float)
+    rows, unknowns = coordinates.shape
     measurements = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (rows, leaf.shape[-1])), measurements)
-    moving = np.array([k for k in range(unknowns) if k != held], int)
+    moving = np.array([k for k in range(unknowns) if k != fixed], int)
     bounded = [unknown.has_lower or unknown.has_upper for unknown in problem.unknowns]
     reach = np.where(bounded, FARTHEST, np.inf)[moving]
     done, steps = np.zeros(rows, bool), np.zeros(rows, int)
-    with Progress(rows, "fit", shown=progress) as shown:
-        current = _Fit.of(linearise(problem, at, measurements), moving)
-        shown.begin()
+    with Progress(rows, "fit", shown=progress) as display:
+        current = _Fit.of(linearise(problem, coordinates, measurements), moving)
+        display.begin()
         scale, damping = np.zeros((rows, len(moving))), np.full(rows, FIRST_DAMPING)
         free = max(current.residual.shape[1] - len(moving), 1)
         history = [current.deviance]
@@ -94,25 +94,25 @@ def minimise(
             if done.all():
                 break
             scale = np.maximum(scale, np.sum(current.jacobian**2, axis=1))
-            move, promised = _step(current, scale, damping, reach)
-            tried = at.copy()
-            tried[:, moving] += move
-            trial = _Fit.of(linearise(problem, tried, measurements, ~done), moving)
+            move, predicted_gain = _step(current, scale, damping, reach)
+            trial_coordinates = coordinates.copy()
+            trial_coordinates[:, moving] += move
+            trial = _Fit.of(linearise(problem, trial_coordinates, measurements, ~done), moving)
             gain = current.deviance - trial.deviance
-            better = ~done & (gain > 0.0)
-            damping = np.where(better, np.where(gain > GOOD * promised, EASED, 1.0), HARDENED) * damping
-            at[better] = tried[better]
-            current = _Fit(*(_chosen(better, new, old) for new, old in zip(trial, current, strict=True)))
+            improves = ~done & (gain > 0.0)
+            damping = np.where(improves, np.where(gain > GOOD * predicted_gain, EASED, 1.0), HARDENED) * damping
+            coordinates[improves] = trial_coordinates[improves]
+            current = _Fit(*(_chosen(improves, new, old) for new, old in zip(trial, current, strict=True)))
             history.append(current.deviance)
             steps[~done] = step
-            left = _promise(current)
-            ended = (left < CONVERGED) | (~better & (left < NEGLIGIBLE))
+            remaining_gain = _promise(current)
+            ended = (remaining_gain < CONVERGED) | (~improves & (remaining_gain < NEGLIGIBLE))
             if step >= PATIENCE:
                 excess = np.maximum(current.deviance - BAD * free, 1.0)
                 ended |= history[-1 - PATIENCE] - current.deviance < STALLED * excess
-            shown.advance(int(np.sum(ended & ~done)), steps=step)
+            display.advance(int(np.sum(ended & ~done)), steps=step)
             done |= ended
-    return Ends(at, done, steps)
+    return Ends(coordinates, done, steps)
 
 
 class _Fit(NamedTuple):
@@ -129,9 +129,9 @@ class _Fit(NamedTuple):
         return cls(deviance, linearised.whole_residual, linearised.whole_jacobian[..., moving])
 
 
-def _chosen(better: Bool[np.ndarray, " rows"], new: np.ndarray, old: np.ndarray) -> np.ndarray:
+def _chosen(improves: Bool[np.ndarray, " rows"], new: np.ndarray, old: np.ndarray) -> np.ndarray:
     """The new rows where they are better, the old ones elsewhere."""
-    return np.where(better.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
+    return np.where(improves.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
 
 
 def _step(
@@ -155,5 +155,5 @@ def _promise(current: _Fit) -> Float[np.ndarray, " rows"]:
     """Decrease of -2 log posterior by an undamped step, to first order in the model."""
     norms = np.linalg.norm(current.jacobian, axis=1, keepdims=True)
     sides, values, _ = np.linalg.svd(current.jacobian / np.where(norms > 0.0, norms, 1.0), full_matrices=False)
-    seen = values > ROUND_OFF * np.max(values, axis=1, keepdims=True, initial=0.0)
-    return np.sum(np.where(seen, np.einsum("rni,rn->ri", sides, current.residual), 0.0) ** 2, axis=1)
+    is_significant = values > ROUND_OFF * np.max(values, axis=1, keepdims=True, initial=0.0)
+    return np.sum(np.where(is_significant, np.einsum("rni,rn->ri", sides, current.residual), 0.0) ** 2, axis=1)

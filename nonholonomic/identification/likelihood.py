@@ -114,21 +114,25 @@ class Measurements(eqx.Module):
 
         **Arguments:** `prediction`: (..., n). **Returns:** (..., n).
         """
-        known = jnp.isfinite(prediction)
-        at = jnp.where(known, prediction, 0.0)
+        is_finite = jnp.isfinite(prediction)
+        finite_prediction = jnp.where(is_finite, prediction, 0.0)
         low, high = jnp.isfinite(self.value), jnp.isfinite(self.upper)
-        above = (at - jnp.where(low, self.value, 0.0)) / self.error
-        below = (jnp.where(high, self.upper, 0.0) - at) / self.error
-        both = low & high & self.censored
-        middle = jnp.where(both, 0.5 * (self.value + self.upper), 0.0)
-        half = jnp.where(both, 0.5 * (self.upper - self.value) / self.error, 1.0)
+        excess = (finite_prediction - jnp.where(low, self.value, 0.0)) / self.error
+        shortfall = (jnp.where(high, self.upper, 0.0) - finite_prediction) / self.error
+        two_limits = low & high & self.censored
+        middle = jnp.where(two_limits, 0.5 * (self.value + self.upper), 0.0)
+        half = jnp.where(two_limits, 0.5 * (self.upper - self.value) / self.error, 1.0)
         residuals = jnp.select(
-            [~self.censored, both, low],
-            [self._of_value(at), between((at - middle) / self.error, half), one_sided(above)],
-            -one_sided(below),
+            [~self.censored, two_limits, low],
+            [
+                self._of_value(finite_prediction),
+                between((finite_prediction - middle) / self.error, half),
+                one_sided(excess),
+            ],
+            -one_sided(shortfall),
         )
-        beyond = low & ~high & (prediction == jnp.inf)
-        return jnp.where(known, residuals, jnp.where(beyond, 0.0, MISSING))
+        is_exceeded = low & ~high & (prediction == jnp.inf)
+        return jnp.where(is_finite, residuals, jnp.where(is_exceeded, 0.0, MISSING))
 
     def _of_value(self, prediction: Float[Array, "... n"]) -> Float[Array, "... n"]:
         """The residual of a measured value."""
@@ -137,8 +141,8 @@ class Measurements(eqx.Module):
         freedom = jnp.where(heavy, self.student, 1.0)
         share = z**2 / freedom
         # log(1 + q) / q without 0 / 0; divided before the square root, whose slope at 0 is infinite.
-        small = share < 1e-8
-        flat = jnp.where(small, 1.0 - 0.5 * share, jnp.log1p(share) / jnp.where(small, 1.0, share))
+        is_small = share < 1e-8
+        flat = jnp.where(is_small, 1.0 - 0.5 * share, jnp.log1p(share) / jnp.where(is_small, 1.0, share))
         return jnp.where(heavy, z * jnp.sqrt((freedom + 1.0) / freedom * flat), z)
 
     def whole_periods(self, off: Float[Array | np.ndarray, "... n"]) -> Float[Array, "... n"]:
@@ -149,9 +153,9 @@ class Measurements(eqx.Module):
 
     def standardised(self, prediction: Float[Array | np.ndarray, "... n"]) -> Float[Array, "... n"]:
         """(prediction - value) / error, with whole periods removed; 0 for limits."""
-        off = jnp.where(self.censored, 0.0, prediction - self.value)
-        off = off - self.whole_periods(off)
-        return off / self.error
+        difference = jnp.where(self.censored, 0.0, prediction - self.value)
+        difference = difference - self.whole_periods(difference)
+        return difference / self.error
 
     def residuals_and_slopes(
         self, prediction: Float[Array | np.ndarray, "... n"]
@@ -183,18 +187,18 @@ class Measurements(eqx.Module):
 
 def joined(parts: list[Measurements]) -> Measurements:
     """The measurements of several sets, one after the other; their series are renumbered consecutively."""
-    first, whole = 0, []
+    first, renumbered = 0, []
     for part in parts:
-        whole.append(eqx.tree_at(lambda part: part.series, part, part.series + first))
+        renumbered.append(eqx.tree_at(lambda part: part.series, part, part.series + first))
         first += int(np.max(part.series)) + 1
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *whole)
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *renumbered)
 
 
 def one_sided(z: Float[Array, "..."]) -> Float[Array, "..."]:
     """The residual -sqrt(-2 log Phi(z)) of a lower limit; 0 if its magnitude is less than 1e-9."""
     # Beyond this, the derivative of the square root would be infinity times zero.
-    near = z < 9.0
-    return jnp.where(near, -jnp.sqrt(-2.0 * log_ndtr(jnp.where(near, z, 0.0))), 0.0)
+    in_range = z < 9.0
+    return jnp.where(in_range, -jnp.sqrt(-2.0 * log_ndtr(jnp.where(in_range, z, 0.0))), 0.0)
 
 
 def between(z: Float[Array, "..."], half: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -204,18 +208,18 @@ def between(z: Float[Array, "..."], half: Float[Array, "..."]) -> Float[Array, "
     in errors.
     """
 
-    def log_probability(off: Float[Array, "..."]) -> Float[Array, "..."]:
-        upper, lower = log_ndtr(half - off), log_ndtr(-half - off)
+    def log_probability(distance: Float[Array, "..."]) -> Float[Array, "..."]:
+        upper, lower = log_ndtr(half - distance), log_ndtr(-half - distance)
         return upper + jnp.log(-jnp.expm1(lower - upper))
 
     # Near the middle, use z times the root of the curvature, 2 half phi(half) / P(0): the difference of logarithms
     # cancels there.
-    off = jnp.abs(z)
-    lost = 2.0 * (log_probability(jnp.zeros_like(off)) - log_probability(off))
-    near = lost < 1e-9
+    distance = jnp.abs(z)
+    deviance = 2.0 * (log_probability(jnp.zeros_like(distance)) - log_probability(distance))
+    at_middle = deviance < 1e-9
     density = jnp.exp(-0.5 * half**2) / math.sqrt(2.0 * math.pi)
-    curvature = 2.0 * half * density / jnp.exp(log_probability(jnp.zeros_like(off)))
-    return jnp.where(near, z * jnp.sqrt(curvature), jnp.sign(z) * jnp.sqrt(jnp.where(near, 1.0, lost)))
+    curvature = 2.0 * half * density / jnp.exp(log_probability(jnp.zeros_like(distance)))
+    return jnp.where(at_middle, z * jnp.sqrt(curvature), jnp.sign(z) * jnp.sqrt(jnp.where(at_middle, 1.0, deviance)))
 
 
 def estimated_errors(measurements: Measurements, prediction: Any, unknowns: int) -> Float[np.ndarray, " n"]:
@@ -226,10 +230,10 @@ def estimated_errors(measurements: Measurements, prediction: Any, unknowns: int)
     likelihood).
     """
     errors = np.array(measurements.error)
-    series, open_ = np.asarray(measurements.series), np.asarray(measurements.estimated)
+    series, estimated = np.asarray(measurements.series), np.asarray(measurements.estimated)
     off = np.asarray(measurements.standardised(jnp.asarray(prediction))) * errors
-    for number in np.unique(series[open_]):
-        in_series = (series == number) & open_ & np.isfinite(off)
+    for number in np.unique(series[estimated]):
+        in_series = (series == number) & estimated & np.isfinite(off)
         n = np.sum(in_series)
         share = max(1.0 - unknowns / off.size, 1.0 / off.size)
         freedom = np.asarray(measurements.student)[in_series]
@@ -238,11 +242,11 @@ def estimated_errors(measurements: Measurements, prediction: Any, unknowns: int)
             for _ in range(50):
                 weight = (freedom + 1.0) / (freedom + (off[in_series] / scale) ** 2)
                 scale = math.sqrt(np.sum(weight * off[in_series] ** 2) / (n * share))
-        errors[(series == number) & open_] = max(scale, 1e-300)
+        errors[(series == number) & estimated] = max(scale, 1e-300)
     return errors
 
 
 def down_weighted(measurements: Measurements, horizon: float) -> Measurements:
     """The same measurements, but those after a given time have nearly no weight."""
-    late = measurements.time > horizon
-    return measurements.with_errors(jnp.where(late, measurements.error * DOWN_WEIGHTED, measurements.error))
+    is_late = measurements.time > horizon
+    return measurements.with_errors(jnp.where(is_late, measurements.error * DOWN_WEIGHTED, measurements.error))

@@ -51,9 +51,9 @@ class AbstractDataModel(eqx.Module):
         for k, source in enumerate(self.data):
             groups.setdefault(self.together(source, values[k]), []).append(k)
         parts: dict[int, Array] = {}
-        for alike in groups.values():
-            predictions = self.predict([(self.data[k], values[k]) for k in alike], rows)
-            parts |= dict(zip(alike, predictions, strict=True))
+        for data_of_kind in groups.values():
+            predictions = self.predict([(self.data[k], values[k]) for k in data_of_kind], rows)
+            parts |= dict(zip(data_of_kind, predictions, strict=True))
         return jnp.concatenate([parts[k] for k in range(len(self.data))], axis=1)[:, self.seen]
 
 

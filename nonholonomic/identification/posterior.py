@@ -74,13 +74,13 @@ class LogDensity(eqx.Module):
                         f"priors: {name!r} = {prior!r} must be a mean and a standard deviation, or a function"
                     )
                 require(prior[1], f"standard deviation of the prior of {name}", above=0.0)
-        series, open_ = np.asarray(measurements.series), np.asarray(measurements.estimated)
-        kept = {name: _as_leaves(prior) for name, prior in all_priors.items()}
+        series, estimated = np.asarray(measurements.series), np.asarray(measurements.estimated)
+        leaves = {name: _as_leaves(prior) for name, prior in all_priors.items()}
         return cls(
             Problem(model, tuple(unknowns.items())),
             measurements,
-            kept,
-            tuple(np.unique(series[open_]).tolist()),
+            leaves,
+            tuple(np.unique(series[estimated]).tolist()),
             series_units,
         )
 
@@ -92,14 +92,14 @@ class LogDensity(eqx.Module):
     @property
     def units(self) -> dict[str, str]:
         """The units of the unknown errors, if known."""
-        known = {k: self.series_units[k] for k in self.open_series if k < len(self.series_units)}
-        return {f"error[{k}]": unit for k, unit in known.items()}
+        units = {k: self.series_units[k] for k in self.open_series if k < len(self.series_units)}
+        return {f"error[{k}]": unit for k, unit in units.items()}
 
     @property
     def _first_errors(self) -> Float[Array, " errors"]:
         """The first guesses of the unknown errors, one for each series."""
-        own = [self.measurements.estimated & (self.measurements.series == k) for k in self.open_series]
-        return jnp.array([self.measurements.error[jnp.argmax(series)] for series in own])
+        mask = [self.measurements.estimated & (self.measurements.series == k) for k in self.open_series]
+        return jnp.array([self.measurements.error[jnp.argmax(series)] for series in mask])
 
     @property
     def start(self) -> Float[Array, " unknowns"]:
@@ -117,8 +117,8 @@ class LogDensity(eqx.Module):
         """
         numbers, coordinates = len(self.problem.names), jnp.asarray(coordinates, float)
         if coordinates.shape[-1:] == (numbers,):
-            rest = jnp.zeros((*coordinates.shape[:-1], len(self.open_series)))
-            coordinates = jnp.concatenate([coordinates, rest], axis=-1)
+            padding = jnp.zeros((*coordinates.shape[:-1], len(self.open_series)))
+            coordinates = jnp.concatenate([coordinates, padding], axis=-1)
         if coordinates.shape[-1:] != (len(self.names),):
             raise ValueError(
                 f"coordinates of shape {coordinates.shape} must have {len(self.names)} numbers along the last axis: "
@@ -137,12 +137,12 @@ class LogDensity(eqx.Module):
         """New measurements drawn from the predictions and their errors; limits are replaced by values."""
         random, predicted = np.random.default_rng(seed), np.asarray(_predicted(self, jnp.asarray(coordinates)))
         heavy = np.isfinite(freedom := np.asarray(self.measurements.student))
-        drawn = random.normal(size=predicted.shape)
-        drawn /= np.where(
+        noise = random.normal(size=predicted.shape)
+        noise /= np.where(
             heavy, np.sqrt(random.chisquare(np.where(heavy, freedom, 1.0), predicted.shape) / freedom), 1.0
         )
         errors = jax.vmap(lambda point: self._with_errors(point).error)(jnp.asarray(coordinates))
-        return predicted + np.asarray(errors) * drawn
+        return predicted + np.asarray(errors) * noise
 
     @status_line("simulating")
     def __call__(self, coordinates: Float[Array, " unknowns"]) -> Float[Array, ""]:
@@ -162,8 +162,8 @@ class LogDensity(eqx.Module):
     def _with_errors(self, coordinates: Float[Array, " unknowns"]) -> Measurements:
         errors = self.measurements.error
         for coordinate, series in zip(coordinates[len(self.problem.names) :], self.open_series, strict=True):
-            own = self.measurements.estimated & (self.measurements.series == series)
-            errors = jnp.where(own, errors * jnp.exp(coordinate), errors)
+            mask = self.measurements.estimated & (self.measurements.series == series)
+            errors = jnp.where(mask, errors * jnp.exp(coordinate), errors)
         return self.measurements.with_errors(errors)
 
     def _log_prior(self, coordinates: Float[Array, " unknowns"]) -> Float[Array, ""]:

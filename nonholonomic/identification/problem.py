@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..integration import padded
+from ..compiled_programs import padded
 from .likelihood import Measurements
 from .unknown import Free, Unknown
 
@@ -109,51 +109,53 @@ _predicted = eqx.filter_jit(Problem.predict)
 def _differences(problem: Problem, step: float, coordinates: Rows) -> tuple[np.ndarray, np.ndarray]:
     """Predictions and central differences; if a side has no prediction, its slope is 0."""
     rows, unknowns = coordinates.shape
-    moves = step * np.concatenate([np.zeros((1, unknowns)), np.eye(unknowns), -np.eye(unknowns)])
+    offsets = step * np.concatenate([np.zeros((1, unknowns)), np.eye(unknowns), -np.eye(unknowns)])
     predict = Problem.predict if getattr(problem.model, "on_host", False) else _predicted
-    predictions = np.asarray(predict(problem, jnp.asarray((coordinates[:, None] + moves).reshape(-1, unknowns))))
-    values, ahead, behind = np.split(predictions.reshape(rows, len(moves), -1), [1, 1 + unknowns], axis=1)
+    predictions = np.asarray(predict(problem, jnp.asarray((coordinates[:, None] + offsets).reshape(-1, unknowns))))
+    values, values_above, values_below = np.split(
+        predictions.reshape(rows, len(offsets), -1), [1, 1 + unknowns], axis=1
+    )
     with np.errstate(invalid="ignore"):
-        slopes = np.moveaxis(ahead - behind, 1, -1) / (2.0 * step)
+        slopes = np.moveaxis(values_above - values_below, 1, -1) / (2.0 * step)
     return values[:, 0], np.where(np.isfinite(slopes), slopes, 0.0)
 
 
-def predictions_and_slopes(problem: Problem, coordinates: Rows, asked: Any = None) -> tuple[np.ndarray, np.ndarray]:
+def predictions_and_slopes(problem: Problem, coordinates: Rows, mask: Any = None) -> tuple[np.ndarray, np.ndarray]:
     """Predictions and their slopes, for every row of coordinates.
 
-    **Arguments:** `coordinates`: (rows, unknowns); `asked`: (rows,), a mask of the rows that are needed, by default
+    **Arguments:** `coordinates`: (rows, unknowns); `mask`: (rows,), which of the rows that are needed, by default
     all.
 
     **Returns:** (rows, n) and (rows, n, unknowns); NaN and 0 for rows that are not needed.
     """
     coordinates = np.asarray(coordinates, float)
-    asked = np.ones(len(coordinates), bool) if asked is None else np.asarray(asked)
+    mask = np.ones(len(coordinates), bool) if mask is None else np.asarray(mask)
     # The program is compiled for a fixed number of rows. Rows that are not needed get NaN parameters, so their runs end
     # at once.
-    needed = np.where(asked[:, None], coordinates, np.nan)
+    points = np.where(mask[:, None], coordinates, np.nan)
     if problem.step is None:
-        prediction, slopes = _differentiated(problem, needed)
+        prediction, slopes = _differentiated(problem, points)
         return np.asarray(prediction), np.asarray(slopes)
-    return _differences(problem, problem.step, needed)
+    return _differences(problem, problem.step, points)
 
 
-def linearise(problem: Problem, coordinates: Any, measurements: Measurements, asked: Any = None) -> Linearised:
+def linearise(problem: Problem, coordinates: Any, measurements: Measurements, mask: Any = None) -> Linearised:
     """Predictions, residuals and their slopes.
 
     **Arguments:**
 
     - `problem`: the `Problem`.
-    - `coordinates`: (rows, unknowns); `asked`: as for `predictions_and_slopes`.
+    - `coordinates`: (rows, unknowns); `mask`: as for `predictions_and_slopes`.
     - `measurements`: `Measurements` of shape (n,) or (rows, n).
 
     **Returns:** a `Linearised`.
 
     **Raises:** `ValueError` if the model does not return one prediction per measurement.
     """
-    prediction, slopes = predictions_and_slopes(problem, coordinates, asked)
-    wanted = (len(coordinates), measurements.value.shape[-1])
-    if prediction.shape != wanted:
-        raise ValueError(f"model must predict {wanted} for {wanted[0]} sets, not {prediction.shape}")
+    prediction, slopes = predictions_and_slopes(problem, coordinates, mask)
+    shape = (len(coordinates), measurements.value.shape[-1])
+    if prediction.shape != shape:
+        raise ValueError(f"model must predict {shape} for {shape[0]} sets, not {prediction.shape}")
     residual, by_prediction, root = _compared(measurements, prediction)
     prior, by_coordinate = map(np.asarray, _priors(problem.unknowns, jnp.asarray(coordinates, float)))
     return Linearised(

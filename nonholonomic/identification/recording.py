@@ -53,10 +53,10 @@ class Quantities:
         words = quantity if isinstance(quantity, tuple) else (quantity,)
         columns: list[str] = []
         for word in words:
-            known = {**self.columns, **{name: (name,) for name in self.units}}
-            if not isinstance(word, str) or word not in known:
-                raise ValueError(f"quantity = {word!r} must be one of {', '.join(map(repr, known))}")
-            columns += known[word]
+            columns_of_name = {**self.columns, **{name: (name,) for name in self.units}}
+            if not isinstance(word, str) or word not in columns_of_name:
+                raise ValueError(f"quantity = {word!r} must be one of {', '.join(map(repr, columns_of_name))}")
+            columns += columns_of_name[word]
         if not columns or len(set(columns)) < len(columns):
             raise ValueError(f"quantity = {quantity!r} must name at least one column, and each only once")
         return tuple(columns)
@@ -159,8 +159,8 @@ class AbstractRecording(eqx.Module):
     @property
     def labels(self) -> tuple[str, ...]:
         """A label for each sample, such as `theta(0.1 s)`; missing samples are omitted."""
-        every = [f"{column}({time:.4g} s)" for time in np.asarray(self.times) for column in self.columns]
-        return tuple(every[i] for i in self.seen)
+        all_labels = [f"{column}({time:.4g} s)" for time in np.asarray(self.times) for column in self.columns]
+        return tuple(all_labels[i] for i in self.seen)
 
     @property
     def series_units(self) -> tuple[str, ...]:
@@ -240,7 +240,7 @@ def predicted(
     >>> print(predicted(scene, [(data[0], {"scene.rate": jnp.array([2.0])})], 1, simulate)[0].round(3))
     [[0.135 0.018 0.002]]
     """
-    first, longest = recordings[0][0], max(len(recording.times) for recording, _ in recordings)
+    first, size = recordings[0][0], max(len(recording.times) for recording, _ in recordings)
     columns = tuple(dict.fromkeys(name for recording, _ in recordings for name in recording.columns))
 
     def lanes(of_each: list[Array]) -> Array:
@@ -253,7 +253,7 @@ def predicted(
     lane_numbers |= {"t0": lanes([recording.t0 for recording, _ in recordings])}
     lane_numbers |= {name: lanes([values[name] for _, values in recordings]) for name in recordings[0][1]}
     # Shorter recordings are extended by an instant, so that all have the same number of times.
-    clock = jnp.stack([_lengthened(recording.times, longest) for recording, _ in recordings])
+    clock = jnp.stack([_lengthened(recording.times, size) for recording, _ in recordings])
 
     def samples_of_lane(lane: Values, times: Float[Array, " times"]) -> Float[Array, "times columns"]:
         values = {name: value for name, value in lane.items() if name != "t0"}
@@ -262,7 +262,7 @@ def predicted(
         return jnp.stack([first.quantities.samples(trajectory, name) for name in columns], axis=-1)
 
     predictions = jax.vmap(samples_of_lane)(lane_numbers, jnp.tile(clock, (rows, 1))).reshape(
-        rows, len(recordings), longest, len(columns)
+        rows, len(recordings), size, len(columns)
     )
     parts = []
     for k, (recording, _) in enumerate(recordings):

@@ -173,7 +173,7 @@ class Identification:
             raise ValueError(f"values = {values!r} must lie within the bounds ({free.lower}, {free.upper}) of {name!r}")
         starts = np.tile(self.coordinates, (len(values), 1))
         starts[:, k] = np.asarray(free.coordinate(values))
-        ends = minimise(self.problem, starts, self.measurements, held=k)
+        ends = minimise(self.problem, starts, self.measurements, fixed=k)
         optima = np.asarray(self.problem.values(jnp.asarray(ends.coordinates)))
         deviance = deviance_of(self.problem, ends.coordinates, self.measurements) - self.deviance
         others = {other: optima[:, i] for i, other in enumerate(self.problem.names) if i != k}
@@ -197,8 +197,8 @@ class Identification:
         return draw_fit(self)
 
     def _place(self, name: str) -> int:
-        known = list(self.estimates)
-        return known.index(full_name("name", name, known))
+        valid = list(self.estimates)
+        return valid.index(full_name("name", name, valid))
 
     def _repr_html_(self) -> str:
         return text_as_html(str(self))
@@ -225,8 +225,10 @@ class Identification:
         for row in self.residuals[:MOST_ROWS]:
             lines.append(f"  {row.label:{width}}  {row.measured:20}  {row.prediction:.6g}  {row.residual:+.2f}")
         if len(self.residuals) > MOST_ROWS:
-            worst = max(self.residuals, key=lambda row: abs(row.residual))
-            lines.append(f"  and {len(self.residuals) - MOST_ROWS} more; largest {worst.label} {worst.residual:+.2f}")
+            largest = max(self.residuals, key=lambda row: abs(row.residual))
+            lines.append(
+                f"  and {len(self.residuals) - MOST_ROWS} more; largest {largest.label} {largest.residual:+.2f}"
+            )
         return "\n".join(lines)
 
 
@@ -246,9 +248,9 @@ def coordinate_covariance(jacobian: Float[np.ndarray, "residuals unknowns"]) -> 
     values, directions = _singular(jacobian / norms)
     seen = values > NO_SLOPE * max(values[0], 1e-300)
     covariance = (directions[seen].T / values[seen] ** 2) @ directions[seen] / np.outer(norms, norms)
-    open_ = np.any(np.abs(directions[~seen]) > 1e-6, axis=0)
-    covariance[open_, :] = covariance[:, open_] = 0.0
-    covariance[open_, open_] = np.inf
+    is_undetermined = np.any(np.abs(directions[~seen]) > 1e-6, axis=0)
+    covariance[is_undetermined, :] = covariance[:, is_undetermined] = 0.0
+    covariance[is_undetermined, is_undetermined] = np.inf
     return covariance
 
 
@@ -269,8 +271,8 @@ def identifiability(problem: Problem, estimates: Any, slopes: Any, jacobian: Any
     units = np.array(
         [abs(x) if unknown.positive else unknown.unit for x, unknown in zip(estimates, problem.unknowns, strict=True)]
     )
-    scaled = np.asarray(jacobian) * units / np.where(slopes == 0.0, 1.0, slopes)
-    values, directions = _singular(scaled)
+    relative = np.asarray(jacobian) * units / np.where(slopes == 0.0, 1.0, slopes)
+    values, directions = _singular(relative)
     words = tuple(_in_words(problem, direction) for direction in directions)
     return Identifiability(values, directions, words)
 
@@ -278,9 +280,9 @@ def identifiability(problem: Problem, estimates: Any, slopes: Any, jacobian: Any
 def _in_words(problem: Problem, direction: Float[np.ndarray, " unknowns"]) -> str:
     """The parameters that change together: in per cent if a parameter cannot be negative, otherwise in hundredths of
     its unit."""
-    most = np.argmax(np.abs(direction))
+    largest = np.argmax(np.abs(direction))
     parts = []
-    for share, (name, free) in zip(direction / direction[most], problem.free, strict=True):
+    for share, (name, free) in zip(direction / direction[largest], problem.free, strict=True):
         if abs(share) >= LEAST_SHARE:
             parts.append(f"{name} {share:+.2g} %" if free.positive else f"{name} {0.01 * share * free.unit:+.2g}")
     return ", ".join(parts)
@@ -296,8 +298,8 @@ def summarise(
     at_ends: Linearised,
 ) -> Identification:
     """The result of fits from several starts: the best fit, with a record of the other fits."""
-    known = np.any(np.isfinite(at_ends.prediction), axis=1) & np.all(np.isfinite(ends), axis=1)
-    deviances = np.where(known & np.isfinite(at_ends.deviance), at_ends.deviance, np.inf)
+    valid = np.any(np.isfinite(at_ends.prediction), axis=1) & np.all(np.isfinite(ends), axis=1)
+    deviances = np.where(valid & np.isfinite(at_ends.deviance), at_ends.deviance, np.inf)
     statuses = tuple(
         "failed" if np.isinf(deviance) else "converged" if has_converged else "not_converged"
         for deviance, has_converged in zip(deviances, converged, strict=True)
@@ -306,12 +308,15 @@ def summarise(
     optimum, names = ends[best], problem.names
     values = np.asarray(problem.values(jnp.asarray(ends)))
     slopes = np.array(
-        [float(jax.grad(unknown.value)(at)) for at, unknown in zip(optimum, problem.unknowns, strict=True)]
+        [
+            float(jax.grad(unknown.value)(coordinate))
+            for coordinate, unknown in zip(optimum, problem.unknowns, strict=True)
+        ]
     )
     covariance = coordinate_covariance(at_ends.whole_information[best])
     with np.errstate(invalid="ignore"):
         by_value = np.where(covariance == 0.0, 0.0, covariance * np.outer(slopes, slopes))
-    begins = np.asarray(problem.values(jnp.asarray(starts)))
+    start_values = np.asarray(problem.values(jnp.asarray(starts)))
     numbers = (
         measurements.value,
         measurements.error,
@@ -332,7 +337,7 @@ def summarise(
         identifiability=combinations,
         residuals=tuple(ResidualRow(*row) for row in table),
         status=statuses[best],
-        starts=dict(zip(names, begins.T, strict=True)),
+        starts=dict(zip(names, start_values.T, strict=True)),
         ends=dict(zip(names, values.T, strict=True)),
         end_deviances=deviances,
         statuses=statuses,
@@ -362,8 +367,10 @@ def agreement(
     likelihood, and all."""
     errors = np.sqrt(np.diag(covariance))
     with np.errstate(invalid="ignore"):
-        off = np.abs(ends - ends[best]) / errors
+        distances = np.abs(ends - ends[best]) / errors
     # Parameters of infinite error are ignored: their value does not matter.
-    near = np.all(np.where(np.isfinite(errors), off, 0.0) < CLOSE, axis=1) | (deviances < deviances[best] + SAME)
-    agree = near & (deviances < deviances[best] + 1.0)
+    is_close = np.all(np.where(np.isfinite(errors), distances, 0.0) < CLOSE, axis=1) | (
+        deviances < deviances[best] + SAME
+    )
+    agree = is_close & (deviances < deviances[best] + 1.0)
     return int(np.sum(agree)), int(np.sum(~agree & (deviances < deviances[best] + RIVAL))), len(ends)

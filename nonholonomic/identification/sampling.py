@@ -74,8 +74,8 @@ class Draws(NamedTuple):
         values = {name: np.asarray(value) for name, value in density.values(jnp.asarray(coordinates)).items()}
         draws = map(np.asarray, _diagnosed(coordinates))
         # For a single unknown, these are numbers instead of lists.
-        named = (dict(zip(density.names, numbers.reshape(-1).tolist(), strict=True)) for numbers in draws)
-        return cls(values, coordinates, *named, accepted=accepted, runs=runs, units=density.units)
+        draws_by_name = (dict(zip(density.names, numbers.reshape(-1).tolist(), strict=True)) for numbers in draws)
+        return cls(values, coordinates, *draws_by_name, accepted=accepted, runs=runs, units=density.units)
 
     def __str__(self) -> str:
         width = max(map(len, self.values))
@@ -125,28 +125,31 @@ def sample(
     1.00
     """
     require_package("blackjax", "bayes", "sample")
-    for name, value, least in (("chains", chains, 2), ("warmup", warmup, 0), ("draws", draws, 2), ("seed", seed, 0)):
-        require_whole(value, name, least)
+    for name, value, lower in (("chains", chains, 2), ("warmup", warmup, 0), ("draws", draws, 2), ("seed", seed, 0)):
+        require_whole(value, name, lower)
     require_flag(progress, "progress")
     random = np.random.default_rng(seed)
-    kept, accepted = [], 0.0
-    with Progress(warmup + draws, "step", shown=progress) as shown:
+    samples, accepted = [], 0.0
+    with Progress(warmup + draws, "step", shown=progress) as display:
         surrogate, walk, runs = learn(Surrogate.around(density, centre, covariance), chains, random)
         surrogate = surrogate.to_power(PROPOSING)
-        at, log_density = _with_ratio(surrogate, walk.points)
-        shown.begin()
+        coordinates, log_density = _with_ratio(surrogate, walk.points)
+        display.begin()
         for step in range(warmup + draws):
-            ahead = _walked(surrogate, _key(random), walk, jnp.asarray(False))
-            tried, proposed_log_density = _with_ratio(surrogate, ahead.points)
-            taken = np.log(random.uniform(size=chains)) < proposed_log_density - log_density
-            at, log_density = np.where(taken[:, None], tried, at), np.where(taken, proposed_log_density, log_density)
-            walk = walk._replace(points=jnp.where(taken[:, None], ahead.points, walk.points))
+            proposal = _walked(surrogate, _key(random), walk, jnp.asarray(False))
+            proposed, proposed_log_density = _with_ratio(surrogate, proposal.points)
+            accept = np.log(random.uniform(size=chains)) < proposed_log_density - log_density
+            coordinates, log_density = (
+                np.where(accept[:, None], proposed, coordinates),
+                np.where(accept, proposed_log_density, log_density),
+            )
+            walk = walk._replace(points=jnp.where(accept[:, None], proposal.points, walk.points))
             if step >= warmup:
-                accepted += float(np.mean(taken)) / draws
-                kept.append(at)
-            shown.advance(1)
+                accepted += float(np.mean(accept)) / draws
+                samples.append(coordinates)
+            display.advance(1)
     with status_line("diagnosing the draws", progress):
-        return Draws.of(density, np.stack(kept, axis=1), accepted, runs + chains * (warmup + draws + 1))
+        return Draws.of(density, np.stack(samples, axis=1), accepted, runs + chains * (warmup + draws + 1))
 
 
 class Walk(NamedTuple):
@@ -166,30 +169,30 @@ def learn(surrogate: Surrogate, chains: int, random: np.random.Generator) -> tup
     from blackjax.adaptation.step_size import dual_averaging_adaptation
 
     surrogate, density, runs = surrogate.to_power(LEARNING), surrogate.density, surrogate.runs_a_round
-    begin = dual_averaging_adaptation(ACCEPTED)[0]
+    adaptation_init = dual_averaging_adaptation(ACCEPTED)[0]
     points = random.normal(size=(runs, len(surrogate.centre)))
-    drawn, pool = np.asarray(_at(surrogate, points)), []
+    points_drawn, pool = np.asarray(_at(surrogate, points)), []
     for turn in range(ROUNDS):
-        chosen = random.permutation(drawn)[:runs]
-        predicted = np.asarray(_predicted(density, chosen))
-        true = np.asarray(_log_density(density, chosen, predicted))
+        selection = random.permutation(points_drawn)[:runs]
+        predicted = np.asarray(_predicted(density, selection))
+        exact = np.asarray(_log_density(density, selection, predicted))
         if (
             turn >= LEAST
-            and np.std(true - _log_density(density, chosen, _surrogate_predicted(surrogate, chosen))) < PREDICTED
+            and np.std(exact - _log_density(density, selection, _surrogate_predicted(surrogate, selection))) < PREDICTED
         ):
             break
-        pool.append((chosen, predicted, true))
+        pool.append((selection, predicted, exact))
         surrogate = surrogate.learned(*(np.concatenate(parts) for parts in zip(*pool, strict=True)))
         if turn > 0:
-            surrogate, points = surrogate.recentred(drawn)
+            surrogate, points = surrogate.recentred(points_drawn)
         # Convert to arrays, because a Python number would become a constant of the program.
-        adaptation = jax.tree.map(np.asarray, begin(1.0 / len(surrogate.centre) ** 0.25))
+        adaptation = jax.tree.map(np.asarray, adaptation_init(1.0 / len(surrogate.centre) ** 0.25))
         walk, path = Walk(jnp.asarray(points[-chains:]), adaptation), []
         for _ in range(-(-2 * runs // chains)):
             walk = _walked(surrogate, _key(random), walk, jnp.asarray(True))
             path.append(np.asarray(_at(surrogate, walk.points)))
         # Discard the first half as warm-up.
-        drawn = np.concatenate(path[len(path) // 2 :])
+        points_drawn = np.concatenate(path[len(path) // 2 :])
     return surrogate, walk, runs * (1 + turn)
 
 
@@ -203,9 +206,9 @@ def _with_ratio(
 ) -> tuple[Float[np.ndarray, "chains unknowns"], Float[np.ndarray, " chains"]]:
     """The coordinates of some points, and the log ratio of the posterior to the surrogate's proposal density there."""
     density, coordinates = surrogate.density, np.asarray(_at(surrogate, points))
-    true = _log_density(density, coordinates, _predicted(density, coordinates))
+    exact = _log_density(density, coordinates, _predicted(density, coordinates))
     surrogate_value = _log_density(density, coordinates, _surrogate_predicted(surrogate, coordinates))
-    return coordinates, np.asarray(true - surrogate.power * surrogate_value)
+    return coordinates, np.asarray(exact - surrogate.power * surrogate_value)
 
 
 # Compiled functions also accept NumPy arrays.
@@ -247,8 +250,8 @@ def _walked(surrogate: Surrogate, key: Array, walk: Walk, adapting: Bool[Array, 
         length = jnp.exp(jnp.where(adapting, state.log_step_size, state.log_step_size_avg))
 
         def step(key: Array, point: Float[Array, " unknowns"]) -> tuple[Array, Array]:
-            begun = blackjax.nuts.init(point, surrogate)
-            ended, info = kernel(key, begun, surrogate, length, round_mass, max_num_doublings=DOUBLINGS)
+            initial = blackjax.nuts.init(point, surrogate)
+            ended, info = kernel(key, initial, surrogate, length, round_mass, max_num_doublings=DOUBLINGS)
             return ended.position, info.acceptance_rate
 
         points, accepted = jax.vmap(step)(jax.random.split(key, len(walk.points)), walk.points)

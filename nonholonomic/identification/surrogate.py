@@ -59,16 +59,16 @@ class Surrogate(eqx.Module):
             )
         if np.shape(centre) != (numbers,):
             raise ValueError(f"centre = {centre!r} must be of shape {(numbers,)}")
-        series, open_ = np.asarray(density.measurements.series), np.asarray(density.measurements.estimated)
-        sizes = [math.sqrt(0.5 / np.sum(open_ & (series == number))) for number in density.open_series]
+        series, estimated = np.asarray(density.measurements.series), np.asarray(density.measurements.estimated)
+        sizes = [math.sqrt(0.5 / np.sum(estimated & (series == number))) for number in density.open_series]
         root = np.zeros((numbers + len(sizes),) * 2)
         root[:numbers, :numbers] = np.linalg.cholesky(covariance)
         root[numbers:, numbers:] = np.diag(sizes)
-        whole = np.concatenate([np.asarray(centre, float), np.zeros(len(sizes))])
+        mean = np.concatenate([np.asarray(centre, float), np.zeros(len(sizes))])
         coefficients = jnp.zeros((len(_factors(numbers)), density.measurements.value.size))
         scale = np.linalg.inv(root[:numbers, :numbers])
         bends = np.concatenate([root[None], np.zeros((BENT - 1, *root.shape))])
-        arrays = map(jnp.asarray, (whole, bends, 1.0, whole[:numbers], scale))
+        arrays = map(jnp.asarray, (mean, bends, 1.0, mean[:numbers], scale))
         middle, bends, power, origin, scale = arrays
         return cls(density, middle, bends, power, origin, scale, coefficients)
 
@@ -97,17 +97,17 @@ class Surrogate(eqx.Module):
     ) -> "Surrogate":
         """The surrogate with the polynomials that best fit the predictions of the given runs, with more weight for
         likely runs."""
-        known = np.all(np.isfinite(predictions), axis=1)
-        if not np.any(known):
+        valid = np.all(np.isfinite(predictions), axis=1)
+        if not np.any(valid):
             raise ValueError("density: the model has no predictions within the covariance around the centre")
         # An angle that jumps by a whole turn is not a polynomial.
-        middle = predictions[np.argmax(np.where(known, log_densities, -np.inf))]
+        middle = predictions[np.argmax(np.where(valid, log_densities, -np.inf))]
         predictions = predictions - np.asarray(self.density.measurements.whole_periods(predictions - middle))
-        below = np.max(log_densities[known]) - log_densities[known]
-        weights = 1.0 / np.sqrt(1.0 + below / len(self.centre))
+        deficit = np.max(log_densities[valid]) - log_densities[valid]
+        weights = 1.0 / np.sqrt(1.0 + deficit / len(self.centre))
         # Use NumPy, because the number of runs grows from round to round.
-        terms = self._terms(np, coordinates[known])
-        coefficients, *_ = np.linalg.lstsq(terms * weights[:, None], predictions[known] * weights[:, None])
+        terms = self._terms(np, coordinates[valid])
+        coefficients, *_ = np.linalg.lstsq(terms * weights[:, None], predictions[valid] * weights[:, None])
         return eqx.tree_at(lambda surrogate: surrogate.coefficients, self, jnp.asarray(coefficients))
 
     def recentred(
@@ -122,16 +122,16 @@ class Surrogate(eqx.Module):
         centre = coordinates.mean(axis=0)
         axes = np.linalg.eigh(np.atleast_2d(np.cov(coordinates.T)))[1][:, ::-1]
         count, unknowns = coordinates.shape
-        along, points = (coordinates - centre) @ axes, np.zeros((count, unknowns))
+        projection, points = (coordinates - centre) @ axes, np.zeros((count, unknowns))
         bends, shift = np.zeros((BENT, unknowns, unknowns)), np.zeros(unknowns)
         for k in range(unknowns):
             powers = np.concatenate([points[:, :k] ** (p + 1) for p in range(BENT)], axis=1)
             terms = np.concatenate([np.ones((count, 1)), powers], axis=1)
-            fitted, *_ = np.linalg.lstsq(terms, along[:, k])
-            rest = along[:, k] - terms @ fitted
-            bends[0, k, k], shift[k] = np.std(rest), fitted[0]
-            points[:, k] = rest / bends[0, k, k]
-            bends[:, k, :k] = fitted[1:].reshape(BENT, k)
+            coefficients, *_ = np.linalg.lstsq(terms, projection[:, k])
+            remainder = projection[:, k] - terms @ coefficients
+            bends[0, k, k], shift[k] = np.std(remainder), coefficients[0]
+            points[:, k] = remainder / bends[0, k, k]
+            bends[:, k, :k] = coefficients[1:].reshape(BENT, k)
         new = (centre + axes @ shift, axes @ bends)
         return eqx.tree_at(
             lambda surrogate: (surrogate.centre, surrogate.bends), self, tuple(map(jnp.asarray, new))
@@ -144,8 +144,8 @@ class Surrogate(eqx.Module):
     def _terms(self, xp: Any, coordinates: Float[Any, "... unknowns"]) -> Float[Any, "... terms"]:
         """The terms of the polynomials. **Arguments:** `xp`: `numpy` or `jax.numpy`."""
         x = (coordinates[..., : len(self.origin)] - xp.asarray(self.origin)) @ xp.asarray(self.scale).T
-        ones = xp.ones_like(x[..., :1])
-        return xp.prod(xp.concatenate([ones, x], axis=-1)[..., _factors(len(self.origin))], axis=-1)
+        unit_column = xp.ones_like(x[..., :1])
+        return xp.prod(xp.concatenate([unit_column, x], axis=-1)[..., _factors(len(self.origin))], axis=-1)
 
 
 def _factors(numbers: int) -> np.ndarray:

@@ -157,6 +157,6 @@ def draw_starts(free: dict[str, Free], count: int, spread: float, seed: int) -> 
             for unknown in free.values()
         ]
     )
-    drawn = centre + reach * np.random.default_rng(seed).uniform(-1.0, 1.0, (count, len(free)))
-    drawn[0] = centre
-    return drawn
+    coordinates = centre + reach * np.random.default_rng(seed).uniform(-1.0, 1.0, (count, len(free)))
+    coordinates[0] = centre
+    return coordinates

@@ -112,8 +112,8 @@ def judge(
     p_value = math.nan if estimated or degrees < 1 else chi_squared_tail(float(np.sum(scores[exact] ** 2)), degrees)
     numbers = np.asarray(measurements.series)
     parts = [scores[exact & (numbers == number)] for number in np.unique(numbers)]
-    seen = tuple(runs for runs in map(runs_of_signs, parts) if runs.count > 1)
-    noisy = [runs_of_signs(part).p_value for part in parts if np.any(np.abs(part) > NEGLIGIBLE)]
+    series = tuple(runs for runs in map(runs_of_signs, parts) if runs.count > 1)
+    p_values = [runs_of_signs(part).p_value for part in parts if np.any(np.abs(part) > NEGLIGIBLE)]
     agree, rivals, starts = agreement
     limits = np.abs(residual[~exact])
     concerns = []
@@ -129,17 +129,18 @@ def judge(
         )
     if np.any(limits > FAR):
         concerns.append(f"{int(np.sum(limits > FAR))} limits are violated by more than {FAR:.0f} errors")
-    few = min(noisy, default=1.0) * max(len(noisy), 1)
-    if few < POOR:
+    p_trend = min(p_values, default=1.0) * max(len(p_values), 1)
+    if p_trend < POOR:
         concerns.append(
-            f"the residuals keep their sign for too long (p = {few:.2g}): the model misses a trend, or errors are correlated"
+            f"the residuals keep their sign for too long (p = {p_trend:.2g}): the model misses a trend, or "
+            "errors are correlated"
         )
     if rivals:
         concerns.append(f"{rivals} of {starts} starts ended elsewhere and explain the data nearly as well")
     if starts > 1 and agree == 1:
         concerns.append(f"only one of {starts} starts ended here: there may be better minima; give more starts")
     concerns += [f"the data do not determine {words}" for words in undetermined]
-    return Verdict(p_value, seen, agree, starts, undetermined, tuple(concerns))
+    return Verdict(p_value, series, agree, starts, undetermined, tuple(concerns))
 
 
 def normal_scores(measurements: Measurements, prediction: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -176,14 +177,17 @@ def runs_of_signs(values: Float[np.ndarray, " n"]) -> Series:
         return Series(len(signs), runs, min(1.0, 2.0 ** (1 - len(signs))) if len(signs) else 1.0)
 
     def log_choose(n: int, k: np.ndarray) -> np.ndarray:
-        inside = (k >= 0) & (k <= n)
-        at = np.where(inside, k, 0)
-        return np.where(inside, gammaln(n + 1.0) - gammaln(at + 1.0) - gammaln(n - at + 1.0), -np.inf)
+        is_valid = (k >= 0) & (k <= n)
+        k_valid = np.where(is_valid, k, 0)
+        return np.where(is_valid, gammaln(n + 1.0) - gammaln(k_valid + 1.0) - gammaln(n - k_valid + 1.0), -np.inf)
 
     # For r runs, the positive signs are cut into r // 2 runs and the negative ones into r - r // 2, or the other way
     # round.
     counts = np.arange(2, runs + 1)
-    less, more = counts // 2 - 1, counts - counts // 2 - 1
-    whole = log_choose(positive + negative, np.array(positive))
-    ways = [log_choose(a - 1, less) + log_choose(b - 1, more) for a, b in ((positive, negative), (negative, positive))]
-    return Series(len(signs), runs, min(1.0, float(np.sum(np.exp(np.array(ways) - whole)))))
+    few_cuts, many_cuts = counts // 2 - 1, counts - counts // 2 - 1
+    total = log_choose(positive + negative, np.array(positive))
+    ways = [
+        log_choose(a - 1, few_cuts) + log_choose(b - 1, many_cuts)
+        for a, b in ((positive, negative), (negative, positive))
+    ]
+    return Series(len(signs), runs, min(1.0, float(np.sum(np.exp(np.array(ways) - total)))))

@@ -2,9 +2,8 @@
 
 `solve_ensemble` runs many cells of a problem in lanes that step together; `follow` and `sample` integrate single runs
 with any solver of Diffrax. `solve_by_diffrax` is an independent reference. Hybrid runs are in `nonholonomic.hybrid`.
-`Settings` holds the options. The status codes of a run are `RUNNING`, `REACHED_END` (at the horizon), `CROSSED` (on the
-event), `LEFT_DOMAIN`, `FAILED` and `UNRESOLVED`. The limits are `DEFAULT_MAX_STEPS`, `MOST_STEPS` for runs that should
-be short, and `TIGHTEST`, the smallest tolerance.
+`Settings` holds the options. Import more from three modules of this subpackage: the codes of how a run ended from
+`status`, checks of arguments from `checks`, and zeros of functions from `zeros`.
 
 A `nonholonomic.AbstractMode` has functions of one state, and the package maps them over cells. An `AbstractProblem` has
 functions of all cells at once: components along the first axis, cells along the last. `Lanes` is the type of one number
@@ -39,7 +38,6 @@ per cell, and `States` the type of the states of all cells.
 
 from .dense import DenseSolution as DenseSolution
 from .dense import follow as follow
-from .dense import padded as padded
 from .dense import sample as sample
 from .ensemble import solve_ensemble as solve_ensemble
 from .ensemble import traced_solve_ensemble as traced_solve_ensemble
@@ -56,25 +54,5 @@ from .runge_kutta import States as States
 from .runge_kutta import explicit_tableau as explicit_tableau
 from .samples import solve_with_samples as solve_with_samples
 from .scheduler import Outcome as Outcome
-from .settings import DEFAULT_MAX_STEPS as DEFAULT_MAX_STEPS
-from .settings import MOST_STEPS as MOST_STEPS
-from .settings import TIGHTEST as TIGHTEST
 from .settings import Settings as Settings
-from .settings import legal_run as legal_run
-from .settings import require_adaptive as require_adaptive
-from .settings import require_adjoint as require_adjoint
-from .settings import require_run as require_run
-from .settings import require_times as require_times
-from .settings import run_bounds as run_bounds
-from .settings import tolerance_bound as tolerance_bound
-from .status import CROSSED as CROSSED
-from .status import FAILED as FAILED
-from .status import LEFT_DOMAIN as LEFT_DOMAIN
-from .status import REACHED_END as REACHED_END
-from .status import RUNNING as RUNNING
-from .status import UNRESOLVED as UNRESOLVED
-from .status import Status as Status
 from .step import LaneState as LaneState
-from .zeros import few_trials as few_trials
-from .zeros import halved as halved
-from .zeros import sign_changes as sign_changes

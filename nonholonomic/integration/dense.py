@@ -12,6 +12,7 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Bool, Float, Int
 
+from ..compiled_programs import padded
 from .problem import AbstractProblem
 from .settings import Settings
 from .zeros import halved
@@ -23,9 +24,6 @@ PIECE = 2048
 #: margin checked, for all steps of a segment. With 2048 a short flight of a top takes 37 ms and 5 MB, with 128 it takes
 #: 7 ms and 0.4 MB.
 PIECE_OF_MODE = 128
-
-#: Least number of times at which a program evaluates a run: few runs are so long that more sizes are worth a compilation.
-LEAST_PADDED = 256
 
 #: Places in every step at which the domain margin is checked, besides the ends of the step.
 LOOKS = np.arange(1, 8) / 8.0
@@ -54,27 +52,10 @@ class DenseSolution(NamedTuple):
         """States at the given times, by the dense output; times must lie within the run."""
         states = np.repeat(self.states[:, :1], len(times), axis=1)
         for segment in self.segments:
-            within = (times > float(segment.t0)) & (times <= float(segment.t1))
-            if within.any():
-                states[:, within] = np.asarray(_evaluate(segment, padded(times[within], len(times)))).T[
-                    :, : within.sum()
-                ]
+            mask = (times > float(segment.t0)) & (times <= float(segment.t1))
+            if mask.any():
+                states[:, mask] = np.asarray(_evaluate(segment, padded(times[mask], len(times)))).T[:, : mask.sum()]
         return states
-
-
-def padded(values: Float[np.ndarray, "... times"], least: int) -> Float[np.ndarray, "... more"]:
-    """Values padded to a power of two of at least `least` and `LEAST_PADDED` by repeating the last one, so that one
-    program serves many sizes.
-
-    **Example:**
-
-    >>> import numpy as np
-    >>> from nonholonomic.integration import padded
-    >>> padded(np.array([1.0, 2.0, 3.0]), least=300).shape
-    (512,)
-    """
-    more = (1 << (max(least, LEAST_PADDED) - 1).bit_length()) - values.shape[-1]
-    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, more)], mode="edge")
 
 
 @eqx.filter_jit
@@ -140,13 +121,13 @@ def _piece(
     )
     ends, _ = saved(solution)
     lengths = jnp.where(jnp.isfinite(ends[1:]), ends[1:] - ends[:-1], 0.0)
-    begins = jnp.where(jnp.isfinite(ends[:-1]), ends[:-1], t0)
+    starts = jnp.where(jnp.isfinite(ends[:-1]), ends[:-1], t0)
 
     def least(begin, length):
-        at = begin + length * jnp.asarray([*LOOKS, 1.0])
-        return jnp.min(jax.vmap(lambda t: _guard(problem, t, solution.evaluate(t)))(at))
+        points = begin + length * jnp.asarray([*LOOKS, 1.0])
+        return jnp.min(jax.vmap(lambda t: _guard(problem, t, solution.evaluate(t)))(points))
 
-    domain_margins = jax.vmap(least)(begins, lengths) if watched else jnp.ones_like(lengths)
+    domain_margins = jax.vmap(least)(starts, lengths) if watched else jnp.ones_like(lengths)
     return solution, domain_margins
 
 
@@ -191,32 +172,32 @@ def follow(
     end, lost, failed = jnp.asarray(t1, state.dtype), False, False
     length = None if first is None else jnp.asarray(first, state.dtype)
     # The program is compiled for this number of steps, so it must not change with the number that is left.
-    each = dataclasses.replace(settings, max_steps=min(piece, settings.max_steps))
+    piece_settings = dataclasses.replace(settings, max_steps=min(piece, settings.max_steps))
     if margin is not None and float(margin) <= 0.0:
         return DenseSolution(times[0], states[0], [], True, False, 0, 0)
     while float(time) < t1 and not (lost or failed):
-        solution, domain_margins = _piece(problem, time, end, length, state, scales, each, dense)
+        solution, domain_margins = _piece(problem, time, end, length, state, scales, piece_settings, dense)
         steps = int(solution.stats["num_accepted_steps"])
         accepted, rejected = accepted + steps, rejected + int(solution.stats["num_rejected_steps"])
         ts, ys = saved(solution)
         # Cut as NumPy arrays: a slice by JAX would be compiled for every number of steps.
         ts, ys = np.asarray(ts)[1 : steps + 1], np.asarray(ys)[1 : steps + 1].T
         finite = np.isfinite(ts) & np.all(np.isfinite(ys), axis=0)
-        out = np.flatnonzero(np.asarray(domain_margins)[:steps] < 0.0)
-        if out.size:
-            lost, steps = True, int(out[0]) + 1
-            begin = float(ts[out[0] - 1]) if out[0] else float(time)
+        outside = np.flatnonzero(np.asarray(domain_margins)[:steps] < 0.0)
+        if outside.size:
+            lost, steps = True, int(outside[0]) + 1
+            begin = float(ts[outside[0] - 1]) if outside[0] else float(time)
             ts, ys, finite = ts[:steps].copy(), ys[:, :steps].copy(), finite[:steps]
             ts[-1] = float(_loss(problem, solution, jnp.asarray(begin), jnp.asarray(ts[-1])))
             ys[:, -1] = np.asarray(_evaluate(solution, ts[-1:]))[0]
         failed = steps == 0 or not finite.all()
-        good = int(finite.sum()) if finite.all() else int(np.argmin(finite))
-        times.append(ts[:good])
-        states.append(ys[:, :good])
+        valid_steps = int(finite.sum()) if finite.all() else int(np.argmin(finite))
+        times.append(ts[:valid_steps])
+        states.append(ys[:, :valid_steps])
         segments.append(solution)
-        if good:
-            length = jnp.asarray(ts[-1] - (ts[-2] if good > 1 else float(time)))
-            time, state = jnp.asarray(ts[good - 1]), jnp.asarray(ys[:, good - 1])
+        if valid_steps:
+            length = jnp.asarray(ts[-1] - (ts[-2] if valid_steps > 1 else float(time)))
+            time, state = jnp.asarray(ts[valid_steps - 1]), jnp.asarray(ys[:, valid_steps - 1])
         failed = failed or (not lost and bool(solution.result == diffrax.RESULTS.dt_min_reached))
         failed = failed or (not lost and float(time) < t1 and accepted + rejected >= settings.max_steps)
     return DenseSolution(
@@ -300,9 +281,9 @@ def sample(
     )
     if times is None:
         assert grid is not None
-        times, every, most = grid, diffrax.SubSaveAt(t0=True, steps=True), grid.size - 1
+        times, save_at, max_points = grid, diffrax.SubSaveAt(t0=True, steps=True), grid.size - 1
     else:
-        every, most = diffrax.SubSaveAt(ts=jnp.minimum(times, t1)), settings.max_steps
+        save_at, max_points = diffrax.SubSaveAt(ts=jnp.minimum(times, t1)), settings.max_steps
     if grid is None:
         controller = diffrax.ClipStepSizeController(_control(settings, scales), step_ts=jnp.minimum(times, t1))
     else:
@@ -316,8 +297,8 @@ def sample(
         state,
         args=problem,
         stepsize_controller=controller,
-        saveat=diffrax.SaveAt(subs=[every, diffrax.SubSaveAt(t1=True)]),
-        max_steps=most,
+        saveat=diffrax.SaveAt(subs=[save_at, diffrax.SubSaveAt(t1=True)]),
+        max_steps=max_points,
         event=event if watched else None,
         adjoint=diffrax.ForwardMode() if adjoint is None else adjoint,
         throw=False,

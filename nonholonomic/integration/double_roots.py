@@ -35,7 +35,7 @@ ON_MARGIN = 1e-10
 
 
 def missed_double_root(
-    function: Callable[[States], Lanes | None], side: Lanes, before: tuple[States, States], tried: Step, length: Lanes
+    function: Callable[[States], Lanes | None], side: Lanes, start: tuple[States, States], trial: Step, length: Lanes
 ) -> Lanes:
     """Fraction of a step at which a function may fall below zero and return; 2 if nowhere. This is the minimum of the
     cubic through values and derivatives at both ends, if the minimum is far below both values.
@@ -43,17 +43,17 @@ def missed_double_root(
     **Arguments:**
 
     - `function`: function of the state; where `side` is -1, its negative is used.
-    - `before`: state and rate at the start of the step; `tried`: the step, of the given `length` [s].
+    - `start`: state and rate at the start of the step; `trial`: the step, of the given `length` [s].
     """
-    state, rate = before
+    state, rate = start
     if function(state) is None:
         return jnp.full_like(length, 2.0)
     low, fall = jax.jvp(function, (state,), (rate,))
-    high, rise = jax.jvp(function, (tried.state,), (tried.rate,))
+    high, rise = jax.jvp(function, (trial.state,), (trial.rate,))
     low, high = side * low, side * high
-    at, least = _minimum(low, side * fall * length, high, side * rise * length)
-    dips = (least < DIP * jnp.minimum(low, high)) & (at > 0.02) & (at < 0.98)
-    return jnp.where(dips, at, 2.0)
+    place, minimum = _minimum(low, side * fall * length, high, side * rise * length)
+    dips = (minimum < DIP * jnp.minimum(low, high)) & (place > 0.02) & (place < 0.98)
+    return jnp.where(dips, place, 2.0)
 
 
 def missed_loss(
@@ -74,18 +74,18 @@ def missed_loss(
     if margins is None or len(places) < 3:
         return jnp.full(free.shape, 2.0)
     values = list(jnp.unstack(margins))
-    inside, at_end = functools.reduce(jnp.minimum, values[1:-1]), jnp.minimum(values[0], values[-1])
-    lowest = jnp.minimum(inside, at_end)
-    spread = functools.reduce(jnp.maximum, values) - lowest
-    suspect = free & (lowest < jnp.where(inside < at_end, SUSPECT_INSIDE, SUSPECT_AT_END) * spread)
+    inner_least, at_end = functools.reduce(jnp.minimum, values[1:-1]), jnp.minimum(values[0], values[-1])
+    least_value = jnp.minimum(inner_least, at_end)
+    scale = functools.reduce(jnp.maximum, values) - least_value
+    suspect = free & (least_value < jnp.where(inner_least < at_end, SUSPECT_INSIDE, SUSPECT_AT_END) * scale)
     # Where a mode begins with a margin of 0, this zero does not end the mode. If the margin rises from there with slope
     # 0, the parabola may fall at first.
     suspect &= values[0] > ON_MARGIN
 
     def first_minimum() -> Lanes:
-        place, least = _least_minimum(places, values, lowest)
-        error = SCATTER * spread * 4.0 * place * (1.0 - place)
-        dips = suspect & (place > 0.0) & (place < 1.0) & (least < error)
+        place, minimum = _least_minimum(places, values, least_value)
+        error = SCATTER * scale * 4.0 * place * (1.0 - place)
+        dips = suspect & (place > 0.0) & (place < 1.0) & (minimum < error)
         return jnp.min(jnp.where(dips, place, 2.0), axis=0)
 
     # A branch, because few steps come near a zero.
@@ -103,15 +103,15 @@ def _minimum(
     cubic = 3.0 * (fall + rise - 2.0 * (high - low))
     square = 3.0 * (high - low) - 2.0 * fall - rise
     root = square + jnp.sqrt(jnp.maximum(square * square - cubic * fall, 0.0))
-    at = -fall / jnp.where(root == 0.0, 1.0, root)
-    least = low + at * (fall + at * (square + at * cubic / 3.0))
-    return jnp.where((fall < 0.0) & (rise > 0.0), at, 2.0), least
+    place = -fall / jnp.where(root == 0.0, 1.0, root)
+    minimum = low + place * (fall + place * (square + place * cubic / 3.0))
+    return jnp.where((fall < 0.0) & (rise > 0.0), place, 2.0), minimum
 
 
 def _least_minimum(
     places: Float[np.ndarray, " places"],
     values: list[Float[Array, "margins lanes"]],
-    lowest: Float[Array, "margins lanes"],
+    least_value: Float[Array, "margins lanes"],
 ) -> tuple[Float[Array, "margins lanes"], Float[Array, "margins lanes"]]:
     """Place and value of the minimum of the parabola through three neighbouring places: the place of the least value
     and its neighbours; if the least value is at an end of the step, the three places at that end. The place is 2 if the
@@ -121,17 +121,20 @@ def _least_minimum(
     """
     gaps = np.diff(places)
     # Divisions cost as much as everything else here, so they are left to constants.
-    slopes = [(after - before) * (1.0 / gap) for before, after, gap in zip(values[:-1], values[1:], gaps, strict=True)]
+    slopes = [
+        (slope_after - slope_before) * (1.0 / gap)
+        for slope_before, slope_after, gap in zip(values[:-1], values[1:], gaps, strict=True)
+    ]
 
     def about(k: int) -> tuple[Any, ...]:
         return slopes[k - 1], slopes[k], values[k], places[k], gaps[k - 1], 1.0 / (gaps[k - 1] + gaps[k])
 
-    chosen = about(len(places) - 2)
+    parabola = about(len(places) - 2)
     for k in range(len(places) - 3, 0, -1):
-        earlier = functools.reduce(jnp.minimum, values[: k + 1]) <= lowest
-        chosen = tuple(jnp.where(earlier, new, old) for new, old in zip(about(k), chosen, strict=True))
-    before, after, middle, place, gap, per_length = chosen
-    bend = (after - before) * per_length
-    slope = before + bend * gap
+        is_earlier = functools.reduce(jnp.minimum, values[: k + 1]) <= least_value
+        parabola = tuple(jnp.where(is_earlier, new, old) for new, old in zip(about(k), parabola, strict=True))
+    slope_before, slope_after, middle, place, gap, per_length = parabola
+    bend = (slope_after - slope_before) * per_length
+    slope = slope_before + bend * gap
     shift = 0.5 * slope / jnp.where(bend > 0.0, bend, 1.0)
     return jnp.where(bend > 0.0, place - shift, 2.0), middle - 0.5 * slope * shift

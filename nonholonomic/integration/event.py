@@ -35,46 +35,46 @@ class Bracket(NamedTuple):
 
 
 def refine(
-    bracketing: Bool[Array, " lanes"], was: Bracket, before: Lanes, margin: Lanes, length: Lanes
+    bracketing: Bool[Array, " lanes"], old_bracket: Bracket, old_margin: Lanes, margin: Lanes, length: Lanes
 ) -> tuple[Bracket, Lanes, Bool[Array, " lanes"]]:
     """Narrow the bracket with the result of a trial step (Anderson and Bjorck, BIT 13 (1973) 253).
 
     **Arguments:**
 
     - `bracketing`: which lanes have a bracket; any other lane opens its bracket with the step it just took.
-    - `was`: the bracket.
-    - `before`, `margin`: the margin at the start of the trial step and at its end.
+    - `old_bracket`: the bracket.
+    - `old_margin`, `margin`: the margin at the start of the trial step and at its end.
     - `length`: length of the trial step [s].
 
     **Returns:** the bracket, the length to try next, and whether the trial step ended on the event.
     """
-    opens = ~bracketing
+    is_new = ~bracketing
     replaces_high = margin <= 0.0
     # Just past an event the margin is round-off, or 0, and would lead back to that event.
-    start = jnp.maximum(before, -1e-3 * margin)
+    start = jnp.maximum(old_margin, -1e-3 * margin)
     # The retained end is given less weight, so that it moves too in the next trial.
-    weighted_low = was.margin_low * _fade(margin, was.margin_high)
-    weighted_high = was.margin_high * _fade(margin, was.margin_low)
+    weighted_low = old_bracket.margin_low * _fade(margin, old_bracket.margin_high)
+    weighted_high = old_bracket.margin_high * _fade(margin, old_bracket.margin_low)
     bracket = Bracket(
-        low=jnp.where(opens, 0.0, jnp.where(replaces_high, was.low, length)),
-        high=jnp.where(opens | replaces_high, length, was.high),
-        margin_low=jnp.where(opens, start, jnp.where(replaces_high, weighted_low, margin)),
-        margin_high=jnp.where(opens | replaces_high, margin, weighted_high),
-        stride=jnp.where(opens, length, was.stride),
-        trials=jnp.where(opens, 0, was.trials + 1),
+        low=jnp.where(is_new, 0.0, jnp.where(replaces_high, old_bracket.low, length)),
+        high=jnp.where(is_new | replaces_high, length, old_bracket.high),
+        margin_low=jnp.where(is_new, start, jnp.where(replaces_high, weighted_low, margin)),
+        margin_high=jnp.where(is_new | replaces_high, margin, weighted_high),
+        stride=jnp.where(is_new, length, old_bracket.stride),
+        trials=jnp.where(is_new, 0, old_bracket.trials + 1),
     )
     rise = bracket.margin_high - bracket.margin_low
     guess = bracket.low - bracket.margin_low * (bracket.high - bracket.low) / jnp.where(rise == 0.0, 1.0, rise)
     guess = jnp.where(jnp.isfinite(guess), jnp.clip(guess, bracket.low, bracket.high), bracket.high)
-    located = max(LOCATED, 8.0 * float(jnp.finfo(margin.dtype).eps)) * bracket.stride
-    tired = bracket.trials >= MOST_TRIALS
-    close = bracketing & ((jnp.abs(guess - length) <= 2.0 * located) | tired)
+    resolution = max(LOCATED, 8.0 * float(jnp.finfo(margin.dtype).eps)) * bracket.stride
+    is_exhausted = bracket.trials >= MOST_TRIALS
+    close = bracketing & ((jnp.abs(guess - length) <= 2.0 * resolution) | is_exhausted)
     # A run through a nonterminal event must restart beyond the event, or it would locate the same event again.
     is_located = close & replaces_high
-    beyond = jnp.where(tired, bracket.high, jnp.minimum(length + located, bracket.high))
-    return bracket, jnp.where(close & ~is_located, beyond, guess), is_located
+    length_beyond = jnp.where(is_exhausted, bracket.high, jnp.minimum(length + resolution, bracket.high))
+    return bracket, jnp.where(close & ~is_located, length_beyond, guess), is_located
 
 
-def _fade(margin: Lanes, replaced: Lanes) -> Lanes:
-    factor = 1.0 - margin / jnp.where(replaced == 0.0, 1.0, replaced)
+def _fade(margin: Lanes, old_margin: Lanes) -> Lanes:
+    factor = 1.0 - margin / jnp.where(old_margin == 0.0, 1.0, old_margin)
     return jnp.where(factor > 0.0, factor, 0.5)

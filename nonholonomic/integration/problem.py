@@ -167,8 +167,8 @@ def event_time(problem: AbstractProblem, function: Callable[[States], Any], time
     and the series t - g/g' - g'' g^2 / (2 g'^3) turns its variation into that of the time (implicit function theorem).
     """
 
-    def slope(at: States) -> Lanes:
-        return jax.jvp(function, (at,), (problem.field(time, at),))[1]
+    def slope(point: States) -> Lanes:
+        return jax.jvp(function, (point,), (problem.field(time, point),))[1]
 
     first, second = jax.jvp(slope, (state,), (problem.field(time, state),))
     first = jnp.where(first == 0.0, 1.0, first)

@@ -37,16 +37,16 @@ def solve_by_diffrax(
     >>> print(solve_by_diffrax(problem, jnp.asarray(5.0), settings).crossing_time.round(6))
     [0.693147 0.346574 0.173287]
     """
-    (starts, scales), rtol = problem.start(), settings.tolerance
-    varying = jax.tree.map(lambda leaf: None if jnp.ndim(leaf) == 0 else -1, problem)
+    (states, scales), rtol = problem.start(), settings.tolerance
+    lane_axes = jax.tree.map(lambda leaf: None if jnp.ndim(leaf) == 0 else -1, problem)
 
     def solve_cell(cell_problem: AbstractProblem, state: Array, scale: Array) -> Outcome:
         conditions = {
             CROSSED: None
-            if problem.event_function(starts) is None
+            if problem.event_function(states) is None
             else (lambda t, y, args, **_: args.event_function(y)),
             LEFT_DOMAIN: None
-            if problem.domain_margin(starts[0], starts) is None
+            if problem.domain_margin(states[0], states) is None
             else (lambda t, y, args, **_: args.domain_margin(t, y)),
         }
         conditions = {code: condition for code, condition in conditions.items() if condition is not None}
@@ -71,8 +71,8 @@ def solve_by_diffrax(
         ends, finals = saved(solution)
         end, final = ends[0], finals[0]
         status = jnp.where(end >= t1, REACHED_END, FAILED)
-        for code, happened, begun in zip(conditions, solution.event_mask or [], at_once, strict=True):
-            status = jnp.where(happened | begun, code, status)
+        for code, occurred, at_start in zip(conditions, solution.event_mask or [], at_once, strict=True):
+            status = jnp.where(occurred | at_start, code, status)
         return Outcome(
             status,
             jnp.where(status == CROSSED, end, jnp.inf),
@@ -83,5 +83,5 @@ def solve_by_diffrax(
             solution.stats["num_rejected_steps"],
         )
 
-    out = Outcome._make((0, 0, 0, 0, -1, 0, 0))
-    return jax.vmap(solve_cell, in_axes=(varying, -1, -1), out_axes=out)(problem, starts, scales)
+    axes = Outcome._make((0, 0, 0, 0, -1, 0, 0))
+    return jax.vmap(solve_cell, in_axes=(lane_axes, -1, -1), out_axes=axes)(problem, states, scales)

@@ -22,7 +22,7 @@ class Step(NamedTuple):
     """The result of a trial step.
 
     - `state`, `rate`: the state at the end, and the field there; `error`: the estimated error.
-    - `watched`: the least of the margins and the event function at the end.
+    - `margin`: the least of the margins and the event function at the end.
     - `first_negative`: time of the first stage at which a margin or the event function was negative, as a fraction of
       the step; 2 if there was none.
     - `margins`: all margins at `watched_places` of the step; `None` if there are none.
@@ -31,7 +31,7 @@ class Step(NamedTuple):
     state: States
     rate: States
     error: States
-    watched: Lanes
+    margin: Lanes
     first_negative: Lanes
     margins: Float[Array, "places margins lanes"] | None
 
@@ -98,41 +98,43 @@ def explicit_step(
     # If the last stage of the method is the end of the step, it is computed below.
     inner = len(tableau.c) - 1 if tableau.fsal else len(tableau.c)
     looks = stages_to_look(tableau.c)
-    places, looked = jnp.asarray(tableau.c[:inner]), jnp.asarray(np.isin(np.arange(inner), looks))
+    places, is_look = jnp.asarray(tableau.c[:inner]), jnp.asarray(np.isin(np.arange(inner), looks))
     rows = jnp.asarray(np.searchsorted(looks, np.arange(inner)) + 1)
 
     def do(stage: Int[Array, ""], carry: tuple[Stages, Any]) -> tuple[Stages, Any]:
-        rates, seen = carry
+        rates, history = carry
         trial = moved_state(stage, tableau.a_lower[:inner], state, length, rates)
-        at = time + places[stage] * length
+        stage_time = time + places[stage] * length
 
-        def look(seen: Float[Array, "places margins lanes"]) -> Float[Array, "places margins lanes"]:
-            return written_in_place(seen, jnp.stack(margins(at, trial)), at=rows[stage])
+        def look(history: Float[Array, "places margins lanes"]) -> Float[Array, "places margins lanes"]:
+            return written_in_place(history, jnp.stack(margins(stage_time, trial)), at=rows[stage])
 
         # A branch, because margins in every stage would add a tenth to the cost of a step of a top in a cylinder.
-        seen = None if seen is None else jax.lax.cond(looked[stage], look, lambda seen: seen, seen)
-        return written_by_component(rates, field(at, trial), at=stage + 1), seen
+        history = None if history is None else jax.lax.cond(is_look[stage], look, lambda history: history, history)
+        return written_by_component(rates, field(stage_time, trial), at=stage + 1), history
 
-    none, first = jnp.zeros((1 + inner, *rate.shape), rate.dtype), jnp.zeros((), int)
-    seen = None
+    zeros, first = jnp.zeros((1 + inner, *rate.shape), rate.dtype), jnp.zeros((), int)
+    history = None
     if margins_before is not None:
-        seen = jnp.zeros((2 + len(looks), *margins_before.shape), margins_before.dtype)
-        seen = written_in_place(seen, margins_before, at=first)
-    rates, seen = over_stages(inner, do, (written_in_place(none, rate, at=first), seen))
+        history = jnp.zeros((2 + len(looks), *margins_before.shape), margins_before.dtype)
+        history = written_in_place(history, margins_before, at=first)
+    rates, history = over_stages(inner, do, (written_in_place(zeros, rate, at=first), history))
     stages, first_negative = list(jnp.unstack(rates)), jnp.full_like(length, 2.0)
     for row, stage in enumerate(looks, start=1):
         trial = state + length * weighted_sum(tableau.a_lower[stage], stages[: stage + 1])
-        margin = lesser(_least(None if seen is None else seen[row]), crossing(trial, stages[stage + 1]), length)
+        margin = lesser(_least(None if history is None else history[row]), crossing(trial, stages[stage + 1]), length)
         negative = jnp.where(margin < 0.0, tableau.c[stage], 2.0)
         first_negative = jnp.minimum(first_negative, negative)
     # Stored, because the step, its error and the event all depend on it.
     end = jax.lax.optimization_barrier(state + length * weighted_sum(tableau.b_sol[: 1 + inner], stages))
     last_rate = jax.lax.optimization_barrier(field(time + length, end))
-    last = None if seen is None else jax.lax.optimization_barrier(jnp.stack(margins(time + length, end)))
-    watched = jax.lax.optimization_barrier(lesser(_least(last), crossing(end, last_rate), length))
-    seen = None if seen is None or last is None else written_in_place(seen, last, at=jnp.asarray(1 + len(looks)))
+    last = None if history is None else jax.lax.optimization_barrier(jnp.stack(margins(time + length, end)))
+    margin_at_end = jax.lax.optimization_barrier(lesser(_least(last), crossing(end, last_rate), length))
+    history = (
+        None if history is None or last is None else written_in_place(history, last, at=jnp.asarray(1 + len(looks)))
+    )
     stages += [last_rate] if tableau.fsal else []
-    return Step(end, last_rate, length * weighted_sum(tableau.b_error, stages), watched, first_negative, seen)
+    return Step(end, last_rate, length * weighted_sum(tableau.b_error, stages), margin_at_end, first_negative, history)
 
 
 def watched_places(tableau: diffrax.ButcherTableau) -> Float[np.ndarray, " places"]:
@@ -160,9 +162,11 @@ def over_stages(stages: int, do: Callable[[Int[Array, ""], Any], Any], start: An
 
 def stages_to_look(fractions: Float[np.ndarray, " stages"]) -> list[int]:
     """The stages nearest to 1/4, 1/2 and 3/4 of the step, where the inside of the step is checked."""
-    between = [stage for stage, fraction in enumerate(fractions) if 0.0 < fraction < 1.0]
-    nearest = {min(between, key=lambda stage: abs(fractions[stage] - part)) for part in (0.25, 0.5, 0.75) if between}
-    return sorted(nearest)
+    inner_stages = [stage for stage, fraction in enumerate(fractions) if 0.0 < fraction < 1.0]
+    stages = {
+        min(inner_stages, key=lambda stage: abs(fractions[stage] - part)) for part in (0.25, 0.5, 0.75) if inner_stages
+    }
+    return sorted(stages)
 
 
 def weighted_sum(weights: Float[np.ndarray, " stages"], rates: Sequence[States]) -> States:
@@ -189,7 +193,7 @@ def moved_state(
 
 
 def scaled_error(
-    error: States, before: States, after: States, rtol: Float[Array, ""], atol: States, n_blocks: int
+    error: States, old_state: States, new_state: States, rtol: Float[Array, ""], atol: States, n_blocks: int
 ) -> Lanes:
     """Error in units of the tolerance: the greatest root mean square among the blocks of the state (Diffrax's norm and
     scale).
@@ -197,7 +201,7 @@ def scaled_error(
     The squares are added one by one: XLA compiles a sum over an axis of more than eight components lane by lane, which
     took half of the time of a run with twelve components.
     """
-    ratio = error / (atol + rtol * jnp.maximum(jnp.abs(before), jnp.abs(after)))
+    ratio = error / (atol + rtol * jnp.maximum(jnp.abs(old_state), jnp.abs(new_state)))
     squares, size = [component * component for component in ratio], ratio.shape[0] // n_blocks
     means = [functools.reduce(operator.add, squares[k * size : (k + 1) * size]) / size for k in range(n_blocks)]
     return jnp.sqrt(functools.reduce(jnp.maximum, means))
@@ -238,10 +242,10 @@ def first_length(
     magnitude, slope = measure(state), measure(rate)
     unit = magnitude / slope
     # A state at rest has no unit of time of its own; longer units would overflow below.
-    still = (magnitude < 1e-5) | ~(unit < 1e15)
-    unit = jnp.where(still, 1e-4, unit)
+    at_rest = (magnitude < 1e-5) | ~(unit < 1e15)
+    unit = jnp.where(at_rest, 1e-4, unit)
     trial = 0.01 * unit
     bend = measure(field(time + trial, state + trial * rate) - rate) / trial
-    steepest = unit * jnp.maximum(slope, unit * bend)
-    fraction = jnp.where(steepest <= 1e-15, 0.01, inverse_root(jnp.maximum(steepest, 1e-15) * 100.0, order))
+    max_slope = unit * jnp.maximum(slope, unit * bend)
+    fraction = jnp.where(max_slope <= 1e-15, 0.01, inverse_root(jnp.maximum(max_slope, 1e-15) * 100.0, order))
     return unit * jnp.minimum(1.0, fraction)

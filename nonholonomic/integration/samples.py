@@ -70,14 +70,14 @@ class SampleRecorder(AbstractRecorder):
 
     def at_start(self, lane_state: LaneState, starts: Float[Array, "components cells"]) -> Collected:
         """The samples at the start."""
-        early = (self.times <= 0.0).reshape(len(self.times), -1).T
+        is_initial = (self.times <= 0.0).reshape(len(self.times), -1).T
 
         def of_start(values: Float[Array, "1 cells ..."]) -> Float[Array, "cells times ..."]:
             values = jnp.moveaxis(values, 0, 1)
-            return jnp.where(early.reshape(*early.shape, *[1] * (values.ndim - 2)), values, jnp.nan)
+            return jnp.where(is_initial.reshape(*is_initial.shape, *[1] * (values.ndim - 2)), values, jnp.nan)
 
-        begun = self.read(jnp.arange(len(self.first)), starts[None])
-        return Collected(self._begin(lane_state), jax.tree.map(of_start, begun))
+        first_values = self.read(jnp.arange(len(self.first)), starts[None])
+        return Collected(self._begin(lane_state), jax.tree.map(of_start, first_values))
 
     def begin(self, lane_state: LaneState, collected: Collected) -> tuple[Bool[Array, " lanes"], Array, Reached]:
         room = jnp.zeros((self.period, *lane_state.state.shape), lane_state.state.dtype)
@@ -95,20 +95,20 @@ class SampleRecorder(AbstractRecorder):
         (problem, control, atol), (accepted, sample, reached) = in_lanes, record
         count, horizon = len(self.times), jnp.broadcast_to(control.t1, lane_state.time.shape)
         next_time = self._time_of(sample, lane_state)
-        stop = jnp.where(sample < count, jnp.minimum(next_time, horizon), horizon)
-        even = _even(lane_state.length, stop - lane_state.time, lane_state.bracketing)
+        target = jnp.where(sample < count, jnp.minimum(next_time, horizon), horizon)
+        even_length = _even(lane_state.length, target - lane_state.time, lane_state.bracketing)
         # The step after a rejected step is shorter on purpose, because it may have to end on a minimum of a margin.
-        length = jnp.where(accepted, even, jnp.minimum(even, lane_state.length))
+        length = jnp.where(accepted, even_length, jnp.minimum(even_length, lane_state.length))
         lane_state = lane_state._replace(length=length)
-        after = try_step(problem, control._replace(t1=stop), atol, lane_state)
-        stopped = (lane_state.status == RUNNING) & (after.status == REACHED_END)
-        is_sample = stopped & (sample < count) & (after.time >= next_time)
-        goes_on = stopped & (after.time < horizon)
-        status = jnp.where(after.steps < control.max_steps, RUNNING, FAILED)
-        after = after._replace(status=jnp.where(goes_on, status, after.status))
-        entry = Reached(after.state, jnp.where(is_sample, sample, count))
+        new_lanes = try_step(problem, control._replace(t1=target), atol, lane_state)
+        at_target = (lane_state.status == RUNNING) & (new_lanes.status == REACHED_END)
+        is_sample = at_target & (sample < count) & (new_lanes.time >= next_time)
+        goes_on = at_target & (new_lanes.time < horizon)
+        status = jnp.where(new_lanes.steps < control.max_steps, RUNNING, FAILED)
+        new_lanes = new_lanes._replace(status=jnp.where(goes_on, status, new_lanes.status))
+        entry = Reached(new_lanes.state, jnp.where(is_sample, sample, count))
         reached = jax.tree.map(functools.partial(written_in_place, at=iteration), reached, entry)
-        return after, (after.time > lane_state.time, sample + is_sample, reached)
+        return new_lanes, (new_lanes.time > lane_state.time, sample + is_sample, reached)
 
     def collect(
         self, collected: Collected, record: tuple[Array, Array, Reached], ended: LaneState, refilled: LaneState
@@ -131,8 +131,8 @@ class SampleRecorder(AbstractRecorder):
 
     def _time_of(self, sample: Int[Array, " lanes"], lane_state: LaneState) -> Lanes:
         """The time of a sample in every lane."""
-        inside = jnp.minimum(sample, len(self.times) - 1)
-        return self.times[inside] if self.times.ndim == 1 else self.times[inside, self._cell(lane_state)]
+        index = jnp.minimum(sample, len(self.times) - 1)
+        return self.times[index] if self.times.ndim == 1 else self.times[index, self._cell(lane_state)]
 
 
 def solve_with_samples(

@@ -44,7 +44,7 @@ class Outcome(NamedTuple, Generic[Numbers]):
 
     **Example:** the outcome of the subpackage's example, whose runs end on the event.
 
-    >>> from nonholonomic.integration import CROSSED
+    >>> from nonholonomic.integration.status import CROSSED
     >>> print(outcome.status == CROSSED, outcome.state.shape)
     [ True  True  True] (1, 3)
     """
@@ -58,7 +58,7 @@ class Outcome(NamedTuple, Generic[Numbers]):
     rejected: Int[Numbers, " cells"]
 
 
-class Progress(NamedTuple):
+class SchedulerState(NamedTuple):
     """The lanes, the number of cells that have left the queue, and the number of iterations so far."""
 
     lane_state: LaneState
@@ -145,12 +145,12 @@ class LaneScheduler(eqx.Module):
         control = Control(
             explicit_tableau(solver), explicit_order(solver), rtol, t1, settings.max_steps, nonterminal, n_blocks
         )
-        starts, scales = problem.start()
-        zero = jnp.zeros_like(starts[0])
-        rates, atols = problem.field(zero, starts), settings.absolute * rtol * scales
-        lengths = first_length(problem.field, zero, starts, rates, control.order, rtol, atols, n_blocks)
-        fresh = _fresh_lanes(problem, control, starts, rates, jnp.minimum(stop_gradient(lengths), t1))
-        return cls(problem, control, atols, fresh, cells, settings.lanes_of(starts.shape[1], n_blocks), one_kernel)
+        states, scales = problem.start()
+        zero = jnp.zeros_like(states[0])
+        rates, atols = problem.field(zero, states), settings.absolute * rtol * scales
+        lengths = first_length(problem.field, zero, states, rates, control.order, rtol, atols, n_blocks)
+        fresh = _fresh_lanes(problem, control, states, rates, jnp.minimum(stop_gradient(lengths), t1))
+        return cls(problem, control, atols, fresh, cells, settings.lanes_of(states.shape[1], n_blocks), one_kernel)
 
     @property
     def capacity(self) -> int:
@@ -159,8 +159,8 @@ class LaneScheduler(eqx.Module):
 
     def pick(self, tree: Any, cell: Int[Array, " lanes"]) -> Any:
         """The leaves for the given cells; scalars stay unchanged."""
-        inside = jnp.minimum(cell, self.capacity - 1)
-        return jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., inside], tree)
+        index = jnp.minimum(cell, self.capacity - 1)
+        return jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., index], tree)
 
     def in_lanes(self, lane_state: LaneState) -> InLanes:
         """Problem, control and absolute tolerances of the cells in the lanes."""
@@ -181,7 +181,7 @@ class LaneScheduler(eqx.Module):
         **Arguments:** `recorder`; `collected`: what the recorder has collected before the first step.
         """
 
-        def period(carry: tuple[Progress, Outcome, Any]) -> tuple[Progress, Outcome, Any]:
+        def period(carry: tuple[SchedulerState, Outcome, Any]) -> tuple[SchedulerState, Outcome, Any]:
             progress, outcome, collected = carry
             progress, record = self.run(progress, recorder, collected)
             refilled = self.refill(progress)
@@ -192,55 +192,57 @@ class LaneScheduler(eqx.Module):
         progress, outcome, collected = jax.lax.while_loop(lambda carry: self.unfinished(carry[0]), period, carry)
         return self.store(outcome, progress.lane_state), progress.iterations, collected
 
-    def start(self) -> Progress:
+    def start(self) -> SchedulerState:
         """The first cells, one in each lane."""
         lane_state = self._load(jnp.arange(self.lanes))
-        return Progress(lane_state, jnp.minimum(self.lanes, self.cells), jnp.zeros((), int))
+        return SchedulerState(lane_state, jnp.minimum(self.lanes, self.cells), jnp.zeros((), int))
 
-    def unfinished(self, progress: Progress) -> Bool[Array, ""]:
+    def unfinished(self, progress: SchedulerState) -> Bool[Array, ""]:
         """Whether a lane is running or a cell waiting."""
         return jnp.any(progress.lane_state.status == RUNNING) | (progress.loaded < self.cells)
 
-    def run(self, progress: Progress, recorder: AbstractRecorder, collected: Any = None) -> tuple[Progress, Any]:
+    def run(
+        self, progress: SchedulerState, recorder: AbstractRecorder, collected: Any = None
+    ) -> tuple[SchedulerState, Any]:
         """Advance the lanes by a period: until all have ended, the record is full, or a refill pays off while cells
         wait.
 
-        **Returns:** the `Progress`, and the record of the period.
+        **Returns:** the `SchedulerState`, and the record of the period.
         """
         in_lanes = self.in_lanes(progress.lane_state)
 
         def goes_on(carry: tuple[LaneState, Any, Int[Array, ""], Int[Array, ""]]) -> Bool[Array, ""]:
             lane_state, _, missed, count = carry
             refill = (progress.loaded < self.cells) & (missed >= recorder.refill_cost * self.lanes)
-            going = jnp.any(lane_state.status == RUNNING) & ~refill
-            return going if recorder.period is None else going & (count < recorder.period)
+            is_running = jnp.any(lane_state.status == RUNNING) & ~refill
+            return is_running if recorder.period is None else is_running & (count < recorder.period)
 
         def step(
             carry: tuple[LaneState, Any, Int[Array, ""], Int[Array, ""]],
         ) -> tuple[LaneState, Any, Int[Array, ""], Int[Array, ""]]:
             # `missed` counts the steps that idle lanes have missed since the last refill.
             lane_state, record, missed, count = carry
-            after, record = recorder.step(in_lanes, lane_state, record, count)
-            return after, record, missed + jnp.sum(lane_state.status != RUNNING), count + 1
+            new_state, record = recorder.step(in_lanes, lane_state, record, count)
+            return new_state, record, missed + jnp.sum(lane_state.status != RUNNING), count + 1
 
         def loop(lane_state: LaneState) -> tuple[LaneState, Any, Int[Array, ""], Int[Array, ""]]:
             zero = jnp.zeros((), int)
             return jax.lax.while_loop(goes_on, step, (lane_state, recorder.begin(lane_state, collected), zero, zero))
 
         lane_state, record, _, count = self.in_kernel(loop)(progress.lane_state)
-        return Progress(lane_state, progress.loaded, progress.iterations + count), record
+        return SchedulerState(lane_state, progress.loaded, progress.iterations + count), record
 
     def in_kernel(self, loop: Callable[[Any], Any]) -> Callable[[Any], Any]:
         """A loop over steps, compiled into a single kernel if `one_kernel` is set."""
         return in_one_kernel(loop) if self.one_kernel and self.problem.fits_one_kernel else loop
 
-    def refill(self, progress: Progress) -> Progress:
+    def refill(self, progress: SchedulerState) -> SchedulerState:
         """Give every idle lane the next waiting cell."""
         lane_state, loaded, iterations = progress
         idle = lane_state.status != RUNNING
         fresh = self._load(jnp.where(idle, jnp.minimum(loaded + jnp.cumsum(idle) - 1, self.capacity), lane_state.cell))
         lane_state = jax.tree.map(lambda new, old: jnp.where(idle, new, old), fresh, lane_state)
-        return Progress(lane_state, jnp.minimum(loaded + jnp.sum(idle), self.cells), iterations)
+        return SchedulerState(lane_state, jnp.minimum(loaded + jnp.sum(idle), self.cells), iterations)
 
     def empty(self) -> Outcome:
         """An empty outcome of the right shapes."""
@@ -249,8 +251,10 @@ class LaneScheduler(eqx.Module):
     def store(self, outcome: Outcome, lane_state: LaneState) -> Outcome:
         """Store the cells whose lanes have ended in the outcome."""
         in_lanes = outcome_of(lane_state)
-        to = jnp.where((lane_state.status != RUNNING) & (lane_state.cell < self.cells), lane_state.cell, self.capacity)
-        return jax.tree.map(lambda cells, lanes: cells.at[..., to].set(lanes, mode="drop"), outcome, in_lanes)
+        targets = jnp.where(
+            (lane_state.status != RUNNING) & (lane_state.cell < self.cells), lane_state.cell, self.capacity
+        )
+        return jax.tree.map(lambda cells, lanes: cells.at[..., targets].set(lanes, mode="drop"), outcome, in_lanes)
 
     def _load(self, cell: Int[Array, " lanes"]) -> LaneState:
         lane_state = self.pick(self.fresh, cell)
@@ -273,24 +277,24 @@ def _fresh_lanes(
 ) -> LaneState:
     """Every cell at its start; a cell that starts beyond the event or outside the domain has ended."""
     zero = jnp.zeros_like(lengths)
-    no = jnp.zeros(lengths.shape, bool)
+    false = jnp.zeros(lengths.shape, bool)
     if problem.direction_decides:
-        inside = _holds(problem, problem.event_function, states, rates, lengths)
-        valid = _holds(problem, lambda at: problem.domain_margin(zero, at), states, rates, lengths)
-        side = jnp.ones_like(zero) if inside is None else jnp.where(inside, 1.0, -1.0).astype(zero.dtype)
+        before_event = _holds(problem, problem.event_function, states, rates, lengths)
+        valid = _holds(problem, lambda point: problem.domain_margin(zero, point), states, rates, lengths)
+        side = jnp.ones_like(zero) if before_event is None else jnp.where(before_event, 1.0, -1.0).astype(zero.dtype)
         status = jnp.full(zero.shape, RUNNING) if valid is None else jnp.where(valid, RUNNING, LEFT_DOMAIN)
         return _lanes_at_start(problem, states, rates, lengths, side, status, jnp.full_like(zero, jnp.inf))
     crossing, domain_margin = problem.event_function(states), problem.domain_margin(zero, states)
-    beyond = no
+    is_beyond = false
     if crossing is not None:
         # Exactly on the event, the direction of the motion decides.
-        falls = jax.jvp(problem.event_function, (states,), (rates,))[1] <= 0.0
-        beyond = (crossing < 0.0) | ((crossing == 0.0) & (falls | (not control.nonterminal)))
-    side = jnp.where(beyond & control.nonterminal, -1.0, 1.0).astype(lengths.dtype)
-    status = jnp.where(beyond & (not control.nonterminal), CROSSED, RUNNING)
+        is_falling = jax.jvp(problem.event_function, (states,), (rates,))[1] <= 0.0
+        is_beyond = (crossing < 0.0) | ((crossing == 0.0) & (is_falling | (not control.nonterminal)))
+    side = jnp.where(is_beyond & control.nonterminal, -1.0, 1.0).astype(lengths.dtype)
+    status = jnp.where(is_beyond & (not control.nonterminal), CROSSED, RUNNING)
     if domain_margin is not None:
         status = jnp.where(domain_margin <= 0.0, LEFT_DOMAIN, status)
-    return _lanes_at_start(problem, states, rates, lengths, side, status, jnp.where(beyond, zero, jnp.inf))
+    return _lanes_at_start(problem, states, rates, lengths, side, status, jnp.where(is_beyond, zero, jnp.inf))
 
 
 def _lanes_at_start(
@@ -303,7 +307,7 @@ def _lanes_at_start(
     crossing_time: Float[Array, " cells"],
 ) -> LaneState:
     """Every cell at its start, on a side of the event."""
-    zero, none = jnp.zeros_like(lengths), jnp.zeros(lengths.shape, int)
+    zero, zeros = jnp.zeros_like(lengths), jnp.zeros(lengths.shape, int)
     return LaneState(
         cell=jnp.arange(lengths.shape[0]),
         status=status,
@@ -317,9 +321,9 @@ def _lanes_at_start(
         first_crossing=crossing_time,
         crossing_time=crossing_time,
         bracketing=jnp.zeros(lengths.shape, bool),
-        bracket=Bracket(zero, zero, zero, zero, zero, none),
-        steps=none,
-        rejected=none,
+        bracket=Bracket(zero, zero, zero, zero, zero, zeros),
+        steps=zeros,
+        rejected=zeros,
     )
 
 
@@ -337,10 +341,10 @@ def _holds(
     if value is None:
         return None
 
-    def slope(at: States) -> Lanes:
-        return jax.jvp(function, (at,), (problem.field(zero, at),))[1]
+    def slope(point: States) -> Lanes:
+        return jax.jvp(function, (point,), (problem.field(zero, point),))[1]
 
     first, second = jax.jvp(slope, (states,), (rates,))
-    ahead = SOON * lengths
-    change = ahead * (first + 0.5 * ahead * second)
+    lead = SOON * lengths
+    change = lead * (first + 0.5 * lead * second)
     return jnp.where(jnp.abs(value) <= AT_ZERO * jnp.abs(change), change > 0.0, value > 0.0)

@@ -1,4 +1,8 @@
-"""The state of a run: codes of the integration, and words for users."""
+"""How a run ended: codes of the integration, and words for users.
+
+The codes are `RUNNING`, `REACHED_END` (at the horizon), `CROSSED` (on the event), `LEFT_DOMAIN`, `FAILED` and
+`UNRESOLVED`. `tippe.Status` has the words.
+"""
 
 import enum
 from typing import Self

@@ -101,56 +101,58 @@ def try_step(problem: AbstractProblem, control: Control, atol: States, lane_stat
     tried_length = length_to_try(control, lane_state)
     crossing = side_of(problem, lane_state.side)
     start = (lane_state.time, lane_state.state, lane_state.rate, tried_length)
-    tried = explicit_step(control.tableau, problem.field, problem.margins, crossing, *start, lane_state.margins)
-    return after_step(problem, control, atol, lane_state, tried_length, tried)
+    trial = explicit_step(control.tableau, problem.field, problem.margins, crossing, *start, lane_state.margins)
+    return after_step(problem, control, atol, lane_state, tried_length, trial)
 
 
 def after_step(
-    problem: AbstractProblem, control: Control, atol: States, lane_state: LaneState, tried_length: Lanes, tried: Step
+    problem: AbstractProblem, control: Control, atol: States, lane_state: LaneState, tried_length: Lanes, trial: Step
 ) -> LaneState:
     """Update each lane after a trial step.
 
-    **Arguments:** as for `try_step`; `tried_length` contains the lengths of the steps [s], and `tried` their results.
+    **Arguments:** as for `try_step`; `tried_length` contains the lengths of the steps [s], and `trial` their results.
 
     **Returns:** the lanes after the step.
     """
     running = lane_state.status == RUNNING
     free = running & ~lane_state.bracketing
     error = scaled_error(
-        *stop_gradient((tried.error, lane_state.state, tried.state)), control.rtol, atol, control.n_blocks
+        *stop_gradient((trial.error, lane_state.state, trial.state)), control.rtol, atol, control.n_blocks
     )
     # An event is located where the margin is round-off. Stored jointly, behind a barrier, the margin is computed once;
     # otherwise the compiler would fuse it into several kernels with different round-off, and only some of them would
     # detect the event.
-    error, margin = stored(error, stop_gradient(tried.watched))
+    error, margin = stored(error, stop_gradient(trial.margin))
     # A step to a state that is not finite counts as one with a huge error.
     error = jnp.where(jnp.isfinite(error) & ~jnp.isnan(margin), error, jnp.inf)
-    good = error <= 1.0
+    accurate = error <= 1.0
     # Negative inside the step: end the step there and check again, so that the first of several events is located.
     event = missed_double_root(
-        problem.event_function, lane_state.side, (lane_state.state, lane_state.rate), tried, tried_length
+        problem.event_function, lane_state.side, (lane_state.state, lane_state.rate), trial, tried_length
     )
-    loss = missed_loss(watched_places(control.tableau), stop_gradient(tried.margins), free & good)
-    negative = jnp.minimum(tried.first_negative, stop_gradient(jnp.minimum(event, loss)))
-    between = good & (negative < 1.0)
-    beyond = good & ~between & (margin <= 0.0)
-    forward = free & good & ~between & ~beyond
+    loss = missed_loss(watched_places(control.tableau), stop_gradient(trial.margins), free & accurate)
+    negative = jnp.minimum(trial.first_negative, stop_gradient(jnp.minimum(event, loss)))
+    crosses_inside = accurate & (negative < 1.0)
+    is_beyond = accurate & ~crosses_inside & (margin <= 0.0)
+    forward = free & accurate & ~crosses_inside & ~is_beyond
 
-    bracket, guess, located = refine(lane_state.bracketing, lane_state.bracket, lane_state.margin, margin, tried_length)
-    hit = running & located
-    bracketing = (lane_state.bracketing | (free & beyond)) & ~hit
+    bracket, guess, is_located = refine(
+        lane_state.bracketing, lane_state.bracket, lane_state.margin, margin, tried_length
+    )
+    hit = running & is_located
+    bracketing = (lane_state.bracketing | (free & is_beyond)) & ~hit
     moved = forward | hit
     time = jnp.where(moved, lane_state.time + tried_length, lane_state.time)
 
-    length = tried_length * _factor(error, good, control.order)
-    length = jnp.where(between, tried_length * negative, length)
+    length = tried_length * _factor(error, accurate, control.order)
+    length = jnp.where(crosses_inside, tried_length * negative, length)
     length = jnp.where(bracketing, guess, jnp.where(hit, bracket.stride, length))
-    status, side, first, latest = _classify(problem, control, lane_state, tried, time, hit)
+    status, side, first, latest_crossing = _classify(problem, control, lane_state, trial, time, hit)
     ended = running & (status == RUNNING) & moved & (time >= control.t1)
     steps = lane_state.steps + running
     # Written so that a NaN length counts as stuck.
-    tiny = 8.0 * jnp.finfo(time.dtype).eps * jnp.maximum(time, 1e-3)
-    stuck = free & ~forward & ~bracketing & ~(length > tiny)
+    shortest = 8.0 * jnp.finfo(time.dtype).eps * jnp.maximum(time, 1e-3)
+    stuck = free & ~forward & ~bracketing & ~(length > shortest)
     stuck |= forward & (time == lane_state.time) & (tried_length > 0.0)
     failed = running & (status == RUNNING) & ~ended & (stuck | (steps >= control.max_steps))
     status = jnp.where(failed, FAILED, jnp.where(ended, REACHED_END, status))
@@ -158,46 +160,48 @@ def after_step(
         cell=lane_state.cell,
         status=status,
         time=jnp.where(ended, control.t1, time),
-        state=jnp.where(moved, tried.state, lane_state.state),
-        rate=jnp.where(moved, tried.rate, lane_state.rate),
+        state=jnp.where(moved, trial.state, lane_state.state),
+        rate=jnp.where(moved, trial.rate, lane_state.rate),
         length=length,
         side=side,
         # Just past a crossing the margin is round-off of either sign.
         margin=jnp.where(hit, jnp.abs(margin), jnp.where(forward, margin, lane_state.margin)),
         margins=None
-        if tried.margins is None or lane_state.margins is None
-        else jnp.where(moved, stop_gradient(tried.margins[-1]), lane_state.margins),
+        if trial.margins is None or lane_state.margins is None
+        else jnp.where(moved, stop_gradient(trial.margins[-1]), lane_state.margins),
         first_crossing=first,
-        crossing_time=latest,
+        crossing_time=latest_crossing,
         bracketing=bracketing,
         bracket=bracket,
         steps=steps,
-        rejected=lane_state.rejected + (free & ~forward & ~beyond),
+        rejected=lane_state.rejected + (free & ~forward & ~is_beyond),
     )
 
 
-def _factor(error: Lanes, good: Bool[Array, " lanes"], order: int) -> Lanes:
+def _factor(error: Lanes, accurate: Bool[Array, " lanes"], order: int) -> Lanes:
     """Growth factor of the next step, as in Diffrax's I controller."""
     factor = SAFETY * inverse_root(jnp.maximum(error, 1e-30), order)
-    return jnp.where(good, jnp.clip(factor, 1.0, GROW), jnp.clip(factor, SHRINK, SAFETY))
+    return jnp.where(accurate, jnp.clip(factor, 1.0, GROW), jnp.clip(factor, SHRINK, SAFETY))
 
 
 def _classify(
     problem: AbstractProblem,
     control: Control,
     lane_state: LaneState,
-    tried: Step,
+    trial: Step,
     time: Lanes,
     hit: Bool[Array, " lanes"],
 ) -> tuple[Int[Array, " lanes"], Lanes, Lanes, Lanes]:
     """Status, side, first and latest crossing time of the lanes, where `hit` marks the lanes in which an event was
     located."""
-    crossing, margins = problem.event_function(tried.state), tried.margins
+    crossing, margins = problem.event_function(trial.state), trial.margins
     # The located event belongs to the lesser of the margins and the event function, whose sign may be round-off.
     by_margin = hit
     if crossing is not None:
-        lost = False if margins is None else jnp.min(stop_gradient(margins[-1]), axis=0) <= lane_state.side * crossing
-        by_margin = hit & lost
+        by_loss = (
+            False if margins is None else jnp.min(stop_gradient(margins[-1]), axis=0) <= lane_state.side * crossing
+        )
+        by_margin = hit & by_loss
     crossed = hit & ~by_margin
     if not control.nonterminal:
         status = jnp.where(hit, jnp.where(by_margin, LEFT_DOMAIN, CROSSED), lane_state.status)
@@ -209,8 +213,8 @@ def _classify(
         return status, side, lane_state.first_crossing, lane_state.crossing_time
     # Only a crossing from positive to negative is the event; the return does not count.
     counts = crossed & (lane_state.side > 0.0)
-    time_of_crossing = crossing_time(problem, time, tried.state)
+    time_of_crossing = crossing_time(problem, time, trial.state)
     first = jnp.where(counts & jnp.isinf(lane_state.first_crossing), time_of_crossing, lane_state.first_crossing)
-    latest = jnp.where(counts, time_of_crossing, lane_state.crossing_time)
+    latest_crossing = jnp.where(counts, time_of_crossing, lane_state.crossing_time)
     status = jnp.where(by_margin, LEFT_DOMAIN, lane_state.status)
-    return status, jnp.where(crossed, -lane_state.side, lane_state.side), first, latest
+    return status, jnp.where(crossed, -lane_state.side, lane_state.side), first, latest_crossing

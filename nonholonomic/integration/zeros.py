@@ -34,7 +34,7 @@ def halved(
 
     **Example:**
 
-    >>> from nonholonomic.integration import halved
+    >>> from nonholonomic.integration.zeros import halved
     >>> low, high = halved(lambda x: x**2 < 2.0, jnp.asarray(1.0), jnp.asarray(2.0))
     >>> print(f"{low:.6f}")
     1.414214
@@ -43,8 +43,8 @@ def halved(
     def halve(_, bracket):
         low, high = bracket
         middle = 0.5 * (low + high)
-        inside = holds(middle)
-        return jnp.where(inside, middle, low), jnp.where(inside, high, middle)
+        is_inside = holds(middle)
+        return jnp.where(is_inside, middle, low), jnp.where(is_inside, high, middle)
 
     return jax.lax.fori_loop(0, HALVINGS, halve, (low, high))
 
@@ -58,7 +58,7 @@ def sign_changes(
 
     **Example:**
 
-    >>> from nonholonomic.integration import sign_changes
+    >>> from nonholonomic.integration.zeros import sign_changes
     >>> print(sign_changes(jnp.cos, jnp.arange(0.5, 7.0)).round(6))
     [1.570796 4.712389]
     """
@@ -84,7 +84,7 @@ def few_trials(
     **Example:**
 
     >>> import numpy as np
-    >>> from nonholonomic.integration import few_trials
+    >>> from nonholonomic.integration.zeros import few_trials
     >>> low, high = np.array([1.0]), np.array([2.0])
     >>> few_trials(lambda x: x**2 - 2.0, low, high, low**2 - 2.0, high**2 - 2.0).round(6)
     array([1.414214])
@@ -100,11 +100,11 @@ def few_trials(
         if np.all(np.minimum(high - low, np.abs(guess - last)) <= LOCATED * np.maximum(high, 1.0)):
             break
         value = function(guess)
-        beyond = (value > 0.0) != (at_low > 0.0)
+        past_root = (value > 0.0) != (at_low > 0.0)
         with np.errstate(all="ignore"):
             fade_low, fade_high = 1.0 - value / at_high, 1.0 - value / at_low
         fade_low, fade_high = (np.where(fade > 0.0, fade, 0.5) for fade in (fade_low, fade_high))
         # The retained end is given less weight, so that it moves too in the next trial.
-        at_low, at_high = np.where(beyond, at_low * fade_low, value), np.where(beyond, value, at_high * fade_high)
-        low, high = np.where(beyond, low, guess), np.where(beyond, guess, high)
+        at_low, at_high = np.where(past_root, at_low * fade_low, value), np.where(past_root, value, at_high * fade_high)
+        low, high = np.where(past_root, low, guess), np.where(past_root, guess, high)
     return guess

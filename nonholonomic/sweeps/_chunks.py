@@ -55,28 +55,28 @@ class ChunkStore:
     def _find(self) -> None:
         stored = Stored(self.path) if self.path.exists() else None
         header = self.folder / "table.h5"
-        begun = stored or (Stored(header) if header.exists() else None)
-        if begun is not None:
-            self._check(begun)
+        table = stored or (Stored(header) if header.exists() else None)
+        if table is not None:
+            self._check(table)
             # The table records the versions with which it was begun; words added since then follow its own words.
-            self.layout = begun.layout._replace(words=layout_words(begun.layout.words, self.layout.words))
-        good = {chunk for chunk in range(self.layout.chunks) if stored is not None and stored.chunk(chunk) is not None}
-        self._whole = len(good) == self.layout.chunks
+            self.layout = table.layout._replace(words=layout_words(table.layout.words, self.layout.words))
+        valid = {chunk for chunk in range(self.layout.chunks) if stored is not None and stored.chunk(chunk) is not None}
+        self._whole = len(valid) == self.layout.chunks
         if self._whole:
-            self.finished = good
+            self.finished = valid
             return
         if not header.exists():
             self._begin(header)
-        kept = {int(file.stem) for file in self.folder.glob("*.npz")}
-        damaged = {chunk for chunk in kept if read_chunk(self.folder, self.layout, chunk) is None}
-        self.finished = kept - damaged
+        chunks_on_disk = {int(file.stem) for file in self.folder.glob("*.npz")}
+        damaged = {chunk for chunk in chunks_on_disk if read_chunk(self.folder, self.layout, chunk) is None}
+        self.finished = chunks_on_disk - damaged
         if stored is not None:
-            damaged |= set(range(self.layout.chunks)) - good - self.finished
-            for chunk in sorted(good - self.finished):
+            damaged |= set(range(self.layout.chunks)) - valid - self.finished
+            for chunk in sorted(valid - self.finished):
                 values = stored.chunk(chunk)
                 assert values is not None
                 self.write(chunk, values)
-            self.finished |= good
+            self.finished |= valid
         for part in self.folder.glob("*.part"):
             part.unlink()
         if damaged:
@@ -89,12 +89,13 @@ class ChunkStore:
     def _begin(self, header: Path) -> None:
         """Create the folder, with a note about its purpose."""
         # The chunks remain until the table's file exists.
-        need = 2 * self.layout.bytes_of_cells(self.layout.cells)
+        bytes_needed = 2 * self.layout.bytes_of_cells(self.layout.cells)
         try:
             room = shutil.disk_usage(self.path.parent).free
-            if room < need:
+            if room < bytes_needed:
                 raise OSError(
-                    0, f"{1e-9 * room:.3g} GB are free, and the table needs {1e-9 * need:.3g} GB while it is computed"
+                    0,
+                    f"{1e-9 * room:.3g} GB are free, and the table needs {1e-9 * bytes_needed:.3g} GB while it is computed",
                 )
             self.folder.mkdir(exist_ok=True)
             sync_folder(self.path.parent)
@@ -106,26 +107,30 @@ class ChunkStore:
             self.folder.rmdir()
             raise
 
-    def _check(self, begun: Stored) -> None:
-        ours, theirs = self.layout, begun.layout
-        difference = same_request(str(theirs.attributes["request"]), ours.attributes["request"])
+    def _check(self, table: Stored) -> None:
+        new_layout, old_layout = self.layout, table.layout
+        difference = same_request(str(old_layout.attributes["request"]), new_layout.attributes["request"])
         if difference is None:
-            for name, values in ours.coords.items():
-                if name not in theirs.coords or not np.array_equal(theirs.coords[name], values):
+            for name, values in new_layout.coords.items():
+                if name not in old_layout.coords or not np.array_equal(old_layout.coords[name], values):
                     difference = f"the axis {name} differs"
-        if difference is None and list(theirs.coords) != list(ours.coords):
-            difference = f"its axes are {', '.join(theirs.coords)}"
-        new, old = (json.loads(str(layout.attributes.get("versions", "{}"))) for layout in (ours, theirs))
+        if difference is None and list(old_layout.coords) != list(new_layout.coords):
+            difference = f"its axes are {', '.join(old_layout.coords)}"
+        new, old = (json.loads(str(layout.attributes.get("versions", "{}"))) for layout in (new_layout, old_layout))
         if difference is None and old.get("nonholonomic") != new.get("nonholonomic"):
             difference = f"nonholonomic is {old.get('nonholonomic')} in the file and {new.get('nonholonomic')} here"
-        if difference is None and (theirs.kinds, theirs.inner, theirs.chunk) != (ours.kinds, ours.inner, ours.chunk):
-            difference = f"it was not written by a sweep in {ours.chunks} chunks"
+        if difference is None and (old_layout.kinds, old_layout.inner, old_layout.chunk) != (
+            new_layout.kinds,
+            new_layout.inner,
+            new_layout.chunk,
+        ):
+            difference = f"it was not written by a sweep in {new_layout.chunks} chunks"
         if difference is not None:
-            what = self.path if begun.path == self.path else self.folder
-            raise ValueError(f"{what} holds the result of another run: {difference}; give another path or remove it")
-        others = [name for name in new if name not in ("nonholonomic", "python") and old.get(name) != new[name]]
-        if others and begun.path != self.path:
-            versions = ", ".join(f"{name} {old.get(name)}, now {new[name]}" for name in others)
+            source = self.path if table.path == self.path else self.folder
+            raise ValueError(f"{source} holds the result of another run: {difference}; give another path or remove it")
+        changed = [name for name in new if name not in ("nonholonomic", "python") and old.get(name) != new[name]]
+        if changed and table.path != self.path:
+            versions = ", ".join(f"{name} {old.get(name)}, now {new[name]}" for name in changed)
             warnings.warn(f"{self.path} was begun with {versions}: digits may differ", RuntimeWarning, stacklevel=7)
 
     def filled(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> Stored:
@@ -145,10 +150,10 @@ class ChunkStore:
             self.write(chunk, values)
             yield chunk, values
         for chunk in sorted(self.finished):
-            kept = read_chunk(self.folder, self.layout, chunk)
-            if kept is None:
+            values_on_disk = read_chunk(self.folder, self.layout, chunk)
+            if values_on_disk is None:
                 raise OSError(f"cannot read {self.folder}: chunk {chunk} is damaged; the same call computes it again")
-            yield chunk, kept
+            yield chunk, values_on_disk
 
     def write(self, chunk: int, values: dict[str, Values]) -> None:
         """Store a chunk.
@@ -171,10 +176,10 @@ class ChunkStore:
         """Keep other processes from computing the same file; the system releases the lock when this process ends."""
         if fcntl is None:
             return None
-        beside = self.path.with_name(self.path.name + ".lock")
+        lock_path = self.path.with_name(self.path.name + ".lock")
         while True:
             try:
-                lock = beside.open("w")
+                lock = lock_path.open("w")
             except OSError as error:
                 raise OSError(f"cannot write {self.path}: {error.strerror}") from None
             try:
@@ -184,7 +189,7 @@ class ChunkStore:
                 raise OSError(f"cannot write {self.path}: another process is writing it") from None
             # A process that has just closed the file has removed its lock, possibly after we opened it.
             with contextlib.suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(lock.fileno()), beside.stat()):
+                if os.path.samestat(os.fstat(lock.fileno()), lock_path.stat()):
                     return lock
             lock.close()
 
@@ -195,10 +200,15 @@ class ChunkStore:
             self._lock.close()
 
 
-def layout_words(begun: dict[str, tuple[str, ...]], ours: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """The words of a resumed table: `ours` if they begin with the words of the file, otherwise the words of the
+def layout_words(
+    old_words: dict[str, tuple[str, ...]], new_words: dict[str, tuple[str, ...]]
+) -> dict[str, tuple[str, ...]]:
+    """The words of a resumed table: `new_words` if they begin with the words of the file, otherwise the words of the
     file."""
-    return {name: ours[name] if ours.get(name, ())[: len(words)] == words else words for name, words in begun.items()}
+    return {
+        name: new_words[name] if new_words.get(name, ())[: len(words)] == words else words
+        for name, words in old_words.items()
+    }
 
 
 def with_spaces(count: int) -> str:

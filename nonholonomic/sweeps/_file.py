@@ -32,18 +32,18 @@ LONG_NAMES, LONG_NAME = "long_names", "long_name"
 INNER = "inner"
 
 #: Variables of tables larger than this [bytes] are read only when needed.
-HELD = 1 << 27
+MAX_BYTES_IN_MEMORY = 1 << 27
 
 
 @contextlib.contextmanager
-def replacing(path: Path, beside: Path | None = None) -> Iterator[Path]:
+def replacing(path: Path, folder: Path | None = None) -> Iterator[Path]:
     """A new file that replaces `path` at the end of the context, completely or not at all.
 
-    **Arguments:** `beside`: the folder of the new file until then, by default that of `path`.
+    **Arguments:** `folder`: the folder of the new file until then, by default that of `path`.
 
     **Raises:** `OSError` that names the path if it cannot be written.
     """
-    scratch = (beside or path.parent) / f"{path.name}.{uuid.uuid4().hex}.part"
+    scratch = (folder or path.parent) / f"{path.name}.{uuid.uuid4().hex}.part"
     try:
         if path.is_dir():
             raise OSError(0, "it is a folder")
@@ -73,7 +73,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def write_file(
-    path: Path, layout: Layout, chunks: Iterable[tuple[int, dict[str, Values]]], beside: Path | None = None
+    path: Path, layout: Layout, chunks: Iterable[tuple[int, dict[str, Values]]], folder: Path | None = None
 ) -> None:
     """Write a table completely or not at all; an existing file is replaced.
 
@@ -85,7 +85,7 @@ def write_file(
     # The import takes a tenth of a second, and most processes do not need it.
     import h5py
 
-    with replacing(path, beside) as scratch, scratch.open("r+b", buffering=0) as disk:
+    with replacing(path, folder) as scratch, scratch.open("r+b", buffering=0) as disk:
         stream = Stream(disk)
         with h5py.File(stream, "w", libver=("v110", "v110"), track_order=True) as file:
             _describe(file, layout)
@@ -118,10 +118,10 @@ class Stream:
 
     def write(self, data: Any) -> int:
         """Write all data, unless an earlier call has failed."""
-        rest = memoryview(data)
-        while self._error is None and rest:
+        remainder = memoryview(data)
+        while self._error is None and remainder:
             with self._noting():
-                rest = rest[self._disk.write(rest) :]
+                remainder = remainder[self._disk.write(remainder) :]
         return len(data)
 
     def truncate(self, size: int) -> int:
@@ -180,16 +180,16 @@ def _describe(file: "h5py.File", layout: Layout) -> None:
             _set(file[name], LONG_NAME, long_names[name])
 
 
-def _set(of: Any, name: str, value: Any) -> None:
+def _set(node: Any, name: str, value: Any) -> None:
     """Set an attribute; a string is stored at its own length, because no checksum covers HDF5's strings of variable length."""
     # Only files need it.
     import h5py
 
     if isinstance(value, str):
-        stored = value.encode()
-        of.attrs.create(name, stored, dtype=h5py.string_dtype("utf-8", max(1, len(stored))))
+        data = value.encode()
+        node.attrs.create(name, data, dtype=h5py.string_dtype("utf-8", max(1, len(data))))
     else:
-        of.attrs.create(name, value)
+        node.attrs.create(name, value)
 
 
 def _dataset(group: "h5py.Group", name: str) -> "h5py.Dataset":
@@ -206,9 +206,9 @@ def _dataset(group: "h5py.Group", name: str) -> "h5py.Dataset":
     return array
 
 
-def _attribute(of: Any, name: str) -> Any:
+def _attribute(node: Any, name: str) -> Any:
     """An attribute, a number or a string."""
-    value = of.attrs[name]
+    value = node.attrs[name]
     return value.decode() if isinstance(value, bytes) else value
 
 
@@ -343,7 +343,7 @@ class StoredVariables(Mapping[str, Values]):
 
 def coded(values: Values, words: tuple[str, ...]) -> tuple[Values, tuple[str, ...]]:
     """Words as codes, and the words in the order of their codes, beginning with the given ones."""
-    met = (word for word in dict.fromkeys(values.ravel().tolist()) if word not in (*words, UNREACHED))
-    words = (*words, *met)
+    new_words = (word for word in dict.fromkeys(values.ravel().tolist()) if word not in (*words, UNREACHED))
+    words = (*words, *new_words)
     codes = {word: code for code, word in enumerate(words)} | {UNREACHED: PENDING}
     return np.vectorize(codes.__getitem__, otypes=[np.int8])(values), words

@@ -113,7 +113,7 @@ def cells_to_check(axes: list[Axis]) -> Iterator[dict[str, Values]]:
         yield columns(axes, 0, size_of(axes))
         return
     for axis in axes:
-        fixed = {other.number: np.repeat(other.values[:1], len(axis.values)) for other in axes}
-        yield fixed | {axis.number: axis.values}
+        constants = {neighbour.number: np.repeat(neighbour.values[:1], len(axis.values)) for neighbour in axes}
+        yield constants | {axis.number: axis.values}
     corners = np.array(list(itertools.product(*((axis.values.min(), axis.values.max()) for axis in axes))))
     yield {axis.number: corner for axis, corner in zip(axes, corners.T, strict=True)}

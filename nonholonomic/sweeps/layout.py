@@ -81,8 +81,8 @@ class Layout(NamedTuple):
 
 def axes_of(coords: dict[str, Values], inner: dict[str, tuple[str, ...]]) -> list[str]:
     """The coordinates that are axes of the grid, without those of the variables' additional dimensions."""
-    within = {dim for dims in inner.values() for dim in dims}
-    return [name for name in coords if name not in within]
+    inner_dims = {dim for dims in inner.values() for dim in dims}
+    return [name for name in coords if name not in inner_dims]
 
 
 def boxes(shape: tuple[int, ...], first: int, end: int) -> Iterator[tuple[slice, ...]]:
@@ -92,13 +92,13 @@ def boxes(shape: tuple[int, ...], first: int, end: int) -> Iterator[tuple[slice,
         return
     row = math.prod(shape[1:])
     while first < end:
-        start, within = divmod(first, row)
+        start, offset = divmod(first, row)
         rows = (end - first) // row
-        if within == 0 and rows:
+        if offset == 0 and rows:
             yield (slice(start, start + rows), *(slice(0, size) for size in shape[1:]))
             first += rows * row
         else:
             stop = min(end, (start + 1) * row)
-            for rest in boxes(shape[1:], within, within + stop - first):
-                yield (slice(start, start + 1), *rest)
+            for box in boxes(shape[1:], offset, offset + stop - first):
+                yield (slice(start, start + 1), *box)
             first = stop

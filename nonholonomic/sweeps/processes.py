@@ -96,9 +96,9 @@ def _started(place: int, threads: int) -> ProcessPoolExecutor:
     pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin)
     with _starting, _environment(_settings()), _cores(place, threads), _without_interrupts():
         # The process starts with the first call.
-        begun = pool.submit(int)
+        first_call = pool.submit(int)
     try:
-        begun.result()
+        first_call.result()
     except BrokenProcessPool as error:
         # It would die again.
         raise RuntimeError(
@@ -120,12 +120,12 @@ def _settings() -> dict[str, str]:
 
 @contextlib.contextmanager
 def _environment(settings: dict[str, str]) -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in settings}
+    old_values = {name: os.environ.get(name) for name in settings}
     os.environ.update(settings)
     try:
         yield
     finally:
-        for name, value in before.items():
+        for name, value in old_values.items():
             if value is None:
                 del os.environ[name]
             else:
@@ -153,11 +153,11 @@ def _without_interrupts() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    old_values = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, old_values)
 
 
 def _begin() -> None:

@@ -96,12 +96,12 @@ def sweep(
     except KeyboardInterrupt:
         raise KeyboardInterrupt(store.interrupted()) from None
     except ExecutorBroken as error:
-        kept = (
+        state_of_file = (
             "without path=, nothing is saved"
             if path is None
             else f"{path} has the finished chunks; repeat the call to resume"
         )
-        raise RuntimeError(f"{error}, {kept}") from error.__cause__
+        raise RuntimeError(f"{error}, {state_of_file}") from error.__cause__
     finally:
         store.close()
 
@@ -111,25 +111,25 @@ def computed(
 ) -> Iterator[tuple[int, dict[str, Values]]]:
     """Compute the unfinished chunks, and yield each when it is finished; see `sweep`."""
     todo = [chunk for chunk in range(layout.chunks) if chunk not in finished]
-    done = layout.cells - sum(map(layout.size, todo))
-    with Progress(layout.cells, "cell", shown=progress) as shown, workforce(work, executor) as submit:
-        begun = executor is None
-        if begun:
+    finished_cells = layout.cells - sum(map(layout.size, todo))
+    with Progress(layout.cells, "cell", shown=progress) as display, workforce(work, executor) as submit:
+        is_compiled = executor is None
+        if is_compiled:
             if todo:
                 in_a_thread(work.compile)
-            shown.begin(done)
+            display.begin(finished_cells)
         try:
             for chunk, values in handed_out(lambda chunk: submit(chunk * layout.chunk, layout.chunk), todo, HANDED_OUT):
                 yield chunk, failed_chunk(work.axes, layout, chunk) if values is None else values
-                done += layout.size(chunk)
+                finished_cells += layout.size(chunk)
                 # If other processes compute, they do not report when they have compiled.
-                if begun:
-                    shown.advance(layout.size(chunk))
+                if is_compiled:
+                    display.advance(layout.size(chunk))
                 else:
-                    shown.begin(done)
-                begun = True
+                    display.begin(finished_cells)
+                is_compiled = True
         except ExecutorBroken as error:
-            raise ExecutorBroken(f"{error}; {done} of {layout.cells} cells are done") from error.__cause__
+            raise ExecutorBroken(f"{error}; {finished_cells} of {layout.cells} cells are done") from error.__cause__
 
 
 def layout_of(
@@ -147,8 +147,8 @@ def layout_of(
     long_names = {variable.name: variable.long_name for variable in (*axes, *inner)}
     long_names |= {name: variable.long_name for name, variable in variables.items()}
     if any(long_names.values()):
-        named = {name: long_name for name, long_name in long_names.items() if long_name}
-        attributes[LONG_NAMES] = json.dumps(named, sort_keys=True)
+        present = {name: long_name for name, long_name in long_names.items() if long_name}
+        attributes[LONG_NAMES] = json.dumps(present, sort_keys=True)
     kinds = {name: np.dtype(variable.kind) for name, variable in variables.items()}
     words = {name: variable.words for name, variable in variables.items() if variable.words is not None}
     dims = {name: variable.inner for name, variable in variables.items() if variable.inner}
@@ -163,22 +163,22 @@ class Held:
 
         **Raises:** `ValueError` if this machine does not have enough memory.
         """
-        need, room = layout.bytes_of_cells(layout.cells), memory()
-        if need > room:
+        required, room = layout.bytes_of_cells(layout.cells), memory()
+        if required > room:
             raise ValueError(
-                f"path = None: {layout.cells:.3g} cells take {1e-9 * need:.3g} GB, and this machine has {1e-9 * room:.3g} GB "
-                "of memory; pass path= to keep them in a file"
+                f"path = None: {layout.cells:.3g} cells take {1e-9 * required:.3g} GB, and this machine has "
+                f"{1e-9 * room:.3g} GB of memory; pass path= to keep them in a file"
             )
         self.finished: set[int] = set()
-        self._layout, self._found = layout, layout.empty(layout.cells)
+        self._layout, self._values = layout, layout.empty(layout.cells)
 
     def filled(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> dict[str, Values]:
         """Store the computed chunks, and return the variables with all cells along the first axis."""
         for chunk, values in computed:
             first, end = self._layout.ends(chunk)
             for name, values_of_chunk in values.items():
-                self._found[name][first:end] = values_of_chunk
-        return self._found
+                self._values[name][first:end] = values_of_chunk
+        return self._values
 
     def interrupted(self) -> str:
         """Message after Ctrl-C."""
@@ -213,8 +213,10 @@ def workforce(work: ChunkTask, executor: Executor | None) -> Iterator[Callable[[
     elif isinstance(executor, ThreadPoolExecutor):
         yield functools.partial(executor.submit, work.results)
     else:
-        sent, needed = packed(work), stamp()
-        yield lambda first, count: executor.submit(remote_results, sent, needed, first, count, uuid.uuid4().hex)
+        payload, versions_here = packed(work), stamp()
+        yield lambda first, count: executor.submit(
+            remote_results, payload, versions_here, first, count, uuid.uuid4().hex
+        )
 
 
 def failed_chunk(axes: list[Axis], layout: Layout, chunk: int) -> dict[str, Values]:
@@ -222,9 +224,9 @@ def failed_chunk(axes: list[Axis], layout: Layout, chunk: int) -> dict[str, Valu
     cells."""
     first, end = layout.ends(chunk)
     ends = [columns(axes, cell, 1) for cell in (first, end - 1)]
-    named = ", ".join(f"{name} {ends[0][name].item():.6g} to {ends[1][name].item():.6g}" for name in ends[0])
+    ranges = ", ".join(f"{name} {ends[0][name].item():.6g} to {ends[1][name].item():.6g}" for name in ends[0])
     warnings.warn(
-        f"cells {first} to {end - 1} ({named}) are given up as failed: they killed {MAX_CRASHES} workers or more",
+        f"cells {first} to {end - 1} ({ranges}) are given up as failed: they killed {MAX_CRASHES} workers or more",
         RuntimeWarning,
         stacklevel=4,
     )
@@ -252,8 +254,8 @@ def chunk_for(cells: int) -> int:
 
 def chunks_together(layout: Layout, chunk: int) -> int:
     """Number of chunks that are dispatched and stored together, a power of two, greater than one for large grids."""
-    wanted = min(layout.cells // (CHUNKS * chunk), MOST_BYTES // layout.bytes_of_cells(chunk))
-    return 1 << max(wanted, 1).bit_length() - 1
+    count = min(layout.cells // (CHUNKS * chunk), MOST_BYTES // layout.bytes_of_cells(chunk))
+    return 1 << max(count, 1).bit_length() - 1
 
 
 def memory() -> float:

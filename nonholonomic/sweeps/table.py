@@ -12,7 +12,7 @@ from ..parameters import as_html, readable_unit
 from ..validation import as_path, require_package
 from ..views import draw_table
 from ._chunks import unfinished
-from ._file import HELD, LONG_NAMES, Stored, StoredVariables, coded, replacing, write_file
+from ._file import LONG_NAMES, MAX_BYTES_IN_MEMORY, Stored, StoredVariables, coded, replacing, write_file
 from .digits import concise_strings
 from .layout import UNREACHED, Layout, Values, axes_of
 
@@ -66,11 +66,11 @@ class Table(eqx.Module):
 
     def __getitem__(self, name: str) -> Values:
         if not isinstance(name, str):
-            known = ", ".join([*self.variables, *self.coords])
-            raise ValueError(f"table[{name!r}]: {name!r} must be the name of a variable or an axis: {known}")
-        for known in (self.variables, self.coords):
-            if name in known:
-                return known[name]
+            names = ", ".join([*self.variables, *self.coords])
+            raise ValueError(f"table[{name!r}]: {name!r} must be the name of a variable or an axis: {names}")
+        for names in (self.variables, self.coords):
+            if name in names:
+                return names[name]
         raise KeyError(f"the table has no {name!r}; it has {', '.join([*self.variables, *self.coords])}")
 
     def _ipython_key_completions_(self) -> list[str]:
@@ -115,12 +115,12 @@ class Table(eqx.Module):
         import xarray
 
         if chunks is not None and isinstance(self.variables, StoredVariables):
-            stored = self.variables.stored
-            dataset = xarray.open_dataset(stored.path, engine="h5netcdf", chunks=chunks)
+            file = self.variables.stored
+            dataset = xarray.open_dataset(file.path, engine="h5netcdf", chunks=chunks)
             for name, words in self.words.items():
-                known = np.array([*words, UNREACHED])
+                meanings = np.array([*words, UNREACHED])
                 dataset[name] = dataset[name].copy(
-                    data=dataset[name].data.map_blocks(known.__getitem__, dtype=known.dtype)
+                    data=dataset[name].data.map_blocks(meanings.__getitem__, dtype=meanings.dtype)
                 )
             return dataset
 
@@ -160,25 +160,29 @@ class Table(eqx.Module):
         import pandas
 
         inner = dict.fromkeys(dim for dims in self.inner.values() for dim in dims)
-        named = {dim for dim in inner if np.asarray(self.coords[dim]).dtype.kind == "U"}
-        dims = [*axes_of(self.coords, self.inner), *(dim for dim in inner if dim not in named)]
+        component_dims = {dim for dim in inner if np.asarray(self.coords[dim]).dtype.kind == "U"}
+        dims = [*axes_of(self.coords, self.inner), *(dim for dim in inner if dim not in component_dims)]
         shape = tuple(len(self.coords[dim]) for dim in dims)
 
-        def column(values: Values, own: tuple[str, ...]) -> Values:
+        def column(values: Values, own_dims: tuple[str, ...]) -> Values:
             # The variable's dimensions are in the order of the table's.
-            spread = np.expand_dims(values, [k for k, dim in enumerate(dims) if dim not in own])
-            return np.broadcast_to(spread, shape).reshape(-1)
+            expanded = np.expand_dims(values, [k for k, dim in enumerate(dims) if dim not in own_dims])
+            return np.broadcast_to(expanded, shape).reshape(-1)
 
         columns, units = {dim: column(self.coords[dim], (dim,)) for dim in dims}, dict(self.units)
         for name in self.variables:
-            own = self.dims(name)
-            for index in np.ndindex(*(len(self.coords[dim]) if dim in named else 1 for dim in own)):
-                parts = [str(self.coords[dim][k]) for dim, k in zip(own, index, strict=True) if dim in named]
-                at = tuple(k if dim in named else slice(None) for dim, k in zip(own, index, strict=True))
-                whole = ".".join([name, *parts])
-                columns[whole] = column(self.variables[name][at], tuple(dim for dim in own if dim not in named))
+            own_dims = self.dims(name)
+            for index in np.ndindex(*(len(self.coords[dim]) if dim in component_dims else 1 for dim in own_dims)):
+                parts = [
+                    str(self.coords[dim][k]) for dim, k in zip(own_dims, index, strict=True) if dim in component_dims
+                ]
+                key = tuple(k if dim in component_dims else slice(None) for dim, k in zip(own_dims, index, strict=True))
+                column_name = ".".join([name, *parts])
+                columns[column_name] = column(
+                    self.variables[name][key], tuple(dim for dim in own_dims if dim not in component_dims)
+                )
                 if name in units:
-                    units[whole] = units[name]
+                    units[column_name] = units[name]
         frame = pandas.DataFrame(columns)
         frame.attrs["units"] = {name: unit for name, unit in units.items() if name in columns}
         return frame
@@ -193,14 +197,14 @@ class Table(eqx.Module):
             with replacing(file) as scratch:
                 shutil.copyfile(self.variables.stored.path, scratch)
             return
-        words, stored = {}, {}
+        words, arrays = {}, {}
         for name, values in self.variables.items():
-            stored[name] = np.asarray(values)
-            if stored[name].dtype.kind == "U":
-                stored[name], words[name] = coded(stored[name], self.words.get(name, ()))
-        kinds = {name: values.dtype for name, values in stored.items()}
+            arrays[name] = np.asarray(values)
+            if arrays[name].dtype.kind == "U":
+                arrays[name], words[name] = coded(arrays[name], self.words.get(name, ()))
+        kinds = {name: values.dtype for name, values in arrays.items()}
         layout = Layout(self.coords, kinds, self.units, self.attributes, words, self.inner, CHUNK)
-        flat = {name: values.reshape(-1, *layout.inner_shape(name)) for name, values in stored.items()}
+        flat = {name: values.reshape(-1, *layout.inner_shape(name)) for name, values in arrays.items()}
         ends = enumerate(map(layout.ends, range(layout.chunks)))
         cut = ((chunk, {name: values[first:end] for name, values in flat.items()}) for chunk, (first, end) in ends)
         write_file(file, layout, cut)
@@ -213,14 +217,14 @@ class Table(eqx.Module):
         **Raises:** `OSError` that names the path if the file cannot be read or contains no table.
         """
         file = as_path(path, "path")
-        begun = unfinished(file)
-        return cls.of(Stored(file)) if begun is None else cls.laid_out(*begun)
+        partial = unfinished(file)
+        return cls.of(Stored(file)) if partial is None else cls.laid_out(*partial)
 
     @classmethod
     def of(cls, stored: Stored) -> "Table":
         """A table whose variables stay in the file; a small table is read at once."""
         layout = stored.layout
-        if layout.bytes_of_cells(layout.cells) <= HELD:
+        if layout.bytes_of_cells(layout.cells) <= MAX_BYTES_IN_MEMORY:
             return cls.laid_out(layout, {name: stored.whole(name) for name in layout.kinds})
         variables = StoredVariables(stored)
         return cls(layout.coords, variables, layout.units, layout.attributes, layout.words, layout.inner)

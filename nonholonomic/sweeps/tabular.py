@@ -137,8 +137,8 @@ class Tabular(abc.ABC):
         **Raises:** `ValueError` for an unknown variable.
         """
         require_package("matplotlib", "plot", "portrait")
-        across, up = self.portrait_axes
-        return draw_portrait(self.to_table(), across if x is None else x, up if y is None else y, ax)
+        x_name, y_name = self.portrait_axes
+        return draw_portrait(self.to_table(), x_name if x is None else x, y_name if y is None else y, ax)
 
     def __getattr__(self, name: str) -> Any:
         # Python calls this for unknown names, and for known names whose property raised an AttributeError, which is

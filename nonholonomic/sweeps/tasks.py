@@ -42,9 +42,9 @@ class ChunkTask(NamedTuple):
         end = min(first + count, size_of(self.axes))
         parts = []
         for start in range(first, end, self.chunk):
-            counted = min(self.chunk, end - start)
-            variables = self.job(columns(self.axes, start, self.chunk), counted)
-            parts.append({name: np.asarray(values)[:counted] for name, values in variables.items()})
+            count_of_part = min(self.chunk, end - start)
+            variables = self.job(columns(self.axes, start, self.chunk), count_of_part)
+            parts.append({name: np.asarray(values)[:count_of_part] for name, values in variables.items()})
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
@@ -62,25 +62,25 @@ def packed(work: ChunkTask) -> bytes:
         ) from None
 
 
-def remote_results(sent: bytes, needed: dict[str, str], first: int, count: int, mark: str) -> dict[str, Values]:
+def remote_results(payload: bytes, needed: dict[str, str], first: int, count: int, mark: str) -> dict[str, Values]:
     """Compute the results of several cells in a worker process.
 
-    **Arguments:** `sent`: the result of `packed`; `needed`: the `stamp` of the sender; `first`, `count`: as for
+    **Arguments:** `payload`: the result of `packed`; `needed`: the `stamp` of the sender; `first`, `count`: as for
     `ChunkTask.results`; `mark`: different in every call, because Dask merges calls with equal arguments.
 
     **Raises:** `RuntimeError` that names the worker if a package there has another version, which may give other
     results.
     """
-    own = stamp()
+    local = stamp()
     for name in MUST_AGREE:
-        if own[name] != needed[name]:
+        if local[name] != needed[name]:
             raise RuntimeError(
-                f"the worker {platform.node()}, process {os.getpid()}, has {name} {own[name]}, and {needed[name]} is needed: "
+                f"the worker {platform.node()}, process {os.getpid()}, has {name} {local[name]}, and {needed[name]} is needed: "
                 "all workers of a table need the same versions"
             )
     # Otherwise, threads of one worker would compile the same program twice.
     with _unpacking:
-        work = _unpacked(sent)
+        work = _unpacked(payload)
     return work.results(first, count)
 
 
@@ -88,10 +88,10 @@ _unpacking = threading.Lock()
 
 
 @functools.lru_cache(maxsize=4)
-def _unpacked(sent: bytes) -> ChunkTask:
+def _unpacked(payload: bytes) -> ChunkTask:
     """The work, compiled once per process, however many parts of it arrive."""
     forget_programs_if_many()
-    work = pickle.loads(sent)
+    work = pickle.loads(payload)
     work.compile()
     return work
 
@@ -99,12 +99,14 @@ def _unpacked(sent: bytes) -> ChunkTask:
 @functools.cache
 def versions() -> dict[str, str]:
     """The versions that a result depends on."""
-    others = ("jax", "jaxlib", "diffrax", "numpy")
-    return {"python": platform.python_version(), "nonholonomic": __version__} | {name: version(name) for name in others}
+    packages = ("jax", "jaxlib", "diffrax", "numpy")
+    return {"python": platform.python_version(), "nonholonomic": __version__} | {
+        name: version(name) for name in packages
+    }
 
 
 def stamp() -> dict[str, str]:
     """The versions in this process of the packages in `MUST_AGREE`."""
     # Float64 may have been switched off by hand.
-    own = versions() | {"float": str(np.dtype(jnp.result_type(float)))}
-    return {name: own[name] for name in MUST_AGREE}
+    local = versions() | {"float": str(np.dtype(jnp.result_type(float)))}
+    return {name: local[name] for name in MUST_AGREE}

@@ -87,9 +87,9 @@ def _elements(number: Array) -> Elements:
 def _constants(array: Any) -> Elements:
     """The elements of an array that is known, or that is traced outside the function."""
     elements = np.empty(np.shape(array), object)
-    known = array if is_traced(array) else np.asarray(array)
+    constants_array = array if is_traced(array) else np.asarray(array)
     for index in np.ndindex(elements.shape):
-        elements[index] = known[index]
+        elements[index] = constants_array[index]
     return elements
 
 
@@ -151,11 +151,11 @@ class Evaluation:
 
     def _number(self, name: str, operands: list[Any], equation: Any = None) -> Any:
         """A scalar operation: arithmetic, or the operation of an equation."""
-        simple = _simplified(name, operands)
-        if simple is not None:
-            if name == "mul" and _is_constant(simple):
+        simplified = _simplified(name, operands)
+        if simplified is not None:
+            if name == "mul" and _is_constant(simplified):
                 self.dropped += [operand for operand in operands if id(operand) in self.risky]
-            return simple
+            return simplified
         if all(map(_is_constant, operands)) and name in ("eq", "ne", "lt", "le", "gt", "ge"):
             return np.bool_(getattr(operator, name)(*operands))
         if name == "convert_element_type" and _is_constant(operands[0]):
@@ -166,14 +166,14 @@ class Evaluation:
             if len(self.computed) > MOST_OPERATIONS:
                 raise TooLarge(name)
             shape = np.broadcast_shapes(*map(np.shape, operands))
-            full = [jnp.broadcast_to(jnp.asarray(operand), shape) for operand in operands]
+            operands_of_shape = [jnp.broadcast_to(jnp.asarray(operand), shape) for operand in operands]
             self.kept += operands
             bind = (
                 FUNCTIONS[name] if name in FUNCTIONS else functools.partial(equation.primitive.bind, **equation.params)
             )
-            result = bind(*full)
+            result = bind(*operands_of_shape)
             # Stored together with an operand, because XLA would recompute a result that is stored alone.
-            result = stored(result, full[0])[0] if name in COSTLY.split() else result
+            result = stored(result, operands_of_shape[0])[0] if name in COSTLY.split() else result
             if _is_risky(name, operands, equation) or any(id(operand) in self.risky for operand in operands):
                 self.risky.add(id(result))
             if name in TRANSPARENT.split():
@@ -186,26 +186,26 @@ class Evaluation:
         shows this. Most such factors are also terms of a result, which is then not finite. The other factors, which are
         rare, are multiplied by zero and added to the first result.
         """
-        shown, waiting = set(), list(results)
-        while waiting:
-            number = waiting.pop()
-            if id(number) not in shown:
-                shown.add(id(number))
-                waiting += self.sources.get(id(number), [])
-        hidden = {id(factor): factor for factor in self.dropped if id(factor) not in shown}
+        visited, stack = set(), list(results)
+        while stack:
+            number = stack.pop()
+            if id(number) not in visited:
+                visited.add(id(number))
+                stack += self.sources.get(id(number), [])
+        factors = {id(factor): factor for factor in self.dropped if id(factor) not in visited}
         place = next((k for k, result in enumerate(results) if jnp.issubdtype(result.dtype, jnp.floating)), None)
-        if not hidden or place is None:
+        if not factors or place is None:
             return results
-        total = functools.reduce(operator.add, hidden.values())
+        total = functools.reduce(operator.add, factors.values())
         return [result + 0.0 * total if k == place else result for k, result in enumerate(results)]
 
     def _sum(self, terms: Iterator[Any], name: str = "add") -> Any:
         return functools.reduce(lambda total, term: self._number(name, [total, term]), terms)
 
     def _reduced(self, name: str, elements: Elements, axes: Sequence[int]) -> Elements:
-        kept = [k for k in range(elements.ndim) if k not in axes]
-        rows = np.transpose(elements, (*kept, *axes)).reshape(
-            *(elements.shape[k] for k in kept), math.prod(elements.shape[k] for k in axes)
+        kept_axes = [k for k in range(elements.ndim) if k not in axes]
+        rows = np.transpose(elements, (*kept_axes, *axes)).reshape(
+            *(elements.shape[k] for k in kept_axes), math.prod(elements.shape[k] for k in axes)
         )
         results = np.empty(rows.shape[:-1], object)
         for index in np.ndindex(results.shape):
@@ -221,10 +221,10 @@ class Evaluation:
         # There may be no elements: a system without constraints has empty arrays.
         count = math.prod(left.shape[k] for k in sums)
         rows = np.transpose(left, (*batch, *free, *sums)).reshape(*shapes[0], *shapes[1], count)
-        others = np.transpose(right, (*right_batch, *right_free, *right_sums)).reshape(*shapes[0], *shapes[2], count)
+        columns = np.transpose(right, (*right_batch, *right_free, *right_sums)).reshape(*shapes[0], *shapes[2], count)
         results = np.empty([*shapes[0], *shapes[1], *shapes[2]], object)
         for lane, row, column in itertools.product(*(list(np.ndindex(*shape)) for shape in shapes)):
-            pairs = zip(rows[(*lane, *row)], others[(*lane, *column)], strict=True)
+            pairs = zip(rows[(*lane, *row)], columns[(*lane, *column)], strict=True)
             terms = (self._number("mul", list(pair)) for pair in pairs)
             results[(*lane, *row, *column)] = self._sum(terms) if count else np.float64(0.0)
         return results
@@ -293,12 +293,12 @@ def _broadcast(equation: Any, elements: Elements, *dynamic: Any) -> Elements:
 
 def _padded(equation: Any, elements: Elements, filling: Elements) -> Elements:
     widths = equation.params["padding_config"]
-    if any(inside for _, _, inside in widths) or any(width < 0 for width in np.ravel(widths)):
+    if any(interior for _, _, interior in widths) or any(width < 0 for width in np.ravel(widths)):
         raise TooLarge("pad")
-    whole = np.full(equation.outvars[0].aval.shape, None, object)
-    whole.fill(filling.item())
-    whole[tuple(slice(low, low + size) for (low, _, _), size in zip(widths, elements.shape, strict=True))] = elements
-    return whole
+    result = np.full(equation.outvars[0].aval.shape, None, object)
+    result.fill(filling.item())
+    result[tuple(slice(low, low + size) for (low, _, _), size in zip(widths, elements.shape, strict=True))] = elements
+    return result
 
 
 def _sliced(equation: Any, elements: Elements) -> Elements:
@@ -313,10 +313,10 @@ def _reshaped(equation: Any, elements: Elements) -> Elements:
 
 def _counted(equation: Any) -> Elements:
     params = equation.params
-    along = np.arange(params["shape"][params["dimension"]]).astype(params["dtype"])
+    indices = np.arange(params["shape"][params["dimension"]]).astype(params["dtype"])
     axes = [1] * len(params["shape"])
     axes[params["dimension"]] = -1
-    return _constants(np.broadcast_to(along.reshape(axes), params["shape"]))
+    return _constants(np.broadcast_to(indices.reshape(axes), params["shape"]))
 
 
 #: Operations that move numbers.

@@ -16,7 +16,8 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from ..hybrid import AbstractBatchedMode, Transition
-from ..integration import CROSSED, FAILED, LEFT_DOMAIN, RUNNING, AbstractProblem, Lanes, States
+from ..integration import AbstractProblem, Lanes, States
+from ..integration.status import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
 from .components import TooLarge, by_components
 from .form import Form, OfRun
 from .mode import State
@@ -56,7 +57,7 @@ class ModeProblem(AbstractProblem):
 
     def field(self, time: Lanes, state: States) -> States:
         rates = self._over_lanes(lambda *run: tuple(self.form.function("field", self.mode)(*run)), state)
-        clock = (jnp.ones_like(state[0]),) if self.form.traits.timed else ()
+        clock = (jnp.ones_like(state[0]),) if self.form.traits.depends_on_time else ()
         return jnp.stack((*rates, *clock))
 
     def event_function(self, state: States) -> Lanes | None:
@@ -88,7 +89,7 @@ class ModeProblem(AbstractProblem):
 
 def time_and_state(form: Form, parts: tuple[Array, ...]) -> tuple[Array, State]:
     """Time and state of a run, from its components; the time is a placeholder if nothing depends on it."""
-    if form.traits.timed:
+    if form.traits.depends_on_time:
         return parts[-1], jnp.stack(parts[:-1])
     return jnp.asarray(jnp.nan), jnp.stack(parts)
 
@@ -128,30 +129,30 @@ class BatchedMode(AbstractBatchedMode):
         value, slope = margin.along(state)
         # The end was located to a fraction of a step and may lie after the zero; the way back is known.
         close = margin.is_near_zero(state, AT_END) & (slope < 0.0) & (value < 0.0)
-        late = jnp.where(close, -value / jnp.where(close, slope, 1.0), 0.0)
-        state = state + late * margin.rate(state)
-        none = jnp.zeros((), int)
+        delay = jnp.where(close, -value / jnp.where(close, slope, 1.0), 0.0)
+        state = state + delay * margin.rate(state)
+        zero = jnp.zeros((), int)
         if not form.traits.resets[self.mode]:
-            nothing = jnp.full_like(late, jnp.inf)
-            return Transition(none + self.mode, state, late, none + LEFT_DOMAIN, nothing, none[None])
+            no_time = jnp.full_like(delay, jnp.inf)
+            return Transition(zero + self.mode, state, delay, zero + LEFT_DOMAIN, no_time, zero[None])
         t, y = time_and_state(form, tuple(state))
-        after, number = form.function("reset", self.mode)(numbers, t, y)
+        state_after, number = form.function("reset", self.mode)(numbers, t, y)
         number = jnp.asarray(number).astype(int)
-        after = jnp.concatenate([after, state[form.size :]])
+        state_after = jnp.concatenate([state_after, state[form.size :]])
         status = jnp.where((number >= 0) & (number < form.modes), RUNNING, FAILED)
         if not form.has_event:
-            return Transition(number, after, late, status, jnp.full_like(late, jnp.inf), none[None] + 1)
+            return Transition(number, state_after, delay, status, jnp.full_like(delay, jnp.inf), zero[None] + 1)
         event = _Watched(form, self.mode, form.function("event"), numbers, scales)
-        before, falling = event.along(state)
-        ends = event.is_near_zero(state, ROUND_OFF) & (falling < 0.0)
-        jumps = ~ends & (before > 0.0) & (event.value(after) <= 0.0)
+        value_before, slope_before = event.along(state)
+        ends = event.is_near_zero(state, ROUND_OFF) & (slope_before < 0.0)
+        jumps = ~ends & (value_before > 0.0) & (event.value(state_after) <= 0.0)
         crossed = ends | jumps
         return Transition(
             mode=jnp.where(ends, self.mode, jnp.where(jumps, form.modes, number)),
-            state=jnp.where(ends, state, after),
-            elapsed=late,
+            state=jnp.where(ends, state, state_after),
+            elapsed=delay,
             status=jnp.where(crossed, CROSSED, status),
-            crossing_time=jnp.where(crossed, late, jnp.inf),
+            crossing_time=jnp.where(crossed, delay, jnp.inf),
             counts=jnp.where(ends, 0, 1)[None],
         )
 
@@ -203,9 +204,9 @@ class Cells(eqx.Module):
         """
         shape = () if cells is None else (cells,)
         states = jnp.stack([jnp.broadcast_to(part, shape) for part in self.start])
-        largest = jnp.max(jnp.abs(stop_gradient(states)), axis=0)
-        scales = jnp.broadcast_to(jnp.where(largest > 0.0, jnp.minimum(largest, 1.0), 1.0), states.shape)
-        if not self.form.traits.timed:
+        magnitude = jnp.max(jnp.abs(stop_gradient(states)), axis=0)
+        scales = jnp.broadcast_to(jnp.where(magnitude > 0.0, jnp.minimum(magnitude, 1.0), 1.0), states.shape)
+        if not self.form.traits.depends_on_time:
             return states, scales
         clock = jnp.zeros((1, *shape))
         return jnp.concatenate([states, clock]), jnp.concatenate([scales, clock + UNMEASURED])

@@ -15,16 +15,9 @@ from ..derivatives import (
     traced_solve_ensemble_with_tangents,
 )
 from ..hybrid import HybridOutcome, traced_solve_hybrid, traced_solve_hybrid_with_tangents
-from ..integration import (
-    CROSSED,
-    FAILED,
-    UNRESOLVED,
-    Outcome,
-    Settings,
-    explicit_tableau,
-    legal_run,
-    traced_solve_ensemble,
-)
+from ..integration import Outcome, Settings, explicit_tableau, traced_solve_ensemble
+from ..integration.checks import legal_run
+from ..integration.status import CROSSED, FAILED, UNRESOLVED
 from ..progress import status_line
 from ..validation import as_number
 from .engine import Cells
@@ -111,12 +104,12 @@ def event_time(
 @eqx.filter_jit
 def _time(cells: Cells, t1: Float[Array, ""], settings: Settings) -> Float[Array, ""]:
     numbers, structure = jax.tree.flatten(cells)
-    movable = [number for number in numbers if eqx.is_inexact_array(number)]
-    others = [number for number in numbers if not eqx.is_inexact_array(number)]
+    floats = [number for number in numbers if eqx.is_inexact_array(number)]
+    static = [number for number in numbers if not eqx.is_inexact_array(number)]
     places = tuple(eqx.is_inexact_array(number) for number in numbers)
     solve = SmoothEvent if cells.form.traits.smooth else HybridEvent
-    event = solve(len(movable), structure, places, settings.with_tolerance(None))
-    return differentiable_solve(event, *movable, *others, t1, settings.tolerance)
+    event = solve(len(floats), structure, places, settings.with_tolerance(None))
+    return differentiable_solve(event, *floats, *static, t1, settings.tolerance)
 
 
 class SmoothEvent(AbstractDifferentiableSolve):
@@ -137,8 +130,8 @@ class SmoothEvent(AbstractDifferentiableSolve):
 
     def of_leaves(self, leaves: tuple[Array, ...]) -> Cells:
         """The cells."""
-        floats, others = iter(leaves[: self.movable]), iter(leaves[self.movable :])
-        return jax.tree.unflatten(self.structure, [next(floats if is_float else others) for is_float in self.places])
+        floats, static = iter(leaves[: self.movable]), iter(leaves[self.movable :])
+        return jax.tree.unflatten(self.structure, [next(floats if is_float else static) for is_float in self.places])
 
     def permitted(self, leaves: tuple[Array, ...]) -> tuple[Bool[Array, "..."], Float[Array, "..."], Settings]:
         """A mask of the cells with a legal horizon, tolerance and start; the horizons, 0 for all other cells; and the
@@ -160,8 +153,8 @@ class SmoothEvent(AbstractDifferentiableSolve):
     def value_and_tangents(
         self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
-        def build(movable: tuple[Array, ...], cells: int | None) -> Any:
-            return self.of_leaves((*movable, *leaves[self.movable :])).problem(cells)
+        def build(floats: tuple[Array, ...], cells: int | None) -> Any:
+            return self.of_leaves((*floats, *leaves[self.movable :])).problem(cells)
 
         is_legal, t1, settings = self.permitted(leaves)
         problem, tangents, gather = tangents_by(build, active, leaves[: self.movable], cells)
@@ -188,16 +181,16 @@ class HybridEvent(SmoothEvent):
                 "second derivatives are not available through resets; take differences of a gradient instead"
             )
 
-        def build(movable: tuple[Array, ...], cells: int | None) -> Any:
+        def build(floats: tuple[Array, ...], cells: int | None) -> Any:
             assert cells is not None
-            return self.of_leaves((*movable, *leaves[self.movable :])).modes(cells)
+            return self.of_leaves((*floats, *leaves[self.movable :])).modes(cells)
 
         is_legal, t1, settings = self.permitted(leaves)
         (modes, first, states), tangents, gather = tangents_by(build, active, leaves[: self.movable], cells)
 
-        moved = tuple((tangent[0], tangent[2]) for tangent in tangents)
+        hybrid_tangents = tuple((tangent[0], tangent[2]) for tangent in tangents)
         outcome, sensitivities = traced_solve_hybrid_with_tangents(
-            modes, moved, first, states, t1, cells, settings, counters=1
+            modes, hybrid_tangents, first, states, t1, cells, settings, counters=1
         )
         time = _named(is_legal, outcome)
         return time, [jnp.where(jnp.isinf(time), 0.0, slope + 0.0 * time) for slope in gather([*sensitivities.slopes])]

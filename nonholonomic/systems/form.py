@@ -31,15 +31,15 @@ class Form:
     """A hybrid system without its numbers. The numbers are listed one by one, in order within each array.
 
     - `structure`: structure of the tree of numbers; `kinds`: shape and type of each leaf.
-    - `rest`, `rest_structure`: the leaves that are not numbers.
+    - `static_leaves`, `static_structure`: the leaves that are not numbers.
     - `modes`: number of modes; `first`: mode in which runs start; `has_event`: whether there is an event.
     - `size`: number of components of the state.
     """
 
     structure: Any
     kinds: tuple[tuple[tuple[int, ...], Any], ...]
-    rest: tuple[Hashable, ...]
-    rest_structure: Any
+    static_leaves: tuple[Hashable, ...]
+    static_structure: Any
     modes: int
     first: int
     has_event: bool
@@ -48,26 +48,26 @@ class Form:
     @classmethod
     def of(cls, hybrid: Hybrid, size: int) -> tuple["Form", tuple[Array, ...]]:
         """The form of a system with states of the given size, and its numbers."""
-        tree, others = eqx.partition(hybrid, is_number)
+        tree, static = eqx.partition(hybrid, is_number)
         leaves, structure = jax.tree.flatten(tree)
         arrays = [jnp.asarray(leaf) for leaf in leaves]
-        rest, rest_structure = jax.tree.flatten(others)
+        static_leaves, static_structure = jax.tree.flatten(static)
         kinds = tuple((array.shape, array.dtype) for array in arrays)
         modes = (len(hybrid.modes), hybrid.first, hybrid.event is not None)
-        form = cls(structure, kinds, tuple(rest), rest_structure, *modes, size)
+        form = cls(structure, kinds, tuple(static_leaves), static_structure, *modes, size)
         return form, tuple(
             number for array in arrays for number in (jnp.unstack(array.ravel()) if array.ndim else [array])
         )
 
     def system(self, numbers: Sequence[Array]) -> Hybrid:
         """The system with the given numbers, each a scalar."""
-        leaves, begin = [], 0
+        leaves, first = [], 0
         for shape, _ in self.kinds:
-            end = begin + math.prod(shape)
-            leaves.append(jnp.stack(numbers[begin:end]).reshape(shape) if shape else numbers[begin])
-            begin = end
-        rest = jax.tree.unflatten(self.rest_structure, self.rest)
-        return eqx.combine(jax.tree.unflatten(self.structure, leaves), rest)
+            end = first + math.prod(shape)
+            leaves.append(jnp.stack(numbers[first:end]).reshape(shape) if shape else numbers[first])
+            first = end
+        static = jax.tree.unflatten(self.static_structure, self.static_leaves)
+        return eqx.combine(jax.tree.unflatten(self.structure, leaves), static)
 
     def function(self, name: str, mode: int = 0) -> OfRun:
         """One of the user's functions: "field", "margin" or "reset" of a mode, or "event"."""
@@ -96,12 +96,12 @@ class Form:
 class Traits(NamedTuple):
     """The traits of a hybrid system, found by tracing its functions.
 
-    - `timed`: whether a function depends on time, which is then an additional component of the state.
+    - `depends_on_time`: whether a function depends on time, which is then an additional component of the state.
     - `elementary`: whether all functions that are evaluated within steps fit a single kernel.
     - `ends`, `resets`: for each mode, whether it has a margin, and whether it also has a reset.
     """
 
-    timed: bool
+    depends_on_time: bool
     elementary: bool
     ends: tuple[bool, ...]
     resets: tuple[bool, ...]
@@ -118,29 +118,34 @@ def _traits(form: Form) -> Traits:
 
     **Raises:** `ValueError` that names a function that returns a wrong type or shape.
     """
-    ends, resets, within, others = [], [], [], []
+    ends, resets, step_functions, reset_functions = [], [], [], []
     for k in range(form.modes):
         _require_shape(form, "field", k, (form.size,))
         ends.append(_result(form, "margin", k) is not None)
         reset = _result(form, "reset", k) if ends[k] else None
         resets.append(reset is not None)
-        within.append(form.function("field", k))
+        step_functions.append(form.function("field", k))
         if ends[k]:
             _require_shape(form, "margin", k, ())
-            within.append(form.function("margin", k))
+            step_functions.append(form.function("margin", k))
         if reset is not None:
             _require_pair(form, k, reset)
-            others.append(form.function("reset", k))
+            reset_functions.append(form.function("reset", k))
     if form.has_event:
         _require_shape(form, "event", 0, ())
-        within.append(form.function("event"))
+        step_functions.append(form.function("event"))
 
-    def seen(functions: list[OfRun]) -> Callable[..., Any]:
+    def combined(functions: list[OfRun]) -> Callable[..., Any]:
         return lambda t, y, *numbers: [function(numbers, t, y) for function in functions]
 
     numbers, t, y = form.arguments
-    timed = depends_on_first(seen([*within, *others]), t, y, *numbers)
-    return Traits(timed, is_elementary(spelled_out(seen(within)), t, y, *numbers), tuple(ends), tuple(resets))
+    depends_on_time = depends_on_first(combined([*step_functions, *reset_functions]), t, y, *numbers)
+    return Traits(
+        depends_on_time,
+        is_elementary(spelled_out(combined(step_functions)), t, y, *numbers),
+        tuple(ends),
+        tuple(resets),
+    )
 
 
 def _name(name: str, mode: int) -> str:
@@ -157,13 +162,15 @@ def _result(form: Form, name: str, mode: int) -> Any:
 
 def _require_shape(form: Form, name: str, mode: int, shape: tuple[int, ...]) -> None:
     """Raise `ValueError` unless a function returns an array of floats of a shape."""
-    what, result = _name(name, mode), _result(form, name, mode)
+    function_name, result = _name(name, mode), _result(form, name, mode)
     if not hasattr(result, "shape") or result.shape != shape:
-        wanted = "one number" if shape == () else f"an array of shape {shape}, like the start"
-        got = f"an array of shape {result.shape}" if hasattr(result, "shape") else repr(result)
-        raise ValueError(f"{what} must return {wanted}, not {got}; jnp.array([...]) makes an array of numbers")
+        expected = "one number" if shape == () else f"an array of shape {shape}, like the start"
+        description = f"an array of shape {result.shape}" if hasattr(result, "shape") else repr(result)
+        raise ValueError(
+            f"{function_name} must return {expected}, not {description}; jnp.array([...]) makes an array of numbers"
+        )
     if not jnp.issubdtype(result.dtype, jnp.floating):
-        raise ValueError(f"{what} must return floats, not {result.dtype}: it must be smooth")
+        raise ValueError(f"{function_name} must return floats, not {result.dtype}: it must be smooth")
 
 
 def _require_pair(form: Form, mode: int, result: Any) -> None:

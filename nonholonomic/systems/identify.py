@@ -23,7 +23,7 @@ from ..identification import (
     model_times,
     search_options,
 )
-from ..integration import tolerance_bound
+from ..integration.checks import tolerance_bound
 from ..progress import status_line
 from ..validation import as_number, as_number_or_none
 from .mode import Hybrid
@@ -38,8 +38,8 @@ class Components(Quantities):
 
     def of(self, quantity: Any) -> tuple[str, ...]:
         names = quantity if isinstance(quantity, tuple) else (quantity,)
-        wrong = [name for name in names if not (isinstance(name, str) and re.fullmatch(r"(y|q|rate)\d+", name))]
-        if wrong or not names or len(set(names)) < len(names):
+        unknown_names = [name for name in names if not (isinstance(name, str) and re.fullmatch(r"(y|q|rate)\d+", name))]
+        if unknown_names or not names or len(set(names)) < len(names):
             raise ValueError(
                 f"quantity = {quantity!r} must name components, such as 'y0' or ('q0', 'rate0'), each once"
             )
@@ -95,8 +95,8 @@ class SystemModel(AbstractDataModel):
 
     def _predict(self, recording: Recording, row: dict[str, Array]) -> Float[Array, " samples"]:
         """Predictions for the recording of one run, ordered by time."""
-        named = numbers_of(self.system, recording)
-        tree = named.tree(named.replaced(row))
+        parameters_of_data = numbers_of(self.system, recording)
+        tree = parameters_of_data.tree(parameters_of_data.replaced(row))
         times = model_times(recording.times, row.get("t0", recording.t0))
         start = tree["start"]
         start = (start["q"], start["rate"]) if isinstance(start, dict) else start
@@ -170,18 +170,24 @@ def identify(
     tolerance_bound(tolerance).require()
     if isinstance(system, Hybrid):
         system = dataclasses.replace(system, event=None)
-    named = [numbers_of(system, recording) for recording in data]
-    own = [[name for name in numbers.movable if name.startswith("start")] + ["t0"] for numbers in named]
-    known = [name for name in named[0].known if name.startswith("system")]
+    parameters_of_data = [numbers_of(system, recording) for recording in data]
+    names_of_data = [
+        [name for name in numbers.movable if name.startswith("start")] + ["t0"] for numbers in parameters_of_data
+    ]
+    shared = [name for name in parameters_of_data[0].known if name.startswith("system")]
 
     def check(values: dict[str, float]) -> None:
-        check_again(named[0].tree(named[0].replaced({name: jnp.asarray(value) for name, value in values.items()})))
+        check_again(
+            parameters_of_data[0].tree(
+                parameters_of_data[0].replaced({name: jnp.asarray(value) for name, value in values.items()})
+            )
+        )
 
     with status_line("fitting", progress):
-        unknowns = free_numbers(free, known, own, check)
+        unknowns = free_numbers(free, shared, names_of_data, check)
         require_apart("free", unknowns)
         return fit_data(
-            lambda seen: SystemModel(system=system, data=data, seen=jnp.asarray(seen), tolerance=tolerance),
+            lambda indices: SystemModel(system=system, data=data, seen=jnp.asarray(indices), tolerance=tolerance),
             data,
             unknowns,
             search,

@@ -110,10 +110,10 @@ class Hybrid(eqx.Module):
     first: int = eqx.field(static=True, default=0)
 
     def __check_init__(self):
-        wrong = [mode for mode in self.modes if not isinstance(mode, AbstractMode)]
-        if not self.modes or wrong:
-            what = f"modes holds {wrong[0]!r}" if wrong else "modes is empty"
-            raise ValueError(f"{what}: it must hold one AbstractMode or more, such as [Flying(), Sliding()]")
+        illegal = [mode for mode in self.modes if not isinstance(mode, AbstractMode)]
+        if not self.modes or illegal:
+            problem = f"modes holds {illegal[0]!r}" if illegal else "modes is empty"
+            raise ValueError(f"{problem}: it must hold one AbstractMode or more, such as [Flying(), Sliding()]")
         if self.event is not None and not callable(self.event):
             raise ValueError(f"event = {self.event!r} must be a function event(t, y) of time and state, or None")
         if not isinstance(self.first, int) or not 0 <= self.first < len(self.modes):

@@ -32,13 +32,13 @@ class Named(NamedTuple):
     places: tuple[int, ...]
     shapes: tuple[tuple[int, ...], ...]
     structure: Any
-    rest: Any
+    static: Any
 
     @classmethod
     def of(cls, tree: dict[str, Any], shared: Iterable[str] = ()) -> "Named":
         """The numbers of several named trees. **Arguments:** `shared`: names such as `"system.modes[*].drag"`, each of
         which becomes one number, with the value in the first of the modes."""
-        numbers, rest = eqx.partition(tree, is_number)
+        numbers, static = eqx.partition(tree, is_number)
         leaves, structure = jax.tree_util.tree_flatten_with_path(numbers)
         names, values, shapes = [], [], []
         for path, leaf in leaves:
@@ -47,22 +47,27 @@ class Named(NamedTuple):
             names += [name + "".join(f"[{k}]" for k in index) for index in np.ndindex(array.shape)]
             values += [jnp.asarray(array[index]) for index in np.ndindex(array.shape)]
             shapes.append(array.shape)
-        whole = [_of_all_modes(name) if _of_all_modes(name) in shared else name for name in names]
-        first = {name: k for k, name in reversed(list(enumerate(whole)))}
-        kept = sorted(first.values())
-        places = tuple(kept.index(first[name]) for name in whole)
+        merged_names = [_of_all_modes(name) if _of_all_modes(name) in shared else name for name in names]
+        first = {name: k for k, name in reversed(list(enumerate(merged_names)))}
+        indices = sorted(first.values())
+        places = tuple(indices.index(first[name]) for name in merged_names)
         return cls(
-            tuple(whole[k] for k in kept), tuple(values[k] for k in kept), places, tuple(shapes), structure, rest
+            tuple(merged_names[k] for k in indices),
+            tuple(values[k] for k in indices),
+            places,
+            tuple(shapes),
+            structure,
+            static,
         )
 
     def tree(self, values: tuple[Array, ...]) -> dict[str, Any]:
         """The trees for other values of the numbers."""
-        leaves, begin = [], 0
+        leaves, first = [], 0
         for shape in self.shapes:
-            part = [values[k] for k in self.places[begin : begin + math.prod(shape)]]
+            part = [values[k] for k in self.places[first : first + math.prod(shape)]]
             leaves.append(jnp.stack(part).reshape(shape) if shape else part[0])
-            begin += len(part)
-        return eqx.combine(jax.tree.unflatten(self.structure, leaves), self.rest)
+            first += len(part)
+        return eqx.combine(jax.tree.unflatten(self.structure, leaves), self.static)
 
     def replaced(self, changes: dict[str, Any]) -> tuple[Array, ...]:
         """The numbers with replacements, by name; a name such as `"system.modes[*].drag"` replaces several."""
@@ -79,8 +84,8 @@ class Named(NamedTuple):
     @property
     def known(self) -> list[str]:
         """The names of the numbers that can be varied, one by one or in all modes that have them."""
-        whole = [_of_all_modes(name) for name in self.movable]
-        return [*self.movable, *dict.fromkeys(name for name in whole if whole.count(name) > 1)]
+        merged_names = [_of_all_modes(name) for name in self.movable]
+        return [*self.movable, *dict.fromkeys(name for name in merged_names if merged_names.count(name) > 1)]
 
     def full_name(self, argument: str, name: str) -> str:
         """The full name for a name, as in `nonholonomic.parameters.full_name`.

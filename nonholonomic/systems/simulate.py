@@ -12,7 +12,9 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from ..derivatives import sampled_run
 from ..hybrid import AbstractBatchedMode, hybrid_samples
-from ..integration import FAILED, Settings, explicit_tableau, legal_run, require_times
+from ..integration import Settings, explicit_tableau
+from ..integration.checks import legal_run, require_times
+from ..integration.status import FAILED
 from ..progress import status_line
 from ..validation import as_known, as_number, is_traced, nan_unless
 from .engine import Cells, ModeProblem
@@ -91,14 +93,14 @@ def _sampled(
     """The run, or NaN and "failed" if a traced number is out of range."""
     cells = run.cells
     is_legal, horizon, tolerance = legal_run(True, t1, settings.tolerance, times)
-    settings, at = settings.with_tolerance(tolerance), jnp.where(is_legal, times, 0.0)
+    settings, legal_times = settings.with_tolerance(tolerance), jnp.where(is_legal, times, 0.0)
     if cells.form.traits.smooth:
-        samples = sampled_run(_problem, cells, at, horizon, settings)
-        states, reached = samples.states, jnp.all(jnp.isfinite(samples.states), axis=1)
-        mode, switches = jnp.where(reached, cells.form.first, -1), jnp.zeros(())
+        samples = sampled_run(_problem, cells, legal_times, horizon, settings)
+        states, is_reached = samples.states, jnp.all(jnp.isfinite(samples.states), axis=1)
+        mode, switches = jnp.where(is_reached, cells.form.first, -1), jnp.zeros(())
         status, steps = samples.status, samples.accepted + samples.rejected
     else:
-        samples = hybrid_samples(_modes, cells, at, horizon, settings, 1)
+        samples = hybrid_samples(_modes, cells, legal_times, horizon, settings, 1)
         states, mode, switches = (
             samples.shown.T,
             jnp.where(jnp.isnan(samples.number), -1, samples.number),

@@ -15,16 +15,8 @@ from jaxtyping import Array
 from ..derivatives import solve_ensemble_with_tangents, tangent_scale, tangents_of
 from ..formulations import AbstractSystem
 from ..hybrid import HybridOutcome, solve_hybrid, solve_hybrid_with_tangents
-from ..integration import (
-    CROSSED,
-    FAILED,
-    LEFT_DOMAIN,
-    UNRESOLVED,
-    Outcome,
-    Settings,
-    explicit_tableau,
-    solve_ensemble,
-)
+from ..integration import Outcome, Settings, explicit_tableau, solve_ensemble
+from ..integration.status import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED
 from ..sweeps import Table, Variable, axis, chunk_for, size_of
 from ..sweeps import sweep as computed
 from ..validation import as_number
@@ -109,29 +101,29 @@ def sweep(
     if isinstance(system, Hybrid) and event is not None:
         system, event = dataclasses.replace(system, event=event), None
     mechanical = isinstance(system, AbstractSystem)
-    begin = dict(zip(("q", "rate"), map(as_number, start), strict=True)) if mechanical else as_number(start)
-    tree = {"system": system, "start": begin, "event": event}
-    named = Named.of(tree)
-    full = {named.full_name("axes", name): values for name, values in axes.items()}
-    by = [named.full_name("sensitivities", name) for name in sensitivities]
-    require_apart("axes and sensitivities", [*full, *by])
-    named = Named.of(tree, [*full, *by])
-    shorts = short_names([*full, *(name for name in by if name not in full)])
-    grid = [axis(shorts[name], name, "1", values) for name, values in full.items()]
+    initial = dict(zip(("q", "rate"), map(as_number, start), strict=True)) if mechanical else as_number(start)
+    tree = {"system": system, "start": initial, "event": event}
+    parameters = Named.of(tree)
+    full_axes = {parameters.full_name("axes", name): values for name, values in axes.items()}
+    sensitivity_names = [parameters.full_name("sensitivities", name) for name in sensitivities]
+    require_apart("axes and sensitivities", [*full_axes, *sensitivity_names])
+    parameters = Named.of(tree, [*full_axes, *sensitivity_names])
+    shorts = short_names([*full_axes, *(name for name in sensitivity_names if name not in full_axes)])
+    grid = [axis(shorts[name], name, "1", values) for name, values in full_axes.items()]
     for grid_axis in grid if has_checks(system) or has_checks(event) else ():
         for value in grid_axis.values:
-            check_again(named.tree(named.replaced({grid_axis.number: jnp.asarray(value)})))
-    job = SweepJob(named, float(t1), settings, tuple(by))
-    run = _run(named.tree(named.values))
-    if by and not run.cells.form.has_event:
+            check_again(parameters.tree(parameters.replaced({grid_axis.number: jnp.asarray(value)})))
+    job = SweepJob(parameters, float(t1), settings, tuple(sensitivity_names))
+    run = _run(parameters.tree(parameters.values))
+    if sensitivity_names and not run.cells.form.has_event:
         raise ValueError("sensitivities are those of the event's time: pass event=, a function of time and state")
-    values = {name: float(value) for name, value in zip(named.names, named.values, strict=True)}
+    values = {name: float(value) for name, value in zip(parameters.names, parameters.values, strict=True)}
     request = {
         "system": type(system).__name__,
         "event": _function(system.event if isinstance(system, Hybrid) else event),
     }
-    request |= {name: value for name, value in values.items() if name not in full}
-    request |= {name: "an axis" for name in full} | {"sensitivities": by}
+    request |= {name: value for name, value in values.items() if name not in full_axes}
+    request |= {name: "an axis" for name in full_axes} | {"sensitivities": sensitivity_names}
     request |= {
         "t1": float(t1),
         "tolerance": float(tolerance),
@@ -156,10 +148,10 @@ def _run(tree: dict[str, Any]) -> Run:
 class SweepJob(NamedTuple):
     """The computation for every cell, as data that can be sent to another process; see `sweep`."""
 
-    named: Named
+    parameters: Named
     t1: float
     settings: Settings
-    by: tuple[str, ...]
+    sensitivity_names: tuple[str, ...]
 
     @classmethod
     def of(cls, tree: dict[str, Any], shared: tuple[str, ...], *rest: Any) -> "SweepJob":
@@ -168,7 +160,7 @@ class SweepJob(NamedTuple):
 
     def __reduce__(self) -> Any:
         # The structure of a tree with a user's classes cannot be pickled, but the tree can.
-        return SweepJob.of, (self.named.tree(self.named.values), self.named.names, *self[1:])
+        return SweepJob.of, (self.parameters.tree(self.parameters.values), self.parameters.names, *self[1:])
 
     def variables(self, run: Run, shorts: dict[str, str]) -> dict[str, Variable]:
         """The variables of the table."""
@@ -179,37 +171,37 @@ class SweepJob(NamedTuple):
         variables |= {name: Variable("1", np.float64, long_name=f"{name} at the end") for name in run.names}
         counts = {"steps": "steps", "rejected": "rejected steps"} | ({} if smooth else {"switches": "resets"})
         variables |= {name: Variable("1", np.int64, long_name=words) for name, words in counts.items()}
-        variables |= {f"time_by_{shorts[name]}": Variable("1", np.float64) for name in self.by}
-        if self.by and not smooth:
+        variables |= {f"time_by_{shorts[name]}": Variable("1", np.float64) for name in self.sensitivity_names}
+        if self.sensitivity_names and not smooth:
             variables |= {"grazes": Variable("1", np.int8, long_name="whether the end of a mode was grazing")}
         return variables
 
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
         """The variables of some cells, of which only the first `count` are run."""
         size = next((len(values) for values in columns.values()), 1)
-        cells, begin, tangents, scales = _cells(self.named, columns, self.by, size)
+        cells, initial, tangents, scales = _cells(self.parameters, columns, self.sensitivity_names, size)
         settings, t1 = self.settings, np.asarray(self.t1)
         grazing, slopes = np.zeros(size, bool), []
         if cells.form.traits.smooth:
-            problem, counted = begin, np.asarray(count)
-            if self.by:
-                outcome, slopes = solve_ensemble_with_tangents(problem, tangents, t1, counted, settings)
+            problem, count_array = initial, np.asarray(count)
+            if self.sensitivity_names:
+                outcome, slopes = solve_ensemble_with_tangents(problem, tangents, t1, count_array, settings)
             else:
-                outcome, _ = solve_ensemble(problem, t1, counted, settings)
+                outcome, _ = solve_ensemble(problem, t1, count_array, settings)
         else:
-            modes, first, states = begin
+            modes, first, states = initial
             options = (np.asarray(first), np.asarray(states), t1, count, settings)
-            if self.by:
+            if self.sensitivity_names:
                 outcome, sensitivities = solve_hybrid_with_tangents(modes, tangents, *options, counters=1)
                 slopes, grazing = sensitivities.slopes, np.asarray(sensitivities.grazing)
             else:
                 outcome = solve_hybrid(modes, *options, counters=1)
         crossed = np.asarray(outcome.status) == CROSSED
-        shorts = short_names([*columns, *(name for name in self.by if name not in columns)])
+        shorts = short_names([*columns, *(name for name in self.sensitivity_names if name not in columns)])
         ends = self._ends(cells, columns, outcome, crossed, size)
-        for name, slope, scale in zip(self.by, slopes, scales, strict=True):
+        for name, slope, scale in zip(self.sensitivity_names, slopes, scales, strict=True):
             ends[f"time_by_{shorts[name]}"] = np.where(crossed, np.asarray(slope) / np.asarray(scale), 0.0)
-        if self.by and not cells.form.traits.smooth:
+        if self.sensitivity_names and not cells.form.traits.smooth:
             ends["grazes"] = (crossed & grazing).astype(np.int8)
         return ends
 
@@ -225,61 +217,66 @@ class SweepJob(NamedTuple):
         counts = {"steps": outcome.steps, "rejected": outcome.rejected}
         if isinstance(outcome, HybridOutcome):
             counts |= {"switches": outcome.counts[0]}
-        states = _shown(self.named, columns, jnp.asarray(outcome.state), size)
+        states = _shown(self.parameters, columns, jnp.asarray(outcome.state), size)
         ends |= {"status": words.astype(np.int8), "end_time": np.asarray(outcome.end_time)}
         return ends | {name: np.asarray(values) for name, values in (counts | states).items()}
 
 
 @eqx.filter_jit
 def _cells(
-    named: Named, columns: dict[str, Any], by: tuple[str, ...], size: int
+    parameters: Named, columns: dict[str, Any], sensitivity_names: tuple[str, ...], size: int
 ) -> tuple[Cells, Any, Any, list[Array]]:
     """The cells, their engine objects, the tangents of these with respect to some numbers, and the scales of the
     tangents."""
-    values = named.replaced({name: jnp.asarray(column) for name, column in columns.items()})
-    varied = [k for k, name in enumerate(named.names) if name in columns or name in by]
+    values = parameters.replaced({name: jnp.asarray(column) for name, column in columns.items()})
+    indices = [k for k, name in enumerate(parameters.names) if name in columns or name in sensitivity_names]
 
     def of_one(*numbers: Array) -> Cells:
-        every = list(named.values)
-        for k, number in zip(varied, numbers, strict=True):
-            every[k] = number
-        return _run(named.tree(tuple(every))).cells
+        all_values = list(parameters.values)
+        for k, number in zip(indices, numbers, strict=True):
+            all_values[k] = number
+        return _run(parameters.tree(tuple(all_values))).cells
 
-    point = tuple(jnp.broadcast_to(values[k], (size,)).astype(float) for k in varied)
+    point = tuple(jnp.broadcast_to(values[k], (size,)).astype(float) for k in indices)
 
     def of_all(*numbers: Array) -> Cells:
         first = [number[0] for number in numbers]
-        alone, many = of_one(*first), jax.vmap(of_one, axis_size=size)(*numbers)
+        single, batch = of_one(*first), jax.vmap(of_one, axis_size=size)(*numbers)
         depends = dependent_outputs(of_one, *first)
-        leaves = [a if d else b for a, b, d in zip(jax.tree.leaves(many), jax.tree.leaves(alone), depends, strict=True)]
-        return jax.tree.unflatten(jax.tree.structure(alone), leaves)
+        leaves = [
+            a if d else b for a, b, d in zip(jax.tree.leaves(batch), jax.tree.leaves(single), depends, strict=True)
+        ]
+        return jax.tree.unflatten(jax.tree.structure(single), leaves)
 
     def problem(*moving: Array) -> Any:
-        every = list(point)
-        for name, number in zip(by, moving, strict=True):
-            every[varied.index(named.names.index(name))] = number
-        cells = of_all(*every)
+        all_values = list(point)
+        for name, number in zip(sensitivity_names, moving, strict=True):
+            all_values[indices.index(parameters.names.index(name))] = number
+        cells = of_all(*all_values)
         if cells.form.traits.smooth:
             return cells.problem(size)
         modes, _, states = cells.modes(size)
         return modes, states
 
-    where = [varied.index(named.names.index(name)) for name in by]
-    scales = [tangent_scale(point[k]) for k in where]
-    rows = [tuple(scale if i == j else jnp.zeros_like(scale) for j, scale in enumerate(scales)) for i in range(len(by))]
-    tangents = tangents_of(problem, tuple(point[k] for k in where), rows) if by else ()
+    positions = [indices.index(parameters.names.index(name)) for name in sensitivity_names]
+    scales = [tangent_scale(point[k]) for k in positions]
+    rows = [
+        tuple(scale if i == j else jnp.zeros_like(scale) for j, scale in enumerate(scales))
+        for i in range(len(sensitivity_names))
+    ]
+    tangents = tangents_of(problem, tuple(point[k] for k in positions), rows) if sensitivity_names else ()
     cells = of_all(*point)
     return cells, cells.problem(size) if cells.form.traits.smooth else cells.modes(size), tangents, scales
 
 
 @eqx.filter_jit
-def _shown(named: Named, columns: dict[str, Any], states: Array, size: int) -> dict[str, Array]:
+def _shown(parameters: Named, columns: dict[str, Any], states: Array, size: int) -> dict[str, Array]:
     """The states in the user's components."""
-    values = named.replaced({name: jnp.asarray(column) for name, column in columns.items()})
-    axes = tuple(0 if name in columns else None for name in named.names)
+    values = parameters.replaced({name: jnp.asarray(column) for name, column in columns.items()})
+    axes = tuple(0 if name in columns else None for name in parameters.names)
 
     def of_one(state: Array, *numbers: Array) -> Array:
-        return _run(named.tree(numbers)).shown(state)
+        return _run(parameters.tree(numbers)).shown(state)
 
     parts = jax.vmap(of_one, in_axes=(1, *axes), out_axes=1)(states, *values)
-    return dict(zip(_run(named.tree(named.values)).names, parts, strict=True))
+    return dict(zip(_run(parameters.tree(parameters.values)).names, parts, strict=True))

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..formulations import AbstractFormulation, AbstractSystem, Hamel, Lagrange
-from ..integration import run_bounds
+from ..integration.checks import run_bounds
 from ..validation import UNTRACEABLE, as_number, is_traced, require, require_all
 from .engine import Cells
 from .form import Form
@@ -144,14 +144,14 @@ def _check_mechanical_functions(form: Form) -> None:
         mode: Any = form.system(numbers).modes[0]
         return getattr(mode.formulation.system, method)(*arguments)
 
-    for name, (arguments, wanted, fits) in functions.items():
+    for name, (arguments, expected_shape, fits) in functions.items():
         try:
             result = jax.eval_shape(functools.partial(called, name.partition("(")[0]), numbers, *arguments)
         except jax.errors.JAXTypeError as error:
             raise ValueError(f"{name} {UNTRACEABLE}") from error
         shape = getattr(result, "shape", None)
         if shape is None or not fits(shape):
-            raise ValueError(f"{name} must be {wanted}, not {result if shape is None else shape}")
+            raise ValueError(f"{name} must be {expected_shape}, not {result if shape is None else shape}")
 
 
 def _check_mechanical_start(system: AbstractSystem, start: Any) -> None:
@@ -167,14 +167,14 @@ def _check_mechanical_start(system: AbstractSystem, start: Any) -> None:
     violation, frame = constraints @ rate, constraints @ system.frame(q)[:, : system.freedom]
     if is_traced(violation) or is_traced(frame):
         return
-    worst = float(jnp.max(jnp.abs(violation)))
-    if worst > VIOLATION * float(jnp.max(jnp.abs(constraints)) * jnp.max(jnp.abs(rate))):
+    error = float(jnp.max(jnp.abs(violation)))
+    if error > VIOLATION * float(jnp.max(jnp.abs(constraints)) * jnp.max(jnp.abs(rate))):
         raise ValueError(
-            f"start: rate = {np.asarray(rate)} violates the constraints by {worst:.3g}; constraints(q) @ rate must be 0"
+            f"start: rate = {np.asarray(rate)} violates the constraints by {error:.3g}; constraints(q) @ rate must be 0"
         )
-    across = float(jnp.max(jnp.abs(frame)))
-    if isinstance(formulation_of(system), Hamel) and across > VIOLATION * float(jnp.max(jnp.abs(constraints))):
+    component = float(jnp.max(jnp.abs(frame)))
+    if isinstance(formulation_of(system), Hamel) and component > VIOLATION * float(jnp.max(jnp.abs(constraints))):
         raise ValueError(
             f"frame(q): the constraints must annihilate its first {system.freedom} columns, and do so only up to "
-            f"{across:.3g}; leave it out to run with Lagrange multipliers"
+            f"{component:.3g}; leave it out to run with Lagrange multipliers"
         )

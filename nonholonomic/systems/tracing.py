@@ -72,13 +72,17 @@ def _product(left: Array, right: Array, dimensions: Any) -> Array:
     terms = math.prod(left.shape) * math.prod(right.shape[k] for k in right_free)
     if terms > MOST_TERMS:
         return jax.lax.dot_general(left, right, dimensions)
-    whole = jnp.transpose(left, (*batch, *free, *sums))
-    other = jnp.transpose(right, (*right_batch, *right_free, *right_sums))
+    left_factor = jnp.transpose(left, (*batch, *free, *sums))
+    right_factor = jnp.transpose(right, (*right_batch, *right_free, *right_sums))
     shape = [left.shape[k] for k in batch], [left.shape[k] for k in free], [right.shape[k] for k in right_free]
     contracted = [left.shape[k] for k in sums]
-    whole = whole.reshape(*shape[0], *shape[1], *(1 for _ in shape[2]), *contracted)
-    other = other.reshape(*shape[0], *(1 for _ in shape[1]), *shape[2], *contracted)
-    return jnp.sum(whole * other, axis=tuple(range(-len(contracted), 0))) if contracted else whole * other
+    left_factor = left_factor.reshape(*shape[0], *shape[1], *(1 for _ in shape[2]), *contracted)
+    right_factor = right_factor.reshape(*shape[0], *(1 for _ in shape[1]), *shape[2], *contracted)
+    return (
+        jnp.sum(left_factor * right_factor, axis=tuple(range(-len(contracted), 0)))
+        if contracted
+        else left_factor * right_factor
+    )
 
 
 def is_elementary(function: Callable[..., Any], *args: Any) -> bool:
@@ -122,11 +126,11 @@ def dependent_outputs(function: Callable[..., Any], *args: Any) -> list[bool]:
 
 def _reached(jaxpr: Jaxpr, inputs: Sequence[Any]) -> list[bool]:
     """Which outputs depend on some of the inputs."""
-    reached = set(inputs)
+    dependents = set(inputs)
     for equation in jaxpr.eqns:
-        if any(not isinstance(variable, Literal) and variable in reached for variable in equation.invars):
-            reached |= set(equation.outvars)
-    return [not isinstance(variable, Literal) and variable in reached for variable in jaxpr.outvars]
+        if any(not isinstance(variable, Literal) and variable in dependents for variable in equation.invars):
+            dependents |= set(equation.outvars)
+    return [not isinstance(variable, Literal) and variable in dependents for variable in jaxpr.outvars]
 
 
 def with_own_numbers(event: Callable[..., Any], *args: Any) -> Callable[..., Any]:

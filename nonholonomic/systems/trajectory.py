@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..integration import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED
+from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED
 from ..sweeps import Table, Tabular
 from ..validation import is_traced
 
@@ -98,12 +98,12 @@ class Trajectory(Tabular, eqx.Module):
         """
         import matplotlib.pyplot as plt
 
-        figure, own = (None, ax) if ax is not None else plt.subplots()
+        figure, axes = (None, ax) if ax is not None else plt.subplots()
         for name, component in zip(self.names, np.asarray(self.state).T, strict=True):
-            own.plot(np.asarray(self.t), component, label=name)
-        own.set_xlabel("time [s]")
-        own.legend()
-        return own if figure is None else figure
+            axes.plot(np.asarray(self.t), component, label=name)
+        axes.set_xlabel("time [s]")
+        axes.legend()
+        return axes if figure is None else figure
 
     def __str__(self) -> str:
         if is_traced(self.code) or np.ndim(self.t) != 1:

@@ -53,9 +53,9 @@ def _draw_curve(panel: Any, shows: list[Show], label: str) -> None:
     low, high = panel.get_ylim()
     middle = (low + high) / 2.0
     # Draw values that are constant except for round-off as a constant.
-    least = LEAST_RANGE * max(abs(low), abs(high))
-    if high - low < least:
-        panel.set_ylim(middle - least, middle + least)
+    min_range = LEAST_RANGE * max(abs(low), abs(high))
+    if high - low < min_range:
+        panel.set_ylim(middle - min_range, middle + min_range)
 
 
 def write_animation(stages: list[Stage], path: Any, times: Times | None) -> None:
@@ -115,11 +115,13 @@ class _Space:
         self.frames = [nearest(show.times, times) for show in stage.shows]
         camera, self.follow = view_from(stage)
         place, middle = np.array(camera[:3]), np.array(camera[3:6])
-        away = place - middle
-        distance = np.linalg.norm(away)
+        direction = place - middle
+        distance = np.linalg.norm(direction)
         self.extent = centre_and_extent(np.stack([show.bodies[0].position[0] for show in stage.shows]))[1]
         self.reach, self.middle = 0.8 * distance * np.tan(np.radians(ANGLE) / 2.0), middle
-        axes.view_init(np.degrees(np.arcsin(away[2] / distance)), np.degrees(np.arctan2(away[1], away[0])))
+        axes.view_init(
+            np.degrees(np.arcsin(direction[2] / distance)), np.degrees(np.arctan2(direction[1], direction[0]))
+        )
         axes.set_axis_off()
         axes.set_box_aspect((1.0, 1.0, 1.0), zoom=1.8)
         axes.set_title(f"{stage.title} ({stage.arena.spacing})", fontsize="medium")
@@ -130,9 +132,9 @@ class _Space:
         self.tiles = mesh.vertices[np.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]], axis=-1)]
         self.tiles = self.tiles.reshape(-1, 4, 3)
         front = np.cross(*(mesh.vertices[mesh.triangles[0]][[1, 2]] - mesh.vertices[mesh.triangles[0]][0]))
-        across = np.cross(self.tiles[:, 1] - self.tiles[:, 0], self.tiles[:, 2] - self.tiles[:, 0])
-        across *= np.sign(np.sum(across[0] * front))
-        self.tile_colours = _lit(across, mesh.colour)
+        normals = np.cross(self.tiles[:, 1] - self.tiles[:, 0], self.tiles[:, 2] - self.tiles[:, 0])
+        normals *= np.sign(np.sum(normals[0] * front))
+        self.tile_colours = _lit(normals, mesh.colour)
         self.ground = axes.add_collection3d(
             Line3DCollection([np.zeros((2, 3))], colors="0.75", linewidths=0.6, zorder=1)
         )
@@ -151,34 +153,34 @@ class _Space:
         """Draw the stage at one of its times."""
         middle, reach = self.middle, self.reach
         if self.follow:
-            shown = zip(self.stage.shows, self.frames, strict=True)
+            pairs = zip(self.stage.shows, self.frames, strict=True)
             middle, extent = centre_and_extent(
-                np.stack([show.bodies[0].position[frames[frame]] for show, frames in shown])
+                np.stack([show.bodies[0].position[frames[frame]] for show, frames in pairs])
             )
             reach += extent - self.extent
         for axis, centre in zip("xyz", middle, strict=True):
             getattr(self.axes, f"set_{axis}lim")(centre - reach, centre + reach)
-        within = np.linalg.norm(self.tiles.mean(axis=1) - middle, axis=-1) < 1.6 * reach
-        self.floor.set_verts(self.tiles[within])
-        self.floor.set_facecolor(self.tile_colours[within])
-        self.floor.set_edgecolor(self.tile_colours[within])
-        near = [line for whole in self.stage.arena.lines for line in _pieces(whole, middle, 1.6 * reach)]
-        self.ground.set_segments(near)
+        in_view = np.linalg.norm(self.tiles.mean(axis=1) - middle, axis=-1) < 1.6 * reach
+        self.floor.set_verts(self.tiles[in_view])
+        self.floor.set_facecolor(self.tile_colours[in_view])
+        self.floor.set_edgecolor(self.tile_colours[in_view])
+        segments = [line for whole in self.stage.arena.lines for line in _pieces(whole, middle, 1.6 * reach)]
+        self.ground.set_segments(segments)
         triangles, colours, traces, arrows = [], [], iter(self.traces), iter(self.arrows)
         for show, frames in zip(self.stage.shows, self.frames, strict=True):
-            now = frames[frame]
+            index = frames[frame]
             for body in show.bodies:
-                turn = matrices(body.orientation[now : now + 1])[0]
+                turn = matrices(body.orientation[index : index + 1])[0]
                 for mesh in body.meshes:
-                    corners = (mesh.vertices @ turn.T + body.position[now])[mesh.triangles]
+                    corners = (mesh.vertices @ turn.T + body.position[index])[mesh.triangles]
                     triangles.append(corners)
                     colours.append(_shaded(corners, mesh.colour))
             for trace in filter(lambda trace: trace.shown, show.traces):
-                points = finite(trace.points[: now + 1]) + (0.0 if trace.about is None else trace.about[now])
+                points = finite(trace.points[: index + 1]) + (0.0 if trace.about is None else trace.about[index])
                 points = np.where(np.linalg.norm(points - middle, axis=-1, keepdims=True) < 1.6 * reach, points, np.nan)
                 next(traces).set_data_3d(*points.T)
             for arrow in filter(lambda arrow: arrow.shown, show.arrows):
-                ends = np.stack([arrow.start[now], arrow.start[now] + arrow.drawn[now]])
+                ends = np.stack([arrow.start[index], arrow.start[index] + arrow.drawn[index]])
                 next(arrows).set_data_3d(*ends.T)
         self.solids.set_verts(np.concatenate(triangles))
         # Edges of the same colour close the seams between triangles.
@@ -188,12 +190,12 @@ class _Space:
 
 def _pieces(line: np.ndarray, middle: np.ndarray, reach: float) -> list[np.ndarray]:
     """The parts of a line that are in view."""
-    inside = np.linalg.norm(line - middle, axis=-1) < reach
-    cuts = np.flatnonzero(np.diff(inside)) + 1
+    in_view = np.linalg.norm(line - middle, axis=-1) < reach
+    cuts = np.flatnonzero(np.diff(in_view)) + 1
     return [
         part
-        for part, good in zip(np.split(line, cuts), np.split(inside, cuts), strict=True)
-        if good[0] and len(part) > 1
+        for part, mask in zip(np.split(line, cuts), np.split(in_view, cuts), strict=True)
+        if mask[0] and len(part) > 1
     ]
 
 
@@ -201,8 +203,8 @@ def _shaded(corners: Float[np.ndarray, "triangles 3 3"], colour: int) -> Float[n
     return _lit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), colour)
 
 
-def _lit(across: Float[np.ndarray, "faces 3"], colour: int) -> Float[np.ndarray, "faces 3"]:
+def _lit(normals: Float[np.ndarray, "faces 3"], colour: int) -> Float[np.ndarray, "faces 3"]:
     """A colour with the brightness of faces with these normals (of any length) in the light."""
-    across = across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-30)
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
     base = np.array([colour >> 16 & 255, colour >> 8 & 255, colour & 255]) / 255.0
-    return base * (SHADE + (1.0 - SHADE) * np.clip(across @ LIGHT, 0.0, 1.0))[:, None]
+    return base * (SHADE + (1.0 - SHADE) * np.clip(normals @ LIGHT, 0.0, 1.0))[:, None]

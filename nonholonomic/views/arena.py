@@ -45,9 +45,9 @@ def arena(
     (first, second), (step_1, step_2), words = chart.ranges(margin, spacing)
     mesh = chart.grid(*np.meshgrid(np.linspace(*first, FINE), np.linspace(*second, FINE), indexing="ij"))
     # One grid for all lines: evaluating a surface is expensive.
-    along = [(np.full(FINE, a), np.linspace(*second, FINE)) for a in marks(first, step_1)]
-    along += [(np.linspace(*first, FINE), np.full(FINE, b)) for b in marks(second, step_2)]
-    lines = chart.grid(*np.moveaxis(np.array(along), 1, 0)) if along else ()
+    grid_lines = [(np.full(FINE, a), np.linspace(*second, FINE)) for a in marks(first, step_1)]
+    grid_lines += [(np.linspace(*first, FINE), np.full(FINE, b)) for b in marks(second, step_2)]
+    lines = chart.grid(*np.moveaxis(np.array(grid_lines), 1, 0)) if grid_lines else ()
     ground = facing(Mesh(mesh.reshape(-1, 3), of_grid(FINE, FINE), GREY), points, normal)
     return Arena(ground, tuple(lines), words, normal)
 
@@ -110,15 +110,15 @@ class _Chart:
 
     def _legal(self, number: int, low: float, high: float) -> tuple[float, float]:
         """The part of a range in which numbers are legal: a latitude ends at the poles."""
-        tried = np.linspace(low, high, 401)
-        place = [np.full_like(tried, np.median(values)) for values in self.places]
-        place[number] = tried
-        back = np.asarray(self.surface.place_at(_charted(self.surface, tuple(place)))[number])
-        away = back - tried
+        candidates = np.linspace(low, high, 401)
+        place = [np.full_like(candidates, np.median(values)) for values in self.places]
+        place[number] = candidates
+        recovered = np.asarray(self.surface.place_at(_charted(self.surface, tuple(place)))[number])
+        difference = recovered - candidates
         if self.angles[number]:
-            away = (away + np.pi) % (2.0 * np.pi) - np.pi
-        good = tried[np.abs(away) < 1e-6 * (1.0 + np.abs(tried))]
-        return (low, high) if len(good) < 2 else (good[0], good[-1])
+            difference = (difference + np.pi) % (2.0 * np.pi) - np.pi
+        legal = candidates[np.abs(difference) < 1e-6 * (1.0 + np.abs(candidates))]
+        return (low, high) if len(legal) < 2 else (legal[0], legal[-1])
 
 
 class _Patch:
@@ -148,11 +148,11 @@ def own(surface: AbstractSurface, position: np.ndarray) -> tuple:
 
 def fixed(surface: AbstractSurface, vector: tuple) -> np.ndarray:
     """A vector in the surface's axes, converted to the fixed frame, (..., 3)."""
-    like = next(part for part in vector if part is not None)
-    full = vector_of(
-        np.zeros_like(np.asarray(like, dtype=float)) if part is None else np.asarray(part) for part in vector
+    example = next(part for part in vector if part is not None)
+    components = vector_of(
+        np.zeros_like(np.asarray(example, dtype=float)) if part is None else np.asarray(part) for part in vector
     )
-    return np.stack(np.broadcast_arrays(*(np.asarray(part) for part in surface.in_fixed_frame(full))), axis=-1)
+    return np.stack(np.broadcast_arrays(*(np.asarray(part) for part in surface.in_fixed_frame(components))), axis=-1)
 
 
 def nice(step: float, angle: bool) -> float:

@@ -109,8 +109,8 @@ def _draw_profile(fit: Fit, name: str, axes: Any) -> None:
 
 def _draw_correlation(fit: Fit, names: list[str], axes: Any) -> None:
     image = axes.imshow(fit.correlation, vmin=-1.0, vmax=1.0, cmap="RdBu")
-    short = [name.rsplit(".", 1)[-1] for name in names]
-    axes.set_xticks(range(len(names)), short, rotation=90, fontsize=8)
-    axes.set_yticks(range(len(names)), short, fontsize=8)
+    labels = [name.rsplit(".", 1)[-1] for name in names]
+    axes.set_xticks(range(len(names)), labels, rotation=90, fontsize=8)
+    axes.set_yticks(range(len(names)), labels, fontsize=8)
     axes.set_title("correlation", fontsize=9)
     axes.figure.colorbar(image, ax=axes, shrink=0.8)

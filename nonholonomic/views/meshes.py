@@ -5,8 +5,8 @@ from jaxtyping import Float
 
 from .stage import Mesh
 
-#: Number of corners of a circle.
-SEGMENTS = 48
+#: Number of corners of a circle, and of sectors with alternating colours.
+SEGMENTS, SECTORS = 48, 6
 
 
 def revolved(profile: list[tuple[float, float]] | Float[np.ndarray, "points 2"], colour: int) -> Mesh:
@@ -39,14 +39,14 @@ def ball(radius: float, colours: tuple[int, int]) -> tuple[Mesh, Mesh]:
     return striped(radius * np.stack([np.sin(polar), np.cos(polar)], axis=-1), colours)
 
 
-def striped(profile: Float[np.ndarray, "points 2"], colours: tuple[int, int], sectors: int = 6) -> tuple[Mesh, Mesh]:
+def striped(profile: Float[np.ndarray, "points 2"], colours: tuple[int, int]) -> tuple[Mesh, Mesh]:
     """The solid of revolution of a profile, in sectors about the z axis with two alternating colours."""
-    whole = revolved(profile, colours[0])
-    middles = whole.vertices[whole.triangles].mean(axis=1)
-    first = np.floor(np.arctan2(middles[:, 1], middles[:, 0]) / np.pi * sectors / 2.0).astype(int) % 2 == 0
+    mesh = revolved(profile, colours[0])
+    middles = mesh.vertices[mesh.triangles].mean(axis=1)
+    first = np.floor(np.arctan2(middles[:, 1], middles[:, 0]) / np.pi * SECTORS / 2.0).astype(int) % 2 == 0
     return (
-        Mesh(whole.vertices, whole.triangles[first], colours[0]),
-        Mesh(whole.vertices, whole.triangles[~first], colours[1]),
+        Mesh(mesh.vertices, mesh.triangles[first], colours[0]),
+        Mesh(mesh.vertices, mesh.triangles[~first], colours[1]),
     )
 
 
@@ -68,13 +68,13 @@ def box(lengths: tuple[float, float, float], centre: tuple[float, float, float],
 
 def bar(begin: tuple[float, float, float], end: tuple[float, float, float], radius: float, colour: int) -> Mesh:
     """A round bar between two points [m]."""
-    foot, along = np.asarray(begin), np.subtract(end, begin)
-    straight = revolved([(0.0, 1.0), (radius, 1.0), (radius, 0.0), (0.0, 0.0)], colour)
-    z = along / np.linalg.norm(along)
+    foot, direction = np.asarray(begin), np.subtract(end, begin)
+    tube = revolved([(0.0, 1.0), (radius, 1.0), (radius, 0.0), (0.0, 0.0)], colour)
+    z = direction / np.linalg.norm(direction)
     x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
     x /= np.linalg.norm(x)
-    axes = np.stack([x, np.cross(z, x), along])
-    return straight._replace(vertices=straight.vertices @ axes + foot)
+    axes = np.stack([x, np.cross(z, x), direction])
+    return tube._replace(vertices=tube.vertices @ axes + foot)
 
 
 def wheel(radius: float, width: float, colours: tuple[int, int]) -> tuple[Mesh, ...]:
@@ -82,7 +82,7 @@ def wheel(radius: float, width: float, colours: tuple[int, int]) -> tuple[Mesh, 
     half, inner = width / 2.0, 0.78 * radius
     edge = [(inner, half), (radius, half), (radius, -half), (inner, -half), (inner, half)]
     tyre = revolved(edge, colours[0])
-    across = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    rotation = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     spokes = [
         bar(
             (-inner * np.cos(a), 0.0, -inner * np.sin(a)),
@@ -92,4 +92,4 @@ def wheel(radius: float, width: float, colours: tuple[int, int]) -> tuple[Mesh, 
         )
         for a, colour in zip(np.pi * np.arange(3) / 3.0, (colours[1], colours[0], colours[0]), strict=True)
     ]
-    return tyre._replace(vertices=tyre.vertices @ across), *spokes
+    return tyre._replace(vertices=tyre.vertices @ rotation), *spokes

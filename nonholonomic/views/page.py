@@ -90,10 +90,10 @@ def page(
     parts = {"TITLE": html.escape(title), "HEIGHT": str(height), "ABOVE": above, "BELOW": below, "VIEW": ""}
     if stages:
         parts["VIEW"] = "\n".join([_view(stages, speed, autoplay), *scripts])
-    whole = _template("page.html")
+    page = _template("page.html")
     for name, text in parts.items():
-        whole = whole.replace(f"[{name}]", text)
-    return Page(whole)
+        page = page.replace(f"[{name}]", text)
+    return Page(page)
 
 
 def table_as_html(rows: list[list[str]], heads: int) -> str:
@@ -190,8 +190,8 @@ class _Numbers:
 
     @property
     def floats(self) -> bytes:
-        joined = np.concatenate(self.parts["<f4"])
-        return joined.view(np.uint8).reshape(-1, 4).T.tobytes()
+        numbers = np.concatenate(self.parts["<f4"])
+        return numbers.view(np.uint8).reshape(-1, 4).T.tobytes()
 
     @property
     def whole(self) -> bytes:
@@ -287,9 +287,9 @@ def view_from(stage: Stage) -> tuple[list[float], bool]:
         middle, extent = centre_and_extent(np.stack([path[0] for path in paths]))
         reach = 1.1 * size + extent
     normal = stage.arena.normal
-    aside = np.array([0.35, -1.0, 0.0])
-    aside = aside - (aside @ normal) * normal
-    direction = RISE * normal + aside / np.linalg.norm(aside)
+    view_axis = np.array([0.35, -1.0, 0.0])
+    view_axis = view_axis - (view_axis @ normal) * normal
+    direction = RISE * normal + view_axis / np.linalg.norm(view_axis)
     distance = 1.05 * (reach + 1.6 * size) / np.sin(np.radians(ANGLE) / 2.0)
     place = middle + distance * direction / np.linalg.norm(direction)
     return [*place.tolist(), *middle.tolist(), 0.0, 0.0, 1.0], follow

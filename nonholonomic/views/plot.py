@@ -91,30 +91,30 @@ def draw_table(
     variable = _first_number(table) if variable is None else variable
     values = table.variables.get(variable)
     if values is None or values.dtype.kind == "U":
-        known = [name for name, values in table.variables.items() if values.dtype.kind != "U"]
+        names = [name for name, values in table.variables.items() if values.dtype.kind != "U"]
         raise ValueError(
-            f"variable = {variable!r} must be a numeric variable of the table: {', '.join(known)}{likely(variable, known)}"
+            f"variable = {variable!r} must be a numeric variable of the table: {', '.join(names)}{likely(variable, names)}"
         )
     dims = table.dims(variable)
     if not dims:
         raise ValueError("a table of one cell has nothing to draw")
     names, cut = _drawn(table, variable, at or {})
-    shown = _slice(np.where(np.isfinite(values), values, np.nan), dims, names, cut)
+    visible = _slice(np.where(np.isfinite(values), values, np.nan), dims, names, cut)
     figure, drawing = _drawing(ax)
     drawing.set_xlabel(table.label(names[0]))
     drawing.set_title(", ".join(_cut_text(table, name, place) for name, place in cut.items()), fontsize="medium")
     if len(names) == 1 or len(table.coords[names[1]]) <= MOST_LINES:
-        _draw_lines(drawing, table, names, shown.reshape(len(shown), -1))
+        _draw_lines(drawing, table, names, visible.reshape(len(visible), -1))
         drawing.set_ylabel(table.label(variable))
         if log:
             drawing.set_yscale("log")
             _plain_numbers(drawing.yaxis)
     else:
         drawing.set_ylabel(table.label(names[1]))
-        _draw_map(drawing, table, names, shown, table.label(variable), log)
+        _draw_map(drawing, table, names, visible, table.label(variable), log)
         if "status" in table.variables and not table.inner.get(variable):
             words = _slice(table.variables["status"], dims, names, cut)
-            _mark_words(drawing, table, names, np.where(np.isnan(shown), words, ""))
+            _mark_words(drawing, table, names, np.where(np.isnan(visible), words, ""))
     return drawing if figure is None else figure
 
 
@@ -132,13 +132,13 @@ def _drawn(table: Labelled, variable: str, at: dict[str, float]) -> tuple[list[s
     for name, value in at.items():
         if name not in dims:
             raise ValueError(f"at: {name!r} must be one of {', '.join(dims)}{likely(name, dims)}")
-        known = table.coords[name]
-        if known.dtype.kind == "U":
-            if value not in known:
-                raise ValueError(f"at: {name} = {value!r} must be one of {', '.join(known)}")
-            cut[name] = int(np.flatnonzero(known == value)[0])
+        coordinate = table.coords[name]
+        if coordinate.dtype.kind == "U":
+            if value not in coordinate:
+                raise ValueError(f"at: {name} = {value!r} must be one of {', '.join(coordinate)}")
+            cut[name] = int(np.flatnonzero(coordinate == value)[0])
         else:
-            cut[name] = int(np.argmin(np.abs(known - value)))
+            cut[name] = int(np.argmin(np.abs(coordinate - value)))
     cells = len(table.shape)
     # A quantity with its own dimension, such as time, is drawn over that dimension.
     left = [name for name in (*dims[cells:], *dims[:cells]) if name not in cut]
@@ -169,16 +169,16 @@ def _draw_lines(drawing: Any, table: Labelled, names: list[str], lines: Any) -> 
         drawing.legend()
 
 
-def _draw_map(drawing: Any, table: Labelled, names: list[str], shown: Any, label: str, log: bool) -> None:
+def _draw_map(drawing: Any, table: Labelled, names: list[str], visible: Any, label: str, log: bool) -> None:
     from matplotlib.colors import LogNorm, Normalize
 
-    known = shown[np.isfinite(shown) & (shown > 0.0)] if log else shown[np.isfinite(shown)]
-    low, high = np.quantile(known, QUANTILES) if known.size else (0.0, 1.0)
+    values = visible[np.isfinite(visible) & (visible > 0.0)] if log else visible[np.isfinite(visible)]
+    low, high = np.quantile(values, QUANTILES) if values.size else (0.0, 1.0)
     scale = (LogNorm if log else Normalize)(low, high)
     x, y = table.coords[names[0]], table.coords[names[1]]
-    image = drawing.pcolormesh(x, y, shown.T, shading="nearest", norm=scale)
-    beyond = known.size and (known.min() < low, known.max() > high)
-    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
+    image = drawing.pcolormesh(x, y, visible.T, shading="nearest", norm=scale)
+    is_clipped = values.size and (values.min() < low, values.max() > high)
+    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(is_clipped, "neither")
     bar = drawing.figure.colorbar(image, ax=drawing, label=label, extend=extend)
     if log:
         _plain_numbers(bar.ax.yaxis)
@@ -221,12 +221,12 @@ def draw_portrait(table: Labelled, x: str, y: str, ax: Any = None) -> Any:
 
     **Raises:** `ValueError` for an unknown variable or component.
     """
-    (across, across_label), (up, up_label) = _column(table, "x", x), _column(table, "y", y)
+    (x_values, x_label), (y_values, y_label) = _column(table, "x", x), _column(table, "y", y)
     figure, drawing = _drawing(ax, 5.0, 4.5)
-    (line,) = drawing.plot(across, up, linewidth=1.0)
-    drawing.plot(across[:1], up[:1], "o", color=line.get_color())
-    drawing.set_xlabel(across_label)
-    drawing.set_ylabel(up_label)
+    (line,) = drawing.plot(x_values, y_values, linewidth=1.0)
+    drawing.plot(x_values[:1], y_values[:1], "o", color=line.get_color())
+    drawing.set_xlabel(x_label)
+    drawing.set_ylabel(y_label)
     if {x, y} == {"position.x", "position.y"}:
         # A path, seen from above.
         drawing.set_aspect("equal", adjustable="datalim")
@@ -243,6 +243,8 @@ def _column(table: Labelled, argument: str, name: str) -> tuple[Any, str]:
         place = int(np.flatnonzero(table.coords[dims[0]] == component)[0])
         name, bracket, unit = table.label(variable).rpartition(" [")
         return table[variable][:, place], f"{name}, {component}{bracket}{unit}" if bracket else f"{unit}, {component}"
-    known = [other for other in table.variables if other not in table.inner]
-    known += [f"{other}.{part}" for other, dims in table.inner.items() for part in table.coords[dims[0]]]
-    raise ValueError(f"{argument} = {name!r} must be one of {', '.join(known)}{likely(name, known)}")
+    candidates = [variable_name for variable_name in table.variables if variable_name not in table.inner]
+    candidates += [
+        f"{variable_name}.{part}" for variable_name, dims in table.inner.items() for part in table.coords[dims[0]]
+    ]
+    raise ValueError(f"{argument} = {name!r} must be one of {', '.join(candidates)}{likely(name, candidates)}")

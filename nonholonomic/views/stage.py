@@ -65,8 +65,8 @@ class Arrow(NamedTuple):
     def drawn(self) -> Points:
         """The vectors with their drawn lengths [m]."""
         lengths = self.scale * np.linalg.norm(self.vector, axis=-1, keepdims=True)
-        longest = lengths if self.limit is None else np.minimum(lengths, self.limit)
-        return self.scale * self.vector * np.divide(longest, lengths, out=np.ones_like(lengths), where=lengths > 0.0)
+        scaled = lengths if self.limit is None else np.minimum(lengths, self.limit)
+        return self.scale * self.vector * np.divide(scaled, lengths, out=np.ones_like(lengths), where=lengths > 0.0)
 
 
 class Curve(NamedTuple):
@@ -132,8 +132,8 @@ def distinguished_by_colour(shows: tuple[Show, ...]) -> tuple[Show, ...]:
 
 def finite(points: Points) -> Points:
     """Points, with NaN replaced by the last finite point before."""
-    good = np.all(np.isfinite(points), axis=-1)
-    last = np.maximum.accumulate(np.where(good, np.arange(len(points)), 0))
+    is_finite = np.all(np.isfinite(points), axis=-1)
+    last = np.maximum.accumulate(np.where(is_finite, np.arange(len(points)), 0))
     return np.nan_to_num(points[last])
 
 
@@ -153,8 +153,8 @@ def turned(rotation: Float[np.ndarray, "times 3 3"]) -> Float[np.ndarray, "times
         products[:, i, j] = products[:, j, i] = m[:, i, j] + m[:, j, i]
         products[:, i, 3] = products[:, 3, i] = m[:, k, j] - m[:, j, k]
     products[:, 3, 3] = 1.0 + trace
-    largest = np.argmax(np.diagonal(products, axis1=1, axis2=2), axis=-1)
-    axis = products[np.arange(len(m)), largest]
+    component = np.argmax(np.diagonal(products, axis1=1, axis2=2), axis=-1)
+    axis = products[np.arange(len(m)), component]
     return axis / np.linalg.norm(axis, axis=-1, keepdims=True)
 
 
@@ -171,5 +171,5 @@ def matrices(orientation: Float[np.ndarray, "times 4"]) -> Float[np.ndarray, "ti
 
 def nearest(times: Float[np.ndarray, " times"], at: Float[np.ndarray, " frames"]) -> Int[np.ndarray, " frames"]:
     """The indices of the times that are nearest to the given times."""
-    after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
-    return after - (at - times[after - 1] < times[after] - at)
+    index = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
+    return index - (at - times[index - 1] < times[index] - at)

@@ -17,7 +17,7 @@ from nonholonomic.identification import (
     scene_unknowns,
     search_options,
 )
-from nonholonomic.integration import tolerance_bound
+from nonholonomic.integration.checks import tolerance_bound
 from nonholonomic.parameters import numbers
 from nonholonomic.progress import status_line
 from nonholonomic.validation import as_number, require_kind
@@ -101,11 +101,14 @@ def identify(
             scene.check(recording.launch)
         unknowns = _unknowns_of(scene, data, free)
         return fit_data(
-            lambda seen: SceneModel(scene=scene, data=data, seen=seen, tolerance=tolerance), data, unknowns, search
+            lambda indices: SceneModel(scene=scene, data=data, seen=indices, tolerance=tolerance),
+            data,
+            unknowns,
+            search,
         )
 
 
 def _unknowns_of(scene: Scene, data: tuple[Recording, ...], free: Any) -> dict[str, Free]:
     """Check the unknowns of a scene and its data, and return them by their full names."""
-    own = [[*numbers("launch", recording.launch), "t0"] for recording in data]
-    return scene_unknowns(free, scene, data[0].launch, list(numbers("scene", scene)), own)
+    names_of_data = [[*numbers("launch", recording.launch), "t0"] for recording in data]
+    return scene_unknowns(free, scene, data[0].launch, list(numbers("scene", scene)), names_of_data)

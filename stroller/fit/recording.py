@@ -97,5 +97,5 @@ def read_recording(
     >>> print(ride.times, ride.value.round(2))
     [0. 1. 2.] [1.5  1.39 1.31]
     """
-    read = read_columns(path, columns, fps, error, QUANTITIES)
-    return Recording(launch, *read, input=input, t0=t0, student=student)
+    table = read_columns(path, columns, fps, error, QUANTITIES)
+    return Recording(launch, *table, input=input, t0=t0, student=student)

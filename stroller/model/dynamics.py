@@ -99,8 +99,8 @@ class Dynamics(eqx.Module):
 
     def unpack(self, state: State) -> tuple[Vector, Vector, State]:
         """Position, heading and the other components of a state."""
-        place, turned = self.surface.axes, self.surface.axes + self.heading.axes(self.surface)
-        return padded(state[:place]), padded(state[place:turned]), state[turned:]
+        place, heading_end = self.surface.axes, self.surface.axes + self.heading.axes(self.surface)
+        return padded(state[:place]), padded(state[place:heading_end]), state[heading_end:]
 
     def righted(self, state: State) -> State:
         """The state with sin^2 + cos^2 of the steering angle corrected to 1."""
@@ -112,8 +112,8 @@ class Dynamics(eqx.Module):
     def inertia(self, direction: Vector, lead: Component, sine: Component, cosine: Component) -> Component:
         """Reduced mass M_w = m cos^2(phi) d.d + J nu^2 sin^2(phi) / l^2 [kg] of the front wheel's speed."""
         arm = multiply(lead, sine, 1.0 / self.body.wheelbase)
-        along = multiply(self.body.mass, cosine, cosine, self.heading.square(direction))
-        return along + self.body.inertia * arm * arm
+        mass_term = multiply(self.body.mass, cosine, cosine, self.heading.square(direction))
+        return mass_term + self.body.inertia * arm * arm
 
     def geometry(self, state: State) -> Geometry:
         """Velocities, rates and normal force at a state (components, ...)."""
@@ -195,12 +195,12 @@ class Dynamics(eqx.Module):
         weight = body.mass * self.gravity
         # If the centre of mass is ahead of the axle, it swings with the yaw, and its weight has a moment about the
         # normal.
-        across = cross(g.normal, e)
-        swing = multiply(weight, body.centre, self.side, dot(across, self.up))
+        side_axis = cross(g.normal, e)
+        swing = multiply(weight, body.centre, self.side, dot(side_axis, self.up))
         yaw_torque = subtract(drag.yaw, add(multiply(self.absolute, torque), swing))
         pushing = add(multiply(g.cosine, add(forces.drive, drag.rear)), drag.front, multiply(arm, yaw_torque))
-        falling = multiply(weight, g.cosine, dot(g.direction, self.up))
-        momentum_rate = multiply(g.gauge, subtract(multiply(g.lead, pushing), falling))
+        weight_force = multiply(weight, g.cosine, dot(g.direction, self.up))
+        momentum_rate = multiply(g.gauge, subtract(multiply(g.lead, pushing), weight_force))
         heading_rate = self.heading.rate(e, g.normal, g.normal_rate, g.motion.yaw_rate, self.side)
         power, turn = self.power(g, forces), g.motion.steering_rate
         return stacked(
@@ -228,8 +228,8 @@ class Dynamics(eqx.Module):
 
     def rank(self, state: State) -> Float[Array, "..."]:
         """Reduced mass M_w relative to m + J/l^2: at zero the constraints lose rank and the motion is undetermined."""
-        whole = self.body.mass + self.body.inertia / self.body.wheelbase**2
-        return 1.0 / (whole * self.geometry(state).gauge ** 2)
+        total = self.body.mass + self.body.inertia / self.body.wheelbase**2
+        return 1.0 / (total * self.geometry(state).gauge ** 2)
 
     def contact(self, state: State) -> Float[Array, "..."]:
         """Normal force [N] of the ground on the stroller; negative where the ground would have to pull."""
@@ -265,7 +265,7 @@ class Dynamics(eqx.Module):
         climb, bank = multiply(weight, dot(g.direction, up)), multiply(weight, dot(g.left, up))
         centre_along = subtract(v_rate, multiply(body.centre, yaw, yaw))
         centre_across = add(multiply(v, yaw), multiply(body.centre, yaw_acceleration))
-        along = add(body.mass * centre_along, climb, subtract(None, add(forces.drive, forces.drag.rear)))
+        rear_force = add(body.mass * centre_along, climb, subtract(None, add(forces.drive, forces.drag.rear)))
         spin = add(
             body.inertia * yaw_acceleration,
             multiply(body.mass, body.centre, v, yaw),
@@ -273,12 +273,14 @@ class Dynamics(eqx.Module):
             multiply(self.absolute, self.fork_torque(g, forces)),
             subtract(None, forces.drag.yaw),
         )
-        front = g.cosine * spin / body.wheelbase - g.sine * along
+        front = g.cosine * spin / body.wheelbase - g.sine * rear_force
         # Curvature turns the frame as it moves, and the spin of the frame reacts with a sideways force.
         carried = add(body.inertia * yaw, multiply(self.absolute, body.steering_inertia, g.fork_rate))
         gyration = multiply(self.surface.gaussian_curvature(g.motion.position), carried, v)
-        across = subtract(add(body.mass * centre_across, bank), add(gyration, multiply(forces.drag.front, g.sine)))
-        return across - front * g.cosine, front
+        lateral_force = subtract(
+            add(body.mass * centre_across, bank), add(gyration, multiply(forces.drag.front, g.sine))
+        )
+        return lateral_force - front * g.cosine, front
 
     def projected_side_force(
         self, t: Float[Array, "..."], state: State, controls: Input | None
@@ -300,18 +302,18 @@ class Dynamics(eqx.Module):
         forces = self.forces(t, g, controls)
         drag, heading, arm = forces.drag, g.motion.heading, body.wheelbase
         left = cross(self.surface.up, heading)
-        ahead = sum_vectors(scale(g.cosine, heading), scale(g.sine, left))
-        pushed = sum_vectors(scale(add(forces.drive, drag.rear), heading), scale(drag.front, ahead))
-        risen = sum_vectors(acceleration, scale(self.gravity, self.surface.up))
-        lacking = sum_vectors(scale(body.mass, risen), scale(-1.0, pushed))
-        turned = add(drag.yaw, multiply(drag.front, arm, g.sine))
+        wheel_direction = sum_vectors(scale(g.cosine, heading), scale(g.sine, left))
+        push = sum_vectors(scale(add(forces.drive, drag.rear), heading), scale(drag.front, wheel_direction))
+        proper_acceleration = sum_vectors(acceleration, scale(self.gravity, self.surface.up))
+        missing_force = sum_vectors(scale(body.mass, proper_acceleration), scale(-1.0, push))
+        moment = add(drag.yaw, multiply(drag.front, arm, g.sine))
         spin = add(body.inertia * yaw_acceleration, multiply(self.absolute, self.fork_torque(g, forces)))
         swept = g.sine * g.lead
-        weighted = subtract(g.cosine / arm * subtract(spin, turned), swept * dot(lacking, g.direction))
+        weighted = subtract(g.cosine / arm * subtract(spin, moment), swept * dot(missing_force, g.direction))
         front = weighted / (g.cosine**2 + swept**2)
         square = self.heading.square(g.direction)
         tilt = multiply(dot(heading, g.normal), dot(left, g.normal))
-        return dot(lacking, g.left) / square - front * (g.cosine + g.sine * tilt / square), front
+        return dot(missing_force, g.left) / square - front * (g.cosine + g.sine * tilt / square), front
 
 
 def padded(components: State) -> Vector:

@@ -164,7 +164,7 @@ class Formula(eqx.Module):
     @classmethod
     def of(cls, controls: Input, t: Any, motion: Any) -> "Formula":
         """The formula of a function that takes scalars of these types; their values do not matter."""
-        closed = jax.make_jaxpr(lambda *at: tuple(map(as_number, controls(*at))))(t, motion)
+        closed = jax.make_jaxpr(lambda *arguments: tuple(map(as_number, controls(*arguments))))(t, motion)
         return cls(tuple(closed.consts), Program(closed.jaxpr))
 
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced, shown
+from nonholonomic.validation import IN_DEGREES, Bound, Bounded, as_number, is_traced, shown
 
 #: Largest usual angles [rad]: a front wheel that turns by half a turn, and a heading after two turns.
 USUAL = {"steering": math.pi, "heading": 4.0 * math.pi}
@@ -71,16 +71,13 @@ class Launch(Bounded):
             raise ValueError(f"place = {shown(self.place)} must be a pair of numbers, or (x, y, z) [m]")
 
     def suspicion(self) -> str | None:
-        for name, usual in USUAL.items():
+        for name, limit in USUAL.items():
             value = getattr(self, name)
             if is_traced(value) or not isinstance(value, jax.Array) or value.size == 0:
                 continue
-            largest = float(np.max(np.abs(value)))
-            if largest > usual:
-                return (
-                    f"{name} = {largest:g} rad is large: was it in degrees? "
-                    f"{largest:g} degrees are {math.radians(largest):.4g} rad"
-                )
+            magnitude = float(np.max(np.abs(value)))
+            if magnitude > limit:
+                return f"{name} = {magnitude:g} rad is large{IN_DEGREES.format(f'{magnitude:g}')}"
         return None
 
     def bounds(self) -> Iterator[Bound]:

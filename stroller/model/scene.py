@@ -152,24 +152,24 @@ class Scene(Bounded):
         """Whether a launch has a speed although its front wheel is at a right angle; a concrete value for a concrete
         launch."""
         steering, speed = launch.steering, launch.speed
-        of = jnp if is_traced(steering) or is_traced(speed) else np
-        return (of.abs(of.cos(of.asarray(steering))) < RIGHT_ANGLE) & (of.asarray(speed) != 0.0)
+        xp = jnp if is_traced(steering) or is_traced(speed) else np
+        return (xp.abs(xp.cos(xp.asarray(steering))) < RIGHT_ANGLE) & (xp.asarray(speed) != 0.0)
 
     def level(self, launch: Launch) -> Any:
         """Whether a launch with a projected heading is on the equator; a concrete value for a concrete launch."""
         if self.heading != "projected" or not isinstance(self.surface, AbstractQuadric):
             return False
         polar, last = self.surface.semi_axes[1], launch.place[-1]
-        of = jnp if is_traced(last) or is_traced(polar) else np
-        sine = of.sin(of.asarray(last)) if len(launch.place) == 2 else of.asarray(last) / of.asarray(polar)
-        return of.abs(sine) < RIGHT_ANGLE
+        xp = jnp if is_traced(last) or is_traced(polar) else np
+        sine = xp.sin(xp.asarray(last)) if len(launch.place) == 2 else xp.asarray(last) / xp.asarray(polar)
+        return xp.abs(sine) < RIGHT_ANGLE
 
-    def may_start(self, launch: Launch, *others: Any) -> Bool[Array, ""]:
+    def may_start(self, launch: Launch, *modules: Any) -> Bool[Array, ""]:
         """Whether the numbers of the scene, a launch and other modules are legal; for traced numbers, which `check`
         ignores."""
-        own = [bound for module in (self, launch, *others) for bound in all_bounds(module)]
-        stuck = jnp.asarray(self.sideways(launch) | self.level(launch))
-        return jnp.all(legal([*own, *self.start_bounds(launch)]) & ~stuck)
+        bounds = [bound for module in (self, launch, *modules) for bound in all_bounds(module)]
+        is_stuck = jnp.asarray(self.sideways(launch) | self.level(launch))
+        return jnp.all(legal([*bounds, *self.start_bounds(launch)]) & ~is_stuck)
 
     def state(self, launch: Launch, driven: bool = False) -> State:
         """The state at the start of a run (see `dynamics.py` for its components).
@@ -194,8 +194,8 @@ class Scene(Bounded):
         if dynamics.absolute is not None:
             fork_rate = fork_rate + wheel * lead * sine / self.body.wheelbase
         axes = (*position[: self.surface.axes], *heading[: dynamics.heading.axes(self.surface)])
-        works = (None,) * (2 * driven + self.friction.dissipates)
-        start = (*axes, launch.steering, momentum, fork_rate, sine, cosine, *works)
+        work_components = (None,) * (2 * driven + self.friction.dissipates)
+        start = (*axes, launch.steering, momentum, fork_rate, sine, cosine, *work_components)
         shape = jnp.broadcast_arrays(*(component for component in start if component is not None))[0]
         return stacked(start, shape[None])
 
@@ -208,14 +208,14 @@ class Scene(Bounded):
         **Arguments:** as for `state`. **Returns:** an array (components, ...) in SI units.
         """
         body, dynamics = self.body, self.dynamics
-        ones = jnp.ones_like(self.state(launch, driven)[0])
+        one = jnp.ones_like(self.state(launch, driven)[0])
         rate = jnp.sqrt(self.gravity / body.wheelbase) + jnp.abs(launch.steering_rate) + 1e-3
         rate = rate + jnp.abs(launch.speed) / body.wheelbase
         speed = rate * body.wheelbase
         places, headings = self.surface.axes, dynamics.heading.axes(self.surface)
-        motion = (ones, jnp.sqrt(body.mass) * speed, rate, ones, ones)
-        works = (body.mass * speed**2,) * (2 * driven + self.friction.dissipates)
-        return stacked((*(body.wheelbase,) * places, *(ones,) * headings, *motion, *works), ones[None])
+        motion = (one, jnp.sqrt(body.mass) * speed, rate, one, one)
+        work_components = (body.mass * speed**2,) * (2 * driven + self.friction.dissipates)
+        return stacked((*(body.wheelbase,) * places, *(one,) * headings, *motion, *work_components), one[None])
 
     def energy(self, state: State) -> Float[Array, "..."]:
         """Kinetic and potential energy [J] at a state."""

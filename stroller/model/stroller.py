@@ -59,5 +59,7 @@ class Stroller(Bounded):
         if self.centre is not None:
             yield Bound(self.centre, "centre", at_least=0.0)
             yield Bound(self.centre, "centre", at_most=self.wheelbase, why="the wheelbase")
-            least = self.mass * self.centre**2
-            yield Bound(self.inertia, "inertia", at_least=least, why="mass centre^2, as it is about the rear axle")
+            min_inertia = self.mass * self.centre**2
+            yield Bound(
+                self.inertia, "inertia", at_least=min_inertia, why="mass centre^2, as it is about the rear axle"
+            )

@@ -38,8 +38,8 @@ def constraints_plane(p: Parameters, q: Four) -> Float[Array, "2 4"]:
 
 def position(p: Parameters, eta: Float[Array, ""], mu: Float[Array, ""]) -> Float[Array, " 3"]:
     """(4) and (11): x, y and z [m] of a point of the spheroid."""
-    across = p.a * jnp.cosh(p.xi) * jnp.cos(eta)
-    return jnp.array([across * jnp.cos(mu), across * jnp.sin(mu), p.a * jnp.sinh(p.xi) * jnp.sin(eta)])
+    transverse = p.a * jnp.cosh(p.xi) * jnp.cos(eta)
+    return jnp.array([transverse * jnp.cos(mu), transverse * jnp.sin(mu), p.a * jnp.sinh(p.xi) * jnp.sin(eta)])
 
 
 def differentials(p: Parameters, eta: Float[Array, ""], mu: Float[Array, ""]) -> Float[Array, "2 2"]:

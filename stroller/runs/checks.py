@@ -2,7 +2,8 @@
 
 from typing import Any
 
-from nonholonomic.integration import ImplicitMidpoint, require_adaptive, require_adjoint, require_run
+from nonholonomic.integration import ImplicitMidpoint
+from nonholonomic.integration.checks import require_adaptive, require_adjoint, require_run
 from nonholonomic.validation import require_whole
 
 from ..model.input import check_input

@@ -1,14 +1,12 @@
 """Find the times at which a quantity was zero during a run. To find a time within a step, the step is repeated with
 other lengths."""
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.integration import few_trials
+from nonholonomic.integration.zeros import few_trials
 
 from ..model.dynamics import State
 from .ride import RideSpec
@@ -29,23 +27,9 @@ CLOSER_LOOKS = 3
 CLOSEST = 1e-14
 
 
-class Between(NamedTuple):
-    """A watched quantity, minus a level, at any time of a run."""
-
-    spec: RideSpec
-    steps: Steps
-    name: str
-    level: float
-
-    def at(self, times: Lanes) -> Lanes:
-        """The quantity at the given times; NaN counts as beyond the level."""
-        value = watched(self.spec, self.steps.at(self.spec, times), self.name) - self.level
-        return np.where(np.isfinite(value), value, -np.inf)
-
-
 def watched(spec: RideSpec, states: States, name: str) -> Lanes:
     """A quantity in `WATCHED` at the given states."""
-    return in_blocks(lambda at: _watched(spec, at), states)[WATCHED.index(name)]
+    return in_blocks(lambda state: _watched(spec, state), states)[WATCHED.index(name)]
 
 
 @eqx.filter_jit
@@ -58,21 +42,26 @@ def _watched(spec: RideSpec, states: State) -> Float[Array, "watched lanes"]:
 def crossings(spec: RideSpec, steps: Steps, name: str, level: float) -> Float[np.ndarray, " times"]:
     """Times [s] at which a watched quantity passes a level, in either direction, in increasing order."""
     time, value = steps.times, watched(spec, steps.states, name) - level
-    which = np.flatnonzero(_may_cross(value))
-    if which.size == 0:
+    indices = np.flatnonzero(_may_cross(value))
+    if indices.size == 0:
         return np.zeros(0)
-    quantity = Between(spec, steps, name, level)
+
+    def quantity(times: Lanes) -> Lanes:
+        """The quantity minus the level; NaN counts as beyond the level."""
+        value = watched(spec, steps.at(spec, times), name) - level
+        return np.where(np.isfinite(value), value, -np.inf)
+
     parts = np.arange(1, PARTS) / PARTS
-    new = (time[which] + parts[:, None] * (time[which + 1] - time[which])).ravel()
+    new = (time[indices] + parts[:, None] * (time[indices + 1] - time[indices])).ravel()
     for _ in range(1 + CLOSER_LOOKS):
-        time, value = np.concatenate([time, new]), np.concatenate([value, quantity.at(new)])
+        time, value = np.concatenate([time, new]), np.concatenate([value, quantity(new)])
         order = np.argsort(time, kind="stable")
         time, value = time[order], value[order]
         new = _nearest(time, value)
         if new.size == 0:
             break
     changes = np.flatnonzero((value[:-1] > 0.0) != (value[1:] > 0.0))
-    return few_trials(quantity.at, time[changes], time[changes + 1], value[changes], value[changes + 1])
+    return few_trials(quantity, time[changes], time[changes + 1], value[changes], value[changes + 1])
 
 
 def _may_cross(value: Float[np.ndarray, " steps"]) -> Bool[np.ndarray, " gaps"]:
@@ -80,22 +69,24 @@ def _may_cross(value: Float[np.ndarray, " steps"]) -> Bool[np.ndarray, " gaps"]:
     neighbour."""
     with np.errstate(invalid="ignore"):
         change = np.abs(np.diff(value))
-        largest = np.max([change, np.append(change[1:], 0.0), np.insert(change[:-1], 0, 0.0)], axis=0)
-        small = np.minimum(np.abs(value[:-1]), np.abs(value[1:])) < largest
-    return small | ((value[:-1] > 0.0) != (value[1:] > 0.0))
+        max_change = np.max([change, np.append(change[1:], 0.0), np.insert(change[:-1], 0, 0.0)], axis=0)
+        is_small = np.minimum(np.abs(value[:-1]), np.abs(value[1:])) < max_change
+    return is_small | ((value[:-1] > 0.0) != (value[1:] > 0.0))
 
 
 def _nearest(time: Float[np.ndarray, " looks"], value: Float[np.ndarray, " looks"]) -> Float[np.ndarray, " new"]:
     """The times at which a quantity is nearest to zero between checks of equal sign: the vertices of parabolas."""
     distance = np.abs(value)
-    least = (distance[1:-1] < distance[:-2]) & (distance[1:-1] <= distance[2:])
-    least &= (value[1:-1] > 0.0) == (value[:-2] > 0.0)
-    least &= (value[1:-1] > 0.0) == (value[2:] > 0.0)
-    middle = np.flatnonzero(least) + 1
-    before, after = time[middle] - time[middle - 1], time[middle + 1] - time[middle]
+    is_minimum = (distance[1:-1] < distance[:-2]) & (distance[1:-1] <= distance[2:])
+    is_minimum &= (value[1:-1] > 0.0) == (value[:-2] > 0.0)
+    is_minimum &= (value[1:-1] > 0.0) == (value[2:] > 0.0)
+    middle = np.flatnonzero(is_minimum) + 1
+    gap_before, gap_after = time[middle] - time[middle - 1], time[middle + 1] - time[middle]
     with np.errstate(all="ignore"):
-        fall = (distance[middle - 1] - distance[middle]) / before
-        rise = (distance[middle + 1] - distance[middle]) / after
-        vertex = time[middle] + 0.5 * (fall * after**2 - rise * before**2) / (fall * after + rise * before)
-    inside = (vertex > time[middle - 1]) & (vertex < time[middle + 1]) & (np.abs(vertex - time[middle]) > CLOSEST)
-    return vertex[inside]
+        fall = (distance[middle - 1] - distance[middle]) / gap_before
+        rise = (distance[middle + 1] - distance[middle]) / gap_after
+        vertex = time[middle] + 0.5 * (fall * gap_after**2 - rise * gap_before**2) / (
+            fall * gap_after + rise * gap_before
+        )
+    is_inside = (vertex > time[middle - 1]) & (vertex < time[middle + 1]) & (np.abs(vertex - time[middle]) > CLOSEST)
+    return vertex[is_inside]

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.geometry import Plane
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, AbstractProblem, LaneState, Settings, Status
+from nonholonomic.integration import AbstractPassive, ExtendedProblem, LaneState, Settings
+from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, Status
 from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.progress import status_line
 from nonholonomic.validation import require_file
@@ -117,10 +118,10 @@ def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float, input:
     controls = as_module(input, roots["scene"], roots["launch"])
 
     def modules(values: Numbers) -> tuple[Scene, Launch, Input | None]:
-        replaced = with_numbers(roots, {knob.path: value for knob, value in zip(knobs, values, strict=True)})
-        return replaced["scene"], replaced["launch"], replaced.get("input", controls)
+        new_roots = with_numbers(roots, {knob.path: value for knob, value in zip(knobs, values, strict=True)})
+        return new_roots["scene"], new_roots["launch"], new_roots.get("input", controls)
 
-    def moment(values: Numbers, problem: "RollingRide", lane: LaneState) -> Frame:
+    def moment(values: Numbers, problem: Any, lane: LaneState) -> Frame:
         scene, _, controls = modules(values)
         return frame(scene, controls, lane)
 
@@ -133,7 +134,7 @@ def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float, input:
         sliders=knobs,
         allowed=lambda values: modules(values)[0].may_start(modules(values)[1]),
         answer=Answer("distance from the start", "m", ride),
-        motion=Simulator(lambda values: RollingRide.of(*modules(values)), t1, settings, {"frame": moment}),
+        motion=Simulator(lambda values: rolling_ride(*modules(values)), t1, settings, {"frame": moment}),
         summaries=(Summary("speed", "m/s", 0), Summary("energy", "J", 2)),
     )
 
@@ -154,43 +155,32 @@ def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float
     }
 
 
-class RollingRide(AbstractProblem):
-    """A ride with the rolling angles of its left, right and front wheel."""
+class WheelAngles(AbstractPassive):
+    """The rolling angles of the left, the right and the front wheel of a ride."""
 
-    ride: RideProblem
+    def rates(self, problem: Any, time: Float[Array, "..."], state: State, passive: State) -> State:
+        """Each rear wheel, half a track from the middle, rolls as fast as the ground passes below it."""
+        length = problem.dynamics.body.wheelbase
+        motion = problem.dynamics.geometry(state).motion
+        side_offset = 0.5 * TRACK * length * motion.yaw_rate
+        speeds = jnp.stack([motion.speed - side_offset, motion.speed + side_offset, motion.front_speed])
+        return jnp.concatenate([problem.field(time, state), speeds / (RADIUS * length)])
 
-    @classmethod
-    def of(cls, scene: Scene, launch: Launch, controls: Input | None) -> "RollingRide":
-        """The problem of one cell."""
-        return cls(RideProblem.of(scene, launch, controls, 1, False))
 
-    def start(self) -> tuple[State, State]:
-        state, scales = self.ride.start()
-        return jnp.concatenate([state, jnp.zeros((3, 1))]), jnp.concatenate([scales, jnp.ones((3, 1))])
-
-    def field(self, time: Float[Array, "..."], state: State) -> State:
-        """The ride's field; each rear wheel, half a track from the middle, rolls as fast as the ground passes below it."""
-        length = self.ride.dynamics.body.wheelbase
-        motion = self.ride.dynamics.geometry(state[:-3]).motion
-        aside = 0.5 * TRACK * length * motion.yaw_rate
-        speeds = jnp.stack([motion.speed - aside, motion.speed + aside, motion.front_speed])
-        return jnp.concatenate([self.ride.field(time, state[:-3]), speeds / (RADIUS * length)])
-
-    def event_function(self, state: State) -> None:
-        return None
-
-    def domain_margin(self, time: Float[Array, "..."], state: State) -> Any:
-        return self.ride.domain_margin(time, state[:-3])
+def rolling_ride(scene: Scene, launch: Launch, controls: Input | None) -> ExtendedProblem[RideProblem]:
+    """A ride of one cell with the rolling angles of its wheels."""
+    ride = RideProblem.of(scene, launch, controls, 1, False)
+    return ExtendedProblem(ride, WheelAngles(), jnp.zeros((3, 1)), jnp.ones((3, 1)))
 
 
 def outcome(problem: RideProblem, lane: LaneState) -> tuple[Int[Array, ""], Float[Array, ""]]:
     """The `Status` of a ride and the distance of its end from its start [m], infinite if the ride is not completed."""
     first, last = problem.dynamics.unpack(problem.states)[0], problem.dynamics.unpack(lane.state)[0]
-    apart = [(a - b) ** 2 for a, b in zip(first, last, strict=True) if a is not None and b is not None]
+    squares = [(a - b) ** 2 for a, b in zip(first, last, strict=True) if a is not None and b is not None]
     status = jnp.where(jnp.isfinite(lane.first_crossing), int(Status.CONTACT_LOST), int(Status.COMPLETED))
     status = jnp.where(lane.status == LEFT_DOMAIN, int(Status.RANK_LOST), status)
     status = jnp.where(lane.status == FAILED, int(Status.FAILED), status)[0]
-    return status, jnp.where(status == int(Status.COMPLETED), jnp.sqrt(sum(apart))[0], jnp.inf)
+    return status, jnp.where(status == int(Status.COMPLETED), jnp.sqrt(sum(squares))[0], jnp.inf)
 
 
 def stage(runs: list[dict[str, Any]], t1: float, controls: Any) -> Stage:
@@ -205,35 +195,40 @@ def stage(runs: list[dict[str, Any]], t1: float, controls: Any) -> Stage:
 def frame(scene: Scene, controls: Input | None, lane: LaneState) -> Frame:
     """The drawn quantities of a stroller at one time, in the order of `view.show`."""
     arrays = quantities_of(scene, controls, lane.time, lane.state[:-3])
-    drawn = {name: arrays[name][0] for name in SHOWN}
-    length, position, heading = scene.body.wheelbase, drawn["position"], drawn["direction"]
+    outputs = {name: arrays[name][0] for name in SHOWN}
+    length, position, heading = scene.body.wheelbase, outputs["position"], outputs["direction"]
     normal = scene.surface.sign(scene.side, DRIVES) * fixed_normal(scene, position)
     x = heading / jnp.linalg.norm(heading)
     y = jnp.cross(normal, x)
     y = y / jnp.linalg.norm(y)
     z = jnp.cross(x, y)
-    cosine, sine = jnp.cos(drawn["steering"]), jnp.sin(drawn["steering"])
+    cosine, sine = jnp.cos(outputs["steering"]), jnp.sin(outputs["steering"])
     forward, left = cosine * x + sine * y, cosine * y - sine * x
     radius, half = RADIUS * length, 0.5 * TRACK * length
     axle, front = position + radius * z, position + length * x + radius * z
-    rolled = lane.state[-3:, 0]
+    angles = lane.state[-3:, 0]
     contacts = (position + 0.02 * radius * z, position + length * x + 0.02 * radius * z)
     return Frame(
         normal=normal,
         bodies=(
             (axle, quaternion(jnp.stack([x, y, z], axis=-1))),
-            (axle + half * y, rolling(x, y, z, rolled[0])),
-            (axle - half * y, rolling(x, y, z, rolled[1])),
-            (front, rolling(forward, left, z, rolled[2])),
+            (axle + half * y, rolling(x, y, z, angles[0])),
+            (axle - half * y, rolling(x, y, z, angles[1])),
+            (front, rolling(forward, left, z, angles[2])),
         ),
         traces=((contacts[0], None), (contacts[1], None)),
         arrows=(
-            (axle - 1.4 * half * y, drawn["normal_force"] * z),
-            (contacts[0], drawn["side_force"][0] * y),
-            (contacts[1], drawn["side_force"][1] * left),
+            (axle - 1.4 * half * y, outputs["normal_force"] * z),
+            (contacts[0], outputs["side_force"][0] * y),
+            (contacts[1], outputs["side_force"][1] * left),
         ),
-        curves=(drawn["speed"], drawn["steering"], drawn["energy"], drawn["normal_force"]),
-        turning_rate=jnp.maximum(jnp.abs(drawn["speed"]), jnp.abs(drawn["front_speed"])) / radius,
+        curves=(
+            outputs["speed"],
+            outputs["steering"],
+            outputs["energy"],
+            outputs["normal_force"],
+        ),
+        turning_rate=jnp.maximum(jnp.abs(outputs["speed"]), jnp.abs(outputs["front_speed"])) / radius,
     )
 
 
@@ -246,6 +241,6 @@ def rolling(x: Array, y: Array, z: Array, angle: Float[Array, ""]) -> Float[Arra
 def fixed_normal(scene: Scene, position: Float[Array, "3"]) -> Float[Array, "3"]:
     """The ground's outward normal at a point, in the fixed frame."""
     surface = scene.surface
-    own = surface.normal(surface.in_own_axes((position[0], position[1], position[2])))
-    x, y, z = (jnp.zeros(()) if part is None else jnp.asarray(part) + 0.0 for part in own)
+    normal = surface.normal(surface.in_own_axes((position[0], position[1], position[2])))
+    x, y, z = (jnp.zeros(()) if part is None else jnp.asarray(part) + 0.0 for part in normal)
     return jnp.stack([jnp.asarray(part) for part in surface.in_fixed_frame((x, y, z))])

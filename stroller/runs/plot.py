@@ -27,7 +27,7 @@ def draw_rides(grounds: dict[str, AbstractSurface], rides: dict[tuple[str, str],
     figure = Figure(figsize=(18.0, 4.2 * len(grounds)), layout="constrained")
     layout = figure.add_gridspec(len(grounds), 4, width_ratios=(1.5, 1.0, 1.0, 1.0))
     for row, (name, ground) in enumerate(grounds.items()):
-        on_ground = {ride: run for (where, ride), run in rides.items() if where == name}
+        on_ground = {ride: run for (place_name, ride), run in rides.items() if place_name == name}
         space = figure.add_subplot(layout[row, 0], projection="3d")
         _draw_ground(space, ground, on_ground)
         panels = [figure.add_subplot(layout[row, column]) for column in (1, 2, 3)]

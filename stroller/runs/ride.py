@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.derivatives import SampledRun, sampled_run, sampled_run_by_diffrax
 from nonholonomic.geometry import Plane
-from nonholonomic.integration import REACHED_END, AbstractProblem, Settings
+from nonholonomic.integration import AbstractProblem, Settings
+from nonholonomic.integration.status import REACHED_END
 
 from ..model.dynamics import Dynamics, State
 from ..model.heading import Projected
@@ -106,7 +107,7 @@ class RideSpec(eqx.Module):
     """A `Ride` that can leave a transformation: its numbers are leaves and everything else is static."""
 
     numbers: Any
-    rest: Any = eqx.field(static=True)
+    static: Any = eqx.field(static=True)
 
     @classmethod
     def of(cls, ride: Ride) -> "RideSpec":
@@ -116,7 +117,7 @@ class RideSpec(eqx.Module):
     @property
     def ride(self) -> Ride:
         """The ride."""
-        return eqx.combine(self.numbers, self.rest)
+        return eqx.combine(self.numbers, self.static)
 
 
 def as_module(controls: Input | None, scene: Scene, launch: Launch) -> Any:

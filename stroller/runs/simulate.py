@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.integration import ImplicitMidpoint, Settings, legal_run, require_times
+from nonholonomic.integration import ImplicitMidpoint, Settings
+from nonholonomic.integration.checks import legal_run, require_times
 from nonholonomic.progress import status_line
 from nonholonomic.validation import as_known, is_traced, nan_unless
 
@@ -113,17 +114,17 @@ _sampled = eqx.filter_jit(functools.partial(traced_ride, adjoint=None))
 @eqx.filter_jit
 def _legal_or_nan(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None) -> Trajectory:
     """The run, or NaN and `finished` false if a traced number is out of range."""
-    starts = ride.scene.may_start(ride.launch, ride.input)
-    is_legal, t1, tolerance = legal_run(starts, ride.t1, ride.settings.tolerance, times)
-    begun, run_times = ride._replace(settings=ride.settings.with_tolerance(tolerance)), times
+    may_start = ride.scene.may_start(ride.launch, ride.input)
+    is_legal, t1, tolerance = legal_run(may_start, ride.t1, ride.settings.tolerance, times)
+    legal_ride, run_times = ride._replace(settings=ride.settings.with_tolerance(tolerance)), times
     if ride.grid is None:
-        begun, run_times = begun._replace(t1=t1), jnp.where(is_legal, times, 0.0)
+        legal_ride, run_times = legal_ride._replace(t1=t1), jnp.where(is_legal, times, 0.0)
     if adjoint is not None:
         # A run with illegal numbers never begins, but Diffrax would differentiate it.
-        begun = begun._replace(
+        legal_ride = legal_ride._replace(
             **nan_unless(is_legal, {"scene": ride.scene, "launch": ride.launch, "input": ride.input})
         )
-    run = read_off(RideSpec.of(ride), run_times, *traced_ride(begun, run_times, adjoint))
+    run = read_off(RideSpec.of(ride), run_times, *traced_ride(legal_ride, run_times, adjoint))
     stats = run.stats._replace(finished=run.stats.finished & is_legal)
     return eqx.tree_at(lambda trajectory: (trajectory.t, trajectory.stats), nan_unless(is_legal, run), (times, stats))
 
@@ -134,18 +135,18 @@ def _evenly_spaced(t1: Float[Array, ""]) -> Float[Array, " times"]:
 
 
 def even_steps(
-    times: Float[Array, " times"], t1: Float[Array, ""], longest: Float[Array, ""]
+    times: Float[Array, " times"], t1: Float[Array, ""], max_duration: Float[Array, ""]
 ) -> Float[Array, " steps"]:
-    """Times from 0 to `t1`, at most `longest` apart, that include all `times` and are evenly spaced between them.
+    """Times from 0 to `t1`, at most `max_duration` apart, that include all `times` and are evenly spaced between them.
 
     **Raises:** `ValueError` if an argument is traced, because the number of steps is part of the program.
     """
-    for name, number in {"t1": t1, "times": times, "step_length": longest}.items():
+    for name, number in {"t1": t1, "times": times, "step_length": max_duration}.items():
         if is_traced(number):
             raise ValueError(
                 f"{name} is traced and must be known for ImplicitMidpoint, whose steps have a given length"
             )
     knots = np.union1d(np.asarray(times), [0.0, float(t1)])
-    counts = np.ceil(np.diff(knots) / float(longest) * (1.0 - 1e-12)).astype(int)
+    counts = np.ceil(np.diff(knots) / float(max_duration) * (1.0 - 1e-12)).astype(int)
     pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(knots, knots[1:], counts, strict=False)]
     return jnp.asarray(np.concatenate([*pieces, knots[-1:]]))

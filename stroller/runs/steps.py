@@ -34,29 +34,29 @@ class Steps(NamedTuple):
 
     def at(self, spec: RideSpec, times: Lanes) -> States:
         """The states at the given times [s]; NaN after the end of the run."""
-        which = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
-        ends = np.where(times == self.times[which], which, which + 1)
+        step = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
+        ends = np.where(times == self.times[step], step, step + 1)
         states = self.states[:, ends]
-        inside = (times > self.times[which]) & (times < self.times[which + 1])
-        if inside.any():
-            states[:, inside] = self._between(spec, which[inside], times[inside] - self.times[which[inside]])
+        is_inside = (times > self.times[step]) & (times < self.times[step + 1])
+        if is_inside.any():
+            states[:, is_inside] = self._between(spec, step[is_inside], times[is_inside] - self.times[step[is_inside]])
         states[:, times > self.times[-1]] = np.nan
         return states
 
-    def _between(self, spec: RideSpec, which: Any, length: Lanes) -> States:
+    def _between(self, spec: RideSpec, step: Any, length: Lanes) -> States:
         """The states at given times [s] after the starts of some steps."""
 
         def field(times: Lanes, states: States) -> States:
-            return in_blocks(lambda *at: _field(spec, *at), times, states)
+            return in_blocks(lambda *arguments: _field(spec, *arguments), times, states)
 
-        time, start, solver = self.times[which], self.states[:, which], spec.ride.settings.for_steps_alone
+        time, start, solver = self.times[step], self.states[:, step], spec.ride.settings.for_steps_alone
         rates = [field(time, start)]
         if not isinstance(solver, diffrax.AbstractERK):
             # Use the cubic through states and rates at both ends; repeating an implicit step would be expensive.
-            whole, end = self.times[which + 1] - time, self.states[:, which + 1]
-            part, change = length / whole, end - start
-            last = field(time + whole, end)
-            bend = (1.0 - part) * (whole * rates[0] - change) - part * (whole * last - change)
+            length_of_step, end = self.times[step + 1] - time, self.states[:, step + 1]
+            part, change = length / length_of_step, end - start
+            last = field(time + length_of_step, end)
+            bend = (1.0 - part) * (length_of_step * rates[0] - change) - part * (length_of_step * last - change)
             return start + part * (change + (1.0 - part) * bend)
         tableau = explicit_tableau(solver)
         for fraction, row in zip(tableau.c, tableau.a_lower, strict=True):
@@ -90,9 +90,9 @@ def followed(spec: RideSpec) -> tuple[Steps, Stats]:
         return Steps(path.times, path.states), _counted(path.accepted, path.rejected, not path.failed)
     solution = _on_grid(problem, spec)
     ends = np.asarray(ride.grid)
-    good = ends <= float(solution.end_time)
-    steps = Steps(ends[good], np.asarray(solution.states)[:, good])
-    return steps, _counted(int(solution.accepted), int(solution.rejected), bool(good.all()))
+    mask = ends <= float(solution.end_time)
+    steps = Steps(ends[mask], np.asarray(solution.states)[:, mask])
+    return steps, _counted(int(solution.accepted), int(solution.rejected), bool(mask.all()))
 
 
 def _counted(accepted: int, rejected: int, finished: bool) -> Stats:

@@ -11,7 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import AbstractSurface, Plane
-from nonholonomic.integration import DEFAULT_MAX_STEPS, FAILED, LEFT_DOMAIN, Settings, explicit_tableau, solve_ensemble
+from nonholonomic.integration import Settings, explicit_tableau, solve_ensemble
+from nonholonomic.integration.settings import DEFAULT_MAX_STEPS
+from nonholonomic.integration.status import FAILED, LEFT_DOMAIN
 from nonholonomic.parameters import description, full_axes, numbers, with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, cells_to_check
 from nonholonomic.sweeps import sweep as computed
@@ -137,8 +139,8 @@ def sweep(
     grid = named_axes(full_axes(axes, variable_numbers(roots)), scene.surface, launch)
     # The modules check every value of every axis here, before anything compiles.
     for cells in cells_to_check(grid):
-        changed = with_numbers(roots, cells)
-        changed["scene"].check(changed["launch"])
+        new_roots = with_numbers(roots, cells)
+        new_roots["scene"].check(new_roots["launch"])
 
     request = description("scene", scene) | description("launch", dataclasses.replace(launch, place=(0.0, 0.0)))
     request |= {"launch.place": [float(part) for part in launch.place], "t1": float(t1), "tolerance": float(tolerance)}
@@ -190,8 +192,8 @@ class RideJob(NamedTuple):
             problem, as_number(self.t1), jnp.asarray(count), self.settings, nonterminal=problem.watched
         )
         contact_time = np.asarray(outcome.first_crossing)
-        lost = np.isfinite(contact_time)
-        words = np.select([outcome.status == FAILED, outcome.status == LEFT_DOMAIN, lost], [3, 2, 1], 0)
+        is_lost = np.isfinite(contact_time)
+        words = np.select([outcome.status == FAILED, outcome.status == LEFT_DOMAIN, is_lost], [3, 2, 1], 0)
         ends = read_ends(cells["scene"], outcome.state, problem.states)
         return {name: np.asarray(values) for name, values in ends.items()} | {
             "contact_time": contact_time,
@@ -229,15 +231,15 @@ def named_axes(axes: dict[str, Any], surface: AbstractSurface, launch: Launch) -
     """The axes of the table. The name of an axis is the last part of its full name, or the last two parts if one is
     ambiguous. Numbers of a place have the surface's names, followed by a zero: `x0`.
     """
-    lasts = [number.rsplit(".", 1)[-1] for number in axes]
-    named = surface.coordinates if len(launch.place) == len(surface.coordinates) else FIXED
-    places = dict(zip(place_numbers(launch), named, strict=True))
+    last_names = [number.rsplit(".", 1)[-1] for number in axes]
+    coordinates = surface.coordinates if len(launch.place) == len(surface.coordinates) else FIXED
+    places = dict(zip(place_numbers(launch), coordinates, strict=True))
     grid = []
-    for number, last in zip(axes, lasts, strict=True):
+    for number, last in zip(axes, last_names, strict=True):
         name, unit = last, UNITS.get(last, "1")
         if number in places:
             name, unit = places[number][0] + "0", places[number][1]
-        elif lasts.count(last) > 1 or last in VARIABLES:
+        elif last_names.count(last) > 1 or last in VARIABLES:
             name = "_".join(number.split(".")[-2:])
         if number.endswith("steering"):
             unit = "N m s" if "friction" in number else "rad"

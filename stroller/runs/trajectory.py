@@ -122,9 +122,9 @@ class Trajectory(Viewable, Tabular, eqx.Module):
     def _grip_line(self) -> str:
         """The greatest friction coefficient that each axle needs, and the axle that slips if tyres cannot provide
         it."""
-        needs = dict(zip(self.loaded_axles, np.max(np.asarray(self.grip()), axis=0), strict=False))
-        text = ", ".join(f"{name} axle {most:.3g}" for name, most in needs.items())
-        slips = " and ".join(name for name, most in needs.items() if most > MOST_GRIP)
+        grip_needed = dict(zip(self.loaded_axles, np.max(np.asarray(self.grip()), axis=0), strict=False))
+        text = ", ".join(f"{name} axle {grip:.3g}" for name, grip in grip_needed.items())
+        slips = " and ".join(name for name, grip in grip_needed.items() if grip > MOST_GRIP)
         remark = f": the {slips} wheels would slip, because tyres provide at most {MOST_GRIP:g}" if slips else ""
         return f"needed friction up to {text}{remark}"
 
@@ -231,17 +231,17 @@ def side_slip(scene: Scene, rate: State, state: State) -> tuple[Float[Array, "..
     velocity = dynamics.unpack(rate)[0]
     heading_rate = padded(jax.jvp(heading_components, (state,), (rate,))[1])
     if scene.heading == "projected":
-        along, left = g.motion.heading, (-g.motion.heading[1], g.motion.heading[0], None)
+        heading, left = g.motion.heading, (-g.motion.heading[1], g.motion.heading[0], None)
     else:
-        along, left = g.direction, g.left
-    sideways = sum_vectors(scale(-g.sine, along), scale(g.cosine, left))
+        heading, left = g.direction, g.left
+    sideways = sum_vectors(scale(-g.sine, heading), scale(g.cosine, left))
     front = sum_vectors(velocity, scale(multiply(body.wheelbase, dot(heading_rate, left)), left))
     return dot(velocity, left), dot(front, sideways)
 
 
-def spread(component: Component, like: Float[Array, "..."]) -> Float[Array, "..."]:
+def spread(component: Component, example: Float[Array, "..."]) -> Float[Array, "..."]:
     """A component as an array, with zeros if it vanishes identically."""
-    return jnp.zeros_like(like) if component is None else jnp.broadcast_to(component, like.shape)
+    return jnp.zeros_like(example) if component is None else jnp.broadcast_to(component, example.shape)
 
 
 def side_force(
@@ -271,15 +271,15 @@ def quantities_of(
     dynamics, surface = scene.dynamics, scene.surface
     integrated, states = states, scene.dynamics.righted(states)
     g = dynamics.geometry(states)
-    motion, like = g.motion, states[0]
+    motion, example = g.motion, states[0]
     place = surface.place_at(motion.position)
     _, east, north = surface.chart(place)
     power = dynamics.power(g, dynamics.forces(t, g, controls))
-    normal_force = spread(g.normal_force, like)
-    front_load = spread(g.front_load, like)
+    normal_force = spread(g.normal_force, example)
+    front_load = spread(g.front_load, example)
 
     def columns(*components):
-        return jnp.stack([spread(component, like) for component in components], axis=-1)
+        return jnp.stack([spread(component, example) for component in components], axis=-1)
 
     return dict(
         t=t,
@@ -290,15 +290,15 @@ def quantities_of(
         steering=motion.steering,
         speed=motion.speed,
         front_speed=motion.front_speed,
-        steering_rate=spread(motion.steering_rate, like),
+        steering_rate=spread(motion.steering_rate, example),
         yaw_rate=motion.yaw_rate,
         energy=scene.energy(states),
         work=scene.work(states),
-        power=Power(*(spread(part, like) for part in power)),
+        power=Power(*(spread(part, example) for part in power)),
         side_force=columns(*side_force(scene, t, states, controls)),
         normal_force=normal_force,
         load=columns(normal_force - front_load, front_load),
         constraint=columns(*side_slip(scene, dynamics.field(t, states, controls), states)),
-        departure=spread(surface.offset(motion.position), like),
+        departure=spread(surface.offset(motion.position), example),
         state=integrated.T,
     )

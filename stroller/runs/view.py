@@ -74,9 +74,9 @@ def grouped(groups: list[list[tuple[int, Any]]], names: list[str]) -> list[Stage
 def normals(surface: AbstractSurface, side: str | None, position: np.ndarray) -> np.ndarray:
     """Unit normals at positions (times, 3), towards the side on which the stroller is."""
     components = surface.normal(surface.in_own_axes(vector_of(position.T)))
-    like = np.zeros(len(position))
-    full = vector_of(like if part is None else np.asarray(part) + like for part in components)
-    return surface.sign(side, DRIVES) * np.stack([np.asarray(part) for part in surface.in_fixed_frame(full)], axis=-1)
+    zero = np.zeros(len(position))
+    filled = vector_of(zero if part is None else np.asarray(part) + zero for part in components)
+    return surface.sign(side, DRIVES) * np.stack([np.asarray(part) for part in surface.in_fixed_frame(filled)], axis=-1)
 
 
 def show(run: Any, number: int, name: str) -> Show:
@@ -85,27 +85,27 @@ def show(run: Any, number: int, name: str) -> Show:
     length, colour = float(scene.body.wheelbase), COLOURS[number % len(COLOURS)]
     radius, half = RADIUS * length, TRACK * length / 2.0
     step_times = np.asarray(run.t)
-    times, read = refined(run, radius)
-    position, direction = read(run.position), read(run.direction)
-    normal = read(normals(scene.surface, scene.side, np.asarray(run.position)))
+    times, reader = refined(run, radius)
+    position, direction = reader(run.position), reader(run.direction)
+    normal = reader(normals(scene.surface, scene.side, np.asarray(run.position)))
     x = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
     y = np.cross(normal, x)
     y /= np.linalg.norm(y, axis=-1, keepdims=True)
     z = np.cross(x, y)
-    steering = read(run.steering)[:, None]
+    steering = reader(run.steering)[:, None]
     forward, left = np.cos(steering) * x + np.sin(steering) * y, np.cos(steering) * y - np.sin(steering) * x
     axle, front = position + radius * z, position + length * x + radius * z
-    rolled = {
-        side: read(_integral(step_times, (np.asarray(run.speed) - sign * half * np.asarray(run.yaw_rate)) / radius))
+    roll_angles = {
+        side: reader(_integral(step_times, (np.asarray(run.speed) - sign * half * np.asarray(run.yaw_rate)) / radius))
         for side, sign in (("left", 1.0), ("right", -1.0))
     }
-    ahead = read(_integral(step_times, np.asarray(run.front_speed) / radius))
+    front_angle = reader(_integral(step_times, np.asarray(run.front_speed) / radius))
     rear = wheel(radius, WIDTH * length, (DARK, PALE))
     weight = float(scene.body.mass * scene.gravity)
-    forces, scale = read(run.side_force), WEIGHT * length / weight
+    forces, scale = reader(run.side_force), WEIGHT * length / weight
     contacts = (position + 0.02 * radius * z, position + length * x + 0.02 * radius * z)
     grip = np.asarray(run.grip())[:, : len(run.loaded_axles)]
-    push = read(run.normal_force)[:, None] * z
+    push = reader(run.normal_force)[:, None] * z
     return Show(
         name,
         colour,
@@ -114,9 +114,14 @@ def show(run: Any, number: int, name: str) -> Show:
         SIZE * length,
         (
             Body("frame", axle, _orientation(x, y, z), frame(length, colour)),
-            Body("left wheel", axle + half * y, _rolling(x, y, z, rolled["left"]), rear),
-            Body("right wheel", axle - half * y, _rolling(x, y, z, rolled["right"]), rear),
-            Body("front wheel", front, _rolling(forward, left, z, ahead), wheel(radius, WIDTH * length, (DARK, PALE))),
+            Body("left wheel", axle + half * y, _rolling(x, y, z, roll_angles["left"]), rear),
+            Body("right wheel", axle - half * y, _rolling(x, y, z, roll_angles["right"]), rear),
+            Body(
+                "front wheel",
+                front,
+                _rolling(forward, left, z, front_angle),
+                wheel(radius, WIDTH * length, (DARK, PALE)),
+            ),
         ),
         (
             Trace("path of the rear axle", contacts[0], GREEN, 0.05 * length),
@@ -131,11 +136,11 @@ def show(run: Any, number: int, name: str) -> Show:
             ),
         ),
         (
-            Curve("speed [m/s]", read(run.speed)),
-            Curve("steering angle [rad]", read(run.steering)),
-            Curve("energy [J]", read(run.energy)),
-            Curve("normal force [N]", read(run.normal_force)),
-            Curve("friction that the tyres need [1]", read(np.minimum(grip, DRAWN_GRIP).max(axis=-1))),
+            Curve("speed [m/s]", reader(run.speed)),
+            Curve("steering angle [rad]", reader(run.steering)),
+            Curve("energy [J]", reader(run.energy)),
+            Curve("normal force [N]", reader(run.normal_force)),
+            Curve("friction that the tyres need [1]", reader(np.minimum(grip, DRAWN_GRIP).max(axis=-1))),
         ),
         grip_warning(run),
     )
@@ -143,10 +148,10 @@ def show(run: Any, number: int, name: str) -> Show:
 
 def grip_warning(run: Any) -> str:
     """A warning for a ride that needs more grip than tyres provide; empty for others."""
-    needed = float(np.max(np.asarray(run.grip())[:, : len(run.loaded_axles)]))
+    max_grip = float(np.max(np.asarray(run.grip())[:, : len(run.loaded_axles)]))
     return (
-        f"needs friction {needed:.2g}, more than any tyre provides: a real stroller would slip"
-        if needed > MOST_GRIP
+        f"needs friction {max_grip:.2g}, more than any tyre provides: a real stroller would slip"
+        if max_grip > MOST_GRIP
         else ""
     )
 
@@ -160,28 +165,30 @@ def refined(run: Any, radius: float) -> tuple[np.ndarray, Any]:
     from scipy.interpolate import CubicSpline
 
     gaps = np.diff(times)
-    rolled = np.maximum(np.abs(run.speed), np.abs(run.front_speed)).max() * gaps / radius
-    parts = np.clip(np.ceil(rolled / ROLL_PER_FRAME), 1, 20).astype(int)
-    fine = np.concatenate([a + (b - a) * np.arange(n) / n for a, b, n in zip(times, times[1:], parts, strict=False)])
-    fine = np.append(fine, times[-1])
-    return fine, lambda values: CubicSpline(times, np.asarray(values))(fine)
+    roll_angles = np.maximum(np.abs(run.speed), np.abs(run.front_speed)).max() * gaps / radius
+    parts = np.clip(np.ceil(roll_angles / ROLL_PER_FRAME), 1, 20).astype(int)
+    refined_times = np.concatenate(
+        [a + (b - a) * np.arange(n) / n for a, b, n in zip(times, times[1:], parts, strict=False)]
+    )
+    refined_times = np.append(refined_times, times[-1])
+    return refined_times, lambda values: CubicSpline(times, np.asarray(values))(refined_times)
 
 
 def frame(length: float, colour: int) -> tuple[Mesh, ...]:
     """Axle, chassis, basket, handle and fork, as seen from the middle of the rear axle."""
-    half, thin = TRACK * length / 2.0, 0.025 * length
+    half, thickness = TRACK * length / 2.0, 0.025 * length
     low, high = 0.12 * length, 0.62 * length
     handle = [(-0.55 * length, sign * 0.3 * half, 0.95 * length) for sign in (1.0, -1.0)]
-    posts = [bar((0.0, 0.3 * half * sign, low), handle[k], thin, DARK) for k, sign in enumerate((1.0, -1.0))]
+    posts = [bar((0.0, 0.3 * half * sign, low), handle[k], thickness, DARK) for k, sign in enumerate((1.0, -1.0))]
     return (
-        bar((0.0, -half, 0.0), (0.0, half, 0.0), thin, DARK),
-        bar((0.0, 0.0, 0.0), (0.92 * length, 0.0, 0.30 * length), thin, DARK),
-        bar((length, 0.0, 0.22 * length), (length, 0.0, 0.34 * length), 1.4 * thin, DARK),
-        bar((0.92 * length, 0.0, 0.30 * length), (length, 0.0, 0.30 * length), thin, DARK),
+        bar((0.0, -half, 0.0), (0.0, half, 0.0), thickness, DARK),
+        bar((0.0, 0.0, 0.0), (0.92 * length, 0.0, 0.30 * length), thickness, DARK),
+        bar((length, 0.0, 0.22 * length), (length, 0.0, 0.34 * length), 1.4 * thickness, DARK),
+        bar((0.92 * length, 0.0, 0.30 * length), (length, 0.0, 0.30 * length), thickness, DARK),
         box((0.62 * length, 1.1 * half, high - low), (0.22 * length, 0.0, (low + high) / 2.0 + 0.06 * length), colour),
         box((0.5 * length, 0.9 * half, 0.02 * length), (0.22 * length, 0.0, high + 0.07 * length), PALE),
         *posts,
-        bar(handle[0], handle[1], 1.3 * thin, DARK),
+        bar(handle[0], handle[1], 1.3 * thickness, DARK),
     )
 
 

@@ -62,35 +62,37 @@ class Chart(AbstractSystem):
         equatorial, _ = self.quadric.semi_axes
         if self.scene.heading == "projected":
             # The pull-back of cos(theta) dx + sin(theta) dy and its like by x = A cos(eta) cos(mu), y = ... sin(mu).
-            inwards, across = -equatorial * jnp.sin(q[0]), equatorial * jnp.cos(q[0])
+            inwards, radial = -equatorial * jnp.sin(q[0]), equatorial * jnp.cos(q[0])
             sine, cosine = jnp.sin(q[2] - q[1]), jnp.cos(q[2] - q[1])
-            long = [inwards * cosine, across * sine, zero, zero]
-            lat = [-inwards * sine, across * cosine, zero, zero]
-            return jnp.array([long, lat, [zero, zero, unit, zero]])
+            longitudinal = [inwards * cosine, radial * sine, zero, zero]
+            lateral = [-inwards * sine, radial * cosine, zero, zero]
+            return jnp.array([longitudinal, lateral, [zero, zero, unit, zero]])
         h_eta, h_mu = jnp.sqrt(self.ground_metric(q))
         connection = equatorial * jnp.sin(q[0]) / h_eta
         side = self.scene.dynamics.side
-        lat = [side * h_eta * cosine, -side * h_mu * sine, zero, zero]
-        return jnp.array([[h_eta * sine, h_mu * cosine, zero, zero], lat, [zero, side * connection, side * unit, zero]])
+        lateral = [side * h_eta * cosine, -side * h_mu * sine, zero, zero]
+        return jnp.array(
+            [[h_eta * sine, h_mu * cosine, zero, zero], lateral, [zero, side * connection, side * unit, zero]]
+        )
 
     def metric(self, q: Coordinates) -> Float[Array, "4 4"]:
         body, absolute = self.scene.body, FORKS[self.scene.fork]
-        _, lat, yaw = self.forms(q)
+        _, lateral, yaw = self.forms(q)
         fork = jnp.zeros(4).at[3].set(1.0) + (0.0 if absolute is None else absolute * yaw)
         G = body.mass * jnp.diag(jnp.concatenate([self.ground_metric(q), jnp.zeros(2)]))
         G = G + body.inertia * jnp.outer(yaw, yaw) + body.steering_inertia * jnp.outer(fork, fork)
         if body.centre is not None:
             # The centre of mass also moves sideways at b Omega; the inertia is about the axle and includes m b^2.
-            across = jnp.outer(lat, yaw)
-            G = G + body.mass * body.centre * (across + across.T)
+            coupling = jnp.outer(lateral, yaw)
+            G = G + body.mass * body.centre * (coupling + coupling.T)
         return G
 
     def potential(self, q: Coordinates) -> Float[Array, ""]:
         scene = self.scene
         if self.quadric is None:
             slope = scene.surface.up[0]
-            along = add(q[0], multiply(scene.body.centre, jnp.cos(q[2])))
-            height = multiply(along, slope)
+            centre_x = add(q[0], multiply(scene.body.centre, jnp.cos(q[2])))
+            height = multiply(centre_x, slope)
         else:
             height = self.quadric.semi_axes[1] * (1.0 + jnp.sin(q[0]))
         weight = multiply(scene.body.mass * scene.gravity, height)
@@ -98,25 +100,37 @@ class Chart(AbstractSystem):
         return add(jnp.zeros(()), weight, spring)
 
     def constraints(self, q: Coordinates) -> Float[Array, "2 4"]:
-        long, lat, yaw = self.forms(q)
+        longitudinal, lateral, yaw = self.forms(q)
         sine, cosine = jnp.sin(q[3]), jnp.cos(q[3])
-        return jnp.stack([lat, -sine * long + cosine * lat + self.scene.body.wheelbase * cosine * yaw])
+        return jnp.stack([lateral, -sine * longitudinal + cosine * lateral + self.scene.body.wheelbase * cosine * yaw])
 
     def frame(self, q: Coordinates) -> Float[Array, "4 4"]:
         sine, cosine, length = jnp.sin(q[3]), jnp.cos(q[3]), self.scene.body.wheelbase
         forms = self.forms(q)
         # Long and lat do not depend on the turn of the heading, and only steering changes phi.
-        across = inverse(forms[:2, :2])
-        level = jnp.concatenate([across, -forms[2:, :2] @ across / forms[2, 2], jnp.zeros((1, 2))])
-        (long, lat), yaw, steering = level.T, jnp.zeros(4).at[2].set(1.0 / forms[2, 2]), jnp.zeros(4).at[3].set(1.0)
-        return jnp.stack([cosine * long + sine / length * yaw, steering, lat, cosine * yaw - length * sine * long], 1)
+        block = inverse(forms[:2, :2])
+        level = jnp.concatenate([block, -forms[2:, :2] @ block / forms[2, 2], jnp.zeros((1, 2))])
+        (longitudinal, lateral), yaw, steering = (
+            level.T,
+            jnp.zeros(4).at[2].set(1.0 / forms[2, 2]),
+            jnp.zeros(4).at[3].set(1.0),
+        )
+        return jnp.stack(
+            [
+                cosine * longitudinal + sine / length * yaw,
+                steering,
+                lateral,
+                cosine * yaw - length * sine * longitudinal,
+            ],
+            1,
+        )
 
     def wheel_motion(self, q: Coordinates, rate: Coordinates) -> tuple[Float[Array, "4 4"], WheelMotion]:
         """The one-forms of rear-wheel speed, front-wheel speed, yaw and steering rate, a row each, and their values."""
-        body, (long, lat, yaw) = self.scene.body, self.forms(q)
+        body, (longitudinal, lateral, yaw) = self.scene.body, self.forms(q)
         sine, cosine = jnp.sin(q[3]), jnp.cos(q[3])
-        front = cosine * long + sine * lat + body.wheelbase * sine * yaw
-        rows = jnp.stack([long, front, yaw, jnp.zeros(4).at[3].set(1.0)])
+        front = cosine * longitudinal + sine * lateral + body.wheelbase * sine * yaw
+        rows = jnp.stack([longitudinal, front, yaw, jnp.zeros(4).at[3].set(1.0)])
         load = self.normal_force(q, rate)
         front_load = None if body.centre is None else load * body.centre / body.wheelbase
         v, w, yaw_rate, steering_rate = rows @ rate

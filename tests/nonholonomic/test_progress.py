@@ -18,7 +18,8 @@ from terminal import Terminal, left, watched, words
 
 from nonholonomic import progress
 from nonholonomic.derivatives import growth
-from nonholonomic.integration import REACHED_END, Settings
+from nonholonomic.integration import Settings
+from nonholonomic.integration.status import REACHED_END
 from nonholonomic.progress import Progress, status_line
 from nonholonomic.sweeps import Variable, axis, sweep
 

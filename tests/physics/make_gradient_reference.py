@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import tippe
-from nonholonomic.integration import CROSSED, Settings, solve_ensemble
+from nonholonomic.integration import Settings, solve_ensemble
+from nonholonomic.integration.status import CROSSED
 from nonholonomic.parameters import with_numbers
 from tippe.modes.inversion_problem import InversionProblem
 

@@ -78,7 +78,7 @@ def test_flight_is_the_free_motion():
     assert_close(np.linalg.norm(e, axis=0), 1.0, atol=1e-14)
     assert_close(energy(body, 9.81, later), energy(body, 9.81, free), rtol=1e-13)
     for last in (False, True):
-        cos_angle = cone(body, free).along[2] + 0.01
+        cos_angle = cone(body, free).parallel[2] + 0.01
         reached = angle_reached(body, free, cos_angle, 0.5 * jnp.ones(6), last)
         assert np.isfinite(reached).all()
         height, height_rate = jax.jvp(lambda t: flown(body, 9.81, free, t).axis[2], (reached,), (jnp.ones(6),))

@@ -15,7 +15,7 @@ from nonholonomic.hybrid import HybridPath
 from nonholonomic.integration import Settings
 from tippe.modes.sticking import ROLLING
 from tippe.modes.trajectory_problem import trajectory_problem
-from tippe.runs.stick_slip_trajectory import solve_stick_slip_dense
+from tippe.runs.trajectory import stick_slip_path
 
 
 def cohen_top() -> tippe.Top:
@@ -85,7 +85,7 @@ def test_a_bowling_ball_slides_and_then_rolls():
     scene, end = scene_of(homogeneous_ball(), 0.3), 2.0 / (7.0 * 0.3 * 9.81)
     run = trajectory_problem((scene, tippe.Launch(theta=0.7, spin=0.0)))
     run = eqx.tree_at(lambda run: run.problem.states, run, run.problem.states.at[0].set(1.0))
-    path = solve_stick_slip_dense(run, 3.0 * end, Settings(1e-11))
+    path = stick_slip_path(run, 3.0 * end, Settings(1e-11))
     assert kinds(path) == [False, True]
     assert_close(path.mode_segments[0].end, end, atol=1e-7)
     times = np.array([0.3, 0.9, 0.999, 1.5, 3.0]) * end
@@ -248,11 +248,12 @@ def test_the_time_of_inversion_of_the_regularised_law_is_creep():
     assert_close(np.diff(table.time) / np.diff(1.0 / speeds), 0.05, rtol=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("surface", "launch"),
     [
         (tippe.Plane(0.9), tippe.Launch(np.pi, 0.0)),
-        pytest.param(tippe.Sphere(0.2), tippe.Launch(np.pi, 50.0, eta=1.2), marks=pytest.mark.slow),
+        (tippe.Sphere(0.2), tippe.Launch(np.pi, 50.0, eta=1.2)),
     ],
     ids=["plane", "sphere"],
 )
@@ -263,6 +264,7 @@ def test_a_launch_on_the_stem_slips_off_a_slope(surface, launch):
     assert run.stats["energy_residual"] < 1e-9
 
 
+@pytest.mark.slow
 def test_a_launch_beyond_the_angle_from_which_the_top_slips_at_once_is_inverted_at_the_start():
     """At rest on a steep wall, as under smooth laws; 5.7 ms later the slip has begun."""
     scene = tippe.Scene(rutstam_top(), tippe.Sphere(0.2), tippe.SetValuedCoulomb(0.3))

@@ -15,7 +15,8 @@ from drawn_strollers import KINDS, LANES, MORE_KINDS, batch_of
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from nonholonomic.integration import LEFT_DOMAIN, REACHED_END, Settings, solve_ensemble
+from nonholonomic.integration import Settings, solve_ensemble
+from nonholonomic.integration.status import LEFT_DOMAIN, REACHED_END
 from stroller import Damping, Launch, Plane, RollingResistance, Scene, Sphere, Spheroid, Stroller
 from stroller.runs.table import RideProblem
 

@@ -96,7 +96,7 @@ def test_the_wooden_top_turns_over_in_four_fifths_of_the_launches(tmp_path, caps
     scene = job.scenes(job.parser().parse_args(["--mu", "0.5"]))["cylinder"]
     times = np.array([3.0, 6.0, 10.0])
     theta = theta_over_time(scene, tippe.Launch.degrees(18, 1900), times, 1e-6, ("launch.theta", "scene.friction.mu"))
-    np.testing.assert_allclose(np.degrees(theta[:2]), [145.0, 161.0], atol=4.0)
+    np.testing.assert_allclose(np.degrees(theta[:2]), [145.0, 161.0], atol=8.0)
     assert theta[2] < INVERTED + 0.02
 
 

@@ -11,9 +11,8 @@ import tippe
 from nonholonomic.integration import Settings
 from nonholonomic.sweeps.digits import concise, concise_strings
 from tippe import steady
-from tippe.runs.cells import InversionRuns
+from tippe.runs.cells import InversionJob, InversionRuns
 from tippe.runs.run_kind import run_kind_of
-from tippe.runs.table import InversionJob
 from tippe.runs.time_error import FINER, SAFETY, SAFETY_OF_HISTORIES, error_bound, errors_of, second_tolerance
 
 SCENE = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
@@ -54,7 +53,7 @@ def test_times_through_the_threshold(near_threshold):
     assert (near_threshold.time_error[:3] == 0.0).all()
 
 
-@pytest.mark.parametrize("factor", [1.01, 1.2])
+@pytest.mark.parametrize("factor", [1.01, pytest.param(1.2, marks=pytest.mark.slow)])
 def test_the_estimate_covers_the_error_near_the_threshold(near_threshold, factor):
     """Above the true error, below thirty times of it (five is due)."""
     cell = int(np.flatnonzero(factor == FACTORS)[0])

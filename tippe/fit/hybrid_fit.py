@@ -3,6 +3,7 @@ JAX's transformations."""
 
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -12,11 +13,13 @@ from nonholonomic.parameters import numbers, with_numbers
 
 from ..model.scene import Scene
 from ..runs.cells import InversionRuns
-from ..runs.extended_times import LEAST_ANGLE
+from ..runs.extended_times import beyond_horizon
 from ..runs.run_kind import run_kind_of
 from ..runs.trajectory import simulate
 from .inversion_times import InversionTimes
 from .recording import Recording
+
+_beyond_horizon = jax.jit(beyond_horizon)
 
 
 class HybridModel(NamedTuple):
@@ -48,8 +51,8 @@ class HybridModel(NamedTuple):
         if allowed and isinstance(data, InversionTimes):
             # Legal rows run in the place of illegal ones, so that every call has the same number of cells and is
             # compiled once.
-            every = [rows[i] if i in allowed else rows[allowed[0]] for i in range(len(rows))]
-            predictions[allowed] = self._times(data, every)[allowed]
+            all_rows = [rows[i] if i in allowed else rows[allowed[0]] for i in range(len(rows))]
+            predictions[allowed] = self._times(data, all_rows)[allowed]
         elif allowed:
             for i in allowed:
                 predictions[i] = self._samples(data, rows[i])
@@ -63,8 +66,8 @@ class HybridModel(NamedTuple):
         return True
 
     def _roots(self, data: Any, row: dict[str, float]) -> dict[str, Any]:
-        own = {name: value for name, value in row.items() if name != "t0"}
-        return with_numbers({"scene": self.scene, "launch": data.launch}, own)
+        scene_row = {name: value for name, value in row.items() if name != "t0"}
+        return with_numbers({"scene": self.scene, "launch": data.launch}, scene_row)
 
     def _times(self, data: InversionTimes, rows: list[dict[str, float]]) -> Float[np.ndarray, "rows launches"]:
         """Times continued beyond the horizon, as by `extended_inversion_time`."""
@@ -79,26 +82,25 @@ class HybridModel(NamedTuple):
         runs = InversionRuns(run_kind_of(self.scene), t1, angle, "first", Settings(self.tolerance), "ensemble", [])
         count = launches * len(rows)
         variables = runs.results({"scene": self.scene, "launch": data.launch}, columns, count)
-        missing = np.log(angle / np.clip(np.asarray(variables["end_theta"]), LEAST_ANGLE, angle))
-        whole = np.maximum(np.log(angle / np.clip(columns["launch.theta"], LEAST_ANGLE, angle)), 1.0)
-        time = np.where(np.isfinite(variables["time"]), variables["time"], t1 * (1.0 + missing / whole))
-        failed = np.asarray(variables["status"]) == runs.run_kind.words.index("failed")
-        return np.where(failed, np.nan, time).reshape(len(rows), launches)
+        later = np.asarray(_beyond_horizon(variables["end_theta"], columns["launch.theta"], angle, t1))
+        time = np.where(np.isfinite(variables["time"]), variables["time"], later)
+        has_failed = np.asarray(variables["status"]) == runs.run_kind.words.index("failed")
+        return np.where(has_failed, np.nan, time).reshape(len(rows), launches)
 
     def _samples(self, data: Recording, row: dict[str, float]) -> Float[np.ndarray, " size"]:
         """The samples of one run. Samples before the launch equal those at the launch; samples after the run's end are
         NaN."""
         roots = self._roots(data, row)
-        since = np.maximum(np.asarray(data.times) - row.get("t0", float(data.t0)), 0.0)
-        at, where = np.unique(since, return_inverse=True)
-        run = simulate(roots["scene"], roots["launch"], float(at[-1]), tolerance=self.tolerance)
-        reached = at[at <= float(run.end_time)]
-        samples = np.full((len(at), len(data.columns)), np.nan)
-        shown = run.at(reached)
-        samples[: len(reached)] = np.stack(
-            [np.asarray(data.quantities.samples(shown, name)) for name in data.columns], axis=-1
+        run_times = np.maximum(np.asarray(data.times) - row.get("t0", float(data.t0)), 0.0)
+        times_to_sample, inverse = np.unique(run_times, return_inverse=True)
+        run = simulate(roots["scene"], roots["launch"], float(times_to_sample[-1]), tolerance=self.tolerance)
+        times_reached = times_to_sample[times_to_sample <= float(run.end_time)]
+        samples = np.full((len(times_to_sample), len(data.columns)), np.nan)
+        run_samples = run.at(times_reached)
+        samples[: len(times_reached)] = np.stack(
+            [np.asarray(data.quantities.samples(run_samples, name)) for name in data.columns], axis=-1
         )
-        return samples[where].reshape(-1)
+        return samples[inverse].reshape(-1)
 
 
 def _count(columns: dict[str, np.ndarray]) -> int:

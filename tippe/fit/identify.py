@@ -113,7 +113,11 @@ def identify(
         kind = SceneModel if smooth else HybridModel
         slopes = slopes or ("exact" if smooth else "differences")
         return fit_data(
-            lambda seen: kind(scene=scene, data=data, seen=seen, tolerance=tolerance), data, unknowns, search, slopes
+            lambda indices: kind(scene=scene, data=data, seen=indices, tolerance=tolerance),
+            data,
+            unknowns,
+            search,
+            slopes,
         )
 
 
@@ -133,5 +137,7 @@ def unknowns_of(scene: Scene, data: tuple[Any, ...], free: Any) -> dict[str, Fre
     launches = [
         [name for name, value in numbers("launch", source.launch).items() if value is not None] for source in data
     ]
-    own = [names + ["t0"] * isinstance(source, Recording) for names, source in zip(launches, data, strict=True)]
-    return scene_unknowns(free, scene, data[0].launch, list(variable_numbers(scene)), own)
+    names_of_data = [
+        names + ["t0"] * isinstance(source, Recording) for names, source in zip(launches, data, strict=True)
+    ]
+    return scene_unknowns(free, scene, data[0].launch, list(variable_numbers(scene)), names_of_data)

@@ -82,8 +82,8 @@ class InversionTimes(eqx.Module):
             raise ValueError(f"time = {measured[np.argmax(last < first)]} must be a time, or two in order")
         if self.student is not None:
             require(self.student, "student", above=0.0)
-        alike = numbers("launch", self.launch) | {"error": self.error, "until": self.until}
-        for name, value in alike.items():
+        key = numbers("launch", self.launch) | {"error": self.error, "until": self.until}
+        for name, value in key.items():
             if value is not None and np.shape(value) not in ((), shape[:1]):
                 raise ValueError(f"{name} must be one number or one for each launch, not of shape {np.shape(value)}")
 
@@ -100,9 +100,9 @@ class InversionTimes(eqx.Module):
     def measurements(self) -> Measurements:
         """The times as `Measurements`."""
         first, last = self._limits
-        before = (first == 0.0) & np.isfinite(last)
+        is_before = (first == 0.0) & np.isfinite(last)
         student = math.inf if self.student is None else float(self.student)
-        return Measurements(np.where(before, -np.inf, first), self.error, upper=last, student=student)
+        return Measurements(np.where(is_before, -np.inf, first), self.error, upper=last, student=student)
 
     @property
     def series_units(self) -> tuple[str, ...]:

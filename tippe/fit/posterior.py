@@ -44,7 +44,7 @@ def log_density(
     unknowns = unknowns_of(scene, data, free)
     if priors is not None and not isinstance(priors, dict):
         raise ValueError(f"priors = {priors!r} must be a dictionary, name of a number -> (mean, standard deviation)")
-    named = {full_name("priors", name, list(unknowns)): prior for name, prior in (priors or {}).items()}
-    measurements, _, seen = joined(data)
-    model = SceneModel(scene=scene, data=data, seen=seen, tolerance=tolerance)
-    return LogDensity.of(model, measurements, unknowns, named, series_units(data))
+    priors_by_name = {full_name("priors", name, list(unknowns)): prior for name, prior in (priors or {}).items()}
+    measurements, _, indices = joined(data)
+    model = SceneModel(scene=scene, data=data, seen=indices, tolerance=tolerance)
+    return LogDensity.of(model, measurements, unknowns, priors_by_name, series_units(data))

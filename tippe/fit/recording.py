@@ -114,5 +114,5 @@ def read_recording(
     >>> print(film.times, film.value.round(4))
     [0.   0.04] [0.0995 0.11  ]
     """
-    read = read_columns(path, columns, fps, error, QUANTITIES)
-    return Recording(launch, *read, t0, student)
+    table = read_columns(path, columns, fps, error, QUANTITIES)
+    return Recording(launch, *table, t0, student)

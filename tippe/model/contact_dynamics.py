@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.geometry import Component, Tangent, multiply, stacked
-from nonholonomic.integration import Status
+from nonholonomic.integration.status import Status
 from nonholonomic.xla_cpu import least
 
 from .contact_load import ContactLoad, Slip

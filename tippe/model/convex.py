@@ -140,8 +140,8 @@ class ConvexBody(AbstractBody):
         yield from self.inertia_bounds()
         height, radius, meridian = (jnp.min(part, axis=0) for part in self._samples())
         yield Bound(height, "least support", above=0.0, why="the centre of mass lies inside the body")
-        for least in (radius, meridian):
-            yield Bound(least, "least radius of curvature by support", above=0.0, why="the body is convex")
+        for radius_part in (radius, meridian):
+            yield Bound(radius_part, "least radius of curvature by support", above=0.0, why="the body is convex")
 
     def _samples(self) -> tuple[Float[Array, "samples ..."], ...]:
         """Height and the two radii of curvature at the checked inclinations [m]."""

@@ -24,20 +24,20 @@ def drive(law: Any) -> str | None:
         grid.ravel() for grid in np.meshgrid(np.arange(8) * math.pi / 4.0, SPEEDS, TURNINGS, indexing="ij")
     )
     x, y = speed * np.cos(angle), speed * np.sin(angle)
-    none, drilling = jnp.zeros(turning.shape), jnp.asarray(turning) if law.uses_spin else None
+    zero, drilling = jnp.zeros(turning.shape), jnp.asarray(turning) if law.uses_spin else None
     try:
         with jax.ensure_compile_time_eval():
-            power = np.asarray(_power(law, Slip(jnp.asarray(x), jnp.asarray(y), (none, none, drilling))))
+            power = np.asarray(_power(law, Slip(jnp.asarray(x), jnp.asarray(y), (zero, zero, drilling))))
     except Exception:
         # The first run reports what is wrong with such a law.
         return None
     if power.shape != x.shape or not np.any(power > 1e-12):
         return None
-    worst = int(np.nanargmax(power / speed))
-    drills = f" and a turning of {turning[worst]:g} rad/s" if law.uses_spin and turning[worst] else ""
+    index = int(np.nanargmax(power / speed))
+    drills = f" and a turning of {turning[index]:g} rad/s" if law.uses_spin and turning[index] else ""
     return (
-        f"friction = {one_line(law)} drives the top: at a slip of ({x[worst]:.3g}, {y[worst]:.3g}) m/s{drills} its power is "
-        f"{power[worst]:.3g} W per newton of normal force, but the power of friction is never positive. Is a sign wrong? A run "
+        f"friction = {one_line(law)} drives the top: at a slip of ({x[index]:.3g}, {y[index]:.3g}) m/s{drills} its power is "
+        f"{power[index]:.3g} W per newton of normal force, but the power of friction is never positive. Is a sign wrong? A run "
         "whose energy grows ends as 'unresolved'. For a level belt, give Launch the velocity relative to it"
     )
 

@@ -56,8 +56,8 @@ class AbstractFriction(Bounded):
 
     def suspicion(self) -> str | None:
         # The laws of this package oppose every slip. Traced numbers have no values to judge.
-        own = str(type(self).per_normal_force.__module__).startswith("tippe.")
-        return None if own or any(is_traced(leaf) for leaf in jax.tree.leaves(self)) else drive(self)
+        is_own = str(type(self).per_normal_force.__module__).startswith("tippe.")
+        return None if is_own or any(is_traced(leaf) for leaf in jax.tree.leaves(self)) else drive(self)
 
     @property
     def uses_spin(self) -> bool:

@@ -52,9 +52,9 @@ class Inertia(Bounded):
                 f"inertia = {matrix!r} must be a matrix of shape (3, 3), in kg m^2 about the centre of mass"
             )
         if not is_traced(values):
-            unequal = np.abs(np.asarray(values) - np.asarray(values).T)
-            if np.any(unequal > 1e-12 * np.max(np.abs(values))):
-                row, column = np.unravel_index(np.argmax(unequal), (3, 3))
+            asymmetry = np.abs(np.asarray(values) - np.asarray(values).T)
+            if np.any(asymmetry > 1e-12 * np.max(np.abs(values))):
+                row, column = np.unravel_index(np.argmax(asymmetry), (3, 3))
                 entry, mirrored = float(values[row, column]), float(values[column, row])
                 raise ValueError(
                     f"inertia must be symmetric: inertia[{row}][{column}] = {entry:g}, inertia[{column}][{row}] = {mirrored:g}"
@@ -72,9 +72,9 @@ class Inertia(Bounded):
         # semidefinite; the tensor is positive definite. Both are divided by powers of the trace, so that rounding
         # errors are comparable.
         second = SymmetricMatrix(half - xx, half - yy, half - zz, -xy, -xz, -yz)
-        why = "the largest principal moment of a rigid body is at most the sum of the other two" + self._moments
+        reason = "the largest principal moment of a rigid body is at most the sum of the other two" + self._moments
         for number, degree in zip(second.principal_minors, DEGREES, strict=True):
-            yield Bound(number / half**degree, "inertia: excess of moments", at_least=-FLAT, why=why)
+            yield Bound(number / half**degree, "inertia: excess of moments", at_least=-FLAT, why=reason)
         for number, degree in zip(self.tensor.principal_minors, DEGREES, strict=True):
             positive = f"the principal moments of a rigid body are positive{self._moments}"
             yield Bound(number / half**degree, "inertia: product of moments", above=0.0, why=positive)
@@ -153,5 +153,5 @@ class SymmetricMatrix(eqx.Module):
         """The seven principal minors, from one row to three rows; all are nonnegative if the matrix is positive
         semidefinite."""
         adjugate = self.adjugate
-        smaller = (self.xx, self.yy, self.zz, adjugate.xx, adjugate.yy, adjugate.zz)
-        return (*smaller, self.determinant(adjugate))
+        minors = (self.xx, self.yy, self.zz, adjugate.xx, adjugate.yy, adjugate.zz)
+        return (*minors, self.determinant(adjugate))

@@ -101,9 +101,9 @@ class Launch(Bounded):
 
         ```
         """
-        for value, name, largest in ((theta, "theta", 180.0), (eta, "eta", 180.0), (azimuth, "azimuth", None)):
-            least = 0.0 if name == "theta" else None if largest is None else -largest
-            require(value, name, at_least=least, at_most=largest, why="in degrees")
+        for value, name, limit in ((theta, "theta", 180.0), (eta, "eta", 180.0), (azimuth, "azimuth", None)):
+            lower_limit = 0.0 if name == "theta" else None if limit is None else -limit
+            require(value, name, at_least=lower_limit, at_most=limit, why="in degrees")
         require(rpm, "rpm")
         theta, eta, azimuth = (jnp.radians(as_number(angle)) for angle in (theta, eta, azimuth))
         return cls(theta, as_number(rpm) * (2.0 * jnp.pi / 60.0), eta, azimuth, **others)

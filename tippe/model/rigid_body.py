@@ -151,12 +151,13 @@ class Ellipsoid(AbstractRigidBody):
 
     def surface_point(self, normal: Vector, rate: Vector) -> tuple[Vector, Vector]:
         # p = -A n / q with q^2 = n.A n, A the squares of the semi-axes.
-        scaled = vector_of(axis * axis * part for axis, part in zip(self.semi_axes, normal, strict=True))
-        per_height = 1.0 / jnp.sqrt(dot(normal, scaled))
-        point = vector_of(scale(-per_height, scaled))
-        along = dot(point, rate)
+        scaled_normal = vector_of(axis * axis * part for axis, part in zip(self.semi_axes, normal, strict=True))
+        per_height = 1.0 / jnp.sqrt(dot(normal, scaled_normal))
+        point = vector_of(scale(-per_height, scaled_normal))
+        projection = dot(point, rate)
         change = (
-            along * part - axis * axis * moved for axis, part, moved in zip(self.semi_axes, point, rate, strict=True)
+            projection * part - axis * axis * component
+            for axis, part, component in zip(self.semi_axes, point, rate, strict=True)
         )
         return point, vector_of(scale(per_height, vector_of(change)))
 
@@ -206,18 +207,18 @@ class RigidBody(AbstractRigidBody):
         yield Bound(self.mass, "mass", above=0.0)
         for k in range(3):
             yield Bound(self.centre_of_mass[k], f"centre_of_mass[{k}]")
-        height, sharpest = (jnp.min(part, axis=0) for part in self._samples())
+        height, min_radius = (jnp.min(part, axis=0) for part in self._samples())
         yield Bound(height, "least support seen from centre_of_mass", above=0.0, why="the centre of mass lies inside")
-        yield Bound(sharpest, "least radius of curvature by support", above=0.0, why="the body is strictly convex")
+        yield Bound(min_radius, "least radius of curvature by support", above=0.0, why="the body is strictly convex")
 
     def _samples(self) -> tuple[Float[Array, "samples ..."], Float[Array, "samples ..."]]:
         """Height of the centre of mass above a plane, and the smaller principal radius of curvature [m], by direction."""
 
         def sample(normal: Float[Array, "3"], first: Float[Array, "3"], second: Float[Array, "3"]) -> tuple[Any, Any]:
             # A plane that turns about one tangent moves the contact by the radius along the other.
-            point, along = self.contact(tuple(normal), tuple(first))
+            point, projection = self.contact(tuple(normal), tuple(first))
             _, across = self.contact(tuple(normal), tuple(second))
-            a, b, c = -dot(tuple(first), along), -dot(tuple(first), across), -dot(tuple(second), across)
+            a, b, c = -dot(tuple(first), projection), -dot(tuple(first), across), -dot(tuple(second), across)
             return -dot(tuple(normal), point), 0.5 * (a + c) - jnp.sqrt(0.25 * (a - c) ** 2 + b * b)
 
         return jax.vmap(sample)(*evenly_spread(SAMPLES))
@@ -229,8 +230,8 @@ class RigidBody(AbstractRigidBody):
     @property
     def half_widths(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         def half_width(normal: Float[Array, "3"]) -> Any:
-            still = tuple(jnp.zeros(3))
-            (low, _), (high, _) = (self.surface_point(tuple(sign * normal), still) for sign in (1.0, -1.0))
+            no_velocity = tuple(jnp.zeros(3))
+            (low, _), (high, _) = (self.surface_point(tuple(sign * normal), no_velocity) for sign in (1.0, -1.0))
             return 0.5 * dot(tuple(normal), vector_of(sum_vectors(high, scale(-1.0, low))))
 
         half_widths = jax.vmap(half_width)(evenly_spread(SAMPLES)[0])

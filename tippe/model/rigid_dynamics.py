@@ -88,12 +88,12 @@ class ContactMotion(NamedTuple):
     """The motion of the contact point.
 
     - `normal_rate`, `lever_rate`: rates of change of the components of n and of r in the body's axes.
-    - `along`: velocity of the contact point along the arena [m/s]; `frame`: motion of the frame.
+    - `contact_velocity`: velocity of the contact point along the arena [m/s]; `frame`: motion of the frame.
     """
 
     normal_rate: Vector
     lever_rate: Vector
-    along: Tangent
+    contact_velocity: Tangent
     frame: FrameMotion
 
 
@@ -145,18 +145,20 @@ class AbstractRigidDynamics(AbstractContactDynamics):
         arena [m/s]."""
         normal_rate, lever_rate = attitude.fixed_rates
         over_body = attitude.in_frame(lever_rate)
-        along = (add(slip[0], over_body[0]), add(slip[1], over_body[1]))
+        contact_velocity = (add(slip[0], over_body[0]), add(slip[1], over_body[1]))
         if isinstance(self.frame, PlaneFrame):
-            return ContactMotion(normal_rate, lever_rate, along, self.frame.frame_motion(place, along))
+            return ContactMotion(
+                normal_rate, lever_rate, contact_velocity, self.frame.frame_motion(place, contact_velocity)
+            )
         # If n turns along a tangent, the contact moves against it over the body, by H.
         tangents = [vector_of(axis[k] for axis in attitude.axes) for k in (0, 1)]
         first, second = (attitude.in_frame(self.body.contact(attitude.normal, t)[1]) for t in tangents)
-        H11, H12, H22, *along = stored(-first[0], -first[1], -second[1], *along)
-        frame, path = self.frame.convex_motion(place, (along[0], along[1]), (H11, H12, H22))
+        H11, H12, H22, *contact_velocity = stored(-first[0], -first[1], -second[1], *contact_velocity)
+        frame, path = self.frame.convex_motion(place, (contact_velocity[0], contact_velocity[1]), (H11, H12, H22))
         path = stored(*path)
-        turned = attitude.in_body((subtract(None, frame.frame_rate[0]), subtract(None, frame.frame_rate[1]), None))
-        moved = attitude.in_body((subtract(path[0], slip[0]), subtract(path[1], slip[1]), None))
-        return ContactMotion(vector_of(sum_vectors(normal_rate, turned)), moved, path, frame)
+        frame_part = attitude.in_body((subtract(None, frame.frame_rate[0]), subtract(None, frame.frame_rate[1]), None))
+        lever_rate_in_body = attitude.in_body((subtract(path[0], slip[0]), subtract(path[1], slip[1]), None))
+        return ContactMotion(vector_of(sum_vectors(normal_rate, frame_part)), lever_rate_in_body, path, frame)
 
     def angular_velocity(self, state: Float[Array, "components ..."]) -> Vector:
         """Angular velocity of the body in the frame [rad/s]."""
@@ -172,10 +174,10 @@ class AbstractRigidDynamics(AbstractContactDynamics):
         """Kinetic energy plus weight times the height of the centre of mass [J]."""
         (u1, u2), _, _, place = parts(self.carried_along(state))
         attitude, place = self.attitude(state), place[:-3]
-        rising = -dot(attitude.angular_velocity, cross(attitude.lever, attitude.normal))
+        vertical_speed = -dot(attitude.angular_velocity, cross(attitude.lever, attitude.normal))
         rotation = 0.5 * dot(attitude.angular_velocity, attitude.momentum)
         height = add(self.frame.height(place), dot(self.mass_from_contact(state), self.frame.vertical(place)))
-        return self.body.mass * (0.5 * (u1**2 + u2**2 + rising**2) + self.gravity * height) + rotation
+        return self.body.mass * (0.5 * (u1**2 + u2**2 + vertical_speed**2) + self.gravity * height) + rotation
 
     def normal_spin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Angular velocity about the arena's normal [rad/s]."""
@@ -261,9 +263,9 @@ class RigidSlipping(AbstractRigidDynamics):
         lever, normal = attitude.lever, attitude.normal
         rise = cross(lever, normal)
         arm = self.inverse.times(rise)
-        moved = sum_vectors(cross(contact.lever_rate, normal), cross(lever, contact.normal_rate))
+        lever_rate_in_body = sum_vectors(cross(contact.lever_rate, normal), cross(lever, contact.normal_rate))
         bend = dot(arm, cross(attitude.momentum, attitude.angular_velocity)) + dot(
-            attitude.angular_velocity, vector_of(moved)
+            attitude.angular_velocity, vector_of(lever_rate_in_body)
         )
         mass = self.body.mass
         painleve_factor = 1.0 + mass * dot(arm, attitude.in_body(moment))
@@ -274,7 +276,9 @@ class RigidSlipping(AbstractRigidDynamics):
         push = (multiply(thrust, f1), multiply(thrust, f2))
         u3 = None if o == (None, None) else -dot(attitude.angular_velocity, rise)
         rates = self.carried_rates(state, attitude, contact, push, u3, scale(N, moment))
-        return Motion(rates, N, friction, slip, contact.along, o, attitude.angular_velocity[2], painleve_factor, room)
+        return Motion(
+            rates, N, friction, slip, contact.contact_velocity, o, attitude.angular_velocity[2], painleve_factor, room
+        )
 
 
 class RigidRolling(AbstractRigidDynamics):
@@ -314,9 +318,9 @@ class RigidRolling(AbstractRigidDynamics):
         u3 = None if o == (None, None) else dot(attitude.normal, cross(r, w))
         rates = self.carried_rates(state, attitude, contact, push, u3, cross(attitude.in_frame(r), F))
         load = ContactLoad((F[0] / F[2], F[1] / F[2]))
-        still = jnp.zeros_like(F[2])
-        slip = Slip(still, still, attitude.in_frame(w))
-        return Motion(rates, F[2], load, slip, contact.along, o, w[2], 1.0 + still, room), F
+        zero = jnp.zeros_like(F[2])
+        slip = Slip(zero, zero, attitude.in_frame(w))
+        return Motion(rates, F[2], load, slip, contact.contact_velocity, o, w[2], 1.0 + zero, room), F
 
     def _about_contact(self, lever: Vector) -> SymmetricMatrix:
         """The inertia about the contact, J + m (r^2 - r r^T), in the body's axes."""

@@ -127,10 +127,10 @@ class RollingDynamics(eqx.Module):
         e_dot = sum_vectors(e_dot, rate_in_frame(e, o))
         L_dot = sum_vectors(cross(r, F), rate_in_frame(L, o))
         rate = (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate)
-        still = jnp.zeros_like(F[2])
+        zero = jnp.zeros_like(F[2])
         load = ContactLoad((F[0] / F[2], F[1] / F[2]))
-        slip = Slip(still, still, (w[0], w[1], None))
-        return Motion(rate, F[2], load, slip, V, o, dot(L, e), 1.0 + still, room), F
+        slip = Slip(zero, zero, (w[0], w[1], None))
+        return Motion(rate, F[2], load, slip, V, o, dot(L, e), 1.0 + zero, room), F
 
     def with_slip(self, state: Float[Array, "components ..."], slip: Slip) -> Float[Array, "components ..."]:
         """The state after an impulse at the contact that gives the contact point the given velocity along the arena.
@@ -154,8 +154,8 @@ class RollingDynamics(eqx.Module):
         lever = cross(r, sum_vectors(v, scale(-1.0, u)))
         w = self._over_inertia(e, r, sum_vectors(L, scale(self.mass, lever)))
         u = sum_vectors(cross(r, w), v)
-        along = dot(w, e)
-        L = sum_vectors(scale(self.I1, w), scale((self.I3 - self.I1) * along, e))
+        axial_rate = dot(w, e)
+        L = sum_vectors(scale(self.I1, w), scale((self.I3 - self.I1) * axial_rate, e))
         return joined(u[:2], e, L, place)
 
     def with_unit_axes(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
@@ -199,5 +199,5 @@ class RollingDynamics(eqx.Module):
         determinant = (self.I3 + m * r2) * self.I1 + m * excess * er * er
         ex = (self.I1 * te + m * er * tr) / determinant
         rx = ((self.I3 + m * r2) * tr - excess * er * te) / determinant
-        rest = sum_vectors(torque, scale(subtract(None, excess * ex), e), scale(m * rx, r))
-        return stored(*scale(1.0 / A, rest))
+        torque_residual = sum_vectors(torque, scale(subtract(None, excess * ex), e), scale(m * rx, r))
+        return stored(*scale(1.0 / A, torque_residual))

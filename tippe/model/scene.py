@@ -126,8 +126,8 @@ class Scene(Bounded, Generic[Body]):
         """The radius [m] that a closed arena must exceed so that the body can be inside."""
         if not isinstance(self.body, AbstractRigidBody):
             return self.body.size
-        least, greatest = self.body.half_widths
-        return greatest if isinstance(self.surface, Sphere) else least
+        lowest, highest = self.body.half_widths
+        return highest if isinstance(self.surface, Sphere) else lowest
 
     def suspicion(self) -> str | None:
         for name, value in numbers("surface", self.surface, functions=False).items():
@@ -190,8 +190,8 @@ class Scene(Bounded, Generic[Body]):
         On a level plane under an isotropic law, the frame turns with the top; how far it has turned is not recorded.
         """
         equations, body = self.dynamics, self.body
-        alike = self.level and self.friction.isotropic
-        if not (isinstance(equations, Dynamics) and isinstance(body, Top)) or not alike:
+        is_isotropic = self.level and self.friction.isotropic
+        if not (isinstance(equations, Dynamics) and isinstance(body, Top)) or not is_isotropic:
             return equations
         # Tops of group I (`tippe/steady/`) soon stand upright, with the axis close to L; in a turning frame, both would
         # move.
@@ -222,8 +222,8 @@ class Scene(Bounded, Generic[Body]):
         counts_from_below = len(launch.place) == 2 and names[0] == "mu"
         for bound in surface.place_bounds(place_named(surface, launch.place), self.body.size):
             if counts_from_below and bound.name == "place[1]":
-                why = "from the lowest point"
-                yield Bound(launch.place[1], "place[1]", at_least=0.0, at_most=math.pi, why=why, unit="rad")
+                reason = "from the lowest point"
+                yield Bound(launch.place[1], "place[1]", at_least=0.0, at_most=math.pi, why=reason, unit="rad")
             else:
                 yield bound
 
@@ -250,8 +250,8 @@ class Scene(Bounded, Generic[Body]):
         L, u = scale(body.I3 * launch.spin, e), launch.velocity or (zero, zero)
         if launch.angular_velocity is not None:
             w = vector_of(launch.angular_velocity)
-            along = dot(w, e)
-            L = sum_vectors(L, scale(body.I1, w), scale((body.I3 - body.I1) * along, e))
+            axial_rate = dot(w, e)
+            L = sum_vectors(L, scale(body.I1, w), scale((body.I3 - body.I1) * axial_rate, e))
             u = sum_vectors(u, scale(multiply(-1.0, body.offset_of_path), cross(w, e)[:2]))
         return joined(u, e, L, self.start(launch)[0])
 
@@ -265,7 +265,7 @@ class Scene(Bounded, Generic[Body]):
 
         **Arguments:** as for `state`. **Returns:** an array (components, ...) in SI units.
         """
-        ones = jnp.ones_like(launch.theta)
+        one = jnp.ones_like(launch.theta)
         rate = jnp.sqrt(self.gravity / self.body.size)
         velocity = rate * self.body.size
         I1, I3 = self._moments
@@ -273,13 +273,13 @@ class Scene(Bounded, Generic[Body]):
         if launch.angular_velocity is not None:
             w = launch.angular_velocity
             momentum = jnp.maximum(momentum, I1 * jnp.sqrt(dot(w, w)))
-        place = scale(ones, self.frame.place_scales(self.body.size))
+        place = scale(one, self.frame.place_scales(self.body.size))
         tilt = jnp.sin(launch.theta) / NEARLY_UPRIGHT
         # A top that stands exactly upright has no growth to resolve.
         tilt = jnp.where(tilt > 0.0, jnp.clip(tilt, 1e-280, 1.0), 1.0)
         velocities, momenta = (velocity * tilt, velocity * tilt), (momentum * tilt, momentum * tilt, momentum)
-        x_axis = (ones, ones, tilt) if isinstance(self.body, AbstractRigidBody) else ()
-        return joined(velocities, (tilt, tilt, ones), momenta, place, x_axis)
+        x_axis = (one, one, tilt) if isinstance(self.body, AbstractRigidBody) else ()
+        return joined(velocities, (tilt, tilt, one), momenta, place, x_axis)
 
     @property
     def _moments(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:

@@ -46,8 +46,8 @@ def _check_convex(scene: Any) -> None:
     kind = type(scene.body).__name__
     kind = f"an {kind}" if kind[0] in "AEIOU" else f"a {kind}"
     if not isinstance(scene.surface, Plane) and isinstance(scene.body, AbstractBody):
-        others = "a Top runs on any arena, as an Ellipsoid or a RigidBody does"
-        raise ValueError(f"surface = {scene.surface!r} must be a Plane for {kind}; {others}")
+        allowed_bodies = "a Top runs on any arena, as an Ellipsoid or a RigidBody does"
+        raise ValueError(f"surface = {scene.surface!r} must be a Plane for {kind}; {allowed_bodies}")
     if scene.contact != "stop":
         raise ValueError(f"contact = {scene.contact!r} must be 'stop' for {kind}; only a Top can fly")
     if scene.friction.set_valued and isinstance(scene.body, AbstractBody):

@@ -58,8 +58,8 @@ def _radau() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     nodes[-1] = 1.0
     integrals = []
     for k in range(STAGES):
-        others = np.delete(nodes, k)
-        basis = Polynomial.fromroots(others) / np.prod(nodes[k] - others)
+        other_nodes = np.delete(nodes, k)
+        basis = Polynomial.fromroots(other_nodes) / np.prod(nodes[k] - other_nodes)
         integrals.append(basis.integ().coef)
     highest = np.linalg.inv(legendre.legvander(2.0 * nodes - 1.0, STAGES - 1))[-1]
     return nodes, np.stack(integrals, axis=1), highest
@@ -87,9 +87,9 @@ class Onset(eqx.Module):
         powers = jnp.stack([fraction**k for k in range(STAGES + 1)])
         return self.start + self.length * jnp.einsum("ps,p...,cs...->c...", INTEGRALS, powers, self.rates)
 
-    def of_components(self, chosen: slice) -> "Onset":
+    def of_components(self, components: slice) -> "Onset":
         """The same step of some components alone."""
-        return Onset(self.start[chosen], self.length, self.rates[chosen], self.converged)
+        return Onset(self.start[components], self.length, self.rates[components], self.converged)
 
     def falls_to_zero(
         self, event: Callable[[Float[Array, "components ..."]], Float[Array, "..."]], first: Float[Array, "..."]
@@ -100,21 +100,21 @@ class Onset(eqx.Module):
         def halved(_, bracket):
             low, high = bracket
             middle = 0.5 * (low + high)
-            above = event(self.at(middle)) > 0.0
-            return jnp.where(above, middle, low), jnp.where(above, high, middle)
+            is_positive = event(self.at(middle)) > 0.0
+            return jnp.where(is_positive, middle, low), jnp.where(is_positive, high, middle)
 
         fraction = jax.lax.stop_gradient(jax.lax.fori_loop(0, 52, halved, (first, jnp.ones_like(first)))[1])
         # Bisection has no derivative, so the implicit function theorem supplies it.
-        missing, rise = jax.jvp(lambda at: event(self.at(at)), (fraction,), (jnp.ones_like(fraction),))
-        inside = (fraction < 1.0) & (rise != 0.0)
-        shift = (missing - jax.lax.stop_gradient(missing)) / jax.lax.stop_gradient(jnp.where(inside, rise, 1.0))
-        return fraction - jnp.where(inside, shift, 0.0)
+        missing, rise = jax.jvp(lambda part: event(self.at(part)), (fraction,), (jnp.ones_like(fraction),))
+        is_inside = (fraction < 1.0) & (rise != 0.0)
+        shift = (missing - jax.lax.stop_gradient(missing)) / jax.lax.stop_gradient(jnp.where(is_inside, rise, 1.0))
+        return fraction - jnp.where(is_inside, shift, 0.0)
 
     @property
     def end(self) -> Float[Array, "components ..."]:
         """The state at the end of the step, NaN if the step did not converge."""
-        moved = self.start + self.length * jnp.einsum("s,cs...->c...", WEIGHTS[-1], self.rates)
-        return jnp.where(self.converged, moved, jnp.nan)
+        state = self.start + self.length * jnp.einsum("s,cs...->c...", WEIGHTS[-1], self.rates)
+        return jnp.where(self.converged, state, jnp.nan)
 
 
 def slip_onset(
@@ -125,7 +125,7 @@ def slip_onset(
     state: Float[Array, "components ..."],
     size: int,
     scales: Float[Array, "components ..."],
-    most: Float[Array, "..."],
+    max_duration: Float[Array, "..."],
     tolerance: Float[Array, ""],
 ) -> Onset:
     """Compute the beginning of a slip from a contact at rest.
@@ -136,57 +136,59 @@ def slip_onset(
     - `field`: rate of the slipping state, including other integrated components.
     - `state`: a state at rest, (components, ...); the equations use the first `size` components; `scales`: their
       magnitudes.
-    - `most`: longest duration [s]; `tolerance`: tolerance for the estimated error, relative to the magnitudes.
+    - `max_duration`: longest duration [s]; `tolerance`: tolerance for the estimated error, relative to the magnitudes.
 
     **Returns:** an `Onset`.
     """
-    own = state[:size]
-    rolls = rolling.field(own)
-    contact = _Contact.of(rolling, mu, own, rolls)
-    rolls = jnp.concatenate([rolls, jnp.zeros_like(state[size:])])
+    core_state = state[:size]
+    rolling_rate = rolling.field(core_state)
+    contact = _Contact.of(rolling, mu, core_state, rolling_rate)
+    rolling_rate = jnp.concatenate([rolling_rate, jnp.zeros_like(state[size:])])
     scales = scales.reshape(scales.shape[:1] + (1,) * (state.ndim - scales.ndim) + scales.shape[1:])
 
-    def iterated(age, times):
+    def iterated(duration, times):
         """Slip velocities and rates at the stages, in one loop, so that the equations are compiled once."""
 
         def newton(_, carry):
-            v, moved, _, _ = carry
-            slipping_state = rolling.with_slip(moved[:size], Slip(v[0], v[1]))
-            rates = field(jnp.concatenate([slipping_state, moved[size:]]))
-            moved = state[:, None] + age * jnp.einsum("js,cs...->cj...", WEIGHTS, rates)
-            slip = slipping.motion(moved[:size]).slip
-            change = contact.correction(age, v, jnp.stack([slip.x, slip.y]) - v)
-            return v + change, moved, change, rates
+            v, states, _, _ = carry
+            slipping_state = rolling.with_slip(states[:size], Slip(v[0], v[1]))
+            rates = field(jnp.concatenate([slipping_state, states[size:]]))
+            states = state[:, None] + duration * jnp.einsum("js,cs...->cj...", WEIGHTS, rates)
+            slip = slipping.motion(states[:size]).slip
+            change = contact.correction(duration, v, jnp.stack([slip.x, slip.y]) - v)
+            return v + change, states, change, rates
 
         # The force of rolling must have changed accordingly, or Newton's first correction would stop the slip.
-        rolled = state[:, None] + times * rolls[:, None]
+        rolling_states = state[:, None] + times * rolling_rate[:, None]
         v = contact.first_guess(times)
-        return jax.lax.fori_loop(0, ITERATIONS, newton, (v, rolled, v, jnp.zeros_like(rolled)))
+        return jax.lax.fori_loop(0, ITERATIONS, newton, (v, rolling_states, v, jnp.zeros_like(rolling_states)))
 
     def shorten(carry):
-        trial, age, converged, _ = carry
-        times = age * NODES.reshape((-1,) + (1,) * (state.ndim - 1))
-        _, moved, change, rates = iterated(age, times)
-        unsettled = jnp.max(length(*change), axis=0) / contact.speed
-        highest = age * jnp.abs(jnp.einsum("s,cs...->c...", HIGHEST, rates))
+        trial, duration, converged, _ = carry
+        times = duration * NODES.reshape((-1,) + (1,) * (state.ndim - 1))
+        _, states, change, rates = iterated(duration, times)
+        residual = jnp.max(length(*change), axis=0) / contact.speed
+        highest = duration * jnp.abs(jnp.einsum("s,cs...->c...", HIGHEST, rates))
         # The scales of a launch that is upright up to round-off are nearly zero.
-        sizes = jnp.maximum(scales, jnp.max(jnp.abs(moved), axis=1))
-        error = jnp.maximum(jnp.max((highest / sizes)[:size], axis=0), unsettled)
+        sizes = jnp.maximum(scales, jnp.max(jnp.abs(states), axis=1))
+        error = jnp.maximum(jnp.max((highest / sizes)[:size], axis=0), residual)
         # The contact must persist, or this step would miss a loss of contact.
-        lost = jnp.min(slipping.contact_margin(moved[:size]), axis=0) <= 0.0
+        lost = jnp.min(slipping.contact_margin(states[:size]), axis=0) <= 0.0
         error = jnp.where(jnp.isfinite(error) & ~lost, error, jnp.inf)
         converged = error <= jnp.maximum(tolerance, ROUNDING)
-        shorter = jnp.clip(0.8 * (tolerance / error) ** (1.0 / STAGES), 0.4, 0.8)
-        return trial + 1, jnp.where(converged, age, shorter * age), converged, rates
+        factor = jnp.clip(0.8 * (tolerance / error) ** (1.0 / STAGES), 0.4, 0.8)
+        return trial + 1, jnp.where(converged, duration, factor * duration), converged, rates
 
     def goes_on(carry):
         trial, _, converged, _ = carry
         return (trial < TRIALS) & ~jnp.all(converged)
 
-    age = jnp.minimum(FIRST * tolerance ** (1.0 / STAGES) * contact.unit, most)
+    duration = jnp.minimum(FIRST * tolerance ** (1.0 / STAGES) * contact.unit, max_duration)
     rates = jnp.zeros((*state.shape[:1], STAGES, *state.shape[1:]))
-    _, age, converged, rates = jax.lax.while_loop(goes_on, shorten, (0, age, jnp.zeros(age.shape, bool), rates))
-    return Onset(state, age, rates, converged)
+    _, duration, converged, rates = jax.lax.while_loop(
+        goes_on, shorten, (0, duration, jnp.zeros(duration.shape, bool), rates)
+    )
+    return Onset(state, duration, rates, converged)
 
 
 class _Contact(eqx.Module):
@@ -194,16 +196,16 @@ class _Contact(eqx.Module):
 
     - `direction`: against the force of rolling; `rise`: the slip's acceleration [m/s^2] and half its rate [m/s^3] at
       the start.
-    - `inverse_mass`: M [1/kg] as (M11, M12, M22); `lifted`: n, the change of N by the force along the arena.
-    - `mu`; `unloaded`: N without a force along the arena [N]; `speed`: sqrt(g R) [m/s]; `unit`: unit of time [s].
+    - `inverse_mass`: M [1/kg] as (M11, M12, M22); `load_change`: n, the change of N by the force along the arena.
+    - `mu`; `free_load`: N without a force along the arena [N]; `speed`: sqrt(g R) [m/s]; `unit`: unit of time [s].
     """
 
     direction: Float[Array, "2 ..."]
     rise: tuple[Float[Array, "..."], Float[Array, "..."]]
     inverse_mass: tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]
-    lifted: Float[Array, "2 ..."]
+    load_change: Float[Array, "2 ..."]
     mu: Float[Array, "..."]
-    unloaded: Float[Array, "..."]
+    free_load: Float[Array, "..."]
     speed: Float[Array, "..."]
     unit: Float[Array, "..."]
 
@@ -216,7 +218,7 @@ class _Contact(eqx.Module):
         rate: Float[Array, "components ..."],
     ) -> "_Contact":
         weight = rolling.mass * rolling.gravity
-        grip, falls = jax.jvp(lambda at: rolling.grip(at, mu), (state,), (rate,))
+        grip, grip_rate = jax.jvp(lambda point: rolling.grip(point, mu), (state,), (rate,))
         F1, F2, N = rolling.reaction(state)
         force = length(F1, F2)
         force = jnp.where(force > 0.0, force, 1.0)
@@ -225,21 +227,21 @@ class _Contact(eqx.Module):
         # The impulses that give the contact unit velocities: P_t = M^-1 v and P_n = -n . P_t.
         (a, b, f), (_, c, h) = rolling.unit_impulse(state, 0), rolling.unit_impulse(state, 1)
         determinant = a * c - b * b
-        lifted = jnp.stack([b * h - c * f, b * f - a * h]) / determinant
+        load_change = jnp.stack([b * h - c * f, b * f - a * h]) / determinant
         yields = d[0] * (a * d[0] + b * d[1] + mu * f) + d[1] * (b * d[0] + c * d[1] + mu * h)
-        rise = (greatest(-grip, 0.0) * weight / yields, greatest(-falls, 0.0) * weight / (2.0 * yields))
+        rise = (greatest(-grip, 0.0) * weight / yields, greatest(-grip_rate, 0.0) * weight / (2.0 * yields))
         speed = jnp.sqrt(rolling.gravity * rolling.size)
         spin = jnp.sqrt(sum(x * x for x in rolling.angular_velocity(state)))
         unit = 1.0 / jnp.maximum(spin, speed / rolling.size)
         inverse_mass = (c / determinant, -b / determinant, a / determinant)
-        return cls(d, rise, inverse_mass, lifted, mu, N + lifted[0] * F1 + lifted[1] * F2, speed, unit)
+        return cls(d, rise, inverse_mass, load_change, mu, N + load_change[0] * F1 + load_change[1] * F2, speed, unit)
 
     def first_guess(self, times: Float[Array, "stages ..."]) -> Float[Array, "2 stages ..."]:
         """The slip velocity in the limit of small times [m/s]."""
         return self.direction[:, None] * (self.rise[0] + self.rise[1] * times) * times
 
     def correction(
-        self, age: Float[Array, "..."], v: Float[Array, "2 stages ..."], missing: Float[Array, "2 stages ..."]
+        self, duration: Float[Array, "..."], v: Float[Array, "2 stages ..."], missing: Float[Array, "2 stages ..."]
     ) -> Float[Array, "2 stages ..."]:
         """Newton's correction of the slip velocities; only the slip's direction makes the equations stiff.
 
@@ -249,32 +251,32 @@ class _Contact(eqx.Module):
         """
         size = length(v[0], v[1])
         size = jnp.where(size > 0.0, size, 1.0)
-        along = v / size
-        across = jnp.stack([-along[1], along[0]])
-        n, (M11, M12, M22) = self.lifted, self.inverse_mass
-        painleve_factor = 1.0 - self.mu * (n[0] * along[0] + n[1] * along[1])
-        share = self.mu * (n[0] * across[0] + n[1] * across[1]) / painleve_factor
-        x, y = self.mu * self.unloaded / painleve_factor * (across + share * along)
+        unit = v / size
+        normal = jnp.stack([-unit[1], unit[0]])
+        n, (M11, M12, M22) = self.load_change, self.inverse_mass
+        painleve_factor = 1.0 - self.mu * (n[0] * unit[0] + n[1] * unit[1])
+        share = self.mu * (n[0] * normal[0] + n[1] * normal[1]) / painleve_factor
+        x, y = self.mu * self.free_load / painleve_factor * (normal + share * unit)
         pull = jnp.stack([M11 * x + M12 * y, M12 * x + M22 * y])
-        # For each pair of stages: across_j . pull_k, times the weight of stage k in stage j.
-        matrix = age * jnp.einsum("jk,ij...,ik...->jk...", WEIGHTS, across, pull)
+        # For each pair of stages: normal_j . pull_k, times the weight of stage k in stage j.
+        matrix = duration * jnp.einsum("jk,ij...,ik...->jk...", WEIGHTS, normal, pull)
         matrix = matrix + jnp.eye(STAGES).reshape((STAGES, STAGES) + (1,) * (size.ndim - 1)) * size
-        turn = _solved(matrix, across[0] * missing[0] + across[1] * missing[1])
-        change = missing - age * jnp.einsum("js,is...->ij...", WEIGHTS, pull * turn)
+        turn = _solved(matrix, normal[0] * missing[0] + normal[1] * missing[1])
+        change = missing - duration * jnp.einsum("js,is...->ij...", WEIGHTS, pull * turn)
         # The force depends only on the slip's direction, and where a slip begins, v is much smaller than the change of
         # v by a small turn of the force. So the new direction is the turned direction, not the direction of the
         # corrected v, and v is never reversed.
-        turned = along + turn * across
-        longer = greatest(size + change[0] * along[0] + change[1] * along[1], 0.2 * size)
-        return longer / length(turned[0], turned[1]) * turned - v
+        new_direction = unit + turn * normal
+        new_size = greatest(size + change[0] * unit[0] + change[1] * unit[1], 0.2 * size)
+        return new_size / length(new_direction[0], new_direction[1]) * new_direction - v
 
 
 def _solved(matrix: Float[Array, "n n ..."], right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     """Solution of a few linear equations, lane by lane, by elimination. The matrices here need no pivots."""
     rows = jnp.arange(len(right)).reshape((-1,) + (1,) * (right.ndim - 1))
 
-    def eliminated(k, both):
-        matrix, right = both
+    def eliminated(k, system):
+        matrix, right = system
         row, of_row = matrix[k] / matrix[k, k], right[k] / matrix[k, k]
         column = jnp.where(rows == k, 0.0, matrix[:, k])
         matrix = jnp.where(rows[:, None] == k, row, matrix - column[:, None] * row)

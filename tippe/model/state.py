@@ -49,5 +49,5 @@ def angular_velocity(body: Any, axis: Vector, momentum: Vector) -> Vector:
 
     **Arguments:** `body`: a body with the moments of inertia `I1` and `I3` [kg m^2].
     """
-    along = (1.0 / body.I3 - 1.0 / body.I1) * dot(momentum, axis)
-    return sum_vectors(scale(1.0 / body.I1, momentum), scale(along, axis))
+    factor = (1.0 / body.I3 - 1.0 / body.I1) * dot(momentum, axis)
+    return sum_vectors(scale(1.0 / body.I1, momentum), scale(factor, axis))

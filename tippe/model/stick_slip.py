@@ -71,8 +71,8 @@ class StickSlip(AbstractDynamics):
         """
         assert isinstance(friction, SetValuedCoulomb)
         if isinstance(body, AbstractRigidBody):
-            shared = (frame, body, gravity, body.inertia.tensor.inverse)
-            return cls(RigidSlipping(*shared, friction, 1.0 / body.mass), RigidRolling(*shared), friction.mu)
+            arguments = (frame, body, gravity, body.inertia.tensor.inverse)
+            return cls(RigidSlipping(*arguments, friction, 1.0 / body.mass), RigidRolling(*arguments), friction.mu)
         slipping = Dynamics.of(body, frame, friction, gravity)
         return cls(slipping, RollingDynamics.of(body, frame, gravity), friction.mu)
 
@@ -125,8 +125,8 @@ class StickSlip(AbstractDynamics):
         Step errors change this length, so the slip after the impulse would be as large as these errors; but
         where a slip begins, its direction tolerates only rounding errors.
         """
-        nothing = jnp.zeros_like(state[0])
-        return self.rolling.with_slip(self.rolling.with_unit_axes(state), Slip(nothing, nothing))
+        zero = jnp.zeros_like(state[0])
+        return self.rolling.with_slip(self.rolling.with_unit_axes(state), Slip(zero, zero))
 
     def lifts_off(self, state: Float[Array, "components ..."]) -> Bool[Array, "..."]:
         """Whether a contact at rest separates at once: without a force at the contact point, the arena would have to
@@ -222,30 +222,40 @@ class ContactMode(AbstractDynamics):
         - `slipping`: rate of the whole state during slip; `scales`: its magnitudes.
         - `left`: time [s] to the horizon; the beginning of a slip is not longer.
         """
-        stick_slip, own, rest = self.stick_slip, state[:size], state[size:]
-        still = stick_slip.stopped(own)
-        nothing = jnp.zeros_like(own[0])
+        stick_slip, core_state, quadratures = self.stick_slip, state[:size], state[size:]
+        stopped_state = stick_slip.stopped(core_state)
+        zero = jnp.zeros_like(core_state[0])
         if self.rolls:
-            holds = nothing > 0.0
+            sticks = zero > 0.0
             # The mode ended because of the grip or the room, or there was no contact to begin with, as after an impact.
-            room, lost = stick_slip.rolling.motion(own).room, stick_slip.lifts_off(still)
-            lost = lost if room is None else lost | (room - FITS <= stick_slip.grip_left(own))
-            wait = nothing
+            room, lost = stick_slip.rolling.motion(core_state).room, stick_slip.lifts_off(stopped_state)
+            lost = lost if room is None else lost | (room - FITS <= stick_slip.grip_left(core_state))
+            wait = zero
         else:
-            holds = stick_slip.rolling.grip(still, stick_slip.mu) >= 0.0
-            lost = stick_slip.slipping.contact_margin(own) <= self.slip_left(own)
+            sticks = stick_slip.rolling.grip(stopped_state, stick_slip.mu) >= 0.0
+            lost = stick_slip.slipping.contact_margin(core_state) <= self.slip_left(core_state)
             # A slip that only reverses continues through zero, which it reaches in its remaining time.
-            speed, change = self._slowing(own)
+            speed, change = self._slowing(core_state)
             slows = change < 0.0
-            wait = jnp.where(slows & ~holds & ~lost, -speed / jnp.where(slows, change, 1.0), 0.0)
+            wait = jnp.where(slows & ~sticks & ~lost, -speed / jnp.where(slows, change, 1.0), 0.0)
             wait = jnp.minimum(wait, left)
-            still = still + wait * stick_slip.rolling.field(still + 0.5 * wait * stick_slip.rolling.field(still))
-            rest = rest + wait * slipping(state)[size:]
-        whole = jnp.concatenate([still, rest])
-        slips = ~(holds | lost)
-        most = jnp.where(slips, left - wait, 0.0)
+            stopped_state = stopped_state + wait * stick_slip.rolling.field(
+                stopped_state + 0.5 * wait * stick_slip.rolling.field(stopped_state)
+            )
+            quadratures = quadratures + wait * slipping(state)[size:]
+        new_state = jnp.concatenate([stopped_state, quadratures])
+        slips = ~(sticks | lost)
+        max_duration = jnp.where(slips, left - wait, 0.0)
         onset = slip_onset(
-            stick_slip.slipping, stick_slip.rolling, stick_slip.mu, slipping, whole, size, scales, most, self.tolerance
+            stick_slip.slipping,
+            stick_slip.rolling,
+            stick_slip.mu,
+            slipping,
+            new_state,
+            size,
+            scales,
+            max_duration,
+            self.tolerance,
         )
-        after = jnp.where(slips, onset.end, jnp.where(lost, state, whole))
-        return Change(after, holds, lost, onset, wait, wait + jnp.where(slips, onset.length, 0.0))
+        state_after = jnp.where(slips, onset.end, jnp.where(lost, state, new_state))
+        return Change(state_after, sticks, lost, onset, wait, wait + jnp.where(slips, onset.length, 0.0))

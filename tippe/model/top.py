@@ -149,10 +149,10 @@ class Top(AbstractBody):
         """
         require(density, "density", above=0.0)
         if not is_traced(density) and np.any(np.asarray(density) < LEAST_DENSITY):
-            least = float(np.min(density))
+            min_density = float(np.min(density))
             warnings.warn(
-                f"density = {least:g} kg/m^3 is less than that of balsa wood, 100 kg/m^3: was it in g/cm^3? "
-                f"{least:g} g/cm^3 are {1e3 * least:g} kg/m^3",
+                f"density = {min_density:g} kg/m^3 is less than that of balsa wood, 100 kg/m^3: was it in g/cm^3? "
+                f"{min_density:g} g/cm^3 are {1e3 * min_density:g} kg/m^3",
                 UserWarning,
                 stacklevel=2,
             )
@@ -160,8 +160,8 @@ class Top(AbstractBody):
         shape = Shape.checked(lengths | {"hole_radius": hole_radius, "hole_depth": hole_depth})
         moments = shape.moments
         offset = -moments.first / moments.volume
-        why = "the centre of mass lies above the centre of the sphere: shorten the stem, or drill a hole around it"
-        require(offset, "offset", at_least=0.0, why=why)
+        reason = "the centre of mass lies above the centre of the sphere: shorten the stem, or drill a hole around it"
+        require(offset, "offset", at_least=0.0, why=reason)
         transverse = moments.transverse - moments.volume * offset**2
         stem = Stem(shape.stem_radius, shape.tip + offset)
         density = as_number(density)
@@ -205,16 +205,16 @@ class Top(AbstractBody):
         if any(is_traced(number) or not isinstance(number, jax.Array) for number in numbers):
             return None
         mass, radius, I1 = (np.asarray(number, dtype=float) for number in numbers)
-        largest = float(np.max(radius))
-        if largest > GREATEST_RADIUS:
-            unit = "mm" if largest > 10.0 else "cm"
-            return f"radius = {largest:g} m is large for a top: was it in {unit}?"
+        max_radius = float(np.max(radius))
+        if max_radius > GREATEST_RADIUS:
+            unit = "mm" if max_radius > 10.0 else "cm"
+            return f"radius = {max_radius:g} m is large for a top: was it in {unit}?"
         ratios = I1 / (mass * radius**2)
-        strange = np.ravel(ratios[(ratios < RATIOS[0]) | (ratios > RATIOS[1])])
-        if strange.size == 0:
+        odd_ratios = np.ravel(ratios[(ratios < RATIOS[0]) | (ratios > RATIOS[1])])
+        if odd_ratios.size == 0:
             return None
-        ratio = float(strange[0])
-        likely = {f"I1 in {unit}": factor for unit, factor in INERTIAS.items()} | {"the mass in g": 1e3}
-        suspects = [what for what, factor in likely.items() if RATIOS[0] <= ratio * factor <= RATIOS[1]]
+        ratio = float(odd_ratios[0])
+        mistakes = {f"I1 in {unit}": factor for unit, factor in INERTIAS.items()} | {"the mass in g": 1e3}
+        suspects = [mistake for mistake, factor in mistakes.items() if RATIOS[0] <= ratio * factor <= RATIOS[1]]
         question = f"was {suspects[0]}?" if suspects else "are mass, radius and I1 in kg, m and kg m^2?"
         return f"I1 = {ratio:.3g} m R^2 is out of the range {RATIOS} of bodies like a top: {question}"

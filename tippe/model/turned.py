@@ -41,36 +41,36 @@ def truncated_ball(radius: Number, cut: Number) -> Moments:
     def vertical(z):
         return radius**2 * z**3 / 3.0 - z**5 / 5.0
 
-    around = jnp.pi / 2.0 * (axial(cut) - axial(-radius))
+    transverse = jnp.pi / 2.0 * (axial(cut) - axial(-radius))
     return Moments(
         jnp.pi * (2.0 * radius**3 / 3.0 + radius**2 * cut - cut**3 / 3.0),
         -jnp.pi / 4.0 * (radius**2 - cut**2) ** 2,
-        around,
-        around / 2.0 + jnp.pi * (vertical(cut) - vertical(-radius)),
+        transverse,
+        transverse / 2.0 + jnp.pi * (vertical(cut) - vertical(-radius)),
     )
 
 
 def cylinder(radius: Number, low: Number, high: Number) -> Moments:
     """A cylinder between two heights."""
     section = jnp.pi * radius**2
-    around = section * (high - low) * radius**2 / 2.0
+    transverse = section * (high - low) * radius**2 / 2.0
     return Moments(
         section * (high - low),
         section * (high**2 - low**2) / 2.0,
-        around,
-        around / 2.0 + section * (high**3 - low**3) / 3.0,
+        transverse,
+        transverse / 2.0 + section * (high**3 - low**3) / 3.0,
     )
 
 
 def half_ball(radius: Number, centre: Number) -> Moments:
     """The upper half of a ball about a point on the axis."""
-    volume, above = 2.0 * jnp.pi * radius**3 / 3.0, jnp.pi * radius**4 / 4.0
+    volume, moment = 2.0 * jnp.pi * radius**3 / 3.0, jnp.pi * radius**4 / 4.0
     second = 2.0 * volume * radius**2 / 5.0
     return Moments(
         volume,
-        volume * centre + above,
+        volume * centre + moment,
         second,
-        second + 2.0 * above * centre + volume * centre**2,
+        second + 2.0 * moment * centre + volume * centre**2,
     )
 
 
@@ -108,8 +108,8 @@ class Shape(NamedTuple):
             require(shape.hole_depth, "hole_depth", above=0.0, below=wall, why="the hole must not pierce the sphere")
         # On the level plane, sphere and stem touch together where cos(theta) is (stem - radius) / tip; the rim touches
         # where it is -cut / radius.
-        why = "else the rim of the cut touches the table before the stem; lengthen the stem, or cut less off"
-        require(shape.tip, "cut + stem_length - stem_radius", above=radius * (radius - stem) / cut, why=why)
+        reason = "else the rim of the cut touches the table before the stem; lengthen the stem, or cut less off"
+        require(shape.tip, "cut + stem_length - stem_radius", above=radius * (radius - stem) / cut, why=reason)
         return shape
 
     @property

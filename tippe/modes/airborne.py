@@ -31,7 +31,8 @@ from nonholonomic.geometry import (
     vector_of,
 )
 from nonholonomic.hybrid import Transition
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, AbstractPassive, AbstractProblem
+from nonholonomic.integration import AbstractPassive, AbstractProblem
+from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED
 from nonholonomic.xla_cpu import compiled_setup, greatest
 
 from ..model.dynamics import Dynamics
@@ -87,8 +88,8 @@ def below(scene: Scene[Top], flying: FlightState, ball: Ball | None = None) -> B
     centre = centre_of(flying, ball)
     foot = vector_of(0.0 * centre[0] if part is None else part for part in scene.surface.nearest(centre))
     n = frame.normal(foot)
-    away = dot(tuple(subtract(a, b) for a, b in zip(centre, foot, strict=True)), n)
-    return Below(foot, (*tangents(n), n), away - ball.radius)
+    difference = dot(tuple(subtract(a, b) for a, b in zip(centre, foot, strict=True)), n)
+    return Below(foot, (*tangents(n), n), difference - ball.radius)
 
 
 # A step evaluates it in several places, which share one trace.
@@ -119,9 +120,9 @@ def missed(scene: Scene[Top], site: Below, ball: Ball) -> Bool[Array, "..."]:
     there.
     """
     n = carried_frame(scene).normal(site.foot)
-    turned = tuple(subtract(a, b) for a, b in zip(n, site.axes[2], strict=True))
+    axis = tuple(subtract(a, b) for a, b in zip(n, site.axes[2], strict=True))
     # Written so that NaN is a miss.
-    return ~((jnp.abs(site.gap) < LANDED * ball.radius) & (dot(turned, turned) < LANDED**2))
+    return ~((jnp.abs(site.gap) < LANDED * ball.radius) & (dot(axis, axis) < LANDED**2))
 
 
 def carried_frame(scene: Scene[Top]) -> CarriedFrame:
@@ -175,19 +176,24 @@ def gap_margin(scene: Scene[Top], flying: FlightState, ball: Ball, rounding: flo
     """
     body, ground = scene.body, landing_site(scene, flying, ball)
     rate = gap_rate(body, ball, as_free_body(scene, flying, ground, ball))
-    far = add(*(jnp.abs(part) for part in flying.place))
-    rounding = rounding + 4.0 * jnp.finfo(far.dtype).eps * far / body.radius
+    distance = add(*(jnp.abs(part) for part in flying.place))
+    rounding = rounding + 4.0 * jnp.finfo(distance.dtype).eps * distance / body.radius
     return ground.gap / body.radius + still_parting(rate, scene.gravity, body.radius, rounding)
 
 
 class FlightProblem(AbstractProblem):
-    """Flying until theta reaches an angle or a sphere is back at the arena; `falls` is the acceleration [m/s^2]."""
+    """Flying until theta reaches an angle or a sphere is back at the arena.
+
+    - `acceleration`: acceleration [m/s^2].
+    - `strikes`: whether a sphere is already at the arena, so that the flight ends at once; `None` if it never is.
+    """
 
     scene: Scene[Top]
     cos_angle: Float[Array, "..."]
     states: Float[Array, "components cells"]
     scales: Float[Array, "components cells"]
-    falls: Vector
+    acceleration: Vector
+    strikes: Bool[Array, ""] | None = None
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales
@@ -195,7 +201,7 @@ class FlightProblem(AbstractProblem):
     def field(self, time, state):
         flying, body = flight_state(state), self.scene.body
         e_dot = axis_rate(body, flying.axis, flying.momentum)
-        return stacked((*flying.velocity, *self.falls, *e_dot, None, None, None, None, None), state)
+        return stacked((*flying.velocity, *self.acceleration, *e_dot, None, None, None, None, None), state)
 
     def event_function(self, state):
         return cosine(self.scene, flight_state(state)) - self.cos_angle
@@ -205,7 +211,8 @@ class FlightProblem(AbstractProblem):
 
     def margins(self, time, state):
         flying = flight_state(state)
-        return tuple(gap_margin(self.scene, flying, ball) for ball in balls(self.scene.body))
+        margins = tuple(gap_margin(self.scene, flying, ball) for ball in balls(self.scene.body))
+        return margins if self.strikes is None else tuple(jnp.where(self.strikes, -1.0, part) for part in margins)
 
 
 class QuadraturesInFlight(AbstractPassive):
@@ -262,11 +269,11 @@ def lift_off(
     velocity = (*u, -ball.offset * axis_rate(body, e, L)[2])
     centre = sum_vectors(place[:3], scale(ball.radius, axes[2]))
     s = sum_vectors(centre, scale(-ball.offset, from_frame(e, axes)))
-    flies = in_flight(s, axes, FreeBody(velocity, jnp.zeros_like(state[0]), e, L))
+    flight = in_flight(s, axes, FreeBody(velocity, jnp.zeros_like(state[0]), e, L))
     if not with_quadratures:
-        return flies
-    across = from_frame(vector_of(state[OWN + k] for k in range(3)), axes)
-    return jnp.concatenate([flies, jnp.stack(across), state[OWN + 3 :]])
+        return flight
+    c_vector = from_frame(vector_of(state[OWN + k] for k in range(3)), axes)
+    return jnp.concatenate([flight, jnp.stack(c_vector), state[OWN + 3 :]])
 
 
 class Fly(AbstractFlyingMode):
@@ -275,21 +282,21 @@ class Fly(AbstractFlyingMode):
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         return self.extended(self.flight(state), QuadraturesInFlight(self.scene.body), state)
 
-    def flight(self, state: Float[Array, "components cells"]) -> FlightProblem:
-        """The motion in flight from given states."""
+    def flight(self, state: Float[Array, "components cells"], strikes: Bool[Array, ""] | None = None) -> FlightProblem:
+        """The motion in flight from given states. **Arguments:** `strikes`: as for `FlightProblem`."""
         velocity, momentum = self.scales[0], self.scales[7]
-        ones = jnp.ones_like(velocity)
-        rows = [ones * self.scene.body.radius] * 3 + [velocity] * 3 + [ones] * 3 + [momentum] * 3 + [ones] * 2
-        falls = scale(-1.0 * self.scene.gravity, self.scene.surface.up)
-        return FlightProblem(self.scene, self.cos_angle, state[:OWN], jnp.stack(rows), falls)
+        one = jnp.ones_like(velocity)
+        rows = [one * self.scene.body.radius] * 3 + [velocity] * 3 + [one] * 3 + [momentum] * 3 + [one] * 2
+        acceleration = scale(-1.0 * self.scene.gravity, self.scene.surface.up)
+        return FlightProblem(self.scene, self.cos_angle, state[:OWN], jnp.stack(rows), acceleration, strikes)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         flying = flight_state(state)
         ground = below(self.scene, flying)
         free = as_free_body(self.scene, flying, ground)
-        across = to_frame(vector_of(state[OWN + k] for k in range(3)), ground.axes)
+        c_vector = to_frame(vector_of(state[OWN + k] for k in range(3)), ground.axes)
         rate = gap_rate(self.scene.body, balls(self.scene.body)[0], free)
-        rows = [jnp.stack(across), state[OWN + 3 :], jnp.stack([ground.gap, rate])]
+        rows = [jnp.stack(c_vector), state[OWN + 3 :], jnp.stack([ground.gap, rate])]
         return jnp.concatenate([in_contact(ground, free), *rows])
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
@@ -302,25 +309,41 @@ class Fly(AbstractFlyingMode):
         rebounds = bounce * speed > CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
         bounce = jnp.where(rebounds, bounce, 0.0)
         if isinstance(scene.friction, SetValuedCoulomb):
-            after_impact, fails = resolve_coulomb_impact(scene.body, scene.friction, ball, free, bounce)
+            body_after, fails = resolve_coulomb_impact(scene.body, scene.friction, ball, free, bounce)
         else:
-            after_impact, fails = resolve_impact(scene.body, scene.friction, ball, free, bounce)
+            body_after, fails = resolve_impact(scene.body, scene.friction, ball, free, bounce)
         # If the landing was located slightly below the arena, the next flight would end where it begins.
-        lifted = vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2])))
-        after = jnp.where(rebounds, in_flight(lifted, ground.axes, after_impact), in_contact(ground, after_impact))
-        if self.with_quadratures:
-            across = vector_of(state[OWN + k] for k in range(3))
-            across = jnp.where(rebounds, jnp.stack(across), jnp.stack(to_frame(across, ground.axes)))
-            gained = energy(scene.body, 0.0, after_impact) - energy(scene.body, 0.0, free)
-            after = jnp.concatenate([after, across, state[OWN + 3 :].at[1].add(gained)])
+        place_on_arena = vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2])))
         return Transition(
             mode=jnp.where(rebounds, FLYING, SLIDING),
-            state=after,
+            state=self.after_impact(state, place_on_arena, ground, free, body_after, rebounds),
             elapsed=zero,
             status=jnp.where(missed(scene, ground, ball), UNRESOLVED, jnp.where(fails, FAILED, RUNNING)),
             crossing_time=jnp.full_like(zero, jnp.inf),
             counts=rebounds.astype(int)[None],
         )
+
+    def after_impact(
+        self,
+        state: Float[Array, "components cells"],
+        place: Vector,
+        ground: Below,
+        body_before: FreeBody,
+        body_after: FreeBody,
+        flies: Bool[Array, " cells"],
+    ) -> Float[Array, "components cells"]:
+        """The state after an impact, including passive quadratures.
+
+        **Arguments:** `state`: the state in flight before the impact; `place`: the centre of mass; `ground`: the arena
+        below the sphere that strikes; `flies`: whether the top flies off, or else is in contact.
+        """
+        state_after = jnp.where(flies, in_flight(place, ground.axes, body_after), in_contact(ground, body_after))
+        if not self.with_quadratures:
+            return state_after
+        c_vector = vector_of(state[OWN + k] for k in range(3))
+        c_vector = jnp.where(flies, jnp.stack(c_vector), jnp.stack(to_frame(c_vector, ground.axes)))
+        energy_change = energy(self.scene.body, 0.0, body_after) - energy(self.scene.body, 0.0, body_before)
+        return jnp.concatenate([state_after, c_vector, state[OWN + 3 :].at[1].add(energy_change)])
 
 
 def modes(

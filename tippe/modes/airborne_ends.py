@@ -51,20 +51,23 @@ def lifted(scene: Scene[Top], state: Float[Array, "14 ..."], distance: Any, rate
     of its sphere from the ground, and `rate` [m/s] the rate of this distance."""
     _, e, L, place = parts(state)
     # In contact the velocity along n is that of the centre of mass about the sphere's centre.
-    about = -scene.body.offset * (L[0] * e[1] - L[1] * e[0]) / scene.body.I1
-    raised = scene.gravity * distance * scene.frame.vertical(place)[2]
-    return scene.body.mass * (raised + 0.5 * ((about + rate) ** 2 - about**2))
+    moment = -scene.body.offset * (L[0] * e[1] - L[1] * e[0]) / scene.body.I1
+    potential = scene.gravity * distance * scene.frame.vertical(place)[2]
+    return scene.body.mass * (potential + 0.5 * ((moment + rate) ** 2 - moment**2))
 
 
 def _above_the_ground(
     scene: Scene[Top], state: Float[Array, "components cells"], mode: Int[Array, " cells"]
 ) -> tuple[Float[Array, "14 cells"], Float[Array, " cells"], Float[Array, " cells"]]:
     """States as `on_the_ground` has them, and the distance [m] of the top's own sphere with its rate [m/s]."""
-    flies, flown = mode == FLYING, state[:OWN]
+    flies, flight = mode == FLYING, state[:OWN]
     if scene.body.stem is not None:
         on_stem = mode == ON_STEM
-        flies, flown = mode != SLIDING, jnp.where(on_stem, lift_off(scene, flown, False, balls(scene.body)[1]), flown)
-    flying = flight_state(flown)
+        flies, flight = (
+            mode != SLIDING,
+            jnp.where(on_stem, lift_off(scene, flight, False, balls(scene.body)[1]), flight),
+        )
+    flying = flight_state(flight)
     ground = below(scene, flying)
     free = as_free_body(scene, flying, ground)
     rate = gap_rate(scene.body, balls(scene.body)[0], free)
@@ -74,10 +77,10 @@ def _above_the_ground(
 
 def loss(scene: Scene[Top], state: Float[Array, "components ..."]) -> Int[Array, "..."]:
     """Why a contact ended, if it was not merely lost: a code in `LOSSES` (`tippe/model/contact_dynamics.py`)."""
-    own, state = scene.dynamics, state[:OWN]
+    dynamics, state = scene.dynamics, state[:OWN]
     if scene.body.stem is None:
-        return own.loss(state)
+        return dynamics.loss(state)
     # The domain margin of the touching sphere has vanished.
     stem = standing(scene, balls(scene.body)[1])
-    on_stem = jnp.abs(stem.contact_margin(state)) < jnp.abs(own.contact_margin(state))
-    return jnp.where(on_stem, stem.loss(state), own.loss(state))
+    on_stem = jnp.abs(stem.contact_margin(state)) < jnp.abs(dynamics.contact_margin(state))
+    return jnp.where(on_stem, stem.loss(state), dynamics.loss(state))

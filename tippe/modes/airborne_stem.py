@@ -10,12 +10,14 @@ as `UNRESOLVED`, because the equations of leaning are those of the plane (`leani
 import functools
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.geometry import scale, sum_vectors, vector_of
 from nonholonomic.hybrid import Transition
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, AbstractProblem
+from nonholonomic.integration import AbstractProblem
+from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED
 from nonholonomic.xla_cpu import compiled_setup, greatest
 
 from ..model.scene import Scene
@@ -28,7 +30,6 @@ from .airborne import (
     SLIDING,
     STRIKING,
     Below,
-    FlightProblem,
     FlightState,
     Fly,
     QuadraturesInFlight,
@@ -37,16 +38,13 @@ from .airborne import (
     flight_state,
     from_frame,
     gap_margin,
-    in_contact,
-    in_flight,
     landing_site,
     lift_off,
     missed,
     standing,
-    to_frame,
 )
 from .flying_mode import AbstractFlyingMode
-from .free_body import Ball, FreeBody, balls, energy, gap_rate
+from .free_body import Ball, FreeBody, balls, gap_rate
 from .impact import CLOSING_SPEED, TOUCHING, resolve_impact
 from .inversion_problem import InversionProblem
 from .trajectory_problem import Quadratures
@@ -56,55 +54,45 @@ from .trajectory_problem import Quadratures
 OVERLAP = 1e-11
 
 
-class OneOfTwo(AbstractProblem):
+class OneOfTwo(InversionProblem):
     """Sliding on one of two spheres until theta reaches an angle, the contact ends, or the other sphere is at the
     arena.
 
-    `contact` is the sliding mode; `own` and `other` are the spheres; `on_stem` is true if the stem slides.
+    `contact_ball` and `other_ball` are the spheres; `on_stem` is true if the stem slides.
     """
 
-    scene: Scene[Top]
-    contact: InversionProblem
-    own: Ball
-    other: Ball
-    on_stem: Bool[Array, ""]
-
-    @property
-    def dynamics(self) -> Any:
-        """The equations of motion of the sphere that slides."""
-        return self.contact.dynamics
-
-    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
-        return self.contact.start()
-
-    def field(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, "components cells"]:
-        return self.contact.field(time, state)
+    scene: Scene[Top] = eqx.field(kw_only=True)
+    contact_ball: Ball = eqx.field(kw_only=True)
+    other_ball: Ball = eqx.field(kw_only=True)
+    on_stem: Bool[Array, ""] = eqx.field(kw_only=True)
 
     def event_function(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
         # theta is measured from the normal below the top's own sphere; if this sphere slides, the state contains
         # cos(theta).
-        apart = _cosine_beside(self.scene, self.own, self.other, state)
-        return jnp.where(self.on_stem, apart, state[COS_THETA]) - self.contact.cos_angle
+        cosine_of_theta = _cosine_beside(self.scene, self.contact_ball, self.other_ball, state)
+        return jnp.where(self.on_stem, cosine_of_theta, state[COS_THETA]) - self.cos_angle
 
     def domain_margin(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
         return functools.reduce(jnp.minimum, self.margins(time, state))
 
     def margins(self, time: Any, state: Float[Array, "components cells"]) -> tuple[Float[Array, " cells"], ...]:
-        return (*self.contact.margins(time, state), clearance(self.scene, self.own, self.other, state))
+        return (*super().margins(time, state), clearance(self.scene, self.contact_ball, self.other_ball, state))
 
 
 @compiled_setup
 def _cosine_beside(
-    scene: Scene[Top], own: Ball, other: Ball, state: Float[Array, "components ..."]
+    scene: Scene[Top], contact_ball: Ball, other_ball: Ball, state: Float[Array, "components ..."]
 ) -> Float[Array, "..."]:
     """The cosine of the angle between the axis and the normal below the other sphere, while a sphere slides."""
-    return cosine(scene, flight_state(lift_off(scene, state, False, own)), other)
+    return cosine(scene, flight_state(lift_off(scene, state, False, contact_ball)), other_ball)
 
 
 @compiled_setup
-def clearance(scene: Scene[Top], own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+def clearance(
+    scene: Scene[Top], contact_ball: Ball, other_ball: Ball, state: Float[Array, "components ..."]
+) -> Float[Array, "..."]:
     """Distance of the other sphere from the arena as a fraction of R, plus the round-off allowed at lift-off."""
-    return gap_margin(scene, flight_state(lift_off(scene, state[:OWN], False, own)), other, OVERLAP)
+    return gap_margin(scene, flight_state(lift_off(scene, state[:OWN], False, contact_ball)), other_ball, OVERLAP)
 
 
 class SlideOnOne(AbstractFlyingMode):
@@ -121,54 +109,34 @@ class SlideOnOne(AbstractFlyingMode):
         return own_and_other(self.scene, self.number)
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
-        own, other = self.spheres
-        contact = InversionProblem(standing(self.scene, own), self.cos_angle, state[:OWN], self.scales[:OWN])
-        problem = OneOfTwo(self.scene, contact, own, other, self.number == 1)
+        contact_ball, other_ball = self.spheres
+        contact = (standing(self.scene, contact_ball), self.cos_angle, state[:OWN], self.scales[:OWN])
+        problem = OneOfTwo(
+            *contact, scene=self.scene, contact_ball=contact_ball, other_ball=other_ball, on_stem=self.number == 1
+        )
         return self.extended(problem, Quadratures(self.scene.body.I3), state)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         flight = Fly(self.scene, self.scales, self.cos_angle, self.with_quadratures)
-        beside = flight.shown(lift_off(self.scene, state, True, self.spheres[0]))
-        return jnp.where(self.number == 1, beside, jnp.concatenate([state, jnp.zeros_like(state[:2])]))
+        output_on_stem = flight.shown(lift_off(self.scene, state, True, self.spheres[0]))
+        return jnp.where(self.number == 1, output_on_stem, jnp.concatenate([state, jnp.zeros_like(state[:2])]))
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Fly if the contact is lost, strike with the other sphere if it is at the arena, and end if the contact jams
         or the sphere does not fit. Counts the flights.
         """
-        own, other = self.spheres
-        dynamics, zero = standing(self.scene, own), jnp.zeros_like(state[0])
-        lands = clearance(self.scene, own, other, state) <= dynamics.contact_margin(state[:OWN])
+        contact_ball, other_ball = self.spheres
+        dynamics, zero = standing(self.scene, contact_ball), jnp.zeros_like(state[0])
+        lands = clearance(self.scene, contact_ball, other_ball, state) <= dynamics.contact_margin(state[:OWN])
         ends = (dynamics.loss(state[:OWN]) > 0) & ~lands
         return Transition(
             mode=jnp.where(ends, jnp.where(self.number == 0, SLIDING, ON_STEM), jnp.where(lands, STRIKING, FLYING)),
-            state=jnp.where(ends, state, lift_off(self.scene, state, self.with_quadratures, own)),
+            state=jnp.where(ends, state, lift_off(self.scene, state, self.with_quadratures, contact_ball)),
             elapsed=zero,
             status=jnp.where(ends, LEFT_DOMAIN, RUNNING),
             crossing_time=jnp.full_like(zero, jnp.inf),
             counts=(~ends & ~lands).astype(int)[None],
         )
-
-
-class FlightToImpact(AbstractProblem):
-    """A flight; where a sphere is already at the arena (`strikes`), the flight ends at once."""
-
-    flight: FlightProblem
-    strikes: Bool[Array, ""]
-
-    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
-        return self.flight.start()
-
-    def field(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, "components cells"]:
-        return self.flight.field(time, state)
-
-    def event_function(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
-        return self.flight.event_function(state)
-
-    def domain_margin(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
-        return jnp.where(self.strikes, -1.0, self.flight.domain_margin(time, state))
-
-    def margins(self, time: Any, state: Float[Array, "components cells"]) -> tuple[Float[Array, " cells"], ...]:
-        return tuple(jnp.where(self.strikes, -1.0, margin) for margin in self.flight.margins(time, state))
 
 
 class FlyBoth(Fly):
@@ -180,8 +148,7 @@ class FlyBoth(Fly):
     strikes: Bool[Array, ""]
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
-        problem = FlightToImpact(self.flight(state), self.strikes)
-        return self.extended(problem, QuadraturesInFlight(self.scene.body), state)
+        return self.extended(self.flight(state, self.strikes), QuadraturesInFlight(self.scene.body), state)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """The impact of the sphere that touches the arena, after which the top rebounds, or slides on that sphere if
@@ -193,27 +160,19 @@ class FlyBoth(Fly):
         scene, flying, zero = self.scene, flight_state(state), jnp.zeros_like(state[0])
         main, stem = (gap_margin(scene, flying, ball) for ball in balls(scene.body))
         number = (stem < main).astype(int)
-        own, other = own_and_other(scene, number)
-        ground = landing_site(scene, flying, own)
-        misses = missed(scene, ground, own)
+        contact_ball, other_ball = own_and_other(scene, number)
+        ground = landing_site(scene, flying, contact_ball)
+        misses = missed(scene, ground, contact_ball)
         # If the landing was located slightly below the arena, the next mode would end where it begins.
         flying = flying._replace(place=vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2]))))
         ground = ground._replace(gap=zero)
-        impact = resolve_arena_impact(scene, flying, ground, own, other)
+        free = as_free_body(scene, flying, ground, contact_ball)
+        impact = resolve_arena_impact(scene, flying, ground, free, contact_ball, other_ball)
         flies = impact.rebounds | impact.throws
-        after = in_flight(flying.place, ground.axes, impact.free)
-        after = jnp.where(flies, after, in_contact(ground, impact.free))
-        if self.with_quadratures:
-            across = vector_of(state[OWN + k] for k in range(3))
-            across = jnp.where(flies, jnp.stack(across), jnp.stack(to_frame(across, ground.axes)))
-            gained = energy(scene.body, 0.0, impact.free) - energy(
-                scene.body, 0.0, as_free_body(scene, flying, ground, own)
-            )
-            after = jnp.concatenate([after, across, state[OWN + 3 :].at[1].add(gained)])
         slides = jnp.where(number == 0, SLIDING, ON_STEM)
         return Transition(
             mode=jnp.where(impact.throws, STRIKING, jnp.where(impact.rebounds, FLYING, slides)),
-            state=after,
+            state=self.after_impact(state, flying.place, ground, free, impact.free, flies),
             elapsed=zero,
             status=jnp.where(misses | impact.rests, UNRESOLVED, jnp.where(impact.fails, FAILED, RUNNING)),
             crossing_time=jnp.full_like(zero, jnp.inf),
@@ -236,33 +195,36 @@ class ArenaImpact(NamedTuple):
     fails: Bool[Array, " cells"]
 
 
-def resolve_arena_impact(scene: Scene[Top], flying: FlightState, ground: Below, own: Ball, other: Ball) -> ArenaImpact:
+def resolve_arena_impact(
+    scene: Scene[Top], flying: FlightState, ground: Below, free: FreeBody, contact_ball: Ball, other_ball: Ball
+) -> ArenaImpact:
     """The impact of one sphere on the tangent plane at its foot; a slow rebound closes the contact.
 
-    **Arguments:** `flying`: the top, whose sphere `own` is at the arena; `ground`: the arena below this sphere;
-    `other`: the other sphere.
+    **Arguments:** `flying`: the top, whose sphere `contact_ball` is at the arena; `ground`: the arena below this sphere;
+    `free`: the top above this ground; `other_ball`: the other sphere.
     """
     body, closing = scene.body, CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
-    free = as_free_body(scene, flying, ground, own)
-    speed = greatest(-gap_rate(body, own, free), 0.0)
+    speed = greatest(-gap_rate(body, contact_ball, free), 0.0)
     bounce = jnp.zeros_like(speed) if scene.restitution is None else scene.restitution
     rebounds = bounce * speed > closing
-    after, fails = resolve_impact(body, scene.friction, own, free, jnp.where(rebounds, bounce, 0.0))
-    thrown = flying._replace(
-        velocity=from_frame(after.velocity, ground.axes), momentum=from_frame(after.momentum, ground.axes)
+    state_after, fails = resolve_impact(body, scene.friction, contact_ball, free, jnp.where(rebounds, bounce, 0.0))
+    flying_after = flying._replace(
+        velocity=from_frame(state_after.velocity, ground.axes), momentum=from_frame(state_after.momentum, ground.axes)
     )
-    beside = landing_site(scene, flying, other)
-    before, now = (gap_rate(body, other, as_free_body(scene, motion, beside, other)) for motion in (flying, thrown))
-    touches = beside.gap < TOUCHING * body.radius
-    rests = touches & ~rebounds & (speed <= closing) & (jnp.abs(before) <= closing)
-    return ArenaImpact(after, rebounds, touches & ~rests & (now < -closing), rests, fails)
+    site = landing_site(scene, flying, other_ball)
+    rate_before, rate_after = (
+        gap_rate(body, other_ball, as_free_body(scene, motion, site, other_ball)) for motion in (flying, flying_after)
+    )
+    touches = site.gap < TOUCHING * body.radius
+    rests = touches & ~rebounds & (speed <= closing) & (jnp.abs(rate_before) <= closing)
+    return ArenaImpact(state_after, rebounds, touches & ~rests & (rate_after < -closing), rests, fails)
 
 
 def own_and_other(scene: Scene[Top], number: Int[Array, "..."]) -> tuple[Ball, Ball]:
     """The sphere of a top with the given number, and the other sphere."""
     main, stem = balls(scene.body)
-    own = Ball(*(jnp.where(number == 0, a, b) for a, b in zip(main, stem, strict=True)))
-    return own, Ball(*(jnp.where(number == 0, b, a) for a, b in zip(main, stem, strict=True)))
+    contact_ball = Ball(*(jnp.where(number == 0, a, b) for a, b in zip(main, stem, strict=True)))
+    return contact_ball, Ball(*(jnp.where(number == 0, b, a) for a, b in zip(main, stem, strict=True)))
 
 
 def modes(
@@ -283,5 +245,5 @@ def modes(
 def _first_mode(scene: Scene[Top], states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
     """The index of the mode in which each run starts."""
     main, stem = balls(scene.body)
-    started = flight_state(lift_off(scene, states[:OWN], False, main))
-    return jnp.where(landing_site(scene, started, stem).gap < 0.0, ON_STEM, SLIDING)
+    flying = flight_state(lift_off(scene, states[:OWN], False, main))
+    return jnp.where(landing_site(scene, flying, stem).gap < 0.0, ON_STEM, SLIDING)

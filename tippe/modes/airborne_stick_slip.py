@@ -11,7 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.hybrid import Transition
-from nonholonomic.integration import LEFT_DOMAIN, RUNNING, AbstractProblem
+from nonholonomic.integration import AbstractProblem
+from nonholonomic.integration.status import LEFT_DOMAIN, RUNNING
 
 from ..model.scene import Scene
 from ..model.stick_slip import AT_REST, ContactMode, StickSlip
@@ -50,14 +51,16 @@ class Touch(AbstractFlyingMode):
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Stick, slip, or fly where the contact is lost. Counts flights, and changes from slip to rolling."""
         transition = self.contact_state.reset_map(state, left)
-        whole = transition.state
+        state_after = transition.state
         if self.kind.rolls:
-            whole = jnp.concatenate([self.kind.stick_slip.rolling.carried_along(whole[:OWN]), whole[OWN:]])
-        flies = (transition.status == LEFT_DOMAIN) & (self.kind.loss(whole[:OWN]) == 0)
+            state_after = jnp.concatenate(
+                [self.kind.stick_slip.rolling.carried_along(state_after[:OWN]), state_after[OWN:]]
+            )
+        flies = (transition.status == LEFT_DOMAIN) & (self.kind.loss(state_after[:OWN]) == 0)
         mode = jnp.where(transition.mode == sticking.ROLLING, ROLLING, SLIPPING)
         return transition._replace(
             mode=jnp.where(flies, FLYING, mode),
-            state=jnp.where(flies, lift_off(self.scene, whole, self.with_quadratures), transition.state),
+            state=jnp.where(flies, lift_off(self.scene, state_after, self.with_quadratures), transition.state),
             status=jnp.where(flies, RUNNING, transition.status),
             counts=jnp.concatenate([flies.astype(int)[None], transition.counts]),
         )
@@ -90,6 +93,6 @@ def modes(
     return (slips, Land(*arguments), rolls), jnp.where(rests, ROLLING, SLIPPING)
 
 
-def _at_no_distance(shown: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
+def _at_no_distance(rows: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
     """The output rows of states in contact."""
-    return jnp.concatenate([shown, jnp.zeros_like(shown[:2])])
+    return jnp.concatenate([rows, jnp.zeros_like(rows[:2])])

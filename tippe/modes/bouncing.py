@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.geometry import dot
-from nonholonomic.integration import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
+from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
 from nonholonomic.xla_cpu import greatest
 
 from ..model.dynamics import Dynamics
@@ -57,15 +57,15 @@ def lost_contact(scene: Scene[Top], number: Int[Array, ""], state: Float[Array, 
     """The top at the end of sliding on the sphere with the given number: its contact is lost or jams, or the other
     sphere is at the plane.
     """
-    own, other = own_and_other(balls(scene.body), number)
+    contact_ball, other_ball = own_and_other(balls(scene.body), number)
     zero = jnp.zeros_like(state[0])
-    dynamics = standing_on(scene.dynamics, own)
+    dynamics = standing_on(scene.dynamics, contact_ball)
     falls, ball, jams = None, jnp.broadcast_to(number, zero.shape), dynamics.loss(state) > 0
-    if other is not None:
-        falls = clearance(dynamics, own, other, state) <= dynamics.contact_margin(state)
+    if other_ball is not None:
+        falls = clearance(dynamics, contact_ball, other_ball, state) <= dynamics.contact_margin(state)
         ball, jams = jnp.where(falls, 1 - number, number), jams & ~falls
     return Air(
-        free=as_free_body(scene.body, own, state),
+        free=as_free_body(scene.body, contact_ball, state),
         elapsed=zero,
         ball=ball,
         rising=jnp.zeros(zero.shape, bool),
@@ -88,62 +88,62 @@ def take_flight(
     """
     body, gravity = scene.body, scene.gravity
     flight = fly(body, gravity, balls(body), air.free, air.ball, air.rising, greatest(left - air.elapsed, 0.0))
-    reached = angle_reached(body, air.free, cos_angle, flight.duration, last)
-    crosses = jnp.isfinite(reached) & (not last)
-    duration = jnp.where(crosses, reached, flight.duration)
-    landed = flight.landed & ~crosses & ~flight.lost
+    crossing_time = angle_reached(body, air.free, cos_angle, flight.duration, last)
+    crosses = jnp.isfinite(crossing_time) & (not last)
+    duration = jnp.where(crosses, crossing_time, flight.duration)
+    has_landed = flight.landed & ~crosses & ~flight.lost
     status = jnp.where(crosses, CROSSED, jnp.where(flight.landed, air.status, REACHED_END))
-    after = Air(
+    air_after = Air(
         free=flown(body, gravity, air.free, duration),
         elapsed=air.elapsed + duration,
-        ball=jnp.where(landed, flight.ball, air.ball),
+        ball=jnp.where(has_landed, flight.ball, air.ball),
         rising=air.rising,
         falls=air.falls,
         status=jnp.where(flight.lost, FAILED, status),
-        crossing_time=jnp.where(jnp.isfinite(reached), air.elapsed + reached, air.crossing_time),
+        crossing_time=jnp.where(jnp.isfinite(crossing_time), air.elapsed + crossing_time, air.crossing_time),
         flights=air.flights + 1,
-        open=landed,
-        log_rates=air.log_rates + jnp.where(landed, flight.log_rate, 0.0),
+        open=has_landed,
+        log_rates=air.log_rates + jnp.where(has_landed, flight.log_rate, 0.0),
         quadratures=None if air.quadratures is None else quadratures_after(body, air.free, air.quadratures, duration),
     )
-    return after, landed
+    return air_after, has_landed
 
 
 def land(scene: Scene[Top], air: Air) -> Air:
     """The impact of the sphere that has reached the plane; a slow rebound closes the contact."""
     body, spheres = scene.body, balls(scene.body)
-    own, other = own_and_other(spheres, air.ball)
-    speed = greatest(-gap_rate(body, own, air.free), 0.0)
+    contact_ball, other_ball = own_and_other(spheres, air.ball)
+    speed = greatest(-gap_rate(body, contact_ball, air.free), 0.0)
     restitution = (
         jnp.zeros_like(speed) if scene.restitution is None else jnp.broadcast_to(scene.restitution, speed.shape)
     )
     closing = CLOSING_SPEED * jnp.sqrt(scene.gravity * body.radius)
     rebounds = restitution * speed > closing
-    free, fails = resolve_impact(body, scene.friction, own, air.free, jnp.where(rebounds, restitution, 0.0))
+    free, fails = resolve_impact(body, scene.friction, contact_ball, air.free, jnp.where(rebounds, restitution, 0.0))
     after_impact = air._replace(free=free, rising=rebounds, open=rebounds, status=jnp.where(fails, FAILED, air.status))
-    if other is not None:
-        after_impact = _with_other(scene, air, after_impact, other, (speed <= closing) & ~rebounds, closing)
+    if other_ball is not None:
+        after_impact = _with_other(scene, air, after_impact, other_ball, (speed <= closing) & ~rebounds, closing)
     if air.quadratures is not None:
-        gained = energy(body, scene.gravity, after_impact.free) - energy(body, scene.gravity, air.free)
-        *others, work = air.quadratures
-        after_impact = after_impact._replace(quadratures=jnp.stack([*others, work + gained]))
+        energy_change = energy(body, scene.gravity, after_impact.free) - energy(body, scene.gravity, air.free)
+        *path, work = air.quadratures
+        after_impact = after_impact._replace(quadratures=jnp.stack([*path, work + energy_change]))
     return after_impact._replace(open=after_impact.open & ~fails)
 
 
 def _with_other(
-    scene: Scene[Top], air: Air, after_impact: Air, other: Ball, slow: Bool[Array, " cells"], closing: Cells
+    scene: Scene[Top], air: Air, after_impact: Air, other_ball: Ball, is_slow: Bool[Array, " cells"], closing: Cells
 ) -> Air:
     """Effect of an impact on the other sphere if that is at the plane: it also strikes, or the top comes to rest on
     both.
 
-    **Arguments:** `air`: the top before the impact; `after_impact`: the top after the impact; `slow`: mask of the impacts
+    **Arguments:** `air`: the top before the impact; `after_impact`: the top after the impact; `is_slow`: mask of the impacts
     that are so slow that they may be the last.
     """
-    touches = gap(other, air.free) < TOUCHING * scene.body.radius
-    falls = touches & (gap_rate(scene.body, other, after_impact.free) < -closing)
-    stopped, takes = LeaningDynamics.of(scene).stopped(air.free)
-    rests = touches & slow & (jnp.abs(gap_rate(scene.body, other, air.free)) <= closing) & takes
-    free, number, definite = LeaningDynamics.of(scene).settled(stopped)
+    touches = gap(other_ball, air.free) < TOUCHING * scene.body.radius
+    falls = touches & (gap_rate(scene.body, other_ball, after_impact.free) < -closing)
+    stopped_body, dissipates = LeaningDynamics.of(scene).stopped(air.free)
+    rests = touches & is_slow & (jnp.abs(gap_rate(scene.body, other_ball, air.free)) <= closing) & dissipates
+    free, number, definite = LeaningDynamics.of(scene).settled(stopped_body)
     falls &= ~rests
     return after_impact._replace(
         free=select(rests, free, after_impact.free),
@@ -158,25 +158,29 @@ def quadratures_after(
     body: Top, free: FreeBody, quadratures: Float[Array, "7 ..."], time: Float[Array, "..."]
 ) -> Float[Array, "7 ..."]:
     """The passive quadratures after some time [s] in flight."""
-    x, y, *across, angle, work = quadratures
+    x, y, *c_vector, angle, work = quadratures
     u1, u2, _ = free.velocity
     spin_rate = dot(free.axis, free.momentum) / body.I3
-    across = c_in_flight(body, free, tuple(across), time)
-    return jnp.stack([x + u1 * time, y + u2 * time, *across, angle + spin_rate * time, work + 0.0 * time])
+    c_vector = c_in_flight(body, free, tuple(c_vector), time)
+    return jnp.stack([x + u1 * time, y + u2 * time, *c_vector, angle + spin_rate * time, work + 0.0 * time])
 
 
-def clearance(dynamics: Dynamics, own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+def clearance(
+    dynamics: Dynamics, contact_ball: Ball, other_ball: Ball, state: Float[Array, "components ..."]
+) -> Float[Array, "..."]:
     """Distance of the other sphere from the plane as a fraction of the radius of the touching sphere, plus the
     round-off allowed at lift-off.
     """
     _, e, L, _ = parts(state[:OWN])
-    rate = (other.offset - own.offset) * dynamics.per_transverse * (L[0] * e[1] - L[1] * e[0])
-    return height(own, other, state) / own.radius + still_parting(rate, dynamics.gravity, own.radius)
+    rate = (other_ball.offset - contact_ball.offset) * dynamics.per_transverse * (L[0] * e[1] - L[1] * e[0])
+    return height(contact_ball, other_ball, state) / contact_ball.radius + still_parting(
+        rate, dynamics.gravity, contact_ball.radius
+    )
 
 
-def height(own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-    """Distance [m] of the other sphere from the plane, for a top that stands on the sphere `own`."""
-    return own.radius - other.radius + (other.offset - own.offset) * state[COS_THETA]
+def height(contact_ball: Ball, other_ball: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    """Distance [m] of the other sphere from the plane, for a top that stands on the sphere `contact_ball`."""
+    return contact_ball.radius - other_ball.radius + (other_ball.offset - contact_ball.offset) * state[COS_THETA]
 
 
 def own_and_other(spheres: tuple[Ball, ...], number: Int[Array, "..."]) -> tuple[Ball, Ball | None]:
@@ -187,6 +191,6 @@ def own_and_other(spheres: tuple[Ball, ...], number: Int[Array, "..."]) -> tuple
     return select(number == 0, main, stem), select(number == 0, stem, main)
 
 
-def select(condition: Bool[Array, " cells"], chosen: Any, other: Any) -> Any:
+def select(condition: Bool[Array, " cells"], first: Any, second: Any) -> Any:
     """Each leaf of one tree where a condition holds, and of the other tree elsewhere."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), chosen, other)
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), first, second)

@@ -17,7 +17,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from nonholonomic.geometry import Vector, dot, scale, sum_vectors, vector_of
-from nonholonomic.integration import LEFT_DOMAIN, MOST_STEPS, AbstractProblem, Settings, traced_solve_ensemble
+from nonholonomic.integration import AbstractProblem, Settings, traced_solve_ensemble
+from nonholonomic.integration.settings import MOST_STEPS
+from nonholonomic.integration.status import LEFT_DOMAIN
 from nonholonomic.xla_cpu import greatest, least
 
 from ..model.friction import SetValuedCoulomb, length
@@ -52,8 +54,8 @@ class Skid(AbstractProblem):
         return sum_vectors(contact.velocity, changes)
 
     def start(self) -> tuple[Float[Array, "3 cells"], Float[Array, "3 cells"]]:
-        none = jnp.zeros((3, *self.pace.shape))
-        return none, jnp.ones_like(none)
+        zeros = jnp.zeros((3, *self.pace.shape))
+        return zeros, jnp.ones_like(zeros)
 
     def field(self, time: Cells, state: Float[Array, "3 cells"]) -> Float[Array, "3 cells"]:
         v1, v2, _ = self.velocity(state)
@@ -86,13 +88,13 @@ def resolve_coulomb_impact(
     stops = skid.slip_left(outcome.state) <= STOPS
     rates = skid.field(outcome.end_time, outcome.state)
     # An impact that ends while it slips is corrected by one step of Newton's method, as in `Impact.ended`.
-    left, slope = jax.jvp(lambda at: impact.domain_margin(at[2], at[:2]), (outcome.state,), (rates,))
+    left, slope = jax.jvp(lambda point: impact.domain_margin(point[2], point[:2]), (outcome.state,), (rates,))
     step = -left / jnp.where(slope == 0.0, 1.0, slope)
     step = jnp.where(jnp.abs(step) < 1e-6, step, 0.0)
     state = jnp.where(stops, outcome.state, outcome.state + step * rates)
     impulse = impact.impulse(state[2], state[:2])
-    remaining = _remaining_impulse(impact, friction.mu, impulse.force)
-    force = vector_of(jnp.where(stops, a + b, a) for a, b in zip(impulse.force, remaining, strict=True))
+    remaining_impulse = _remaining_impulse(impact, friction.mu, impulse.force)
+    force = vector_of(jnp.where(stops, a + b, a) for a, b in zip(impulse.force, remaining_impulse, strict=True))
     return apply_impulse(body, contact, free, ContactImpulse(force, None)), outcome.status != LEFT_DOMAIN
 
 
@@ -109,25 +111,27 @@ def _remaining_impulse(impact: Impact, mu: Float[Array, "..."], impulse: Vector)
     # Where the contact sticks, the impulse first removes the remaining slip.
     v1, v2, _ = sum_vectors(contact.velocity, change(impulse))
     sticks, determinant = f1 * f1 + f2 * f2 < mu * mu, a * c - b * b
-    rest = (
+    stopping_impulse = (
         jnp.where(sticks, (b * v2 - c * v1) / determinant, 0.0),
         jnp.where(sticks, (b * v1 - a * v2) / determinant, 0.0),
     )
-    impulse = sum_vectors(impulse, (*rest, None))
-    velocity, along = sum_vectors(contact.velocity, change(impulse)), (f1, f2, jnp.ones_like(f1))
+    impulse = sum_vectors(impulse, (*stopping_impulse, None))
+    velocity, impulse_direction = sum_vectors(contact.velocity, change(impulse)), (f1, f2, jnp.ones_like(f1))
     # The impact ends as in `Impact.domain_margin`: the normal velocity is linear in the impulse, and the energy is
     # quadratic.
-    gains = change(along)
-    wanted = greatest((contact.velocity[2] + impact.gained - velocity[2]) / gains[2], 0.0)
+    gains = change(impulse_direction)
+    normal_impulse = greatest((contact.velocity[2] + impact.gained - velocity[2]) / gains[2], 0.0)
     compressed = greatest(-velocity[2], 0.0) / gains[2]
-    power, stiff = dot(along, velocity), dot(along, gains)
+    power, stiff = dot(impulse_direction, velocity), dot(impulse_direction, gains)
     gain = least(dot(impulse, contact.velocity) + 0.5 * dot(impulse, change(impulse)), 0.0)
     restored = (-power + jnp.sqrt(power * power - 2.0 * gain * stiff)) / stiff
-    return sum_vectors(scale(least(wanted, greatest(compressed, restored)), along), (*rest, None))
+    return sum_vectors(
+        scale(least(normal_impulse, greatest(compressed, restored)), impulse_direction), (*stopping_impulse, None)
+    )
 
 
 def sticking_force(
-    matrix: tuple[Cells, Cells, Cells], lifted: tuple[Cells, Cells], mu: Float[Array, "..."]
+    matrix: tuple[Cells, Cells, Cells], coupling: tuple[Cells, Cells], mu: Float[Array, "..."]
 ) -> tuple[Cells, Cells]:
     """The f with |f| <= mu that minimises f.A f / 2 + f.b, for A = (A11, A12, A22) positive definite.
 
@@ -141,18 +145,18 @@ def sticking_force(
         return ((c + k) * x - b * y) / determinant, ((a + k) * y - b * x) / determinant
 
     def force(k: Cells) -> tuple[Cells, Cells]:
-        return solved(k, (-lifted[0], -lifted[1]))
+        return solved(k, (-coupling[0], -coupling[1]))
 
     free = length(*force(jnp.zeros_like(a)))
-    beyond = (free > mu) & (mu > 0.0)
-    wanted = jnp.where(beyond, mu, 1.0)
+    is_beyond = (free > mu) & (mu > 0.0)
+    normal_impulse = jnp.where(is_beyond, mu, 1.0)
 
     def newton(_: int, k: Cells) -> Cells:
         f1, f2 = force(k)
-        size = jnp.where(beyond, length(f1, f2), 1.0)
+        size = jnp.where(is_beyond, length(f1, f2), 1.0)
         g1, g2 = solved(k, (f1, f2))
-        slope = jnp.where(beyond, (f1 * g1 + f2 * g2) / size**3, 1.0)
-        return k + jnp.where(beyond, (1.0 / wanted - 1.0 / size) / slope, 0.0)
+        slope = jnp.where(is_beyond, (f1 * g1 + f2 * g2) / size**3, 1.0)
+        return k + jnp.where(is_beyond, (1.0 / normal_impulse - 1.0 / size) / slope, 0.0)
 
     f1, f2 = force(jax.lax.fori_loop(0, ITERATIONS, newton, jnp.zeros_like(a)))
     return jnp.where(mu > 0.0, f1, 0.0), jnp.where(mu > 0.0, f2, 0.0)

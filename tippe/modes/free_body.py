@@ -125,8 +125,8 @@ def still_parting(
 def energy(body: Top, gravity: Float[ArrayLike, "..."], free: FreeBody) -> Float[Array, "..."]:
     """Kinetic energy plus weight times height above the plane [J]."""
     axial = dot(free.momentum, free.axis)
-    across = dot(free.momentum, free.momentum) - axial**2
-    rotation = across / (2.0 * body.I1) + axial**2 / (2.0 * body.I3)
+    transverse_square = dot(free.momentum, free.momentum) - axial**2
+    rotation = transverse_square / (2.0 * body.I1) + axial**2 / (2.0 * body.I3)
     return body.mass * (0.5 * dot(free.velocity, free.velocity) + gravity * free.height) + rotation
 
 
@@ -140,10 +140,12 @@ def energy_in(
     **Arguments:** `number`: index of the mode in `sliding.py`; where both spheres touch, either determines the height.
     """
     main, stem = balls(scene.body)[0], balls(scene.body)[-1]
-    own = Ball(*(jnp.where(number == 1, of_stem, of_main) for of_stem, of_main in zip(stem, main, strict=True)))
-    free = as_free_body(scene.body, own, state)
-    whole = energy(scene.body, scene.gravity, free)
-    return whole - 0.5 * scene.body.mass * free.velocity[2] ** 2, whole
+    contact_ball = Ball(
+        *(jnp.where(number == 1, of_stem, of_main) for of_stem, of_main in zip(stem, main, strict=True))
+    )
+    free = as_free_body(scene.body, contact_ball, state)
+    total = energy(scene.body, scene.gravity, free)
+    return total - 0.5 * scene.body.mass * free.velocity[2] ** 2, total
 
 
 def jellett(ball: Ball, free: FreeBody) -> Float[Array, "..."]:

@@ -25,7 +25,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from nonholonomic.geometry import Vector, cross, dot, scale, sum_vectors
-from nonholonomic.integration import LEFT_DOMAIN, MOST_STEPS, AbstractProblem, Settings, traced_solve_ensemble
+from nonholonomic.integration import AbstractProblem, Settings, traced_solve_ensemble
+from nonholonomic.integration.settings import MOST_STEPS
+from nonholonomic.integration.status import LEFT_DOMAIN
 from nonholonomic.xla_cpu import greatest, least
 
 from ..model.contact_load import ContactLoad, Slip
@@ -108,8 +110,8 @@ class Impact(AbstractProblem):
         contact, torque = self.approach, cross(self.approach.arm, impulse.force)
         velocity = tuple(dot(column, impulse.force) for column in contact.response)
         if impulse.torque is not None:
-            turned = angular_velocity(self.body, contact.axis, impulse.torque)
-            velocity = sum_vectors(velocity, cross(turned, contact.arm))
+            angular_change = angular_velocity(self.body, contact.axis, impulse.torque)
+            velocity = sum_vectors(velocity, cross(angular_change, contact.arm))
             torque = sum_vectors(torque, impulse.torque)
         return velocity, angular_velocity(self.body, contact.axis, torque)
 
@@ -119,9 +121,9 @@ class Impact(AbstractProblem):
         return self.friction.per_normal_force(Slip(velocity[0], velocity[1], (w[0], w[1], drilling)))
 
     def start(self) -> tuple[Float[Array, "rows cells"], Float[Array, "rows cells"]]:
-        turns = self.load(self.approach.velocity, self.approach.angular_velocity).torque != (None, None, None)
-        none = jnp.zeros((5 if turns else 2, *self.gained.shape))
-        return none, jnp.ones_like(none)
+        has_torque = self.load(self.approach.velocity, self.approach.angular_velocity).torque != (None, None, None)
+        zeros = jnp.zeros((5 if has_torque else 2, *self.gained.shape))
+        return zeros, jnp.ones_like(zeros)
 
     def field(self, time: Cells, state: Float[Array, "rows cells"]) -> Float[Array, "rows cells"]:
         contact, (velocity, w) = self.approach, self.changes(self.impulse(time, state))
@@ -135,16 +137,18 @@ class Impact(AbstractProblem):
 
     def domain_margin(self, time: Cells, state: Float[Array, "rows cells"]) -> Cells:
         impulse, response = self.impulse(time, state), self.approach.response
-        change, turned = self.changes(impulse)
+        change, angular_change = self.changes(impulse)
         missing = (self.gained - change[2]) / self.speed
         # In compression, the sphere still approaches; in restitution, the margin is the dissipated energy that need not
         # be returned.
         approaches = -(self.approach.velocity[2] + change[2]) / self.speed
         gain = dot(impulse.force, self.approach.velocity) + 0.5 * dot(impulse.force, change)
         if impulse.torque is not None:
-            gain = gain + dot(impulse.torque, self.approach.angular_velocity) + 0.5 * dot(impulse.torque, turned)
-        short = -gain * response[2][2] / self.speed**2
-        return least(missing, jnp.where(approaches > short, approaches, short))
+            gain = (
+                gain + dot(impulse.torque, self.approach.angular_velocity) + 0.5 * dot(impulse.torque, angular_change)
+            )
+        shortfall = -gain * response[2][2] / self.speed**2
+        return least(missing, jnp.where(approaches > shortfall, approaches, shortfall))
 
     def ended(self, time: Cells, state: Float[Array, "rows cells"]) -> ContactImpulse:
         """The impulses of an impact whose end has been located, corrected by one step of Newton's method.
@@ -171,11 +175,11 @@ def approach(body: Top, ball: Ball, free: FreeBody) -> Approach:
     velocity = sum_vectors(free.velocity, cross(w, arm))
     zero, unit = jnp.zeros_like(arm[0]), jnp.ones_like(arm[0])
 
-    def gained(impulse: Vector) -> Vector:
-        turned = angular_velocity(body, free.axis, cross(arm, impulse))
-        return sum_vectors(scale(1.0 / body.mass, impulse), cross(turned, arm))
+    def impulse_gain(impulse: Vector) -> Vector:
+        angular_change = angular_velocity(body, free.axis, cross(arm, impulse))
+        return sum_vectors(scale(1.0 / body.mass, impulse), cross(angular_change, arm))
 
-    response = (gained((unit, zero, zero)), gained((zero, unit, zero)), gained((zero, zero, unit)))
+    response = (impulse_gain((unit, zero, zero)), impulse_gain((zero, unit, zero)), impulse_gain((zero, zero, unit)))
     return Approach(arm, velocity, response, free.axis, w)
 
 
@@ -196,9 +200,9 @@ def resolve_impact(
     **Returns:** the body after the impact; and whether the impact could not be computed (`MOST_STEPS`, `LARGEST`).
     """
     contact = approach(body, ball, free)
-    gained = (1.0 + restitution) * greatest(-contact.velocity[2], 0.0)
-    problem = Impact(body, friction, contact, ball.radius, gained)
-    cells = gained.shape[0]
+    impulse_gain = (1.0 + restitution) * greatest(-contact.velocity[2], 0.0)
+    problem = Impact(body, friction, contact, ball.radius, impulse_gain)
+    cells = impulse_gain.shape[0]
     outcome, _ = traced_solve_ensemble(
         problem,
         jnp.asarray(LARGEST),

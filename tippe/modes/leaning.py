@@ -92,34 +92,36 @@ class LeaningDynamics(AbstractDynamics):
         spheres, m, I1, I3 = balls(self.body), self.body.mass, self.body.I1, self.body.I3
         u, e, L, _ = parts(state)
         c, p, b = e[2], L[2], dot(e, L)
-        across = (-e[1], e[0])
-        sine2 = dot(across, across)
-        along = (b - c * p) / sine2
-        precession = (p - c * along) / I1
-        rolling = along / I1 + (1.0 / I3 - 1.0 / I1) * b
+        perpendicular = (-e[1], e[0])
+        sine2 = dot(perpendicular, perpendicular)
+        axial_rate = (b - c * p) / sine2
+        precession = (p - c * axial_rate) / I1
+        rolling = axial_rate / I1 + (1.0 / I3 - 1.0 / I1) * b
 
         w = (rolling * e[0], rolling * e[1], rolling * c + precession if self.friction.uses_spin else None)
-        velocities = [sum_vectors(u, scale(rolling * R + precession * a, across)) for a, R in spheres]
+        velocities = [sum_vectors(u, scale(rolling * R + precession * a, perpendicular)) for a, R in spheres]
         slips = [Slip(x, y, w) for x, y in velocities]
         loads = [self.friction.per_normal_force(slip) for slip in slips]
         height = spheres[0].radius - spheres[0].offset * c
         m_0, m_1 = (
-            subtract(add(ball.offset * sine2, multiply(height, dot(load.force, e[:2]))), dot(across, load.torque[:2]))
+            subtract(
+                add(ball.offset * sine2, multiply(height, dot(load.force, e[:2]))), dot(perpendicular, load.torque[:2])
+            )
             for ball, load in zip(spheres, loads, strict=True)
         )
         weight = m * self.gravity
-        N_1 = -(along * precession * sine2 + weight * m_0) / (m_1 - m_0)
+        N_1 = -(axial_rate * precession * sine2 + weight * m_0) / (m_1 - m_0)
         normal = (weight - N_1, N_1)
 
         u_dot = scale(1.0 / m, sum_vectors(*(scale(N, load.force) for N, load in zip(normal, loads, strict=True))))
-        pulls = [dot(across, load.force) for load in loads]
-        each = list(zip(spheres, pulls, loads, strict=True))
-        p_dot = dot(normal, tuple(add(multiply(ball.offset, t), load.torque[2]) for ball, t, load in each))
-        b_dot = dot(normal, tuple(add(multiply(ball.radius, t), dot(load.torque, e)) for ball, t, load in each))
+        pulls = [dot(perpendicular, load.force) for load in loads]
+        triples = list(zip(spheres, pulls, loads, strict=True))
+        p_dot = dot(normal, tuple(add(multiply(ball.offset, t), load.torque[2]) for ball, t, load in triples))
+        b_dot = dot(normal, tuple(add(multiply(ball.radius, t), dot(load.torque, e)) for ball, t, load in triples))
         # L turns with the axis, including its part across; so b changes by its own rate alone.
         growth = multiply(1.0 / sine2, subtract(b_dot, multiply(c, p_dot)))
         L_dot = sum_vectors(scale(growth, e[:2]), (-precession * L[1], precession * L[0]))
-        rate = (*u_dot, *scale(precession, across), None, *L_dot, p_dot)
+        rate = (*u_dot, *scale(precession, perpendicular), None, *L_dot, p_dot)
         power = dot(normal, tuple(load.power(slip) for load, slip in zip(loads, slips, strict=True)))
         stiff = (m_1 - m_0) / ((spheres[1].offset - spheres[0].offset) * sine2)
         return LeaningMotion(rate, normal, power, b, stiff)
@@ -148,23 +150,23 @@ class LeaningDynamics(AbstractDynamics):
         """
         spheres, zero = balls(self.body), jnp.zeros_like(free.height)
         w1, w2, w3 = angular_velocity(self.body, free.axis, free.momentum)
-        forces, turns, gains = [], [], []
+        forces, torques, gains = [], [], []
         for ball in spheres:
-            meets = approach(self.body, ball, free)
-            slip = Slip(*meets.velocity[:2], (w1, w2, w3 if self.friction.uses_spin else None))
+            contact = approach(self.body, ball, free)
+            slip = Slip(*contact.velocity[:2], (w1, w2, w3 if self.friction.uses_spin else None))
             load = self.friction.per_normal_force(slip)
             forces.append(tuple(zero if part is None else part for part in (*load.force, 1.0 + zero)))
-            turns.append(sum_vectors(cross(meets.arm, forces[-1]), load.torque))
+            torques.append(sum_vectors(cross(contact.arm, forces[-1]), load.torque))
             gains.append(zero if (power := load.power(slip)) is None else power)
         speeds = [gap_rate(self.body, ball, free) for ball in spheres]
-        rates = [axis_rate(self.body, free.axis, turn)[2] for turn in turns]
+        rates = [axis_rate(self.body, free.axis, turn)[2] for turn in torques]
         (G_00, G_01), (G_10, G_11) = ([1.0 / self.body.mass + ball.offset * rate for rate in rates] for ball in spheres)
         determinant = G_00 * G_11 - G_01 * G_10
         per = 1.0 / jnp.where(determinant == 0.0, 1.0, determinant)
         impulses = (per * (G_01 * speeds[1] - G_11 * speeds[0]), per * (G_10 * speeds[0] - G_00 * speeds[1]))
         total = sum_vectors(*(scale(P, force) for P, force in zip(impulses, forces, strict=True)))
         velocity = sum_vectors(free.velocity, scale(1.0 / self.body.mass, total))
-        momentum = sum_vectors(free.momentum, *(scale(P, turn) for P, turn in zip(impulses, turns, strict=True)))
+        momentum = sum_vectors(free.momentum, *(scale(P, turn) for P, turn in zip(impulses, torques, strict=True)))
         return FreeBody(velocity, free.height, free.axis, momentum), dot(impulses, tuple(gains)) <= 0.0
 
     def settled(self, free: FreeBody) -> tuple[FreeBody, Int[Array, "..."], Bool[Array, "..."]]:
@@ -195,7 +197,7 @@ def at_rest(body: Top, free: FreeBody) -> FreeBody:
     square = e[0] ** 2 + e[1] ** 2
     # The length of e is unchanged.
     factor = jnp.sqrt((square + e[2] ** 2 - c**2) / square)
-    across = (-e[1], e[0])
-    L = (*sum_vectors(L[:2], scale(-dot(across, L[:2]) / square, across)), L[2])
+    perpendicular = (-e[1], e[0])
+    L = (*sum_vectors(L[:2], scale(-dot(perpendicular, L[:2]) / square, perpendicular)), L[2])
     velocity = (free.velocity[0], free.velocity[1], jnp.zeros_like(c))
     return FreeBody(velocity, main.radius - main.offset * c, (*scale(factor, e[:2]), c), L)

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.hybrid import AbstractHoppingMode, Transition, TransitionPath
-from nonholonomic.integration import CROSSED, RUNNING, UNRESOLVED, AbstractProblem
+from nonholonomic.integration import AbstractProblem
+from nonholonomic.integration.status import CROSSED, RUNNING, UNRESOLVED
 from nonholonomic.xla_cpu import compiled_setup, least
 
 from ..model.dynamics import Dynamics
@@ -56,37 +57,20 @@ MOST_BOUNCES = 10_000
 SHOWN = 0.4
 
 
-class Sliding(AbstractProblem):
-    """Sliding until theta reaches an angle, a contact is lost or jams, or a sphere that does not touch the plane lands.
-
-    `own` is the sphere that slides, and `other` the other sphere; `None` without a stem.
+class SlidingOnOne(InversionProblem):
+    """Sliding on one of two spheres until theta reaches an angle, the contact is lost or jams, or the other sphere
+    lands.
     """
 
-    dynamics: Dynamics | LeaningDynamics
-    own: Ball | None
-    other: Ball | None
-    cos_angle: Float[Array, "..."]
-    states: Float[Array, "components cells"]
-    scales: Float[Array, "components cells"]
-
-    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
-        return self.states, self.scales
-
-    def field(self, time: Cells, state: Float[Array, "components cells"]) -> Float[Array, "components cells"]:
-        return self.dynamics.field(state)
-
-    def event_function(self, state: Float[Array, "components cells"]) -> Cells:
-        return state[COS_THETA] - self.cos_angle
+    contact_ball: Ball = eqx.field(kw_only=True)
+    other_ball: Ball = eqx.field(kw_only=True)
 
     def domain_margin(self, time: Cells, state: Float[Array, "components cells"]) -> Cells:
         return least(*self.margins(time, state))
 
     def margins(self, time: Cells, state: Float[Array, "components cells"]) -> tuple[Cells, ...]:
-        margins = self.dynamics.margins(state)
-        if self.own is None or self.other is None:
-            return margins
         assert isinstance(self.dynamics, Dynamics)
-        return (*margins, clearance(self.dynamics, self.own, self.other, state))
+        return (*super().margins(time, state), clearance(self.dynamics, self.contact_ball, self.other_ball, state))
 
 
 class Slide(AbstractFlyingMode, AbstractHoppingMode):
@@ -102,19 +86,23 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
     last: bool = eqx.field(static=True)
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
-        own, other = own_and_other(balls(self.scene.body), self.number)
-        dynamics = standing_on(self.scene.dynamics, own)
-        problem = Sliding(dynamics, own, other, self.cos_angle, state[:OWN], self.scales[:OWN])
+        contact_ball, other_ball = own_and_other(balls(self.scene.body), self.number)
+        contact = (standing_on(self.scene.dynamics, contact_ball), self.cos_angle, state[:OWN], self.scales[:OWN])
+        problem = (
+            InversionProblem(*contact)
+            if other_ball is None
+            else SlidingOnOne(*contact, contact_ball=contact_ball, other_ball=other_ball)
+        )
         return self.extended(problem, Quadratures(self.scene.body.I3, of_mass=True), state)
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
-        own, _ = own_and_other(balls(self.scene.body), self.number)
-        return shown(self.scene.body, as_free_body(self.scene.body, own, state), state[OWN:])
+        contact_ball, _ = own_and_other(balls(self.scene.body), self.number)
+        return shown(self.scene.body, as_free_body(self.scene.body, contact_ball, state), state[OWN:])
 
     def between(self, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "17 times"]:
         free, quadratures = motion
-        later = flown(self.scene.body, self.scene.gravity, free, passed)
-        return shown(self.scene.body, later, quadratures_after(self.scene.body, free, quadratures, passed))
+        free_after = flown(self.scene.body, self.scene.gravity, free, passed)
+        return shown(self.scene.body, free_after, quadratures_after(self.scene.body, free, quadratures, passed))
 
     def reset_map(self, state: Float[Array, "components cells"], left: Cells) -> Transition:
         """Fly, and bounce, until a sphere stays on the plane; or let the other sphere land if it touches the plane.
@@ -124,8 +112,8 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
 
         def hop(carry: tuple[Air, Array, TransitionPath | None]) -> tuple[Air, Array, TransitionPath | None]:
             air, count, record = carry
-            after, landed = self.hop(air, left)
-            return landed, count + 1, _with_flight(self.scene.body, record, air, after)
+            air_after, air_landed = self.hop(air, left)
+            return air_landed, count + 1, _with_flight(self.scene.body, record, air, air_after)
 
         def under_way(carry: tuple[Air, Array, TransitionPath | None]) -> Array:
             return jnp.any(carry[0].open) & (carry[1] < MOST_BOUNCES)
@@ -138,17 +126,19 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
     def lost(self, state: Float[Array, "components cells"]) -> Air:
         start = lost_contact(self.scene, self.number, state)
         # A launch beyond the angle and without contact ends at once.
-        beyond = start.open & (state[COS_THETA] <= self.cos_angle) & (not self.last)
-        ended = start._replace(status=jnp.full_like(start.status, CROSSED), open=~beyond, crossing_time=start.elapsed)
-        start = select(beyond, ended, start)
+        is_beyond = start.open & (state[COS_THETA] <= self.cos_angle) & (not self.last)
+        ended = start._replace(
+            status=jnp.full_like(start.status, CROSSED), open=~is_beyond, crossing_time=start.elapsed
+        )
+        start = select(is_beyond, ended, start)
         return start._replace(quadratures=state[OWN:]) if self.with_quadratures else start
 
     def hop(self, air: Air, left: Cells) -> tuple[Air, Air]:
         """One flight of a top whose contact is open, and the impact at its end."""
-        after, landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
+        air_after, air_landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
         if air.falls is not None:
-            after, landed = select(air.falls, air, after), air.falls | landed
-        return after, select(air.open, select(landed, land(self.scene, after), after), air)
+            air_after, air_landed = select(air.falls, air, air_after), air.falls | air_landed
+        return air_after, select(air.open, select(air_landed, land(self.scene, air_after), air_after), air)
 
     def motion_in(self, air: Air) -> tuple[FreeBody, Float[Array, "7 cells"] | None]:
         return air.free, air.quadratures
@@ -166,7 +156,8 @@ class Lean(AbstractFlyingMode):
     """Sliding on both spheres; numbered after the modes of the single spheres."""
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
-        problem = Sliding(LeaningDynamics.of(self.scene), None, None, self.cos_angle, state[:OWN], self.scales[:OWN])
+        dynamics: Any = LeaningDynamics.of(self.scene)
+        problem = InversionProblem(dynamics, self.cos_angle, state[:OWN], self.scales[:OWN])
         return self.extended(problem, Quadratures(self.scene.body.I3, of_mass=True), state)
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
@@ -175,11 +166,13 @@ class Lean(AbstractFlyingMode):
     def reset_map(self, state: Float[Array, "components cells"], left: Cells) -> Transition:
         """Slide on the sphere whose normal force has not vanished."""
         number = LeaningDynamics.of(self.scene).heavier(state)
-        own = contact_state(at_rest(self.scene.body, as_free_body(self.scene.body, balls(self.scene.body)[0], state)))
-        state = jnp.concatenate([own, state[OWN:]])
+        state_at_rest = contact_state(
+            at_rest(self.scene.body, as_free_body(self.scene.body, balls(self.scene.body)[0], state))
+        )
+        state = jnp.concatenate([state_at_rest, state[OWN:]])
         zero = jnp.zeros_like(state[0])
-        running, none = jnp.full(zero.shape, RUNNING), jnp.zeros((1, *zero.shape), int)
-        return Transition(number, state, zero, running, jnp.full_like(zero, jnp.inf), none)
+        running, zeros = jnp.full(zero.shape, RUNNING), jnp.zeros((1, *zero.shape), int)
+        return Transition(number, state, zero, running, jnp.full_like(zero, jnp.inf), zeros)
 
 
 def modes(
@@ -219,13 +212,15 @@ def _no_flights(start: Air) -> TransitionPath:
     return TransitionPath(jnp.inf + room(start.elapsed), motions, room(start.flights))
 
 
-def _with_flight(body: Top, record: TransitionPath | None, before: Air, after: Air) -> TransitionPath | None:
+def _with_flight(body: Top, record: TransitionPath | None, air_before: Air, air_after: Air) -> TransitionPath | None:
     """The record of a single run, if there is one, with the flight between two states added, if there was one."""
     if record is None:
         return None
-    place, flew = before.flights[0], after.flights > before.flights
-    turned = cone(body, before.free).rate * (after.elapsed - before.elapsed)
+    place, has_flown = air_before.flights[0], air_after.flights > air_before.flights
+    angle = cone(body, air_before.free).rate * (air_after.elapsed - air_before.elapsed)
     new = TransitionPath(
-        jnp.where(flew, after.elapsed, jnp.inf), (before.free, before.quadratures), 1 + (turned / SHOWN).astype(int)
+        jnp.where(has_flown, air_after.elapsed, jnp.inf),
+        (air_before.free, air_before.quadratures),
+        1 + (angle / SHOWN).astype(int),
     )
-    return jax.tree.map(lambda kept, leaf: kept.at[place].set(leaf), record, new)
+    return jax.tree.map(lambda leaves, leaf: leaves.at[place].set(leaf), record, new)

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.hybrid import AbstractBatchedMode, Transition, TransitionPath
-from nonholonomic.integration import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING, AbstractProblem, ExtendedProblem
+from nonholonomic.integration import AbstractProblem, ExtendedProblem
+from nonholonomic.integration.status import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING
 from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.dynamics import NO_COSINE
@@ -58,8 +59,8 @@ class StickSlipMode(AbstractBatchedMode):
         """The velocity of a rolling top follows from the other components of its state."""
         if not self.kind.rolls:
             return state
-        own = self.kind.stick_slip.rolling.carried_along(state[: self._size(state)])
-        return jnp.concatenate([own, state[self._size(state) :]])
+        core_state = self.kind.stick_slip.rolling.carried_along(state[: self._size(state)])
+        return jnp.concatenate([core_state, state[self._size(state) :]])
 
     def between(self, motion: tuple[Onset, Array], passed: Float[Array, " times"]) -> Float[Array, "components times"]:
         onset, wait = motion
@@ -68,32 +69,32 @@ class StickSlipMode(AbstractBatchedMode):
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Stick, slip, or end if the contact is lost. Counts the changes from slip to rolling."""
         slipping = self._under(self.kind.stick_slip.slipping, state)
-        change = self.kind.ended(state, self._size(state), lambda at: slipping.field(left, at), self.scales, left)
+        change = self.kind.ended(state, self._size(state), lambda point: slipping.field(left, point), self.scales, left)
         onset, length = change.onset, change.onset.length
-        began = -change.wait / jnp.where(length > 0.0, length, 1.0)
-        falls = (self._event(state) > 0.0) & (self._event(change.state) <= 0.0)
+        wait_fraction = -change.wait / jnp.where(length > 0.0, length, 1.0)
+        is_falling = (self._event(state) > 0.0) & (self._event(change.state) <= 0.0)
         if self.spin is None:
-            crosses = falls & ~change.rolls & ~change.lost
+            crosses = is_falling & ~change.rolls & ~change.lost
             cosine = onset.of_components(slice(COS_THETA, COS_THETA + 1))
-            fraction = cosine.falls_to_zero(lambda part: part[0] - self.cos_angle, began)
+            fraction = cosine.falls_to_zero(lambda part: part[0] - self.cos_angle, wait_fraction)
         else:
             # The impulse that stops a slip changes the spin, too.
-            crosses = falls & ~change.lost
-            fraction = onset.falls_to_zero(self._event, began)
+            crosses = is_falling & ~change.lost
+            fraction = onset.falls_to_zero(self._event, wait_fraction)
         # Only a launch beyond the event, from which the top slips at once, reaches this point beyond the event.
-        beyond = (self._event(state) <= 0.0) & (not self.last)
-        crossing = jnp.where(beyond, 0.0, change.wait + fraction * length)
-        crosses |= beyond
+        is_beyond = (self._event(state) <= 0.0) & (not self.last)
+        crossing = jnp.where(is_beyond, 0.0, change.wait + fraction * length)
+        crosses |= is_beyond
         ends = crosses & (not self.last)
         status = jnp.where(change.elapsed >= left, REACHED_END, RUNNING)
         status = jnp.where(change.lost, LEFT_DOMAIN, jnp.where(ends, CROSSED, status))
         return Transition(
-            mode=jnp.where(beyond, int(self.kind.rolls), jnp.where(change.rolls, ROLLING, SLIPPING)),
-            state=jnp.where(beyond, state, jnp.where(ends, onset.at(fraction), change.state)),
+            mode=jnp.where(is_beyond, int(self.kind.rolls), jnp.where(change.rolls, ROLLING, SLIPPING)),
+            state=jnp.where(is_beyond, state, jnp.where(ends, onset.at(fraction), change.state)),
             elapsed=jnp.where(ends, crossing, change.elapsed),
             status=status,
             crossing_time=jnp.where(crosses, crossing, jnp.inf),
-            counts=(change.rolls & ~change.lost & ~beyond & (not self.kind.rolls)).astype(int)[None],
+            counts=(change.rolls & ~change.lost & ~is_beyond & (not self.kind.rolls)).astype(int)[None],
             record=None if self.passive is None else _recorded(change),
         )
 

@@ -46,16 +46,16 @@ class Quadratures(AbstractPassive):
         path_rate = u if self.of_mass else dynamics.frame.cyclic_rate(tuple(path), motion.velocity, frame_rate)
         # In a frame that turns, the components of the axis have another rate than the axis.
         if self.of_mass or not isinstance(dynamics, Dynamics):
-            falls = dot(sum_vectors(motion.rate[2:5], scale(-1.0, rate_in_frame(e, frame_rate))), c)
+            axial_rate = dot(sum_vectors(motion.rate[2:5], scale(-1.0, rate_in_frame(e, frame_rate))), c)
         else:
-            falls = dot(cross(L, e), c) * dynamics.per_transverse
-        rates = (*path_rate, *c_rate(c, e, falls, frame_rate), motion.spin_momentum / self.axial)
+            axial_rate = dot(cross(L, e), c) * dynamics.per_transverse
+        rates = (*path_rate, *c_rate(c, e, axial_rate, frame_rate), motion.spin_momentum / self.axial)
         return stacked((*motion.rate, *rates, motion.friction_power), state)
 
 
-def c_rate(c: Vector, axis: Vector, falls: Component, frame_rate: Tangent = (None, None)) -> tuple[Component, ...]:
-    """c' = (e x e') x c = -(e'.c) e, with `falls` = e'.c [1/s], in a frame that turns at a rate [rad/s]."""
-    return sum_vectors(scale(-falls, axis), rate_in_frame(c, frame_rate))
+def c_rate(c: Vector, axis: Vector, axial_rate: Component, frame_rate: Tangent = (None, None)) -> tuple[Component, ...]:
+    """c' = (e x e') x c = -(e'.c) e, with `axial_rate` = e'.c [1/s], in a frame that turns at a rate [rad/s]."""
+    return sum_vectors(scale(-axial_rate, axis), rate_in_frame(c, frame_rate))
 
 
 def trajectory_problem(modules: tuple[Scene, Launch], cells: int | None = None) -> TrajectoryProblem:
@@ -67,9 +67,9 @@ def trajectory_problem(modules: tuple[Scene, Launch], cells: int | None = None) 
 def _problem(scene: Scene, launch: Launch, cells: int | None) -> TrajectoryProblem:
     size, weight = scene.body.size, scene.body.mass * scene.gravity
     sine, cosine = jnp.sin(launch.theta), jnp.cos(launch.theta)
-    across = (cosine * jnp.cos(launch.azimuth), cosine * jnp.sin(launch.azimuth), -sine)
+    perpendicular = (cosine * jnp.cos(launch.azimuth), cosine * jnp.sin(launch.azimuth), -sine)
     path, zero, unit = scene.start(launch)[1], jnp.zeros(()), jnp.ones(())
-    values = (*path, *across, zero, zero)
+    values = (*path, *perpendicular, zero, zero)
     scales = (*[size] * len(path), unit, unit, unit, unit, weight * size)
     values, scales = (jnp.stack(jnp.broadcast_arrays(*rows)) for rows in (values, scales))
     rows = (scene.state(launch), scene.scales(launch), values, scales)

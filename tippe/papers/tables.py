@@ -128,8 +128,8 @@ def surface_of(words: list[str]) -> AbstractSurface:
     **Raises:** `ValueError` for an unknown name or illegal numbers.
     """
     name, *numbers = words
-    for known, kind in SURFACES.items():
-        if known.split()[0] == name and len(numbers) == len(known.split()) - 1:
+    for surface_name, kind in SURFACES.items():
+        if surface_name.split()[0] == name and len(numbers) == len(surface_name.split()) - 1:
             try:
                 arguments = [float(number) for number in numbers]
             except ValueError:
@@ -182,7 +182,7 @@ def printed_times(options: argparse.Namespace, eta: float) -> list[str] | None:
 
 def columns(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[tuple[str, list[str]]]:
     """The columns of the report: a heading of two words or more, and an entry for every theta(0)."""
-    shown = [("theta(0)|[rad]", [f"{theta:.4g}" for theta in options.theta])]
+    columns_to_print = [("theta(0)|[rad]", [f"{theta:.4g}" for theta in options.theta])]
     places = []
     for arena, scene in scenes(options).items():
         etas = [(f"eta={eta:.4g}", (slice(None), i)) for i, eta in enumerate(options.eta)]
@@ -191,11 +191,11 @@ def columns(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[tup
         table = by_arena[arena]
         for crossing, times in (("first", table.first_time), ("last", table.last_time)):
             entries = [_entry(t, word) for t, word in zip(times[cells], table.status[cells], strict=True)]
-            shown.append((f"{shown_name(options, arena)} {place}|{crossing} [s]", entries))
+            columns_to_print.append((f"{shown_name(options, arena)} {place}|{crossing} [s]", entries))
         printed = printed_times(options, options.eta[cells[1]]) if arena == "cylinder" else None
         if printed is not None:
-            shown.append(("paper|[s]", printed))
-    return shown
+            columns_to_print.append(("paper|[s]", printed))
+    return columns_to_print
 
 
 def _entry(seconds: float, word: str) -> str:
@@ -207,11 +207,13 @@ def _entry(seconds: float, word: str) -> str:
 
 def report(options: argparse.Namespace, by_arena: dict[str, Table]) -> str:
     """The tables side by side, as text."""
-    shown = columns(options, by_arena)
-    heads = [heading.split("|") for heading, _ in shown]
-    widths = [max(len(text) for text in (*head, *entries)) for head, (_, entries) in zip(heads, shown, strict=True)]
+    columns_to_print = columns(options, by_arena)
+    heads = [heading.split("|") for heading, _ in columns_to_print]
+    widths = [
+        max(len(text) for text in (*head, *entries)) for head, (_, entries) in zip(heads, columns_to_print, strict=True)
+    ]
     rows = [list(row) for row in zip(*heads, strict=True)]
-    rows += [list(row) for row in zip(*(entries for _, entries in shown), strict=True)]
+    rows += [list(row) for row in zip(*(entries for _, entries in columns_to_print), strict=True)]
     lines = [*described(options), ""]
     lines += ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     return "\n".join(lines)
@@ -271,12 +273,12 @@ def picture(options: argparse.Namespace, by_arena: dict[str, Table]) -> Any:
     panels, thetas = [], np.asarray(options.theta)
     for arena, scene in scenes(options).items():
         etas, _ = starts(options, scene)
-        shown = np.asarray(runs[arena].theta).reshape(len(etas), len(thetas), -1)
+        columns_to_print = np.asarray(runs[arena].theta).reshape(len(etas), len(thetas), -1)
         ends = by_arena[arena].last_time.reshape(len(thetas), len(etas))
         for i, eta in enumerate(etas):
             name = shown_name(options, arena)
             title = f"{name}, η(0) = {eta:.4g}" if counts_eta(scene) else name
-            panels.append(Panel(title, times, shown[i], thetas, ends[:, i]))
+            panels.append(Panel(title, times, columns_to_print[i], thetas, ends[:, i]))
     return draw_launches(panels, options.angle, "Dots: above the dashed angle for good")
 
 
@@ -285,10 +287,10 @@ def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[Sta
     turns over."""
     ends = np.stack([table.last_time.reshape(len(options.theta), -1)[:, 0] for table in by_arena.values()]).max(axis=0)
     # In a longer run, the samples would be too far apart to follow the spin.
-    longest = SAMPLES / max(abs(spin_of(options, scene)) for scene in scenes(options).values())
-    tilt = np.where(ends + 0.5 <= longest, options.theta, np.inf)
+    step = SAMPLES / max(abs(spin_of(options, scene)) for scene in scenes(options).values())
+    tilt = np.where(ends + 0.5 <= step, options.theta, np.inf)
     row = int(np.argmin(tilt if np.isfinite(tilt).any() else ends))
-    last = min(options.t1, longest, float(ends[row]) + 0.5)
+    last = min(options.t1, step, float(ends[row]) + 0.5)
     (_, runs), groups = drawn(options, last), []
     for arena, scene in scenes(options).items():
         name = f"{shown_name(options, arena)}, θ(0) = {options.theta[row]:.4g} rad"
@@ -298,17 +300,17 @@ def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[Sta
 
 def write_page(options: argparse.Namespace, by_arena: dict[str, Table], drawing: Path | None) -> Path:
     """Write the page: two moving tops if three.js is installed, the tables, and the picture if there is one."""
-    intro, rows = (
+    paragraphs, rows = (
         described(options),
         [list(row) for row in zip(*(heading.split("|") for heading, _ in columns(options, by_arena)), strict=True)],
     )
     rows += [list(row) for row in zip(*(entries for _, entries in columns(options, by_arena)), strict=True)]
-    below = "<h2>Inversion times</h2>" + table_as_html(rows, 2)
-    below += "".join(f'<p class="note">{escape(line)}</p>' for line in intro)
-    below += "" if drawing is None else "<h2>θ(t) of every launch</h2>" + picture_as_html(drawing)
-    above = "" if can_view() else f'<p class="note">{NO_VIEW}</p>'
+    sections = "<h2>Inversion times</h2>" + table_as_html(rows, 2)
+    sections += "".join(f'<p class="note">{escape(line)}</p>' for line in paragraphs)
+    sections += "" if drawing is None else "<h2>θ(t) of every launch</h2>" + picture_as_html(drawing)
+    note = "" if can_view() else f'<p class="note">{NO_VIEW}</p>'
     path = options.out / "index.html"
-    page(motions(options, by_arena) if can_view() else [], "A tippe top turns over", 0.5, above, below).save(path)
+    page(motions(options, by_arena) if can_view() else [], "A tippe top turns over", 0.5, note, sections).save(path)
     return path
 
 
@@ -321,23 +323,23 @@ def main(arguments: list[str] | None = None) -> int:
     """
     options = parser().parse_args(arguments)
     enable_compilation_cache()
-    started = time.perf_counter()
+    start_time = time.perf_counter()
     try:
         by_arena = tables(options)
         print(report(options, by_arena))
         with status_line("drawing"):
-            written, drawing = [options.out / f"{arena}.h5" for arena in by_arena], None
+            paths, drawing = [options.out / f"{arena}.h5" for arena in by_arena], None
             if find_spec("matplotlib") is None:
                 print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
             else:
                 drawing = options.out / "theta.png"
                 picture(options, by_arena).savefig(drawing, dpi=130)
-                written.append(drawing)
-            shown = write_page(options, by_arena, drawing)
+                paths.append(drawing)
+            columns_to_print = write_page(options, by_arena, drawing)
     except (ValueError, OSError) as error:
         print(f"python -m tippe --paper: {error}", file=sys.stderr)
         return 2
     cells = sum(table.status.size for table in by_arena.values())
-    see = f"To see it, open {shown}{'' if can_view() else f'. {NO_VIEW}'}"
-    print(closing_lines(cells, started, written, see))
+    see = f"To see it, open {columns_to_print}{'' if can_view() else f'. {NO_VIEW}'}"
+    print(closing_lines(cells, start_time, paths, see))
     return 0

@@ -10,7 +10,8 @@ from jaxtyping import Array, Float, Int
 
 from nonholonomic.geometry import scale, sum_vectors, vector_of
 from nonholonomic.hybrid import BETWEEN, Segment, hybrid_samples, solve_hybrid_dense
-from nonholonomic.integration import Settings, Status
+from nonholonomic.integration import Settings
+from nonholonomic.integration.status import Status
 from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.contact_dynamics import LOSSES, Motion
@@ -86,9 +87,9 @@ class ArenaTrajectory(HybridTrajectory):
         """The motion on the stem, at times at which the stem touches; the first tangent is the projection of the
         reported one."""
         scene, place = self.scene, parts(self._states).place
-        (distance, rate), own, stem = self.above, *balls(scene.body)
+        (distance, rate), main, stem = self.above, *balls(scene.body)
         # The flying top is treated as one whose own sphere is larger by the distance, so that this sphere touches.
-        flying = flight_state(lift_off(scene, self._states, False, Ball(own.offset, own.radius + distance)))
+        flying = flight_state(lift_off(scene, self._states, False, Ball(main.offset, main.radius + distance)))
         frame = carried_frame(scene)
         flying = flying._replace(velocity=vector_of(sum_vectors(flying.velocity, scale(rate, frame.normal(place[:3])))))
         ground = below(scene, flying, stem)
@@ -107,8 +108,8 @@ class ArenaTrajectory(HybridTrajectory):
         return "a flight does not end at the arena"
 
     @staticmethod
-    def parts_of(shown: Float[Array | np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
-        return shown[:14], shown[14:17], shown[17], shown[18], shown[19:]
+    def parts_of(rows: Float[Array | np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
+        return rows[:14], rows[14:17], rows[17], rows[18], rows[19:]
 
     @staticmethod
     def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:
@@ -176,5 +177,7 @@ def sampled_airborne(scene: Scene[Top], launch: Launch, times: Any, t1: Any, set
     for `simulate`, already checked."""
     samples = hybrid_samples(arena_modes, (scene, launch), times, t1, settings, counters=1)
     codes = jnp.array([int(status) for status in LOSSES])
-    grown = has_grown_between(scene, arena_modes((scene, launch), settings.tolerance), samples, energy_in, settings)
-    return sampled_flights(ArenaTrajectory, scene, times, samples, codes[loss(scene, samples.end_state)], grown)
+    energy_grew = has_grown_between(
+        scene, arena_modes((scene, launch), settings.tolerance), samples, energy_in, settings
+    )
+    return sampled_flights(ArenaTrajectory, scene, times, samples, codes[loss(scene, samples.end_state)], energy_grew)

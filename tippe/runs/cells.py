@@ -1,4 +1,4 @@
-"""The cells of an inversion table: run them, and compute the variables of each cell."""
+"""The cells of an inversion table: the job that runs them, and computes the variables of each cell."""
 
 from typing import Any, NamedTuple
 
@@ -8,18 +8,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.hybrid import HybridOutcome
-from nonholonomic.integration import (
-    CROSSED,
-    FAILED,
-    LEFT_DOMAIN,
-    UNRESOLVED,
-    Outcome,
-    Settings,
-    Status,
-    solve_by_diffrax,
-)
+from nonholonomic.integration import Outcome, Settings, solve_by_diffrax
+from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED, Status
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Variable
+from nonholonomic.validation import as_number
 
 from ..model.contact_dynamics import LOSSES
 from ..model.scene import Scene
@@ -28,6 +21,7 @@ from ..modes.inversion_problem import InversionProblem
 from .inversion import Inversions, checked, is_inverted
 from .run_kind import COUNTED, HYBRID, WORDS, RunKind
 from .sensitivities import sensitivities_of_cells
+from .time_error import errors_of, second_tolerance
 
 TIMES = {"time": "inversion time", "first_time": "first inversion time", "last_time": "last inversion time"}
 
@@ -59,10 +53,10 @@ WORD_OF_STATUS = {
 }
 
 
-def too_many_steps(t1: float, most: int, end: float) -> str:
+def too_many_steps(t1: float, max_steps: int, end: float) -> str:
     """Message for a run that needs more than the allowed steps."""
     return (
-        f"t1 = {t1:g} s is too long: the run needs more than {most:_} steps, which reached only {end:.4g} s; "
+        f"t1 = {t1:g} s is too long: the run needs more than {max_steps:_} steps, which reached only {end:.4g} s; "
         "take a shorter t1 or a larger tolerance"
     ).replace("_", " ")
 
@@ -161,12 +155,12 @@ class InversionRuns(NamedTuple):
     ) -> dict[str, Any]:
         """The variables that describe how the runs ended, except the first of two times."""
         ended, inverted, theta = at_the_end(scene, problem, outcome, self.last, tolerance)
-        others = [np.asarray(ended) == status for status in WORD_OF_STATUS]
-        code = np.select([np.asarray(inverted), *others], [0, *WORD_OF_STATUS.values()], 1)
-        lost = code == WORDS.index("contact_lost")
-        if lost.any():
+        conditions = [np.asarray(ended) == status for status in WORD_OF_STATUS]
+        code = np.select([np.asarray(inverted), *conditions], [0, *WORD_OF_STATUS.values()], 1)
+        is_lost = code == WORDS.index("contact_lost")
+        if is_lost.any():
             words = np.array([WORDS.index(status.word) for status in LOSSES])
-            code = np.where(lost, words[self._loss(scene, jnp.asarray(outcome.state))], code)
+            code = np.where(is_lost, words[self._loss(scene, jnp.asarray(outcome.state))], code)
         counts = zip(self.run_kind.counts, outcome.counts, strict=True) if isinstance(outcome, HybridOutcome) else ()
         return {
             self.times[-1]: np.where(inverted, outcome.crossing_time, np.inf),
@@ -189,3 +183,47 @@ class InversionRuns(NamedTuple):
 def _time_of_first(outcome: HybridOutcome) -> Float[np.ndarray, " cells"]:
     """The time of the first crossing, infinite in cells that ended otherwise."""
     return np.where(outcome.status == CROSSED, outcome.crossing_time, np.inf)
+
+
+class InversionJob(NamedTuple):
+    """The computation for every cell, as data that can be sent to another process.
+
+    `errors`: whether to run every cell again at another tolerance.
+    """
+
+    runs: InversionRuns
+    roots: dict[str, Any]
+    errors: bool
+
+    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+        """The variables of some cells, of which only the first `count` are run."""
+        runs, words = self.runs, self.runs.run_kind.words
+        if runs.method == "diffrax" and count == 0:
+            # The slow reference always computes a whole chunk, so a call only to compile would compute the first chunk
+            # twice.
+            return {}
+        variables = runs.results(self.roots, columns, count)
+        if self.errors:
+            settings = runs.settings.with_tolerance(as_number(second_tolerance(float(runs.settings.tolerance))))
+            second = runs._replace(settings=settings, slopes_by=[]).results(self.roots, columns, count)
+            silent = tuple(words.index(word) for word in ("failed", "unresolved") if word in words)
+            variables |= errors_of(variables, second, runs.times, runs.run_kind.counts, silent)
+        return variables
+
+
+class ScatteredJob(NamedTuple):
+    """A job whose cells are listed in columns, one row per cell. The results include the columns.
+
+    `columns`: full name of a number -> its value in every cell; `names`: full name -> name of the variable.
+    """
+
+    job: InversionJob
+    columns: dict[str, Any]
+    names: dict[str, str]
+
+    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+        """The variables of some cells, of which only the first `count` are run."""
+        values_of_columns = {number: values[columns["cell"]] for number, values in self.columns.items()}
+        return self.job(values_of_columns, count) | {
+            self.names[number]: values for number, values in values_of_columns.items()
+        }

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.integration import legal_run, require_run
-from nonholonomic.validation import Bound, all_bounds, is_traced, legal, nan_unless, require
+from nonholonomic.integration.checks import legal_run, require_run
+from nonholonomic.validation import IN_DEGREES, Bound, all_bounds, is_traced, legal, nan_unless, require
 from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.friction import Frictionless
@@ -82,8 +82,8 @@ def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, angle: An
     if np.any(np.asarray(theta) >= angle):
         start = np.max(np.asarray(theta))
         warnings.warn(
-            f"theta = {start:g} rad is not below the angle to be reached, {angle:.4g} rad: the top "
-            f"is inverted from the start; was theta in degrees? {start:g} degrees are {math.radians(start):.4g} rad",
+            f"theta = {start:g} rad is not below the angle to be reached, {angle:.4g} rad: the top is inverted from the "
+            f"start{IN_DEGREES.format(f'{start:g}')}",
             UserWarning,
             stacklevel=4,
         )

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.integration import Status
+from nonholonomic.integration.status import Status
 
 from ..model.scene import Scene
 
@@ -37,8 +37,8 @@ def if_balanced(run: Any, tolerance: float | Float[Array, ""]) -> Any:
     """A single run, with the status "unresolved" if its energy has grown or does not balance the work of friction and
     impacts."""
     energy = np.asarray(run.energy)
-    most = float(allowance(run.scene, np.max(np.abs(energy)), tolerance))
-    balanced = run.stats["energy_residual"] <= most and energy[-1] <= energy[0] + most
+    limit = float(allowance(run.scene, np.max(np.abs(energy)), tolerance))
+    balanced = run.stats["energy_residual"] <= limit and energy[-1] <= energy[0] + limit
     if balanced or run.status == Status.FAILED.word:
         return run
     return dataclasses.replace(run, status=Status.UNRESOLVED.word)
@@ -47,6 +47,6 @@ def if_balanced(run: Any, tolerance: float | Float[Array, ""]) -> Any:
 def why_unbalanced(run: Any) -> str:
     """The reason why such a run is "unresolved"."""
     energy = np.asarray(run.energy)
-    if (gained := energy[-1] - energy[0]) > run.stats["energy_residual"]:
-        return f"the energy has grown by {gained:.1e} J, although nothing drives the top"
+    if (gain := energy[-1] - energy[0]) > run.stats["energy_residual"]:
+        return f"the energy has grown by {gain:.1e} J, although nothing drives the top"
     return f"the energy residual of {run.stats['energy_residual']:.1e} J is beyond what the tolerance allows"

@@ -11,16 +11,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.hybrid import HybridOutcome
-from nonholonomic.integration import (
-    CROSSED,
-    FAILED,
-    LEFT_DOMAIN,
-    UNRESOLVED,
-    LaneState,
-    Settings,
-    Status,
-    crossing_time,
-)
+from nonholonomic.integration import LaneState, Settings, crossing_time
+from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED, Status
 from nonholonomic.parameters import numbers, readable_unit, with_numbers
 from nonholonomic.progress import status_line
 from nonholonomic.validation import all_bounds, legal, require_file
@@ -52,7 +44,7 @@ from .checks import check_reversible, check_run
 from .flight_trajectory import HybridTrajectory, level_modes
 from .launches import LONG_NAMES, UNITS
 from .quantities import OF_RIGID_BODIES, QUANTITIES
-from .trajectory import Trajectory, simulate
+from .trajectory import Trajectory, parts_of, simulate
 from .view import AXIS, BESIDE, DrawnMotion, aside, curve_of_rotation, show
 
 Numbers = Float[Array, " numbers"]
@@ -121,8 +113,8 @@ def explore(
     if path is not None:
         require_file(path, "path", ".html", ".htm")
     live = live_run(scene, launch, sliders, t1)
-    drawn = stage_at_start(scene, launch, t1) if flies(scene) else stage_of_runs(scene, launch, live.sliders, float(t1))
-    page = live_page(live, drawn)
+    stage = stage_at_start(scene, launch, t1) if flies(scene) else stage_of_runs(scene, launch, live.sliders, float(t1))
+    page = live_page(live, stage)
     if path is not None:
         page.save(path)
     return page
@@ -137,12 +129,12 @@ def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float
     roots = {"scene": scene, "launch": launch}
     ranges = default_ranges(scene, launch) if sliders is None else sliders
     # The position of the stem's end is relative to the centre of mass, so another offset would change the shape.
-    drawn = ("scene.body.stem.", "scene.body.offset") if has_stem(scene) else ()
-    knobs = sliders_of(ranges, roots, LONG_NAMES, UNITS | scene.body.units | scene.friction.units, drawn)
+    paths_drawn = ("scene.body.stem.", "scene.body.offset") if has_stem(scene) else ()
+    knobs = sliders_of(ranges, roots, LONG_NAMES, UNITS | scene.body.units | scene.friction.units, paths_drawn)
 
     def modules(values: Numbers) -> tuple[Scene, Launch]:
-        replaced = with_numbers(roots, {knob.path: value for knob, value in zip(knobs, values, strict=True)})
-        return replaced["scene"], replaced["launch"]
+        new_roots = with_numbers(roots, {knob.path: value for knob, value in zip(knobs, values, strict=True)})
+        return new_roots["scene"], new_roots["launch"]
 
     def allowed(values: Numbers) -> Bool[Array, ""]:
         scene, launch = modules(values)
@@ -250,14 +242,14 @@ def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float
     ranges = {"theta": (min(0.02, theta), max(0.6, theta)), "spin": tuple(sorted((0.4 * spin, 1.4 * spin)))}
     if spin == 0.0:
         ranges["spin"] = (0.0, 200.0)
-    known, parts = numbers("scene", scene), {"mu": (0.1, 3.0)} | ({} if has_stem(scene) else {"offset": (0.5, 1.5)})
-    for name, (least, most) in parts.items():
-        path = next((path for path in known if path.endswith(f".{name}")), None)
-        if path is not None and known[path] > 0.0:
-            value = float(known[path])
+    values, parts = numbers("scene", scene), {"mu": (0.1, 3.0)} | ({} if has_stem(scene) else {"offset": (0.5, 1.5)})
+    for name, (low, high) in parts.items():
+        path = next((path for path in values if path.endswith(f".{name}")), None)
+        if path is not None and values[path] > 0.0:
+            value = float(values[path])
             ranges[path] = (
-                least * value,
-                min(most * value, 0.9 * float(scene.body.size)) if name == "offset" else most * value,
+                low * value,
+                min(high * value, 0.9 * float(scene.body.size)) if name == "offset" else high * value,
             )
     return ranges
 
@@ -267,9 +259,9 @@ def outcome(problem: InversionProblem, lane: LaneState) -> tuple[Int[Array, ""],
     inverted = lane.status == CROSSED
     # A run that starts above the angle is inverted at once.
     time = jnp.where(lane.time > 0.0, crossing_time(problem, lane.time, lane.state), 0.0)
-    lost = jnp.array([int(status) for status in LOSSES])[problem.dynamics.loss(lane.state)]
-    others = jnp.where(lane.status == FAILED, int(Status.FAILED), int(Status.NOT_INVERTED))
-    status = jnp.where(lane.status == LEFT_DOMAIN, lost, others)
+    loss_codes = jnp.array([int(status) for status in LOSSES])[problem.dynamics.loss(lane.state)]
+    codes = jnp.where(lane.status == FAILED, int(Status.FAILED), int(Status.NOT_INVERTED))
+    status = jnp.where(lane.status == LEFT_DOMAIN, loss_codes, codes)
     return jnp.where(inverted, int(Status.INVERTED), status)[0], jnp.where(inverted, time, jnp.inf)[0]
 
 
@@ -295,15 +287,17 @@ def stage_of_runs(scene: Scene, launch: Launch, knobs: tuple[Slider, ...], t1: f
 def stage_at_start(scene: Scene[Top], launch: Launch, t1: float) -> Stage:
     """A top on a level plane at its launch; the page replaces it by a simulated run before it is visible."""
     start = DrawnMotion(*(np.repeat(np.asarray(part), 2, axis=0) for part in _motion_at_start(scene, launch)))
-    drawn, size = show(scene, start._replace(times=np.array([0.0, 1.0])), 0, ""), float(scene.body.size)
+    initial_show, size = show(scene, start._replace(times=np.array([0.0, 1.0])), 0, ""), float(scene.body.size)
     # Slips grow as the top rises; a slip at half the speed of the equator gets the longest arrow.
-    normal_force, slip, *others = drawn.arrows
+    normal_force, slip, *arrows = initial_show.arrows
     assert slip.limit is not None
     fastest = 0.5 * size * float(np.linalg.norm(start.angular_velocity[0]))
-    drawn = drawn._replace(arrows=(normal_force, slip._replace(scale=slip.limit / max(fastest, 1e-12)), *others))
+    initial_show = initial_show._replace(
+        arrows=(normal_force, slip._replace(scale=slip.limit / max(fastest, 1e-12)), *arrows)
+    )
     reach = REACH * math.sqrt(float(scene.gravity) * size) * t1
     ground = arena(scene.surface, start.contact, start.normal[0], max(reach, 10.0 * size), 2.5 * size)
-    return Stage("", ground, (drawn,), follows=True)
+    return Stage("", ground, (initial_show,), follows=True)
 
 
 @eqx.filter_jit
@@ -312,46 +306,42 @@ def _motion_at_start(scene: Scene[Top], launch: Launch) -> DrawnMotion[Array]:
     assert isinstance(modes[0], Slide)
     # The other tops stand on their stem.
     rows = dataclasses.replace(modes[0], number=number).shown(state)
-    return DrawnMotion.of(hybrid_run(scene, number, rows, jnp.zeros(1)))
+    return DrawnMotion.of(hybrid_moment(scene, number, rows, jnp.zeros(1)))
 
 
 def smooth_frame(scene: Scene, problem: TrajectoryProblem, lane: LaneState) -> Frame:
     """The drawn quantities of a top at one time in contact."""
-    lean, rows = problem.leading, lane.state
-    parts = (rows[:lean], rows[lean:-2], rows[-2], rows[-1])
-    return frame(scene, Trajectory(lane.time, scene, *parts, status=0, end_time=lane.time[0], stats={}, dense=None))
+    return frame(scene, Trajectory(lane.time, scene, *parts_of(problem.leading, lane.state)))
 
 
 def hybrid_frame(scene: Scene, number: Int[Array, "1"], rows: Float[Array, "17 1"], time: Float[Array, "1"]) -> Frame:
     """The drawn quantities of a top at one time in contact or in flight; `rows` are the output rows of the modes."""
-    return frame(scene, hybrid_run(scene, number, rows, time))
+    return frame(scene, hybrid_moment(scene, number, rows, time))
 
 
-def hybrid_run(
+def hybrid_moment(
     scene: Scene[Top], number: Int[Array, "1"], rows: Float[Array, "17 1"], time: Float[Array, "1"]
 ) -> HybridTrajectory:
     """A run in contact or in flight, at a single time."""
-    states, place, spin_angle, work, distance = HybridTrajectory.parts_of(rows)
-    ends = (0, time[0], {}, None, distance, number, None)
     kind: Any = HybridTrajectory
-    return kind(time, scene, states, place, spin_angle, work, *ends)
+    return kind(time, scene, *kind.parts_of(rows), number)
 
 
 def frame(scene: Scene, run: Any) -> Frame:
     """The drawn quantities of a top for a run with a single time, in the order of `view.show`."""
     motion = DrawnMotion(*(part[0] for part in DrawnMotion.of(run)))
     radius = scene.body.size
-    lifted = motion.contact + 0.02 * radius * motion.normal
+    arrow_start = motion.contact + 0.02 * radius * motion.normal
     offset = scene.body.offset if isinstance(scene.body, Top) else 0.0
     centre = motion.position - offset * motion.axis
     weight = jnp.stack([jnp.zeros(()), jnp.zeros(()), -scene.body.mass * scene.gravity])
     return Frame(
         normal=motion.normal,
         bodies=((motion.position, quaternion(motion.rotation)),),
-        traces=((lifted, None), (AXIS * radius * motion.axis, motion.position)),
+        traces=((arrow_start, None), (AXIS * radius * motion.axis, motion.position)),
         arrows=(
-            (lifted + BESIDE * radius * aside(motion.normal[None])[0], motion.normal_force * motion.normal),
-            (lifted, motion.slip),
+            (arrow_start + BESIDE * radius * aside(motion.normal[None])[0], motion.normal_force * motion.normal),
+            (arrow_start, motion.slip),
             (centre, weight),
             (centre, motion.angular_velocity),
             (centre, motion.angular_momentum),

@@ -15,7 +15,9 @@ from nonholonomic.derivatives import (
     in_groups,
     tangents_by,
 )
-from nonholonomic.integration import CROSSED, FAILED, MOST_STEPS, Settings, crossing_time, traced_solve_ensemble
+from nonholonomic.integration import Lanes, Settings, crossing_time, traced_solve_ensemble
+from nonholonomic.integration.settings import MOST_STEPS
+from nonholonomic.integration.status import CROSSED, FAILED
 from nonholonomic.progress import status_line
 from nonholonomic.validation import as_number, is_traced
 from nonholonomic.xla_cpu import greatest, least
@@ -118,33 +120,36 @@ class ExtendedSolve(AbstractDifferentiableSolve):
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
         """The extended times of every cell, and their derivatives along tangents (as of `VariationalProblem`)."""
         is_legal, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
-        varied = VariationalProblem(problem, tangents, True)
+        variational = VariationalProblem(problem, tangents, True)
         # A fit may try parameters that are far off.
         settings = Settings(tolerance, max_steps=MOST_STEPS)
         outcome, _ = traced_solve_ensemble(
-            varied, t1, jnp.asarray(cells), settings, one_kernel=not nested, n_blocks=1 + len(tangents)
+            variational, t1, jnp.asarray(cells), settings, one_kernel=not nested, n_blocks=1 + len(tangents)
         )
-        state, *variations = varied.parts(outcome.state)
-        crossed = outcome.status == CROSSED
+        state, *variations = variational.parts(outcome.state)
+        has_crossed = outcome.status == CROSSED
 
         def extended(problem: InversionProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
             # A cell that starts beyond the angle has reached it at time 0.
             time = jnp.where(outcome.end_time > 0.0, crossing_time(problem, outcome.end_time, state), 0.0)
-            angle = jnp.arccos(problem.cos_angle)
-            missing = _e_folds(state, angle)
-            whole = greatest(_e_folds(problem.states, angle), 1.0)
-            return jnp.where(crossed, time, t1 * (1.0 + missing / whole))
+            end, start = (inclination(parts(states).axis) for states in (state, problem.states))
+            return jnp.where(has_crossed, time, beyond_horizon(end, start, jnp.arccos(problem.cos_angle), t1))
 
-        good = is_legal & (outcome.status != FAILED)
-        times = jnp.where(good, extended(problem, state), jnp.nan)
+        is_good = is_legal & (outcome.status != FAILED)
+        times = jnp.where(is_good, extended(problem, state), jnp.nan)
         slopes = [
-            jnp.where(good, eqx.filter_jvp(extended, (problem, state), moved)[1], jnp.nan)
-            for moved in zip(tangents, variations, strict=True)
+            jnp.where(is_good, eqx.filter_jvp(extended, (problem, state), direction)[1], jnp.nan)
+            for direction in zip(tangents, variations, strict=True)
         ]
         return times, slopes
 
 
-def _e_folds(state: Float[Array, "components cells"], angle: Float[Array, "..."]) -> Float[Array, " cells"]:
-    """Number of e-folds by which theta must still grow to reach an angle."""
-    theta = inclination(parts(state).axis)
-    return jnp.log(angle / least(greatest(theta, LEAST_ANGLE), angle))
+def beyond_horizon(end: Lanes, start: Lanes, angle: Any, t1: Any) -> Lanes:
+    """The time [s] of a top that has not inverted by `t1`, with theta at the end and at the start of the run [rad]; see
+    `extended_inversion_time`."""
+
+    def e_folds(theta: Lanes) -> Lanes:
+        """Number of e-folds by which theta must still grow to reach the angle."""
+        return jnp.log(angle / least(greatest(theta, LEAST_ANGLE), angle))
+
+    return t1 * (1.0 + e_folds(end) / greatest(e_folds(start), 1.0))

@@ -16,7 +16,8 @@ from nonholonomic.hybrid import (
     hybrid_samples,
     solve_hybrid_dense,
 )
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED, Settings, Status
+from nonholonomic.integration import Settings
+from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED, Status
 from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.dynamics import NO_COSINE
@@ -83,13 +84,14 @@ class HybridTrajectory(AbstractTrajectory):
     cyclic: Float[np.ndarray, "5 times"]
     spin_angle: Float[np.ndarray, " times"]
     work: Float[np.ndarray, " times"]
-    status: Any
-    end_time: float | Float[Array, ""]
-    stats: dict[str, Any]
-    dense: Any
     distance: Float[np.ndarray, "2 times"]
     contact: Int[np.ndarray, " times"]
-    hops: Float[np.ndarray, "hops 2"] | None
+    # The end of the run; not needed where only the times are read, as in a page.
+    status: Any = None
+    end_time: Any = None
+    stats: dict[str, Any] = eqx.field(default_factory=dict)
+    dense: Any = None
+    hops: Float[np.ndarray, "hops 2"] | None = None
 
     unused = (*AbstractTrajectory.unused, "hops")
     by_time = (*AbstractTrajectory.by_time, "distance", "contact")
@@ -116,7 +118,7 @@ class HybridTrajectory(AbstractTrajectory):
         """The touching sphere; in flight, and if both touch, the top's own."""
         spheres = balls(self.scene.body)
         return Ball(
-            *(jnp.where(self.contact == 1, stem, own) for own, stem in zip(spheres[0], spheres[-1], strict=True))
+            *(jnp.where(self.contact == 1, stem, main) for main, stem in zip(spheres[0], spheres[-1], strict=True))
         )
 
     @of_each_run
@@ -128,8 +130,8 @@ class HybridTrajectory(AbstractTrajectory):
     def normal_force(self) -> Float[Array, " times"]:
         """Normal force [N]; 0 in flight. If both spheres touch, this is the sum of both forces, the weight."""
         motion = standing_on(self.scene.dynamics, self._ball).motion(self._states)
-        both = jnp.where(self.contact == BOTH, self.scene.body.mass * self.scene.gravity, motion.normal_force)
-        return jnp.where(self.contact < 0, 0.0, both)
+        total_force = jnp.where(self.contact == BOTH, self.scene.body.mass * self.scene.gravity, motion.normal_force)
+        return jnp.where(self.contact < 0, 0.0, total_force)
 
     @of_each_run
     def slip(self) -> Float[Array, "times 2"]:
@@ -147,10 +149,10 @@ class HybridTrajectory(AbstractTrajectory):
         )
 
     @staticmethod
-    def parts_of(shown: Float[Array | np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
+    def parts_of(rows: Float[Array | np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
         """State, cyclic coordinates, spin angle, work, and the distance with its rate, from the output rows of the
         modes."""
-        return shown[:8], shown[8:13], shown[13], shown[14], shown[15:]
+        return rows[:8], rows[8:13], rows[13], rows[14], rows[15:]
 
     @staticmethod
     def work_in(piece: Segment) -> float:
@@ -216,8 +218,10 @@ def simulate_hybrid(scene: Scene[Top], launch: Launch, t1: float, times: Any, se
 def sampled_hybrid(scene: Scene[Top], launch: Launch, times: Any, t1: Any, settings: Settings) -> HybridTrajectory:
     """Run one launch of a hybrid scene inside a transformation. **Arguments:** as for `simulate`, already checked."""
     samples = hybrid_samples(level_modes, (scene, launch), times, t1, settings, counters=1)
-    grown = has_grown_between(scene, level_modes((scene, launch), settings.tolerance), samples, energy_in, settings)
-    return sampled_flights(HybridTrajectory, scene, times, samples, jnp.asarray(int(Status.JAMMED)), grown)
+    energy_grew = has_grown_between(
+        scene, level_modes((scene, launch), settings.tolerance), samples, energy_in, settings
+    )
+    return sampled_flights(HybridTrajectory, scene, times, samples, jnp.asarray(int(Status.JAMMED)), energy_grew)
 
 
 def has_grown_between(scene: Scene[Top], built: Any, samples: HybridSamples, energies: Any, settings: Settings) -> Any:
@@ -227,35 +231,33 @@ def has_grown_between(scene: Scene[Top], built: Any, samples: HybridSamples, ene
     least and the greatest energy of a state in a mode.
     """
     _, first, state = built
-    after, _ = energies(scene, samples.end_state[:, None], samples.end_mode[None].astype(int))
-    return has_grown(scene, energies(scene, state, first)[1], after, settings.tolerance)[0]
+    end_energy, _ = energies(scene, samples.end_state[:, None], samples.end_mode[None].astype(int))
+    return has_grown(scene, energies(scene, state, first)[1], end_energy, settings.tolerance)[0]
 
 
 def sampled_flights(
-    kind: type[HybridTrajectory],
+    kind: type[Any],
     scene: Scene[Top],
     times: Any,
     samples: HybridSamples,
     lost: Int[Array, ""],
-    grown: Bool[Array, ""],
+    energy_grew: Bool[Array, ""],
 ) -> Any:
-    """A trajectory of the given class from samples. `lost` is the status code for a run that left its domain, and
-    `grown` whether the run has gained energy.
+    """A trajectory of the given class, a `HybridTrajectory`, from samples. `lost` is the status code for a run that left
+    its domain, and `energy_grew` whether the run has gained energy.
     """
-    states, place, spin_angle, work, distance = kind.parts_of(samples.shown)
     # After the end, no sphere touches.
     number = jnp.where(jnp.isnan(samples.number), BETWEEN, samples.number).astype(int)
     ended = {code: jnp.asarray(int(status)) for code, status in STATUS.items()} | {LEFT_DOMAIN: lost}
-    ended |= {code: jnp.where(grown, int(Status.UNRESOLVED), ended[code]) for code in (REACHED_END, LEFT_DOMAIN)}
+    ended |= {code: jnp.where(energy_grew, int(Status.UNRESOLVED), ended[code]) for code in (REACHED_END, LEFT_DOMAIN)}
     status = sum(jnp.where(samples.status == code, index, 0) for code, index in ended.items())
     stats = {"accepted": samples.steps - samples.rejected, "rejected": samples.rejected, "hops": samples.counts[0]}
     stats = {name: count.astype(int) for name, count in stats.items()}
-    ends = (status, samples.end_time, stats, None, distance, kind.touching(number), None)
-    return kind(times, scene, states, place, spin_angle, work, *ends)
+    return kind(times, scene, *kind.parts_of(samples.shown), kind.touching(number), status, samples.end_time, stats)
 
 
 def flights_of(
-    kind: type[HybridTrajectory],
+    kind: type[Any],
     scene: Scene[Top],
     path: HybridPath,
     status: str,
@@ -263,14 +265,12 @@ def flights_of(
     times: Any,
     tolerance: float | Float[Array, ""],
 ) -> Any:
-    """A trajectory of the given class along a path, at given times or at those of its steps.
+    """A trajectory of the given class, a `HybridTrajectory`, along a path, at given times or at those of its steps.
 
     A run whose energy does not balance the work of friction and impacts ends as "unresolved".
     """
-    shown = path.times
-    states, place, spin_angle, work, distance = kind.parts_of(path.at(shown))
-    ends = (status, path.end_time, {}, path, distance, kind.touching(path.numbers(shown)), hops)
-    run = kind(shown, scene, states, place, spin_angle, work, *ends)
+    parts, contact = kind.parts_of(path.at(path.times)), kind.touching(path.numbers(path.times))
+    run = kind(path.times, scene, *parts, contact, status, path.end_time, dense=path, hops=hops)
     in_contact = sum(kind.work_in(segment) for segment in path.segments)
     # The remaining work is that of the impacts.
     run = run.with_stats(path, impact_loss=float(in_contact - path.state[-1]))

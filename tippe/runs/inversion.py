@@ -22,16 +22,8 @@ from nonholonomic.hybrid import (
     traced_solve_hybrid,
     traced_solve_hybrid_with_tangents,
 )
-from nonholonomic.integration import (
-    CROSSED,
-    FAILED,
-    REACHED_END,
-    UNRESOLVED,
-    Outcome,
-    Settings,
-    solve_ensemble,
-    traced_solve_ensemble,
-)
+from nonholonomic.integration import Outcome, Settings, solve_ensemble, traced_solve_ensemble
+from nonholonomic.integration.status import CROSSED, FAILED, REACHED_END, UNRESOLVED
 
 from ..model.scene import Scene
 from ..modes.airborne_ends import on_the_ground
@@ -117,8 +109,8 @@ class Inversions(eqx.Module):
             # The derivatives need the run only up to the event, whose time is known.
             outcome = self.solve(t1, cells, settings, solvers)
             t1 = xp.where(xp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
-        moved = tuple((tangent.modes, tangent.problem.states) for tangent in tangents)
-        arguments = (self.modes, moved, *self._start(xp), t1, cells, settings)
+        hybrid_tangents = tuple((tangent.modes, tangent.problem.states) for tangent in tangents)
+        arguments = (self.modes, hybrid_tangents, *self._start(xp), t1, cells, settings)
         run, sensitivities = solvers.hybrid_with_tangents(
             *arguments, counters=len(self.kind.counts), ends_on_event=not self.last
         )
@@ -141,8 +133,8 @@ def checked(
     first: Any = None if kind.modes is None else kind.modes(scene, problem, tolerance, False)[1]
     mode: Any = outcome.mode if isinstance(outcome, HybridOutcome) else None
     state = jnp.asarray(outcome.state)[: len(problem.states)]
-    before, after = kind.energy_in(scene, problem.states, first)[1], kind.energy_in(scene, state, mode)[0]
-    grown = has_grown(scene, before, after, tolerance) & (outcome.status != FAILED)
+    energy_before, energy_after = kind.energy_in(scene, problem.states, first)[1], kind.energy_in(scene, state, mode)[0]
+    grown = has_grown(scene, energy_before, energy_after, tolerance) & (outcome.status != FAILED)
     outcome = outcome._replace(status=jnp.where(grown, UNRESOLVED, outcome.status))
     return outcome._replace(state=on_the_ground(scene, state, mode)) if kind.flight_state else outcome
 
@@ -152,5 +144,5 @@ def is_inverted(outcome: Outcome | HybridOutcome, problem: InversionProblem, las
     angle."""
     if not last:
         return outcome.status == CROSSED
-    above = problem.event_function(jnp.asarray(outcome.state)) <= 0.0
-    return (outcome.status == REACHED_END) & above & jnp.isfinite(outcome.crossing_time)
+    is_above = problem.event_function(jnp.asarray(outcome.state)) <= 0.0
+    return (outcome.status == REACHED_END) & is_above & jnp.isfinite(outcome.crossing_time)

@@ -14,7 +14,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from nonholonomic.derivatives import AbstractDifferentiableSolve, differentiable_solve, tangents_by
 from nonholonomic.hybrid import HybridOutcome
-from nonholonomic.integration import FAILED, UNRESOLVED, Outcome, Settings, explicit_tableau
+from nonholonomic.integration import Outcome, Settings, explicit_tableau
+from nonholonomic.integration.status import FAILED, UNRESOLVED
 from nonholonomic.progress import status_line
 from nonholonomic.validation import as_number, is_traced
 
@@ -103,8 +104,8 @@ def first_or_last_time(
     solve = InversionSolve(len(leaves) - 2, structure, settings.with_tolerance(None), crossing == "last", unchecked)
     time = differentiable_solve(solve, *leaves)
     if not is_traced(time) and not unchecked and np.isnan(time):
-        known = None if angle is None else np.asarray(angle).item()
-        explain_failure(scene, launch, float(t1), known, crossing, settings)
+        concrete_angle = None if angle is None else np.asarray(angle).item()
+        explain_failure(scene, launch, float(t1), concrete_angle, crossing, settings)
     return nan_if_illegal(time, structure, unchecked, leaves)
 
 
@@ -121,17 +122,17 @@ def explain_failure(
 
     **Arguments:** as for `inversion_time`.
     """
-    most = settings.max_steps
+    max_steps = settings.max_steps
     runs = InversionRuns(run_kind_of(scene), t1, angle, crossing, settings, "ensemble", [])
     cell = {name: values[0] for name, values in runs.results({"scene": scene, "launch": launch}, {}, 1).items()}
     word = runs.run_kind.words[cell["status"]]
-    if word == "failed" and cell["steps"] >= most:
-        raise ValueError(too_many_steps(t1, most, cell["end_time"]))
+    if word == "failed" and cell["steps"] >= max_steps:
+        raise ValueError(too_many_steps(t1, max_steps, cell["end_time"]))
     event = "reversal" if angle is None else "inversion"
-    why = f": {why_unresolved(runs.run_kind)}" if word == "unresolved" else ""
+    reason = f": {why_unresolved(runs.run_kind)}" if word == "unresolved" else ""
     end = f"at {cell['end_time']:.6g} s, at {cell['end_theta']:.6g} rad"
     warnings.warn(
-        f"the {event} time is NaN: the run ended as {word!r} {end}{why}",
+        f"the {event} time is NaN: the run ended as {word!r} {end}{reason}",
         UserWarning,
         stacklevel=4,
     )
@@ -176,13 +177,13 @@ class InversionSolve(AbstractDifferentiableSolve):
 
     def _modules(self, leaves: Sequence[Array]) -> Any:
         """Scene, launch, angle, horizon and tolerance; `None` for omitted leaves at the end."""
-        unused = (None,) * (self.structure.num_leaves - len(leaves))
-        return jax.tree.unflatten(self.structure, (*leaves, *unused))
+        no_tangents = (None,) * (self.structure.num_leaves - len(leaves))
+        return jax.tree.unflatten(self.structure, (*leaves, *no_tangents))
 
     def _inversions(self, leaves: tuple[Array, ...], cells: int | None) -> Inversions:
         """The launches of some cells, from the leaves that move the event, and the tolerance."""
-        *movable, tolerance = leaves
-        scene, launch, angle, *_ = self._modules(movable)
+        *numbers, tolerance = leaves
+        scene, launch, angle, *_ = self._modules(numbers)
         assert cells is not None
         return Inversions.of(scene, InversionProblem.of(scene, launch, angle, cells), tolerance, self.last)
 
@@ -198,6 +199,6 @@ class InversionSolve(AbstractDifferentiableSolve):
         """The times of inversion and their derivatives: infinite and 0 where there is none, NaN where the run failed."""
         outcome = checked(self._modules(leaves)[0], inversions.problem, outcome, tolerance)
         inverted = is_inverted(outcome, inversions.problem, self.last)
-        good = is_legal & (outcome.status != FAILED) & (outcome.status != UNRESOLVED)
-        time = jnp.where(good, jnp.where(inverted, outcome.crossing_time, jnp.inf), jnp.nan)
-        return time, [jnp.where(good, jnp.where(inverted, slope, 0.0), jnp.nan) for slope in slopes]
+        is_good = is_legal & (outcome.status != FAILED) & (outcome.status != UNRESOLVED)
+        time = jnp.where(is_good, jnp.where(inverted, outcome.crossing_time, jnp.inf), jnp.nan)
+        return time, [jnp.where(is_good, jnp.where(inverted, slope, 0.0), jnp.nan) for slope in slopes]

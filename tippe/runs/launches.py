@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from nonholonomic.integration import require_run
+from nonholonomic.integration.checks import require_run
 from nonholonomic.parameters import description, full_axes, numbers, with_numbers
 from nonholonomic.sweeps import Axis, axis, cells_to_check
 from nonholonomic.validation import require_kind
@@ -91,27 +91,27 @@ def launches(
     if axes is not None and not (isinstance(axes, dict) and all(isinstance(number, str) for number in axes)):
         raise ValueError(f"axes = {axes!r} must be a dictionary, path of a number -> values")
     axes = full_axes(axes or {}, [*variable_numbers(scene), *NUMBERS_OF_A_LAUNCH])
-    known = numbers("scene.friction", scene.friction)
-    of_mu = next((number for number in known if number.endswith(".mu")), "scene.friction.mu")
+    friction_numbers = numbers("scene.friction", scene.friction)
+    of_mu = next((number for number in friction_numbers if number.endswith(".mu")), "scene.friction.mu")
     paths = {name: of_mu if name == "mu" else f"launch.{name}" for name in launch_values}
     values = {paths[name]: value for name, value in launch_values.items() if name != "mu" or value is not None}
     for number in values:
         if number in axes:
             raise ValueError(f"axes: {number!r} has its own argument")
     values |= axes
-    fixed = {number: value for number, value in values.items() if np.ndim(value) == 0}
-    launch, several = _with_room(scene, values)
-    units = UNITS | scene.body.units | scene.friction.units | dict(several.values())
-    names = {number: several.get(number, (number.rsplit(".", 1)[-1],))[0] for number in values}
+    scalars = {number: value for number, value in values.items() if np.ndim(value) == 0}
+    launch, axes_of_lists = _with_room(scene, values)
+    units = UNITS | scene.body.units | scene.friction.units | dict(axes_of_lists.values())
+    names = {number: axes_of_lists.get(number, (number.rsplit(".", 1)[-1],))[0] for number in values}
     # `place` replaces the argument `eta`.
     counts = Counter(name for number, name in names.items() if number != "launch.eta" or launch.place is None)
     grid = []
     for number, name in names.items():
-        if number not in fixed:
-            alone = counts[name] == 1 and name not in taken
+        if number not in scalars:
+            is_unique = counts[name] == 1 and name not in taken
             unit, long_name = units.get(name, "1"), LONG_NAMES.get(name, name)
-            grid.append(axis(name if alone else number, number, unit, values[number], long_name))
-    roots = with_numbers({"scene": scene, "launch": launch}, fixed)
+            grid.append(axis(name if is_unique else number, number, unit, values[number], long_name))
+    roots = with_numbers({"scene": scene, "launch": launch}, scalars)
     # The numbers of axes are 0 here, which may not be a place on the arena; starts are checked cell by cell.
     require_run(roots["scene"], roots["launch"], t1, tolerance, (Scene, Launch), LISTS)
     # The modules check their numbers, which may be illegal only in combination.
@@ -128,8 +128,10 @@ def rows(lists: list[Axis]) -> dict[str, Any]:
     """
     lengths = {grid_axis.name: len(grid_axis.values) for grid_axis in lists}
     if len(set(lengths.values())) != 1:
-        shown = ", ".join(f"{name} of {length}" for name, length in lengths.items()) or "none"
-        raise ValueError(f"scattered = True takes lists of one length, not {shown}; the other numbers are scalars")
+        lengths_text = ", ".join(f"{name} of {length}" for name, length in lengths.items()) or "none"
+        raise ValueError(
+            f"scattered = True takes lists of one length, not {lengths_text}; the other numbers are scalars"
+        )
     return {grid_axis.number: grid_axis.values for grid_axis in lists}
 
 

@@ -11,7 +11,9 @@ from jaxtyping import Array, Float, Int, Shaped
 
 from nonholonomic.derivatives import exponent_of, growth
 from nonholonomic.geometry import cross, vector_of
-from nonholonomic.integration import LEFT_DOMAIN, REACHED_END, Settings, explicit_tableau, tolerance_bound
+from nonholonomic.integration import Settings, explicit_tableau
+from nonholonomic.integration.checks import tolerance_bound
+from nonholonomic.integration.status import LEFT_DOMAIN, REACHED_END
 from nonholonomic.progress import status_line
 from nonholonomic.validation import require, require_kind
 
@@ -119,16 +121,18 @@ def lyapunov_exponent(
     problem = dataclasses.replace(problem, dynamics=scene.dynamics, cos_angle=jnp.asarray(NO_COSINE))
     growths = growth(problem, generic_direction(scene, launch, cells), float(t1), STRETCHES, settings)
     exponent, error = exponent_of(growths.logarithm, float(t1))
-    whole = growths.status == REACHED_END
-    lost = np.array([status.word for status in LOSSES])[np.asarray(problem.dynamics.loss(jnp.asarray(growths.state)))]
-    words = np.select([whole, growths.status == LEFT_DOMAIN], ["completed", lost], "failed")
+    is_complete = growths.status == REACHED_END
+    loss_words = np.array([status.word for status in LOSSES])[
+        np.asarray(problem.dynamics.loss(jnp.asarray(growths.state)))
+    ]
+    words = np.select([is_complete, growths.status == LEFT_DOMAIN], ["completed", loss_words], "failed")
     times = t1 * np.arange(1, STRETCHES + 1) / STRETCHES
-    passed = np.minimum(times[:, None], growths.end_time)
+    elapsed = np.minimum(times[:, None], growths.end_time)
     # A run of zero length has no divergence.
-    running = np.cumsum(growths.logarithm, axis=0) / np.where(passed > 0.0, passed, 1.0)
+    running = np.cumsum(growths.logarithm, axis=0) / np.where(elapsed > 0.0, elapsed, 1.0)
     return LyapunovExponent(
-        exponent=np.where(whole, exponent, np.nan).reshape(shape),
-        error=np.where(whole, error, np.nan).reshape(shape),
+        exponent=np.where(is_complete, exponent, np.nan).reshape(shape),
+        error=np.where(is_complete, error, np.nan).reshape(shape),
         status=words.reshape(shape),
         end_time=growths.end_time.reshape(shape),
         steps=growths.steps.reshape(shape),

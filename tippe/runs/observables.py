@@ -12,9 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from nonholonomic.compiled_programs import padded
 from nonholonomic.geometry import Component, Vector, dot, rate_in_frame, scale, stacked, sum_vectors
 from nonholonomic.hybrid import HybridPath
-from nonholonomic.integration import DenseSolution, Status, few_trials, padded
+from nonholonomic.integration import DenseSolution
+from nonholonomic.integration.status import Status
+from nonholonomic.integration.zeros import few_trials
 from nonholonomic.progress import status_line
 from nonholonomic.sweeps import Table, Tabular
 from nonholonomic.validation import is_traced, require, require_increasing
@@ -44,10 +47,10 @@ def of_each_run(function: Callable[[Any], Array]) -> property:
     def get(self):
         if self.t.ndim == 1 and not any(is_traced(leaf) for leaf in jax.tree.leaves((self.t, self.states, self.scene))):
             return jax.device_put(np.asarray(compiled(self.padded()))[: len(self.t)])
-        mapped = function
+        batched = function
         for _ in range(self.t.ndim - 1):
-            mapped = eqx.filter_vmap(mapped)
-        return mapped(self)
+            batched = eqx.filter_vmap(batched)
+        return batched(self)
 
     return property(get, doc=function.__doc__)
 
@@ -89,8 +92,8 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
     def padded(self) -> Self:
         """The run with its last time repeated, up to a power of two, and without fields that observables do not
         need."""
-        longer = {name: padded(np.asarray(getattr(self, name)), len(self.t)) for name in self.by_time}
-        return dataclasses.replace(self, **longer, **dict.fromkeys(self.unused, None))
+        arrays = {name: padded(np.asarray(getattr(self, name)), len(self.t)) for name in self.by_time}
+        return dataclasses.replace(self, **arrays, **dict.fromkeys(self.unused, None))
 
     @property
     @abc.abstractmethod
@@ -131,14 +134,14 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
             return 0.0
         # Within a step, theta may exceed its values at the ends.
         last = np.argmax(value >= 0.0) if np.any(value >= 0.0) else len(value) - 1
-        near = np.flatnonzero(np.maximum(value[:last], value[1 : last + 1]) > -NEAR)
-        between = times[near] + np.arange(1, LOOKS)[:, None] / LOOKS * (times[near + 1] - times[near])
-        times = np.unique(np.concatenate([times[: last + 1], between.ravel()]))
+        suspects = np.flatnonzero(np.maximum(value[:last], value[1 : last + 1]) > -NEAR)
+        check_times = times[suspects] + np.arange(1, LOOKS)[:, None] / LOOKS * (times[suspects + 1] - times[suspects])
+        times = np.unique(np.concatenate([times[: last + 1], check_times.ravel()]))
         value = beyond(times)
-        reached = np.flatnonzero(value >= 0.0)
-        if not reached.size:
+        crossings = np.flatnonzero(value >= 0.0)
+        if not crossings.size:
             return np.inf
-        k = reached[0]
+        k = crossings[0]
         return float(few_trials(beyond, times[k - 1 : k], times[k : k + 1], value[k - 1 : k], value[k : k + 1])[0])
 
     @of_each_run
@@ -176,20 +179,20 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         """Velocity of the point whose path is `position` [m/s]."""
         motion = self.scene.dynamics.motion(self.states)
         rate = stacked(motion.rate, self.states)
-        beside, change = jax.jvp(self.scene.path_from_frame, (self.states,), (rate,))
+        path_vector, change = jax.jvp(self.scene.path_from_frame, (self.states,), (rate,))
         # The frame turns while the components of the vector change.
-        turned = scale(-1.0, rate_in_frame(beside, motion.frame_rate))
-        return self._fixed(sum_vectors((*motion.velocity, self.above[1]), change, turned))
+        frame_part = scale(-1.0, rate_in_frame(path_vector, motion.frame_rate))
+        return self._fixed(sum_vectors((*motion.velocity, self.above[1]), change, frame_part))
 
     @of_each_run
     def position(self) -> Float[Array, "times 3"]:
         """Position of the sphere's centre, or of the centre of mass for other bodies [m]; the plane is z = 0, the
         cylinder's axis x = z = 0, and a run on the plane starts above the origin."""
-        frame, where = self.scene.frame, (self._place, self._path)
-        centre = sum_vectors(frame.position(*where), scale(self.above[0], frame.axes(*where)[2]))
-        beside = self.scene.path_from_frame(self.states)
+        frame, places = self.scene.frame, (self._place, self._path)
+        centre = sum_vectors(frame.position(*places), scale(self.above[0], frame.axes(*places)[2]))
+        path_vector = self.scene.path_from_frame(self.states)
         point = jnp.stack(centre, axis=-1)
-        return point if beside == (None, None, None) else point + self._fixed(beside)
+        return point if path_vector == (None, None, None) else point + self._fixed(path_vector)
 
     @of_each_run
     def jellett(self) -> Float[Array, " times"]:
@@ -248,12 +251,12 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         # Step errors change the unit length of both vectors and their right angle.
         if isinstance(self.scene.body, AbstractRigidBody):
             e, x = unit(self.axis), self._fixed(tuple(self.states[-3:]))
-            aside = unit(jnp.cross(e, x))
-            return jnp.stack([jnp.cross(aside, e), aside, e], axis=-1)
+            side_axis = unit(jnp.cross(e, x))
+            return jnp.stack([jnp.cross(side_axis, e), side_axis, e], axis=-1)
         e, angle = unit(self.axis), self.spin_angle[:, None]
-        aside = unit(jnp.cross(e, self._fixed(tuple(self.cyclic[-3:]))))
-        across = jnp.cross(aside, e)
-        first = jnp.cos(angle) * across + jnp.sin(angle) * aside
+        side_axis = unit(jnp.cross(e, self._fixed(tuple(self.cyclic[-3:]))))
+        c_vector = jnp.cross(side_axis, e)
+        first = jnp.cos(angle) * c_vector + jnp.sin(angle) * side_axis
         return jnp.stack([first, jnp.cross(e, first), e], axis=-1)
 
     @property

@@ -7,7 +7,8 @@ from typing import Any
 import diffrax
 from jaxtyping import Array, Float
 
-from nonholonomic.integration import DEFAULT_MAX_STEPS, Settings, explicit_tableau
+from nonholonomic.integration import Settings, explicit_tableau
+from nonholonomic.integration.settings import DEFAULT_MAX_STEPS
 from nonholonomic.progress import status_line
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import require_kind, require_outside

@@ -95,8 +95,8 @@ def why_unresolved(kind: RunKind) -> str:
         "its energy has grown by more than the tolerance allows, although nothing drives the top: the law of friction pushes "
         "it, or the arena's heights do not fit its normals"
     )
-    others = "the model does not determine the motion from there on, or the mode changed too often, or"
-    return grown if kind.smooth else f"{others} {grown}; tippe.simulate states which"
+    reasons = "the model does not determine the motion from there on, or the mode changed too often, or"
+    return grown if kind.smooth else f"{reasons} {grown}; tippe.simulate states which"
 
 
 def check_differentiable(scene: Scene[Any]) -> None:

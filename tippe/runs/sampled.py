@@ -1,13 +1,12 @@
 """Runs sampled at given times, as functions for `jit`, `vmap`, `grad`, `jvp` and their compositions."""
 
-from typing import NamedTuple
-
 import diffrax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.derivatives import sampled_run, sampled_run_by_diffrax
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, Settings, Status
+from nonholonomic.derivatives import SampledRun, sampled_run, sampled_run_by_diffrax
+from nonholonomic.integration import Settings
+from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, Status
 
 from ..model.contact_dynamics import LOSSES
 from ..model.launch import Launch
@@ -26,22 +25,10 @@ def ended(
 ) -> Int[Array, "..."]:
     """The `Status` of a run that has ended, as an integer: unresolved if the run has gained energy (`energy.py`)."""
     state = state[: run.leading]
-    lost = jnp.array([int(status) for status in LOSSES])[run.problem.dynamics.loss(state)]
-    grown = has_grown(scene, scene.energy(run.problem.states), scene.energy(state), tolerance)
-    ended = jnp.where(grown, int(Status.UNRESOLVED), jnp.where(left_domain, lost, int(Status.COMPLETED)))
+    loss_codes = jnp.array([int(status) for status in LOSSES])[run.problem.dynamics.loss(state)]
+    energy_grew = has_grown(scene, scene.energy(run.problem.states), scene.energy(state), tolerance)
+    ended = jnp.where(energy_grew, int(Status.UNRESOLVED), jnp.where(left_domain, loss_codes, int(Status.COMPLETED)))
     return jnp.where(failed, int(Status.FAILED), ended)
-
-
-class SampledContact(NamedTuple):
-    """The samples of a run: `states`, and `quadratures` (the other components of a `TrajectoryProblem`), are NaN after
-    the end; `status` is a `Status` as a float."""
-
-    states: Float[Array, "components times"]
-    quadratures: Float[Array, "quadratures times"]
-    end_time: Float[Array, ""]
-    status: Float[Array, ""]
-    accepted: Float[Array, ""]
-    rejected: Float[Array, ""]
 
 
 def sampled(
@@ -51,8 +38,8 @@ def sampled(
     t1: Float[Array, ""],
     settings: Settings,
     adjoint: diffrax.AbstractAdjoint | None,
-) -> SampledContact:
-    """Simulate one launch inside a transformation and sample it.
+) -> SampledRun:
+    """Simulate one launch inside a transformation and sample it; the `status` is a `Status` as a float.
 
     **Arguments:** as for `simulate`.
     """
@@ -63,7 +50,4 @@ def sampled(
         samples = sampled_run_by_diffrax(run, times, t1, settings, adjoint)
     codes = (samples.status == LEFT_DOMAIN, samples.status == FAILED)
     status = ended(run, scene, samples.end_state, *codes, settings.tolerance)
-    assert samples.quadratures is not None
-    return SampledContact(
-        samples.states.T, samples.quadratures.T, samples.end_time, status, samples.accepted, samples.rejected
-    )
+    return samples._replace(status=status)

@@ -26,8 +26,10 @@ def sensitivity_names(roots: dict[str, Any], names: Any) -> list[str]:
     """
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"sensitivities = {names!r} must be a list of names, such as ['scene.friction.mu']")
-    known = [name for root, tree in roots.items() for name, value in numbers(root, tree).items() if value is not None]
-    full_names = [full_name("sensitivities", name, known) for name in names]
+    number_names = [
+        name for root, tree in roots.items() for name, value in numbers(root, tree).items() if value is not None
+    ]
+    full_names = [full_name("sensitivities", name, number_names) for name in names]
     if len(set(full_names)) < len(full_names):
         raise ValueError(f"sensitivities = {names!r} must name every parameter only once")
     return full_names

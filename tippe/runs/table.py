@@ -10,17 +10,17 @@ from typing import Any, NamedTuple
 import diffrax
 import numpy as np
 
-from nonholonomic.integration import DEFAULT_MAX_STEPS, Settings, explicit_tableau
+from nonholonomic.integration import Settings, explicit_tableau
+from nonholonomic.integration.settings import DEFAULT_MAX_STEPS
 from nonholonomic.sweeps import Axis, Table, Variable, sweep
-from nonholonomic.validation import as_number, require_flag, require_outside, require_whole
+from nonholonomic.validation import require_flag, require_outside, require_whole
 
 from ..model.scene import Scene
-from .cells import InversionRuns, too_many_steps
+from .cells import InversionJob, InversionRuns, ScatteredJob, too_many_steps
 from .checks import check_event, check_reversible, warn_if_it_cannot_invert
 from .launches import described, launches, rows
 from .run_kind import RunKind, check_differentiable, reversal_kind_of, run_kind_of, why_unresolved
 from .sensitivities import sensitivity_names, sensitivity_variables
-from .time_error import errors_of, second_tolerance
 
 
 def inversion_table(
@@ -224,15 +224,17 @@ def request_of(runs: InversionRuns, options: TableOptions) -> dict[str, Any]:
     return request
 
 
-def warn_of_long_runs(table: Table, t1: float, most: int) -> None:
+def warn_of_long_runs(table: Table, t1: float, max_steps: int) -> None:
     """Warn of runs that needed more than the allowed steps. Tables whose variables stay in the file are not checked."""
     if not isinstance(table.variables, dict):
         return
-    long = (table.variables["status"] == "failed") & (table.variables["steps"] >= most)
-    if long.any():
-        end = float(np.min(table.variables["end_time"][long]))
+    is_long = (table.variables["status"] == "failed") & (table.variables["steps"] >= max_steps)
+    if is_long.any():
+        end = float(np.min(table.variables["end_time"][is_long]))
         warnings.warn(
-            f"{long.sum()} of {long.size} runs have failed: {too_many_steps(t1, most, end)}", UserWarning, stacklevel=3
+            f"{is_long.sum()} of {is_long.size} runs have failed: {too_many_steps(t1, max_steps, end)}",
+            UserWarning,
+            stacklevel=3,
         )
 
 
@@ -246,51 +248,9 @@ def warn_of_unresolved_runs(table: Table, run_kind: RunKind) -> None:
         warnings.warn(f"{number}: {why_unresolved(run_kind)}", UserWarning, stacklevel=3)
 
 
-class InversionJob(NamedTuple):
-    """The computation for every cell, as data that can be sent to another process.
-
-    `errors`: whether to run every cell again at another tolerance.
-    """
-
-    runs: InversionRuns
-    roots: dict[str, Any]
-    errors: bool
-
-    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
-        """The variables of some cells, of which only the first `count` are run."""
-        runs, words = self.runs, self.runs.run_kind.words
-        if runs.method == "diffrax" and count == 0:
-            # The slow reference always computes a whole chunk, so a call only to compile would compute the first chunk
-            # twice.
-            return {}
-        variables = runs.results(self.roots, columns, count)
-        if self.errors:
-            settings = runs.settings.with_tolerance(as_number(second_tolerance(float(runs.settings.tolerance))))
-            second = runs._replace(settings=settings, slopes_by=[]).results(self.roots, columns, count)
-            silent = tuple(words.index(word) for word in ("failed", "unresolved") if word in words)
-            variables |= errors_of(variables, second, runs.times, runs.run_kind.counts, silent)
-        return variables
-
-
-class ScatteredJob(NamedTuple):
-    """A job whose cells are listed in columns, one row per cell. The results include the columns.
-
-    `columns`: full name of a number -> its value in every cell; `names`: full name -> name of the variable.
-    """
-
-    job: InversionJob
-    columns: dict[str, Any]
-    names: dict[str, str]
-
-    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
-        """The variables of some cells, of which only the first `count` are run."""
-        chosen = {number: values[columns["cell"]] for number, values in self.columns.items()}
-        return self.job(chosen, count) | {self.names[number]: values for number, values in chosen.items()}
-
-
 def digest(columns: dict[str, Any]) -> str:
     """A checksum of the columns and their names."""
-    whole = hashlib.sha256()
+    digest = hashlib.sha256()
     for name, values in columns.items():
-        whole.update(name.encode() + np.ascontiguousarray(values, float).tobytes())
-    return whole.hexdigest()[:16]
+        digest.update(name.encode() + np.ascontiguousarray(values, float).tobytes())
+    return digest.hexdigest()[:16]

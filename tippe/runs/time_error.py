@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
-from nonholonomic.integration import TIGHTEST
+from nonholonomic.integration.checks import TIGHTEST
 
 #: Ratio of the tolerance of the first run to that of the second. With a pair of eighth order, the second run costs 1.8
 #: times as much as the first. The error of the second run is a hundredth of that of the first, so the difference of the
@@ -26,9 +26,9 @@ ROUND_OFF = 1e-14
 def second_tolerance(tolerance: float) -> float:
     """Tolerance of the second run: a hundredth of that of the first run. If the integration allows no smaller
     tolerance, it is a hundred times that of the first run, and the bound is up to a hundred times wider."""
-    finer = tolerance / FINER
+    fine_tolerance = tolerance / FINER
     # Because of rounding, the quotient of 1e-12 may be below the least tolerance.
-    return max(finer, TIGHTEST) if finer > 0.99 * TIGHTEST else tolerance * FINER
+    return max(fine_tolerance, TIGHTEST) if fine_tolerance > 0.99 * TIGHTEST else tolerance * FINER
 
 
 def error_bound(
@@ -49,11 +49,11 @@ def error_bound(
     **Returns:** the bound, in units of the value: infinite if the runs disagree, 0 if both find no time.
     """
     agree = agree & (np.isfinite(value) == np.isfinite(second))
-    both = np.isfinite(value) & np.isfinite(second)
-    known = np.where(both, value, 0.0)
-    difference = np.abs(known - np.where(both, second, 0.0))
+    is_finite = np.isfinite(value) & np.isfinite(second)
+    finite_value = np.where(is_finite, value, 0.0)
+    difference = np.abs(finite_value - np.where(is_finite, second, 0.0))
     bound = np.where(same_history, SAFETY, SAFETY_OF_HISTORIES) * difference
-    return np.where(agree, np.maximum(bound, ROUND_OFF * np.abs(known)), np.inf)
+    return np.where(agree, np.maximum(bound, ROUND_OFF * np.abs(finite_value)), np.inf)
 
 
 def errors_of(
@@ -75,8 +75,12 @@ def errors_of(
     `status_error` if the runs disagree on the status or one is silent.
     """
     agree = (first["status"] == second["status"]) & ~np.isin(first["status"], silent)
-    counted = {name: np.abs(first[name] - second[name]) for name in counts}
-    same = np.all([difference == 0 for difference in counted.values()], axis=0) if counts else np.ones_like(agree)
-    bounds = {name: error_bound(first[name], second[name], agree, same) for name in (*times, "end_time", "end_theta")}
-    errors = bounds | {"status": (~agree).astype(np.int8)} | counted
+    differences = {name: np.abs(first[name] - second[name]) for name in counts}
+    is_same = (
+        np.all([difference == 0 for difference in differences.values()], axis=0) if counts else np.ones_like(agree)
+    )
+    bounds = {
+        name: error_bound(first[name], second[name], agree, is_same) for name in (*times, "end_time", "end_theta")
+    }
+    errors = bounds | {"status": (~agree).astype(np.int8)} | differences
     return {f"{name}_error": np.asarray(error) for name, error in errors.items()}

@@ -10,18 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import scale, sum_vectors
-from nonholonomic.hybrid import HybridPath
-from nonholonomic.integration import (
-    DenseSolution,
-    Settings,
-    Status,
-    explicit_tableau,
-    follow,
-    legal_run,
-    require_adaptive,
-    require_adjoint,
-    require_times,
-)
+from nonholonomic.hybrid import HybridPath, solve_hybrid_dense
+from nonholonomic.integration import DenseSolution, Settings, explicit_tableau, follow
+from nonholonomic.integration.checks import legal_run, require_adaptive, require_adjoint, require_times
+from nonholonomic.integration.status import Status
 from nonholonomic.progress import status_line
 from nonholonomic.validation import (
     all_bounds,
@@ -36,6 +28,7 @@ from nonholonomic.xla_cpu import on_device
 from ..model.friction import length
 from ..model.launch import Launch
 from ..model.scene import Scene
+from ..modes.sticking import contact_modes
 from ..modes.trajectory_problem import TrajectoryProblem, trajectory_problem
 from .airborne_trajectory import sampled_airborne, simulate_airborne
 from .checks import check_run
@@ -43,7 +36,6 @@ from .energy import if_balanced, why_unbalanced
 from .flight_trajectory import HybridTrajectory, sampled_hybrid, simulate_hybrid
 from .observables import AbstractTrajectory, of_each_run
 from .sampled import ended, sampled
-from .stick_slip_trajectory import solve_stick_slip_dense
 
 
 class Trajectory(AbstractTrajectory):
@@ -87,10 +79,11 @@ class Trajectory(AbstractTrajectory):
     cyclic: Float[Array, "cyclic times"]
     spin_angle: Float[Array, " times"]
     work: Float[Array, " times"]
-    status: Any
-    end_time: Float[Array, ""]
-    stats: dict[str, Any]
-    dense: Any
+    # The end of the run; not needed where only the times are read, as in a page.
+    status: Any = None
+    end_time: Any = None
+    stats: dict[str, Any] = eqx.field(default_factory=dict)
+    dense: Any = None
 
     @property
     def above(self) -> tuple[None, None]:
@@ -129,8 +122,8 @@ class Trajectory(AbstractTrajectory):
     @of_each_run
     def contact(self) -> Float[Array, "times 3"]:
         """The point at which the top touches the arena [m]."""
-        frame, where = self.scene.frame, (self._place, self._path)
-        foot = sum_vectors(frame.position(*where), scale(-frame.distance, frame.axes(*where)[2]))
+        frame, places = self.scene.frame, (self._place, self._path)
+        foot = sum_vectors(frame.position(*places), scale(-frame.distance, frame.axes(*places)[2]))
         return jnp.stack(foot, axis=-1)
 
     @of_each_run
@@ -144,7 +137,7 @@ class Trajectory(AbstractTrajectory):
 
     def resampled(self, times: Float[np.ndarray, " times"]) -> "Trajectory":
         """The same run at other times, without checking them."""
-        arrays = on_device(times, *_parts(len(self.states), self.dense.at(times)))
+        arrays = on_device(times, *parts_of(len(self.states), self.dense.at(times)))
         return eqx.tree_at(lambda run: (run.t, run.states, run.cyclic, run.spin_angle, run.work), self, arrays)
 
 
@@ -211,18 +204,23 @@ def simulate(
         solve_flights_dense = simulate_hybrid if scene.flies_in_closed_form else simulate_airborne
         return solve_flights_dense(scene, launch, float(t1), times, settings)
     run = trajectory_problem((scene, launch))
-    through = solve_stick_slip_dense if scene.friction.set_valued else follow
-    path = through(run, float(t1), settings)
+    path = stick_slip_path(run, t1, settings) if scene.friction.set_valued else follow(run, float(t1), settings)
     trajectory = _as_trajectory(scene, run, path, settings.tolerance)
     if times is None:
         return trajectory
-    reached = np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)]
-    if not reached.size:
+    times_reached = np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)]
+    if not times_reached.size:
         raise ValueError(
             f"times = {shown(times)} are all after the end of the run at {float(trajectory.end_time):.6g} s "
             f"({trajectory.status}): pass earlier times, or omit `times` to get those of the steps"
         )
-    return trajectory.at(reached)
+    return trajectory.at(times_reached)
+
+
+def stick_slip_path(run: TrajectoryProblem, t1: float | Float[Array, ""], settings: Settings) -> HybridPath:
+    """One run in a scene with `SetValuedCoulomb`, mode by mode, until `t1` or until contact is lost."""
+    modes, first, state = contact_modes(run, settings.tolerance)
+    return solve_hybrid_dense(modes, int(first[0]), state[:, 0], float(t1), settings, counters=1)
 
 
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
@@ -272,11 +270,13 @@ def _traced(
     samples = sampled(scene, launch, times, t1, settings, adjoint)
     status = samples.status.astype(int)
     stats = {"accepted": samples.accepted.astype(int), "rejected": samples.rejected.astype(int)}
-    quadratures = (samples.quadratures[:-2], samples.quadratures[-2], samples.quadratures[-1])
-    return Trajectory(times, scene, samples.states, *quadratures, status, samples.end_time, stats, None)
+    assert samples.quadratures is not None
+    quadratures = samples.quadratures.T
+    parts = (samples.states.T, quadratures[:-2], quadratures[-2], quadratures[-1])
+    return Trajectory(times, scene, *parts, status, samples.end_time, stats)
 
 
-def _parts(lean: int, states: Any) -> tuple[Any, Any, Any, Any]:
+def parts_of(lean: int, states: Any) -> tuple[Any, Any, Any, Any]:
     """State, with its number of components, cyclic coordinates, spin angle and work, of an array (components, times)."""
     return states[:lean], states[lean:-2], states[-2], states[-1]
 
@@ -292,7 +292,7 @@ def _as_trajectory(
     times, end, last = on_device(path.times, path.times[-1], states[:, -1])
     codes = (jnp.asarray(path.left_domain), jnp.asarray(path.failed))
     status = Status(int(_ended(run, scene, last, *codes, jnp.asarray(tolerance)))).word
-    sticks = {"sticks": int(path.counts[0])} if isinstance(path, HybridPath) else {}
-    lean, cyclic, spin_angle, work = on_device(*_parts(run.leading, states))
+    counts = {"sticks": int(path.counts[0])} if isinstance(path, HybridPath) else {}
+    lean, cyclic, spin_angle, work = on_device(*parts_of(run.leading, states))
     trajectory = Trajectory(times, scene, lean, cyclic, spin_angle, work, status, end, {}, path)
-    return if_balanced(trajectory.with_stats(path, **sticks), tolerance)
+    return if_balanced(trajectory.with_stats(path, **counts), tolerance)

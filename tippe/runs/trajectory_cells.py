@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.geometry import Plane
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, CoreProblem, Outcome, Settings, solve_with_samples
+from nonholonomic.integration import CoreProblem, Outcome, Settings, solve_with_samples
+from nonholonomic.integration.status import FAILED, LEFT_DOMAIN
 from nonholonomic.xla_cpu import compiled_alone
 
 from ..model.launch import Launch
@@ -38,8 +39,8 @@ def launches_with(scene: Scene, launch: Launch, cells: int, names: tuple[str, ..
     if scene.level and WITHOUT_DIRECTION.issuperset(names):
         turning = eqx.tree_at(lambda run: run.problem.dynamics, run, scene.turning_dynamics)
         return CoreProblem(turning, run.leading)
-    needed = {"position"} if isinstance(scene.surface, Plane) else set(QUANTITIES) - OF_THE_STATE
-    return CoreProblem(run, run.leading if needed.isdisjoint(names) else len(run.start()[0]) - BEHIND_PATH)
+    quantities_needed = {"position"} if isinstance(scene.surface, Plane) else set(QUANTITIES) - OF_THE_STATE
+    return CoreProblem(run, run.leading if quantities_needed.isdisjoint(names) else len(run.start()[0]) - BEHIND_PATH)
 
 
 def _reader(
@@ -50,19 +51,19 @@ def _reader(
     def read_lane(scene: Scene, states: Float[Array, "iterations components"]) -> dict[str, Array]:
         # No quantity reads the spin angle or the work.
         missing = len(run.start()[0]) - 2 - states.shape[1]
-        nothing, end = jnp.zeros(len(states)), jnp.zeros(())
+        zeros = jnp.zeros(len(states))
         state, cyclic = jnp.split(jnp.pad(states.T, ((0, missing), (0, 0))), [run.leading])
-        trajectory = Trajectory(nothing, scene, state, cyclic, nothing, nothing, None, end, {}, None)
+        trajectory = Trajectory(zeros, scene, state, cyclic, zeros, zeros)
         return {name: getattr(trajectory, name) for name in names}
 
     def own_axis(leaf: Any) -> int | None:
         return 0 if eqx.is_array(leaf) and leaf.ndim else None
 
-    def read(cells: Int[Array, " lanes"], states: Float[Array, "iterations components lanes"]) -> dict[str, Array]:
+    def reader(cells: Int[Array, " lanes"], states: Float[Array, "iterations components lanes"]) -> dict[str, Array]:
         of_lanes = jax.tree.map(lambda leaf: leaf if own_axis(leaf) is None else leaf[cells], scene)
         return eqx.filter_vmap(read_lane, in_axes=(own_axis, -1), out_axes=1)(of_lanes, states)
 
-    return read
+    return reader
 
 
 # Compiled on its own, not inside other transformed functions; otherwise it does not get the compiler's options.
@@ -77,8 +78,8 @@ def _followed(
 ) -> tuple[Outcome, Int[Array, " cells"], dict[str, Float[Array, "cells times ..."]]]:
     """The `Status` of the runs as integers, and the named quantities at the samples."""
     run = cast(TrajectoryProblem, problem.whole)
-    read = _reader(run, scene, names)
-    outcome, samples = solve_with_samples(problem, times, times[-1], count, settings, one_kernel=True, read=read)
+    reader = _reader(run, scene, names)
+    outcome, samples = solve_with_samples(problem, times, times[-1], count, settings, one_kernel=True, read=reader)
     codes = (outcome.status == LEFT_DOMAIN, outcome.status == FAILED)
     status = ended(run, scene, outcome.state, *codes, settings.tolerance)
     return outcome, status, samples

@@ -7,7 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nonholonomic.integration import DEFAULT_MAX_STEPS, Settings, Status, require_times
+from nonholonomic.integration import Settings
+from nonholonomic.integration.checks import require_times
+from nonholonomic.integration.settings import DEFAULT_MAX_STEPS
+from nonholonomic.integration.status import Status
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, sweep
 from nonholonomic.validation import as_number, require, require_outside, require_whole
@@ -95,11 +98,11 @@ def trajectory_table(
     require(times[-1], "times[-1]", above=0.0, why="it is the horizon")
     launch_values = {"theta": theta, "eta": eta, "mu": mu, "spin": spin}
     roots, grid, _ = launches(scene, launch_values, axes, times[-1], tolerance, taken=QUANTITIES)
-    why = "for trajectory_table: simulate samples runs of several modes, one by one"
+    reason = "for trajectory_table: simulate samples runs of several modes, one by one"
     if scene.contact == "hybrid":
-        raise ValueError(f"contact = 'hybrid' must be 'stop' {why}")
+        raise ValueError(f"contact = 'hybrid' must be 'stop' {reason}")
     if scene.friction.set_valued:
-        raise ValueError(f"friction = {type(scene.friction).__name__} must be a law with a single mode {why}")
+        raise ValueError(f"friction = {type(scene.friction).__name__} must be a law with a single mode {reason}")
 
     inner = [axis("time", "time", "s", times, "time")]
     variables = {}
@@ -118,9 +121,9 @@ def trajectory_table(
     if max_steps != DEFAULT_MAX_STEPS:
         request |= {"max_steps": int(max_steps)}
     # A run has about a dozen components.
-    most = max(16, 1 << (MOST_SAMPLED // (12 * len(times))).bit_length() - 1)
+    max_cells = max(16, 1 << (MOST_SAMPLED // (12 * len(times))).bit_length() - 1)
     job = SamplingJob(roots, times, settings, names)
-    options = {"path": path, "most": most, "inner": inner, "progress": progress, "executor": executor}
+    options = {"path": path, "most": max_cells, "inner": inner, "progress": progress, "executor": executor}
     return sweep(job, grid, variables, request, **options)
 
 

@@ -91,8 +91,8 @@ class DrawnMotion(NamedTuple, Generic[Numbers]):
         if isinstance(body, AbstractRigidBody):
             momentum = run.angular_momentum
         else:
-            along = jnp.sum(w * axis, axis=-1, keepdims=True)
-            momentum = body.I1 * w + (body.I3 - body.I1) * along * axis
+            axial_part = jnp.sum(w * axis, axis=-1, keepdims=True)
+            momentum = body.I1 * w + (body.I3 - body.I1) * axial_part * axis
         return DrawnMotion(
             run.t,
             position,
@@ -120,8 +120,8 @@ def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
         require_one_run(run, "a picture", ", and pass the others as others=")
     starts = [f"θ(0) = {float(run.theta[0]):.3g} rad, {float(run.spin[0]):.4g} rad/s" for run in runs]
     names = distinguishing_labels(starts, [run.scene for run in runs])
-    named = [(name, run.scene, motion(run)) for name, run in zip(names, runs, strict=True)]
-    return stages([named] if overlaid else [[run] for run in named])
+    motions_by_name = [(name, run.scene, motion(run)) for name, run in zip(names, runs, strict=True)]
+    return stages([motions_by_name] if overlaid else [[run] for run in motions_by_name])
 
 
 def motion(run: Any) -> DrawnMotion[np.ndarray]:
@@ -142,7 +142,7 @@ def show(scene: Scene, motion: DrawnMotion[np.ndarray], number: int, name: str) 
     body, colour = scene.body, COLOURS[number % len(COLOURS)]
     motion = DrawnMotion(*(np.asarray(part)[np.isfinite(motion.theta)] for part in motion))
     radius, weight = float(body.size), float(body.mass * scene.gravity)
-    lifted = motion.contact + 0.02 * radius * motion.normal
+    arrow_start = motion.contact + 0.02 * radius * motion.normal
     return Show(
         name,
         colour,
@@ -151,7 +151,7 @@ def show(scene: Scene, motion: DrawnMotion[np.ndarray], number: int, name: str) 
         radius,
         (Body("top", motion.position, turned(motion.rotation), meshes(body, colour)),),
         (
-            Trace("contact", lifted, GREEN, 0.06 * radius),
+            Trace("contact", arrow_start, GREEN, 0.06 * radius),
             Trace("path of the axis", AXIS * radius * motion.axis, BLUE, 0.012 * radius, motion.position, False),
         ),
         arrows(motion, float(body.offset) if isinstance(body, Top) else 0.0, radius, weight),
@@ -174,19 +174,28 @@ def curve_of_rotation(scene: Scene, motion: DrawnMotion[Any]) -> tuple[str, Any]
 
 def arrows(motion: DrawnMotion[np.ndarray], offset: float, radius: float, weight: float) -> tuple[Arrow, ...]:
     """Forces and slip at the contact, weight, angular velocity and momentum at the centre of mass."""
-    lifted = motion.contact + 0.02 * radius * motion.normal
+    arrow_start = motion.contact + 0.02 * radius * motion.normal
     # Inside the sphere it would be invisible.
-    beside = lifted + BESIDE * radius * np.asarray(aside(motion.normal))
+    label_place = arrow_start + BESIDE * radius * np.asarray(aside(motion.normal))
     centre = motion.position - offset * motion.axis
     speed = np.linalg.norm(motion.slip, axis=-1)
     common = max(float(np.quantile(speed, COMMON_SLIP)), 1e-12)
-    down = np.broadcast_to([0.0, 0.0, -weight], centre.shape)
+    weight_vector = np.broadcast_to([0.0, 0.0, -weight], centre.shape)
     push, width = motion.normal_force[:, None] * motion.normal, 0.05 * radius
-    drawn = [
-        Arrow("normal force", beside, push, "N", WEIGHT * radius / weight, VIOLET, width),
-        Arrow("slip", lifted, motion.slip, "m/s", SLIP * radius / common, GOLD, width, SLIP * radius),
+    arrows = [
+        Arrow("normal force", label_place, push, "N", WEIGHT * radius / weight, VIOLET, width),
+        Arrow("slip", arrow_start, motion.slip, "m/s", SLIP * radius / common, GOLD, width, SLIP * radius),
         Arrow(
-            "weight at the centre of mass", centre, down, "N", WEIGHT * radius / weight, BLACK, width, None, True, False
+            "weight at the centre of mass",
+            centre,
+            weight_vector,
+            "N",
+            WEIGHT * radius / weight,
+            BLACK,
+            width,
+            None,
+            True,
+            False,
         ),
     ]
     for name, vector, unit, colour in (
@@ -194,8 +203,8 @@ def arrows(motion: DrawnMotion[np.ndarray], offset: float, radius: float, weight
         ("angular momentum", motion.angular_momentum, "kg m²/s", PINK),
     ):
         scale = SPIN * radius / max(float(np.linalg.norm(vector, axis=-1).max()), 1e-300)
-        drawn.append(Arrow(name, centre, vector, unit, scale, colour, width, None, True, False))
-    return tuple(drawn)
+        arrows.append(Arrow(name, centre, vector, unit, scale, colour, width, None, True, False))
+    return tuple(arrows)
 
 
 def stages(groups: list[list[tuple[str, Scene, DrawnMotion]]]) -> list[Stage]:
@@ -217,9 +226,9 @@ def stages(groups: list[list[tuple[str, Scene, DrawnMotion]]]) -> list[Stage]:
 def aside(normal: Float[Array | np.ndarray, "times 3"]) -> Float[Array, "times 3"]:
     """Unit vectors across the normal: the projection of x, or of y where the normal is along x."""
     x, y = jnp.array([[1.0, 0.0, 0.0]]), jnp.array([[0.0, 1.0, 0.0]])
-    towards = jnp.where(jnp.abs(normal[:, :1]) < 0.9, x, y)
-    across = towards - jnp.sum(towards * normal, axis=-1, keepdims=True) * normal
-    return across / jnp.linalg.norm(across, axis=-1, keepdims=True)
+    guide = jnp.where(jnp.abs(normal[:, :1]) < 0.9, x, y)
+    tangent = guide - jnp.sum(guide * normal, axis=-1, keepdims=True) * normal
+    return tangent / jnp.linalg.norm(tangent, axis=-1, keepdims=True)
 
 
 def meshes(body: AbstractBody | AbstractRigidBody, colour: int) -> tuple[Mesh, ...]:
@@ -239,8 +248,8 @@ def meshes(body: AbstractBody | AbstractRigidBody, colour: int) -> tuple[Mesh, .
 def touching(body: AbstractRigidBody, directions: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
     """The points of a body's surface at which it has the given outward unit normals, from the centre of mass, in the
     body's axes [m]."""
-    normal, still = vector_of(-jnp.asarray(directions).T), jnp.zeros(len(directions))
-    return np.stack(body.contact(normal, (still, still, still))[0], axis=-1)
+    normal, zero = vector_of(-jnp.asarray(directions).T), jnp.zeros(len(directions))
+    return np.stack(body.contact(normal, (zero, zero, zero))[0], axis=-1)
 
 
 def truncated(radius: float, knob: float, end: float) -> Float[np.ndarray, "points 2"]:
@@ -248,8 +257,8 @@ def truncated(radius: float, knob: float, end: float) -> Float[np.ndarray, "poin
 
     The scene does not contain the height of the cut; the rim must not touch the arena before the stem does.
     """
-    lowest = min(radius * (radius - knob) / end, 0.9 * radius)
-    polar = np.linspace(np.arccos((radius - 0.8 * (radius - lowest)) / radius), np.pi, 25)
+    lower_radius = min(radius * (radius - knob) / end, 0.9 * radius)
+    polar = np.linspace(np.arccos((radius - 0.8 * (radius - lower_radius)) / radius), np.pi, 25)
     ball = radius * np.stack([np.sin(polar), np.cos(polar)], axis=-1)
     return np.concatenate([[[0.0, ball[0, 1]]], ball])
 

@@ -68,10 +68,10 @@ def standing_matrix(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = F
 @eqx.filter_jit
 def _standing_matrix(scene: Scene, spin: Float[Array, ""], inverted: bool) -> Float[Array, "k k"]:
     state = standing_state(scene, spin, inverted)
-    across = [0, 1, 2, 3, 5, 6, *_places_across(scene)]
+    components = [0, 1, 2, 3, 5, 6, *_places_across(scene)]
     scales = scene.scales(Launch(0.0, spin))
     jacobian = jax.jacfwd(scene.field)(state) * scales / scales[:, None]
-    return jacobian[np.ix_(across, across)]
+    return jacobian[np.ix_(components, components)]
 
 
 def _places_across(scene: Scene) -> range:
@@ -109,17 +109,17 @@ def _tumbling_matrix(scene: Scene[Top], motion: Tumbling) -> Float[Array, "5 5"]
     state = tumbling_state(scene, motion)
     scales = scene.scales(Launch(motion.theta, motion.spin))
 
-    def field_in_frame(scaled):
+    def field_in_frame(scaled_state):
         """The rate of a scaled state in the frame that precesses."""
-        state = scaled * scales
+        state = scaled_state * scales
         return (scene.field(state) - motion.precession * quarter_turn(state)) / scales
 
-    scaled = state / scales
-    length = jax.grad(lambda x: jnp.sum((x * scales)[AXIS] ** 2))(scaled)
-    jellett = jax.grad(lambda x: scene.jellett(x * scales))(scaled)
-    excluded = jnp.stack([length, jellett, quarter_turn(state) / scales], axis=1)
-    basis = jnp.linalg.qr(excluded / jnp.linalg.norm(excluded, axis=0), mode="complete")[0][:, 3:]
-    return basis.T @ jax.jacfwd(field_in_frame)(scaled) @ basis
+    scaled_state = state / scales
+    length = jax.grad(lambda x: jnp.sum((x * scales)[AXIS] ** 2))(scaled_state)
+    jellett = jax.grad(lambda x: scene.jellett(x * scales))(scaled_state)
+    excluded_directions = jnp.stack([length, jellett, quarter_turn(state) / scales], axis=1)
+    basis = jnp.linalg.qr(excluded_directions / jnp.linalg.norm(excluded_directions, axis=0), mode="complete")[0][:, 3:]
+    return basis.T @ jax.jacfwd(field_in_frame)(scaled_state) @ basis
 
 
 def growth_rate(matrix: Float[Array, "k k"]) -> Float[Array, ""]:

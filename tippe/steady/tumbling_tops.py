@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.integration import sign_changes
+from nonholonomic.integration.zeros import sign_changes
 from nonholonomic.validation import as_number, require, require_kind, require_whole
 
 from ..model.scene import Scene
@@ -142,8 +142,8 @@ def tumbling_state(scene: Scene[Top], motion: Tumbling) -> Float[Array, " 8"]:
     require_motion(scene, motion)
     body, s, c = scene.body, jnp.sin(motion.theta), jnp.cos(motion.theta)
     zero = jnp.zeros_like(s)
-    across, along = -body.I1 * motion.precession * s, body.I3 * motion.spin
-    return joined((zero, zero), (s, zero, c), (across * c + along * s, zero, -across * s + along * c))
+    transverse, axial = -body.I1 * motion.precession * s, body.I3 * motion.spin
+    return joined((zero, zero), (s, zero, c), (transverse * c + axial * s, zero, -transverse * s + axial * c))
 
 
 def quarter_turn(state: Float[Array, " 8"]) -> Float[Array, " 8"]:

@@ -24,15 +24,9 @@ from ..model.state import AXIS, MOMENTUM, PLACE, VELOCITY
 from ..model.top import Top
 
 
-class Across(NamedTuple):
-    """The coordinate across the arena: length [m] per unit, and turning angle [rad] of the frame per unit."""
-
-    metric: Float[Array, ""] | float
-    turning: float
-
-
-def across(scene: Scene[Top]) -> Across:
-    """Length and turning per unit of the coordinate across the arena: (1, 0) on a plane, (rho, 1) on a cylinder.
+def across(scene: Scene[Top]) -> tuple[Float[Array, ""] | float, float]:
+    """The length [m] and the turning angle [rad] of the frame per unit of the coordinate across the arena: (1, 0) on a
+    plane, (rho, 1) on a cylinder.
 
     **Arguments:**
 
@@ -40,10 +34,10 @@ def across(scene: Scene[Top]) -> Across:
 
     **Raises:** `ValueError` for an arena that is curved in both directions.
     """
-    curvature, along = scene.frame.frame_motion(scene.frame.at_angle(0.0)[0], (1.0, 0.0)).frame_rate
-    if along is not None:
+    curvature, slope = scene.frame.frame_motion(scene.frame.at_angle(0.0)[0], (1.0, 0.0)).frame_rate
+    if slope is not None:
         raise ValueError(f"surface = {scene.surface!r} must be a Plane or a Cylinder for these coordinates")
-    return Across(1.0, 0.0) if curvature is None else Across(1.0 / curvature, 1.0)
+    return (1.0, 0.0) if curvature is None else (1.0 / curvature, 1.0)
 
 
 def from_vector_state(scene: Scene[Top], state: Float[Array, " components"]) -> Float[Array, " 8"]:
@@ -57,22 +51,22 @@ def from_vector_state(scene: Scene[Top], state: Float[Array, " components"]) -> 
     **Returns:** (eta or x, theta, phi, and the rates of eta or x, y, theta, phi, psi), an array (8,) in rad, m and s; x
     is 0.
     """
-    metric, turns = across(scene)
+    metric, angle_metric = across(scene)
     e, L = state[AXIS], state[MOMENTUM]
     spinning = jnp.cross(L, e) / scene.body.I1
     velocity = state[VELOCITY] + scene.body.offset * spinning[:2]
     turning = scene.frame.frame_motion(tuple(state[PLACE]), (velocity[0], velocity[1])).frame_rate
-    seen = jnp.stack(
+    components = jnp.stack(
         [a if b is None else a + b for a, b in zip(spinning, rate_in_frame(tuple(e), turning), strict=True)]
     )
 
     def angles(axis):
         return jnp.stack([jnp.arctan2(jnp.hypot(axis[0], axis[1]), axis[2]), jnp.arctan2(axis[1], axis[0])])
 
-    (theta, phi), (theta_dot, phi_dot) = jax.jvp(angles, (e,), (seen,))
-    eta = jnp.arctan2(*state[PLACE]) if turns else jnp.zeros_like(theta)
+    (theta, phi), (theta_dot, phi_dot) = jax.jvp(angles, (e,), (components,))
+    eta = jnp.arctan2(*state[PLACE]) if angle_metric else jnp.zeros_like(theta)
     eta_dot = velocity[0] / metric
-    psi_dot = L @ e / scene.body.I3 - phi_dot * e[2] + turns * eta_dot * e[1]
+    psi_dot = L @ e / scene.body.I3 - phi_dot * e[2] + angle_metric * eta_dot * e[1]
     return jnp.stack([eta, theta, phi, eta_dot, velocity[1], theta_dot, phi_dot, psi_dot])
 
 
@@ -121,10 +115,10 @@ def contact_motion(
     **Returns:** O' [m/s] and e' [1/s] in the frame (t1, t2, n), and (p, q, omega3) [rad/s], the frame turning at
     -eta' t2.
     """
-    metric, turns = across(scene)
+    metric, angle_metric = across(scene)
     _, _, theta, phi, _, gap = q
     eta_dot, y_dot, theta_dot, phi_dot, psi_dot, gap_dot = q_dot
-    turning = turns * eta_dot
+    turning = angle_metric * eta_dot
     s, c, sp, cp = jnp.sin(theta), jnp.cos(theta), jnp.sin(phi), jnp.cos(phi)
     rates = jnp.stack(
         [
@@ -134,7 +128,7 @@ def contact_motion(
         ]
     )
     e1, e2, _ = axes(theta, phi)
-    velocity = jnp.stack([(metric - turns * gap) * eta_dot, y_dot, gap_dot])
+    velocity = jnp.stack([(metric - angle_metric * gap) * eta_dot, y_dot, gap_dot])
     return velocity, rates[1] * e1 - rates[0] * e2, rates
 
 
@@ -231,20 +225,24 @@ def equations(scene: Scene[Top], state: Float[Array, " 8"]) -> tuple[Float[Array
     **Returns:** A (6, 6) and b (6,).
     """
     body = scene.body
-    metric, turns = across(scene)
+    metric, angle_metric = across(scene)
     q, q_dot = spread(state)
     eta, theta, phi, eta_dot, _, theta_dot, phi_dot, psi_dot = state
-    turning = turns * eta_dot
+    turning = angle_metric * eta_dot
     s, c, sp, cp = jnp.sin(theta), jnp.cos(theta), jnp.sin(phi), jnp.cos(phi)
     e1, e2, e = axes(theta, phi)
     zero, unit = jnp.zeros_like(s), jnp.ones_like(s)
 
     # e'' = turns eta'' (-e3, 0, e1) + theta'' e1 + phi'' sin(theta) e2 + bend: the frame turns at -eta' t2.
-    seen = theta_dot * e1 + phi_dot * s * e2
+    components = theta_dot * e1 + phi_dot * s * e2
     lean = jnp.stack([cp, sp, zero])
     bend = -(theta_dot**2) * e + 2.0 * c * theta_dot * phi_dot * e2 - phi_dot**2 * s * lean
-    bend = bend + 2.0 * turning * jnp.stack([-seen[2], zero, seen[0]]) - turning**2 * jnp.stack([e[0], zero, e[2]])
-    swing = turns * jnp.stack([-e[2], zero, e[0]])
+    bend = (
+        bend
+        + 2.0 * turning * jnp.stack([-components[2], zero, components[0]])
+        - turning**2 * jnp.stack([e[0], zero, e[2]])
+    )
+    swing = angle_metric * jnp.stack([-e[2], zero, e[0]])
 
     f, torque = friction_per_normal_force(scene, slip_velocity(scene, q, q_dot), angular_velocity(scene, q, q_dot))
     push = jnp.append(f, unit)
@@ -258,8 +256,8 @@ def equations(scene: Scene[Top], state: Float[Array, " 8"]) -> tuple[Float[Array
     q_rest = turning * sp * phi_dot
     spin_rest = -phi_dot * theta_dot * s - turning * (c * sp * theta_dot + s * cp * phi_dot)
 
-    centripetal = metric * turns * eta_dot**2 * jnp.stack([zero, zero, unit])
-    vertical = jnp.stack([turns * jnp.sin(eta), zero, jnp.cos(turns * eta)])
+    centripetal = metric * angle_metric * eta_dot**2 * jnp.stack([zero, zero, unit])
+    vertical = jnp.stack([angle_metric * jnp.sin(eta), zero, jnp.cos(angle_metric * eta)])
     m, a = body.mass, body.offset
     momentum = jnp.stack(
         [
@@ -272,9 +270,9 @@ def equations(scene: Scene[Top], state: Float[Array, " 8"]) -> tuple[Float[Array
         ],
         axis=1,
     )
-    row1 = jnp.stack([-body.I1 * turns * c * sp, zero, zero, -body.I1 * s, zero, -(moment @ e1)])
-    row2 = jnp.stack([-body.I1 * turns * cp, zero, body.I1, zero, zero, -(moment @ e2)])
-    row3 = jnp.stack([-body.I3 * turns * s * sp, zero, zero, body.I3 * c, body.I3, -(moment @ e)])
+    row1 = jnp.stack([-body.I1 * angle_metric * c * sp, zero, zero, -body.I1 * s, zero, -(moment @ e1)])
+    row2 = jnp.stack([-body.I1 * angle_metric * cp, zero, body.I1, zero, zero, -(moment @ e2)])
+    row3 = jnp.stack([-body.I3 * angle_metric * s * sp, zero, zero, body.I3 * c, body.I3, -(moment @ e)])
     matrix = jnp.concatenate([momentum, jnp.stack([row1, row2, row3])])
     right = jnp.concatenate(
         [
@@ -309,14 +307,14 @@ def normal_force(scene: Scene[Top], state: Float[Array, " 8"], second_rates: Flo
     - `state`: (8,), as in the module's docstring.
     - `second_rates`: (5,) as in `Accelerations`.
     """
-    metric, turns = across(scene)
+    metric, angle_metric = across(scene)
     eta, theta, phi, eta_dot, _, theta_dot, phi_dot, _ = state
-    turning = turns * eta_dot
+    turning = angle_metric * eta_dot
     s, c, sp, cp = jnp.sin(theta), jnp.cos(theta), jnp.sin(phi), jnp.cos(phi)
     e_t_dot = c * cp * theta_dot - s * sp * phi_dot
     axis = second_rates[2] * s + theta_dot**2 * c + turning**2 * c
-    axis = axis - turns * second_rates[0] * s * cp - 2.0 * turning * e_t_dot
-    pull = scene.gravity * jnp.cos(turns * eta) + metric * turning**2
+    axis = axis - angle_metric * second_rates[0] * s * cp - 2.0 * turning * e_t_dot
+    pull = scene.gravity * jnp.cos(angle_metric * eta) + metric * turning**2
     return scene.body.mass * (pull + scene.body.offset * axis)
 
 

@@ -48,45 +48,52 @@ def by_equation_2(scene: Scene[Top], state: Float[Array, " 8"]) -> Accelerations
     q, q_dot = spread(state)
     frame = nodal_frame(q)
     v = jnp.linalg.solve(frame, q_dot)
-    kept = np.delete(np.arange(6), PSI)
-    rest = v[kept]
+    indices = np.delete(np.arange(6), PSI)
+    velocities = v[indices]
 
     def parts(place):
         # R = rest.A rest / 2 + beta1 b.rest - beta1^2 / (2 g_11) - U, where g is the metric in the frame.
         fields = nodal_frame(place)
         g = fields.T @ metric(scene, place) @ fields
-        b = g[PSI, kept] / g[PSI, PSI]
-        return g[np.ix_(kept, kept)] - g[PSI, PSI] * jnp.outer(b, b), b, g[PSI, PSI]
+        b = g[PSI, indices] / g[PSI, PSI]
+        return g[np.ix_(indices, indices)] - g[PSI, PSI] * jnp.outer(b, b), b, g[PSI, PSI]
 
     A, b, axial = parts(q)
-    beta = axial * (v[PSI] + b @ rest)
+    beta = axial * (v[PSI] + b @ velocities)
 
     def routhian(place):
         A, b, axial = parts(place)
-        return 0.5 * rest @ A @ rest + beta * (b @ rest) - 0.5 * beta**2 / axial - potential(scene, place)
+        return (
+            0.5 * velocities @ A @ velocities
+            + beta * (b @ velocities)
+            - 0.5 * beta**2 / axial
+            - potential(scene, place)
+        )
 
     def momenta(place):
         A, b, _ = parts(place)
-        return A @ rest + beta * b
+        return A @ velocities + beta * b
 
     p = momenta(q)
     _, drift = jax.jvp(momenta, (q,), (q_dot,))
     c = structure_constants(nodal_frame, q)
-    gyroscopic = jnp.einsum("lmr,m,l->r", c[np.ix_(kept, np.arange(6), kept)], v, p) + beta * v @ c[PSI][:, kept]
-    along = frame[:, kept].T @ jax.grad(routhian)(q)
+    gyroscopic = (
+        jnp.einsum("lmr,m,l->r", c[np.ix_(indices, np.arange(6), indices)], v, p) + beta * v @ c[PSI][:, indices]
+    )
+    gradient = frame[:, indices].T @ jax.grad(routhian)(q)
 
     # With the generalised forces Q = N contact, the equations are linear in the four remaining v', and in N.
     contact = frame.T @ per_normal_force(scene, q, q_dot)
-    column = contact[PSI] * b - contact[kept]
+    column = contact[PSI] * b - contact[indices]
     system = jnp.concatenate([A[:, :4], column[:, None]], axis=1)
-    solution = jnp.linalg.solve(system, gyroscopic + along - drift)
+    solution = jnp.linalg.solve(system, gyroscopic + gradient - drift)
     rest_dot, N = jnp.append(solution[:4], 0.0), solution[4]
 
-    def velocity(place, rest, beta):
+    def velocity(place, velocities, beta):
         _, b, axial = parts(place)
-        return nodal_frame(place) @ jnp.insert(rest, PSI, beta / axial - b @ rest)
+        return nodal_frame(place) @ jnp.insert(velocities, PSI, beta / axial - b @ velocities)
 
-    _, second_rates = jax.jvp(velocity, (q, rest, beta), (q_dot, rest_dot, N * contact[PSI]))
+    _, second_rates = jax.jvp(velocity, (q, velocities, beta), (q_dot, rest_dot, N * contact[PSI]))
     return Accelerations(second_rates[:5], N)
 
 
@@ -116,8 +123,8 @@ class TopSystem(AbstractSystem):
     def constraints(self, q: Float[Array, " 5"]) -> Float[Array, "k 5"]:
         if not self.rolling:
             return jnp.zeros((0, 5), q.dtype)
-        whole = jnp.append(q, 0.0)
-        return jax.jacfwd(lambda rate: slip_velocity(self.scene, whole, jnp.append(rate, 0.0)))(jnp.zeros_like(q))
+        full_place = jnp.append(q, 0.0)
+        return jax.jacfwd(lambda rate: slip_velocity(self.scene, full_place, jnp.append(rate, 0.0)))(jnp.zeros_like(q))
 
     def frame(self, q: Float[Array, " 5"]) -> Float[Array, "5 5"]:
         """The nodal frame; when rolling, the first three fields move the centre so that the slip vanishes."""

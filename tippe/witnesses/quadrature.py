@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.integration import halved
+from nonholonomic.integration.zeros import halved
 
 from ..model.scene import Scene
 from ..model.state import AXIS, MOMENTUM, VELOCITY
@@ -156,8 +156,8 @@ def rolling_rate(scene: Scene[Top], state: Float[Array, " 6"]) -> Float[Array, "
     # J changes with e; its rate is already contained in w x L, which is taken in the turning body.
     torque = -jnp.cross(w, inertia @ w) + body.mass * jnp.cross(r, jnp.cross(body.offset * e_dot, w))
     torque = torque + body.mass * scene.gravity * jnp.cross(r, up)
-    whole = inertia + body.mass * (r @ r * jnp.eye(3) - jnp.outer(r, r))
-    return jnp.concatenate([e_dot, jnp.linalg.solve(whole, torque)])
+    full_inertia = inertia + body.mass * (r @ r * jnp.eye(3) - jnp.outer(r, r))
+    return jnp.concatenate([e_dot, jnp.linalg.solve(full_inertia, torque)])
 
 
 class Swing(eqx.Module):
@@ -194,12 +194,12 @@ class Swing(eqx.Module):
 
     def theta(self, t: Float[Array, "..."]) -> Float[Array, "..."]:
         """Angle [rad] from the normal to the axis at the times [s]."""
-        due = t + self.elapsed(self.phase)
+        due_time = t + self.elapsed(self.phase)
 
         def newton(_, chi):
-            return chi - (self.elapsed(chi) - due) / self.pace(chi)
+            return chi - (self.elapsed(chi) - due_time) / self.pace(chi)
 
-        chi = jax.lax.fori_loop(0, 30, newton, due / self.cosines[0])
+        chi = jax.lax.fori_loop(0, 30, newton, due_time / self.cosines[0])
         return jnp.arccos(self.middle - self.half * jnp.cos(chi))
 
 
@@ -222,13 +222,13 @@ def swing(nutation: AbstractNutation, z: Float[Array, ""], z_dot: Float[Array, "
     curvature = jax.vmap(jax.grad(jax.grad(nutation.drive)))
 
     def pace(chi):
-        at = middle - half * jnp.cos(chi)
+        point = middle - half * jnp.cos(chi)
         first = nodes[:, None]
         second = (1.0 - first) * nodes[None, :]
-        where = at + first * (low - at) + second * (high - at)
+        where = point + first * (low - point) + second * (high - point)
         share = weights[:, None] * weights[None, :] * (1.0 - first)
         divided = jnp.sum(share * curvature(where.ravel()).reshape(where.shape))
-        return jnp.sqrt(-0.5 * nutation.inertia(at) / divided)
+        return jnp.sqrt(-0.5 * nutation.inertia(point) / divided)
 
     angles = (jnp.arange(COSINES) + 0.5) * (math.pi / COSINES)
     waves = jnp.cos(jnp.arange(COSINES)[:, None] * angles)

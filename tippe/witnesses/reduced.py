@@ -156,8 +156,8 @@ def spin_rate_from_jellett(
     """The paper's (7), right as printed on the plane: psi' [rad/s] from Jellett's constant alone."""
     body, s, c = scene.body, jnp.sin(theta), jnp.cos(theta)
     lever = body.radius * c - body.offset
-    rest = jellett - body.I1 * phi_dot * body.radius * s**2 - body.I3 * phi_dot * c * lever
-    return rest / (body.I3 * lever)
+    spin_part = jellett - body.I1 * phi_dot * body.radius * s**2 - body.I3 * phi_dot * c * lever
+    return spin_part / (body.I3 * lever)
 
 
 def lagrangian(

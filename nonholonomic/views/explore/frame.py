@@ -39,18 +39,18 @@ def quaternion(rotation: Float[Array, "3 3"]) -> Float[Array, "4"]:
     m, trace = rotation, rotation[0, 0] + rotation[1, 1] + rotation[2, 2]
     # Four times the products of the quaternion's components, one row each.
     skew = (m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1])
-    even = (m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1])
+    symmetric = (m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1])
     squares = [1.0 - trace + 2.0 * m[k, k] for k in range(3)]
     rows = jnp.stack(
         [
-            jnp.stack([squares[0], even[0], even[1], skew[0]]),
-            jnp.stack([even[0], squares[1], even[2], skew[1]]),
-            jnp.stack([even[1], even[2], squares[2], skew[2]]),
+            jnp.stack([squares[0], symmetric[0], symmetric[1], skew[0]]),
+            jnp.stack([symmetric[0], squares[1], symmetric[2], skew[1]]),
+            jnp.stack([symmetric[1], symmetric[2], squares[2], skew[2]]),
             jnp.stack([*skew, 1.0 + trace]),
         ]
     )
-    best = rows[0]
+    row = rows[0]
     for k in range(1, 4):
-        # `best` holds the largest of the first k compared rows.
-        best = jnp.where(rows[k, k] > jnp.max(jnp.stack([rows[j, j] for j in range(k)])), rows[k], best)
-    return best / jnp.sqrt(jnp.sum(best * best))
+        # `row` is the largest of the first k compared rows.
+        row = jnp.where(rows[k, k] > jnp.max(jnp.stack([rows[j, j] for j in range(k)])), rows[k], row)
+    return row / jnp.sqrt(jnp.sum(row * row))

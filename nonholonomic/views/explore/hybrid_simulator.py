@@ -14,9 +14,10 @@ from jaxtyping import Array, Float, Int
 
 from ...hybrid import MOST_ROUNDS, AbstractBatchedMode, AbstractHoppingMode, HybridOutcome
 from ...hybrid.ensemble import after_reset, after_solve, at_start
-from ...integration import LEFT_DOMAIN, RUNNING, UNRESOLVED, Settings
+from ...integration import Settings
 from ...integration.ensemble import with_crossing_times
 from ...integration.scheduler import LaneScheduler, outcome_of
+from ...integration.status import LEFT_DOMAIN, RUNNING, UNRESOLVED
 from .simulator import Functions, Numbers, Stepper, as_object, offsets_of, size_of
 
 Start = tuple[tuple[AbstractBatchedMode, ...], Int[Array, "1"], Float[Array, "components 1"]]
@@ -102,18 +103,18 @@ class HybridSimulator(NamedTuple):
             return stretch.open, stretch.elapsed, stretch
 
         def hop(values: Numbers, runs: HybridOutcome, stretch: Any) -> Any:
-            after, following = self._mode(values, group, runs.mode).hop(stretch, _left(t1, runs))
-            return following.open, after.elapsed, following
+            state_after, following = self._mode(values, group, runs.mode).hop(stretch, _left(t1, runs))
+            return following.open, state_after.elapsed, following
 
         def closed(values: Numbers, runs: HybridOutcome, stretch: Any) -> HybridOutcome:
             return after_reset(jnp, runs, self._mode(values, group, runs.mode).closed(stretch), t1)
 
-        def shown(values: Numbers, runs: HybridOutcome, state: Any) -> Any:
+        def output(values: Numbers, runs: HybridOutcome, state: Any) -> Any:
             return self._mode(values, group, runs.mode).shown(state)
 
-        def between(values: Numbers, runs: HybridOutcome, stretch: Any, passed: Any) -> Any:
+        def between(values: Numbers, runs: HybridOutcome, stretch: Any, elapsed: Any) -> Any:
             mode = self._mode(values, group, runs.mode)
-            return mode.between(mode.motion_in(stretch), passed)
+            return mode.between(mode.motion_in(stretch), elapsed)
 
         stepper = Stepper.of(begin, (values, runs), self.settings)
         functions, facts = stepper.functions, stepper.facts
@@ -128,7 +129,7 @@ class HybridSimulator(NamedTuple):
             if self.frame is not None:
                 functions["between"] = (between, (values, runs, stretch, runs.end_time))
         if self.frame is not None:
-            functions["shown"] = (shown, (values, runs, runs.state))
+            functions["shown"] = (output, (values, runs, runs.state))
         return as_object(facts, functions)
 
 
@@ -151,8 +152,8 @@ def _chosen(modes: list[AbstractBatchedMode], numbers: list[int], number: Any) -
 
     def leaf(*leaves: Any) -> Any:
         value = leaves[-1]
-        for other, candidate in list(zip(numbers, leaves, strict=True))[-2::-1]:
-            value = value if candidate is value else jnp.where(number == other, candidate, value)
+        for index, candidate in list(zip(numbers, leaves, strict=True))[-2::-1]:
+            value = value if candidate is value else jnp.where(number == index, candidate, value)
         return value
 
     return jax.tree.map(leaf, *modes)

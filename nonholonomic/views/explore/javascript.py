@@ -109,10 +109,10 @@ def javascript(name: str, function: Callable[..., Any], *arguments: Any) -> str:
         shapes = [np.zeros(leaf.shape) for leaf in jax.tree.leaves(argument)]
         values += [_map(lambda _, names=names: block.name(next(names)), shape) for shape in shapes]
     results = _flat(block.call(jax.make_jaxpr(function)(*arguments), values))
-    written = [f"out[{k}] = {_text(number)};" for k, number in enumerate(results)]
+    statements = [f"out[{k}] = {_text(number)};" for k, number in enumerate(results)]
     heads = ", ".join([*(f"a{number}" for number in range(len(arguments))), "out"])
-    inside = _indented([*block.leading_to(results)[0], *written, "return out;"])
-    return "\n".join([f"function {name}({heads}) {{", *inside, "}", ""])
+    body = _indented([*block.leading_to(results)[0], *statements, "return out;"])
+    return "\n".join([f"function {name}({heads}) {{", *body, "}", ""])
 
 
 def _text(number: Number) -> str:
@@ -152,12 +152,12 @@ class _Block:
 
     def leading_to(self, needed: Sequence[Number]) -> tuple[list[str], set[str]]:
         """The lines that some numbers depend on, and the names that these lines read."""
-        names, kept = set(_strings(needed)), []
+        names, blocks = set(_strings(needed)), []
         for results, reads, lines in reversed(self.statements):
             if not names.isdisjoint(results):
                 names |= reads
-                kept.append(lines)
-        return [line for lines in reversed(kept) for line in lines], names
+                blocks.append(lines)
+        return [line for lines in reversed(blocks) for line in lines], names
 
     def call(self, closed: Any, arguments: Sequence[Value]) -> Values:
         """The results of a jaxpr."""
@@ -183,8 +183,8 @@ class _Block:
         if inner := [parameters[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in parameters]:
             return self.call(inner[0], inputs)
         if name in MOVES:
-            moved = MOVES[name](*inputs, **{key: parameters[key] for key in parameters if key != "sharding"})
-            return moved if isinstance(moved, list) else [np.asarray(moved, object)]
+            output = MOVES[name](*inputs, **{key: parameters[key] for key in parameters if key != "sharding"})
+            return output if isinstance(output, list) else [np.asarray(output, object)]
         if name in INDEXED:
             return self.indexed(equation, inputs, range(len(inputs))[INDEXED[name]])
         if name in REDUCTIONS:
@@ -242,27 +242,27 @@ class _Block:
             value = functools.reduce(functools.partial(self.each, kind), _rows(value, axis))
         return np.asarray(value, object)
 
-    def product(self, a: Value, b: Value, contracted: Any, together: Any) -> Value:
+    def product(self, a: Value, b: Value, contracted: Any, batch_axes: Any) -> Value:
         """The product of two arrays, summed over the contracted axes; batch axes are kept."""
 
-        def factor(value: Value, summed: Sequence[int], beside: Sequence[int]) -> tuple[Value, list[list[int]]]:
-            free = [k for k in range(value.ndim) if k not in (*summed, *beside)]
-            shape = [[value.shape[k] for k in axes] for axes in (beside, free, summed)]
-            return np.transpose(value, [*beside, *free, *summed]).reshape([math.prod(part) for part in shape]), shape
+        def factor(value: Value, summed: Sequence[int], batch: Sequence[int]) -> tuple[Value, list[list[int]]]:
+            free = [k for k in range(value.ndim) if k not in (*summed, *batch)]
+            shape = [[value.shape[k] for k in axes] for axes in (batch, free, summed)]
+            return np.transpose(value, [*batch, *free, *summed]).reshape([math.prod(part) for part in shape]), shape
 
-        (left, (common, rows, _)), (right, (_, columns, _)) = map(factor, (a, b), contracted, together)
-        whole = self.reduced("add", self.each("mul", left[:, :, None], right[:, None]), [3])
-        return whole.reshape([*common, *rows, *columns])
+        (left, (common, rows, _)), (right, (_, columns, _)) = map(factor, (a, b), contracted, batch_axes)
+        product = self.reduced("add", self.each("mul", left[:, :, None], right[:, None]), [3])
+        return product.reshape([*common, *rows, *columns])
 
     def extreme(self, kind: str, value: Value, axis: int) -> Value:
         """The index of the first extreme element along an axis."""
 
-        def better(best: Values, other: Values) -> Values:
-            is_better = self.each(kind, other[1], best[1])
-            return [self.each(CHOICE, is_better, *pair) for pair in zip(best, other, strict=True)]
+        def choose(extreme: Values, candidate: Values) -> Values:
+            is_better = self.each(kind, candidate[1], extreme[1])
+            return [self.each(CHOICE, is_better, *pair) for pair in zip(extreme, candidate, strict=True)]
 
         rows = enumerate(_rows(value, axis))
-        return functools.reduce(better, ([_value(np.full(row.shape, number)), row] for number, row in rows))[0]
+        return functools.reduce(choose, ([_value(np.full(row.shape, number)), row] for number, row in rows))[0]
 
     def indexed(self, equation: Any, inputs: Values, indices: Sequence[int]) -> Values:
         """Elements at indices that may be known only in JavaScript, which then selects among all possible indices."""
@@ -271,21 +271,21 @@ class _Block:
         labels, values = itertools.count(), []
         labelled = [value if k in indices else _map(lambda _: next(labels), value) for k, value in enumerate(inputs)]
         # A gather beyond the end fills with a number that is not a label.
-        picked = functools.partial(_map, lambda k: pool[k] if 0 <= k < len(pool) else math.nan)
+        pick = functools.partial(_map, lambda k: pool[k] if 0 <= k < len(pool) else math.nan)
         # One more than the number of elements: an index beyond the end has a separate meaning.
         options = range(max(inputs[0].shape, default=0) + 1)
         for option in itertools.product(options, repeat=len(unknown)):
-            operands, same = [value.copy() for value in labelled], []
+            operands, matches = [value.copy() for value in labelled], []
             for (k, index), choice in zip(unknown, option, strict=True):
                 operands[k][index] = choice
-                same.append(self.each("eq", np.asarray(inputs[k][index], object), _value(choice)))
+                matches.append(self.each("eq", np.asarray(inputs[k][index], object), _value(choice)))
             # An index beyond the end gives -1, which is not a label.
             parameters = equation.params | ({"fill_value": -1} if "fill_value" in equation.params else {})
-            moved = equation.primitive.bind(*(operand.astype(int) for operand in operands), **parameters)
-            results = [picked(np.asarray(part)) for part in jax.tree.leaves(moved)]
+            output = equation.primitive.bind(*(operand.astype(int) for operand in operands), **parameters)
+            results = [pick(np.asarray(part)) for part in jax.tree.leaves(output)]
             if values:
-                chosen = functools.reduce(functools.partial(self.each, "and"), same)
-                results = [self.each(CHOICE, chosen, *pair) for pair in zip(values, results, strict=True)]
+                condition = functools.reduce(functools.partial(self.each, "and"), matches)
+                results = [self.each(CHOICE, condition, *pair) for pair in zip(values, results, strict=True)]
             values = results
         return values
 
@@ -294,14 +294,16 @@ class _Block:
         variables, starts, block = self.variables(carry), _flat(carry), self.inner()
         names = _flat(variables)
         # A loop variable may become another one, so read all of them before writing any.
-        after = [
+        new_values = [
             block.name(f"({number})", number) if number in names and number != name else number
             for name, number in zip(names, _flat(step(block, variables)), strict=True)
         ]
-        moved = [f"{name} = {_text(number)};" for name, number in zip(names, after, strict=True) if name != number]
-        inside, reads = block.leading_to([*after, LEAVES])
+        assignments = [
+            f"{name} = {_text(number)};" for name, number in zip(names, new_values, strict=True) if name != number
+        ]
+        body, reads = block.leading_to([*new_values, LEAVES])
         lines = [f"let {name} = {_text(start)};" for name, start in zip(names, starts, strict=True)]
-        lines += [f"{head} {{", *_indented([*inside, *moved]), "}"]
+        lines += [f"{head} {{", *_indented([*body, *assignments]), "}"]
         self.statements.append((names, reads.union(_strings(starts)), lines))
         return variables
 
@@ -327,11 +329,11 @@ class _Block:
         if not rows and len(_opened(jaxpr)[0].outvars) == count and length > WRITTEN_OUT:
             head = f"for (let k = 0; k < {length}; k++)"
             return self.loop(head, carry, lambda block, carry: block.call(jaxpr, [*constants, *carry]))
-        stacked: list[Any] = [None] * length
+        rows_of_steps: list[Any] = [None] * length
         for k in reversed(range(length)) if reverse else range(length):
-            after = self.call(jaxpr, [*constants, *carry, *(np.asarray(row[k], object) for row in rows)])
-            carry, stacked[k] = after[:count], after[count:]
-        return [*carry, *(np.stack(parts) for parts in zip(*stacked, strict=True))]
+            new_values = self.call(jaxpr, [*constants, *carry, *(np.asarray(row[k], object) for row in rows)])
+            carry, rows_of_steps[k] = new_values[:count], new_values[count:]
+        return [*carry, *(np.stack(parts) for parts in zip(*rows_of_steps, strict=True))]
 
     def cond_(self, inputs: Values, branches: Sequence[Any], **_: Any) -> Values:
         number, operands = inputs[0].item(), inputs[1:]
@@ -343,9 +345,9 @@ class _Block:
         for k, branch in enumerate(branches):
             block = self.inner()
             end = _flat(block.call(branch, operands))
-            inside, inside_reads = block.leading_to(end)
-            written = [f"{name} = {_text(value)};" for name, value in zip(names, end, strict=True)]
-            lines += [f"{'} else ' if k else ''}if ({number} == {k}) {{", *_indented([*inside, *written])]
+            body, inside_reads = block.leading_to(end)
+            assignments = [f"{name} = {_text(value)};" for name, value in zip(names, end, strict=True)]
+            lines += [f"{'} else ' if k else ''}if ({number} == {k}) {{", *_indented([*body, *assignments])]
             reads |= inside_reads
         self.statements.append((names, reads, [*lines, "}"]))
         return variables

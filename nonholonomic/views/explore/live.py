@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ...integration import Status
+from ...integration.status import Status
 from ..page import Page, page, script
 from ..stage import Stage
 from .frame import Frame
@@ -71,10 +71,15 @@ def live_page(live: LiveRun, stage: Stage, speed: float = 1.0, below: str = "") 
     written in JavaScript.
     """
     # The title and the warnings describe one run, but the sliders change the run.
-    drawn = stage._replace(title="", shows=tuple(show._replace(note="") for show in stage.shows))
+    stage_of_live = stage._replace(title="", shows=tuple(show._replace(note="") for show in stage.shows))
     scripts = [script(text) for text in (programs(live), _file("map.js"), _file("explore.js"))]
     return page(
-        [drawn], live.title, speed, _file("explore.html"), f'<section id="below">{below}</section>', scripts=scripts
+        [stage_of_live],
+        live.title,
+        speed,
+        _file("explore.html"),
+        f'<section id="below">{below}</section>',
+        scripts=scripts,
     )
 
 

@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...integration import RUNNING, AbstractProblem, LaneState, Settings, explicit_tableau
+from ...integration import AbstractProblem, LaneState, Settings, explicit_tableau
 from ...integration.runge_kutta import Step, stages_to_look, watched_places
 from ...integration.scheduler import LaneScheduler
+from ...integration.status import RUNNING
 from ...integration.step import Control, after_step, length_to_try
 from .javascript import javascript
 
@@ -97,11 +98,11 @@ class Stepper(NamedTuple):
         time, state = lane.time, lane.state
         places = len(watched_places(explicit_tableau(self.settings.for_lanes)))
         margins = jax.tree.map(lambda least: jax.ShapeDtypeStruct((places, *least.shape), least.dtype), lane.margins)
-        tried = Step(state, state, state, time, time, margins)
+        trial = Step(state, state, state, time, time, margins)
 
-        def after(constants: Any, lane: LaneState, length: Any, tried: Step) -> LaneState:
+        def after(constants: Any, lane: LaneState, length: Any, trial: Step) -> LaneState:
             problem, control, atols = run(constants)
-            return after_step(problem, control, atols, lane, length, tried)
+            return after_step(problem, control, atols, lane, length, trial)
 
         return {
             "begin": (lambda *inputs: eqx.filter(_started(self.begin, *inputs), eqx.is_array), self.examples),
@@ -115,7 +116,7 @@ class Stepper(NamedTuple):
                 lambda constants, state, rate: run(constants)[0].crossing_along(state, rate),
                 (constants, state, state),
             ),
-            "after": (after, (constants, lane, time, tried)),
+            "after": (after, (constants, lane, time, trial)),
         }
 
     @property

@@ -42,8 +42,8 @@ def sliders_of(
             f"sliders = {ranges!r} must be a dictionary, name of a parameter -> (low, high), such as "
             '{"theta": (0.05, 0.5)}'
         )
-    known = {path: value for root, tree in roots.items() for path, value in numbers(root, tree).items()}
-    scalars = [path for path, value in known.items() if value is not None and np.ndim(value) == 0]
+    values = {path: value for root, tree in roots.items() for path, value in numbers(root, tree).items()}
+    scalars = [path for path, value in values.items() if value is not None and np.ndim(value) == 0]
     sliders = []
     for name, ends in ranges.items():
         path = full_name("sliders", name, scalars)
@@ -53,7 +53,7 @@ def sliders_of(
                 f"sliders[{name!r}]: {path} changes the drawn arena or body, which a page cannot change; "
                 "write a page for each value"
             )
-        value, short = float(known[path]), path.rsplit(".", 1)[-1]
+        value, label_name = float(values[path]), path.rsplit(".", 1)[-1]
         if not low <= value <= high:
             raise ValueError(
                 f"sliders[{name!r}] = {ends!r} must contain the parameter's own value, {value:g}: the page starts there"
@@ -61,8 +61,8 @@ def sliders_of(
         for end in (low, high):
             # The modules check the number.
             with_numbers(roots, {path: end})
-        unit = readable_unit(units.get(short, "1"))
-        sliders.append(Slider(name, path, labels.get(short, short.replace("_", " ")), unit, low, high, value))
+        unit = readable_unit(units.get(label_name, "1"))
+        sliders.append(Slider(name, path, labels.get(label_name, label_name.replace("_", " ")), unit, low, high, value))
     return tuple(sliders)
 
 

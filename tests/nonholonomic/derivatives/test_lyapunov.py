@@ -6,7 +6,8 @@ import numpy as np
 from close import assert_close
 
 from nonholonomic.derivatives import exponent_of, growth
-from nonholonomic.integration import LEFT_DOMAIN, REACHED_END, AbstractProblem, Settings
+from nonholonomic.integration import AbstractProblem, Settings
+from nonholonomic.integration.status import LEFT_DOMAIN, REACHED_END
 
 
 class Shears(AbstractProblem):

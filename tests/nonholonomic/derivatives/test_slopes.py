@@ -12,7 +12,8 @@ import nonholonomic.derivatives._adjoint as adjoint
 import nonholonomic.derivatives._periods as periods
 import nonholonomic.derivatives.slopes as slopes
 from nonholonomic.derivatives import tangents_of
-from nonholonomic.integration import CROSSED, LEFT_DOMAIN, AbstractProblem, Settings
+from nonholonomic.integration import AbstractProblem, Settings
+from nonholonomic.integration.status import CROSSED, LEFT_DOMAIN
 
 MOVED = ("rate", "height", "growth")
 #: So many that the runs are differentiated backward.
@@ -143,7 +144,7 @@ def test_runs_longer_than_what_is_kept_are_repeated(kept, steps, monkeypatch):
     the same to the last digit."""
     _, single_pass, _ = found_and_expected()
     monkeypatch.setattr(adjoint.StepRecorder, "period", 2)
-    monkeypatch.setattr(periods, "KEPT", kept)
+    monkeypatch.setattr(periods, "SLOTS", kept)
     monkeypatch.setattr(periods, "STEPS_KEPT", steps)
     _, segments, expected = found_and_expected(run=compiled_anew())
     for whole_slope, segment_slope, expected_slope in zip(single_pass, segments, expected, strict=True):
@@ -153,7 +154,7 @@ def test_runs_longer_than_what_is_kept_are_repeated(kept, steps, monkeypatch):
 
 def test_the_starts_that_are_kept_are_spread_out(monkeypatch):
     """Of two hundred starts eight are kept: the first and the last always, the others with no gap above half of the run."""
-    monkeypatch.setattr(periods, "KEPT", 8)
+    monkeypatch.setattr(periods, "SLOTS", 8)
     checkpoints = periods.Checkpoints.none(jnp.zeros(()))
     for index in range(200):
         checkpoints = checkpoints.added(jnp.asarray(index), jnp.asarray(float(index)))

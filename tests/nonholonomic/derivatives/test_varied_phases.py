@@ -15,7 +15,8 @@ from nonholonomic.hybrid import (
     solve_hybrid_with_tangents,
     traced_solve_hybrid_with_tangents,
 )
-from nonholonomic.integration import CROSSED, REACHED_END, RUNNING, AbstractProblem, Settings
+from nonholonomic.integration import AbstractProblem, Settings
+from nonholonomic.integration.status import CROSSED, REACHED_END, RUNNING
 
 CELLS = 8
 

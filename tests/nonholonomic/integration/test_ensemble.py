@@ -11,10 +11,6 @@ from close import assert_close
 from scipy.optimize import brentq
 
 from nonholonomic.integration import (
-    CROSSED,
-    FAILED,
-    LEFT_DOMAIN,
-    REACHED_END,
     AbstractPassive,
     AbstractProblem,
     ExtendedProblem,
@@ -25,6 +21,7 @@ from nonholonomic.integration import (
     solve_ensemble,
 )
 from nonholonomic.integration.ensemble import ensemble_solve
+from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END
 
 pytestmark = pytest.mark.newest
 

@@ -15,7 +15,8 @@ from nonholonomic.hybrid import (
     solve_hybrid,
     solve_hybrid_dense,
 )
-from nonholonomic.integration import CROSSED, REACHED_END, RUNNING, UNRESOLVED, AbstractProblem, Settings
+from nonholonomic.integration import AbstractProblem, Settings
+from nonholonomic.integration.status import CROSSED, REACHED_END, RUNNING, UNRESOLVED
 
 GRAVITY, CLOSING = 9.81, 1e-3
 

@@ -44,7 +44,7 @@ def test_a_step_is_that_of_diffrax(solver):
         np.testing.assert_allclose(step.state[:, lane], y1, rtol=1e-13, atol=1e-15)
         np.testing.assert_allclose(np.abs(step.error[:, lane]), np.abs(error), rtol=1e-9, atol=1e-15)
         np.testing.assert_allclose(step.rate[:, lane], field(t1, y1), rtol=1e-12, atol=1e-14)
-        assert step.watched[lane] == step.state[0, lane]
+        assert step.margin[lane] == step.state[0, lane]
         assert step.margins[-1, :, lane].tolist() == [10.0 + step.state[1, lane], 20.0 + step.state[0, lane]]
     # As far from the start as the state moves in the part of the step that the places say.
     places = watched_places(explicit_tableau(solver))

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from close import assert_close
 
-from nonholonomic.integration import LEFT_DOMAIN, REACHED_END, AbstractProblem, Settings, solve_with_samples
+from nonholonomic.integration import AbstractProblem, Settings, solve_with_samples
+from nonholonomic.integration.status import LEFT_DOMAIN, REACHED_END
 
 CELLS = 40
 

@@ -35,7 +35,7 @@ def large_sweep(path, **options):
 
 @pytest.fixture
 def in_its_file(monkeypatch):
-    monkeypatch.setattr("nonholonomic.sweeps.table.HELD", 1000)
+    monkeypatch.setattr("nonholonomic.sweeps.table.MAX_BYTES_IN_MEMORY", 1000)
 
 
 def test_a_table_in_its_file_takes_the_memory_of_some_blocks(tmp_path, monkeypatch, in_its_file):

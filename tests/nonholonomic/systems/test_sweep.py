@@ -57,8 +57,8 @@ def test_a_job_may_be_sent_to_another_process():
     named = Named.of({"system": BALL, "start": jnp.array([1.0, 0.0, 0.0]), "event": None})
     job = SweepJob(named, 1.4, Settings(1e-9), ())
     sent = pickle.loads(pickle.dumps(job))
-    assert sent.named.names == job.named.names
-    assert_close(sent.named.values, job.named.values)
+    assert sent.parameters.names == job.parameters.names
+    assert_close(sent.parameters.values, job.parameters.values)
 
 
 class Middle(eqx.Module):
