@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from nonholonomic.hybrid import HybridOutcome
-from nonholonomic.integration import REACHED_END, Settings
+from nonholonomic.integration import Settings
+from nonholonomic.integration.status import REACHED_END
 from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.sweeps import chunk_for
 
