@@ -88,8 +88,8 @@ def test_a_file_with_the_words_of_earlier_versions_is_read_with_those_of_today(t
     # The same call finds all of it done.
     assert swept(OF_TRAJECTORIES, tmp_path / "old.h5", fails_at=0).status.tolist() == table.status.tolist()
     table.save(tmp_path / "new.h5")
-    with xarray.open_dataset(tmp_path / "new.h5", engine="h5netcdf") as stored:
-        assert stored["status"].attrs["flag_meanings"].split()[0] == "completed"
+    with xarray.open_dataset(tmp_path / "new.h5", engine="h5netcdf") as dataset:
+        assert dataset["status"].attrs["flag_meanings"].split()[0] == "completed"
 
 
 def test_a_sweep_that_was_begun_with_the_former_words_goes_on_with_all_of_today(tmp_path):

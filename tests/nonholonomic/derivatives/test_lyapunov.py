@@ -18,8 +18,8 @@ class Shears(AbstractProblem):
     end: jax.Array
 
     def start(self):
-        ones = jnp.ones_like(self.a)
-        return jnp.stack([ones, ones, 0.0 * ones]), jnp.stack([ones, ones, ones])
+        one = jnp.ones_like(self.a)
+        return jnp.stack([one, one, 0.0 * one]), jnp.stack([one, one, one])
 
     def field(self, time, state):
         return jnp.stack([self.a * state[0] + state[1], self.b * state[1], jnp.ones_like(state[2])])
@@ -37,8 +37,8 @@ class Lorenz(AbstractProblem):
     x: jax.Array
 
     def start(self):
-        ones = jnp.ones_like(self.x)
-        return jnp.stack([self.x, 1.0 + self.x, 20.0 * ones]), jnp.stack([10.0 * ones] * 3)
+        one = jnp.ones_like(self.x)
+        return jnp.stack([self.x, 1.0 + self.x, 20.0 * one]), jnp.stack([10.0 * one] * 3)
 
     def field(self, time, state):
         x, y, z = state

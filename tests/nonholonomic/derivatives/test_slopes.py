@@ -68,13 +68,16 @@ def found_and_expected(names=MANY, patience=1e3, heights=HEIGHTS, cells=100, run
     """Outcome, slopes by the named numbers, and what they should be; rate and height differ from cell to cell."""
     point = (jnp.asarray(RATES), jnp.asarray(heights), jnp.asarray(0.7))
     tangents = [
-        tuple(jnp.full_like(component, name == moved) for component, moved in zip(point, MOVED, strict=True))
+        tuple(
+            jnp.full_like(component, name == name_of_tangent)
+            for component, name_of_tangent in zip(point, MOVED, strict=True)
+        )
         for name in names
     ]
     options = {"solver": diffrax.Dopri8()} | options
     outcome, derivatives = run(point, tangents, jnp.asarray(patience), jnp.asarray(cells), **options)
-    every = gradients(*point)
-    return outcome, derivatives, [every[MOVED.index(name)] for name in names]
+    all_gradients = gradients(*point)
+    return outcome, derivatives, [all_gradients[MOVED.index(name)] for name in names]
 
 
 def compiled_anew():
@@ -118,11 +121,11 @@ def test_few_directions_are_integrated_forward_and_many_backward(count, backward
 
 def test_a_cell_that_ends_otherwise_has_no_slope_and_leaves_the_others_theirs():
     outcome, derivatives, expected = found_and_expected(patience=1.0)
-    late = np.asarray(time_of_decay(RATES, HEIGHTS, 0.7)) > 1.0
-    assert 20 < late.sum() < 80
-    assert (np.asarray(outcome.status) == np.where(late, LEFT_DOMAIN, CROSSED)).all()
+    is_late = np.asarray(time_of_decay(RATES, HEIGHTS, 0.7)) > 1.0
+    assert 20 < is_late.sum() < 80
+    assert (np.asarray(outcome.status) == np.where(is_late, LEFT_DOMAIN, CROSSED)).all()
     for slope, expected_slope in zip(derivatives, expected, strict=True):
-        assert_close(slope, np.where(late, 0.0, expected_slope), rtol=1e-7)
+        assert_close(slope, np.where(is_late, 0.0, expected_slope), rtol=1e-7)
 
 
 @pytest.mark.parametrize("cells", [0, pytest.param(1, marks=pytest.mark.slow), 70])
@@ -193,7 +196,9 @@ def test_a_component_at_rest_has_its_tangent_integrated(names):
     """Steps judged by the run alone would reach the event in a few strides of which the tangent bears none: along one
     direction, and backward by five."""
     point = (jnp.zeros(4), jnp.zeros(4))
-    tangents = [tuple(jnp.full(4, name == moved) * 1.0 for moved in ("rest", "push")) for name in names]
+    tangents = [
+        tuple(jnp.full(4, name == name_of_tangent) * 1.0 for name_of_tangent in ("rest", "push")) for name in names
+    ]
 
     @eqx.filter_jit
     def run():

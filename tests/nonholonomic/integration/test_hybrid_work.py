@@ -65,11 +65,11 @@ class Turn(AbstractBatchedMode):
 
     def reset_map(self, state, left):
         zero = jnp.zeros_like(state[0])
-        other = zero.astype(int) + 1 - self.clock
-        clocks = [jnp.where(other == k, OWN, OTHER) for k in range(2)]
+        next_mode = zero.astype(int) + 1 - self.clock
+        clocks = [jnp.where(next_mode == k, OWN, OTHER) for k in range(2)]
         counts = jnp.ones((1, *zero.shape), int)
         return Transition(
-            other, jnp.stack([*clocks, *state[2:]]), zero, zero.astype(int) + RUNNING, zero + jnp.inf, counts
+            next_mode, jnp.stack([*clocks, *state[2:]]), zero, zero.astype(int) + RUNNING, zero + jnp.inf, counts
         )
 
 

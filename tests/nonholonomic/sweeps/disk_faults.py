@@ -34,9 +34,9 @@ def fail_on_disk(monkeypatch, moment, torn, error):
     def saved(stream, savez=np.savez, **arrays):
         buffer = io.BytesIO()
         savez(buffer, **arrays)
-        falls = next(count) == moment
-        stream.write(buffer.getvalue()[: int(torn * len(buffer.getvalue())) if falls else None])
-        if falls:
+        is_due = next(count) == moment
+        stream.write(buffer.getvalue()[: int(torn * len(buffer.getvalue())) if is_due else None])
+        if is_due:
             raise error
 
     monkeypatch.setattr(os, "fsync", failing(os.fsync))

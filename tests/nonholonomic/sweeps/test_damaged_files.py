@@ -35,38 +35,38 @@ def contents(path):
 
 def check_flips(images, folder, places_of):
     """A file with one bit flipped is read as it was, or refused."""
-    refused = 0
+    refusals = 0
     for name, image in images.items():
         path = folder / f"{name}.h5"
         path.write_bytes(image)
         right = contents(path)
         for place, bit in places_of(image):
-            changed = bytearray(image)
-            changed[place] ^= 1 << bit
-            path.write_bytes(changed)
+            damaged = bytearray(image)
+            damaged[place] ^= 1 << bit
+            path.write_bytes(damaged)
             content = contents(path)
-            refused += content is None
+            refusals += content is None
             assert content in (None, right), place
-    return refused
+    return refusals
 
 
 def test_a_flipped_bit(images, tmp_path):
     random = np.random.default_rng(1)
-    refused = check_flips(
+    refusals = check_flips(
         images,
         tmp_path,
         lambda image: zip(random.integers(len(image), size=60), random.integers(8, size=60), strict=True),
     )
-    assert 20 < refused < 100
+    assert 20 < refusals < 100
 
 
 @pytest.mark.slow
 def test_a_bit_flipped_in_every_byte(images, tmp_path):
     random = np.random.default_rng(2)
-    refused = check_flips(
+    refusals = check_flips(
         images, tmp_path, lambda image: ((place, int(random.integers(8))) for place in range(len(image)))
     )
-    assert refused > 5000
+    assert refusals > 5000
 
 
 def check_flips_of_blocks(folder, places_of):
@@ -74,21 +74,21 @@ def check_flips_of_blocks(folder, places_of):
     start = folder / "start" / "table.h5"
     start.parent.mkdir()
     half_finished(start)
-    right, refused = contents(start), 0
+    right, refusals = contents(start), 0
     for file in sorted((folder / "start" / "table.h5.blocks").iterdir()):
         for place, bit in places_of(file.read_bytes()):
             shutil.rmtree(folder / "now", ignore_errors=True)
             shutil.copytree(folder / "start", folder / "now")
             path = folder / "now" / "table.h5"
-            changed = bytearray(file.read_bytes())
-            changed[place] ^= 1 << bit
-            (folder / "now" / "table.h5.blocks" / file.name).write_bytes(changed)
+            damaged = bytearray(file.read_bytes())
+            damaged[place] ^= 1 << bit
+            (folder / "now" / "table.h5.blocks" / file.name).write_bytes(damaged)
             content = contents(path)
             assert content in (None, right), (file.name, place)
-            refused += content is None
+            refusals += content is None
             if file.suffix == ".npz":
                 assert len(resumed(path)) == 4 + (content is None)
-    return refused
+    return refusals
 
 
 def test_a_bit_flipped_in_a_block(tmp_path):
@@ -168,20 +168,20 @@ def test_foreign_files_and_folders_are_left_alone(images, tmp_path):
         file.attrs["request"] = file.attrs["axes"] = "{}"
         file.create_group("checksums")
     for path in (text, empty, foreign, half):
-        before = path.read_bytes()
+        content_before = path.read_bytes()
         assert contents(path) is None
         with pytest.raises(OSError, match=f"cannot read {path}"):
             cheap_sweep(path, pytest.fail)
-        assert path.read_bytes() == before
-    saved = tmp_path / "saved.h5"
-    saved.write_bytes(images["saved"])
+        assert path.read_bytes() == content_before
+    copy = tmp_path / "saved.h5"
+    copy.write_bytes(images["saved"])
     with pytest.raises(ValueError, match=r"saved\.h5 holds .*: it was not written by a sweep in 7 chunks"):
-        cheap_sweep(saved, pytest.fail)
+        cheap_sweep(copy, pytest.fail)
     folder = tmp_path / "folder"
     folder.mkdir()
     with pytest.raises(OSError, match="folder: it is a folder"):
         cheap_sweep(folder, pytest.fail)
-    assert saved.read_bytes() == images["saved"]
+    assert copy.read_bytes() == images["saved"]
     # No one may write in the first; the second is no folder.
     for path in (Path("/proc/table.h5"), text / "table.h5"):
         with pytest.raises(OSError, match=f"cannot write {path}"):

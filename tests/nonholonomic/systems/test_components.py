@@ -42,9 +42,9 @@ def test_zeros_are_not_computed_with():
     def scaled(*parts):
         return tuple(np.diag(np.arange(6.0)) @ jnp.stack(parts))
 
-    listed = jax.make_jaxpr(by_components(scaled, *SCALARS))(*LANES)
-    assert [equation.primitive.name for equation in listed.eqns].count("mul") == 4
-    assert "add" not in [equation.primitive.name for equation in listed.eqns]
+    jaxpr = jax.make_jaxpr(by_components(scaled, *SCALARS))(*LANES)
+    assert [equation.primitive.name for equation in jaxpr.eqns].count("mul") == 4
+    assert "add" not in [equation.primitive.name for equation in jaxpr.eqns]
 
 
 def hidden_in_zeros(*parts):
@@ -62,8 +62,8 @@ def test_a_number_that_is_not_finite_does_not_disappear_with_the_zeros_of_a_matr
     results = np.array(by_components(hidden_in_zeros, *SCALARS)(*parts))
     assert_close(results[:, 0], expected[:, 0], rtol=1e-15)
     assert np.isnan(results).any(axis=0).tolist() == [False, True, True]
-    listed = jax.make_jaxpr(by_components(hidden_in_zeros, *SCALARS))(*parts)
-    assert [equation.primitive.name for equation in listed.eqns].count("mul") == 3
+    jaxpr = jax.make_jaxpr(by_components(hidden_in_zeros, *SCALARS))(*parts)
+    assert [equation.primitive.name for equation in jaxpr.eqns].count("mul") == 3
 
 
 def test_large_functions_and_loops_are_left_in_arrays():
