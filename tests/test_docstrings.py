@@ -74,10 +74,10 @@ def folders_of_its_own(tmp_path, monkeypatch):
     """Temporary folders are removed, and compiled programs are kept afterwards where they were kept before."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.delenv("NONHOLONOMIC_CACHE", raising=False)
-    before = {name: getattr(jax.config, name) for name in KEPT}
+    values_before = {name: getattr(jax.config, name) for name in KEPT}
     yield
-    if jax.config.jax_compilation_cache_dir != before["jax_compilation_cache_dir"]:
-        for name, value in before.items():
+    if jax.config.jax_compilation_cache_dir != values_before["jax_compilation_cache_dir"]:
+        for name, value in values_before.items():
             jax.config.update(name, value)
         compilation_cache.reset_cache()
 

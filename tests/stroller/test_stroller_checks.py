@@ -28,16 +28,18 @@ def test_illegal_numbers_in_a_batch_of_rides_give_nothing_that_looks_right():
         launch, options = Launch((0.3, latitude), 0.5, 1.5, steering), {"times": [0.0, 0.1], "tolerance": tolerance}
         return stroller.simulate(scene, launch, 0.1, push, **options)
 
-    good = (1.7, 0.2, -0.6, 0.3, 1e-9)
-    columns = [good]
-    for which, values in ((0, (-1.7, np.nan)), (1, (np.pi / 2,)), (2, (2.0,)), (3, (-0.3,)), (4, (-1.0, np.nan))):
-        columns += [tuple(value if i == which else number for i, number in enumerate(good)) for value in values]
+    legal_values = (1.7, 0.2, -0.6, 0.3, 1e-9)
+    columns = [legal_values]
+    for column, values in ((0, (-1.7, np.nan)), (1, (np.pi / 2,)), (2, (2.0,)), (3, (-0.3,)), (4, (-1.0, np.nan))):
+        columns += [
+            tuple(value if i == column else number for i, number in enumerate(legal_values)) for value in values
+        ]
     rides = jax.jit(jax.vmap(ride))(*jnp.array(columns).T)
     assert rides.stats.finished.tolist() == [True] + 7 * [False]
     assert jax.vmap(ride)(*jnp.array(columns).T[:, :0]).speed.shape == (0, 2)
-    for read in (rides.position, rides.steering, rides.energy, rides.work, rides.normal_force, rides.load):
-        assert np.all(np.isfinite(read[0]))
-        assert np.all(np.isnan(read[1:]))
+    for values_ in (rides.position, rides.steering, rides.energy, rides.work, rides.normal_force, rides.load):
+        assert np.all(np.isfinite(values_[0]))
+        assert np.all(np.isnan(values_[1:]))
 
 
 BAD = [

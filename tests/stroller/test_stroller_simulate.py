@@ -69,8 +69,8 @@ def test_midpoint_rule_is_of_second_order_and_balances_energy(reference):
     errors = []
     for step, end in ((0.02, 10.0), (0.01, 5.0)):
         run = midpoint_ride(np.linspace(0.0, end, 11), step)
-        at = int(jnp.searchsorted(run.t, 3.0 - 1e-9))
-        errors.append(float(jnp.linalg.norm(run.position[at] - reference.position[3])))
+        index = int(jnp.searchsorted(run.t, 3.0 - 1e-9))
+        errors.append(float(jnp.linalg.norm(run.position[index] - reference.position[3])))
         assert_exact_balance(run)
     np.testing.assert_allclose(errors[0] / errors[1], 4.0, rtol=0.03)
 
@@ -107,9 +107,9 @@ def test_a_ride_by_the_midpoint_rule_can_be_kept_on_disk():
     problem, grid = RideProblem.single(FULL, LAUNCH, None), jnp.linspace(0.0, 0.1, 3)
     settings = Settings(1e-9, ImplicitMidpoint(0.05))
     program = jax.make_jaxpr(lambda t1: sample(problem, None, t1, settings, grid=grid).states)(0.1)
-    asked = jax.make_jaxpr(lambda t1: sample(problem, grid, t1, settings, grid=grid).states)(0.1)
+    program_of_times = jax.make_jaxpr(lambda t1: sample(problem, grid, t1, settings, grid=grid).states)(0.1)
     assert "callback" not in str(program)
-    assert "callback" in str(asked)
+    assert "callback" in str(program_of_times)
 
 
 def test_adaptive_energy_error_follows_the_tolerance():
@@ -176,13 +176,13 @@ def test_runs_are_vmapped_and_scene_numbers_too():
     np.testing.assert_allclose(batch[1], end(1.0), atol=1e-9)
 
 
-def central_difference(function, tree, where, scale):
+def central_difference(function, tree, leaf_of, scale):
     """Central difference of a function with respect to a number of a tree, at the step where it changes least."""
     steps = scale * np.array([3e-3, 1e-3, 3e-4, 1e-4])
-    value = where(tree)
+    value = leaf_of(tree)
     slopes = []
     for h in steps:
-        ends = [function(eqx.tree_at(where, tree, value + offset)) for offset in (-2 * h, -h, h, 2 * h)]
+        ends = [function(eqx.tree_at(leaf_of, tree, value + offset)) for offset in (-2 * h, -h, h, 2 * h)]
         slopes.append((ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * h))
     changes = [np.max(np.abs(a - b)) for a, b in itertools.pairwise(slopes)]
     return slopes[int(np.argmin(changes)) + 1]
