@@ -38,8 +38,8 @@ def over_the_crest() -> Row:
     )
     run = timed(lambda: tippe.simulate(scene, launch, number["t1"], tolerance=1e-11), 1)
     error = abs(float(run.result.end_time) - number["end_time"])
-    happens = f"loses contact at {float(run.result.end_time):.6f} s"
-    return of_runs("2.1 m/s over waves of 40 mm", happens, error, 1e-7, "SciPy by events, time [s]", run)
+    outcome = f"loses contact at {float(run.result.end_time):.6f} s"
+    return of_runs("2.1 m/s over waves of 40 mm", outcome, error, 1e-7, "SciPy by events, time [s]", run)
 
 
 def no_room() -> Row:
@@ -59,8 +59,8 @@ def a_thousand_seconds_in_a_bowl() -> Row:
     launch = tippe.Launch(0.3, 20.0, place=(0.1, 0.05), velocity=(0.2, 0.1))
     run = timed(lambda: tippe.simulate(scene, launch, 1000.0, tolerance=1e-6), 1)
     feet = tuple(np.asarray(run.result.states[8:11]))
-    off = float(np.max(np.abs(scene.surface.offset(feet))) / 0.02)
-    error = off if run.result.status == "completed" else math.nan
+    offset = float(np.max(np.abs(scene.surface.offset(feet))) / 0.02)
+    error = offset if run.result.status == "completed" else math.nan
     return of_runs("1000 s in a bowl, tolerance 1e-6", "the foot stays on it", error, 1e-6, "on the arena [R]", run)
 
 

@@ -110,14 +110,14 @@ def test_an_independent_program_finds_these_losses(mu, theta, spin, lost):
 def first_loss(body: Body, state: np.ndarray, t1: float) -> float:
     """When the normal force first vanishes [s]: 30 looks at every step, and at the least of them the minimum."""
     run = solve_ivp(rate(body), (0.0, t1), state, "DOP853", rtol=1e-12, atol=1e-12, dense_output=True)
-    for start, end in zip(run.t[:-1], run.t[1:], strict=True):
-        looks = np.linspace(start, end, 31)
+    for step_start, end in zip(run.t[:-1], run.t[1:], strict=True):
+        looks = np.linspace(step_start, end, 31)
         forces = [normal_force(body, run.sol(time)) for time in looks]
-        bound = int(np.argmin(forces))
-        bounds = looks[max(bound - 1, 0)], looks[min(bound + 1, 30)]
+        index = int(np.argmin(forces))
+        bounds = looks[max(index - 1, 0)], looks[min(index + 1, 30)]
         minimum = minimize_scalar(lambda time: normal_force(body, run.sol(time)), bounds=bounds, method="bounded")
         if minimum.fun < 0.0:
-            low, high = start, minimum.x
+            low, high = step_start, minimum.x
             for _ in range(50):
                 middle = 0.5 * (low + high)
                 low, high = (middle, high) if normal_force(body, run.sol(middle)) > 0.0 else (low, middle)
