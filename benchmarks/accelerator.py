@@ -87,7 +87,7 @@ def samples(launches: int, tolerance: float) -> Any:
 
 
 def sampled_table(launches: int, tolerance: float) -> np.ndarray:
-    """The same by `trajectory_table`."""
+    """theta at 201 times by `trajectory_table`."""
     grid = {"theta": thetas(launches), "spin": SPIN, "times": np.linspace(0.0, T1, 201)}
     table = tippe.trajectory_table(scene(tippe.Viscous(0.3)), **grid, tolerance=tolerance, progress=False)
     return table.theta
@@ -103,7 +103,7 @@ _gradients: dict[int, Any] = {}
 
 
 def _gradient_of(launches: int, loss: Any) -> Any:
-    """Compiled once for each number of launches."""
+    """The gradient; compiled once for each number of launches."""
     return _gradients.setdefault(launches, jax.jit(jax.grad(loss)))
 
 

@@ -130,7 +130,7 @@ def of_stroller(ground: AbstractSurface) -> tuple[AbstractProblem, ...]:
 
 
 def counts_of_field(problems: Problems) -> list[int]:
-    """Operations of the field, a slow function as 20; of each mode where there are several."""
+    """Operations of the field, or of the field of each mode; a slow function counts as 20."""
     return [rounded(operations_of_field(problem)) for problem in problems()]
 
 

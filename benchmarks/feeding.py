@@ -35,7 +35,7 @@ VARIABLES |= {name: Variable("1", np.int64) for name in ("steps", "rejected")}
 
 
 def results(columns, count):
-    """Numbers that cost nearly nothing."""
+    """Results that take almost no time to compute."""
     variables = {name: columns["x"] for name in NAMES}
     zeros = np.zeros(len(columns["x"]), int)
     return variables | {"status": zeros.astype(np.int8), "steps": zeros, "rejected": zeros}

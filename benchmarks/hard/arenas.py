@@ -23,7 +23,7 @@ REFERENCE = list(
 
 
 def over_the_crest() -> Row:
-    """Over the crest of a wave at 2.1 m/s: the time at which contact is lost, and the axis then."""
+    """A top that crosses the crest of a wave at 2.1 m/s: time of the loss of contact, and the axis at that time."""
     row = next(case for case in REFERENCE if case["arena"] == "graph" and case["status"] == "contact_lost")
     number = {name: float(value) for name, value in row.items() if name not in ("arena", "status")}
     waves = tippe.Graph(lambda x, y: number["p1"] * jnp.sin(number["p2"] * x) * jnp.cos(number["p2"] * y))
@@ -43,7 +43,7 @@ def over_the_crest() -> Row:
 
 
 def no_room() -> Row:
-    """Along a trough that narrows: the run ends where its curvature is that of the ball."""
+    """A top in a trough that narrows: the run ends where the curvature of the trough is that of the ball."""
     trough = tippe.Graph(lambda x, y: y * y * (5.0 + 150.0 * x))
     launch = tippe.Launch(0.0, 50.0, place=(0.0, 0.0), velocity=(0.4, 0.0))
     run = timed(lambda: tippe.simulate(tippe.Scene(rutstam_top(), trough), launch, 1.0), 1)
@@ -53,7 +53,7 @@ def no_room() -> Row:
 
 
 def a_thousand_seconds_in_a_bowl() -> Row:
-    """1000 s in a bowl given by a function: how far the foot has left it at most."""
+    """1000 s in a bowl given by a function: greatest distance of the foot from the bowl."""
     bowl = tippe.Graph(lambda x, y: 2.0 * jnp.sqrt(0.25 + x * x + y * y))
     scene = tippe.Scene(rutstam_top(), bowl, tippe.Viscous(0.02))
     launch = tippe.Launch(0.3, 20.0, place=(0.1, 0.05), velocity=(0.2, 0.1))

@@ -50,7 +50,7 @@ def hertz_disc(ratio: float, rings: int = 100, directions: int = 400) -> tuple[f
 
 
 def disc_by_quadrature() -> Row:
-    """The ellipsoid against the exact disc over four decades of sliding against drilling: a departure, not an error."""
+    """Departure of the ellipsoidal approximation from the exact disc, over four decades of sliding relative to drilling."""
     law, radius = tippe.Contensou(1.0, 0.01, 1e-12), 0.01
 
     def departure() -> float:
