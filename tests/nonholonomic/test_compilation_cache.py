@@ -1,4 +1,4 @@
-"""Compiled programs on disk: a second process compiles nothing, and a bad entry costs a compilation, nothing else."""
+"""Compiled programs on disk: a second process compiles nothing, and a damaged entry costs only a compilation."""
 
 import concurrent.futures
 import json
@@ -42,7 +42,7 @@ SMALL = "result = jax.jit(lambda x: (x * x).sum())(np.arange(4.0)).item()"
 
 
 def run(program, home, **settings):
-    """What `COUNTED` tells in a process of its own, in which every warning is an error, and what else it says."""
+    """The result of `COUNTED` in a separate process in which every warning is an error, and its other output."""
     settings_of_cache = ("JAX_COMPILATION_CACHE_DIR", "NONHOLONOMIC_CACHE")
     settings = {name: value for name, value in os.environ.items() if name not in settings_of_cache} | settings
     settings |= {"XDG_CACHE_HOME": str(home), "JAX_PLATFORMS": "cpu"}
@@ -70,7 +70,7 @@ def damaged(content):
 
 @pytest.fixture(scope="module")
 def small_home(tmp_path_factory):
-    """A home in which a process has left the compiled `SMALL`, and what it told."""
+    """A home folder with the compiled `SMALL`, and the output of the process that compiled it."""
     home = tmp_path_factory.mktemp("home")
     return home, run(SMALL, home)[0]
 
@@ -136,7 +136,7 @@ def test_without_a_folder_everything_goes_on(forbidden, tmp_path):
     (tmp_path / "nonholonomic").write_text("this is a file")
     answer, message = run(SMALL, tmp_path, **({"NONHOLONOMIC_CACHE": "0"} if forbidden else {}))
     assert (answer["folder"], answer["result"], answer["found"]) == ("None", 14.0, 0)
-    # One line names the folder; nobody needs to be told of what he has forbidden.
+    # One line names the folder; there is no message if the user has switched caching off.
     assert len(message.splitlines()) == (0 if forbidden else 1)
     assert forbidden or str(tmp_path / "nonholonomic") in message
 
@@ -151,7 +151,7 @@ SETTINGS = (
 
 @pytest.fixture
 def unset(monkeypatch):
-    """No folder is chosen or forbidden, and what is set after that is forgotten."""
+    """Without a chosen folder, and with caching allowed; later changes of settings are undone."""
     monkeypatch.delenv("NONHOLONOMIC_CACHE", raising=False)
     values_before = {name: getattr(jax.config, name) for name in SETTINGS}
     jax.config.update("jax_compilation_cache_dir", None)

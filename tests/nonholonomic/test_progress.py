@@ -1,4 +1,4 @@
-"""A long call says what it is doing, to whoever watches."""
+"""The status line of a long call."""
 
 import io
 import subprocess
@@ -32,7 +32,7 @@ class Pipe(Terminal):
 
 
 def slow_sweep(monkeypatch, stream, cells=6, block=3, waits=(1.3, 0.8), **options):
-    """A sweep that compiles for 1.3 s and takes 0.8 s for each of its blocks, one at a time; what it writes, and when."""
+    """Output, with times, of a sweep that compiles for 1.3 s and takes 0.8 s for each of its blocks, one at a time."""
 
     def compute(columns, count):
         time.sleep(waits[count > 0])
@@ -67,7 +67,7 @@ def test_a_table_of_one_block_says_so_too(monkeypatch):
 
 
 def test_the_rate_is_that_of_all_workers(monkeypatch):
-    """Two at once: what the first two blocks took is not known apart from the preparations, and the rest is twice as fast."""
+    """With two workers, the time of the first two blocks includes the preparations, and the rest is twice as fast."""
     with ThreadPoolExecutor(2) as pool:
         lines = slow_sweep(monkeypatch, Terminal(), cells=18, executor=pool)
     half = next(text for _, text in lines if "12/18" in text)
@@ -102,7 +102,7 @@ def test_what_is_told_is_whether_a_program_is_being_made(monkeypatch):
 
 
 def test_a_line_within_a_line_does_not_garble_it(monkeypatch):
-    """One that counts takes the line while it lasts; one that does not, leaves it alone."""
+    """A context that counts items owns the line until it ends; a context that does not count leaves the line unchanged."""
     terminal = watched(monkeypatch)
     with status_line("fitting"):
         with status_line("simulating"):

@@ -125,7 +125,7 @@ def follow(case, rtol=1e-13, max_step=1e-3):
 
 
 def row(case):
-    """What the file holds of a case."""
+    """The row of a case in the file."""
     samples, hops, place = follow(case)
     entry = dict(zip(("q1", "q2", "q3"), place, strict=True))
     entry |= {"hops": len(hops), "first": hops[0][0], "landing": hops[0][1]}

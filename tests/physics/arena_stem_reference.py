@@ -165,7 +165,7 @@ def follow(case):
 
 
 def row(case):
-    """What the file holds of a case."""
+    """The row of a case in the file."""
     samples, place, landings, hops = follow(case)
     entry = dict(zip(("q1", "q2", "q3"), place, strict=True)) | {"hops": len(hops), "landings": len(landings)}
     entry |= {f"landings_{k}": sum(sphere == k for _, sphere, _ in landings) for k in (0, 1)}

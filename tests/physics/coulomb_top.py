@@ -59,7 +59,7 @@ def skew(r):
 
 
 class Contact:
-    """What both kinds of motion need at a state."""
+    """Quantities at a state that both kinds of motion need."""
 
     def __init__(self, body: Body, state: np.ndarray):
         e, u, w, centre = state[:3], state[3:6], state[6:9], state[9:]

@@ -272,7 +272,7 @@ def follow(case, rtol=1e-12, flight_step=2e-4, contact_step=2.5e-4, slowest=CLOS
             continue
         number = free_numbers[event_number - 1 - len(balls)]
         ball = case.balls[number]
-        # The ball is on the plane exactly; what the event left is round-off.
+        # Put the ball exactly on the plane: the event leaves a distance of round-off.
         state[2] = ball[1] - ball[0] * state[8]
         state, flying = resolve_impact(case, state, ball, slowest)
         contacts.append((time, number))
@@ -313,7 +313,7 @@ RESULTS = ("status", "time", "end_theta", "flights", "landings", "last_landing",
 
 
 def row(case, **accuracy):
-    """What the table holds of a case."""
+    """The row of a case in the table."""
     status, time, state, flights, contacts, energies, parted = follow(case, **accuracy)
     last = contacts[-1][0] if contacts else inf
     theta = np.arctan2(np.hypot(state[6], state[7]), state[8])

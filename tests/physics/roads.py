@@ -43,7 +43,7 @@ CODES = {
 
 
 def table_of(scenes: Batch, count: int, t1: float) -> dict[str, np.ndarray]:
-    """What a table of these scenes has, with errors, and the status in words."""
+    """The table of these scenes, with errors, and the status as words."""
     kind = run_kind_of(scenes.scene)
     roots = {"scene": scenes.scene, "launch": scenes.launch}
     first, second = (
@@ -96,7 +96,7 @@ def batch_of_runs(scenes: Batch, ends: np.ndarray, t1: float) -> tuple[np.ndarra
 
 
 class Findings:
-    """What differs, in words, and how many comparisons were made."""
+    """Descriptions of all differences, and the number of comparisons."""
 
     def __init__(self, kind: str):
         self.kind, self.lines, self.compared = kind, [], 0
@@ -194,7 +194,7 @@ def compare_with_stops(findings: Findings, scenes: Batch, hybrid: dict[str, np.n
 
 
 def main(kinds: list[str]) -> int:
-    """Search through some kinds of scenes and print what differs."""
+    """Search some kinds of scenes and print the differences."""
     differing_batches = 0
     for kind in kinds:
         count, singles = (45, 3) if kind.endswith("stop") else (16, 1) if kind.startswith("plane") else (4, 1)

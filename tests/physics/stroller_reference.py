@@ -65,7 +65,7 @@ def graph(height: Callable[[float, float], tuple[Array, Array]]) -> Level:
 
 
 class Vehicle(NamedTuple):
-    """Numbers of the stroller and of what acts on it, in SI units; `damping`: rolling, front, scrub, steering."""
+    """Parameters of the stroller and of the forces on it, in SI units; `damping`: rolling, front, scrub, steering."""
 
     mass: float
     wheelbase: float

@@ -1,4 +1,4 @@
-"""Flights over any arena: an independent program, the plane as a graph, energy, and what is refused."""
+"""Flights over any arena: comparison with an independent program, the plane as a graph, energy, and illegal scenes."""
 
 import diffrax
 import jax.numpy as jnp

@@ -67,7 +67,7 @@ def check_against_the_program(number: int, surface: tippe.Cylinder | tippe.Parab
 
 @pytest.mark.slow
 def test_both_spheres_bounce_in_a_cylinder():
-    """A top thrown over onto its stem, and one that starts on it, against NumPy and SciPy."""
+    """A top thrown onto its stem and a top that starts on its stem agree with a reference in NumPy and SciPy."""
     run = check_against_the_program(0, tippe.Cylinder(CASES[0].p1))
     assert run.contact[0] == 0
     run_on_stem = check_against_the_program(1, tippe.Cylinder(CASES[1].p1))
@@ -129,7 +129,7 @@ def test_both_spheres_bounce_in_a_bowl():
 
 @pytest.mark.slow
 def test_a_huge_cylinder_is_the_plane():
-    """Tables: what differs falls as the curvature does, to 1e-7 of the times."""
+    """The difference between tables decreases with the curvature, to 1e-7 of the times."""
     arguments = {"theta": 0.1, "spin": [180.0, 190.0], "t1": 1.6, "tolerance": 1e-11}
     friction, errors = tippe.Coulomb(0.3, 0.05), []
     plane = tippe.inversion_table(tippe.Scene(TOP, friction=friction, contact="hybrid"), **arguments)

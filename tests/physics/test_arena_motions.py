@@ -40,7 +40,7 @@ def scene_on(ground, mu=0.3, slip_speed=0.05, gravity=9.81):
 
 
 def launched(place, velocity=(0.0, 0.0), turning=(0.0, 0.0, 0.0), theta=0.3, spin=100.0, azimuth=0.0):
-    """A launch with all its numbers, so that all are of one kind."""
+    """A launch with all its numbers given, so that all launches share a program."""
     return tippe.Launch(theta, spin, azimuth=azimuth, place=place, velocity=velocity, angular_velocity=turning)
 
 
@@ -158,7 +158,7 @@ def test_a_table_says_where_the_ball_no_longer_fits():
 @settings(max_examples=12, deadline=None, derandomize=True)
 @given(strategies.integers(0, 2**32 - 1))
 def test_on_random_ground_energy_never_grows(seed):
-    """Finite or flagged; what energy is lost friction has taken."""
+    """Runs are finite or flagged, and friction accounts for the loss of energy."""
     random = np.random.default_rng(seed)
 
     def wave():
@@ -189,7 +189,7 @@ def test_on_random_ground_energy_never_grows(seed):
     assert run.stats["energy_residual"] < 1e-6 * size
 
 
-#: What the forces are differentiated by.
+#: The parameters with respect to which the forces are differentiated.
 NUMBERS = {
     "scene.surface.height.bowl": 1.0 / 0.5,
     "scene.surface.height.first[0]": 0.002,

@@ -1,4 +1,4 @@
-"""What must not change, or change at a known rate: energy, Jellett's constant, the length of the axis."""
+"""Quantities that are constant or change at a known rate: energy, Jellett's constant, the length of the axis."""
 
 import equinox as eqx
 import jax

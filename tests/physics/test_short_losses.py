@@ -108,7 +108,7 @@ def test_an_independent_program_finds_these_losses(mu, theta, spin, lost):
 
 
 def first_loss(body: Body, state: np.ndarray, t1: float) -> float:
-    """When the normal force first vanishes [s]: 30 looks at every step, and at the least of them the minimum."""
+    """The time [s] at which the normal force first vanishes: the minimum near the least of 30 values in every step."""
     run = solve_ivp(rate(body), (0.0, t1), state, "DOP853", rtol=1e-12, atol=1e-12, dense_output=True)
     for step_start, end in zip(run.t[:-1], run.t[1:], strict=True):
         looks = np.linspace(step_start, end, 31)

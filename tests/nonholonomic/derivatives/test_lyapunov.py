@@ -57,7 +57,7 @@ def follow(problem, t1, cells, stretches=32):
 
 
 def test_known_rates_and_a_run_that_ends():
-    """The greatest of a, b and 0, whichever it is; the growth to the very end; nothing after the guard."""
+    """The exponent is the greatest of a, b and 0; growth counts to the end of the run, and not beyond the domain."""
     a, b, end = np.array([0.5, -0.3, -0.3, 0.5]), np.array([0.2, 0.8, -0.2, 0.2]), np.array([1e3, 1e3, 1e3, 17.0])
     outcome = follow(Shears(*map(jnp.asarray, (a, b, end))), 40.0, 4)
     assert outcome.status.tolist() == [REACHED_END] * 3 + [LEFT_DOMAIN]

@@ -65,7 +65,7 @@ gradients = jax.jit(jax.vmap(jax.grad(time_of_decay, (0, 1, 2)), (0, 0, None)))
 
 
 def found_and_expected(names=MANY, patience=1e3, heights=HEIGHTS, cells=100, run=compiled_solve, **options):
-    """Outcome, slopes by the named numbers, and what they should be; rate and height differ from cell to cell."""
+    """Outcome, derivatives with respect to the named numbers, and their exact values; rate and height differ between cells."""
     point = (jnp.asarray(RATES), jnp.asarray(heights), jnp.asarray(0.7))
     tangents = [
         tuple(
@@ -81,7 +81,7 @@ def found_and_expected(names=MANY, patience=1e3, heights=HEIGHTS, cells=100, run
 
 
 def compiled_anew():
-    """`solve`, traced with what has been patched."""
+    """`solve`, traced again so that patched constants take effect."""
     return eqx.filter_jit(lambda *arguments, **options: solve(*arguments, **options))
 
 
@@ -156,7 +156,7 @@ def test_runs_longer_than_what_is_kept_are_repeated(kept, steps, monkeypatch):
 
 
 def test_the_starts_that_are_kept_are_spread_out(monkeypatch):
-    """Of two hundred starts eight are kept: the first and the last always, the others with no gap above half of the run."""
+    """Of two hundred checkpoints, eight remain: the first, the last, and others without a gap of more than half the run."""
     monkeypatch.setattr(periods, "SLOTS", 8)
     checkpoints = periods.Checkpoints.none(jnp.zeros(()))
     for index in range(200):

@@ -78,7 +78,7 @@ def time_of_level(height, gravity, restitution, level, bounces):
 
 
 def settings_of(tolerance):
-    """What compiles fast."""
+    """Derivatives that compile fast."""
     return Settings(tolerance, diffrax.Tsit5())
 
 
@@ -107,7 +107,7 @@ def balls():
 
 @pytest.mark.slow
 def test_a_bouncing_ball(balls):
-    """By the height, gravity, the restitution and the level, through five impacts and what follows each."""
+    """Derivatives with respect to height, gravity, restitution and level, through five impacts and the flights between them."""
     arguments, times, expected = balls
     hybrid_outcome, sensitivities = solve_hybrid_with_tangents(*arguments, 50.0, CELLS, settings_of(1e-10), counters=1)
     assert (hybrid_outcome.status == CROSSED).all()

@@ -152,7 +152,7 @@ def test_chaplygin_sleigh(formulation):
 
 
 def test_multiplier_is_the_blade_force():
-    """The side force on the blade: m (v omega + a omega'), less what the drag does not do across."""
+    """The side force on the blade is m (v omega + a omega')."""
     q, rate, acceleration = sleigh_motion()
     force = jax.jit(lambda q, rate: Multipliers(SLEIGH).multipliers(0.0, q, rate))(q, rate)
     expected = SLEIGH.mass * (0.8 * 1.3 + SLEIGH.ahead * acceleration[2])
@@ -178,7 +178,7 @@ def test_velocity_that_violates_a_constraint_is_projected_with_a_warning():
 
 
 def test_drift_is_kept_damped_or_ignored():
-    """W q' stays as it is by the bare multipliers, decays at Baumgarte's rate, or is projected out of the velocity."""
+    """W q' is constant with multipliers alone, decays at Baumgarte's rate, or is removed by projection."""
     q, rate, _ = sleigh_motion()
     skid = rate + 0.1 * SLEIGH.constraints(q)[0]
     state = jnp.concatenate([q, SLEIGH.metric(q) @ skid])

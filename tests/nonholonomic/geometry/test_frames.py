@@ -50,7 +50,7 @@ def carried_frame(surface, side):
 
 
 def foot_of(name):
-    """A point of the surface with nothing special about it, in the surface's axes."""
+    """A generic point of the surface, in the surface's axes."""
     surface, _ = SURFACES[name]
     x, y = FOOT
     start_foot = (jnp.asarray(x), jnp.asarray(y), jnp.asarray(-0.29))

@@ -33,7 +33,7 @@ def heights(x, y):
 
 
 def test_arrays_of_a_function_are_not_taken_for_numbers_of_lanes():
-    """What the engine picks for one lane of many is the whole function; in lanes each has its own height."""
+    """A cell of a batch has the complete function; in a batch, each lane has its own height."""
     ground = Graph(Bowl(BENDS, 1.0))
     assert all(leaf.ndim == 0 for leaf in jax.tree.leaves(ground))
     x, y = jnp.array([0.1, 0.2, 0.3]), jnp.array([0.3, -0.2, 0.1])

@@ -51,7 +51,7 @@ SURFACES = [Plane(), Plane(0.3), *CURVED]
 
 
 def places(surface, count=LANES):
-    """Random places all over a surface; those of an implicit one near a sphere, to be moved on it."""
+    """Random places on a surface; for an implicit surface, places near a sphere, to be moved onto the surface."""
     if isinstance(surface, Implicit):
         displacement = RNG.normal(size=(3, count))
         return tuple(jnp.asarray(part) for part in 1.1 * displacement / np.linalg.norm(displacement, axis=0))

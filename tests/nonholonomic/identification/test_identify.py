@@ -1,4 +1,4 @@
-"""Identification without a simulation: textbook estimates, one-sided likelihoods, bounds, what data cannot see."""
+"""Identification without a simulation: textbook estimates, one-sided likelihoods, bounds, undetermined parameters."""
 
 import sys
 import time
@@ -148,7 +148,7 @@ def test_a_prior_is_one_more_measurement():
     fit = identify(lambda p: p["x"][:, None], data, {"x": Free(1.0, prior=(3.0, 0.6))})
     assert_close(fit.estimates["x"], (4.0 / 0.09 + 3.0 / 0.36) / (1.0 / 0.09 + 1.0 / 0.36), rtol=1e-8)
     assert_close(fit.standard_errors["x"], (1.0 / 0.09 + 1.0 / 0.36) ** -0.5, rtol=1e-9)
-    # What the data alone fix does not change.
+    # The estimates that the data determine do not change.
     assert_close(fit.identifiability.singular_values, 1.0 / 0.3, rtol=1e-9)
 
 

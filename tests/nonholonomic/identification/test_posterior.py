@@ -49,7 +49,7 @@ def test_the_density_is_that_of_bayes_in_the_coordinates():
 
 
 def test_densities_that_differ_in_numbers_share_a_program(caplog):
-    """The same with other starts, bounds and priors has other values, and compiles nothing."""
+    """With other starts, bounds and priors, the density has other values and compiles nothing."""
 
     def density(start, lower, slope, prior, data):
         free = {"height": Free(start, lower), "slope": Free(0.0, prior=slope)}
@@ -172,7 +172,7 @@ def test_draws_are_from_a_density_that_the_surrogate_misses():
     weights /= weights.sum()
     values = {name: np.asarray(value) for name, value in density.values(flat).items()}
     assert posterior.accepted < 0.8
-    # The roughness itself: its share of the density, which a smooth stand-in would give as 0.
+    # The contribution of the roughness to the density; a smooth surrogate would give 0.
     for name, of in (
         *((name, lambda v, n=name: v[n]) for name in values),
         ("wave", lambda v: np.sin(40.0 * v["rate"])),

@@ -1,4 +1,4 @@
-"""Whether a fit can be believed: scatter, order, starts, and what the picture shows."""
+"""Verdicts on fits: scatter, runs of signs, agreement of starts, and the plot."""
 
 import itertools
 import math
@@ -21,7 +21,7 @@ def oscillation(p):
 
 
 def recorded(error=0.5):
-    """An oscillation of height 1 and rate 6 with noise of 0.5, as it was measured with an alleged error."""
+    """Measurements of an oscillation of amplitude 1 and rate 6 with noise of 0.5 and a stated error."""
     return Measurements(np.sin(6.0 * T) + 0.5 * np.random.default_rng(3).normal(size=T.size), error)
 
 

@@ -126,7 +126,7 @@ def test_the_last_crossing_of_many():
 
 
 def test_a_dip_between_the_ends_of_a_step_is_found():
-    """The guard is negative for a third of a period; a loose tolerance makes steps of half of one."""
+    """The domain margin is negative for a third of a period; with a loose tolerance, steps are half a period long."""
     outcome, _ = run([1.0], level=-2.0, floor=0.5, tolerance=1e-2)
     assert outcome.status[0] == LEFT_DOMAIN
     assert_close(outcome.end_time, math.asin(0.5), atol=2e-2)
@@ -145,7 +145,7 @@ def test_padding_is_not_run():
 
 
 def test_a_dip_between_the_stages_of_a_step_is_found():
-    """x = cos t is below -0.9999 for 0.028 s, within a step twenty times as long that sees nothing of it at its stages."""
+    """x = cos t is below -0.9999 for 0.028 s, inside a step twenty times as long whose stages all miss this interval."""
     level = -0.9999
     outcome, _ = run([1.0], level=level, t1=8.0, tolerance=1e-6)
     assert int(outcome.status[0]) == CROSSED
@@ -181,7 +181,7 @@ def test_too_many_steps_and_nonsense_are_failures():
 
 
 def time_of(numbers):
-    """When one oscillator reaches its level, w and level given; the exact time is acos(level) / w."""
+    """The time at which an oscillator of rate w reaches a level; exactly acos(level) / w."""
     problem = Oscillators(numbers[:1], numbers[1:], jnp.asarray(2.0))
     settings = Settings(1e-12, absolute=1.0, lanes=1)
     outcome, _ = ensemble_solve(problem, jnp.asarray(9.0), jnp.asarray(1), settings)

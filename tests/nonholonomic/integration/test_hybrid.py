@@ -209,7 +209,7 @@ def test_a_single_ball_ends_as_it_does_in_a_table():
 
 def test_what_needs_too_many_rounds_is_given_up():
     outcome = table(30.0, np.full(CELLS, np.inf), most_rounds=10)
-    # One round for each fall, and one for the rest.
+    # One round for each fall, and one at rest.
     gives_up = [ball.rests_after + 1 > 10 for ball in BALLS]
     assert (outcome.status[:CELLS] == np.where(gives_up, UNRESOLVED, REACHED_END)).all()
     assert 0 < sum(gives_up) < CELLS

@@ -1,4 +1,4 @@
-"""Runs of several modes cost what their steps cost: how often the field and the guard are evaluated."""
+"""Numbers of evaluations of the field and the domain margin in runs of several modes."""
 
 import equinox as eqx
 import jax
@@ -56,7 +56,7 @@ class Turns(AbstractProblem):
 
 
 class Turn(AbstractBatchedMode):
-    """Turns until its own clock has run down; then the other one begins."""
+    """A rotation until the clock of the mode runs down; then the other mode begins."""
 
     clock: int = eqx.field(static=True)
 

@@ -1,4 +1,4 @@
-"""The pair of `Oscillatory8`: its orders, tree by tree, its weights, and what it gains and refuses."""
+"""The pair of `Oscillatory8`: order conditions, weights, accuracy and errors raised."""
 
 import diffrax
 import jax.numpy as jnp
@@ -56,7 +56,7 @@ def test_it_is_no_more_than_of_eighth_order_and_no_worse_in_ninth_than_the_pair_
 
 
 def test_its_weights_magnify_round_off_less():
-    """What a unit of round-off in every rate can become: the sums of the weights' magnitudes."""
+    """The greatest effect of a unit of round-off in every rate: the sums of the weights' magnitudes."""
     for oscillatory8, dopri8 in zip(PAIR[:2], PLAIN[:2], strict=True):
         assert np.abs(oscillatory8).sum(axis=-1).max() < np.abs(dopri8).sum(axis=-1).max()
 
@@ -88,7 +88,7 @@ def test_a_single_run_with_it_is_refused_as_its_dense_output_is_a_cubic():
 
 
 def test_a_rotation_keeps_its_amplitude_and_its_phase():
-    """The step of y' = i y: what is left of exp(i z) at z = 1, to a tenth of what it is with the pair it replaces."""
+    """The error of a step of y' = i y at z = 1 is a tenth of that of `Dopri8`."""
 
     def left(pair):
         first = np.linalg.solve(np.eye(13) - 1j * np.asarray(pair.stages), np.ones(13))

@@ -22,7 +22,7 @@ def field(time, state):
     ids=lambda value: type(value).__name__,
 )
 def test_a_step_is_that_of_diffrax(solver):
-    """In three lanes: where it leads, its error estimate, and what was seen on the way."""
+    """In three lanes: the state after a step, its error estimate, and the margins at its stages."""
     time, length = np.array([0.0, 0.5, 2.0]), np.array([0.1, 0.4, 1.5])
     state = jnp.array([[1.0, 0.3, -0.2], [0.0, 0.4, 0.01]])
     step = explicit_step(

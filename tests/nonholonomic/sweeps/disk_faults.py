@@ -15,7 +15,7 @@ class Killed(BaseException):
     """The end of the process at a chosen moment."""
 
 
-#: What is done on the disk: for the folder of the blocks and what it is for, for each block, and for the table's file.
+#: Disk operations: for the folder of the blocks and its note, for each block, and for the table's file.
 FOR_THE_FOLDER, FOR_A_BLOCK, FOR_THE_FILE = 4, 4, 3
 
 

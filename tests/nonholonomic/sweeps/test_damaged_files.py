@@ -34,7 +34,7 @@ def contents(path):
 
 
 def check_flips(images, folder, places_of):
-    """A file with one bit flipped is read as it was, or refused."""
+    """A file with one flipped bit is read with its original contents, or refused."""
     refusals = 0
     for name, image in images.items():
         path = folder / f"{name}.h5"
@@ -70,7 +70,7 @@ def test_a_bit_flipped_in_every_byte(images, tmp_path):
 
 
 def check_flips_of_blocks(folder, places_of):
-    """One bit flipped in what there is of an unfinished table: a reader has the truth or refuses it, a sweep mends it."""
+    """An unfinished table with a flipped bit: readers return its contents or refuse, and a sweep repairs it."""
     start = folder / "start" / "table.h5"
     start.parent.mkdir()
     half_finished(start)
@@ -105,7 +105,7 @@ def test_a_bit_flipped_in_every_byte_of_a_block(tmp_path):
 
 
 def test_a_changed_number_is_refused_by_a_reader_and_repaired_by_a_sweep(tmp_path):
-    """Wherever in the numbers of a block: the sweep says so and computes that block again, and no other."""
+    """A flipped bit anywhere in a block: the sweep warns and computes only that block again."""
     path = tmp_path / "table.h5"
     cheap_sweep(path)
     with h5py.File(path, "r+") as file:
@@ -120,7 +120,7 @@ def test_a_changed_number_is_refused_by_a_reader_and_repaired_by_a_sweep(tmp_pat
 
 
 def check_cuts(images, folder, lengths_of):
-    """A file cut short is refused, by a reader and by a sweep, which computes nothing."""
+    """Readers and sweeps refuse a truncated file; the sweep computes nothing."""
     for name, image in images.items():
         path = folder / f"{name}.h5"
         for length in lengths_of(image):
@@ -182,7 +182,7 @@ def test_foreign_files_and_folders_are_left_alone(images, tmp_path):
     with pytest.raises(OSError, match="folder: it is a folder"):
         cheap_sweep(folder, pytest.fail)
     assert copy.read_bytes() == images["saved"]
-    # No one may write in the first; the second is no folder.
+    # The first is not writable; the second is not a folder.
     for path in (Path("/proc/table.h5"), text / "table.h5"):
         with pytest.raises(OSError, match=f"cannot write {path}"):
             cheap_sweep(path, pytest.fail)

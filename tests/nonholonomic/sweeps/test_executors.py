@@ -1,4 +1,4 @@
-"""Blocks computed by other processes: the same numbers to the bit, dead workers, dead schedulers, and what is refused."""
+"""Blocks computed by other processes: bit-identical results, dead workers, dead schedulers, and illegal arguments."""
 
 import logging
 import multiprocessing
@@ -144,7 +144,7 @@ def test_a_block_that_three_workers_die_of_is_failed_and_the_others_are_not(way,
 
 
 def test_a_pool_that_breaks_ends_the_sweep_and_another_goes_on(processes, tmp_path):
-    """Python's own pool has no more workers after the first that dies."""
+    """Python's own pool breaks when its first worker dies."""
     job, path = CheapJob(tmp_path, deadly=3, crashes=1, pause=0.05), tmp_path / "table.h5"
     message = r"accepts no more chunks .*; 24 of 50 cells are done, .*table\.h5 has"
     spawn = multiprocessing.get_context("spawn")
@@ -182,7 +182,7 @@ def test_a_scheduler_that_dies_ends_the_sweep_and_threads_go_on(tmp_path):
         processes[0].send_signal(signal.SIGKILL)
 
     killer = threading.Thread(target=kill_the_scheduler)
-    # What the client says of its lost connection.
+    # The client's messages about its lost connection.
     logging.disable(logging.CRITICAL)
     try:
         with distributed.Client(scheduler_file=str(address), timeout=60) as client:
@@ -227,7 +227,7 @@ def test_an_error_of_a_block_is_the_sweep_s_and_starts_no_further_block(processe
 
 
 def test_a_user_s_system_is_computed_by_other_processes(processes, monkeypatch):
-    """The same bits as in this process, where nothing is computed then."""
+    """Results are bit-identical to those of this process, which computes nothing meanwhile."""
     start, axes = (np.zeros(3), np.array([1.0, 0.0, 0.0])), {"rate[2]": [0.5, 1.0], "ahead": [0.2, 0.3]}
     expected = nonholonomic.sweep(Sleigh(), start, 2.0, axes=axes, progress=False)
     monkeypatch.setattr(SweepJob, "__call__", None)

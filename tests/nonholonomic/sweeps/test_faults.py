@@ -38,7 +38,7 @@ def kill_sweeps(folder, rounds):
 
 
 def test_sweeps_killed_at_random_moments(tmp_path):
-    """SIGKILL, and again on resuming: what was finished stays, is right, and is not computed again."""
+    """After SIGKILL, also during a resumed run, finished blocks remain, are correct, and are not computed again."""
     kills, *_ = kill_sweeps(tmp_path, 5)
     assert kills == 5
 
@@ -100,7 +100,7 @@ def record(path, monkeypatch):
 
 
 def after_the_cut(process, random):
-    """The files after the power failed, and how many blocks had been confirmed: what a sync has not may be there, or a part."""
+    """The files after a power failure, and the number of confirmed blocks; data that was not synced may be missing or cut."""
     files, confirmed = {}, 0
     for place, (operation, folder, *file) in enumerate(process):
         if operation == "rename":
@@ -126,7 +126,7 @@ def check_power_cuts(tmp_path, monkeypatch, rounds):
         for (folder, name), content in files.items():
             place = tmp_path / name if folder == tmp_path.name else blocks / name
             place.parent.mkdir(exist_ok=True)
-            # When the file is there the blocks are removed, one by one.
+            # Once the file exists, the blocks are removed one by one.
             if place == path or moment < len(process) or random.integers(2):
                 place.write_bytes(content)
         has_begun = path.exists() or (blocks / "table.h5").exists()
@@ -149,7 +149,7 @@ def test_the_power_fails_a_hundred_times(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("room", [0, 1000, 5000])
 def test_a_disk_too_small_for_anything(tmp_path, room):
-    """It is told before anything is computed; nothing is left behind."""
+    """The error is raised before anything is computed, and no file remains."""
     path = tmp_path / "table.h5"
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
@@ -227,7 +227,7 @@ def test_another_version_is_told_or_refused(tmp_path, monkeypatch):
             cheap_sweep(path)
     with pytest.warns(RuntimeWarning, match=rf"was begun with jax 0\.0\.1, now {versions['jax']}: digits may differ"):
         table = cheap_sweep(path)
-    # The table says what its file says; now that all is there, no one need be told again.
+    # The table reads from its file; the file is complete, so there is no further warning.
     assert json.loads(table.attributes["versions"])["jax"] == "0.0.1"
     with warnings.catch_warnings():
         warnings.simplefilter("error")

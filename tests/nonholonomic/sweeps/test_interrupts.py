@@ -1,4 +1,4 @@
-"""Ctrl-C, by real signals to real processes: what is saved is said within two seconds, and nothing crashes."""
+"""Ctrl-C by real signals to real processes: within two seconds a message states what is saved, and nothing crashes."""
 
 import os
 import signal
@@ -96,7 +96,7 @@ def started(folder: Path, *arguments: str) -> subprocess.Popen:
 
 
 def run(folder: Path, program: str, *arguments: str) -> subprocess.Popen:
-    """A program, from a file, as processes that it starts need one."""
+    """A program in a file, because the processes that it starts import it."""
     (folder / "program.py").write_text(program)
     return started(folder, str(folder / "program.py"), *arguments)
 
@@ -133,7 +133,7 @@ def test_a_table_says_what_is_saved_and_goes_on_from_there(way, tmp_path):
         error[-1]
         == f"KeyboardInterrupt: saved {8 * saved_blocks} of 50 cells to {path}; run the same call again to resume"
     )
-    # The processes of the executor say nothing.
+    # The executor's processes print nothing.
     assert sum(line.startswith("Traceback") for line in error) == 1
     assert len(resumed(path)) == 7 - saved_blocks
 
@@ -172,7 +172,7 @@ def test_the_main_job_of_the_top_says_what_is_saved(tmp_path):
 
 @pytest.mark.parametrize("program", ["tippe", "stroller"])
 def test_a_command_line_ends_with_one_line_while_it_is_imported(program, tmp_path):
-    """Python sends itself the signal as it is about to import jax, while it collects garbage."""
+    """The process sends itself the signal during garbage collection, just before it imports jax."""
     (tmp_path / "sitecustomize.py").write_text(IMPORTING)
     process = started(tmp_path, "-m", program, "--out", "out")
     _, output, error = process.wait(timeout=60), *process.communicate()

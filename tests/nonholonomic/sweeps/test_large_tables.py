@@ -119,7 +119,7 @@ def test_a_small_grid_is_checked_whole_and_a_large_one_at_its_edges_and_corners(
 
 
 def test_a_billion_cells_are_refused_at_once(monkeypatch):
-    """Illegal only together, in one corner of the grid."""
+    """Values that are illegal only in combination, in one corner of the grid."""
     monkeypatch.setattr("tippe.runs.table.sweep", lambda *_, **__: pytest.fail("it was run"))
     scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3))
     axes = {"scene.body.radius": np.linspace(0.02, 0.01, 100), "scene.body.offset": np.linspace(0.001, 0.011, 100)}
@@ -154,7 +154,7 @@ def test_an_illegal_cell_inside_a_large_grid_ends_the_sweep_when_its_turn_comes(
 
 
 def test_more_cells_than_memory_holds_are_refused_at_once(tmp_path):
-    """10^10 of them: without a file for want of memory, with one for want of room on the disk, unless there is that much."""
+    """A table of 10^10 cells: refused without a file for lack of memory, and with a file for lack of disk space."""
     axes = [axis(name, name, "1", np.arange(1e5)) for name in ("x", "y")]
     text = r"path = None: 1e\+10 cells take 2\d\d GB, and this machine has .* GB of memory; pass path= to keep them in a file"
     with pytest.raises(ValueError, match=text):

@@ -1,4 +1,4 @@
-"""Tables show themselves: by name, in pictures, in xarray, and in files without what a sweep needs for itself."""
+"""Access to tables: variables by name, plots, xarray, and files without the sweep's internal attributes."""
 
 import io
 import json
@@ -16,7 +16,7 @@ THETA, SPIN, MU = np.linspace(0.1, 0.4, 4), np.linspace(60.0, 160.0, 11), np.arr
 
 @pytest.fixture(scope="module")
 def table():
-    """Times 1 + theta + mu spin, one of them far off, one not there."""
+    """Times 1 + theta + mu spin, with one outlier and one missing value."""
     time = 1.0 + THETA[:, None, None] + MU[:, None] * SPIN
     time[0, 0, 0], time[1, 0, 1] = 1e4, np.inf
     status = np.where(np.isfinite(time), "inverted", "not_inverted")

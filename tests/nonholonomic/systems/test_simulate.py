@@ -160,7 +160,7 @@ def test_a_lagrangian_of_one_s_own_is_run_by_poincare_s_equations():
 
 
 def test_derivatives_that_do_not_exist_through_resets_are_refused_in_words():
-    """By the horizon, and second ones: the messages do not speak of another model."""
+    """Derivatives with respect to the horizon, and second derivatives: messages do not mention another model."""
     ball, start = Hybrid([Ball()]), jnp.array([1.0, 0.0, 0.0])
     with pytest.raises(ValueError, match="runs with resets; differentiate with respect to the start or the parameters"):
         jax.grad(lambda t1: simulate(ball, start, t1, times=t1 * TIMES / 1.5).state[0, 0])(1.5)

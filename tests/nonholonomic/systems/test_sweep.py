@@ -22,7 +22,7 @@ BALL = Hybrid([Ball()], event=Bounces(3.0))
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory):
-    """The third bounces of balls, whose table is kept in a file."""
+    """Third bounces of balls, in a table with a file."""
     path = tmp_path_factory.mktemp("balls") / "balls.h5"
     axes = {"start[0]": HEIGHTS, "restitution": RESTITUTIONS}
     arguments = {"axes": axes, "sensitivities": ["restitution", "modes[0].gravity"], "path": path, "progress": False}

@@ -1,4 +1,4 @@
-"""Arenas, animations and pages of what is no run: a ball that somebody rolls along a line."""
+"""Arenas, animations and pages of a prescribed motion: a ball that rolls along a line."""
 
 import base64
 import json

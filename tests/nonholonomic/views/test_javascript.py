@@ -1,4 +1,4 @@
-"""What is written in JavaScript computes what the function computes, in a real browser."""
+"""Functions written in JavaScript have the same values in a real browser."""
 
 import json
 
@@ -65,7 +65,7 @@ def everything(x):
 
 
 def array_work(x):
-    """Sums, products, extremes and places that are known only as it runs."""
+    """Sums, products, extremes and indices that are known only at run time."""
     indices = (x[2] > 0.0).astype(int)
     matrix = jnp.outer(x, x) + jnp.eye(3)
     selections = (
@@ -87,7 +87,7 @@ def array_work(x):
 
 
 def slopes(x):
-    """What automatic differentiation makes of a function."""
+    """The derivative of a function by automatic differentiation."""
     return jax.grad(lambda y: jnp.sin(y[0]) * y[1] ** 3 / jnp.sqrt(1.0 + y[2] ** 2))(x)
 
 

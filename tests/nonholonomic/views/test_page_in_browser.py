@@ -1,4 +1,4 @@
-"""The page of a run, opened in a real browser with the network off: what is drawn is where the run is."""
+"""The page of a run, opened in a real browser without a network, draws the bodies at their positions in the run."""
 
 import time
 
@@ -35,7 +35,7 @@ def ride():
 
 @pytest.fixture(scope="module")
 def stages(top, ride):
-    """A top, and two rides in one place."""
+    """A top in one view, and two rides overlaid in another."""
     return [*top.stages(), *ride.stages([ride_at(8.0)], overlaid=True)]
 
 
@@ -188,7 +188,7 @@ def test_curves_and_arrows_tell_the_same_between_frames(browser, stages):
         "return [player.stages[0].runs[0].arrows[0].size, Number(strip.querySelector('.value span').textContent)]"
     )
     assert arrow == pytest.approx(expected, rel=1e-4)
-    # Told to four digits.
+    # The page rounds to four digits.
     assert curve == pytest.approx(expected, rel=5e-4)
 
 
