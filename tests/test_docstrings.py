@@ -116,7 +116,13 @@ def test_the_public_names_are_those_that_people_use():
     assert len(names) > 40
 
 
-@pytest.mark.parametrize("room", ENGINE)
+#: The rooms of which other tests of the ordinary run go through the same programs.
+TESTED = ("nonholonomic.hybrid", "nonholonomic.derivatives", "nonholonomic.identification")
+
+
+@pytest.mark.parametrize(
+    "room", [pytest.param(room, marks=pytest.mark.slow if room in TESTED else ()) for room in ENGINE]
+)
 def test_the_examples_of_the_engine_give_what_they_say(room):
     """They go on from the example of their room."""
     namespace: dict[str, Any] = {}

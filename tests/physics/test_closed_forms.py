@@ -66,7 +66,7 @@ def test_a_free_ball_turns_about_its_angular_momentum():
     assert_close(path.states[2:5, -1], expected, atol=2e-10)
 
 
-@pytest.mark.parametrize("arena", [tippe.Cylinder(0.2), tippe.Sphere(0.2)])
+@pytest.mark.parametrize("arena", [pytest.param(tippe.Cylinder(0.2), marks=pytest.mark.slow), tippe.Sphere(0.2)])
 def test_a_frictionless_ball_swings_as_a_pendulum(arena):
     """No spin, amplitude 1.2: period 4 sqrt(rho/g) K(sin^2(A/2)) = 0.934689 s for rho = 0.18 (section 7, row 4)."""
     scene = tippe.Scene(homogeneous_ball(), arena, tippe.Frictionless())

@@ -24,7 +24,7 @@ TORQUES = {
 ARENAS = {"plane": tippe.Plane(), "cylinder": tippe.Cylinder(0.3), "sphere": tippe.Sphere(0.3)}
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", [pytest.param(law, marks=pytest.mark.slow if law != "coulomb" else ()) for law in LAWS])
 def test_jelletts_constant_on_the_plane(law):
     """lambda is constant to 1e-9 over 30 s for every friction at the contact point, and |e| = 1 with it."""
     scene = tippe.Scene(rutstam_top(), tippe.Plane(), LAWS[law])
@@ -41,7 +41,7 @@ def test_the_axis_keeps_its_length_without_projection(rutstam_scene):
 
 
 #: Whose rates of energy at random states are all that the ordinary run looks at.
-LONGER = (("coulomb", "cylinder"), ("coulomb", "sphere"), ("frictionless", "sphere"))
+LONGER = [("coulomb", "cylinder"), ("frictionless", "cylinder"), *((law, "sphere") for law in LAWS)]
 
 
 @pytest.mark.parametrize(

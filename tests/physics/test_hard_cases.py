@@ -14,7 +14,8 @@ SLOW = (
     *("explicit_at_a_tenth", "orderly_without_friction", "energy_through_hops", "bounces", "coulomb_hops"),
     *("leaning_for_ever", "over_the_crest", "no_room", "a_thousand_seconds_in_a_bowl"),
     *("jellett_through_hops", "hops", "explicit_at_a_hundredth", "rate_of_the_rise", "just_above_the_threshold"),
-    *("upright_almost", "explicit_at_a_thousandth"),
+    *("upright_almost", "explicit_at_a_thousandth", "explicit_at_a_ten_thousandth", "just_below_the_threshold"),
+    "jellett_under_torque",
 )
 
 ROWS = [

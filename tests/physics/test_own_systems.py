@@ -111,6 +111,7 @@ class TwoDiscs(AbstractMode):
         return jnp.array([y[0], y[1], y[3], y[2]]), 0
 
 
+@pytest.mark.slow
 def test_the_gradient_of_a_collision_is_exact():
     """At 0 and 0.52 with 1 m/s and 0 for 1 s: the second ends where the first would be, a diameter ahead: (1, 0, 1, 0)."""
 

@@ -82,6 +82,7 @@ def test_a_small_tilt_grows_as_the_theory_says():
     assert_close(tilts / 1e-6, expected / 1e-6, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_slow_spin_reverses_as_the_amplitude_equations_say():
     """n = -N tanh(s N (t - t0)), for pitch alone; the error falls with the square of the spin."""
     errors = []

@@ -13,6 +13,8 @@ import tippe
 FILE = Path(__file__).with_name("inversion_reference.csv")
 ROWS = list(csv.DictReader(FILE.read_text().splitlines()))
 FAMILIES = sorted({row["family"] for row in ROWS})
+#: Those of the ordinary run: each arena and each law once.
+SHORT = ("plane-viscous", "cylinder-Coulomb")
 
 
 def computed(rows: list[dict[str, str]]) -> list[tippe.Table]:
@@ -31,7 +33,9 @@ def computed(rows: list[dict[str, str]]) -> list[tippe.Table]:
     return times
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize(
+    "family", [pytest.param(family, marks=() if family in SHORT else pytest.mark.slow) for family in FAMILIES]
+)
 def test_inversion_and_contact_loss_agree_with_lagranges_equations(family):
     """Status in every row; times of inversion and of contact loss to 1e-8 relative, the angle of loss to 1e-7 rad."""
     rows = [row for row in ROWS if row["family"] == family]

@@ -118,6 +118,7 @@ def run() -> tippe.Trajectory:
     return tippe.simulate(scene, tippe.Launch(0.02, 0.5, place=(0.0, 0.1)), t1=0.5)
 
 
+@pytest.mark.slow
 def test_a_run_in_a_cylinder(run):
     """The contact point is on the arena and at rest, the velocity is the position's rate, and the energy stays."""
     assert run.status == "completed"
@@ -141,6 +142,7 @@ def reversals(radii, spin, **options) -> tippe.Table:
     return tippe.reversal_table(scene, **start, axes=axes, t1=4.0, progress=False, **options)
 
 
+@pytest.mark.slow
 def test_reversals_in_bowls_and_how_contact_ends():
     """In a bowl of 10^8 m a rattleback reverses when it does on the plane, at 2.6846470 s. Where the bowl is more curved than
     the body, a run ends at once. A fast rattleback jumps."""

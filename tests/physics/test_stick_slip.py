@@ -248,11 +248,12 @@ def test_the_time_of_inversion_of_the_regularised_law_is_creep():
     assert_close(np.diff(table.time) / np.diff(1.0 / speeds), 0.05, rtol=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("surface", "launch"),
     [
         (tippe.Plane(0.9), tippe.Launch(np.pi, 0.0)),
-        pytest.param(tippe.Sphere(0.2), tippe.Launch(np.pi, 50.0, eta=1.2), marks=pytest.mark.slow),
+        (tippe.Sphere(0.2), tippe.Launch(np.pi, 50.0, eta=1.2)),
     ],
     ids=["plane", "sphere"],
 )
@@ -263,6 +264,7 @@ def test_a_launch_on_the_stem_slips_off_a_slope(surface, launch):
     assert run.stats["energy_residual"] < 1e-9
 
 
+@pytest.mark.slow
 def test_a_launch_beyond_the_angle_from_which_the_top_slips_at_once_is_inverted_at_the_start():
     """At rest on a steep wall, as under smooth laws; 5.7 ms later the slip has begun."""
     scene = tippe.Scene(rutstam_top(), tippe.Sphere(0.2), tippe.SetValuedCoulomb(0.3))

@@ -130,7 +130,7 @@ def test_side_force_at_the_jackknife_is_the_limit_of_its_neighbours():
     assert np.all(np.abs(forces[1]) > 0.1)
 
 
-@pytest.mark.parametrize("side", ["outside", "inside"])
+@pytest.mark.parametrize("side", [pytest.param("outside", marks=pytest.mark.slow), "inside"])
 def test_over_the_pole(side):
     """A straight ride through the pole of the axis stays in its meridian plane, and a steered one is smooth there."""
     sign = 1.0 if side == "outside" else -1.0

@@ -27,6 +27,7 @@ def with_torques(impacts: Falls) -> Falls:
     )
 
 
+@pytest.mark.slow
 def test_impacts_with_torques():
     """The torque per unit normal force has the normal impulse as its clock too: against the independent program, 1000 end, and
     no energy comes from nowhere."""

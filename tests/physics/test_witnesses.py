@@ -150,7 +150,7 @@ def test_the_general_formulations_give_the_accelerations_of_the_frictionless_top
         assert jnp.max(relative_error(accelerations(scenes, chart), expected, lengths)) < 1e-10
 
 
-@pytest.mark.parametrize("arena", ARENAS)
+@pytest.mark.parametrize("arena", [pytest.param("plane", marks=pytest.mark.slow), "cylinder"])
 def test_the_general_reduction_by_a_cyclic_angle_gives_the_accelerations_of_the_frictionless_top(arena):
     """Hamel's equations of the Routhian without psi, the paper's (2) in the frame of the coordinates."""
     scenes, states = legal_cases(arena, "frictionless")

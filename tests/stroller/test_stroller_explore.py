@@ -39,7 +39,7 @@ def browser():
         yield driver
 
 
-@pytest.mark.parametrize("name", GROUNDS)
+@pytest.mark.parametrize("name", [pytest.param("plane", marks=pytest.mark.slow), "spheroid"])
 def test_ten_rides_end_where_those_of_the_table_end(browser, name):
     ground, place, controls = GROUNDS[name]
     scene, launch = scene_on(ground), stroller.Launch(place=place, heading=0.3, speed=2.0)

@@ -94,6 +94,7 @@ def test_the_times_in_a_bowl_are_those_of_the_independent_program():
     assert_close([independent_time(theta, spin) for theta, spin in zip(THETA, SPIN, strict=True)], TIMES, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_shape_of_a_bowl_from_inversion_times():
     """From a bowl a tenth too wide, in which every top inverts 0.2 to 0.4 s later; of exact times nothing is left."""
     launch = tippe.Launch(theta=THETA, spin=SPIN, place=PLACE)

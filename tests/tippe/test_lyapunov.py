@@ -22,6 +22,7 @@ def test_the_rise_of_an_upright_top_is_the_greatest_eigenvalue():
     assert_close(exponents.exponent, expected, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_orderly_motion_on_the_plane():
     """Without friction the top on the plane is integrable: nearby runs part linearly, so the exponent falls as ln t / t."""
     scene = tippe.Scene(rutstam_top())

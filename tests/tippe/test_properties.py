@@ -246,9 +246,11 @@ FEW = settings(COMMON, max_examples=3, derandomize=True)
 MANY = settings(COMMON, max_examples=180, print_blob=True)
 
 
-@pytest.mark.parametrize(
-    "arena", [*(pytest.param(name, marks=pytest.mark.slow) for name in ("plane", "cylinder")), "sphere"]
-)
+#: The ordinary run looks at one arena.
+SHORT = [*(pytest.param(name, marks=pytest.mark.slow) for name in ("plane", "cylinder")), "sphere"]
+
+
+@pytest.mark.parametrize("arena", SHORT)
 def test_properties(arena):
     """Finite or flagged, energy, Jellett's constant, mirrors, units, time reversal, turning."""
 
@@ -285,7 +287,7 @@ def test_properties_of_many_examples(arena):
     check()
 
 
-@pytest.mark.parametrize("arena", ARENAS)
+@pytest.mark.parametrize("arena", SHORT)
 def test_runs_without_friction_are_mostly_kept(arena):
     """The reversal is tested on most lanes of a batch, not on the few that keep contact."""
     fractions = []

@@ -50,6 +50,20 @@ def fit(tmp_path_factory, rutstam_scene):
     return tippe.identify(rutstam_scene, [first, second], free)
 
 
+def test_friction_from_a_film(rutstam_scene):
+    """The short form of the two films: theta alone, a sample missing, by a clock that is not known."""
+    clock, value = film(0)
+    value[5, 0] = np.nan
+    recording = tippe.Recording(tippe.Launch(0.4, 100.0), clock, value[:, 0], NOISE)
+    fit = tippe.identify(rutstam_scene, recording, {"mu": 0.2, "data[0].t0": 0.01}, progress=False)
+    assert fit.status == "converged"
+    assert len(fit.residuals) == len(clock) - 1
+    for name, exact in {"scene.friction.mu": MU, "data[0].t0": LAUNCHES["t0"][0]}.items():
+        assert abs(fit.estimates[name] - exact) < 4.0 * fit.standard_errors[name], name
+    assert fit.standard_errors["scene.friction.mu"] < 0.05
+
+
+@pytest.mark.slow
 def test_friction_from_two_films_with_clocks_and_azimuths_of_their_own(fit):
     truth = {"scene.friction.mu": MU}
     truth |= {
@@ -64,6 +78,7 @@ def test_friction_from_two_films_with_clocks_and_azimuths_of_their_own(fit):
     assert fit.verdict.good, str(fit)
 
 
+@pytest.mark.slow
 def test_missing_samples_are_left_out_and_unknown_errors_are_found(fit):
     labels = [row.label for row in fit.residuals]
     assert len(labels) == 2 * (30 + 24) - 5

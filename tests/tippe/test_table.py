@@ -258,7 +258,7 @@ def test_a_table_prints_and_draws(table):
         _ = table.tme
 
 
-@pytest.mark.parametrize("arena", [tippe.Plane(), tippe.Cylinder(0.3)])
+@pytest.mark.parametrize("arena", [pytest.param(tippe.Plane(), marks=pytest.mark.slow), tippe.Cylinder(0.3)])
 def test_first_and_last_crossing_come_from_one_run(arena):
     """From the cylinder's wall theta swings past the angle and back, so the two differ; each is what its own table says."""
     scene = tippe.Scene(rutstam_top(), arena, tippe.Viscous(0.3))

@@ -107,6 +107,7 @@ def blocks_of(path):
     return {int(block.stem) for block in path.with_name(f"{path.name}.blocks").glob("*.npz")}
 
 
+@pytest.mark.slow
 def test_a_killed_sweep_leaves_a_file_that_opens_and_resumes(tmp_path):
     """SIGKILL in the middle: what is marked finished is right, and the rest is pending."""
     path = tmp_path / "table.h5"

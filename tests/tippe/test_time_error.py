@@ -54,7 +54,7 @@ def test_times_through_the_threshold(near_threshold):
     assert (near_threshold.time_error[:3] == 0.0).all()
 
 
-@pytest.mark.parametrize("factor", [1.01, 1.2])
+@pytest.mark.parametrize("factor", [1.01, pytest.param(1.2, marks=pytest.mark.slow)])
 def test_the_estimate_covers_the_error_near_the_threshold(near_threshold, factor):
     """Above the true error, below thirty times of it (five is due)."""
     cell = int(np.flatnonzero(factor == FACTORS)[0])

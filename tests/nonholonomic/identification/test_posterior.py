@@ -157,6 +157,7 @@ def rough(p):
     return smooth + 0.1 * jnp.sin(40.0 * p["rate"])[:, None]
 
 
+@pytest.mark.slow
 def test_draws_are_from_a_density_that_the_surrogate_misses():
     """Against quadrature, where the polynomials are wrong by up to half an error, and priors are of the parameters."""
     error, free = 0.2, {"height": Free(1.0, 0.0, prior=(1.0, 0.3)), "rate": Free(1.0, 0.0, prior=(1.0, 0.4))}

@@ -28,6 +28,11 @@ from nonholonomic.systems.sweep import SweepJob
 
 HERE = Path(__file__).parent
 
+#: A cluster takes long to start. In the ordinary run, one worker without a cluster computes for a scheduler, which is killed.
+DASK = pytest.param("dask", marks=pytest.mark.slow)
+#: In the ordinary run, a pool of Python's computes until it breaks.
+POOL = pytest.param("pool", marks=pytest.mark.slow)
+
 
 @pytest.fixture(scope="module")
 def processes():
@@ -76,7 +81,7 @@ def by_threads():
         return tippe.inversion_table(TOP, **TIMES)
 
 
-@pytest.mark.parametrize("way", ["serial", "processes", "dask", "pool"])
+@pytest.mark.parametrize("way", ["serial", "processes", DASK, POOL])
 def test_whoever_computes_a_table_gets_the_same_bits(way, many_blocks, by_threads, request):
     """Four blocks, in one thread, in processes of ours, in Dask's, in a pool of Python's; the reference by all cores."""
     if way == "serial":
@@ -118,7 +123,7 @@ def test_trajectories_and_rides_from_other_processes_have_the_same_bits(processe
     assert_same_bits(local_table, remote)
 
 
-@pytest.mark.parametrize("way", ["processes", "dask"])
+@pytest.mark.parametrize("way", ["processes", DASK])
 def test_a_block_whose_worker_dies_is_computed_by_another(way, tmp_path, request):
     job = CheapJob(tmp_path, deadly=2, crashes=1)
     table = cheap_sweep(tmp_path / "table.h5", job=job, executor=request.getfixturevalue(way))
@@ -128,7 +133,7 @@ def test_a_block_whose_worker_dies_is_computed_by_another(way, tmp_path, request
     assert {len(job.begun(block)) for block in (0, 1, 3, 4, 5, 6)} <= {1, 2}
 
 
-@pytest.mark.parametrize("way", ["processes", pytest.param("dask", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("way", ["processes", DASK])
 def test_a_block_that_three_workers_die_of_is_failed_and_the_others_are_not(way, tmp_path, request):
     job, path = CheapJob(tmp_path, deadly=2, crashes=99), tmp_path / "table.h5"
     message = r"cells 16 to 23 \(x 0\.326\d* to 0\.469\d*\) are given up as failed: they killed 3 workers or more"

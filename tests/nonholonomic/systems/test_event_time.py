@@ -34,22 +34,32 @@ def test_a_batch_of_balls_is_one_block():
     assert_close(times, jax.vmap(lambda height: bounce(height, 0.8, GRAVITY, 5))(heights), rtol=1e-13)
 
 
+class Linear(eqx.Module):
+    """An event function that is a number plus multiples of height, velocity and time: one program serves all events."""
+
+    numbers: jax.Array
+
+    def __call__(self, t, y):
+        return self.numbers[0] + self.numbers[1] * y[0] + self.numbers[2] * y[1] + self.numbers[3] * t
+
+
 @pytest.mark.parametrize(
-    ("event", "start", "expected"),
+    ("numbers", "start", "expected"),
     [
         # The event is the end of the mode.
-        (lambda t, y: y[0], [1.0, 0.0, 0.0], bounce(1.0, 0.8, GRAVITY, 1)),
+        ((0.0, 1.0, 0.0, 0.0), [1.0, 0.0, 0.0], bounce(1.0, 0.8, GRAVITY, 1)),
         # Starts on the event: the start does not count, and the ball rises first.
-        (lambda t, y: y[0], [0.0, 3.0, 0.0], 6.0 / GRAVITY),
+        ((0.0, 1.0, 0.0, 0.0), [0.0, 3.0, 0.0], 6.0 / GRAVITY),
         # Starts on the event and falls: the next fall through zero is the apex after the bounce.
-        (lambda t, y: y[1], [1.0, 0.0, 0.0], 1.8 * bounce(1.0, 0.8, GRAVITY, 1)),
+        ((0.0, 0.0, 1.0, 0.0), [1.0, 0.0, 0.0], 1.8 * bounce(1.0, 0.8, GRAVITY, 1)),
         # Starts beyond the event, and crosses it downwards on the second fall.
-        (lambda t, y: y[0] - 0.5, [0.4, 0.0, 0.0], jnp.inf),
+        ((-0.5, 1.0, 0.0, 0.0), [0.4, 0.0, 0.0], jnp.inf),
         # A function of time alone.
-        (lambda t, y: 0.7 - t, [1.0, 0.0, 0.0], 0.7),
+        ((0.7, 0.0, 0.0, -1.0), [1.0, 0.0, 0.0], 0.7),
     ],
 )
-def test_the_event_is_the_first_fall_through_zero_after_the_start(event, start, expected):
+def test_the_event_is_the_first_fall_through_zero_after_the_start(numbers, start, expected):
+    event = Linear(jnp.array(numbers))
     assert_close(event_time(Hybrid([Ball()], event=event), jnp.array(start), 2.0), expected, rtol=1e-12)
 
 

@@ -39,7 +39,11 @@ def curves():
 
 @pytest.mark.parametrize(
     ("ratio", "upright", "inverted"),
-    [(5, 24.196, [38.8, 39.5, 44.1]), (20, 26.739, [41.025]), (1000, 27.393, [41.547])],
+    [
+        (5, 24.196, [38.8, 39.5, 44.1]),
+        pytest.param(20, 26.739, [41.025], marks=pytest.mark.slow),
+        pytest.param(1000, 27.393, [41.547], marks=pytest.mark.slow),
+    ],
 )
 def test_critical_spins_of_a_standing_top_in_a_cylinder(critical_spins, ratio, upright, inverted):
     """rc / R = 5, 20, 1000, viscous 0.3 s/m, Rutstam's top (`tippe.md`, section 6)."""
