@@ -136,7 +136,7 @@ def measured(
                     yield f"{program}, {launches} launches, tolerance {tolerance:.0e}"
                     continue
                 timing = timed(
-                    lambda tolerance_=tolerance, run=run, launch_count=launches: run(launch_count, tolerance_), 2
+                    lambda rtol=tolerance, run=run, launch_count=launches: run(launch_count, rtol), 2
                 )
                 exact = np.asarray(run(launches, TIGHT)) if exact is None else exact
                 error = float(np.max(np.abs(np.asarray(timing.result) - exact)) / np.max(np.abs(exact)))

@@ -58,10 +58,10 @@ def log_posterior(density: LogDensity, tables: Measurements, coordinates: Any, p
     """The log density of every draw from the posterior of its table."""
 
     def of_table(
-        table: Measurements, coordinates_: Float[Array, "draws k"], predictions: Float[Array, "draws n"]
+        table: Measurements, draws_of_table: Float[Array, "draws k"], predictions: Float[Array, "draws n"]
     ) -> Any:
         density_of_table = eqx.tree_at(lambda node: node.measurements, density, table)
-        return jax.vmap(density_of_table.of_prediction)(coordinates_, predictions)
+        return jax.vmap(density_of_table.of_prediction)(draws_of_table, predictions)
 
     return np.asarray(jax.jit(jax.vmap(of_table))(tables, jnp.asarray(coordinates), jnp.asarray(predicted)))
 

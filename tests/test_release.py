@@ -51,7 +51,7 @@ def test_every_python_that_is_named_is_tested():
     checks = yaml.safe_load((ROOT / ".github" / "workflows" / "check.yml").read_text())
     versions = checks["jobs"]["run"]["strategy"]["matrix"]["python"]
     matches = [re.fullmatch(r"Programming Language :: Python :: (3\.\d+)", line) for line in PROJECT["classifiers"]]
-    assert versions == [match_.group(1) for match_ in matches if match_]
+    assert versions == [version.group(1) for version in matches if version]
     assert PROJECT["requires-python"] == f">={versions[0]}"
 
 

@@ -151,7 +151,9 @@ def follow(body: Rattleback, mu: float, y, t1: float, floor=1e-8, onset=1e-9, rt
         equations, method = (body if is_rolling else slipping), "Radau" if is_early else "DOP853"
         options = {"rtol": rtol, "atol": 1e-2 * rtol, "events": leaves if is_rolling else stops}
         end = min(slip_start + stiff, t1) if is_early else t1
-        solution = solve_ivp(lambda t, y, equations_=equations: equations_.motion(y)[0], (t, end), y, method, **options)
+        solution = solve_ivp(
+            lambda t, y, kind_of_motion=equations: kind_of_motion.motion(y)[0], (t, end), y, method, **options
+        )
         if modes and not is_rolling and not modes[-1].rolls:
             last_mode = modes.pop()
             modes.append(

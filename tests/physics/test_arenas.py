@@ -112,13 +112,13 @@ def test_the_forms_of_their_own_move_as_the_general_one(name):
     scene = tippe.Scene(rutstam_top(), surface, tippe.Coulomb(0.3, 0.1), side=side)
     launch = tippe.Launch(0.8, 100.0, azimuth=0.5, velocity=(0.1, -0.05), angular_velocity=(3.0, -2.0, 1.0), **place)
     state, (own_place, own_path) = scene.state(launch), scene.start(launch)
-    carried_frame_ = CarriedFrame.of(surface, scene.body.radius, jnp.asarray(20.0), surface.sign(side, "inside"))
+    general_frame = CarriedFrame.of(surface, scene.body.radius, jnp.asarray(20.0), surface.sign(side, "inside"))
     axes = scene.frame.axes(own_place, own_path)
     centre, normal = scene.frame.position(own_place, own_path), axes[2]
     foot = tuple(c - scene.body.radius * n for c, n in zip(centre, normal, strict=True))
     first = (*surface.in_own_axes(foot), *surface.in_own_axes(axes[0]))
     motions = []
-    for frame, start, path in ((scene.frame, own_place, own_path), (carried_frame_, first, ())):
+    for frame, start, path in ((scene.frame, own_place, own_path), (general_frame, first, ())):
         dynamics = Dynamics.of(scene.body, frame, scene.friction, scene.gravity)
         size = 8 + len(start)
         y = np.concatenate([state[:8], np.array([0.0 if part is None else float(part) for part in (*start, *path)])])

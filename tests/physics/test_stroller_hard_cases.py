@@ -195,8 +195,8 @@ def test_projected_heading_crosses_the_equator_with_its_speed_reversed():
 def test_projected_heading_loses_rank_on_the_equator():
     """Section 3: at eta = 0 with th - mu = pi/2 the rear axle's form vanishes; the run says that it came by."""
     scene = Scene(BODY, Spheroid(2.0, 1.1), heading="projected", side="inside")
-    starts_ = jnp.array([0.0, 1e-6, np.pi / 2, 0.3])
-    W = Chart(scene).constraints(starts_.at[0].set(0.0).at[1].set(0.0))
+    place = jnp.array([0.0, 1e-6, np.pi / 2, 0.3])
+    W = Chart(scene).constraints(place.at[0].set(0.0).at[1].set(0.0))
     assert np.linalg.matrix_rank(np.asarray(W), tol=1e-12) == 1
     state = scene.state(Launch((0.0, -1e-6), np.pi / 2, 0.0))
     np.testing.assert_allclose(scene.rank(state), 0.0, atol=1e-10)

@@ -37,9 +37,9 @@ def test_illegal_numbers_in_a_batch_of_rides_give_nothing_that_looks_right():
     rides = jax.jit(jax.vmap(ride))(*jnp.array(columns).T)
     assert rides.stats.finished.tolist() == [True] + 7 * [False]
     assert jax.vmap(ride)(*jnp.array(columns).T[:, :0]).speed.shape == (0, 2)
-    for values_ in (rides.position, rides.steering, rides.energy, rides.work, rides.normal_force, rides.load):
-        assert np.all(np.isfinite(values_[0]))
-        assert np.all(np.isnan(values_[1:]))
+    for quantity in (rides.position, rides.steering, rides.energy, rides.work, rides.normal_force, rides.load):
+        assert np.all(np.isfinite(quantity[0]))
+        assert np.all(np.isnan(quantity[1:]))
 
 
 BAD = [

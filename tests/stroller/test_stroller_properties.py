@@ -176,11 +176,11 @@ def signs_of(scene: Scene, place, heading, remainder):
 def check_mirror(scene: Scene, launch: Launch):
     """In a mirror across y the ride is the same to the last bit, with left for right, and takes the same steps."""
     signs = signs_of(scene, (1, -1, 1), (1, -1, 1), (-1, 1, -1, -1, 1, 1))
-    plain_ride_, mirrored = ride(scene, launch), ride(scene, launch, states=signs * scene.state(launch))
-    np.testing.assert_array_equal(mirrored.status, plain_ride_.status)
-    np.testing.assert_array_equal(mirrored.steps, plain_ride_.steps)
-    np.testing.assert_array_equal(mirrored.end_time, plain_ride_.end_time)
-    np.testing.assert_array_equal(signs * mirrored.state, plain_ride_.state)
+    unmirrored, mirrored = ride(scene, launch), ride(scene, launch, states=signs * scene.state(launch))
+    np.testing.assert_array_equal(mirrored.status, unmirrored.status)
+    np.testing.assert_array_equal(mirrored.steps, unmirrored.steps)
+    np.testing.assert_array_equal(mirrored.end_time, unmirrored.end_time)
+    np.testing.assert_array_equal(signs * mirrored.state, unmirrored.state)
 
 
 def check_units(scene: Scene, launch: Launch, exponents: tuple[int, int, int]):

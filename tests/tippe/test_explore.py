@@ -62,10 +62,10 @@ def table_of(scene: tippe.Scene, launch: tippe.Launch, grid: dict[str, np.ndarra
     return tippe.inversion_table(scene, **grid, **options)
 
 
-def answers(browser, live_run_, values: np.ndarray) -> np.ndarray:
+def answers(browser, page_run, values: np.ndarray) -> np.ndarray:
     """Status, time of the event, end and final angle of runs in the browser; `values`: of the sliders, (runs, sliders)."""
     browser.get("about:blank")
-    script = f"""{programs(live_run_)}
+    script = f"""{programs(page_run)}
         const asks = integrator(live.answer), at = live.answer.lane, text = (x) => Number.isFinite(x) ? x : String(x);
         return {json.dumps(values.tolist())}.map((values) => {{
           const lane = asks.run(values), cosine = lane[at.state + 4];
@@ -79,10 +79,10 @@ def answers(browser, live_run_, values: np.ndarray) -> np.ndarray:
 )
 def test_the_browser_says_what_the_table_says(browser, arena, law):
     scene, launch, grid = launches_of(arena, law, CASES.index((arena, law)))
-    live_run_ = live_run(scene, launch, RANGES, HORIZONS[law])
+    page_run = live_run(scene, launch, RANGES, HORIZONS[law])
     table = table_of(scene, launch, grid, HORIZONS[law])
     theta, mu, spin = (values.ravel() for values in np.meshgrid(grid["theta"], grid["mu"], grid["spin"], indexing="ij"))
-    status, time, end, angle = answers(browser, live_run_, np.stack([theta, spin, mu], axis=-1))
+    status, time, end, angle = answers(browser, page_run, np.stack([theta, spin, mu], axis=-1))
     assert [tippe.Status(int(code)).word for code in status] == list(np.ravel(table.status))
     np.testing.assert_allclose(time, np.ravel(table.time), rtol=CLOSE)
     np.testing.assert_allclose(end, np.ravel(table.end_time), rtol=CLOSE)
@@ -94,19 +94,19 @@ def test_the_browser_says_what_the_table_says(browser, arena, law):
 @pytest.mark.slow
 def test_the_browser_says_when_rattlebacks_reverse(browser):
     """The times of `reversal_table`, for both senses; the words are those of reversals, and a spin of 0 is not allowed."""
-    live_run_ = live_run(rattleback(), tippe.Launch(0.02, -5.0), None, 4.0)
-    assert [slider.path for slider in live_run_.sliders] == ["launch.theta", "launch.spin"]
+    page_run = live_run(rattleback(), tippe.Launch(0.02, -5.0), None, 4.0)
+    assert [slider.path for slider in page_run.sliders] == ["launch.theta", "launch.spin"]
     grid = {"theta": np.linspace(0.005, 0.06, 4), "spin": np.array([-8.0, -6.0, -3.0, 3.0])}
     table = tippe.reversal_table(rattleback(), **grid, t1=4.0, tolerance=TOLERANCE, progress=False)
     values = np.stack([part.ravel() for part in np.meshgrid(*grid.values(), indexing="ij")], axis=-1)
-    status, time, end, _ = answers(browser, live_run_, values)
+    status, time, end, _ = answers(browser, page_run, values)
     words = {int(code): word for code, word in browser.execute_script("return live.facts.words").items()}
     assert [words[int(code)] for code in status] == list(np.ravel(table.status))
     np.testing.assert_allclose(time, np.ravel(table.time), rtol=CLOSE)
     np.testing.assert_allclose(end, np.ravel(table.end_time), rtol=CLOSE)
     assert set(np.ravel(table.status)) == {"reversed", "not_reversed", "contact_lost"}
-    assert live_run_.allowed(jnp.array([0.02, 1.0]))
-    assert not live_run_.allowed(jnp.array([0.02, 0.0]))
+    assert page_run.allowed(jnp.array([0.02, 1.0]))
+    assert not page_run.allowed(jnp.array([0.02, 0.0]))
 
 
 @pytest.fixture(scope="module")
@@ -288,11 +288,9 @@ def test_keys_play_and_reset(browser, page):
 
 
 def test_numbers_that_do_not_fit_together_are_refused_in_the_page(browser, rutstam_scene):
-    live_run_ = live_run(rutstam_scene, tippe.Launch(0.1, 155.0), {"theta": (0.05, 0.5)}, 7.0)
+    page_run = live_run(rutstam_scene, tippe.Launch(0.1, 155.0), {"theta": (0.05, 0.5)}, 7.0)
     browser.get("about:blank")
-    script = (
-        f"{programs(live_run_)} return [[0.3], [-0.3], [4.0]].map((values) => Boolean(live.allowed(values, [])[0]))"
-    )
+    script = f"{programs(page_run)} return [[0.3], [-0.3], [4.0]].map((values) => Boolean(live.allowed(values, [])[0]))"
     assert browser.execute_script(script) == [True, False, False]
 
 
@@ -326,11 +324,11 @@ def test_flights_of_curved_arenas_and_sticking_are_refused(rutstam_scene):
 def test_in_the_browser_the_wooden_top_hops_and_climbs_onto_its_stem(browser):
     """As `simulate` has it: through flights, impacts and changes of contact, to the end on its stem."""
     scene, launch = tippe.presets.classroom(), tippe.Launch.degrees(theta=6, rpm=1900)
-    live_run_, times = live_run(scene, launch, None, 4.0), np.array([0.0, 0.5, 2.6, 2.78, 2.85, 4.0])
+    page_run, times = live_run(scene, launch, None, 4.0), np.array([0.0, 0.5, 2.6, 2.78, 2.85, 4.0])
     run = tippe.simulate(scene, launch, 4.0, tolerance=1e-10)
     browser.get("about:blank")
     (status, time), end, hops, rows = browser.execute_script(
-        f"""{programs(live_run_)}
+        f"""{programs(page_run)}
         const values = live.facts.sliders.map((slider) => slider.value), asks = integrator(live.answer);
         const moves = integrator(live.motion);
         asks.run(values);

@@ -212,8 +212,8 @@ def experiment():
     data = tippe.InversionTimes(launch, np.full(10, 5.0), error, t1=60.0, angle=0.5 * np.pi)
     free = (("scene.friction.mu", Free(0.3, 0.0)), ("scene.body.offset", Free(0.0035, 0.0)))
     problem = Problem(SceneModel(scene, (data,), data.seen, 1e-8), free)
-    launches_ = zip(np.asarray(launch.theta), np.asarray(launch.spin), strict=True)
-    exact = [independent_time(0.0035, a, w, 60.0, 0.5 * np.pi) for a, w in launches_]
+    pairs = zip(np.asarray(launch.theta), np.asarray(launch.spin), strict=True)
+    exact = [independent_time(0.0035, a, w, 60.0, 0.5 * np.pi) for a, w in pairs]
     return problem, truth, np.array([exact]), error
 
 
@@ -232,8 +232,8 @@ def test_two_hundred_noisy_tables_give_unbiased_estimates_and_intervals_that_cov
     problem, truth, exact, error = experiment
     draw = np.random.default_rng(0)
     noisy_data = Measurements(exact + error * draw.normal(size=(200, 10)), error)
-    launches_ = truth + 0.05 * draw.uniform(-1.0, 1.0, (200, 2))
-    ends = minimise(problem, launches_, noisy_data)
+    start_points = truth + 0.05 * draw.uniform(-1.0, 1.0, (200, 2))
+    ends = minimise(problem, start_points, noisy_data)
     linearised = linearise(problem, ends.coordinates, noisy_data)
     errors = np.array(
         [np.sqrt(np.diag(coordinate_covariance(np.asarray(jacobian)))) for jacobian in linearised.jacobian]

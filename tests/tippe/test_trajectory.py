@@ -76,9 +76,9 @@ def test_illegal_numbers_in_a_batch_of_runs_give_nothing_that_looks_right(rutsta
     assert jax.vmap(run)(*jnp.array(columns).T[:, :0]).theta.shape == (0, 2)
     single_run = tippe.simulate(rutstam_scene, LAUNCH, 0.05, times=[0.0, 0.05])
     assert_close(runs.theta[0], single_run.theta, rtol=1e-8)
-    for values_ in (runs.theta, runs.energy, runs.position, runs.normal_force, runs.work, runs.end_time):
-        assert np.all(np.isfinite(values_[0]))
-        assert np.all(np.isnan(values_[1:]))
+    for quantity in (runs.theta, runs.energy, runs.position, runs.normal_force, runs.work, runs.end_time):
+        assert np.all(np.isfinite(quantity[0]))
+        assert np.all(np.isnan(quantity[1:]))
 
 
 @pytest.mark.slow
