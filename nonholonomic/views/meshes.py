@@ -5,8 +5,8 @@ from jaxtyping import Float
 
 from .stage import Mesh
 
-#: Number of corners of a circle.
-SEGMENTS = 48
+#: Number of corners of a circle, and of sectors with alternating colours.
+SEGMENTS, SECTORS = 48, 6
 
 
 def revolved(profile: list[tuple[float, float]] | Float[np.ndarray, "points 2"], colour: int) -> Mesh:
@@ -39,11 +39,11 @@ def ball(radius: float, colours: tuple[int, int]) -> tuple[Mesh, Mesh]:
     return striped(radius * np.stack([np.sin(polar), np.cos(polar)], axis=-1), colours)
 
 
-def striped(profile: Float[np.ndarray, "points 2"], colours: tuple[int, int], sectors: int = 6) -> tuple[Mesh, Mesh]:
+def striped(profile: Float[np.ndarray, "points 2"], colours: tuple[int, int]) -> tuple[Mesh, Mesh]:
     """The solid of revolution of a profile, in sectors about the z axis with two alternating colours."""
     mesh = revolved(profile, colours[0])
     middles = mesh.vertices[mesh.triangles].mean(axis=1)
-    first = np.floor(np.arctan2(middles[:, 1], middles[:, 0]) / np.pi * sectors / 2.0).astype(int) % 2 == 0
+    first = np.floor(np.arctan2(middles[:, 1], middles[:, 0]) / np.pi * SECTORS / 2.0).astype(int) % 2 == 0
     return (
         Mesh(mesh.vertices, mesh.triangles[first], colours[0]),
         Mesh(mesh.vertices, mesh.triangles[~first], colours[1]),

@@ -11,9 +11,8 @@ import tippe
 from nonholonomic.integration import Settings
 from nonholonomic.sweeps.digits import concise, concise_strings
 from tippe import steady
-from tippe.runs.cells import InversionRuns
+from tippe.runs.cells import InversionJob, InversionRuns
 from tippe.runs.run_kind import run_kind_of
-from tippe.runs.table import InversionJob
 from tippe.runs.time_error import FINER, SAFETY, SAFETY_OF_HISTORIES, error_bound, errors_of, second_tolerance
 
 SCENE = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))

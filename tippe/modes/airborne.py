@@ -309,27 +309,41 @@ class Fly(AbstractFlyingMode):
         rebounds = bounce * speed > CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
         bounce = jnp.where(rebounds, bounce, 0.0)
         if isinstance(scene.friction, SetValuedCoulomb):
-            after_impact, fails = resolve_coulomb_impact(scene.body, scene.friction, ball, free, bounce)
+            body_after, fails = resolve_coulomb_impact(scene.body, scene.friction, ball, free, bounce)
         else:
-            after_impact, fails = resolve_impact(scene.body, scene.friction, ball, free, bounce)
+            body_after, fails = resolve_impact(scene.body, scene.friction, ball, free, bounce)
         # If the landing was located slightly below the arena, the next flight would end where it begins.
         place_on_arena = vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2])))
-        state_after = jnp.where(
-            rebounds, in_flight(place_on_arena, ground.axes, after_impact), in_contact(ground, after_impact)
-        )
-        if self.with_quadratures:
-            c_vector = vector_of(state[OWN + k] for k in range(3))
-            c_vector = jnp.where(rebounds, jnp.stack(c_vector), jnp.stack(to_frame(c_vector, ground.axes)))
-            energy_change = energy(scene.body, 0.0, after_impact) - energy(scene.body, 0.0, free)
-            state_after = jnp.concatenate([state_after, c_vector, state[OWN + 3 :].at[1].add(energy_change)])
         return Transition(
             mode=jnp.where(rebounds, FLYING, SLIDING),
-            state=state_after,
+            state=self.after_impact(state, place_on_arena, ground, free, body_after, rebounds),
             elapsed=zero,
             status=jnp.where(missed(scene, ground, ball), UNRESOLVED, jnp.where(fails, FAILED, RUNNING)),
             crossing_time=jnp.full_like(zero, jnp.inf),
             counts=rebounds.astype(int)[None],
         )
+
+    def after_impact(
+        self,
+        state: Float[Array, "components cells"],
+        place: Vector,
+        ground: Below,
+        body_before: FreeBody,
+        body_after: FreeBody,
+        flies: Bool[Array, " cells"],
+    ) -> Float[Array, "components cells"]:
+        """The state after an impact, including passive quadratures.
+
+        **Arguments:** `state`: the state in flight before the impact; `place`: the centre of mass; `ground`: the arena
+        below the sphere that strikes; `flies`: whether the top flies off, or else is in contact.
+        """
+        state_after = jnp.where(flies, in_flight(place, ground.axes, body_after), in_contact(ground, body_after))
+        if not self.with_quadratures:
+            return state_after
+        c_vector = vector_of(state[OWN + k] for k in range(3))
+        c_vector = jnp.where(flies, jnp.stack(c_vector), jnp.stack(to_frame(c_vector, ground.axes)))
+        energy_change = energy(self.scene.body, 0.0, body_after) - energy(self.scene.body, 0.0, body_before)
+        return jnp.concatenate([state_after, c_vector, state[OWN + 3 :].at[1].add(energy_change)])
 
 
 def modes(

@@ -38,16 +38,13 @@ from .airborne import (
     flight_state,
     from_frame,
     gap_margin,
-    in_contact,
-    in_flight,
     landing_site,
     lift_off,
     missed,
     standing,
-    to_frame,
 )
 from .flying_mode import AbstractFlyingMode
-from .free_body import Ball, FreeBody, balls, energy, gap_rate
+from .free_body import Ball, FreeBody, balls, gap_rate
 from .impact import CLOSING_SPEED, TOUCHING, resolve_impact
 from .inversion_problem import InversionProblem
 from .trajectory_problem import Quadratures
@@ -169,21 +166,13 @@ class FlyBoth(Fly):
         # If the landing was located slightly below the arena, the next mode would end where it begins.
         flying = flying._replace(place=vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2]))))
         ground = ground._replace(gap=zero)
-        impact = resolve_arena_impact(scene, flying, ground, contact_ball, other_ball)
+        free = as_free_body(scene, flying, ground, contact_ball)
+        impact = resolve_arena_impact(scene, flying, ground, free, contact_ball, other_ball)
         flies = impact.rebounds | impact.throws
-        state_after = in_flight(flying.place, ground.axes, impact.free)
-        state_after = jnp.where(flies, state_after, in_contact(ground, impact.free))
-        if self.with_quadratures:
-            c_vector = vector_of(state[OWN + k] for k in range(3))
-            c_vector = jnp.where(flies, jnp.stack(c_vector), jnp.stack(to_frame(c_vector, ground.axes)))
-            energy_change = energy(scene.body, 0.0, impact.free) - energy(
-                scene.body, 0.0, as_free_body(scene, flying, ground, contact_ball)
-            )
-            state_after = jnp.concatenate([state_after, c_vector, state[OWN + 3 :].at[1].add(energy_change)])
         slides = jnp.where(number == 0, SLIDING, ON_STEM)
         return Transition(
             mode=jnp.where(impact.throws, STRIKING, jnp.where(impact.rebounds, FLYING, slides)),
-            state=state_after,
+            state=self.after_impact(state, flying.place, ground, free, impact.free, flies),
             elapsed=zero,
             status=jnp.where(misses | impact.rests, UNRESOLVED, jnp.where(impact.fails, FAILED, RUNNING)),
             crossing_time=jnp.full_like(zero, jnp.inf),
@@ -207,15 +196,14 @@ class ArenaImpact(NamedTuple):
 
 
 def resolve_arena_impact(
-    scene: Scene[Top], flying: FlightState, ground: Below, contact_ball: Ball, other_ball: Ball
+    scene: Scene[Top], flying: FlightState, ground: Below, free: FreeBody, contact_ball: Ball, other_ball: Ball
 ) -> ArenaImpact:
     """The impact of one sphere on the tangent plane at its foot; a slow rebound closes the contact.
 
     **Arguments:** `flying`: the top, whose sphere `contact_ball` is at the arena; `ground`: the arena below this sphere;
-    `other_ball`: the other sphere.
+    `free`: the top above this ground; `other_ball`: the other sphere.
     """
     body, closing = scene.body, CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
-    free = as_free_body(scene, flying, ground, contact_ball)
     speed = greatest(-gap_rate(body, contact_ball, free), 0.0)
     bounce = jnp.zeros_like(speed) if scene.restitution is None else scene.restitution
     rebounds = bounce * speed > closing

@@ -1,4 +1,4 @@
-"""The cells of an inversion table: run them, and compute the variables of each cell."""
+"""The cells of an inversion table: the job that runs them, and computes the variables of each cell."""
 
 from typing import Any, NamedTuple
 
@@ -12,6 +12,7 @@ from nonholonomic.integration import Outcome, Settings, solve_by_diffrax
 from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED, Status
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Variable
+from nonholonomic.validation import as_number
 
 from ..model.contact_dynamics import LOSSES
 from ..model.scene import Scene
@@ -20,6 +21,7 @@ from ..modes.inversion_problem import InversionProblem
 from .inversion import Inversions, checked, is_inverted
 from .run_kind import COUNTED, HYBRID, WORDS, RunKind
 from .sensitivities import sensitivities_of_cells
+from .time_error import errors_of, second_tolerance
 
 TIMES = {"time": "inversion time", "first_time": "first inversion time", "last_time": "last inversion time"}
 
@@ -181,3 +183,47 @@ class InversionRuns(NamedTuple):
 def _time_of_first(outcome: HybridOutcome) -> Float[np.ndarray, " cells"]:
     """The time of the first crossing, infinite in cells that ended otherwise."""
     return np.where(outcome.status == CROSSED, outcome.crossing_time, np.inf)
+
+
+class InversionJob(NamedTuple):
+    """The computation for every cell, as data that can be sent to another process.
+
+    `errors`: whether to run every cell again at another tolerance.
+    """
+
+    runs: InversionRuns
+    roots: dict[str, Any]
+    errors: bool
+
+    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+        """The variables of some cells, of which only the first `count` are run."""
+        runs, words = self.runs, self.runs.run_kind.words
+        if runs.method == "diffrax" and count == 0:
+            # The slow reference always computes a whole chunk, so a call only to compile would compute the first chunk
+            # twice.
+            return {}
+        variables = runs.results(self.roots, columns, count)
+        if self.errors:
+            settings = runs.settings.with_tolerance(as_number(second_tolerance(float(runs.settings.tolerance))))
+            second = runs._replace(settings=settings, slopes_by=[]).results(self.roots, columns, count)
+            silent = tuple(words.index(word) for word in ("failed", "unresolved") if word in words)
+            variables |= errors_of(variables, second, runs.times, runs.run_kind.counts, silent)
+        return variables
+
+
+class ScatteredJob(NamedTuple):
+    """A job whose cells are listed in columns, one row per cell. The results include the columns.
+
+    `columns`: full name of a number -> its value in every cell; `names`: full name -> name of the variable.
+    """
+
+    job: InversionJob
+    columns: dict[str, Any]
+    names: dict[str, str]
+
+    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+        """The variables of some cells, of which only the first `count` are run."""
+        values_of_columns = {number: values[columns["cell"]] for number, values in self.columns.items()}
+        return self.job(values_of_columns, count) | {
+            self.names[number]: values for number, values in values_of_columns.items()
+        }

@@ -44,7 +44,7 @@ from .checks import check_reversible, check_run
 from .flight_trajectory import HybridTrajectory, level_modes
 from .launches import LONG_NAMES, UNITS
 from .quantities import OF_RIGID_BODIES, QUANTITIES
-from .trajectory import Trajectory, simulate
+from .trajectory import Trajectory, parts_of, simulate
 from .view import AXIS, BESIDE, DrawnMotion, aside, curve_of_rotation, show
 
 Numbers = Float[Array, " numbers"]
@@ -306,29 +306,25 @@ def _motion_at_start(scene: Scene[Top], launch: Launch) -> DrawnMotion[Array]:
     assert isinstance(modes[0], Slide)
     # The other tops stand on their stem.
     rows = dataclasses.replace(modes[0], number=number).shown(state)
-    return DrawnMotion.of(hybrid_run(scene, number, rows, jnp.zeros(1)))
+    return DrawnMotion.of(hybrid_moment(scene, number, rows, jnp.zeros(1)))
 
 
 def smooth_frame(scene: Scene, problem: TrajectoryProblem, lane: LaneState) -> Frame:
     """The drawn quantities of a top at one time in contact."""
-    lean, rows = problem.leading, lane.state
-    parts = (rows[:lean], rows[lean:-2], rows[-2], rows[-1])
-    return frame(scene, Trajectory(lane.time, scene, *parts, status=0, end_time=lane.time[0], stats={}, dense=None))
+    return frame(scene, Trajectory(lane.time, scene, *parts_of(problem.leading, lane.state)))
 
 
 def hybrid_frame(scene: Scene, number: Int[Array, "1"], rows: Float[Array, "17 1"], time: Float[Array, "1"]) -> Frame:
     """The drawn quantities of a top at one time in contact or in flight; `rows` are the output rows of the modes."""
-    return frame(scene, hybrid_run(scene, number, rows, time))
+    return frame(scene, hybrid_moment(scene, number, rows, time))
 
 
-def hybrid_run(
+def hybrid_moment(
     scene: Scene[Top], number: Int[Array, "1"], rows: Float[Array, "17 1"], time: Float[Array, "1"]
 ) -> HybridTrajectory:
     """A run in contact or in flight, at a single time."""
-    states, place, spin_angle, work, distance = HybridTrajectory.parts_of(rows)
-    ends = (0, time[0], {}, None, distance, number, None)
     kind: Any = HybridTrajectory
-    return kind(time, scene, states, place, spin_angle, work, *ends)
+    return kind(time, scene, *kind.parts_of(rows), number)
 
 
 def frame(scene: Scene, run: Any) -> Frame:

@@ -84,13 +84,14 @@ class HybridTrajectory(AbstractTrajectory):
     cyclic: Float[np.ndarray, "5 times"]
     spin_angle: Float[np.ndarray, " times"]
     work: Float[np.ndarray, " times"]
-    status: Any
-    end_time: float | Float[Array, ""]
-    stats: dict[str, Any]
-    dense: Any
     distance: Float[np.ndarray, "2 times"]
     contact: Int[np.ndarray, " times"]
-    hops: Float[np.ndarray, "hops 2"] | None
+    # The end of the run; not needed where only the times are read, as in a page.
+    status: Any = None
+    end_time: Any = None
+    stats: dict[str, Any] = eqx.field(default_factory=dict)
+    dense: Any = None
+    hops: Float[np.ndarray, "hops 2"] | None = None
 
     unused = (*AbstractTrajectory.unused, "hops")
     by_time = (*AbstractTrajectory.by_time, "distance", "contact")
@@ -235,17 +236,16 @@ def has_grown_between(scene: Scene[Top], built: Any, samples: HybridSamples, ene
 
 
 def sampled_flights(
-    kind: type[HybridTrajectory],
+    kind: type[Any],
     scene: Scene[Top],
     times: Any,
     samples: HybridSamples,
     lost: Int[Array, ""],
     energy_grew: Bool[Array, ""],
 ) -> Any:
-    """A trajectory of the given class from samples. `lost` is the status code for a run that left its domain, and
-    `energy_grew` whether the run has gained energy.
+    """A trajectory of the given class, a `HybridTrajectory`, from samples. `lost` is the status code for a run that left
+    its domain, and `energy_grew` whether the run has gained energy.
     """
-    states, place, spin_angle, work, distance = kind.parts_of(samples.shown)
     # After the end, no sphere touches.
     number = jnp.where(jnp.isnan(samples.number), BETWEEN, samples.number).astype(int)
     ended = {code: jnp.asarray(int(status)) for code, status in STATUS.items()} | {LEFT_DOMAIN: lost}
@@ -253,12 +253,11 @@ def sampled_flights(
     status = sum(jnp.where(samples.status == code, index, 0) for code, index in ended.items())
     stats = {"accepted": samples.steps - samples.rejected, "rejected": samples.rejected, "hops": samples.counts[0]}
     stats = {name: count.astype(int) for name, count in stats.items()}
-    ends = (status, samples.end_time, stats, None, distance, kind.touching(number), None)
-    return kind(times, scene, states, place, spin_angle, work, *ends)
+    return kind(times, scene, *kind.parts_of(samples.shown), kind.touching(number), status, samples.end_time, stats)
 
 
 def flights_of(
-    kind: type[HybridTrajectory],
+    kind: type[Any],
     scene: Scene[Top],
     path: HybridPath,
     status: str,
@@ -266,14 +265,12 @@ def flights_of(
     times: Any,
     tolerance: float | Float[Array, ""],
 ) -> Any:
-    """A trajectory of the given class along a path, at given times or at those of its steps.
+    """A trajectory of the given class, a `HybridTrajectory`, along a path, at given times or at those of its steps.
 
     A run whose energy does not balance the work of friction and impacts ends as "unresolved".
     """
-    step_times = path.times
-    states, place, spin_angle, work, distance = kind.parts_of(path.at(step_times))
-    ends = (status, path.end_time, {}, path, distance, kind.touching(path.numbers(step_times)), hops)
-    run = kind(step_times, scene, states, place, spin_angle, work, *ends)
+    parts, contact = kind.parts_of(path.at(path.times)), kind.touching(path.numbers(path.times))
+    run = kind(path.times, scene, *parts, contact, status, path.end_time, dense=path, hops=hops)
     in_contact = sum(kind.work_in(segment) for segment in path.segments)
     # The remaining work is that of the impacts.
     run = run.with_stats(path, impact_loss=float(in_contact - path.state[-1]))

@@ -13,15 +13,14 @@ import numpy as np
 from nonholonomic.integration import Settings, explicit_tableau
 from nonholonomic.integration.settings import DEFAULT_MAX_STEPS
 from nonholonomic.sweeps import Axis, Table, Variable, sweep
-from nonholonomic.validation import as_number, require_flag, require_outside, require_whole
+from nonholonomic.validation import require_flag, require_outside, require_whole
 
 from ..model.scene import Scene
-from .cells import InversionRuns, too_many_steps
+from .cells import InversionJob, InversionRuns, ScatteredJob, too_many_steps
 from .checks import check_event, check_reversible, warn_if_it_cannot_invert
 from .launches import described, launches, rows
 from .run_kind import RunKind, check_differentiable, reversal_kind_of, run_kind_of, why_unresolved
 from .sensitivities import sensitivity_names, sensitivity_variables
-from .time_error import errors_of, second_tolerance
 
 
 def inversion_table(
@@ -247,50 +246,6 @@ def warn_of_unresolved_runs(table: Table, run_kind: RunKind) -> None:
     if unresolved.any():
         number = f"{unresolved.sum()} of {unresolved.size} runs are unresolved"
         warnings.warn(f"{number}: {why_unresolved(run_kind)}", UserWarning, stacklevel=3)
-
-
-class InversionJob(NamedTuple):
-    """The computation for every cell, as data that can be sent to another process.
-
-    `errors`: whether to run every cell again at another tolerance.
-    """
-
-    runs: InversionRuns
-    roots: dict[str, Any]
-    errors: bool
-
-    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
-        """The variables of some cells, of which only the first `count` are run."""
-        runs, words = self.runs, self.runs.run_kind.words
-        if runs.method == "diffrax" and count == 0:
-            # The slow reference always computes a whole chunk, so a call only to compile would compute the first chunk
-            # twice.
-            return {}
-        variables = runs.results(self.roots, columns, count)
-        if self.errors:
-            settings = runs.settings.with_tolerance(as_number(second_tolerance(float(runs.settings.tolerance))))
-            second = runs._replace(settings=settings, slopes_by=[]).results(self.roots, columns, count)
-            silent = tuple(words.index(word) for word in ("failed", "unresolved") if word in words)
-            variables |= errors_of(variables, second, runs.times, runs.run_kind.counts, silent)
-        return variables
-
-
-class ScatteredJob(NamedTuple):
-    """A job whose cells are listed in columns, one row per cell. The results include the columns.
-
-    `columns`: full name of a number -> its value in every cell; `names`: full name -> name of the variable.
-    """
-
-    job: InversionJob
-    columns: dict[str, Any]
-    names: dict[str, str]
-
-    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
-        """The variables of some cells, of which only the first `count` are run."""
-        values_of_columns = {number: values[columns["cell"]] for number, values in self.columns.items()}
-        return self.job(values_of_columns, count) | {
-            self.names[number]: values for number, values in values_of_columns.items()
-        }
 
 
 def digest(columns: dict[str, Any]) -> str:

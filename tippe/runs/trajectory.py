@@ -79,10 +79,11 @@ class Trajectory(AbstractTrajectory):
     cyclic: Float[Array, "cyclic times"]
     spin_angle: Float[Array, " times"]
     work: Float[Array, " times"]
-    status: Any
-    end_time: Float[Array, ""]
-    stats: dict[str, Any]
-    dense: Any
+    # The end of the run; not needed where only the times are read, as in a page.
+    status: Any = None
+    end_time: Any = None
+    stats: dict[str, Any] = eqx.field(default_factory=dict)
+    dense: Any = None
 
     @property
     def above(self) -> tuple[None, None]:
@@ -136,7 +137,7 @@ class Trajectory(AbstractTrajectory):
 
     def resampled(self, times: Float[np.ndarray, " times"]) -> "Trajectory":
         """The same run at other times, without checking them."""
-        arrays = on_device(times, *_parts(len(self.states), self.dense.at(times)))
+        arrays = on_device(times, *parts_of(len(self.states), self.dense.at(times)))
         return eqx.tree_at(lambda run: (run.t, run.states, run.cyclic, run.spin_angle, run.work), self, arrays)
 
 
@@ -272,10 +273,10 @@ def _traced(
     assert samples.quadratures is not None
     quadratures = samples.quadratures.T
     parts = (samples.states.T, quadratures[:-2], quadratures[-2], quadratures[-1])
-    return Trajectory(times, scene, *parts, status, samples.end_time, stats, None)
+    return Trajectory(times, scene, *parts, status, samples.end_time, stats)
 
 
-def _parts(lean: int, states: Any) -> tuple[Any, Any, Any, Any]:
+def parts_of(lean: int, states: Any) -> tuple[Any, Any, Any, Any]:
     """State, with its number of components, cyclic coordinates, spin angle and work, of an array (components, times)."""
     return states[:lean], states[lean:-2], states[-2], states[-1]
 
@@ -292,6 +293,6 @@ def _as_trajectory(
     codes = (jnp.asarray(path.left_domain), jnp.asarray(path.failed))
     status = Status(int(_ended(run, scene, last, *codes, jnp.asarray(tolerance)))).word
     counts = {"sticks": int(path.counts[0])} if isinstance(path, HybridPath) else {}
-    lean, cyclic, spin_angle, work = on_device(*_parts(run.leading, states))
+    lean, cyclic, spin_angle, work = on_device(*parts_of(run.leading, states))
     trajectory = Trajectory(times, scene, lean, cyclic, spin_angle, work, status, end, {}, path)
     return if_balanced(trajectory.with_stats(path, **counts), tolerance)

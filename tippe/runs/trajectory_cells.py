@@ -51,9 +51,9 @@ def _reader(
     def read_lane(scene: Scene, states: Float[Array, "iterations components"]) -> dict[str, Array]:
         # No quantity reads the spin angle or the work.
         missing = len(run.start()[0]) - 2 - states.shape[1]
-        zeros, end = jnp.zeros(len(states)), jnp.zeros(())
+        zeros = jnp.zeros(len(states))
         state, cyclic = jnp.split(jnp.pad(states.T, ((0, missing), (0, 0))), [run.leading])
-        trajectory = Trajectory(zeros, scene, state, cyclic, zeros, zeros, None, end, {}, None)
+        trajectory = Trajectory(zeros, scene, state, cyclic, zeros, zeros)
         return {name: getattr(trajectory, name) for name in names}
 
     def own_axis(leaf: Any) -> int | None:
