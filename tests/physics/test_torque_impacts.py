@@ -10,7 +10,7 @@ from hop_reference import Case, row
 from impact_reference import Body, Law
 from impact_reference import resolve_impact as reference_impact
 from test_hops import scene_of
-from test_strong_friction import COUNT, Falls, random_falls, struck
+from test_strong_friction import COUNT, Falls, random_falls, impact_of
 
 import tippe
 from tippe.model.state import angular_velocity
@@ -32,7 +32,7 @@ def test_impacts_with_torques():
     """The torque per unit normal force has the normal impulse as its clock too: against the independent program, 1000 end, and
     no energy comes from nowhere."""
     impacts = with_torques(random_falls(0.0, 5.0))
-    free_after, has_failed = struck(impacts)
+    free_after, has_failed = impact_of(impacts)
     assert not np.asarray(has_failed).any()
     free, ball, law = impacts.free, balls(impacts.body)[0], impacts.friction
     energy_before = np.asarray(energy(impacts.body, 9.81, free))
@@ -63,10 +63,10 @@ def test_impacts_without_disc_or_lever_are_those_of_coulomb():
         coulomb = impacts.friction
         contensou = tippe.Contensou(coulomb.mu, disc * impacts.body.radius, coulomb.slip_speed)
         law = tippe.Rolling(lever * impacts.body.radius, np.ones(COUNT), contensou)
-        free_after, _ = struck(eqx.tree_at(lambda impacts: impacts.friction, impacts, law))
+        free_after, _ = impact_of(eqx.tree_at(lambda impacts: impacts.friction, impacts, law))
         return np.stack(free_after.velocity)
 
-    expected = np.stack(struck(impacts)[0].velocity)
+    expected = np.stack(impact_of(impacts)[0].velocity)
     size = np.linalg.norm(impacts.velocity, axis=0)
     assert_close(changed(0.0, 0.0) / size, expected / size, atol=1e-11)
     for law_at, order in ((lambda h: changed(h, 0.0), 2.0), (lambda h: changed(0.0, h), 1.0)):
