@@ -117,7 +117,7 @@ def test_the_public_names_are_those_that_people_use():
 
 
 #: The rooms of which other tests of the ordinary run go through the same programs.
-TESTED = ("nonholonomic.hybrid", "nonholonomic.derivatives", "nonholonomic.identification")
+TESTED = [f"nonholonomic.{room}" for room in ("integration", "hybrid", "derivatives", "identification")]
 
 
 @pytest.mark.parametrize(

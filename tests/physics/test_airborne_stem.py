@@ -79,6 +79,7 @@ def test_both_spheres_bounce_in_a_cylinder():
 
 
 @pytest.mark.filterwarnings("ignore:surface.radius = .* is larger than a room")
+@pytest.mark.slow
 def test_a_top_that_leans_ends_as_unresolved():
     """In a huge cylinder it rocks from sphere to sphere until both are at rest, when it would on the plane."""
     number = next(k for k, case in enumerate(ON_THE_PLANE) if case.theta == 2.4)

@@ -126,8 +126,9 @@ def test_random_rides_with_components_at_rest():
 
 @pytest.mark.parametrize(
     ("transform", "options"),
-    [(jax.grad, {}), pytest.param(jax.jacfwd, {"adjoint": diffrax.ForwardMode()}, marks=pytest.mark.slow)],
+    [(jax.grad, {}), (jax.jacfwd, {"adjoint": diffrax.ForwardMode()})],
 )
+@pytest.mark.slow
 def test_the_midpoint_rule_is_differentiated_by_either_way(transform, options):
     """Its steps have a given length, whoever differentiates them."""
 

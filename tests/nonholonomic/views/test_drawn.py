@@ -36,7 +36,7 @@ SURFACES = (
     (Torus(1.0, 0.3), (0.3, 2.0)),
     (Paraboloid(0.4), (0.1, 0.2)),
     (Graph(lambda x, y: 0.1 * jnp.sin(3.0 * x) * y), (0.1, 0.2)),
-    (Implicit(lambda x, y, z: x**2 + y**2 + z**2 - 0.25), (0.3, 0.0, -0.4)),
+    pytest.param(Implicit(lambda x, y, z: x**2 + y**2 + z**2 - 0.25), (0.3, 0.0, -0.4), marks=pytest.mark.slow),
 )
 
 
