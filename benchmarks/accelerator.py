@@ -135,9 +135,7 @@ def measured(
                 if time.monotonic() > deadline:
                     yield f"{program}, {launches} launches, tolerance {tolerance:.0e}"
                     continue
-                timing = timed(
-                    lambda rtol=tolerance, run=run, launch_count=launches: run(launch_count, rtol), 2
-                )
+                timing = timed(lambda rtol=tolerance, run=run, launch_count=launches: run(launch_count, rtol), 2)
                 exact = np.asarray(run(launches, TIGHT)) if exact is None else exact
                 error = float(np.max(np.abs(np.asarray(timing.result) - exact)) / np.max(np.abs(exact)))
                 yield Row(program, launches, tolerance, timing.wall / launches * 1e6, error, timing.first)

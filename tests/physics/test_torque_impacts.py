@@ -10,7 +10,7 @@ from hop_reference import Case, row
 from impact_reference import Body, Law
 from impact_reference import resolve_impact as reference_impact
 from test_hops import scene_of
-from test_strong_friction import COUNT, Falls, random_falls, impact_of
+from test_strong_friction import COUNT, Falls, impact_of, random_falls
 
 import tippe
 from tippe.model.state import angular_velocity
