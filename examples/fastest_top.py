@@ -27,37 +27,31 @@ def time_and_force(numbers: jax.Array) -> jax.Array:
     adjoint = diffrax.ForwardMode()
     run = tippe.simulate(scene, tippe.Launch(THETA, SPIN), T1, times=times, tolerance=1e-8, adjoint=adjoint)
     theta = jnp.nan_to_num(run.theta)
-    index = jnp.argmax(theta > ANGLE)
-    share = (ANGLE - theta[index - 1]) / (theta[index] - theta[index - 1])
-    force = jnp.where((jnp.arange(TIMES) < index) & (theta > 0.0), run.normal_force / (MASS * 9.81), jnp.inf)
+    after = jnp.argmax(theta > ANGLE)
+    share = (ANGLE - theta[after - 1]) / (theta[after] - theta[after - 1])
+    force = jnp.where((jnp.arange(TIMES) < after) & (theta > 0.0), run.normal_force / (MASS * 9.81), jnp.inf)
     # The least force lies between the times: at the vertex of the parabola through the least three.
-    low, minimum, high = force[jnp.clip(jnp.argmin(force[:-1]) + jnp.arange(-1, 2), 0, TIMES - 1)]
-    bend = low - 2.0 * minimum + high
-    vertex = minimum - jnp.where(bend > 0.0, (high - low) ** 2 / (8.0 * bend), 0.0)
-    return jnp.where(index > 0, jnp.stack([times[index - 1] + share * times[1], vertex]), jnp.array([2.0 * T1, 1.0]))
+    low, least, high = force[jnp.clip(jnp.argmin(force[:-1]) + jnp.arange(-1, 2), 0, TIMES - 1)]
+    bend = low - 2.0 * least + high
+    vertex = least - jnp.where(bend > 0.0, (high - low) ** 2 / (8.0 * bend), 0.0)
+    return jnp.where(after > 0, jnp.stack([times[after - 1] + share * times[1], vertex]), jnp.array([2.0 * T1, 1.0]))
 
 
 def main() -> None:
-    single, batch, slopes = map(jax.jit, (time_and_force, jax.vmap(time_and_force), jax.jacfwd(time_and_force)))
+    single, many, slopes = map(jax.jit, (time_and_force, jax.vmap(time_and_force), jax.jacfwd(time_and_force)))
     grid = np.stack(np.meshgrid(np.linspace(0.15, 0.48, 12), np.linspace(0.87, 1.08, 8)), axis=-1).reshape(-1, 2)
-    times, forces = np.asarray(batch(grid)).T
-    limit = {
-        "type": "ineq",
-        "fun": lambda numbers: single(numbers)[1] - LEAST,
-        "jac": lambda numbers: slopes(numbers)[1],
-    }
+    times, forces = np.asarray(many(grid)).T
+    limit = {"type": "ineq", "fun": lambda at: single(at)[1] - LEAST, "jac": lambda at: slopes(at)[1]}
     fits = []
     for start in grid[np.argsort(np.where(forces > LEAST, times, 2.0 * T1))[:4]]:
-        options = {"jac": lambda numbers: slopes(numbers)[0], "bounds": BOUNDS, "constraints": limit, "tol": 1e-6}
-        fits.append(minimize(lambda numbers: single(numbers)[0], start, method="SLSQP", **options).x)
+        options = {"jac": lambda at: slopes(at)[0], "bounds": BOUNDS, "constraints": limit, "tol": 1e-6}
+        fits.append(minimize(lambda at: single(at)[0], start, method="SLSQP", **options).x)
         print("from", start.round(3), "to", fits[-1].round(4), "time and force", np.round(single(fits[-1]), 4))
-    optimum = min(fits, key=lambda numbers: single(numbers)[0] if single(numbers)[1] > LEAST - 1e-4 else np.inf)
-    time, force = np.asarray(single(optimum))
-    print(
-        f"fastest: offset / radius {optimum[0]:.4f}, I1 / I3 {optimum[1]:.4f}: {time:.3f} s, least force {force:.4f} mg"
-    )
+    best = min(fits, key=lambda at: single(at)[0] if single(at)[1] > LEAST - 1e-4 else np.inf)
+    time, force = np.asarray(single(best))
+    print(f"fastest: offset / radius {best[0]:.4f}, I1 / I3 {best[1]:.4f}: {time:.3f} s, least force {force:.4f} mg")
     turn = 2.0 * np.pi * np.arange(64) / 64.0
-    times, forces = np.asarray(batch(optimum + 0.005 * np.stack([np.cos(turn), np.sin(turn)], axis=-1))).T
+    times, forces = np.asarray(many(best + 0.005 * np.stack([np.cos(turn), np.sin(turn)], axis=-1))).T
     print(f"Of 64 tops around it {np.sum((times < time) & (forces >= LEAST))} are faster and keep the limit.")
 
 

@@ -22,31 +22,26 @@ def scene(mass: float, radius: float, printed: dict) -> tippe.Scene:
 
 def thresholds(printed: dict) -> jnp.ndarray:
     """Spins [rad/s] above which Rutstam's top inverts if launched upright, and above which standing upright is unstable."""
-    case, lever = scene(0.02, 0.02, printed), 0.02 - printed["offset"]
-    return jnp.stack([steady.jellett_thresholds(case)[1] / (lever * printed["I3"]), steady.upright_critical_spin(case)])
+    of, lever = scene(0.02, 0.02, printed), 0.02 - printed["offset"]
+    return jnp.stack([steady.jellett_thresholds(of)[1] / (lever * printed["I3"]), steady.upright_critical_spin(of)])
 
 
 def final_motion(printed: dict) -> jnp.ndarray:
     """Final inclination [rad], phi' and psi' [rad/s] of Cohen's top, launched at 0.1 rad with 100 rad/s."""
-    case = scene(0.015, 0.025, printed)
+    of = scene(0.015, 0.025, printed)
     launched = 100.0 * printed["I3"] * (0.025 * jnp.cos(0.1) - printed["offset"])
     theta = jnp.asarray(2.0)
     for _ in range(8):
-        jellett, slope = jax.value_and_grad(lambda theta: steady.tumbling(case, theta).jellett - launched)(theta)
+        jellett, slope = jax.value_and_grad(lambda theta: steady.tumbling(of, theta).jellett - launched)(theta)
         theta = theta - jellett / slope
-    motion = steady.tumbling(case, theta)
+    motion = steady.tumbling(of, theta)
     return jnp.stack([theta, motion.precession, motion.spin - motion.precession * jnp.cos(theta)])
 
 
 def shown(title: str, model: Callable, data: Measurements, start: dict) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", tippe.FitWarning)  # that they leave much open is the point
-        fit = identify(
-            jax.vmap(model),
-            data,
-            {name: tippe.Free(start_value, 0.0) for name, start_value in start.items()},
-            progress=False,
-        )
+        fit = identify(jax.vmap(model), data, {name: tippe.Free(at, 0.0) for name, at in start.items()}, progress=False)
     print(title, "of the published top:", *(f"{number:.4g}" for number in model(start)))
     for value, words in zip(fit.identifiability.singular_values, fit.identifiability.words, strict=True):
         print(f"  {words}: " + (f"known to {100.0 / value:.2g} %" if value > 1e-3 else "not at all"))
