@@ -87,7 +87,7 @@ def samples(launches: int, tolerance: float) -> Any:
 
 
 def sampled_table(launches: int, tolerance: float) -> np.ndarray:
-    """The same by `trajectory_table`."""
+    """theta at 201 times by `trajectory_table`."""
     grid = {"theta": thetas(launches), "spin": SPIN, "times": np.linspace(0.0, T1, 201)}
     table = tippe.trajectory_table(scene(tippe.Viscous(0.3)), **grid, tolerance=tolerance, progress=False)
     return table.theta
@@ -103,7 +103,7 @@ _gradients: dict[int, Any] = {}
 
 
 def _gradient_of(launches: int, loss: Any) -> Any:
-    """Compiled once for each number of launches."""
+    """The gradient; compiled once for each number of launches."""
     return _gradients.setdefault(launches, jax.jit(jax.grad(loss)))
 
 
@@ -135,13 +135,13 @@ def measured(
                 if time.monotonic() > deadline:
                     yield f"{program}, {launches} launches, tolerance {tolerance:.0e}"
                     continue
-                timing = timed(lambda at=tolerance, run=run, many=launches: run(many, at), 2)
+                timing = timed(lambda rtol=tolerance, run=run, launch_count=launches: run(launch_count, rtol), 2)
                 exact = np.asarray(run(launches, TIGHT)) if exact is None else exact
                 error = float(np.max(np.abs(np.asarray(timing.result) - exact)) / np.max(np.abs(exact)))
                 yield Row(program, launches, tolerance, timing.wall / launches * 1e6, error, timing.first)
 
 
-def page(rows: list[Row], omitted: list[str]) -> str:
+def page(rows: list[Row], omissions: list[str]) -> str:
     """The results in Markdown."""
     columns = [
         {
@@ -157,7 +157,7 @@ def page(rows: list[Row], omitted: list[str]) -> str:
     lines = ["# Cost and error on an accelerator", "", "`python benchmarks/accelerator.py`, float64:", ""]
     lines += [*(f"* {jax.devices()[0].device_kind}", *(f"* {line}" for line in machine().splitlines())), ""]
     lines += [table(columns) if columns else "Nothing was measured.", ""]
-    lines += [f"No time was left for: {'; '.join(omitted)}.", ""] if omitted else []
+    lines += [f"No time was left for: {'; '.join(omissions)}.", ""] if omissions else []
     return "\n".join(lines)
 
 
@@ -172,12 +172,12 @@ def main(arguments: list[str] | None = None) -> None:
         return
     if jnp.result_type(float) != jnp.float64:
         raise SystemExit("JAX_ENABLE_X64 = 0 must be left out: the measurements are of float64")
-    rows, omitted = [], []
+    rows, omissions = [], []
     for row in measured(programs(), LAUNCHES, TOLERANCES, options.seconds):
         print(row, flush=True)
-        (rows if isinstance(row, Row) else omitted).append(row)
+        (rows if isinstance(row, Row) else omissions).append(row)
         # Written after every row, so that nothing is lost.
-        options.out.write_text(page(rows, omitted))
+        options.out.write_text(page(rows, omissions))
 
 
 if __name__ == "__main__":

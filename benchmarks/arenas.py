@@ -84,9 +84,9 @@ def drifts() -> list[dict[str, str]]:
         for tolerance in (1e-6, 1e-9):
             run = tippe.simulate(scene, launch, 1000.0, times, tolerance)
             foot = tuple(jnp.asarray(run.states[8:11]))
-            off = float(jnp.max(jnp.abs(scene.surface.offset(foot))) / scene.body.radius)
+            offset = float(jnp.max(jnp.abs(scene.surface.offset(foot))) / scene.body.radius)
             entries.append(
-                {"arena": name, "tolerance": f"{tolerance:g}", "status": run.status, "drift / R": f"{off:.1e}"}
+                {"arena": name, "tolerance": f"{tolerance:g}", "status": run.status, "drift / R": f"{offset:.1e}"}
             )
     return entries
 

@@ -41,9 +41,9 @@ class Measured(NamedTuple):
 def inversion_with(make: Callable[[], OdeSolver], highest_order: int | None, t1: float) -> tuple[float, int, int]:
     """Time of inversion, evaluations and steps of a SciPy solver, the event found on its dense output."""
     solver, steps = make(), 0
-    usual = bdf.MAX_ORDER
+    usual_order = bdf.MAX_ORDER
     # A solver reads the highest order at each step; its tables are created with the usual order.
-    bdf.MAX_ORDER = highest_order or usual
+    bdf.MAX_ORDER = highest_order or usual_order
     try:
         while solver.status == "running" and solver.t < t1:
             solver.step()
@@ -51,7 +51,7 @@ def inversion_with(make: Callable[[], OdeSolver], highest_order: int | None, t1:
             if solver.y[4] < np.cos(ANGLE):
                 return crossing(solver), solver.nfev, steps
     finally:
-        bdf.MAX_ORDER = usual
+        bdf.MAX_ORDER = usual_order
     return np.inf, solver.nfev, steps
 
 
@@ -73,21 +73,21 @@ def measure(options: argparse.Namespace) -> tuple[float, list[Measured]]:
     def rate(_, y):
         return np.asarray(field(y))
 
-    def run(name, kind, rtol, highest_order=None, **more):
+    def run(name, kind, rtol, highest_order=None, **extra_options):
         def make():
-            return kind(rate, 0.0, start, options.t1, rtol=rtol, atol=0.1 * rtol * scales, **more)
+            return kind(rate, 0.0, start, options.t1, rtol=rtol, atol=0.1 * rtol * scales, **extra_options)
 
-        begin = time.perf_counter()
+        start_time = time.perf_counter()
         inversion_time, evaluations, steps = inversion_with(make, highest_order, options.t1)
-        return Measured(name, rtol, inversion_time, evaluations, steps, time.perf_counter() - begin)
+        return Measured(name, rtol, inversion_time, evaluations, steps, time.perf_counter() - start_time)
 
     # The smallest tolerance that SciPy accepts is a hundred rounding units.
     reference = run("DOP853", DOP853, 3e-14).time
     rows = []
     for rtol in options.tolerances:
-        more = {"jac": lambda _, y: np.asarray(jacobian(y))}
-        rows.append(run("NDF, order 2 (the paper's)", BDF, rtol, 2, **more))
-        rows.append(run("NDF, orders 1-5", BDF, rtol, **more))
+        extra_options = {"jac": lambda _, y: np.asarray(jacobian(y))}
+        rows.append(run("NDF, order 2 (the paper's)", BDF, rtol, 2, **extra_options))
+        rows.append(run("NDF, orders 1-5", BDF, rtol, **extra_options))
         rows.append(run("DOP853", DOP853, rtol))
         rows.append(ours(scene, launch, rtol, options.t1))
     return reference, rows
@@ -100,9 +100,9 @@ def ours(scene: tippe.Scene, launch: tippe.Launch, rtol: float, t1: float) -> Me
         return float(tippe.inversion_time(scene, launch, t1, angle=ANGLE, tolerance=rtol))
 
     call()
-    begin = time.perf_counter()
+    start_time = time.perf_counter()
     inversion_time = call()
-    return Measured("tippe.inversion_time", rtol, inversion_time, 0, 0, time.perf_counter() - begin)
+    return Measured("tippe.inversion_time", rtol, inversion_time, 0, 0, time.perf_counter() - start_time)
 
 
 def draw(reference: float, rows: list[Measured], path: str) -> None:

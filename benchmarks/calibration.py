@@ -57,9 +57,11 @@ def predictions(density: LogDensity, coordinates: np.ndarray) -> np.ndarray:
 def log_posterior(density: LogDensity, tables: Measurements, coordinates: Any, predicted: Any) -> np.ndarray:
     """The log density of every draw from the posterior of its table."""
 
-    def of_table(table: Measurements, at: Float[Array, "draws k"], predictions: Float[Array, "draws n"]) -> Any:
-        own = eqx.tree_at(lambda node: node.measurements, density, table)
-        return jax.vmap(own.of_prediction)(at, predictions)
+    def of_table(
+        table: Measurements, draws_of_table: Float[Array, "draws k"], predictions: Float[Array, "draws n"]
+    ) -> Any:
+        density_of_table = eqx.tree_at(lambda node: node.measurements, density, table)
+        return jax.vmap(density_of_table.of_prediction)(draws_of_table, predictions)
 
     return np.asarray(jax.jit(jax.vmap(of_table))(tables, jnp.asarray(coordinates), jnp.asarray(predicted)))
 
@@ -70,7 +72,7 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=64)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    spent, random = time.process_time(), np.random.default_rng(options.seed)
+    start_time, random = time.process_time(), np.random.default_rng(options.seed)
     free = {name: Free(prior[0], 0.0, prior=prior) for name, prior in PRIORS.items()}
     launches = tippe.Launch(THETA, SPIN)
     data = tippe.InversionTimes(launches, np.full(len(THETA), 10.0), ERROR, t1=60.0, angle=ANGLE)
@@ -83,36 +85,38 @@ def main() -> None:
     # Beyond the horizon, a time is only known to be later.
     tables = Measurements(np.minimum(noisy, 60.0), ERROR, noisy > 60.0)
     print(
-        f"{np.sum(noisy > 60.0)} of {noisy.size} tops did not invert; {time.process_time() - spent:.0f} s of CPU",
+        f"{np.sum(noisy > 60.0)} of {noisy.size} tops did not invert; {time.process_time() - start_time:.0f} s of CPU",
         flush=True,
     )
     problem = Problem(model, tuple(free.items()), STEP)
     ends = minimise(problem, np.tile(np.log(mean), (options.tables, 1)), tables)
     linearised = linearise(problem, ends.coordinates, tables)
-    print(f"fitted: {np.mean(ends.converged):.3f} converged; {time.process_time() - spent:.0f} s of CPU", flush=True)
+    print(
+        f"fitted: {np.mean(ends.converged):.3f} converged; {time.process_time() - start_time:.0f} s of CPU", flush=True
+    )
     roots = np.stack(
         [np.linalg.cholesky(coordinate_covariance(information)) for information in linearised.whole_information]
     )
     shape = (options.tables, options.draws, len(mean))
     points = random.normal(size=shape) / np.sqrt(random.chisquare(FREEDOM, (*shape[:2], 1)) / FREEDOM)
-    drawn = ends.coordinates[:, None] + WIDER * np.einsum("tij,tdj->tdi", roots, points)
-    predicted = predictions(density, drawn.reshape(-1, len(mean))).reshape(*shape[:2], -1)
-    proposed = -0.5 * (FREEDOM + len(mean)) * np.log1p(np.sum(points**2, axis=-1) / FREEDOM)
-    weights = log_posterior(density, tables, drawn, predicted) - proposed
+    proposals = ends.coordinates[:, None] + WIDER * np.einsum("tij,tdj->tdi", roots, points)
+    predicted = predictions(density, proposals.reshape(-1, len(mean))).reshape(*shape[:2], -1)
+    log_proposal = -0.5 * (FREEDOM + len(mean)) * np.log1p(np.sum(points**2, axis=-1) / FREEDOM)
+    weights = log_posterior(density, tables, proposals, predicted) - log_proposal
     weights = np.exp(weights - np.max(weights, axis=1, keepdims=True))
     weights /= np.sum(weights, axis=1, keepdims=True)
-    worth = 1.0 / np.sum(weights**2, axis=1)
+    effective_size = 1.0 / np.sum(weights**2, axis=1)
     print(
-        f"weights are worth {np.percentile(worth, [0, 10, 50])} draws (least, 10 %, median); "
-        f"{time.process_time() - spent:.0f} s of CPU"
+        f"weights are worth {np.percentile(effective_size, [0, 10, 50])} draws (least, 10 %, median); "
+        f"{time.process_time() - start_time:.0f} s of CPU"
     )
-    below = np.sum(weights[..., None] * (drawn < truth[:, None]), axis=1)
-    for name, share in zip(PRIORS, below.T, strict=True):
+    rank = np.sum(weights[..., None] * (proposals < truth[:, None]), axis=1)
+    for name, share in zip(PRIORS, rank.T, strict=True):
         bins = scipy.stats.chisquare(np.histogram(share, bins=10, range=(0.0, 1.0))[0]).pvalue
-        inside = [np.mean(np.abs(share - 0.5) < 0.5 * part) for part in (0.5, 0.9)]
+        coverage = [np.mean(np.abs(share - 0.5) < 0.5 * part) for part in (0.5, 0.9)]
         print(
             f"{name}: uniform with p = {scipy.stats.kstest(share, 'uniform').pvalue:.2f} and {bins:.2f}; "
-            f"central 50 and 90 % hold the truth in {inside[0]:.3f} and {inside[1]:.3f}"
+            f"central 50 and 90 % hold the truth in {coverage[0]:.3f} and {coverage[1]:.3f}"
         )
 
 

@@ -117,8 +117,8 @@ def _variational(names: list[str], scene: tippe.Scene, launch: tippe.Launch) -> 
         return InversionProblem.of(cells["scene"], cells["launch"], ANGLE, LAUNCHES)
 
     point = tuple(jnp.ones(()) for _ in names)
-    along = [tuple(jnp.asarray(float(row == k)) for k in range(len(names))) for row in range(len(names))]
-    return (VariationalProblem(build(*point), tangents_of(build, point, along), True),)
+    directions = [tuple(jnp.asarray(float(row == k)) for k in range(len(names))) for row in range(len(names))]
+    return (VariationalProblem(build(*point), tangents_of(build, point, directions), True),)
 
 
 def of_stroller(ground: AbstractSurface) -> tuple[AbstractProblem, ...]:
@@ -130,7 +130,7 @@ def of_stroller(ground: AbstractSurface) -> tuple[AbstractProblem, ...]:
 
 
 def counts_of_field(problems: Problems) -> list[int]:
-    """Operations of the field, a slow function as 20; of each mode where there are several."""
+    """Operations of the field, or of the field of each mode; a slow function counts as 20."""
     return [rounded(operations_of_field(problem)) for problem in problems()]
 
 
@@ -154,11 +154,11 @@ def record() -> dict[str, dict[str, list[float]]]:
     return json.loads(RECORD.read_text())
 
 
-def has_grown(recorded: list[float], counted: list[float]) -> bool:
+def has_grown(recorded: list[float], new_counts: list[float]) -> bool:
     """Whether a number has grown by more than 2 %, or the set of numbers has changed."""
-    if len(recorded) != len(counted):
+    if len(recorded) != len(new_counts):
         return True
-    return any(count > (1.0 + GROWTH) * before for before, count in zip(recorded, counted, strict=True))
+    return any(count > (1.0 + GROWTH) * old for old, count in zip(recorded, new_counts, strict=True))
 
 
 def main() -> None:
@@ -166,22 +166,22 @@ def main() -> None:
     command = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     command.add_argument("--write", action="store_true", help="write the record anew")
     options = command.parse_args()
-    counted = {
+    new_counts = {
         "field": {name: counts_of_field(problems) for name, problems in fields()},
         "step": {name: counts_of_step(problems) for name, problems in fields()},
         "steps": {name: steps(case) for name, case in scenes(LAUNCHES).items()},
     }
     recorded = record() if RECORD.exists() else {}
-    for kind, numbers in counted.items():
+    for kind, numbers in new_counts.items():
         for name, number in numbers.items():
-            before = recorded.get(kind, {}).get(name)
-            if number != before:
-                print(f"{kind}, {name}: {before} recorded, {number} now")
+            old_count = recorded.get(kind, {}).get(name)
+            if number != old_count:
+                print(f"{kind}, {name}: {old_count} recorded, {number} now")
     if options.write:
         lines = (
             f'  "{kind}": {{\n'
             + ",\n".join(f"    {json.dumps(name)}: {json.dumps(entry)}" for name, entry in entries.items())
-            for kind, entries in counted.items()
+            for kind, entries in new_counts.items()
         )
         RECORD.write_text("{\n" + "\n  },\n".join(lines) + "\n  }\n}\n")
 

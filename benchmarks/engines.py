@@ -96,8 +96,8 @@ def drake(times: np.ndarray, step: float) -> np.ndarray:
     diagram = builder.Build()
     simulator = Simulator(diagram)
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    turned = RotationMatrix.MakeYRotation(THETA)
-    plant.SetFreeBodyPose(context, body, RigidTransform(turned, [0.0, 0.0, HEIGHT]))
+    orientation = RotationMatrix.MakeYRotation(THETA)
+    plant.SetFreeBodyPose(context, body, RigidTransform(orientation, [0.0, 0.0, HEIGHT]))
     plant.SetFreeBodySpatialVelocity(context, body, SpatialVelocity(SPIN * AXIS, np.zeros(3)))
     angles = []
     for moment in times:
@@ -121,8 +121,8 @@ def pybullet(times: np.ndarray, step: float) -> np.ndarray:
     ball = bullet.createCollisionShape(
         bullet.GEOM_SPHERE, radius=RADIUS * scale, collisionFramePosition=[0.0, 0.0, OFFSET * scale]
     )
-    turned = [*QUATERNION[1:], QUATERNION[0]]
-    top = bullet.createMultiBody(MASS, ball, basePosition=[0.0, 0.0, HEIGHT * scale], baseOrientation=turned)
+    orientation = [*QUATERNION[1:], QUATERNION[0]]
+    top = bullet.createMultiBody(MASS, ball, basePosition=[0.0, 0.0, HEIGHT * scale], baseOrientation=orientation)
     square = scale * scale
     bullet.changeDynamics(top, -1, localInertiaDiagonal=[I1 * square, I1 * square, I3 * square], linearDamping=0.0)
     for body in (plane, top):
@@ -153,9 +153,9 @@ ENGINES: dict[str, tuple[str, Engine, tuple[float, ...]]] = {
 
 def spent(run: Callable[[], Any]) -> Measured:
     """Call once and measure the CPU time."""
-    began = time.process_time()
+    start_time = time.process_time()
     theta = run()
-    return Measured(np.asarray(theta), time.process_time() - began)
+    return Measured(np.asarray(theta), time.process_time() - start_time)
 
 
 def ours(times: np.ndarray, tolerance: float) -> np.ndarray:
@@ -167,13 +167,13 @@ def ours(times: np.ndarray, tolerance: float) -> np.ndarray:
 
 def row(program: str, step: str, times: np.ndarray, measured: Measured, exact: np.ndarray) -> dict[str, str]:
     """A row of the table; the error up to 0.5 s is that before a false inversion begins."""
-    shown = {f"theta at {times[place]:g} s": f"{measured.theta[place]:.5f}" for place in PRINTED}
+    columns = {f"theta at {times[place]:g} s": f"{measured.theta[place]:.5f}" for place in PRINTED}
     on_its_side = measured.theta > 0.5 * np.pi
     errors = np.abs(measured.theta - exact)
     return {
         "program": program,
         "step": step,
-        **shown,
+        **columns,
         "on its side at [s]": f"{times[on_its_side.argmax()]:.2f}" if on_its_side.any() else "never",
         "error to 0.5 s": f"{np.max(errors[times <= 0.5]):.1e}",
         "error": f"{np.max(errors):.1e}",

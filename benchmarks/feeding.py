@@ -35,7 +35,7 @@ VARIABLES |= {name: Variable("1", np.int64) for name in ("steps", "rejected")}
 
 
 def results(columns, count):
-    """Numbers that cost nearly nothing."""
+    """Results that take almost no time to compute."""
     variables = {name: columns["x"] for name in NAMES}
     zeros = np.zeros(len(columns["x"]), int)
     return variables | {"status": zeros.astype(np.int8), "steps": zeros, "rejected": zeros}
@@ -45,23 +45,23 @@ class Sleepers(Executor):
     """Workers that sleep for `each` seconds per cell; their results arrive as bytes, and a thread of a pool unpickles
     them."""
 
-    def __init__(self, workers: int, each: float, cells: int):
-        self._pool, self._each, self._cells = ThreadPoolExecutor(workers), each, cells
+    def __init__(self, workers: int, seconds_per_block: float, cells: int):
+        self._pool, self._each, self._cells = ThreadPoolExecutor(workers), seconds_per_block, cells
         self._sent: dict[bool, bytes] = {}
         self._lock, self.blocks, self.done = threading.Lock(), 0, 0.0
 
-    def submit(self, function, /, sent, needed, first, count, mark) -> Future:
-        return self._pool.submit(self._worked, function, sent, needed, first, count, mark)
+    def submit(self, function, /, payload, stamp, first, count, mark) -> Future:
+        return self._pool.submit(self._worked, function, payload, stamp, first, count, mark)
 
     def shutdown(self, wait=True, *, cancel_futures=False):
         self._pool.shutdown(wait, cancel_futures=cancel_futures)
 
-    def _worked(self, function, sent, needed, first, count, mark):
+    def _worked(self, function, payload, stamp, first, count, mark):
         with self._lock:
             # The last may be shorter; all others have the same results here.
             last = first + count > self._cells
             if last not in self._sent:
-                self._sent[last] = pickle.dumps(function(sent, needed, first, count, mark))
+                self._sent[last] = pickle.dumps(function(payload, stamp, first, count, mark))
             self.blocks += 1
         time.sleep(count * self._each)
         message = pickle.loads(self._sent[last])
@@ -80,14 +80,14 @@ class Took(NamedTuple):
     blocks: int
 
 
-def run(cells: int, workers: int, each: float, folder: Path) -> Took:
+def run(cells: int, workers: int, seconds_per_block: float, folder: Path) -> Took:
     """A sweep over `cells` cells, a multiple of 4096."""
     x, y = axis("x", "x", "1", np.linspace(0.0, 1.0, 1 << 12)), axis("y", "y", "1", np.arange(cells >> 12))
-    sleepers, fed = Sleepers(workers, each, cells), []
+    sleepers, busy = Sleepers(workers, seconds_per_block, cells), []
 
     def handed_out(*arguments, original=running.handed_out):
         yield from original(*arguments)
-        fed.extend([time.perf_counter(), time.process_time()])
+        busy.extend([time.perf_counter(), time.process_time()])
 
     running.handed_out, original = handed_out, running.handed_out
     start, processor = time.perf_counter(), time.process_time()
@@ -100,7 +100,7 @@ def run(cells: int, workers: int, each: float, folder: Path) -> Took:
     assert isinstance(table, Table)
     assert table.shape == (len(y.values), len(x.values))
     (folder / "table.h5").unlink()
-    return Took(sleepers.done - start, fed[0] - start, end - fed[0], fed[1] - processor, sleepers.blocks)
+    return Took(sleepers.done - start, busy[0] - start, end - busy[0], busy[1] - processor, sleepers.blocks)
 
 
 def cost_of_a_cell() -> float:
@@ -134,28 +134,31 @@ def main() -> None:
         # The blocks keep their size.
         cells, running.BLOCKS = cells // 100 >> 12 << 12, running.BLOCKS // 100
     with tempfile.TemporaryDirectory(dir=".") as folder:
-        took = run(cells, options.workers, 0.0, Path(folder))
-        rate = cells / took.fed
+        times = run(cells, options.workers, 0.0, Path(folder))
+        rate = cells / times.fed
         print(
-            f"{cells:.3g} cells in {took.blocks} blocks, workers that need no time: {took.fed:.1f} s, {rate:.3g} cells a second"
+            f"{cells:.3g} cells in {times.blocks} blocks, workers that need no time: {times.fed:.1f} s, "
+            f"{rate:.3g} cells a second"
         )
-        print(f"after the last block: {took.after:.1f} s; at most {peak():.2f} GiB held")
+        print(f"after the last block: {times.after:.1f} s; at most {peak():.2f} GiB held")
         print(f"so one parent feeds {rate * options.each:.0f} workers that take {options.each:g} s a cell")
         # Every worker gets the same number of chunks of the same size, whatever the number of workers.
-        size = -(-cells // took.blocks // 512) * 512
+        size = -(-cells // times.blocks // 512) * 512
         running.chunks_together, original = lambda layout, chunk: size // chunk, running.chunks_together
-        few = size * options.workers * 8 >> 12 << 12
-        ideal = few * options.each / options.workers
-        took = run(few, options.workers, options.each, Path(folder))
+        cell_count = size * options.workers * 8 >> 12 << 12
+        ideal = cell_count * options.each / options.workers
+        times = run(cell_count, options.workers, options.each, Path(folder))
         running.chunks_together = original
-        print(f"{few:.3g} cells in {took.blocks} blocks, {options.workers} workers that sleep for {ideal:.1f} s each:")
         print(
-            f"  the last was done after {took.worked:.1f} s: they waited for {100 * (took.worked / ideal - 1):.1f} % of that"
+            f"{cell_count:.3g} cells in {times.blocks} blocks, {options.workers} workers that sleep for {ideal:.1f} s each:"
         )
         print(
-            f"  the last {options.workers} blocks, which came at once, were written {took.fed - took.worked:.1f} s later"
+            f"  the last was done after {times.worked:.1f} s: they waited for {100 * (times.worked / ideal - 1):.1f} % of that"
         )
-        print(f"  the parent took {took.processor:.1f} s of a core, {100 * took.processor / ideal:.1f} %")
+        print(
+            f"  the last {options.workers} blocks, which came at once, were written {times.fed - times.worked:.1f} s later"
+        )
+        print(f"  the parent took {times.processor:.1f} s of a core, {100 * times.processor / ideal:.1f} %")
 
 
 if __name__ == "__main__":

@@ -52,9 +52,9 @@ def plane(y, p, functions):
     u1, u2, e1, e2, e3, L1, L2, L3 = y
     i1 = 1.0 / p.I1
     d1, d2, d3 = (L2 * e3 - L3 * e2) * i1, (L3 * e1 - L1 * e3) * i1, (L1 * e2 - L2 * e1) * i1
-    along = (1.0 / p.I3 - i1) * (L1 * e1 + L2 * e2 + L3 * e3)
-    s1 = u1 + p.offset * d1 - p.radius * (L2 * i1 + along * e2)
-    s2 = u2 + p.offset * d2 + p.radius * (L1 * i1 + along * e1)
+    axial_rate = (1.0 / p.I3 - i1) * (L1 * e1 + L2 * e2 + L3 * e3)
+    s1 = u1 + p.offset * d1 - p.radius * (L2 * i1 + axial_rate * e2)
+    s2 = u2 + p.offset * d2 + p.radius * (L1 * i1 + axial_rate * e1)
     f = -p.mu if p.slip_speed == 0.0 else -p.mu / functions.sqrt(s1 * s1 + s2 * s2 + p.slip_speed * p.slip_speed)
     f1, f2 = f * s1, f * s2
     r1, r2, r3 = p.offset * e1, p.offset * e2, p.offset * e3 - p.radius
@@ -77,9 +77,9 @@ def cylinder(y, p, functions):
     d1, d2, d3 = (L2 * e3 - L3 * e2) * i1, (L3 * e1 - L1 * e3) * i1, (L1 * e2 - L2 * e1) * i1
     V1, V2 = u1 + p.offset * d1, u2 + p.offset * d2
     o = V1 / p.rho
-    along = (1.0 / p.I3 - i1) * (L1 * e1 + L2 * e2 + L3 * e3)
-    s1 = V1 - p.radius * (L2 * i1 + along * e2)
-    s2 = V2 + p.radius * (L1 * i1 + along * e1)
+    axial_rate = (1.0 / p.I3 - i1) * (L1 * e1 + L2 * e2 + L3 * e3)
+    s1 = V1 - p.radius * (L2 * i1 + axial_rate * e2)
+    s2 = V2 + p.radius * (L1 * i1 + axial_rate * e1)
     f = -p.mu if p.slip_speed == 0.0 else -p.mu / functions.sqrt(s1 * s1 + s2 * s2 + p.slip_speed * p.slip_speed)
     f1, f2 = f * s1, f * s2
     r1, r2, r3 = p.offset * e1, p.offset * e2, p.offset * e3 - p.radius
@@ -104,19 +104,19 @@ def cylinder(y, p, functions):
 def spheroid(y, p, functions):
     """Rate of (r1, r2, r3, e1, e2, e3, phi, P, phi', sin phi, cos phi, work) inside a spheroid (`stroller.md`, section 5)."""
     r1, r2, r3, e1, e2, e3, phi, P, turning, sine, cosine, _ = y
-    across, along = 1.0 / (p.equatorial * p.equatorial), 1.0 / (p.polar * p.polar)
-    g1, g2, g3 = across * r1, across * r2, along * r3
+    radial_weight, axial_rate = 1.0 / (p.equatorial * p.equatorial), 1.0 / (p.polar * p.polar)
+    g1, g2, g3 = radial_weight * r1, radial_weight * r2, axial_rate * r3
     unit = 1.0 / functions.sqrt(g1 * g1 + g2 * g2 + g3 * g3)
     n1, n2, n3 = unit * g1, unit * g2, unit * g3
-    off = e1 * n1 + e2 * n2 + e3 * n3
-    d1, d2, d3 = e1 - off * n1, e2 - off * n2, e3 - off * n3
+    normal_part = e1 * n1 + e2 * n2 + e3 * n3
+    d1, d2, d3 = e1 - normal_part * n1, e2 - normal_part * n2, e3 - normal_part * n3
     d = 1.0 / functions.sqrt(d1 * d1 + d2 * d2 + d3 * d3)
     arm = sine / p.wheelbase
     gauge = 1.0 / functions.sqrt(p.mass * cosine * cosine + p.inertia * arm * arm)
     w = P * gauge
     v, yaw = w * cosine, w * arm
     v1, v2, v3 = v * d * d1, v * d * d2, v * d * d3
-    c1, c2, c3 = across * v1, across * v2, along * v3
+    c1, c2, c3 = radial_weight * v1, radial_weight * v2, axial_rate * v3
     tipping = n1 * c1 + n2 * c2 + n3 * c3
     m1, m2, m3 = unit * (c1 - tipping * n1), unit * (c2 - tipping * n2), unit * (c3 - tipping * n3)
     # The driver's left is to the right of the outward normal: inside, the frame turns at -yaw about it.

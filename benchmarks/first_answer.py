@@ -32,74 +32,74 @@ TOLERANCE = 1e-9
 MODES = ("import", "trace", "compile", "run")
 
 
-def phases_of_jax(begin: float, imported: float, spent: dict[str, float]) -> dict[str, float]:
+def phases_of_jax(start_time: float, imported: float, durations: dict[str, float]) -> dict[str, float]:
     """Times of the phases of a JAX program [s], from the durations that JAX reports."""
     trace = sum(
-        spent.get(f"/jax/core/compile/{name}_duration", 0.0) for name in ("jaxpr_trace", "jaxpr_to_mlir_module")
+        durations.get(f"/jax/core/compile/{name}_duration", 0.0) for name in ("jaxpr_trace", "jaxpr_to_mlir_module")
     )
-    compiled = spent.get("/jax/core/compile/backend_compile_duration", 0.0)
+    compiled = durations.get("/jax/core/compile/backend_compile_duration", 0.0)
     run = time.perf_counter() - imported - trace - compiled
-    return {"import": imported - begin, "trace": trace, "compile": compiled, "run": run}
+    return {"import": imported - start_time, "trace": trace, "compile": compiled, "run": run}
 
 
 def listen() -> dict[str, float]:
     """The durations that JAX reports, summed by name."""
     import jax
 
-    spent: dict[str, float] = {}
+    durations: dict[str, float] = {}
     jax.monitoring.register_event_duration_secs_listener(
-        lambda name, seconds, **_: spent.__setitem__(name, spent.get(name, 0.0) + seconds)
+        lambda name, seconds, **_: durations.__setitem__(name, durations.get(name, 0.0) + seconds)
     )
-    return spent
+    return durations
 
 
 def ours(launches: int, folder: Path) -> dict[str, float]:
     """`inversion_table`."""
-    begin = time.perf_counter()
+    start_time = time.perf_counter()
     import nonholonomic
     import tippe
 
-    imported, spent = time.perf_counter(), listen()
+    imported, durations = time.perf_counter(), listen()
     nonholonomic.enable_compilation_cache(folder / "ours")
     inertia = 0.02 * 0.02**2
     top = tippe.Top(0.02, 0.02, 0.006, 131.0 / 350.0 * inertia, 0.4 * inertia)
     scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
     theta = np.linspace(0.05, 0.15, launches)
     table = tippe.inversion_table(scene, theta=theta, spin=100.0, t1=30.0, tolerance=TOLERANCE)
-    return phases_of_jax(begin, imported, spent) | {"answer": float(table.time[-1])}
+    return phases_of_jax(start_time, imported, durations) | {"answer": float(table.time[-1])}
 
 
 def heyoka(launches: int, folder: Path) -> dict[str, float]:
     """heyoka's batches, with its own cache on disk."""
     from peers import heyoka_batch
 
-    begin = time.perf_counter()
+    start_time = time.perf_counter()
     import heyoka as _  # noqa: F401
 
     imported = time.perf_counter()
     task = task_of(launches, folder)
     run = heyoka_batch(task)
-    written = time.perf_counter()
+    write_time = time.perf_counter()
     # A single launch compiles everything, in a hundredth of the time.
     heyoka_first = heyoka_batch(task.of(slice(0, 1)))
     heyoka_first(TOLERANCE)
     compiled = time.perf_counter()
     ends = run(TOLERANCE)
-    done = time.perf_counter()
-    modes = {"import": imported - begin, "trace": written - imported, "compile": compiled - written}
-    return modes | {"run": done - compiled, "answer": float(ends.time[-1])}
+    finish_time = time.perf_counter()
+    modes = {"import": imported - start_time, "trace": write_time - imported, "compile": compiled - write_time}
+    return modes | {"run": finish_time - compiled, "answer": float(ends.time[-1])}
 
 
 def diffrax(launches: int, folder: Path) -> dict[str, float]:
     """`jax.vmap(diffrax.diffeqsolve)` with an event that Newton's method locates, with JAX's own cache."""
-    begin = time.perf_counter()
+    start_time = time.perf_counter()
     import diffrax
     import jax
     import jax.numpy as jnp
     import optimistix
     from fields import Functions
 
-    imported, spent = time.perf_counter(), listen()
+    imported, durations = time.perf_counter(), listen()
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_compilation_cache_dir", str(folder / "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -123,7 +123,7 @@ def diffrax(launches: int, folder: Path) -> dict[str, float]:
         return solution.ts[0]
 
     answer = float(times(jnp.asarray(task.starts.T))[-1])
-    return phases_of_jax(begin, imported, spent) | {"answer": answer}
+    return phases_of_jax(start_time, imported, durations) | {"answer": answer}
 
 
 def task_of(launches: int, folder: Path) -> Any:
@@ -131,9 +131,9 @@ def task_of(launches: int, folder: Path) -> Any:
     import fields
     from peers import Task
 
-    stored = np.load(folder / f"{launches}.npz")
-    numbers = fields.Top(*(float(number) for number in stored["numbers"]))
-    return Task(fields.plane, numbers, stored["starts"], stored["scales"], 30.0, 0.95 * math.pi, slice(2, 5))
+    reference = np.load(folder / f"{launches}.npz")
+    numbers = fields.Top(*(float(number) for number in reference["numbers"]))
+    return Task(fields.plane, numbers, reference["starts"], reference["scales"], 30.0, 0.95 * math.pi, slice(2, 5))
 
 
 def write_task(launches: int, folder: Path) -> None:
@@ -152,16 +152,16 @@ def measured(program: str, launches: int, state: str, folder: Path) -> dict[str,
     command = [sys.executable, __file__, "--child", program, "--launches", str(launches), "--folder", str(folder)]
     # heyoka stores compiled code here, JAX and this package in the given folders.
     environment = os.environ | {"XDG_CACHE_HOME": str(folder / "home")}
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    begin = time.perf_counter()
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
-    duration = time.perf_counter() - begin
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    if done.returncode != 0:
-        print(f"{program} skipped: {done.stderr.strip().splitlines()[-1]}", file=sys.stderr)
+    usage_before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    start_time = time.perf_counter()
+    finish_time = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    duration = time.perf_counter() - start_time
+    usage_after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    if finish_time.returncode != 0:
+        print(f"{program} skipped: {finish_time.stderr.strip().splitlines()[-1]}", file=sys.stderr)
         return None
-    answer = json.loads(done.stdout.splitlines()[-1])
-    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    answer = json.loads(finish_time.stdout.splitlines()[-1])
+    cpu = usage_after.ru_utime + usage_after.ru_stime - usage_before.ru_utime - usage_before.ru_stime
     row = {"launches": str(launches), "program": program, "state": state, "whole [s]": f"{duration:.2f}"}
     row |= {"CPU [s]": f"{cpu:.2f}"} | {f"{name} [s]": f"{answer[name]:.2f}" for name in MODES}
     return row | {"last time [s]": f"{answer['answer']:.7f}"}

@@ -103,8 +103,10 @@ def row_of(
         "six": timed(lambda: times(scene, theta, tolerance, SIX), 2),
     }
     for label, (values, *functions) in losses.items():
-        for what, function in zip(("loss", "gradient"), functions, strict=True):
-            runs[f"{what} of {label}"] = timed(lambda run=function, at=values: run(at, jnp.asarray(tolerance)), 2)
+        for name_of_function, function in zip(("loss", "gradient"), functions, strict=True):
+            runs[f"{name_of_function} of {label}"] = timed(
+                lambda run=function, values_of_call=values: run(values_of_call, jnp.asarray(tolerance)), 2
+            )
     base, slopes = runs["table"].cpu, runs["one"].result.time_by_mu
     slope, doubt = difference
     return {

@@ -52,13 +52,13 @@ def cost(surface, place, rides: int) -> tuple[float, int]:
     """CPU time [s] of a step of one lane, and the number of steps of all rides."""
     scene = stroller.Scene(BODY, surface, FRICTION, side="inside" if "inside" in surface.sides else None)
     launch = stroller.Launch(place, 0.3, 1.0, 0.2, 0.5)
-    spent = []
+    durations = []
     for _ in range(6):
         start = time.process_time()
         table = stroller.sweep(scene, launch, 10.0, axes={"launch.speed": np.linspace(1.0, 3.0, rides)})
-        spent.append(time.process_time() - start)
+        durations.append(time.process_time() - start)
     steps = int(np.sum(table.steps))
-    return min(spent[1:]) / steps, steps
+    return min(durations[1:]) / steps, steps
 
 
 def main() -> None:

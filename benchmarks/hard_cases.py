@@ -30,19 +30,19 @@ def main() -> int:
     command.add_argument("--only", nargs="+", choices=list(functions), metavar="name", help=", ".join(functions))
     command.add_argument("--csv", type=Path, help="file for the same table")
     options = command.parse_args()
-    started = time.perf_counter()
+    start_time = time.perf_counter()
     print(machine())
     rows = {}
     for name in options.only or functions:
-        print(f"{time.perf_counter() - started:6.0f} s: {name}", file=sys.stderr, flush=True)
+        print(f"{time.perf_counter() - start_time:6.0f} s: {name}", file=sys.stderr, flush=True)
         rows[name] = functions[name]()
     cells = [row.cells(name) for name, row in rows.items()]
     print(table(cells))
     if options.csv is not None:
         write_csv(options.csv, cells)
-    broken = [name for name, row in rows.items() if not row.ok]
-    print(f"\n{time.perf_counter() - started:.0f} s in all; {', '.join(broken) or 'no row'} broke its bound")
-    return 1 if broken else 0
+    failures = [name for name, row in rows.items() if not row.ok]
+    print(f"\n{time.perf_counter() - start_time:.0f} s in all; {', '.join(failures) or 'no row'} broke its bound")
+    return 1 if failures else 0
 
 
 if __name__ == "__main__":

@@ -16,16 +16,16 @@ from nonholonomic.compiled_programs import count_mappings, resident_memory
 def main(scenes: int) -> None:
     """Time one launch in each of many scenes."""
     top = tippe.Top(0.02, 0.02, 0.006, 2.994e-6, 3.2e-6)
-    peak, begun = 0.0, time.perf_counter()
+    peak, start_time = 0.0, time.perf_counter()
     for number in range(scenes):
         law = type(f"Law{number}", (tippe.Viscous,), {})
         scene = tippe.Scene(top, friction=law(0.3), contact="hybrid")
         tippe.inversion_time(scene, tippe.Launch(0.1, 155.0), 0.5, tolerance=1e-6)
         memory = 1e-9 * resident_memory()
         peak = max(peak, memory)
-        passed = time.perf_counter() - begun
+        duration = time.perf_counter() - start_time
         print(
-            f"{number + 1:4d} scenes {passed:7.1f} s {memory:6.2f} GB, peak {peak:5.2f} {count_mappings():6d} mappings"
+            f"{number + 1:4d} scenes {duration:7.1f} s {memory:6.2f} GB, peak {peak:5.2f} {count_mappings():6d} mappings"
         )
 
 

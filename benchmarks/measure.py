@@ -26,15 +26,15 @@ class Timed(NamedTuple):
 
 def timed(run: Callable[[], Any], runs: int = 3) -> Timed:
     """Call once to compile, then `runs` times."""
-    started = time.perf_counter()
+    start_time = time.perf_counter()
     result = jax.block_until_ready(run())
-    first = time.perf_counter() - started
+    first = time.perf_counter() - start_time
     walls, cpus = [], []
     for _ in range(runs):
-        started, spent = time.perf_counter(), time.process_time()
+        start_time, cpu_start = time.perf_counter(), time.process_time()
         result = jax.block_until_ready(run())
-        walls.append(time.perf_counter() - started)
-        cpus.append(time.process_time() - spent)
+        walls.append(time.perf_counter() - start_time)
+        cpus.append(time.process_time() - cpu_start)
     return Timed(result, min(walls), min(cpus), first)
 
 

@@ -85,7 +85,9 @@ def operations_of_field(problem: AbstractProblem) -> Operations:
     """Count the operations of one evaluation of a problem's vector field in one lane. **Arguments:** as above."""
     states = _states(problem)
     times = jax.ShapeDtypeStruct(states.shape[1:], states.dtype)
-    return operations(lambda problem, *at: problem.field(*at), problem, times, states).times(1.0 / states.shape[1])
+    return operations(lambda problem, *arguments: problem.field(*arguments), problem, times, states).times(
+        1.0 / states.shape[1]
+    )
 
 
 def _states(problem: AbstractProblem) -> Any:

@@ -90,8 +90,8 @@ def sleigh_reference(speeds: Any, ahead: float) -> Any:
     def field(t, y):
         return sleigh_field(t, y, ahead)
 
-    tight = {"method": "DOP853", "events": event, "rtol": 2.3e-14, "atol": 1e-14}
-    runs = [solve_ivp(field, (0, 5), [0.0, speed, 1.3], **tight) for speed in np.asarray(speeds)]
+    options = {"method": "DOP853", "events": event, "rtol": 2.3e-14, "atol": 1e-14}
+    runs = [solve_ivp(field, (0, 5), [0.0, speed, 1.3], **options) for speed in np.asarray(speeds)]
     return np.array([run.t_events[0][0] for run in runs])
 
 
@@ -100,7 +100,7 @@ def ball_by_diffrax(tolerance: float) -> Callable[[Any, Any], Any]:
 
     def time(height, restitution):
         def leg(carry, _):
-            begun, y = carry
+            has_begun, y = carry
             solution = diffrax.diffeqsolve(
                 diffrax.ODETerm(lambda t, y, args: jnp.array([y[1], -GRAVITY])),
                 diffrax.Dopri8(),
@@ -114,7 +114,7 @@ def ball_by_diffrax(tolerance: float) -> Callable[[Any, Any], Any]:
                 max_steps=4096,
             )
             end = solution.ys[-1]
-            return (begun + solution.ts[-1], jnp.array([0.0, -restitution * end[1]])), None
+            return (has_begun + solution.ts[-1], jnp.array([0.0, -restitution * end[1]])), None
 
         start = (jnp.zeros(()), jnp.array([height, 0.0]))
         return jax.lax.scan(leg, start, None, length=BOUNCES)[0][0]
@@ -222,14 +222,14 @@ def rows_of(name: str, starts: Any, reference: Any, runs: dict[str, Callable[[fl
     return rows
 
 
-def derivative_row(name: str, time: Callable[[Any], Any], at: float, exact: float | None) -> dict[str, str]:
+def derivative_row(name: str, time: Callable[[Any], Any], value: float, exact: float | None) -> dict[str, str]:
     """The derivative with respect to a number, and a central difference with the best step of a scan."""
-    slope = float(eqx.filter_jit(jax.grad(time))(at))
+    slope = float(eqx.filter_jit(jax.grad(time))(value))
     jitted = eqx.filter_jit(time)
-    differences = [float((jitted(at + h) - jitted(at - h)) / (2 * h)) for h in 10.0 ** -np.arange(2.0, 8.0)]
-    best = differences[int(np.argmin(np.abs(np.diff(differences))))]
-    row = {"system": name, "derivative": f"{slope:.12f}", "scanned difference": f"{best:.12f}"}
-    return row | {"error": f"{abs(slope - (best if exact is None else exact)):.1e}"}
+    differences = [float((jitted(value + h) - jitted(value - h)) / (2 * h)) for h in 10.0 ** -np.arange(2.0, 8.0)]
+    index = differences[int(np.argmin(np.abs(np.diff(differences))))]
+    row = {"system": name, "derivative": f"{slope:.12f}", "scanned difference": f"{index:.12f}"}
+    return row | {"error": f"{abs(slope - (index if exact is None else exact)):.1e}"}
 
 
 def main() -> None:

@@ -71,20 +71,20 @@ def main() -> None:
     unknowns = 9 if options.law == "coulomb" else 8
     low, high, members = LOW[:unknowns], HIGH[:unknowns], options.members
     run = jax.jit(lambda numbers: times(numbers, options.law))
-    begin, generations = time.perf_counter(), 0
+    start_time, generations = time.perf_counter(), 0
 
     def stop(intermediate_result) -> bool:
         nonlocal generations
         generations += 1
         if generations % 50 == 0:
             print(f"generation {generations}: {intermediate_result.fun:.1f}", flush=True)
-        return time.perf_counter() - begin > options.seconds
+        return time.perf_counter() - start_time > options.seconds
 
     random = np.random.default_rng(options.seed)
-    drawn = [random.uniform(low, high, (members, unknowns)) for _ in range(options.draws)]
-    bent = np.concatenate([deviances(parameters.T, options.law, run)[1] for parameters in drawn])
-    first = np.concatenate(drawn)[np.argsort(bent)[:members]]
-    print(f"best of {bent.size} random sets: {bent.min():.1f}, {time.perf_counter() - begin:.0f} s", flush=True)
+    draws = [random.uniform(low, high, (members, unknowns)) for _ in range(options.draws)]
+    bent = np.concatenate([deviances(parameters.T, options.law, run)[1] for parameters in draws])
+    first = np.concatenate(draws)[np.argsort(bent)[:members]]
+    print(f"best of {bent.size} random sets: {bent.min():.1f}, {time.perf_counter() - start_time:.0f} s", flush=True)
     search = differential_evolution(
         lambda numbers: deviances(numbers, options.law, run)[1],
         list(zip(low, high, strict=True)),
@@ -102,13 +102,13 @@ def main() -> None:
     )
     last = search.population.T
     exact, _ = deviances(last, options.law, run)
-    reached = np.asarray(run(jnp.asarray(last)))
+    errors = np.asarray(run(jnp.asarray(last)))
     order = np.argsort(exact)
-    sets, seconds = members * (options.draws + generations), time.perf_counter() - begin
+    sets, seconds = members * (options.draws + generations), time.perf_counter() - start_time
     print(f"{options.law}: {sets} sets in {generations} generations, {seconds:.0f} s")
     for k in order[:6]:
         print(f"deviance {exact[k]:.1f}: " + ", ".join(f"{n} {v:.6g}" for n, v in zip(NAMES, last[:, k], strict=False)))
-    print("times of the first [s]:", np.round(reached[order[0]], 1).tolist())
+    print("times of the first [s]:", np.round(errors[order[0]], 1).tolist())
 
 
 if __name__ == "__main__":

@@ -89,18 +89,18 @@ def rows(
     total = shape[0] * shape[1]
     cells, angles = np.repeat(numbers, shape[1], axis=0).T, np.tile(theta, shape[0])
     time_, status = np.empty(total), np.empty(total, int)
-    for begin in range(0, total, BLOCK):
-        indices = np.minimum(np.arange(begin, begin + BLOCK), total - 1)
+    for start_time in range(0, total, BLOCK):
+        indices = np.minimum(np.arange(start_time, start_time + BLOCK), total - 1)
         scene, launch = scene_and_launch(cells[:, indices], table, angles[indices], options.law)
-        count = min(BLOCK, total - begin)
+        count = min(BLOCK, total - start_time)
         outcome, _ = solve_ensemble(
             InversionProblem.of(scene, launch, ANGLE, BLOCK),
             jnp.asarray(options.horizon),
             jnp.asarray(count),
             Settings(options.tolerance, max_steps=100_000),
         )
-        time_[begin : begin + count] = outcome.crossing_time[:count]
-        status[begin : begin + count] = outcome.status[:count]
+        time_[start_time : start_time + count] = outcome.crossing_time[:count]
+        status[start_time : start_time + count] = outcome.status[:count]
     return np.where(status == CROSSED, time_, np.inf).reshape(shape), status.reshape(shape)
 
 
@@ -112,48 +112,48 @@ def inclinations_and_times(table: paper.PrintedTable) -> tuple[np.ndarray, np.nd
 
 def run(numbers: np.ndarray, table: paper.PrintedTable, options: argparse.Namespace) -> Rows:
     """Run the rows of a table for every set; those that must reverse come first, one at a time."""
-    theta, wanted = inclinations_and_times(table)
-    reversing = np.isfinite(wanted)
-    inversion_times, lost = np.full((len(numbers), len(theta)), np.inf), np.zeros((len(numbers), len(theta)), bool)
+    theta, expected_times = inclinations_and_times(table)
+    reversing = np.isfinite(expected_times)
+    inversion_times, is_lost = np.full((len(numbers), len(theta)), np.inf), np.zeros((len(numbers), len(theta)), bool)
     failed, alive = np.zeros(len(numbers), bool), np.arange(len(numbers))
     for group in (*np.flatnonzero(reversing)[:, None], np.flatnonzero(~reversing)):
         time_, status = rows(numbers[alive], table, theta[group], options)
-        inversion_times[np.ix_(alive, group)], lost[np.ix_(alive, group)] = time_, status == LEFT_DOMAIN
+        inversion_times[np.ix_(alive, group)], is_lost[np.ix_(alive, group)] = time_, status == LEFT_DOMAIN
         failed[alive] = np.any(status == FAILED, axis=1)
         right = np.all(np.isfinite(time_) == reversing[group], axis=1)
         alive = alive[right & ~failed[alive]]
     pattern = np.isin(np.arange(len(numbers)), alive)
-    return Rows(inversion_times, pattern, pattern & ~np.any(lost, axis=1), failed)
+    return Rows(inversion_times, pattern, pattern & ~np.any(is_lost, axis=1), failed)
 
 
 def worst_error(runs: Rows, table: paper.PrintedTable, wanted_sets: np.ndarray) -> np.ndarray:
     """Largest error of the times of a set [s], infinite for unwanted sets."""
-    _, wanted = inclinations_and_times(table)
-    reversing = np.isfinite(wanted)
+    _, expected_times = inclinations_and_times(table)
+    reversing = np.isfinite(expected_times)
     with np.errstate(invalid="ignore"):
-        error = np.max(np.abs(runs.time[:, reversing] - wanted[reversing]), axis=1)
+        error = np.max(np.abs(runs.time[:, reversing] - expected_times[reversing]), axis=1)
     return np.where(wanted_sets, error, np.inf)
 
 
 def scan(table: paper.PrintedTable, options: argparse.Namespace) -> None:
     """Draw, run, count, refine and print."""
-    begin, rng = time.perf_counter(), np.random.default_rng(options.seed)
+    start_time, rng = time.perf_counter(), np.random.default_rng(options.seed)
     numbers = draw(rng, options.sets)
     runs = run(numbers, table, options)
     print(f"  pattern reproduced by {np.sum(runs.pattern)} sets, with contact in all rows by {np.sum(runs.contact)}")
-    print(f"  sets that failed: {np.sum(runs.failed)}; {time.perf_counter() - begin:.0f} s on {jax.devices()[0]}")
-    for label, chosen in (("pattern", runs.pattern), ("pattern and contact", runs.contact)):
-        error = worst_error(runs, table, chosen)
-        if np.any(chosen):
+    print(f"  sets that failed: {np.sum(runs.failed)}; {time.perf_counter() - start_time:.0f} s on {jax.devices()[0]}")
+    for label, mask in (("pattern", runs.pattern), ("pattern and contact", runs.contact)):
+        error = worst_error(runs, table, mask)
+        if np.any(mask):
             show(f"best with {label}", numbers[np.argmin(error)], np.min(error), runs.time[np.argmin(error)])
     if options.rounds and np.any(runs.contact):
         numbers, runs = refine(rng, numbers, runs, table, options)
         error = worst_error(runs, table, runs.contact)
         show(f"best after {options.rounds} rounds", numbers[0], error[0], runs.time[0])
-    best = np.argmin(worst_error(runs, table, runs.contact if np.any(runs.contact) else runs.pattern))
+    index = np.argmin(worst_error(runs, table, runs.contact if np.any(runs.contact) else runs.pattern))
     if np.any(runs.pattern):
-        confirm(numbers[best], options)
-    print(f"  {time.perf_counter() - begin:.0f} s in all")
+        confirm(numbers[index], options)
+    print(f"  {time.perf_counter() - start_time:.0f} s in all")
 
 
 def refine(
@@ -167,10 +167,10 @@ def refine(
         variation = 0.1 * 0.9**turn * scale * rng.normal(size=(PARENTS * CHILDREN, len(NAMES)))
         children = logarithms(np.repeat(parents, CHILDREN, axis=0)[: len(variation)])
         children = exponentials(np.clip(children + variation[: len(children)], LOW, HIGH))
-        kept = Rows(*(part[order] for part in runs))
+        kept_runs = Rows(*(part[order] for part in runs))
         new = run(children, table, options)
         numbers = np.concatenate([parents, children])
-        runs = Rows(*(np.concatenate(pair) for pair in zip(kept, new, strict=True)))
+        runs = Rows(*(np.concatenate(pair) for pair in zip(kept_runs, new, strict=True)))
     order = np.argsort(worst_error(runs, table, runs.contact))
     return numbers[order], Rows(*(part[order] for part in runs))
 

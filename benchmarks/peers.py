@@ -37,9 +37,9 @@ class Task(NamedTuple):
     def launches(self) -> int:
         return self.starts.shape[1]
 
-    def of(self, which: Any) -> "Task":
+    def of(self, indices: Any) -> "Task":
         """The same for some of the launches."""
-        return self._replace(starts=self.starts[:, which], scales=self.scales[:, which])
+        return self._replace(starts=self.starts[:, indices], scales=self.scales[:, indices])
 
 
 class Ends(NamedTuple):
@@ -55,9 +55,9 @@ class Ends(NamedTuple):
         times, states = zip(*ends, strict=True)
         return cls(np.array(times), np.array(states)[:, task.compared])
 
-    def of(self, which: Any) -> "Ends":
+    def of(self, indices: Any) -> "Ends":
         """The same for some of the launches."""
-        return Ends(self.time[which], self.state[which])
+        return Ends(self.time[indices], self.state[indices])
 
 
 def available(name: str) -> bool:
@@ -112,8 +112,8 @@ def heyoka_batch(task: Task) -> Callable[[float], Any]:
             if task.angle is not None:
                 falling = heyoka.event_direction.negative
                 events = [heyoka.nt_event_batch(variables[E3] - math.cos(task.angle), record_event, direction=falling)]
-            blank = np.ones((len(variables), width))
-            integrators[tolerance] = heyoka.taylor_adaptive_batch(system, blank, tol=tolerance, nt_events=events)
+            ones = np.ones((len(variables), width))
+            integrators[tolerance] = heyoka.taylor_adaptive_batch(system, ones, tol=tolerance, nt_events=events)
         integrator, answers = integrators[tolerance], []
         for first in range(0, task.launches, width):
             lanes = np.minimum(np.arange(first, first + width), task.launches - 1)

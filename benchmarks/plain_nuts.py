@@ -31,8 +31,8 @@ class InPoints(eqx.Module):
 def plain(library: str, density: LogDensity, fit: Any, warmup: int, draws: int) -> tuple[Draws, int]:
     """Draws by the no-U-turn sampler of a library with the gradient of the density, and the number of leaps for these
     draws."""
-    around = Surrogate.around(density, fit.coordinates, fit.coordinate_covariance)
-    surrogate, walk, runs = learn(around, 4, np.random.default_rng(0))
+    surrogate_around = Surrogate.around(density, fit.coordinates, fit.coordinate_covariance)
+    surrogate, walk, runs = learn(surrogate_around, 4, np.random.default_rng(0))
     points, leaps = BY[library](InPoints(density, surrogate), walk.points, warmup, draws)
     coordinates = np.asarray(surrogate.at(jnp.asarray(points)))
     return Draws.of(density, coordinates, math.nan, runs + leaps), leaps
@@ -58,7 +58,7 @@ def by_blackjax(density: InPoints, starts: Any, warmup: int, draws: int) -> tupl
         adaptation = blackjax.window_adaptation(
             blackjax.nuts, density, is_mass_matrix_diagonal=False, max_num_doublings=DEEPEST
         )
-        first, then = jax.random.split(key)
+        first, second = jax.random.split(key)
         (state, parameters), _ = adaptation.run(first, start, warmup)
         step = blackjax.nuts(density, **parameters).step
 
@@ -66,7 +66,7 @@ def by_blackjax(density: InPoints, starts: Any, warmup: int, draws: int) -> tupl
             state, info = step(key, state)
             return state, (state.position, info.num_integration_steps)
 
-        return jax.lax.scan(advance, state, jax.random.split(then, draws))[1]
+        return jax.lax.scan(advance, state, jax.random.split(second, draws))[1]
 
     points, steps = jax.jit(jax.vmap(chain))(jax.random.split(jax.random.key(1), len(starts)), starts)
     return np.asarray(points), int(np.sum(steps))

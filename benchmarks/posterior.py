@@ -52,10 +52,13 @@ def main() -> None:
     print(machine())
     data, free = film() if arguments.data == "film" else (measured(), free_numbers())
     start = scene(0.3, 0.0035)
-    began, spent = time.perf_counter(), time.process_time()
+    start_time, cpu_start = time.perf_counter(), time.process_time()
 
-    def clock(what: str) -> None:
-        print(f"{what}: {time.process_time() - spent:.0f} s of CPU, {time.perf_counter() - began:.0f} s", flush=True)
+    def clock(label: str) -> None:
+        print(
+            f"{label}: {time.process_time() - cpu_start:.0f} s of CPU, {time.perf_counter() - start_time:.0f} s",
+            flush=True,
+        )
 
     fit = tippe.identify(start, data, free, tolerance=arguments.tolerance, progress=False)
     clock("fit")

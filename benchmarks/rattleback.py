@@ -71,13 +71,13 @@ def mujoco(spin: float, step: float) -> float:
     turn = np.array([[np.cos(THETA), 0.0, np.sin(THETA)], [0.0, 1.0, 0.0], [-np.sin(THETA), 0.0, np.cos(THETA)]])
     lever = turn @ (-squares * normal / np.sqrt(squares @ normal**2) - CENTRE)
     data.qvel[:3], data.qvel[3:] = -np.cross(turn @ [0.0, 0.0, spin], lever), [0.0, 0.0, spin]
-    before = spin
+    spin_before = spin
     for count in range(round(HORIZON / step)):
         mujoco.mj_step(model, data)
         normal_spin = float(data.xmat[1].reshape(3, 3)[2] @ data.qvel[3:])
         if normal_spin * spin <= 0.0:
-            return (count + before / (before - normal_spin)) * step
-        before = normal_spin
+            return (count + spin_before / (spin_before - normal_spin)) * step
+        spin_before = normal_spin
     return np.inf
 
 
@@ -109,14 +109,14 @@ def costs_of_steps() -> list[dict[str, str]]:
     mass, radius, offset, I1, I3 = TOP
     ball = tippe.Ellipsoid(mass, (radius,) * 3, (0.0, 0.0, -offset), np.diag([I1, I1, I3]))
     theta, spin = np.linspace(0.1, 0.3, 32), np.linspace(120.0, 160.0, 32)
-    tilt, slow = np.linspace(0.01, 0.03, 32), np.linspace(-6.0, -3.0, 32)
+    tilt, slow_spin = np.linspace(0.01, 0.03, 32), np.linspace(-6.0, -3.0, 32)
 
     def inversions(body: Any) -> Callable[[], Table]:
         scene = tippe.Scene(body, friction=tippe.Viscous(0.3))
         return lambda: tippe.inversion_table(scene, theta=theta, spin=spin, t1=8.0, progress=False)
 
     def reversals(law: tippe.AbstractFriction) -> Callable[[], Table]:
-        return lambda: tippe.reversal_table(rattleback(law), theta=tilt, spin=slow, t1=5.0, progress=False)
+        return lambda: tippe.reversal_table(rattleback(law), theta=tilt, spin=slow_spin, t1=5.0, progress=False)
 
     cases = {
         "top, viscous": inversions(tippe.Top(*TOP)),

@@ -51,7 +51,7 @@ def times_of(scene: tippe.Scene, launches: int) -> tippe.Table:
     return tippe.inversion_table(scene, theta=theta, spin=100.0, t1=30.0, tolerance=TOLERANCE)
 
 
-def cpu_row(scene: tippe.Scene, launches: int, cores: int, operations: float, most: float) -> dict[str, str]:
+def cpu_row(scene: tippe.Scene, launches: int, cores: int, operations: float, max_seconds: float) -> dict[str, str]:
     """Cost of one table on a CPU, for the given operations per step and the peak performance of a core."""
     times = {}
     for workers in sorted({1, cores}):
@@ -62,7 +62,7 @@ def cpu_row(scene: tippe.Scene, launches: int, cores: int, operations: float, mo
     return {
         "launches": str(launches),
         "cpu ms per launch, one core": f"{single_core.cpu / launches * 1e3:.3f}",
-        "of peak": f"{100.0 * operations * single_core.result.steps.sum() / single_core.cpu / most:.0f} %",
+        "of peak": f"{100.0 * operations * single_core.result.steps.sum() / single_core.cpu / max_seconds:.0f} %",
         "wall s, one core": f"{single_core.wall:.2f}",
         f"wall s, {cores} cores": f"{all_cores.wall:.2f}",
         "ratio": f"{single_core.wall / all_cores.wall:.2f}",
@@ -71,14 +71,14 @@ def cpu_row(scene: tippe.Scene, launches: int, cores: int, operations: float, mo
     }
 
 
-def device_row(scene: tippe.Scene, launches: int, operations: float, most: float) -> dict[str, str]:
+def device_row(scene: tippe.Scene, launches: int, operations: float, max_seconds: float) -> dict[str, str]:
     """Cost of one table on an accelerator with the given peak performance."""
     run = timed(lambda: times_of(scene, launches), 2)
     memory = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use", 0) / 2**30
     return {
         "launches": str(launches),
         "us per launch": f"{run.wall / launches * 1e6:.2f}",
-        "of peak": f"{100.0 * operations * run.result.steps.sum() / run.wall / most:.1f} %",
+        "of peak": f"{100.0 * operations * run.result.steps.sum() / run.wall / max_seconds:.1f} %",
         "wall s": f"{run.wall:.2f}",
         "first call s": f"{run.first:.1f}",
         "device memory GiB": f"{memory:.2f}",
@@ -114,13 +114,13 @@ def lanes_table(scene: tippe.Scene) -> list[dict[str, str]]:
             )
 
         measured = timed(run, 1)
-        spent = measured.cpu if ON_CPU else measured.wall
+        seconds = measured.cpu if ON_CPU else measured.wall
         steps = float(measured.result[1]) * lanes
         rows.append(
             {
                 "lanes": str(lanes),
-                "ms per launch": f"{spent / cells * 1e3:.3f}",
-                "ns per lane-step": f"{spent / steps * 1e9:.3g}",
+                "ms per launch": f"{seconds / cells * 1e3:.3f}",
+                "ns per lane-step": f"{seconds / steps * 1e9:.3g}",
             }
         )
     return rows
@@ -133,23 +133,25 @@ def main() -> None:
     options = command.parse_args()
     print(machine())
     scene = tippe.Scene(tippe.Top(*TOP), tippe.Plane(), tippe.Viscous(0.3))
-    started = time.perf_counter()
+    start_time = time.perf_counter()
     problem = InversionProblem.of(scene, tippe.Launch(np.linspace(0.05, 0.15, 64), 100.0), 0.95 * np.pi, 64)
-    operations, most = operations_per_step(problem).arithmetic, peak()
+    operations, max_seconds = operations_per_step(problem).arithmetic, peak()
     device = f"{jax.devices()[0].device_kind}, {'double' if DOUBLE else 'single'} precision"
     print(
-        f"{device}: {operations:.0f} operations a step, at most {most:.3g} a second{' on one core' if ON_CPU else ''}"
+        f"{device}: {operations:.0f} operations a step, at most {max_seconds:.3g} a second{' on one core' if ON_CPU else ''}"
     )
     cores = running.workers()
     counts = [10**power for power in range(8) if 10**power <= options.most]
     rows = [
-        cpu_row(scene, count, cores, operations, most) if ON_CPU else device_row(scene, count, operations, most)
+        cpu_row(scene, count, cores, operations, max_seconds)
+        if ON_CPU
+        else device_row(scene, count, operations, max_seconds)
         for count in counts
     ]
     print(table(rows))
     print(f"\nuseful lane-steps on the 64 x 64 grid of theta x spin: {100.0 * useful_share(scene):.0f} %\n")
     print(table(lanes_table(scene)))
-    print(f"\n{time.perf_counter() - started:.0f} s in all")
+    print(f"\n{time.perf_counter() - start_time:.0f} s in all")
 
 
 if __name__ == "__main__":

@@ -60,14 +60,14 @@ def of_top(scene: tippe.Scene, launch: tippe.Launch, t1: float, angle: float | N
     if angle is None:
         # No angle has a cosine of -2: every run goes on to the horizon.
         problem = InversionProblem(problem.dynamics, jnp.asarray(-2.0), problem.states, problem.scales)
-    inside = isinstance(scene.surface, tippe.Cylinder)
+    is_cylinder = isinstance(scene.surface, tippe.Cylinder)
     numbers = fields.Top(
         *(float(value) for value in (body.mass, body.radius, body.offset, body.I1, body.I3, law.mu, scene.gravity)),
         slip_speed=float(getattr(law, "slip_speed", 0.0)),
-        rho=float(scene.surface.radius - body.radius) if inside else 0.0,
+        rho=float(scene.surface.radius - body.radius) if is_cylinder else 0.0,
         turns=0.0 if problem.dynamics.turns is None else float(problem.dynamics.turns),
     )
-    return case(fields.cylinder if inside else fields.plane, numbers, problem, t1, angle, AXIS)
+    return case(fields.cylinder if is_cylinder else fields.plane, numbers, problem, t1, angle, AXIS)
 
 
 def of_stroller(launches: int, t1: float) -> Case:
@@ -88,8 +88,8 @@ def of_stroller(launches: int, t1: float) -> Case:
 
 def case(field, numbers, problem, t1: float, angle: float | None, compared: slice) -> Case:
     """The case, with the same initial states and magnitudes for all programs."""
-    starts, scales = map(np.asarray, problem.start())
-    return Case(Task(field, numbers, starts, scales, t1, angle, compared), problem)
+    states, scales = map(np.asarray, problem.start())
+    return Case(Task(field, numbers, states, scales, t1, angle, compared), problem)
 
 
 def misprint(case: Case) -> float:
@@ -99,5 +99,5 @@ def misprint(case: Case) -> float:
     task = case.task
     states = task.starts + 0.3 * task.scales * np.random.default_rng(5).normal(size=task.starts.shape)
     lean = np.array(task.field(states, task.numbers, NUMPY))
-    own = np.asarray(case.problem.field(jnp.zeros(task.launches), jnp.asarray(states)))
-    return float(np.max(np.abs(lean - own) / np.max(np.abs(own), axis=1, keepdims=True)))
+    rates = np.asarray(case.problem.field(jnp.zeros(task.launches), jnp.asarray(states)))
+    return float(np.max(np.abs(lean - rates) / np.max(np.abs(rates), axis=1, keepdims=True)))

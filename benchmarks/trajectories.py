@@ -90,16 +90,16 @@ def main() -> None:
     launches, thetas, times = options.launches, np.linspace(0.05, 0.15, options.launches), None
     times = np.linspace(0.0, HORIZON, options.samples)
     inputs = (jnp.asarray(thetas), jnp.asarray(times))
-    mu_value, ones = jnp.asarray(MU), jnp.ones((launches, options.samples))
+    mu_value, one = jnp.asarray(MU), jnp.ones((launches, options.samples))
 
     def forward(mu: Any) -> Any:
         return jax.jvp(lambda mu: simulated(*inputs, mu), (mu,), (jnp.ones(()),))
 
     def reverse(mu: Any) -> Any:
         samples, pullback = jax.vjp(lambda mu: simulated(*inputs, mu), mu)
-        return samples, pullback(ones)
+        return samples, pullback(one)
 
-    refine, wide, obvious = jax.jit(simulated), compiled_alone(simulated), jax.jit(by_diffrax)
+    refine, wide_program, obvious_program = jax.jit(simulated), compiled_alone(simulated), jax.jit(by_diffrax)
     along, back_through = jax.jit(forward), jax.jit(reverse)
     ways: dict[str, tuple[Callable[[], Any], int]] = {
         "inversion_table": (
@@ -109,11 +109,11 @@ def main() -> None:
         "trajectory_table": (lambda: tabled(thetas, times).theta, 5),
         "trajectory_table, position": (lambda: tabled(thetas, times, quantities=("position",)).position, 3),
         "jit(vmap(simulate))": (lambda: refine(*inputs), 3),
-        "vmap(simulate), wide vectors": (lambda: wide(*inputs), 3),
+        "vmap(simulate), wide vectors": (lambda: wide_program(*inputs), 3),
     }
     if not options.quick:
         ways |= {
-            "vmap(diffeqsolve)": (lambda: obvious(*inputs), 1),
+            "vmap(diffeqsolve)": (lambda: obvious_program(*inputs), 1),
             "samples and forward derivative": (lambda: along(mu_value), 2),
             "samples and reverse derivative": (lambda: back_through(mu_value), 2),
         }
@@ -130,21 +130,21 @@ def main() -> None:
     print(
         table([{key: mu_value if key == "way" else f"{mu_value:.3g}" for key, mu_value in row.items()} for row in rows])
     )
-    tight = tabled(thetas, times, TIGHT).theta
-    worst = 0
+    reference = tabled(thetas, times, TIGHT).theta
+    max_row = 0
     print("error of theta against tolerance 1e-13: the way, the greatest over the samples, at the end")
     for name, angles in theta.items():
-        if not isinstance(angles, tuple) and angles.shape == tight.shape:
-            errors = np.max(np.abs(np.asarray(angles) - tight), axis=0)
-            worst = int(errors.argmax()) if name == "trajectory_table" else worst
+        if not isinstance(angles, tuple) and angles.shape == reference.shape:
+            errors = np.max(np.abs(np.asarray(angles) - reference), axis=0)
+            max_row = int(errors.argmax()) if name == "trajectory_table" else max_row
             print(f"  {name}: {errors.max():.1e} (at {times[errors.argmax()]:.2f} s), {errors[-1]:.1e}")
-    sampled = np.max(np.abs(theta["trajectory_table"] - tight), axis=0)
+    sampled = np.max(np.abs(theta["trajectory_table"] - reference), axis=0)
     print("error of a sample, and of the end state of runs without samples to the same time")
-    for place in sorted({worst, *np.linspace(0, options.samples - 1, 6).astype(int)[1:]}):
+    for place in sorted({max_row, *np.linspace(0, options.samples - 1, 6).astype(int)[1:]}):
         ends = tippe.inversion_table(
             scene(), theta=thetas, spin=SPIN, t1=float(times[place]), crossing="last"
         ).end_theta
-        print(f"  {times[place]:5.2f} s: {sampled[place]:.1e}, {np.max(np.abs(ends - tight[:, place])):.1e}")
+        print(f"  {times[place]:5.2f} s: {sampled[place]:.1e}, {np.max(np.abs(ends - reference[:, place])):.1e}")
 
 
 if __name__ == "__main__":

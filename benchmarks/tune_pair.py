@@ -71,13 +71,13 @@ def descended(aim: Aim, unknowns: Unknowns, passes: int = 45) -> tuple[Unknowns,
         normal, fall = rows.T @ rows, rows.T @ residuals
         for _ in range(10):
             move = -free @ np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), fall)
-            moved, left = returned(unknowns + move * min(1.0, 2.0 / np.abs(move).max()), 8)
-            if left < 3e-11 and aim(moved) < heights[-1]:
+            trial, left = returned(unknowns + move * min(1.0, 2.0 / np.abs(move).max()), 8)
+            if left < 3e-11 and aim(trial) < heights[-1]:
                 break
             damping *= 5.0
         else:
             break
-        unknowns, damping = moved, max(damping / 8.0, 1e-9)
+        unknowns, damping = trial, max(damping / 8.0, 1e-9)
         heights.append(aim(unknowns))
         if len(heights) > 8 and heights[-6] - heights[-1] < 1e-2:
             break
@@ -89,9 +89,9 @@ def neighbour(unknowns: Unknowns, random: np.random.Generator) -> Unknowns:
     for _ in range(4):
         free = free_directions(unknowns)
         step = free @ random.normal(size=free.shape[1])
-        moved, left = returned(unknowns + step * random.choice([0.2, 0.5, 1.0, 2.0]) / np.abs(step).max(), 20)
-        if left < 1e-11 and np.abs(moved).max() < 60.0:
-            unknowns = moved
+        trial, left = returned(unknowns + step * random.choice([0.2, 0.5, 1.0, 2.0]) / np.abs(step).max(), 20)
+        if left < 1e-11 and np.abs(trial).max() < 60.0:
+            unknowns = trial
     return unknowns
 
 
@@ -101,8 +101,8 @@ def shown(aim: Aim, unknowns: Unknowns, height: float) -> str:
     ninth = jnp.linalg.norm(error_coefficients(pair.stages, pair.eighth, 9))
     eighth = jnp.linalg.norm(error_coefficients(pair.stages, pair.seventh, 8))
     listing = ", ".join(f"{name} {size:.3f}" for (name, _, _), size in sizes)
-    largest = f"largest weights {jnp.abs(pair.stages).max():.1f}, {jnp.abs(pair.eighth).max():.2f}"
-    return f"aim {height:.2f}; {listing}; T9 {ninth:.1e}, T8 of the seventh order {eighth:.1e}, {largest}"
+    weights_text = f"largest weights {jnp.abs(pair.stages).max():.1f}, {jnp.abs(pair.eighth).max():.2f}"
+    return f"aim {height:.2f}; {listing}; T9 {ninth:.1e}, T8 of the seventh order {eighth:.1e}, {weights_text}"
 
 
 def main() -> None:
@@ -113,17 +113,18 @@ def main() -> None:
     command.add_argument("--seed", type=int, default=0)
     options = command.parse_args()
     print(machine())
-    random, started = np.random.default_rng(options.seed), time.perf_counter()
-    aim, best = Aim(motions(options.launches), options.seed), []
+    random, start_time = np.random.default_rng(options.seed), time.perf_counter()
+    aim, candidates = Aim(motions(options.launches), options.seed), []
     for start in range(options.starts):
-        first = neighbour(best[random.integers(min(3, len(best)))][1], random) if best else PLAIN
+        first = neighbour(candidates[random.integers(min(3, len(candidates)))][1], random) if candidates else PLAIN
         parameters, height = descended(aim, first)
-        best = sorted([*best, (height, parameters)], key=lambda candidate: candidate[0])[:3]
-        if best[0][1] is parameters:
+        candidates = sorted([*candidates, (height, parameters)], key=lambda candidate: candidate[0])[:3]
+        if candidates[0][1] is parameters:
             print(
-                f"{time.perf_counter() - started:5.0f} s, start {start}: {shown(aim, parameters, height)}", flush=True
+                f"{time.perf_counter() - start_time:5.0f} s, start {start}: {shown(aim, parameters, height)}",
+                flush=True,
             )
-    for name, rows in pair_of(best[0][1])._asdict().items():
+    for name, rows in pair_of(candidates[0][1])._asdict().items():
         print(name, *(repr(row.tolist()) for row in np.atleast_2d(np.asarray(rows))), sep="\n")
 
 

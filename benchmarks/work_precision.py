@@ -91,16 +91,18 @@ def obvious_diffrax(task: Task, launches: int) -> Any:
     return lambda: batched(y0)
 
 
-def spread(launches: int, most: int) -> Any:
+def spread(launches: int, max_launches: int) -> Any:
     """The launches for a program that is too slow for all of them: a sample with the same range of cost."""
-    count = min(launches, most)
+    count = min(launches, max_launches)
     return ((np.arange(count) + 0.5) * launches / count).astype(int)
 
 
 def errors(task: Task, ends: Ends, reference: Ends) -> tuple[float, float]:
     """The greatest errors over the launches: of the time [s] (of the end state if the horizon ends a run), and of the
     end state."""
-    time, end = (float(np.max(np.abs(value - other))) for value, other in zip(ends, reference, strict=True))
+    time, end = (
+        float(np.max(np.abs(value - reference_value))) for value, reference_value in zip(ends, reference, strict=True)
+    )
     return (end if task.angle is None else time), end
 
 
@@ -140,16 +142,16 @@ def measure(name: str, case: Case, quick: bool) -> list[dict[str, str]]:
         if missing:
             print(f"{peer}: {' and '.join(missing)} not installed, skipped")
             continue
-        which = spread(task.launches, bears)
-        few, right = task.of(which), reference.of(which)
+        indices = spread(task.launches, bears)
+        subset, right = task.of(indices), reference.of(indices)
         try:
-            run = make(few)
+            run = make(subset)
         except NotImplementedError as reason:
             print(f"{peer}: {reason}, skipped")
             continue
         for tolerance in tolerances if "heyoka" in peer else tolerances[::2]:
             measured = timed(lambda run=run, tolerance=tolerance: run(tolerance), RUNS if "heyoka" in peer else 1)
-            rows.append(row(name, peer, tolerance, few, measured, right))
+            rows.append(row(name, peer, tolerance, subset, measured, right))
             print(rows[-1], flush=True)
     return rows
 
@@ -173,9 +175,9 @@ def summary(rows: list[dict[str, str]]) -> list[dict[str, str]]:
     for scene in dict.fromkeys(row["scene"] for row in rows):
         for program in dict.fromkeys(row["program"] for row in rows if row["scene"] == scene):
             costs = [cost_at(rows, scene, program, error) for error in (1e-6, 1e-8)]
-            shown = [f"{cost:.3g}" if math.isfinite(cost) else "-" for cost in costs]
+            texts = [f"{cost:.3g}" if math.isfinite(cost) else "-" for cost in costs]
             entries.append(
-                {"scene": scene, "program": program, "ms at error 1e-6": shown[0], "ms at error 1e-8": shown[1]}
+                {"scene": scene, "program": program, "ms at error 1e-6": texts[0], "ms at error 1e-8": texts[1]}
             )
     return entries
 
@@ -229,13 +231,13 @@ def main() -> None:
     one_core()
     print(machine())
     rows = []
-    described = scenes(options.launches)
-    for name in options.scenes or described:
-        rows += measure(name, described[name], options.quick)
+    scenes_by_name = scenes(options.launches)
+    for name in options.scenes or scenes_by_name:
+        rows += measure(name, scenes_by_name[name], options.quick)
     write_csv(options.out / "work_precision.csv", rows)
     print(table(summary(rows)))
-    if not options.quick and "plane, viscous" in (options.scenes or described):
-        task = described["plane, viscous"].task
+    if not options.quick and "plane, viscous" in (options.scenes or scenes_by_name):
+        task = scenes_by_name["plane, viscous"].task
         row = next(
             float(row["cpu ms per launch"])
             for row in rows

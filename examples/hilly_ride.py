@@ -16,8 +16,8 @@ class Hills(eqx.Module):
     distance: float
 
     def __call__(self, x, y):
-        along, across = 2.0 * jnp.pi * x / self.distance, 2.0 * jnp.pi * y / (1.7 * self.distance)
-        return self.height * jnp.cos(along) * jnp.cos(across)
+        phase, side_phase = 2.0 * jnp.pi * x / self.distance, 2.0 * jnp.pi * y / (1.7 * self.distance)
+        return self.height * jnp.cos(phase) * jnp.cos(side_phase)
 
 
 LAUNCH = stroller.Launch(place=(0.0, 0.4), heading=0.1, speed=1.0)

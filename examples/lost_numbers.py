@@ -44,7 +44,7 @@ def model(numbers: dict) -> jnp.ndarray:
 def main() -> None:
     data = Measurements([row.time or HORIZON for _, row in ROWS], 1.0, [row.time is None for _, row in ROWS])
     labels = tuple(f"Table {2 if table is paper.TABLE_2 else 3}, theta {row.theta:.3g}" for table, row in ROWS)
-    free = {name: Free(at, *between) for name, at, between in zip(NAMES, TOPS[0], BOUNDS, strict=False)}
+    free = {name: Free(start, *bounds) for name, start, bounds in zip(NAMES, TOPS[0], BOUNDS, strict=False)}
     free |= {"azimuth": Free(TOPS[0][6]), "mu [s/m]": Free(TOPS[0][7], 0.0, prior=(0.3, 0.03))}
     print(fit := identify(model, data, free, max_steps=10, labels=labels))
     print(f"It misses the tables by {(fit.deviance / fit.degrees) ** 0.5:.2g} s. Other tops do as well; deviances:")

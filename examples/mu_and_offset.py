@@ -17,14 +17,14 @@ def scene(mu: float, offset: float) -> tippe.Scene:
 
 
 def main() -> None:
-    true = {"scene.friction.mu": 0.3, "scene.body.offset": 0.0035}
-    top = scene(*true.values())
+    truth = {"scene.friction.mu": 0.3, "scene.body.offset": 0.0035}
+    top = scene(*truth.values())
     times = jax.vmap(lambda a, w: tippe.inversion_time(top, tippe.Launch(a, w), t1=60.0, angle=ANGLE))(THETA, SPIN)
     measured = np.asarray(times) + ERROR * np.random.default_rng(1).normal(size=len(THETA))
     data = tippe.InversionTimes(tippe.Launch(THETA, SPIN), measured, ERROR, t1=60.0, angle=ANGLE)
     fit = tippe.identify(top, data, {"friction.mu": 0.45, "offset": 0.005}, starts=4)
     print(fit)
-    for name, value in true.items():
+    for name, value in truth.items():
         low, high = fit.interval(name)
         print(f"truth {name} = {value}: {'inside' if low < value < high else 'outside'} its 95 % interval")
     print("Times fix one combination, friction times a power of the offset, far better than either number alone.")

@@ -28,16 +28,16 @@ def main() -> None:
         scene(), theta=THETA, spin=SPIN, t1=60.0, angle=ANGLE, tolerance=1e-7, sensitivities=list(NAMES)
     )
     # Slopes of the times with respect to relative changes, in units of the error: a launch adds their outer product.
-    slopes = [at * np.asarray(table.variables[f"time_by_{name}"]) / ERROR for name, at in NAMES.items()]
+    slopes = [value * np.asarray(table.variables[f"time_by_{name}"]) / ERROR for name, value in NAMES.items()]
     slopes = np.stack(slopes, axis=-1)
     information = sum(np.outer(slopes[launch], slopes[launch]) for launch in DONE)
     print(f"{len(DONE)} launches of theta {THETA[1]} fix {errors(information)}")
     for _ in range(3):
-        more = information + slopes[..., :, None] * slopes[..., None, :]
-        gain = np.linalg.slogdet(more)[1] - np.linalg.slogdet(information)[1]
-        best = np.unravel_index(np.argmax(gain), gain.shape)
-        information = more[best]
-        print(f"next: theta {THETA[best[0]]}, spin {SPIN[best[1]]:.0f} rad/s: then {errors(information)}")
+        new_information = information + slopes[..., :, None] * slopes[..., None, :]
+        gain = np.linalg.slogdet(new_information)[1] - np.linalg.slogdet(information)[1]
+        index = np.unravel_index(np.argmax(gain), gain.shape)
+        information = new_information[index]
+        print(f"next: theta {THETA[index[0]]}, spin {SPIN[index[1]]:.0f} rad/s: then {errors(information)}")
     repeated = sum(np.outer(slopes[launch], slopes[launch]) for launch in (*DONE, *DONE, DONE[0]))
     print(f"measuring the first ones again instead: {errors(repeated)}")
     print("A time is a staircase in the parameters: check that slopes do not depend on small changes of the launch.")

@@ -14,8 +14,8 @@ def draw() -> Any:
     launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=-2.0, steering=0.02, steering_rate=0.06)
     ride = stroller.simulate(scene, launch, 4.0, times=np.linspace(0.0, 4.0, 2001), tolerance=1e-7)
     figure = ride.portrait("position.x", "position.y")
-    turned = ", ".join(f"{time:.2f} s" for time in ride.jackknifed_at)
-    figure.axes[0].set(aspect="equal", title=f"jackknifed at {turned}" if turned else "it does not jackknife")
+    times = ", ".join(f"{time:.2f} s" for time in ride.jackknifed_at)
+    figure.axes[0].set(aspect="equal", title=f"jackknifed at {times}" if times else "it does not jackknife")
     return figure
 
 

@@ -22,8 +22,8 @@ def scene(mu: float, offset: float) -> tippe.Scene:
 def measured() -> tippe.InversionTimes:
     top = scene(TRUE_MU, TRUE_OFFSET)
     times = jax.vmap(lambda a, w: tippe.inversion_time(top, tippe.Launch(a, w), t1=60.0, angle=ANGLE))(THETA, SPIN)
-    noisy = np.asarray(times) + ERROR * np.random.default_rng(1).normal(size=len(THETA))
-    return tippe.InversionTimes(tippe.Launch(THETA, SPIN), noisy, ERROR, t1=60.0, angle=ANGLE)
+    noisy_times = np.asarray(times) + ERROR * np.random.default_rng(1).normal(size=len(THETA))
+    return tippe.InversionTimes(tippe.Launch(THETA, SPIN), noisy_times, ERROR, t1=60.0, angle=ANGLE)
 
 
 def free_numbers() -> dict[str, tippe.Free]:
@@ -39,8 +39,8 @@ def main(path: str | None = None) -> None:
     draws = sample(density, fit.coordinates, fit.coordinate_covariance)
     print(draws)
     replicas = density.replicate(draws.coordinates.reshape(-1, len(free))[::10])
-    inside = np.mean((np.sort(replicas, axis=0)[2] < data.time) & (data.time < np.sort(replicas, axis=0)[-3]))
-    print(f"{100.0 * inside:.0f} % of the times lie where the posterior predicts them")
+    coverage = np.mean((np.sort(replicas, axis=0)[2] < data.time) & (data.time < np.sort(replicas, axis=0)[-3]))
+    print(f"{100.0 * coverage:.0f} % of the times lie where the posterior predicts them")
     if path is not None:
         from matplotlib.figure import Figure
 

@@ -151,7 +151,7 @@ def require_kind(value: Any, name: str, kind: type, example: str = "") -> None:
         return
     kind_name = kind.__name__.removeprefix("Abstract")
     if type(value).__name__ == kind_name:
-        package_of_value, package_of_kind = (type_.__module__.partition(".")[0] for type_ in (type(value), kind))
+        package_of_value, package_of_kind = (owner.__module__.partition(".")[0] for owner in (type(value), kind))
         raise ValueError(
             f"{name} is a {package_of_value}.{kind_name} and must be a {package_of_kind}.{kind_name}: each package has its own"
         )

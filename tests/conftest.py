@@ -1,4 +1,4 @@
-"""What pytest does around every test, and the scene that most of them ask for."""
+"""Fixtures that pytest applies to every test, and the scene that most tests use."""
 
 import gc
 import os
@@ -23,7 +23,7 @@ ORDINARY = "not slow"
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """What one test compiles serves all others, in every worker and child process, and in the next run of the tests.
+    """All tests, their worker and child processes, and the next run of the tests share compiled programs.
 
     `pytest --cache-clear` forgets it; a folder that `JAX_COMPILATION_CACHE_DIR` names is used instead.
 

@@ -69,8 +69,8 @@ def arrows_of(file: str) -> Iterator[Arrow]:
         if isinstance(node, ast.Import):
             targets = [(name.name, ()) for name in node.names]
         else:
-            above = folder[: len(folder) - node.level + 1] if node.level else ()
-            module = ".".join([*above, *([node.module] if node.module else [])])
+            parents = folder[: len(folder) - node.level + 1] if node.level else ()
+            module = ".".join([*parents, *([node.module] if node.module else [])])
             modules = [name.name for name in node.names if is_module(f"{module}.{name.name}")]
             targets = [(f"{module}.{name}", ()) for name in modules]
             imported_names = tuple(name.name for name in node.names if name.name not in modules)
@@ -88,8 +88,8 @@ def room(name: str) -> str:
     parts = name.removesuffix(".py").split("/") if "/" in name else name.split(".")
     if parts[0] == "tests" and parts[1] in PACKAGES and len(parts) > 3:
         parts = parts[1:]
-    inside = len(parts) > 1 and (ROOT / parts[0] / parts[1] / "__init__.py").exists()
-    return "/".join(parts[:2]) if inside else parts[0]
+    is_subpackage = len(parts) > 1 and (ROOT / parts[0] / parts[1] / "__init__.py").exists()
+    return "/".join(parts[:2]) if is_subpackage else parts[0]
 
 
 ARROWS = [arrow for file in files(*PACKAGES) for arrow in arrows_of(file)]
@@ -154,7 +154,7 @@ def test_modules_close_no_circle(package):
 
 
 def test_witnesses_and_papers_are_not_needed_to_compute_anything():
-    wrong = []
+    violations = []
     for arrow in ARROWS:
         file_room, module_room = room(arrow.file).rpartition("/")[2], room(arrow.module).rpartition("/")[2]
         by_right = (
@@ -163,8 +163,8 @@ def test_witnesses_and_papers_are_not_needed_to_compute_anything():
             or arrow.file.endswith("/__main__.py")
         )
         if module_room in CHECKS and not by_right:
-            wrong.append(str(arrow))
-    assert wrong == []
+            violations.append(str(arrow))
+    assert violations == []
 
 
 def test_private_modules_and_names_stay_in_their_rooms():
@@ -182,15 +182,15 @@ def test_the_vehicles_and_own_systems_use_only_the_public_engine():
     def is_private(name: str) -> bool:
         return name not in api_pages.CONSTANTS and id(api_pages.resolve(name)) not in public
 
-    used = {
+    names_used = {
         f"{arrow.module}.{name}": str(arrow)
         for arrow in ARROWS
         if room(arrow.file).split("/")[0] in ("tippe", "stroller") or room(arrow.file) == "nonholonomic/systems"
         if arrow.module.startswith(api_pages.ENGINE_ROOMS)
         for name in arrow.names
     }
-    assert {"nonholonomic.integration.AbstractProblem", "nonholonomic.hybrid.Transition"} <= set(used)
-    assert [arrow for name, arrow in used.items() if is_private(name)] == []
+    assert {"nonholonomic.integration.AbstractProblem", "nonholonomic.hybrid.Transition"} <= set(names_used)
+    assert [arrow for name, arrow in names_used.items() if is_private(name)] == []
     assert is_private("nonholonomic.integration.scheduler.LaneScheduler")
 
 
@@ -221,9 +221,9 @@ def test_few_files_stand_outside_of_the_rooms():
 
 
 def test_every_file_that_the_walk_names_exists():
-    named = re.findall(
+    names = re.findall(
         r"`((?:tests|tippe|nonholonomic|stroller)/[\w/.]*)`",
         (ROOT / "docs" / "development" / "architecture.md").read_text(),
     )
-    assert named
-    assert [name for name in named if not (ROOT / name).exists()] == []
+    assert names
+    assert [name for name in names if not (ROOT / name).exists()] == []

@@ -69,9 +69,9 @@ def test_an_axis_whose_name_means_nothing_or_too_much_is_refused(axes, message):
 def test_only_what_can_be_varied_is_suggested():
     with pytest.raises(ValueError, match="unknown axis") as refused:
         axes_of(TOP, {"colour": [1.0]})
-    suggested = re.findall(r"[\w.\[\]]+", str(refused.value).partition("varied are ")[2])
-    assert "scene.surface.tilt" in suggested
-    for name in suggested:
+    suggestions = re.findall(r"[\w.\[\]]+", str(refused.value).partition("varied are ")[2])
+    assert "scene.surface.tilt" in suggestions
+    for name in suggestions:
         if name not in ("launch.theta", "launch.spin", "launch.eta", "launch.place[2]"):
             assert axes_of(TOP, {name: [1e-3]}) if "body" not in name else name in numbers("scene", TOP)
     with pytest.raises(ValueError, match="unknown axis 'colour'") as refused:

@@ -37,8 +37,8 @@ def prose(text: str) -> str:
 def missing(path: Path) -> list[str]:
     """What a file cites that is not there."""
     text = path.read_text()
-    every = CITED.findall(prose(text) if path.suffix == ".py" else text)
-    return [cited for cited in every if re.sub(r"^(?:\.\./)+", "", cited) not in THERE]
+    citations = CITED.findall(prose(text) if path.suffix == ".py" else text)
+    return [cited for cited in citations if re.sub(r"^(?:\.\./)+", "", cited) not in THERE]
 
 
 def test_what_is_not_there_is_found(tmp_path):

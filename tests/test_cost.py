@@ -27,14 +27,14 @@ def test_the_record_has_every_field_and_scene():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_fields_have_no_more_operations_than_recorded(name):
-    counted = cost.counts_of_field(FIELDS[name])
-    assert not cost.has_grown(RECORD["field"][name], counted), counted
+    counts = cost.counts_of_field(FIELDS[name])
+    assert not cost.has_grown(RECORD["field"][name], counts), counts
 
 
 @pytest.mark.parametrize("name", ["top, plane"])
 def test_a_step_has_no_more_operations_than_recorded(name):
-    counted = cost.counts_of_step(FIELDS[name])
-    assert not cost.has_grown(RECORD["step"][name], counted), counted
+    counts = cost.counts_of_step(FIELDS[name])
+    assert not cost.has_grown(RECORD["step"][name], counts), counts
 
 
 @pytest.mark.slow
@@ -45,8 +45,8 @@ def test_steps_of_all_fields_have_no_more_operations_than_recorded(name):
 
 @pytest.mark.parametrize("name", COMPILED_ANYWAY)
 def test_launches_take_no_more_steps_than_recorded(name):
-    counted = cost.steps(all_scenes()[name])
-    assert not cost.has_grown(RECORD["steps"][name], counted), counted
+    counts = cost.steps(all_scenes()[name])
+    assert not cost.has_grown(RECORD["steps"][name], counts), counts
 
 
 @pytest.mark.slow
@@ -80,8 +80,8 @@ def test_one_more_operation_in_a_field_shows_thirteen_times_in_a_step():
     """The pair has thirteen stages, so a factor on eight components is 104 operations, 4 % of a step."""
     (problem,) = FIELDS["top, plane"]()
     kind = type(problem)
-    slower = type("Slower", (kind,), {"field": lambda self, time, state: 1.5 * kind.field(self, time, state)})
-    changed = slower(problem.dynamics, problem.cos_angle, problem.states, problem.scales)
-    more = operations_per_step(changed).arithmetic
-    assert more - operations_per_step(problem).arithmetic == pytest.approx(13 * 8)
-    assert cost.has_grown(RECORD["step"]["top, plane"], [more])
+    slow_kind = type("Slower", (kind,), {"field": lambda self, time, state: 1.5 * kind.field(self, time, state)})
+    slow_problem = slow_kind(problem.dynamics, problem.cos_angle, problem.states, problem.scales)
+    operations = operations_per_step(slow_problem).arithmetic
+    assert operations - operations_per_step(problem).arithmetic == pytest.approx(13 * 8)
+    assert cost.has_grown(RECORD["step"]["top, plane"], [operations])

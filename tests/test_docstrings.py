@@ -74,10 +74,10 @@ def folders_of_its_own(tmp_path, monkeypatch):
     """Temporary folders are removed, and compiled programs are kept afterwards where they were kept before."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.delenv("NONHOLONOMIC_CACHE", raising=False)
-    before = {name: getattr(jax.config, name) for name in KEPT}
+    values_before = {name: getattr(jax.config, name) for name in KEPT}
     yield
-    if jax.config.jax_compilation_cache_dir != before["jax_compilation_cache_dir"]:
-        for name, value in before.items():
+    if jax.config.jax_compilation_cache_dir != values_before["jax_compilation_cache_dir"]:
+        for name, value in values_before.items():
             jax.config.update(name, value)
         compilation_cache.reset_cache()
 
@@ -117,7 +117,7 @@ def test_the_public_names_are_those_that_people_use():
 
 
 #: The rooms of which other tests of the ordinary run go through the same programs.
-TESTED = ("nonholonomic.hybrid", "nonholonomic.derivatives", "nonholonomic.identification")
+TESTED = [f"nonholonomic.{room}" for room in ("integration", "hybrid", "derivatives", "identification")]
 
 
 @pytest.mark.parametrize(

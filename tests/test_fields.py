@@ -53,8 +53,8 @@ def slow_in(function, *arguments):
 
 
 def test_the_search_finds_what_is_hidden():
-    inside = jax.jit(lambda x: jax.lax.cond(x > 0.0, jnp.sin, lambda x: x**0.3, x))
-    assert slow_in(lambda x: jax.lax.fori_loop(0, 3, lambda i, x: inside(x), x), 1.0) == {"sin", "pow"}
+    jaxpr = jax.jit(lambda x: jax.lax.cond(x > 0.0, jnp.sin, lambda x: x**0.3, x))
+    assert slow_in(lambda x: jax.lax.fori_loop(0, 3, lambda i, x: jaxpr(x), x), 1.0) == {"sin", "pow"}
 
 
 def slow_in_problem(problem):
@@ -165,10 +165,10 @@ def test_fields_of_a_top_with_a_stem(arena):
 @pytest.mark.parametrize("law", LAWS, ids=name_of)
 def test_fields_of_impacts(law):
     def impact(body):
-        ones = jnp.ones(1)
-        (ball,), free = balls(body), FreeBody((ones, ones, -ones), ones, (ones, ones, ones), (ones, ones, ones))
-        outcome = Impact(body, law, approach(body, ball, free), ball.radius, ones)
-        return Skid(outcome, law.mu, ones) if law.set_valued else outcome
+        one = jnp.ones(1)
+        (ball,), free = balls(body), FreeBody((one, one, -one), one, (one, one, one), (one, one, one))
+        outcome = Impact(body, law, approach(body, ball, free), ball.radius, one)
+        return Skid(outcome, law.mu, one) if law.set_valued else outcome
 
     assert slow_in_problem(eqx.filter_eval_shape(impact, rutstam_top())) == set()
 
@@ -202,16 +202,16 @@ def test_fields_of_the_stroller(ground, friction, spring, heading):
     place = (0.0, 1.2, 1.6) if isinstance(ground, stroller.Implicit) else (0.3, 0.5)
     launch = stroller.Launch(place, 0.5, 1.5, 0.2, 0.1)
     allowed = {"tanh"} if isinstance(friction, stroller.RollingResistance) else set()
-    dynamics, pushed = scene.dynamics, stroller.Steady(1.0, 0.1)
-    for controls in (None, pushed):
+    dynamics, push = scene.dynamics, stroller.Steady(1.0, 0.1)
+    for controls in (None, push):
         state = scene.state(launch, controls is not None)
         assert slow_in(lambda t, state, controls=controls: dynamics.field(t, state, controls), 0.0, state) == allowed
     problem = RideProblem.of(scene, launch, None, 1, watched=True)
     states = problem.start()[0]
     assert slow_in(problem.field, jnp.zeros(1), states) == allowed
     rates = problem.field(jnp.zeros(1), states)
-    along = functools.partial(problem.crossing_along, rate=rates)
-    for watch in (lambda state: problem.domain_margin(jnp.zeros(1), state), problem.event_function, along):
+    crossing = functools.partial(problem.crossing_along, rate=rates)
+    for watch in (lambda state: problem.domain_margin(jnp.zeros(1), state), problem.event_function, crossing):
         assert watch(states) is None or slow_in(watch, states) == set()
     if problem.watched:
-        np.testing.assert_allclose(along(states), problem.event_function(states), rtol=1e-14)
+        np.testing.assert_allclose(crossing(states), problem.event_function(states), rtol=1e-14)

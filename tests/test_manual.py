@@ -13,10 +13,10 @@ DOCS = ROOT / "docs"
 
 def test_every_public_name_is_on_a_page_of_the_api():
     assert api_pages.missing() == []
-    shown = [name for page in api_pages.PAGES.values() for name in page.names]
-    assert len(shown) == len({id(api_pages.resolve(name)) for name in shown})
+    names = [name for page in api_pages.PAGES.values() for name in page.names]
+    assert len(names) == len({id(api_pages.resolve(name)) for name in names})
     for name, members in api_pages.MEMBERS.items():
-        assert name in shown
+        assert name in names
         bases = api_pages.resolve(name).__mro__
         all_members = {member for base in bases for member in (*vars(base), *inspect.get_annotations(base))}
         assert set(members.split()) <= all_members
@@ -26,10 +26,10 @@ def test_every_public_name_is_on_a_page_of_the_api():
 
 
 def test_the_gallery_has_a_card_with_a_thumbnail_for_every_picture():
-    shown = re.findall(r"^:link: gallery/(\w+)$", (DOCS / "gallery.md").read_text(), re.M)
-    assert len(shown) >= 12
-    assert sorted(shown) == sorted(p.stem for p in (ROOT / "examples").glob("*.py") if "def draw(" in p.read_text())
-    assert sorted(shown) == sorted(path.stem for path in (DOCS / "gallery").glob("*.webp"))
+    names = re.findall(r"^:link: gallery/(\w+)$", (DOCS / "gallery.md").read_text(), re.M)
+    assert len(names) >= 12
+    assert sorted(names) == sorted(p.stem for p in (ROOT / "examples").glob("*.py") if "def draw(" in p.read_text())
+    assert sorted(names) == sorted(path.stem for path in (DOCS / "gallery").glob("*.webp"))
 
 
 def test_every_section_of_a_derivation_that_a_docstring_cites_exists():

@@ -42,10 +42,10 @@ def test_notebooks_have_the_code_of_the_tutorials(builder, tmp_path):
 
 def test_errors_that_a_page_shows_do_not_stop_a_notebook(builder, capsys):
     cells = builder.notebook(DOCS / builder.PAGES["stroller"]).cells
-    shown = [cell.source for cell in cells if "raises-exception" in cell.metadata.get("tags", [])]
-    assert len(shown) == 1
+    sources = [cell.source for cell in cells if "raises-exception" in cell.metadata.get("tags", [])]
+    assert len(sources) == 1
     # The names of the earlier cells are missing: the error is printed.
-    exec(shown[0], {})
+    exec(sources[0], {})
     assert "is not defined" in capsys.readouterr().out
 
 

@@ -68,7 +68,7 @@ def test_every_name_it_gives_is_there_after_a_plain_import():
     """Such as `tippe.steady`, a module; and nothing is loaded that takes long."""
     names = sorted(set(re.findall(r"\b(?:tippe|stroller|nonholonomic)\.(?!md\b)\w+", README)))
     assert "tippe.steady" in names
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", LOOK_UP, *names], capture_output=True, text=True, check=True, timeout=120
     )
-    assert json.loads(done.stdout) == []
+    assert json.loads(process.stdout) == []

@@ -62,8 +62,8 @@ def test_the_package_agrees_with_the_scene(name):
     answer = with_nonholonomic.simulate(scene)
     assert beyond(scene, answer) == {}
     assert len(answer["events"]) == len(scene["events"])
-    wrong = answer["states"] | {"position": answer["states"]["position"] * (1.0 + 1e-6)}
-    assert list(beyond(scene, answer | {"states": wrong})) == ["position"]
+    wrong_states = answer["states"] | {"position": answer["states"]["position"] * (1.0 + 1e-6)}
+    assert list(beyond(scene, answer | {"states": wrong_states})) == ["position"]
 
 
 @pytest.mark.slow

@@ -49,10 +49,10 @@ def test_citations_name_the_same_authors_and_licence():
 
 def test_every_python_that_is_named_is_tested():
     checks = yaml.safe_load((ROOT / ".github" / "workflows" / "check.yml").read_text())
-    tested = checks["jobs"]["run"]["strategy"]["matrix"]["python"]
-    named = [re.fullmatch(r"Programming Language :: Python :: (3\.\d+)", line) for line in PROJECT["classifiers"]]
-    assert tested == [match.group(1) for match in named if match]
-    assert PROJECT["requires-python"] == f">={tested[0]}"
+    versions = checks["jobs"]["run"]["strategy"]["matrix"]["python"]
+    matches = [re.fullmatch(r"Programming Language :: Python :: (3\.\d+)", line) for line in PROJECT["classifiers"]]
+    assert versions == [version.group(1) for version in matches if version]
+    assert PROJECT["requires-python"] == f">={versions[0]}"
 
 
 def test_the_paper_cites_what_its_bibliography_has():

@@ -23,7 +23,7 @@ REFERENCE = list(
 
 
 def over_the_crest() -> Row:
-    """Over the crest of a wave at 2.1 m/s: the time at which contact is lost, and the axis then."""
+    """A top that crosses the crest of a wave at 2.1 m/s: time of the loss of contact, and the axis at that time."""
     row = next(case for case in REFERENCE if case["arena"] == "graph" and case["status"] == "contact_lost")
     number = {name: float(value) for name, value in row.items() if name not in ("arena", "status")}
     waves = tippe.Graph(lambda x, y: number["p1"] * jnp.sin(number["p2"] * x) * jnp.cos(number["p2"] * y))
@@ -38,12 +38,12 @@ def over_the_crest() -> Row:
     )
     run = timed(lambda: tippe.simulate(scene, launch, number["t1"], tolerance=1e-11), 1)
     error = abs(float(run.result.end_time) - number["end_time"])
-    happens = f"loses contact at {float(run.result.end_time):.6f} s"
-    return of_runs("2.1 m/s over waves of 40 mm", happens, error, 1e-7, "SciPy by events, time [s]", run)
+    outcome = f"loses contact at {float(run.result.end_time):.6f} s"
+    return of_runs("2.1 m/s over waves of 40 mm", outcome, error, 1e-7, "SciPy by events, time [s]", run)
 
 
 def no_room() -> Row:
-    """Along a trough that narrows: the run ends where its curvature is that of the ball."""
+    """A top in a trough that narrows: the run ends where the curvature of the trough is that of the ball."""
     trough = tippe.Graph(lambda x, y: y * y * (5.0 + 150.0 * x))
     launch = tippe.Launch(0.0, 50.0, place=(0.0, 0.0), velocity=(0.4, 0.0))
     run = timed(lambda: tippe.simulate(tippe.Scene(rutstam_top(), trough), launch, 1.0), 1)
@@ -53,14 +53,14 @@ def no_room() -> Row:
 
 
 def a_thousand_seconds_in_a_bowl() -> Row:
-    """1000 s in a bowl given by a function: how far the foot has left it at most."""
+    """1000 s in a bowl given by a function: greatest distance of the foot from the bowl."""
     bowl = tippe.Graph(lambda x, y: 2.0 * jnp.sqrt(0.25 + x * x + y * y))
     scene = tippe.Scene(rutstam_top(), bowl, tippe.Viscous(0.02))
     launch = tippe.Launch(0.3, 20.0, place=(0.1, 0.05), velocity=(0.2, 0.1))
     run = timed(lambda: tippe.simulate(scene, launch, 1000.0, tolerance=1e-6), 1)
     feet = tuple(np.asarray(run.result.states[8:11]))
-    off = float(np.max(np.abs(scene.surface.offset(feet))) / 0.02)
-    error = off if run.result.status == "completed" else math.nan
+    offset = float(np.max(np.abs(scene.surface.offset(feet))) / 0.02)
+    error = offset if run.result.status == "completed" else math.nan
     return of_runs("1000 s in a bowl, tolerance 1e-6", "the foot stays on it", error, 1e-6, "on the arena [R]", run)
 
 

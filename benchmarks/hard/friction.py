@@ -43,23 +43,23 @@ def hertz_disc(ratio: float, rings: int = 100, directions: int = 400) -> tuple[f
     # r = sin(angle); the pressure is 3 / (2 pi) sqrt(1 - r^2).
     angle, weight = (nodes + 1.0) * math.pi / 4.0, weights * math.pi / 4.0
     weight = (3.0 * weight * np.cos(angle) ** 2 * np.sin(angle))[:, None] / directions
-    around = (np.arange(directions) + 0.5) * 2.0 * math.pi / directions
-    x, y = np.sin(angle)[:, None] * np.cos(around), np.sin(angle)[:, None] * np.sin(around)
+    angles = (np.arange(directions) + 0.5) * 2.0 * math.pi / directions
+    x, y = np.sin(angle)[:, None] * np.cos(angles), np.sin(angle)[:, None] * np.sin(angles)
     speed = np.hypot(ratio - y, x)
     return float(np.sum(weight * (ratio - y) / speed)), float(np.sum(weight * (x * x - y * (ratio - y)) / speed))
 
 
 def disc_by_quadrature() -> Row:
-    """The ellipsoid against the exact disc over four decades of sliding against drilling: a departure, not an error."""
+    """Departure of the ellipsoidal approximation from the exact disc, over four decades of sliding relative to drilling."""
     law, radius = tippe.Contensou(1.0, 0.01, 1e-12), 0.01
 
     def departure() -> float:
-        worst = 0.0
+        max_error = 0.0
         for ratio in np.geomspace(1e-2, 1e2, 25):
             load = law.per_normal_force(Slip(jnp.asarray(ratio * radius), jnp.zeros(()), (0.0, 0.0, 1.0)))
             force, torque = hertz_disc(ratio)
-            worst = max(worst, abs(float(load.force[0]) + force), abs(float(load.torque[2]) / radius + torque))
-        return worst
+            max_error = max(max_error, abs(float(load.force[0]) + force), abs(float(load.torque[2]) / radius + torque))
+        return max_error
 
     run = timed(departure, 1)
     return Row(
@@ -146,8 +146,8 @@ def jellett_under_torque() -> Row:
     size, body = float(scene.jellett(start)), scene.body
 
     @jax.jit
-    def rate(whole: Any) -> Any:
-        state = whole[:8]
+    def rate(full_state: Any) -> Any:
+        state = full_state[:8]
         e, L = state[2:5], state[5:8]
         w = L / body.I1 + (1.0 / body.I3 - 1.0 / body.I1) * (L @ e) * e
         slip = scene.slip_velocity(state)
@@ -157,9 +157,9 @@ def jellett_under_torque() -> Row:
         change = drilling * (body.radius - body.offset * e[2]) - body.offset * rolling @ e[:2]
         return jnp.append(scene.field(state), scene.normal_force(state) * change / size)
 
-    small = 1e-14 * np.append(np.asarray(scene.scales(launch)), 1.0)
+    scales = 1e-14 * np.append(np.asarray(scene.scales(launch)), 1.0)
     audit = solve_ivp(
-        lambda _, y: np.asarray(rate(y)), (0.0, 2.0), jnp.append(start, 1.0), "DOP853", times, rtol=1e-13, atol=small
+        lambda _, y: np.asarray(rate(y)), (0.0, 2.0), jnp.append(start, 1.0), "DOP853", times, rtol=1e-13, atol=scales
     )
     run = timed(lambda: tippe.simulate(scene, launch, 2.0, times, tolerance=1e-12), 1)
     share = np.asarray(run.result.jellett) / size

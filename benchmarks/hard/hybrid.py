@@ -27,7 +27,7 @@ def leine_glocker_top() -> tippe.Top:
 
 
 def _against_reference(number: int, case: str, happens: str, bound: float) -> Row:
-    """A case of the reference, run at a tolerance of 1e-11; a wrong number of flights breaks the bound."""
+    """A case of the reference at a tolerance of 1e-11; with a wrong number of flights, the error is infinite."""
     expected = {name: float(value) for name, value in REFERENCE[number].items() if name != "status"}
     friction = tippe.Viscous(expected["mu"])
     if expected["slip_speed"]:
@@ -44,27 +44,27 @@ def _against_reference(number: int, case: str, happens: str, bound: float) -> Ro
 
 
 def hops() -> Row:
-    """Rutstam's top at 2.6 times the threshold of Jellett: contact is lost, again and again."""
+    """Rutstam's top at 2.6 times Jellett's threshold: contact is lost repeatedly."""
     return _against_reference(1, "viscous 0.3, 200 rad/s: N reaches 0", "lands, inverts", 1e-7)
 
 
 def bounces() -> Row:
-    """The same with restitution: every landing is a series of bounces that ends."""
+    """The top of `hops` with restitution: every landing is a finite series of bounces."""
     return _against_reference(4, "the same, e_N = 0.5", "bounces out, inverts", 1e-7)
 
 
 def coulomb_hops() -> Row:
-    """Regularised Coulomb friction loses contact at half that spin."""
+    """With regularised Coulomb friction, the top of `hops` loses contact at half the spin."""
     return _against_reference(5, "Coulomb 0.3, 0.05 m/s, 155 rad/s", "lands, inverts", 1e-7)
 
 
 def over_to_the_stem() -> Row:
-    """Leine and Glocker's top: from the sphere to the stem, back, and over for good."""
+    """Leine and Glocker's top: it moves from its sphere to its stem and back, and finally onto its stem."""
     return _against_reference(7, "two spheres, Coulomb, 180 rad/s", "goes over to its stem", 1e-7)
 
 
 def jellett_through_hops() -> Row:
-    """Forces act at the contact point only, impacts too: Jellett's quantity of a top without stem is constant."""
+    """Jellett's quantity of a top without a stem is constant, because forces and impacts act at the contact point."""
     scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3), contact="hybrid", restitution=0.3)
     run = timed(lambda: tippe.simulate(scene, tippe.Launch(0.1, 250.0), 7.0, tolerance=1e-11), 1)
     ride = run.result
@@ -74,7 +74,7 @@ def jellett_through_hops() -> Row:
 
 
 def energy_through_hops() -> Row:
-    """Energy never grows, through flights, impacts and changes of sphere."""
+    """The energy never grows in flights, impacts and changes of the touching sphere."""
     scene = tippe.Scene(leine_glocker_top(), friction=tippe.Coulomb(0.3, 0.05), contact="hybrid")
     run = timed(lambda: tippe.simulate(scene, tippe.Launch(0.1, 250.0), 4.0, tolerance=1e-10), 1)
     ride = run.result
@@ -84,7 +84,7 @@ def energy_through_hops() -> Row:
 
 
 def leaning_on_the_stem() -> Row:
-    """Too slow to rise: it rocks between sphere and stem, ever less, slides on both at once, and falls back on its sphere."""
+    """A top too slow to rise rocks between sphere and stem, slides on both, and falls back onto its sphere."""
     expected = {name: float(value) for name, value in REFERENCE[9].items() if name != "status"}
     scene = tippe.Scene(leine_glocker_top(), friction=tippe.Coulomb(0.3, 0.05), contact="hybrid")
     arguments = {"theta": 0.1, "spin": expected["spin"], "t1": expected["t1"], "tolerance": 1e-11}
@@ -96,7 +96,7 @@ def leaning_on_the_stem() -> Row:
 
 
 def leaning_for_ever() -> Row:
-    """A little slower, it comes to roll on its sphere at the angle of both contacts, and presses its stem ever less."""
+    """A slower top rolls at the angle at which both spheres touch, while the load on its stem decreases to zero."""
     scene = tippe.Scene(leine_glocker_top(), friction=tippe.Coulomb(0.3, 0.05), contact="hybrid")
     run = timed(lambda: tippe.inversion_table(scene, theta=0.1, spin=120.0, t1=30.0), 1)
     table = run.result

@@ -36,10 +36,10 @@ def upright_almost() -> Row:
     run = timed(lambda: tippe.inversion_table(scene, theta=theta, spin=155.0, t1=300.0), 1)
     time = np.asarray(run.result.time)
     slope = np.diff(time) / np.diff(np.log(theta)) * -float(growth_rate(standing_matrix(scene, 155.0)))
-    happens = f"inverts after {time[0]:.2f}, {time[1]:.2f}, {time[2]:.2f} s"
+    outcome = f"inverts after {time[0]:.2f}, {time[1]:.2f}, {time[2]:.2f} s"
     return of_table(
         "theta(0) = 1e-100, 1e-12, 1e-6, 155 rad/s",
-        happens,
+        outcome,
         np.max(np.abs(slope - 1.0)),
         5e-8,
         "slope of t over ln(1 / theta(0)) times the eigenvalue = 1",
@@ -54,9 +54,9 @@ def horizontal() -> Row:
     angles = tumbling_angles(scene, float(scene.jellett(scene.state(tippe.Launch(math.pi / 2.0, 100.0)))))
     theta = float(run.result.end_theta)
     error = min((abs(theta - angle) for angle in angles), default=math.nan)
-    happens = f"ends tumbling at {theta:.4f} rad"
+    outcome = f"ends tumbling at {theta:.4f} rad"
     return of_table(
-        "theta(0) = pi/2, 100 rad/s, 2e3 s", happens, error, 2e-6, "tumbling angle of Jellett's constant", run
+        "theta(0) = pi/2, 100 rad/s, 2e3 s", outcome, error, 2e-6, "tumbling angle of Jellett's constant", run
     )
 
 
@@ -125,8 +125,8 @@ def against_lagrange(case: str, tops: list[tippe.Top], arena: Any, launch: tippe
         np.max(np.abs(theta - theta_by_lagrange(scene, launch, times[: len(theta)])))
         for scene, theta in zip(scenes, angles, strict=True)
     ]
-    happens = "theta comes to " + ", ".join(f"{theta[-1]:.3f}" for theta in angles) + " rad"
-    return of_runs(case, happens, max(gaps), 4e-10, "Lagrange in Euler angles [rad]", run)
+    outcome = "theta comes to " + ", ".join(f"{theta[-1]:.3f}" for theta in angles) + " rad"
+    return of_runs(case, outcome, max(gaps), 4e-10, "Lagrange in Euler angles [rad]", run)
 
 
 def huge_cylinder() -> Row:
@@ -141,9 +141,9 @@ def huge_cylinder() -> Row:
     gaps = np.array([np.linalg.norm(np.asarray(trajectory.axis[0]) - flat) for trajectory in runs.result])
     orders = np.log10(gaps[:3] / gaps[1:4])
     error = np.abs(orders[-1] - 1.0) if gaps[4] < 1e-10 else math.nan
-    happens = f"departs by {gaps[3]:.1e} at 1e5 radii, {gaps[4]:.0e} at 1e15"
+    outcome = f"departs by {gaps[3]:.1e} at 1e5 radii, {gaps[4]:.0e} at 1e15"
     return of_runs(
-        "cylinder of 1e2, 1e3, ..., 1e15 radii", happens, error, 1e-4, "order 1 in R / radius, 1e4 to 1e5", runs
+        "cylinder of 1e2, 1e3, ..., 1e15 radii", outcome, error, 1e-4, "order 1 in R / radius, 1e4 to 1e5", runs
     )
 
 

@@ -59,8 +59,8 @@ def just_below_the_threshold() -> Row:
     low, high = 2.7, 3.1
     for _ in range(60):
         middle = 0.5 * (low + high)
-        below = float(steady.tumbling(PLANE, middle).jellett) < jellett
-        low, high = (middle, high) if below else (low, middle)
+        is_below = float(steady.tumbling(PLANE, middle).jellett) < jellett
+        low, high = (middle, high) if is_below else (low, middle)
     return Row(
         "Jellett's constant 0.99 times the threshold's, 200 s",
         f"never inverts, tumbles at {float(table.end_theta[0]):.6f} rad; both runs agree: error {table.time_error[0]:g}",
@@ -110,9 +110,9 @@ def chaos_in_a_cylinder() -> Row:
     """Without friction a top that rocks in a cylinder is chaotic: a table of its times would hold no digit to believe."""
     scene = tippe.Scene(TOP, tippe.Cylinder(0.06))
     run = timed(lambda: tippe.lyapunov_exponent(scene, tippe.Launch(**CHAOTIC), 7.0), 1)
-    nearby = CHAOTIC | {"theta": CHAOTIC["theta"] + 1e-9 * np.arange(16)}
-    long = tippe.lyapunov_exponent(scene, tippe.Launch(**nearby), 300.0)
-    spread = float(np.std(long.exponent)) / math.sqrt(len(long.exponent))
+    launches = CHAOTIC | {"theta": CHAOTIC["theta"] + 1e-9 * np.arange(16)}
+    exponents = tippe.lyapunov_exponent(scene, tippe.Launch(**launches), 300.0)
+    scatter = float(np.std(exponents.exponent)) / math.sqrt(len(exponents.exponent))
     times = run.result.times[4::3]
 
     def tilts(shift: float) -> np.ndarray:
@@ -123,13 +123,13 @@ def chaos_in_a_cylinder() -> Row:
     rates = [np.polyfit(times, logarithm, 1)[0] for logarithm in (parted, times * run.result.running[4::3])]
     return Row(
         "no friction, no spin, in a cylinder of three radii: parting of nearby launches in 7 s",
-        f"{rates[1]:.2f} /s; {long.exponent.mean():.2f} +- {spread:.2f} /s over 300 s, mean of 16: chaos",
+        f"{rates[1]:.2f} /s; {exponents.exponent.mean():.2f} +- {scatter:.2f} /s over 300 s, mean of 16: chaos",
         float(abs(rates[1] / rates[0] - 1.0)),
         0.3,
         "two runs of Lagrange's equations, SciPy (relative)",
         int(run.result.steps),
         run.cpu,
-        ", ".join(np.unique(long.status)),
+        ", ".join(np.unique(exponents.status)),
     )
 
 

@@ -47,13 +47,13 @@ def regularised(slip_speed: float, solver: diffrax.AbstractSolver, tolerance: fl
     """The regularised law at one slip speed with one method, against the other method at a sharp tolerance."""
     friction = tippe.Coulomb(0.3, slip_speed)
     explicit = isinstance(solver, diffrax.Dopri8)
-    other = final_theta(friction, implicit() if explicit else diffrax.Dopri8(), 1e-9)
+    reference = final_theta(friction, implicit() if explicit else diffrax.Dopri8(), 1e-9)
     run = timed(lambda: final_theta(friction, solver, tolerance), 1)
     theta = float(run.result.theta[-1])
     return of_runs(
         f"Cohen's top, Coulomb regularised by {slip_speed:g} m/s, {'explicit' if explicit else 'implicit'}",
         f"theta(0.5 s) = {theta:.6f} rad",
-        abs(theta - float(other.theta[-1])),
+        abs(theta - float(reference.theta[-1])),
         bound,
         f"{'Kvaerno5' if explicit else 'Dopri8'} at 1e-9 [rad]",
         run,

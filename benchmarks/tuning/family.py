@@ -74,18 +74,18 @@ def equations(unknowns: Unknowns) -> Float[Array, " equations"]:
     """
     A, b, h = pair_of(unknowns)
     c = A.sum(axis=1)
-    poor, rich = slice(3, 5), slice(5, None)
+    poor_pair, rich_pair = slice(3, 5), slice(5, None)
     residuals = [
         (A @ c - c**2 / 2.0)[2:],
         (A @ c**2 - c**3 / 3.0)[3:],
-        (A @ c**3 - c**4 / 4.0)[rich],
+        (A @ c**3 - c**4 / 4.0)[rich_pair],
         c[11:] - 1.0,
         h[12:],
     ]
     for w, order in ((b, 8), (h, 7)):
         residuals += [w @ A - w * (1.0 - c), jnp.stack([w @ c**k - 1.0 / (k + 1) for k in range(order)])]
-        residuals += [((w * c) @ A)[poor], jnp.atleast_1d((w * c) @ A @ c**4 - 1.0 / 35.0)]
-    residuals += [((b * c**2) @ A)[poor], ((b * (1.0 - c)) @ A @ A)[poor]]
+        residuals += [((w * c) @ A)[poor_pair], jnp.atleast_1d((w * c) @ A @ c**4 - 1.0 / 35.0)]
+    residuals += [((b * c**2) @ A)[poor_pair], ((b * (1.0 - c)) @ A @ A)[poor_pair]]
     residuals += [
         (b * c**2) @ A @ c**4 - 1.0 / 40.0,
         (b * c) @ A @ c**5 - 1.0 / 48.0,
@@ -109,8 +109,8 @@ def returned(unknowns: Unknowns, passes: int = 12) -> tuple[Unknowns, float]:
         left = np.asarray(equations(unknowns))
         if np.abs(left).max() < 1e-15:
             break
-        rank, values, right, turned = _decomposed(unknowns)
-        unknowns = unknowns - right[:rank].T @ ((turned.T @ left)[:rank] / values[:rank])
+        rank, values, right, directions = _decomposed(unknowns)
+        unknowns = unknowns - right[:rank].T @ ((directions.T @ left)[:rank] / values[:rank])
     return unknowns, float(np.abs(equations(unknowns)).max())
 
 
@@ -118,5 +118,5 @@ def _decomposed(unknowns: Unknowns) -> tuple[int, np.ndarray, np.ndarray, np.nda
     """Rank, singular values and vectors of the slopes of the equations. There are more equations than needed, so a gap
     in the singular values determines the rank."""
     left, values, right = np.linalg.svd(np.asarray(_slopes(unknowns)))
-    falls = np.where(values[1:] < 1e-8 * values[0], values[:-1] / np.maximum(values[1:], 1e-300), 0.0)
-    return 1 + int(np.argmax(falls)), values, right, left
+    drops = np.where(values[1:] < 1e-8 * values[0], values[:-1] / np.maximum(values[1:], 1e-300), 0.0)
+    return 1 + int(np.argmax(drops)), values, right, left

@@ -50,37 +50,37 @@ def motions(launches: int) -> dict[str, Case]:
 def steps_of(case: Case, seed: int) -> list[Steps]:
     """Steps from random times of a motion, a set for each of `STRETCHES`."""
     problem, launches = case.problem, case.task.launches
-    when = np.random.default_rng(seed).uniform(0.02, 1.0, launches) * min(case.task.t1, 6.0)
-    starts = solve_ensemble(problem, jnp.asarray(when), jnp.asarray(launches), Settings(1e-11))[0].state
+    times = np.random.default_rng(seed).uniform(0.02, 1.0, launches) * min(case.task.t1, 6.0)
+    states = solve_ensemble(problem, jnp.asarray(times), jnp.asarray(launches), Settings(1e-11))[0].state
     scales = problem.start()[1]
-    absolute = 0.1 * TOLERANCE * jnp.broadcast_to(scales.reshape(len(scales), -1), starts.shape)
+    absolute = 0.1 * TOLERANCE * jnp.broadcast_to(scales.reshape(len(scales), -1), states.shape)
     lengths = jnp.full(launches, 1e-4)
     for _ in range(12):
-        ends, error = moved(PLAIN, problem, starts, lengths)
-        ratio = error / (absolute + TOLERANCE * jnp.maximum(jnp.abs(starts), jnp.abs(ends)))
+        ends, error = moved(PLAIN, problem, states, lengths)
+        ratio = error / (absolute + TOLERANCE * jnp.maximum(jnp.abs(states), jnp.abs(ends)))
         lengths = lengths * jnp.clip(0.9 * jnp.mean(ratio**2, axis=0) ** (-1.0 / 16.0), 0.2, 5.0)
     counts = []
     for stretch in STRETCHES:
-        ends = starts
+        ends = states
         for _ in range(16):
             ends, _ = moved(PLAIN, problem, ends, stretch * lengths / 16.0)
-        units = absolute + TOLERANCE * jnp.maximum(jnp.abs(starts), jnp.abs(ends))
-        counts.append(shared(Steps(problem, starts, stretch * lengths, ends, units, jnp.ones(launches))))
+        units = absolute + TOLERANCE * jnp.maximum(jnp.abs(states), jnp.abs(ends))
+        counts.append(shared(Steps(problem, states, stretch * lengths, ends, units, jnp.ones(launches))))
     return counts
 
 
 @eqx.filter_jit
-def moved(unknowns: Unknowns, problem: AbstractProblem, starts: States, lengths: Any) -> tuple[States, States]:
+def moved(unknowns: Unknowns, problem: AbstractProblem, states: States, lengths: Any) -> tuple[States, States]:
     """The end state of a step, and its error estimate."""
     pair = pair_of(unknowns)
 
     def rate(state: States) -> States:
         return jnp.stack(list(problem.field(jnp.zeros_like(lengths), state)))
 
-    rates = [rate(starts)]
+    rates = [rate(states)]
     for stage in range(1, STAGES):
-        rates.append(rate(starts + lengths * _sum(pair.stages[stage], rates)))
-    return starts + lengths * _sum(pair.eighth, rates), lengths * _sum(pair.eighth - pair.seventh, rates)
+        rates.append(rate(states + lengths * _sum(pair.stages[stage], rates)))
+    return states + lengths * _sum(pair.eighth, rates), lengths * _sum(pair.eighth - pair.seventh, rates)
 
 
 def _sum(weights: Float[Array, " stages"], rates: list[States]) -> States:
@@ -100,7 +100,9 @@ slopes = eqx.filter_jit(jax.jacfwd(errors))
 
 def shared(steps: Steps) -> Steps:
     """The steps with weights such that the errors of `Dopri8` have the norm 1 and all steps count about equally."""
-    plain = jnp.sum(errors(PLAIN, steps) ** 2, axis=0)
-    good = jnp.isfinite(plain)
-    share = jnp.where(good, 1.0 / jnp.sqrt((plain + 0.1 * jnp.nanmedian(plain)) * jnp.sum(good)), 0.0)
+    plain_error = jnp.sum(errors(PLAIN, steps) ** 2, axis=0)
+    is_finite = jnp.isfinite(plain_error)
+    share = jnp.where(
+        is_finite, 1.0 / jnp.sqrt((plain_error + 0.1 * jnp.nanmedian(plain_error)) * jnp.sum(is_finite)), 0.0
+    )
     return steps._replace(share=share)

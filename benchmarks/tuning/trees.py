@@ -25,13 +25,13 @@ def trees(order: int) -> list[list[Tree]]:
     return trees_by_size
 
 
-def _forests(trees_by_size: list[list[Tree]], vertices: int, largest: int) -> list[list[Tree]]:
+def _forests(trees_by_size: list[list[Tree]], vertices: int, max_size: int) -> list[list[Tree]]:
     """All lists of trees with the given total number of vertices, none with more than `largest`."""
     if vertices == 0:
         return [[]]
     return [
         [tree, *siblings]
-        for size in range(min(vertices, largest), 0, -1)
+        for size in range(min(vertices, max_size), 0, -1)
         for siblings in _forests(trees_by_size, vertices - size, size)
         for tree in trees_by_size[size - 1]
     ]
@@ -56,15 +56,15 @@ def error_coefficients(
     stages: Float[Array, "stages stages"], weights: Float[Array, " stages"], order: int
 ) -> Float[Array, " trees"]:
     """(b . Phi(t) - 1/gamma(t)) / sigma(t) of every tree of an order: all vanish if the method is of that order."""
-    trees_by_order, grown = trees(order), {}
+    trees_by_order, trees_of_size = trees(order), {}
 
     def phi(tree: Tree) -> Float[Array, " stages"]:
         """The elementary weights of a tree, one per stage."""
         value = jnp.ones_like(weights)
         for branch in tree:
-            if branch not in grown:
-                grown[branch] = stages @ phi(branch)
-            value = value * grown[branch]
+            if branch not in trees_of_size:
+                trees_of_size[branch] = stages @ phi(branch)
+            value = value * trees_of_size[branch]
         return value
 
     return jnp.stack(

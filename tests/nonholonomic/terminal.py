@@ -8,7 +8,7 @@ from nonholonomic import progress
 
 
 class Terminal(io.StringIO):
-    """A stream that notes when what was written."""
+    """A stream that records its text and the time of each write."""
 
     def __init__(self):
         super().__init__()
@@ -25,7 +25,7 @@ class Terminal(io.StringIO):
 
 def watched(monkeypatch):
     """Standard error as a terminal, on which everything happens ten times as fast."""
-    # Importing the bar takes longer than what is fast here.
+    # Importing tqdm takes longer than the fast calls here.
     progress.bar_class()
     stream = Terminal()
     monkeypatch.setattr(sys, "stderr", stream)
@@ -40,7 +40,7 @@ def words(stream):
 
 
 def left(stream):
-    """What is still to be seen on the terminal when all is over."""
+    """The text that remains on the terminal at the end."""
     rows = []
     for line in stream.getvalue().split("\n"):
         row = []

@@ -1,4 +1,4 @@
-"""Programs lower for accelerators, on a machine without one: no callbacks to Python, nothing that only a CPU has."""
+"""Programs lower for accelerators on a machine without one: no callbacks to Python, and no operations of CPUs only."""
 
 import re
 
@@ -87,7 +87,7 @@ def lowered(program, arguments, *platforms):
 
 
 def foreign(text):
-    """What a program calls that is not its own, and the attributes that are for one compiler only."""
+    """The custom calls of a program, and the attributes that only one compiler understands."""
     return set(re.findall(r"custom_call @(\w+)|(xla_cpu_\w+|frontend_attributes)", text))
 
 
@@ -136,10 +136,10 @@ def test_the_benchmark_says_that_there_is_no_accelerator(tmp_path, capsys):
 
 
 def test_the_benchmark_names_what_it_leaves_out():
-    """With no time left nothing is run, and the page says so."""
-    omitted = list(accelerator.measured({"table": lambda launches, tolerance: None}, (8,), (1e-6,), 0.0))
-    assert omitted == ["table, 8 launches, tolerance 1e-06"]
-    assert "No time was left for: table, 8 launches, tolerance 1e-06." in accelerator.page([], omitted)
+    """Without time left, nothing runs, and the page states that."""
+    omissions = list(accelerator.measured({"table": lambda launches, tolerance: None}, (8,), (1e-6,), 0.0))
+    assert omissions == ["table, 8 launches, tolerance 1e-06"]
+    assert "No time was left for: table, 8 launches, tolerance 1e-06." in accelerator.page([], omissions)
 
 
 @pytest.mark.slow
@@ -147,8 +147,8 @@ def test_the_benchmark_measures_every_program():
     """On a CPU, with few launches; a hundredfold tolerance shows in the error."""
     rows = list(accelerator.measured(accelerator.programs(), (8,), (1e-4, 1e-8), 1e9))
     assert len(rows) == 2 * len(accelerator.programs())
-    for loose, tight in zip(rows[::2], rows[1::2], strict=True):
-        assert tight.error < 1e-5
-        assert tight.error < loose.error, loose
+    for loose_row, tight_row in zip(rows[::2], rows[1::2], strict=True):
+        assert tight_row.error < 1e-5
+        assert tight_row.error < loose_row.error, loose_row
     page = accelerator.page(rows, [])
     assert all(f"| {name} " in page for name in accelerator.programs())

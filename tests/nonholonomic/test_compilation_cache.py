@@ -1,4 +1,4 @@
-"""Compiled programs on disk: a second process compiles nothing, and a bad entry costs a compilation, nothing else."""
+"""Compiled programs on disk: a second process compiles nothing, and a damaged entry costs only a compilation."""
 
 import concurrent.futures
 import json
@@ -43,14 +43,14 @@ SMALL = "result = jax.jit(lambda x: (x * x).sum())(np.arange(4.0)).item()"
 
 
 def run(program, home, **settings):
-    """What `COUNTED` tells in a process of its own, in which every warning is an error, and what else it says."""
-    own = ("JAX_COMPILATION_CACHE_DIR", "NONHOLONOMIC_CACHE")
-    settings = {name: value for name, value in os.environ.items() if name not in own} | settings
+    """The result of `COUNTED` in a separate process in which every warning is an error, and its other output."""
+    settings_of_cache = ("JAX_COMPILATION_CACHE_DIR", "NONHOLONOMIC_CACHE")
+    settings = {name: value for name, value in os.environ.items() if name not in settings_of_cache} | settings
     settings |= {"XDG_CACHE_HOME": str(home), "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-W", "error", "-c", COUNTED.format(program=program)]
-    done = subprocess.run(command, capture_output=True, text=True, env=settings, check=False)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout), done.stderr
+    process = subprocess.run(command, capture_output=True, text=True, env=settings, check=False)
+    assert process.returncode == 0, process.stderr
+    return json.loads(process.stdout), process.stderr
 
 
 def test_a_second_process_compiles_nothing(tmp_path):
@@ -65,13 +65,13 @@ def test_a_second_process_compiles_nothing(tmp_path):
 def damaged(content):
     """Ways in which an entry can be bad."""
     middle = len(content) // 2
-    turned = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
-    return {"empty": b"", "cut": content[:middle], "one bit turned": turned, "noise": os.urandom(len(content))}
+    flipped = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+    return {"empty": b"", "cut": content[:middle], "one bit turned": flipped, "noise": os.urandom(len(content))}
 
 
 @pytest.fixture(scope="module")
 def small_home(tmp_path_factory):
-    """A home in which a process has left the compiled `SMALL`, and what it told."""
+    """A home folder with the compiled `SMALL`, and the output of the process that compiled it."""
     home = tmp_path_factory.mktemp("home")
     return home, run(SMALL, home)[0]
 
@@ -137,7 +137,7 @@ def test_without_a_folder_everything_goes_on(forbidden, tmp_path):
     (tmp_path / "nonholonomic").write_text("this is a file")
     answer, message = run(SMALL, tmp_path, **({"NONHOLONOMIC_CACHE": "0"} if forbidden else {}))
     assert (answer["folder"], answer["result"], answer["found"]) == ("None", 14.0, 0)
-    # One line names the folder; nobody needs to be told of what he has forbidden.
+    # One line names the folder; there is no message if the user has switched caching off.
     assert len(message.splitlines()) == (0 if forbidden else 1)
     assert forbidden or str(tmp_path / "nonholonomic") in message
 
@@ -152,13 +152,13 @@ SETTINGS = (
 
 @pytest.fixture
 def unset(monkeypatch):
-    """No folder is chosen or forbidden, and what is set after that is forgotten."""
+    """Without a chosen folder, and with caching allowed; later changes of settings are undone."""
     monkeypatch.delenv("NONHOLONOMIC_CACHE", raising=False)
-    before = {name: getattr(jax.config, name) for name in SETTINGS}
+    values_before = {name: getattr(jax.config, name) for name in SETTINGS}
     jax.config.update("jax_compilation_cache_dir", None)
     with warnings.catch_warnings():
         yield
-    for name, value in before.items():
+    for name, value in values_before.items():
         jax.config.update(name, value)
     compilation_cache.reset_cache()
 
@@ -194,12 +194,12 @@ def test_words_that_forbid_it(unset, tmp_path, monkeypatch):
 
 def test_a_full_disk_is_told_and_still_read(unset, tmp_path, caplog):
     """Stood in for by the shell's limit on the length of a file."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
+    values_before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, values_before[1]))
     try:
         assert enable_compilation_cache(tmp_path) == tmp_path / environment_name()
     finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        resource.setrlimit(resource.RLIMIT_FSIZE, values_before)
     (message,) = caplog.messages
     assert message.startswith(f"compiled programs can no longer be stored in {tmp_path}")
     assert not list((tmp_path / environment_name()).iterdir())

@@ -87,12 +87,12 @@ def test_looking_at_the_memory_compiles_nothing(program, monkeypatch):
 
 def test_nothing_is_forgotten_while_a_program_is_traced(monkeypatch):
     monkeypatch.setattr(compiled_programs, "MANY_MAPPINGS", 10)
-    forgot = []
+    calls = []
 
     @jax.jit
     def inner(x):
-        forgot.append(forget_programs_if_many(1000))
+        calls.append(forget_programs_if_many(1000))
         return x
 
     inner(1.0)
-    assert forgot == [False]
+    assert calls == [False]

@@ -1,4 +1,4 @@
-"""A long call says what it is doing, to whoever watches."""
+"""The status line of a long call."""
 
 import io
 import subprocess
@@ -32,7 +32,7 @@ class Pipe(Terminal):
 
 
 def slow_sweep(monkeypatch, stream, cells=6, block=3, waits=(1.3, 0.8), **options):
-    """A sweep that compiles for 1.3 s and takes 0.8 s for each of its blocks, one at a time; what it writes, and when."""
+    """Output, with times, of a sweep that compiles for 1.3 s and takes 0.8 s for each of its blocks, one at a time."""
 
     def compute(columns, count):
         time.sleep(waits[count > 0])
@@ -47,15 +47,15 @@ def slow_sweep(monkeypatch, stream, cells=6, block=3, waits=(1.3, 0.8), **option
 
 def test_a_table_says_what_it_does_within_a_second_and_then_how_fast(monkeypatch):
     lines = slow_sweep(monkeypatch, Terminal())
-    since, first = lines[0]
-    assert since < 1.0
+    start_time, first = lines[0]
+    assert start_time < 1.0
     assert first.startswith("compiling")
-    assert {text.split()[0] for at, text in lines if at < 1.3} == {"compiling"}
+    assert {text.split()[0] for time_of_text, text in lines if time_of_text < 1.3} == {"compiling"}
     # Half done: as much time is left as has passed since the compilation, and the rate leaves the compilation out.
     half = next(text for _, text in lines if "3/6" in text)
-    passed, left = (float(half.split(mark)[1][:5].replace("00:", "")) for mark in ("[", "<"))
+    elapsed, left = (float(half.split(mark)[1][:5].replace("00:", "")) for mark in ("[", "<"))
     rate = float(half.split(", ")[1].split("cell/s")[0])
-    assert 0.0 <= left - passed <= 1.0 or passed == left
+    assert 0.0 <= left - elapsed <= 1.0 or elapsed == left
     assert 2.0 < rate < 4.0
     assert "6/6" in lines[-1][1]
 
@@ -67,7 +67,7 @@ def test_a_table_of_one_block_says_so_too(monkeypatch):
 
 
 def test_the_rate_is_that_of_all_workers(monkeypatch):
-    """Two at once: what the first two blocks took is not known apart from the preparations, and the rest is twice as fast."""
+    """With two workers, the time of the first two blocks includes the preparations, and the rest is twice as fast."""
     with ThreadPoolExecutor(2) as pool:
         lines = slow_sweep(monkeypatch, Terminal(), cells=18, executor=pool)
     half = next(text for _, text in lines if "12/18" in text)
@@ -102,15 +102,15 @@ def test_what_is_told_is_whether_a_program_is_being_made(monkeypatch):
 
 
 def test_a_line_within_a_line_does_not_garble_it(monkeypatch):
-    """One that counts takes the line while it lasts; one that does not, leaves it alone."""
+    """A context that counts items owns the line until it ends; a context that does not count leaves the line unchanged."""
     terminal = watched(monkeypatch)
     with status_line("fitting"):
         with status_line("simulating"):
             time.sleep(0.3)
-        with Progress(2, "fit") as counted:
-            counted.begin()
+        with Progress(2, "fit") as progress:
+            progress.begin()
             time.sleep(0.3)
-            counted.advance(2)
+            progress.advance(2)
         time.sleep(0.3)
     lines = words(terminal)
     assert "simulating" not in lines
@@ -138,10 +138,10 @@ def test_nothing_is_left_behind_after_an_error_and_nothing_is_in_the_way_of_what
         fails()
     assert words(terminal)
     assert left(terminal) == ""
-    with Progress(3, "ride") as shown:
-        shown.begin()
+    with Progress(3, "ride") as progress:
+        progress.begin()
         time.sleep(0.3)
-        with shown.aside():
+        with progress.aside():
             remainder = left(terminal)
             time.sleep(0.1)
             assert left(terminal) == remainder == ""
@@ -149,21 +149,21 @@ def test_nothing_is_left_behind_after_an_error_and_nothing_is_in_the_way_of_what
 
 def test_no_frame_is_written_twice(monkeypatch):
     terminal = watched(monkeypatch)
-    with Progress(3, "ride") as shown:
-        shown.begin()
+    with Progress(3, "ride") as progress:
+        progress.begin()
         time.sleep(0.3)
-    first, second, *_ = (at for at, text in terminal.lines if "0/3" in text)
+    first, second, *_ = (time_of_text for time_of_text, text in terminal.lines if "0/3" in text)
     assert second - first > 0.03
 
 
 def test_short_calls_start_no_threads(monkeypatch):
     terminal = watched(monkeypatch)
-    started, start = [], threading.Thread.start
-    monkeypatch.setattr(threading.Thread, "start", lambda self: (started.append(self), start(self)))
+    threads, start = [], threading.Thread.start
+    monkeypatch.setattr(threading.Thread, "start", lambda self: (threads.append(self), start(self)))
     for _ in range(50):
         with status_line("simulating"):
             pass
-    assert len(started) <= 1
+    assert len(threads) <= 1
     time.sleep(0.3)
     assert terminal.lines == []
 
@@ -207,5 +207,5 @@ def test_a_notebook_without_widgets_has_a_line_of_text_and_no_warning(widgets, m
 
 def test_what_few_processes_need_is_not_imported_with_the_package():
     program = "import sys, tippe; print({'h5py', 'tqdm', 'matplotlib', 'pandas', 'jax.scipy.stats'} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout == "set()\n"
+    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert process.stdout == "set()\n"

@@ -1,4 +1,4 @@
-"""One list of words for how a run ended: in results of both packages, in tables, and in files of earlier versions."""
+"""The status words are the same in results of both packages, in tables, and in files of earlier versions."""
 
 import h5py
 import numpy as np
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.newest
 
 Status = nonholonomic.Status
 
-#: The words of files that were written before there was one list.
+#: The words in files of earlier versions.
 FORMER = ("reached_end", "contact_lost", "failed", "jammed")
 CELLS = np.arange(12.0)
 
@@ -56,7 +56,7 @@ def test_all_tables_use_words_of_the_list():
     for words in (OF_RIDES, OF_TRAJECTORIES, *(kind.words for kind in kinds)):
         assert words_of_list.issuperset(words)
         assert len(set(words)) == len(words)
-    # Files say themselves what their integers mean; these are the ones that they have had from the beginning.
+    # Each file states the meanings of its integers; these integers are the oldest.
     words = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit", "unresolved")
     assert words == run_kind.WORDS
     assert OF_TRAJECTORIES[:4] == ("completed", "contact_lost", "failed", "jammed")
@@ -64,7 +64,7 @@ def test_all_tables_use_words_of_the_list():
 
 
 def swept(words, path, fails_at=np.inf):
-    """A sweep of three chunks whose statuses are 0 to 3 and from the ninth cell on one that is new, if there is one."""
+    """A sweep of three chunks with statuses 0 to 3 and, from the ninth cell on, a new status if given."""
 
     def job(columns, count):
         place = columns["x"].astype(int)
@@ -88,8 +88,8 @@ def test_a_file_with_the_words_of_earlier_versions_is_read_with_those_of_today(t
     # The same call finds all of it done.
     assert swept(OF_TRAJECTORIES, tmp_path / "old.h5", fails_at=0).status.tolist() == table.status.tolist()
     table.save(tmp_path / "new.h5")
-    with xarray.open_dataset(tmp_path / "new.h5", engine="h5netcdf") as stored:
-        assert stored["status"].attrs["flag_meanings"].split()[0] == "completed"
+    with xarray.open_dataset(tmp_path / "new.h5", engine="h5netcdf") as dataset:
+        assert dataset["status"].attrs["flag_meanings"].split()[0] == "completed"
 
 
 def test_a_sweep_that_was_begun_with_the_former_words_goes_on_with_all_of_today(tmp_path):

@@ -71,19 +71,19 @@ class Hopper(Top):
         v = u + cross(w, r)
         bounces = -RESTITUTION * (n @ v) > CLOSING * sqrt(c.gravity * c.radius)
         target_speed = -RESTITUTION * (n @ v) if bounces else 0.0
-        along, matrix = np.eye(3) - np.outer(n, n), np.zeros((4, 4))
-        matrix[:3, :3], matrix[:3, 3] = -c.mu * along @ response, n - c.mu * along @ v
+        projector, matrix = np.eye(3) - np.outer(n, n), np.zeros((4, 4))
+        matrix[:3, :3], matrix[:3, 3] = -c.mu * projector @ response, n - c.mu * projector @ v
 
         def impulse(p):
             return expm(p * matrix)[:3, 3]
 
-        most = 3.0 * (target_speed - n @ v) / (n @ response @ n)
-        p = brentq(lambda p: n @ (v + response @ impulse(p)) - target_speed, 0.0, most, xtol=1e-20, rtol=1e-15)
+        max_impulse = 3.0 * (target_speed - n @ v) / (n @ response @ n)
+        p = brentq(lambda p: n @ (v + response @ impulse(p)) - target_speed, 0.0, max_impulse, xtol=1e-20, rtol=1e-15)
         P = impulse(p)
         return np.concatenate([centre, u + P / c.mass, e, w + inverse @ cross(r, P)]), bounces
 
 
-def follow(case, rtol=1e-13, longest=1e-3):
+def follow(case, rtol=1e-13, max_step=1e-3):
     """The motion at `SAMPLES`, the flights (begin, end), and the foot at the start."""
     top = Hopper(case)
     y, time, flying, bounced = top.start(), 0.0, False, False
@@ -103,7 +103,7 @@ def follow(case, rtol=1e-13, longest=1e-3):
             (time, case.t1),
             y,
             first_step=min(first, case.t1 - time),
-            max_step=longest,
+            max_step=max_step,
             events=event,
             dense_output=True,
             method="DOP853",
@@ -125,7 +125,7 @@ def follow(case, rtol=1e-13, longest=1e-3):
 
 
 def row(case):
-    """What the file holds of a case."""
+    """The row of a case in the file."""
     samples, hops, place = follow(case)
     entry = dict(zip(("q1", "q2", "q3"), place, strict=True))
     entry |= {"hops": len(hops), "first": hops[0][0], "landing": hops[0][1]}

@@ -76,10 +76,14 @@ def level(case, q):
         return q @ (weights * q) - np.sign(weights[0]), 2 * weights * q, np.diag(2 * weights)
     if case.arena == "torus":
         rho = sqrt(x * x + y * y)
-        away = rho - p1
-        gradient = -2 * np.array((away * x / rho, away * y / rho, z))
+        distance_from_circle = rho - p1
+        gradient = -2 * np.array((distance_from_circle * x / rho, distance_from_circle * y / rho, z))
         xx, yy, xy = 1 - p1 * y * y / rho**3, 1 - p1 * x * x / rho**3, p1 * x * y / rho**3
-        return p2 * p2 - away * away - z * z, gradient, -2 * np.array(((xx, xy, 0), (xy, yy, 0), (0, 0, 1.0)))
+        return (
+            p2 * p2 - distance_from_circle * distance_from_circle - z * z,
+            gradient,
+            -2 * np.array(((xx, xy, 0), (xy, yy, 0), (0, 0, 1.0))),
+        )
     raise ValueError(case.arena)
 
 
@@ -144,8 +148,8 @@ class Top:
             O_dot2 = u_dot + c.offset * (cross(w_dot, e) + cross(w, e_dot))
             return u_dot, w_dot, n @ O_dot2 + n_dot @ V
 
-        without, unit = accelerations(0.0)[2], accelerations(1.0)[2]
-        N = -without / (unit - without)
+        rates_without_force, unit = accelerations(0.0)[2], accelerations(1.0)[2]
+        N = -rates_without_force / (unit - rates_without_force)
         u_dot, w_dot, _ = accelerations(N)
         return np.concatenate([V, u_dot, e_dot, w_dot]), N
 

@@ -46,8 +46,8 @@ class TwoSpheres:
             # The velocity of the launch is that of the centre of the top's own sphere; that of the one that touches has no part
             # along the normal.
             (t1, t2, n), e_dot = self.frame(number), np.cross(y[9:], y[6:9])
-            along = self.case.v1 * t1 + self.case.v2 * t2 - self.case.offset * e_dot
-            y[3:6] = along - n * (n @ along) - self.spheres[number].case.offset * n * (n @ e_dot)
+            slip = self.case.v1 * t1 + self.case.v2 * t2 - self.case.offset * e_dot
+            y[3:6] = slip - n * (n @ slip) - self.spheres[number].case.offset * n * (n @ e_dot)
             if self.gap(1 - number, y) > 0.0:
                 return y, number
         raise ValueError(self.case)
@@ -71,11 +71,11 @@ class TwoSpheres:
     def speed(self, number, y):
         return self.spheres[number].speed(self.of(number, y))
 
-    def rates(self, touching, y):
+    def rates(self, sphere_in_contact, y):
         """Rates of the state; in flight `touching` is `None`."""
-        number = touching or 0
-        sphere, own = self.spheres[number], self.of(number, y)
-        slope = sphere.flight_state(own) if touching is None else sphere.motion(own)[0]
+        number = sphere_in_contact or 0
+        sphere, state_of_sphere = self.spheres[number], self.of(number, y)
+        slope = sphere.flight_state(state_of_sphere) if sphere_in_contact is None else sphere.motion(state_of_sphere)[0]
         # Of a sphere's centre.
         slope[:3] = y[3:6]
         return slope
@@ -91,8 +91,8 @@ class TwoSpheres:
 
     def struck(self, number, y):
         """The state after the blow of a sphere, and whether it bounces."""
-        after, bounces = self.spheres[number].resolve_impact(self.of(number, y))
-        return np.concatenate([y[:3], after[3:]]), bounces
+        state_after, bounces = self.spheres[number].resolve_impact(self.of(number, y))
+        return np.concatenate([y[:3], state_after[3:]]), bounces
 
     def landed(self, number, y):
         """The state after the blows that follow the landing of a sphere, and the one that touches then, `None` in flight."""
@@ -101,10 +101,10 @@ class TwoSpheres:
         while True:
             y, bounces = self.struck(number, y)
             blows += 1
-            other = 1 - number
-            if self.gap(other, y) > 1e-9 * c.radius or self.speed(other, y) > -closing:
+            other_number = 1 - number
+            if self.gap(other_number, y) > 1e-9 * c.radius or self.speed(other_number, y) > -closing:
                 return y, None if bounces else number, blows
-            number = other
+            number = other_number
 
 
 def follow(case):
@@ -112,20 +112,20 @@ def follow(case):
     flights."""
     arena_hop_reference.RESTITUTION = case.restitution
     top = TwoSpheres(case)
-    y, touching = top.start()
-    place, samples, landings, hops, time = top.spheres[touching].near.copy(), [], [], [], 0.0
+    y, sphere_in_contact = top.start()
+    place, samples, landings, hops, time = top.spheres[sphere_in_contact].near.copy(), [], [], [], 0.0
     sample_times = list(np.array(SAMPLES) * case.t1)
-    if top.force(touching, y) <= 0.0:
-        touching = None
+    if top.force(sphere_in_contact, y) <= 0.0:
+        sphere_in_contact = None
     while True:
-        free = [number for number in (0, 1) if number != touching]
+        free = [number for number in (0, 1) if number != sphere_in_contact]
         events = [watched(lambda y, k=k: top.gap(k, y)) for k in free]
-        if touching is not None:
-            events.append(watched(lambda y: top.force(touching, y)))  # noqa: B023
+        if sphere_in_contact is not None:
+            events.append(watched(lambda y: top.force(sphere_in_contact, y)))  # noqa: B023
         parting = [speed for k in free if top.gap(k, y) < 1e-6 and (speed := top.speed(k, y)) > 0.0]
         first = min([0.2 * max(min(parting, default=1.0), 1e-7) / case.gravity, 1e-3, case.t1 - time])
         run = solve_ivp(
-            lambda _, y: top.rates(touching, y),  # noqa: B023
+            lambda _, y: top.rates(sphere_in_contact, y),  # noqa: B023
             (time, case.t1),
             y,
             first_step=first,
@@ -141,27 +141,31 @@ def follow(case):
             samples.append(
                 (
                     sample,
-                    *((0.0, 0.0) if touching is None else (top.force(touching, sample), top.slip(touching, sample))),
+                    *(
+                        (0.0, 0.0)
+                        if sphere_in_contact is None
+                        else (top.force(sphere_in_contact, sample), top.slip(sphere_in_contact, sample))
+                    ),
                 )
             )
-        if touching is None:
+        if sphere_in_contact is None:
             hops.append((time, run.t[-1]))
         time, y = run.t[-1], run.y[:, -1]
         y[6:9] /= np.linalg.norm(y[6:9])
-        which = [k for k, times in enumerate(run.t_events) if times.size]
-        if not which:
+        event_numbers = [k for k, times in enumerate(run.t_events) if times.size]
+        if not event_numbers:
             return samples, place, landings, hops
-        if which[0] < len(free):
-            y, touching, blows = top.landed(free[which[0]], y)
-            landings.append((time, free[which[0]], blows))
-            if touching is not None and top.force(touching, y) <= 0.0:
-                touching = None
+        if event_numbers[0] < len(free):
+            y, sphere_in_contact, blows = top.landed(free[event_numbers[0]], y)
+            landings.append((time, free[event_numbers[0]], blows))
+            if sphere_in_contact is not None and top.force(sphere_in_contact, y) <= 0.0:
+                sphere_in_contact = None
         else:
-            touching = None
+            sphere_in_contact = None
 
 
 def row(case):
-    """What the file holds of a case."""
+    """The row of a case in the file."""
     samples, place, landings, hops = follow(case)
     entry = dict(zip(("q1", "q2", "q3"), place, strict=True)) | {"hops": len(hops), "landings": len(landings)}
     entry |= {f"landings_{k}": sum(sphere == k for _, sphere, _ in landings) for k in (0, 1)}

@@ -59,7 +59,7 @@ def skew(r):
 
 
 class Contact:
-    """What both kinds of motion need at a state."""
+    """Quantities at a state that both kinds of motion need."""
 
     def __init__(self, body: Body, state: np.ndarray):
         e, u, w, centre = state[:3], state[3:6], state[6:9], state[9:]
@@ -156,26 +156,28 @@ def follow(
 
     stops.terminal = leaves.terminal = True
     stops.direction = leaves.direction = -1.0
-    slips, t, modes, begins = stops(0.0, state) > 0.0, 0.0, [], -stiff
+    slips, t, modes, slip_start = stops(0.0, state) > 0.0, 0.0, [], -stiff
     while t < t1:
         kind, event = ("slipping", stops) if slips else ("rolling", leaves)
-        early = slips and t < begins + stiff
-        method, end = ("Radau", min(begins + stiff, t1)) if early else ("DOP853", t1)
-        out = solve_ivp(rate_of(body, kind), (t, end), state, method, rtol=rtol, atol=atol, events=event)
-        assert out.success, out.message
-        if slips and not early and begins >= 0.0 and modes and modes[-1].kind == "slipping":
-            was = modes.pop()
-            modes.append(Mode(kind, np.append(was.times, out.t[1:]), np.hstack([was.states, out.y[:, 1:]])))
+        is_early = slips and t < slip_start + stiff
+        method, end = ("Radau", min(slip_start + stiff, t1)) if is_early else ("DOP853", t1)
+        solution = solve_ivp(rate_of(body, kind), (t, end), state, method, rtol=rtol, atol=atol, events=event)
+        assert solution.success, solution.message
+        if slips and not is_early and slip_start >= 0.0 and modes and modes[-1].kind == "slipping":
+            last_mode = modes.pop()
+            modes.append(
+                Mode(kind, np.append(last_mode.times, solution.t[1:]), np.hstack([last_mode.states, solution.y[:, 1:]]))
+            )
         else:
-            modes.append(Mode(kind, out.t, out.y))
-        t, state = out.t[-1], out.y[:, -1]
-        if out.status == 0:
+            modes.append(Mode(kind, solution.t, solution.y))
+        t, state = solution.t[-1], solution.y[:, -1]
+        if solution.status == 0:
             continue
         if slips:
             state = slip_to(body, state, np.zeros(3))
         slips = leaves(t, state) <= 0.0 if slips else True
         if slips:
-            state, begins = begun(body, state, onset), t
+            state, slip_start = begun(body, state, onset), t
     return modes
 
 

@@ -64,8 +64,8 @@ class Egg:
             O_second = u_dot + self.a * (A @ e + W @ W @ e)
             return u_dot, w_dot, O_second[2] - reach_second
 
-        without, with_one = accelerations(0.0)[2], accelerations(1.0)[2]
-        N = -without / (with_one - without)
+        rates_without_force, with_one = accelerations(0.0)[2], accelerations(1.0)[2]
+        N = -rates_without_force / (with_one - rates_without_force)
         u_dot, w_dot, _ = accelerations(N)
         return np.concatenate((u, u_dot, (W @ Q).ravel(), w_dot)), N, r
 

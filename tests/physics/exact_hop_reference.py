@@ -46,11 +46,11 @@ def struck(body: Body, state: np.ndarray, restitution: float) -> tuple[np.ndarra
     frame = np.array([t / np.linalg.norm(t), cross(n, t / np.linalg.norm(t)), n])
     speed = -(contact.v @ n)
     bounces = restitution * speed > CLOSING * np.sqrt(body.gravity * body.radius)
-    plain = impact_reference.Body(body.mass, body.radius, body.offset, body.I1, body.I3)
+    body_of_impact = impact_reference.Body(body.mass, body.radius, body.offset, body.I1, body.I3)
     motion = (frame @ state[:3], frame @ state[3:6], frame @ state[6:9])
     law = impact_reference.Law(body.mu, 1e-10 * np.linalg.norm(contact.v))
-    after = impact_reference.resolve_impact(plain, *motion, law, restitution if bounces else 0.0)
-    new = np.concatenate([state[:3], frame.T @ after.velocity, frame.T @ after.turning, state[9:]])
+    motion_after = impact_reference.resolve_impact(body_of_impact, *motion, law, restitution if bounces else 0.0)
+    new = np.concatenate([state[:3], frame.T @ motion_after.velocity, frame.T @ motion_after.turning, state[9:]])
     if bounces:
         return new, "flying"
     new_contact = Contact(body, new)
@@ -91,11 +91,11 @@ def follow(
     while t < t1:
         rate = free_rate(body) if kind == "flying" else rate_of(body, kind)
         # A slip that has just begun is stiff.
-        begins = kind == "slipping" and np.linalg.norm(Contact(body, state).v) < 1e-6
-        method, to = ("Radau", min(t + 2e-3, t1)) if begins else ("DOP853", t1)
+        is_onset = kind == "slipping" and np.linalg.norm(Contact(body, state).v) < 1e-6
+        method, t_end = ("Radau", min(t + 2e-3, t1)) if is_onset else ("DOP853", t1)
         # A flight begins on the arena.
         first = 1e-6 if kind == "flying" else None
-        run = solve_ivp(rate, (t, to), state, method, rtol=rtol, atol=atol, events=ends[kind], first_step=first)
+        run = solve_ivp(rate, (t, t_end), state, method, rtol=rtol, atol=atol, events=ends[kind], first_step=first)
         assert run.success, run.message
         stretches.append(Stretch(kind, t, run.t[-1], run.y[:, -1]))
         t, state = run.t[-1], run.y[:, -1]

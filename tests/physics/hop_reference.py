@@ -76,15 +76,15 @@ def friction(case, slip, w):
     """Tangential force and torque per unit normal force, for the contact point's velocity and the angular velocity."""
     slip, lever = slip * (1.0 - UP), 3.0 * pi / 16.0 * case.contact_radius
     size = sqrt(slip @ slip + (lever * w[2]) ** 2 + case.slip_speed**2) if case.slip_speed else 1.0
-    rolls = w * (1.0 - UP)
-    against = case.resistance / sqrt(rolls @ rolls + case.turning_speed**2) * rolls
-    return -case.mu / size * slip, -case.mu / size * lever**2 * w[2] * UP - against
+    rolling_rate = w * (1.0 - UP)
+    resistance = case.resistance / sqrt(rolling_rate @ rolling_rate + case.turning_speed**2) * rolling_rate
+    return -case.mu / size * slip, -case.mu / size * lever**2 * w[2] * UP - resistance
 
 
 def solve_inertia(case, e, torque):
     """J^-1 torque."""
-    along = (torque @ e) * e
-    return (torque - along) / case.I1 + along / case.I3
+    axial_part = (torque @ e) * e
+    return (torque - axial_part) / case.I1 + axial_part / case.I3
 
 
 def arm(ball, e):
@@ -97,8 +97,8 @@ def accelerations(case, state, loads=()):
     _, _, e, w = split(state)
     spin_momentum = case.I1 * w + (case.I3 - case.I1) * (w @ e) * e
     torque = -cross(w, spin_momentum)
-    for ball, force, own in loads:
-        torque = torque + cross(arm(ball, e), force) + own
+    for ball, force, contact_forces in loads:
+        torque = torque + cross(arm(ball, e), force) + contact_forces
     return sum((force for _, force, _ in loads), 0.0) / case.mass - case.gravity * UP, solve_inertia(case, e, torque)
 
 
@@ -116,13 +116,13 @@ def contact(case, state, balls):
         force, torque = friction(case, u + cross(w, arm(ball, e)), w)
         units.append((ball, force + UP, torque))
     free = accelerations(case, state)
-    rises = np.array([centre_acceleration(state, ball, *free) for ball in balls])
-    pushed = [accelerations(case, state, [unit]) for unit in units]
+    accelerations_of_balls = np.array([centre_acceleration(state, ball, *free) for ball in balls])
+    responses = [accelerations(case, state, [unit]) for unit in units]
     matrix = [
-        [centre_acceleration(state, ball, *pushing_force) - rise for pushing_force in pushed]
-        for ball, rise in zip(balls, rises, strict=True)
+        [centre_acceleration(state, ball, *pushing_force) - rise for pushing_force in responses]
+        for ball, rise in zip(balls, accelerations_of_balls, strict=True)
     ]
-    forces = np.linalg.solve(matrix, -rises) if balls else rises
+    forces = np.linalg.solve(matrix, -accelerations_of_balls) if balls else accelerations_of_balls
     loads = [(ball, N * force, N * torque) for N, (ball, force, torque) in zip(forces, units, strict=True)]
     return forces, *accelerations(case, state, loads)
 
@@ -153,16 +153,16 @@ def resolve_impact(case, state, ball, closing=CLOSING):
     """The state after the impact of a ball, and whether it bounces."""
     s, u, e, w = split(state)
     r = arm(ball, e)
-    before = u + cross(w, r)
+    velocity_before = u + cross(w, r)
     response = np.array([d / case.mass + cross(solve_inertia(case, e, cross(r, d)), r) for d in np.eye(3)]).T
-    bounces = -case.restitution * before[2] > closing * sqrt(case.gravity * case.radius)
-    target_speed = -case.restitution * before[2] if bounces else 0.0
+    bounces = -case.restitution * velocity_before[2] > closing * sqrt(case.gravity * case.radius)
+    target_speed = -case.restitution * velocity_before[2] if bounces else 0.0
     torque = np.zeros(3)
     if case.slip_speed:
         # Impulses of the force and of the torque.
         def moved(P):
-            turned = w + solve_inertia(case, e, cross(r, P[:3]) + P[3:])
-            return u + P[:3] / case.mass + cross(turned, r), turned
+            new_rotation = w + solve_inertia(case, e, cross(r, P[:3]) + P[3:])
+            return u + P[:3] / case.mass + cross(new_rotation, r), new_rotation
 
         def change(_, P):
             force, torque = friction(case, *moved(P))
@@ -173,29 +173,37 @@ def resolve_impact(case, state, ball, closing=CLOSING):
 
         reaches.terminal = True
         # Strong friction can at first pull the ball down.
-        most = 1e3 * (target_speed - before[2]) / response[2, 2]
-        run = solve_ivp(change, (0.0, most), np.zeros(6), method="DOP853", rtol=1e-12, atol=1e-18, events=reaches)
+        max_impulse = 1e3 * (target_speed - velocity_before[2]) / response[2, 2]
+        run = solve_ivp(
+            change, (0.0, max_impulse), np.zeros(6), method="DOP853", rtol=1e-12, atol=1e-18, events=reaches
+        )
         impulse, torque = np.split(run.y_events[0][0], 2)
     else:
         # P' = -mu (before + response P) along the plane, 1 along the normal: P(p) from one exponential.
         matrix = np.zeros((4, 4))
-        matrix[:2, :3], matrix[:2, 3], matrix[2, 3] = -case.mu * response[:2], -case.mu * before[:2], 1.0
+        matrix[:2, :3], matrix[:2, 3], matrix[2, 3] = -case.mu * response[:2], -case.mu * velocity_before[:2], 1.0
 
         def after(p):
             return expm(p * matrix)[:3, 3]
 
-        most = 3.0 * (target_speed - before[2]) / response[2, 2]
-        p = brentq(lambda p: (before + response @ after(p))[2] - target_speed, 0.0, most, xtol=1e-20, rtol=1e-15)
+        max_impulse = 3.0 * (target_speed - velocity_before[2]) / response[2, 2]
+        p = brentq(
+            lambda p: (velocity_before + response @ after(p))[2] - target_speed,
+            0.0,
+            max_impulse,
+            xtol=1e-20,
+            rtol=1e-15,
+        )
         impulse = after(p)
-    turned = w + solve_inertia(case, e, cross(r, impulse) + torque)
-    return np.concatenate((s, u + impulse / case.mass, e, turned)), bounces
+    new_rotation = w + solve_inertia(case, e, cross(r, impulse) + torque)
+    return np.concatenate((s, u + impulse / case.mass, e, new_rotation)), bounces
 
 
 def at_rest(state):
     """The state without u_z and without the turning of e towards the normal."""
     s, u, e, w = split(state)
-    across = cross(UP, e)
-    return np.concatenate((s, u * (1.0 - UP), e, w - (w @ across) / (across @ across) * across))
+    side_axis = cross(UP, e)
+    return np.concatenate((s, u * (1.0 - UP), e, w - (w @ side_axis) / (side_axis @ side_axis) * side_axis))
 
 
 def launch(case):
@@ -223,21 +231,21 @@ def follow(case, rtol=1e-12, flight_step=2e-4, contact_step=2.5e-4, slowest=CLOS
     both came to rest there, energies at the ends of all pieces, when first one of two balls parted)."""
     state, number = launch(case)
     # `touching`: the numbers of the balls on the plane.
-    time, touching, flights, contacts, energies, parted = 0.0, [number], 0, [], [energy(case, state)], inf
+    time, contacts_closed, flights, contacts, energies, parted = 0.0, [number], 0, [], [energy(case, state)], inf
     swing = sqrt(case.gravity / case.radius)
     closing, numbers = slowest * swing * case.radius, range(len(case.balls))
     absolute = rtol * np.repeat((case.radius, swing * case.radius, 1.0, swing), 3)
     inverts = watched(lambda y: y[8] - cos(case.angle), -1.0)
     while True:
-        balls, free_numbers = [case.balls[k] for k in touching], [k for k in numbers if k not in touching]
+        balls, free_numbers = [case.balls[k] for k in contacts_closed], [k for k in numbers if k not in contacts_closed]
         ends = [watched(lambda y, k=k: contact(case, y, balls)[0][k], -1.0) for k in range(len(balls))]  # noqa: B023
         ends += [watched(lambda y, k=k: gap(case.balls[k], y), -1.0) for k in free_numbers]
         # A short bounce must not hide within the first step.
-        speed, most = (
+        speed, max_impulse = (
             max((gap_rate(case.balls[k], state) for k in free_numbers), default=0.0),
             [contact_step, flight_step][not balls],
         )
-        first = min(0.2 * speed / case.gravity, most, case.t1 - time) if speed > 1e-9 else None
+        first = min(0.2 * speed / case.gravity, max_impulse, case.t1 - time) if speed > 1e-9 else None
         run = solve_ivp(
             lambda _, y: rate(case, y, balls),  # noqa: B023
             (time, case.t1),
@@ -246,7 +254,7 @@ def follow(case, rtol=1e-12, flight_step=2e-4, contact_step=2.5e-4, slowest=CLOS
             rtol=rtol,
             atol=absolute,
             first_step=first,
-            max_step=most,
+            max_step=max_impulse,
             events=[inverts, *ends],
         )
         time, state = run.t[-1], run.y[:, -1]
@@ -254,32 +262,32 @@ def follow(case, rtol=1e-12, flight_step=2e-4, contact_step=2.5e-4, slowest=CLOS
         energies.append(energy(case, state))
         if run.status == 0:
             return "not_inverted", inf, state, flights, contacts, energies, parted
-        which = next(k for k, times in enumerate(run.t_events) if len(times))
-        if which == 0:
+        event_number = next(k for k, times in enumerate(run.t_events) if len(times))
+        if event_number == 0:
             return "inverted", time, state, flights, contacts, energies, parted
-        if which <= len(balls):
+        if event_number <= len(balls):
             parted = min(parted, time) if len(balls) == 2 else parted
-            touching = [k for k in touching if k != touching[which - 1]]
-            flights += not touching
+            contacts_closed = [k for k in contacts_closed if k != contacts_closed[event_number - 1]]
+            flights += not contacts_closed
             continue
-        number = free_numbers[which - 1 - len(balls)]
+        number = free_numbers[event_number - 1 - len(balls)]
         ball = case.balls[number]
-        # The ball is on the plane exactly; what the event left is round-off.
+        # Put the ball exactly on the plane: the event leaves a distance of round-off.
         state[2] = ball[1] - ball[0] * state[8]
         state, flying = resolve_impact(case, state, ball, slowest)
         contacts.append((time, number))
-        touching = [] if flying else [number]
+        contacts_closed = [] if flying else [number]
         if not flying:
             state[5] -= gap_rate(ball, state)
             touching_pairs = [(k, b) for k, b in enumerate(case.balls) if abs(gap(b, state)) < 1e-9 * case.radius]
             if len(touching_pairs) == 2 and max(abs(gap_rate(b, state)) for _, b in touching_pairs) <= closing:
                 state = at_rest(state)
                 forces = contact(case, state, case.balls)[0]
-                touching = [k for k in numbers if forces[k] > 0.0]
-                contacts += [(time, 2)] if len(touching) == 2 else []
+                contacts_closed = [k for k in numbers if forces[k] > 0.0]
+                contacts += [(time, 2)] if len(contacts_closed) == 2 else []
             elif contact(case, state, [ball])[0][0] <= 0.0:
-                touching = []
-        flights += not touching
+                contacts_closed = []
+        flights += not contacts_closed
 
 
 MR2 = 0.02 * 0.02**2
@@ -305,12 +313,12 @@ RESULTS = ("status", "time", "end_theta", "flights", "landings", "last_landing",
 
 
 def row(case, **accuracy):
-    """What the table holds of a case."""
+    """The row of a case in the table."""
     status, time, state, flights, contacts, energies, parted = follow(case, **accuracy)
     last = contacts[-1][0] if contacts else inf
     theta = np.arctan2(np.hypot(state[6], state[7]), state[8])
-    leans = next((when for when, ball in contacts if ball == 2), inf)
-    values = (status, time, theta, flights, len(contacts), last, energies[-1], leans, parted)
+    lean_time = next((time_of_contact for time_of_contact, ball in contacts if ball == 2), inf)
+    values = (status, time, theta, flights, len(contacts), last, energies[-1], lean_time, parted)
     return dict(zip(RESULTS, values, strict=True))
 
 
@@ -341,20 +349,20 @@ def main():
         table = csv.DictWriter(file, [*names, *RESULTS, "reference_error"], lineterminator="\n")
         table.writeheader()
         for case in CASES:
-            fine, check = row(case), row(case, rtol=3e-11, flight_step=1e-4, contact_step=2e-3)
+            fine_row, check = row(case), row(case, rtol=3e-11, flight_step=1e-4, contact_step=2e-3)
             error = max(
-                abs(fine[name] / check[name] - 1)
+                abs(fine_row[name] / check[name] - 1)
                 for name in ("time", "end_theta", "end_energy")
-                if np.isfinite(fine[name])
+                if np.isfinite(fine_row[name])
             )
-            if np.isfinite(fine["leans"]):
-                slower = [row(case, slowest=closing) for closing in CLOSING * 0.262 ** np.arange(-1.0, 3.0)]
-                fine, more = limit(slower)
-                error = max(error, more)
-            same = fine["flights"] == check["flights"] and fine["status"] == check["status"]
-            print(case, fine, error, same, sep="\n  ", flush=True)
+            if np.isfinite(fine_row["leans"]):
+                rows_of_speeds = [row(case, slowest=closing) for closing in CLOSING * 0.262 ** np.arange(-1.0, 3.0)]
+                fine_row, extrapolated = limit(rows_of_speeds)
+                error = max(error, extrapolated)
+            agree = fine_row["flights"] == check["flights"] and fine_row["status"] == check["status"]
+            print(case, fine_row, error, agree, sep="\n  ", flush=True)
             table.writerow(
-                {k: v if isinstance(v, str) else float(v) for k, v in (asdict(case) | fine).items()}
+                {k: v if isinstance(v, str) else float(v) for k, v in (asdict(case) | fine_row).items()}
                 | {"reference_error": float(error)}
             )
 

@@ -73,24 +73,24 @@ def resolve_impact(body, axis, velocity, turning, law, restitution):
     jacobian = np.block([[np.eye(3), -skew(arm)], [np.zeros((3, 3)), np.eye(3)]])
     lever = np.linalg.solve(mass_matrix, jacobian.T)
     response = jacobian @ lever
-    before = jacobian @ np.concatenate([velocity, turning])
-    speed = -before[2]
+    velocity_before = jacobian @ np.concatenate([velocity, turning])
+    speed = -velocity_before[2]
     # In units of the speed of approach, and of the impulse that it would take without friction.
-    start, matrix, up = before / speed, response / response[2, 2], np.eye(6)[2]
+    start, matrix, up = velocity_before / speed, response / response[2, 2], np.eye(6)[2]
 
     def rate(_, impulse):
         load, v = up, start + matrix @ impulse
-        for acts, most, slow in law.parts(speed):
+        for acts, max_force, is_slow in law.parts(speed):
             slip = acts @ v
-            load = load - most / np.sqrt(slip @ slip + slow**2) * (acts.T @ slip)
+            load = load - max_force / np.sqrt(slip @ slip + is_slow**2) * (acts.T @ slip)
         return load
 
     def jacobian_of_rate(_, impulse):
         slope, v = np.zeros((6, 6)), start + matrix @ impulse
-        for acts, most, slow in law.parts(speed):
+        for acts, max_force, is_slow in law.parts(speed):
             slip = acts @ v
-            square = slip @ slip + slow**2
-            slope -= most / np.sqrt(square) * acts.T @ (np.eye(len(slip)) - np.outer(slip, slip) / square) @ acts
+            square = slip @ slip + is_slow**2
+            slope -= max_force / np.sqrt(square) * acts.T @ (np.eye(len(slip)) - np.outer(slip, slip) / square) @ acts
         return slope @ matrix
 
     def compressed(_, impulse):
@@ -109,15 +109,15 @@ def resolve_impact(body, axis, velocity, turning, law, restitution):
         span = (impulse[2], impulse[2] + 1e6)
         options = {"method": "Radau", "rtol": 1e-10, "atol": 1e-13, "jac": jacobian_of_rate}
         run = solve_ivp(rate, span, impulse, events=events, **options)
-        least = min(matrix[2] @ rate(0.0, state) for state in run.y.T)
+        min_response = min(matrix[2] @ rate(0.0, state) for state in run.y.T)
         ends = [state[0] for state in run.y_events if len(state)]
         assert ends, "an impact without an end"
-        return ends[0], least
+        return ends[0], min_response
 
-    impulse, least = until(np.zeros(6), [compressed])
+    impulse, min_response = until(np.zeros(6), [compressed])
     if restitution > 0.0:
-        impulse, later = until(impulse, [rebounds, restores])
-        least = min(least, later)
+        impulse, min_response_later = until(impulse, [rebounds, restores])
+        min_response = min(min_response, min_response_later)
     scale = speed / response[2, 2]
     change = lever @ (scale * impulse)
-    return Impact(velocity + change[:3], turning + change[3:], scale * impulse[2], least)
+    return Impact(velocity + change[:3], turning + change[3:], scale * impulse[2], min_response)

@@ -113,7 +113,9 @@ def accelerations(scene, state, pole="z"):
     # velocity of the contact point v = O' - R w x n along t and y; its derivatives by the rates
     t3, t4, t5 = -R * dot(kth, y), -R * y[2], -R * dot(e, y)
     y3, y4, y5 = R * dot(kth, t), R * t[2], R * dot(e, t)
-    turn = [(dot(kth, along), along[2], dot(e, along)) for along in (t, y, n)]  # dw/dq' along t, y and n
+    turn = [
+        (dot(kth, axis_of_turn), axis_of_turn[2], dot(e, axis_of_turn)) for axis_of_turn in (t, y, n)
+    ]  # dw/dq' along t, y and n
     w = [dot(row, (dth, dph, dps)) for row in turn]
     v = rho * du + t3 * dth + t4 * dph + t5 * dps, dy + y3 * dth + y4 * dph + y5 * dps
     ft, fy, *torque = friction(scene, *v, *w)
@@ -163,8 +165,8 @@ def lagrange_forces(scene, q, dq, ddq, pole="z"):
         return np.subtract(*kinetic_potential(scene, q, dq, pole))
 
     h, units, q, dq, ddq = 1e-30, np.eye(6), np.array(q), np.array(dq), np.array(ddq)
-    ahead, rate = q + 1j * h * dq, dq + 1j * h * ddq
-    momenta = [(L(ahead, rate + unit) - L(ahead, rate - unit)) / 2 for unit in units]  # exact: L is quadratic in q'
+    q_ahead, rate = q + 1j * h * dq, dq + 1j * h * ddq
+    momenta = [(L(q_ahead, rate + unit) - L(q_ahead, rate - unit)) / 2 for unit in units]  # exact: L is quadratic in q'
     return np.array([p.imag - L(q + 1j * h * unit, dq).imag for p, unit in zip(momenta, units, strict=True)]) / h
 
 
@@ -252,9 +254,9 @@ def follow(scene, t1, angle=0.95 * pi, rtol=1e-12, pole="x", closest=0.3):
     [rad], least gaps at the ends of the steps before that); the time is inf if there was no event by t1.
     The chart is changed when sin theta of the chart falls below `closest`."""
     state, names = start(scene, pole), ("inverted", "contact_lost")
-    old = spare = gaps(scene, angle, state, pole)
+    old = gaps_before = gaps(scene, angle, state, pole)
     if min(old) < -TOUCH:
-        return names[int(old[0] >= -TOUCH)], 0.0, scene.theta, spare
+        return names[int(old[0] >= -TOUCH)], 0.0, scene.theta, gaps_before
 
     def state_at(t):
         part = solver(scene, run.t_old, state, t, rtol, pole)
@@ -266,7 +268,7 @@ def follow(scene, t1, angle=0.95 * pi, rtol=1e-12, pole="x", closest=0.3):
     while run.status == "running":
         run.step()
         if run.status == "failed" or not np.all(np.isfinite(run.y)):
-            return "failed", run.t, tilt(scene, state, pole), spare
+            return "failed", run.t, tilt(scene, state, pole), gaps_before
         new = gaps(scene, angle, run.y, pole)
         times = [
             crossing(lambda x, k=k, pole=pole: gaps(scene, angle, x, pole)[k], (old[k], new[k]), run, state_at)
@@ -276,12 +278,12 @@ def follow(scene, t1, angle=0.95 * pi, rtol=1e-12, pole="x", closest=0.3):
         ]
         time = min(times)
         if time < inf:
-            return names[times.index(time)], time, tilt(scene, state_at(time), pole), spare
-        state, old, spare = run.y, new, np.minimum(spare, new)
+            return names[times.index(time)], time, tilt(scene, state_at(time), pole), gaps_before
+        state, old, gaps_before = run.y, new, np.minimum(gaps_before, new)
         if sin(state[1]) < closest and run.status == "running":
             state, pole = best_chart(state, pole)
             run = solver(scene, run.t, state, t1, rtol, pole, min(run.step_size, t1 - run.t))
-    return "not_inverted", inf, tilt(scene, state, pole), spare
+    return "not_inverted", inf, tilt(scene, state, pole), gaps_before
 
 
 def inversion(scene, t1, angle=0.95 * pi, rtol=1e-12):

@@ -58,36 +58,36 @@ def times_of(row: dict[str, str], columns: dict[str, np.ndarray], t1: float) -> 
 
 def extrapolated(differences: np.ndarray) -> tuple[float, float]:
     """The limit of central differences with steps that shrink by `RATIO`, and its error."""
-    previous, best, error = [], math.nan, math.inf
+    previous, estimate, error = [], math.nan, math.inf
     for difference in differences:
         row = [difference]
-        for k, above in enumerate(previous, start=1):
+        for k, old_estimate in enumerate(previous, start=1):
             factor = RATIO ** (2 * k)
-            row.append((factor * row[k - 1] - above) / (factor - 1.0))
-            spread = max(abs(row[k] - row[k - 1]), abs(row[k] - above))
-            if spread < error:
-                best, error = row[k], spread
+            row.append((factor * row[k - 1] - old_estimate) / (factor - 1.0))
+            change = max(abs(row[k] - row[k - 1]), abs(row[k] - old_estimate))
+            if change < error:
+                estimate, error = row[k], change
         previous = row
-    return best, error
+    return estimate, error
 
 
 def derivatives(rows: list[dict[str, str]]) -> list[dict[str, Any]]:
     """The rows of one family with their times, derivatives and errors."""
     columns = columns_of(rows)
-    shrunk = STEP / RATIO ** np.arange(STEPS)
-    factors = 1.0 + np.concatenate([[0.0], shrunk, -shrunk])
+    steps = STEP / RATIO ** np.arange(STEPS)
+    factors = 1.0 + np.concatenate([[0.0], steps, -steps])
     cells = {path: [] for path in columns}
-    for moved in MOVED.values():
+    for path_of_number in MOVED.values():
         for path, values in columns.items():
-            cells[path].append(np.outer(values, factors if path == moved else np.ones_like(factors)))
-    spread = {path: np.stack(values).reshape(-1) for path, values in cells.items()}
-    times = times_of(rows[0], spread, 8.0).reshape(len(MOVED), len(rows), len(factors))
+            cells[path].append(np.outer(values, factors if path == path_of_number else np.ones_like(factors)))
+    change = {path: np.stack(values).reshape(-1) for path, values in cells.items()}
+    times = times_of(rows[0], change, 8.0).reshape(len(MOVED), len(rows), len(factors))
     derivative_rows = []
     for index, row in enumerate(rows):
         result = {name: row.get(name, "") for name in ("family", *NUMBERS)} | {"time": repr(float(times[0, index, 0]))}
         for number, (name, path) in enumerate(MOVED.items()):
-            up, down = times[number, index, 1 : 1 + STEPS], times[number, index, 1 + STEPS :]
-            slope, error = extrapolated((up - down) / (2.0 * shrunk * columns[path][index]))
+            times_above, times_below = times[number, index, 1 : 1 + STEPS], times[number, index, 1 + STEPS :]
+            slope, error = extrapolated((times_above - times_below) / (2.0 * steps * columns[path][index]))
             result |= {f"by_{name}": repr(float(slope)), f"error_{name}": f"{error / abs(slope):.1e}"}
         derivative_rows.append(result)
     return derivative_rows
@@ -115,15 +115,13 @@ def spheres() -> list[dict[str, str]]:
 
 
 if __name__ == "__main__":
-    drawn = list(csv.DictReader((HERE / "inversion_reference.csv").read_text().splitlines()))
-    drawn = [row for row in drawn if row["status"] == "inverted"] + spheres()
-    families = dict.fromkeys(row["family"] for row in drawn)
-    written = [
-        result for family in families for result in derivatives([row for row in drawn if row["family"] == family])
-    ]
+    rows = list(csv.DictReader((HERE / "inversion_reference.csv").read_text().splitlines()))
+    rows = [row for row in rows if row["status"] == "inverted"] + spheres()
+    families = dict.fromkeys(row["family"] for row in rows)
+    lines = [result for family in families for result in derivatives([row for row in rows if row["family"] == family])]
     with (HERE / "gradient_reference.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(written[0]))
+        writer = csv.DictWriter(file, list(lines[0]))
         writer.writeheader()
-        writer.writerows(written)
-    for row in written:
+        writer.writerows(lines)
+    for row in lines:
         print(row["family"], row["time"], *(f"{name} {row['by_' + name]} ({row['error_' + name]})" for name in MOVED))

@@ -105,18 +105,20 @@ def judge(scene, quota):
     """(status, time, theta, error) of a scene, or in a word why it is not taken."""
     if scene.spin > FASTEST:
         return "too fast or no threshold"
-    quick = follow(scene, T1, ANGLE, rtol=1e-8)
-    if quota.get(quick[0], 1) == 0:
-        return "quota full: " + quick[0]
-    fine = follow(scene, T1, ANGLE, rtol=1e-13, pole="x", closest=0.3)
+    coarse_run = follow(scene, T1, ANGLE, rtol=1e-8)
+    if quota.get(coarse_run[0], 1) == 0:
+        return "quota full: " + coarse_run[0]
+    fine_run = follow(scene, T1, ANGLE, rtol=1e-13, pole="x", closest=0.3)
     check = follow(scene, T1, ANGLE, rtol=1e-12, pole="y", closest=0.5)
-    if not fine[0] == check[0] == quick[0] or fine[0] not in quota:
-        return f"unclear: {quick[0]}, {check[0]}, {fine[0]}"
-    error = difference(fine, check)
-    if error > AGREEMENT or difference(fine, quick) > ROUGH_AGREEMENT:
-        return f"sensitive: {fine[0]}"
-    missed = min(gap for name, gap in zip(("inverted", "contact_lost"), fine[3], strict=True) if name != fine[0])
-    return "close miss: " + fine[0] if missed < MARGIN else (*fine[:3], error)
+    if not fine_run[0] == check[0] == coarse_run[0] or fine_run[0] not in quota:
+        return f"unclear: {coarse_run[0]}, {check[0]}, {fine_run[0]}"
+    error = difference(fine_run, check)
+    if error > AGREEMENT or difference(fine_run, coarse_run) > ROUGH_AGREEMENT:
+        return f"sensitive: {fine_run[0]}"
+    least_gap = min(
+        gap for name, gap in zip(("inverted", "contact_lost"), fine_run[3], strict=True) if name != fine_run[0]
+    )
+    return "close miss: " + fine_run[0] if least_gap < MARGIN else (*fine_run[:3], error)
 
 
 def rows(family, rng, count):

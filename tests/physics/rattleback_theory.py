@@ -62,8 +62,8 @@ class Oscillations:
         """
         squares, modes = np.linalg.eig(np.linalg.solve(self.inertia_matrix, self.stiffness))
         order = np.argsort(squares)
-        along = self.mass * self.height * QUARTER @ self.radii
-        rates = [-0.5 * (v @ along @ v) / (v @ self.inertia_matrix @ v) for v in modes[:, order].T]
+        stiffness = self.mass * self.height * QUARTER @ self.radii
+        rates = [-0.5 * (v @ stiffness @ v) / (v @ self.inertia_matrix @ v) for v in modes[:, order].T]
         return np.array(rates), np.sqrt(squares[order])
 
     def small_angle_growth(self):
@@ -88,5 +88,5 @@ class Oscillations:
         amplitude = tilt * (mode @ M)[0] / (mode @ M @ mode)
         energy = 0.5 * amplitude**2 * (mode @ K @ mode)
         rate = self.slow_growth()[0][1]
-        most = np.sqrt(spin**2 + 2.0 * energy / self.inertia[2, 2])
-        return np.arctanh(spin / most) / (rate * most)
+        max_rate = np.sqrt(spin**2 + 2.0 * energy / self.inertia[2, 2])
+        return np.arctanh(spin / max_rate) / (rate * max_rate)

@@ -71,10 +71,10 @@ class OnArena(Rattleback):
             system[6:, :6], right[6:] = C, -right_side
         else:
             slip = u + np.cross(w, r)
-            across = np.linalg.svd(n[None])[2][1:]
+            tangent_axes = np.linalg.svd(n[None])[2][1:]
             push = self.friction(slip - n * (n @ slip))
             system[6, :6], right[6] = C[0], -right_side[0]
-            system[7:, 6:] = across - np.outer(across @ push, n)
+            system[7:, 6:] = tangent_axes - np.outer(tangent_axes @ push, n)
         solution = np.linalg.solve(system, right)
         q_dot = 0.5 * np.concatenate(([-w @ q[1:]], q[0] * w + np.cross(w, q[1:])))
         return np.concatenate((u, solution[:3], q_dot, solution[3:6])), solution[6:]

@@ -71,10 +71,10 @@ class Rattleback:
             system[6:, :6], right[6:] = acceleration, -right_side
         else:
             slip = u + np.cross(w, r)
-            along = self.friction(slip * (1.0 - UP))
+            friction_force = self.friction(slip * (1.0 - UP))
             system[8, :6], right[8] = acceleration[2], -right_side[2]
             for k in range(2):
-                system[6 + k, 6 + k], system[6 + k, 8] = 1.0, -along[k]
+                system[6 + k, 6 + k], system[6 + k, 8] = 1.0, -friction_force[k]
         solution = np.linalg.solve(system, right)
         q_dot = 0.5 * np.concatenate(([-w @ q[1:]], q[0] * w + np.cross(w, q[1:])))
         return np.concatenate((u, solution[:3], q_dot, solution[3:6])), solution[6:]
@@ -145,25 +145,33 @@ def follow(body: Rattleback, mu: float, y, t1: float, floor=1e-8, onset=1e-9, rt
 
     stops.terminal = leaves.terminal = True
     stops.direction = leaves.direction = -1.0
-    rolls, t, modes, began = stops(0.0, y) <= 0.0, 0.0, [], -stiff
+    is_rolling, t, modes, slip_start = stops(0.0, y) <= 0.0, 0.0, [], -stiff
     while t < t1:
-        early = not rolls and t < began + stiff
-        equations, method = (body if rolls else slipping), "Radau" if early else "DOP853"
-        options = {"rtol": rtol, "atol": 1e-2 * rtol, "events": leaves if rolls else stops}
-        end = min(began + stiff, t1) if early else t1
-        out = solve_ivp(lambda t, y, at=equations: at.motion(y)[0], (t, end), y, method, **options)
-        if modes and not rolls and not modes[-1].rolls:
-            past = modes.pop()
-            modes.append(Mode(rolls, np.append(past.times, out.t[1:]), np.hstack((past.states, out.y[:, 1:]))))
+        is_early = not is_rolling and t < slip_start + stiff
+        equations, method = (body if is_rolling else slipping), "Radau" if is_early else "DOP853"
+        options = {"rtol": rtol, "atol": 1e-2 * rtol, "events": leaves if is_rolling else stops}
+        end = min(slip_start + stiff, t1) if is_early else t1
+        solution = solve_ivp(
+            lambda t, y, kind_of_motion=equations: kind_of_motion.motion(y)[0], (t, end), y, method, **options
+        )
+        if modes and not is_rolling and not modes[-1].rolls:
+            last_mode = modes.pop()
+            modes.append(
+                Mode(
+                    is_rolling,
+                    np.append(last_mode.times, solution.t[1:]),
+                    np.hstack((last_mode.states, solution.y[:, 1:])),
+                )
+            )
         else:
-            modes.append(Mode(rolls, out.t, out.y))
-        t, y = out.t[-1], out.y[:, -1]
-        if out.status == 0:
+            modes.append(Mode(is_rolling, solution.t, solution.y))
+        t, y = solution.t[-1], solution.y[:, -1]
+        if solution.status == 0:
             continue
-        if not rolls:
+        if not is_rolling:
             y = struck(y, np.zeros(2))
-        rolls = not rolls and leaves(t, y) > 0.0
-        if not rolls:
-            force, began = body.motion(y)[1], t
+        is_rolling = not is_rolling and leaves(t, y) > 0.0
+        if not is_rolling:
+            force, slip_start = body.motion(y)[1], t
             y = struck(y, -onset * force[:2] / np.hypot(*force[:2]))
     return modes

@@ -58,9 +58,9 @@ def in_plane(xx, yy, zz, xz):
     return jnp.array([[xx, xz, 0.0], [xz, zz, 0.0], [0.0, 0.0, yy]])
 
 
-def wheel(across, along):
+def wheel(side, heading):
     """Inertia of a wheel about a diameter and about its axle."""
-    return jnp.diag(jnp.array([across, across, along]))
+    return jnp.diag(jnp.array([side, side, heading]))
 
 
 class Bicycle(RigidBodies):
@@ -90,8 +90,8 @@ class Bicycle(RigidBodies):
     def pose(self, q):
         """Centres of the four bodies; rotations of rear frame and fork."""
         rear = about_z(q[3]) @ about_x(q[4]) @ about_z(q[5])
-        upwards = -jnp.array([jnp.sin(self.tilt), jnp.cos(self.tilt), 0.0])
-        fork = rear @ about(upwards, q[6])
+        vertical = -jnp.array([jnp.sin(self.tilt), jnp.cos(self.tilt), 0.0])
+        fork = rear @ about(vertical, q[6])
         # Seen from the rear wheel's centre, forward and down; the second point lies on the steer axis.
         on_axis = jnp.array([self.wheelbase + self.trail, self.rear_radius, 0.0])
         frame, handlebar = jnp.array([0.3, self.rear_radius - 0.9, 0.0]), jnp.array([0.9, self.rear_radius - 0.7, 0.0])
@@ -106,20 +106,20 @@ class Bicycle(RigidBodies):
         (_, (rear, fork)), (speeds, (rear_rate, fork_rate)) = jax.jvp(self.pose, (q,), (rate,))
         rear_turns, fork_turns = body_rates(rear, rear_rate), body_rates(fork, fork_rate)
         axle = jnp.array([0.0, 0.0, 1.0])
-        turns = (rear_turns + rate[7] * axle, rear_turns, fork_turns, fork_turns + rate[8] * axle)
-        return tuple(zip(speeds, turns, strict=True))
+        spin = (rear_turns + rate[7] * axle, rear_turns, fork_turns, fork_turns + rate[8] * axle)
+        return tuple(zip(speeds, spin, strict=True))
 
     def upward(self, rotation):
         """The unit vector in a wheel's plane that points up most."""
         axle, up = rotation[:, 2], jnp.array([0.0, 0.0, 1.0])
-        steepest = up - axle[2] * axle
-        return steepest / jnp.sqrt(steepest @ steepest)
+        slope_direction = up - axle[2] * axle
+        return slope_direction / jnp.sqrt(slope_direction @ slope_direction)
 
     def slips(self, q, rate):
         (_, rotations), velocities = self.pose(q), self.velocities(q, rate)
         wheels = ((velocities[0], rotations[0], self.rear_radius), (velocities[3], rotations[1], self.front_radius))
         return jnp.concatenate(
-            [speed - radius * jnp.cross(R @ turns, self.upward(R)) for (speed, turns), R, radius in wheels]
+            [speed - radius * jnp.cross(R @ spin, self.upward(R)) for (speed, spin), R, radius in wheels]
         )
 
     def heights(self, q):
@@ -152,8 +152,8 @@ class Disc(RigidBodies):
         return ((speed, body_rates(rotation, rotation_rate) + rate[4] * jnp.array([0.0, 0.0, 1.0])),)
 
     def slips(self, q, rate):
-        ((speed, turns),), (_, rotation) = self.velocities(q, rate), self.pose(q)
-        return (speed - self.radius * jnp.cross(rotation @ turns, rotation[:, 1]))[:2]
+        ((speed, spin),), (_, rotation) = self.velocities(q, rate), self.pose(q)
+        return (speed - self.radius * jnp.cross(rotation @ spin, rotation[:, 1]))[:2]
 
     def potential(self, q):
         return GRAVITY * self.pose(q)[0][2]
@@ -177,11 +177,11 @@ class BallOnTurntable(RigidBodies):
 
     def velocities(self, q, rate):
         rotation, rotation_rate = jax.jvp(self.rotation, (q,), (rate,))
-        still, up = jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])
-        return ((jnp.array([rate[0], rate[1], 0.0]), body_rates(rotation, rotation_rate)), (still, rate[5] * up))
+        zero, up = jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])
+        return ((jnp.array([rate[0], rate[1], 0.0]), body_rates(rotation, rotation_rate)), (zero, rate[5] * up))
 
     def slips(self, q, rate):
-        (speed, turns), (_, table) = self.velocities(q, rate)
+        (speed, spin), (_, table) = self.velocities(q, rate)
         up = jnp.array([0.0, 0.0, 1.0])
-        below = jnp.cross(table, jnp.array([q[0], q[1], 0.0]))
-        return (speed - self.radius * jnp.cross(self.rotation(q) @ turns, up) - below)[:2]
+        contact_velocity = jnp.cross(table, jnp.array([q[0], q[1], 0.0]))
+        return (speed - self.radius * jnp.cross(self.rotation(q) @ spin, up) - contact_velocity)[:2]

@@ -43,7 +43,7 @@ CODES = {
 
 
 def table_of(scenes: Batch, count: int, t1: float) -> dict[str, np.ndarray]:
-    """What a table of these scenes has, with errors, and the status in words."""
+    """The table of these scenes, with errors, and the status as words."""
     kind = run_kind_of(scenes.scene)
     roots = {"scene": scenes.scene, "launch": scenes.launch}
     first, second = (
@@ -64,9 +64,9 @@ def scene_and_launch(scenes: Batch, cell: int) -> tuple[tippe.Scene, tippe.Launc
     return roots["scene"], roots["launch"]
 
 
-def apart(times: np.ndarray, others: np.ndarray) -> np.ndarray:
+def apart(times: np.ndarray, other_times: np.ndarray) -> np.ndarray:
     """Differences of times, 0 where both are infinite."""
-    return np.abs(np.subtract(times, others, where=times != others, out=np.zeros(times.shape)))
+    return np.abs(np.subtract(times, other_times, where=times != other_times, out=np.zeros(times.shape)))
 
 
 def batch_of_times(scenes: Batch, t1: float) -> np.ndarray:
@@ -96,18 +96,20 @@ def batch_of_runs(scenes: Batch, ends: np.ndarray, t1: float) -> tuple[np.ndarra
 
 
 class Findings:
-    """What differs, in words, and how many comparisons were made."""
+    """Descriptions of all differences, and the number of comparisons."""
 
     def __init__(self, kind: str):
         self.kind, self.lines, self.compared = kind, [], 0
 
-    def check(self, what: str, cells: Any, holds: Any, *shown: Any) -> None:
+    def check(self, label: str, cells: Any, is_true: Any, *columns: Any) -> None:
         """Note each of some cells of which something does not hold."""
         for cell in np.atleast_1d(cells):
-            at = [float(np.atleast_1d(values)[cell if np.size(values) > 1 else 0]) for values in shown]
+            values_of_cell = [float(np.atleast_1d(values)[cell if np.size(values) > 1 else 0]) for values in columns]
             self.compared += 1
-            if not np.atleast_1d(holds)[cell if np.size(holds) > 1 else 0]:
-                self.lines.append(f"{self.kind}, scene {cell}: {what}: {', '.join(f'{value:.12g}' for value in at)}")
+            if not np.atleast_1d(is_true)[cell if np.size(is_true) > 1 else 0]:
+                self.lines.append(
+                    f"{self.kind}, scene {cell}: {label}: {', '.join(f'{value:.12g}' for value in values_of_cell)}"
+                )
 
 
 def compare_roads(kind: str, count: int, singles: int, seed: int = 5) -> tuple[Findings, int]:
@@ -116,21 +118,21 @@ def compare_roads(kind: str, count: int, singles: int, seed: int = 5) -> tuple[F
     **Returns:** what differs, and of how many scenes a table has an answer with an error.
     """
     findings, scenes = Findings(kind), batch(kind, count, seed=seed)
-    flies = scenes.scene.contact == "hybrid"
-    t1 = HORIZON_OF_FLIGHTS if flies else HORIZON
+    hybrid = scenes.scene.contact == "hybrid"
+    t1 = HORIZON_OF_FLIGHTS if hybrid else HORIZON
     table = table_of(scenes, count, t1)
     time_error, end_error, end = table["time_error"], table["end_time_error"], table["end_time"]
     comparable = (table["status_error"] == 0) & (time_error < 1e-3) & (end_error < 1e-3)
     inverted, word = table["word"] == "inverted", table["word"]
-    stops = comparable & np.isin(word, list(CODES))
+    is_stopped = comparable & np.isin(word, list(CODES))
 
     times = batch_of_times(scenes, t1)
     findings.check(
         "a batch of times inverts, or not", np.flatnonzero(comparable), np.isfinite(times) == inverted, times
     )
-    near = apart(times, table["time"]) <= APART * time_error
+    is_close = apart(times, table["time"]) <= APART * time_error
     findings.check(
-        "time in a batch, in a table", np.flatnonzero(comparable & inverted), near, times, table["time"], time_error
+        "time in a batch, in a table", np.flatnonzero(comparable & inverted), is_close, times, table["time"], time_error
     )
 
     flat = FASTEST * (1e-6 * t1 + APART * end_error) + APART * table["end_theta_error"]
@@ -138,64 +140,72 @@ def compare_roads(kind: str, count: int, singles: int, seed: int = 5) -> tuple[F
         # Just before the run's end in the table, where each run still is.
         theta, ended, status = batch_of_runs(scenes, end * (1.0 - 1e-6), t1)
         codes = np.array([CODES.get(name, -1) for name in word])
-        findings.check("status of a batch of runs, of a table", np.flatnonzero(stops), status == codes, status, codes)
-        near = np.abs(ended - end) <= APART * end_error
-        findings.check("end in a batch of runs, in a table", np.flatnonzero(stops), near, ended, end, end_error)
-        near = np.abs(theta - table["end_theta"]) <= flat
         findings.check(
-            "theta in a batch, in a table", np.flatnonzero(comparable), near, theta, table["end_theta"], flat
+            "status of a batch of runs, of a table", np.flatnonzero(is_stopped), status == codes, status, codes
+        )
+        is_close = np.abs(ended - end) <= APART * end_error
+        findings.check(
+            "end in a batch of runs, in a table", np.flatnonzero(is_stopped), is_close, ended, end, end_error
+        )
+        is_close = np.abs(theta - table["end_theta"]) <= flat
+        findings.check(
+            "theta in a batch, in a table", np.flatnonzero(comparable), is_close, theta, table["end_theta"], flat
         )
 
     for cell in np.flatnonzero(comparable)[:singles]:
         scene, launch = scene_and_launch(scenes, cell)
         single_time = float(tippe.inversion_time(scene, launch, t1, ANGLE, TOLERANCE))
-        same = single_time == table["time"][cell] or abs(single_time - table["time"][cell]) <= APART * time_error[cell]
-        findings.check("time alone, in a table", cell, same, np.full(count, single_time), table["time"], time_error)
+        is_same = (
+            single_time == table["time"][cell] or abs(single_time - table["time"][cell]) <= APART * time_error[cell]
+        )
+        findings.check("time alone, in a table", cell, is_same, np.full(count, single_time), table["time"], time_error)
         run = tippe.simulate(scene, launch, min(t1, 1.001 * float(end[cell]) + 1e-3), tolerance=OF_PATHS)
         state = run.at([min(float(end[cell]) * (1.0 - 1e-6), float(run.end_time))])
-        same = abs(float(state.theta[0]) - table["end_theta"][cell]) <= flat[cell]
+        is_same = abs(float(state.theta[0]) - table["end_theta"][cell]) <= flat[cell]
         theta = np.full(count, state.theta[0])
-        findings.check("theta of a run alone, in a table", cell, same, theta, table["end_theta"], flat)
-        ends = stops[cell] == (run.status != "completed") and (not stops[cell] or run.status == word[cell])
+        findings.check("theta of a run alone, in a table", cell, is_same, theta, table["end_theta"], flat)
+        ends = is_stopped[cell] == (run.status != "completed") and (not is_stopped[cell] or run.status == word[cell])
         findings.check(f"{run.status} alone, {word[cell]} in a table", cell, ends, np.full(count, run.end_time), end)
 
-    if flies:
+    if hybrid:
         compare_with_stops(findings, scenes, table, count, t1)
     return findings, int(comparable.sum())
 
 
-def compare_with_stops(findings: Findings, scenes: Batch, flies: dict[str, np.ndarray], count: int, t1: float) -> None:
+def compare_with_stops(findings: Findings, scenes: Batch, hybrid: dict[str, np.ndarray], count: int, t1: float) -> None:
     """A top that keeps its contact does the same whether or not it may fly; one that loses it in one flies in the other."""
     scene, columns = (
         scenes.scene,
         {name: values for name, values in scenes.columns.items() if "restitution" not in name},
     )
-    stop = tippe.Scene(scene.body, scene.surface, scene.friction)
-    stops = table_of(scenes._replace(scene=stop, columns=columns), count, t1)
-    sure = (stops["status_error"] == 0) & (flies["status_error"] == 0)
-    indices = np.flatnonzero(sure & (stops["word"] != "contact_lost") & (flies["hops"] == 0))
-    same = (stops["word"] == flies["word"]) & (np.isfinite(stops["time"]) == np.isfinite(flies["time"]))
-    findings.check("status with stop and hybrid", indices, same, stops["end_time"], flies["end_time"])
-    error = APART * (stops["time_error"] + flies["time_error"])
-    near = apart(stops["time"], flies["time"]) <= error
-    findings.check("time with stop and hybrid", indices, near, stops["time"], flies["time"], error)
-    lost = np.flatnonzero(sure & (stops["word"] == "contact_lost") & (flies["end_time"] > stops["end_time"]))
-    findings.check("flights of a top that loses its contact", lost, flies["hops"] > 0, flies["hops"])
+    stop_scene = tippe.Scene(scene.body, scene.surface, scene.friction)
+    is_stopped = table_of(scenes._replace(scene=stop_scene, columns=columns), count, t1)
+    is_certain = (is_stopped["status_error"] == 0) & (hybrid["status_error"] == 0)
+    indices = np.flatnonzero(is_certain & (is_stopped["word"] != "contact_lost") & (hybrid["hops"] == 0))
+    is_same = (is_stopped["word"] == hybrid["word"]) & (np.isfinite(is_stopped["time"]) == np.isfinite(hybrid["time"]))
+    findings.check("status with stop and hybrid", indices, is_same, is_stopped["end_time"], hybrid["end_time"])
+    error = APART * (is_stopped["time_error"] + hybrid["time_error"])
+    is_close = apart(is_stopped["time"], hybrid["time"]) <= error
+    findings.check("time with stop and hybrid", indices, is_close, is_stopped["time"], hybrid["time"], error)
+    cells_lost = np.flatnonzero(
+        is_certain & (is_stopped["word"] == "contact_lost") & (hybrid["end_time"] > is_stopped["end_time"])
+    )
+    findings.check("flights of a top that loses its contact", cells_lost, hybrid["hops"] > 0, hybrid["hops"])
 
 
 def main(kinds: list[str]) -> int:
-    """Search through some kinds of scenes and print what differs."""
-    differ = 0
+    """Search some kinds of scenes and print the differences."""
+    differing_batches = 0
     for kind in kinds:
         count, singles = (45, 3) if kind.endswith("stop") else (16, 1) if kind.startswith("plane") else (4, 1)
-        begun = time.process_time()
+        start_time = time.process_time()
         findings, comparable = compare_roads(kind, count, singles)
-        differ += len(findings.lines)
+        differing_batches += len(findings.lines)
         print(
-            f"{kind}: {findings.compared} comparisons, {comparable} of {count} scenes, {time.process_time() - begun:.0f} s"
+            f"{kind}: {findings.compared} comparisons, {comparable} of {count} scenes, {time.process_time() - start_time:.0f} s"
         )
         print("".join(f"  {line}\n" for line in findings.lines), end="", flush=True)
-    return differ
+    return differing_batches
 
 
 if __name__ == "__main__":

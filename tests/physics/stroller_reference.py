@@ -44,10 +44,10 @@ def torus(ring: float, tube: float) -> Level:
 
     def slopes(r: Array) -> tuple[Array, Array]:
         rho = np.hypot(r[0], r[1])
-        across = np.array([r[0], r[1], 0.0]) / rho
-        bend = (np.diag([1.0, 1.0, 0.0]) - np.outer(across, across)) / rho
-        gradient = 2.0 * (rho - ring) * across + 2.0 * r[2] * UP
-        return gradient, 2.0 * (np.outer(across, across) + (rho - ring) * bend + np.outer(UP, UP))
+        transverse = np.array([r[0], r[1], 0.0]) / rho
+        bend = (np.diag([1.0, 1.0, 0.0]) - np.outer(transverse, transverse)) / rho
+        gradient = 2.0 * (rho - ring) * transverse + 2.0 * r[2] * UP
+        return gradient, 2.0 * (np.outer(transverse, transverse) + (rho - ring) * bend + np.outer(UP, UP))
 
     return Level(slopes)
 
@@ -65,7 +65,7 @@ def graph(height: Callable[[float, float], tuple[Array, Array]]) -> Level:
 
 
 class Vehicle(NamedTuple):
-    """Numbers of the stroller and of what acts on it, in SI units; `damping`: rolling, front, scrub, steering."""
+    """Parameters of the stroller and of the forces on it, in SI units; `damping`: rolling, front, scrub, steering."""
 
     mass: float
     wheelbase: float
@@ -100,7 +100,7 @@ def instant(level: Level, vehicle: Vehicle, t: float, y: Array) -> Instant:
     left = cross(up, e)
     left_rate = cross(up_rate, e) + cross(up, e_rate)
     sine, cosine = np.sin(phi), np.cos(phi)
-    ahead, across = cosine * e + sine * left, cosine * left - sine * e
+    wheel_direction, transverse = cosine * e + sine * left, cosine * left - sine * e
     v, lateral = e @ velocity, left @ velocity
     w = cosine * v + sine * lateral + length * sine * yaw
     drive, torque = vehicle.push(t)
@@ -109,14 +109,14 @@ def instant(level: Level, vehicle: Vehicle, t: float, y: Array) -> Instant:
     # Columns: r'' (3), yaw acceleration, phi'', normal force, rear and front side force.
     A, b = np.zeros((8, 8)), np.zeros(8)
     A[:3, :3] = m * np.eye(3)
-    A[:3, 5], A[:3, 6], A[:3, 7] = -up, -left, -across
-    b[:3] = -m * vehicle.gravity * UP + (drive - c_v * v) * e - c_w * w * ahead
+    A[:3, 5], A[:3, 6], A[:3, 7] = -up, -left, -transverse
+    b[:3] = -m * vehicle.gravity * UP + (drive - c_v * v) * e - c_w * w * wheel_direction
     A[3, 3], A[3, 7] = J, -length * cosine
     b[3] = -c_yaw * yaw - c_w * w * length * sine - (fork if vehicle.absolute else 0.0)
     A[4, 3], A[4, 4], b[4] = (Jf if vehicle.absolute else 0.0), Jf, fork
     A[5, :3], b[5] = up, -up_rate @ velocity
     A[6, :3], b[6] = left, -left_rate @ velocity
-    A[7, :3], A[7, 3] = across, length * cosine
+    A[7, :3], A[7, 3] = transverse, length * cosine
     b[7] = steering * w - cosine * (left_rate @ velocity) + sine * (e_rate @ velocity)
     x = np.linalg.solve(A, b)
     # The spin about the normal reacts on a frame that the curvature turns (`stroller.md`, section 4).

@@ -1,4 +1,4 @@
-"""Flights over any arena: an independent program, the plane as a graph, energy, and what is refused."""
+"""Flights over any arena: comparison with an independent program, the plane as a graph, energy, and illegal scenes."""
 
 import diffrax
 import jax.numpy as jnp
@@ -52,22 +52,22 @@ def check_flights(number: int, run: tippe.HybridTrajectory) -> None:
     """The first flight to 1e-11 s; the bounces that are not followed take e / (1 - e) of the last one's time."""
     row = REFERENCE[number]
     assert_close(run.hops[0], [row["first"], row["landing"]], atol=1e-11)
-    begin, end = run.hops[-1]
-    assert end - begin < 1e-5
-    assert_close(end + (end - begin) * RESTITUTION / (1.0 - RESTITUTION), row["rest"], atol=2e-9)
+    start, end = run.hops[-1]
+    assert end - start < 1e-5
+    assert_close(end + (end - start) * RESTITUTION / (1.0 - RESTITUTION), row["rest"], atol=2e-9)
 
 
 @pytest.mark.slow
 def test_bounces_in_a_bowl():
     """To rest, then sliding, against NumPy and SciPy: the error goes with the tolerance, to 2e-10, and no constant stops it."""
-    loose, tight = (bounced(0, tippe.Paraboloid(CASES[0].p1), tolerance) for tolerance in (1e-8, 1e-12))
-    assert (loose.status, tight.status) == ("completed", "completed")
-    assert tight.contact[-1] == 0
-    assert greatest_error(0, tight) < 2e-10
-    assert 2e-8 < greatest_error(0, loose) < 2e-7
-    check_flights(0, tight)
+    loose_run, tight_run = (bounced(0, tippe.Paraboloid(CASES[0].p1), tolerance) for tolerance in (1e-8, 1e-12))
+    assert (loose_run.status, tight_run.status) == ("completed", "completed")
+    assert tight_run.contact[-1] == 0
+    assert greatest_error(0, tight_run) < 2e-10
+    assert 2e-8 < greatest_error(0, loose_run) < 2e-7
+    check_flights(0, tight_run)
     # The foot of the loose run has left the bowl by 1e-11 R where it parts: its flight begins at the bowl, and is one.
-    assert loose.dense.counts[0] == len(loose.hops) == len(tight.hops)
+    assert loose_run.dense.counts[0] == len(loose_run.hops) == len(tight_run.hops)
 
 
 def test_a_ball_comes_to_rest():
@@ -76,10 +76,10 @@ def test_a_ball_comes_to_rest():
     batched_modes, *_ = arena_modes((scene, tippe.Launch(0.0, 0.0)), 1e-12)
     upright = (0.0, 0.0, 1.0)
     centre = (0.0, 0.0, h + CASES[0].radius - CASES[0].offset)
-    dropped = jnp.array([*centre, *np.zeros(3), *upright, *np.zeros(5), 1.0, *np.zeros(4)])
-    path = solve_hybrid_dense(batched_modes, FLYING, dropped, 0.16, Settings(1e-12, diffrax.Dopri8()), counters=1)
-    *_, last, rests = path.mode_segments
-    assert (last.number, rests.number) == (FLYING, SLIDING)
+    state = jnp.array([*centre, *np.zeros(3), *upright, *np.zeros(5), 1.0, *np.zeros(4)])
+    path = solve_hybrid_dense(batched_modes, FLYING, state, 0.16, Settings(1e-12, diffrax.Dopri8()), counters=1)
+    *_, last, rest = path.mode_segments
+    assert (last.number, rest.number) == (FLYING, SLIDING)
     rest_time = last.end + (last.end - last.begin) * e / (1.0 - e)
     assert_close(rest_time, np.sqrt(2.0 * h / 9.81) * (1.0 + e) / (1.0 - e), atol=1e-11)
 

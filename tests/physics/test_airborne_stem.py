@@ -52,11 +52,11 @@ def check_against_the_program(number: int, surface: tippe.Cylinder | tippe.Parab
     for name, values, size in (("O", samples.position, case.radius), ("e", samples.axis, 1.0)):
         expected = [[row[f"{name}{i}_{k}"] for i in range(3)] for k in range(1, len(SAMPLES) + 1)]
         assert_close(values, expected, atol=1e-10 * size)
-    touches = samples.contact >= 0
+    in_contact = samples.contact >= 0
     forces, slips = (np.array([row[f"{name}_{k}"] for k in range(1, len(SAMPLES) + 1)]) for name in ("N", "slip"))
-    np.testing.assert_array_equal(touches, forces > 0.0)
+    np.testing.assert_array_equal(in_contact, forces > 0.0)
     assert_close(samples.normal_force, forces, atol=1e-9 * case.mass * case.gravity)
-    assert_close(np.linalg.norm(samples.slip, axis=1)[touches], slips[touches], atol=1e-10)
+    assert_close(np.linalg.norm(samples.slip, axis=1)[in_contact], slips[in_contact], atol=1e-10)
     assert 10 < len(run.hops) <= row["hops"]
     assert {-1, 0} <= set(run.contact)
     # Friction and blows take energy only, and it is all accounted for.
@@ -67,31 +67,32 @@ def check_against_the_program(number: int, surface: tippe.Cylinder | tippe.Parab
 
 @pytest.mark.slow
 def test_both_spheres_bounce_in_a_cylinder():
-    """A top thrown over onto its stem, and one that starts on it, against NumPy and SciPy."""
-    thrown = check_against_the_program(0, tippe.Cylinder(CASES[0].p1))
-    assert thrown.contact[0] == 0
-    started = check_against_the_program(1, tippe.Cylinder(CASES[1].p1))
-    on_stem = started.contact == 1
+    """A top thrown onto its stem and a top that starts on its stem agree with a reference in NumPy and SciPy."""
+    run = check_against_the_program(0, tippe.Cylinder(CASES[0].p1))
+    assert run.contact[0] == 0
+    run_on_stem = check_against_the_program(1, tippe.Cylinder(CASES[1].p1))
+    on_stem = run_on_stem.contact == 1
     assert on_stem.any()
     assert min(REFERENCE[k][f"landings_{sphere}"] for k in (0, 1) for sphere in (0, 1)) > 0
     # The top's own sphere is off the arena while the stem slides.
-    assert (started.distance[0][on_stem] > 0.0).all()
+    assert (run_on_stem.distance[0][on_stem] > 0.0).all()
 
 
 @pytest.mark.filterwarnings("ignore:surface.radius = .* is larger than a room")
+@pytest.mark.slow
 def test_a_top_that_leans_ends_as_unresolved():
     """In a huge cylinder it rocks from sphere to sphere until both are at rest, when it would on the plane."""
     number = next(k for k, case in enumerate(ON_THE_PLANE) if case.theta == 2.4)
     case, expected = ON_THE_PLANE[number], FOUND_ON_THE_PLANE[number]
-    scene, leans = stem_scene(tippe.Cylinder(1e3), NONE_TO_SPEAK_OF), float(expected["leans"])
+    scene, lean_time = stem_scene(tippe.Cylinder(1e3), NONE_TO_SPEAK_OF), float(expected["leans"])
     # As in the test above, a place, a velocity and an angular velocity are given: the program is the same.
     launch = tippe.Launch(
         case.theta, case.spin, place=(0.0, 0.0, -1e3), velocity=(0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)
     )
-    run = tippe.simulate(scene, launch, 2.0 * leans, tolerance=1e-12, solver=diffrax.Tsit5())
+    run = tippe.simulate(scene, launch, 2.0 * lean_time, tolerance=1e-12, solver=diffrax.Tsit5())
     assert run.status == "unresolved"
     assert "unresolved: sphere and stem came to rest on the arena together" in str(run)
-    assert_close(run.end_time, leans, atol=1e-4)
+    assert_close(run.end_time, lean_time, atol=1e-4)
     assert_close(run.theta[-1], np.arccos((STEM.radius - TOP.radius) / (STEM.offset - TOP.offset)), atol=1e-4)
 
 
@@ -129,7 +130,7 @@ def test_both_spheres_bounce_in_a_bowl():
 
 @pytest.mark.slow
 def test_a_huge_cylinder_is_the_plane():
-    """Tables: what differs falls as the curvature does, to 1e-7 of the times."""
+    """The difference between tables decreases with the curvature, to 1e-7 of the times."""
     arguments = {"theta": 0.1, "spin": [180.0, 190.0], "t1": 1.6, "tolerance": 1e-11}
     friction, errors = tippe.Coulomb(0.3, 0.05), []
     plane = tippe.inversion_table(tippe.Scene(TOP, friction=friction, contact="hybrid"), **arguments)
@@ -154,13 +155,13 @@ def test_slopes_go_through_the_blows_of_both():
     assert (table.status == "inverted").all()
     assert (table.hops > 0).all()
     assert (table.grazes == 0).all()
-    step, other = 2e-3, 3e-6
+    step, mu_step = 2e-3, 3e-6
     spins = [spin + d for spin in (180.0, 200.0) for d in (-step, step)]
     time = tippe.inversion_table(scene, spin=spins, tolerance=1e-12, **arguments).time.reshape(2, 2)
     assert_close(table.time_by_spin, np.diff(time, axis=1)[:, 0] / (2.0 * step), rtol=1e-5)
-    mus = [0.3 - other, 0.3 + other]
+    mus = [0.3 - mu_step, 0.3 + mu_step]
     time = tippe.inversion_table(scene, spin=[180.0, 200.0], mu=mus, tolerance=1e-12, **arguments).time
-    assert_close(table.time_by_mu, np.diff(time.reshape(2, 2), axis=0)[0] / (2.0 * other), rtol=1e-4)
+    assert_close(table.time_by_mu, np.diff(time.reshape(2, 2), axis=0)[0] / (2.0 * mu_step), rtol=1e-4)
 
 
 @pytest.mark.slow
@@ -199,8 +200,8 @@ def test_one_blow_may_throw_the_other_sphere_into_the_arena(monkeypatch):
     L = float(TOP.I1) * w + float(TOP.I3 - TOP.I1) * (e @ w) * e[:, None]
     rest = np.zeros((2, cells))
     states = np.concatenate([np.tile(place[:, None], cells), u, np.tile(e[:, None], cells), L, rest])
-    flies = FlyBoth(scene, jnp.ones((14, cells)), jnp.asarray(-2.0), False, jnp.asarray(True))
-    transition = eqx.filter_jit(flies.reset_map)(jnp.asarray(states), jnp.ones(cells))
+    mode = FlyBoth(scene, jnp.ones((14, cells)), jnp.asarray(-2.0), False, jnp.asarray(True))
+    transition = eqx.filter_jit(mode.reset_map)(jnp.asarray(states), jnp.ones(cells))
     top, outcomes = TwoSpheres(case), []
     for sphere in top.spheres:
         sphere.near = np.array((0.0, 0.0, -case.p1))
@@ -208,10 +209,10 @@ def test_one_blow_may_throw_the_other_sphere_into_the_arena(monkeypatch):
         y = np.concatenate([place, u[:, k], e, w[:, k]])
         if top.speed(1, y) > -1e-3:
             continue
-        after, _ = top.struck(1, y)
-        throws = top.speed(0, after) < -1e-4
-        assert int(transition.mode[k]) == (STRIKING if throws else ON_STEM)
-        outcomes.append(throws)
-        if throws:
-            assert_close(transition.state[3:6, k], after[3:6], atol=1e-10)
+        state_after, _ = top.struck(1, y)
+        is_thrown = top.speed(0, state_after) < -1e-4
+        assert int(transition.mode[k]) == (STRIKING if is_thrown else ON_STEM)
+        outcomes.append(is_thrown)
+        if is_thrown:
+            assert_close(transition.state[3:6, k], state_after[3:6], atol=1e-10)
     assert {True, False} == set(outcomes)

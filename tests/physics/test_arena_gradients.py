@@ -29,7 +29,7 @@ def test_the_slope_of_a_time_is_that_of_differences(arena, place):
         scene, theta=0.2, spin=spin, t1=8.0, angle=0.8 * np.pi, axes=axes, tolerance=1e-11, sensitivities=["spin"]
     )
     assert (table.status == "inverted").all()
-    plain = (table.time[1:8] - table.time[8:]) / (2.0 * steps)
-    better = (16.0 * plain[1:] - plain[:-1]) / 15.0
-    best = np.argmin(np.abs(np.diff(better)))
-    assert_close(table.time_by_spin[0], better[best + 1], rtol=1e-6)
+    differences = (table.time[1:8] - table.time[8:]) / (2.0 * steps)
+    extrapolated = (16.0 * differences[1:] - differences[:-1]) / 15.0
+    position = np.argmin(np.abs(np.diff(extrapolated)))
+    assert_close(table.time_by_spin[0], extrapolated[position + 1], rtol=1e-6)

@@ -70,20 +70,20 @@ class Start(NamedTuple):
     @classmethod
     def at_random(cls, arena, body, law, spread=0.03):
         """Feet about a place of an arena, any axis, spins to 200 rad/s, slips to 1 m/s, the same in the fixed frame on all."""
-        (surface, side, near), random = arena, np.random.default_rng(7)
+        (surface, side, place_guess), random = arena, np.random.default_rng(7)
         scene = tippe.Scene(body, surface, law, side=side)
 
         def draw(*shape):
             # Both halves of the lanes are the same tops.
             return np.tile(random.normal(size=(*shape, COUNT // 2)), 2)
 
-        around = tuple(jnp.asarray(part + spread * draw()) for part in near)
-        where = scene.frame.at_foot(tuple(filled(surface.nearest(surface.in_own_axes(around)))))
+        place_near = tuple(jnp.asarray(part + spread * draw()) for part in place_guess)
+        place_and_path = scene.frame.at_foot(tuple(filled(surface.nearest(surface.in_own_axes(place_near)))))
         V, e, L = (draw(3) for _ in range(3))
         e, L = e / np.linalg.norm(e, axis=0), 100.0 * body.I3 * L
         u = 0.3 * V - body.offset * jnp.cross(L, e, axis=0) / body.I1
-        u, e, L = (tuple(jnp.einsum("jx,ijx->ix", vector, axes_at(scene, where))) for vector in (u, e, L))
-        return cls(scene, where, joined(u[:2], e, L, where[0]))
+        u, e, L = (tuple(jnp.einsum("jx,ijx->ix", vector, axes_at(scene, place_and_path))) for vector in (u, e, L))
+        return cls(scene, place_and_path, joined(u[:2], e, L, place_and_path[0]))
 
 
 def filled(vector):
@@ -91,14 +91,14 @@ def filled(vector):
     return jnp.stack([jnp.zeros(COUNT) if part is None else jnp.broadcast_to(part, (COUNT,)) for part in vector])
 
 
-def axes_at(scene, where):
+def axes_at(scene, place_and_path):
     """The frame's vectors in the fixed frame, (3, 3, lanes)."""
-    return jnp.stack([filled(axis) for axis in scene.frame.axes(*where)])
+    return jnp.stack([filled(axis) for axis in scene.frame.axes(*place_and_path)])
 
 
-def in_space(scene, where, vector):
+def in_space(scene, place_and_path, vector):
     """A vector of the frame, in the fixed frame."""
-    return jnp.einsum("ix,ijx->jx", filled(vector), axes_at(scene, where))
+    return jnp.einsum("ix,ijx->jx", filled(vector), axes_at(scene, place_and_path))
 
 
 class Seen(NamedTuple):
@@ -115,12 +115,12 @@ class Seen(NamedTuple):
 
 def quantities_of(scene, state, cyclic):
     u, e, L, place = parts(state)
-    where, offset = (place, cyclic), scene.body.offset
+    place_and_path, offset = (place, cyclic), scene.body.offset
     turning = jnp.cross(filled(L), filled(e), axis=0) / scene.body.I1
-    axis, normal = in_space(scene, where, e), axes_at(scene, where)[2]
-    velocity = in_space(scene, where, (*u, -offset * turning[2]))
-    centre = filled(scene.frame.position(*where))
-    numbers = (in_space(scene, where, L), normal, scene.energy(state), scene.jellett(state))
+    axis, normal = in_space(scene, place_and_path, e), axes_at(scene, place_and_path)[2]
+    velocity = in_space(scene, place_and_path, (*u, -offset * turning[2]))
+    centre = filled(scene.frame.position(*place_and_path))
+    numbers = (in_space(scene, place_and_path, L), normal, scene.energy(state), scene.jellett(state))
     return Seen(centre - offset * axis, velocity, axis, *numbers)
 
 
@@ -145,10 +145,10 @@ def test_what_changes_and_what_stays(name):
     numbers = {"offset": by_lanes(OFFSET, OFFSET, 0.0), "I1": by_lanes(float(top.I1), float(top.I1), inertia)}
     body = tippe.Top(0.02, RADIUS, **numbers, I3=inertia)
     law = tippe.Rolling(by_lanes(1e-3, 0.0, 0.0), 2.0, tippe.Contensou(by_lanes(0.3, 0.0, 0.0), 2e-3, 0.05))
-    scene, where, state = Start.at_random(ARENAS[name], body, law)
+    scene, place_and_path, state = Start.at_random(ARENAS[name], body, law)
     motion = scene.dynamics.motion(state)
-    rates = (scene.field(state), scene.frame.cyclic_rate(where[1], motion.velocity, motion.frame_rate))
-    quantities, rate = jax.jvp(lambda *arguments: quantities_of(scene, *arguments), (state, where[1]), rates)
+    rates = (scene.field(state), scene.frame.cyclic_rate(place_and_path[1], motion.velocity, motion.frame_rate))
+    quantities, rate = jax.jvp(lambda *arguments: quantities_of(scene, *arguments), (state, place_and_path[1]), rates)
     rubs, balls = by_lanes(1, 0, 0) > 0, by_lanes(0, 0, 1) > 0
 
     assert_close(rate.place, quantities.velocity, atol=1e-12)
@@ -157,19 +157,19 @@ def test_what_changes_and_what_stays(name):
     assert_close(rate.energy, power, atol=1e-11 * np.max(np.abs(quantities.energy)))
     assert np.all((power * np.sign(motion.normal_force) < 0.0) == rubs)
 
-    torque = motion.normal_force * in_space(scene, where, motion.friction.torque)
+    torque = motion.normal_force * in_space(scene, place_and_path, motion.friction.torque)
     by_turning = RADIUS * inner(quantities.momentum, rate.normal)
     assert name.endswith("plane") == bool(np.all(by_turning == 0.0))
     by_torque = inner(torque, body.offset * quantities.axis - RADIUS * quantities.normal)
     assert np.all((by_torque != 0.0) == rubs)
     assert_close(rate.jellett, by_turning - by_torque, atol=1e-11 * np.max(np.abs(quantities.jellett)))
 
-    s, bend, own = (np.asarray(part) for part in (quantities.place, rate.velocity, rate.momentum[2]))
+    s, bend, momentum_rate = (np.asarray(part) for part in (quantities.place, rate.velocity, rate.momentum[2]))
     size = 0.02 * np.max(np.abs(s)) * (9.81 + np.max(np.abs(bend)))
     orbital = 0.02 * (s[0] * bend[1] - s[1] * bend[0])
-    mode_segments = np.max(np.abs(orbital + own)[~rubs]) < 1e-12 * size
+    mode_segments = np.max(np.abs(orbital + momentum_rate)[~rubs]) < 1e-12 * size
     assert mode_segments == (name not in NOT_OF_REVOLUTION)
-    assert_close(own[balls], 0.0, atol=1e-12 * size)
+    assert_close(momentum_rate[balls], 0.0, atol=1e-12 * size)
 
 
 #: Sizes of an arena that tends to another with them: half of the lanes each.
@@ -208,16 +208,16 @@ LIMITS = {
 def forces(arena, spread):
     """Normal force, friction per newton of it and the turning of the frame, (3, lanes) in the fixed frame."""
     law = tippe.Rolling(1e-3, 2.0, tippe.Contensou(0.3, 2e-3, 0.05))
-    scene, where, state = Start.at_random(arena, rutstam_top(), law, spread)
+    scene, place_and_path, state = Start.at_random(arena, rutstam_top(), law, spread)
     motion = scene.dynamics.motion(state)
     vectors = ((None, None, motion.normal_force), (*motion.friction.force, None), motion.friction.torque)
     turning = (*motion.frame_rate, None)
-    return [np.asarray(in_space(scene, where, vector)) for vector in (*vectors, turning)]
+    return [np.asarray(in_space(scene, place_and_path, vector)) for vector in (*vectors, turning)]
 
 
-def departure(arena, other, spread):
+def departure(arena, limit_arena, spread):
     """Greatest difference on two arenas for each lane: of the forces, each by its size, and of the turning [rad/s]."""
-    pairs = list(zip(forces(arena, spread), forces(other, spread), strict=True))
+    pairs = list(zip(forces(arena, spread), forces(limit_arena, spread), strict=True))
     sizes = [np.max(np.abs(a)) for a, _ in pairs[:-1]] + [1.0]
     return np.max([np.max(np.abs(a - b), axis=0) / size for (a, b), size in zip(pairs, sizes, strict=True)], axis=0)
 
@@ -226,10 +226,10 @@ def departure(arena, other, spread):
 def test_limits(name):
     """All forces tend to those on the other arena, at the rate at which the surfaces do."""
     case = LIMITS[name]
-    off = departure(case.near, case.limit, case.spread)
-    large, small = np.max(off[: COUNT // 2]), np.max(off[COUNT // 2 :])
-    assert 0.0 < large < 0.1
-    assert_close(large / small, 10.0**case.power, rtol=0.1)
+    departures = departure(case.near, case.limit, case.spread)
+    large_departure, small_departure = np.max(departures[: COUNT // 2]), np.max(departures[COUNT // 2 :])
+    assert 0.0 < large_departure < 0.1
+    assert_close(large_departure / small_departure, 10.0**case.power, rtol=0.1)
 
 
 def test_a_graph_of_zero_is_a_plane():

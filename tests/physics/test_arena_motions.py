@@ -40,7 +40,7 @@ def scene_on(ground, mu=0.3, slip_speed=0.05, gravity=9.81):
 
 
 def launched(place, velocity=(0.0, 0.0), turning=(0.0, 0.0, 0.0), theta=0.3, spin=100.0, azimuth=0.0):
-    """A launch with all its numbers, so that all are of one kind."""
+    """A launch with all its numbers given, so that all launches share a program."""
     return tippe.Launch(theta, spin, azimuth=azimuth, place=place, velocity=velocity, angular_velocity=turning)
 
 
@@ -158,7 +158,7 @@ def test_a_table_says_where_the_ball_no_longer_fits():
 @settings(max_examples=12, deadline=None, derandomize=True)
 @given(strategies.integers(0, 2**32 - 1))
 def test_on_random_ground_energy_never_grows(seed):
-    """Finite or flagged; what energy is lost friction has taken."""
+    """Runs are finite or flagged, and friction accounts for the loss of energy."""
     random = np.random.default_rng(seed)
 
     def wave():
@@ -172,12 +172,12 @@ def test_on_random_ground_energy_never_grows(seed):
 
     ground = Ground(wave(), wave(), random.uniform(-2.0, 3.0), tuple(random.uniform(-1.0, 1.0, 2)))
     scene = scene_on(ground, random.uniform(0.0, 1.0), random.uniform(0.02, 1.0), random.uniform(1.0, 30.0))
-    drawn = random.uniform(-1.0, 1.0, 8)
+    numbers = random.uniform(-1.0, 1.0, 8)
     launch = launched(
-        tuple(0.2 * drawn[:2]),
-        tuple(drawn[2:4]),
-        tuple(30.0 * drawn[4:7]),
-        3.0 * abs(drawn[7]),
+        tuple(0.2 * numbers[:2]),
+        tuple(numbers[2:4]),
+        tuple(30.0 * numbers[4:7]),
+        3.0 * abs(numbers[7]),
         random.uniform(-300, 300),
     )
     run = tippe.simulate(scene, launch, 0.3, tolerance=1e-9)
@@ -189,7 +189,7 @@ def test_on_random_ground_energy_never_grows(seed):
     assert run.stats["energy_residual"] < 1e-6 * size
 
 
-#: What the forces are differentiated by.
+#: The parameters with respect to which the forces are differentiated.
 NUMBERS = {
     "scene.surface.height.bowl": 1.0 / 0.5,
     "scene.surface.height.first[0]": 0.002,
@@ -212,13 +212,16 @@ def test_derivatives_of_the_forces_by_ground_friction_and_launch():
         state = copies["scene"].state(copies["launch"])
         return jnp.append(copies["scene"].field(state), copies["scene"].normal_force(state))
 
-    at = tuple(NUMBERS.values())
-    jacobian = np.stack(jax.jit(jax.jacfwd(forces, tuple(range(len(at)))))(*at))
-    for k, value in enumerate(at):
+    numbers_of_law = tuple(NUMBERS.values())
+    jacobian = np.stack(jax.jit(jax.jacfwd(forces, tuple(range(len(numbers_of_law)))))(*numbers_of_law))
+    for k, value in enumerate(numbers_of_law):
 
         def difference(step, k=k):
-            up, down = (forces(*at[:k], at[k] + sign * step, *at[k + 1 :]) for sign in (1.0, -1.0))
-            return (up - down) / (2.0 * step)
+            forces_above, forces_below = (
+                forces(*numbers_of_law[:k], numbers_of_law[k] + sign * step, *numbers_of_law[k + 1 :])
+                for sign in (1.0, -1.0)
+            )
+            return (forces_above - forces_below) / (2.0 * step)
 
         steps = 1e-2 * value / 1.6 ** np.arange(8)
         differences = np.stack([difference(step) for step in steps])

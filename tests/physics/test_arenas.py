@@ -112,13 +112,13 @@ def test_the_forms_of_their_own_move_as_the_general_one(name):
     scene = tippe.Scene(rutstam_top(), surface, tippe.Coulomb(0.3, 0.1), side=side)
     launch = tippe.Launch(0.8, 100.0, azimuth=0.5, velocity=(0.1, -0.05), angular_velocity=(3.0, -2.0, 1.0), **place)
     state, (own_place, own_path) = scene.state(launch), scene.start(launch)
-    general = CarriedFrame.of(surface, scene.body.radius, jnp.asarray(20.0), surface.sign(side, "inside"))
+    general_frame = CarriedFrame.of(surface, scene.body.radius, jnp.asarray(20.0), surface.sign(side, "inside"))
     axes = scene.frame.axes(own_place, own_path)
     centre, normal = scene.frame.position(own_place, own_path), axes[2]
     foot = tuple(c - scene.body.radius * n for c, n in zip(centre, normal, strict=True))
     first = (*surface.in_own_axes(foot), *surface.in_own_axes(axes[0]))
     motions = []
-    for frame, start, path in ((scene.frame, own_place, own_path), (general, first, ())):
+    for frame, start, path in ((scene.frame, own_place, own_path), (general_frame, first, ())):
         dynamics = Dynamics.of(scene.body, frame, scene.friction, scene.gravity)
         size = 8 + len(start)
         y = np.concatenate([state[:8], np.array([0.0 if part is None else float(part) for part in (*start, *path)])])
@@ -132,9 +132,9 @@ def test_the_forms_of_their_own_move_as_the_general_one(name):
         y = solve_ivp(lambda _, y, rate=rate: np.asarray(rate(y)), (0.0, 0.3), y, "DOP853", rtol=1e-12, atol=1e-14).y[
             :, -1
         ]
-        where = (tuple(y[8:size]), tuple(y[size:]))
-        axes = np.array(frame.axes(*map(lambda part: tuple(map(jnp.asarray, part)), where)), dtype=float)
-        centre = np.array(frame.position(*map(lambda part: tuple(map(jnp.asarray, part)), where)), dtype=float)
+        place_and_path = (tuple(y[8:size]), tuple(y[size:]))
+        axes = np.array(frame.axes(*map(lambda part: tuple(map(jnp.asarray, part)), place_and_path)), dtype=float)
+        centre = np.array(frame.position(*map(lambda part: tuple(map(jnp.asarray, part)), place_and_path)), dtype=float)
         motions.append(np.concatenate([y[2:5] @ axes, centre, y[5:8] @ axes / float(scene.body.I3 * 100.0)]))
     assert_close(motions[0], motions[1], atol=1e-10)
 

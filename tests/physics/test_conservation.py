@@ -1,4 +1,4 @@
-"""What must not change, or change at a known rate: energy, Jellett's constant, the length of the axis."""
+"""Quantities that are constant or change at a known rate: energy, Jellett's constant, the length of the axis."""
 
 import equinox as eqx
 import jax
@@ -99,8 +99,8 @@ def test_position_is_the_integral_of_velocity(rutstam_scene):
         scene = tippe.Scene(rutstam_top(), arena, tippe.Viscous(0.3))
         run = tippe.simulate(scene, tippe.Launch(0.4, 120.0, eta=0.3), 0.5, tolerance=1e-11)
         middle, step = np.linspace(0.1, 0.4, 7), 1e-4
-        ahead, behind = run.at(middle + step), run.at(middle - step)
-        difference = (np.asarray(ahead.position) - np.asarray(behind.position)) / (2.0 * step)
+        state_after, state_before = run.at(middle + step), run.at(middle - step)
+        difference = (np.asarray(state_after.position) - np.asarray(state_before.position)) / (2.0 * step)
         assert_close(difference, run.at(middle).velocity, atol=2e-5)
         assert_close(np.linalg.norm(run.axis, axis=1), 1.0, atol=1e-10)
 

@@ -56,14 +56,14 @@ def test_a_sphere_by_its_support_function_is_the_top(tilt):
 
 def test_a_spheroid_tends_to_the_sphere():
     """The departure of the normal force is proportional to polar - equatorial."""
-    off = []
+    errors = []
     for change in (1e-5, 1e-6):
         body = egg(0.02 * (1.0 + change), 0.004)
         top = tippe.Top(body.mass, 0.02, 0.004, body.I1, body.I3)
         scenes = [tippe.Scene(shape, friction=LAWS["coulomb"]) for shape in (body, top)]
         states = random_states(scenes[0], 50)
-        off.append(np.abs(np.subtract(*(np.asarray(scene.normal_force(states)) for scene in scenes))).max())
-    assert 9.0 < off[0] / off[1] < 11.0
+        errors.append(np.abs(np.subtract(*(np.asarray(scene.normal_force(states)) for scene in scenes))).max())
+    assert 9.0 < errors[0] / errors[1] < 11.0
 
 
 @pytest.mark.parametrize("polar", [0.028, 0.013])
@@ -142,14 +142,14 @@ def test_what_a_run_says_of_itself(run):
 def test_what_is_drawn_of_a_run_stands_on_the_plane(run):
     """The lowest corner of the egg's mesh, turned and put where the page has it, is at z = 0 but for the mesh's width."""
     ((show,),) = [stage.shows for stage in run.stages()]
-    (body,), lowest = show.bodies, []
+    (body,), lowest_points = show.bodies, []
     corners = np.concatenate([mesh.vertices for mesh in body.meshes])
     square = (corners[:, 0] ** 2 + corners[:, 1] ** 2) / 0.02**2 + (corners[:, 2] - 0.003) ** 2 / 0.028**2
     assert_close(square, 1.0, atol=1e-9)
     for position, turning in zip(body.position[::50], matrices(body.orientation[::50]), strict=True):
-        lowest.append((corners @ turning.T + position)[:, 2].min())
-    assert min(lowest) > -1e-9
-    assert max(lowest) < 1e-4
+        lowest_points.append((corners @ turning.T + position)[:, 2].min())
+    assert min(lowest_points) > -1e-9
+    assert max(lowest_points) < 1e-4
 
 
 # The egg that rises
@@ -205,16 +205,16 @@ def rising_time(mu: float, polar: float, raised: float, angle: float) -> float:
 def test_the_slow_rise_tends_to_that_of_moffatt_and_shimomura():
     """As the inverse square of the spin."""
     limit = rising_time(0.3, 0.028, 0.1, 3.0)
-    off = [slow_rise(egg(), lambda v: -0.3 * v, spin, 0.1, 3.0) - limit for spin in (400.0, 800.0)]
-    assert 0.0 < off[1] < 0.01 * limit
-    assert 3.9 < off[0] / off[1] < 4.2
+    errors = [slow_rise(egg(), lambda v: -0.3 * v, spin, 0.1, 3.0) - limit for spin in (400.0, 800.0)]
+    assert 0.0 < errors[1] < 0.01 * limit
+    assert 3.9 < errors[0] / errors[1] < 4.2
 
 
 def reaches(run: tippe.Trajectory, angle: float) -> float:
     """When a run first reaches an angle [s]."""
-    after = int(np.argmax(np.asarray(run.theta) >= angle))
-    assert after > 0
-    times = np.linspace(float(run.t[after - 1]), float(run.t[after]), 200)
+    index = int(np.argmax(np.asarray(run.theta) >= angle))
+    assert index > 0
+    times = np.linspace(float(run.t[index - 1]), float(run.t[index]), 200)
     return float(np.interp(angle, run.at(times).theta, times))
 
 
@@ -229,8 +229,8 @@ def risen() -> tippe.Trajectory:
 def test_an_egg_rises(risen):
     """From lying to nearly upright, in the time of a slow rise but for what it moves; Jellett's quantity drifts by percents."""
     assert risen.status == "completed"
-    slow = slow_rise(egg(), lambda v: -0.2 * v / math.hypot(v, 0.05), 140.0, 0.2, 2.9)
-    assert_close(reaches(risen, 2.9), slow, rtol=0.05)
+    rate_of_rise = slow_rise(egg(), lambda v: -0.2 * v / math.hypot(v, 0.05), 140.0, 0.2, 2.9)
+    assert_close(reaches(risen, 2.9), rate_of_rise, rtol=0.05)
     drift = np.asarray(risen.jellett) / float(risen.jellett[0]) - 1.0
     assert 1e-3 < np.abs(drift).max() < 0.02
     assert float(risen.position[-1, 2]) > 0.0275
@@ -252,12 +252,12 @@ def test_a_table_of_eggs(risen):
 def test_rising_times_of_fast_eggs():
     """Viscous: 2 % off a slow rise at 100 rad/s and less the faster; a still faster one jumps on the way."""
     body = egg()
-    scene, off = tippe.Scene(body, friction=tippe.Viscous(0.3)), []
+    scene, errors = tippe.Scene(body, friction=tippe.Viscous(0.3)), []
     for spin in (100.0, 140.0, 200.0):
         time = tippe.inversion_time(scene, balanced(body, spin, 0.1), 5.0, tolerance=1e-8)
-        off.append(float(time) / slow_rise(body, lambda v: -0.3 * v, spin, 0.1, 0.95 * math.pi) - 1.0)
-    assert 0.0 < off[2] < off[1] < off[0] < 0.025
-    assert off[2] < 0.006
+        errors.append(float(time) / slow_rise(body, lambda v: -0.3 * v, spin, 0.1, 0.95 * math.pi) - 1.0)
+    assert 0.0 < errors[2] < errors[1] < errors[0] < 0.025
+    assert errors[2] < 0.006
     assert tippe.simulate(scene, balanced(body, 280.0, 0.1), 5.0, tolerance=1e-8).status == "contact_lost"
 
 
@@ -271,9 +271,9 @@ def test_derivatives_of_rising_times(make):
         launch = tippe.Launch(1.8, 0.0, angular_velocity=(0.0, 0.0, turning))
         return tippe.inversion_time(tippe.Scene(body, friction=tippe.Viscous(mu)), launch, 3.0, 2.6, 1e-11)
 
-    at = (jnp.asarray(0.028), jnp.asarray(0.3), jnp.asarray(140.0))
-    gradient = jax.grad(time, argnums=(0, 1, 2))(*at)
+    numbers = (jnp.asarray(0.028), jnp.asarray(0.3), jnp.asarray(140.0))
+    gradient = jax.grad(time, argnums=(0, 1, 2))(*numbers)
     for k in range(3):
-        sides = [time(*at[:k], at[k] * (1.0 + step), *at[k + 1 :]) for step in (1e-5, -1e-5)]
-        difference = (sides[0] - sides[1]) / (2e-5 * at[k])
+        sides = [time(*numbers[:k], numbers[k] * (1.0 + step), *numbers[k + 1 :]) for step in (1e-5, -1e-5)]
+        difference = (sides[0] - sides[1]) / (2e-5 * numbers[k])
         assert_close(gradient[k], difference, rtol=1e-5)

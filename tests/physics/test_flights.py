@@ -34,8 +34,8 @@ def random_descents(count: int, seed: int) -> Descent:
 def test_landings_by_brute_force():
     """No root is missed: the first sign change on 100 000 samples, refined, for 300 random flights."""
     descent = random_descents(300, 1)
-    time, lost = search(descent, jnp.full(300, 10.0))
-    assert not np.asarray(lost).any()
+    time, has_failed = search(descent, jnp.full(300, 10.0))
+    assert not np.asarray(has_failed).any()
     assert np.isfinite(time).all()
     values = np.asarray(jax.jit(lambda d, t: d.value(t))(descent, time))
     assert np.max(np.abs(values)) < 1e-15
@@ -57,12 +57,12 @@ def test_a_flight_that_begins_with_the_third_power_of_time():
     """From N = 0 the distance is c (W t)^3 / 6 - g t^2 (W t)^2 / 24 at first: a graze of 1e-9 m and its landing are seen."""
     rate, gravity = 200.0, 9.81
     slopes = -(10.0 ** np.linspace(-7.0, -5.0, 300))
-    ones = np.ones(300)
+    one = np.ones(300)
     descent = Descent(
-        *map(jnp.asarray, (0 * ones, 0 * ones, gravity * ones, rate * ones, -gravity / rate**2 * ones, slopes))
+        *map(jnp.asarray, (0 * one, 0 * one, gravity * one, rate * one, -gravity / rate**2 * one, slopes))
     )
-    time, lost = search(descent, jnp.asarray(ones))
-    assert not np.asarray(lost).any()
+    time, has_failed = search(descent, jnp.asarray(one))
+    assert not np.asarray(has_failed).any()
     first_order = 4.0 * -slopes * rate / gravity
     assert_close(time, first_order, rtol=2e-2)
 
@@ -72,16 +72,16 @@ def test_flight_is_the_free_motion():
     body = rutstam_top()
     free = free_bodies(6, 2)
     time = jnp.linspace(0.01, 0.05, 6)
-    later, rate = jax.jvp(lambda t: flown(body, 9.81, free, t), (time,), (jnp.ones(6),))
-    e, L = np.stack(later.axis), np.stack(free.momentum)
+    body_after, rate = jax.jvp(lambda t: flown(body, 9.81, free, t), (time,), (jnp.ones(6),))
+    e, L = np.stack(body_after.axis), np.stack(free.momentum)
     assert_close(np.stack(rate.axis), np.cross(L, e, axis=0) / float(body.I1), atol=1e-9)
     assert_close(np.linalg.norm(e, axis=0), 1.0, atol=1e-14)
-    assert_close(energy(body, 9.81, later), energy(body, 9.81, free), rtol=1e-13)
+    assert_close(energy(body, 9.81, body_after), energy(body, 9.81, free), rtol=1e-13)
     for last in (False, True):
         cos_angle = cone(body, free).parallel[2] + 0.01
-        reached = angle_reached(body, free, cos_angle, 0.5 * jnp.ones(6), last)
-        assert np.isfinite(reached).all()
-        height, height_rate = jax.jvp(lambda t: flown(body, 9.81, free, t).axis[2], (reached,), (jnp.ones(6),))
+        times = angle_reached(body, free, cos_angle, 0.5 * jnp.ones(6), last)
+        assert np.isfinite(times).all()
+        height, height_rate = jax.jvp(lambda t: flown(body, 9.81, free, t).axis[2], (times,), (jnp.ones(6),))
         assert_close(height, cos_angle, atol=1e-12)
         assert np.all(height_rate < 0.0)
 
@@ -108,21 +108,21 @@ def test_impacts(slip_speed):
     body, friction = rutstam_top(), scene_of(case).friction
     ball, free = balls(body)[0], free_bodies(60, 3)
     restitution = jnp.asarray(np.repeat([0.0, 0.5, 1.0], 20))
-    after, jams = eqx.filter_jit(resolve_impact)(body, friction, ball, free, restitution)
+    free_after, jams = eqx.filter_jit(resolve_impact)(body, friction, ball, free, restitution)
     assert not np.asarray(jams).any()
-    assert_close(jellett(ball, after), jellett(ball, free), atol=1e-20)
-    lost = energy(body, 9.81, free) - energy(body, 9.81, after)
-    assert np.min(lost) > -1e-12
+    assert_close(jellett(ball, free_after), jellett(ball, free), atol=1e-20)
+    has_failed = energy(body, 9.81, free) - energy(body, 9.81, free_after)
+    assert np.min(has_failed) > -1e-12
     # Newton's restitution, unless it would take energy from nowhere.
-    approach, rebound = -gap_rate(body, ball, free), gap_rate(body, ball, after)
-    full = np.abs(rebound - restitution * approach) < 1e-12
-    assert full[:40].all()
-    assert full.sum() > 50
-    assert np.all((rebound <= restitution * approach + 1e-12) & (full | (np.abs(lost) < 1e-9)))
-    before, end_state = state_of(body, free), state_of(body, after)
-    for i in np.flatnonzero(full)[::6]:
+    approach, rebound = -gap_rate(body, ball, free), gap_rate(body, ball, free_after)
+    is_exact = np.abs(rebound - restitution * approach) < 1e-12
+    assert is_exact[:40].all()
+    assert is_exact.sum() > 50
+    assert np.all((rebound <= restitution * approach + 1e-12) & (is_exact | (np.abs(has_failed) < 1e-9)))
+    state_before, end_state = state_of(body, free), state_of(body, free_after)
+    for i in np.flatnonzero(is_exact)[::6]:
         single_case = Case(**{**case.__dict__, "restitution": float(restitution[i])})
-        expected, _ = reference_impact(single_case, before[:, i], (0.006, 0.02))
+        expected, _ = reference_impact(single_case, state_before[:, i], (0.006, 0.02))
         assert_close(end_state[:, i], expected, rtol=1e-9, atol=1e-9)
 
 

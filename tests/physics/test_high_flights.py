@@ -31,20 +31,20 @@ def flown(run, time: float):
     centre, u = (np.asarray(part)[0] for part in (sample.position, sample.velocity))
     rate = np.linalg.norm(L) / I1
     direction = L / np.linalg.norm(L)
-    along, ahead = (direction @ e) * direction, np.cross(direction, e)
-    s, u = centre - OFFSET * e, u - OFFSET * rate * ahead
+    parallel, binormal = (direction @ e) * direction, np.cross(direction, e)
+    s, u = centre - OFFSET * e, u - OFFSET * rate * binormal
 
     def path(t: float):
         t = t - time
-        axis = along + np.cos(rate * t) * (e - along) + np.sin(rate * t) * ahead
+        axis = parallel + np.cos(rate * t) * (e - parallel) + np.sin(rate * t) * binormal
         return s + u * t - np.array([0.0, 0.0, 0.5 * GRAVITY * t * t]) + OFFSET * axis
 
     return path
 
 
-def landing(path, distance, begin: float, end: float) -> float:
+def landing(path, distance, start: float, end: float) -> float:
     """When the sphere is first at the arena again [s]."""
-    times = np.linspace(begin, end, 400)
+    times = np.linspace(start, end, 400)
     gaps = np.array([distance(path(t)) for t in times]) - RADIUS
     k = np.flatnonzero(gaps < 0.0)[0]
     return brentq(lambda t: distance(path(t)) - RADIUS, times[k - 1], times[k], xtol=1e-13)
@@ -63,8 +63,8 @@ def from_ripples(centre) -> float:
         return (x - s) ** 2 + (ripples(x) - z) ** 2
 
     grid = s + np.linspace(-0.15, 0.15, 3001)
-    best = grid[np.argmin(square(grid))]
-    return np.sqrt(minimize(lambda x: square(x[0]), [best], tol=1e-16).fun)
+    start_guess = grid[np.argmin(square(grid))]
+    return np.sqrt(minimize(lambda x: square(x[0]), [start_guess], tol=1e-16).fun)
 
 
 def from_ellipse(equatorial: float, polar: float):
@@ -77,8 +77,8 @@ def from_ellipse(equatorial: float, polar: float):
             return (equatorial * np.cos(eta) - r) ** 2 + (polar * np.sin(eta) - z) ** 2
 
         grid = np.linspace(-np.pi / 2, np.pi / 2, 3001)
-        best = grid[np.argmin(square(grid))]
-        return np.sqrt(minimize(lambda x: square(x[0]), [best], tol=1e-16).fun)
+        start_guess = grid[np.argmin(square(grid))]
+        return np.sqrt(minimize(lambda x: square(x[0]), [start_guess], tol=1e-16).fun)
 
     return distance
 
@@ -89,16 +89,16 @@ def from_bowl(p: float):
     def distance(centre) -> float:
         r, z = np.hypot(*centre[:2]), centre[2]
         roots = np.roots([1.0 / (2.0 * p * p), 0.0, 1.0 - z / p, -r])
-        real = roots[np.abs(roots.imag) < 1e-9].real
-        return np.sqrt(np.min((real - r) ** 2 + (real**2 / (2.0 * p) - z) ** 2))
+        real_roots = roots[np.abs(roots.imag) < 1e-9].real
+        return np.sqrt(np.min((real_roots - r) ** 2 + (real_roots**2 / (2.0 * p) - z) ** 2))
 
     return distance
 
 
 def check(run, distance, flight: int) -> None:
     """A flight ends where it should, the energy never grows, and the top stays clear of the arena."""
-    begin, end = run.hops[flight]
-    middle = 0.5 * (begin + end)
+    start, end = run.hops[flight]
+    middle = 0.5 * (start + end)
     assert_close(end, landing(flown(run, middle), distance, middle, end + 0.1), atol=2e-9)
     energy, work = np.asarray(run.energy), np.asarray(run.work)
     assert_close(energy, energy[0] + work, atol=1e-9 * energy[0])
@@ -165,7 +165,7 @@ class Mistaken(tippe.Paraboloid):
 def test_a_run_whose_energy_does_not_balance_is_unresolved():
     """The same run in a bowl that states its heights is whole."""
     launch = tippe.Launch(0.4, 100.0, place=(0.1, 0.0), velocity=(0.0, 0.2))
-    exact, mistaken = (thrown(kind(0.3), launch, 0.05, 1e-9) for kind in (tippe.Paraboloid, Mistaken))
-    assert [exact.status, mistaken.status] == ["completed", "unresolved"]
+    exact, wrong_run = (thrown(kind(0.3), launch, 0.05, 1e-9) for kind in (tippe.Paraboloid, Mistaken))
+    assert [exact.status, wrong_run.status] == ["completed", "unresolved"]
     assert "unresolved" not in str(exact)
-    assert "unresolved: the energy residual of" in str(mistaken)
+    assert "unresolved: the energy residual of" in str(wrong_run)

@@ -68,14 +68,16 @@ def test_inversion_times_through_hops(hopping_table):
 def test_a_cell_does_not_depend_on_its_neighbours(hopping_table):
     axes = {"scene.restitution": [0.5, 0.0]}
     spins = [280.0, 150.0, 200.0]
-    other = tippe.inversion_table(scene_of(CASES[0], 0.1), theta=0.1, spin=spins, axes=axes, t1=20.0, tolerance=1e-11)
+    finer_table = tippe.inversion_table(
+        scene_of(CASES[0], 0.1), theta=0.1, spin=spins, axes=axes, t1=20.0, tolerance=1e-11
+    )
     for spin in (200.0, 280.0):
         # The order of the axes' values is turned round.
-        assert_close(other.time[spins.index(spin), ::-1], hopping_table.time[SPINS.index(spin)], rtol=1e-12)
-        np.testing.assert_array_equal(other.hops[spins.index(spin), ::-1], hopping_table.hops[SPINS.index(spin)])
+        assert_close(finer_table.time[spins.index(spin), ::-1], hopping_table.time[SPINS.index(spin)], rtol=1e-12)
+        np.testing.assert_array_equal(finer_table.hops[spins.index(spin), ::-1], hopping_table.hops[SPINS.index(spin)])
     # Where contact is never lost restitution makes no difference.
-    assert other.hops[1].tolist() == [0, 0]
-    assert other.time[1, 0] == other.time[1, 1]
+    assert finer_table.hops[1].tolist() == [0, 0]
+    assert finer_table.time[1, 0] == finer_table.time[1, 1]
 
 
 @pytest.mark.slow
@@ -114,8 +116,8 @@ def test_last_crossing_through_flights():
     last = tippe.inversion_table(scene, crossing="last", **arguments)
     first = tippe.inversion_table(scene, **arguments)
     run = tippe.simulate(scene, tippe.Launch(0.1, 200.0), 6.3, times=np.linspace(0.0, 6.3, 200_001), tolerance=1e-10)
-    above = run.theta >= angle
-    crossings = run.t[1:][above[1:] & ~above[:-1]]
+    is_above = run.theta >= angle
+    crossings = run.t[1:][is_above[1:] & ~is_above[:-1]]
     assert last.status[0] == first.status[0] == "inverted"
     assert len(crossings) > 1
     assert_close(last.time[0], crossings[-1], atol=4e-5)
@@ -169,14 +171,14 @@ def test_energy_falls_and_jellett_stays_through_hops(ride):
     assert ride.stats["energy_residual"] < 1e-9 * ride.energy[0]
     assert ride.stats["impact_loss"] > 0.0
     on_stem = np.flatnonzero(ride.contact == 1)
-    before = ride.jellett[: on_stem[0]]
+    jellett_before = ride.jellett[: on_stem[0]]
     assert np.sum(ride.contact[: on_stem[0]] == -1) > 10
-    assert_close(before, before[0], rtol=1e-9)
+    assert_close(jellett_before, jellett_before[0], rtol=1e-9)
     # From the last time that the sphere touches, that of the stem.
     last = np.flatnonzero(ride.contact == 0)[-1] + 1
     stem = jellett(balls(ride.scene.body)[1], ride._free)[last:]
     assert_close(stem, stem[0], rtol=1e-9)
-    assert abs(ride.jellett[-1] / before[0] - 1.0) > 1e-3
+    assert abs(ride.jellett[-1] / jellett_before[0] - 1.0) > 1e-3
 
 
 def test_a_ride_at_other_times_is_the_same(ride):
@@ -185,16 +187,16 @@ def test_a_ride_at_other_times_is_the_same(ride):
     times = np.unique(np.concatenate([sampled_times, middles, ends, ends + 1e-9]))
     samples = ride.at(times)
 
-    def places(of):
-        return np.searchsorted(times, of)
+    def places(kind):
+        return np.searchsorted(times, kind)
 
     for name in ("theta", "energy", "spin_angle"):
         assert_close(getattr(samples, name)[places(sampled_times)], getattr(ride, name)[::7], rtol=1e-12, atol=1e-12)
     assert np.all(samples.contact[places(middles)] == -1)
     # Positions are continuous, also where velocities are not.
     for name, atol in (("position", 1e-8), ("rotation", 1e-6)):
-        shown = getattr(samples, name)
-        assert_close(shown[places(ends + 1e-9)], shown[places(ends)], atol=atol)
+        samples_of_name = getattr(samples, name)
+        assert_close(samples_of_name[places(ends + 1e-9)], samples_of_name[places(ends)], atol=atol)
     assert "flights" in str(ride)
     with pytest.raises(ValueError, match=r"must be at most .* \(the run ends there\)"):
         ride.at([4.5])
@@ -202,14 +204,14 @@ def test_a_ride_at_other_times_is_the_same(ride):
 
 def test_the_rotation_goes_with_the_angular_velocity(ride):
     """In a flight, on the sphere and on the stem: R' = w x R."""
-    small, moments = 1e-6, []
+    step, moments = 1e-6, []
     for number in (-1, 0, 1):
         steps = np.flatnonzero((ride.contact[1:] == number) & (ride.contact[:-1] == number))
-        longest = steps[np.argmax(np.diff(ride.t)[steps])]
-        moments.append(ride.t[longest : longest + 2].mean())
-    run = ride.at(np.add.outer(sorted(moments), [-small, 0.0, small]).ravel())
+        longest_steps = steps[np.argmax(np.diff(ride.t)[steps])]
+        moments.append(ride.t[longest_steps : longest_steps + 2].mean())
+    run = ride.at(np.add.outer(sorted(moments), [-step, 0.0, step]).ravel())
     rotation = np.asarray(run.rotation).reshape(3, 3, 3, 3)
-    rate = (rotation[:, 2] - rotation[:, 0]) / (2.0 * small)
+    rate = (rotation[:, 2] - rotation[:, 0]) / (2.0 * step)
     turning = np.asarray(run.angular_velocity)[1::3]
     expected = np.cross(turning[:, :, None], rotation[:, 1], axis=1)
     assert_close(rate, expected, atol=1e-6 * np.max(np.abs(turning)))
@@ -258,8 +260,8 @@ def test_a_start_on_the_wall_has_contact():
         state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + field(state + h * k3))
     motion = dynamics.motion(scene.state(launch))
     e = np.asarray(scene.state(launch)[2:5])
-    along = sum(force * direction for force, direction in zip(motion.friction.force, e, strict=False))
-    A = (a * (1.0 - e[2] ** 2) + (R - a * e[2]) * along) / float(top.I1)
+    push = sum(force * direction for force, direction in zip(motion.friction.force, e, strict=False))
+    A = (a * (1.0 - e[2] ** 2) + (R - a * e[2]) * push) / float(top.I1)
     expected = 1.5 * weight * 9.81 * (h * steps) ** 2 / (rho * (1.0 + 0.02 * a * A))
     assert_close(scene.normal_force(state) / expected, 1.0, atol=6e-3)
 

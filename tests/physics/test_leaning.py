@@ -39,8 +39,8 @@ def leaning_states(body: tippe.Top, count: int, seed: int) -> np.ndarray:
     random = np.random.default_rng(seed)
     theta, azimuth = first_contact(body), random.uniform(-np.pi, np.pi, count)
     e = np.stack([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.full(count, np.cos(theta))])
-    along, upright = random.normal(scale=[[7e-5], [3e-5]], size=(2, count))
-    momentum = along * e + upright * np.array([[0.0], [0.0], [1.0]])
+    slips, upright = random.normal(scale=[[7e-5], [3e-5]], size=(2, count))
+    momentum = slips * e + upright * np.array([[0.0], [0.0], [1.0]])
     return np.concatenate([random.normal(scale=0.3, size=(2, count)), e, momentum])
 
 
@@ -81,11 +81,11 @@ def test_the_contacts_that_hold():
     )
     assert np.asarray(definite).all()
     outcomes = []
-    for state, chosen in zip(states_of_the_reference(scene, states).T, np.asarray(number), strict=True):
-        (holds,) = (touching for touching in ([], [0], [1], [0, 1]) if nothing_pulls(case, state, touching))
+    for state, sphere in zip(states_of_the_reference(scene, states).T, np.asarray(number), strict=True):
+        (contacts,) = (touching for touching in ([], [0], [1], [0, 1]) if nothing_pulls(case, state, touching))
         # A top that nothing holds stands on the sphere whose force is positive with both, where a flight begins at once.
-        assert not holds or (holds == [0, 1] if chosen == BOTH else holds == [chosen])
-        outcomes.append(tuple(holds))
+        assert not contacts or (contacts == [0, 1] if sphere == BOTH else contacts == [sphere])
+        outcomes.append(tuple(contacts))
     assert set(outcomes) == {(), (0,), (1,), (0, 1)}
 
 
@@ -94,8 +94,8 @@ def nothing_pulls(case: Case, state: np.ndarray, touching: list[int]) -> bool:
     forces, u_dot, w_dot = contact(case, state, [case.balls[k] for k in touching])
     e, w = state[6:9], state[9:]
     e_ddot = np.cross(w_dot, e) + np.cross(w, np.cross(w, e))
-    rises = [u_dot[2] + case.balls[k][0] * e_ddot[2] for k in (0, 1) if k not in touching]
-    return min([*forces, *rises]) > 0.0
+    accelerations = [u_dot[2] + case.balls[k][0] * e_ddot[2] for k in (0, 1) if k not in touching]
+    return min([*forces, *accelerations]) > 0.0
 
 
 def test_friction_without_an_answer():
@@ -106,8 +106,8 @@ def test_friction_without_an_answer():
     _, _, definite = LeaningDynamics.of(scene).settled(
         as_free_body(scene.body, balls(scene.body)[0], jnp.asarray(states))
     )
-    for state, fine in zip(states_of_the_reference(scene, states).T, np.asarray(definite), strict=True):
-        assert fine == (determinant(case, state) > 0.0)
+    for state, is_definite in zip(states_of_the_reference(scene, states).T, np.asarray(definite), strict=True):
+        assert is_definite == (determinant(case, state) > 0.0)
     assert not np.asarray(definite).all()
 
 
@@ -129,14 +129,19 @@ def test_coming_to_rest_along_the_normal():
     random = np.random.default_rng(5)
     tilt = random.normal(scale=1e-6, size=20)
     states[5:7] += tilt * np.stack([-states[3], states[2]])
-    before = as_free_body(scene.body, spheres[1], jnp.asarray(states))
-    after: FreeBody = at_rest(scene.body, before)
+    free_before = as_free_body(scene.body, spheres[1], jnp.asarray(states))
+    free_after: FreeBody = at_rest(scene.body, free_before)
     for ball in spheres:
-        assert_close(gap_rate(scene.body, ball, after), 0.0, atol=1e-16)
-        assert_close(jellett(ball, after), jellett(ball, before), atol=1e-20)
-    turned = tilt * math.sin(first_contact(scene.body))
-    lost = turned**2 / (2.0 * 8e-7) + 6e-3 * np.asarray(before.velocity[2]) ** 2 / 2.0
-    assert_close(energy_of(scene.body, 9.81, before) - energy_of(scene.body, 9.81, after), lost, rtol=1e-8, atol=1e-17)
+        assert_close(gap_rate(scene.body, ball, free_after), 0.0, atol=1e-16)
+        assert_close(jellett(ball, free_after), jellett(ball, free_before), atol=1e-20)
+    rate = tilt * math.sin(first_contact(scene.body))
+    energy_loss = rate**2 / (2.0 * 8e-7) + 6e-3 * np.asarray(free_before.velocity[2]) ** 2 / 2.0
+    assert_close(
+        energy_of(scene.body, 9.81, free_before) - energy_of(scene.body, 9.81, free_after),
+        energy_loss,
+        rtol=1e-8,
+        atol=1e-17,
+    )
 
 
 def test_the_end_of_rocking():
@@ -147,25 +152,25 @@ def test_the_end_of_rocking():
     """
     scene = scene_of(CASES[SHORT])
     spheres, states = balls(scene.body), leaning_states(scene.body, 50, 6)
-    free, taken = as_free_body(scene.body, spheres[0], jnp.asarray(states)), []
+    free, impulses = as_free_body(scene.body, spheres[0], jnp.asarray(states)), []
     for striking in (0, 1):
         # The top turns about the sphere that stays.
-        mode_segments, strikes = spheres[1 - striking], spheres[striking]
-        turned = -1e-6 / (strikes.offset - mode_segments.offset)
-        across = np.stack([-states[3], states[2]]) / math.sin(first_contact(scene.body))
+        mode_segments, other_sphere = spheres[1 - striking], spheres[striking]
+        rate = -1e-6 / (other_sphere.offset - mode_segments.offset)
+        horizontal = np.stack([-states[3], states[2]]) / math.sin(first_contact(scene.body))
         sine2 = states[2] ** 2 + states[3] ** 2
-        tilt = turned * 8e-7 / np.sqrt(sine2)
-        momentum = (*(L - tilt * a for L, a in zip(free.momentum[:2], across, strict=True)), free.momentum[2])
-        before = FreeBody((*free.velocity[:2], -mode_segments.offset * turned), free.height, free.axis, momentum)
-        assert_close(gap_rate(scene.body, strikes, before), -1e-6, rtol=1e-9)
-        assert_close(gap_rate(scene.body, mode_segments, before), 0.0, atol=1e-15)
-        after, takes = LeaningDynamics.of(scene).stopped(before)
-        assert_close([gap_rate(scene.body, ball, after) for ball in spheres], 0.0, atol=1e-15)
-        gained = energy_of(scene.body, 9.81, after) - energy_of(scene.body, 9.81, before)
-        assert np.all(np.asarray(gained)[np.asarray(takes)] < 0.0)
-        taken.append(np.asarray(takes))
-    assert np.all(taken[0] | taken[1])
-    assert not np.all(taken[0] & taken[1])
+        tilt = rate * 8e-7 / np.sqrt(sine2)
+        momentum = (*(L - tilt * a for L, a in zip(free.momentum[:2], horizontal, strict=True)), free.momentum[2])
+        free_before = FreeBody((*free.velocity[:2], -mode_segments.offset * rate), free.height, free.axis, momentum)
+        assert_close(gap_rate(scene.body, other_sphere, free_before), -1e-6, rtol=1e-9)
+        assert_close(gap_rate(scene.body, mode_segments, free_before), 0.0, atol=1e-15)
+        free_after, takes = LeaningDynamics.of(scene).stopped(free_before)
+        assert_close([gap_rate(scene.body, ball, free_after) for ball in spheres], 0.0, atol=1e-15)
+        energy_change = energy_of(scene.body, 9.81, free_after) - energy_of(scene.body, 9.81, free_before)
+        assert np.all(np.asarray(energy_change)[np.asarray(takes)] < 0.0)
+        impulses.append(np.asarray(takes))
+    assert np.all(impulses[0] | impulses[1])
+    assert not np.all(impulses[0] & impulses[1])
 
 
 @pytest.fixture(scope="module")
@@ -186,20 +191,22 @@ def test_a_top_leans_and_falls_back(ride):
     start = states_of_the_reference(ride.scene, piece.motion.states[:8, :1])[:, 0]
     options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-14}
     ends = [watched(lambda y, k=k: contact(case, y, case.balls)[0][k], -1.0) for k in (0, 1)]
-    leans = solve_ivp(lambda _, y: rate(case, y, case.balls), (piece.begin, case.t1), start, events=ends, **options)
+    lean_run = solve_ivp(lambda _, y: rate(case, y, case.balls), (piece.begin, case.t1), start, events=ends, **options)
     # A contact is held until it would pull by 1e-8 of the weight.
-    assert_close(piece.end, leans.t[-1], atol=5e-8)
-    assert len(leans.t_events[1]) == 1
-    own, other = case.balls
-    return_event = watched(lambda y: gap(other, y) + 1e-12, -1.0)
-    to = (leans.t[-1], leans.t[-1] + 0.5)
-    stands = solve_ivp(lambda _, y: rate(case, y, [own]), to, leans.y[:, -1], events=return_event, **options)
-    assert stands.t[-1] == to[1]
-    sample = ride.at([to[1]])
+    assert_close(piece.end, lean_run.t[-1], atol=5e-8)
+    assert len(lean_run.t_events[1]) == 1
+    ball, other_ball = case.balls
+    return_event = watched(lambda y: gap(other_ball, y) + 1e-12, -1.0)
+    interval = (lean_run.t[-1], lean_run.t[-1] + 0.5)
+    standing_run = solve_ivp(
+        lambda _, y: rate(case, y, [ball]), interval, lean_run.y[:, -1], events=return_event, **options
+    )
+    assert standing_run.t[-1] == interval[1]
+    sample = ride.at([interval[1]])
     assert sample.contact.tolist() == [0]
     reference_states = states_of_the_reference(ride.scene, sample.states)[:, 0]
-    assert_close(reference_states[2:9], stands.y[2:9, -1], atol=1e-8)
-    assert_close(reference_states[9:], stands.y[9:, -1], atol=1e-6)
+    assert_close(reference_states[2:9], standing_run.y[2:9, -1], atol=1e-8)
+    assert_close(reference_states[9:], standing_run.y[9:, -1], atol=1e-6)
 
 
 @pytest.mark.slow

@@ -73,8 +73,8 @@ def test_cohens_flat_top_stops_at_an_intermediate_angle():
     scene = tippe.Scene(cohen_top(0.8), tippe.Plane(), tippe.Viscous(0.3))
     run = tippe.simulate(scene, tippe.Launch(0.1, 100.0), 60.0, times=np.linspace(59.0, 60.0, 201))
     assert_close(np.mean(run.theta), 2.07687, atol=5e-5)
-    turns = np.unwrap(np.asarray(run.azimuth))
-    precession = (turns[-1] - turns[0]) / 1.0
+    angles = np.unwrap(np.asarray(run.azimuth))
+    precession = (angles[-1] - angles[0]) / 1.0
     assert_close(precession, 55.784, rtol=1e-4)
     # psi' = w3 - phi' cos(theta)
     assert_close(np.mean(run.spin) - precession * math.cos(2.07687), -11.157, rtol=1e-4)

@@ -48,19 +48,21 @@ def beginning(scene, start, scales, tolerance):
         jnp.asarray(0.1),
         tolerance,
     )
-    slips = [stick_slip.slipping.motion(at).slip for at in (onset.at(jnp.asarray(0.5)), onset.end)]
+    slips = [stick_slip.slipping.motion(point).slip for point in (onset.at(jnp.asarray(0.5)), onset.end)]
     return onset, [jnp.stack([slip.x, slip.y]) for slip in slips]
 
 
 def begun(scene, launch, start):
     """The beginning at a tolerance of 1e-9, with its slips, after a comparison with that at 1e-11."""
     scales, start = scene.scales(launch), jnp.asarray(start)
-    (long, slips), (short, _) = (beginning(scene, start, scales, jnp.asarray(tol)) for tol in (1e-9, 1e-11))
-    assert bool(long.converged)
-    assert bool(short.converged)
-    assert float(long.length) > float(short.length) > 1e-4
-    assert_close(long.at(short.length / long.length) / scales, short.end / scales, atol=1e-10)
-    return long, *slips
+    (coarse_onset, slips), (fine_onset, _) = (
+        beginning(scene, start, scales, jnp.asarray(tol)) for tol in (1e-9, 1e-11)
+    )
+    assert bool(coarse_onset.converged)
+    assert bool(fine_onset.converged)
+    assert float(coarse_onset.length) > float(fine_onset.length) > 1e-4
+    assert_close(coarse_onset.at(fine_onset.length / coarse_onset.length) / scales, fine_onset.end / scales, atol=1e-10)
+    return coarse_onset, *slips
 
 
 @pytest.mark.newest

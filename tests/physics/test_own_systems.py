@@ -40,16 +40,18 @@ def bicycle():
     @jax.jit
     def evaluated(state):
         # The values are those of the first of the forward passes.
-        (motion, held), slopes = jax.vmap(lambda along: jax.jvp(described, (state,), (along,)))(jnp.eye(18))
-        return motion[0, 9:], held[0], *(slope.T for slope in slopes)
+        (motion, constraint_values), slopes = jax.vmap(lambda direction: jax.jvp(described, (state,), (direction,)))(
+            jnp.eye(18)
+        )
+        return motion[0, 9:], constraint_values[0], *(slope.T for slope in slopes)
 
     return lambda q, rate: tuple(map(np.asarray, evaluated(jnp.asarray([*q, *rate]))))
 
 
 def test_the_accelerations_of_the_nonlinear_benchmark_bicycle(bicycle):
     """All nine to 1e-10; the published state keeps to the ground and does not slip."""
-    acceleration, held, _, _ = bicycle(PLACE, RATE)
-    assert_close(held, 0.0, atol=1e-11)
+    acceleration, constraint_values, _, _ = bicycle(PLACE, RATE)
+    assert_close(constraint_values, 0.0, atol=1e-11)
     assert_close(acceleration, ACCELERATION, atol=1e-10)
 
 
@@ -58,9 +60,9 @@ def test_the_eigenvalues_of_the_benchmark_bicycle(bicycle, speed):
     """Weave, capsize and castering of the upright ride, from JAX's derivative of the equations along the constraints."""
     q = [0.0, 0.0, 0.3, 0.0, 0.5 * np.pi, np.pi, 0.0, 0.0, 0.0]
     rate = [-speed, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, speed / 0.3, speed / 0.35]
-    acceleration, _, motion, held = bicycle(q, rate)
+    acceleration, _, motion, constraint_values = bicycle(q, rate)
     assert_close(acceleration, 0.0, atol=1e-12)
-    tangent = null_space(held)
+    tangent = null_space(constraint_values)
     assert tangent.shape == (18, 10)
     eigenvalues = np.linalg.eigvals(np.linalg.lstsq(tangent, motion @ tangent)[0])
     for eigenvalue in EIGENVALUES[speed]:
@@ -134,19 +136,19 @@ def test_the_steady_circles_of_a_rolling_disc():
     disc, lean, ratio = Disc(), 0.5, 0.7
     spin = np.sqrt(4 * GRAVITY / disc.radius * np.sin(lean) / ((6 - 5 * ratio * np.sin(lean)) * ratio * np.cos(lean)))
     q, rate = np.array([0.0, 0.0, 0.3, lean, 0.0]), np.array([0.0, 0.0, -ratio * spin, 0.0, spin])
-    held = np.asarray(disc.constraints(q))
-    rate[:2] = -np.linalg.solve(held[:, :2], held @ rate)
+    constraint_values = np.asarray(disc.constraints(q))
+    rate[:2] = -np.linalg.solve(constraint_values[:, :2], constraint_values @ rate)
     assert_close(acceleration_of(disc, q, rate)[2:], 0.0, atol=1e-12)
-    faster = rate * np.array([1.0, 1.0, 1.01, 1.0, 1.0])
-    assert abs(acceleration_of(disc, q, faster)[3]) > 1e-2
+    wrong_rate = rate * np.array([1.0, 1.0, 1.01, 1.0, 1.0])
+    assert abs(acceleration_of(disc, q, wrong_rate)[3]) > 1e-2
 
 
 def turntable_start(turning):
     """A ball that rolls on a turntable with a velocity of its own."""
     ball, q = BallOnTurntable(), np.array([0.2, 0.0, 0.1, 0.2, 0.0, 0.0])
     free = np.array([0.05, -0.02, 0.0, 0.0, 0.0, turning])
-    held = np.asarray(ball.constraints(q))
-    free[2:4] = -np.linalg.solve(held[:, 2:4], held @ free)
+    constraint_values = np.asarray(ball.constraints(q))
+    free[2:4] = -np.linalg.solve(constraint_values[:, 2:4], constraint_values @ free)
     return ball, q, free
 
 

@@ -17,5 +17,5 @@ def test_a_number_that_is_off_is_seen(number):
     """The check of the stroller's field looks at every number of the scene."""
     case = SCENES["spheroid, stroller"]
     numbers = case.task.numbers
-    off = numbers._replace(**{number: getattr(numbers, number) * (1.0 + 1e-9)})
-    assert misprint(case._replace(task=case.task._replace(numbers=off))) > 1e-12
+    changed_numbers = numbers._replace(**{number: getattr(numbers, number) * (1.0 + 1e-9)})
+    assert misprint(case._replace(task=case.task._replace(numbers=changed_numbers))) > 1e-12

@@ -59,14 +59,14 @@ def test_one_sense_of_spin_lets_pitch_grow_and_the_other_roll():
     exponents = exponents[np.argsort(exponents.imag)][2:]
     assert_close(exponents.real / 1e-3, rates, rtol=1e-7)
     assert_close(exponents.imag, frequencies, rtol=1e-7)
-    off = []
+    errors = []
     for product in (-2e-5, -2e-6):
         body = with_product(product)
-        off.append(np.abs(body.small_angle_growth()[0] / body.slow_growth()[0] - 1.0).max())
-        (slow, fast), squares = body.small_angle_growth()[0], body.small_angle_growth()[1] ** 2
-        assert_close(fast / slow, -squares[1] / squares[0], rtol=1e-12)
-    assert off[0] < 1e-3
-    assert_close(off[1] / off[0], 1e-2, rtol=0.02)
+        errors.append(np.abs(body.small_angle_growth()[0] / body.slow_growth()[0] - 1.0).max())
+        (slow_growth, fast_growth), squares = body.small_angle_growth()[0], body.small_angle_growth()[1] ** 2
+        assert_close(fast_growth / slow_growth, -squares[1] / squares[0], rtol=1e-12)
+    assert errors[0] < 1e-3
+    assert_close(errors[1] / errors[0], 1e-2, rtol=0.02)
     assert_close(np.linalg.eigvals(with_product(0.0).matrix(2.0)).real, 0.0, atol=1e-10)
 
 
@@ -85,11 +85,11 @@ def test_a_small_tilt_grows_as_the_theory_says():
 @pytest.mark.slow
 def test_a_slow_spin_reverses_as_the_amplitude_equations_say():
     """n = -N tanh(s N (t - t0)), for pitch alone; the error falls with the square of the spin."""
-    off = []
+    errors = []
     for spin, theta in ((-0.5, 0.002), (-0.25, 0.001)):
         time = float(tippe.reversal_time(rattleback(), tippe.Launch(theta, spin), 60.0, tolerance=1e-9))
-        off.append(time / THEORY.reversal(spin, theta) - 1.0)
-    assert 0.0 < off[1] < 0.3 * off[0] < 0.01
+        errors.append(time / THEORY.reversal(spin, theta) - 1.0)
+    assert 0.0 < errors[1] < 0.3 * errors[0] < 0.01
 
 
 def test_nearby_rattlebacks_part_within_the_states_of_a_rolling_body():

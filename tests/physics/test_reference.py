@@ -46,10 +46,10 @@ def test_inversion_and_contact_loss_agree_with_lagranges_equations(family):
     assert_close(times, [float(row["time"]) for _, row in ended], rtol=1e-8)
     inverted = [float(table.time) for table, row in ended if row["status"] == "inverted"]
     assert_close(inverted, [float(row["time"]) for _, row in ended if row["status"] == "inverted"], rtol=1e-8)
-    lost = [
+    failures = [
         (float(table.end_theta), float(row["final_theta"])) for table, row in ended if row["status"] == "contact_lost"
     ]
-    assert_close(*zip(*lost, strict=True), atol=1e-7)
+    assert_close(*zip(*failures, strict=True), atol=1e-7)
 
 
 def test_the_reference_is_a_healthy_mixture():
@@ -63,10 +63,10 @@ def test_the_reference_repeats_itself():
     """The first row of every family, integrated again by the reference program at 1e-12."""
     from lagrange_top import Scene, inversion
 
-    known = {field.name for field in dataclasses.fields(Scene)}
+    fields = {field.name for field in dataclasses.fields(Scene)}
     for family in FAMILIES:
         row = next(row for row in ROWS if row["family"] == family and row["status"] == "inverted")
-        scene = Scene(**{name: float(value) for name, value in row.items() if value and name in known})
+        scene = Scene(**{name: float(value) for name, value in row.items() if value and name in fields})
         status, time, _ = inversion(scene, float(row["t1"]), 0.95 * np.pi, 1e-12)
         assert status == row["status"]
         assert_close(time, float(row["time"]), rtol=1e-9)

@@ -54,11 +54,11 @@ def test_a_body_of_revolution_moves_as_it_does_by_its_own_equations(body, tilt):
     law, arena = tippe.Rolling(1e-3, 2.0, tippe.Contensou(0.3, 2e-3, 0.05)), tippe.Plane(tilt)
     round_scene, rigid = tippe.Scene(body, arena, law), tippe.Scene(as_ellipsoid(body), arena, law)
     states = random_states(round_scene, 50)
-    longer = turned_anyhow(states)
+    state = turned_anyhow(states)
     for name in ("field", "normal_force", "slip_velocity", "energy", "jellett", "spin", "friction_power"):
         expected = np.atleast_2d(getattr(round_scene, name)(states))
         size = np.abs(expected).max(axis=1, keepdims=True)
-        assert_close(np.atleast_2d(getattr(rigid, name)(longer))[: len(size)] / size, expected / size, atol=1e-13)
+        assert_close(np.atleast_2d(getattr(rigid, name)(state))[: len(size)] / size, expected / size, atol=1e-13)
 
 
 @pytest.mark.parametrize(
@@ -181,12 +181,12 @@ def test_what_is_drawn_stands_on_the_plane(run):
     (body,) = show.bodies
     corners = np.concatenate([mesh.vertices for mesh in body.meshes])
     assert_close((((corners + np.array(CENTRE)) / SHAPE) ** 2).sum(axis=1), 1.0, atol=1e-12)
-    lowest = [
+    lowest_points = [
         (corners @ turning.T + position)[:, 2].min()
         for position, turning in zip(body.position[::50], matrices(body.orientation[::50]), strict=True)
     ]
-    assert min(lowest) > -1e-9
-    assert max(lowest) < 1e-3
+    assert min(lowest_points) > -1e-9
+    assert max(lowest_points) < 1e-3
 
 
 # Times and derivatives
@@ -219,10 +219,10 @@ def test_an_unbalanced_top_inverts_when_the_balanced_one_does(sensitivities):
 def test_limits_have_the_same_times_to_a_nanosecond():
     """Inversion times of a top, and rising times of an egg, by both sets of equations."""
     law = tippe.Viscous(0.3)
-    rising = tippe.SpheroidBody(0.05, 0.02, 0.028, 1.184e-5, 8e-6)
+    rising_body = tippe.SpheroidBody(0.05, 0.02, 0.028, 1.184e-5, 8e-6)
     for body, launch, angle in (
         (rutstam_top(), tippe.Launch(0.1, 155.0), 0.95 * math.pi),
-        (rising, tippe.Launch(1.8, 0.0, angular_velocity=(0.0, 0.0, 140.0)), 2.6),
+        (rising_body, tippe.Launch(1.8, 0.0, angular_velocity=(0.0, 0.0, 140.0)), 2.6),
     ):
         round_time, rigid_time = (
             float(tippe.inversion_time(tippe.Scene(shape, friction=law), launch, 8.0, angle, tolerance=1e-13))
@@ -267,7 +267,7 @@ def test_derivatives_by_every_component():
             mirrored = index[::-1] if len(index) == 2 else index
             size = max(abs(float(leaf[index])), 1e-4 if len(index) == 2 else 1e-2)
             expected = float(slope[index]) + (float(slope[mirrored]) if mirrored != index else 0.0)
-            off = []
+            errors = []
             for step in (1e-3 * size, 1e-4 * size, 1e-5 * size, 1e-6 * size):
                 move = np.zeros(leaf.shape)
                 move[index] = move[mirrored] = step
@@ -275,8 +275,8 @@ def test_derivatives_by_every_component():
                     run(jax.tree.unflatten(structure, [*leaves[:k], leaf + sign * move, *leaves[k + 1 :]]))
                     for sign in (1.0, -1.0)
                 ]
-                off.append(abs(float(sides[0] - sides[1]) / (2.0 * step) - expected))
-            assert min(off) < 1e-5 * abs(expected) + 1e-7, (k, index)
+                errors.append(abs(float(sides[0] - sides[1]) / (2.0 * step) - expected))
+            assert min(errors) < 1e-5 * abs(expected) + 1e-7, (k, index)
     for place, number in ((1, -0.03), (3, -1.0)):
         illegal = [*leaves]
         illegal[place] = leaves[place].at[(1,) * leaves[place].ndim].set(number)

@@ -40,15 +40,15 @@ def odd_on(arena, side, law) -> tippe.Scene:
 def test_a_top_moves_as_it_does_by_its_own_equations(name):
     """Rates, forces, slips, energies and powers at 50 states, under sliding, drilling and rolling friction."""
     arena, side = ARENAS[name]
-    longer = states_on(arena, side, 50)
-    states = longer[:-3]
+    state = states_on(arena, side, 50)
+    states = state[:-3]
     top, rigid = (
         tippe.Scene(body, arena, DISC_LAW, side=side) for body in (rutstam_top(), as_ellipsoid(rutstam_top()))
     )
     for quantity in ("field", "normal_force", "slip_velocity", "energy", "friction_power"):
         expected = np.atleast_2d(getattr(top, quantity)(states))
         size = np.maximum(np.abs(expected).max(axis=1, keepdims=True), 1e-12)
-        assert_close(np.atleast_2d(getattr(rigid, quantity)(longer))[: len(size)] / size, expected / size, atol=1e-13)
+        assert_close(np.atleast_2d(getattr(rigid, quantity)(state))[: len(size)] / size, expected / size, atol=1e-13)
 
 
 @pytest.mark.parametrize("rolls", [False, True], ids=["sliding", "rolling"])
@@ -63,9 +63,11 @@ def test_forces_and_contact_are_those_of_an_independent_program(name, rolls):
     motion = scene.dynamics.motion(states)
     f1, f2 = motion.friction.force
     frame, rise = scene.frame, scene.dynamics.mass_from_contact(states)
-    where = (tuple(states[8:-3]), (jnp.zeros(10),) * 4)
-    axes = np.array(jnp.broadcast_arrays(*(part for axis in frame.axes(*where) for part in axis))).reshape(3, 3, 10)
-    foot = np.array(jnp.broadcast_arrays(*frame.position(*where)))
+    place_and_path = (tuple(states[8:-3]), (jnp.zeros(10),) * 4)
+    axes = np.array(jnp.broadcast_arrays(*(part for axis in frame.axes(*place_and_path) for part in axis))).reshape(
+        3, 3, 10
+    )
+    foot = np.array(jnp.broadcast_arrays(*frame.position(*place_and_path)))
     turning, slip = np.stack(scene.angular_velocity(states)), np.asarray(scene.slip_velocity(states))
     for k, state in enumerate(np.asarray(states).T):
         to_fixed = axes[:, :, k].T
@@ -78,9 +80,13 @@ def test_forces_and_contact_are_those_of_an_independent_program(name, rolls):
         N = float(motion.normal_force[k])
         size = abs(force).max()
         assert_close(to_fixed @ [f1[k] * N, f2[k] * N, N] / size, force / size, atol=1e-8)
-        ahead, behind = (reference.contact(y[:3] + s * u, turn(s * w) @ Q, foot[:, k])[0] for s in (1e-5, -1e-5))
-        along = np.array([float(part[k]) for part in motion.velocity])
-        assert_close(to_fixed.T @ (ahead - behind) / 2e-5, [*along, 0.0], atol=1e-6 * np.abs(along).max())
+        lever_after, lever_before = (
+            reference.contact(y[:3] + s * u, turn(s * w) @ Q, foot[:, k])[0] for s in (1e-5, -1e-5)
+        )
+        velocity = np.array([float(part[k]) for part in motion.velocity])
+        assert_close(
+            to_fixed.T @ (lever_after - lever_before) / 2e-5, [*velocity, 0.0], atol=1e-6 * np.abs(velocity).max()
+        )
 
 
 # Balances
@@ -151,12 +157,12 @@ def test_reversals_in_bowls_and_how_contact_ends():
 @pytest.mark.slow
 def test_derivatives_by_the_bowls_radius():
     """Against central differences, the best of three steps."""
-    off = []
+    errors = []
     for step in (1e-2, 1e-3, 1e-4):
         table = reversals([4.0 - step, 4.0, 4.0 + step], -5.0, tolerance=1e-12, sensitivities=["surface.radius"])
         difference = (table.time[2] - table.time[0]) / (2.0 * step)
-        off.append(abs(float(table.time_by_radius[1] / difference) - 1.0))
-    assert min(off) < 1e-7
+        errors.append(abs(float(table.time_by_radius[1] / difference) - 1.0))
+    assert min(errors) < 1e-7
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ def test_a_top_sticks_and_slips_as_by_its_own_equations(arena):
     law = tippe.SetValuedCoulomb(0.3)
     top, rigid = (tippe.Scene(body, arena, law).dynamics for body in (rutstam_top(), as_ellipsoid(rutstam_top())))
     states = random_states(tippe.Scene(rutstam_top(), arena), 30)
-    longer = turned_anyhow(states)
+    state = turned_anyhow(states)
 
     def quantities(stick_slip, states):
         return [
@@ -37,7 +37,7 @@ def test_a_top_sticks_and_slips_as_by_its_own_equations(arena):
             stick_slip.rolling.with_slip(states, Slip(states[0], states[1])),
         ]
 
-    for expected, value in zip(quantities(top, states), quantities(rigid, longer), strict=True):
+    for expected, value in zip(quantities(top, states), quantities(rigid, state), strict=True):
         expected = np.atleast_2d(expected)
         size = np.abs(expected).max(axis=1, keepdims=True)
         assert_close(np.atleast_2d(value)[: len(size)] / size, expected / size, atol=1e-12)
@@ -66,9 +66,9 @@ def test_a_blow_that_stops_the_slip_takes_energy():
     """At 30 states; the contact point is at rest after it, and only the contact acts: L - r x m u does not change."""
     stick_slip = rattleback(0.3).dynamics
     states = stick_slip.rolling.with_unit_axes(turned_anyhow(random_states(tippe.Scene(rutstam_top()), 30)))
-    still = stick_slip.stopped(states)
-    assert_close(stick_slip.slip_speed(still) / stick_slip.slip_speed(states), 0.0, atol=1e-13)
-    assert np.all(np.asarray(stick_slip.slipping.energy(still) <= stick_slip.slipping.energy(states)))
+    stopped_states = stick_slip.stopped(states)
+    assert_close(stick_slip.slip_speed(stopped_states) / stick_slip.slip_speed(states), 0.0, atol=1e-13)
+    assert np.all(np.asarray(stick_slip.slipping.energy(stopped_states) <= stick_slip.slipping.energy(states)))
 
     def about_contact(state):
         attitude = stick_slip.rolling.attitude(state)
@@ -77,7 +77,7 @@ def test_a_blow_that_stops_the_slip_takes_energy():
         return np.asarray(state[5:8]) - np.cross(r, u, axis=0)
 
     size = np.abs(about_contact(states)).max()
-    assert_close(about_contact(still) / size, about_contact(states) / size, atol=1e-13)
+    assert_close(about_contact(stopped_states) / size, about_contact(states) / size, atol=1e-13)
 
 
 @pytest.mark.slow
@@ -90,20 +90,20 @@ def test_a_rattleback_that_rolls_and_slips_again():
     expected = follow(body, 0.2, start, 0.56)
     pieces = run.dense.mode_segments
     assert [piece.number == ROLLING for piece in pieces] == [mode.rolls for mode in expected] == [False, True] * 2
-    stop, onset, second_stop, _ = (
+    stop_time, onset, second_stop, _ = (
         float(mode.times[-1] - piece.end) for piece, mode in zip(pieces, expected, strict=True)
     )
     # The blow that stops a slip comes early, by the speed over the deceleration.
-    assert 0.0 < stop < second_stop < 2e-5
+    assert 0.0 < stop_time < second_stop < 2e-5
     assert_close(onset, 0.0, atol=1e-9)
     assert_close(run.position[-1], expected[-1].states[:3, -1], atol=1e-8)
     assert_close(run.angular_velocity[-1], expected[-1].states[10:, -1], atol=1e-6)
     assert run.stats["sticks"] == 2
     assert run.stats["energy_residual"] < 1e-8 * float(run.energy[0])
     assert np.all(np.diff(np.asarray(run.energy)) < 1e-12 * float(run.energy[0]))
-    rolls = (run.t > pieces[0].end + 1e-9) & (run.t < pieces[1].end - 1e-9)
-    assert_close(run.slip[rolls], 0.0, atol=1e-15)
-    assert np.all(np.asarray(run.grip)[rolls] < 0.2)
+    is_rolling = (run.t > pieces[0].end + 1e-9) & (run.t < pieces[1].end - 1e-9)
+    assert_close(run.slip[is_rolling], 0.0, atol=1e-15)
+    assert np.all(np.asarray(run.grip)[is_rolling] < 0.2)
     assert_close(run.grip[run.t < pieces[0].end], 0.2, rtol=1e-9)
 
 
@@ -111,7 +111,7 @@ def test_a_rattleback_that_rolls_and_slips_again():
 def test_reversals_of_a_rattleback_that_sticks_and_slips():
     """The time of a table is that of a single run; its derivatives are central differences, the better of two steps."""
     axes, start = {"theta": 0.02, "spin": -5.0, "t1": 3.0}, tippe.Launch(0.02, -5.0)
-    off = []
+    errors = []
     for step in (1e-4, 1e-5):
         table = tippe.reversal_table(
             rattleback(0.3),
@@ -123,7 +123,7 @@ def test_reversals_of_a_rattleback_that_sticks_and_slips():
         )
         assert table.status.tolist() == 3 * ["reversed"]
         difference = (table.time[2] - table.time[0]) / (2.0 * step)
-        off.append(abs(float(table.time_by_mu[1] / difference) - 1.0))
-    assert min(off) < 1e-6
+        errors.append(abs(float(table.time_by_mu[1] / difference) - 1.0))
+    assert min(errors) < 1e-6
     time, run = float(table.time[1]), tippe.simulate(rattleback(0.3), start, 3.0, tolerance=1e-11)
     assert_close(run.at([time]).normal_spin, 0.0, atol=1e-6)

@@ -16,8 +16,8 @@ AIRBORNE = ["cylinder-viscous-hybrid", "sphere-coulomb-hybrid"]
 
 def test_all_roads_lead_to_the_same_answer():
     """The short form: 24 tops on the plane, of which two run by themselves as well."""
-    findings, known = compare_roads("plane-viscous-stop", 24, 2)
-    assert known > 20
+    findings, counts = compare_roads("plane-viscous-stop", 24, 2)
+    assert counts > 20
     assert findings.lines == []
     assert findings.compared > 60
 
@@ -29,8 +29,8 @@ def test_all_roads_lead_to_the_same_answer_on_every_arena_and_under_every_law(ki
     script = Path(__file__).with_name("roads.py")
     paths = [str(script.parents[1] / "shared"), str(script.parents[2]), os.environ.get("PYTHONPATH", "")]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, script, kind], env=environment, capture_output=True, text=True, timeout=600, check=False
     )
-    print(done.stdout)
-    assert done.returncode == 0, done.stdout + done.stderr[-2000:]
+    print(process.stdout)
+    assert process.returncode == 0, process.stdout + process.stderr[-2000:]

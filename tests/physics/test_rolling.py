@@ -34,11 +34,11 @@ def rolling_states(scene: tippe.Scene, rolling: RollingDynamics, count: int):
 def roll(rolling: RollingDynamics, start, t1: float, times):
     """States (components, times) of a rolling run, by SciPy."""
     field = jax.jit(lambda y: rolling.field(y))
-    out = solve_ivp(
+    solution = solve_ivp(
         lambda _, y: np.asarray(field(y)), (0.0, t1), np.asarray(start), "DOP853", times, rtol=1e-12, atol=1e-15
     )
-    assert out.success
-    return jnp.asarray(out.y)
+    assert solution.success
+    return jnp.asarray(solution.y)
 
 
 class Prescribed(AbstractFriction):
@@ -61,8 +61,8 @@ def test_the_reaction_is_the_force_that_keeps_the_contact_at_rest(arena):
     assert_close(forced.normal_force(states), motion.normal_force, rtol=1e-12)
     rates = rolling.field(states)
     assert_close(forced.field(states), rates, atol=1e-13 * float(jnp.max(jnp.abs(rates))))
-    _, starts = jax.jvp(scene.slip_velocity, (states,), (rates,))
-    assert jnp.max(jnp.abs(starts)) < 1e-12
+    _, accelerations = jax.jvp(scene.slip_velocity, (states,), (rates,))
+    assert jnp.max(jnp.abs(accelerations)) < 1e-12
     _, power = jax.jvp(scene.energy, (states,), (rates,))
     assert jnp.max(jnp.abs(power)) < 1e-14
 
@@ -75,28 +75,28 @@ def test_multipliers_give_the_same_accelerations():
     @jax.jit
     @jax.vmap
     def accelerations_of(state):
-        def chart(at):
-            return euler_angles.from_vector_state(scene, at)
+        def chart(values):
+            return euler_angles.from_vector_state(scene, values)
 
         angles, rates = jax.jvp(chart, (state,), (rolling.field(state),))
         system = poincare.TopSystem(scene, rolling=True)
         return rates[3:], Multipliers(system).acceleration(0.0, *poincare.from_angles(angles))
 
-    own, reference = accelerations_of(states)
+    rates_of_rolling, reference = accelerations_of(states)
     size = jnp.max(jnp.abs(reference), axis=1, keepdims=True)
-    assert_close(own / size, reference / size, atol=1e-11)
+    assert_close(rates_of_rolling / size, reference / size, atol=1e-11)
 
 
 def test_a_blow_changes_the_slip_and_neither_jellett_nor_the_momentum_about_the_contact():
     scene, rolling = rolling_top(tippe.Plane())
     states = random_states(scene, 20)
-    struck = rolling.with_slip(states, Slip(jnp.full(20, 0.3), jnp.full(20, -0.2)))
-    assert_close(scene.slip_velocity(struck), np.repeat([[0.3], [-0.2]], 20, axis=1), atol=1e-14)
-    assert_close(scene.jellett(struck), scene.jellett(states), rtol=1e-12, atol=1e-20)
-    slipping_state = rolling.with_slip(struck, Slip(*scene.slip_velocity(states)))
+    slipping_states = rolling.with_slip(states, Slip(jnp.full(20, 0.3), jnp.full(20, -0.2)))
+    assert_close(scene.slip_velocity(slipping_states), np.repeat([[0.3], [-0.2]], 20, axis=1), atol=1e-14)
+    assert_close(scene.jellett(slipping_states), scene.jellett(states), rtol=1e-12, atol=1e-20)
+    slipping_state = rolling.with_slip(slipping_states, Slip(*scene.slip_velocity(states)))
     assert_close(slipping_state, states, atol=1e-14)
-    still = rolling.with_slip(states, Slip(jnp.zeros(20), jnp.zeros(20)))
-    assert jnp.all(scene.energy(still) < scene.energy(states))
+    resting_states = rolling.with_slip(states, Slip(jnp.zeros(20), jnp.zeros(20)))
+    assert jnp.all(scene.energy(resting_states) < scene.energy(states))
 
 
 def test_three_constants_and_the_quadrature_on_the_plane():
@@ -130,7 +130,7 @@ def test_viscous_friction_without_bound_is_rolling():
         viscous = tippe.Scene(scene.body, tippe.Plane(), tippe.Viscous(mu))
         field = jax.jit(lambda y: viscous.field(y))
         jacobian = jax.jit(jax.jacfwd(lambda y: viscous.field(y)))
-        out = solve_ivp(
+        solution = solve_ivp(
             lambda _, y: np.asarray(field(y)),
             (0.0, 0.3),
             np.asarray(start),
@@ -139,7 +139,7 @@ def test_viscous_friction_without_bound_is_rolling():
             atol=1e-14,
             jac=lambda _, y: np.asarray(jacobian(y)),
         )
-        return np.linalg.norm(out.y[2:5, -1] - np.asarray(end[2:5]))
+        return np.linalg.norm(solution.y[2:5, -1] - np.asarray(end[2:5]))
 
     errors = [distance(mu) for mu in (30.0, 300.0, 3000.0)]
     assert errors[2] < 1e-3
@@ -150,17 +150,17 @@ def test_viscous_friction_without_bound_is_rolling():
 def test_a_ball_that_rolls_in_the_cylinder():
     """Period sqrt(7/5) of the sliding pendulum's; V_y = V_y0 cos(q D) - q R w_n0 sin(q D) (tippe.md, section 7, 4b)."""
     scene, rolling = rolling_top(tippe.Cylinder(0.2), homogeneous_ball())
-    body, rho, amplitude, drilling, along = scene.body, 0.18, 1.2, 7.0, 0.4
+    body, rho, amplitude, drilling, speed_along = scene.body, 0.18, 1.2, 7.0, 0.4
     R, inertia = body.radius, body.I1
     # At rest across, with V_y = R w1 along the axis and an angular velocity w_n about the normal.
-    momentum = inertia * jnp.array([-along / R, 0.0, drilling])
+    momentum = inertia * jnp.array([-speed_along / R, 0.0, drilling])
     place = (jnp.sin(amplitude), jnp.cos(amplitude))
-    start = jnp.concatenate([jnp.array([0.0, along, 0.0, 0.0, 1.0]), momentum, jnp.stack(place)])
+    start = jnp.concatenate([jnp.array([0.0, speed_along, 0.0, 0.0, 1.0]), momentum, jnp.stack(place)])
     period = 4.0 * np.sqrt(1.4 * rho / 9.81) * ellipk(np.sin(amplitude / 2.0) ** 2)
     times = np.linspace(0.0, 1.0, 9) * period
     states = roll(rolling, start, period, times)
     assert_close(states[8, -1], start[8], atol=1e-9)
     angle = np.arctan2(np.asarray(states[8]), np.asarray(states[9])) - amplitude
     q = np.sqrt(2.0 / 7.0)
-    expected = along * np.cos(q * angle) - q * R * drilling * np.sin(q * angle)
+    expected = speed_along * np.cos(q * angle) - q * R * drilling * np.sin(q * angle)
     assert_close(states[1], expected, atol=1e-9)

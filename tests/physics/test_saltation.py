@@ -12,41 +12,45 @@ from tops import rutstam_top
 import tippe
 
 
+@pytest.mark.slow
 def test_a_table_through_flights_and_impacts():
     """By spin and restitution, after some dozen flights: a difference in one is taken on both sides of the other.
 
     The steps are from the middle of a range over which the differences agree.
     """
     scene, arguments = scene_of(CASES[0], 0.1), {"theta": 0.1, "t1": 20.0, "angle": 1.9, "progress": False}
-    step, other, bounces = 1e-3, 1e-5, np.array([0.2, 0.3])
+    step, mu_step, bounces = 1e-3, 1e-5, np.array([0.2, 0.3])
     # As many cells and the same axes as in `test_hops`: the programs are those.
-    spins, axes = [200.0 - step, 200.0 + step], {"scene.restitution": [b + d for b in bounces for d in (-other, other)]}
-    around = tippe.inversion_table(scene, spin=spins, axes=axes, tolerance=1e-11, **arguments)
-    time = around.time.reshape(2, 2, 2)
+    spins, axes = (
+        [200.0 - step, 200.0 + step],
+        {"scene.restitution": [b + d for b in bounces for d in (-mu_step, mu_step)]},
+    )
+    table_around = tippe.inversion_table(scene, spin=spins, axes=axes, tolerance=1e-11, **arguments)
+    time = table_around.time.reshape(2, 2, 2)
     arguments |= {"spin": [200.0], "axes": {"scene.restitution": list(bounces)}, "solver": diffrax.Tsit5()}
     table = tippe.inversion_table(scene, tolerance=1e-9, sensitivities=["spin", "restitution"], **arguments)
     assert (table.status == "inverted").all()
     assert (table.hops > 20).all()
     assert (table.grazes == 0).all()
     assert_close(table.time_by_spin[0], (np.diff(time, axis=0) / (2.0 * step)).mean(axis=(0, 2)), rtol=1e-5)
-    assert_close(table.time_by_restitution[0], (np.diff(time, axis=2) / (2.0 * other)).mean(axis=(0, 2)), rtol=1e-4)
+    assert_close(table.time_by_restitution[0], (np.diff(time, axis=2) / (2.0 * mu_step)).mean(axis=(0, 2)), rtol=1e-4)
 
 
-def scanned(function, at, steps):
+def scanned(function, value, steps):
     """Central differences, each extrapolated from two steps: the one that differs least from that of the next step."""
     estimates = []
     for step in steps:
-        ends = [np.asarray(function(at + k * step)) for k in (-2, -1, 1, 2)]
+        ends = [np.asarray(function(value + k * step)) for k in (-2, -1, 1, 2)]
         estimates.append((8.0 * (ends[2] - ends[1]) - (ends[3] - ends[0])) / (12.0 * step))
     estimates = np.array(estimates)
-    best = np.argmin(np.abs(np.diff(estimates, axis=0)), axis=0)
-    return np.take_along_axis(estimates, best[None], axis=0)[0]
+    index = np.argmin(np.abs(np.diff(estimates, axis=0)), axis=0)
+    return np.take_along_axis(estimates, index[None], axis=0)[0]
 
 
-def differences(scene, variable, at, step, **arguments):
+def differences(scene, variable, value, step, **arguments):
     """Central differences of an inversion time by one number, for that step and four more, each a tenth of the last."""
     steps = step * 0.1 ** np.arange(5)
-    points = at + np.outer(steps, (-2, -1, 1, 2)).ravel()
+    points = value + np.outer(steps, (-2, -1, 1, 2)).ravel()
     arguments |= {"axes": {"scene.friction.mu": points}} if variable == "mu" else {variable: points}
     t = tippe.inversion_table(scene, tolerance=1e-12, progress=False, **arguments).time.reshape(-1, 4).T
     return (8.0 * (t[2] - t[1]) - (t[3] - t[0])) / (12.0 * steps)
@@ -66,8 +70,8 @@ def test_a_time_through_sticks_and_slips(theta, spin, sticks):
     at = {"spin": (spin, 1e-2), "mu": (0.1, 1e-4), "theta": (theta, 1e-4)}
     for name, slope in slopes.items():
         estimates = differences(scene, name, *at[name], **arguments)
-        best = estimates[np.argmin(np.abs(np.diff(estimates)))]
-        assert_close(np.ravel(slope)[0], best, rtol=2e-6)
+        index = estimates[np.argmin(np.abs(np.diff(estimates)))]
+        assert_close(np.ravel(slope)[0], index, rtol=2e-6)
 
 
 @pytest.mark.slow

@@ -42,9 +42,9 @@ def test_a_batch_of_runs_ends_at_these_losses_wherever_its_samples_are():
         return run.end_time, run.status, run.stats["accepted"] + run.stats["rejected"]
 
     # The force is least about 0.3 ms after it vanishes.
-    least = lost + 3e-4
-    for before, after in ((2.0, 0.0), (0.004, 4e-5), (0.002, 6e-5)):
-        times = jnp.stack([least - before, least + after], axis=1)
+    bound = lost + 3e-4
+    for interval, tolerance in ((2.0, 0.0), (0.004, 4e-5), (0.002, 6e-5)):
+        times = jnp.stack([bound - interval, bound + tolerance], axis=1)
         end, status, steps = ends(mu, theta, spin, times)
         assert (status == int(tippe.Status.CONTACT_LOST)).all()
         assert_close(end, lost, atol=1e-6)
@@ -82,18 +82,18 @@ def test_derivatives_through_a_short_loss_are_those_of_scanned_differences():
     mu, theta, spin, _ = SHORT[0]
     steps = 10.0 ** -np.arange(2.0, 5.5, 0.5)
     spins = np.concatenate([spin + steps, spin - steps])
-    stops = tippe.Scene(rutstam_top(), friction=tippe.Viscous(mu))
-    table = tippe.inversion_table(stops, theta=theta, spin=spins, t1=6.0, tolerance=1e-12)
+    stopping_scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(mu))
+    table = tippe.inversion_table(stopping_scene, theta=theta, spin=spins, t1=6.0, tolerance=1e-12)
     difference = scanned_difference(table.end_time, steps)
     assert_close(difference, -0.0293920, atol=1e-7)
     assert_close(jax.jit(jax.grad(loss_time, argnums=2))(mu, theta, spin), difference, rtol=1e-6)
 
-    flies = tippe.Scene(rutstam_top(), friction=tippe.Viscous(mu), contact="hybrid", restitution=0.5)
+    hopping_scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(mu), contact="hybrid", restitution=0.5)
     arguments = {"theta": theta, "t1": 8.0}
-    table = tippe.inversion_table(flies, spin=spins, tolerance=1e-12, **arguments)
+    table = tippe.inversion_table(hopping_scene, spin=spins, tolerance=1e-12, **arguments)
     difference = scanned_difference(table.time, steps)
     assert_close(difference, -0.0082219, atol=1e-7)
-    table = tippe.inversion_table(flies, spin=spin, sensitivities=["launch.spin"], **arguments)
+    table = tippe.inversion_table(hopping_scene, spin=spin, sensitivities=["launch.spin"], **arguments)
     assert (int(table["hops"]), int(table["grazes"])) == (2, 0)
     assert_close(table.time_by_spin, difference, rtol=1e-5)
 
@@ -108,16 +108,16 @@ def test_an_independent_program_finds_these_losses(mu, theta, spin, lost):
 
 
 def first_loss(body: Body, state: np.ndarray, t1: float) -> float:
-    """When the normal force first vanishes [s]: 30 looks at every step, and at the least of them the minimum."""
+    """The time [s] at which the normal force first vanishes: the minimum near the least of 30 values in every step."""
     run = solve_ivp(rate(body), (0.0, t1), state, "DOP853", rtol=1e-12, atol=1e-12, dense_output=True)
-    for begin, end in zip(run.t[:-1], run.t[1:], strict=True):
-        looks = np.linspace(begin, end, 31)
+    for step_start, end in zip(run.t[:-1], run.t[1:], strict=True):
+        looks = np.linspace(step_start, end, 31)
         forces = [normal_force(body, run.sol(time)) for time in looks]
-        least = int(np.argmin(forces))
-        bounds = looks[max(least - 1, 0)], looks[min(least + 1, 30)]
+        index = int(np.argmin(forces))
+        bounds = looks[max(index - 1, 0)], looks[min(index + 1, 30)]
         minimum = minimize_scalar(lambda time: normal_force(body, run.sol(time)), bounds=bounds, method="bounded")
         if minimum.fun < 0.0:
-            low, high = begin, minimum.x
+            low, high = step_start, minimum.x
             for _ in range(50):
                 middle = 0.5 * (low + high)
                 low, high = (middle, high) if normal_force(body, run.sol(middle)) > 0.0 else (low, middle)
@@ -156,17 +156,17 @@ def test_losses_do_not_depend_on_the_tolerance():
     errs by 1e-5 m g there and vanishes; at 1e-7 the cell passes that minimum and loses contact in the next nutation.
     """
     grid = {"theta": np.linspace(0.05, 0.6, 8), "spin": np.linspace(165.0, 320.0, 8), "t1": 8.0}
-    loose, middle, tight = (
+    coarse_table, middle, fine_table = (
         tippe.inversion_table(SCENE, tolerance=tolerance, **grid) for tolerance in (1e-6, 1e-7, 1e-11)
     )
-    assert (np.asarray(tight.status) == "contact_lost").sum() == 58
-    assert (middle.status == tight.status).all()
-    assert_close(middle.end_time, tight.end_time, atol=1e-5)
-    assert (loose.status == tight.status).all()
-    late = np.asarray(tight.end_time)
-    assert_close(late[5, 4], 4.1664154, atol=1e-6)
-    late[5, 4] = 4.1408553
-    assert_close(loose.end_time, late, atol=1e-4)
+    assert (np.asarray(fine_table.status) == "contact_lost").sum() == 58
+    assert (middle.status == fine_table.status).all()
+    assert_close(middle.end_time, fine_table.end_time, atol=1e-5)
+    assert (coarse_table.status == fine_table.status).all()
+    end_times = np.asarray(fine_table.end_time)
+    assert_close(end_times[5, 4], 4.1664154, atol=1e-6)
+    end_times[5, 4] = 4.1408553
+    assert_close(coarse_table.end_time, end_times, atol=1e-4)
 
 
 @pytest.mark.slow
@@ -195,21 +195,21 @@ def losses():
         return state + length * weighted_sum(tableau.b_sol[: len(rates)], rates)
 
     def looked(carry, number):
-        state, before, last, lost, inverted = carry
+        state, interval, last, lost, inverted = carry
         state = step(state)
         force = dynamics.motion(state).normal_force
-        bend, slope = 0.5 * (before + force) - last, 0.5 * (force - before)
-        at = jnp.where(bend > 0.0, -slope / (2.0 * bend), 2.0)
-        inside = jnp.abs(at) < 1.0
-        least = jnp.where(inside, last + at * (slope + at * bend), jnp.minimum(last, force))
+        bend, slope = 0.5 * (interval + force) - last, 0.5 * (force - interval)
+        vertex = jnp.where(bend > 0.0, -slope / (2.0 * bend), 2.0)
+        is_inside = jnp.abs(vertex) < 1.0
+        bound = jnp.where(is_inside, last + vertex * (slope + vertex * bend), jnp.minimum(last, force))
         under_way = jnp.isinf(lost) & jnp.isinf(inverted)
         time = number * length
-        lost = jnp.where(under_way & (least < 0.0), time + jnp.where(inside, at, 0.0) * length, lost)
+        lost = jnp.where(under_way & (bound < 0.0), time + jnp.where(is_inside, vertex, 0.0) * length, lost)
         inverted = jnp.where(under_way & (problem.event_function(state) < 0.0), time, inverted)
         return (state, last, force, lost, inverted), None
 
     state = problem.start()[0]
-    force, never = dynamics.motion(state).normal_force, jnp.full(cells[0].shape, jnp.inf)
-    start = (state, force, force, never, never)
+    force, no_time = dynamics.motion(state).normal_force, jnp.full(cells[0].shape, jnp.inf)
+    start = (state, force, force, no_time, no_time)
     lost = jax.jit(lambda start: jax.lax.scan(looked, start, jnp.arange(16_000))[0][3])(start)
     return theta, spin, np.asarray(lost).reshape(37, 120)

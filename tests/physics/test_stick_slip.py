@@ -36,8 +36,8 @@ def kinds(path: HybridPath) -> list[bool]:
 def reference(body: tippe.Top, mu: float, theta: float, spin: float, t1: float) -> list[coulomb_top.Mode]:
     """The modes of the same run in plain NumPy and SciPy."""
     numbers = [float(x) for x in (body.mass, body.radius, body.offset, body.I1, body.I3)]
-    plain = coulomb_top.Body(*numbers, mu)
-    return coulomb_top.follow(plain, coulomb_top.start(plain, theta, spin), t1)
+    reference_body = coulomb_top.Body(*numbers, mu)
+    return coulomb_top.follow(reference_body, coulomb_top.start(reference_body, theta, spin), t1)
 
 
 @pytest.mark.slow
@@ -55,16 +55,16 @@ def test_cohens_top_stops_slipping_and_rolls():
     at_end = run.at([0.03, 0.05])
     assert_close(at_end.axis[1], expected[1].states[:3, -1], atol=1e-9)
     assert_close(run.scene.theta(jnp.asarray(slip.motion.states[:8, -1])), 0.0529, atol=5e-5)
-    rolls = run.t > 0.03
-    assert_close(run.energy[rolls], 2.153106e-2, rtol=1e-6)
-    assert_close(run.energy[rolls], run.energy[-1], rtol=1e-9)
+    is_rolling = run.t > 0.03
+    assert_close(run.energy[is_rolling], 2.153106e-2, rtol=1e-6)
+    assert_close(run.energy[is_rolling], run.energy[-1], rtol=1e-9)
     assert_close(run.jellett, run.jellett[0], rtol=1e-9)
-    assert_close(np.max(run.theta[rolls]), 0.0749, atol=1e-4)
+    assert_close(np.max(run.theta[is_rolling]), 0.0749, atol=1e-4)
     force = run.scene.dynamics.rolling.reaction(jnp.asarray(rolling.motion.states[:8]))
-    needed = np.hypot(force[0], force[1]) / force[2]
-    assert_close(needed[0], 0.0865, atol=1e-4)
-    assert_close(np.max(needed), 0.0910, atol=1e-4)
-    assert_close(run.slip[rolls], 0.0)
+    friction_needed = np.hypot(force[0], force[1]) / force[2]
+    assert_close(friction_needed[0], 0.0865, atol=1e-4)
+    assert_close(np.max(friction_needed), 0.0910, atol=1e-4)
+    assert_close(run.slip[is_rolling], 0.0)
 
 
 def test_a_top_that_sticks_and_slips_again():
@@ -144,8 +144,8 @@ def test_a_ball_that_friction_cannot_hold_slips_down_through_a_turn_of_its_slip(
     state, time = [0.8, 0.0, spin], 0.0
     for sign in (1.0, -1.0) if spin else (-1.0,):
         event, options = (slip if sign > 0.0 else None), {"rtol": 1e-13, "atol": 1e-15}
-        out = solve_ivp(rate, (time, 0.1), state, "DOP853", events=event, args=(sign,), **options)
-        time, state = out.t[-1], out.y[:, -1]
+        solution = solve_ivp(rate, (time, 0.1), state, "DOP853", events=event, args=(sign,), **options)
+        time, state = solution.t[-1], solution.y[:, -1]
     launch = tippe.Launch(np.pi / 2.0, spin, 0.8, np.pi / 2.0)
     run = tippe.simulate(scene, launch, 0.1, tolerance=1e-10)
     assert not any(kinds(run.dense))

@@ -33,14 +33,14 @@ def test_reversing_with_a_free_fork_jackknifes_and_settles(jackknife):
     assert run.status == "completed"
     assert run.jackknifed_at.size == 1
     P, fork_rate = float(run.state[0, 5]), float(run.state[0, 6])
-    settled = float(run.steering[-1])
+    final_steering = float(run.steering[-1])
 
     def excess(phi):
         return P * np.sin(phi) / (L * np.sqrt(front_mass(phi))) - fork_rate
 
-    sign = np.sign(settled)
+    sign = np.sign(final_steering)
     root = sign * brentq(lambda phi: excess(sign * phi), np.pi / 2, np.pi - 1e-6, xtol=1e-15)
-    np.testing.assert_allclose(settled, root, atol=1e-8)
+    np.testing.assert_allclose(final_steering, root, atol=1e-8)
     np.testing.assert_allclose(run.steering_rate[-1], 0.0, atol=1e-8)
 
 
@@ -82,12 +82,12 @@ def test_everything_is_regular_through_the_jackknife(jackknife):
     np.testing.assert_allclose(run.constraint, 0.0, atol=1e-12)
     assert np.all(np.isfinite(run.side_force))
     assert float(run.speed[0]) < 0.0 < float(run.speed[-1])
-    at = float(run.jackknifed_at[0])
+    time = float(run.jackknifed_at[0])
     single_sample = stroller.simulate(
-        scene, Launch((0.0, 0.0), 0.0, -1.2, 0.1, 0.05), 20.0, times=[at], tolerance=1e-12
+        scene, Launch((0.0, 0.0), 0.0, -1.2, 0.1, 0.05), 20.0, times=[time], tolerance=1e-12
     )
     np.testing.assert_allclose(single_sample.steering[0] % np.pi, np.pi / 2, atol=1e-10)
-    assert f"jackknifed      at {at:.6g} s" in str(run)
+    assert f"jackknifed      at {time:.6g} s" in str(run)
 
 
 def test_multiplier_form_goes_through_the_jackknife_too(jackknife):
@@ -137,8 +137,8 @@ def test_over_the_pole(side):
     scene = Scene(BODY, Spheroid(2.0, 1.1), side=side)
     launch = Launch((0.3, sign * (np.pi / 2 - 0.4)), sign * np.pi / 2, 2.0)
     run = stroller.simulate(scene, launch, 1.0, tolerance=1e-13)
-    across = run.position[:, 1] * np.cos(0.3) - run.position[:, 0] * np.sin(0.3)
-    np.testing.assert_allclose(across, 0.0, atol=1e-12)
+    sideways = run.position[:, 1] * np.cos(0.3) - run.position[:, 0] * np.sin(0.3)
+    np.testing.assert_allclose(sideways, 0.0, atol=1e-12)
     assert float(run.position[0, 0]) > 0.5 > -0.5 > float(run.position[-1, 0])
     np.testing.assert_allclose(run.energy_residual, 0.0, atol=1e-10)
 
@@ -171,11 +171,11 @@ def test_loss_of_contact_is_reported_where_the_ball_leaves_the_sphere():
     run = stroller.simulate(Scene(BODY, Sphere(R)), Launch((0.0, np.pi / 2), 0.0, v0), 1.5, tolerance=1e-10)
     assert run.status == "contact_lost"
     times = np.linspace(0.0, 1.5, 1501)
-    fine = stroller.simulate(
+    fine_run = stroller.simulate(
         Scene(BODY, Sphere(R)), Launch((0.0, np.pi / 2), 0.0, v0), 1.5, times=times, tolerance=1e-10
     )
-    np.testing.assert_allclose(run.contact_lost_at, fine.contact_lost_at, atol=1e-8)
-    height = np.interp(fine.contact_lost_at, times, np.asarray(fine.position[:, 2])) / R
+    np.testing.assert_allclose(run.contact_lost_at, fine_run.contact_lost_at, atol=1e-8)
+    height = np.interp(fine_run.contact_lost_at, times, np.asarray(fine_run.position[:, 2])) / R
     np.testing.assert_allclose(height, 2.0 / 3.0 * (1.0 + v0**2 / (2.0 * 9.81 * R)), atol=1e-5)
     assert "contact lost" in str(run)
 
@@ -195,8 +195,8 @@ def test_projected_heading_crosses_the_equator_with_its_speed_reversed():
 def test_projected_heading_loses_rank_on_the_equator():
     """Section 3: at eta = 0 with th - mu = pi/2 the rear axle's form vanishes; the run says that it came by."""
     scene = Scene(BODY, Spheroid(2.0, 1.1), heading="projected", side="inside")
-    along = jnp.array([0.0, 1e-6, np.pi / 2, 0.3])
-    W = Chart(scene).constraints(along.at[0].set(0.0).at[1].set(0.0))
+    place = jnp.array([0.0, 1e-6, np.pi / 2, 0.3])
+    W = Chart(scene).constraints(place.at[0].set(0.0).at[1].set(0.0))
     assert np.linalg.matrix_rank(np.asarray(W), tol=1e-12) == 1
     state = scene.state(Launch((0.0, -1e-6), np.pi / 2, 0.0))
     np.testing.assert_allclose(scene.rank(state), 0.0, atol=1e-10)
@@ -211,8 +211,8 @@ def test_rank_is_kept_by_the_intrinsic_heading():
     scene = Scene(BODY, Spheroid(2.0, 1.1))
     angles = jnp.linspace(-3.0, 3.0, 41)
     states = scene.state(Launch((0.0 * angles, angles / 2.1), angles, 0.0, angles))
-    least = min(M, J / L**2) / (M + J / L**2)
-    assert float(jnp.min(scene.rank(states))) >= least * (1.0 - 1e-12)
+    expected = min(M, J / L**2) / (M + J / L**2)
+    assert float(jnp.min(scene.rank(states))) >= expected * (1.0 - 1e-12)
 
 
 def test_gradients_are_finite_through_the_jackknife(jackknife):

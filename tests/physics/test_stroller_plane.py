@@ -62,10 +62,10 @@ def test_heading_on_a_tilted_plane_is_a_pendulum():
         times=times,
         tolerance=1e-14,
     )
-    turned = run.heading + np.pi / 2
-    np.testing.assert_allclose(turned, amplitude * np.array([1.0, 0.0, -1.0, 0.0, 1.0]), atol=2e-13)
+    angle = run.heading + np.pi / 2
+    np.testing.assert_allclose(angle, amplitude * np.array([1.0, 0.0, -1.0, 0.0, 1.0]), atol=2e-13)
     # Where the pendulum passes its lowest point, an error of the angle is one of the period times the rate.
-    np.testing.assert_allclose(turned[1] / (run.yaw_rate[1] * period), 0.0, atol=2e-14)
+    np.testing.assert_allclose(angle[1] / (run.yaw_rate[1] * period), 0.0, atol=2e-14)
 
 
 def test_rolling_resistance_stops_the_stroller_after_its_distance():

@@ -51,8 +51,8 @@ def test_straight_ride_is_a_geodesic_of_geographiclib(flattening):
         eta, mu = np.arctan(polar * np.tan(np.radians(destination["lat2"]))), np.radians(destination["lon2"])
         expected = [np.cos(eta) * np.cos(mu), np.cos(eta) * np.sin(mu), polar * np.sin(eta)]
         np.testing.assert_allclose(run.position[k], expected, atol=3e-12)
-        turned = np.radians(90.0 - destination["azi2"]) - run.heading[k]
-        np.testing.assert_allclose(np.angle(np.exp(1j * turned)), 0.0, atol=3e-12)
+        angle = np.radians(90.0 - destination["azi2"]) - run.heading[k]
+        np.testing.assert_allclose(np.angle(np.exp(1j * angle)), 0.0, atol=3e-12)
 
 
 def test_locked_steering_on_a_sphere_runs_a_small_circle():
@@ -92,9 +92,9 @@ def test_straight_ride_through_the_bottom_of_a_bowl_is_a_pendulum():
     scene = Scene(BODY, Sphere(R), side="inside")
     launch = Launch((0.4, amplitude - np.pi / 2), -np.pi / 2, 0.0)
     run = stroller.simulate(scene, launch, period, times=times, tolerance=1e-13)
-    away = jnp.hypot(run.position[:, 0], run.position[:, 1]) / R
-    np.testing.assert_allclose(away, np.sin(amplitude) * np.array([1.0, 0.0, 1.0, 1.0]), atol=1e-10)
-    np.testing.assert_allclose(away[1] * R / (run.speed[1] * period), 0.0, atol=1e-10)
+    radial_distance = jnp.hypot(run.position[:, 0], run.position[:, 1]) / R
+    np.testing.assert_allclose(radial_distance, np.sin(amplitude) * np.array([1.0, 0.0, 1.0, 1.0]), atol=1e-10)
+    np.testing.assert_allclose(radial_distance[1] * R / (run.speed[1] * period), 0.0, atol=1e-10)
     np.testing.assert_allclose(run.speed[1], np.sqrt(2.0 * 9.81 * R * (1.0 - np.cos(amplitude))), rtol=1e-11)
     np.testing.assert_allclose(run.normal_force[1], M * 9.81 * (3.0 - 2.0 * np.cos(amplitude)), rtol=1e-11)
     assert run.status == "completed"
@@ -144,14 +144,14 @@ def test_path_at_locked_steering_does_not_depend_on_the_forces():
     """Row 10: with gravity, friction and drive the same path is run at another speed."""
     ground, launch = Spheroid(2.0, 1.1), Launch((0.3, -0.9), 0.7, 3.0, 0.25)
     driven = Scene(BODY, ground, Damping(0.9, 0.2, 0.1), gravity=3.0)
-    slow = stroller.simulate(driven, launch, 1.0, Steady(force=1.0), tolerance=1e-13)
-    assert float(slow.speed[-1]) < 2.5
+    slow_run = stroller.simulate(driven, launch, 1.0, Steady(force=1.0), tolerance=1e-13)
+    assert float(slow_run.speed[-1]) < 2.5
     # The work of a force of 1 N is the length of the path.
-    times = slow.state[::40, 11] / 3.0
+    times = slow_run.state[::40, 11] / 3.0
     free = Scene(BODY, ground, gravity=WEIGHTLESS)
-    along = stroller.simulate(free, launch, float(times[-1]), times=times, tolerance=1e-13)
-    np.testing.assert_allclose(along.position, slow.position[::40], atol=7e-11)
-    np.testing.assert_allclose(along.direction, slow.direction[::40], atol=7e-11)
+    free_run = stroller.simulate(free, launch, float(times[-1]), times=times, tolerance=1e-13)
+    np.testing.assert_allclose(free_run.position, slow_run.position[::40], atol=7e-11)
+    np.testing.assert_allclose(free_run.direction, slow_run.direction[::40], atol=7e-11)
 
 
 @pytest.mark.slow
@@ -192,10 +192,10 @@ def test_energy_is_the_work_done(side, fork):
 def test_straight_projected_ride_is_a_vertical_section():
     """Row 14: with the paper's heading, phi = 0 goes straight in the map, and locked steering runs a circle there."""
     scene = Scene(BODY, Spheroid.from_oblate(2.0, 0.8), heading="projected")
-    straight = stroller.simulate(scene, Launch((0.3, 0.9), 0.5, 1.0), 1.0, tolerance=1e-13)
-    x, y = straight.position[:, 0], straight.position[:, 1]
-    across = (x - x[0]) * np.sin(0.5) - (y - y[0]) * np.cos(0.5)
-    np.testing.assert_allclose(across, 0.0, atol=1e-11)
+    run = stroller.simulate(scene, Launch((0.3, 0.9), 0.5, 1.0), 1.0, tolerance=1e-13)
+    x, y = run.position[:, 0], run.position[:, 1]
+    deviation = (x - x[0]) * np.sin(0.5) - (y - y[0]) * np.cos(0.5)
+    np.testing.assert_allclose(deviation, 0.0, atol=1e-11)
     steered = stroller.simulate(scene, Launch((0.3, 0.9), 0.5, 1.0, 0.5), 1.5, tolerance=1e-13)
     x, y = steered.position[:, 0], steered.position[:, 1]
     radius = L / np.tan(0.5)

@@ -28,9 +28,9 @@ class Hills(eqx.Module):
     def slopes(self, x, y):
         """Gradient and Hessian, for the reference."""
         share, kx, ky, mode = np.asarray(self.waves)
-        at, number = kx * x + ky * y + mode, np.stack([kx, ky])
+        phase, number = kx * x + ky * y + mode, np.stack([kx, ky])
         height = float(self.height)
-        return height * number @ (share * np.cos(at)), -height * (number * share * np.sin(at)) @ number.T
+        return height * number @ (share * np.cos(phase)), -height * (number * share * np.sin(phase)) @ number.T
 
 
 HILLS = Hills(0.3, np.array([[0.6, 0.5, 0.3, 0.2], [0.9, -0.4, 1.3, 0.2], [0.3, 1.1, -0.8, 1.7], [0.1, 2.0, 4.0, 5.0]]))
@@ -147,8 +147,8 @@ def test_a_straight_ride_without_gravity_is_a_geodesic(surface, geodesic):
 def circle(rear, heading, radius, distance):
     """Where a turn to the left of a given radius leads from a point of the plane."""
     centre = rear + radius * np.array([-np.sin(heading), np.cos(heading)])
-    turned = heading + distance / radius
-    return centre + radius * np.stack([np.sin(turned), -np.cos(turned)], axis=-1)
+    angle = heading + distance / radius
+    return centre + radius * np.stack([np.sin(angle), -np.cos(angle)], axis=-1)
 
 
 LOCKED = 0.3 / np.tan(0.5)
@@ -168,12 +168,12 @@ def test_a_cylinder_unrolls_and_a_huge_torus_does_so_nearly():
     run = ride(locked(scene(Cylinder(1.2), gravity=0.0)), Launch((0.2, 2.0), 0.7, 1.1, 0.5))
     expected = circle(np.array([0.2, 1.2 * 2.0]), 0.7, -LOCKED, 1.1 * TIMES)
     np.testing.assert_allclose(run.place * np.array([1.0, 1.2]), expected, atol=1e-10)
-    off = []
+    errors = []
     for ring in (1e4, 1e5):
         run = ride(locked(scene(Torus(ring, 1.2), gravity=0.0)), Launch((0.2 / ring, 2.0 - 0.5 * np.pi), 0.7, 1.1, 0.5))
         unrolled = run.place * np.array([ring, 1.2]) + np.array([0.0, 0.6 * np.pi])
-        off.append(np.max(np.abs(unrolled - expected)))
-    np.testing.assert_allclose(off[0] / off[1], 10.0, rtol=1e-2)
+        errors.append(np.max(np.abs(unrolled - expected)))
+    np.testing.assert_allclose(errors[0] / errors[1], 10.0, rtol=1e-2)
 
 
 def test_a_graph_of_zero_is_a_plane():

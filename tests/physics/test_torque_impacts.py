@@ -10,20 +10,20 @@ from hop_reference import Case, row
 from impact_reference import Body, Law
 from impact_reference import resolve_impact as reference_impact
 from test_hops import scene_of
-from test_strong_friction import COUNT, Falls, random_falls, struck
+from test_strong_friction import COUNT, Falls, impact_of, random_falls
 
 import tippe
 from tippe.model.state import angular_velocity
 from tippe.modes.free_body import balls, energy, gap_rate
 
 
-def with_torques(falls: Falls) -> Falls:
+def with_torques(impacts: Falls) -> Falls:
     """Discs of contact to a tenth of the radius, and rolling resistance."""
-    sliding, radius, random = falls.friction, falls.body.radius, np.random.default_rng(2)
+    sliding, radius, random = impacts.friction, impacts.body.radius, np.random.default_rng(2)
     disc, lever = 0.1 * radius * random.random((2, COUNT))
     contensou = tippe.Contensou(sliding.mu, disc, sliding.slip_speed)
     return eqx.tree_at(
-        lambda falls: falls.friction, falls, tippe.Rolling(lever, random.uniform(1.0, 10.0, COUNT), contensou)
+        lambda impacts: impacts.friction, impacts, tippe.Rolling(lever, random.uniform(1.0, 10.0, COUNT), contensou)
     )
 
 
@@ -31,19 +31,24 @@ def with_torques(falls: Falls) -> Falls:
 def test_impacts_with_torques():
     """The torque per unit normal force has the normal impulse as its clock too: against the independent program, 1000 end, and
     no energy comes from nowhere."""
-    falls = with_torques(random_falls(0.0, 5.0))
-    after, fails = struck(falls)
-    assert not np.asarray(fails).any()
-    free, ball, law = falls.free, balls(falls.body)[0], falls.friction
-    before = np.asarray(energy(falls.body, 9.81, free))
-    assert np.max(np.asarray(energy(falls.body, 9.81, after)) / before) < 1.0 + 1e-13
+    impacts = with_torques(random_falls(0.0, 5.0))
+    free_after, has_failed = impact_of(impacts)
+    assert not np.asarray(has_failed).any()
+    free, ball, law = impacts.free, balls(impacts.body)[0], impacts.friction
+    energy_before = np.asarray(energy(impacts.body, 9.81, free))
+    assert np.max(np.asarray(energy(impacts.body, 9.81, free_after)) / energy_before) < 1.0 + 1e-13
     numbers = (law.sliding.mu, law.sliding.slip_speed, law.sliding.contact_radius, law.resistance, law.turning_speed)
-    velocity, turning = np.stack(after.velocity), np.stack(angular_velocity(falls.body, after.axis, after.momentum))
-    falling = np.flatnonzero(-np.asarray(gap_rate(falls.body, ball, free)) > 1e-3)
-    for i in falling[:20]:
-        body = Body(*(float(getattr(falls.body, name)[i]) for name in Body._fields))
-        motion = falls.axis[:, i], falls.velocity[:, i], falls.turning[:, i]
-        expected = reference_impact(body, *motion, Law(*(float(number[i]) for number in numbers)), falls.restitution[i])
+    velocity, turning = (
+        np.stack(free_after.velocity),
+        np.stack(angular_velocity(impacts.body, free_after.axis, free_after.momentum)),
+    )
+    indices = np.flatnonzero(-np.asarray(gap_rate(impacts.body, ball, free)) > 1e-3)
+    for i in indices[:20]:
+        body = Body(*(float(getattr(impacts.body, name)[i]) for name in Body._fields))
+        motion = impacts.axis[:, i], impacts.velocity[:, i], impacts.turning[:, i]
+        expected = reference_impact(
+            body, *motion, Law(*(float(number[i]) for number in numbers)), impacts.restitution[i]
+        )
         speed = np.linalg.norm(motion[1]) + body.radius * np.linalg.norm(motion[2])
         assert_close(velocity[:, i], expected.velocity, atol=1e-9 * speed)
         assert_close(turning[:, i], expected.turning, atol=1e-9 * speed / body.radius)
@@ -52,20 +57,20 @@ def test_impacts_with_torques():
 @pytest.mark.slow
 def test_impacts_without_disc_or_lever_are_those_of_coulomb():
     """In the limit, and close by in proportion to the lever and, but for its torque, to the square of the disc's radius."""
-    falls = random_falls(0.0, 1.0)
+    impacts = random_falls(0.0, 1.0)
 
     def changed(disc, lever):
-        coulomb = falls.friction
-        contensou = tippe.Contensou(coulomb.mu, disc * falls.body.radius, coulomb.slip_speed)
-        law = tippe.Rolling(lever * falls.body.radius, np.ones(COUNT), contensou)
-        after, _ = struck(eqx.tree_at(lambda falls: falls.friction, falls, law))
-        return np.stack(after.velocity)
+        coulomb = impacts.friction
+        contensou = tippe.Contensou(coulomb.mu, disc * impacts.body.radius, coulomb.slip_speed)
+        law = tippe.Rolling(lever * impacts.body.radius, np.ones(COUNT), contensou)
+        free_after, _ = impact_of(eqx.tree_at(lambda impacts: impacts.friction, impacts, law))
+        return np.stack(free_after.velocity)
 
-    expected = np.stack(struck(falls)[0].velocity)
-    size = np.linalg.norm(falls.velocity, axis=0)
+    expected = np.stack(impact_of(impacts)[0].velocity)
+    size = np.linalg.norm(impacts.velocity, axis=0)
     assert_close(changed(0.0, 0.0) / size, expected / size, atol=1e-11)
-    for near, order in ((lambda h: changed(h, 0.0), 2.0), (lambda h: changed(0.0, h), 1.0)):
-        gaps = [np.max(np.abs(near(h) - expected) / size) for h in (2e-5, 1e-5)]
+    for law_at, order in ((lambda h: changed(h, 0.0), 2.0), (lambda h: changed(0.0, h), 1.0)):
+        gaps = [np.max(np.abs(law_at(h) - expected) / size) for h in (2e-5, 1e-5)]
         assert_close(np.log2(gaps[0] / gaps[1]), order, atol=0.05)
 
 

@@ -79,8 +79,8 @@ def from_vector_form(scene, state):
 def relative_error(value, expected, lengths):
     """Largest error of the accelerations, as a share of the largest acceleration of the same state, all in 1/s^2."""
     metric, y, radius = lengths.T
-    ones = jnp.ones_like(radius)
-    units = jnp.stack([metric / radius, y / radius, ones, ones, ones], axis=1)
+    one = jnp.ones_like(radius)
+    units = jnp.stack([metric / radius, y / radius, one, one, one], axis=1)
     return jnp.max(jnp.abs(value - expected) * units, axis=1) / jnp.max(jnp.abs(expected) * units, axis=1)
 
 
@@ -111,14 +111,14 @@ def test_rutstam_and_the_jellett_reduction_give_the_accelerations_of_the_vector_
     @eqx.filter_vmap
     def errors(scene, state):
         rate = scene.field(state)
-        small = jnp.array([1.0, 1.0, 1.0, 1.0, scene.body.radius, scene.body.radius])
+        scales = jnp.array([1.0, 1.0, 1.0, 1.0, scene.body.radius, scene.body.radius])
         chart, expected = jax.jvp(lambda s: reduced.rutstam_state(scene, s), (state,), (rate,))
-        rutstam = (reduced.rutstam_rate(scene, chart) - expected) / small
+        rutstam = (reduced.rutstam_rate(scene, chart) - expected) / scales
 
         chart, expected = jax.jvp(lambda s: reduced.jellett_state(scene, s), (state,), (rate,))
         jellett_rate = reduced.jellett_rate(scene, chart, scene.jellett(state))
-        small = reduced.JellettState(1.0, 1.0, scene.body.I3, scene.body.radius, scene.body.radius)
-        jellett = jnp.stack(jax.tree.map(lambda a, b, unit: (a - b) / unit, jellett_rate, expected, small))
+        scales = reduced.JellettState(1.0, 1.0, scene.body.I3, scene.body.radius, scene.body.radius)
+        jellett = jnp.stack(jax.tree.map(lambda a, b, unit: (a - b) / unit, jellett_rate, expected, scales))
         # Rates in 1/s^2, as a share of the squared angular velocity and of g / R together.
         w = jnp.linalg.norm(state[5:8]) / scene.body.I1
         scale = w**2 + scene.gravity / scene.body.radius
@@ -160,8 +160,8 @@ def test_the_general_reduction_by_a_cyclic_angle_gives_the_accelerations_of_the_
     @eqx.filter_vmap
     def accelerations(scene, angles):
         q, rate = poincare.from_angles(angles)
-        full = poincare.TopSystem(scene)
-        reduced_system = formulation.Routhian(full, poincare.PSI, full.metric(q)[poincare.PSI] @ rate)
+        system = poincare.TopSystem(scene)
+        reduced_system = formulation.Routhian(system, poincare.PSI, system.metric(q)[poincare.PSI] @ rate)
         return formulation.Hamel(reduced_system).acceleration(0.0, q[: poincare.PSI], rate[: poincare.PSI])
 
     acceleration = accelerations(scenes, chart)
@@ -210,26 +210,26 @@ def top(ratio=131 / 350):
 
 def run(parts, t1, count=26):
     """Integrate several fields side by side with DOP853 at 1e-12; (field, start, size of a component) each."""
-    starts = [np.asarray(start) for _, start, _ in parts]
+    start_states = [np.asarray(start) for _, start, _ in parts]
     sizes = [np.broadcast_to(size, np.shape(start)) for _, start, size in parts]
-    ends = np.cumsum([len(start) for start in starts])
-    begins = ends - [len(start) for start in starts]
+    ends = np.cumsum([len(start) for start in start_states])
+    start_indices = ends - [len(start) for start in start_states]
 
     @jax.jit
     def rate(y):
-        return jnp.concatenate([field(y[i:j]) for (field, _, _), i, j in zip(parts, begins, ends, strict=True)])
+        return jnp.concatenate([field(y[i:j]) for (field, _, _), i, j in zip(parts, start_indices, ends, strict=True)])
 
     solution = solve_ivp(
         lambda _, y: np.asarray(rate(y)),
         (0.0, t1),
-        np.concatenate(starts),
+        np.concatenate(start_states),
         method="DOP853",
         rtol=1e-12,
         atol=1e-14 * np.concatenate(sizes),
         t_eval=np.linspace(0.0, t1, count),
     )
     assert solution.success
-    return [solution.y[i:j] for i, j in zip(begins, ends, strict=True)]
+    return [solution.y[i:j] for i, j in zip(start_indices, ends, strict=True)]
 
 
 ANGLES = np.array([1.0, 1.0, 1.0, 10.0, 0.1, 10.0, 10.0, 10.0])

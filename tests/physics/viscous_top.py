@@ -35,11 +35,11 @@ def _load(contact: Contact) -> float:
 def follow(body: Body, state: np.ndarray, times: np.ndarray, rtol: float = 1e-9) -> np.ndarray:
     """States (12, times) at times [s], which increase from 0 or later; before that the top is where it starts."""
     atol = rtol * np.repeat([1.0, np.sqrt(body.gravity * body.radius), 100.0, body.radius], 3)
-    since = np.maximum(times, 0.0)
-    span = (0.0, since[-1])
-    run = solve_ivp(rate(body), span, state, "DOP853", t_eval=np.unique(since), rtol=rtol, atol=atol)
+    elapsed = np.maximum(times, 0.0)
+    span = (0.0, elapsed[-1])
+    run = solve_ivp(rate(body), span, state, "DOP853", t_eval=np.unique(elapsed), rtol=rtol, atol=atol)
     assert run.success, run.message
-    return run.y[:, np.searchsorted(run.t, since)]
+    return run.y[:, np.searchsorted(run.t, elapsed)]
 
 
 def azimuth(states: np.ndarray) -> np.ndarray:

@@ -38,9 +38,9 @@ def open_browser(size: str = "500,500") -> Iterator[Any]:
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     driver = Chrome(options=options, service=Service(DRIVER))
     try:
-        off = {"offline": True, "latency": 0, "downloadThroughput": 0, "uploadThroughput": 0}
+        network = {"offline": True, "latency": 0, "downloadThroughput": 0, "uploadThroughput": 0}
         driver.execute_cdp_cmd("Network.enable", {})
-        driver.execute_cdp_cmd("Network.emulateNetworkConditions", off)
+        driver.execute_cdp_cmd("Network.emulateNetworkConditions", network)
         yield driver
     finally:
         driver.quit()
@@ -48,9 +48,9 @@ def open_browser(size: str = "500,500") -> Iterator[Any]:
 
 def wait(driver: Any, script: str) -> None:
     """Wait until a script returns what counts as true."""
-    until = time.monotonic() + 60.0
+    deadline = time.monotonic() + 60.0
     while not driver.execute_script(script):
-        assert time.monotonic() < until, driver.get_log("browser")
+        assert time.monotonic() < deadline, driver.get_log("browser")
         time.sleep(0.05)
 
 

@@ -27,9 +27,9 @@ def followed():
 
 
 def run_of_nothing():
-    nothing = jnp.zeros(3)
+    zero = jnp.zeros(3)
     states = jnp.tile(TOP.state(LAUNCH)[:, None], 3)
-    return tippe.Trajectory(nothing, TOP, states, jnp.zeros((5, 3)), nothing, nothing, 0, nothing[0], {}, None)
+    return tippe.Trajectory(zero, TOP, states, jnp.zeros((5, 3)), zero, zero, 0, zero[0], {}, None)
 
 
 def density_of_a_film():

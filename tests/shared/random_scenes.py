@@ -62,11 +62,11 @@ def batch(kind: str, count: int, seed: int = 11) -> Batch:
         "launch.spin": spin,
         "launch.azimuth": random.uniform(-np.pi, np.pi, count),
     }
-    surface, place, more = _arena(arena, R, random.uniform(5.0, 30.0, count), random)
+    surface, place, extra_options = _arena(arena, R, random.uniform(5.0, 30.0, count), random)
     slip_speed = random.uniform(0.02, 0.2, count)
     friction, of_law = _law(law, mu, slip_speed, R, random)
     options: dict[str, Any] = {}
-    columns |= more | of_law
+    columns |= extra_options | of_law
     if contact == "hybrid":
         options = {"contact": "hybrid", "restitution": 0.3}
         columns["scene.restitution"] = random.uniform(0.0, 0.8, count)

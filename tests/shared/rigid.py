@@ -42,8 +42,8 @@ def egg() -> tippe.SpheroidBody:
 def turned_anyhow(states):
     """States of a top with an x axis of the body, anywhere across the axis."""
     random, axis = np.random.default_rng(3), np.asarray(states[2:5]).T
-    across = np.cross(axis, random.normal(size=axis.shape))
-    return jnp.concatenate([states, (across / np.linalg.norm(across, axis=1, keepdims=True)).T])
+    transverse = np.cross(axis, random.normal(size=axis.shape))
+    return jnp.concatenate([states, (transverse / np.linalg.norm(transverse, axis=1, keepdims=True)).T])
 
 
 def odd_scene(law: tippe.AbstractFriction, inertia=ODD_INERTIA) -> tippe.Scene:

@@ -7,13 +7,13 @@ WRITE = running.ChunkStore.write
 
 def recorded(monkeypatch, most=None):
     """The list of the blocks that are written from now on; with `most` of them written the run is interrupted."""
-    done = []
+    chunks = []
 
     def write(self, block, values):
-        if len(done) == most:
+        if len(chunks) == most:
             raise KeyboardInterrupt
-        done.append(block)
+        chunks.append(block)
         WRITE(self, block, values)
 
     monkeypatch.setattr(running.ChunkStore, "write", write)
-    return done
+    return chunks

@@ -19,10 +19,10 @@ def sideways(torque, scene=DAMPED, steering=0.0, t1=10.0, **options):
     return ride.position[-1, 1]
 
 
-def extrapolated(function, at, step):
+def extrapolated(function, value, step):
     """A central difference, extrapolated from two steps."""
-    fine, coarse = ((function(at + h) - function(at - h)) / (2.0 * h) for h in (step, 2.0 * step))
-    return (4.0 * fine - coarse) / 3.0
+    fine_slope, coarse = ((function(value + h) - function(value - h)) / (2.0 * h) for h in (step, 2.0 * step))
+    return (4.0 * fine_slope - coarse) / 3.0
 
 
 def test_a_torque_on_a_steering_at_rest():
@@ -116,23 +116,24 @@ def test_random_rides_with_components_at_rest():
     sizes = np.where(points == 0.0, 1.0, np.abs(points))
     for k in (0, 3, 7, 8, 9, 10):
         step = 1e-4 * sizes[:, k]
-        fine, coarse = (
+        fine_slope, coarse = (
             (ends(points.at[:, k].add(h)) - ends(points.at[:, k].add(-h))) / (2.0 * h) for h in (step, 2.0 * step)
         )
         scale = np.max(np.abs(gradients), axis=1)
-        error = np.abs(gradients[:, k] - (4.0 * fine - coarse) / 3.0)
+        error = np.abs(gradients[:, k] - (4.0 * fine_slope - coarse) / 3.0)
         assert np.all(error < 1e-6 * scale / sizes[:, k].clip(max=1.0)), (k, error / scale)
 
 
 @pytest.mark.parametrize(
     ("transform", "options"),
-    [(jax.grad, {}), pytest.param(jax.jacfwd, {"adjoint": diffrax.ForwardMode()}, marks=pytest.mark.slow)],
+    [(jax.grad, {}), (jax.jacfwd, {"adjoint": diffrax.ForwardMode()})],
 )
+@pytest.mark.slow
 def test_the_midpoint_rule_is_differentiated_by_either_way(transform, options):
     """Its steps have a given length, whoever differentiates them."""
 
-    def end(torque, **more):
-        return sideways(torque, t1=1.0, solver=stroller.ImplicitMidpoint(0.1), **more)
+    def end(torque, **extra_options):
+        return sideways(torque, t1=1.0, solver=stroller.ImplicitMidpoint(0.1), **extra_options)
 
     derivative = transform(lambda torque: end(torque, **options))(0.1)
     np.testing.assert_allclose(derivative, extrapolated(end, 0.1, 1e-4), rtol=1e-7)

@@ -48,10 +48,10 @@ def test_ten_rides_end_where_those_of_the_table_end(browser, name):
     options = {"input": controls, "tolerance": TOLERANCE, "progress": False}
     table = stroller.sweep(scene, launch, 2.0, axes=axes, **options)
     roots = {"scene": scene, "launch": launch}
-    live = live_run(roots, sliders_of(RANGES, roots, {}, {}), 2.0, controls)
+    live_page_run = live_run(roots, sliders_of(RANGES, roots, {}, {}), 2.0, controls)
     runs = np.stack([part.ravel() for part in np.meshgrid(*axes.values(), indexing="ij")], axis=-1)
     browser.get("about:blank")
-    script = f"""{programs(live)}
+    script = f"""{programs(live_page_run)}
         const asks = integrator(live.answer), moves = integrator(live.motion), text = (x) => Number.isFinite(x) ? x : String(x);
         return {json.dumps(runs.tolist())}.map((values) => {{
           asks.run(values);
@@ -88,9 +88,9 @@ def test_the_page_opens_and_rides_anew(browser, tmp_path):
     browser.get_log("browser")
     browser.get(path.as_uri())
     wait(browser, "return !!(window.live && live.ready)")
-    before = browser.execute_script("return live.outcome.value")
+    value_before = browser.execute_script("return live.outcome.value")
     browser.execute_script("live.set([1.0, 0.0])")
-    wait(browser, f"return live.outcome.value < {before!r}")
+    wait(browser, f"return live.outcome.value < {value_before!r}")
     assert complaints(browser) == []
 
 

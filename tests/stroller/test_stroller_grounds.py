@@ -72,14 +72,14 @@ def test_a_place_may_be_a_point_in_space(surface, place):
     scene = Scene(BODY, surface, Frictionless())
     position = surface.chart(tuple(jnp.asarray(part) for part in place))[0]
     point = np.array(surface.in_fixed_frame(position))
-    near = Launch(tuple(point + 1e-11), 0.7, 1.0)
-    scene.check(near)
-    assert bool(scene.may_start(near))
-    np.testing.assert_allclose(scene.state(near), scene.state(Launch(place, 0.7, 1.0)), atol=3e-11)
-    away = Launch(tuple(point + 1e-4), 0.7, 1.0)
+    launch_nearby = Launch(tuple(point + 1e-11), 0.7, 1.0)
+    scene.check(launch_nearby)
+    assert bool(scene.may_start(launch_nearby))
+    np.testing.assert_allclose(scene.state(launch_nearby), scene.state(Launch(place, 0.7, 1.0)), atol=3e-11)
+    launch_off_ground = Launch(tuple(point + 1e-4), 0.7, 1.0)
     with pytest.raises(ValueError, match=r"distance = .* must be at (most|least) .*place from the surface"):
-        scene.check(away)
-    assert not bool(scene.may_start(away))
+        scene.check(launch_off_ground)
+    assert not bool(scene.may_start(launch_off_ground))
 
 
 def test_numbers_of_a_place_are_named_as_the_surface_names_them():
@@ -115,8 +115,8 @@ def test_what_a_surface_has_not_is_refused(build, message):
 def test_lanes_with_their_own_places_and_hills_are_single_scenes():
     """The field of a table's cells, of which every number of launch, surface and body is its own."""
     heights, places = np.array([0.5, 0.9, -0.4]), np.array([[-2.0, 0.1, 1.0], [0.3, 0.2, -0.5]])
-    many = eqx.tree_at(lambda hill: hill.surface.height.height, HILL, jnp.asarray(heights))
-    problem = RideProblem.of(many, Launch(tuple(places), 0.1, 2.5, 0.2), None, 3, True)
+    batch = eqx.tree_at(lambda hill: hill.surface.height.height, HILL, jnp.asarray(heights))
+    problem = RideProblem.of(batch, Launch(tuple(places), 0.1, 2.5, 0.2), None, 3, True)
     field = eqx.filter_jit(lambda problem: problem.field(jnp.zeros(3), problem.states))(problem)
     for k, height in enumerate(heights):
         hill = eqx.tree_at(lambda scene: scene.surface.height.height, HILL, jnp.asarray(height))
@@ -161,9 +161,9 @@ def test_derivatives_by_the_ground():
     step = 1e-4
     expected = (float(end(0.8 + step, Hill)) - float(end(0.8 - step, Hill))) / (2.0 * step)
     for ground in (Hill, closed):
-        np.testing.assert_allclose(jax.grad(lambda height, of=ground: end(height, of))(0.8), expected, rtol=1e-6)
-    many = jax.vmap(lambda height: end(height, Hill))(jnp.array([0.5, 0.8]))
-    np.testing.assert_allclose(many[1], end(0.8, Hill), rtol=1e-9)
+        np.testing.assert_allclose(jax.grad(lambda height, kind=ground: end(height, kind))(0.8), expected, rtol=1e-6)
+    batch = jax.vmap(lambda height: end(height, Hill))(jnp.array([0.5, 0.8]))
+    np.testing.assert_allclose(batch[1], end(0.8, Hill), rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -179,17 +179,17 @@ def test_a_hill_is_found_from_a_ride_over_it():
 def test_an_implicit_ground_is_that_with_the_name():
     """Inside a spheroid, from a point in space."""
     place, damping = (0.3, -0.9), Damping(0.3, 0.1, 0.1, 0.05)
-    named = Scene(BODY, Spheroid(2.0, 1.1), damping, side="inside")
-    run = stroller.simulate(named, Launch(place, 0.4, 1.5, 0.2), 3.0, tolerance=1e-11)
+    scene_by_name = Scene(BODY, Spheroid(2.0, 1.1), damping, side="inside")
+    run = stroller.simulate(scene_by_name, Launch(place, 0.4, 1.5, 0.2), 3.0, tolerance=1e-11)
     scene = Scene(BODY, Implicit(Ball(2.0, 1.1)), damping)
     # Its east is the projection of x, and its left is that of the driver.
     east = np.array(scene.surface.chart(tuple(run.position[0]))[1])
     north = np.array(scene.surface.chart(tuple(run.position[0]))[2])
     heading = np.arctan2(run.direction[0] @ north, run.direction[0] @ east)
-    same = stroller.simulate(scene, Launch(tuple(run.position[0]), heading, 1.5, 0.2), 3.0, tolerance=1e-11)
-    assert same.place.shape == (201, 3)
-    np.testing.assert_allclose(same.position, run.position, atol=1e-8)
-    np.testing.assert_allclose(same.side_force, run.side_force, atol=1e-7)
+    run_again = stroller.simulate(scene, Launch(tuple(run.position[0]), heading, 1.5, 0.2), 3.0, tolerance=1e-11)
+    assert run_again.place.shape == (201, 3)
+    np.testing.assert_allclose(run_again.position, run.position, atol=1e-8)
+    np.testing.assert_allclose(run_again.side_force, run.side_force, atol=1e-7)
 
 
 @pytest.mark.slow

@@ -92,9 +92,9 @@ def map_of(scene: Scene, launch: Launch, start, end):
     """
     components, lanes = start.shape
     nudges = NUDGE * np.concatenate([np.zeros((1, components)), np.eye(components)])
-    nudged = start + nudges[:, :, None] * weights_of(scene, launch, start)
-    starts = np.swapaxes(nudged, 0, 1).reshape(components, -1)
-    ends = ride(scene, launch, 1e-11, starts, horizon=HORIZON / STRETCHES).state.reshape(components, -1, lanes)
+    states = start + nudges[:, :, None] * weights_of(scene, launch, start)
+    start_states = np.swapaxes(states, 0, 1).reshape(components, -1)
+    ends = ride(scene, launch, 1e-11, start_states, horizon=HORIZON / STRETCHES).state.reshape(components, -1, lanes)
     return np.transpose((ends[:, 1:] - ends[:, :1]) / (NUDGE * weights_of(scene, launch, end)[:, None]), (2, 0, 1))
 
 
@@ -106,12 +106,12 @@ def growth_of(maps):
     **Returns:** the growth, infinite where the changes that were followed did not stay small.
     """
     total = np.broadcast_to(np.eye(maps[0].shape[-1]), maps[0].shape)
-    most = row_norms(total).max(axis=-1)
+    largest = row_norms(total).max(axis=-1)
     for matrix in maps:
         total = total @ matrix
-        most = np.maximum(most, row_norms(total).max(axis=-1))
-    followed = np.max([row_norms(matrix).max(axis=-1) for matrix in maps], axis=0)
-    return np.where(NUDGE * followed < SMALL, most, np.inf)
+        largest = np.maximum(largest, row_norms(total).max(axis=-1))
+    size = np.max([row_norms(matrix).max(axis=-1) for matrix in maps], axis=0)
+    return np.where(NUDGE * size < SMALL, largest, np.inf)
 
 
 def first_integrals(scene: Scene, states):
@@ -120,13 +120,13 @@ def first_integrals(scene: Scene, states):
     """
     position, heading, (_, _, _, sine, cosine, work) = scene.dynamics.unpack(states)
     length = jnp.sqrt(sum(part * part for part in heading if part is not None))
-    along, off = jnp.zeros_like(length), jnp.zeros_like(length)
+    slope_along, offset = jnp.zeros_like(length), jnp.zeros_like(length)
     if not isinstance(scene.surface, Plane):
-        off = scene.surface.offset(position)
+        offset = scene.surface.offset(position)
         if scene.heading == "intrinsic":
-            along = sum(a * b for a, b in zip(heading, scene.surface.normal(position), strict=True))
+            slope_along = sum(a * b for a, b in zip(heading, scene.surface.normal(position), strict=True))
     steering = jnp.sqrt(sine * sine + cosine * cosine) - 1.0
-    return jnp.stack([length - 1.0, along, off, steering, scene.energy(states) - work])
+    return jnp.stack([length - 1.0, slope_along, offset, steering, scene.energy(states) - work])
 
 
 @eqx.filter_jit
@@ -150,33 +150,37 @@ def check_a_batch(scene: Scene, launch: Launch, knots, kink):
     outcome = ride(scene, launch, tolerance)
     assert np.isfinite(outcome.state).all()
     assert np.isin(outcome.status, [REACHED_END, LEFT_DOMAIN] if scene.heading == "projected" else [REACHED_END]).all()
-    most = 0.0
+    largest = 0.0
     for knot in knots:
         slopes = np.asarray(integrals_and_slopes(scene, jnp.asarray(knot))[1]) * weights_of(scene, launch, knot)
-        most = np.maximum(most, row_norms(np.swapaxes(slopes, 1, 2)))
-    before, after = (np.asarray(integrals_and_slopes(scene, at)[0]) for at in (scene.state(launch), outcome.state))
+        largest = np.maximum(largest, row_norms(np.swapaxes(slopes, 1, 2)))
+    integrals_before, integrals_after = (
+        np.asarray(integrals_and_slopes(scene, state)[0]) for state in (scene.state(launch), outcome.state)
+    )
     steps = np.asarray(outcome.steps)
     # What vanishes identically, as on a plane, has no slope.
-    errors = np.abs(after - before) / np.where(most > 0.0, tolerance * steps * most, np.finfo(float).tiny)
+    errors = np.abs(integrals_after - integrals_before) / np.where(
+        largest > 0.0, tolerance * steps * largest, np.finfo(float).tiny
+    )
     work, weight = np.asarray(outcome.state[-1]), weights_of(scene, launch, knots[-1])[-1]
-    gained = np.maximum(work, 0.0) / (math.sqrt(len(knots[0])) * tolerance * steps * weight)
-    return np.where(kink, 0.0, np.max([*errors, gained], axis=0))
+    excess = np.maximum(work, 0.0) / (math.sqrt(len(knots[0])) * tolerance * steps * weight)
+    return np.where(kink, 0.0, np.max([*errors, excess], axis=0))
 
 
 def signs_of(scene: Scene, place, heading, remainder):
     """A column of signs for the components of a state."""
-    turned = scene.dynamics.heading.axes(scene.surface)
-    return np.array([*place[: scene.surface.axes], *heading[:turned], *remainder])[:, None]
+    heading_axes = scene.dynamics.heading.axes(scene.surface)
+    return np.array([*place[: scene.surface.axes], *heading[:heading_axes], *remainder])[:, None]
 
 
 def check_mirror(scene: Scene, launch: Launch):
     """In a mirror across y the ride is the same to the last bit, with left for right, and takes the same steps."""
     signs = signs_of(scene, (1, -1, 1), (1, -1, 1), (-1, 1, -1, -1, 1, 1))
-    straight, mirrored = ride(scene, launch), ride(scene, launch, states=signs * scene.state(launch))
-    np.testing.assert_array_equal(mirrored.status, straight.status)
-    np.testing.assert_array_equal(mirrored.steps, straight.steps)
-    np.testing.assert_array_equal(mirrored.end_time, straight.end_time)
-    np.testing.assert_array_equal(signs * mirrored.state, straight.state)
+    unmirrored, mirrored = ride(scene, launch), ride(scene, launch, states=signs * scene.state(launch))
+    np.testing.assert_array_equal(mirrored.status, unmirrored.status)
+    np.testing.assert_array_equal(mirrored.steps, unmirrored.steps)
+    np.testing.assert_array_equal(mirrored.end_time, unmirrored.end_time)
+    np.testing.assert_array_equal(signs * mirrored.state, unmirrored.state)
 
 
 def check_units(scene: Scene, launch: Launch, exponents: tuple[int, int, int]):
@@ -202,20 +206,22 @@ def check_units(scene: Scene, launch: Launch, exponents: tuple[int, int, int]):
         )
 
     parts = (converted(part) for part in (scene.body, scene.surface, scene.friction))
-    other = Scene(*parts, scene.gravity * length / time**2, scene.side, scene.fork, scene.heading)
+    scaled_scene = Scene(*parts, scene.gravity * length / time**2, scene.side, scene.fork, scene.heading)
     place = launch.place
     if isinstance(scene.surface, Plane):
         place = tuple(part * length for part in place)
-    moved = Launch(place, launch.heading, launch.speed * length / time, launch.steering, launch.steering_rate / time)
+    scaled_launch = Launch(
+        place, launch.heading, launch.speed * length / time, launch.steering, launch.steering_rate / time
+    )
     remainder = (1.0, math.sqrt(mass) * length / time, 1.0 / time, 1.0, 1.0, inertia / time**2)
     sizes = signs_of(scene, (length,) * 3, (1.0,) * 3, remainder)
-    near = ride(scene, launch)
+    ride_of_scene = ride(scene, launch)
     # The scales have a least rate of 1e-3 rad/s in them, so that rest has a scale.
-    far = ride(other, moved, scales=sizes * scene.scales(launch), horizon=HORIZON * time)
-    np.testing.assert_array_equal(far.status, near.status)
-    np.testing.assert_array_equal(far.steps, near.steps)
-    np.testing.assert_array_equal(far.end_time / time, near.end_time)
-    np.testing.assert_array_equal(far.state / sizes, near.state)
+    scaled_ride = ride(scaled_scene, scaled_launch, scales=sizes * scene.scales(launch), horizon=HORIZON * time)
+    np.testing.assert_array_equal(scaled_ride.status, ride_of_scene.status)
+    np.testing.assert_array_equal(scaled_ride.steps, ride_of_scene.steps)
+    np.testing.assert_array_equal(scaled_ride.end_time / time, ride_of_scene.end_time)
+    np.testing.assert_array_equal(scaled_ride.state / sizes, ride_of_scene.state)
 
 
 def missed_by(scene, launch, states, reference_states, tolerance, steps, growth):
@@ -257,9 +263,9 @@ def check_reversal(scene: Scene, launch: Launch):
     knots = signs * knots_of(smooth, launch, STRETCHES)
     growth = growth_of([map_of(smooth, launch, a, b) for a, b in zip(knots[1:], knots[:-1], strict=True)])
     steps = arrival.steps + return_ride.steps
-    missed, mask = missed_by(smooth, launch, smooth.state(launch), signs * return_ride.state, tolerance, steps, growth)
-    stays = mask & reached(arrival, return_ride)
-    return np.where(stays, missed, 0.0), stays
+    error, mask = missed_by(smooth, launch, smooth.state(launch), signs * return_ride.state, tolerance, steps, growth)
+    is_valid = mask & reached(arrival, return_ride)
+    return np.where(is_valid, error, 0.0), is_valid
 
 
 def check_moving(scene: Scene, launch: Launch, angle: float, knots, kink):
@@ -270,7 +276,7 @@ def check_moving(scene: Scene, launch: Launch, angle: float, knots, kink):
     tolerance, flat = 1e-11, isinstance(scene.surface, Plane)
     cosine, sine = math.cos(angle), math.sin(angle)
 
-    def moved(state):
+    def scaled_launch(state):
         state = np.array(state)
         if flat:
             state[:2] += np.array([[cosine], [sine]]) * np.asarray(scene.body.wheelbase)
@@ -281,12 +287,15 @@ def check_moving(scene: Scene, launch: Launch, angle: float, knots, kink):
         return state
 
     states = scene.state(launch)
-    plain_ride, moved_ride = ride(scene, launch, tolerance, states), ride(scene, launch, tolerance, moved(states))
+    plain_ride, moved_ride = (
+        ride(scene, launch, tolerance, states),
+        ride(scene, launch, tolerance, scaled_launch(states)),
+    )
     growth = growth_of([map_of(scene, launch, a, b) for a, b in zip(knots[:-1], knots[1:], strict=True)][::-1])
     steps = plain_ride.steps + moved_ride.steps
-    missed, mask = missed_by(scene, launch, moved(plain_ride.state), moved_ride.state, tolerance, steps, growth)
-    stays = mask & reached(plain_ride, moved_ride) & ~kink
-    return np.where(stays, missed, 0.0), stays
+    error, mask = missed_by(scene, launch, scaled_launch(plain_ride.state), moved_ride.state, tolerance, steps, growth)
+    is_valid = mask & reached(plain_ride, moved_ride) & ~kink
+    return np.where(is_valid, error, 0.0), is_valid
 
 
 def check_everything(batch, angle, exponents):
@@ -297,10 +306,10 @@ def check_everything(batch, angle, exponents):
     assert np.all(errors < 1.0), errors
     check_mirror(scene, launch)
     check_units(scene, launch, exponents)
-    for missed, stays in (check_reversal(scene, launch), check_moving(scene, launch, angle, knots, kink)):
-        assert np.all(missed < 1.0), missed
+    for error, is_valid in (check_reversal(scene, launch), check_moving(scene, launch, angle, knots, kink)):
+        assert np.all(error < 1.0), error
         # A quarter of a batch at least, or little would be tested.
-        assert stays.mean() >= 0.25
+        assert is_valid.mean() >= 0.25
 
 
 def batches(kind):

@@ -64,9 +64,9 @@ def test_table_is_labelled_and_its_file_opens_in_xarray(bowl):
     assert table.shape == (2,) * 6
     assert np.all(table.status == "completed")
     assert np.all(np.abs(table.residual) < 1e-8)
-    with xarray.open_dataset(path, engine="h5netcdf") as stored:
-        np.testing.assert_array_equal(stored["end_speed"].values, table.end_speed)
-        assert stored["wheelbase"].attrs["units"] == "m"
+    with xarray.open_dataset(path, engine="h5netcdf") as dataset:
+        np.testing.assert_array_equal(dataset["end_speed"].values, table.end_speed)
+        assert dataset["wheelbase"].attrs["units"] == "m"
     np.testing.assert_array_equal(Table.load(path).x, table.x)
 
 
@@ -94,8 +94,8 @@ def test_lost_contact_is_marked_with_its_time():
     assert list(table.status) == ["completed", "contact_lost"]
     assert table.contact_time[0] == np.inf
     assert table.end_time[1] == 1.4
-    at = float(table.contact_time[1])
-    run = stroller.simulate(scene, launch, 1.4, times=[at, 1.4], tolerance=1e-11)
+    contact_time = float(table.contact_time[1])
+    run = stroller.simulate(scene, launch, 1.4, times=[contact_time, 1.4], tolerance=1e-11)
     expected = 1.4 * 2.0 / 3.0 * (1.0 + 0.5**2 / (2.0 * 9.81 * 1.4))
     np.testing.assert_allclose(run.position[0, 2], expected, rtol=1e-8)
     np.testing.assert_allclose(table.z[1], run.position[1, 2], atol=1e-8)
@@ -112,16 +112,16 @@ def test_places_are_axes_too(places):
     """On a level plane the ride does not depend on where it starts."""
     table = places
     assert list(table.coords) == ["x0", "y0"]
-    moved = table.x - table.coords["x0"][:, None]
-    np.testing.assert_allclose(moved, moved[0, 0], atol=1e-12)
+    distance = table.x - table.coords["x0"][:, None]
+    np.testing.assert_allclose(distance, distance[0, 0], atol=1e-12)
     R = 0.7 / np.tan(0.3)
-    np.testing.assert_allclose(moved[0, 0], R * (np.sin(0.5 + 2.0 / R) - np.sin(0.5)), atol=1e-8)
+    np.testing.assert_allclose(distance[0, 0], R * (np.sin(0.5 + 2.0 / R) - np.sin(0.5)), atol=1e-8)
 
 
 def test_a_map_shows_its_values_and_is_grey_only_where_there_is_none(places):
     drawing = places.plot("energy").axes[0]
-    (shown,) = drawing.collections
-    np.testing.assert_array_equal(shown.get_array(), places.energy.T)
+    (image,) = drawing.collections
+    np.testing.assert_array_equal(image.get_array(), places.energy.T)
     assert drawing.get_legend() is None
     # The ground never has to pull, so no cell has a time at which it did.
     drawing = places.plot("contact_time").axes[0]
@@ -171,11 +171,11 @@ def test_main_job(tmp_path, capsys, monkeypatch):
     assert 'id="floats"' in page
     assert audit[0][-1] in page
     assert f"To see it, open {tmp_path / 'index.html'}" in printed
-    with xarray.open_dataset(tmp_path / "rides.h5", engine="h5netcdf") as stored:
-        assert {"ride": 2, "time": 201}.items() <= dict(stored.sizes).items()
-        energy = stored["energy"].values
-        np.testing.assert_allclose(energy, energy[:, :1] + stored["work"].values, atol=1e-8)
-        assert float(jnp.max(stored["friction_power"].values[1])) < 0.0
+    with xarray.open_dataset(tmp_path / "rides.h5", engine="h5netcdf") as dataset:
+        assert {"ride": 2, "time": 201}.items() <= dict(dataset.sizes).items()
+        energy = dataset["energy"].values
+        np.testing.assert_allclose(energy, energy[:, :1] + dataset["work"].values, atol=1e-8)
+        assert float(jnp.max(dataset["friction_power"].values[1])) < 0.0
     monkeypatch.setattr(job, "computed", lambda options: {})
     assert main([*arguments, "--out", str(tmp_path / "again")]) == 0
     again = capsys.readouterr().out

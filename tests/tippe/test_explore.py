@@ -62,10 +62,10 @@ def table_of(scene: tippe.Scene, launch: tippe.Launch, grid: dict[str, np.ndarra
     return tippe.inversion_table(scene, **grid, **options)
 
 
-def answers(browser, live, values: np.ndarray) -> np.ndarray:
+def answers(browser, page_run, values: np.ndarray) -> np.ndarray:
     """Status, time of the event, end and final angle of runs in the browser; `values`: of the sliders, (runs, sliders)."""
     browser.get("about:blank")
-    script = f"""{programs(live)}
+    script = f"""{programs(page_run)}
         const asks = integrator(live.answer), at = live.answer.lane, text = (x) => Number.isFinite(x) ? x : String(x);
         return {json.dumps(values.tolist())}.map((values) => {{
           const lane = asks.run(values), cosine = lane[at.state + 4];
@@ -79,10 +79,10 @@ def answers(browser, live, values: np.ndarray) -> np.ndarray:
 )
 def test_the_browser_says_what_the_table_says(browser, arena, law):
     scene, launch, grid = launches_of(arena, law, CASES.index((arena, law)))
-    live = live_run(scene, launch, RANGES, HORIZONS[law])
+    page_run = live_run(scene, launch, RANGES, HORIZONS[law])
     table = table_of(scene, launch, grid, HORIZONS[law])
     theta, mu, spin = (values.ravel() for values in np.meshgrid(grid["theta"], grid["mu"], grid["spin"], indexing="ij"))
-    status, time, end, angle = answers(browser, live, np.stack([theta, spin, mu], axis=-1))
+    status, time, end, angle = answers(browser, page_run, np.stack([theta, spin, mu], axis=-1))
     assert [tippe.Status(int(code)).word for code in status] == list(np.ravel(table.status))
     np.testing.assert_allclose(time, np.ravel(table.time), rtol=CLOSE)
     np.testing.assert_allclose(end, np.ravel(table.end_time), rtol=CLOSE)
@@ -94,33 +94,33 @@ def test_the_browser_says_what_the_table_says(browser, arena, law):
 @pytest.mark.slow
 def test_the_browser_says_when_rattlebacks_reverse(browser):
     """The times of `reversal_table`, for both senses; the words are those of reversals, and a spin of 0 is not allowed."""
-    live = live_run(rattleback(), tippe.Launch(0.02, -5.0), None, 4.0)
-    assert [slider.path for slider in live.sliders] == ["launch.theta", "launch.spin"]
+    page_run = live_run(rattleback(), tippe.Launch(0.02, -5.0), None, 4.0)
+    assert [slider.path for slider in page_run.sliders] == ["launch.theta", "launch.spin"]
     grid = {"theta": np.linspace(0.005, 0.06, 4), "spin": np.array([-8.0, -6.0, -3.0, 3.0])}
     table = tippe.reversal_table(rattleback(), **grid, t1=4.0, tolerance=TOLERANCE, progress=False)
     values = np.stack([part.ravel() for part in np.meshgrid(*grid.values(), indexing="ij")], axis=-1)
-    status, time, end, _ = answers(browser, live, values)
+    status, time, end, _ = answers(browser, page_run, values)
     words = {int(code): word for code, word in browser.execute_script("return live.facts.words").items()}
     assert [words[int(code)] for code in status] == list(np.ravel(table.status))
     np.testing.assert_allclose(time, np.ravel(table.time), rtol=CLOSE)
     np.testing.assert_allclose(end, np.ravel(table.end_time), rtol=CLOSE)
     assert set(np.ravel(table.status)) == {"reversed", "not_reversed", "contact_lost"}
-    assert live.allowed(jnp.array([0.02, 1.0]))
-    assert not live.allowed(jnp.array([0.02, 0.0]))
+    assert page_run.allowed(jnp.array([0.02, 1.0]))
+    assert not page_run.allowed(jnp.array([0.02, 0.0]))
 
 
 @pytest.fixture(scope="module")
 def page(browser, rutstam_scene, tmp_path_factory):
     """The page of Rutstam's top, with two sliders, opened from disk."""
     path = tmp_path_factory.mktemp("page") / "top.html"
-    written = tippe.explore(
+    page = tippe.explore(
         rutstam_scene, tippe.Launch(0.1, 155.0), path, {"theta": (0.05, 0.5), "spin": (60.0, 200.0)}, t1=7.0
     )
     browser.get_log("browser")
     browser.get_log("performance")
     browser.get(path.as_uri())
     wait(browser, "return !!(window.live && live.ready)")
-    return written
+    return page
 
 
 def reset(browser):
@@ -148,8 +148,8 @@ def test_it_shows_the_time_of_the_launch_and_the_run(browser, page, rutstam_scen
         in browser.find_element("id", "result").text
     )
     assert "kg m³/s" in browser.find_element("id", "result").text
-    read = "return live.moves.trajectory(live.values(), 'frame').read([0, 2, 7]).map((row) => [...row])"
-    rows = np.array(browser.execute_script(read))
+    script = "return live.moves.trajectory(live.values(), 'frame').read([0, 2, 7]).map((row) => [...row])"
+    rows = np.array(browser.execute_script(script))
     np.testing.assert_allclose(rows[:, 3:6], run.position, atol=CLOSE)
     theta, energy, jellett, force = rows[:, -5:-1].T
     np.testing.assert_allclose(theta, run.theta, atol=3e-6)
@@ -163,8 +163,8 @@ def test_angles_and_spins_have_their_familiar_units(browser, page):
     """Like the launches that teachers describe: degrees, and revolutions per minute."""
     browser.execute_script("live.set([0.209440, 157.0796])")
     texts = "return [...document.querySelectorAll('#knobs output')].map((one) => one.textContent)"
-    shown = browser.execute_script(texts)
-    assert shown == ["0.209 rad = 12.0°", "157 rad/s = 1500 rpm"]
+    labels = browser.execute_script(texts)
+    assert labels == ["0.209 rad = 12.0°", "157 rad/s = 1500 rpm"]
 
 
 def test_a_slider_simulates_anew(browser, page, rutstam_scene):
@@ -179,9 +179,9 @@ def test_a_slider_simulates_anew(browser, page, rutstam_scene):
     shown_time = browser.execute_script("return Number.isFinite(live.outcome.value) ? live.outcome.value : 1e300")
     assert shown_time == pytest.approx(min(time, 1e300), rel=CLOSE)
     # The drawn top is that of the new run.
-    drawn = browser.execute_script("player.seek(1.0); return player.matrix(0, 0, 0)")
+    matrix = browser.execute_script("player.seek(1.0); return player.matrix(0, 0, 0)")
     run = tippe.simulate(rutstam_scene, tippe.Launch(theta, spin), 1.0, times=[1.0])
-    np.testing.assert_allclose(np.array(drawn).reshape(4, 4)[3, :3], run.position[0], atol=1e-4)
+    np.testing.assert_allclose(np.array(matrix).reshape(4, 4)[3, :3], run.position[0], atol=1e-4)
 
 
 def test_the_address_holds_the_sliders(browser, page):
@@ -288,9 +288,9 @@ def test_keys_play_and_reset(browser, page):
 
 
 def test_numbers_that_do_not_fit_together_are_refused_in_the_page(browser, rutstam_scene):
-    live = live_run(rutstam_scene, tippe.Launch(0.1, 155.0), {"theta": (0.05, 0.5)}, 7.0)
+    page_run = live_run(rutstam_scene, tippe.Launch(0.1, 155.0), {"theta": (0.05, 0.5)}, 7.0)
     browser.get("about:blank")
-    script = f"{programs(live)} return [[0.3], [-0.3], [4.0]].map((values) => Boolean(live.allowed(values, [])[0]))"
+    script = f"{programs(page_run)} return [[0.3], [-0.3], [4.0]].map((values) => Boolean(live.allowed(values, [])[0]))"
     assert browser.execute_script(script) == [True, False, False]
 
 
@@ -324,11 +324,11 @@ def test_flights_of_curved_arenas_and_sticking_are_refused(rutstam_scene):
 def test_in_the_browser_the_wooden_top_hops_and_climbs_onto_its_stem(browser):
     """As `simulate` has it: through flights, impacts and changes of contact, to the end on its stem."""
     scene, launch = tippe.presets.classroom(), tippe.Launch.degrees(theta=6, rpm=1900)
-    live, times = live_run(scene, launch, None, 4.0), np.array([0.0, 0.5, 2.6, 2.78, 2.85, 4.0])
+    page_run, times = live_run(scene, launch, None, 4.0), np.array([0.0, 0.5, 2.6, 2.78, 2.85, 4.0])
     run = tippe.simulate(scene, launch, 4.0, tolerance=1e-10)
     browser.get("about:blank")
     (status, time), end, hops, rows = browser.execute_script(
-        f"""{programs(live)}
+        f"""{programs(page_run)}
         const values = live.facts.sliders.map((slider) => slider.value), asks = integrator(live.answer);
         const moves = integrator(live.motion);
         asks.run(values);
@@ -371,13 +371,13 @@ def test_the_browser_flies_as_the_table_does(browser, kind):
     status, time, end, hops = np.array(browser.execute_script(script), dtype=float).T
     assert [tippe.Status(int(code)).word for code in status] == list(np.ravel(table.status))
     # Through hundreds of bounces even round-off grows: where tables depend on the tolerance as much, no digit is certain.
-    finer = tippe.inversion_table(scene, **grid, t1=5.0, tolerance=0.1 * TOLERANCE, progress=False)
-    for in_page, *in_tables in ((time, table.time, finer.time), (end, table.end_time, finer.end_time)):
+    fine_table = tippe.inversion_table(scene, **grid, t1=5.0, tolerance=0.1 * TOLERANCE, progress=False)
+    for in_page, *in_tables in ((time, table.time, fine_table.time), (end, table.end_time, fine_table.end_time)):
         finite = np.isfinite(in_page)
         in_page, at_tolerance, with_less = (np.ravel(values)[finite] for values in (in_page, *in_tables))
-        certain = np.abs(with_less - at_tolerance) < 1e-3 * at_tolerance
-        assert np.mean(certain) > 0.8
-        np.testing.assert_allclose(in_page[certain], at_tolerance[certain], rtol=CLOSE)
+        is_certain = np.abs(with_less - at_tolerance) < 1e-3 * at_tolerance
+        assert np.mean(is_certain) > 0.8
+        np.testing.assert_allclose(in_page[is_certain], at_tolerance[is_certain], rtol=CLOSE)
     assert np.max(hops) > 10
     assert len(set(status)) > 1
 

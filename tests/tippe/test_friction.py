@@ -65,11 +65,11 @@ def test_without_disc_or_lever_the_laws_are_those_of_sliding(arena):
     np.testing.assert_array_equal(field(tippe.Contensou(0.3, 0.0, 0.05)), expected)
     np.testing.assert_array_equal(field(tippe.Rolling(0.0, 1.0, coulomb)), expected)
     # The ellipsoid departs from Coulomb with the square of the radius, but for its torque, and the lever in proportion.
-    for near, order in (
+    for law_at, order in (
         (lambda h: tippe.Contensou(0.3, h, 0.05), 2.0),
         (lambda h: tippe.Rolling(h, 1.0, coulomb), 1.0),
     ):
-        gaps = [np.abs(field(near(h)) - expected).max() for h in (2e-7, 1e-7)]
+        gaps = [np.abs(field(law_at(h)) - expected).max() for h in (2e-7, 1e-7)]
         assert_close(np.log2(gaps[0] / gaps[1]), order, atol=0.02)
 
 
@@ -157,10 +157,10 @@ def test_an_isotropic_law_turns_with_the_slip(law):
         return cosine * x - sine * y, sine * x + cosine * y
 
     load = law.per_normal_force(Slip(0.1, -0.3, (5.0, 7.0, 90.0)))
-    other = law.per_normal_force(Slip(*turned(0.1, -0.3), (*turned(5.0, 7.0), 90.0)))
-    assert_close(other.force, turned(*load.force), rtol=1e-12)
+    turned_load = law.per_normal_force(Slip(*turned(0.1, -0.3), (*turned(5.0, 7.0), 90.0)))
+    assert_close(turned_load.force, turned(*load.force), rtol=1e-12)
     if load.torque[0] is not None:
-        assert_close(other.torque, (*turned(*load.torque[:2]), load.torque[2]), rtol=1e-12)
+        assert_close(turned_load.torque, (*turned(*load.torque[:2]), load.torque[2]), rtol=1e-12)
 
 
 class Belt(tippe.AbstractFriction):

@@ -65,9 +65,9 @@ def test_friction_from_exact_times(exact_fit):
 
 def test_another_start_other_bounds_data_and_tolerance_compile_nothing(exact_fit, rutstam_scene, caplog):
     times, _ = exact_fit
-    other = tippe.InversionTimes(LAUNCH, [1.01 * time for time in times], 0.04, t1=6.5, angle=0.94 * math.pi)
+    other_data = tippe.InversionTimes(LAUNCH, [1.01 * time for time in times], 0.04, t1=6.5, angle=0.94 * math.pi)
     with jax.log_compiles():
-        second_fit = tippe.identify(rutstam_scene, other, {"friction.mu": Free(0.25, 0.05)}, tolerance=1e-7)
+        second_fit = tippe.identify(rutstam_scene, other_data, {"friction.mu": Free(0.25, 0.05)}, tolerance=1e-7)
     assert not [text for text in caplog.messages if "Finished XLA compilation" in text]
     # Each of these numbers counted.
     assert second_fit.problem.unknowns[0].lower == 0.05
@@ -82,9 +82,9 @@ def test_noisy_times_give_unbiased_friction_within_its_errors(exact_fit):
     times, result = exact_fit
     exact, error, z = np.where(np.isfinite(times), times, 6.0), 0.002, []
     for draw in np.random.default_rng(7).normal(size=(12, 4)):
-        noisy = Measurements(exact + error * draw, error, np.isinf(times))
-        ends = minimise(result.problem, result.coordinates[None], noisy)
-        linearised = linearise(result.problem, ends.coordinates, noisy)
+        noisy_data = Measurements(exact + error * draw, error, np.isinf(times))
+        ends = minimise(result.problem, result.coordinates[None], noisy_data)
+        linearised = linearise(result.problem, ends.coordinates, noisy_data)
         z.append(
             (ends.coordinates[0, 0] - math.log(0.3)) / math.sqrt(coordinate_covariance(linearised.information[0])[0, 0])
         )
@@ -106,12 +106,12 @@ def batch_of_times(scene, theta, spin, t1, angle):
 def test_beyond_the_horizon_times_go_on_without_a_jump(rutstam_scene):
     """The penalty begins at the horizon, and tells a run that was nearly there from one that was not."""
     theta, spin, angle = np.full(4, 0.2), np.array([140.0, 110.0, 80.0, 60.0]), 0.95 * math.pi
-    late = extended_times(rutstam_scene, theta, spin, 6.0, angle)
-    time = float(late[0])
+    late_time = extended_times(rutstam_scene, theta, spin, 6.0, angle)
+    time = float(late_time[0])
     assert time < 6.0
-    before = extended_times(rutstam_scene, theta, spin, time * (1.0 - 1e-6), angle)
-    assert_close(before[0], time, rtol=1e-4)
-    assert before[0] < before[3]
+    time_before = extended_times(rutstam_scene, theta, spin, time * (1.0 - 1e-6), angle)
+    assert_close(time_before[0], time, rtol=1e-4)
+    assert time_before[0] < time_before[3]
 
 
 def test_beyond_the_horizon_times_follow_the_rate_of_growth(rutstam_scene):
@@ -123,8 +123,8 @@ def test_beyond_the_horizon_times_follow_the_rate_of_growth(rutstam_scene):
     times = extended_times(rutstam_scene, theta, spin, 60.0, angle)
     assert np.all(times < 60.0)
     t1 = 0.8 * times.min()
-    beyond = extended_times(rutstam_scene, theta, spin, t1, angle)
-    assert_close(beyond, t1 * (2.0 - t1 / times), rtol=0.15)
+    time_beyond = extended_times(rutstam_scene, theta, spin, t1, angle)
+    assert_close(time_beyond, t1 * (2.0 - t1 / times), rtol=0.15)
 
 
 @pytest.mark.slow
@@ -132,15 +132,15 @@ def test_beyond_the_horizon_times_follow_the_rate_of_growth(rutstam_scene):
 def test_slopes_of_the_times_are_those_of_central_differences(rutstam_scene, tables):
     """Along three directions, which are run in groups of two; with many lanes, in one kernel; and beyond the horizon."""
     data = tippe.InversionTimes(LAUNCH, [1.0, 2.0, 3.0, np.inf], 0.05, t1=6.0)
-    free = tuple((name, Free(at, 0.0)) for name, at in (("scene.friction.mu", 0.3), ("scene.body.offset", 0.006)))
+    free = tuple((name, Free(point, 0.0)) for name, point in (("scene.friction.mu", 0.3), ("scene.body.offset", 0.006)))
     problem = Problem(SceneModel(rutstam_scene, (data,), data.seen, 1e-11), (*free, ("scene.gravity", Free(9.81, 0.0))))
-    at = jnp.log(jnp.array([[0.3, 0.006, 9.81]])) + jnp.zeros((tables, 1))
-    slopes = linearise(problem, at, Measurements(np.full(4, 2.0), 1.0)).jacobian
+    point = jnp.log(jnp.array([[0.3, 0.006, 9.81]])) + jnp.zeros((tables, 1))
+    slopes = linearise(problem, point, Measurements(np.full(4, 2.0), 1.0)).jacobian
     predict = eqx.filter_jit(problem.predict)
     for k in range(3):
 
         def difference(step):
-            return (predict(at.at[:, k].add(step)) - predict(at.at[:, k].add(-step))) / (2.0 * step)  # noqa: B023
+            return (predict(point.at[:, k].add(step)) - predict(point.at[:, k].add(-step))) / (2.0 * step)  # noqa: B023
 
         extrapolated = (4.0 * difference(1e-5) - difference(2e-5)) / 3.0
         assert_close(slopes[..., k], extrapolated, rtol=1e-5, atol=1e-6)
@@ -205,16 +205,16 @@ def test_scenes_with_phases_are_refused_where_slopes_are_needed(rutstam_scene, m
 @pytest.fixture(scope="module")
 def experiment():
     """Friction and offset from ten times: the problem, its true coordinates, the exact times and their error [s]."""
-    true, error = np.log([0.3, 0.0035]), 0.02
+    truth, error = np.log([0.3, 0.0035]), 0.02
     top = rutstam_top()
     scene = tippe.Scene(tippe.Top(top.mass, top.radius, 0.0035, top.I1, top.I3), friction=tippe.Viscous(0.3))
     launch = tippe.Launch(np.repeat([0.005, 0.015], 5), np.tile([70.0, 80.0, 100.0, 120.0, 150.0], 2))
     data = tippe.InversionTimes(launch, np.full(10, 5.0), error, t1=60.0, angle=0.5 * np.pi)
     free = (("scene.friction.mu", Free(0.3, 0.0)), ("scene.body.offset", Free(0.0035, 0.0)))
     problem = Problem(SceneModel(scene, (data,), data.seen, 1e-8), free)
-    starts = zip(np.asarray(launch.theta), np.asarray(launch.spin), strict=True)
-    exact = [independent_time(0.0035, a, w, 60.0, 0.5 * np.pi) for a, w in starts]
-    return problem, true, np.array([exact]), error
+    pairs = zip(np.asarray(launch.theta), np.asarray(launch.spin), strict=True)
+    exact = [independent_time(0.0035, a, w, 60.0, 0.5 * np.pi) for a, w in pairs]
+    return problem, truth, np.array([exact]), error
 
 
 #: A chi squared of 8 degrees of freedom exceeds this once in 40000 times.
@@ -229,25 +229,25 @@ def test_two_hundred_noisy_tables_give_unbiased_estimates_and_intervals_that_cov
     right program would miss it once in twenty draws for either number: the draw was made once. So with the bias, whose mean
     over 200 has a standard deviation of 0.07 errors.
     """
-    problem, true, exact, error = experiment
+    problem, truth, exact, error = experiment
     draw = np.random.default_rng(0)
-    noisy = Measurements(exact + error * draw.normal(size=(200, 10)), error)
-    starts = true + 0.05 * draw.uniform(-1.0, 1.0, (200, 2))
-    ends = minimise(problem, starts, noisy)
-    linearised = linearise(problem, ends.coordinates, noisy)
+    noisy_data = Measurements(exact + error * draw.normal(size=(200, 10)), error)
+    start_points = truth + 0.05 * draw.uniform(-1.0, 1.0, (200, 2))
+    ends = minimise(problem, start_points, noisy_data)
+    linearised = linearise(problem, ends.coordinates, noisy_data)
     errors = np.array(
         [np.sqrt(np.diag(coordinate_covariance(np.asarray(jacobian)))) for jacobian in linearised.jacobian]
     )
-    z = (np.asarray(ends.coordinates) - true) / errors
-    bias, covered = z.mean(axis=0), np.mean(np.abs(z) < 1.96, axis=0)
+    z = (np.asarray(ends.coordinates) - truth) / errors
+    bias, coverage = z.mean(axis=0), np.mean(np.abs(z) < 1.96, axis=0)
     with capsys.disabled():
-        print("\nbias / error", bias, "covered", covered, "steps", np.percentile(ends.steps, [50, 100]))
+        print("\nbias / error", bias, "covered", coverage, "steps", np.percentile(ends.steps, [50, 100]))
         print("mean deviance", np.mean(linearised.deviance), "of 8 degrees; converged", np.mean(ends.converged))
     # One in a hundred may go to and fro on a step of the time's staircase until its steps are used up.
     assert np.mean(ends.converged) >= 0.99
     assert np.all(linearised.deviance < TOO_MUCH)
     assert np.all(np.abs(bias) < 0.2)
-    assert np.all((covered > 0.92) & (covered < 0.98))
+    assert np.all((coverage > 0.92) & (coverage < 0.98))
 
 
 @pytest.mark.slow
@@ -257,18 +257,18 @@ def test_single_starts_a_factor_two_off_find_the_truth(experiment, capsys):
     At some of them, up to seven of the ten tops have not inverted by the horizon. The truth counts as found where a fit
     explains its table at least as well as the true numbers do, and these lie within five of its standard errors.
     """
-    problem, true, exact, error = experiment
+    problem, truth, exact, error = experiment
     tables = 25
-    off = np.log(2.0) * np.array([[a, b] for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)])
-    noisy = np.repeat(exact + error * np.random.default_rng(1).normal(size=(tables, 10)), len(off), axis=0)
-    measurements = Measurements(noisy, error)
-    ends = minimise(problem, np.tile(true + off, (tables, 1)), measurements)
+    offsets = np.log(2.0) * np.array([[a, b] for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)])
+    noisy_data = np.repeat(exact + error * np.random.default_rng(1).normal(size=(tables, 10)), len(offsets), axis=0)
+    measurements = Measurements(noisy_data, error)
+    ends = minimise(problem, np.tile(truth + offsets, (tables, 1)), measurements)
     linearised = linearise(problem, ends.coordinates, measurements)
     errors = np.array(
         [np.sqrt(np.diag(coordinate_covariance(np.asarray(jacobian)))) for jacobian in linearised.jacobian]
     )
-    deviations = np.abs(np.asarray(ends.coordinates) - true) / errors
-    of_truth = np.sum(((noisy - exact) / error) ** 2, axis=1)
+    deviations = np.abs(np.asarray(ends.coordinates) - truth) / errors
+    of_truth = np.sum(((noisy_data - exact) / error) ** 2, axis=1)
     successes = (np.asarray(linearised.deviance) <= of_truth) & np.all(deviations < 5.0, axis=1)
     with capsys.disabled():
         print("\nfound by", np.sum(successes), "of", len(successes), "starts; converged", np.mean(ends.converged))

@@ -27,10 +27,10 @@ def time_of(mu=0.3, theta=0.1, spin=155.0, offset=0.006, tolerance=1e-11, crossi
 
 def central_difference(function, point, steps):
     """Central differences with one Richardson step, for every step of a scan; the pair that agrees best is taken."""
-    plain = [(function(point + h) - function(point - h)) / (2.0 * h) for h in steps]
-    better = [(4.0 * fine - coarse) / 3.0 for coarse, fine in zip(plain[:-1], plain[1:], strict=True)]
-    gaps = [abs(a - b) for a, b in zip(better[:-1], better[1:], strict=True)]
-    return better[int(np.argmin(gaps)) + 1]
+    differences = [(function(point + h) - function(point - h)) / (2.0 * h) for h in steps]
+    extrapolated = [(4.0 * fine - coarse) / 3.0 for coarse, fine in zip(differences[:-1], differences[1:], strict=True)]
+    gaps = [abs(a - b) for a, b in zip(extrapolated[:-1], extrapolated[1:], strict=True)]
+    return extrapolated[int(np.argmin(gaps)) + 1]
 
 
 #: Numbers of the scene and launch, where they are and the first step of the scan.
@@ -136,8 +136,8 @@ def test_illegal_numbers_inside_transformations_give_nothing_that_looks_right():
     columns = {name: [good[name]] for name in good}
     for name, values in bad.items():
         for value in values:
-            for other in columns:
-                columns[other].append(value if other == name else good[other])
+            for other_name in columns:
+                columns[other_name].append(value if other_name == name else good[other_name])
     assert len(columns["mu"]) == LANES
     times = times_of(columns)
     assert_close(times[0], time_of(), rtol=1e-6)
@@ -188,8 +188,8 @@ def test_first_and_last_crossing_in_the_cylinder():
     run = tippe.simulate(scene, launch, 15.0, tolerance=1e-10)
     angle = 0.95 * math.pi
     fine = np.linspace(0.0, 15.0, 60001)
-    beyond = np.asarray(run.at(fine).theta) >= angle
-    ups = fine[1:][beyond[1:] & ~beyond[:-1]]
+    is_beyond = np.asarray(run.at(fine).theta) >= angle
+    ups = fine[1:][is_beyond[1:] & ~is_beyond[:-1]]
     first = tippe.inversion_time(scene, launch, 15.0)
     last = tippe.inversion_time(scene, launch, 15.0, crossing="last")
     assert len(ups) > 5
@@ -265,7 +265,7 @@ def test_float32_works_at_its_own_tolerance():
     import subprocess
     import sys
 
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", FLOAT32],
         env=os.environ | {"JAX_ENABLE_X64": "0"},
         capture_output=True,
@@ -275,7 +275,7 @@ def test_float32_works_at_its_own_tolerance():
     )
     scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
     expected = tippe.inversion_table(scene, theta=[0.3, 0.4], spin=[155.0, 160.0], t1=8.0)
-    assert_close([float(time) for time in done.stdout.split(",")], expected.time.ravel(), rtol=2e-2)
+    assert_close([float(time) for time in process.stdout.split(",")], expected.time.ravel(), rtol=2e-2)
 
 
 @pytest.mark.slow
@@ -302,14 +302,16 @@ def test_a_frame_that_turns_with_the_top_saves_digits_and_changes_none(rutstam_s
         sizes = np.abs(exact).max(axis=1, keepdims=True)
         assert_close(ends(tables, 1e-13) / sizes, exact / sizes, atol=1e-9)
     # The fast ones under viscous friction, where nothing but the turning limits the steps.
-    wrong = {
+    bad_arguments = {
         name: np.abs((ends(problem, 1e-8) - exact) / sizes).max(axis=0)[:3]
         for name, problem in (("turning", tables), ("rest", at_rest))
     }
-    assert (2.0 * wrong["turning"] < wrong["rest"]).all(), wrong
+    assert (2.0 * bad_arguments["turning"] < bad_arguments["rest"]).all(), bad_arguments
     # The frame has turned: only what has no direction is the same.
-    turned, fixed = (problem.dynamics.field(tables.states + 0.1 * tables.scales) for problem in (tables, at_rest))
-    assert not np.allclose(turned[2], fixed[2])
+    turned_rates, fixed_rates = (
+        problem.dynamics.field(tables.states + 0.1 * tables.scales) for problem in (tables, at_rest)
+    )
+    assert not np.allclose(turned_rates[2], fixed_rates[2])
 
 
 def test_the_frame_of_a_top_that_cannot_invert_is_at_rest():

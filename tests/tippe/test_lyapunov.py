@@ -71,9 +71,9 @@ def test_lagranges_equations_part_as_fast():
     assert exponents.exponent.shape == ()
     times, parted = exponents.times[4:], []
     for time in times:
-        near, far = (inversion(numbers | {"theta": THETA[0] + d}, time, math.pi, 1e-12) for d in (0.0, 1e-7))
-        assert near[0] == far[0] == "not_inverted"
-        parted.append(math.log(abs(near[2] - far[2]) / 1e-7))
+        time_a, time_b = (inversion(numbers | {"theta": THETA[0] + d}, time, math.pi, 1e-12) for d in (0.0, 1e-7))
+        assert time_a[0] == time_b[0] == "not_inverted"
+        parted.append(math.log(abs(time_a[2] - time_b[2]) / 1e-7))
     expected, rate = (np.polyfit(times, logarithm, 1)[0] for logarithm in (parted, times * exponents.running[4:]))
     assert_close(rate, expected, rtol=0.15)
 
@@ -86,10 +86,10 @@ def test_the_error_covers_the_spread_of_chaotic_runs():
     """
     theta = THETA[0] + 1e-9 * np.arange(32)
     exponents = tippe.lyapunov_exponent(cylinder_scene(), tippe.Launch(theta, SPIN[0], ETA[0], AZIMUTH[0]), 300.0)
-    away = np.abs(exponents.exponent - 1.84) / exponents.error
+    deviation = np.abs(exponents.exponent - 1.84) / exponents.error
     assert_close(exponents.exponent.mean(), 1.84, atol=0.25)
-    assert np.mean(away < 2.0) > 0.7
-    assert np.max(away) < 5.0
+    assert np.mean(deviation < 2.0) > 0.7
+    assert np.max(deviation) < 5.0
     assert np.mean(exponents.exponent > 2.0 * exponents.error) > 0.8
 
 

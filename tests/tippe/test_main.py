@@ -28,9 +28,9 @@ def test_the_papers_tables_are_printed_written_and_drawn(tmp_path, capsys):
     assert "first [s]" in printed
     assert "9.98" in printed
     assert (tmp_path / "out" / "theta.png").read_bytes().startswith(b"\x89PNG")
-    shown = tmp_path / "out" / "index.html"
-    assert printed.rstrip().endswith(f"To see it, open {shown}")
-    page = shown.read_text()
+    page_path = tmp_path / "out" / "index.html"
+    assert printed.rstrip().endswith(f"To see it, open {page_path}")
+    page = page_path.read_text()
     assert "<td>9.98" in page
     assert 'id="floats"' in page
     assert "data:image/png" in page

@@ -23,6 +23,6 @@ def test_padding_changes_nothing(rutstam_scene):
     """Three times and all that surround them: the same numbers."""
     times = np.linspace(0.0, 1.0, 7)
     run = tippe.simulate(rutstam_scene, tippe.Launch(0.1, 155.0), 1.0)
-    few, many = run.at(times[:3]), run.at(times)
+    first_run, full_run = run.at(times[:3]), run.at(times)
     for name in ("theta", "energy", "position", "axis", "slip", "normal_force"):
-        assert_close(getattr(few, name), getattr(many, name)[:3], rtol=1e-14, atol=1e-16)
+        assert_close(getattr(first_run, name), getattr(full_run, name)[:3], rtol=1e-14, atol=1e-16)

@@ -93,28 +93,28 @@ def check_a_batch(scene: tippe.Scene, launch: tippe.Launch):
     outcome = ends(scene, launch)
     assert np.isfinite(outcome.state).all()
     assert np.all(np.asarray(outcome.status) != FAILED)
-    jammed = (np.asarray(outcome.status) == LEFT_DOMAIN) & (np.asarray(scene.dynamics.loss(outcome.state)) == 1)
-    assert np.all(may_jam(scene) | ~jammed)
+    has_jammed = (np.asarray(outcome.status) == LEFT_DOMAIN) & (np.asarray(scene.dynamics.loss(outcome.state)) == 1)
+    assert np.all(may_jam(scene) | ~has_jammed)
     start, end = scene.state(launch), outcome.state
-    turns = 1.0 + np.abs(np.asarray(launch.spin)) * HORIZON
-    assert np.all(np.abs(np.linalg.norm(end[2:5], axis=0) - 1.0) < 1e-7 * turns)
+    turn_count = 1.0 + np.abs(np.asarray(launch.spin)) * HORIZON
+    assert np.all(np.abs(np.linalg.norm(end[2:5], axis=0) - 1.0) < 1e-7 * turn_count)
     energy = (
         np.asarray(jax.vmap(type(scene).energy)(scene, start.T)),
         np.asarray(jax.vmap(type(scene).energy)(scene, end.T)),
     )
     size = np.asarray(scene.body.I3 * launch.spin**2 + scene.body.mass * scene.gravity * scene.body.radius)
     if isinstance(scene.surface, tippe.Graph):
-        fallen = jax.vmap(lambda scene, at: scene.frame.height(tuple(at[8:])))(scene, end.T) - scene.body.radius
-        size = size + np.asarray(scene.body.mass * scene.gravity * (jnp.abs(fallen) + 30.0 * scene.body.radius))
+        height = jax.vmap(lambda scene, state: scene.frame.height(tuple(state[8:])))(scene, end.T) - scene.body.radius
+        size = size + np.asarray(scene.body.mass * scene.gravity * (jnp.abs(height) + 30.0 * scene.body.radius))
     elif not plane:
         size = size + np.asarray(scene.body.mass * scene.gravity * scene.surface.radius)
-    assert np.all(energy[1] <= energy[0] + 1e-7 * size * turns)
+    assert np.all(energy[1] <= energy[0] + 1e-7 * size * turn_count)
     if plane:
-        before, after = scene.jellett(start), scene.jellett(end)
+        jellett_before, jellett_after = scene.jellett(start), scene.jellett(end)
         unit = np.asarray(scene.body.radius * scene.body.I3 * jnp.abs(launch.spin)) + 1e-300
         at_a_point = (scene.friction.resistance == 0.0) & (scene.friction.sliding.contact_radius == 0.0)
-        drift = np.where(at_a_point, np.abs(np.asarray(after - before)) / unit, 0.0)
-        assert np.all(drift < 1e-6 * turns)
+        drift = np.where(at_a_point, np.abs(np.asarray(jellett_after - jellett_before)) / unit, 0.0)
+        assert np.all(drift < 1e-6 * turn_count)
 
 
 def may_jam(scene: tippe.Scene) -> np.ndarray:
@@ -139,7 +139,7 @@ def sensitivity(scene, launch, states, tolerance):
     """By how much a small change of the state at the start grows until the end of a run."""
     random = np.random.default_rng(0)
     nudge = 1e-7 * np.asarray(scene.scales(launch)) * random.choice([-1.0, 1.0], np.shape(states))
-    outcomes = [ends(scene, launch, tolerance, at) for at in (states, states + nudge)]
+    outcomes = [ends(scene, launch, tolerance, state) for state in (states, states + nudge)]
     return departure(scene, launch, *(outcome.state for outcome in outcomes)) / 1e-7
 
 
@@ -159,14 +159,14 @@ MIRRORS = {
 
 def check_mirrors(arena: str, scene: tippe.Scene, launch: tippe.Launch):
     """Every arena has two mirrors. The other side of a mirror is the same to the last bit, and takes the same steps."""
-    states, straight = scene.state(launch), ends(scene, launch)
+    states, plain_run = scene.state(launch), ends(scene, launch)
     for velocity, axis, momentum, places in MIRRORS.values():
         signs = np.array([*velocity, *axis, *momentum, *places[arena]])[:, None]
         mirrored = ends(scene, launch, states=signs * states)
-        np.testing.assert_array_equal(mirrored.status, straight.status)
-        np.testing.assert_array_equal(mirrored.steps, straight.steps)
-        np.testing.assert_array_equal(mirrored.end_time, straight.end_time)
-        np.testing.assert_array_equal(signs * mirrored.state, straight.state)
+        np.testing.assert_array_equal(mirrored.status, plain_run.status)
+        np.testing.assert_array_equal(mirrored.steps, plain_run.steps)
+        np.testing.assert_array_equal(mirrored.end_time, plain_run.end_time)
+        np.testing.assert_array_equal(signs * mirrored.state, plain_run.state)
 
 
 def check_units(scene: tippe.Scene, launch: tippe.Launch, exponents: tuple[int, int, int]):
@@ -178,15 +178,15 @@ def check_units(scene: tippe.Scene, launch: tippe.Launch, exponents: tuple[int, 
     law = scene.friction.sliding
     sliding = tippe.Contensou(law.mu, law.contact_radius * length, law.slip_speed * length / time)
     friction = tippe.Rolling(scene.friction.resistance * length, scene.friction.turning_speed / time, sliding)
-    other = tippe.Scene(body, surface, friction, scene.gravity * length / time**2)
-    turned = tippe.Launch(launch.theta, launch.spin / time, launch.eta, launch.azimuth)
-    near, far = ends(scene, launch), ends(other, turned, horizon=HORIZON * time)
-    np.testing.assert_array_equal(far.status, near.status)
-    np.testing.assert_array_equal(far.steps, near.steps)
-    np.testing.assert_array_equal(far.end_time / time, near.end_time)
-    sizes = np.ones((near.state.shape[0], 1))
+    other_run = tippe.Scene(body, surface, friction, scene.gravity * length / time**2)
+    turned_launch = tippe.Launch(launch.theta, launch.spin / time, launch.eta, launch.azimuth)
+    ends_of_scene, scaled_ends = ends(scene, launch), ends(other_run, turned_launch, horizon=HORIZON * time)
+    np.testing.assert_array_equal(scaled_ends.status, ends_of_scene.status)
+    np.testing.assert_array_equal(scaled_ends.steps, ends_of_scene.steps)
+    np.testing.assert_array_equal(scaled_ends.end_time / time, ends_of_scene.end_time)
+    sizes = np.ones((ends_of_scene.state.shape[0], 1))
     sizes[:2], sizes[5:8] = length / time, mass * length**2 / time
-    np.testing.assert_array_equal(far.state / sizes, near.state)
+    np.testing.assert_array_equal(scaled_ends.state / sizes, ends_of_scene.state)
 
 
 def check_reversal(scene: tippe.Scene, launch: tippe.Launch):
@@ -199,10 +199,10 @@ def check_reversal(scene: tippe.Scene, launch: tippe.Launch):
     signs[:2] = signs[5:8] = -1.0
     arrival = ends(smooth, launch, tolerance)
     return_run = ends(smooth, launch, tolerance, signs * arrival.state)
-    stays = (np.asarray(arrival.status) == REACHED_END) & (np.asarray(return_run.status) == REACHED_END)
-    missed = departure(smooth, launch, signs * return_run.state, smooth.state(launch))
+    is_valid = (np.asarray(arrival.status) == REACHED_END) & (np.asarray(return_run.status) == REACHED_END)
+    error = departure(smooth, launch, signs * return_run.state, smooth.state(launch))
     growth = 1.0 + sensitivity(smooth, launch, signs * arrival.state, tolerance)
-    return np.where(stays, missed / (tolerance * growth * np.asarray(arrival.steps)), 0.0), stays
+    return np.where(is_valid, error / (tolerance * growth * np.asarray(arrival.steps)), 0.0), is_valid
 
 
 def check_turning(scene: tippe.Scene, launch: tippe.Launch, angle: float):
@@ -210,7 +210,7 @@ def check_turning(scene: tippe.Scene, launch: tippe.Launch, angle: float):
     tolerance = 1e-11
     cosine, sine = math.cos(angle), math.sin(angle)
 
-    def turned(state):
+    def turned_launch(state):
         state = np.array(state)
         for first in (0, 2, 5):
             x, y = state[first], state[first + 1]
@@ -218,11 +218,11 @@ def check_turning(scene: tippe.Scene, launch: tippe.Launch, angle: float):
         return state
 
     states = scene.state(launch)
-    straight, other = ends(scene, launch, tolerance), ends(scene, launch, tolerance, turned(states))
-    stays = (np.asarray(straight.status) == REACHED_END) & (np.asarray(other.status) == REACHED_END)
-    missed = departure(scene, launch, turned(straight.state), other.state)
+    plain_run, other_run = ends(scene, launch, tolerance), ends(scene, launch, tolerance, turned_launch(states))
+    is_valid = (np.asarray(plain_run.status) == REACHED_END) & (np.asarray(other_run.status) == REACHED_END)
+    error = departure(scene, launch, turned_launch(plain_run.state), other_run.state)
     growth = 1.0 + sensitivity(scene, launch, states, tolerance)
-    return np.where(stays, missed / (tolerance * growth * np.asarray(straight.steps)), 0.0), stays
+    return np.where(is_valid, error / (tolerance * growth * np.asarray(plain_run.steps)), 0.0), is_valid
 
 
 def check_everything(arena, batch, angle, exponents):
@@ -230,12 +230,12 @@ def check_everything(arena, batch, angle, exponents):
     check_a_batch(*batch)
     check_mirrors(arena, *batch)
     check_units(*batch, exponents)
-    missed, _ = check_reversal(*batch)
+    error, _ = check_reversal(*batch)
     # Over a thousand batches the greatest are 0.12; most are below 0.03.
-    assert np.all(missed < 1.0), missed
+    assert np.all(error < 1.0), error
     if arena == "plane":
-        missed, _ = check_turning(*batch, angle)
-        assert np.all(missed < 1.0), missed
+        error, _ = check_turning(*batch, angle)
+        assert np.all(error < 1.0), error
 
 
 ANGLES = st.floats(-math.pi, math.pi)
@@ -305,16 +305,16 @@ def test_lengths_by_four_and_times_by_two_give_the_same_inversion_time():
     """To the last bit, through the public function: a mass by 8 besides, on the plane and in the cylinder."""
     length, mass = 4.0, 8.0
     time = math.sqrt(length)
-    small = {"mass": 0.02, "radius": 0.02, "offset": 0.006, "I1": 3e-6, "I3": 3.2e-6}
+    numbers = {"mass": 0.02, "radius": 0.02, "offset": 0.006, "I1": 3e-6, "I3": 3.2e-6}
     units = {"mass": mass, "radius": length, "offset": length, "I1": mass * length**2, "I3": mass * length**2}
-    large = {name: value * units[name] for name, value in small.items()}
+    large = {name: value * units[name] for name, value in numbers.items()}
     for arena, grown in ((tippe.Plane(), tippe.Plane()), (tippe.Cylinder(0.3), tippe.Cylinder(0.3 * length))):
-        near = tippe.Scene(tippe.Top(**small), arena, tippe.Viscous(0.3))
-        far = tippe.Scene(tippe.Top(**large), grown, tippe.Viscous(0.3 * time / length))
+        ends_of_scene = tippe.Scene(tippe.Top(**numbers), arena, tippe.Viscous(0.3))
+        scaled_ends = tippe.Scene(tippe.Top(**large), grown, tippe.Viscous(0.3 * time / length))
         launches = [tippe.Launch(0.1, 155.0, 0.2), tippe.Launch(0.1, 155.0 / time, 0.2)]
         times = [
-            float(tippe.inversion_time(near, launches[0], 10.0)),
-            float(tippe.inversion_time(far, launches[1], 10.0 * time)) / time,
+            float(tippe.inversion_time(ends_of_scene, launches[0], 10.0)),
+            float(tippe.inversion_time(scaled_ends, launches[1], 10.0 * time)) / time,
         ]
         assert times[1] == times[0]
 
@@ -330,7 +330,7 @@ def test_symmetries_of_the_arena():
     def time_of(spin, eta, azimuth):
         return float(tippe.inversion_time(cylinder, tippe.Launch(0.1, spin, eta, azimuth), 10.0))
 
-    straight = time_of(155.0, 0.4, 0.7)
+    plain_run = time_of(155.0, 0.4, 0.7)
     # Reflection x -> -x turns eta, the axis' x component and every spin about; y -> -y the axis' y component and the spin.
-    assert_close(time_of(-155.0, -0.4, math.pi - 0.7), straight, rtol=1e-7)
-    assert_close(time_of(-155.0, 0.4, -0.7), straight, rtol=1e-7)
+    assert_close(time_of(-155.0, -0.4, math.pi - 0.7), plain_run, rtol=1e-7)
+    assert_close(time_of(-155.0, 0.4, -0.7), plain_run, rtol=1e-7)

@@ -151,13 +151,13 @@ def test_the_field_costs_what_the_lean_one_does(arena, law):
     scene = tippe.Scene(rutstam_top(), surface, friction[law])
     dynamics, states = scene.dynamics, random_states(scene, 7)
     equations = jax.make_jaxpr(lambda state: dynamics.motion(state).rate)(states).jaxpr.eqns
-    moves = {"squeeze", "slice", "broadcast_in_dim", "neg", "unstack"}
+    primitives = {"squeeze", "slice", "broadcast_in_dim", "neg", "unstack"}
     arithmetic = {"add", "sub", "mul", "div", "sqrt"}
     results = [
         (equation.primitive.name, result.aval.shape) for equation in equations for result in equation.outvars[:1]
     ]
     on_lanes = Counter(name for name, shape in results if shape == (7,))
-    assert set(on_lanes) <= arithmetic | moves
+    assert set(on_lanes) <= arithmetic | primitives
     assert sum(count for name, count in on_lanes.items() if name in arithmetic) <= YARDSTICK[arena, law] + 2
 
 
@@ -168,8 +168,8 @@ def test_one_function_serves_one_state_and_a_block():
     block = scene.field(states)
     for lane in range(5):
         assert_close(scene.field(states[:, lane]), block[:, lane], rtol=1e-12, atol=1e-12)
-    wide = tippe.Scene(rutstam_top(), tippe.Cylinder(jnp.full(5, 0.3)), tippe.Coulomb(jnp.full(5, 0.3), 0.1))
-    assert_close(wide.field(states), block, rtol=1e-12, atol=1e-12)
+    scenes = tippe.Scene(rutstam_top(), tippe.Cylinder(jnp.full(5, 0.3)), tippe.Coulomb(jnp.full(5, 0.3), 0.1))
+    assert_close(scenes.field(states), block, rtol=1e-12, atol=1e-12)
 
 
 def test_the_margin_of_a_contact_has_its_slope_however_it_is_compiled(rutstam_scene):

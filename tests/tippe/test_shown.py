@@ -58,9 +58,9 @@ def test_a_suspicion_is_told_once():
 
 def test_theta_changes_at_its_rate(run):
     times = np.linspace(0.2, 0.8, 601)
-    fine = run.at(times)
-    slopes = np.gradient(np.asarray(fine.theta), times)
-    assert_close(fine.theta_rate[1:-1], slopes[1:-1], atol=0.02 * np.abs(slopes).max())
+    fine_run = run.at(times)
+    slopes = np.gradient(np.asarray(fine_run.theta), times)
+    assert_close(fine_run.theta_rate[1:-1], slopes[1:-1], atol=0.02 * np.abs(slopes).max())
 
 
 def test_a_run_goes_to_xarray_and_to_a_file(run, tmp_path):
@@ -70,9 +70,9 @@ def test_a_run_goes_to_xarray_and_to_a_file(run, tmp_path):
     assert data["theta"].attrs == {"units": "rad", "long_name": "inclination θ"}
     np.testing.assert_array_equal(data["normal_force"], run.normal_force)
     run.save(tmp_path / "run.h5")
-    with xarray.open_dataset(tmp_path / "run.h5", engine="h5netcdf") as stored:
-        assert set(stored.variables) == set(data.variables)
-        np.testing.assert_array_equal(stored["axis"], run.axis)
+    with xarray.open_dataset(tmp_path / "run.h5", engine="h5netcdf") as dataset:
+        assert set(dataset.variables) == set(data.variables)
+        np.testing.assert_array_equal(dataset["axis"], run.axis)
     table = tippe.Table.load(tmp_path / "run.h5")
     np.testing.assert_array_equal(table["work"], run.work)
     assert '"status": "completed"' in table.attributes["request"]

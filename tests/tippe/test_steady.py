@@ -69,17 +69,17 @@ def test_a_tumbling_top_is_a_zero_of_the_field_seen_while_precessing():
     @jax.vmap
     def residual(top_scene, motion):
         state = steady.tumbling_state(top_scene, motion)
-        turned = motion.precession * steady.quarter_turn(state)
+        rate = motion.precession * steady.quarter_turn(state)
         scales = top_scene.scales(tippe.Launch(motion.theta, motion.spin))
-        still = jnp.abs(top_scene.field(state) - turned) / scales / motion.precession
+        residual_rate = jnp.abs(top_scene.field(state) - rate) / scales / motion.precession
         return (
-            jnp.max(still),
+            jnp.max(residual_rate),
             top_scene.jellett(state) / motion.jellett - 1.0,
             top_scene.normal_force(state) / top_scene.body.mass / top_scene.gravity,
         )
 
-    still, jellett, weights = residual(scenes, motion)
-    assert jnp.max(still) < 1e-12
+    residual_rate, jellett, weights = residual(scenes, motion)
+    assert jnp.max(residual_rate) < 1e-12
     np.testing.assert_allclose(jellett, 0.0, atol=1e-12)
     np.testing.assert_allclose(weights, 1.0, rtol=1e-12)
 
@@ -125,10 +125,11 @@ def test_a_standing_top_feels_only_the_curvature_of_the_arena(surface, same):
 )
 def test_a_standing_top_is_as_stable_whether_or_not_it_may_fly(surface, growth):
     """Inverted, 100 rad/s: "hybrid" and "stop" agree, and no direction of symmetry counts as marginal."""
-    stops = scene(0.3, 0.94, surface=surface)
-    flies = dataclasses.replace(stops, contact="hybrid", restitution=0.5)
+    stopping_scene = scene(0.3, 0.94, surface=surface)
+    hopping_scene = dataclasses.replace(stopping_scene, contact="hybrid", restitution=0.5)
     rates = [
-        float(steady.growth_rate(steady.standing_matrix(variant, 100.0, inverted=True))) for variant in (stops, flies)
+        float(steady.growth_rate(steady.standing_matrix(variant, 100.0, inverted=True)))
+        for variant in (stopping_scene, hopping_scene)
     ]
     assert rates[0] == rates[1]
     assert rates[0] < -1e-3
@@ -174,11 +175,11 @@ def test_the_growth_rate_of_a_tumbling_top_vanishes_at_the_fold_of_jelletts_cons
     slope = jax.jit(jax.vmap(jax.grad(lambda theta: steady.tumbling(top_scene, theta).jellett)))
     folds = sign_changes(slope, jnp.linspace(0.01, 3.13, 500))
     assert folds.size > 0
-    beside = jnp.concatenate([folds - 3e-8, folds + 3e-8])
-    motion = steady.tumbling(top_scene, beside)
-    lanes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, beside.shape), top_scene)
-    before, after = jnp.split(tumbling_growth(lanes, motion), 2)
-    assert jnp.all(before * after < 0.0)
+    spins_near_folds = jnp.concatenate([folds - 3e-8, folds + 3e-8])
+    motion = steady.tumbling(top_scene, spins_near_folds)
+    lanes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, spins_near_folds.shape), top_scene)
+    growth_before, growth_after = jnp.split(tumbling_growth(lanes, motion), 2)
+    assert jnp.all(growth_before * growth_after < 0.0)
     spins = motion.spin.reshape(2, -1)
     assert jnp.all(jnp.abs(spins[1] / spins[0] - 1.0) < 1e-6)
 
@@ -204,8 +205,8 @@ def test_thresholds_of_rutstams_top():
         inverted / (top_scene.body.I3 * (top_scene.body.radius - top_scene.body.offset)), 77.18, rtol=2e-4
     )
     # A standing top has the constant of the tumbling tops next to it.
-    near = steady.tumbling(top_scene, jnp.array([1e-6, np.pi - 1e-6])).jellett
-    np.testing.assert_allclose(near, [upright, inverted], rtol=1e-9)
+    jellett_near = steady.tumbling(top_scene, jnp.array([1e-6, np.pi - 1e-6])).jellett
+    np.testing.assert_allclose(jellett_near, [upright, inverted], rtol=1e-9)
 
 
 def test_cohens_top_with_a_smaller_axial_inertia_tumbles_at_an_intermediate_angle():
@@ -234,8 +235,8 @@ def test_the_steady_motions_are_the_extrema_of_the_effective_energy():
         assert abs(energy(motion.theta, motion.jellett)) < 1e-14
         assert (curvature(motion.theta, motion.jellett) > 0.0) == stable
     assert angles == {True, False}
-    several = steady.tumbling_angles(top_scene, float(motion.jellett))
-    assert any(abs(theta - 3.0) < 1e-9 for theta in several)
+    angles_found = steady.tumbling_angles(top_scene, float(motion.jellett))
+    assert any(abs(theta - 3.0) < 1e-9 for theta in angles_found)
 
 
 def test_no_steady_tumbling_where_the_lever_is_negative_or_the_arena_is_curved():

@@ -41,10 +41,10 @@ def test_a_run_that_needs_more_than_the_most_steps_has_failed(table, rutstam_sce
     """A file of another limit is another request; the default limit is not in the request, so that older files resume."""
     arguments = {"theta": THETA, "spin": SPIN, "t1": 12.0, "path": tmp_path / "table.h5"}
     with pytest.warns(UserWarning, match=r"6 of 6 runs have failed: t1 = 12 s is too long: .* more than 40 steps"):
-        short = tippe.inversion_table(rutstam_scene_module, max_steps=40, **arguments)
-    assert (short.status == "failed").all()
-    assert (short["steps"] == 40).all()
-    assert json.loads(short.attributes["request"])["max_steps"] == 40
+        short_table = tippe.inversion_table(rutstam_scene_module, max_steps=40, **arguments)
+    assert (short_table.status == "failed").all()
+    assert (short_table["steps"] == 40).all()
+    assert json.loads(short_table.attributes["request"])["max_steps"] == 40
     assert "max_steps" not in json.loads(table.attributes["request"])
     with pytest.raises(ValueError, match="max_steps is 40 in the file"):
         tippe.inversion_table(rutstam_scene_module, **arguments)
@@ -61,15 +61,15 @@ def test_every_cell_is_inversion_time(table, rutstam_scene_module):
 
 def test_scattered_cells_are_those_of_the_grid(table, rutstam_scene_module, tmp_path):
     """Launches that are no grid, in one call: the same numbers to the bit, and the columns among the variables."""
-    which = np.array([[0, 1], [2, 0], [1, 1], [2, 0]])
-    columns = {"theta": np.array(THETA)[which[:, 0]], "spin": np.array(SPIN)[which[:, 1]]}
+    cell_indices = np.array([[0, 1], [2, 0], [1, 1], [2, 0]])
+    columns = {"theta": np.array(THETA)[cell_indices[:, 0]], "spin": np.array(SPIN)[cell_indices[:, 1]]}
     arguments = {"t1": 12.0, "scattered": True, "path": tmp_path / "cells.h5"}
     cells = tippe.inversion_table(rutstam_scene_module, **columns, **arguments)
     assert cells.shape == (4,)
     assert cells.dims("time") == ("cell",)
     for name, values in columns.items():
         np.testing.assert_array_equal(cells[name], values)
-    np.testing.assert_array_equal(cells.time, table.time[tuple(which.T)])
+    np.testing.assert_array_equal(cells.time, table.time[tuple(cell_indices.T)])
     assert cells.units["theta"] == "rad"
     second_table = tippe.inversion_table(rutstam_scene_module, **columns, **arguments)
     np.testing.assert_array_equal(second_table.time, cells.time)
@@ -153,11 +153,11 @@ def test_grids_larger_than_a_block_are_cut_and_joined(rutstam_scene_module, monk
 
 
 def test_a_scene_that_changes_only_in_numbers_does_not_compile_again(rutstam_scene_module, caplog):
-    other = tippe.Scene(tippe.Top(0.03, 0.025, 0.005, 5e-6, 5.5e-6), tippe.Plane(), tippe.Viscous(0.2))
+    other_scene = tippe.Scene(tippe.Top(0.03, 0.025, 0.005, 5e-6, 5.5e-6), tippe.Plane(), tippe.Viscous(0.2))
     # Not the module's table: what was compiled for it may have been forgotten since.
     tippe.inversion_table(rutstam_scene_module, theta=[0.1, 0.2, 0.3], spin=[100.0, 110.0], t1=1.0)
     with jax.log_compiles():
-        tippe.inversion_table(other, theta=[0.07, 0.11, 0.2], spin=[95.0, 130.0], t1=9.0)
+        tippe.inversion_table(other_scene, theta=[0.07, 0.11, 0.2], spin=[95.0, 130.0], t1=9.0)
     assert not [text for text in caplog.messages if "Finished XLA compilation" in text and "ensemble_solve" in text]
 
 

@@ -68,10 +68,10 @@ def test_the_estimate_covers_the_error_in_every_cell_through_the_threshold(near_
     for factor, time, status, estimate in zip(
         FACTORS, near_threshold.time, near_threshold.status, near_threshold.time_error, strict=True
     ):
-        known_status, known = reference(factor)
+        known_status, known_times = reference(factor)
         assert known_status == status
         if status == "inverted":
-            assert abs(time - known) < estimate < 30.0 * abs(time - known)
+            assert abs(time - known_times) < estimate < 30.0 * abs(time - known_times)
 
 
 def test_digits_of_a_table(near_threshold):
@@ -89,12 +89,16 @@ def test_digits_of_a_table(near_threshold):
 
 
 def test_the_rest_of_the_table_is_that_without_errors(near_threshold):
-    plain = tippe.inversion_table(SCENE, theta=0.1, spin=threshold_spins(FACTORS), t1=40.0, angle=ANGLE, tolerance=1e-8)
-    assert list(plain.variables) == [name for name in near_threshold.variables if not name.endswith("_error")]
-    for name, values in plain.variables.items():
+    table_without_errors = tippe.inversion_table(
+        SCENE, theta=0.1, spin=threshold_spins(FACTORS), t1=40.0, angle=ANGLE, tolerance=1e-8
+    )
+    assert list(table_without_errors.variables) == [
+        name for name in near_threshold.variables if not name.endswith("_error")
+    ]
+    for name, values in table_without_errors.variables.items():
         assert (values == near_threshold.variables[name]).all()
     with pytest.raises(ValueError, match="the table has no 'time_error'"):
-        plain.digits("time")
+        table_without_errors.digits("time")
     with pytest.raises(ValueError, match="the table has no 'weight'"):
         near_threshold.digits("weight")
 
@@ -183,8 +187,8 @@ def test_agreement_on_no_answer_is_no_agreement(monkeypatch):
     runs = InversionRuns(run_kind_of(scene), 1.0, ANGLE, "both", Settings(1e-9), "ensemble", [])
     outcome = InversionJob(runs, {"scene": scene}, errors=True)({}, len(words))
     for name in ("first_time", "last_time"):
-        doubtful = np.isinf(outcome[f"{name}_error"])
-        assert {word for word, doubt in zip(words, doubtful, strict=True) if doubt} == {"failed", "unresolved"}
+        is_doubtful = np.isinf(outcome[f"{name}_error"])
+        assert {word for word, doubt in zip(words, is_doubtful, strict=True) if doubt} == {"failed", "unresolved"}
     assert concise_strings(outcome["last_time"], outcome["last_time_error"], np.array(words))[-1] == "unresolved?"
 
 
@@ -221,16 +225,16 @@ def judged(first, second, true, counts):
     error = np.abs(first["time"][finite] - true["time"][finite])
     # The reference has its own round-off.
     error = np.maximum(error - 1e-13 * true["time"][finite], 0.0)
-    unseen = (first["status"] != true["status"]) & (bounds["status_error"] == 0)
-    return np.array([finite.sum(), (error > bound).sum(), (bound > 30.0 * (error + 1e-13)).sum(), unseen.sum()])
+    is_unseen = (first["status"] != true["status"]) & (bounds["status_error"] == 0)
+    return np.array([finite.sum(), (error > bound).sum(), (bound > 30.0 * (error + 1e-13)).sum(), is_unseen.sum()])
 
 
 def test_the_bound_holds_in_random_scenes():
     """The short form of the study below: 200 tops on the plane, of which fifty invert."""
     runs, counts = runs_of("plane-viscous-stop", 200, (1e-8, 1e-10, 1e-13))
-    cells, below, far_above, unseen = judged(*runs.values(), counts)
+    cells, below_bound, far_above, is_unseen = judged(*runs.values(), counts)
     assert cells > 30
-    assert (below, unseen) == (0, 0)
+    assert (below_bound, is_unseen) == (0, 0)
     assert far_above <= 0.1 * cells
 
 
@@ -243,9 +247,9 @@ def test_the_bound_holds_in_random_scenes_of_all_kinds():
         runs, counts = runs_of(kind, 300, tolerances)
         for k, tolerance in enumerate(tolerances[:-2]):
             total[tolerance] += judged(*(runs[tolerances[j]] for j in (k, k + 2, -1)), counts)
-    for tolerance, (cells, below, far_above, unseen) in total.items():
-        print(f"{tolerance:.0e}: {cells} times, {below} below, {far_above} far above, {unseen} unseen")
+    for tolerance, (cells, below_bound, far_above, is_unseen) in total.items():
+        print(f"{tolerance:.0e}: {cells} times, {below_bound} below, {far_above} far above, {is_unseen} unseen")
         assert cells > 1000
-        assert below <= 0.003 * cells
+        assert below_bound <= 0.003 * cells
         assert far_above <= 0.1 * cells
-        assert unseen <= 0.003 * cells
+        assert is_unseen <= 0.003 * cells

@@ -69,16 +69,16 @@ def test_illegal_numbers_in_a_batch_of_runs_give_nothing_that_looks_right(rutsta
     good = (0.3, 0.1, 0.05, 1e-9)
     bad = ((0, (-0.3, math.nan)), (1, (10.0, -0.1)), (2, (-0.05, 0.01, math.nan)), (3, (-1.0, 0.0, math.nan)))
     columns = [good]
-    for which, values in bad:
-        columns += [tuple(value if i == which else number for i, number in enumerate(good)) for value in values]
+    for column, values in bad:
+        columns += [tuple(value if i == column else number for i, number in enumerate(good)) for value in values]
     runs = jax.jit(jax.vmap(run))(*jnp.array(columns).T)
     assert runs.status.tolist() == [0] + 10 * [4]
     assert jax.vmap(run)(*jnp.array(columns).T[:, :0]).theta.shape == (0, 2)
     single_run = tippe.simulate(rutstam_scene, LAUNCH, 0.05, times=[0.0, 0.05])
     assert_close(runs.theta[0], single_run.theta, rtol=1e-8)
-    for read in (runs.theta, runs.energy, runs.position, runs.normal_force, runs.work, runs.end_time):
-        assert np.all(np.isfinite(read[0]))
-        assert np.all(np.isnan(read[1:]))
+    for quantity in (runs.theta, runs.energy, runs.position, runs.normal_force, runs.work, runs.end_time):
+        assert np.all(np.isfinite(quantity[0]))
+        assert np.all(np.isnan(quantity[1:]))
 
 
 @pytest.mark.slow
@@ -145,8 +145,8 @@ def test_the_derivative_of_a_trajectory(rutstam_scene):
     assert_close(forward, reverse, rtol=1e-7)
     assert_close(jax.jacfwd(theta)(0.3), reverse, rtol=1e-12)
     steps = [4e-4, 2e-4, 1e-4]
-    plain = [(theta(0.3 + h) - theta(0.3 - h)) / (2.0 * h) for h in steps]
-    assert_close((4.0 * plain[2] - plain[1]) / 3.0, reverse, rtol=1e-7)
+    differences = [(theta(0.3 + h) - theta(0.3 - h)) / (2.0 * h) for h in steps]
+    assert_close((4.0 * differences[2] - differences[1]) / 3.0, reverse, rtol=1e-7)
 
 
 def test_a_batch_of_runs_says_which_lost_contact():

@@ -20,10 +20,10 @@ def axis_x(theta, solver=None, adjoint=None):
     return run.axis[-1, 0]
 
 
-def extrapolated(function, at, step):
+def extrapolated(function, point, step):
     """A central difference, extrapolated from two steps."""
-    fine, coarse = ((function(at + h) - function(at - h)) / (2.0 * h) for h in (step, 2.0 * step))
-    return (4.0 * fine - coarse) / 3.0
+    fine_slope, coarse = ((function(point + h) - function(point - h)) / (2.0 * h) for h in (step, 2.0 * step))
+    return (4.0 * fine_slope - coarse) / 3.0
 
 
 @pytest.mark.slow
@@ -67,10 +67,10 @@ def test_a_transformed_run_ends_where_the_contact_is_lost():
         tippe.simulate(reference_run.scene, tippe.Launch(0.1, 200.0), 6.0, times=[6.0], tolerance=1e-11)
     assert run.status == 1
     assert_close(run.end_time, reference_run.end_time, rtol=5e-8)
-    inside = np.isfinite(run.normal_force)
-    assert inside.sum() == len(reference_run.t)
-    assert np.all(run.normal_force[inside] > 0.0)
-    assert_close(run.theta[inside], reference_run.theta, rtol=1e-6)
+    in_contact = np.isfinite(run.normal_force)
+    assert in_contact.sum() == len(reference_run.t)
+    assert np.all(run.normal_force[in_contact] > 0.0)
+    assert_close(run.theta[in_contact], reference_run.theta, rtol=1e-6)
 
 
 def test_the_loss_of_contact_moves_with_the_launch():
@@ -103,15 +103,15 @@ def test_every_number_of_the_launch_and_some_of_the_scene():
     def end(numbers):
         theta, spin, eta, mu, offset = numbers
         body = tippe.Top(scene.body.mass, scene.body.radius, offset, scene.body.I1, scene.body.I3)
-        changed = tippe.Scene(body, scene.surface, tippe.Viscous(mu))
+        changed_scene = tippe.Scene(body, scene.surface, tippe.Viscous(mu))
         launch = tippe.Launch(theta, spin, eta)
-        run = tippe.simulate(changed, launch, 0.5, times=TIMES, tolerance=1e-11)
+        run = tippe.simulate(changed_scene, launch, 0.5, times=TIMES, tolerance=1e-11)
         return run.theta[3] + 10.0 * run.position[-1, 1] + run.spin_angle[2]
 
-    at = jnp.array([0.2, 110.0, 0.3, 0.25, 0.005])
-    gradient = jax.grad(end)(at)
-    for k, size in enumerate(np.asarray(at)):
-        expected = extrapolated(lambda value, k=k: float(end(at.at[k].set(value))), size, 3e-4 * size)
+    point = jnp.array([0.2, 110.0, 0.3, 0.25, 0.005])
+    gradient = jax.grad(end)(point)
+    for k, size in enumerate(np.asarray(point)):
+        expected = extrapolated(lambda value, k=k: float(end(point.at[k].set(value))), size, 3e-4 * size)
         assert_close(gradient[k], expected, rtol=2e-6)
 
 

@@ -60,13 +60,13 @@ def test_every_cell_is_a_single_run(table, scene):
 
 def test_a_run_that_needs_more_than_the_most_steps_has_failed(table, scene):
     """What it reached is there. The default limit is not in the request, so that older files resume."""
-    short = tippe.trajectory_table(scene, theta=THETA, spin=SPIN, mu=MU, times=TIMES, max_steps=20)
-    assert (short.status == "failed").all()
-    assert (short["steps"] == 20).all()
-    reached = np.isfinite(short.theta)
-    assert 0 < reached.sum() < reached.size
-    np.testing.assert_array_equal(short.theta[reached], table[0].theta[reached])
-    assert json.loads(short.attributes["request"])["max_steps"] == 20
+    short_table = tippe.trajectory_table(scene, theta=THETA, spin=SPIN, mu=MU, times=TIMES, max_steps=20)
+    assert (short_table.status == "failed").all()
+    assert (short_table["steps"] == 20).all()
+    is_reached = np.isfinite(short_table.theta)
+    assert 0 < is_reached.sum() < is_reached.size
+    np.testing.assert_array_equal(short_table.theta[is_reached], table[0].theta[is_reached])
+    assert json.loads(short_table.attributes["request"])["max_steps"] == 20
     assert "max_steps" not in json.loads(table[0].attributes["request"])
 
 
@@ -114,10 +114,10 @@ def test_every_quantity_is_that_of_a_single_run_and_comes_back_from_a_file(arena
     assert table.dims("slip") == ("launch.theta", "time", "tangent")
     assert table.dims("energy") == ("launch.theta", "time")
     table.save(tmp_path / "saved.h5")
-    loaded = tippe.Table.load(tmp_path / "saved.h5")
-    assert list(loaded.coords) == list(table.coords)
-    assert loaded.coords["component"].tolist() == table.coords["component"].tolist() == ["x", "y", "z"]
-    np.testing.assert_array_equal(loaded.position, table.position)
+    loaded_table = tippe.Table.load(tmp_path / "saved.h5")
+    assert list(loaded_table.coords) == list(table.coords)
+    assert loaded_table.coords["component"].tolist() == table.coords["component"].tolist() == ["x", "y", "z"]
+    np.testing.assert_array_equal(loaded_table.position, table.position)
     with xarray.open_dataset(tmp_path / "saved.h5", engine="h5netcdf") as data:
         assert data["velocity"].dims == ("launch.theta", "time", "component")
         assert data["component"].attrs["flag_meanings"] == "x y z"
@@ -126,23 +126,23 @@ def test_every_quantity_is_that_of_a_single_run_and_comes_back_from_a_file(arena
 
 def test_further_axes_and_none(scene):
     axes = {"launch.azimuth": [0.0, 1.0, -2.0], "scene.body.offset": [0.005, 0.006]}
-    turned = tippe.trajectory_table(scene, theta=0.2, spin=100.0, times=TIMES, axes=axes)
-    assert list(turned.coords) == ["launch.azimuth", "offset", "time"]
+    turned_table = tippe.trajectory_table(scene, theta=0.2, spin=100.0, times=TIMES, axes=axes)
+    assert list(turned_table.coords) == ["launch.azimuth", "offset", "time"]
     # The plane looks the same in every direction.
-    assert_close(turned.theta, np.broadcast_to(turned.theta[0], turned.theta.shape), atol=1e-7)
+    assert_close(turned_table.theta, np.broadcast_to(turned_table.theta[0], turned_table.theta.shape), atol=1e-7)
     single_table = tippe.trajectory_table(scene, theta=0.2, spin=100.0, times=TIMES)
     assert single_table.shape == ()
     assert single_table.theta.shape == (31,)
     assert single_table.status == "completed"
-    assert_close(single_table.theta, turned.theta[0, 1], atol=1e-7)
+    assert_close(single_table.theta, turned_table.theta[0, 1], atol=1e-7)
     assert "theta [rad] x time (31)" in str(single_table)
 
 
 def test_the_file_opens_in_xarray_as_the_table_does(table):
     table, path = table
-    loaded = tippe.Table.load(path)
+    loaded_table = tippe.Table.load(path)
     with xarray.open_dataset(path, engine="h5netcdf") as data:
-        for dataset in (data, table.to_xarray(), loaded.to_xarray()):
+        for dataset in (data, table.to_xarray(), loaded_table.to_xarray()):
             assert dataset["theta"].dims == ("launch.theta", "mu", "launch.spin", "time")
             assert dataset["end_time"].dims == ("launch.theta", "mu", "launch.spin")
             assert dataset["theta"].attrs["units"] == "rad"
@@ -152,9 +152,9 @@ def test_the_file_opens_in_xarray_as_the_table_does(table):
             assert_close(cell.sel(time=1.5), table.theta[1, 1, 0, -1])
         assert data["status"].attrs["flag_meanings"].split()[0] == "completed"
     assert set(table.to_xarray()["status"].values.ravel()) == {"completed", "contact_lost"}
-    assert loaded.inner == table.inner
+    assert loaded_table.inner == table.inner
     for name in table.variables:
-        np.testing.assert_array_equal(loaded.variables[name], table.variables[name])
+        np.testing.assert_array_equal(loaded_table.variables[name], table.variables[name])
 
 
 def test_an_interrupted_table_resumes_and_a_damaged_block_is_computed_again(scene, tmp_path, monkeypatch):
@@ -163,7 +163,7 @@ def test_an_interrupted_table_resumes_and_a_damaged_block_is_computed_again(scen
     path = tmp_path / "table.h5"
     arguments = {"theta": np.linspace(0.1, 1.6, 20), "spin": [*SPIN, 90.0, 130.0], "mu": MU, "times": TIMES}
 
-    done = written_blocks.recorded(monkeypatch, most=1)
+    chunks = written_blocks.recorded(monkeypatch, most=1)
     with pytest.raises(KeyboardInterrupt):
         tippe.trajectory_table(scene, path=path, **arguments)
     part = tippe.Table.load(path)
@@ -173,18 +173,18 @@ def test_an_interrupted_table_resumes_and_a_damaged_block_is_computed_again(scen
 
     second_writes = written_blocks.recorded(monkeypatch)
     complete_table = tippe.trajectory_table(scene, path=path, **arguments)
-    assert sorted(done + second_writes) == [0, 1, 2]
+    assert sorted(chunks + second_writes) == [0, 1, 2]
     with h5py.File(path, "r+") as file:
         file["theta"][9, 1, 3, 7] += 1e-12
     with pytest.raises(OSError, match="1 of its 3 chunks do not match"):
         tippe.Table.load(path)
     with pytest.warns(RuntimeWarning, match="1 finished chunks"):
-        mended = tippe.trajectory_table(scene, path=path, **arguments)
-    assert sorted(done + second_writes) == [0, 0, 1, 1, 2, 2]
-    fresh = tippe.trajectory_table(scene, **arguments)
-    for table in (complete_table, mended, tippe.Table.load(path)):
-        np.testing.assert_array_equal(table.theta, fresh.theta)
-        np.testing.assert_array_equal(table.status, fresh.status)
+        repaired = tippe.trajectory_table(scene, path=path, **arguments)
+    assert sorted(chunks + second_writes) == [0, 0, 1, 1, 2, 2]
+    fresh_table = tippe.trajectory_table(scene, **arguments)
+    for table in (complete_table, repaired, tippe.Table.load(path)):
+        np.testing.assert_array_equal(table.theta, fresh_table.theta)
+        np.testing.assert_array_equal(table.status, fresh_table.status)
     with pytest.raises(ValueError, match=r"another run: quantities is \['theta', 'eta'\] in the file"):
         tippe.trajectory_table(scene, path=path, quantities=["theta"], **arguments)
     with pytest.raises(ValueError, match="another run: the axis time differs"):

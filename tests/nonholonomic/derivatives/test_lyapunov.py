@@ -18,8 +18,8 @@ class Shears(AbstractProblem):
     end: jax.Array
 
     def start(self):
-        ones = jnp.ones_like(self.a)
-        return jnp.stack([ones, ones, 0.0 * ones]), jnp.stack([ones, ones, ones])
+        one = jnp.ones_like(self.a)
+        return jnp.stack([one, one, 0.0 * one]), jnp.stack([one, one, one])
 
     def field(self, time, state):
         return jnp.stack([self.a * state[0] + state[1], self.b * state[1], jnp.ones_like(state[2])])
@@ -37,8 +37,8 @@ class Lorenz(AbstractProblem):
     x: jax.Array
 
     def start(self):
-        ones = jnp.ones_like(self.x)
-        return jnp.stack([self.x, 1.0 + self.x, 20.0 * ones]), jnp.stack([10.0 * ones] * 3)
+        one = jnp.ones_like(self.x)
+        return jnp.stack([self.x, 1.0 + self.x, 20.0 * one]), jnp.stack([10.0 * one] * 3)
 
     def field(self, time, state):
         x, y, z = state
@@ -57,7 +57,7 @@ def follow(problem, t1, cells, stretches=32):
 
 
 def test_known_rates_and_a_run_that_ends():
-    """The greatest of a, b and 0, whichever it is; the growth to the very end; nothing after the guard."""
+    """The exponent is the greatest of a, b and 0; growth counts to the end of the run, and not beyond the domain."""
     a, b, end = np.array([0.5, -0.3, -0.3, 0.5]), np.array([0.2, 0.8, -0.2, 0.2]), np.array([1e3, 1e3, 1e3, 17.0])
     outcome = follow(Shears(*map(jnp.asarray, (a, b, end))), 40.0, 4)
     assert outcome.status.tolist() == [REACHED_END] * 3 + [LEFT_DOMAIN]

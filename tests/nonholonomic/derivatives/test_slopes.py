@@ -65,20 +65,23 @@ gradients = jax.jit(jax.vmap(jax.grad(time_of_decay, (0, 1, 2)), (0, 0, None)))
 
 
 def found_and_expected(names=MANY, patience=1e3, heights=HEIGHTS, cells=100, run=compiled_solve, **options):
-    """Outcome, slopes by the named numbers, and what they should be; rate and height differ from cell to cell."""
+    """Outcome, derivatives with respect to the named numbers, and their exact values; rate and height differ between cells."""
     point = (jnp.asarray(RATES), jnp.asarray(heights), jnp.asarray(0.7))
     tangents = [
-        tuple(jnp.full_like(component, name == moved) for component, moved in zip(point, MOVED, strict=True))
+        tuple(
+            jnp.full_like(component, name == name_of_tangent)
+            for component, name_of_tangent in zip(point, MOVED, strict=True)
+        )
         for name in names
     ]
     options = {"solver": diffrax.Dopri8()} | options
     outcome, derivatives = run(point, tangents, jnp.asarray(patience), jnp.asarray(cells), **options)
-    every = gradients(*point)
-    return outcome, derivatives, [every[MOVED.index(name)] for name in names]
+    all_gradients = gradients(*point)
+    return outcome, derivatives, [all_gradients[MOVED.index(name)] for name in names]
 
 
 def compiled_anew():
-    """`solve`, traced with what has been patched."""
+    """`solve`, traced again so that patched constants take effect."""
     return eqx.filter_jit(lambda *arguments, **options: solve(*arguments, **options))
 
 
@@ -118,11 +121,11 @@ def test_few_directions_are_integrated_forward_and_many_backward(count, backward
 
 def test_a_cell_that_ends_otherwise_has_no_slope_and_leaves_the_others_theirs():
     outcome, derivatives, expected = found_and_expected(patience=1.0)
-    late = np.asarray(time_of_decay(RATES, HEIGHTS, 0.7)) > 1.0
-    assert 20 < late.sum() < 80
-    assert (np.asarray(outcome.status) == np.where(late, LEFT_DOMAIN, CROSSED)).all()
+    is_late = np.asarray(time_of_decay(RATES, HEIGHTS, 0.7)) > 1.0
+    assert 20 < is_late.sum() < 80
+    assert (np.asarray(outcome.status) == np.where(is_late, LEFT_DOMAIN, CROSSED)).all()
     for slope, expected_slope in zip(derivatives, expected, strict=True):
-        assert_close(slope, np.where(late, 0.0, expected_slope), rtol=1e-7)
+        assert_close(slope, np.where(is_late, 0.0, expected_slope), rtol=1e-7)
 
 
 @pytest.mark.parametrize("cells", [0, pytest.param(1, marks=pytest.mark.slow), 70])
@@ -153,7 +156,7 @@ def test_runs_longer_than_what_is_kept_are_repeated(kept, steps, monkeypatch):
 
 
 def test_the_starts_that_are_kept_are_spread_out(monkeypatch):
-    """Of two hundred starts eight are kept: the first and the last always, the others with no gap above half of the run."""
+    """Of two hundred checkpoints, eight remain: the first, the last, and others without a gap of more than half the run."""
     monkeypatch.setattr(periods, "SLOTS", 8)
     checkpoints = periods.Checkpoints.none(jnp.zeros(()))
     for index in range(200):
@@ -193,7 +196,9 @@ def test_a_component_at_rest_has_its_tangent_integrated(names):
     """Steps judged by the run alone would reach the event in a few strides of which the tangent bears none: along one
     direction, and backward by five."""
     point = (jnp.zeros(4), jnp.zeros(4))
-    tangents = [tuple(jnp.full(4, name == moved) * 1.0 for moved in ("rest", "push")) for name in names]
+    tangents = [
+        tuple(jnp.full(4, name == name_of_tangent) * 1.0 for name_of_tangent in ("rest", "push")) for name in names
+    ]
 
     @eqx.filter_jit
     def run():

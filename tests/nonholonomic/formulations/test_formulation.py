@@ -117,9 +117,13 @@ def test_routhian_of_the_heavy_top_gives_its_precession_and_nutation():
     @jax.jit
     def by_both(q, rate):
         reduced = Routhian(top, cyclic=2, momentum=(top.metric(q) @ rate)[2])
-        whole = Hamel(top).acceleration(0.0, q, rate)[:2], rate, top.energy(q, rate)
+        full_result = Hamel(top).acceleration(0.0, q, rate)[:2], rate, top.energy(q, rate)
         q, rate = q[:2], rate[:2]
-        return whole, (Hamel(reduced).acceleration(0.0, q, rate), reduced.complete(q, rate)[1], reduced.energy(q, rate))
+        return full_result, (
+            Hamel(reduced).acceleration(0.0, q, rate),
+            reduced.complete(q, rate)[1],
+            reduced.energy(q, rate),
+        )
 
     (acceleration, rate, energy), (part, completed, reduced_energy) = by_both(ORIENTATION, rate)
     np.testing.assert_allclose(part, acceleration, rtol=1e-13)
@@ -148,7 +152,7 @@ def test_chaplygin_sleigh(formulation):
 
 
 def test_multiplier_is_the_blade_force():
-    """The side force on the blade: m (v omega + a omega'), less what the drag does not do across."""
+    """The side force on the blade is m (v omega + a omega')."""
     q, rate, acceleration = sleigh_motion()
     force = jax.jit(lambda q, rate: Multipliers(SLEIGH).multipliers(0.0, q, rate))(q, rate)
     expected = SLEIGH.mass * (0.8 * 1.3 + SLEIGH.ahead * acceleration[2])
@@ -174,7 +178,7 @@ def test_velocity_that_violates_a_constraint_is_projected_with_a_warning():
 
 
 def test_drift_is_kept_damped_or_ignored():
-    """W q' stays as it is by the bare multipliers, decays at Baumgarte's rate, or is projected out of the velocity."""
+    """W q' is constant with multipliers alone, decays at Baumgarte's rate, or is removed by projection."""
     q, rate, _ = sleigh_motion()
     skid = rate + 0.1 * SLEIGH.constraints(q)[0]
     state = jnp.concatenate([q, SLEIGH.metric(q) @ skid])
@@ -201,10 +205,10 @@ def test_negative_baumgarte_rate_is_refused():
 def test_formulations_serve_many_states():
     """vmap over states, and a gradient through the data: d(v')/d(ahead) = omega^2."""
     q, rate, expected = sleigh_motion()
-    many = jax.jit(jax.vmap(lambda q, rate: Hamel(SLEIGH).acceleration(0.0, q, rate)))(
+    batch = jax.jit(jax.vmap(lambda q, rate: Hamel(SLEIGH).acceleration(0.0, q, rate)))(
         np.stack([q, q]), np.stack([rate, rate])
     )
-    np.testing.assert_allclose(many, np.stack([expected, expected]), rtol=1e-13)
+    np.testing.assert_allclose(batch, np.stack([expected, expected]), rtol=1e-13)
 
     def forward(ahead):
         sleigh = eqx.tree_at(lambda s: s.ahead, SLEIGH, ahead)

@@ -50,13 +50,13 @@ def carried_frame(surface, side):
 
 
 def foot_of(name):
-    """A point of the surface with nothing special about it, in the surface's axes."""
+    """A generic point of the surface, in the surface's axes."""
     surface, _ = SURFACES[name]
     x, y = FOOT
-    near = (jnp.asarray(x), jnp.asarray(y), jnp.asarray(-0.29))
+    start_foot = (jnp.asarray(x), jnp.asarray(y), jnp.asarray(-0.29))
     if name.endswith("torus"):
-        near = (jnp.asarray(x + 0.4), jnp.asarray(y), jnp.asarray(-0.16))
-    foot = surface.nearest(near)
+        start_foot = (jnp.asarray(x + 0.4), jnp.asarray(y), jnp.asarray(-0.16))
+    foot = surface.nearest(start_foot)
     return tuple(jnp.zeros(()) if part is None else part for part in foot)
 
 
@@ -108,14 +108,14 @@ def test_the_frame_is_orthonormal_and_turns_as_stated(name):
 def test_a_frame_of_its_own_is_the_carried_one_in_fewer_numbers(name):
     """From the same foot, and t1 along it, both are at the same place with the same axes later, and say the same rates."""
     velocity, positions = (jnp.asarray(0.3), jnp.asarray(-0.2)), []
-    own, general = frame_of(*SURFACES[name], DISTANCE, PULL), carried_frame(*SURFACES[name])
-    start = own.at_foot(foot_of(name))
-    place, _ = general.at_foot(foot_of(name))
-    first = SURFACES[name][0].in_own_axes(own.axes(*start)[0])
-    for frame, begin in ((own, start), (general, ((*place[:3], *first), ()))):
-        arrival = moved(frame, begin, velocity, 0.2)
+    frame_of_surface, frame_by_carrying = frame_of(*SURFACES[name], DISTANCE, PULL), carried_frame(*SURFACES[name])
+    start = frame_of_surface.at_foot(foot_of(name))
+    place, _ = frame_by_carrying.at_foot(foot_of(name))
+    first = SURFACES[name][0].in_own_axes(frame_of_surface.axes(*start)[0])
+    for frame, frame_start in ((frame_of_surface, start), (frame_by_carrying, ((*place[:3], *first), ()))):
+        arrival = moved(frame, frame_start, velocity, 0.2)
         frame_motion = frame.frame_motion(arrival[0], velocity)
-        height = float(frame.height(arrival[0]) - frame.height(begin[0]))
+        height = float(frame.height(arrival[0]) - frame.height(frame_start[0]))
         positions.append(
             np.concatenate(
                 [
@@ -134,10 +134,10 @@ def test_the_foot_is_drawn_back_to_the_surface():
     """A drift decays at the stated rate, and the surface is reached where the foot came from."""
     frame = carried_frame(*SURFACES["graph"])
     place, _ = frame.at_foot(foot_of("graph"))
-    off = (place[0], place[1], place[2] + 1e-4, *place[3:])
-    before = float(frame.surface.distance(off[:3]))
-    later, _ = moved(frame, (off, ()), (jnp.asarray(0.3), jnp.asarray(-0.2)), 0.1)
-    assert_close(frame.surface.distance(later[:3]), before * np.exp(-2.0), rtol=0.05)
+    place_off_surface = (place[0], place[1], place[2] + 1e-4, *place[3:])
+    distance_before = float(frame.surface.distance(place_off_surface[:3]))
+    place_after, _ = moved(frame, (place_off_surface, ()), (jnp.asarray(0.3), jnp.asarray(-0.2)), 0.1)
+    assert_close(frame.surface.distance(place_after[:3]), distance_before * np.exp(-2.0), rtol=0.05)
 
 
 def test_room_is_left_where_the_ball_fits_and_ends_at_the_curvature_of_the_ball():
@@ -155,10 +155,10 @@ def test_the_angle_counts_from_the_lowest_point(name):
     frame = frame_of(*SURFACES[name], DISTANCE, PULL)
     radius = 0.3 - 0.02 if frame.inside else 0.32
     for eta in (0.0, 0.7, -0.7, np.pi / 2.0, 2.0):
-        where = frame.at_angle(jnp.asarray(eta))
-        assert_close(frame.angle(*where), abs(eta) if "sphere" in name else eta, atol=1e-12)
-        assert_close(frame.position(*where), (radius * np.sin(eta), 0.0, -radius * np.cos(eta)), atol=1e-12)
-        assert_close(frame.height(where[0]), 0.3 - radius * np.cos(eta), atol=1e-12)
+        place = frame.at_angle(jnp.asarray(eta))
+        assert_close(frame.angle(*place), abs(eta) if "sphere" in name else eta, atol=1e-12)
+        assert_close(frame.position(*place), (radius * np.sin(eta), 0.0, -radius * np.cos(eta)), atol=1e-12)
+        assert_close(frame.height(place[0]), 0.3 - radius * np.cos(eta), atol=1e-12)
 
 
 def test_a_cylinder_turns_as_the_conventions_say():
@@ -175,15 +175,20 @@ def test_a_cylinder_turns_as_the_conventions_say():
 @pytest.mark.parametrize("name", ["cylinder", "sphere", "outside of a cylinder", "outside of a sphere"])
 def test_a_carried_frame_starts_with_the_axes_of_the_frame_of_its_own(name):
     """At every eta, the papers' 1.571 included, and from a foot: `Launch` promises one t1 for all kinds of contact."""
-    own, general = frame_of(*SURFACES[name], DISTANCE, PULL), carried_frame(*SURFACES[name])
+    frame_of_surface, frame_by_carrying = frame_of(*SURFACES[name], DISTANCE, PULL), carried_frame(*SURFACES[name])
     for eta in (0.0, 0.7, -1.5, 1.571, np.pi / 2.0, 2.0, -2.5, np.pi):
-        axes = [np.array(frame.axes(*frame.at_angle(jnp.asarray(eta))), dtype=float) for frame in (own, general)]
+        axes = [
+            np.array(frame.axes(*frame.at_angle(jnp.asarray(eta))), dtype=float)
+            for frame in (frame_of_surface, frame_by_carrying)
+        ]
         assert_close(axes[1], axes[0], atol=1e-12)
         foot = tuple(jnp.asarray(x) for x in (0.3 * np.sin(eta), 0.0, -0.3 * np.cos(eta)))
         if "sphere" in name:
             foot = (foot[0], jnp.asarray(0.1), foot[2])
             foot = scale(0.3 / jnp.sqrt(dot(foot, foot)), foot)
-        axes = [np.array(frame.axes(*frame.at_foot(foot)), dtype=float) for frame in (own, general)]
+        axes = [
+            np.array(frame.axes(*frame.at_foot(foot)), dtype=float) for frame in (frame_of_surface, frame_by_carrying)
+        ]
         assert_close(axes[1], axes[0], atol=1e-12)
 
 

@@ -33,7 +33,7 @@ def heights(x, y):
 
 
 def test_arrays_of_a_function_are_not_taken_for_numbers_of_lanes():
-    """What the engine picks for one lane of many is the whole function; in lanes each has its own height."""
+    """A cell of a batch has the complete function; in a batch, each lane has its own height."""
     ground = Graph(Bowl(BENDS, 1.0))
     assert all(leaf.ndim == 0 for leaf in jax.tree.leaves(ground))
     x, y = jnp.array([0.1, 0.2, 0.3]), jnp.array([0.3, -0.2, 0.1])
@@ -48,9 +48,9 @@ def test_arrays_of_a_function_are_not_taken_for_numbers_of_lanes():
 def test_a_ground_with_arrays_is_described_printed_and_sent_as_others_are():
     """As the request of a table, which is JSON; as text; and to another process."""
     ground = Graph(Bowl(BENDS, 1.0))
-    described = json.loads(json.dumps(description("ground", ground)))
-    assert described["ground.height.function"] == "Bowl"
-    assert described["ground.height.function.bends.numbers"] == BENDS.ravel().tolist()
+    text = json.loads(json.dumps(description("ground", ground)))
+    assert text["ground.height.function"] == "Bowl"
+    assert text["ground.height.function.bends.numbers"] == BENDS.ravel().tolist()
     assert repr(ground.height).startswith("Bowl(")
     assert_close(pickle.loads(pickle.dumps(ground)).ground(0.1, 0.3), heights(0.1, 0.3), rtol=1e-14)
 

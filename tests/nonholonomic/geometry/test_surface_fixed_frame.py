@@ -51,10 +51,10 @@ SURFACES = [Plane(), Plane(0.3), *CURVED]
 
 
 def places(surface, count=LANES):
-    """Random places all over a surface; those of an implicit one near a sphere, to be moved on it."""
+    """Random places on a surface; for an implicit surface, places near a sphere, to be moved onto the surface."""
     if isinstance(surface, Implicit):
-        away = RNG.normal(size=(3, count))
-        return tuple(jnp.asarray(part) for part in 1.1 * away / np.linalg.norm(away, axis=0))
+        displacement = RNG.normal(size=(3, count))
+        return tuple(jnp.asarray(part) for part in 1.1 * displacement / np.linalg.norm(displacement, axis=0))
     second = math.pi if isinstance(surface, Torus | Cylinder) else 1.5
     return jnp.asarray(RNG.uniform(-3.0, 3.0, count)), jnp.asarray(RNG.uniform(-second, second, count))
 
@@ -68,8 +68,8 @@ def columns(vector, count=LANES):
 def asked(surface, place):
     """What a surface answers at a place: position, east, north, normal, place, position of that, off it by, height less z."""
     r, east, north = surface.chart(place)
-    recovered_place, off, height = surface.place_at(r), surface.offset(r), surface.elevation(r)
-    above = 0.0 if height is None else height - surface.in_fixed_frame(r)[2]
+    recovered_place, offsets, height = surface.place_at(r), surface.offset(r), surface.elevation(r)
+    height_error = 0.0 if height is None else height - surface.in_fixed_frame(r)[2]
     return (
         r,
         east,
@@ -77,8 +77,8 @@ def asked(surface, place):
         surface.normal(r),
         recovered_place,
         surface.chart(recovered_place)[0],
-        0.0 if off is None else off,
-        above,
+        0.0 if offsets is None else offsets,
+        height_error,
     )
 
 
@@ -90,16 +90,16 @@ def directions(count=LANES):
 def test_chart_normal_and_places_belong_together(surface):
     """East and north are unit vectors with n = east x north, and a place comes back from its position, in space too."""
     place = places(surface)
-    r, east, north, normal, recovered_place, chart_position, off, above = asked(surface, place)
+    r, east, north, normal, recovered_place, chart_position, offsets, height_error = asked(surface, place)
     position, east, north, normal = (columns(value) for value in (r, east, north, normal))
     np.testing.assert_allclose(np.sum(east**2, axis=0), 1.0, atol=1e-14)
     np.testing.assert_allclose(np.cross(east, north, axis=0), normal, atol=1e-13)
-    np.testing.assert_allclose(off, 0.0, atol=1e-13)
+    np.testing.assert_allclose(offsets, 0.0, atol=1e-13)
     np.testing.assert_allclose(columns(chart_position), position, atol=1e-13)
     if not isinstance(surface, Implicit):
         np.testing.assert_allclose(np.exp(1j * np.stack(recovered_place)), np.exp(1j * np.stack(place)), atol=1e-13)
     # The height is that in space but for its zero.
-    assert np.ptp(np.asarray(above)) < 1e-13
+    assert np.ptp(np.asarray(height_error)) < 1e-13
 
 
 @pytest.mark.parametrize("surface", CURVED, ids=lambda value: type(value).__name__)
@@ -114,11 +114,11 @@ def test_rate_of_the_normal_and_curvature_are_derivatives(surface):
     def normal_at(time):
         return columns(surface.normal(tuple(columns(r) + time * velocity)))
 
-    near, far = normal_at(step) - normal_at(-step), normal_at(2.0 * step) - normal_at(-2.0 * step)
-    np.testing.assert_allclose(rate, (8.0 * near - far) / (12.0 * step), atol=2e-10)
+    near, places_far = normal_at(step) - normal_at(-step), normal_at(2.0 * step) - normal_at(-2.0 * step)
+    np.testing.assert_allclose(rate, (8.0 * near - places_far) / (12.0 * step), atol=2e-10)
     normal = columns(surface.normal(r))
-    along = [columns(surface.normal_rate(r, value)) for value in (east, north)]
-    K = np.sum(normal * np.cross(*along, axis=0), axis=0)
+    normal_rates = [columns(surface.normal_rate(r, value)) for value in (east, north)]
+    K = np.sum(normal * np.cross(*normal_rates, axis=0), axis=0)
     curvature = surface.gaussian_curvature(r)
     np.testing.assert_allclose(0.0 if curvature is None else curvature, K, atol=1e-12 * np.max(np.abs(K)) + 1e-14)
     # The chart runs along the surface: its derivatives have no part along n.
@@ -130,11 +130,11 @@ def test_rate_of_the_normal_and_curvature_are_derivatives(surface):
 def lifted(surface, place, d):
     """Positions at the distances d above a place, as in space; their distance and its slope, and the place found for them."""
     r = surface.chart(place)[0]
-    above = tuple(
+    height_error = tuple(
         (0.0 if a is None else a) + (0.0 if b is None else d * b) for a, b in zip(r, surface.normal(r), strict=True)
     )
-    distance, slope = jax.jvp(surface.distance, (above,), (tuple(jnp.ones((3, LANES))),))
-    return r, distance, slope, surface.chart(surface.in_fixed_frame(above))[0]
+    distance, slope = jax.jvp(surface.distance, (height_error,), (tuple(jnp.ones((3, LANES))),))
+    return r, distance, slope, surface.chart(surface.in_fixed_frame(height_error))[0]
 
 
 @pytest.mark.parametrize(
@@ -191,17 +191,19 @@ def test_two_descriptions_of_a_surface_agree(case):
 
 def test_a_huge_torus_is_a_cylinder():
     """With the ring's radius G the two differ by terms in 1/G: ten times less for ten times as much."""
-    tube, far = Cylinder(1.3), []
+    tube, places_far = Cylinder(1.3), []
     r, east, north = tube.chart((jnp.asarray(RNG.uniform(-1.0, 1.0, LANES)), places(tube)[1]))
     a, b = directions()
     velocity = tuple(a * columns(east) + b * columns(north))
     for ring in (1e3, 1e4):
         torus = Torus(ring, 1.3)
         moved = (r[0] + ring, *columns(r)[1:])
-        off = [columns(torus.normal(moved)) - columns(tube.normal(r))]
-        off += [columns(torus.normal_rate(moved, velocity)) - columns(tube.normal_rate(r, velocity))]
-        far.append([np.max(np.abs(error)) for error in off] + [np.max(np.abs(torus.gaussian_curvature(moved)))])
-    np.testing.assert_allclose(np.array(far[0]) / np.array(far[1]), 10.0, rtol=2e-2)
+        offsets = [columns(torus.normal(moved)) - columns(tube.normal(r))]
+        offsets += [columns(torus.normal_rate(moved, velocity)) - columns(tube.normal_rate(r, velocity))]
+        places_far.append(
+            [np.max(np.abs(error)) for error in offsets] + [np.max(np.abs(torus.gaussian_curvature(moved)))]
+        )
+    np.testing.assert_allclose(np.array(places_far[0]) / np.array(places_far[1]), 10.0, rtol=2e-2)
 
 
 def test_gaussian_curvature_of_the_oblate_spheroid():
@@ -229,9 +231,9 @@ def test_gaussian_curvature_of_torus_and_paraboloid():
 def test_elevation_is_the_height_in_the_fixed_frame(surface):
     r = surface.chart(places(surface))[0]
     lowest = {Cylinder: "radius", Torus: "tube", Sphere: "radius", Spheroid: "polar"}.get(type(surface))
-    above = surface.in_fixed_frame(r)[2] + (0.0 if lowest is None else getattr(surface, lowest))
+    height_error = surface.in_fixed_frame(r)[2] + (0.0 if lowest is None else getattr(surface, lowest))
     elevation = surface.elevation(r)
-    np.testing.assert_allclose(0.0 if elevation is None else elevation, above, atol=1e-14)
+    np.testing.assert_allclose(0.0 if elevation is None else elevation, height_error, atol=1e-14)
 
 
 def test_east_is_along_y_where_the_normal_is_along_x():

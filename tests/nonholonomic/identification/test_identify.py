@@ -1,4 +1,4 @@
-"""Identification without a simulation: textbook estimates, one-sided likelihoods, bounds, what data cannot see."""
+"""Identification without a simulation: textbook estimates, one-sided likelihoods, bounds, undetermined parameters."""
 
 import sys
 import time
@@ -91,8 +91,8 @@ def test_profile_of_a_linear_model_is_a_parabola(regression):
     assert_close(profile.deviance, deviations**2, atol=1e-7)
     assert profile.converged.all()
     # The other number follows along the regression line.
-    follows = fit.covariance[0, 1] / fit.covariance[1, 1] * (profile.values - fit.estimates["slope"])
-    assert_close(profile.estimates["height"], fit.estimates["height"] + follows, rtol=1e-6)
+    line = fit.covariance[0, 1] / fit.covariance[1, 1] * (profile.values - fit.estimates["slope"])
+    assert_close(profile.estimates["height"], fit.estimates["height"] + line, rtol=1e-6)
 
 
 def test_a_lower_limit_has_the_one_sided_likelihood():
@@ -102,8 +102,8 @@ def test_a_lower_limit_has_the_one_sided_likelihood():
     expected = -2.0 * np.where(z < 0.0, scipy.stats.norm.logcdf(z), right)
     assert_close(np.asarray(jax.jit(one_sided)(z)) ** 2, expected, rtol=1e-9, atol=1e-15)
     value_and_slope = jax.jit(jax.value_and_grad(one_sided))
-    for far in (8.0, 9.0, 40.0, 1e10):
-        value, slope = value_and_slope(far)
+    for distance in (8.0, 9.0, 40.0, 1e10):
+        value, slope = value_and_slope(distance)
         assert abs(value) < 1e-7
         assert np.isfinite(slope)
 
@@ -111,17 +111,17 @@ def test_a_lower_limit_has_the_one_sided_likelihood():
 def test_censored_mean_is_that_of_scipy():
     """The mean of normal numbers of which those above 1 were only seen to exceed 1 (a Tobit model)."""
     value = np.random.default_rng(2).normal(0.7, 0.5, 60)
-    hidden = value > 1.0
-    data = Measurements(np.minimum(value, 1.0), 0.5, hidden)
+    is_censored = value > 1.0
+    data = Measurements(np.minimum(value, 1.0), 0.5, is_censored)
     fit = identify(lambda p: jnp.repeat(p["mean"][:, None], 60, axis=1), data, {"mean": 0.0})
 
     def deviance(mean):
-        log_density = scipy.stats.norm.logpdf(value[~hidden], mean, 0.5).sum()
-        return -2.0 * (log_density + hidden.sum() * scipy.stats.norm.logsf(1.0, mean, 0.5))
+        log_density = scipy.stats.norm.logpdf(value[~is_censored], mean, 0.5).sum()
+        return -2.0 * (log_density + is_censored.sum() * scipy.stats.norm.logsf(1.0, mean, 0.5))
 
-    best = scipy.optimize.minimize_scalar(deviance, (0.0, 1.0), tol=1e-12)
-    assert_close(fit.estimates["mean"], best.x, atol=1e-5)
-    assert fit.residuals[int(np.argmax(hidden))].censored
+    optimum = scipy.optimize.minimize_scalar(deviance, (0.0, 1.0), tol=1e-12)
+    assert_close(fit.estimates["mean"], optimum.x, atol=1e-5)
+    assert fit.residuals[int(np.argmax(is_censored))].censored
 
 
 def test_missing_predictions_are_a_penalty_without_slope():
@@ -148,7 +148,7 @@ def test_a_prior_is_one_more_measurement():
     fit = identify(lambda p: p["x"][:, None], data, {"x": Free(1.0, prior=(3.0, 0.6))})
     assert_close(fit.estimates["x"], (4.0 / 0.09 + 3.0 / 0.36) / (1.0 / 0.09 + 1.0 / 0.36), rtol=1e-8)
     assert_close(fit.standard_errors["x"], (1.0 / 0.09 + 1.0 / 0.36) ** -0.5, rtol=1e-9)
-    # What the data alone fix does not change.
+    # The estimates that the data determine do not change.
     assert_close(fit.identifiability.singular_values, 1.0 / 0.3, rtol=1e-9)
 
 
@@ -209,10 +209,10 @@ def test_bad_measurements_are_refused(measurements):
 
 
 def test_names_are_paths_or_their_ends():
-    known = ["scene.body.offset", "scene.friction.mu", "launch.spin", "launch.mu"]
-    assert full_name("free", "offset", known) == "scene.body.offset"
-    assert full_name("free", "friction.mu", known) == "scene.friction.mu"
+    names = ["scene.body.offset", "scene.friction.mu", "launch.spin", "launch.mu"]
+    assert full_name("free", "offset", names) == "scene.body.offset"
+    assert full_name("free", "friction.mu", names) == "scene.friction.mu"
     with pytest.raises(ValueError, match=r"scene.friction.mu or launch.mu"):
-        full_name("free", "mu", known)
+        full_name("free", "mu", names)
     with pytest.raises(ValueError, match="must be one of"):
-        full_name("free", "fset", known)
+        full_name("free", "fset", names)

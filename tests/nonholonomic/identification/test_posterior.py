@@ -30,36 +30,36 @@ def measured(height=2.0, slope=-3.0, seed=0):
 def test_the_density_is_that_of_bayes_in_the_coordinates():
     data = measured()
     density = LogDensity.of(line, data, {"height": Free(1.5, 0.0), "slope": -2.0}, {"height": PRIOR})
-    at = np.array([np.log(1.8), 0.3])
+    point = np.array([np.log(1.8), 0.3])
 
-    def expected(at):
-        height, slope = np.exp(at[0]), -2.0 + 2.0 * at[1]
+    def expected(point):
+        height, slope = np.exp(point[0]), -2.0 + 2.0 * point[1]
         likelihood = scipy.stats.norm.logpdf(np.asarray(data.value), height + slope * X, ERROR).sum()
         # The height is uniform in no coordinate: its prior is of the height, and d height = height d coordinate.
-        return likelihood + scipy.stats.norm.logpdf(height, *PRIOR) + at[0]
+        return likelihood + scipy.stats.norm.logpdf(height, *PRIOR) + point[0]
 
     constant = float(density(jnp.asarray(density.start))) - expected(np.asarray(density.start))
-    value, gradient = density.value_and_gradient(at)
-    assert_close(value, expected(at) + constant, rtol=1e-10)
+    value, gradient = density.value_and_gradient(point)
+    assert_close(value, expected(point) + constant, rtol=1e-10)
     steps = 1e-5 * np.eye(2)
-    assert_close(gradient, [(expected(at + s) - expected(at - s)) / 2e-5 for s in steps], rtol=1e-6)
-    assert_close(density.values(jnp.asarray(at))["height"], 1.8)
-    several = density.value_and_gradient(np.stack([at, at]))[1]
-    assert_close(several, [gradient, gradient], rtol=1e-12)
+    assert_close(gradient, [(expected(point + s) - expected(point - s)) / 2e-5 for s in steps], rtol=1e-6)
+    assert_close(density.values(jnp.asarray(point))["height"], 1.8)
+    gradients = density.value_and_gradient(np.stack([point, point]))[1]
+    assert_close(gradients, [gradient, gradient], rtol=1e-12)
 
 
 def test_densities_that_differ_in_numbers_share_a_program(caplog):
-    """The same with other starts, bounds and priors has other values, and compiles nothing."""
+    """With other starts, bounds and priors, the density has other values and compiles nothing."""
 
     def density(start, lower, slope, prior, data):
         free = {"height": Free(start, lower), "slope": Free(0.0, prior=slope)}
         return LogDensity.of(line, data, free, {"height": prior})
 
-    at, first = np.zeros(2), density(1.5, 0.0, (-2.0, 1.0), PRIOR, measured())
-    first.value_and_gradient(at)
-    other = density(1.7, 0.1, (-3.0, 2.0), (1.1, 0.2), measured(seed=1))
+    point, first = np.zeros(2), density(1.5, 0.0, (-2.0, 1.0), PRIOR, measured())
+    first.value_and_gradient(point)
+    shifted = density(1.7, 0.1, (-3.0, 2.0), (1.1, 0.2), measured(seed=1))
     with jax.log_compiles():
-        value, gradient = other.value_and_gradient(at)
+        value, gradient = shifted.value_and_gradient(point)
     assert not [text for text in caplog.messages if "Finished XLA compilation" in text]
     # At the coordinate 0 the height is 1 above its bound, the slope is where it started.
     residuals = (1.1 + 0.0 * X - np.asarray(measured(seed=1).value)) / ERROR
@@ -90,8 +90,8 @@ def test_draws_have_the_mean_and_the_covariance_of_the_regression(draws):
         assert_close(value.std(), error, rtol=0.1)
     flat = posterior.coordinates.reshape(-1, 2)
     replicas = density.replicate(flat, seed=1)
-    spread = np.sqrt(ERROR**2 + np.var(np.asarray(density.predict(jnp.asarray(flat))), axis=0))
-    assert_close(replicas.std(axis=0), spread, rtol=0.1)
+    deviations = np.sqrt(ERROR**2 + np.var(np.asarray(density.predict(jnp.asarray(flat))), axis=0))
+    assert_close(replicas.std(axis=0), deviations, rtol=0.1)
 
 
 def test_a_single_unknown_is_drawn_profiled_and_shown_like_several():
@@ -139,9 +139,9 @@ def test_unknown_errors_are_drawn_too():
     data = Measurements(value, 1.0, estimated=True)
     density = LogDensity.of(lambda p: jnp.repeat(p["mean"][:, None], 60, axis=1), data, {"mean": 0.0})
     assert density.names == ("mean", "error[0]")
-    at = np.array([value.mean(), np.log(np.std(value))])
+    point = np.array([value.mean(), np.log(np.std(value))])
     # At the mean and the standard deviation of the values the density has its maximum.
-    assert_close(density.value_and_gradient(at)[1], [0.0, 0.0], atol=1e-9)
+    assert_close(density.value_and_gradient(point)[1], [0.0, 0.0], atol=1e-9)
 
 
 AT = np.linspace(0.0, 2.0, 5)
@@ -166,21 +166,23 @@ def test_draws_are_from_a_density_that_the_surrogate_misses():
     posterior = sample(density, density.start, np.diag([0.1, 0.2]), progress=False)
     grid = np.stack(np.meshgrid(np.linspace(-1.5, 1.5, 101), np.linspace(-3.0, 2.0, 401), indexing="ij"), axis=-1)
     flat = jnp.asarray(grid.reshape(-1, 2))
-    logs = np.asarray(jax.jit(jax.vmap(lambda at: density.of_prediction(at, density.predict(at[None])[0])))(flat))
+    logs = np.asarray(
+        jax.jit(jax.vmap(lambda point: density.of_prediction(point, density.predict(point[None])[0])))(flat)
+    )
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     values = {name: np.asarray(value) for name, value in density.values(flat).items()}
     assert posterior.accepted < 0.8
-    # The roughness itself: its share of the density, which a smooth stand-in would give as 0.
+    # The contribution of the roughness to the density; a smooth surrogate would give 0.
     for name, of in (
         *((name, lambda v, n=name: v[n]) for name in values),
         ("wave", lambda v: np.sin(40.0 * v["rate"])),
     ):
         mean = np.sum(weights * of(values))
-        spread = np.sqrt(np.sum(weights * (of(values) - mean) ** 2))
+        deviations = np.sqrt(np.sum(weights * (of(values) - mean) ** 2))
         ess = min(posterior.ess.values())
-        assert abs(np.mean(of(posterior.values)) - mean) < 4.0 * spread / np.sqrt(ess), name
-        assert_close(np.std(of(posterior.values)), spread, rtol=0.1)
+        assert abs(np.mean(of(posterior.values)) - mean) < 4.0 * deviations / np.sqrt(ess), name
+        assert_close(np.std(of(posterior.values)), deviations, rtol=0.1)
     assert abs(np.sum(weights * np.sin(40.0 * values["rate"]))) > 0.2
 
 
@@ -188,9 +190,9 @@ def test_draws_are_from_a_density_that_the_surrogate_misses():
 def test_numpyro_draws_the_same(draws):
     """The other library, whose figures stand beside in `benchmarks/posterior.py`, on the same density in the same points."""
     fit, density, posterior = draws
-    other, leaps = plain("numpyro", density, fit, 50, 250)
+    shifted, leaps = plain("numpyro", density, fit, 50, 250)
     assert leaps > 1000
     for name, value in posterior.values.items():
         error = fit.standard_errors[name]
-        assert abs(other.values[name].mean() - value.mean()) < 5.0 * error / np.sqrt(other.ess[name])
-        assert_close(other.values[name].std(), error, rtol=0.15)
+        assert abs(shifted.values[name].mean() - value.mean()) < 5.0 * error / np.sqrt(shifted.ess[name])
+        assert_close(shifted.values[name].std(), error, rtol=0.15)

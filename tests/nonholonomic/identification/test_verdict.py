@@ -1,4 +1,4 @@
-"""Whether a fit can be believed: scatter, order, starts, and what the picture shows."""
+"""Verdicts on fits: scatter, runs of signs, agreement of starts, and the plot."""
 
 import itertools
 import math
@@ -21,7 +21,7 @@ def oscillation(p):
 
 
 def recorded(error=0.5):
-    """An oscillation of height 1 and rate 6 with noise of 0.5, as it was measured with an alleged error."""
+    """Measurements of an oscillation of amplitude 1 and rate 6 with noise of 0.5 and a stated error."""
     return Measurements(np.sin(6.0 * T) + 0.5 * np.random.default_rng(3).normal(size=T.size), error)
 
 
@@ -116,5 +116,5 @@ def test_an_angle_is_drawn_on_the_turn_of_its_prediction():
     exact = 3.0 * T + 0.1 * np.random.default_rng(5).normal(size=T.size)
     measured_angles = Measurements((exact + math.pi) % (2.0 * math.pi) - math.pi, 0.1, period=2.0 * math.pi)
     fit = identify(lambda p: p["rate"][:, None] * T, measured_angles, {"rate": 3.01})
-    drawn = fit.plot().axes[0].containers[0].lines[0].get_ydata()
-    assert_close(drawn, exact, atol=1e-9)
+    points_drawn = fit.plot().axes[0].containers[0].lines[0].get_ydata()
+    assert_close(points_drawn, exact, atol=1e-9)

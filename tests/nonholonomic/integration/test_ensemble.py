@@ -34,8 +34,8 @@ class Oscillators(AbstractProblem):
     floor: jax.Array
 
     def start(self):
-        ones = jnp.ones_like(self.frequency)
-        return jnp.stack([ones, 0.0 * ones]), jnp.stack([ones, ones])
+        one = jnp.ones_like(self.frequency)
+        return jnp.stack([one, 0.0 * one]), jnp.stack([one, one])
 
     def field(self, time, state):
         return jnp.stack([self.frequency * state[1], -self.frequency * state[0]])
@@ -120,13 +120,13 @@ def test_the_last_crossing_of_many():
     """Passing through: x falls below 1/2 at (2 pi k + pi/3)/w; the last time before t1 counts."""
     frequency = np.array([0.7, 1.3, 5.0])
     outcome, _ = run(frequency, nonterminal=True, t1=20.0)
-    turns = np.floor((20.0 * frequency - math.pi / 3.0) / (2.0 * math.pi))
-    assert_close(outcome.crossing_time, (2.0 * math.pi * turns + math.pi / 3.0) / frequency, rtol=1e-9)
+    turn_count = np.floor((20.0 * frequency - math.pi / 3.0) / (2.0 * math.pi))
+    assert_close(outcome.crossing_time, (2.0 * math.pi * turn_count + math.pi / 3.0) / frequency, rtol=1e-9)
     assert_close(outcome.state[0], np.cos(20.0 * frequency), atol=1e-7)
 
 
 def test_a_dip_between_the_ends_of_a_step_is_found():
-    """The guard is negative for a third of a period; a loose tolerance makes steps of half of one."""
+    """The domain margin is negative for a third of a period; with a loose tolerance, steps are half a period long."""
     outcome, _ = run([1.0], level=-2.0, floor=0.5, tolerance=1e-2)
     assert outcome.status[0] == LEFT_DOMAIN
     assert_close(outcome.end_time, math.asin(0.5), atol=2e-2)
@@ -139,13 +139,13 @@ def test_padding_is_not_run():
     outcome, iterations = solve_ensemble(problem, jnp.asarray(9.0), jnp.asarray(2), settings)
     assert_close(outcome.crossing_time[:2], math.pi / 3.0 / frequency[:2], rtol=1e-8)
     assert outcome.steps[2:].tolist() == [0, 0]
-    _, nothing = solve_ensemble(problem, jnp.asarray(9.0), jnp.asarray(0), settings)
-    assert nothing == 0
+    _, empty = solve_ensemble(problem, jnp.asarray(9.0), jnp.asarray(0), settings)
+    assert empty == 0
     assert iterations > 0
 
 
 def test_a_dip_between_the_stages_of_a_step_is_found():
-    """x = cos t is below -0.9999 for 0.028 s, within a step twenty times as long that sees nothing of it at its stages."""
+    """x = cos t is below -0.9999 for 0.028 s, inside a step twenty times as long whose stages all miss this interval."""
     level = -0.9999
     outcome, _ = run([1.0], level=level, t1=8.0, tolerance=1e-6)
     assert int(outcome.status[0]) == CROSSED
@@ -166,11 +166,11 @@ def test_a_short_loss_between_the_stages_of_a_step_is_found(solver, depth):
 def test_what_comes_close_to_a_loss_goes_on_and_costs_little():
     """The margin 1 + height - sin(w t) has a least value of `height` in every period."""
     frequency = np.geomspace(0.3, 4.0, 8)
-    far, _ = run(frequency, level=-2.0, floor=2.0, tolerance=1e-8, t1=40.0)
+    outcome, _ = run(frequency, level=-2.0, floor=2.0, tolerance=1e-8, t1=40.0)
     for height in (1e-2, 1e-4, 1e-6):
         close, _ = run(frequency, level=-2.0, floor=1.0 + height, tolerance=1e-8, t1=40.0)
         assert (np.asarray(close.status) == REACHED_END).all()
-        assert int(close.steps.sum()) < 1.6 * int(far.steps.sum())
+        assert int(close.steps.sum()) < 1.6 * int(outcome.steps.sum())
 
 
 def test_too_many_steps_and_nonsense_are_failures():
@@ -181,7 +181,7 @@ def test_too_many_steps_and_nonsense_are_failures():
 
 
 def time_of(numbers):
-    """When one oscillator reaches its level, w and level given; the exact time is acos(level) / w."""
+    """The time at which an oscillator of rate w reaches a level; exactly acos(level) / w."""
     problem = Oscillators(numbers[:1], numbers[1:], jnp.asarray(2.0))
     settings = Settings(1e-12, absolute=1.0, lanes=1)
     outcome, _ = ensemble_solve(problem, jnp.asarray(9.0), jnp.asarray(1), settings)
@@ -237,9 +237,14 @@ def test_locating_an_event_adds_no_error_of_its_own(solver):
     slope = math.exp(exact / 20.0) * (math.cos(exact) / 20.0 - math.sin(exact))
     for tolerance in (1e-6, 1e-8, 1e-10):
         settings = Settings(tolerance, solver, absolute=1.0, lanes=1)
-        located, _ = solve_ensemble(Growing(), jnp.asarray(20.0), jnp.asarray(1), settings)
-        reached, _ = solve_ensemble(Growing(), jnp.asarray(exact), jnp.asarray(1), settings, nonterminal=True)
-        error, state_error = float(located.crossing_time[0]) - exact, float(reached.state[0, 0]) + 2.0
+        outcome_at_event, _ = solve_ensemble(Growing(), jnp.asarray(20.0), jnp.asarray(1), settings)
+        outcome_at_horizon, _ = solve_ensemble(
+            Growing(), jnp.asarray(exact), jnp.asarray(1), settings, nonterminal=True
+        )
+        error, state_error = (
+            float(outcome_at_event.crossing_time[0]) - exact,
+            float(outcome_at_horizon.state[0, 0]) + 2.0,
+        )
         assert_close(error, -state_error / slope, rtol=0.2, atol=1e-11)
 
 
@@ -248,8 +253,8 @@ def test_an_interpolated_event_would_be_a_hundred_times_worse():
     exact = brentq(lambda t: math.exp(t / 20.0) * math.cos(t) + 2.0, 15.0, 15.7, xtol=1e-15)
     settings = Settings(1e-10, diffrax.Dopri8(), absolute=1.0, lanes=1)
     dense = solve_by_diffrax(Growing(), jnp.asarray(20.0), settings)
-    located, _ = solve_ensemble(Growing(), jnp.asarray(20.0), jnp.asarray(1), settings)
-    assert abs(float(located.crossing_time[0]) - exact) < 0.01 * abs(float(dense.crossing_time[0]) - exact)
+    outcome_at_event, _ = solve_ensemble(Growing(), jnp.asarray(20.0), jnp.asarray(1), settings)
+    assert abs(float(outcome_at_event.crossing_time[0]) - exact) < 0.01 * abs(float(dense.crossing_time[0]) - exact)
 
 
 def test_implicit_solvers_are_refused():

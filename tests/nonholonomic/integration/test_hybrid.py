@@ -60,28 +60,28 @@ class Fall(AbstractBatchedMode):
         height, velocity, count = state
         speed = jnp.sqrt(velocity**2 + 2.0 * GRAVITY * height)
         # The ground is found to round-off of a step; the rest of the way, of either sign, is known.
-        late = (speed + velocity) / GRAVITY
+        overrun = (speed + velocity) / GRAVITY
         rebound, count = self.restitution * speed, count + 1.0
-        last, rests = count >= self.bounces, rebound < CLOSING
-        rise = jnp.where(last | rests, 0.0, jnp.minimum(rebound / GRAVITY, left - late))
-        end = self.between((late, rebound, count), late + rise)
-        end = jnp.where(rests & ~last, end * jnp.array([[0.0], [0.0], [1.0]]), end)
+        last, at_rest = count >= self.bounces, rebound < CLOSING
+        rise = jnp.where(last | at_rest, 0.0, jnp.minimum(rebound / GRAVITY, left - overrun))
+        end = self.between((overrun, rebound, count), overrun + rise)
+        end = jnp.where(at_rest & ~last, end * jnp.array([[0.0], [0.0], [1.0]]), end)
         cut = rise < rebound / GRAVITY
         return Transition(
-            mode=jnp.where(rests, RESTING, FALLING),
+            mode=jnp.where(at_rest, RESTING, FALLING),
             state=end,
-            elapsed=late + rise,
-            status=jnp.where(last, CROSSED, jnp.where(cut & ~rests, REACHED_END, RUNNING)),
-            crossing_time=jnp.where(last, late, jnp.inf),
+            elapsed=overrun + rise,
+            status=jnp.where(last, CROSSED, jnp.where(cut & ~at_rest, REACHED_END, RUNNING)),
+            crossing_time=jnp.where(last, overrun, jnp.inf),
             counts=jnp.ones((1, *count.shape), int),
             record=TransitionPath(
-                (late + rise)[None], (late[None], rebound[None], count[None]), jnp.full((1, *count.shape), 3)
+                (overrun + rise)[None], (overrun[None], rebound[None], count[None]), jnp.full((1, *count.shape), 3)
             ),
         )
 
-    def between(self, motion, passed):
-        late, rebound, count = motion
-        time = passed - late
+    def between(self, motion, elapsed):
+        overrun, rebound, count = motion
+        time = elapsed - overrun
         height = rebound * time - 0.5 * GRAVITY * time**2
         return jnp.stack([height, rebound - GRAVITY * time, count + 0.0 * time])
 
@@ -120,10 +120,10 @@ class Ball(NamedTuple):
         count = sum(self.bounce(number) < time for number in range(1, self.rests_after + 1))
         if count == self.rests_after:
             return [0.0, 0.0, count]
-        rebound, passed = self.speed * self.restitution**count, time - (self.bounce(count) if count else 0.0)
+        rebound, elapsed = self.speed * self.restitution**count, time - (self.bounce(count) if count else 0.0)
         if count == 0:
             return [self.height - 0.5 * GRAVITY * time**2, -GRAVITY * time, 0.0]
-        return [rebound * passed - 0.5 * GRAVITY * passed**2, rebound - GRAVITY * passed, count]
+        return [rebound * elapsed - 0.5 * GRAVITY * elapsed**2, rebound - GRAVITY * elapsed, count]
 
 
 HEIGHTS = np.linspace(0.3, 2.0, CELLS)
@@ -171,9 +171,9 @@ def test_the_states_of_many_balls_at_a_horizon(t1):
     assert (outcome.end_time[:CELLS] == t1).all()
     assert_close(outcome.state[:, :CELLS], expected, atol=2e-13)
     assert outcome.counts[0, :CELLS].tolist() == expected[2].tolist()
-    rests = [ball.rests_after == count for ball, count in zip(BALLS, expected[2], strict=True)]
-    assert (outcome.mode[:CELLS] == np.where(rests, RESTING, FALLING)).all()
-    assert all(rests) == (t1 == 30.0)
+    at_rest = [ball.rests_after == count for ball, count in zip(BALLS, expected[2], strict=True)]
+    assert (outcome.mode[:CELLS] == np.where(at_rest, RESTING, FALLING)).all()
+    assert all(at_rest) == (t1 == 30.0)
 
 
 def test_a_single_ball_at_any_time():
@@ -189,8 +189,8 @@ def test_a_single_ball_at_any_time():
     expected = np.array([ball.state(time) for time in times]).T
     # The dense output of a fall has the round-off of its polynomial.
     assert_close(path.at(times), expected, atol=5e-13)
-    rises = path.numbers(times) == BETWEEN
-    assert_close(path.at(times[rises]), expected[:, rises], atol=1e-13)
+    is_rising = path.numbers(times) == BETWEEN
+    assert_close(path.at(times[is_rising]), expected[:, is_rising], atol=1e-13)
     assert set(path.numbers(times)) == {FALLING, RESTING, BETWEEN}
     assert path.at(np.zeros(0)).shape == (3, 0)
 
@@ -209,7 +209,7 @@ def test_a_single_ball_ends_as_it_does_in_a_table():
 
 def test_what_needs_too_many_rounds_is_given_up():
     outcome = table(30.0, np.full(CELLS, np.inf), most_rounds=10)
-    # One round for each fall, and one for the rest.
-    tired = [ball.rests_after + 1 > 10 for ball in BALLS]
-    assert (outcome.status[:CELLS] == np.where(tired, UNRESOLVED, REACHED_END)).all()
-    assert 0 < sum(tired) < CELLS
+    # One round for each fall, and one at rest.
+    gives_up = [ball.rests_after + 1 > 10 for ball in BALLS]
+    assert (outcome.status[:CELLS] == np.where(gives_up, UNRESOLVED, REACHED_END)).all()
+    assert 0 < sum(gives_up) < CELLS

@@ -1,4 +1,4 @@
-"""Runs of several modes cost what their steps cost: how often the field and the guard are evaluated."""
+"""Numbers of evaluations of the field and the domain margin in runs of several modes."""
 
 import equinox as eqx
 import jax
@@ -56,7 +56,7 @@ class Turns(AbstractProblem):
 
 
 class Turn(AbstractBatchedMode):
-    """Turns until its own clock has run down; then the other one begins."""
+    """A rotation until the clock of the mode runs down; then the other mode begins."""
 
     clock: int = eqx.field(static=True)
 
@@ -65,11 +65,11 @@ class Turn(AbstractBatchedMode):
 
     def reset_map(self, state, left):
         zero = jnp.zeros_like(state[0])
-        other = zero.astype(int) + 1 - self.clock
-        clocks = [jnp.where(other == k, OWN, OTHER) for k in range(2)]
+        next_mode = zero.astype(int) + 1 - self.clock
+        clocks = [jnp.where(next_mode == k, OWN, OTHER) for k in range(2)]
         counts = jnp.ones((1, *zero.shape), int)
         return Transition(
-            other, jnp.stack([*clocks, *state[2:]]), zero, zero.astype(int) + RUNNING, zero + jnp.inf, counts
+            next_mode, jnp.stack([*clocks, *state[2:]]), zero, zero.astype(int) + RUNNING, zero + jnp.inf, counts
         )
 
 

@@ -22,14 +22,14 @@ def field(time, state):
     ids=lambda value: type(value).__name__,
 )
 def test_a_step_is_that_of_diffrax(solver):
-    """In three lanes: where it leads, its error estimate, and what was seen on the way."""
+    """In three lanes: the state after a step, its error estimate, and the margins at its stages."""
     time, length = np.array([0.0, 0.5, 2.0]), np.array([0.1, 0.4, 1.5])
     state = jnp.array([[1.0, 0.3, -0.2], [0.0, 0.4, 0.01]])
     step = explicit_step(
         explicit_tableau(solver),
         field,
-        lambda time, at: (10.0 + at[1], 20.0 + at[0]),
-        lambda at, rate: at[0],
+        lambda time, point: (10.0 + point[1], 20.0 + point[0]),
+        lambda point, rate: point[0],
         jnp.asarray(time),
         state,
         field(time, state),
@@ -39,8 +39,8 @@ def test_a_step_is_that_of_diffrax(solver):
     term = diffrax.ODETerm(lambda t, y, _: field(t, y))
     for lane in range(3):
         t0, t1, y0 = time[lane], time[lane] + length[lane], state[:, lane]
-        begun = solver.init(term, t0, t1, y0, None)
-        y1, error, *_ = solver.step(term, t0, t1, y0, None, begun, made_jump=False)
+        solver_state = solver.init(term, t0, t1, y0, None)
+        y1, error, *_ = solver.step(term, t0, t1, y0, None, solver_state, made_jump=False)
         np.testing.assert_allclose(step.state[:, lane], y1, rtol=1e-13, atol=1e-15)
         np.testing.assert_allclose(np.abs(step.error[:, lane]), np.abs(error), rtol=1e-9, atol=1e-15)
         np.testing.assert_allclose(step.rate[:, lane], field(t1, y1), rtol=1e-12, atol=1e-14)
@@ -49,13 +49,13 @@ def test_a_step_is_that_of_diffrax(solver):
     # As far from the start as the state moves in the part of the step that the places say.
     places = watched_places(explicit_tableau(solver))
     assert len(places) == len(step.margins)
-    moved = step.margins[:, 0, 0] - 10.0 - state[1, 0]
+    excess = step.margins[:, 0, 0] - 10.0 - state[1, 0]
     # The second component falls at the rate 1 + t at first; the first stages of Bosh3 are of first order.
-    np.testing.assert_allclose(moved, -(0.1 * places) - 0.5 * (0.1 * places) ** 2, atol=1.5e-3)
+    np.testing.assert_allclose(excess, -(0.1 * places) - 0.5 * (0.1 * places) ** 2, atol=1.5e-3)
     # The first lane stays on its side; the last one is beyond it all along, where there are stages between start and end.
     assert step.first_negative[0] == 2.0
-    between = [fraction for fraction in explicit_tableau(solver).c if fraction < 1.0]
-    assert step.first_negative[2] in between or (not between and step.first_negative[2] == 2.0)
+    interior = [fraction for fraction in explicit_tableau(solver).c if fraction < 1.0]
+    assert step.first_negative[2] in interior or (not interior and step.first_negative[2] == 2.0)
 
 
 def test_an_accelerator_gets_the_stages_written_out(monkeypatch):
@@ -66,7 +66,7 @@ def test_an_accelerator_gets_the_stages_written_out(monkeypatch):
     def compiled():
         def step(state):
             start = (time, state, field(time, state), length, state[:1])
-            return explicit_step(tableau, field, lambda time, at: (at[0],), lambda at, rate: None, *start)
+            return explicit_step(tableau, field, lambda time, point: (point[0],), lambda point, rate: None, *start)
 
         return jax.jit(step)
 

@@ -19,8 +19,8 @@ class Oscillators(AbstractProblem):
     least: jnp.ndarray
 
     def start(self):
-        ones = jnp.ones_like(self.rate)
-        return jnp.stack([ones, 0.0 * ones]), jnp.stack([ones, self.rate])
+        one = jnp.ones_like(self.rate)
+        return jnp.stack([one, 0.0 * one]), jnp.stack([one, self.rate])
 
     def field(self, time, state):
         return jnp.stack([state[1], -(self.rate**2) * state[0]])

@@ -1,4 +1,4 @@
-"""A sweep that costs nothing to compute, and the question whether a file of it tells the truth."""
+"""A sweep that costs almost nothing to compute, and a check of its files."""
 
 import os
 import signal
@@ -59,7 +59,7 @@ class CheapJob(NamedTuple):
 
 
 def cheap_sweep(path, run=None, job=None, **options):
-    """A sweep over `X` in seven blocks; `run` is told of each block that is computed, unless there is a `job`."""
+    """A sweep over `X` in seven blocks; `run` is called for each computed block unless there is a `job`."""
 
     def compute(columns, count):
         if run is not None and count:
@@ -101,5 +101,5 @@ def resumed(path: Path) -> set[int]:
 
 
 def place() -> tuple[int, set[int], str, str]:
-    """Where this is called: the process, its cores, and what JAX read when it was imported."""
+    """The current process, its cores, and the settings that JAX read at import."""
     return os.getpid(), os.sched_getaffinity(0), jax.config.jax_platforms, jax.config.jax_compilation_cache_dir

@@ -15,7 +15,7 @@ class Killed(BaseException):
     """The end of the process at a chosen moment."""
 
 
-#: What is done on the disk: for the folder of the blocks and what it is for, for each block, and for the table's file.
+#: Disk operations: for the folder of the blocks and its note, for each block, and for the table's file.
 FOR_THE_FOLDER, FOR_A_BLOCK, FOR_THE_FILE = 4, 4, 3
 
 
@@ -34,9 +34,9 @@ def fail_on_disk(monkeypatch, moment, torn, error):
     def saved(stream, savez=np.savez, **arrays):
         buffer = io.BytesIO()
         savez(buffer, **arrays)
-        falls = next(count) == moment
-        stream.write(buffer.getvalue()[: int(torn * len(buffer.getvalue())) if falls else None])
-        if falls:
+        is_due = next(count) == moment
+        stream.write(buffer.getvalue()[: int(torn * len(buffer.getvalue())) if is_due else None])
+        if is_due:
             raise error
 
     monkeypatch.setattr(os, "fsync", failing(os.fsync))

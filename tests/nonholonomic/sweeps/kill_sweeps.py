@@ -37,36 +37,36 @@ def child(path: Path, log: Path) -> int:
 def main(folder: Path, rounds: int) -> None:
     """Kill `rounds` sweeps; print how many of them were killed at work and how many files were filled."""
     luck = random.Random(0)
-    sweeps = killed = cut = files = 0
-    longest = 0.3
-    path, log, before = folder / "0.h5", folder / "log", set()
-    while killed < rounds:
+    sweeps = kills = cut = files = 0
+    max_delay = 0.3
+    path, log, blocks_before = folder / "0.h5", folder / "log", set()
+    while kills < rounds:
         log.write_text("")
-        began = time.monotonic()
+        start_time = time.monotonic()
         number = child(path, log)
-        time.sleep(luck.uniform(0.0, longest))
+        time.sleep(luck.uniform(0.0, max_delay))
         os.kill(number, signal.SIGKILL)
         _, status = os.waitpid(number, 0)
         sweeps += 1
         if os.WIFEXITED(status):
             assert os.WEXITSTATUS(status) == 0, "a sweep ended with an error"
-            longest = max(0.05, 0.9 * (time.monotonic() - began))
+            max_delay = max(0.05, 0.9 * (time.monotonic() - start_time))
         else:
             assert os.WTERMSIG(status) == signal.SIGKILL
-            killed += 1
-            longest *= 1.05
-        begun = [int(line) for line in log.read_text().split()]
-        assert not set(begun) & before, "a finished block was computed again"
+            kills += 1
+            max_delay *= 1.05
+        starts = [int(line) for line in log.read_text().split()]
+        assert not set(starts) & blocks_before, "a finished block was computed again"
         begun_at_all = path.exists() or path.with_name(f"{path.name}.blocks").joinpath("table.h5").exists()
-        after = finished_blocks(Table.load(path)) if begun_at_all else set()
-        assert before <= after <= before | set(begun), "a finished block was lost"
-        cut += bool(begun) and len(after) < 7
-        before = after
-        if len(after) >= luck.randint(3, 7):
-            assert resumed(path) == set(range(7)) - after
+        blocks_after = finished_blocks(Table.load(path)) if begun_at_all else set()
+        assert blocks_before <= blocks_after <= blocks_before | set(starts), "a finished block was lost"
+        cut += bool(starts) and len(blocks_after) < 7
+        blocks_before = blocks_after
+        if len(blocks_after) >= luck.randint(3, 7):
+            assert resumed(path) == set(range(7)) - blocks_after
             files += 1
-            path, before = folder / f"{files}.h5", set()
-    print(f"{sweeps} sweeps, {killed} killed, {cut} of them amid their blocks, {files} files filled")
+            path, blocks_before = folder / f"{files}.h5", set()
+    print(f"{sweeps} sweeps, {kills} killed, {cut} of them amid their blocks, {files} files filled")
 
 
 if __name__ == "__main__":

@@ -34,61 +34,61 @@ def contents(path):
 
 
 def check_flips(images, folder, places_of):
-    """A file with one bit flipped is read as it was, or refused."""
-    refused = 0
+    """A file with one flipped bit is read with its original contents, or refused."""
+    refusals = 0
     for name, image in images.items():
         path = folder / f"{name}.h5"
         path.write_bytes(image)
         right = contents(path)
         for place, bit in places_of(image):
-            changed = bytearray(image)
-            changed[place] ^= 1 << bit
-            path.write_bytes(changed)
+            damaged = bytearray(image)
+            damaged[place] ^= 1 << bit
+            path.write_bytes(damaged)
             content = contents(path)
-            refused += content is None
+            refusals += content is None
             assert content in (None, right), place
-    return refused
+    return refusals
 
 
 def test_a_flipped_bit(images, tmp_path):
     random = np.random.default_rng(1)
-    refused = check_flips(
+    refusals = check_flips(
         images,
         tmp_path,
         lambda image: zip(random.integers(len(image), size=60), random.integers(8, size=60), strict=True),
     )
-    assert 20 < refused < 100
+    assert 20 < refusals < 100
 
 
 @pytest.mark.slow
 def test_a_bit_flipped_in_every_byte(images, tmp_path):
     random = np.random.default_rng(2)
-    refused = check_flips(
+    refusals = check_flips(
         images, tmp_path, lambda image: ((place, int(random.integers(8))) for place in range(len(image)))
     )
-    assert refused > 5000
+    assert refusals > 5000
 
 
 def check_flips_of_blocks(folder, places_of):
-    """One bit flipped in what there is of an unfinished table: a reader has the truth or refuses it, a sweep mends it."""
+    """An unfinished table with a flipped bit: readers return its contents or refuse, and a sweep repairs it."""
     start = folder / "start" / "table.h5"
     start.parent.mkdir()
     half_finished(start)
-    right, refused = contents(start), 0
+    right, refusals = contents(start), 0
     for file in sorted((folder / "start" / "table.h5.blocks").iterdir()):
         for place, bit in places_of(file.read_bytes()):
             shutil.rmtree(folder / "now", ignore_errors=True)
             shutil.copytree(folder / "start", folder / "now")
             path = folder / "now" / "table.h5"
-            changed = bytearray(file.read_bytes())
-            changed[place] ^= 1 << bit
-            (folder / "now" / "table.h5.blocks" / file.name).write_bytes(changed)
+            damaged = bytearray(file.read_bytes())
+            damaged[place] ^= 1 << bit
+            (folder / "now" / "table.h5.blocks" / file.name).write_bytes(damaged)
             content = contents(path)
             assert content in (None, right), (file.name, place)
-            refused += content is None
+            refusals += content is None
             if file.suffix == ".npz":
                 assert len(resumed(path)) == 4 + (content is None)
-    return refused
+    return refusals
 
 
 def test_a_bit_flipped_in_a_block(tmp_path):
@@ -105,7 +105,7 @@ def test_a_bit_flipped_in_every_byte_of_a_block(tmp_path):
 
 
 def test_a_changed_number_is_refused_by_a_reader_and_repaired_by_a_sweep(tmp_path):
-    """Wherever in the numbers of a block: the sweep says so and computes that block again, and no other."""
+    """A flipped bit anywhere in a block: the sweep warns and computes only that block again."""
     path = tmp_path / "table.h5"
     cheap_sweep(path)
     with h5py.File(path, "r+") as file:
@@ -120,7 +120,7 @@ def test_a_changed_number_is_refused_by_a_reader_and_repaired_by_a_sweep(tmp_pat
 
 
 def check_cuts(images, folder, lengths_of):
-    """A file cut short is refused, by a reader and by a sweep, which computes nothing."""
+    """Readers and sweeps refuse a truncated file; the sweep computes nothing."""
     for name, image in images.items():
         path = folder / f"{name}.h5"
         for length in lengths_of(image):
@@ -168,21 +168,21 @@ def test_foreign_files_and_folders_are_left_alone(images, tmp_path):
         file.attrs["request"] = file.attrs["axes"] = "{}"
         file.create_group("checksums")
     for path in (text, empty, foreign, half):
-        before = path.read_bytes()
+        content_before = path.read_bytes()
         assert contents(path) is None
         with pytest.raises(OSError, match=f"cannot read {path}"):
             cheap_sweep(path, pytest.fail)
-        assert path.read_bytes() == before
-    saved = tmp_path / "saved.h5"
-    saved.write_bytes(images["saved"])
+        assert path.read_bytes() == content_before
+    copy = tmp_path / "saved.h5"
+    copy.write_bytes(images["saved"])
     with pytest.raises(ValueError, match=r"saved\.h5 holds .*: it was not written by a sweep in 7 chunks"):
-        cheap_sweep(saved, pytest.fail)
+        cheap_sweep(copy, pytest.fail)
     folder = tmp_path / "folder"
     folder.mkdir()
     with pytest.raises(OSError, match="folder: it is a folder"):
         cheap_sweep(folder, pytest.fail)
-    assert saved.read_bytes() == images["saved"]
-    # No one may write in the first; the second is no folder.
+    assert copy.read_bytes() == images["saved"]
+    # The first is not writable; the second is not a folder.
     for path in (Path("/proc/table.h5"), text / "table.h5"):
         with pytest.raises(OSError, match=f"cannot write {path}"):
             cheap_sweep(path, pytest.fail)

@@ -1,4 +1,4 @@
-"""Blocks computed by other processes: the same numbers to the bit, dead workers, dead schedulers, and what is refused."""
+"""Blocks computed by other processes: bit-identical results, dead workers, dead schedulers, and illegal arguments."""
 
 import logging
 import multiprocessing
@@ -49,8 +49,12 @@ def dask():
     settings = {"distributed.scheduler.allowed-failures": 0, "distributed.comm.timeouts.connect": "60s"}
     # A worker that takes long to start again must not be given up.
     settings |= {"distributed.deploy.lost-worker-timeout": "300s"}
-    quiet = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0", "silence_logs": logging.CRITICAL}
-    with dask.config.set(settings), distributed.LocalCluster(**quiet) as cluster, distributed.Client(cluster) as client:
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0", "silence_logs": logging.CRITICAL}
+    with (
+        dask.config.set(settings),
+        distributed.LocalCluster(**options) as cluster,
+        distributed.Client(cluster) as client,
+    ):
         yield client.get_executor()
 
 
@@ -103,20 +107,20 @@ def test_mpi_gives_the_same_bits_too(tmp_path, by_threads):
     environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
     environment |= {"PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}
     program = [mpirun, "-n", "3", sys.executable, "-m", "mpi4py.futures", HERE / "mpi_sweep.py", tmp_path]
-    done = subprocess.run(program, env=environment, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
+    process = subprocess.run(program, env=environment, capture_output=True, text=True, timeout=300)
+    assert process.returncode == 0, process.stderr
     assert_same_bits(Table.load(tmp_path / "table.h5"), by_threads)
 
 
 def test_trajectories_and_rides_from_other_processes_have_the_same_bits(processes, many_blocks):
     arguments = {"theta": [0.1, 0.2, 1.6], "spin": [100.0, 250.0], "mu": [0.2, 0.3], "times": np.linspace(0.0, 1.5, 31)}
-    local, remote = (tippe.trajectory_table(TOP, executor=pool, **arguments) for pool in (None, processes))
-    assert_same_bits(local, remote)
+    local_table, remote = (tippe.trajectory_table(TOP, executor=pool, **arguments) for pool in (None, processes))
+    assert_same_bits(local_table, remote)
     scene = stroller.Scene(stroller.Stroller(1.7, 0.7, 0.4, 0.05), stroller.Plane())
     axes = {"launch.place[0]": [0.0, 1.0, 2.0], "launch.place[1]": np.linspace(0.0, 8.0, 9)}
     launch = stroller.Launch((0.0, 0.0), 0.5, 1.0, 0.3)
-    local, remote = (stroller.sweep(scene, launch, 2.0, axes=axes, executor=pool) for pool in (None, processes))
-    assert_same_bits(local, remote)
+    local_table, remote = (stroller.sweep(scene, launch, 2.0, axes=axes, executor=pool) for pool in (None, processes))
+    assert_same_bits(local_table, remote)
 
 
 @pytest.mark.parametrize("way", ["processes", DASK])
@@ -138,14 +142,14 @@ def test_a_block_that_three_workers_die_of_is_failed_and_the_others_are_not(way,
     # Dask blames blocks that only waited at a worker that died, too; nobody else kills workers here.
     assert len(set(job.begun(2))) == len(job.begun(2)) == 3
     for copy in (table, Table.load(path)):
-        failed = copy.status == "failed"
-        assert np.flatnonzero(failed).tolist() == list(range(16, 24))
-        assert np.isnan(copy.value[failed]).all()
-        np.testing.assert_array_equal(copy.value[~failed], np.sin(copy.coords["x"][~failed]))
+        is_failed = copy.status == "failed"
+        assert np.flatnonzero(is_failed).tolist() == list(range(16, 24))
+        assert np.isnan(copy.value[is_failed]).all()
+        np.testing.assert_array_equal(copy.value[~is_failed], np.sin(copy.coords["x"][~is_failed]))
 
 
 def test_a_pool_that_breaks_ends_the_sweep_and_another_goes_on(processes, tmp_path):
-    """Python's own pool has no more workers after the first that dies."""
+    """Python's own pool breaks when its first worker dies."""
     job, path = CheapJob(tmp_path, deadly=3, crashes=1, pause=0.05), tmp_path / "table.h5"
     message = r"accepts no more chunks .*; 24 of 50 cells are done, .*table\.h5 has"
     spawn = multiprocessing.get_context("spawn")
@@ -166,7 +170,7 @@ def test_a_scheduler_that_dies_ends_the_sweep_and_threads_go_on(tmp_path):
     }
     common = ["--scheduler-file", address, "--no-dashboard"]
     programs = {"dask_scheduler": ["--port", "0"], "dask_worker": ["--no-nanny", "--nthreads", "1"]}
-    started = [
+    processes = [
         subprocess.Popen(
             [sys.executable, "-m", f"distributed.cli.{name}", *common, *options],
             env=environment,
@@ -180,10 +184,10 @@ def test_a_scheduler_that_dies_ends_the_sweep_and_threads_go_on(tmp_path):
     def kill_the_scheduler():
         while not job.begun(3):
             time.sleep(0.02)
-        started[0].send_signal(signal.SIGKILL)
+        processes[0].send_signal(signal.SIGKILL)
 
     killer = threading.Thread(target=kill_the_scheduler)
-    # What the client says of its lost connection.
+    # The client's messages about its lost connection.
     logging.disable(logging.CRITICAL)
     try:
         with distributed.Client(scheduler_file=str(address), timeout=60) as client:
@@ -194,7 +198,7 @@ def test_a_scheduler_that_dies_ends_the_sweep_and_threads_go_on(tmp_path):
                 cheap_sweep(path, job=job, executor=client.get_executor())
     finally:
         logging.disable(logging.NOTSET)
-        for process in started:
+        for process in processes:
             process.kill()
             process.wait()
     killer.join()
@@ -204,8 +208,8 @@ def test_a_scheduler_that_dies_ends_the_sweep_and_threads_go_on(tmp_path):
 
 
 def test_a_worker_of_another_version_is_refused_by_name(processes, tmp_path, monkeypatch):
-    needed = running.stamp() | {"jax": "0.0.1"}
-    monkeypatch.setattr(running, "stamp", lambda: needed)
+    stamp = running.stamp() | {"jax": "0.0.1"}
+    monkeypatch.setattr(running, "stamp", lambda: stamp)
     message = rf"the worker .*, process \d+, has jax {jax.__version__}, and 0\.0\.1 is needed"
     with pytest.raises(RuntimeError, match=message):
         cheap_sweep(None, job=CheapJob(tmp_path), executor=processes)
@@ -228,7 +232,7 @@ def test_an_error_of_a_block_is_the_sweep_s_and_starts_no_further_block(processe
 
 
 def test_a_user_s_system_is_computed_by_other_processes(processes, monkeypatch):
-    """The same bits as in this process, where nothing is computed then."""
+    """Results are bit-identical to those of this process, which computes nothing meanwhile."""
     start, axes = (np.zeros(3), np.array([1.0, 0.0, 0.0])), {"rate[2]": [0.5, 1.0], "ahead": [0.2, 0.3]}
     expected = nonholonomic.sweep(Sleigh(), start, 2.0, axes=axes, progress=False)
     monkeypatch.setattr(SweepJob, "__call__", None)

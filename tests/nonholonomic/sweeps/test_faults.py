@@ -31,22 +31,22 @@ def kill_sweeps(folder, rounds):
     root = KILLER.parents[3]
     environment = os.environ | {"PYTHONPATH": f"{root}{os.pathsep}{KILLER.parent}", "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-W", "ignore", KILLER, folder, str(rounds)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=900)
-    assert done.returncode == 0, done.stderr
-    _, killed, cut, files = (int(part.split()[0]) for part in done.stdout.split(","))
-    return killed, cut, files
+    process = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=900)
+    assert process.returncode == 0, process.stderr
+    _, kills, cut, files = (int(part.split()[0]) for part in process.stdout.split(","))
+    return kills, cut, files
 
 
 def test_sweeps_killed_at_random_moments(tmp_path):
-    """SIGKILL, and again on resuming: what was finished stays, is right, and is not computed again."""
-    killed, *_ = kill_sweeps(tmp_path, 5)
-    assert killed == 5
+    """After SIGKILL, also during a resumed run, finished blocks remain, are correct, and are not computed again."""
+    kills, *_ = kill_sweeps(tmp_path, 5)
+    assert kills == 5
 
 
 @pytest.mark.slow
 def test_sweeps_killed_at_a_hundred_random_moments(tmp_path):
-    killed, cut, files = kill_sweeps(tmp_path, 100)
-    assert killed == 100
+    kills, cut, files = kill_sweeps(tmp_path, 100)
+    assert kills == 100
     assert cut > 20
     assert files > 10
 
@@ -59,14 +59,16 @@ def test_every_moment_of_writing(tmp_path, error):
         path = tmp_path / f"{moment}.h5"
         with pytest.MonkeyPatch.context() as patch:
             fail_on_disk(patch, moment, torn=(moment % 3) / 2.0, error=error)
-            with pytest.raises(Killed if isinstance(error, Killed) else OSError) as raised:
+            with pytest.raises(Killed if isinstance(error, Killed) else OSError) as error_info:
                 cheap_sweep(path)
         if not isinstance(error, Killed):
-            assert re.fullmatch(rf"cannot write {path}(\.blocks/\d\.npz)?: No space left on device", str(raised.value))
-        after = finished_blocks(Table.load(path))
-        written = (moment - FOR_THE_FOLDER) // FOR_A_BLOCK
-        assert len(after) in (written, written + 1)
-        assert resumed(path) == set(range(7)) - after
+            assert re.fullmatch(
+                rf"cannot write {path}(\.blocks/\d\.npz)?: No space left on device", str(error_info.value)
+            )
+        blocks_after = finished_blocks(Table.load(path))
+        blocks_written = (moment - FOR_THE_FOLDER) // FOR_A_BLOCK
+        assert len(blocks_after) in (blocks_written, blocks_written + 1)
+        assert resumed(path) == set(range(7)) - blocks_after
         assert list(tmp_path.iterdir()) == [path]
         path.unlink()
 
@@ -74,13 +76,13 @@ def test_every_moment_of_writing(tmp_path, error):
 def record(path, monkeypatch):
     """Run a sweep; what it does on the disk: the contents of renamed files, whether a sync had confirmed them, and syncs of
     folders."""
-    done, synced = [], set()
+    process, synced = [], set()
 
     def sync(handle, fsync=os.fsync):
         fsync(handle)
         place = Path(f"/proc/self/fd/{handle}").resolve()
         if place.is_dir():
-            done.append(("sync", place.name))
+            process.append(("sync", place.name))
         else:
             synced.add((place, place.read_bytes()))
 
@@ -88,47 +90,47 @@ def record(path, monkeypatch):
         content = Path(start).read_bytes()
         confirmed = (Path(start).resolve(), content) in synced
         replace(start, end)
-        done.append(("rename", Path(end).parent.name, Path(end).name, content, confirmed))
+        process.append(("rename", Path(end).parent.name, Path(end).name, content, confirmed))
 
     monkeypatch.setattr(os, "fsync", sync)
     monkeypatch.setattr(os, "replace", replace)
     cheap_sweep(path)
     monkeypatch.undo()
-    return done
+    return process
 
 
-def after_the_cut(done, random):
-    """The files after the power failed, and how many blocks had been confirmed: what a sync has not may be there, or a part."""
+def after_the_cut(process, random):
+    """The files after a power failure, and the number of confirmed blocks; data that was not synced may be missing or cut."""
     files, confirmed = {}, 0
-    for place, (what, folder, *file) in enumerate(done):
-        if what == "rename":
-            name, content, whole = file
-            kept = ("sync", folder) in done[place:]
-            confirmed += kept and name.endswith(".npz")
-            if kept or random.integers(2):
-                files[folder, name] = content if whole else content[: random.integers(len(content))]
+    for place, (operation, folder, *file) in enumerate(process):
+        if operation == "rename":
+            name, content, image = file
+            is_synced = ("sync", folder) in process[place:]
+            confirmed += is_synced and name.endswith(".npz")
+            if is_synced or random.integers(2):
+                files[folder, name] = content if image else content[: random.integers(len(content))]
     return files, confirmed
 
 
 def check_power_cuts(tmp_path, monkeypatch, rounds):
     random = np.random.default_rng(3)
     path, blocks = tmp_path / "table.h5", tmp_path / "table.h5.blocks"
-    done = record(path, monkeypatch)
-    assert len(done) == 1 + 2 + 7 * 2 + 2
+    process = record(path, monkeypatch)
+    assert len(process) == 1 + 2 + 7 * 2 + 2
     states = set()
     for _ in range(rounds):
         for file in tmp_path.iterdir():
             shutil.rmtree(file) if file.is_dir() else file.unlink()
-        moment = int(random.integers(len(done) + 1))
-        files, confirmed = after_the_cut(done[:moment], random)
+        moment = int(random.integers(len(process) + 1))
+        files, confirmed = after_the_cut(process[:moment], random)
         for (folder, name), content in files.items():
             place = tmp_path / name if folder == tmp_path.name else blocks / name
             place.parent.mkdir(exist_ok=True)
-            # When the file is there the blocks are removed, one by one.
-            if place == path or moment < len(done) or random.integers(2):
+            # Once the file exists, the blocks are removed one by one.
+            if place == path or moment < len(process) or random.integers(2):
                 place.write_bytes(content)
-        begun = path.exists() or (blocks / "table.h5").exists()
-        finished = finished_blocks(Table.load(path)) if begun else set()
+        has_begun = path.exists() or (blocks / "table.h5").exists()
+        finished = finished_blocks(Table.load(path)) if has_begun else set()
         assert confirmed <= len(finished) <= confirmed + 1
         states.add(len(finished))
         assert resumed(path) == set(range(7)) - finished
@@ -147,7 +149,7 @@ def test_the_power_fails_a_hundred_times(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("room", [0, 1000, 5000])
 def test_a_disk_too_small_for_anything(tmp_path, room):
-    """It is told before anything is computed; nothing is left behind."""
+    """The error is raised before anything is computed, and no file remains."""
     path = tmp_path / "table.h5"
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
@@ -225,7 +227,7 @@ def test_another_version_is_told_or_refused(tmp_path, monkeypatch):
             cheap_sweep(path)
     with pytest.warns(RuntimeWarning, match=rf"was begun with jax 0\.0\.1, now {versions['jax']}: digits may differ"):
         table = cheap_sweep(path)
-    # The table says what its file says; now that all is there, no one need be told again.
+    # The table reads from its file; the file is complete, so there is no further warning.
     assert json.loads(table.attributes["versions"])["jax"] == "0.0.1"
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -1,4 +1,4 @@
-"""Ctrl-C, by real signals to real processes: what is saved is said within two seconds, and nothing crashes."""
+"""Ctrl-C by real signals to real processes: within two seconds a message states what is saved, and nothing crashes."""
 
 import os
 import signal
@@ -96,17 +96,17 @@ def started(folder: Path, *arguments: str) -> subprocess.Popen:
 
 
 def run(folder: Path, program: str, *arguments: str) -> subprocess.Popen:
-    """A program, from a file, as processes that it starts need one."""
+    """A program in a file, because the processes that it starts import it."""
     (folder / "program.py").write_text(program)
     return started(folder, str(folder / "program.py"), *arguments)
 
 
 def interrupted(process: subprocess.Popen) -> tuple[int, list[str], list[str], float]:
     """Ctrl-C for a process and all that it has started: exit status, lines of both outputs, and how long it took [s]."""
-    since = time.monotonic()
+    start_time = time.monotonic()
     os.killpg(process.pid, signal.SIGINT)
-    out, error = process.communicate(timeout=60)
-    return process.returncode, out.splitlines(), error.splitlines(), time.monotonic() - since
+    output, error = process.communicate(timeout=60)
+    return process.returncode, output.splitlines(), error.splitlines(), time.monotonic() - start_time
 
 
 def wait_for(condition, process: subprocess.Popen) -> None:
@@ -124,24 +124,27 @@ def test_a_table_says_what_is_saved_and_goes_on_from_there(way, tmp_path):
     path = tmp_path / "table.h5"
     process = run(tmp_path, THREADS if way == "threads" else PROCESSES, str(path), str(tmp_path))
     wait_for(lambda: len(blocks(path)) >= 2, process)
-    status, out, error, passed = interrupted(process)
-    assert (status, out) == (-signal.SIGINT, [])
-    assert passed < PROMPT
-    saved = len(blocks(path))
-    assert 2 <= saved < 7
-    assert error[-1] == f"KeyboardInterrupt: saved {8 * saved} of 50 cells to {path}; run the same call again to resume"
-    # The processes of the executor say nothing.
+    status, output, error, duration = interrupted(process)
+    assert (status, output) == (-signal.SIGINT, [])
+    assert duration < PROMPT
+    saved_blocks = len(blocks(path))
+    assert 2 <= saved_blocks < 7
+    assert (
+        error[-1]
+        == f"KeyboardInterrupt: saved {8 * saved_blocks} of 50 cells to {path}; run the same call again to resume"
+    )
+    # The executor's processes print nothing.
     assert sum(line.startswith("Traceback") for line in error) == 1
-    assert len(resumed(path)) == 7 - saved
+    assert len(resumed(path)) == 7 - saved_blocks
 
 
 def test_a_table_is_heard_while_it_compiles(tmp_path):
     process = run(tmp_path, COMPILING, "table.h5")
     assert process.stdout.readline() == "begun\n"
     time.sleep(0.5)
-    status, out, _, passed = interrupted(process)
-    assert (status, out) == (7, ["saved 0 of 50 cells to table.h5; run the same call again to resume"])
-    assert passed < PROMPT
+    status, output, _, duration = interrupted(process)
+    assert (status, output) == (7, ["saved 0 of 50 cells to table.h5; run the same call again to resume"])
+    assert duration < PROMPT
 
 
 def test_a_command_line_ends_while_it_compiles(tmp_path):
@@ -149,10 +152,10 @@ def test_a_command_line_ends_while_it_compiles(tmp_path):
     assert process.stdout.readline() == "begun\n"
     # Until it no longer hears signals.
     time.sleep(0.5)
-    status, out, error, passed = interrupted(process)
-    assert (status, out) == (INTERRUPTED, [])
+    status, output, error, duration = interrupted(process)
+    assert (status, output) == (INTERRUPTED, [])
     assert error == ["python -m something: interrupted; run the same command again to resume"]
-    assert PATIENCE <= passed < PROMPT
+    assert PATIENCE <= duration < PROMPT
 
 
 def test_the_main_job_of_the_top_says_what_is_saved(tmp_path):
@@ -161,25 +164,25 @@ def test_the_main_job_of_the_top_says_what_is_saved(tmp_path):
     wait_for(lambda: (folder / "table.h5").exists(), process)
     # It compiles for some seconds from here on.
     time.sleep(0.5)
-    status, _, error, passed = interrupted(process)
+    status, _, error, duration = interrupted(process)
     assert status == INTERRUPTED
     assert error == ["python -m tippe: saved 0 of 10 cells to out; run the same command again to resume"]
-    assert passed < PROMPT
+    assert duration < PROMPT
 
 
 @pytest.mark.parametrize("program", ["tippe", "stroller"])
 def test_a_command_line_ends_with_one_line_while_it_is_imported(program, tmp_path):
-    """Python sends itself the signal as it is about to import jax, while it collects garbage."""
+    """The process sends itself the signal during garbage collection, just before it imports jax."""
     (tmp_path / "sitecustomize.py").write_text(IMPORTING)
     process = started(tmp_path, "-m", program, "--out", "out")
-    _, out, error = process.wait(timeout=60), *process.communicate()
-    assert (out, error) == ("", f"python -m {program}: interrupted\n")
+    _, output, error = process.wait(timeout=60), *process.communicate()
+    assert (output, error) == ("", f"python -m {program}: interrupted\n")
 
 
 def test_the_main_job_of_the_stroller_ends_with_one_line(tmp_path):
     process = started(tmp_path, "-m", "stroller", "--out", "out")
     wait_for(lambda: (tmp_path / "out").exists(), process)
-    status, _, error, passed = interrupted(process)
+    status, _, error, duration = interrupted(process)
     assert status == INTERRUPTED
     assert error == ["python -m stroller: interrupted; run the same command again to resume"]
-    assert passed < PROMPT
+    assert duration < PROMPT

@@ -46,9 +46,9 @@ def test_a_table_in_its_file_takes_the_memory_of_some_blocks(tmp_path, monkeypat
     large_sweep(tmp_path / "first.h5")
     tracemalloc.start()
     table = large_sweep(tmp_path / "table.h5")
-    _, most = tracemalloc.get_traced_memory()
+    _, peak_memory = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert most < 5e6
+    assert peak_memory < 5e6
     right = Y.values[:, None] + X.values
     assert table.shape == (500, 1000)
     np.testing.assert_array_equal(table.value, right)
@@ -65,16 +65,16 @@ def test_a_table_in_its_file_is_read_piece_by_piece(tmp_path, monkeypatch, in_it
         _ = table.tme
     table.save(tmp_path / "copy.h5")
     monkeypatch.undo()
-    held = Table.load(tmp_path / "copy.h5")
-    lazy, eager = table.to_xarray(chunks={"y": 100}), held.to_xarray()
-    with lazy:
+    table_in_memory = Table.load(tmp_path / "copy.h5")
+    lazy_dataset, dataset_in_memory = table.to_xarray(chunks={"y": 100}), table_in_memory.to_xarray()
+    with lazy_dataset:
         for name in VARIABLES:
-            assert lazy[name].chunks[0] == (100,) * 5
-            assert lazy[name].dims == eager[name].dims == table.dims(name)
-        assert int((lazy["status"] == "high").sum()) == int((held.status == "high").sum())
-        np.testing.assert_array_equal(lazy["pair"][3, 4], held.pair[3, 4])
-    assert held.to_xarray(chunks={"y": 50})["value"].chunks[0] == (50,) * 10
-    np.testing.assert_array_equal(table.value, held.value)
+            assert lazy_dataset[name].chunks[0] == (100,) * 5
+            assert lazy_dataset[name].dims == dataset_in_memory[name].dims == table.dims(name)
+        assert int((lazy_dataset["status"] == "high").sum()) == int((table_in_memory.status == "high").sum())
+        np.testing.assert_array_equal(lazy_dataset["pair"][3, 4], table_in_memory.pair[3, 4])
+    assert table_in_memory.to_xarray(chunks={"y": 50})["value"].chunks[0] == (50,) * 10
+    np.testing.assert_array_equal(table.value, table_in_memory.value)
 
 
 def test_a_number_that_changed_in_the_file_is_refused_when_it_is_asked_for(tmp_path, in_its_file):
@@ -107,8 +107,8 @@ def test_large_grids_have_larger_blocks(cells, together):
 
 
 def test_a_small_grid_is_checked_whole_and_a_large_one_at_its_edges_and_corners():
-    (small,) = cells_to_check([X, axis("z", "z", "1", [1.0, 2.0])])
-    assert len(small["x"]) == 2000
+    (only_cells,) = cells_to_check([X, axis("z", "z", "1", [1.0, 2.0])])
+    assert len(only_cells["x"]) == 2000
     looked_at = list(cells_to_check([X, Y, axis("z", "z", "1", [3.0, 1.0, 2.0])]))
     assert sum(len(chunk["x"]) for chunk in looked_at) == 1000 + 500 + 3 + 8
     assert set(zip(*looked_at[-1].values(), strict=True)) == set(
@@ -119,16 +119,16 @@ def test_a_small_grid_is_checked_whole_and_a_large_one_at_its_edges_and_corners(
 
 
 def test_a_billion_cells_are_refused_at_once(monkeypatch):
-    """Illegal only together, in one corner of the grid."""
+    """Values that are illegal only in combination, in one corner of the grid."""
     monkeypatch.setattr("tippe.runs.table.sweep", lambda *_, **__: pytest.fail("it was run"))
     scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3))
     axes = {"scene.body.radius": np.linspace(0.02, 0.01, 100), "scene.body.offset": np.linspace(0.001, 0.011, 100)}
-    began = time.process_time()
+    start_time = time.process_time()
     with pytest.raises(ValueError, match=r"offset = 0\.011 must be less than 0\.01"):
         tippe.inversion_table(
             scene, theta=np.linspace(0.1, 1.0, 1000), spin=np.linspace(80.0, 120.0, 100), t1=1.0, axes=axes
         )
-    assert time.process_time() - began < 1.0
+    assert time.process_time() - start_time < 1.0
 
 
 def test_an_illegal_cell_inside_a_large_grid_ends_the_sweep_when_its_turn_comes(monkeypatch, tmp_path):
@@ -154,11 +154,11 @@ def test_an_illegal_cell_inside_a_large_grid_ends_the_sweep_when_its_turn_comes(
 
 
 def test_more_cells_than_memory_holds_are_refused_at_once(tmp_path):
-    """10^10 of them: without a file for want of memory, with one for want of room on the disk, unless there is that much."""
-    many = [axis(name, name, "1", np.arange(1e5)) for name in ("x", "y")]
+    """A table of 10^10 cells: refused without a file for lack of memory, and with a file for lack of disk space."""
+    axes = [axis(name, name, "1", np.arange(1e5)) for name in ("x", "y")]
     text = r"path = None: 1e\+10 cells take 2\d\d GB, and this machine has .* GB of memory; pass path= to keep them in a file"
     with pytest.raises(ValueError, match=text):
         sweep(
-            job, many, {"value": VARIABLES["value"], "count": Variable("1", np.int64), "more": VARIABLES["value"]}, {}
+            job, axes, {"value": VARIABLES["value"], "count": Variable("1", np.int64), "more": VARIABLES["value"]}, {}
         )
     assert running.memory() > 1e8

@@ -1,4 +1,4 @@
-"""Tables show themselves: by name, in pictures, in xarray, and in files without what a sweep needs for itself."""
+"""Access to tables: variables by name, plots, xarray, and files without the sweep's internal attributes."""
 
 import io
 import json
@@ -16,7 +16,7 @@ THETA, SPIN, MU = np.linspace(0.1, 0.4, 4), np.linspace(60.0, 160.0, 11), np.arr
 
 @pytest.fixture(scope="module")
 def table():
-    """Times 1 + theta + mu spin, one of them far off, one not there."""
+    """Times 1 + theta + mu spin, with one outlier and one missing value."""
     time = 1.0 + THETA[:, None, None] + MU[:, None] * SPIN
     time[0, 0, 0], time[1, 0, 1] = 1e4, np.inf
     status = np.where(np.isfinite(time), "inverted", "not_inverted")
@@ -60,10 +60,10 @@ def test_a_picture_is_cut_where_it_says(table):
 
 
 def test_colours_lie_between_quantiles_and_may_be_logarithmic(table):
-    shown = table.time[:, 0]
-    shown = shown[np.isfinite(shown)]
+    times = table.time[:, 0]
+    times = times[np.isfinite(times)]
     image = table.plot(at={"mu": 0.1}).axes[0].collections[0]
-    assert image.get_clim() == pytest.approx(np.quantile(shown, (0.02, 0.98)))
+    assert image.get_clim() == pytest.approx(np.quantile(times, (0.02, 0.98)))
     assert image.get_clim()[1] < 1e4
     assert type(table.plot(at={"mu": 0.1}, log=True).axes[0].collections[0].norm).__name__ == "LogNorm"
     lines = table.plot(log=True)
@@ -122,8 +122,8 @@ def test_a_table_goes_to_pandas_a_row_for_each_cell():
     frame = Table(coords, {"time": time, "status": words}, {"time": "s"}, {}).to_dataframe()
     assert list(frame.columns) == ["theta", "mu", "time", "status"]
     assert frame.attrs["units"] == {"time": "s"}
-    chosen = frame[(frame.theta == 0.2) & (frame.mu == 0.4)]
-    assert (chosen.time.item(), chosen.status.item()) == (4.0, "inverted")
+    rows_of_cell = frame[(frame.theta == 0.2) & (frame.mu == 0.4)]
+    assert (rows_of_cell.time.item(), rows_of_cell.status.item()) == (4.0, "inverted")
     # Points of an additional dimension are rows; components of a vector are columns.
     coords |= {"at": np.array([0.0, 1.0]), "component": np.array(["x", "y"])}
     slip, inner = np.arange(24.0).reshape(2, 3, 2, 2), {"slip": ("at", "component")}

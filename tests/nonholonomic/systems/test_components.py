@@ -42,19 +42,19 @@ def test_zeros_are_not_computed_with():
     def scaled(*parts):
         return tuple(np.diag(np.arange(6.0)) @ jnp.stack(parts))
 
-    listed = jax.make_jaxpr(by_components(scaled, *SCALARS))(*LANES)
-    assert [equation.primitive.name for equation in listed.eqns].count("mul") == 4
-    assert "add" not in [equation.primitive.name for equation in listed.eqns]
+    jaxpr = jax.make_jaxpr(by_components(scaled, *SCALARS))(*LANES)
+    assert [equation.primitive.name for equation in jaxpr.eqns].count("mul") == 4
+    assert "add" not in [equation.primitive.name for equation in jaxpr.eqns]
 
 
 def hidden_in_zeros(*parts):
-    """A root that only zeros of a matrix are multiplied by, and one that is a term elsewhere."""
+    """Two roots: one is multiplied only by zeros of a matrix, the other is also a term elsewhere."""
     vector = jnp.stack([jnp.sqrt(parts[0]), jnp.sqrt(parts[3]), parts[2]])
     return tuple(jnp.array([[0.0, 0.0, 1.0], [0.0, 2.0, 3.0]]) @ vector)
 
 
 def test_a_number_that_is_not_finite_does_not_disappear_with_the_zeros_of_a_matrix():
-    """NaN times zero is NaN, as in arrays; in lanes where the roots are numbers nothing changes, and only one is added."""
+    """NaN times zero is NaN, as in arrays; where the roots are numbers, the result does not change. Only one root is added."""
     parts = (jnp.array([4.0, -1.0, 4.0]), *LANES[1:3], jnp.array([9.0, 9.0, -1.0]), *LANES[4:])
     parts = tuple(part[:3] for part in parts)
     expected = np.array(jax.vmap(hidden_in_zeros)(*parts))
@@ -62,8 +62,8 @@ def test_a_number_that_is_not_finite_does_not_disappear_with_the_zeros_of_a_matr
     results = np.array(by_components(hidden_in_zeros, *SCALARS)(*parts))
     assert_close(results[:, 0], expected[:, 0], rtol=1e-15)
     assert np.isnan(results).any(axis=0).tolist() == [False, True, True]
-    listed = jax.make_jaxpr(by_components(hidden_in_zeros, *SCALARS))(*parts)
-    assert [equation.primitive.name for equation in listed.eqns].count("mul") == 3
+    jaxpr = jax.make_jaxpr(by_components(hidden_in_zeros, *SCALARS))(*parts)
+    assert [equation.primitive.name for equation in jaxpr.eqns].count("mul") == 3
 
 
 def test_large_functions_and_loops_are_left_in_arrays():

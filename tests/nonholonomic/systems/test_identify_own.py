@@ -28,10 +28,10 @@ def test_a_quantity_that_the_system_does_not_have_is_named():
 
 
 def test_one_number_of_all_modes_is_replaced_in_all():
-    named = Named.of({"system": Hybrid([Stick(), Slip()])})
-    assert "system.modes[*].belt" in named.known
-    changed = named.tree(named.replaced({"system.modes[*].belt": 0.7}))["system"]
-    assert [mode.belt for mode in changed.modes] == [0.7, 0.7]
+    numbers = Named.of({"system": Hybrid([Stick(), Slip()])})
+    assert "system.modes[*].belt" in numbers.known
+    system = numbers.tree(numbers.replaced({"system.modes[*].belt": 0.7}))["system"]
+    assert [mode.belt for mode in system.modes] == [0.7, 0.7]
     data = Recording([0.0, 0.5], [1.0], [0.0], 1.0)
     with pytest.raises(ValueError, match=r"'system.modes\[0\].belt' is named twice, alone and for all modes"):
         identify(Hybrid([Stick(), Slip()]), data, {"modes[*].belt": 0.5, "modes[0].belt": 0.5})

@@ -21,10 +21,10 @@ def exact(height, restitution, time):
     bounces = [bounce(height, restitution, GRAVITY, number) for number in (1, 2)]
     speed = jnp.sqrt(2.0 * GRAVITY * height)
     count = int(time > bounces[0]) + int(time > bounces[1])
-    since = time - (bounces[count - 1] if count else 0.0)
+    elapsed = time - (bounces[count - 1] if count else 0.0)
     start = restitution**count * speed if count else 0.0
     place = 0.0 if count else height
-    return jnp.stack([place + start * since - 0.5 * GRAVITY * since**2, start - GRAVITY * since])
+    return jnp.stack([place + start * elapsed - 0.5 * GRAVITY * elapsed**2, start - GRAVITY * elapsed])
 
 
 def states(height, restitution):
@@ -47,9 +47,9 @@ def test_stick_and_slip_where_the_end_of_sticking_is_tangential():
     assert run.status == "completed"
     assert run.mode.tolist() == [0, 1, 1]
     assert_close(run.state[0], [0.5, 0.5], atol=1e-12)
-    since = np.array([1.0, 3.0])
-    assert_close(run.state[1:, 0], 1.0 + 0.5 * np.sin(since), atol=1e-9)
-    assert_close(run.state[1:, 1], 0.5 * np.cos(since), atol=1e-9)
+    elapsed = np.array([1.0, 3.0])
+    assert_close(run.state[1:, 0], 1.0 + 0.5 * np.sin(elapsed), atol=1e-9)
+    assert_close(run.state[1:, 1], 0.5 * np.cos(elapsed), atol=1e-9)
 
 
 class Melting(AbstractMode):
@@ -79,8 +79,8 @@ def test_resets_without_end_are_unresolved():
 
 
 def test_a_printed_run_states_why_it_ended():
-    below = simulate(Hybrid([Ball()]), [-1.0, 0.0, 0.0], 1.0, times=[0.0, 1.0])
-    lines = str(below).splitlines()
+    run = simulate(Hybrid([Ball()]), [-1.0, 0.0, 0.0], 1.0, times=[0.0, 1.0])
+    lines = str(run).splitlines()
     assert lines[0] == "Trajectory of 2 times, unresolved at 0 s"
     assert [line.split(":")[0].strip() for line in lines[1:6]] == ["y0", "y1", "y2", "resets", "steps"]
     assert lines[6].strip().startswith("resets followed one another without end; add a mode for rest")
@@ -160,7 +160,7 @@ def test_a_lagrangian_of_one_s_own_is_run_by_poincare_s_equations():
 
 
 def test_derivatives_that_do_not_exist_through_resets_are_refused_in_words():
-    """By the horizon, and second ones: the messages do not speak of another model."""
+    """Derivatives with respect to the horizon, and second derivatives: messages do not mention another model."""
     ball, start = Hybrid([Ball()]), jnp.array([1.0, 0.0, 0.0])
     with pytest.raises(ValueError, match="runs with resets; differentiate with respect to the start or the parameters"):
         jax.grad(lambda t1: simulate(ball, start, t1, times=t1 * TIMES / 1.5).state[0, 0])(1.5)

@@ -22,7 +22,7 @@ BALL = Hybrid([Ball()], event=Bounces(3.0))
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory):
-    """The third bounces of balls, whose table is kept in a file."""
+    """Third bounces of balls, in a table with a file."""
     path = tmp_path_factory.mktemp("balls") / "balls.h5"
     axes = {"start[0]": HEIGHTS, "restitution": RESTITUTIONS}
     arguments = {"axes": axes, "sensitivities": ["restitution", "modes[0].gravity"], "path": path, "progress": False}
@@ -40,25 +40,25 @@ def test_a_table_of_bounces_and_its_derivatives(table):
 
     heights, restitutions = np.meshgrid(HEIGHTS, RESTITUTIONS, indexing="ij")
     expected = np.vectorize(time)(heights, restitutions, GRAVITY)
-    happens = expected < 1.4
-    assert 0 < happens.sum() < happens.size
-    assert (table.status == np.where(happens, "event", "completed")).all()
-    assert_close(table.time, np.where(happens, expected, np.inf), rtol=1e-13)
+    has_event = expected < 1.4
+    assert 0 < has_event.sum() < has_event.size
+    assert (table.status == np.where(has_event, "event", "completed")).all()
+    assert_close(table.time, np.where(has_event, expected, np.inf), rtol=1e-13)
     slopes = jax.vmap(jax.grad(time, (1, 2)), (0, 0, None))(heights.ravel(), restitutions.ravel(), GRAVITY)
     for name, slope in zip(("restitution", "gravity"), slopes, strict=True):
-        assert_close(table[f"time_by_{name}"].ravel(), np.where(happens.ravel(), slope, 0.0), rtol=1e-11)
-    assert (table.switches[happens] == 3).all()
+        assert_close(table[f"time_by_{name}"].ravel(), np.where(has_event.ravel(), slope, 0.0), rtol=1e-11)
+    assert (table.switches[has_event] == 3).all()
     assert (table.grazes == 0).all()
-    assert_close(table.y2[happens], 3.0)
+    assert_close(table.y2[has_event], 3.0)
     assert_close(table.coords["start_0"], HEIGHTS)
 
 
 def test_a_job_may_be_sent_to_another_process():
-    named = Named.of({"system": BALL, "start": jnp.array([1.0, 0.0, 0.0]), "event": None})
-    job = SweepJob(named, 1.4, Settings(1e-9), ())
-    sent = pickle.loads(pickle.dumps(job))
-    assert sent.parameters.names == job.parameters.names
-    assert_close(sent.parameters.values, job.parameters.values)
+    numbers = Named.of({"system": BALL, "start": jnp.array([1.0, 0.0, 0.0]), "event": None})
+    job = SweepJob(numbers, 1.4, Settings(1e-9), ())
+    copy = pickle.loads(pickle.dumps(job))
+    assert copy.parameters.names == job.parameters.names
+    assert_close(copy.parameters.values, job.parameters.values)
 
 
 class Middle(eqx.Module):
@@ -105,9 +105,9 @@ def test_a_mechanical_system_has_a_table_over_its_start_and_numbers():
     table = sweep(Sleigh(), (np.zeros(3), np.array([1.0, 0.0, 0.0])), 2.0, axes=axes, progress=False)
     assert (table.status == "completed").all()
     turning = 0.4 + 1.7 * np.array([0.2, 0.3]) ** 2
-    before = 1.7 + turning * np.array([[0.5], [1.0]]) ** 2
-    along = table.rate0 * np.cos(table.q2) + table.rate1 * np.sin(table.q2)
-    assert_close(1.7 * along**2 + turning * table.rate2**2, before, rtol=1e-9)
+    squared_speed = 1.7 + turning * np.array([[0.5], [1.0]]) ** 2
+    forward_speed = table.rate0 * np.cos(table.q2) + table.rate1 * np.sin(table.q2)
+    assert_close(1.7 * forward_speed**2 + turning * table.rate2**2, squared_speed, rtol=1e-9)
     assert table.dims("q2") == ("rate_2", "ahead")
 
 

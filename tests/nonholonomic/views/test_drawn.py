@@ -1,4 +1,4 @@
-"""Arenas, animations and pages of what is no run: a ball that somebody rolls along a line."""
+"""Arenas, animations and pages of a prescribed motion: a ball that rolls along a line."""
 
 import base64
 import json
@@ -36,7 +36,7 @@ SURFACES = (
     (Torus(1.0, 0.3), (0.3, 2.0)),
     (Paraboloid(0.4), (0.1, 0.2)),
     (Graph(lambda x, y: 0.1 * jnp.sin(3.0 * x) * y), (0.1, 0.2)),
-    (Implicit(lambda x, y, z: x**2 + y**2 + z**2 - 0.25), (0.3, 0.0, -0.4)),
+    pytest.param(Implicit(lambda x, y, z: x**2 + y**2 + z**2 - 0.25), (0.3, 0.0, -0.4), marks=pytest.mark.slow),
 )
 
 
@@ -44,11 +44,11 @@ SURFACES = (
 def test_an_arena_lies_on_its_surface_and_reaches_about_the_run(surface, place):
     place = (0.2, 0.3) if place is None else place
     point = np.array([float(part) for part in surface.in_fixed_frame(surface.chart(tuple(map(jnp.asarray, place)))[0])])
-    drawn = arena(surface, point[None], np.array([0.0, 0.0, 1.0]), 0.1, 0.03)
-    for points in (drawn.mesh.vertices, np.concatenate(drawn.lines)):
-        away = surface.distance(surface.in_own_axes(tuple(points.T)))
-        assert away is None or np.max(np.abs(away)) < 1e-9
-    distance = np.linalg.norm(drawn.mesh.vertices - point, axis=-1)
+    picture_of_arena = arena(surface, point[None], np.array([0.0, 0.0, 1.0]), 0.1, 0.03)
+    for points in (picture_of_arena.mesh.vertices, np.concatenate(picture_of_arena.lines)):
+        distances = surface.distance(surface.in_own_axes(tuple(points.T)))
+        assert distances is None or np.max(np.abs(distances)) < 1e-9
+    distance = np.linalg.norm(picture_of_arena.mesh.vertices - point, axis=-1)
     assert distance.min() < 0.01
     assert 0.09 < distance.max() < 0.6
 
@@ -92,11 +92,11 @@ def test_an_animation_moves(tmp_path):
     write_animation([rolling()], tmp_path / "ball.gif", np.array([0.0, 1.0, 2.0]))
     with Image.open(tmp_path / "ball.gif") as picture:
         assert picture.n_frames == 3
-        shown = []
+        pictures = []
         for frame in range(3):
             picture.seek(frame)
-            shown.append(np.asarray(picture.convert("RGB"), dtype=float))
-    assert all(np.mean(np.abs(a - b)) > 0.5 for a, b in zip(shown, shown[1:], strict=False))
+            pictures.append(np.asarray(picture.convert("RGB"), dtype=float))
+    assert all(np.mean(np.abs(a - b)) > 0.5 for a, b in zip(pictures, pictures[1:], strict=False))
     with pytest.raises(ValueError, match=r"ball\.avi' must end in \.gif"):
         write_animation([rolling()], tmp_path / "ball.avi", None)
 
@@ -124,8 +124,8 @@ def test_the_front_of_an_arena_is_towards_the_room():
     for normal in (np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])):
         vertices, triangles, _ = arena(Cylinder(0.5), point, normal, 0.1, 0.03).mesh
         corners = vertices[triangles]
-        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        assert np.all(across @ normal > 0.0)
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        assert np.all(normals @ normal > 0.0)
 
 
 def test_a_page_holds_its_numbers_in_single_precision():
@@ -138,14 +138,14 @@ def test_a_page_holds_its_numbers_in_single_precision():
     (show,) = stage.shows
     fact = facts["stages"][0]["runs"][0]
     assert fact == facts["stages"][1]["runs"][0]
-    for (begin, length), values in (
+    for (start, length), values in (
         (fact["times"], show.times),
         (fact["bodies"][0]["orientation"], show.bodies[0].orientation),
         (fact["arrows"][0]["vector"], show.arrows[0].vector),
     ):
-        np.testing.assert_allclose(floats[begin : begin + length], values.ravel(), rtol=1e-6, atol=1e-12)
-    begin, length = facts["stages"][0]["arena"]["triangles"]
-    triangles = np.cumsum(np.frombuffer(steps, "<i4")[begin : begin + length])
+        np.testing.assert_allclose(floats[start : start + length], values.ravel(), rtol=1e-6, atol=1e-12)
+    start, length = facts["stages"][0]["arena"]["triangles"]
+    triangles = np.cumsum(np.frombuffer(steps, "<i4")[start : start + length])
     np.testing.assert_array_equal(triangles, stage.arena.mesh.triangles.ravel())
     # The page of two balls, with three.js.
     assert len(html) < 4e5

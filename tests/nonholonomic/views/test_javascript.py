@@ -1,4 +1,4 @@
-"""What is written in JavaScript computes what the function computes, in a real browser."""
+"""Functions written in JavaScript have the same values in a real browser."""
 
 import json
 
@@ -40,7 +40,7 @@ def of_three(x):
 def everything(x):
     """Functions of one number, where they are defined."""
     a, b = jnp.abs(x) + 1.0, jnp.tanh(x)
-    named = (
+    results = (
         jnp.exp(x),
         jnp.expm1(x),
         jnp.log(a),
@@ -51,10 +51,10 @@ def everything(x):
         jnp.cos(x),
         jnp.tan(x),
     )
-    named += (jnp.arcsin(b), jnp.arccos(b), jnp.arctan(x), jnp.arctan2(x, a), jnp.sinh(x), jnp.cosh(x), jnp.tanh(x))
-    named += (jnp.arcsinh(x), jnp.arccosh(a), jnp.arctanh(b), a**x, a**-3, jnp.exp2(x), jax.lax.rsqrt(a), jnp.sign(x))
+    results += (jnp.arcsin(b), jnp.arccos(b), jnp.arctan(x), jnp.arctan2(x, a), jnp.sinh(x), jnp.cosh(x), jnp.tanh(x))
+    results += (jnp.arcsinh(x), jnp.arccosh(a), jnp.arctanh(b), a**x, a**-3, jnp.exp2(x), jax.lax.rsqrt(a), jnp.sign(x))
     return (
-        *named,
+        *results,
         jnp.floor(x),
         jnp.ceil(x),
         jnp.mod(x, 0.7),
@@ -65,16 +65,29 @@ def everything(x):
 
 
 def array_work(x):
-    """Sums, products, extremes and places that are known only as it runs."""
-    which = (x[2] > 0.0).astype(int)
+    """Sums, products, extremes and indices that are known only at run time."""
+    indices = (x[2] > 0.0).astype(int)
     matrix = jnp.outer(x, x) + jnp.eye(3)
-    picked = (x[which], x[which + jnp.arange(2)], x.at[which].set(7.0), jax.lax.dynamic_slice(x, (which,), (2,)))
+    selections = (
+        x[indices],
+        x[indices + jnp.arange(2)],
+        x.at[indices].set(7.0),
+        jax.lax.dynamic_slice(x, (indices,), (2,)),
+    )
     outputs = (matrix @ x, matrix.T.ravel(), x @ x, jnp.prod(x), jnp.max(x), jnp.min(x), jnp.argmin(x), jnp.argmax(x))
-    return (*picked, *outputs, jnp.any(x > 2.0), jnp.all(x > 2.0), x[::-1], jnp.linalg.norm(x), jnp.hypot(x[0], x[1]))
+    return (
+        *selections,
+        *outputs,
+        jnp.any(x > 2.0),
+        jnp.all(x > 2.0),
+        x[::-1],
+        jnp.linalg.norm(x),
+        jnp.hypot(x[0], x[1]),
+    )
 
 
 def slopes(x):
-    """What automatic differentiation makes of a function."""
+    """The derivative of a function by automatic differentiation."""
     return jax.grad(lambda y: jnp.sin(y[0]) * y[1] ** 3 / jnp.sqrt(1.0 + y[2] ** 2))(x)
 
 

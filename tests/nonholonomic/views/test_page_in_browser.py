@@ -1,4 +1,4 @@
-"""The page of a run, opened in a real browser with the network off: what is drawn is where the run is."""
+"""The page of a run, opened in a real browser without a network, draws the bodies at their positions in the run."""
 
 import time
 
@@ -35,7 +35,7 @@ def ride():
 
 @pytest.fixture(scope="module")
 def stages(top, ride):
-    """A top, and two rides in one place."""
+    """A top in one view, and two rides overlaid in another."""
     return [*top.stages(), *ride.stages([ride_at(8.0)], overlaid=True)]
 
 
@@ -56,9 +56,9 @@ def set_speed(driver, factor: float) -> None:
     )
 
 
-def poses(driver, at: float, stage: int, bodies: int = 1) -> np.ndarray:
+def poses(driver, time_in_page: float, stage: int, bodies: int = 1) -> np.ndarray:
     """The matrices that take the first bodies to their places at a time, as the page's scene has them; it is drawn once."""
-    script = f"player.seek({at!r}); return [...Array({bodies}).keys()].map((body) => player.matrix({stage}, 0, body))"
+    script = f"player.seek({time_in_page!r}); return [...Array({bodies}).keys()].map((body) => player.matrix({stage}, 0, body))"
     return np.array(driver.execute_script(script)).reshape(bodies, 4, 4).swapaxes(1, 2)
 
 
@@ -71,8 +71,8 @@ def test_nothing_is_missing_without_a_network(browser):
 def test_the_top_is_where_the_run_is(browser, top):
     times = np.array([0.0, 0.1234, 0.3, 0.5])
     samples = top.at(times)
-    for number, at in enumerate(times):
-        (pose,) = poses(browser, float(at), 0)
+    for number, time_in_page in enumerate(times):
+        (pose,) = poses(browser, float(time_in_page), 0)
         np.testing.assert_allclose(pose[:3, 3], samples.position[number], atol=SINGLE)
         # Between frames it is turned the short way, so its axis cuts a corner.
         np.testing.assert_allclose(pose[:3, 2], samples.axis[number], atol=2e-3)
@@ -81,19 +81,19 @@ def test_the_top_is_where_the_run_is(browser, top):
 
 def test_the_top_spins_as_fast_as_the_run(browser, top, stages):
     frames = np.asarray(stages[0].shows[0].times)
-    before, after = frames[200], frames[201]
-    turn = poses(browser, float(after), 0)[0, :3, :3] @ poses(browser, float(before), 0)[0, :3, :3].T
+    value_before, value_after = frames[200], frames[201]
+    turn = poses(browser, float(value_after), 0)[0, :3, :3] @ poses(browser, float(value_before), 0)[0, :3, :3].T
     angle = np.arccos((np.trace(turn) - 1.0) / 2.0)
     rate = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    rate *= angle / (2.0 * np.sin(angle) * (after - before))
-    middle = top.at([(before + after) / 2.0])
+    rate *= angle / (2.0 * np.sin(angle) * (value_after - value_before))
+    middle = top.at([(value_before + value_after) / 2.0])
     np.testing.assert_allclose(rate @ np.asarray(middle.axis)[0], middle.spin[0], rtol=1e-3)
 
 
 def test_the_stroller_and_its_wheels_are_where_the_ride_is(browser, ride):
     for number in (0, 10, 20):
-        at = float(ride.t[number])
-        frame, left, right, front = poses(browser, at, 1, 4)
+        time_in_page = float(ride.t[number])
+        frame, left, right, front = poses(browser, time_in_page, 1, 4)
         wheels = [left[:3, 3], right[:3, 3]]
         up = np.cross(frame[:3, 0], frame[:3, 1])
         np.testing.assert_allclose(frame[:3, 0], ride.direction[number], atol=SINGLE)
@@ -101,25 +101,25 @@ def test_the_stroller_and_its_wheels_are_where_the_ride_is(browser, ride):
         np.testing.assert_allclose(sum(wheels) / 2.0, frame[:3, 3], atol=SINGLE)
         np.testing.assert_allclose(front[:3, 3] - frame[:3, 3], 0.7 * np.asarray(ride.direction[number]), atol=SINGLE)
         # The front wheel's axis has turned by the steering angle.
-        turned = np.arctan2(-front[:3, 1] @ frame[:3, 0], front[:3, 1] @ frame[:3, 1])
-        np.testing.assert_allclose(turned, ride.steering[number], atol=SINGLE)
+        roll = np.arctan2(-front[:3, 1] @ frame[:3, 0], front[:3, 1] @ frame[:3, 1])
+        np.testing.assert_allclose(roll, ride.steering[number], atol=SINGLE)
 
 
 def test_the_camera_keeps_all_runs_of_a_place_in_sight(browser):
     """They are 6 m apart in the end, and a vehicle is 0.7 m long."""
-    for at in (0.0, 0.5, 1.0):
-        browser.execute_script(f"player.seek({at!r})")
+    for time_in_page in (0.0, 0.5, 1.0):
+        browser.execute_script(f"player.seek({time_in_page!r})")
         camera, target = np.array(
             browser.execute_script(
                 "const { camera, controls } = player.stages[1];"
                 "return [camera.position.toArray(), controls.target.toArray()]"
             )
         )
-        ahead = (target - camera) / np.linalg.norm(target - camera)
+        view_direction = (target - camera) / np.linalg.norm(target - camera)
         for run in (0, 1):
             matrix = browser.execute_script(f"return player.matrix(1, {run}, 0)")
-            away = np.array(matrix).reshape(4, 4)[3, :3] - camera
-            assert away @ ahead / np.linalg.norm(away) > np.cos(np.radians(ANGLE / 2.0))
+            view_offset = np.array(matrix).reshape(4, 4)[3, :3] - camera
+            assert view_offset @ view_direction / np.linalg.norm(view_offset) > np.cos(np.radians(ANGLE / 2.0))
 
 
 CENTRES = """
@@ -132,8 +132,8 @@ return [...document.querySelectorAll('#controls button, #controls input, #contro
 
 def test_controls_lie_under_nothing_and_nothing_overflows(browser, stages):
     """At 500 px, in the page itself and in the frame that a notebook and the gallery put it in."""
-    for inside in (False, True):
-        if inside:
+    for is_inside in (False, True):
+        if is_inside:
             frame = page(stages, "Both models", height=100, autoplay=False)._repr_html_()
             browser.execute_script(
                 "const box = document.createElement('div'); box.id = 'box'; box.innerHTML = arguments[0];"
@@ -152,12 +152,12 @@ def test_controls_lie_under_nothing_and_nothing_overflows(browser, stages):
 
 def test_the_camera_never_goes_under_the_floor(browser):
     """Wherever it is put, it is drawn from over the tangent plane at the body, less the body's size."""
-    below, size = browser.execute_script(
+    bottom, size = browser.execute_script(
         "const s = player.stages[0], [x, y, z] = s.focus; s.camera.position.set(x, y - 0.05, z - 1); s.render();"
         "const away = s.camera.position.clone().sub(s.controls.target), n = s.runs[0].normal;"
         "const over = away.x * n[0] + away.y * n[1] + away.z * n[2]; s.reset(); s.render(); return [over, s.size]"
     )
-    assert below > -size
+    assert bottom > -size
 
 
 def test_arrows_are_labelled_in_their_units_and_switched_off(browser, top):
@@ -168,9 +168,9 @@ def test_arrows_are_labelled_in_their_units_and_switched_off(browser, top):
         "return [...document.querySelectorAll('figure:first-child .force')]"
         ".filter((one) => one.style.display !== 'none').length"
     )
-    shown = browser.execute_script(label)
+    frame_number = browser.execute_script(label)
     browser.execute_script("arguments[0].click()", chip)
-    assert browser.execute_script(label) == shown - 1
+    assert browser.execute_script(label) == frame_number - 1
     browser.execute_script("arguments[0].click()", chip)
 
 
@@ -179,16 +179,16 @@ def test_curves_and_arrows_tell_the_same_between_frames(browser, stages):
     show = stages[0].shows[0]
     force = next(curve.values for curve in show.curves if curve.label == "normal force [N]")
     swing = int(np.argmax(np.abs(np.diff(force))))
-    at = float(0.51 * show.times[swing] + 0.49 * show.times[swing + 1])
+    time_in_page = float(0.51 * show.times[swing] + 0.49 * show.times[swing + 1])
     expected = 0.51 * force[swing] + 0.49 * force[swing + 1]
     assert abs(expected - force[swing]) > 3e-3 * expected
     arrow, curve = browser.execute_script(
-        f"player.seek({at!r});"
+        f"player.seek({time_in_page!r});"
         "const strip = [...document.querySelectorAll('.strip')].find((one) => one.textContent.includes('normal force'));"
         "return [player.stages[0].runs[0].arrows[0].size, Number(strip.querySelector('.value span').textContent)]"
     )
     assert arrow == pytest.approx(expected, rel=1e-4)
-    # Told to four digits.
+    # The page rounds to four digits.
     assert curve == pytest.approx(expected, rel=5e-4)
 
 
@@ -211,7 +211,7 @@ def test_keys_move_time_and_a_click_on_a_curve_seeks(browser):
 
 def test_a_run_is_replaced_while_the_page_is_open(browser, top):
     """As a live simulation does it: other times, poses and curves in the same stage."""
-    before = browser.execute_script("return player.duration()")
+    value_before = browser.execute_script("return player.duration()")
     browser.execute_script(
         "const run = player.stages[0].fact.runs[0];"
         "window.kept = { times: run.times, bodies: run.bodies.map((one) => ({ ...one })) };"
@@ -222,7 +222,7 @@ def test_a_run_is_replaced_while_the_page_is_open(browser, top):
     (pose,) = poses(browser, 1.0, 0)
     np.testing.assert_allclose(pose[:3, 3], [0.5, 1.0, 1.5], atol=SINGLE)
     browser.execute_script("player.setRun(0, 0, window.kept)")
-    assert browser.execute_script("return player.duration()") == before
+    assert browser.execute_script("return player.duration()") == value_before
 
 
 def test_the_slider_sets_the_time(browser):
@@ -239,10 +239,10 @@ def test_play_runs_to_the_end_and_pause_stops(browser):
     browser.execute_script("player.seek(0.2); document.getElementById('play').click()")
     wait(browser, "return player.time() > 0.21")
     browser.execute_script("document.getElementById('play').click()")
-    stopped = browser.execute_script("return player.time()")
-    assert stopped < 1.0
+    stop_time = browser.execute_script("return player.time()")
+    assert stop_time < 1.0
     time.sleep(0.3)
-    assert browser.execute_script("return [player.time(), player.playing()]") == [stopped, False]
+    assert browser.execute_script("return [player.time(), player.playing()]") == [stop_time, False]
     set_speed(browser, 1)
     browser.execute_script("player.seek(0.95); player.play(true)")
     wait(browser, "return !player.playing()")

@@ -56,14 +56,14 @@ def test_differentials_are_those_of_the_position():
 
 def test_constraints_on_the_spheroid():
     """(7), (8): the pull-back of (2) and (3) by (4); the printed (7) lacks d mu."""
-    pulled = (
+    pulled_form = (
         paper.constraints_plane(P, Q)
         .at[:, :2]
         .set(paper.constraints_plane(P, Q)[:, :2] @ paper.differentials(P, ETA, MU))
     )
-    np.testing.assert_allclose(paper.constraints_spheroid(P, Q), pulled, atol=1e-15)
-    np.testing.assert_allclose(SPHEROID.constraints(Q), pulled, atol=1e-14)
-    assert abs(float(pulled[0, 1])) > 0.1
+    np.testing.assert_allclose(paper.constraints_spheroid(P, Q), pulled_form, atol=1e-15)
+    np.testing.assert_allclose(SPHEROID.constraints(Q), pulled_form, atol=1e-14)
+    assert abs(float(pulled_form[0, 1])) > 0.1
 
 
 def test_hamiltonian_is_the_energy():
@@ -117,8 +117,8 @@ def test_fields_on_the_spheroid():
     np.testing.assert_allclose(paper.constraints_spheroid(P, Q) @ X, 0.0, atol=1e-14)
     np.testing.assert_allclose(SPHEROID.metric(Q), jnp.diag(paper.masses_spheroid(P, ETA)), rtol=1e-14)
     np.testing.assert_allclose(X[:, 0] @ SPHEROID.metric(Q) @ X[:, 1], 0.0, atol=1e-16)
-    broken = (paper.constraints_spheroid(P, Q) @ X[:, 0].at[2].set(0.0))[1]
-    np.testing.assert_allclose(broken, A * P.l / 2.0 * jnp.sin(2.0 * ETA) * jnp.sin(PHI), rtol=1e-13)
+    residual = (paper.constraints_spheroid(P, Q) @ X[:, 0].at[2].set(0.0))[1]
+    np.testing.assert_allclose(residual, A * P.l / 2.0 * jnp.sin(2.0 * ETA) * jnp.sin(PHI), rtol=1e-13)
 
 
 def canonical(chart, rate):

@@ -142,8 +142,8 @@ def test_trajectories_agree_over_ten_seconds(ground, fork, friction, launch):
     for state in sol.ys:
         difference = state[0, :4] - expected
         # The angles are known up to whole turns.
-        turns = jnp.round(difference / (2.0 * jnp.pi)) * jnp.array([ground != "plane", ground != "plane", 1, 0])
-        np.testing.assert_allclose(difference - 2.0 * jnp.pi * turns, 0.0, atol=1e-9)
+        whole_turns = jnp.round(difference / (2.0 * jnp.pi)) * jnp.array([ground != "plane", ground != "plane", 1, 0])
+        np.testing.assert_allclose(difference - 2.0 * jnp.pi * whole_turns, 0.0, atol=1e-9)
 
 
 class UnitSpeed(Chart):

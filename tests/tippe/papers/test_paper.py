@@ -26,8 +26,8 @@ COUNT = 200
 def states(scene):
     """Random states of the vector form, away from the poles of Euler's angles."""
     rng = np.random.default_rng(11)
-    theta, around = rng.uniform(0.2, 2.9, COUNT), rng.uniform(0.0, 2.0 * np.pi, COUNT)
-    e = np.array([np.sin(theta) * np.cos(around), np.sin(theta) * np.sin(around), np.cos(theta)])
+    theta, azimuth = rng.uniform(0.2, 2.9, COUNT), rng.uniform(0.0, 2.0 * np.pi, COUNT)
+    e = np.array([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.cos(theta)])
     w = 40.0 * rng.normal(size=(3, COUNT))
     L = TOP.I1 * w + (TOP.I3 - TOP.I1) * np.sum(w * e, axis=0) * e
     place = np.reshape(scene.frame.at_angle(rng.uniform(-1.0, 1.0, COUNT))[0], (-1, COUNT))
@@ -59,8 +59,8 @@ def test_equation_1_is_jelletts_constant_only_when_corrected(on_the_plane, in_th
 
     vector, (_, theta, phi, eta_dot, _, _, phi_dot, _) = in_the_cylinder
     s, c, spin = jnp.sin(theta), jnp.cos(theta), CYLINDER.spin(vector)
-    across = TOP.I1 * (phi_dot * s**2 + eta_dot * s * c * jnp.sin(phi))
-    corrected = TOP.radius * (across + TOP.I3 * spin * c) - TOP.offset * TOP.I3 * spin
+    transverse = TOP.I1 * (phi_dot * s**2 + eta_dot * s * c * jnp.sin(phi))
+    corrected = TOP.radius * (transverse + TOP.I3 * spin * c) - TOP.offset * TOP.I3 * spin
     np.testing.assert_allclose(corrected, CYLINDER.jellett(vector), rtol=1e-11, atol=1e-20)
 
 
@@ -107,7 +107,7 @@ def test_equation_9_is_an_energy_but_no_routhian(on_the_plane):
 
     gravity = -TOP.mass * PLANE.gravity * TOP.offset * jnp.sin(theta)
     vertical = TOP.mass * (TOP.offset * theta_dot) ** 2 * jnp.sin(theta) * jnp.cos(theta)
-    missing = moment(routhian) - gravity - vertical - moment(lambda *at: paper.printed_kinetic_energy(PLANE, *at))
+    missing = moment(routhian) - gravity - vertical - moment(lambda *rates: paper.printed_kinetic_energy(PLANE, *rates))
     np.testing.assert_allclose(missing, -beta1 * phi_dot * jnp.sin(theta), rtol=1e-9, atol=1e-16)
 
 
@@ -150,8 +150,8 @@ def test_the_printed_generators_are_the_rotations_and_close_as_so3():
 
     x, y, z = cartesian(place)
     rotations = jnp.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
-    pushed = jax.jacfwd(cartesian)(place) @ paper.rotation_generators(place)
-    np.testing.assert_allclose(pushed, rotations, atol=1e-15)
+    generators = jax.jacfwd(cartesian)(place) @ paper.rotation_generators(place)
+    np.testing.assert_allclose(generators, rotations, atol=1e-15)
 
     brackets, fields = lie_brackets(paper.rotation_generators, place), paper.rotation_generators(place)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -182,8 +182,8 @@ def test_the_frame_of_equation_2_has_the_structure_that_the_reduction_needs():
 
 def test_the_unit_of_beta1_as_printed_is_impossible():
     """2500 g m^2/s would spin a top of 50 g and 3 cm at more than 1e5 rad/s; 2500 g cm^2/s is ordinary."""
-    largest = 0.45 * 0.05 * 0.03**2
-    assert paper.BETA1_AS_PRINTED / largest > 1e5
+    limit = 0.45 * 0.05 * 0.03**2
+    assert paper.BETA1_AS_PRINTED / limit > 1e5
     launch = paper.launch(paper.TABLE_2, paper.TABLE_2.rows[0], TOP)
     np.testing.assert_allclose(launch.spin, 78.125, rtol=1e-12)
 

@@ -84,7 +84,7 @@ def test_an_inverted_top_in_a_narrow_cylinder_has_a_band_of_unstable_spins_that_
 
 def test_a_top_that_tumbles_steadily_on_the_plane_runs_down_in_a_cylinder():
     """Two seconds at theta = 1.2: its energy stays on the plane and falls in a cylinder of 20 R, where it must slip."""
-    falls = []
+    decreases = []
     for surface in (tippe.Plane(), tippe.Cylinder(0.4)):
         scene = tippe.Scene(SCENE.body, surface, SCENE.friction)
         state = steady.tumbling_state(SCENE, steady.tumbling(SCENE, 1.2))
@@ -95,9 +95,9 @@ def test_a_top_that_tumbles_steadily_on_the_plane_runs_down_in_a_cylinder():
             lambda _, y, rate=rate: np.asarray(rate(y)), (0.0, 2.0), start, "DOP853", rtol=1e-10, atol=1e-13
         )
         energy = scene.energy(jnp.asarray(run.y))
-        falls.append((energy[0] - energy[-1]) / (SCENE.body.mass * SCENE.gravity * SCENE.body.offset))
-    np.testing.assert_allclose(falls[0], 0.0, atol=1e-8)
-    assert falls[1] > 1e-3
+        decreases.append((energy[0] - energy[-1]) / (SCENE.body.mass * SCENE.gravity * SCENE.body.offset))
+    np.testing.assert_allclose(decreases[0], 0.0, atol=1e-8)
+    assert decreases[1] > 1e-3
 
 
 def test_a_top_without_a_critical_spin_has_no_marginal_curve_from_the_plane():
