@@ -75,5 +75,4 @@ def _draw_ground(space: Any, ground: AbstractSurface, rides: dict[str, Trajector
     if spans[2] < 0.1 * max(spans):
         space.set_zticks([])
         space.set_zlabel("")
-    # Equal scales, on all of the room that the labels leave.
-    space.set_box_aspect([np.ptp(ends) for ends in (space.get_xlim(), space.get_ylim(), space.get_zlim())], zoom=1.2)
+    space.set_aspect("equal")
