@@ -116,13 +116,7 @@ def test_the_public_names_are_those_that_people_use():
     assert len(names) > 40
 
 
-#: The rooms of which other tests of the ordinary run go through the same programs.
-TESTED = [f"nonholonomic.{room}" for room in ("integration", "hybrid", "derivatives", "identification")]
-
-
-@pytest.mark.parametrize(
-    "room", [pytest.param(room, marks=pytest.mark.slow if room in TESTED else ()) for room in ENGINE]
-)
+@pytest.mark.parametrize("room", ENGINE)
 def test_the_examples_of_the_engine_give_what_they_say(room):
     """They go on from the example of their room."""
     namespace: dict[str, Any] = {}

@@ -12,7 +12,6 @@ from tops import rutstam_top
 import tippe
 
 
-@pytest.mark.slow
 def test_a_table_through_flights_and_impacts():
     """By spin and restitution, after some dozen flights: a difference in one is taken on both sides of the other.
 
