@@ -89,8 +89,8 @@ def remark(options: argparse.Namespace) -> str:
     if TOPS[options.top]().stem is None:
         return counts
     return (
-        f"{counts} Where a time is several times those beside it, the top climbs onto its stem as soon as they do, but with a "
-        "smaller theta, and then rises slowly."
+        f"{counts} Where a time is several times those beside it, the top lands on its stem just as early, but with a smaller "
+        "theta, and then rises slowly."
     )
 
 
