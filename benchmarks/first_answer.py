@@ -29,7 +29,7 @@ PROGRAMS = ("inversion_table", "heyoka, batches", "Diffrax")
 MOST = {"inversion_table": 10**7, "heyoka, batches": 10**6, "Diffrax": 10**4}
 
 TOLERANCE = 1e-9
-MODES = ("import", "trace", "compile", "run")
+PHASES = ("import", "trace", "compile", "run")
 
 
 def phases_of_jax(start_time: float, imported: float, durations: dict[str, float]) -> dict[str, float]:
@@ -86,8 +86,8 @@ def heyoka(launches: int, folder: Path) -> dict[str, float]:
     compiled = time.perf_counter()
     ends = run(TOLERANCE)
     finish_time = time.perf_counter()
-    modes = {"import": imported - start_time, "trace": write_time - imported, "compile": compiled - write_time}
-    return modes | {"run": finish_time - compiled, "answer": float(ends.time[-1])}
+    phases = {"import": imported - start_time, "trace": write_time - imported, "compile": compiled - write_time}
+    return phases | {"run": finish_time - compiled, "answer": float(ends.time[-1])}
 
 
 def diffrax(launches: int, folder: Path) -> dict[str, float]:
@@ -154,16 +154,16 @@ def measured(program: str, launches: int, state: str, folder: Path) -> dict[str,
     environment = os.environ | {"XDG_CACHE_HOME": str(folder / "home")}
     usage_before = resource.getrusage(resource.RUSAGE_CHILDREN)
     start_time = time.perf_counter()
-    finish_time = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    process = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     duration = time.perf_counter() - start_time
     usage_after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    if finish_time.returncode != 0:
-        print(f"{program} skipped: {finish_time.stderr.strip().splitlines()[-1]}", file=sys.stderr)
+    if process.returncode != 0:
+        print(f"{program} skipped: {process.stderr.strip().splitlines()[-1]}", file=sys.stderr)
         return None
-    answer = json.loads(finish_time.stdout.splitlines()[-1])
+    answer = json.loads(process.stdout.splitlines()[-1])
     cpu = usage_after.ru_utime + usage_after.ru_stime - usage_before.ru_utime - usage_before.ru_stime
     row = {"launches": str(launches), "program": program, "state": state, "whole [s]": f"{duration:.2f}"}
-    row |= {"CPU [s]": f"{cpu:.2f}"} | {f"{name} [s]": f"{answer[name]:.2f}" for name in MODES}
+    row |= {"CPU [s]": f"{cpu:.2f}"} | {f"{name} [s]": f"{answer[name]:.2f}" for name in PHASES}
     return row | {"last time [s]": f"{answer['answer']:.7f}"}
 
 
