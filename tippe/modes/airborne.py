@@ -120,9 +120,9 @@ def missed(scene: Scene[Top], site: Below, ball: Ball) -> Bool[Array, "..."]:
     there.
     """
     n = carried_frame(scene).normal(site.foot)
-    axis = tuple(subtract(a, b) for a, b in zip(n, site.axes[2], strict=True))
+    normal_change = tuple(subtract(a, b) for a, b in zip(n, site.axes[2], strict=True))
     # Written so that NaN is a miss.
-    return ~((jnp.abs(site.gap) < LANDED * ball.radius) & (dot(axis, axis) < LANDED**2))
+    return ~((jnp.abs(site.gap) < LANDED * ball.radius) & (dot(normal_change, normal_change) < LANDED**2))
 
 
 def carried_frame(scene: Scene[Top]) -> CarriedFrame:
