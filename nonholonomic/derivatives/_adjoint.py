@@ -40,9 +40,12 @@ class StepRecorder(AbstractRecorder):
     period: ClassVar[int] = 128
     refill_cost = 2.0
 
-    def begin(self, lane_state: LaneState, collected: None) -> StepRecord:
+    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: None) -> StepRecord:
         leaves = (lane_state.time, _without_probe(lane_state).state, lane_state.length)
         return StepRecord(*(jnp.zeros((self.period, *leaf.shape), leaf.dtype) for leaf in leaves))
+
+    def has_room(self, record: StepRecord, iteration: Int[Array, ""]) -> Bool[Array, ""]:
+        return iteration < self.period
 
     def step(
         self, in_lanes: InLanes, lane_state: LaneState, record: StepRecord, iteration: Int[Array, ""]
@@ -148,7 +151,8 @@ class Passes:
     def start(self, rows: int) -> Backward:
         """Both passes before the first period. **Arguments:** `rows`: number of rows of the derivatives."""
         scheduler, start = self.scheduler, self.scheduler.start()
-        record = jax.eval_shape(lambda: self.recorder.begin(start.lane_state, None))
+        in_lanes = scheduler.in_lanes(start.lane_state)
+        record = jax.eval_shape(lambda: self.recorder.begin(in_lanes, start.lane_state, None))
         dtype = start.lane_state.state.dtype
         return Backward(
             frontier=start,

@@ -8,6 +8,9 @@ the weights small, because large weights magnify round-off; `python benchmarks/t
 computed them. `docs/performance.md` lists the gain. A rotation by 1 rad per step changes the amplitude by 3e-10 and the
 phase by 7e-10; with `Dopri8`, the changes are 1e-8 and 3e-8. A rotation by 3 rad per step, which only the loosest
 tolerances allow, changes both by 8e-4; `Dopri8` shrinks the amplitude and this pair enlarges it.
+
+Inside a step, a continuous extension of order 7 needs no more stages, but the second derivatives of the state at both
+ends (`continuous_extension.py`).
 """
 
 from typing import Any, ClassVar
@@ -130,6 +133,25 @@ SEVENTH = (
 #: take about as many steps as with Prince and Dormand's pair at the same tolerance, and err less.
 CAUTION = 2.0
 
+#: Weights of the state in the middle of a step: of the stages, the field at the end, and the second derivatives at both
+#: ends (`python benchmarks/tune_middle.py`). They satisfy the order conditions up to order 7.
+MIDDLE = np.array(
+    [
+        0.00947934797670005672,
+        *(0.0, 0.0, 0.0, 0.0),
+        0.230168904967154669,
+        0.30283028385392069,
+        -0.276839618768676743,
+        0.256128116679526452,
+        -0.00501073648702501928,
+        -0.0543396530569756481,
+        0.0295962796869999323,
+        -0.0545129248515897474,
+        1.0 / 16.0,
+        *(-1.0 / 384.0, -1.0 / 384.0),
+    ]
+)
+
 #: Positions in the step of all stages but the first, and of the end of the step, where the next step begins.
 PLACES = np.array([*(sum(row) for row in STAGES), 1.0])
 
@@ -137,9 +159,9 @@ PLACES = np.array([*(sum(row) for row in STAGES), 1.0])
 class Oscillatory8(diffrax.AbstractERK):
     """A Runge-Kutta pair of orders 8 and 7 with thirteen stages, for motions that oscillate or turn.
 
-    Its dense output is the cubic through states and rates at both ends, which is far less accurate than its steps. Use
-    this solver for runs that end, or are sampled, at the ends of steps, as in tables. Functions that interpolate within
-    steps, such as `tippe.simulate` for a single run, therefore raise a `ValueError` for this solver.
+    Its dense output in Diffrax is the cubic through states and rates at both ends, which is far less accurate than its
+    steps. Functions that use Diffrax's dense output, such as `tippe.simulate` for a single run, therefore raise a
+    `ValueError` for this solver. Tables and batches have a continuous extension of their own.
 
     **Example:**
 

@@ -26,6 +26,7 @@ class Step(NamedTuple):
     - `first_negative`: time of the first stage at which a margin or the event function was negative, as a fraction of
       the step; 2 if there was none.
     - `margins`: all margins at `watched_places` of the step; `None` if there are none.
+    - `rates`: the field at all stages.
     """
 
     state: States
@@ -34,6 +35,7 @@ class Step(NamedTuple):
     margin: Lanes
     first_negative: Lanes
     margins: Float[Array, "places margins lanes"] | None
+    rates: Sequence[States]
 
 
 def explicit_tableau(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau:
@@ -134,7 +136,8 @@ def explicit_step(
         None if history is None or last is None else written_in_place(history, last, at=jnp.asarray(1 + len(looks)))
     )
     stages += [last_rate] if tableau.fsal else []
-    return Step(end, last_rate, length * weighted_sum(tableau.b_error, stages), margin_at_end, first_negative, history)
+    error = length * weighted_sum(tableau.b_error, stages)
+    return Step(end, last_rate, error, margin_at_end, first_negative, history, stages)
 
 
 def watched_places(tableau: diffrax.ButcherTableau) -> Float[np.ndarray, " places"]:

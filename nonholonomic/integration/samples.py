@@ -1,45 +1,65 @@
 """Sample many runs at given times, with the lanes that also locate event times.
 
-Steps end on the requested times, so a sample has the accuracy of the method; between two samples the steps have even
-lengths. The state is recorded after each iteration, and the samples of a period are stored together.
+Steps have their natural lengths; samples inside a step come from a continuous extension. The samples of a period are
+stored together.
 """
 
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from ..xla_cpu import written_in_place
+from .continuous_extension import End, StatesInside, continuous_extension, second_derivative, states_by_steps
+from .oscillatory import MIDDLE, Oscillatory8
 from .problem import AbstractProblem
-from .runge_kutta import Lanes
+from .runge_kutta import Lanes, States
 from .scheduler import AbstractRecorder, InLanes, LaneScheduler, Outcome
 from .settings import Settings
-from .status import FAILED, REACHED_END, RUNNING
-from .step import LaneState, try_step
+from .step import LaneState, after_step, trial_step
 
-#: Largest factor by which a step is stretched to end on a sample: its error stays below the tolerance, because steps
-#: are proposed with a margin of `step.SAFETY`.
-STRETCH = 1.08
+#: Rows of a record, of which a period fills at least the first part before it ends: as many as fit the caches.
+ROWS, ROWS_OF_PERIOD = 128, 112
 
-#: The values to keep of some states: (the cells in the lanes, (iterations, components, lanes)) -> a tree of arrays
-#: (iterations, lanes, ...).
-Read = Callable[[Int[Array, " lanes"], Float[Array, "iterations components lanes"]], Any]
+#: The greatest number of samples in a step, so that they fit the rows that are left.
+MAX_SAMPLES_IN_STEP = ROWS - ROWS_OF_PERIOD
+
+#: The values to keep of some states: (the cells in the lanes, (rows, components, lanes)) -> a tree of arrays
+#: (rows, lanes, ...).
+Read = Callable[[Int[Array, " lanes"], Float[Array, "rows components lanes"]], Any]
 
 
-def components(cells: Int[Array, " lanes"], states: Float[Array, "iterations components lanes"]) -> Array:
+def components(cells: Int[Array, " lanes"], states: Float[Array, "rows components lanes"]) -> Array:
     """The states themselves."""
     return jnp.moveaxis(states, 1, -1)
 
 
-class Reached(NamedTuple):
-    """Record of a period: the state after each iteration, and the number of the sample there, if any."""
+class Rows(NamedTuple):
+    """The samples of a period: in each row the states of all lanes, and the number of each lane's sample; the number of
+    samples where a lane has none."""
 
-    state: Float[Array, "iterations components lanes"]
-    sample: Int[Array, "iterations lanes"]
+    state: Float[Array, "rows components lanes"]
+    sample: Int[Array, "rows lanes"]
+
+
+class Record(NamedTuple):
+    """Record of a period.
+
+    `second`: the second derivative of the state where each lane is; `sample`, `sample_time`: the number and the time [s]
+    of the next sample in every lane, infinite if there is none; `rows`: the samples, of which `filled` rows are filled.
+    """
+
+    second: States
+    sample: Int[Array, " lanes"]
+    sample_time: Lanes
+    rows: Rows
+    filled: Int[Array, ""]
 
 
 class Collected(NamedTuple):
@@ -50,23 +70,24 @@ class Collected(NamedTuple):
 
 
 class SampleRecorder(AbstractRecorder):
-    """Lets steps end on the sample times of every cell, and collects the samples.
+    """Collects the samples of every cell.
 
     `times` are the times of the samples [s]; `first` is the number of each cell's first sample after its start; `read`
-    returns the values to keep.
+    returns the values to keep; `solver` is the method of the steps.
     """
 
     times: Float[Array, "times *cells"]
     first: Int[Array, " cells"]
+    solver: diffrax.AbstractSolver
     read: Read = eqx.field(static=True)
 
-    # As many iterations as fit the caches with their record.
-    period = 64
-
     @classmethod
-    def of(cls, times: Float[Array, "times *cells"], cells: int, read: Read) -> "SampleRecorder":
+    def of(
+        cls, times: Float[Array, "times *cells"], cells: int, solver: diffrax.AbstractSolver, read: Read
+    ) -> "SampleRecorder":
         """The recorder of the samples of some cells."""
-        return cls(times, jnp.broadcast_to(jnp.sum(times <= 0.0, axis=0), (cells,)), read)
+        times = stop_gradient(times)
+        return cls(times, jnp.broadcast_to(jnp.sum(times <= 0.0, axis=0), (cells,)), solver, read)
 
     def at_start(self, lane_state: LaneState, starts: Float[Array, "components cells"]) -> Collected:
         """The samples at the start."""
@@ -79,48 +100,79 @@ class SampleRecorder(AbstractRecorder):
         first_values = self.read(jnp.arange(len(self.first)), starts[None])
         return Collected(self._begin(lane_state), jax.tree.map(of_start, first_values))
 
-    def begin(self, lane_state: LaneState, collected: Collected) -> tuple[Bool[Array, " lanes"], Array, Reached]:
-        room = jnp.zeros((self.period, *lane_state.state.shape), lane_state.state.dtype)
-        empty = Reached(room, jnp.full((self.period, *collected.sample.shape), len(self.times)))
-        return jnp.ones(collected.sample.shape, bool), collected.sample, empty
+    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: Collected) -> Record:
+        second = self._second_derivative(in_lanes[0], lane_state.length, lane_state.time, lane_state.state, lane_state.rate)
+        room = jnp.zeros((ROWS, *lane_state.state.shape), lane_state.state.dtype)
+        rows = Rows(room, jnp.full((ROWS, *collected.sample.shape), len(self.times)))
+        sample_time = self._time_of(collected.sample, lane_state)
+        return Record(second, collected.sample, sample_time, rows, jnp.zeros((), int))
+
+    def has_room(self, record: Record, iteration: Int[Array, ""]) -> Bool[Array, ""]:
+        return record.filled < ROWS_OF_PERIOD
 
     def step(
-        self,
-        in_lanes: InLanes,
-        lane_state: LaneState,
-        record: tuple[Bool[Array, " lanes"], Array, Reached],
-        iteration: Int[Array, ""],
-    ) -> tuple[LaneState, tuple[Bool[Array, " lanes"], Array, Reached]]:
-        """The record also contains whether the last step was accepted, and the number of the next sample."""
-        (problem, control, atol), (accepted, sample, reached) = in_lanes, record
-        count, horizon = len(self.times), jnp.broadcast_to(control.t1, lane_state.time.shape)
-        next_time = self._time_of(sample, lane_state)
-        target = jnp.where(sample < count, jnp.minimum(next_time, horizon), horizon)
-        even_length = _even(lane_state.length, target - lane_state.time, lane_state.bracketing)
-        # The step after a rejected step is shorter on purpose, because it may have to end on a minimum of a margin.
-        length = jnp.where(accepted, even_length, jnp.minimum(even_length, lane_state.length))
-        lane_state = lane_state._replace(length=length)
-        new_lanes = try_step(problem, control._replace(t1=target), atol, lane_state)
-        at_target = (lane_state.status == RUNNING) & (new_lanes.status == REACHED_END)
-        is_sample = at_target & (sample < count) & (new_lanes.time >= next_time)
-        goes_on = at_target & (new_lanes.time < horizon)
-        status = jnp.where(new_lanes.steps < control.max_steps, RUNNING, FAILED)
-        new_lanes = new_lanes._replace(status=jnp.where(goes_on, status, new_lanes.status))
-        entry = Reached(new_lanes.state, jnp.where(is_sample, sample, count))
-        reached = jax.tree.map(functools.partial(written_in_place, at=iteration), reached, entry)
-        return new_lanes, (new_lanes.time > lane_state.time, sample + is_sample, reached)
+        self, in_lanes: InLanes, lane_state: LaneState, record: Record, iteration: Int[Array, ""]
+    ) -> tuple[LaneState, Record]:
+        problem, control, atol = in_lanes
+        lane_state = lane_state._replace(length=self._limited_length(lane_state, record.sample))
+        length, trial = trial_step(problem, control, lane_state)
+        new_lanes = after_step(problem, control, atol, lane_state, length, trial)
+        length = stop_gradient(length)
+        start = End(lane_state.time, lane_state.state, lane_state.rate, record.second)
+        end_time = lane_state.time + length
+        second = self._second_derivative(problem, length, end_time, trial.state, trial.rate)
+        if isinstance(self.solver, Oscillatory8):
+            end = End(end_time, trial.state, trial.rate, second)
+            states_inside = continuous_extension(problem, MIDDLE, start, end, length, trial.rates)
+        else:
+            states_inside = states_by_steps(problem, control.tableau, start, length)
+        has_moved = new_lanes.time > lane_state.time
+        last_time = jnp.where(has_moved, new_lanes.time, -jnp.inf)
+        record = self._with_samples(record, new_lanes, last_time, (lane_state.time, length), states_inside)
+        return new_lanes, record._replace(second=jnp.where(has_moved, second, record.second))
 
-    def collect(
-        self, collected: Collected, record: tuple[Array, Array, Reached], ended: LaneState, refilled: LaneState
-    ) -> Collected:
-        _, sample, reached = record
+    def _second_derivative(
+        self, problem: AbstractProblem, length: Lanes, time: Lanes, state: States, rate: States
+    ) -> States:
+        """The second derivative of the state, which only `Oscillatory8` needs."""
+        needed = isinstance(self.solver, Oscillatory8)
+        return second_derivative(problem, length, time, state, rate) if needed else jnp.zeros_like(state)
+
+    def _limited_length(self, lane_state: LaneState, sample: Int[Array, " lanes"]) -> Lanes:
+        """The lengths of the steps, limited so that their samples fit the record."""
+        furthest_time = self._time_of(sample + MAX_SAMPLES_IN_STEP - 1, lane_state)
+        return jnp.minimum(lane_state.length, furthest_time - lane_state.time)
+
+    def _with_samples(
+        self,
+        record: Record,
+        lane_state: LaneState,
+        last_time: Lanes,
+        step: tuple[Lanes, Lanes],
+        states_inside: StatesInside,
+    ) -> Record:
+        """The record with all samples up to a time, which lie in the latest step; `step`: its start and length [s]."""
+        start_time, length = step
+
+        def add(record: Record) -> Record:
+            is_sample = record.sample_time <= last_time
+            state = states_inside((record.sample_time - start_time) / length)
+            entry = Rows(state, jnp.where(is_sample, record.sample, len(self.times)))
+            rows = jax.tree.map(functools.partial(written_in_place, at=record.filled), record.rows, entry)
+            sample = record.sample + is_sample
+            return Record(record.second, sample, self._time_of(sample, lane_state), rows, record.filled + 1)
+
+        return jax.lax.while_loop(lambda record: jnp.any(record.sample_time <= last_time), add, record)
+
+    def collect(self, collected: Collected, record: Record, ended: LaneState, refilled: LaneState) -> Collected:
         cell = self._cell(ended)
 
-        def added(samples: Float[Array, "cells times ..."], rows: Float[Array, "iterations lanes ..."]) -> Array:
-            return samples.at[cell[None], reached.sample].set(rows, mode="drop", unique_indices=True)
+        def added(samples: Float[Array, "cells times ..."], rows: Float[Array, "rows lanes ..."]) -> Array:
+            return samples.at[cell[None], record.rows.sample].set(rows, mode="drop", unique_indices=True)
 
-        samples = jax.tree.map(added, collected.samples, self.read(cell, reached.state))
-        return Collected(jnp.where(refilled.cell != ended.cell, self._begin(refilled), sample), samples)
+        samples = jax.tree.map(added, collected.samples, self.read(cell, record.rows.state))
+        next_sample = jnp.where(refilled.cell != ended.cell, self._begin(refilled), record.sample)
+        return Collected(next_sample, samples)
 
     def _cell(self, lane_state: LaneState) -> Int[Array, " lanes"]:
         return jnp.minimum(lane_state.cell, len(self.first) - 1)
@@ -130,9 +182,10 @@ class SampleRecorder(AbstractRecorder):
         return self.first[self._cell(lane_state)]
 
     def _time_of(self, sample: Int[Array, " lanes"], lane_state: LaneState) -> Lanes:
-        """The time of a sample in every lane."""
+        """The time of a sample in every lane, infinite after the last one."""
         index = jnp.minimum(sample, len(self.times) - 1)
-        return self.times[index] if self.times.ndim == 1 else self.times[index, self._cell(lane_state)]
+        time = self.times[index] if self.times.ndim == 1 else self.times[index, self._cell(lane_state)]
+        return jnp.where(sample < len(self.times), time, jnp.inf)
 
 
 def solve_with_samples(
@@ -150,10 +203,10 @@ def solve_with_samples(
 
     **Arguments:** as for `LaneScheduler.of`, and
 
-    - `times`: times of the samples [s], increasing, at least 0; (times,) for all cells or (times, cells). Runs do not
+    - `times`: times of the samples [s], strictly increasing, at least 0; (times,) for all cells or (times, cells). Runs do not
       reach times after `t1`.
-    - `read`: function of cells (lanes,) and states (iterations, components, lanes) that returns the values to keep, a
-      tree of arrays (iterations, lanes, ...); by default the states themselves. Keeping less saves time and memory.
+    - `read`: function of cells (lanes,) and states (rows, components, lanes) that returns the values to keep, a
+      tree of arrays (rows, lanes, ...); by default the states themselves. Keeping less saves time and memory.
 
     **Returns:** the `Outcome`, without crossing times; and the kept values at the times, with the first axes (cells,
     times), NaN after the end of a run. By default, these are an array (cells, times, components).
@@ -169,14 +222,8 @@ def solve_with_samples(
      [0.67032       nan]]
     """
     scheduler = LaneScheduler.of(problem, t1, cells, settings, n_blocks=n_blocks, one_kernel=one_kernel)
-    recorder = SampleRecorder.of(times, scheduler.capacity, read)
+    recorder = SampleRecorder.of(times, scheduler.capacity, settings.for_lanes, read)
     at_start = recorder.at_start(scheduler.start().lane_state, scheduler.fresh.state)
     outcome, _, collected = scheduler.recorded(recorder, at_start)
     return outcome, collected.samples
 
-
-def _even(length: Lanes, left: Lanes, bracketing: Array) -> Lanes:
-    """The length of a step, changed a little if one or two steps then end on the next sample."""
-    reach = STRETCH * length
-    fitting = jnp.where(reach >= left, left, jnp.where(2.0 * reach >= left, 0.5 * left, length))
-    return jnp.where(bracketing, length, fitting)

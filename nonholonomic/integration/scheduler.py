@@ -74,16 +74,18 @@ class AbstractRecorder(eqx.Module):
     """The part of a solve that records steps, in addition to the `Outcome`. A period is the time between two refills of
     the lanes.
 
-    `period`: the greatest number of iterations of a period, `None` if unlimited; `refill_cost`: cost of a refill, in
-    steps of all lanes.
+    `refill_cost`: cost of a refill, in steps of all lanes.
     """
 
-    period: ClassVar[int | None] = None
     refill_cost: ClassVar[float] = REFILL
 
     @abc.abstractmethod
-    def begin(self, lane_state: LaneState, collected: Any) -> Any:
+    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: Any) -> Any:
         """The record at the start of a period, from what earlier periods have collected."""
+
+    def has_room(self, record: Any, iteration: Int[Array, ""]) -> Bool[Array, ""] | bool:
+        """Whether the record has room for another iteration of the period; otherwise the period ends."""
+        return True
 
     @abc.abstractmethod
     def step(
@@ -102,7 +104,7 @@ class AbstractRecorder(eqx.Module):
 class Unrecorded(AbstractRecorder):
     """A recorder that records nothing."""
 
-    def begin(self, lane_state: LaneState, collected: None) -> None:
+    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: None) -> None:
         return None
 
     def step(
@@ -212,10 +214,9 @@ class LaneScheduler(eqx.Module):
         in_lanes = self.in_lanes(progress.lane_state)
 
         def goes_on(carry: tuple[LaneState, Any, Int[Array, ""], Int[Array, ""]]) -> Bool[Array, ""]:
-            lane_state, _, missed, count = carry
+            lane_state, record, missed, count = carry
             refill = (progress.loaded < self.cells) & (missed >= recorder.refill_cost * self.lanes)
-            is_running = jnp.any(lane_state.status == RUNNING) & ~refill
-            return is_running if recorder.period is None else is_running & (count < recorder.period)
+            return jnp.any(lane_state.status == RUNNING) & ~refill & recorder.has_room(record, count)
 
         def step(
             carry: tuple[LaneState, Any, Int[Array, ""], Int[Array, ""]],
@@ -226,8 +227,8 @@ class LaneScheduler(eqx.Module):
             return new_state, record, missed + jnp.sum(lane_state.status != RUNNING), count + 1
 
         def loop(lane_state: LaneState) -> tuple[LaneState, Any, Int[Array, ""], Int[Array, ""]]:
-            zero = jnp.zeros((), int)
-            return jax.lax.while_loop(goes_on, step, (lane_state, recorder.begin(lane_state, collected), zero, zero))
+            zero, record = jnp.zeros((), int), recorder.begin(in_lanes, lane_state, collected)
+            return jax.lax.while_loop(goes_on, step, (lane_state, record, zero, zero))
 
         lane_state, record, _, count = self.in_kernel(loop)(progress.lane_state)
         return SchedulerState(lane_state, progress.loaded, progress.iterations + count), record

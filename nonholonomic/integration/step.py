@@ -97,12 +97,16 @@ def try_step(problem: AbstractProblem, control: Control, atol: States, lane_stat
 
     **Returns:** the lanes after the step.
     """
+    return after_step(problem, control, atol, lane_state, *trial_step(problem, control, lane_state))
 
+
+def trial_step(problem: AbstractProblem, control: Control, lane_state: LaneState) -> tuple[Lanes, Step]:
+    """The length of each lane's next step [s], and the step."""
     tried_length = length_to_try(control, lane_state)
     crossing = side_of(problem, lane_state.side)
     start = (lane_state.time, lane_state.state, lane_state.rate, tried_length)
     trial = explicit_step(control.tableau, problem.field, problem.margins, crossing, *start, lane_state.margins)
-    return after_step(problem, control, atol, lane_state, tried_length, trial)
+    return tried_length, trial
 
 
 def after_step(

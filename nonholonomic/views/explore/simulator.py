@@ -98,7 +98,7 @@ class Stepper(NamedTuple):
         time, state = lane.time, lane.state
         places = len(watched_places(explicit_tableau(self.settings.for_lanes)))
         margins = jax.tree.map(lambda least: jax.ShapeDtypeStruct((places, *least.shape), least.dtype), lane.margins)
-        trial = Step(state, state, state, time, time, margins)
+        trial = Step(state, state, state, time, time, margins, ())
 
         def after(constants: Any, lane: LaneState, length: Any, trial: Step) -> LaneState:
             problem, control, atols = run(constants)

@@ -1,0 +1,68 @@
+"""Compute `MIDDLE` of `oscillatory.py`: the weights of the state in the middle of a step, for samples inside steps.
+
+    python benchmarks/tune_middle.py
+
+The state in the middle of a step is y + h (weights of the stages and of the field at the end) + h^2 (weights of the
+second derivatives at the start and at the end). The order conditions up to order 7 determine all weights but one; it
+minimises the squares of the errors in eighth order. The script prints the weights and the largest errors.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from tuning.trees import error_coefficients
+
+from nonholonomic.integration import Oscillatory8
+
+#: The stages with a weight: those whose errors are small, and the field at the end of the step.
+WEIGHTED = np.array([0, *range(5, 14)])
+
+
+def stages() -> np.ndarray:
+    """The weights of the earlier stages in each stage of `Oscillatory8`; the last stage is the end of the step."""
+    rows = Oscillatory8.tableau.a_lower
+    return np.array([np.zeros(len(rows) + 1), *(np.pad(row, (0, len(rows) + 1 - len(row))) for row in rows)])
+
+
+def errors(weights: np.ndarray, order: int) -> np.ndarray:
+    """The error coefficients of an order: of the state in the middle, where the solution is shorter by 2^-order."""
+    of_stages = np.asarray(error_coefficients(jnp.asarray(stages()), jnp.asarray(weights[:14]), order))
+    of_solution = -np.asarray(error_coefficients(jnp.asarray(stages()), jnp.zeros(14), order))
+    second_at_start = 2.0 * weights[14] if order == 2 else 0.0
+    second_at_end = order * (order - 1) * weights[15]
+    return of_stages + of_solution * (1.0 - 0.5**order + second_at_start + second_at_end)
+
+
+def middle_weights() -> np.ndarray:
+    """The weights, 0 for the stages that are not used."""
+    used = [*WEIGHTED, 14, 15]
+
+    def conditions(orders: range) -> tuple[np.ndarray, np.ndarray]:
+        """Matrix and right side of the conditions, which are linear in the weights."""
+
+        def of_all(weights: np.ndarray) -> np.ndarray:
+            return np.concatenate([errors(weights, order) for order in orders])
+
+        rest = of_all(np.zeros(16))
+        return np.stack([of_all(np.eye(16)[k]) - rest for k in used], axis=1), -rest
+
+    matrix, right = conditions(range(1, 8))
+    weights = np.linalg.lstsq(matrix, right, rcond=1e-12)[0]
+    free = scipy.linalg.null_space(matrix, rcond=1e-12)
+    next_matrix, next_right = conditions(range(8, 9))
+    shift = np.linalg.lstsq(next_matrix @ free, next_right - next_matrix @ weights, rcond=None)[0]
+    middle = np.zeros(16)
+    middle[used] = weights + free @ shift
+    return middle
+
+
+def main() -> None:
+    """Compute and print."""
+    weights = middle_weights()
+    print("\n".join(f"{weight:.18g}," for weight in weights))
+    for order in range(1, 9):
+        print(f"order {order}: largest error coefficient {np.max(np.abs(errors(weights, order))):.1e}")
+
+
+if __name__ == "__main__":
+    main()
