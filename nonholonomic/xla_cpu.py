@@ -181,7 +181,7 @@ def arctangent(y: Float[ArrayLike, "..."], x: Float[ArrayLike, "..."]) -> Float[
     angle = slope + slope * cubic + jnp.where(is_far, np.pi / 4.0, 0.0)
     angle = jnp.where(height > width, np.pi / 2.0 - angle, angle)
     angle = jnp.where(jnp.asarray(x) < 0.0, np.pi - angle, angle)
-    return jnp.where(longer == 0.0, 0.0, jnp.copysign(angle, y))
+    return jnp.where(longer == 0.0, 0.0, jnp.where(jnp.asarray(y) < 0.0, -angle, angle))
 
 
 @arctangent.defjvp

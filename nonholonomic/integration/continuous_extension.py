@@ -14,9 +14,8 @@ from typing import NamedTuple
 import diffrax
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
 
+from .oscillatory import MIDDLE
 from .problem import AbstractProblem
 from .runge_kutta import Lanes, States, explicit_step, weighted_sum
 
@@ -24,7 +23,7 @@ from .runge_kutta import Lanes, States, explicit_step, weighted_sum
 StatesInside = Callable[[Lanes], States]
 
 
-class End(NamedTuple):
+class StepEnd(NamedTuple):
     """One end of a step: time [s], state, and the first and second derivatives of the state."""
 
     time: Lanes
@@ -55,19 +54,18 @@ def second_derivative(problem: AbstractProblem, length: Lanes, time: Lanes, stat
 
 def continuous_extension(
     problem: AbstractProblem,
-    weights: Float[np.ndarray, " weights"],
-    start: End,
-    end: End,
+    start: StepEnd,
+    end: StepEnd,
     length: Lanes,
     rates: Sequence[States],
 ) -> StatesInside:
-    """The states inside a step of a method whose stages determine the state in the middle.
+    """The states inside a step of `Oscillatory8`.
 
-    **Arguments:** `weights`: as `Oscillatory8.middle`; `start`, `end`: the ends of the step; `length`: its length [s];
+    **Arguments:** `start`, `end`: the ends of the step; `length`: its length [s];
     `rates`: the field at its stages.
     """
-    seconds = weighted_sum(weights[len(rates) :], (start.second, end.second))
-    middle = start.state + length * (weighted_sum(weights[: len(rates)], rates) + length * seconds)
+    seconds = weighted_sum(MIDDLE[len(rates) :], (start.second, end.second))
+    middle = start.state + length * (weighted_sum(MIDDLE[: len(rates)], rates) + length * seconds)
     middle = jax.lax.optimization_barrier(middle)
     middle_rate = jax.lax.optimization_barrier(problem.field(start.time + 0.5 * length, middle))
 
@@ -100,7 +98,7 @@ def hermite_factors(place: Lanes, length: Lanes) -> tuple[Lanes, ...]:
 
 
 def states_by_steps(
-    problem: AbstractProblem, tableau: diffrax.ButcherTableau, start: End, length: Lanes
+    problem: AbstractProblem, tableau: diffrax.ButcherTableau, start: StepEnd, length: Lanes
 ) -> StatesInside:
     """The states inside a step of any method, each by a shorter step from the same start."""
 

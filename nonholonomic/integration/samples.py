@@ -16,8 +16,8 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from ..xla_cpu import written_in_place
-from .continuous_extension import End, StatesInside, continuous_extension, second_derivative, states_by_steps
-from .oscillatory import MIDDLE, Oscillatory8
+from .continuous_extension import StatesInside, StepEnd, continuous_extension, second_derivative, states_by_steps
+from .oscillatory import Oscillatory8
 from .problem import AbstractProblem
 from .runge_kutta import Lanes, States
 from .scheduler import AbstractRecorder, InLanes, LaneScheduler, Outcome
@@ -101,7 +101,9 @@ class SampleRecorder(AbstractRecorder):
         return Collected(self._begin(lane_state), jax.tree.map(of_start, first_values))
 
     def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: Collected) -> Record:
-        second = self._second_derivative(in_lanes[0], lane_state.length, lane_state.time, lane_state.state, lane_state.rate)
+        second = self._second_derivative(
+            in_lanes[0], lane_state.length, lane_state.time, lane_state.state, lane_state.rate
+        )
         room = jnp.zeros((ROWS, *lane_state.state.shape), lane_state.state.dtype)
         rows = Rows(room, jnp.full((ROWS, *collected.sample.shape), len(self.times)))
         sample_time = self._time_of(collected.sample, lane_state)
@@ -118,12 +120,12 @@ class SampleRecorder(AbstractRecorder):
         length, trial = trial_step(problem, control, lane_state)
         new_lanes = after_step(problem, control, atol, lane_state, length, trial)
         length = stop_gradient(length)
-        start = End(lane_state.time, lane_state.state, lane_state.rate, record.second)
+        start = StepEnd(lane_state.time, lane_state.state, lane_state.rate, record.second)
         end_time = lane_state.time + length
         second = self._second_derivative(problem, length, end_time, trial.state, trial.rate)
         if isinstance(self.solver, Oscillatory8):
-            end = End(end_time, trial.state, trial.rate, second)
-            states_inside = continuous_extension(problem, MIDDLE, start, end, length, trial.rates)
+            end = StepEnd(end_time, trial.state, trial.rate, second)
+            states_inside = continuous_extension(problem, start, end, length, trial.rates)
         else:
             states_inside = states_by_steps(problem, control.tableau, start, length)
         has_moved = new_lanes.time > lane_state.time
@@ -226,4 +228,3 @@ def solve_with_samples(
     at_start = recorder.at_start(scheduler.start().lane_state, scheduler.fresh.state)
     outcome, _, collected = scheduler.recorded(recorder, at_start)
     return outcome, collected.samples
-
