@@ -150,46 +150,6 @@ def greatest(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
     return functools.reduce(greater, numbers)
 
 
-#: Cephes' rational approximation of the arctangent (Moshier, 1984): (arctan(x) - x) / x^3 for |x| < 0.66, in x^2.
-NUMERATOR = (-0.8750608600031904, -16.15753718733365, -75.00855792314705, -122.88666844901361, -64.85021904942025)
-DENOMINATOR = (1.0, 24.858464901423062, 165.02700983169885, 432.88106049129027, 485.3903996359137, 194.5506571482614)
-
-
-@jax.custom_jvp
-def arctangent(y: Float[ArrayLike, "..."], x: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
-    """The angle of the point (x, y) in [-pi, pi], like `jnp.arctan2`, for numbers that are finite; 0 at the origin.
-
-    XLA calls the C library for every number. In vectors the angle of each sample of a table takes a sixth of the time, and
-    the table a twelfth less. It can be removed when XLA computes arctangents in vectors.
-
-    **Example:**
-
-    >>> print(arctangent(1.0, -1.0) / np.pi)
-    0.75
-    """
-    width, height = jnp.abs(x), jnp.abs(y)
-    longer, shorter = jnp.maximum(width, height), jnp.minimum(width, height)
-    # Beyond pi / 8, the angle from the diagonal.
-    is_far = shorter > np.tan(np.pi / 8.0) * longer
-    slope = jnp.where(is_far, shorter - longer, shorter) / jnp.where(is_far, shorter + longer, longer)
-    square = slope * slope
-
-    def polynomial(coefficients: tuple[float, ...]) -> Any:
-        return functools.reduce(lambda total, coefficient: total * square + coefficient, coefficients)
-
-    cubic = square * polynomial(NUMERATOR) / polynomial(DENOMINATOR)
-    angle = slope + slope * cubic + jnp.where(is_far, np.pi / 4.0, 0.0)
-    angle = jnp.where(height > width, np.pi / 2.0 - angle, angle)
-    angle = jnp.where(jnp.asarray(x) < 0.0, np.pi - angle, angle)
-    return jnp.where(longer == 0.0, 0.0, jnp.where(jnp.asarray(y) < 0.0, -angle, angle))
-
-
-@arctangent.defjvp
-def _turn(points: Any, directions: Any) -> Any:
-    (y, x), (dy, dx) = points, directions
-    return arctangent(y, x), (x * dy - y * dx) / (x * x + y * y)
-
-
 def on_device(*arrays: Float[ArrayLike, "..."]) -> tuple[Float[Array, "..."], ...]:
     """NumPy arrays as JAX arrays, without compiling.
 

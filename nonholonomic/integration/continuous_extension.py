@@ -1,4 +1,4 @@
-"""States inside a step: a continuous extension of `Oscillatory8` and, for other methods, a shorter step.
+"""States inside a step: a continuous extension of `Oscillatory8`.
 
 The extension needs no more stages. The stages, together with the second derivatives of the state at both ends of the
 step, determine the state in the middle to seventh order (`oscillatory.MIDDLE`); the extension is the polynomial of
@@ -11,13 +11,12 @@ import operator
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 
 from .oscillatory import MIDDLE
 from .problem import AbstractProblem
-from .runge_kutta import Lanes, States, explicit_step, weighted_sum
+from .runge_kutta import Lanes, States, weighted_sum
 
 #: A function of the places in a step, as fractions of the step, that returns the states there.
 StatesInside = Callable[[Lanes], States]
@@ -95,15 +94,3 @@ def hermite_factors(place: Lanes, length: Lanes) -> tuple[Lanes, ...]:
 
     of_middle = (4.0 * place * left) ** 3
     return *of_end(place, left, length), *of_end(left, place, -length), of_middle, of_middle * from_middle * length
-
-
-def states_by_steps(
-    problem: AbstractProblem, tableau: diffrax.ButcherTableau, start: StepEnd, length: Lanes
-) -> StatesInside:
-    """The states inside a step of any method, each by a shorter step from the same start."""
-
-    def states_inside(place: Lanes) -> States:
-        to_place = (start.time, start.state, start.rate, place * length)
-        return explicit_step(tableau, problem.field, lambda *_: (), lambda *_: None, *to_place, None).state
-
-    return states_inside

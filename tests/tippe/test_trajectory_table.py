@@ -58,6 +58,21 @@ def test_every_cell_is_a_single_run(table, scene):
     assert_close(table.theta[1, 0, 0], single(scene, 0.2, 100.0, mu=0.2).theta, atol=1e-7)
 
 
+def test_dense_samples_lie_inside_steps(table, scene):
+    """They are those that end steps, also of runs that lose contact, and take fewer steps."""
+    few, _ = table
+    many = tippe.trajectory_table(scene, theta=THETA, spin=SPIN, mu=MU, times=np.linspace(0.0, TIMES[-1], 1501))
+    for name in ("theta", "eta"):
+        assert_close(many[name][..., ::50], few[name], atol=2e-8)
+    assert np.array_equal(many.status, few.status)
+    assert_close(many.end_time, few.end_time, rtol=1e-8)
+    completed = few.status == "completed"
+    assert np.all(many.steps[completed] < 600)
+    lost = many.theta[few.status == "contact_lost"]
+    ends = few.end_time[few.status == "contact_lost"]
+    assert np.array_equal(np.isfinite(lost), many.coords["time"] <= ends[:, None])
+
+
 def test_a_run_that_needs_more_than_the_most_steps_has_failed(table, scene):
     """What it reached is there. The default limit is not in the request, so that older files resume."""
     short_table = tippe.trajectory_table(scene, theta=THETA, spin=SPIN, mu=MU, times=TIMES, max_steps=20)

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Component, Tangent, Vector, dot, planar_length, scale, sum_vectors
-from nonholonomic.xla_cpu import arctangent
 
 #: Indices of the parts in a state.
 VELOCITY, AXIS, MOMENTUM, PLACE = slice(0, 2), slice(2, 5), slice(5, 8), slice(8, None)
@@ -42,7 +41,7 @@ def joined(*vectors: tuple[Component, ...]) -> Float[Array, "components ..."]:
 
 def inclination(axis: Vector) -> Float[Array, "..."]:
     """The angle theta [rad] from the arena's normal to the axis, in [0, pi]."""
-    return arctangent(planar_length(axis[0], axis[1]), axis[2])
+    return jnp.arctan2(planar_length(axis[0], axis[1]), axis[2])
 
 
 def angular_velocity(body: Any, axis: Vector, momentum: Vector) -> Vector:

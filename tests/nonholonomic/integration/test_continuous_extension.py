@@ -100,7 +100,7 @@ def test_halving_a_step_divides_the_error_by_two_to_the_eighth():
 def sampled(problem, times, tolerance=1e-9, solver=None, horizon=3.0):
     settings = Settings(tolerance, solver, lanes=problem.cells)
     arguments = (jnp.asarray(times), jnp.asarray(horizon), jnp.asarray(problem.cells), settings)
-    return eqx.filter_jit(solve_with_samples)(problem, *arguments)
+    return eqx.filter_jit(solve_with_samples)(problem, *arguments, dense=True)
 
 
 def test_a_field_without_a_derivative_at_the_start_is_sampled():
@@ -120,7 +120,7 @@ def test_steps_do_not_depend_on_the_number_of_samples():
 @pytest.mark.parametrize("count", [7, 20001])
 @pytest.mark.parametrize("solver", [None, diffrax.Dopri8(), diffrax.Tsit5()], ids=["default", "dopri8", "tsit5"])
 def test_samples_are_as_good_as_steps(count, solver):
-    """Many more samples than rows of a record, and few; each by the extension, or by a step of its own."""
+    """Many more samples than rows of a record, and few; inside steps or, for other methods, at their ends."""
     times = np.linspace(0.0, 3.0, count)
     _, samples = sampled(Growth(2), times, solver=solver)
     assert_close(samples[..., 0], np.broadcast_to(np.exp(np.sin(times)), (2, count)), atol=3e-9)

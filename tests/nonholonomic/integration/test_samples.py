@@ -84,11 +84,10 @@ def test_only_what_is_read_is_kept():
 
 
 def test_the_error_falls_with_the_tolerance():
-    """Not above 1e-7, where the steps are so long that the errors of the phases, fitted to oscillations, change their sign."""
     times = np.linspace(0.0, 10.0, 31)
     errors = [
         float(np.max(np.abs(run(times, tolerance=tolerance)[1][..., 0] - np.cos(np.outer(RATES, times)))))
-        for tolerance in (1e-7, 1e-9, 1e-11)
+        for tolerance in (1e-6, 1e-8, 1e-10)
     ]
     assert errors[1] < 0.05 * errors[0]
     assert errors[2] < 0.05 * errors[1]
