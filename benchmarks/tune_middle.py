@@ -2,9 +2,9 @@
 
     python benchmarks/tune_middle.py
 
-The state in the middle of a step is y + h (weights of the stages and of the field at the end) + h^2 (weights of the
-second derivatives at the start and at the end). The order conditions up to order 7 determine all weights but one; it
-minimises the squares of the errors in eighth order. The script prints the weights and the largest errors.
+The state in the middle of a step is y + h (weighted sum of the stages and of the field at the end) + h^2 (weighted sum of
+the second derivatives at the start and at the end). The order conditions up to order 7 determine all weights but one; the
+remaining weight minimises the squares of the errors in eighth order. The script prints the weights and the largest errors.
 """
 
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ def stages() -> np.ndarray:
 
 
 def errors(weights: np.ndarray, order: int) -> np.ndarray:
-    """The error coefficients of an order: of the state in the middle, where the solution is shorter by 2^-order."""
+    """The error coefficients of the state in the middle, whose exact coefficients are 2^-order times those at the end."""
     of_stages = np.asarray(error_coefficients(jnp.asarray(stages()), jnp.asarray(weights[:14]), order))
     of_solution = -np.asarray(error_coefficients(jnp.asarray(stages()), jnp.zeros(14), order))
     second_at_start = 2.0 * weights[14] if order == 2 else 0.0

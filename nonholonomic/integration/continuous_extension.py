@@ -2,8 +2,8 @@
 
 The extension needs no more stages. The stages, together with the second derivatives of the state at both ends of the
 step, determine the state in the middle to seventh order (`oscillatory.MIDDLE`); the extension is the polynomial of
-degree 7 with the states and rates at both ends and in the middle, and with the second derivatives at the ends. Where
-samples lie closer than steps, it costs one derivative and one evaluation of the field per step, a sixth of a step.
+degree 7 with the states and rates at both ends and in the middle, and with the second derivatives at the ends. It costs
+one derivative and one evaluation of the field per step, a sixth of a step.
 """
 
 import functools
@@ -34,14 +34,14 @@ class StepEnd(NamedTuple):
 def second_derivative(problem: AbstractProblem, length: Lanes, time: Lanes, state: States, rate: States) -> States:
     """The second derivative of the state: the derivative of the field along the motion.
 
-    Where the field is not differentiable, such as the norm of a velocity that is zero, it is a difference quotient over a
-    small part of the step of the given length [s].
+    Where this derivative is not finite, as for the norm of a zero velocity, it is a difference quotient over a small part
+    of the step of the given length [s].
     """
     along_motion = jax.linearize(problem.field, time, state)[1]
     second = jax.lax.optimization_barrier(along_motion(jnp.ones_like(time), rate))
 
     def with_quotient() -> States:
-        # So that the errors by curvature and by round-off are about equal.
+        # With this delay, the errors by curvature and by round-off are about equal.
         delay = jnp.sqrt(jnp.finfo(state.dtype).eps) * length
         quotient = (problem.field(time + delay, state + delay * rate) - rate) / delay
         return jnp.where(jnp.isfinite(second), second, quotient)
@@ -80,7 +80,7 @@ def continuous_extension(
 
 def hermite_factors(place: Lanes, length: Lanes) -> tuple[Lanes, ...]:
     """The factors of value, slope and second derivative at the start and at the end of a step, and of value and slope in the
-    middle, in the polynomial of degree 7 that has them all.
+    middle, in the polynomial of degree 7 that matches all of them.
 
     **Arguments:** `place`: where to evaluate the polynomial, as a fraction of the step; `length`: length of the step [s].
     """

@@ -1,4 +1,4 @@
-"""Sample many runs at times that are closer than steps, which have their natural lengths and a continuous extension."""
+"""Sample many runs at closely spaced times, by interpolation inside steps."""
 
 import functools
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from .sample_times import Collected, Rows, SampleTimes
 from .scheduler import AbstractRecorder, InLanes
 from .step import LaneState, after_step, trial_step
 
-#: Rows of a record, of which a period fills at least the first part before it ends: as many as fit the caches.
+#: Rows of a record, and the number of filled rows at which a period ends. The record fits the caches.
 ROWS, ROWS_OF_PERIOD = 128, 112
 
 #: The greatest number of samples in a step, so that they fit the rows that are left.
@@ -25,8 +25,8 @@ MAX_SAMPLES_IN_STEP = ROWS - ROWS_OF_PERIOD
 class DenseRecord(NamedTuple):
     """Record of a period.
 
-    `second`: the second derivative of the state where each lane is; `sample`, `sample_time`: the number and the time [s]
-    of the next sample in every lane, infinite if there is none; `rows`: the samples, of which `filled` rows are filled.
+    `second`: the second derivative of the state where each lane is; `sample`, `sample_time`: index and time [s] of each
+    lane's next sample; the time is infinite if there is none; `rows`: the samples, of which `filled` rows are filled.
     """
 
     second: States
@@ -81,7 +81,7 @@ class DenseSampleRecorder(AbstractRecorder):
         step: tuple[Lanes, Lanes],
         states_inside: StatesInside,
     ) -> DenseRecord:
-        """The record with all samples up to a time, which lie in the latest step; `step`: its start and length [s]."""
+        """Add the samples up to `last_time`, all inside the latest step; `step`: start and length of that step [s]."""
         start_time, length = step
 
         def add(record: DenseRecord) -> DenseRecord:

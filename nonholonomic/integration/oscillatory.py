@@ -9,8 +9,8 @@ computed them. `docs/performance.md` lists the gain. A rotation by 1 rad per ste
 phase by 7e-10; with `Dopri8`, the changes are 1e-8 and 3e-8. A rotation by 3 rad per step, which only the loosest
 tolerances allow, changes both by 8e-4; `Dopri8` shrinks the amplitude and this pair enlarges it.
 
-Inside a step, a continuous extension of order 7 needs no more stages, but the second derivatives of the state at both
-ends (`continuous_extension.py`).
+A continuous extension of order 7 needs no more stages, only the second derivatives at both ends
+(`continuous_extension.py`).
 """
 
 from typing import Any, ClassVar

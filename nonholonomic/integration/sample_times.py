@@ -23,22 +23,22 @@ def components(cells: Int[Array, " lanes"], states: Float[Array, "rows component
 
 
 class Rows(NamedTuple):
-    """The samples of a period: in each row the states of all lanes, and the number of each lane's sample; the number of
-    samples where a lane has none."""
+    """The samples of a period: in each row the states of all lanes, and the index of each lane's sample; where a lane has
+    none, the index is the number of samples."""
 
     state: Float[Array, "rows components lanes"]
     sample: Int[Array, "rows lanes"]
 
 
 class Collected(NamedTuple):
-    """The number of the next sample in every lane, and the samples so far: a tree of arrays (cells, times, ...)."""
+    """The index of the next sample in every lane, and the samples so far: a tree of arrays (cells, times, ...)."""
 
     sample: Int[Array, " lanes"]
     samples: Any
 
 
 class SampleTimes(eqx.Module):
-    """The times of the samples of every cell [s], the number of each cell's first sample after its start, and the values
+    """The times of the samples of every cell [s], the index of each cell's first sample after its start, and the values
     to keep."""
 
     times: Float[Array, "times *cells"]
@@ -66,7 +66,7 @@ class SampleTimes(eqx.Module):
         return Collected(self.first_in(lane_state), jax.tree.map(of_start, first_values))
 
     def first_in(self, lane_state: LaneState) -> Int[Array, " lanes"]:
-        """The number of the first sample after the start in every lane."""
+        """The index of the first sample after the start in every lane."""
         return self.first[self._cell(lane_state)]
 
     def time_of(self, sample: Int[Array, " lanes"], lane_state: LaneState) -> Lanes:
@@ -83,7 +83,7 @@ class SampleTimes(eqx.Module):
     def collect(
         self, collected: Collected, rows: Rows, sample: Int[Array, " lanes"], ended: LaneState, refilled: LaneState
     ) -> Collected:
-        """The samples with those of a period; `sample` is the number of the next sample in every lane."""
+        """The samples with those of a period; `sample` is the index of the next sample in every lane."""
         cell = self._cell(ended)
 
         def added(samples: Float[Array, "cells times ..."], values: Float[Array, "rows lanes ..."]) -> Array:

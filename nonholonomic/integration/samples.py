@@ -92,7 +92,7 @@ def solve_with_samples(
     **Arguments:** as for `LaneScheduler.of`, and
 
     - `times`: times of the samples [s], strictly increasing, at least 0; (times,) for all cells or (times, cells). Runs do not
-      reach times after `t1`.
+      reach times after `t1`. Samples are not differentiable with respect to `times`, nor, if `dense`, to `t1`.
     - `read`: function of cells (lanes,) and states (rows, components, lanes) that returns the values to keep, a
       tree of arrays (rows, lanes, ...); by default the states themselves. Keeping less saves time and memory.
     - `dense`: whether to interpolate the samples inside steps of `Oscillatory8` (`continuous_extension.py`), which takes

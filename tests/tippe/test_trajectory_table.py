@@ -59,7 +59,7 @@ def test_every_cell_is_a_single_run(table, scene):
 
 
 def test_dense_samples_lie_inside_steps(table, scene):
-    """They are those that end steps, also of runs that lose contact, and take fewer steps."""
+    """Interpolated samples agree with samples at the ends of steps, also in runs that lose contact, and need fewer steps."""
     few, _ = table
     many = tippe.trajectory_table(scene, theta=THETA, spin=SPIN, mu=MU, times=np.linspace(0.0, TIMES[-1], 1501))
     for name in ("theta", "eta"):

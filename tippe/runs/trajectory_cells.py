@@ -27,8 +27,8 @@ OF_THE_STATE = {"theta", "azimuth", "spin", "energy", "jellett", "normal_force",
 #: Quantities that do not change if the frame turns about n.
 WITHOUT_DIRECTION = {"theta", "theta_rate", "eta", "spin", "energy", "jellett", "normal_force"}
 
-#: From so many samples on, tables interpolate them inside steps. Runs often take about so many steps; where they take
-#: many more, a table takes up to a sixth longer, and where they take fewer, it takes up to two thirds less time.
+#: Tables with at least this many samples interpolate them inside steps. Runs often take about as many steps; tables of
+#: runs with many more steps take up to a sixth longer, those with fewer up to two thirds less time.
 DENSE = 1000
 
 
@@ -49,10 +49,10 @@ def launches_with(scene: Scene, launch: Launch, cells: int, names: tuple[str, ..
 
 def _reader(
     run: TrajectoryProblem, scene: Scene, names: tuple[str, ...]
-) -> Callable[[Int[Array, " lanes"], Float[Array, "iterations components lanes"]], dict[str, Array]]:
+) -> Callable[[Int[Array, " lanes"], Float[Array, "rows components lanes"]], dict[str, Array]]:
     """A function that computes the named quantities of some cells from their states."""
 
-    def read_lane(scene: Scene, states: Float[Array, "iterations components"]) -> dict[str, Array]:
+    def read_lane(scene: Scene, states: Float[Array, "rows components"]) -> dict[str, Array]:
         # No quantity reads the spin angle or the work.
         missing = len(run.start()[0]) - 2 - states.shape[1]
         zeros = jnp.zeros(len(states))
@@ -63,7 +63,7 @@ def _reader(
     def own_axis(leaf: Any) -> int | None:
         return 0 if eqx.is_array(leaf) and leaf.ndim else None
 
-    def reader(cells: Int[Array, " lanes"], states: Float[Array, "iterations components lanes"]) -> dict[str, Array]:
+    def reader(cells: Int[Array, " lanes"], states: Float[Array, "rows components lanes"]) -> dict[str, Array]:
         of_lanes = jax.tree.map(lambda leaf: leaf if own_axis(leaf) is None else leaf[cells], scene)
         return eqx.filter_vmap(read_lane, in_axes=(own_axis, -1), out_axes=1)(of_lanes, states)
 

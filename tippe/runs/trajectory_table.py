@@ -46,8 +46,9 @@ def trajectory_table(
 ) -> Table:
     """Trajectories over a grid of launches and scenes, sampled at given times, in one batched call on all cores.
 
-    The samples have the accuracy of `simulate`: a step ends on each of the times. With one sample per integration step,
-    this table costs twice as much as a table of inversion times to the same horizon.
+    The samples are as accurate as the steps. Up to 999 samples, a step ends on each of them; from 1000 on, they are
+    interpolated inside steps. With 1001 samples over 10 s, this table costs 1.6 times as much as a table of inversion times
+    to the same horizon.
 
     **Arguments:**
 
