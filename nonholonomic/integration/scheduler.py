@@ -71,8 +71,8 @@ InLanes = tuple[AbstractProblem, Control, States]
 
 
 class AbstractRecorder(eqx.Module):
-    """The part of a solve that records steps, in addition to the `Outcome`. A period ends when
-    enough lanes have ended to refill them, or when the record is full.
+    """The part of a solve that records steps, in addition to the `Outcome`. A period ends when enough lanes have
+    ended to refill them, or when the record is full.
 
     `refill_cost`: cost of a refill, in steps of all lanes.
     """
