@@ -19,6 +19,7 @@ from ..progress import Progress
 from ..validation import require_flag
 from ._chunks import ChunkStore, with_spaces
 from ._file import LONG_NAMES, Stored
+from ._interrupts import no_interrupt_lost
 from .dispatch import MAX_CRASHES, ExecutorBroken, handed_out
 from .grid import Axis, Variable, columns, size_of
 from .layout import Layout, Values
@@ -91,7 +92,9 @@ def sweep(
     work = ChunkTask(job, axes, chunk_size)
     store = Held(layout) if path is None else ChunkStore(path, layout)
     try:
-        result = store.filled(computed(work, layout, store.finished, executor, progress))
+        with no_interrupt_lost() as raise_lost_interrupt:
+            chunks = computed(work, layout, store.finished, executor, progress, raise_lost_interrupt)
+            result = store.filled(chunks)
         return Table.of(result) if isinstance(result, Stored) else Table.laid_out(layout, result)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(store.interrupted()) from None
@@ -107,7 +110,12 @@ def sweep(
 
 
 def computed(
-    work: ChunkTask, layout: Layout, finished: set[int], executor: Executor | None, progress: bool
+    work: ChunkTask,
+    layout: Layout,
+    finished: set[int],
+    executor: Executor | None,
+    progress: bool,
+    raise_lost_interrupt: Callable[[], None],
 ) -> Iterator[tuple[int, dict[str, Values]]]:
     """Compute the unfinished chunks, and yield each when it is finished; see `sweep`."""
     todo = [chunk for chunk in range(layout.chunks) if chunk not in finished]
@@ -128,6 +136,7 @@ def computed(
                 else:
                     display.begin(finished_cells)
                 is_compiled = True
+                raise_lost_interrupt()
         except ExecutorBroken as error:
             raise ExecutorBroken(f"{error}; {finished_cells} of {layout.cells} cells are done") from error.__cause__
 

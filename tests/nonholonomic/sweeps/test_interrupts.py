@@ -23,7 +23,27 @@ DEAF = "import hashlib\ndef deaf(): hashlib.pbkdf2_hmac('sha256', b'', b'', 30_0
 THREADS = """
 import sys, time
 from cheap_sweep import cheap_sweep
-cheap_sweep(sys.argv[1], lambda block: time.sleep(0.2))
+cheap_sweep(sys.argv[1], lambda block: time.sleep(1.0 if block > 2 else 0.0))
+"""
+
+#: Ctrl-C for itself in the middle of the sweep, during garbage collection of the main thread, where exceptions are ignored.
+COLLECTING = """
+import gc, os, signal, sys
+from concurrent.futures import Future, ThreadPoolExecutor
+from cheap_sweep import cheap_sweep
+class Here(ThreadPoolExecutor):
+    def submit(self, function, *arguments):
+        future = Future()
+        future.set_result(function(*arguments))
+        return future
+def interrupt(*_):
+    gc.callbacks.remove(interrupt)
+    os.kill(os.getpid(), signal.SIGINT)
+def collect(block):
+    if block == 2:
+        gc.callbacks.append(interrupt)
+        gc.collect()
+cheap_sweep(sys.argv[1], collect, executor=Here())
 """
 
 COMPILING = (
@@ -51,7 +71,7 @@ from cheap_sweep import CheapJob, cheap_sweep
 from nonholonomic import local_processes
 if __name__ == "__main__":
     with local_processes(1) as processes:
-        cheap_sweep(sys.argv[1], job=CheapJob(Path(sys.argv[2]), pause=0.3), executor=processes)
+        cheap_sweep(sys.argv[1], job=CheapJob(Path(sys.argv[2]), pause=0.8), executor=processes)
 """
 
 COMMAND = (
@@ -125,7 +145,7 @@ def test_a_table_says_what_is_saved_and_goes_on_from_there(way, tmp_path):
     process = run(tmp_path, THREADS if way == "threads" else PROCESSES, str(path), str(tmp_path))
     wait_for(lambda: len(blocks(path)) >= 2, process)
     status, output, error, duration = interrupted(process)
-    assert (status, output) == (-signal.SIGINT, [])
+    assert (status, output) == (-signal.SIGINT, []), error
     assert duration < PROMPT
     saved_blocks = len(blocks(path))
     assert 2 <= saved_blocks < 7
@@ -136,6 +156,14 @@ def test_a_table_says_what_is_saved_and_goes_on_from_there(way, tmp_path):
     # The executor's processes print nothing.
     assert sum(line.startswith("Traceback") for line in error) == 1
     assert len(resumed(path)) == 7 - saved_blocks
+
+
+def test_an_interrupt_during_garbage_collection_is_not_lost(tmp_path):
+    process = run(tmp_path, COLLECTING, "table.h5")
+    _, output, error = process.wait(timeout=60), *process.communicate()
+    assert "Exception ignored" in error
+    assert (process.returncode, output) == (-signal.SIGINT, "")
+    assert error.endswith("KeyboardInterrupt: saved 8 of 50 cells to table.h5; run the same call again to resume\n")
 
 
 def test_a_table_is_heard_while_it_compiles(tmp_path):
