@@ -97,8 +97,8 @@ def test_halving_a_step_divides_the_error_by_two_to_the_eighth():
     assert 150.0 < long / short < 1000.0
 
 
-def sampled(problem, times, tolerance=1e-9, solver=None, horizon=3.0):
-    settings = Settings(tolerance, solver, lanes=problem.cells)
+def sampled(problem, times, tolerance=1e-9, solver=None, horizon=3.0, lanes=None):
+    settings = Settings(tolerance, solver, lanes=lanes or problem.cells)
     arguments = (jnp.asarray(times), jnp.asarray(horizon), jnp.asarray(problem.cells), settings)
     return eqx.filter_jit(solve_with_samples)(problem, *arguments, dense=True)
 
@@ -125,6 +125,13 @@ def test_samples_are_as_good_as_steps(count, solver):
     times = np.linspace(0.0, 3.0, count)
     _, samples = sampled(Growth(2), times, solver=solver)
     assert_close(samples[..., 0], np.broadcast_to(np.exp(np.sin(times)), (2, count)), atol=3e-9)
+
+
+def test_every_cell_is_sampled_at_its_own_times():
+    """Five cells take turns in two lanes."""
+    times = np.linspace(0.01, 0.6, 40)[:, None] * np.arange(1.0, 6.0)
+    _, samples = sampled(Growth(5), times, lanes=2)
+    assert_close(samples[..., 0], np.exp(np.sin(times)).T, atol=3e-9)
 
 
 def test_samples_have_derivatives_where_states_have():
