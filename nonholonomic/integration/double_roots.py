@@ -83,7 +83,8 @@ def missed_loss(
     suspect &= values[0] > ON_MARGIN
 
     def first_minimum() -> Lanes:
-        place, minimum = _least_minimum(places, values, least_value)
+        # Unstacked in here: the operands of a branch are copied in every step.
+        place, minimum = _least_minimum(places, list(jnp.unstack(margins)), least_value)
         error = SCATTER * scale * 4.0 * place * (1.0 - place)
         dips = suspect & (place > 0.0) & (place < 1.0) & (minimum < error)
         return jnp.min(jnp.where(dips, place, 2.0), axis=0)

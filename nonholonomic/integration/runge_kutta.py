@@ -27,6 +27,7 @@ class Step(NamedTuple):
       the step; 2 if there was none.
     - `margins`: all margins at `watched_places` of the step; `None` if there are none.
     - `rates`: the field at all stages.
+    - `stages`: the field at the inner stages (`inner_stages`) in one array, whose memory the next step reuses.
     """
 
     state: States
@@ -36,6 +37,7 @@ class Step(NamedTuple):
     first_negative: Lanes
     margins: Float[Array, "places margins lanes"] | None
     rates: Sequence[States]
+    stages: Stages | None
 
 
 def explicit_tableau(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau:
@@ -77,6 +79,7 @@ def explicit_step(
     rate: States,
     length: Lanes,
     margins_before: Float[Array, "margins lanes"] | None,
+    stages: Stages,
 ) -> Step:
     """Try one step in every lane.
 
@@ -94,18 +97,19 @@ def explicit_step(
     - `time`, `state`, `rate`: time and state at the start of the step, and the field there.
     - `length`: length of the step [s], one per lane.
     - `margins_before`: the margins at the start; `None` if there are none.
+    - `stages`: memory for the inner stages (`memory_for_stages`), whose numbers do not matter. A loop over steps passes it
+      on from step to step: clearing new memory would take a tenth of the time of a step.
 
     **Returns:** a `Step`.
     """
-    # If the last stage of the method is the end of the step, it is computed below.
-    inner = len(tableau.c) - 1 if tableau.fsal else len(tableau.c)
+    inner = inner_stages(tableau)
     looks = stages_to_look(tableau.c)
     places, is_look = jnp.asarray(tableau.c[:inner]), jnp.asarray(np.isin(np.arange(inner), looks))
     rows = jnp.asarray(np.searchsorted(looks, np.arange(inner)) + 1)
 
     def do(stage: Int[Array, ""], carry: tuple[Stages, Any]) -> tuple[Stages, Any]:
-        rates, history = carry
-        trial = moved_state(stage, tableau.a_lower[:inner], state, length, rates)
+        stages, history = carry
+        trial = moved_state(stage, tableau.a_lower[:inner], state, length, stages, first=rate)
         stage_time = time + places[stage] * length
 
         def look(history: Float[Array, "places margins lanes"]) -> Float[Array, "places margins lanes"]:
@@ -113,31 +117,42 @@ def explicit_step(
 
         # A branch, because margins in every stage would add a tenth to the cost of a step of a top in a cylinder.
         history = None if history is None else jax.lax.cond(is_look[stage], look, lambda history: history, history)
-        return written_by_component(rates, field(stage_time, trial), at=stage + 1), history
+        return written_by_component(stages, field(stage_time, trial), at=stage), history
 
-    zeros, first = jnp.zeros((1 + inner, *rate.shape), rate.dtype), jnp.zeros((), int)
     history = None
     if margins_before is not None:
         history = jnp.zeros((2 + len(looks), *margins_before.shape), margins_before.dtype)
-        history = written_in_place(history, margins_before, at=first)
-    rates, history = over_stages(inner, do, (written_in_place(zeros, rate, at=first), history))
-    stages, first_negative = list(jnp.unstack(rates)), jnp.full_like(length, 2.0)
-    for row, stage in enumerate(looks, start=1):
-        trial = state + length * weighted_sum(tableau.a_lower[stage], stages[: stage + 1])
-        margin = lesser(_least(None if history is None else history[row]), crossing(trial, stages[stage + 1]), length)
-        negative = jnp.where(margin < 0.0, tableau.c[stage], 2.0)
-        first_negative = jnp.minimum(first_negative, negative)
+        history = written_in_place(history, margins_before, at=jnp.zeros((), int))
+    stages, history = over_stages(inner, do, (stages, history))
+    rates = [rate, *jnp.unstack(stages)]
     # Stored, because the step, its error and the event all depend on it.
-    end = jax.lax.optimization_barrier(state + length * weighted_sum(tableau.b_sol[: 1 + inner], stages))
+    end = jax.lax.optimization_barrier(state + length * weighted_sum(tableau.b_sol[: 1 + inner], rates))
     last_rate = jax.lax.optimization_barrier(field(time + length, end))
     last = None if history is None else jax.lax.optimization_barrier(jnp.stack(margins(time + length, end)))
     margin_at_end = jax.lax.optimization_barrier(lesser(_least(last), crossing(end, last_rate), length))
     history = (
         None if history is None or last is None else written_in_place(history, last, at=jnp.asarray(1 + len(looks)))
     )
-    stages += [last_rate] if tableau.fsal else []
-    error = length * weighted_sum(tableau.b_error, stages)
-    return Step(end, last_rate, error, margin_at_end, first_negative, history, stages)
+    # Read from the last version of `history`: if an earlier one were still in use, the compiler would copy it.
+    first_negative = jnp.full_like(length, 2.0)
+    for row, stage in enumerate(looks, start=1):
+        trial = state + length * weighted_sum(tableau.a_lower[stage], rates[: stage + 1])
+        margin = lesser(_least(None if history is None else history[row]), crossing(trial, rates[stage + 1]), length)
+        negative = jnp.where(margin < 0.0, tableau.c[stage], 2.0)
+        first_negative = jnp.minimum(first_negative, negative)
+    rates += [last_rate] if tableau.fsal else []
+    error = length * weighted_sum(tableau.b_error, rates)
+    return Step(end, last_rate, error, margin_at_end, first_negative, history, rates, stages)
+
+
+def inner_stages(tableau: diffrax.ButcherTableau) -> int:
+    """Number of stages after the first, without a last stage that is the end of the step."""
+    return len(tableau.c) - 1 if tableau.fsal else len(tableau.c)
+
+
+def memory_for_stages(tableau: diffrax.ButcherTableau, state: States) -> Stages:
+    """Memory in which `explicit_step` stores the field at the inner stages."""
+    return jnp.zeros((inner_stages(tableau), *state.shape), state.dtype)
 
 
 def watched_places(tableau: diffrax.ButcherTableau) -> Float[np.ndarray, " places"]:
@@ -183,14 +198,24 @@ def weighted_sum(weights: Float[np.ndarray, " stages"], rates: Sequence[States])
 
 
 def moved_state(
-    stage: Int[Array, ""], rows: Iterable[Float[np.ndarray, " before"]], state: States, length: Lanes, rates: Stages
+    stage: Int[Array, ""],
+    rows: Iterable[Float[np.ndarray, " before"]],
+    state: States,
+    length: Lanes,
+    rates: Stages,
+    first: States | None = None,
 ) -> States:
     """The state moved along the rates of the earlier stages, with the weights of a stage. Every stage is a branch of
     its own, so that its weights are constants, of which many are 0.
+
+    **Arguments:** `first`: the rate at the first stage, if `rates` begins with the second.
     """
+    before = [] if first is None else [first]
 
     def moved(row: Float[np.ndarray, " before"]) -> Callable[[Stages], States]:
-        return lambda rates: state + length * weighted_sum(row, [rates[k] for k in range(len(row))])
+        return lambda rates: (
+            state + length * weighted_sum(row, [*before, *(rates[k] for k in range(len(row) - len(before)))])
+        )
 
     return jax.lax.switch(stage, [moved(row) for row in rows], rates)
 

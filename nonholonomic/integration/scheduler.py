@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..xla_cpu import in_one_kernel
 from .event import Bracket
 from .problem import AbstractProblem, least_margin
-from .runge_kutta import Lanes, States, explicit_order, explicit_tableau, first_length
+from .runge_kutta import Lanes, States, explicit_order, explicit_tableau, first_length, memory_for_stages
 from .settings import Settings
 from .status import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING
 from .step import Control, LaneState, try_step
@@ -228,7 +228,9 @@ class LaneScheduler(eqx.Module):
 
         def loop(lane_state: LaneState) -> tuple[LaneState, Any, Int[Array, ""], Int[Array, ""]]:
             zero, record = jnp.zeros((), int), recorder.begin(in_lanes, lane_state, collected)
-            return jax.lax.while_loop(goes_on, step, (lane_state, record, zero, zero))
+            lane_state = lane_state._replace(stages=memory_for_stages(self.control.tableau, lane_state.state))
+            lane_state, *others = jax.lax.while_loop(goes_on, step, (lane_state, record, zero, zero))
+            return lane_state._replace(stages=None), *others
 
         lane_state, record, _, count = self.in_kernel(loop)(progress.lane_state)
         return SchedulerState(lane_state, progress.loaded, progress.iterations + count), record

@@ -15,7 +15,7 @@ from ..xla_cpu import stored
 from .double_roots import missed_double_root, missed_loss
 from .event import Bracket, refine
 from .problem import AbstractProblem, crossing_time, side_of
-from .runge_kutta import Lanes, States, Step, explicit_step, inverse_root, scaled_error, watched_places
+from .runge_kutta import Lanes, Stages, States, Step, explicit_step, inverse_root, memory_for_stages, scaled_error, watched_places
 from .status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING
 
 #: Step-size control as in Diffrax's I controller with its defaults.
@@ -52,6 +52,7 @@ class LaneState(NamedTuple):
     - `first_crossing`, `crossing_time`: times of the first and the last event passed [s], infinite if there was none.
     - `bracketing`: whether the lane is locating an event; `bracket`: the current bracket.
     - `steps`: number of all steps; `rejected`: number of steps that step-size control rejected.
+    - `stages`: memory for the stages of the next step (`explicit_step`); `None` outside of a loop over steps.
 
     **Example:**
 
@@ -75,6 +76,7 @@ class LaneState(NamedTuple):
     bracket: Bracket
     steps: Int[Array, " lanes"]
     rejected: Int[Array, " lanes"]
+    stages: Stages | None = None
 
 
 def length_to_try(control: Control, lane_state: LaneState) -> Lanes:
@@ -104,9 +106,9 @@ def trial_step(problem: AbstractProblem, control: Control, lane_state: LaneState
     """The length of each lane's next step [s], and the step."""
     tried_length = length_to_try(control, lane_state)
     crossing = side_of(problem, lane_state.side)
-    start = (lane_state.time, lane_state.state, lane_state.rate, tried_length)
-    trial = explicit_step(control.tableau, problem.field, problem.margins, crossing, *start, lane_state.margins)
-    return tried_length, trial
+    start = (lane_state.time, lane_state.state, lane_state.rate, tried_length, lane_state.margins)
+    stages = memory_for_stages(control.tableau, lane_state.state) if lane_state.stages is None else lane_state.stages
+    return tried_length, explicit_step(control.tableau, problem.field, problem.margins, crossing, *start, stages)
 
 
 def after_step(
@@ -179,6 +181,7 @@ def after_step(
         bracket=bracket,
         steps=steps,
         rejected=lane_state.rejected + (free & ~forward & ~is_beyond),
+        stages=None if lane_state.stages is None else trial.stages,
     )
 
 

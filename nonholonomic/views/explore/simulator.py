@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...integration import AbstractProblem, LaneState, Settings, explicit_tableau
-from ...integration.runge_kutta import Step, stages_to_look, watched_places
+from ...integration.runge_kutta import Step, inner_stages, stages_to_look, watched_places
 from ...integration.scheduler import LaneScheduler
 from ...integration.status import RUNNING
 from ...integration.step import Control, after_step, length_to_try
@@ -98,7 +98,7 @@ class Stepper(NamedTuple):
         time, state = lane.time, lane.state
         places = len(watched_places(explicit_tableau(self.settings.for_lanes)))
         margins = jax.tree.map(lambda least: jax.ShapeDtypeStruct((places, *least.shape), least.dtype), lane.margins)
-        trial = Step(state, state, state, time, time, margins, ())
+        trial = Step(state, state, state, time, time, margins, (), None)
 
         def after(constants: Any, lane: LaneState, length: Any, trial: Step) -> LaneState:
             problem, control, atols = run(constants)
@@ -123,7 +123,7 @@ class Stepper(NamedTuple):
     def facts(self) -> dict[str, Any]:
         """The sizes and the coefficients that `integrator.js` reads."""
         tableau = explicit_tableau(self.settings.for_lanes)
-        inner = len(tableau.c) - 1 if tableau.fsal else len(tableau.c)
+        inner = inner_stages(tableau)
         return {
             "constants": size_of(self.constants),
             "components": self.lane.state.shape[0],

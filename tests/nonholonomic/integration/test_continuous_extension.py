@@ -17,7 +17,7 @@ from nonholonomic.integration.continuous_extension import (
     second_derivative,
 )
 from nonholonomic.integration.oscillatory import MIDDLE
-from nonholonomic.integration.runge_kutta import explicit_step
+from nonholonomic.integration.runge_kutta import explicit_step, memory_for_stages
 
 
 class Growth(AbstractProblem):
@@ -79,9 +79,8 @@ def worst_inside(length):
     problem, time, size = Growth(), jnp.full(1, 0.2), jnp.full(1, length)
     state = jnp.exp(jnp.sin(time))[None]
     rate = problem.field(time, state)
-    step = explicit_step(
-        Oscillatory8.tableau, problem.field, lambda *_: (), lambda *_: None, time, state, rate, size, None
-    )
+    start = (time, state, rate, size, None, memory_for_stages(Oscillatory8.tableau, state))
+    step = explicit_step(Oscillatory8.tableau, problem.field, lambda *_: (), lambda *_: None, *start)
     start = StepEnd(time, state, rate, second_derivative(problem, size, time, state, rate))
     end_time = time + size
     end = StepEnd(end_time, step.state, step.rate, second_derivative(problem, size, end_time, step.state, step.rate))

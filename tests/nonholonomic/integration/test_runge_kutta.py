@@ -8,7 +8,13 @@ import pytest
 from close import assert_close
 
 from nonholonomic.integration import Oscillatory8
-from nonholonomic.integration.runge_kutta import explicit_step, explicit_tableau, inverse_root, watched_places
+from nonholonomic.integration.runge_kutta import (
+    explicit_step,
+    explicit_tableau,
+    inverse_root,
+    memory_for_stages,
+    watched_places,
+)
 
 
 def field(time, state):
@@ -35,6 +41,8 @@ def test_a_step_is_that_of_diffrax(solver):
         field(time, state),
         jnp.asarray(length),
         jnp.stack([10.0 + state[1], 20.0 + state[0]]),
+        # What the memory held before does not matter.
+        jnp.full_like(memory_for_stages(explicit_tableau(solver), state), jnp.nan),
     )
     term = diffrax.ODETerm(lambda t, y, _: field(t, y))
     for lane in range(3):
@@ -65,7 +73,7 @@ def test_an_accelerator_gets_the_stages_written_out(monkeypatch):
 
     def compiled():
         def step(state):
-            start = (time, state, field(time, state), length, state[:1])
+            start = (time, state, field(time, state), length, state[:1], memory_for_stages(tableau, state))
             return explicit_step(tableau, field, lambda time, point: (point[0],), lambda point, rate: None, *start)
 
         return jax.jit(step)
