@@ -104,8 +104,6 @@ def solve_with_adjoint(
     """
     components, size = problem.start()[0].shape
     numbers, problem_with_probe = _with_probe(problem, moving, probe, size)
-    # As many lanes as without the probe: the backward pass, which is the most expensive part, does not use the probe.
-    settings = dataclasses.replace(settings, lanes=settings.lanes_of(size))
     scheduler = LaneScheduler.of(problem_with_probe, t1, cells, settings, one_kernel=one_kernel, n_blocks=2)
     passes = Passes(scheduler, moving, measured)
     run = passes.start(components + len(jax.tree.leaves(numbers)))
@@ -246,8 +244,8 @@ def _taken_back(
             step_record = jax.tree.map(functools.partial(read, index=index - 1), record)
             return index - 1, *step_taken_back(weights, problem, moving, *step_record, *sums)
 
-        room = jnp.zeros((1 + len(weights.fractions), *lane_state.state.shape), adjoint.dtype)
-        return jax.lax.while_loop(lambda carry: carry[0] > 0, step, (count, adjoint, room))[1]
+        memory = StageMemory.of(len(weights.fractions), lane_state.state)
+        return jax.lax.while_loop(lambda carry: carry[0] > 0, step, (count, adjoint, memory))[1]
 
     return scheduler.in_kernel(loop)((lane_state, record, count, adjoint))
 
@@ -290,6 +288,23 @@ class Weights(NamedTuple):
         return cls(fractions, tuple(rows), shares)
 
 
+class StageMemory(NamedTuple):
+    """Memory for the stages of a step, which all steps share; its numbers must be finite.
+
+    `states`, `rates`: the states and the field at the stages; `adjoints`: the derivatives with respect to the end of
+    the step and to the stages.
+    """
+
+    states: Stages
+    rates: Stages
+    adjoints: Stages
+
+    @classmethod
+    def of(cls, stages: int, state: States) -> "StageMemory":
+        """Memory for a number of stages."""
+        return cls(*(jnp.zeros((count, *state.shape), state.dtype) for count in (stages, stages - 1, stages + 1)))
+
+
 def step_taken_back(
     weights: Weights,
     problem: AbstractProblem,
@@ -298,8 +313,8 @@ def step_taken_back(
     state: States,
     length: Lanes,
     adjoint: Float[Array, "rows lanes"],
-    room: Stages,
-) -> tuple[Float[Array, "rows lanes"], Stages]:
+    memory: StageMemory,
+) -> tuple[Float[Array, "rows lanes"], StageMemory]:
     """Carry derivatives from the end of a Runge-Kutta step to its start (Hager, Numer. Math. 87 (2000) 247).
 
     The stages are computed in loops, as in `explicit_step`.
@@ -311,9 +326,9 @@ def step_taken_back(
       respect to which to differentiate.
     - `time`, `state`, `length`: where the step starts, and its length; 0 if no step was made.
     - `adjoint`: derivatives at the end of the step, with respect to the state and the parameters.
-    - `room`: working memory for the derivatives with respect to the end and the stages; finite.
+    - `memory`: memory for the stages.
 
-    **Returns:** the derivatives at the start, and the working memory for reuse.
+    **Returns:** the derivatives at the start, and the memory for reuse.
     """
     numbers, static = eqx.partition(problem, moving)
     components, stages = state.shape[0], len(weights.fractions)
@@ -327,9 +342,9 @@ def step_taken_back(
             stage_states, moved_state(stage, weights.rows, state, length, rates), at=stage + 1
         ), rates
 
-    zeros = jnp.zeros((stages, *state.shape), state.dtype)
-    initial_stages = written_in_place(zeros, state, at=jnp.zeros((), int)), zeros[1:]
-    stage_states, _ = over_stages(stages - 1, stage_made, initial_stages)
+    start = jnp.zeros((), int)
+    initial_stages = written_in_place(memory.states, state, at=start), memory.rates
+    stage_states, rates = over_stages(stages - 1, stage_made, initial_stages)
 
     def pull(
         stage_time: Lanes, numbers: Any, parts: tuple[Lanes, ...], by_rate: tuple[Lanes, ...]
@@ -351,6 +366,6 @@ def step_taken_back(
         term = jax.lax.optimization_barrier(jnp.where(length > 0.0, jnp.stack(term), 0.0))
         return written_in_place(by_stage, term[:components], at=stage + 1), total + term
 
-    zero_state, ends = jnp.zeros_like(state), written_in_place(room, adjoint[:components], at=jnp.zeros((), int))
-    room, total = over_stages(stages, stage_taken_back, (ends, jnp.zeros_like(adjoint)))
-    return adjoint + total, room
+    zero_state, ends = jnp.zeros_like(state), written_in_place(memory.adjoints, adjoint[:components], at=start)
+    adjoints, total = over_stages(stages, stage_taken_back, (ends, jnp.zeros_like(adjoint)))
+    return adjoint + total, StageMemory(stage_states, rates, adjoints)

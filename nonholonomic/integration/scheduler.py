@@ -152,7 +152,7 @@ class LaneScheduler(eqx.Module):
         rates, atols = problem.field(zero, states), settings.absolute * rtol * scales
         lengths = first_length(problem.field, zero, states, rates, control.order, rtol, atols, n_blocks)
         fresh = _fresh_lanes(problem, control, states, rates, jnp.minimum(stop_gradient(lengths), t1))
-        return cls(problem, control, atols, fresh, cells, settings.lanes_of(states.shape[1], n_blocks), one_kernel)
+        return cls(problem, control, atols, fresh, cells, settings.lanes_of(states.shape[1]), one_kernel)
 
     @property
     def capacity(self) -> int:

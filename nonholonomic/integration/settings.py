@@ -73,16 +73,17 @@ class Settings(eqx.Module):
         """The same settings with another tolerance, or without a tolerance if the caller stores it."""
         return eqx.tree_at(lambda settings: settings.tolerance, self, tolerance, is_leaf=lambda leaf: leaf is None)
 
-    def lanes_of(self, cells: int, n_blocks: int = 1) -> int:
-        """Number of a problem's cells that advance together, from the number of blocks in its state."""
-        return lanes_for(cells, n_blocks) if self.lanes is None else self.lanes
+    def lanes_of(self, cells: int) -> int:
+        """Number of a problem's cells that advance together."""
+        return lanes_for(cells) if self.lanes is None else self.lanes
 
 
-def lanes_for(cells: int, n_blocks: int = 1) -> int:
-    """Number of lanes for cells whose state has the given number of equal blocks.
+def lanes_for(cells: int) -> int:
+    """Number of lanes for a number of cells.
 
-    On a CPU the lanes and their stages should fit the first caches; an accelerator needs tens of thousands of lanes.
+    On a CPU, compilers write 64 lanes out as eight vectors; more lanes become loops, and fewer, or a number that is not a
+    power of 2, are partly computed one by one. This matters more than the caches: also with variations, 64 lanes are
+    the fastest. An accelerator needs tens of thousands of lanes.
     """
     max_lanes = 64 if jax.default_backend() == "cpu" else 32768
-    own_lanes = min(max_lanes, 1 << (cells - 1).bit_length())
-    return own_lanes if n_blocks == 1 else max(8, 3 * own_lanes // (2 * n_blocks))
+    return min(max_lanes, 1 << (cells - 1).bit_length())
