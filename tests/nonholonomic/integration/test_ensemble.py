@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from close import assert_close
+from jax.extend.core import ClosedJaxpr
 from scipy.optimize import brentq
 
 from nonholonomic.integration import (
@@ -21,7 +22,9 @@ from nonholonomic.integration import (
     solve_ensemble,
 )
 from nonholonomic.integration.ensemble import ensemble_solve
+from nonholonomic.integration.scheduler import AbstractRecorder, LaneScheduler
 from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END
+from nonholonomic.integration.step import try_step
 
 pytestmark = pytest.mark.newest
 
@@ -99,6 +102,36 @@ def test_cells_of_like_cost_leave_no_lane_idle():
     steps = np.asarray(outcome.steps)
     assert steps.min() < steps.max()
     assert int(iterations) * 64 < 1.1 * steps.sum()
+
+
+def cleared(program):
+    """The sizes of the arrays that a program fills with one number."""
+    for equation in program.eqns:
+        if equation.primitive.name == "broadcast_in_dim":
+            yield equation.outvars[0].aval.size
+        for parameter in jax.tree.leaves(equation.params, is_leaf=lambda leaf: isinstance(leaf, ClosedJaxpr)):
+            yield from cleared(parameter.jaxpr) if isinstance(parameter, ClosedJaxpr) else ()
+
+
+def test_steps_reuse_the_memory_of_their_stages():
+    """Filling 50 KB with zeros in every step took a tenth of the time of a table."""
+    sizes = []
+
+    class Watching(AbstractRecorder):
+        def begin(self, in_lanes, lane_state, collected):
+            return None
+
+        def step(self, in_lanes, lane_state, record, iteration):
+            program = jax.make_jaxpr(lambda lane_state: try_step(*in_lanes, lane_state))(lane_state)
+            sizes.append((lane_state.stages.size, max(cleared(program.jaxpr))))
+            return try_step(*in_lanes, lane_state), record
+
+    problem = Oscillators(jnp.ones(8), jnp.asarray(0.5), jnp.asarray(2.0))
+    scheduler = LaneScheduler.of(problem, jnp.asarray(1.0), jnp.asarray(8), Settings(1e-6, SOLVER))
+    jax.eval_shape(lambda: scheduler.run(scheduler.start(), Watching())[0].iterations)
+    (of_stages, largest), *_ = sizes
+    assert of_stages == 12 * 2 * 8
+    assert largest < of_stages / 2
 
 
 def test_the_guard_ends_a_run_where_it_vanishes():
