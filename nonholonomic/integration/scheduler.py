@@ -226,13 +226,13 @@ class LaneScheduler(eqx.Module):
             new_state, record = recorder.step(in_lanes, lane_state, record, count)
             return new_state, record, missed + jnp.sum(lane_state.status != RUNNING), count + 1
 
-        def loop(lane_state: LaneState) -> tuple[LaneState, Any, Int[Array, ""], Int[Array, ""]]:
+        def loop(lane_state: LaneState) -> tuple[LaneState, Any, Int[Array, ""]]:
             zero, record = jnp.zeros((), int), recorder.begin(in_lanes, lane_state, collected)
             lane_state = lane_state._replace(stages=memory_for_stages(self.control.tableau, lane_state.state))
-            lane_state, *others = jax.lax.while_loop(goes_on, step, (lane_state, record, zero, zero))
-            return lane_state._replace(stages=None), *others
+            lane_state, record, _, count = jax.lax.while_loop(goes_on, step, (lane_state, record, zero, zero))
+            return lane_state._replace(stages=None), record, count
 
-        lane_state, record, _, count = self.in_kernel(loop)(progress.lane_state)
+        lane_state, record, count = self.in_kernel(loop)(progress.lane_state)
         return SchedulerState(lane_state, progress.loaded, progress.iterations + count), record
 
     def in_kernel(self, loop: Callable[[Any], Any]) -> Callable[[Any], Any]:

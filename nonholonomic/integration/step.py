@@ -15,7 +15,17 @@ from ..xla_cpu import stored
 from .double_roots import missed_double_root, missed_loss
 from .event import Bracket, refine
 from .problem import AbstractProblem, crossing_time, side_of
-from .runge_kutta import Lanes, Stages, States, Step, explicit_step, inverse_root, memory_for_stages, scaled_error, watched_places
+from .runge_kutta import (
+    Lanes,
+    Stages,
+    States,
+    Step,
+    explicit_step,
+    inverse_root,
+    memory_for_stages,
+    scaled_error,
+    watched_places,
+)
 from .status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING
 
 #: Step-size control as in Diffrax's I controller with its defaults.

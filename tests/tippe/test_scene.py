@@ -151,6 +151,10 @@ def test_the_field_costs_what_the_lean_one_does(arena, law):
     scene = tippe.Scene(rutstam_top(), surface, friction[law])
     dynamics, states = scene.dynamics, random_states(scene, 7)
     equations = jax.make_jaxpr(lambda state: dynamics.motion(state).rate)(states).jaxpr.eqns
+    # Values that are stored together with their tangents pass through unchanged.
+    stored = [equation for equation in equations if equation.primitive.name == "custom_jvp_call"]
+    assert not any(equation.params["call_jaxpr"].jaxpr.eqns for equation in stored)
+    equations = [equation for equation in equations if equation not in stored]
     primitives = {"squeeze", "slice", "broadcast_in_dim", "neg", "unstack"}
     arithmetic = {"add", "sub", "mul", "div", "sqrt"}
     results = [

@@ -22,7 +22,7 @@ from nonholonomic.geometry import (
     subtract,
     sum_vectors,
 )
-from nonholonomic.xla_cpu import stored
+from nonholonomic.xla_cpu import stored, stored_with_tangents
 
 from .body import AbstractBody, AbstractMeridian
 from .contact_dynamics import AbstractContactDynamics, Motion
@@ -105,7 +105,7 @@ class Dynamics(AbstractContactDynamics):
         # The axis turns with the body. V is the velocity of the centre of a sphere that would touch the arena like the
         # body, and o the rate at which the frame turns. The frame moves with the point at the height `size` above the
         # contact, whose velocity is `path`.
-        e_dot = scale(self.per_transverse, cross(L, e))
+        e_dot = stored_with_tangents(*scale(self.per_transverse, cross(L, e)))
         V = (u1 + a * e_dot[0], u2 + a * e_dot[1])
         changing = multiply(growth, e_dot[2])
         path = (add(V[0], multiply(changing, e[0])), add(V[1], multiply(changing, e[1])))
@@ -136,6 +136,7 @@ class Dynamics(AbstractContactDynamics):
         load = self.mass * pull - coupling * (L[0] * e_dot[1] - L[1] * e_dot[0])
         load = subtract(load, multiply(self.mass, changing, e_dot[2]))
         painleve_factor = 1.0 + coupling * (M1 * e[1] - M2 * e[0])
+        load, painleve_factor = stored_with_tangents(load, painleve_factor)
         N = load / painleve_factor
 
         thrust = N * self.per_mass
