@@ -289,7 +289,7 @@ class Weights(NamedTuple):
 
 
 class StageMemory(NamedTuple):
-    """Memory for the stages of a step, which all steps share; its numbers must be finite.
+    """Memory for the stages of a step, which all steps share; what it holds before a step does not matter.
 
     `states`, `rates`: the states and the field at the stages; `adjoints`: the derivatives with respect to the end of
     the step and to the stages.
