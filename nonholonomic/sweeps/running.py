@@ -6,7 +6,7 @@ import json
 import os
 import uuid
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import Any
 
@@ -94,7 +94,9 @@ def sweep(
     try:
         with no_interrupt_lost() as raise_lost_interrupt:
             chunks = computed(work, layout, store.finished, executor, progress, raise_lost_interrupt)
-            result = store.filled(chunks)
+            # Ctrl-C may arrive while a chunk is saved. The traceback would then keep `chunks` alive, and its workers busy.
+            with contextlib.closing(chunks):
+                result = store.filled(chunks)
         return Table.of(result) if isinstance(result, Stored) else Table.laid_out(layout, result)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(store.interrupted()) from None
@@ -116,7 +118,7 @@ def computed(
     executor: Executor | None,
     progress: bool,
     raise_lost_interrupt: Callable[[], None],
-) -> Iterator[tuple[int, dict[str, Values]]]:
+) -> Generator[tuple[int, dict[str, Values]], None, None]:
     """Compute the unfinished chunks, and yield each when it is finished; see `sweep`."""
     todo = [chunk for chunk in range(layout.chunks) if chunk not in finished]
     finished_cells = layout.cells - sum(map(layout.size, todo))

@@ -5,12 +5,14 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from cheap_sweep import resumed
+from cheap_sweep import cheap_sweep, resumed
 
 from nonholonomic.command_line import INTERRUPTED, PATIENCE
+from nonholonomic.sweeps._chunks import ChunkStore
 
 pytestmark = pytest.mark.newest
 
@@ -156,6 +158,25 @@ def test_a_table_says_what_is_saved_and_goes_on_from_there(way, tmp_path):
     # The executor's processes print nothing.
     assert sum(line.startswith("Traceback") for line in error) == 1
     assert len(resumed(path)) == 7 - saved_blocks
+
+
+def test_no_chunk_starts_after_an_interrupt_while_another_is_saved(tmp_path, monkeypatch):
+    def interrupted_while_saving(store, chunks):
+        next(chunks)
+        raise KeyboardInterrupt
+
+    begun = []
+
+    def run(block):
+        begun.append(block)
+        time.sleep(0.1)
+
+    monkeypatch.setattr(ChunkStore, "filled", interrupted_while_saving)
+    # As long as `caught` exists, so do the frames of its traceback.
+    with ThreadPoolExecutor(1) as executor, pytest.raises(KeyboardInterrupt) as caught:
+        cheap_sweep(tmp_path / "table.h5", run, executor=executor)
+    assert caught
+    assert len(begun) <= 2
 
 
 def test_an_interrupt_during_garbage_collection_is_not_lost(tmp_path):
