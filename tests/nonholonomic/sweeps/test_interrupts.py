@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -165,16 +166,18 @@ def test_no_chunk_starts_after_an_interrupt_while_another_is_saved(tmp_path, mon
         next(chunks)
         raise KeyboardInterrupt
 
-    begun = []
+    begun, is_over = [], threading.Event()
 
     def run(block):
         begun.append(block)
-        time.sleep(0.1)
+        assert block == 0 or is_over.wait(60.0)
 
     monkeypatch.setattr(ChunkStore, "filled", interrupted_while_saving)
-    # As long as `caught` exists, so do the frames of its traceback.
-    with ThreadPoolExecutor(1) as executor, pytest.raises(KeyboardInterrupt) as caught:
-        cheap_sweep(tmp_path / "table.h5", run, executor=executor)
+    with ThreadPoolExecutor(1) as executor:
+        # As long as `caught` exists, so do the frames of its traceback.
+        with pytest.raises(KeyboardInterrupt) as caught:
+            cheap_sweep(tmp_path / "table.h5", run, executor=executor)
+        is_over.set()
     assert caught
     assert len(begun) <= 2
 
