@@ -93,6 +93,8 @@ def interruptible(main: Callable[[], int], program: str) -> int:
     def watch() -> None:
         while signal.SIGINT not in os.read(read_end, 64):
             pass
+        # Other threads otherwise keep the interpreter for 5 ms each time the main thread needs it to read a file.
+        sys.setswitchinterval(1e-5)
         time.sleep(PATIENCE)
         _end(f"python -m {program}: interrupted; run the same command again to resume")
 

@@ -37,6 +37,9 @@ from .runs.theta_over_time import theta_over_time
 
 TOPS = {top.__name__: top for top in (presets.wooden, presets.rutstam, presets.cohen, presets.leine_glocker)}
 
+#: The arenas, which name the files of the tables.
+ARENAS = ("plane", "cylinder")
+
 #: Times at which theta is drawn, close enough to show nutation, and duration of the displayed run [s].
 SAMPLES, SHOWN = 2048, 5.0
 
@@ -76,11 +79,11 @@ def parser() -> argparse.ArgumentParser:
     return command
 
 
-def scenes(options: argparse.Namespace) -> dict[str, Scene]:
-    """The two arenas, with the middle one of the friction coefficients."""
-    top, law = TOPS[options.top](), Coulomb(middle(options.mu), options.slip_speed)
-    arenas = {"plane": Plane(), "cylinder": Cylinder(options.cylinder_radius)}
-    return {name: Scene(top, arena, law, contact="hybrid") for name, arena in arenas.items()}
+def scene(options: argparse.Namespace, arena: str) -> Scene:
+    """The scene in an arena, with the middle one of the friction coefficients."""
+    surface = Plane() if arena == "plane" else Cylinder(options.cylinder_radius)
+    law = Coulomb(middle(options.mu), options.slip_speed)
+    return Scene(TOPS[options.top](), surface, law, contact="hybrid")
 
 
 def remark(options: argparse.Namespace) -> str:
@@ -125,7 +128,7 @@ def table(options: argparse.Namespace, arena: str, cache: Path | None) -> Table:
     path = options.out / f"{arena}.h5"
     compute = functools.partial(
         inversion_table,
-        scenes(options)[arena],
+        scene(options, arena),
         theta=[float(Launch.degrees(theta, 0.0).theta) for theta in options.theta],
         spin=float(launch_shown(options).spin),
         mu=options.mu,
@@ -156,7 +159,7 @@ def launch_shown(options: argparse.Namespace) -> Launch:
 
 def sliders(options: argparse.Namespace) -> str:
     """The page of the top with sliders, with a placeholder for the contents below."""
-    run = (scenes(options)["plane"], launch_shown(options))
+    run = (scene(options, "plane"), launch_shown(options))
     t1 = min(SHOWN, options.t1)
     return live_page(live_run(*run, None, t1)._replace(title=TITLE), stage_at_start(*run, t1), 0.2, BELOW).html
 
@@ -170,7 +173,7 @@ def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str,
     times = np.linspace(0.0, min(SHOWN, options.t1), SAMPLES)
 
     def angles() -> dict[str, bytes]:
-        run, axes = (scenes(options)["plane"], launch_shown(options)), ("launch.theta", "scene.friction.mu")
+        run, axes = (scene(options, "plane"), launch_shown(options)), ("launch.theta", "scene.friction.mu")
         return {"theta": json.dumps(theta_over_time(*run, times, options.tolerance, axes).tolist()).encode()}
 
     def on_plane() -> tuple[Table, Any]:
@@ -208,8 +211,8 @@ def has_matplotlib() -> bool:
 
 def saved(options: argparse.Namespace) -> str:
     """Message after Ctrl-C."""
-    cells = sum(saved_cells(options.out / f"{arena}.h5") for arena in scenes(options))
-    total = len(scenes(options)) * len(options.theta) * len(options.mu)
+    cells = sum(saved_cells(options.out / f"{arena}.h5") for arena in ARENAS)
+    total = len(ARENAS) * len(options.theta) * len(options.mu)
     return f"saved {cells} of {total} cells to {options.out}; run the same command again to resume"
 
 
@@ -285,7 +288,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         print("\n".join(described(options)), flush=True)
         require_folder(options.out, "--out")
-        read = all(are_kept(cache, facts(options, arena)) for arena in scenes(options))
+        read = all(are_kept(cache, facts(options, arena)) for arena in ARENAS)
         arenas, samples, live = computed(options, cache)
         print(report(options, arenas), flush=True)
         with status_line("drawing") as line:

@@ -93,7 +93,7 @@ def test_the_wooden_top_turns_over_in_four_fifths_of_the_launches(tmp_path, caps
     assert "A top has turned over when theta first exceeds 171 deg. Where a time is several times" in printed
     # Such a time, in the last cell of the cylinder: the top is on its stem as soon as the others, but below 171 deg.
     assert table.time[-1, -1] > 3.0 * table.time[-2, -1]
-    scene = job.scenes(job.parser().parse_args(["--mu", "0.5"]))["cylinder"]
+    scene = job.scene(job.parser().parse_args(["--mu", "0.5"]), "cylinder")
     times = np.array([3.0, 6.0, 10.0])
     theta = theta_over_time(scene, tippe.Launch.degrees(18, 1900), times, 1e-6, ("launch.theta", "scene.friction.mu"))
     np.testing.assert_allclose(np.degrees(theta[:2]), [145.0, 161.0], atol=8.0)
