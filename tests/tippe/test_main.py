@@ -48,7 +48,7 @@ def test_the_papers_tables_are_printed_written_and_drawn(tmp_path, capsys):
 def test_the_main_job_prints_writes_and_draws(tmp_path, capsys, monkeypatch, rutstam_scene):
     """Its own top has a stem and a cylinder; these scenes have smaller programs, which other tests compile, too."""
     flying = dataclasses.replace(rutstam_scene, contact="hybrid")
-    monkeypatch.setattr(job, "scenes", lambda options: {"plane": flying, "cylinder": flying})
+    monkeypatch.setattr(job, "scene", lambda options, arena: flying)
     # A page that is kept would be that of other scenes.
     monkeypatch.setenv("NONHOLONOMIC_CACHE", "0")
     arguments = ["--theta", "6", "18", "--mu", "0.2", "0.3", "--rpm", "1480", "--t1", "8", "--out", str(tmp_path)]
@@ -102,7 +102,7 @@ def test_the_wooden_top_turns_over_in_four_fifths_of_the_launches(tmp_path, caps
 
 def test_the_same_command_reads_its_results_in_another_folder(tmp_path, capsys, monkeypatch, rutstam_scene):
     flying = dataclasses.replace(rutstam_scene, contact="hybrid")
-    monkeypatch.setattr(job, "scenes", lambda options: {"plane": flying, "cylinder": flying})
+    monkeypatch.setattr(job, "scene", lambda options, arena: flying)
     monkeypatch.setattr(job, "enable_compilation_cache", lambda: tmp_path)
     arguments = ["--theta", "6", "18", "--mu", "0.2", "0.3", "--rpm", "1480", "--t1", "8"]
     assert main([*arguments, "--out", str(tmp_path / "a")]) == 0
@@ -127,7 +127,7 @@ def test_the_same_command_reads_its_results_in_another_folder(tmp_path, capsys, 
 
 def test_cells_in_the_folder_are_not_kept(tmp_path, monkeypatch, rutstam_scene):
     """Another version of the packages may have computed them."""
-    monkeypatch.setattr(job, "scenes", lambda options: {"plane": rutstam_scene})
+    monkeypatch.setattr(job, "scene", lambda options, arena: rutstam_scene)
     options = job.parser().parse_args(["--theta", "6", "--mu", "0.3", "--out", str(tmp_path)])
     job.table(options, "plane", None)
     job.table(options, "plane", tmp_path)
