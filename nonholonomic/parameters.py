@@ -9,6 +9,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
@@ -60,6 +61,45 @@ def with_numbers(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any
                 name, [known_name for known_name, number in values_of_names.items() if number is not None]
             )
     return {root: _replaced(root, tree, values) for root, tree in roots.items()}
+
+
+def as_one(values: Any, name: str, kind: type) -> Any:
+    """Several modules of one kind, such as launches, as one whose numbers are lists, with one value for each module.
+    Anything but a list of such modules stays unchanged.
+
+    **Arguments:** `name`: name of the list in messages.
+
+    **Raises:** `ValueError` for modules whose numbers are lists already, or that leave out numbers without a default
+    of zero that others have.
+    """
+    if not isinstance(values, list | tuple) or not values or not all(isinstance(value, kind) for value in values):
+        return values
+    stacked = {}
+    for field in dataclasses.fields(kind):
+        parts = [getattr(value, field.name) for value in values]
+        counts = {len(part) for part in parts if isinstance(part, tuple)}
+        if len(counts) > 1 or (field.name not in RESTING and counts and None in parts):
+            sizes = ", ".join("none" if part is None else str(len(part)) for part in parts)
+            raise ValueError(f"{name}: {field.name} must have the same number of coordinates in all, not {sizes}")
+        if counts:
+            zeros = (0.0,) * counts.pop()
+            rows = zip(*(zeros if part is None else part for part in parts), strict=True)
+            stacked[field.name] = tuple(_column(row, name, field.name) for row in rows)
+        else:
+            stacked[field.name] = None if None in parts else _column(parts, name, field.name)
+    return kind(**stacked)
+
+
+#: Parts of a launch that are zero where they are left out.
+RESTING = ("velocity", "angular_velocity")
+
+
+def _column(parts: Any, name: str, field: str) -> Any:
+    """One number of each module as an array."""
+    shapes = {np.shape(part) for part in parts}
+    if shapes != {()}:
+        raise ValueError(f"{name}: {field} must be one number in each of the list, not of shape {max(shapes, key=len)}")
+    return jnp.stack([jnp.asarray(part) for part in parts])
 
 
 def full_name(argument: str, name: str, known: list[str]) -> str:
@@ -156,6 +196,9 @@ def description(root: str, tree: Any) -> dict[str, Any]:
 #: How many numbers of an array are shown; longer arrays show the first and the last ones.
 SHOWN = 4
 
+#: A message shows lists of up to this many values in full.
+MOST_PARTS = 8
+
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -191,7 +234,25 @@ def as_text(value: Any, unit: str = "1") -> str:
         else:
             text = f"{values[0]:.6g}, {values[1]:.6g}, ..., {values[-1]:.6g}, {values.size} numbers"
         return (text if numbers.ndim == 0 else f"[{text}]") + suffix
-    return getattr(value, "__qualname__", None) or repr(value)
+    # A function within a function, such as a lambda, goes by its own name.
+    name = getattr(value, "__qualname__", None)
+    return repr(value) if name is None else name.rpartition("<locals>.")[2]
+
+
+def shown(value: Any) -> str:
+    """The value for a message, as a user would write it: plain numbers in place of arrays, also within lists."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{shown(name)}: {shown(part)}" for name, part in value.items()) + "}"
+    if isinstance(value, list) or (isinstance(value, tuple) and not hasattr(value, "_fields")):
+        parts = [shown(part) for part in value]
+        if len(parts) > MOST_PARTS:
+            parts = [*parts[:2], "...", parts[-1], f"{len(parts)} in all"]
+        opening, closing = "[]" if isinstance(value, list) else ("(", ",)" if len(parts) == 1 else ")")
+        return f"{opening}{', '.join(parts)}{closing}"
+    if isinstance(value, jax.Array | np.ndarray | np.generic) and not isinstance(value, Tracer):
+        array = np.asarray(value)
+        return as_text(array) if array.ndim and array.dtype.kind in "fiu" else shown(array.tolist())
+    return as_text(value) if isinstance(value, jax.Array | np.ndarray | eqx.Module) or callable(value) else repr(value)
 
 
 def contents(module: Any) -> list[tuple[str, str]]:

@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import inspect
 import operator
+import sys
 import tempfile
 import warnings
 from collections.abc import Iterable, Iterator
@@ -22,10 +23,14 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from .parameters import as_html, as_text, contents, in_lines, one_line
+from .parameters import as_html, contents, in_lines, one_line, shown
 
 #: Addition to the message about an angle that may be in degrees.
 IN_DEGREES = "; angles are in radians: did you mean np.radians({})?"
+
+#: Packages whose lines a warning does not point to: ours, and those through which our functions are called.
+NO_CODE_OF_A_USER = ("nonholonomic", "tippe", "stroller", "equinox", "jax", "jaxtyping", "beartype", "typeguard")
+NO_CODE_OF_A_USER += ("contextlib", "dataclasses", "functools", "importlib", "concurrent", "threading")
 
 #: What a message says about a user's function after `jax.errors.JAXTypeError`.
 UNTRACEABLE = (
@@ -64,14 +69,6 @@ def is_traced(value: Any) -> bool:
     return isinstance(value, Tracer)
 
 
-def shown(value: Any) -> str:
-    """The value for a message: a plain number if possible."""
-    if any(is_traced(leaf) for leaf in jax.tree.leaves(value)):
-        return as_text(value)
-    array = np.asarray(value)
-    return repr(array.item()) if array.ndim == 0 and array.dtype != object else as_text(value)
-
-
 def _first(numbers: np.ndarray, holds: np.ndarray) -> str:
     """The first number for which the condition is false."""
     return shown(numbers[~holds].ravel()[0]) if numbers.ndim else shown(numbers)
@@ -104,12 +101,12 @@ def require(
         return
     # NumPy would convert these to numbers.
     if value is None or isinstance(value, str | bytes):
-        raise ValueError(f"{name} = {value!r} is not a number")
+        raise ValueError(f"{name} = {shown(value)} is not a number")
     # JAX transformations rebuild pytrees with placeholders, but constructors must not receive any.
     try:
         numbers = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
-        raise ValueError(f"{name} = {value!r} is not a number") from None
+        raise ValueError(f"{name} = {shown(value)} is not a number") from None
     except OverflowError:
         raise ValueError(f"{name} is an integer beyond 1.8e308 and must be finite") from None
     remark = f" ({why})" if why else ""
@@ -141,26 +138,33 @@ def require_scalars(values: dict[str, Any], otherwise: str) -> None:
             raise ValueError(f"{name} must be one number, not of shape {np.shape(value)}; {otherwise}")
 
 
-def require_kind(value: Any, name: str, kind: type, example: str = "") -> None:
+def require_kind(value: Any, name: str, kind: type, example: str = "", several: str = "") -> None:
     """Raise `ValueError` unless a value is of the given kind, such as a `Scene`.
 
     If the value is a module of the same name from another package, such as a stroller's scene for a top, the message
-    names both packages; otherwise it ends in the `example`.
+    names both packages. For a list of values of the kind, the message says what accepts `several`. Otherwise it ends in
+    the `example`.
     """
     if isinstance(value, kind):
         return
     kind_name = kind.__name__.removeprefix("Abstract")
+    if isinstance(value, list | tuple) and value and all(isinstance(part, kind) for part in value):
+        raise ValueError(
+            f"{name} must be one {kind_name}, not a list of {len(value)}" + (f"; {several}" if several else "")
+        )
     if type(value).__name__ == kind_name:
         package_of_value, package_of_kind = (owner.__module__.partition(".")[0] for owner in (type(value), kind))
         raise ValueError(
             f"{name} is a {package_of_value}.{kind_name} and must be a {package_of_kind}.{kind_name}: each package has its own"
         )
-    raise ValueError(f"{name} = {value!r} must be a {kind_name}{example}{uncalled(value)}")
+    raise ValueError(f"{name} = {shown(value)} must be a {kind_name}{example}{uncalled(value)}")
 
 
 def uncalled(value: Any) -> str:
-    """A hint if the value is a function instead of its result, such as `tippe.presets.wooden` for
+    """A hint if the value is a function or a class instead of its result, such as `tippe.presets.wooden` for
     `tippe.presets.wooden()`."""
+    if inspect.isclass(value):
+        return f"; did you mean {value.__name__}(...)?"
     return f"; did you mean {value.__name__}()?" if inspect.isfunction(value) else ""
 
 
@@ -188,7 +192,7 @@ def require_outside(values: Any, caller: str, instead: str) -> None:
 def require_whole(value: Any, name: str, at_least: int) -> None:
     """Raise `ValueError` unless the value is a whole number of at least `at_least`."""
     if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < at_least:
-        raise ValueError(f"{name} = {value!r} must be a whole number of at least {at_least}")
+        raise ValueError(f"{name} = {shown(value)} must be a whole number of at least {at_least}")
 
 
 def require_increasing(values: Any, name: str) -> None:
@@ -215,7 +219,7 @@ def require_increasing(values: Any, name: str) -> None:
 def require_flag(value: Any, name: str) -> None:
     """Raise `ValueError` unless the value is true or false; a word such as "no" would count as true."""
     if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{name} = {value!r} must be True or False")
+        raise ValueError(f"{name} = {shown(value)} must be True or False")
 
 
 def require_folder(path: Path, name: str) -> None:
@@ -233,7 +237,7 @@ def as_path(path: Any, name: str) -> Path:
     try:
         return Path(path)
     except TypeError:
-        raise ValueError(f"{name} = {path!r} must be the path of a file") from None
+        raise ValueError(f"{name} = {shown(path)} must be the path of a file") from None
 
 
 def require_file(path: Any, name: str, *endings: str) -> Path:
@@ -252,6 +256,17 @@ def require_file(path: Any, name: str, *endings: str) -> Path:
     except OSError as error:
         raise OSError(f"{name} = {file}: nothing can be written there: {error.strerror}") from None
     return file
+
+
+def warn(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn at the line of the user's code that led to the warning, so that Python shows the warning once for each such
+    line."""
+    frame = sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in NO_CODE_OF_A_USER:
+        frame = frame.f_back
+    where = frame.f_globals
+    registry = where.setdefault("__warningregistry__", {})
+    warnings.warn_explicit(message, category, frame.f_code.co_filename, frame.f_lineno, where.get("__name__"), registry)
 
 
 def require_package(name: str, extra: str, purpose: str) -> None:
@@ -317,8 +332,7 @@ class Bounded(eqx.Module):
         require_all(self.bounds())
         suspicion = self.suspicion()
         if suspicion is not None:
-            # Warn from one place in the code, so that Python shows each warning once.
-            warnings.warn(suspicion, UserWarning, stacklevel=1)
+            warn(suspicion)
 
     def _require_one_shape(self) -> None:
         """Raise `ValueError` if the module's own numbers are lists of different lengths, or empty."""

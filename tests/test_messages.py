@@ -13,6 +13,8 @@ from tops import rutstam_top
 import nonholonomic
 import stroller
 import tippe
+from nonholonomic.identification.unknown import as_free
+from nonholonomic.validation import shown
 from nonholonomic.views import Page
 
 pytestmark = pytest.mark.newest
@@ -76,6 +78,81 @@ REFUSED = {
         lambda: nonholonomic.Graph(lambda x, y: x if x > 0.0 else y),
         "jnp.where in place of `if`",
     ),
+    "arrays of JAX in a tuple": (
+        lambda: tippe.Launch(0.1, 155.0, place=(jnp.array(1.5), 2.0, 3.0, 4.0)),
+        "place = (1.5, 2.0, 3.0, 4.0) must be (x, y), (mu, eta) or (x, y, z)",
+    ),
+    "a place of three numbers on a ground": (
+        lambda: TOP.check_start(tippe.Launch(0.1, 155.0, place=(1.0,) * 4)),
+        "place = (1.0, 1.0, 1.0, 1.0) must be",
+    ),
+    "a prior of arrays": (
+        lambda: as_free({"mu": tippe.Free(0.3, prior=(jnp.array(0.3), 0.1, np.float64(2.0)))}),
+        "prior of mu = (0.3, 0.1, 2.0) must be a mean and a standard deviation",
+    ),
+    "a number of NumPy": (
+        lambda: stroller.sweep(PRAM, RIDE, 1.0, axes=np.float64(1.0)),
+        "axes = 1.0 must be a dictionary",
+    ),
+    "a function's name": (
+        lambda: nonholonomic.Graph(lambda x, y: x if x > 0.0 else y),
+        "height = <lambda> cannot be traced by JAX",
+    ),
+    "a class for a law": (
+        lambda: tippe.Scene(rutstam_top(), friction=tippe.Viscous),
+        "friction = Viscous must be a Friction law, such as tippe.Viscous(0.3) or tippe.Coulomb(mu=0.3, slip_speed=0.01); "
+        "did you mean Viscous(...)?",
+    ),
+    "a list of launches for a run": (
+        lambda: tippe.simulate(TOP, [LAUNCH, LAUNCH], 1.0),
+        "launch must be one Launch, not a list of 2; jax.vmap(simulate) takes lists, and so does trajectory_table",
+    ),
+    "a list of launches for a ride": (
+        lambda: stroller.simulate(PRAM, (RIDE, RIDE), 1.0),
+        "launch must be one Launch, not a list of 2; axes of sweep take lists",
+    ),
+    "a list of launches for a recording": (
+        lambda: tippe.Recording([LAUNCH], [0.1], [0.1], 0.01),
+        "launch must be one Launch, not a list of 1; identify takes a list of recordings",
+    ),
+    "launches of several numbers": (
+        lambda: tippe.InversionTimes([LAUNCH, tippe.Launch([0.1, 0.2], 100.0)], [1.0, 2.0], 0.1, t1=5.0),
+        "launch: theta must be one number in each of the list, not of shape (2,)",
+    ),
+    "launches of several places": (
+        lambda: tippe.InversionTimes([LAUNCH, tippe.Launch(0.1, 9.0, place=(0.0, 0.0))], [1.0, 2.0], 0.1, t1=5.0),
+        "launch: place must have the same number of coordinates in all, not none, 2",
+    ),
+    "more launches than times": (
+        lambda: tippe.InversionTimes([LAUNCH] * 3, [1.0, 2.0], 0.1, t1=5.0),
+        "launch.theta must be one number or one for each of the 2 times, not of shape (3,)",
+    ),
+    "no launches": (
+        lambda: tippe.InversionTimes([], [1.0, 2.0], 0.1, t1=5.0),
+        "launch = [] must be a Launch or a list of launches",
+    ),
+    "a stroller larger than its sphere": (
+        lambda: stroller.Scene(PRAM.body, stroller.Sphere(0.3), side="inside"),
+        "surface radius = 0.3 must be at least 0.35 (half the wheelbase, as both axles touch the surface)",
+    ),
+    "a stroller larger than its spheroid": (
+        lambda: stroller.Scene(PRAM.body, stroller.Spheroid(0.3, 0.2)),
+        "greater semi-axis of the surface = 0.3 must be at least 0.35",
+    ),
+    "a stroller larger than its torus": (
+        lambda: stroller.Scene(PRAM.body, stroller.Torus(0.15, 0.1)),
+        "surface ring + tube = 0.25 must be at least 0.35",
+    ),
+    "a table called CSV": (
+        lambda: small_table().save("x.csv"),
+        "path = 'x.csv' must end in .h5: the file is in HDF5; for a CSV or Excel file, use to_dataframe().to_csv or .to_excel",
+    ),
+    "a run called a picture": (lambda: run_of_nothing().save("x.PNG"), "path = 'x.PNG' must end in .h5"),
+    "a sweep called CSV": (
+        lambda: tippe.inversion_table(TOP, theta=0.1, spin=155.0, t1=1.0, path="x.csv"),
+        "path = 'x.csv' must end in .h5: the file is in HDF5; for a CSV",
+    ),
+    "a page called a picture": (lambda: Page("").save("x.png"), "path = 'x.png' must end in .html or .htm"),
     "a table inside jit": (
         lambda: jax.jit(lambda mu: tippe.inversion_table(TOP, theta=0.1, spin=155.0, mu=mu, t1=1.0).time)(0.3),
         "inversion_table cannot be called inside jit, vmap or grad: use inversion_time there",
@@ -186,6 +263,33 @@ EMPTY = {
 def test_an_empty_list_is_no_number(name):
     with pytest.raises(ValueError, match=re.escape(f"{name} = [] must be a number, not an empty list")):
         EMPTY[name]()
+
+
+#: Values as messages show them, with the text.
+SHOWN = [
+    (jnp.array(1.5), "1.5"),
+    ([jnp.array(1.5), np.float64(2.0)], "[1.5, 2.0]"),
+    ((1.5,), "(1.5,)"),
+    ({"a": (jnp.array([0.1, 0.2]), None)}, "{'a': ([0.1, 0.2], None)}"),
+    (list(range(20)), "[0, 1, ..., 19, 20 in all]"),
+    (np.array(["x"]), "['x']"),
+    ([[1, 2], [3]], "[[1, 2], [3]]"),
+    (tippe.Viscous(0.3), "Viscous(mu=0.3 s/m)"),
+    (run_of_nothing, "run_of_nothing"),
+    ("a word", "'a word'"),
+    (1.0 + 2.0j, "(1+2j)"),
+]
+
+
+@pytest.mark.parametrize(("value", "text"), SHOWN)
+def test_a_message_shows_numbers_and_no_arrays(value, text):
+    assert shown(value) == text
+
+
+def test_a_message_shows_a_traced_number_as_traced():
+    texts = []
+    jax.jit(lambda x: texts.append(shown((x, 1.0))) or x)(0.3)
+    assert texts == ["(traced float64[], 1.0)"]
 
 
 @pytest.mark.parametrize("name", REFUSED)

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import importlib
 import re
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -66,6 +67,10 @@ SUSPECTED = {
 }
 
 
+#: The lines of the calls above.
+LINES = {line for call, _ in SUSPECTED.values() for *_, line in call.__code__.co_lines()}
+
+
 @pytest.fixture
 def nothing_runs(monkeypatch):
     """What would run says that it was asked to."""
@@ -86,8 +91,22 @@ def table_of_times(times, steps):
 @pytest.mark.parametrize("name", SUSPECTED)
 def test_what_is_legal_and_likely_a_mistake_is_warned_of(name, nothing_runs):
     call, message = SUSPECTED[name]
-    with pytest.warns(UserWarning, match=re.escape(message)):
+    with pytest.warns(UserWarning, match=re.escape(message)) as caught:
         call()
+    # The warning points to the caller's line, one of those above.
+    assert {warning.filename for warning in caught} == {__file__}
+    assert {warning.lineno for warning in caught} <= LINES
+
+
+def test_python_shows_a_warning_once_for_a_line():
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("default")
+        for _ in range(3):
+            tippe.Launch(0.1, 1600.0)
+        assert len(caught) == 1
+        # One from within a method points here, too.
+        tippe.Launch.degrees(5.0, 20000.0)
+    assert [warning.filename for warning in caught] == [__file__] * 2
 
 
 def test_what_is_usual_is_not_suspected(nothing_runs):

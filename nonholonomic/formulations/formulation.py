@@ -13,7 +13,6 @@ use `jax.vmap` for many. The models of the vehicles are faster and do not use th
 """
 
 import abc
-import warnings
 
 import equinox as eqx
 import jax
@@ -22,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..geometry import solve
-from ..validation import as_number, is_traced, require
+from ..validation import as_number, is_traced, require, warn
 from .brackets import Coordinates, lie_brackets
 
 #: Relative violation of the constraints above which a start gives a warning.
@@ -214,9 +213,8 @@ class Multipliers(AbstractFormulation):
         if not is_traced(violation) and violation.size:
             violation_ratio = float(jnp.max(jnp.abs(violation)) / jnp.maximum(jnp.max(jnp.abs(rate)), 1e-300))
             if violation_ratio > START_TOLERANCE:
-                warnings.warn(
-                    f"the velocity violates the constraints by a relative {violation_ratio:.1e} and is projected onto them",
-                    stacklevel=2,
+                warn(
+                    f"the velocity violates the constraints by a relative {violation_ratio:.1e} and is projected onto them"
                 )
         return jnp.concatenate([q, self.projected(q, self.system.metric(q) @ rate)])
 

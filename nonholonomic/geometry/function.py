@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import eval_jaxpr
 from jaxtyping import Array, Float
 
-from ..validation import UNTRACEABLE, as_number, is_traced
+from ..validation import UNTRACEABLE, as_number, is_traced, shown
 
 
 class Plain(eqx.Module):
@@ -116,23 +116,23 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module
     **Raises:** `ValueError` unless the function returns one number for numbers.
     """
     if not callable(value):
-        raise ValueError(f"{name} = {value!r} must be a function of ({', '.join(arguments)})")
+        raise ValueError(f"{name} = {shown(value)} must be a function of ({', '.join(arguments)})")
     if isinstance(value, eqx.Module):
         value = jax.tree.map(lambda leaf: as_number(leaf) if isinstance(leaf, float | np.ndarray) else leaf, value)
     zeros = (jnp.zeros(()),) * len(arguments)
     try:
         traced = jax.make_jaxpr(value)(*zeros)
     except jax.errors.JAXTypeError as error:
-        raise ValueError(f"{name} = {value!r} {UNTRACEABLE}") from error
+        raise ValueError(f"{name} = {shown(value)} {UNTRACEABLE}") from error
     except TypeError as error:
-        raise ValueError(f"{name} = {value!r} must be a function of ({', '.join(arguments)}): {error}") from error
+        raise ValueError(f"{name} = {shown(value)} must be a function of ({', '.join(arguments)}): {error}") from error
     # The parameters of a module may have one value per lane.
     shapes = {(), *(leaf.shape for leaf in jax.tree.leaves(value) if eqx.is_array(leaf))}
     results = traced.out_avals
     if len(results) != 1 or results[0].shape not in shapes or not jnp.issubdtype(results[0].dtype, jnp.floating):
         names_of_results = ", ".join(map(str, results))
         raise ValueError(
-            f"{name} = {value!r} must return one number for numbers {', '.join(arguments)}, not {names_of_results}"
+            f"{name} = {shown(value)} must return one number for numbers {', '.join(arguments)}, not {names_of_results}"
         )
     if isinstance(value, eqx.Module):
         # If the parameters have one number per lane, so have the results.

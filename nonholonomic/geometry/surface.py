@@ -18,7 +18,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 
-from ..validation import Bound, Bounded
+from ..validation import Bound, Bounded, shown
 from .vector import Component, Vector, dot, scale, subtract
 
 Place = tuple[Any, ...]
@@ -160,7 +160,7 @@ class AbstractSurface(Bounded):
         if len(place) not in (count, 3):
             names = ", ".join(f"{name} [{unit}]" for name, unit in self.coordinates)
             three = "" if count == 3 else " or (x [m], y [m], z [m])"
-            raise ValueError(f"place = {place!r} must be ({names}){three} on a {type(self).__name__}")
+            raise ValueError(f"place = {shown(place)} must be ({names}){three} on a {type(self).__name__}")
         if len(place) == 3:
             distance = self.offset(self.in_own_axes((place[0], place[1], place[2])))
             tolerance = ROUND_OFF * (size + jnp.sqrt(place[0] ** 2 + place[1] ** 2 + place[2] ** 2))
@@ -180,10 +180,10 @@ class AbstractSurface(Bounded):
             return self.sides.get(closed, next(iter(self.sides.values())))
         words = (*CLOSED, *OPEN, *DIVIDED)
         if not isinstance(side, str) or side not in words:
-            raise ValueError(f"side = {side!r} must be one of {', '.join(map(repr, words))}, or None")
+            raise ValueError(f"side = {shown(side)} must be one of {', '.join(map(repr, words))}, or None")
         if side not in self.sides:
             # On a surface without this side, all words have the same meaning.
-            raise ValueError(f"side = {side!r} must be {next(iter(self.sides))!r} on a {type(self).__name__}")
+            raise ValueError(f"side = {shown(side)} must be {next(iter(self.sides))!r} on a {type(self).__name__}")
         return self.sides[side]
 
     def in_fixed_frame(self, vector: Vector) -> tuple[Any, Any, Any]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..validation import as_path, require
+from ..validation import as_path, require, shown
 from .recording import Quantities
 
 #: Value of each unit in the SI unit of the same dimension.
@@ -65,7 +65,7 @@ def read_columns(path: Any, columns: Any, fps: float | None, error: Any, quantit
     array([0.9, 0.8])
     """
     if not isinstance(columns, Mapping) or not columns:
-        raise ValueError(f"columns = {columns!r} must be a dictionary, such as {{'theta': ('tilt', 'deg')}}")
+        raise ValueError(f"columns = {shown(columns)} must be a dictionary, such as {{'theta': ('tilt', 'deg')}}")
     table = _table(as_path(path, "path"))
     names = quantities.of(tuple(name for name in columns if name not in ("time", "frame")))
     for name in columns:
@@ -77,7 +77,7 @@ def read_columns(path: Any, columns: Any, fps: float | None, error: Any, quantit
     errors = None
     if error is not None:
         if not isinstance(error, Mapping) or set(error) != set(names):
-            raise ValueError(f"error = {error!r} must be a dictionary with {', '.join(names)}, or None")
+            raise ValueError(f"error = {shown(error)} must be a dictionary with {', '.join(names)}, or None")
         units = quantities.units
         errors = np.stack([_errors(table, name, error[name], units[name], path) for name in names], axis=1)[mask]
     if len(names) == 1:
@@ -106,7 +106,7 @@ def _times(table: dict[str, list[str]], columns: Mapping[str, Any], fps: Any, pa
     if fps is not None:
         require(fps, "fps", above=0.0)
         if "time" in columns:
-            raise ValueError(f"fps = {fps!r} must be omitted because 'time' is among the columns")
+            raise ValueError(f"fps = {shown(fps)} must be omitted because 'time' is among the columns")
         if "frame" not in columns:
             return np.arange(len(next(iter(table.values())))) / float(fps)
         return _column(table, "frame", columns["frame"], "1", path) / float(fps)
@@ -141,12 +141,14 @@ def _errors(table: dict[str, list[str]], name: str, header_and_unit: Any, si: st
 def _parts(name: str, header_and_unit: Any, si: str) -> tuple[Any, float]:
     """The header (or, for an error, possibly a number), and the factor that converts the file's numbers to SI units."""
     if not isinstance(header_and_unit, tuple) or len(header_and_unit) != 2:
-        raise ValueError(f"columns: {name!r} = {header_and_unit!r} must be (header, unit), such as ('tilt', 'deg')")
+        raise ValueError(
+            f"columns: {name!r} = {shown(header_and_unit)} must be (header, unit), such as ('tilt', 'deg')"
+        )
     first, unit = header_and_unit
     factors = UNITS[si]
     if isinstance(unit, str):
         if unit not in factors:
-            raise ValueError(f"unit of {name} = {unit!r} must be one of {', '.join(factors)}, or a number of {si}")
+            raise ValueError(f"unit of {name} = {shown(unit)} must be one of {', '.join(factors)}, or a number of {si}")
         return first, factors[unit]
     require(unit, f"unit of {name}")
     return first, float(unit)

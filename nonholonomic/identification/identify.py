@@ -1,6 +1,5 @@
 """Estimate parameters by maximum likelihood, with errors and undetermined combinations."""
 
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -8,7 +7,7 @@ import jax
 import numpy as np
 
 from ..progress import status_line
-from ..validation import require, require_flag, require_whole
+from ..validation import require, require_flag, require_whole, shown, warn
 from .levenberg_marquardt import Ends, minimise
 from .likelihood import Measurements, down_weighted, estimated_errors
 from .problem import Linearised, Problem, linearise
@@ -77,7 +76,7 @@ def identify(
     check_search(starts, spread, seed, max_steps, progress)
     step, unknowns = step_of(slopes), as_free(free)
     if not isinstance(measurements, Measurements) or measurements.value.ndim != 1:
-        raise ValueError(f"measurements = {measurements!r} must be Measurements of shape (n,)")
+        raise ValueError(f"measurements = {shown(measurements)} must be Measurements of shape (n,)")
     count = measurements.value.size
     labels = tuple(f"#{i + 1}" for i in range(count)) if labels is None else tuple(labels)
     if len(labels) != count:
@@ -100,7 +99,7 @@ def identify(
             raise ValueError("model: no start led to finite predictions")
         result = summarise(problem, measurements, labels, start_points, ends.coordinates, ends.converged, at_ends)
     if not result.verdict.good:
-        warnings.warn("; ".join(result.verdict.concerns), FitWarning, stacklevel=2)
+        warn("; ".join(result.verdict.concerns), FitWarning)
     return result
 
 
@@ -149,5 +148,5 @@ def step_of(slopes: str) -> float | None:
     """
     ways = {"exact": None, "differences": DIFFERENCE}
     if slopes not in ways:
-        raise ValueError(f"slopes = {slopes!r} must be one of {', '.join(map(repr, ways))}")
+        raise ValueError(f"slopes = {shown(slopes)} must be one of {', '.join(map(repr, ways))}")
     return ways[slopes]

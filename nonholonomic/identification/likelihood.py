@@ -10,7 +10,7 @@ import numpy as np
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Bool, Float, Int
 
-from ..validation import require
+from ..validation import require, shown
 
 #: Residual of a measurement for which the model has no prediction: a penalty without a slope.
 MISSING = 1e4
@@ -85,7 +85,7 @@ class Measurements(eqx.Module):
         upper = np.where(censored, np.inf, value) if upper is None else np.broadcast_to(upper, shape)
         require(value[~(np.isneginf(value) & np.isfinite(upper))], "value")
         if np.any(np.isnan(upper)) or np.any(upper < value):
-            raise ValueError(f"upper = {upper!r} must be at least value")
+            raise ValueError(f"upper = {shown(upper)} must be at least value")
         for name in ("period", "student"):
             if not np.all(np.asarray(arguments[name]) > 0.0):
                 raise ValueError(f"{name} = {arguments[name]!r} must be positive, or infinite")

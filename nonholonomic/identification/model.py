@@ -11,6 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from ..validation import shown
 from .data import joined, of_data
 from .identify import check_search, identify
 from .result import Identification
@@ -73,7 +74,7 @@ def as_sources(data: Any, kinds: Any, expected: str) -> tuple[Any, ...]:
     """
     sources = tuple(data) if isinstance(data, list | tuple) else (data,)
     if not sources or not all(isinstance(source, kinds) for source in sources):
-        raise ValueError(f"data = {data!r} must be {expected}, or a list of them")
+        raise ValueError(f"data = {shown(data)} must be {expected}, or a list of them")
     return sources
 
 

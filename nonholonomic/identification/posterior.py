@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..progress import status_line
-from ..validation import require
+from ..validation import require, shown
 from .likelihood import Measurements
 from .problem import Problem
 from .unknown import as_free
@@ -71,7 +71,7 @@ class LogDensity(eqx.Module):
             if not callable(prior):
                 if np.shape(prior) != (2,):
                     raise ValueError(
-                        f"priors: {name!r} = {prior!r} must be a mean and a standard deviation, or a function"
+                        f"priors: {name!r} = {shown(prior)} must be a mean and a standard deviation, or a function"
                     )
                 require(prior[1], f"standard deviation of the prior of {name}", above=0.0)
         series, estimated = np.asarray(measurements.series), np.asarray(measurements.estimated)

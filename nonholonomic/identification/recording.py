@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..parameters import numbers, one_line, with_numbers
-from ..validation import as_number, as_number_or_none, require
+from ..validation import as_number, as_number_or_none, require, shown
 from ..xla_cpu import greatest
 from .likelihood import Measurements
 
@@ -55,10 +55,10 @@ class Quantities:
         for word in words:
             columns_of_name = {**self.columns, **{name: (name,) for name in self.units}}
             if not isinstance(word, str) or word not in columns_of_name:
-                raise ValueError(f"quantity = {word!r} must be one of {', '.join(map(repr, columns_of_name))}")
+                raise ValueError(f"quantity = {shown(word)} must be one of {', '.join(map(repr, columns_of_name))}")
             columns += columns_of_name[word]
         if not columns or len(set(columns)) < len(columns):
-            raise ValueError(f"quantity = {quantity!r} must name at least one column, and each only once")
+            raise ValueError(f"quantity = {shown(quantity)} must name at least one column, and each only once")
         return tuple(columns)
 
     def samples(self, run: Any, column: str) -> Float[Array, " times"]:
@@ -121,7 +121,7 @@ class AbstractRecording(eqx.Module):
         require(self.times, "times")
         times = np.asarray(self.times, dtype=float)
         if times.ndim != 1 or not len(times) or np.any(np.diff(times) <= 0.0):
-            raise ValueError(f"times = {self.times!r} must be an increasing list")
+            raise ValueError(f"times = {shown(self.times)} must be an increasing list")
         require(self.t0, "t0", below=times[-1], why="the last time")
         shape = (len(times), len(self.columns)) if len(self.columns) > 1 else (len(times),)
         if np.shape(self.value) != shape:

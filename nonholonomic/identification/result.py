@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from ..parameters import full_name, text_as_html
 from ..progress import status_line
-from ..validation import require_package
+from ..validation import require_package, shown
 from ..views import draw_fit
 from .levenberg_marquardt import minimise
 from .likelihood import Measurements
@@ -170,7 +170,9 @@ class Identification:
             values = np.asarray(free.value(jnp.asarray(self.coordinates[k] + np.linspace(-reach, reach, 13))))
         values = np.atleast_1d(np.asarray(values, float))
         if not np.all((values > free.lower) & (values < free.upper)):
-            raise ValueError(f"values = {values!r} must lie within the bounds ({free.lower}, {free.upper}) of {name!r}")
+            raise ValueError(
+                f"values = {shown(values)} must lie within the bounds ({free.lower}, {free.upper}) of {name!r}"
+            )
         starts = np.tile(self.coordinates, (len(values), 1))
         starts[:, k] = np.asarray(free.coordinate(values))
         ends = minimise(self.problem, starts, self.measurements, fixed=k)

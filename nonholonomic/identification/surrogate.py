@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..validation import shown
 from .posterior import LogDensity
 
 #: Highest degree of the polynomials, and their greatest number of terms. To respect this number, the degree is lowered,
@@ -58,7 +59,7 @@ class Surrogate(eqx.Module):
                 f"covariance must be finite and of shape {(numbers, numbers)}: the data do not determine all numbers"
             )
         if np.shape(centre) != (numbers,):
-            raise ValueError(f"centre = {centre!r} must be of shape {(numbers,)}")
+            raise ValueError(f"centre = {shown(centre)} must be of shape {(numbers,)}")
         series, estimated = np.asarray(density.measurements.series), np.asarray(density.measurements.estimated)
         sizes = [math.sqrt(0.5 / np.sum(estimated & (series == number))) for number in density.open_series]
         root = np.zeros((numbers + len(sizes),) * 2)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..validation import require
+from ..validation import require, shown
 
 
 class Free(NamedTuple):
@@ -123,7 +123,7 @@ def as_free(free: Any, lower: dict[str, float] | None = None) -> dict[str, Free]
     **Raises:** `ValueError` that names the unknown and the problem.
     """
     if not isinstance(free, dict) or not free:
-        raise ValueError(f"free = {free!r} must be a non-empty dictionary, name of a number -> start value")
+        raise ValueError(f"free = {shown(free)} must be a non-empty dictionary, name of a number -> start value")
     unknowns = {}
     for name, start in free.items():
         unknown = start if isinstance(start, Free) else Free(start)
@@ -135,7 +135,7 @@ def as_free(free: Any, lower: dict[str, float] | None = None) -> dict[str, Free]
         require(unknown.start, f"start of {name}", above=unknown.lower, below=unknown.upper, why="the bounds")
         if unknown.prior is not None:
             if np.shape(unknown.prior) != (2,):
-                raise ValueError(f"prior of {name} = {unknown.prior!r} must be a mean and a standard deviation")
+                raise ValueError(f"prior of {name} = {shown(unknown.prior)} must be a mean and a standard deviation")
             require(unknown.prior[0], f"mean of the prior of {name}")
             require(unknown.prior[1], f"standard deviation of the prior of {name}", above=0.0)
         unknowns[name] = unknown._replace(

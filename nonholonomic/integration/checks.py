@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..parameters import numbers
-from ..validation import Bound, legal, require_all, require_increasing, require_kind, require_scalars
+from ..validation import Bound, legal, require_all, require_increasing, require_kind, require_scalars, shown
 
 #: The least and the greatest relative tolerance: below this range, round-off would control the steps; above it, the
 #: steps are hardly controlled.
@@ -93,7 +93,7 @@ def require_run(scene: Any, launch: Any, t1: Any, tolerance: Any, kinds: tuple[t
     ValueError: t1 = -1.0 ...
     """
     require_kind(scene, "scene", kinds[0])
-    require_kind(launch, "launch", kinds[1])
+    require_kind(launch, "launch", kinds[1], several=lists)
     require_all(run_bounds(t1, tolerance))
     values = numbers("scene", scene, functions=False) | numbers("launch", launch) | {"t1": t1, "tolerance": tolerance}
     require_scalars(values, lists)
@@ -127,7 +127,7 @@ def require_adaptive(solver: Any, others: str = "") -> None:
     adaptive = isinstance(solver, diffrax.AbstractAdaptiveSolver) and isinstance(structure, type)
     if solver is not None and not adaptive:
         raise ValueError(
-            f"solver = {solver!r} must be an adaptive solver of Diffrax for ordinary differential equations, such as "
+            f"solver = {shown(solver)} must be an adaptive solver of Diffrax for ordinary differential equations, such as "
             f"Dopri8(){others}"
         )
 
@@ -142,4 +142,6 @@ def require_adjoint(adjoint: Any) -> None:
     >>> require_adjoint(diffrax.DirectAdjoint())
     """
     if not isinstance(adjoint, diffrax.AbstractAdjoint | None):
-        raise ValueError(f"adjoint = {adjoint!r} must be one of Diffrax, such as RecursiveCheckpointAdjoint(), or None")
+        raise ValueError(
+            f"adjoint = {shown(adjoint)} must be one of Diffrax, such as RecursiveCheckpointAdjoint(), or None"
+        )

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..validation import shown
 from ..xla_cpu import written_by_component, written_in_place
 
 Lanes = Float[Array, " lanes"]
@@ -54,7 +55,9 @@ def explicit_tableau(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau:
     """
     tableau = getattr(solver, "tableau", None)
     if not isinstance(solver, diffrax.AbstractERK) or not isinstance(tableau, diffrax.ButcherTableau):
-        raise ValueError(f"solver = {solver!r} must be an explicit Runge-Kutta solver of Diffrax, such as Dopri8()")
+        raise ValueError(
+            f"solver = {shown(solver)} must be an explicit Runge-Kutta solver of Diffrax, such as Dopri8()"
+        )
     return tableau
 
 
@@ -65,7 +68,7 @@ def explicit_order(solver: diffrax.AbstractSolver) -> int:
     """
     order = solver.order(None)
     if order is None:
-        raise ValueError(f"solver = {solver!r} must have an order, as Dopri8() has")
+        raise ValueError(f"solver = {shown(solver)} must have an order, as Dopri8() has")
     return order
 
 

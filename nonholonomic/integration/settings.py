@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
-from ..validation import as_number
+from ..validation import as_number, shown
 from .oscillatory import Oscillatory8
 
 #: The absolute tolerance as a fraction of the relative one, in units of a problem's own magnitudes.
@@ -59,8 +59,8 @@ class Settings(eqx.Module):
         """
         if isinstance(self.solver, Oscillatory8):
             raise ValueError(
-                f"solver = {self.solver!r} must have a dense output as accurate as its steps, as Dopri8() has, where Diffrax "
-                "integrates"
+                f"solver = {shown(self.solver)} must have a dense output as accurate as its steps, as Dopri8() has, where "
+                "Diffrax integrates"
             )
         return self.for_steps_alone
 

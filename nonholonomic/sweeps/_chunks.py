@@ -5,7 +5,6 @@ import contextlib
 import json
 import os
 import shutil
-import warnings
 import zipfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -18,8 +17,8 @@ except ImportError:  # not a POSIX system
 
 import numpy as np
 
-from ..validation import as_path
-from ._file import Stored, replacing, sync_folder, write_file
+from ..validation import warn
+from ._file import Stored, replacing, sync_folder, table_path, write_file
 from .layout import Layout, Values
 
 
@@ -43,7 +42,7 @@ class ChunkStore:
         **Raises:** `OSError` that names the path if it cannot be read or written; `ValueError` that names the first
         difference if it holds the result of another request or of another version of this package.
         """
-        self.path = as_path(path, "path")
+        self.path = table_path(path)
         self.folder, self.layout = folder_of(self.path), layout
         self._lock = self._locked()
         try:
@@ -80,10 +79,9 @@ class ChunkStore:
         for part in self.folder.glob("*.part"):
             part.unlink()
         if damaged:
-            warnings.warn(
+            warn(
                 f"{self.path} is damaged: {len(damaged)} finished chunks do not match their checksums and are computed again",
                 RuntimeWarning,
-                stacklevel=6,
             )
 
     def _begin(self, header: Path) -> None:
@@ -131,7 +129,7 @@ class ChunkStore:
         changed = [name for name in new if name not in ("nonholonomic", "python") and old.get(name) != new[name]]
         if changed and table.path != self.path:
             versions = ", ".join(f"{name} {old.get(name)}, now {new[name]}" for name in changed)
-            warnings.warn(f"{self.path} was begun with {versions}: digits may differ", RuntimeWarning, stacklevel=7)
+            warn(f"{self.path} was begun with {versions}: digits may differ", RuntimeWarning)
 
     def filled(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> Stored:
         """Store each chunk when it is computed, and write the table's file from these and from the existing chunks.

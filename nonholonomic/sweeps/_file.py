@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..integration.status import FORMER_WORDS
+from ..validation import as_path
 from .layout import PENDING, UNREACHED, Layout, Values, boxes
 
 if TYPE_CHECKING:
@@ -33,6 +34,39 @@ INNER = "inner"
 
 #: Variables of tables larger than this [bytes] are read only when needed.
 MAX_BYTES_IN_MEMORY = 1 << 27
+
+
+#: Endings of files in other formats, which a table's file must not have.
+OTHER_FORMATS = (
+    ".csv",
+    ".tsv",
+    ".txt",
+    ".dat",
+    ".xls",
+    ".xlsx",
+    ".ods",
+    ".json",
+    ".npy",
+    ".npz",
+    ".mat",
+    ".pkl",
+    ".parquet",
+)
+OTHER_FORMATS += (".html", ".htm", ".png", ".jpg", ".svg", ".pdf", ".gif", ".mp4", ".zip", ".zarr")
+
+
+def table_path(path: Any) -> Path:
+    """The path of a table's file.
+
+    **Raises:** `ValueError` for a value that is no path, or whose ending belongs to another format.
+    """
+    file = as_path(path, "path")
+    if file.suffix.lower() in OTHER_FORMATS:
+        raise ValueError(
+            f"path = {str(path)!r} must end in .h5: the file is in HDF5; for a CSV or Excel file, use to_dataframe().to_csv or "
+            ".to_excel"
+        )
+    return file
 
 
 @contextlib.contextmanager

@@ -13,7 +13,7 @@ from typing import Any
 
 import jax
 
-from ..validation import require
+from ..validation import require, shown
 
 
 @contextlib.contextmanager
@@ -42,7 +42,7 @@ def local_processes(n: int, threads: int = 1) -> Iterator[Executor]:
     for name, value in (("n", n), ("threads", threads)):
         require(value, name, at_least=1)
         if value != int(value):
-            raise ValueError(f"{name} = {value!r} must be a whole number")
+            raise ValueError(f"{name} = {shown(value)} must be a whole number")
     executor = LocalProcesses(int(n), int(threads))
     try:
         yield executor

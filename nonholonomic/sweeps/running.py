@@ -5,7 +5,6 @@ import functools
 import json
 import os
 import uuid
-import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import Any
@@ -16,7 +15,7 @@ import numpy as np
 
 from ..compiled_programs import forget_programs_if_many
 from ..progress import Progress
-from ..validation import require_flag
+from ..validation import require_flag, shown, warn
 from ._chunks import ChunkStore, with_spaces
 from ._file import LONG_NAMES, Stored
 from ._interrupts import no_interrupt_lost
@@ -82,7 +81,7 @@ def sweep(
     """
     require_flag(progress, "progress")
     if executor is not None and not isinstance(executor, Executor):
-        raise ValueError(f"executor = {executor!r} must be a concurrent.futures.Executor, or None")
+        raise ValueError(f"executor = {shown(executor)} must be a concurrent.futures.Executor, or None")
     cells = size_of(axes)
     chunk_size = chunk_for(cells) if chunk is None else chunk
     chunk_size = chunk_size if most is None else min(chunk_size, most)
@@ -236,10 +235,9 @@ def failed_chunk(axes: list[Axis], layout: Layout, chunk: int) -> dict[str, Valu
     first, end = layout.ends(chunk)
     ends = [columns(axes, cell, 1) for cell in (first, end - 1)]
     ranges = ", ".join(f"{name} {ends[0][name].item():.6g} to {ends[1][name].item():.6g}" for name in ends[0])
-    warnings.warn(
+    warn(
         f"cells {first} to {end - 1} ({ranges}) are given up as failed: they killed {MAX_CRASHES} workers or more",
         RuntimeWarning,
-        stacklevel=4,
     )
     (words,) = layout.words.values()
     return layout.empty(end - first, words.index("failed"))

@@ -9,10 +9,10 @@ import equinox as eqx
 import numpy as np
 
 from ..parameters import as_html, readable_unit
-from ..validation import as_path, require_package
+from ..validation import as_path, require_package, shown
 from ..views import draw_table
 from ._chunks import unfinished
-from ._file import LONG_NAMES, MAX_BYTES_IN_MEMORY, Stored, StoredVariables, coded, replacing, write_file
+from ._file import LONG_NAMES, MAX_BYTES_IN_MEMORY, Stored, StoredVariables, coded, replacing, table_path, write_file
 from .digits import concise_strings
 from .layout import UNREACHED, Layout, Values, axes_of
 
@@ -190,9 +190,10 @@ class Table(eqx.Module):
     def save(self, path: Any) -> None:
         """Write the table to an HDF5 file that `xarray.open_dataset(path, engine="h5netcdf")` opens.
 
-        **Raises:** `OSError` that names the path if the file cannot be written.
+        **Raises:** `OSError` that names the path if the file cannot be written; `ValueError` for the ending of another
+        format, such as .csv.
         """
-        file = as_path(path, "path")
+        file = table_path(path)
         if isinstance(self.variables, StoredVariables):
             with replacing(file) as scratch:
                 shutil.copyfile(self.variables.stored.path, scratch)
@@ -249,7 +250,7 @@ class Table(eqx.Module):
         for name in (variable, f"{variable}_error"):
             if name not in self.variables:
                 raise ValueError(
-                    f"variable = {variable!r}: the table has no {name!r}; it has {', '.join(self.variables)}"
+                    f"variable = {shown(variable)}: the table has no {name!r}; it has {', '.join(self.variables)}"
                 )
         values, errors = self.variables[variable], self.variables[f"{variable}_error"]
         return concise_strings(values, errors, self.variables.get("status", values))
@@ -275,7 +276,7 @@ class Table(eqx.Module):
         """
         require_package("matplotlib", "plot", "plot")
         if not isinstance(at, dict | None):
-            raise ValueError(f"at = {at!r} must be a dictionary, name of an axis -> its value")
+            raise ValueError(f"at = {shown(at)} must be a dictionary, name of an axis -> its value")
         return draw_table(self, variable, at or {}, log, ax)
 
     @property

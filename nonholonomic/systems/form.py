@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..validation import UNTRACEABLE
+from ..validation import UNTRACEABLE, shown
 from .mode import Hybrid, State
 from .tracing import depends_on_first, is_elementary, spelled_out
 
@@ -177,9 +177,9 @@ def _require_pair(form: Form, mode: int, result: Any) -> None:
     """Raise `ValueError` unless a reset returns a state and a whole number."""
     expected = f"modes[{mode}].reset(t, y) must return (state, number of the next mode)"
     if not isinstance(result, tuple) or len(result) != 2:
-        raise ValueError(f"{expected}, not {result!r}")
+        raise ValueError(f"{expected}, not {shown(result)}")
     state, number = (jax.eval_shape(lambda part=part: part) if callable(part) else part for part in result)
     if getattr(state, "shape", None) != (form.size,):
         raise ValueError(f"{expected}; its state has the shape {getattr(state, 'shape', state)}, not ({form.size},)")
     if getattr(number, "shape", None) != () or not jnp.issubdtype(number.dtype, jnp.integer):
-        raise ValueError(f"{expected}; its number is {number!r}, not a whole number")
+        raise ValueError(f"{expected}; its number is {shown(number)}, not a whole number")

@@ -25,7 +25,7 @@ from ..identification import (
 )
 from ..integration.checks import tolerance_bound
 from ..progress import status_line
-from ..validation import as_number, as_number_or_none
+from ..validation import as_number, as_number_or_none, shown
 from .mode import Hybrid
 from .numbers import Named, check_again, require_apart
 from .simulate import simulate
@@ -41,7 +41,7 @@ class Components(Quantities):
         unknown_names = [name for name in names if not (isinstance(name, str) and re.fullmatch(r"(y|q|rate)\d+", name))]
         if unknown_names or not names or len(set(names)) < len(names):
             raise ValueError(
-                f"quantity = {quantity!r} must name components, such as 'y0' or ('q0', 'rate0'), each once"
+                f"quantity = {shown(quantity)} must name components, such as 'y0' or ('q0', 'rate0'), each once"
             )
         return names
 
@@ -166,7 +166,9 @@ def identify(
         check_run(system, recording.launch, recording.times[-1], tolerance)
         names = run_of(system, recording.launch, None).names
         if not set(recording.columns) <= set(names):
-            raise ValueError(f"quantity = {recording.quantity!r} must name components of the state: {', '.join(names)}")
+            raise ValueError(
+                f"quantity = {shown(recording.quantity)} must name components of the state: {', '.join(names)}"
+            )
     tolerance_bound(tolerance).require()
     if isinstance(system, Hybrid):
         system = dataclasses.replace(system, event=None)

@@ -7,6 +7,8 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from ..validation import shown
+
 State = Float[Array, " components"]
 
 #: The event function, of time [s] and state; the event happens when it falls through zero.
@@ -115,6 +117,8 @@ class Hybrid(eqx.Module):
             problem = f"modes holds {illegal[0]!r}" if illegal else "modes is empty"
             raise ValueError(f"{problem}: it must hold one AbstractMode or more, such as [Flying(), Sliding()]")
         if self.event is not None and not callable(self.event):
-            raise ValueError(f"event = {self.event!r} must be a function event(t, y) of time and state, or None")
+            raise ValueError(f"event = {shown(self.event)} must be a function event(t, y) of time and state, or None")
         if not isinstance(self.first, int) or not 0 <= self.first < len(self.modes):
-            raise ValueError(f"first = {self.first!r} must be the number of a mode, from 0 to {len(self.modes) - 1}")
+            raise ValueError(
+                f"first = {shown(self.first)} must be the number of a mode, from 0 to {len(self.modes) - 1}"
+            )

@@ -19,7 +19,7 @@ from ..integration import Outcome, Settings, explicit_tableau, solve_ensemble
 from ..integration.status import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED
 from ..sweeps import Table, Variable, axis, chunk_for, size_of
 from ..sweeps import sweep as computed
-from ..validation import as_number
+from ..validation import as_number, shown
 from .engine import Cells
 from .mode import Event, Hybrid
 from .numbers import Named, check_again, has_checks, require_apart, short_names
@@ -95,7 +95,7 @@ def sweep(
     """
     check_run(system, start, t1, tolerance)
     if not isinstance(axes, dict) or not all(isinstance(name, str) for name in axes):
-        raise ValueError(f"axes = {axes!r} must be a dictionary, name of a number -> values")
+        raise ValueError(f"axes = {shown(axes)} must be a dictionary, name of a number -> values")
     settings = Settings(tolerance, solver)
     explicit_tableau(settings.for_lanes)
     if isinstance(system, Hybrid) and event is not None:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from ..formulations import AbstractFormulation, AbstractSystem, Hamel, Lagrange
 from ..integration.checks import run_bounds
-from ..validation import UNTRACEABLE, as_number, is_traced, require, require_all
+from ..validation import UNTRACEABLE, as_number, is_traced, require, require_all, shown
 from .engine import Cells
 from .form import Form
 from .mode import AbstractMode, Event, Hybrid, State
@@ -100,7 +100,7 @@ def check_run(system: Any, start: Any, t1: Any, tolerance: Any) -> None:
     tolerance."""
     if not isinstance(system, Hybrid | AbstractSystem):
         hint = "; wrap modes in nonholonomic.Hybrid([...])" if isinstance(system, AbstractMode) else ""
-        raise ValueError(f"system = {system!r} must be a Hybrid or an AbstractSystem{hint}")
+        raise ValueError(f"system = {shown(system)} must be a Hybrid or an AbstractSystem{hint}")
     if isinstance(system, AbstractSystem):
         _check_mechanical_start(system, start)
     else:
@@ -156,7 +156,7 @@ def _check_mechanical_functions(form: Form) -> None:
 
 def _check_mechanical_start(system: AbstractSystem, start: Any) -> None:
     if not isinstance(start, tuple | list) or len(start) != 2:
-        raise ValueError(f"start = {start!r} must be a pair (q, rate) of coordinates and their rates")
+        raise ValueError(f"start = {shown(start)} must be a pair (q, rate) of coordinates and their rates")
     for name, part in zip(("q", "rate"), start, strict=True):
         _check_vector(part, f"start: {name}", system.dimension)
     _check_mechanical_functions(Form.of(Hybrid([MechanicalMode(Lagrange(system))]), 2 * system.dimension)[0])

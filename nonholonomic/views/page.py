@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..validation import as_path
+from ..validation import require_file
 from .stage import Mesh, Show, Stage, css, finite
 
 #: Selectable speeds of time.
@@ -47,9 +47,9 @@ class Page(NamedTuple):
     def save(self, path: Any) -> None:
         """Write the page to a file.
 
-        **Raises:** `OSError` if it cannot be written.
+        **Raises:** `OSError` if it cannot be written; `ValueError` unless the name ends in .html.
         """
-        as_path(path, "path").write_text(self.html, encoding="utf-8")
+        require_file(path, "path", ".html", ".htm").write_text(self.html, encoding="utf-8")
 
     def _repr_html_(self) -> str:
         style = "width:100%;height:820px;border:0"

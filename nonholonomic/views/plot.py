@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..parameters import likely, readable_unit
+from ..validation import shown
 
 #: Colours of map cells without a finite value, one for each status.
 GREYS = ("0.85", "0.7", "0.55", "0.4", "0.25")
@@ -93,7 +94,7 @@ def draw_table(
     if values is None or values.dtype.kind == "U":
         names = [name for name, values in table.variables.items() if values.dtype.kind != "U"]
         raise ValueError(
-            f"variable = {variable!r} must be a numeric variable of the table: {', '.join(names)}{likely(variable, names)}"
+            f"variable = {shown(variable)} must be a numeric variable of the table: {', '.join(names)}{likely(variable, names)}"
         )
     dims = table.dims(variable)
     if not dims:
@@ -135,7 +136,7 @@ def _drawn(table: Labelled, variable: str, at: dict[str, float]) -> tuple[list[s
         coordinate = table.coords[name]
         if coordinate.dtype.kind == "U":
             if value not in coordinate:
-                raise ValueError(f"at: {name} = {value!r} must be one of {', '.join(coordinate)}")
+                raise ValueError(f"at: {name} = {shown(value)} must be one of {', '.join(coordinate)}")
             cut[name] = int(np.flatnonzero(coordinate == value)[0])
         else:
             cut[name] = int(np.argmin(np.abs(coordinate - value)))
@@ -143,7 +144,7 @@ def _drawn(table: Labelled, variable: str, at: dict[str, float]) -> tuple[list[s
     # A quantity with its own dimension, such as time, is drawn over that dimension.
     left = [name for name in (*dims[cells:], *dims[:cells]) if name not in cut]
     if not left:
-        raise ValueError(f"at = {at!r} leaves no axis to draw over")
+        raise ValueError(f"at = {shown(at)} leaves no axis to draw over")
     return left[:2], cut | {name: 0 for name in left[2:]}
 
 

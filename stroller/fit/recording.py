@@ -6,7 +6,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from nonholonomic.identification import AbstractRecording, Quantities, as_quantity, read_columns
-from nonholonomic.validation import as_number, as_number_or_none
+from nonholonomic.validation import as_number, as_number_or_none, require_kind
 
 from ..model.input import Input
 from ..model.launch import Launch
@@ -55,6 +55,9 @@ class Recording(AbstractRecording):
     t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     quantities: ClassVar[Quantities] = QUANTITIES
+
+    def __check_init__(self):
+        require_kind(self.launch, "launch", Launch, several="identify takes a list of recordings")
 
 
 def read_recording(

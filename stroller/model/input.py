@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Vector
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, shown
 
 
 class Motion(NamedTuple):
@@ -108,7 +108,7 @@ def check_input(controls: Any, scene: Any, launch: Any) -> None:
     if controls is None:
         return
     if not callable(controls):
-        raise ValueError(f"input = {controls!r} must be {WANTED}, or None")
+        raise ValueError(f"input = {shown(controls)} must be {WANTED}, or None")
     t, motion = at_start(scene, launch)
     name = f"input = {getattr(controls, '__qualname__', None) or repr(controls)}"
     try:

@@ -9,7 +9,14 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from nonholonomic.parameters import as_one
 from nonholonomic.validation import IN_DEGREES, Bound, Bounded, as_number, is_traced, shown
+
+
+def as_launch(value: Any) -> Any:
+    """A list of launches as one `Launch` whose numbers are lists; anything else stays unchanged, for later checks."""
+    return as_one(value, "launch", Launch)
+
 
 #: Largest usual angles [rad]: a front wheel that turns by half a turn, and a heading after two turns.
 USUAL = {"steering": math.pi, "heading": 4.0 * math.pi}

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.geometry import AbstractQuadric, AbstractSurface, Plane, stacked
+from nonholonomic.geometry import AbstractQuadric, AbstractSurface, Plane, Sphere, Torus, stacked
 from nonholonomic.validation import (
     Bound,
     Bounded,
@@ -24,7 +24,7 @@ from nonholonomic.validation import (
 from .dynamics import Dynamics, State
 from .friction import AbstractFriction, Frictionless
 from .heading import Intrinsic, Projected
-from .launch import Launch
+from .launch import Launch, as_launch
 from .stroller import Stroller
 
 #: The default side of a closed surface.
@@ -39,7 +39,7 @@ RIGHT_ANGLE = 1e-9
 def require_word(word: Any, name: str, words: dict[str, Any]) -> None:
     """Raise `ValueError` unless `word` is one of the allowed words."""
     if not isinstance(word, str) or word not in words:
-        raise ValueError(f"{name} = {word!r} must be one of {', '.join(map(repr, words))}")
+        raise ValueError(f"{name} = {shown(word)} must be one of {', '.join(map(repr, words))}")
 
 
 def _holds_somewhere(condition: Any) -> bool:
@@ -67,7 +67,8 @@ class Scene(Bounded):
     - `heading`: "intrinsic", or "projected" to reproduce the paper on a plane, sphere or spheroid, which constrains the
       horizontal projection of the velocities (`stroller.md`, section 3, explains why this is not the default).
 
-    **Raises:** `ValueError` if a part is of the wrong kind, a word is unknown, or a number is out of range.
+    **Raises:** `ValueError` if a part is of the wrong kind, a word is unknown, a number is out of range, or the surface is
+    smaller than the wheelbase.
 
     **Example:**
 
@@ -113,6 +114,14 @@ class Scene(Bounded):
 
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.gravity, "gravity", at_least=0.0)
+        surface, half = self.surface, 0.5 * self.body.wheelbase
+        why = "half the wheelbase, as both axles touch the surface"
+        if isinstance(surface, Sphere):
+            yield Bound(surface.radius, "surface radius", at_least=half, why=why)
+        elif isinstance(surface, AbstractQuadric):
+            yield Bound(jnp.maximum(*surface.semi_axes), "greater semi-axis of the surface", at_least=half, why=why)
+        elif isinstance(surface, Torus):
+            yield Bound(surface.ring + surface.tube, "surface ring + tube", at_least=half, why=why)
 
     @property
     def dynamics(self) -> Dynamics:
@@ -130,8 +139,7 @@ class Scene(Bounded):
 
     def check(self, launch: Launch) -> None:
         """Raise `ValueError` if the scene cannot start with the launch."""
-        if not isinstance(launch, Launch):
-            raise ValueError(f"launch = {launch!r} must be a Launch")
+        require_kind(launch, "launch", Launch)
         require_all(self.start_bounds(launch))
         if _holds_somewhere(self.sideways(launch)):
             raise ValueError(
@@ -176,12 +184,12 @@ class Scene(Bounded):
 
         **Arguments:**
 
-        - `launch`: a `Launch` whose numbers, like the scene's, are scalars or one per lane.
+        - `launch`: a `Launch` whose numbers, like the scene's, are scalars or one per lane; or a list of launches.
         - `driven`: whether there is an input, whose work is then part of the state.
 
         **Returns:** an array (components, ...) in SI units.
         """
-        dynamics = self.dynamics
+        launch, dynamics = as_launch(launch), self.dynamics
         position, east, north = self.surface.chart(launch.place)
         heading = dynamics.heading.at_angle(launch.heading, east, north)
         normal = self.surface.normal(position)
@@ -207,7 +215,7 @@ class Scene(Bounded):
 
         **Arguments:** as for `state`. **Returns:** an array (components, ...) in SI units.
         """
-        body, dynamics = self.body, self.dynamics
+        launch, body, dynamics = as_launch(launch), self.body, self.dynamics
         one = jnp.ones_like(self.state(launch, driven)[0])
         rate = jnp.sqrt(self.gravity / body.wheelbase) + jnp.abs(launch.steering_rate) + 1e-3
         rate = rate + jnp.abs(launch.speed) / body.wheelbase

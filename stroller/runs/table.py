@@ -17,7 +17,7 @@ from nonholonomic.integration.status import FAILED, LEFT_DOMAIN
 from nonholonomic.parameters import description, full_axes, numbers, with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, cells_to_check
 from nonholonomic.sweeps import sweep as computed
-from nonholonomic.validation import as_number, require_outside, require_whole
+from nonholonomic.validation import as_number, require_outside, require_whole, shown
 
 from ..model.dynamics import State
 from ..model.friction import Damping, RollingResistance
@@ -131,7 +131,7 @@ def sweep(
     require_outside((scene, launch, t1, axes, input), "sweep", "simulate")
     check_run(scene, launch, t1, input, tolerance)
     if not isinstance(axes, dict) or not all(isinstance(number, str) for number in axes):
-        raise ValueError(f"axes = {axes!r} must be a dictionary, full name of a parameter -> values")
+        raise ValueError(f"axes = {shown(axes)} must be a dictionary, full name of a parameter -> values")
     require_whole(max_steps, "max_steps", 1)
     settings = Settings(tolerance, solver, max_steps=int(max_steps))
     explicit_tableau(settings.for_lanes)

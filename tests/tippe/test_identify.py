@@ -51,6 +51,22 @@ def exact_fit(rutstam_scene):
     return times, tippe.identify(rutstam_scene, data, {"friction.mu": 0.2}, tolerance=1e-8)
 
 
+def test_launches_may_be_a_list_of_launches():
+    launches = [tippe.Launch(theta, spin) for theta, spin in LAUNCHES]
+    launches[1] = tippe.Launch(*LAUNCHES[1], velocity=(0.1, 0.2))
+    at_once = tippe.Launch(LAUNCH.theta, LAUNCH.spin, [0.0] * 4, [0.0] * 4, velocity=([0, 0.1, 0, 0], [0, 0.2, 0, 0]))
+    data = tippe.InversionTimes(launches, TIMES, 0.05, t1=6.0)
+    assert eqx.tree_equal(data, tippe.InversionTimes(at_once, TIMES, 0.05, t1=6.0))
+    assert data.labels[0] == "theta 0.2, spin 110"
+
+
+def test_states_of_a_list_of_launches(rutstam_scene):
+    launches = [tippe.Launch(theta, spin) for theta, spin in LAUNCHES]
+    states = rutstam_scene.state(launches)
+    assert_close(states, np.stack([rutstam_scene.state(launch) for launch in launches], axis=-1), rtol=1e-15)
+    assert rutstam_scene.scales(launches).shape == (8, 4)
+
+
 def test_friction_from_exact_times(exact_fit):
     times, result = exact_fit
     assert result.status == "converged"

@@ -11,9 +11,9 @@ from jaxtyping import Array, Float
 
 from nonholonomic.identification import Measurements
 from nonholonomic.parameters import numbers, one_line, with_numbers
-from nonholonomic.validation import as_number, as_number_or_none, require
+from nonholonomic.validation import as_number, as_number_or_none, require, require_kind
 
-from ..model.launch import Launch
+from ..model.launch import Launch, as_launch
 from ..model.scene import Scene
 from ..runs.checks import check_event
 from ..runs.extended_times import extended_inversion_time
@@ -29,7 +29,7 @@ class InversionTimes(eqx.Module):
 
     **Arguments:**
 
-    - `launch`: a `Launch` whose numbers are scalars or arrays (launches,).
+    - `launch`: a list of launches; or one `Launch` whose numbers are scalars or arrays (launches,).
     - `time`: (launches,) [s], infinite for a top that did not invert while you watched; or (launches, 2), two times
       between which the top inverted: (0, a) before a, (b, inf) later than b, (a, b) between a and b, (t, t) at t.
     - `error`: standard errors [s], a scalar or (launches,); for a limit, the error of the clock.
@@ -52,7 +52,7 @@ class InversionTimes(eqx.Module):
     [False, True, True]
     """
 
-    launch: Launch
+    launch: Launch = eqx.field(converter=as_launch)
     time: Float[Array, "launches *two"] = eqx.field(converter=as_number)
     error: Float[Array, "..."] = eqx.field(converter=as_number)
     t1: Float[Array, ""] = eqx.field(converter=as_number)
@@ -65,6 +65,7 @@ class InversionTimes(eqx.Module):
         return one_line(self)
 
     def __check_init__(self):
+        require_kind(self.launch, "launch", Launch, " or a list of launches")
         shape = np.shape(self.time)
         if len(shape) not in (1, 2) or shape[0] == 0 or shape[1:] not in ((), (2,)):
             raise ValueError(f"time must be a non-empty list of times or of pairs of them, not of shape {shape}")
@@ -85,7 +86,9 @@ class InversionTimes(eqx.Module):
         key = numbers("launch", self.launch) | {"error": self.error, "until": self.until}
         for name, value in key.items():
             if value is not None and np.shape(value) not in ((), shape[:1]):
-                raise ValueError(f"{name} must be one number or one for each launch, not of shape {np.shape(value)}")
+                raise ValueError(
+                    f"{name} must be one number or one for each of the {shape[0]} times, not of shape {np.shape(value)}"
+                )
 
     @property
     def _limits(self) -> tuple[np.ndarray, np.ndarray]:

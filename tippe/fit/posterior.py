@@ -4,6 +4,7 @@ from typing import Any
 
 from nonholonomic.identification import LogDensity, joined, series_units
 from nonholonomic.parameters import full_name
+from nonholonomic.validation import shown
 
 from ..model.scene import Scene
 from .identify import SceneModel, checked_data, unknowns_of
@@ -43,7 +44,9 @@ def log_density(
     data = checked_data(scene, data, tolerance, "log_density")
     unknowns = unknowns_of(scene, data, free)
     if priors is not None and not isinstance(priors, dict):
-        raise ValueError(f"priors = {priors!r} must be a dictionary, name of a number -> (mean, standard deviation)")
+        raise ValueError(
+            f"priors = {shown(priors)} must be a dictionary, name of a number -> (mean, standard deviation)"
+        )
     priors_by_name = {full_name("priors", name, list(unknowns)): prior for name, prior in (priors or {}).items()}
     measurements, _, indices = joined(data)
     model = SceneModel(scene=scene, data=data, seen=indices, tolerance=tolerance)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.identification import AbstractRecording, Quantities, as_quantity, read_columns
-from nonholonomic.validation import as_number, as_number_or_none, require
+from nonholonomic.validation import as_number, as_number_or_none, require, require_kind
 
 from ..model.launch import Launch
 
@@ -60,6 +60,7 @@ class Recording(AbstractRecording):
     quantities: ClassVar[Quantities] = QUANTITIES
 
     def __check_init__(self):
+        require_kind(self.launch, "launch", Launch, several="identify takes a list of recordings")
         # If no check fails, the shapes are right.
         super().__check_init__()
         if "theta" not in self.columns:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import sum_vectors
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require_kind
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require_kind, shown
 
 from .contact_load import ContactLoad, Slip
 from .driving_law import drive
@@ -274,7 +274,9 @@ class Rolling(AbstractFriction):
     def __check_init__(self):
         require_kind(self.sliding, "sliding", AbstractFriction, A_LAW)
         if isinstance(self.sliding, Rolling | NoSlip) or self.sliding.set_valued:
-            raise ValueError(f"sliding = {self.sliding!r} must be a sliding law with a force at every slip velocity")
+            raise ValueError(
+                f"sliding = {shown(self.sliding)} must be a sliding law with a force at every slip velocity"
+            )
 
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.resistance, "resistance", at_least=0.0)

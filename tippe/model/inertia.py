@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Vector, scale, vector_of
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, shown
 
 #: Rounding error allowed in the moments of a flat body, as a fraction of their sum.
 FLAT = 1e-12
@@ -49,7 +49,7 @@ class Inertia(Bounded):
         values = as_number(matrix)
         if not eqx.is_array(values) or values.shape != (3, 3):
             raise ValueError(
-                f"inertia = {matrix!r} must be a matrix of shape (3, 3), in kg m^2 about the centre of mass"
+                f"inertia = {shown(matrix)} must be a matrix of shape (3, 3), in kg m^2 about the centre of mass"
             )
         if not is_traced(values):
             asymmetry = np.abs(np.asarray(values) - np.asarray(values).T)

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require
+from nonholonomic.parameters import as_one
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require, shown
 
 
 def as_numbers(value: Any) -> Any:
@@ -21,6 +22,11 @@ def as_numbers(value: Any) -> Any:
         return tuple(as_number(part) for part in value)
     except TypeError:
         return value
+
+
+def as_launch(value: Any) -> Any:
+    """A list of launches as one `Launch` whose numbers are lists; anything else stays unchanged, for later checks."""
+    return as_one(value, "launch", Launch)
 
 
 #: Spins above this [rad/s] suggest revolutions per minute: by hand a top gets 100 to 300 rad/s, 1000 to 3000 rpm.
@@ -117,7 +123,7 @@ class Launch(Bounded):
         for name, (counts, words) in allowed.items():
             value = getattr(self, name)
             if value is not None and not (isinstance(value, tuple) and len(value) in counts):
-                raise ValueError(f"{name} = {value!r} must be {words}")
+                raise ValueError(f"{name} = {shown(value)} must be {words}")
 
     def suspicion(self) -> str | None:
         if is_traced(self.spin) or not isinstance(self.spin, jax.Array) or self.spin.size == 0:

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from nonholonomic.geometry import Vector, dot, scale, sum_vectors, vector_of
 from nonholonomic.systems.components import TooLarge, by_components
 from nonholonomic.systems.tracing import with_own_numbers
-from nonholonomic.validation import UNTRACEABLE, Bound, Bounded, as_number, is_traced
+from nonholonomic.validation import UNTRACEABLE, Bound, Bounded, as_number, is_traced, shown
 
 from .inertia import Inertia
 from .launch import as_numbers
@@ -73,7 +73,7 @@ class AbstractRigidBody(Bounded):
 def require_three(value: Any, name: str) -> None:
     """Raise `ValueError` unless these are three numbers."""
     if not isinstance(value, tuple) or len(value) != 3:
-        raise ValueError(f"{name} = {value!r} must be three numbers, along the body's axes x, y and z")
+        raise ValueError(f"{name} = {shown(value)} must be three numbers, along the body's axes x, y and z")
 
 
 #: Units of the common parameters of rigid bodies, with their names in scenes and tables.
@@ -278,7 +278,7 @@ def as_support(value: Any) -> eqx.Module:
     **Raises:** `ValueError` unless it returns one number for a vector of three.
     """
     if not callable(value):
-        raise ValueError(f"support = {value!r} must be a function of a direction (3,)")
+        raise ValueError(f"support = {shown(value)} must be a function of a direction (3,)")
     if isinstance(value, eqx.Module):
         value = jax.tree.map(lambda leaf: as_number(leaf) if isinstance(leaf, float | np.ndarray) else leaf, value)
         if any(np.ndim(leaf) and not is_traced(leaf) for leaf in jax.tree.leaves(value)):
@@ -287,11 +287,11 @@ def as_support(value: Any) -> eqx.Module:
     try:
         result = jax.eval_shape(value, direction)
     except jax.errors.JAXTypeError as error:
-        raise ValueError(f"support = {value!r} {UNTRACEABLE}") from error
+        raise ValueError(f"support = {shown(value)} {UNTRACEABLE}") from error
     except (TypeError, IndexError) as error:
-        raise ValueError(f"support = {value!r} must be a function of a direction (3,): {error}") from error
+        raise ValueError(f"support = {shown(value)} must be a function of a direction (3,): {error}") from error
     if getattr(result, "shape", None) != () or not jnp.issubdtype(result.dtype, jnp.floating):
-        raise ValueError(f"support = {value!r} must give one number for a direction (3,), not {result}")
+        raise ValueError(f"support = {shown(value)} must give one number for a direction (3,), not {result}")
     if isinstance(value, eqx.Module):
         return value
     closed = with_own_numbers(value, direction)

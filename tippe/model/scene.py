@@ -31,12 +31,12 @@ from nonholonomic.geometry import (
     vector_of,
 )
 from nonholonomic.parameters import numbers
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require_all
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require_all, shown
 
 from .body import AbstractBody
 from .dynamics import TURNING, Dynamics
 from .friction import AbstractFriction, Frictionless, NoSlip
-from .launch import Launch
+from .launch import Launch, as_launch
 from .rigid_body import AbstractRigidBody
 from .rigid_dynamics import AbstractRigidDynamics, rigid_dynamics
 from .scene_checks import check_parts
@@ -209,7 +209,7 @@ class Scene(Bounded, Generic[Body]):
         """
         if isinstance(self.friction, NoSlip) and launch.velocity is not None:
             raise ValueError(
-                f"velocity = {launch.velocity!r} must be left out where friction = NoSlip(): it follows from the rotation"
+                f"velocity = {shown(launch.velocity)} must be left out where friction = NoSlip(): it follows from the rotation"
             )
         surface = self.surface
         names, kind = [name for name, _ in surface.coordinates], type(surface).__name__
@@ -238,10 +238,11 @@ class Scene(Bounded, Generic[Body]):
 
         **Arguments:**
 
-        - `launch`: a `Launch` whose numbers, like the scene's, are scalars or one per lane.
+        - `launch`: a `Launch` whose numbers, like the scene's, are scalars or one per lane; or a list of launches.
 
         **Returns:** an array (components, ...) in SI units.
         """
+        launch = as_launch(launch)
         body, sine, zero = self.body, jnp.sin(launch.theta), jnp.zeros_like(launch.theta)
         e = (sine * jnp.cos(launch.azimuth), sine * jnp.sin(launch.azimuth), jnp.cos(launch.theta))
         if isinstance(body, AbstractRigidBody):
@@ -265,6 +266,7 @@ class Scene(Bounded, Generic[Body]):
 
         **Arguments:** as for `state`. **Returns:** an array (components, ...) in SI units.
         """
+        launch = as_launch(launch)
         one = jnp.ones_like(launch.theta)
         rate = jnp.sqrt(self.gravity / self.body.size)
         velocity = rate * self.body.size

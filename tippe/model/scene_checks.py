@@ -3,7 +3,7 @@
 from typing import Any
 
 from nonholonomic.geometry import AbstractSurface, Plane
-from nonholonomic.validation import require_kind, uncalled
+from nonholonomic.validation import require_kind, shown, uncalled
 
 from .body import AbstractBody
 from .friction import A_LAW, AbstractFriction, NoSlip
@@ -15,26 +15,26 @@ def check_parts(scene: Any) -> None:
     """Raise `ValueError` if a part of a scene is of the wrong kind, or does not allow another part or an option."""
     if not isinstance(scene.body, AbstractBody | AbstractRigidBody):
         kinds = f"a Top, a SpheroidBody, a ConvexBody, an Ellipsoid or a RigidBody{uncalled(scene.body)}"
-        raise ValueError(f"body = {scene.body!r} must be {kinds}")
+        raise ValueError(f"body = {shown(scene.body)} must be {kinds}")
     require_kind(scene.surface, "surface", AbstractSurface, ", such as tippe.Plane() or tippe.Cylinder(0.3)")
     require_kind(scene.friction, "friction", AbstractFriction, A_LAW)
     # This raises an error if the surface has no such side.
     scene.surface.sign(scene.side, "inside")
     if scene.contact not in ("stop", "hybrid"):
-        raise ValueError(f"contact = {scene.contact!r} must be 'stop' or 'hybrid'")
+        raise ValueError(f"contact = {shown(scene.contact)} must be 'stop' or 'hybrid'")
     if scene.restitution is not None and scene.contact == "stop":
-        raise ValueError(f"restitution = {scene.restitution!r} must be omitted for contact = 'stop'")
+        raise ValueError(f"restitution = {shown(scene.restitution)} must be omitted for contact = 'stop'")
     if isinstance(scene.friction, NoSlip) and not isinstance(scene.body, AbstractRigidBody):
         raise ValueError(
-            f"friction = NoSlip() must be another law for a {type(scene.body).__name__}, such as Coulomb; describe the body "
-            "as an Ellipsoid or a RigidBody to roll it"
+            f"friction = NoSlip() must be another law for a {type(scene.body).__name__}, such as Coulomb; describe the "
+            "body as an Ellipsoid or a RigidBody to roll it"
         )
     if not isinstance(scene.body, Top):
         _check_convex(scene)
         return
     if scene.friction.set_valued and scene.body.stem is not None:
         raise ValueError(
-            f"friction = {scene.friction!r} must be a law with a single mode for a top with a stem, such as Coulomb: "
+            f"friction = {shown(scene.friction)} must be a law with a single mode for a top with a stem, such as Coulomb: "
             "with two contacts it is undetermined which one sticks"
         )
     if scene.contact == "stop" and scene.body.stem is not None:
@@ -47,11 +47,11 @@ def _check_convex(scene: Any) -> None:
     kind = f"an {kind}" if kind[0] in "AEIOU" else f"a {kind}"
     if not isinstance(scene.surface, Plane) and isinstance(scene.body, AbstractBody):
         allowed_bodies = "a Top runs on any arena, as an Ellipsoid or a RigidBody does"
-        raise ValueError(f"surface = {scene.surface!r} must be a Plane for {kind}; {allowed_bodies}")
+        raise ValueError(f"surface = {shown(scene.surface)} must be a Plane for {kind}; {allowed_bodies}")
     if scene.contact != "stop":
-        raise ValueError(f"contact = {scene.contact!r} must be 'stop' for {kind}; only a Top can fly")
+        raise ValueError(f"contact = {shown(scene.contact)} must be 'stop' for {kind}; only a Top can fly")
     if scene.friction.set_valued and isinstance(scene.body, AbstractBody):
         raise ValueError(
-            f"friction = {scene.friction!r} must be a law with a single mode for {kind}, such as Coulomb; describe the body "
-            "as an Ellipsoid or a RigidBody to stick and slip"
+            f"friction = {shown(scene.friction)} must be a law with a single mode for {kind}, such as Coulomb; describe the "
+            "body as an Ellipsoid or a RigidBody to stick and slip"
         )

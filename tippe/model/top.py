@@ -1,6 +1,5 @@
 """The body: an eccentric sphere whose mass is symmetric about the axis through its two centres."""
 
-import warnings
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
@@ -11,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Vector
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require, shown, warn
 
 from .body import AbstractBody, Round
 from .turned import Shape
@@ -150,11 +149,9 @@ class Top(AbstractBody):
         require(density, "density", above=0.0)
         if not is_traced(density) and np.any(np.asarray(density) < LEAST_DENSITY):
             min_density = float(np.min(density))
-            warnings.warn(
+            warn(
                 f"density = {min_density:g} kg/m^3 is less than that of balsa wood, 100 kg/m^3: was it in g/cm^3? "
-                f"{min_density:g} g/cm^3 are {1e3 * min_density:g} kg/m^3",
-                UserWarning,
-                stacklevel=2,
+                f"{min_density:g} g/cm^3 are {1e3 * min_density:g} kg/m^3"
             )
         lengths = {"radius": radius, "cut": cut, "stem_radius": stem_radius, "stem_length": stem_length}
         shape = Shape.checked(lengths | {"hole_radius": hole_radius, "hole_depth": hole_depth})
@@ -169,7 +166,7 @@ class Top(AbstractBody):
 
     def __check_init__(self):
         if self.stem is not None and not isinstance(self.stem, Stem):
-            raise ValueError(f"stem = {self.stem!r} must be a Stem")
+            raise ValueError(f"stem = {shown(self.stem)} must be a Stem")
 
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.mass, "mass", above=0.0)

@@ -1,7 +1,6 @@
 """Checks of the arguments of a run, before anything compiles, and of traced arguments inside a program."""
 
 import math
-import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from nonholonomic.integration.checks import legal_run, require_run
-from nonholonomic.validation import IN_DEGREES, Bound, all_bounds, is_traced, legal, nan_unless, require
+from nonholonomic.validation import IN_DEGREES, Bound, all_bounds, is_traced, legal, nan_unless, require, shown, warn
 from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.friction import Frictionless
@@ -71,29 +70,21 @@ def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, angle: An
     reached.
     """
     if isinstance(scene.friction, Frictionless):
-        warnings.warn(
+        warn(
             "friction = Frictionless(): without friction no top turns over; give the scene a law, such as "
-            "tippe.Scene(top, friction=tippe.Viscous(0.3))",
-            UserWarning,
-            stacklevel=4,
+            "tippe.Scene(top, friction=tippe.Viscous(0.3))"
         )
     if isinstance(scene.body, AbstractRigidBody) or is_traced(theta) or is_traced(angle):
         return
     if np.any(np.asarray(theta) >= angle):
         start = np.max(np.asarray(theta))
-        warnings.warn(
+        warn(
             f"theta = {start:g} rad is not below the angle to be reached, {angle:.4g} rad: the top is inverted from the "
-            f"start{IN_DEGREES.format(f'{start:g}')}",
-            UserWarning,
-            stacklevel=4,
+            f"start{IN_DEGREES.format(f'{start:g}')}"
         )
     at_rest = launch.velocity is None and launch.angular_velocity is None
     if scene.level and at_rest and np.any(np.asarray(theta) == 0.0):
-        warnings.warn(
-            "theta = 0.0 is exactly upright, where a top stays forever: launch it at a small angle, such as 0.01 rad",
-            UserWarning,
-            stacklevel=4,
-        )
+        warn("theta = 0.0 is exactly upright, where a top stays forever: launch it at a small angle, such as 0.01 rad")
 
 
 def event_bounds(angle: Any) -> Iterator[Bound]:
@@ -129,4 +120,4 @@ def check_event(angle: Any, crossing: Any, known: tuple[str, ...] = ("first", "l
     if np.ndim(angle) != 0:
         raise ValueError(f"angle must be one number, not of shape {np.shape(angle)}")
     if crossing not in known:
-        raise ValueError(f"crossing = {crossing!r} must be {' or '.join(map(repr, known))}")
+        raise ValueError(f"crossing = {shown(crossing)} must be {' or '.join(map(repr, known))}")

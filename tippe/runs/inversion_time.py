@@ -1,7 +1,6 @@
 """The time of inversion of one launch, as a function for `jit`, `vmap`, `grad`, `jvp` and their compositions."""
 
 import math
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,7 +16,7 @@ from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import Outcome, Settings, explicit_tableau
 from nonholonomic.integration.status import FAILED, UNRESOLVED
 from nonholonomic.progress import status_line
-from nonholonomic.validation import as_number, is_traced
+from nonholonomic.validation import as_number, is_traced, warn
 
 from ..model.launch import Launch
 from ..model.scene import Scene
@@ -131,11 +130,7 @@ def explain_failure(
     event = "reversal" if angle is None else "inversion"
     reason = f": {why_unresolved(runs.run_kind)}" if word == "unresolved" else ""
     end = f"at {cell['end_time']:.6g} s, at {cell['end_theta']:.6g} rad"
-    warnings.warn(
-        f"the {event} time is NaN: the run ended as {word!r} {end}{reason}",
-        UserWarning,
-        stacklevel=4,
-    )
+    warn(f"the {event} time is NaN: the run ended as {word!r} {end}{reason}")
 
 
 class InversionSolve(AbstractDifferentiableSolve):

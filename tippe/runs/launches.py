@@ -9,7 +9,7 @@ import numpy as np
 from nonholonomic.integration.checks import require_run
 from nonholonomic.parameters import description, full_axes, numbers, with_numbers
 from nonholonomic.sweeps import Axis, axis, cells_to_check
-from nonholonomic.validation import require_kind
+from nonholonomic.validation import require_kind, shown
 
 from ..model.launch import Launch
 from ..model.scene import Scene
@@ -89,7 +89,7 @@ def launches(
     """
     require_kind(scene, "scene", Scene)
     if axes is not None and not (isinstance(axes, dict) and all(isinstance(number, str) for number in axes)):
-        raise ValueError(f"axes = {axes!r} must be a dictionary, path of a number -> values")
+        raise ValueError(f"axes = {shown(axes)} must be a dictionary, path of a number -> values")
     axes = full_axes(axes or {}, [*variable_numbers(scene), *NUMBERS_OF_A_LAUNCH])
     friction_numbers = numbers("scene.friction", scene.friction)
     of_mu = next((number for number in friction_numbers if number.endswith(".mu")), "scene.friction.mu")

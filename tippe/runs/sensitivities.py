@@ -12,6 +12,7 @@ from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import Outcome, Settings
 from nonholonomic.parameters import full_name, numbers, with_numbers
 from nonholonomic.sweeps import Variable
+from nonholonomic.validation import shown
 
 from ..modes.inversion_problem import InversionProblem
 from .inversion import Inversions
@@ -25,13 +26,13 @@ def sensitivity_names(roots: dict[str, Any], names: Any) -> list[str]:
     **Raises:** `ValueError` unless `names` is a list of such names.
     """
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"sensitivities = {names!r} must be a list of names, such as ['scene.friction.mu']")
+        raise ValueError(f"sensitivities = {shown(names)} must be a list of names, such as ['scene.friction.mu']")
     number_names = [
         name for root, tree in roots.items() for name, value in numbers(root, tree).items() if value is not None
     ]
     full_names = [full_name("sensitivities", name, number_names) for name in names]
     if len(set(full_names)) < len(full_names):
-        raise ValueError(f"sensitivities = {names!r} must name every parameter only once")
+        raise ValueError(f"sensitivities = {shown(names)} must name every parameter only once")
     return full_names
 
 

@@ -2,7 +2,6 @@
 
 import hashlib
 import math
-import warnings
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from typing import Any, NamedTuple
@@ -13,7 +12,7 @@ import numpy as np
 from nonholonomic.integration import Settings, explicit_tableau
 from nonholonomic.integration.settings import DEFAULT_MAX_STEPS
 from nonholonomic.sweeps import Axis, Table, Variable, sweep
-from nonholonomic.validation import require_flag, require_outside, require_whole
+from nonholonomic.validation import require_flag, require_outside, require_whole, shown, warn
 
 from ..model.scene import Scene
 from .cells import InversionJob, InversionRuns, ScatteredJob, too_many_steps
@@ -125,13 +124,13 @@ def inversion_table(
     require_outside((scene, theta, spin, eta, mu, azimuth, axes, t1, angle), "inversion_table", "inversion_time")
     check_event(angle, crossing, ("first", "last", "both"))
     if method not in ("ensemble", "diffrax"):
-        raise ValueError(f"method = {method!r} must be 'ensemble' or 'diffrax'")
+        raise ValueError(f"method = {shown(method)} must be 'ensemble' or 'diffrax'")
     if method == "diffrax" and sensitivities:
         raise ValueError("method = 'diffrax' must be 'ensemble' for sensitivities")
     if crossing == "both" and sensitivities:
         raise ValueError("crossing = 'both' must be 'first' or 'last' for sensitivities, which differentiate one time")
     if method == "diffrax" and crossing != "first":
-        raise ValueError(f"crossing = {crossing!r} must be 'first' for method = 'diffrax'")
+        raise ValueError(f"crossing = {shown(crossing)} must be 'first' for method = 'diffrax'")
     launch_values = {"theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
     options = TableOptions(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
     return event_table(scene, launch_values, axes, t1, angle, options, crossing, method)
@@ -231,11 +230,7 @@ def warn_of_long_runs(table: Table, t1: float, max_steps: int) -> None:
     is_long = (table.variables["status"] == "failed") & (table.variables["steps"] >= max_steps)
     if is_long.any():
         end = float(np.min(table.variables["end_time"][is_long]))
-        warnings.warn(
-            f"{is_long.sum()} of {is_long.size} runs have failed: {too_many_steps(t1, max_steps, end)}",
-            UserWarning,
-            stacklevel=3,
-        )
+        warn(f"{is_long.sum()} of {is_long.size} runs have failed: {too_many_steps(t1, max_steps, end)}")
 
 
 def warn_of_unresolved_runs(table: Table, run_kind: RunKind) -> None:
@@ -245,7 +240,7 @@ def warn_of_unresolved_runs(table: Table, run_kind: RunKind) -> None:
     unresolved = np.asarray(table.variables["status"] == "unresolved")
     if unresolved.any():
         number = f"{unresolved.sum()} of {unresolved.size} runs are unresolved"
-        warnings.warn(f"{number}: {why_unresolved(run_kind)}", UserWarning, stacklevel=3)
+        warn(f"{number}: {why_unresolved(run_kind)}")
 
 
 def digest(columns: dict[str, Any]) -> str:

@@ -264,7 +264,7 @@ def _traced(
         raise ValueError("times must be given inside jit, vmap and grad, where the number of steps is not known")
     if scene.contact == "hybrid":
         if adjoint is not None:
-            raise ValueError(f"adjoint = {adjoint!r} must be omitted for contact = 'hybrid'")
+            raise ValueError(f"adjoint = {shown(adjoint)} must be omitted for contact = 'hybrid'")
         explicit_tableau(settings.for_lanes)
         return (sampled_hybrid if scene.flies_in_closed_form else sampled_airborne)(scene, launch, times, t1, settings)
     samples = sampled(scene, launch, times, t1, settings, adjoint)

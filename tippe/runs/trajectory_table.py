@@ -13,7 +13,7 @@ from nonholonomic.integration.settings import DEFAULT_MAX_STEPS
 from nonholonomic.integration.status import Status
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, sweep
-from nonholonomic.validation import as_number, require, require_outside, require_whole
+from nonholonomic.validation import as_number, require, require_outside, require_whole, shown
 
 from ..model.scene import Scene
 from .launches import described, launches
@@ -147,10 +147,10 @@ class SamplingJob(NamedTuple):
 def _names(quantities: Any) -> tuple[str, ...]:
     """The quantities, checked."""
     if isinstance(quantities, str) or not isinstance(quantities, Sequence) or not quantities:
-        raise ValueError(f"quantities = {quantities!r} must be a list of names")
+        raise ValueError(f"quantities = {shown(quantities)} must be a list of names")
     for name in quantities:
         if name not in QUANTITIES:
-            raise ValueError(f"quantities: {name!r} must be one of {', '.join(QUANTITIES)}")
+            raise ValueError(f"quantities: {shown(name)} must be one of {', '.join(QUANTITIES)}")
         if quantities.count(name) > 1:
-            raise ValueError(f"quantities: {name!r} must be named only once")
+            raise ValueError(f"quantities: {shown(name)} must be named only once")
     return tuple(quantities)

@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 from nonholonomic.parameters import numbers
-from nonholonomic.validation import require, require_flag, require_kind, require_outside, require_scalars
+from nonholonomic.validation import require, require_flag, require_kind, require_outside, require_scalars, shown
 
 from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
@@ -17,7 +17,7 @@ MANY = "jax.vmap maps over several"
 def require_top(body: Any) -> None:
     """Raise `ValueError` unless the body is a `Top`."""
     if not isinstance(body, Top):
-        raise ValueError(f"body = {body!r} must be a Top: the formulas are those of a sphere")
+        raise ValueError(f"body = {shown(body)} must be a Top: the formulas are those of a sphere")
 
 
 def require_one_top(body: Any, caller: str) -> None:
@@ -43,7 +43,7 @@ def require_plane(scene: Any) -> None:
     require_scene_of_a_top(scene)
     if not scene.level:
         raise ValueError(
-            f"surface = {scene.surface!r} must be a Plane without tilt: on other arenas, no top tumbles steadily"
+            f"surface = {shown(scene.surface)} must be a Plane without tilt: on other arenas, no top tumbles steadily"
         )
 
 

@@ -3,6 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from nonholonomic.validation import shown
+
 from ..model.scene import Scene
 from ..model.top import Top
 from .checks import require_one_top, require_scene_of_a_top, require_top
@@ -105,7 +107,7 @@ def jellett_thresholds(scene: Scene[Top]) -> tuple[Float[Array, "..."], Float[Ar
     (alpha, _), body = proportions(scene.body), scene.body
     if body.stem is not None:
         raise ValueError(
-            f"stem = {body.stem!r} must be None: a top with a stem does not keep Jellett's constant as it inverts"
+            f"stem = {shown(body.stem)} must be None: a top with a stem does not keep Jellett's constant as it inverts"
         )
     upright = (1.0 - alpha) * body.radius * body.I3 * upright_critical_spin(scene)
     inverted = (1.0 + alpha) * body.radius * body.I3 * inverted_critical_spin(scene)

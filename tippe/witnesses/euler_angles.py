@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import rate_in_frame
+from nonholonomic.validation import shown
 
 from ..model.contact_load import Slip
 from ..model.scene import Scene
@@ -36,7 +37,7 @@ def across(scene: Scene[Top]) -> tuple[Float[Array, ""] | float, float]:
     """
     curvature, slope = scene.frame.frame_motion(scene.frame.at_angle(0.0)[0], (1.0, 0.0)).frame_rate
     if slope is not None:
-        raise ValueError(f"surface = {scene.surface!r} must be a Plane or a Cylinder for these coordinates")
+        raise ValueError(f"surface = {shown(scene.surface)} must be a Plane or a Cylinder for these coordinates")
     return (1.0, 0.0) if curvature is None else (1.0 / curvature, 1.0)
 
 

@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from nonholonomic.validation import shown
+
 from ..model.contact_load import Slip
 from ..model.scene import Scene
 from ..model.state import AXIS, VELOCITY
@@ -37,7 +39,9 @@ def point_friction(scene: Scene[Top], slip: Float[Array, " 2"]) -> Float[Array, 
     zero = jnp.zeros_like(slip[0])
     force, torque = scene.friction.per_normal_force(Slip(slip[0], slip[1], (zero, zero, zero)))
     if torque != (None, None, None):
-        raise ValueError(f"friction = {scene.friction!r} must act at a point, without a torque, for the reduced forms")
+        raise ValueError(
+            f"friction = {shown(scene.friction)} must act at a point, without a torque, for the reduced forms"
+        )
     return jnp.stack([zero if part is None else part for part in force])
 
 

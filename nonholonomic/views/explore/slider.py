@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...parameters import full_name, numbers, readable_unit, with_numbers
+from ...validation import shown
 
 #: Parameters that change the drawn meshes.
 DRAWN = ("scene.surface.", "scene.body.radius", "scene.body.equatorial", "scene.body.polar", "scene.body.wheelbase")
@@ -39,7 +40,7 @@ def sliders_of(
     """
     if not (isinstance(ranges, dict) and ranges and all(isinstance(name, str) for name in ranges)):
         raise ValueError(
-            f"sliders = {ranges!r} must be a dictionary, name of a parameter -> (low, high), such as "
+            f"sliders = {shown(ranges)} must be a dictionary, name of a parameter -> (low, high), such as "
             '{"theta": (0.05, 0.5)}'
         )
     values = {path: value for root, tree in roots.items() for path, value in numbers(root, tree).items()}
@@ -56,7 +57,7 @@ def sliders_of(
         value, label_name = float(values[path]), path.rsplit(".", 1)[-1]
         if not low <= value <= high:
             raise ValueError(
-                f"sliders[{name!r}] = {ends!r} must contain the parameter's own value, {value:g}: the page starts there"
+                f"sliders[{name!r}] = {shown(ends)} must contain the parameter's own value, {value:g}: the page starts there"
             )
         for end in (low, high):
             # The modules check the number.
@@ -77,5 +78,5 @@ def _ends(name: str, ends: Any) -> tuple[float, float]:
     except (TypeError, ValueError):
         low, high = math.nan, math.nan
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise ValueError(f"sliders[{name!r}] = {ends!r} must be two numbers, (low, high), with low < high")
+        raise ValueError(f"sliders[{name!r}] = {shown(ends)} must be two numbers, (low, high), with low < high")
     return low, high
