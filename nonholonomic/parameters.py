@@ -3,8 +3,9 @@
 import dataclasses
 import difflib
 import html
+import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -193,6 +194,16 @@ def description(root: str, tree: Any) -> dict[str, Any]:
     return fields
 
 
+#: Value of each unit in the SI unit of the same dimension, which a file may have and a picture may show.
+UNITS = {
+    "s": {"s": 1.0, "ms": 1e-3, "min": 60.0},
+    "rad": {"rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi},
+    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0, "rev/s": 2.0 * math.pi},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    "m/s": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1.0 / 3.6},
+    "1": {"1": 1.0, "%": 1e-2},
+}
+
 #: How many numbers of an array are shown; longer arrays show the first and the last ones.
 SHOWN = 4
 
@@ -207,13 +218,39 @@ def readable_unit(unit: str) -> str:
     numerator, denominator = [], []
     for part in unit.split():
         match = re.fullmatch(r"([A-Za-z]+)(-?\d+)?", part)
-        if match is not None:
+        if match is None and "/" in part:
+            # A unit in common notation.
+            numerator.append(part)
+        elif match is not None:
             name, power = match[1], int(match[2] or 1)
             (numerator if power > 0 else denominator).append(name + (str(abs(power)) if abs(power) > 1 else ""))
     text = " ".join(numerator) or ("1" if denominator else "")
     if denominator:
         text += "/" + (denominator[0] if len(denominator) == 1 else f"({' '.join(denominator)})")
     return re.sub(r"(?<=[A-Za-z])\d+", lambda power: power[0].translate(_SUPERSCRIPTS), text)
+
+
+def in_unit(si: str, unit: str | Sequence[str]) -> tuple[str, float]:
+    """The unit in which to show a number in the SI unit `si`, and the factor that converts the number.
+
+    **Arguments:** `unit`: one of `UNITS`, such as "deg", or several for numbers of different dimensions; "deg", "rev", "cm"
+    and so on also convert rates, to deg/s and so on, unless a unit of the rate is named.
+    """
+    readable, names = readable_unit(si), [unit] if isinstance(unit, str) else [*unit]
+    for name in [*names, *(f"{name}/s" for name in names)]:
+        # A number without a unit is no percentage unless its unit says so.
+        if readable and name in UNITS.get(readable, {}):
+            return name, 1.0 / UNITS[readable][name]
+    return si, 1.0
+
+
+def require_unit(unit: Any) -> None:
+    """Raise `ValueError` unless this is `None`, a unit that pictures can show, or a list of such units."""
+    known = [name for readable, names in UNITS.items() if readable != "1" for name in names]
+    names = [unit] if isinstance(unit, str) else unit
+    if unit is not None and not (isinstance(names, list | tuple) and all(name in known for name in names)):
+        hint = likely(unit, known) if isinstance(unit, str) else ""
+        raise ValueError(f"unit = {shown(unit)} must be one of {', '.join(known)}, or a list of them{hint}")
 
 
 def as_text(value: Any, unit: str = "1") -> str:
@@ -273,18 +310,19 @@ def in_lines(title: str, rows: list[tuple[str, str]]) -> str:
     return "\n".join([title, *(f"  {name:{width}}  {text}" for name, text in rows)])
 
 
-def distinguishing_labels(starts: list[str], *groups: list[Any]) -> list[str]:
-    """Labels that distinguish modules: the start of each label, followed by the differences between the modules.
+def distinguishing_labels(starts: list[tuple[str, ...]], *groups: list[Any]) -> list[str]:
+    """Labels that distinguish runs, by what differs between them only.
 
-    **Arguments:** `starts`: the starts of the labels; `groups`: modules of one role, such as the scenes, one per label.
+    **Arguments:** `starts`: for each run, the same number of texts, such as its angle and its spin; `groups`: modules of
+    one role, such as the scenes, one per run.
 
-    **Returns:** the labels. Equal labels are numbered.
+    **Returns:** the labels. If nothing differs, a label is the whole start; equal labels are numbered.
     """
-    differences_of_groups = [differences(group) for group in groups]
-    names = [
-        ", ".join([start, *(part for difference in differences_of_groups for part in difference[k])])
-        for k, start in enumerate(starts)
-    ]
+    differing = [k for k, texts in enumerate(zip(*starts, strict=True)) if len(set(texts)) > 1]
+    parts = [[start[k] for k in differing] for start in starts]
+    for group in groups:
+        parts = [part + difference for part, difference in zip(parts, differences(group), strict=True)]
+    names = [", ".join(part or start) for part, start in zip(parts, starts, strict=True)]
     return [
         name if names.count(name) == 1 else f"{name} ({names[: k + 1].count(name)})" for k, name in enumerate(names)
     ]

@@ -176,9 +176,9 @@ REFUSED = {
         "this is a batch of runs, with t of shape (2, 51), and to_table takes",
     ),
     "a batch for a page": (lambda: batch(2, 51).view(), "and a picture takes one run: select one by jax.tree.map"),
-    "a plot of a quantity": (
-        lambda: run_of_nothing().plot("theta"),
-        "others = 'theta' must be a list of runs, such as [run]",
+    "a plot of a number": (
+        lambda: run_of_nothing().plot(3.0),
+        "others = 3.0 must be a list of runs, such as [run]",
     ),
     "a plot beside a number": (
         lambda: run_of_nothing().plot([0.3]),

@@ -146,5 +146,5 @@ def test_a_time_that_takes_too_many_steps_is_an_error_that_says_how_many(monkeyp
 
 def test_a_run_that_lost_contact_says_what_flies_on():
     run = dataclasses.replace(run_of_nothing(), status="contact_lost")
-    assert "lost contact at 0 s" in str(run)
+    assert "contact_lost at 0 s" in str(run)
     assert "to continue through the flight, use a Scene with contact='hybrid'" in str(run)

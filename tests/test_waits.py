@@ -12,6 +12,7 @@ from tops import rutstam_top
 import stroller
 import tippe
 from nonholonomic.identification import Identification, LogDensity, Measurements, identify
+from nonholonomic.sweeps import Tabular
 from nonholonomic.views import Viewable
 from tippe.runs.observables import AbstractTrajectory
 
@@ -86,10 +87,14 @@ def waits(*_, **__):
     raise Enough
 
 
-class SlowRun(Viewable):
+class SlowRun(Viewable, Tabular):
     """A run that takes long to describe for a page."""
 
     stages = waits
+    portrait_axes = ("x", "y")
+
+    def to_table(self):
+        raise NotImplementedError
 
 
 def stub(name):

@@ -9,18 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..parameters import UNITS
 from ..validation import as_path, require, shown
 from .recording import Quantities
-
-#: Value of each unit in the SI unit of the same dimension.
-UNITS = {
-    "s": {"s": 1.0, "ms": 1e-3, "min": 60.0},
-    "rad": {"rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi},
-    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0, "rev/s": 2.0 * math.pi},
-    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
-    "m/s": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1.0 / 3.6},
-    "1": {"1": 1.0, "%": 1e-2},
-}
 
 
 class Read(NamedTuple):

@@ -29,4 +29,5 @@ from .running import sweep as sweep
 from .table import Table as Table
 from .tabular import Quantity as Quantity
 from .tabular import Tabular as Tabular
+from .tabular import chosen as chosen
 from .tabular import run_table as run_table

@@ -1,14 +1,15 @@
 """A labelled result over a grid, and its file."""
 
+import dataclasses
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
 import numpy as np
 
-from ..parameters import as_html, readable_unit
+from ..parameters import as_html, in_unit, readable_unit, require_unit
 from ..validation import as_path, require_package, shown
 from ..views import draw_table
 from ._chunks import unfinished
@@ -256,7 +257,16 @@ class Table(eqx.Module):
         return concise_strings(values, errors, self.variables.get("status", values))
 
     def plot(
-        self, variable: str | None = None, *, at: dict[str, float] | None = None, log: bool = False, ax: Any = None
+        self,
+        variable: str | None = None,
+        *,
+        at: dict[str, float] | None = None,
+        log: bool = False,
+        ax: Any = None,
+        x: str | None = None,
+        y: str | None = None,
+        label: str | None = None,
+        unit: str | Sequence[str] | None = None,
     ) -> Any:
         """Draw a variable over the grid (needs matplotlib): lines over the first axis, or a map of the first two.
 
@@ -266,18 +276,48 @@ class Table(eqx.Module):
         **Arguments:**
 
         - `variable`: name of a numeric variable, the first by default.
-        - `at`: name of an axis -> its value in the plot; the plot uses the nearest value of the grid.
+        - `at`: name of an axis -> its value in the plot, in the unit of the table. The plot uses the nearest value of
+          the grid, and states where this is another one.
         - `log`: whether the variable's scale is logarithmic.
         - `ax`: axes of matplotlib to draw in, instead of a new figure.
+        - `x`: name of the axis along the abscissa; `y`: name of the axis along the ordinate of a map.
+        - `label`: text for the legend of lines, or above a map.
+        - `unit`: unit to draw in, such as "deg" for all angles, or several, such as ("deg", "ms").
 
         **Returns:** the matplotlib figure, or `ax`.
 
-        **Raises:** `ValueError` for a variable that is not numeric, an unknown axis, or a table of one cell.
+        **Raises:** `ValueError` for a variable that is not numeric, an unknown axis, a value beyond its axis, an unknown
+        unit, or a table of one cell.
         """
         require_package("matplotlib", "plot", "plot")
         if not isinstance(at, dict | None):
             raise ValueError(f"at = {shown(at)} must be a dictionary, name of an axis -> its value")
-        return draw_table(self, variable, at or {}, log, ax)
+        require_unit(unit)
+        if unit is not None:
+            at = {name: value * in_unit(self.units.get(name, "1"), unit)[1] for name, value in (at or {}).items()}
+        return draw_table(self.drawn_in(unit, variable), variable, at, log, ax, x, y, label)
+
+    def drawn_in(self, unit: str | Sequence[str] | None, *names: str | None) -> "Table":
+        """The coordinates, the status and some variables in other units, for a plot.
+
+        **Arguments:** `unit`: as for `plot`, checked; `names`: the variables, or `None` for the first.
+        """
+        chosen = [next(iter(self.variables)) if name is None else str(name).partition(".")[0] for name in names]
+        if unit is None or not all(name in self.variables for name in chosen):
+            return self
+        units = {name: in_unit(si, unit) for name, si in self.units.items()}
+
+        def converted(values: Mapping[str, Values], names: Sequence[str]) -> dict[str, Values]:
+            numbers = {name: values[name] for name in names if name in values}
+            factors = {name: units[name][1] for name in numbers if name in units}
+            return {name: array * factors[name] if name in factors else array for name, array in numbers.items()}
+
+        return dataclasses.replace(
+            self,
+            coords=converted(self.coords, list(self.coords)),
+            variables=converted(self.variables, [*chosen, "status"]),
+            units={name: text for name, (text, _) in units.items()},
+        )
 
     @property
     def _title(self) -> str:

@@ -2,12 +2,13 @@
 
 import abc
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
-from ..parameters import likely, readable_unit, text_as_html
+from ..parameters import likely, readable_unit, require_unit, shown, text_as_html
+from ..progress import status_line
 from ..validation import require_package
-from ..views import draw_portrait
+from ..views import draw_portrait, draw_series, require_others
 from .layout import Values
 from .table import Table
 from .tasks import versions
@@ -38,6 +39,24 @@ class Quantity(NamedTuple):
     def of(self, name: str, run: Any) -> Any:
         """The values of the quantity in a run."""
         return getattr(run, name) if self.read is None else self.read(run)
+
+
+def chosen(quantities: dict[str, Quantity], names: Sequence[str]) -> dict[str, Quantity]:
+    """The quantities that are named, alone or by a component, such as "position.x"; all of them if a name is unknown, or
+    without names.
+
+    **Example:**
+
+    >>> from nonholonomic.sweeps import Quantity, chosen
+    >>> list(chosen({"height": Quantity("m", "height"), "speed": Quantity("m s-1", "speed")}, ["speed"]))
+    ['speed']
+    """
+    kept = {name.partition(".")[0] for name in names if isinstance(name, str)}
+    return (
+        {name: quantities[name] for name in quantities if name in kept}
+        if names and kept <= set(quantities)
+        else quantities
+    )
 
 
 def run_table(
@@ -122,7 +141,73 @@ class Tabular(abc.ABC):
         """
         self.to_table().save(path)
 
-    def portrait(self, x: str | None = None, y: str | None = None, ax: Any = None) -> Any:
+    def to_dataframe(self) -> Any:
+        """The run as a `pandas.DataFrame` (needs pandas): a row for each time, a column for each quantity or component.
+
+        **Raises:** `ValueError` for a batch of runs.
+        """
+        require_package("pandas", "pandas", "to_dataframe")
+        return self.to_table().to_dataframe()
+
+    def table_of(self, names: Sequence[str]) -> Table:
+        """A table over the run's times with at least the named quantities, or with all if one of the names is unknown."""
+        return self.to_table()
+
+    def labels_of(self, runs: list[Any]) -> list[str]:
+        """Labels that tell runs of this kind apart; an empty one for a single run."""
+        return [""] if len(runs) == 1 else [f"run {k + 1}" for k in range(len(runs))]
+
+    def overview(self, runs: list[Any], labels: list[str], unit: Any, ax: Any) -> Any:
+        """Draw what is most important in this run and others; arguments as for `plot`."""
+        names = [name for name, values in self.to_table().variables.items() if values.dtype.kind == "f"]
+        return draw_series([run.to_table().drawn_in(unit, *names) for run in runs], names, labels, ax)
+
+    @status_line("drawing")
+    def plot(
+        self,
+        *quantities: Any,
+        others: Sequence[Any] = (),
+        unit: str | Sequence[str] | None = None,
+        label: str | Sequence[str] | None = None,
+        ax: Any = None,
+    ) -> Any:
+        """Draw quantities over time (needs matplotlib), with a panel for each quantity.
+
+        **Arguments:**
+
+        - `quantities`: variables of `to_table()`, such as "theta" or "position", or components, such as "position.x"; by
+          default those that a page of the run shows, or all components of your own system.
+        - `others`: other runs to draw in the same panels, a list.
+        - `unit`: unit to draw in, such as "deg" for all angles, or several, such as ("deg", "ms").
+        - `label`: text for the legend; with `others`, a list of one for each run. By default, labels name what differs.
+        - `ax`: matplotlib axes to draw one quantity in, instead of a new figure.
+
+        **Returns:** the matplotlib figure, or `ax`.
+
+        **Raises:** `ValueError` for an unknown quantity or unit, and for a batch of runs.
+        """
+        require_package("matplotlib", "plot", "plot")
+        require_unit(unit)
+        if len(quantities) == 1 and not isinstance(quantities[0], str):
+            # A list of names; or, as in earlier versions, a list of runs, or axes.
+            (first,) = quantities
+            if isinstance(first, list | tuple) and first and all(isinstance(name, str) for name in first):
+                quantities = tuple(first)
+            elif hasattr(first, "set_xlabel"):
+                quantities, ax = (), first
+            else:
+                quantities, others = (), first
+        runs = [self, *require_others(self, others, "to_table")]
+        labels = [label] if isinstance(label, str) else list(label or self.labels_of(runs))
+        if len(labels) != len(runs):
+            raise ValueError(f"label = {shown(label)} must have {len(runs)} texts, one for each run")
+        if not quantities:
+            return self.overview(runs, labels, unit, ax)
+        return draw_series(
+            [run.table_of(quantities).drawn_in(unit, *quantities) for run in runs], quantities, labels, ax
+        )
+
+    def portrait(self, x: str | None = None, y: str | None = None, ax: Any = None, unit: Any = None) -> Any:
         """Draw one quantity against another, a phase portrait (needs matplotlib).
 
         **Arguments:**
@@ -131,21 +216,25 @@ class Tabular(abc.ABC):
           default `portrait` draws theta and its rate, the steering angle and the yaw rate, or the first and the last
           component of your own system.
         - `ax`: matplotlib axes to draw in, instead of a new figure.
+        - `unit`: unit to draw in, such as "deg" for all angles.
 
         **Returns:** the matplotlib figure, or `ax`.
 
-        **Raises:** `ValueError` for an unknown variable.
+        **Raises:** `ValueError` for an unknown variable or unit.
         """
         require_package("matplotlib", "plot", "portrait")
-        x_name, y_name = self.portrait_axes
-        return draw_portrait(self.to_table(), x_name if x is None else x, y_name if y is None else y, ax)
+        require_unit(unit)
+        x, y = x or self.portrait_axes[0], y or self.portrait_axes[1]
+        return draw_portrait(self.table_of((x, y)).drawn_in(unit, x, y), x, y, ax)
 
     def __getattr__(self, name: str) -> Any:
         # Python calls this for unknown names, and for known names whose property raised an AttributeError, which is
         # raised again here.
         if name.startswith("_") or hasattr(type(self), name) or not self.readable:
             return object.__getattribute__(self, name)
-        raise AttributeError(f"the run has no {name!r}{likely(name, self.readable)} It has {', '.join(self.readable)}")
+        methods = [method for method in dir(type(self)) if not method.startswith("_")]
+        hint = likely(name, [*self.readable, *methods]) or "."
+        raise AttributeError(f"the run has no {name!r}{hint} It has {', '.join(self.readable)}")
 
     def __repr__(self) -> str:
         return str(self)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED
 from ..sweeps import Table, Tabular
 from ..validation import is_traced
+from ..views import new_figure
 
 #: The words for how a run without an event ends, by code.
 WORDS = {REACHED_END: "completed", LEFT_DOMAIN: "stopped", FAILED: "failed", UNRESOLVED: "unresolved"}
@@ -89,21 +90,17 @@ class Trajectory(Tabular, eqx.Module):
         columns = dict(zip(self.names, np.asarray(self.state).T, strict=True)) | {"mode": np.asarray(self.mode)}
         return Table({"time": np.asarray(self.t)}, columns, {"time": "s"}, {"status": self.status})
 
-    def plot(self, ax: Any = None) -> Any:
-        """Draw the components over time (needs matplotlib).
-
-        **Arguments:** `ax`: axes of matplotlib to draw in, instead of a new figure.
-
-        **Returns:** the matplotlib figure, or `ax`.
-        """
-        import matplotlib.pyplot as plt
-
-        figure, axes = (None, ax) if ax is not None else plt.subplots()
+    def overview(self, runs: list[Any], labels: list[str], unit: Any, ax: Any) -> Any:
+        """Draw all components of a run in one picture, or a panel for each component of several runs."""
+        if len(runs) > 1 or unit is not None:
+            return super().overview(runs, labels, unit, ax)
+        figure = new_figure()
+        axes: Any = figure.add_subplot() if ax is None else ax
         for name, component in zip(self.names, np.asarray(self.state).T, strict=True):
             axes.plot(np.asarray(self.t), component, label=name)
         axes.set_xlabel("time [s]")
         axes.legend()
-        return axes if figure is None else figure
+        return figure if ax is None else ax
 
     def __str__(self) -> str:
         if is_traced(self.code) or np.ndim(self.t) != 1:

@@ -17,6 +17,8 @@ from .page import picture_as_html as picture_as_html
 from .page import table_as_html as table_as_html
 from .plot import draw_portrait as draw_portrait
 from .plot import draw_table as draw_table
+from .plot import new_figure as new_figure
+from .series import draw_series as draw_series
 from .stage import COLOURS as COLOURS
 from .stage import DARK as DARK
 from .stage import PALE as PALE
@@ -30,3 +32,4 @@ from .stage import Trace as Trace
 from .stage import distinguished_by_colour as distinguished_by_colour
 from .stage import turned as turned
 from .viewable import Viewable as Viewable
+from .viewable import require_others as require_others

@@ -1,18 +1,23 @@
 """Draw the contents of a page with matplotlib: an animation in a file, and the curves."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from ..parameters import in_unit
 from .arena import FINE
 from .page import ANGLE, centre_and_extent, view_from
 from .plot import new_figure
-from .stage import Show, Stage, css, finite, matrices, nearest
+from .stage import Curve, Show, Stage, css, finite, matrices, nearest
 
 #: Frames per second, default number of frames, and dots per inch.
 RATE, FRAMES, DOTS = 25, 150, 80
+
+#: Number of characters for which a legend has room.
+WIDTH = 90
 
 #: Direction of the light, and brightness of unlit faces.
 LIGHT, SHADE = np.array([0.3, -0.5, 0.81]), 0.55
@@ -23,25 +28,40 @@ LEAST_RANGE = 1e-3
 Times = Float[np.ndarray, " frames"]
 
 
-def draw_curves(stages: list[Stage]) -> Any:
+def draw_curves(stages: list[Stage], names: Sequence[str] = (), unit: str | Sequence[str] | None = None) -> Any:
     """A panel for each label, with the curves of all runs in it.
+
+    **Arguments:** `names`: names of the runs for the legend, by default those on the page; `unit`: as for `plot`.
 
     **Returns:** a matplotlib figure.
     """
     shows = [show for stage in stages for show in stage.shows]
-    labels = _labels(stages)
-    figure = new_figure(7.0, 1.3 + 1.3 * len(labels))
+    shows = [show._replace(curves=tuple(_in_unit(curve, unit) for curve in show.curves)) for show in shows]
+    labels = _labels(shows)
+    figure = new_figure(7.0, 1.3 + 1.5 * len(labels))
     for label, panel in zip(labels, figure.subplots(len(labels), 1, sharex=True, squeeze=False)[:, 0], strict=True):
         _draw_curve(panel, shows, label)
         panel.set_ylabel(label, fontsize="small")
     panel.set_xlabel("time [s]")
-    if len(shows) > 1:
-        figure.legend([f"{show.name}" for show in shows], loc="outside upper center", ncols=3, fontsize="small")
+    if len(shows) > 1 or any(names):
+        names = names or [show.name for show in shows]
+        # As many columns as the longest name leaves room for.
+        columns = max(1, WIDTH // (max(map(len, names)) + 6))
+        figure.legend(names, loc="outside upper center", ncols=min(columns, len(names)), fontsize="small")
     return figure
 
 
-def _labels(stages: list[Stage]) -> list[str]:
-    return list(dict.fromkeys(curve.label for stage in stages for show in stage.shows for curve in show.curves))
+def _labels(shows: list[Show]) -> list[str]:
+    return list(dict.fromkeys(curve.label for show in shows for curve in show.curves))
+
+
+def _in_unit(curve: Curve, unit: str | Sequence[str] | None) -> Curve:
+    """A curve in another unit, if its label ends in a unit that can be converted."""
+    name, bracket, si = curve.label.removesuffix("]").rpartition(" [")
+    if unit is None or not bracket:
+        return curve
+    text, factor = in_unit(si, unit)
+    return Curve(f"{name} [{text}]", factor * curve.values)
 
 
 def _draw_curve(panel: Any, shows: list[Show], label: str) -> None:
@@ -71,7 +91,7 @@ def write_animation(stages: list[Stage], path: Any, times: Times | None) -> None
         raise ValueError(f"path = {str(path)!r} must end in .gif, or in .mp4 where ffmpeg is installed")
     last = max(float(show.times[-1]) for stage in stages for show in stage.shows)
     times = np.linspace(0.0, last, FRAMES) if times is None else times
-    labels = _labels(stages)
+    labels = _labels([show for stage in stages for show in stage.shows])
     figure = new_figure(max(8.0, 5.0 * len(stages)), 6.0)
     grid = figure.add_gridspec(2, len(stages) * len(labels), height_ratios=(3.2, 1.0))
     spaces = []

@@ -8,13 +8,16 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..parameters import likely, readable_unit
-from ..validation import shown
+from ..validation import require, shown
 
 #: Colours of map cells without a finite value, one for each status.
 GREYS = ("0.85", "0.7", "0.55", "0.4", "0.25")
 
 #: The quantiles of the values at the ends of a map's colour scale.
 QUANTILES = (0.02, 0.98)
+
+#: Relative difference from a value of an axis that counts as none.
+ROUND_OFF = 1e-9
 
 #: An axis with at most this many values is drawn as one line per value.
 MOST_LINES = 8
@@ -77,7 +80,14 @@ def _drawing(ax: Any, *size: float) -> tuple[Any, Any]:
 
 
 def draw_table(
-    table: Labelled, variable: str | None = None, at: dict[str, float] | None = None, log: bool = False, ax: Any = None
+    table: Labelled,
+    variable: str | None = None,
+    at: dict[str, float] | None = None,
+    log: bool = False,
+    ax: Any = None,
+    x: str | None = None,
+    y: str | None = None,
+    label: str | None = None,
 ) -> Any:
     """Draw a variable over the grid of a table: lines over the first axis, or a map of the first two.
 
@@ -99,23 +109,25 @@ def draw_table(
     dims = table.dims(variable)
     if not dims:
         raise ValueError("a table of one cell has nothing to draw")
-    names, cut = _drawn(table, variable, at or {})
+    names, cut = _drawn(table, variable, at or {}, x, y)
     visible = _slice(np.where(np.isfinite(values), values, np.nan), dims, names, cut)
     figure, drawing = _drawing(ax)
     drawing.set_xlabel(table.label(names[0]))
-    drawing.set_title(", ".join(_cut_text(table, name, place) for name, place in cut.items()), fontsize="medium")
-    if len(names) == 1 or len(table.coords[names[1]]) <= MOST_LINES:
-        _draw_lines(drawing, table, names, visible.reshape(len(visible), -1))
+    cuts = [_cut_text(table, name, place, (at or {}).get(name)) for name, place in cut.items()]
+    if len(names) == 1 or (y is None and len(table.coords[names[1]]) <= MOST_LINES):
+        _draw_lines(drawing, table, names, visible.reshape(len(visible), -1), label)
         drawing.set_ylabel(table.label(variable))
         if log:
             drawing.set_yscale("log")
             _plain_numbers(drawing.yaxis)
     else:
         drawing.set_ylabel(table.label(names[1]))
+        cuts = [label, *cuts] if label else cuts
         _draw_map(drawing, table, names, visible, table.label(variable), log)
         if "status" in table.variables and not table.inner.get(variable):
             words = _slice(table.variables["status"], dims, names, cut)
             _mark_words(drawing, table, names, np.where(np.isnan(visible), words, ""))
+    drawing.set_title(", ".join(cuts), fontsize="medium")
     return drawing if figure is None else figure
 
 
@@ -126,26 +138,42 @@ def _first_number(table: Labelled) -> str:
     return names[0]
 
 
-def _drawn(table: Labelled, variable: str, at: dict[str, float]) -> tuple[list[str], dict[str, int]]:
+def _drawn(
+    table: Labelled, variable: str, at: dict[str, float], x: str | None, y: str | None
+) -> tuple[list[str], dict[str, int]]:
     """The one or two dimensions to draw over, and the indices at which the others are cut."""
     dims = table.dims(variable)
-    cut = {}
-    for name, value in at.items():
+    wanted = {argument: name for argument, name in {"x": x, "y": y}.items() if name is not None}
+    for argument, name in wanted.items():
         if name not in dims:
-            raise ValueError(f"at: {name!r} must be one of {', '.join(dims)}{likely(name, dims)}")
-        coordinate = table.coords[name]
-        if coordinate.dtype.kind == "U":
-            if value not in coordinate:
-                raise ValueError(f"at: {name} = {shown(value)} must be one of {', '.join(coordinate)}")
-            cut[name] = int(np.flatnonzero(coordinate == value)[0])
-        else:
-            cut[name] = int(np.argmin(np.abs(coordinate - value)))
+            raise ValueError(f"{argument} = {shown(name)} must be one of {', '.join(dims)}{likely(name, dims)}")
+        if name in at or list(wanted.values()).count(name) > 1:
+            raise ValueError(f"{argument} = {name!r} must not be named in at, nor be both x and y")
+    cut = {name: _nearest(table, dims, name, value) for name, value in at.items()}
     cells = len(table.shape)
     # A quantity with its own dimension, such as time, is drawn over that dimension.
-    left = [name for name in (*dims[cells:], *dims[:cells]) if name not in cut]
-    if not left:
+    left = [name for name in (*dims[cells:], *dims[:cells]) if name not in (*cut, x, y)]
+    if not left and not wanted:
         raise ValueError(f"at = {shown(at)} leaves no axis to draw over")
-    return left[:2], cut | {name: 0 for name in left[2:]}
+    first = [x] if x is not None else left[:1]
+    names = [*first, *([y] if y is not None else [name for name in left if name not in first][:1])]
+    return names, cut | {name: 0 for name in left if name not in names}
+
+
+def _nearest(table: Labelled, dims: tuple[str, ...], name: str, value: Any) -> int:
+    """The index of the value of an axis that is nearest to a wanted value within the axis."""
+    if name not in dims:
+        raise ValueError(f"at: {name!r} must be one of {', '.join(dims)}{likely(name, dims)}")
+    coordinate = table.coords[name]
+    if coordinate.dtype.kind == "U":
+        if value not in coordinate:
+            raise ValueError(f"at: {name} = {shown(value)} must be one of {', '.join(coordinate)}")
+        return int(np.flatnonzero(coordinate == value)[0])
+    low, high = float(np.min(coordinate)), float(np.max(coordinate))
+    require(value, f"at: {name}")
+    if not low - ROUND_OFF * abs(low) <= float(value) <= high + ROUND_OFF * abs(high):
+        raise ValueError(f"at: {name} = {shown(value)} must be between the ends of the axis, {low:.6g} and {high:.6g}")
+    return int(np.argmin(np.abs(coordinate - value)))
 
 
 def _slice(values: Any, dims: tuple[str, ...], names: list[str], cut: dict[str, int]) -> Any:
@@ -154,19 +182,22 @@ def _slice(values: Any, dims: tuple[str, ...], names: list[str], cut: dict[str, 
     return values[tuple(cut.get(name, slice(None)) for name in dims)].transpose([left.index(name) for name in names])
 
 
-def _cut_text(table: Labelled, name: str, place: int) -> str:
-    """A coordinate's value as text: "θ(0) = 0.1 rad"."""
+def _cut_text(table: Labelled, name: str, place: int, wanted: Any = None) -> str:
+    """A coordinate's value as text, "θ(0) = 0.1 rad", with the wanted value where it is another."""
     value = table.coords[name][place]
     text = str(value) if isinstance(value, str) else f"{value:.4g}"
-    return f"{table.long_names.get(name, name)} = {text} {readable_unit(table.units.get(name, '1'))}".rstrip()
+    text = f"{table.long_names.get(name, name)} = {text} {readable_unit(table.units.get(name, '1'))}".rstrip()
+    is_near = wanted is None or isinstance(value, str) or abs(value - wanted) <= ROUND_OFF * abs(value)
+    return text if is_near else f"{text} (nearest to {wanted:.4g})"
 
 
-def _draw_lines(drawing: Any, table: Labelled, names: list[str], lines: Any) -> None:
+def _draw_lines(drawing: Any, table: Labelled, names: list[str], lines: Any, label: str | None) -> None:
     marker = "o-" if len(lines) <= 100 else "-"
-    for column, line in enumerate(lines.T):
-        label = _cut_text(table, names[1], column) if len(names) > 1 else None
-        drawing.plot(table.coords[names[0]], line, marker, markersize=3, label=label)
-    if len(names) > 1:
+    for index, line in enumerate(lines.T):
+        texts = [label or "", _cut_text(table, names[1], index) if len(names) > 1 else ""]
+        text = ", ".join(filter(None, texts))
+        drawing.plot(table.coords[names[0]], line, marker, markersize=3, label=text or None)
+    if len(names) > 1 or label:
         drawing.legend()
 
 
@@ -222,7 +253,7 @@ def draw_portrait(table: Labelled, x: str, y: str, ax: Any = None) -> Any:
 
     **Raises:** `ValueError` for an unknown variable or component.
     """
-    (x_values, x_label), (y_values, y_label) = _column(table, "x", x), _column(table, "y", y)
+    (x_values, x_label), (y_values, y_label) = column(table, "x", x), column(table, "y", y)
     figure, drawing = _drawing(ax, 5.0, 4.5)
     (line,) = drawing.plot(x_values, y_values, linewidth=1.0)
     drawing.plot(x_values[:1], y_values[:1], "o", color=line.get_color())
@@ -234,8 +265,15 @@ def draw_portrait(table: Labelled, x: str, y: str, ax: Any = None) -> Any:
     return drawing if figure is None else figure
 
 
-def _column(table: Labelled, argument: str, name: str) -> tuple[Any, str]:
-    """A variable, or one of its components, with its label."""
+def column(table: Labelled, argument: str, name: Any, vectors: bool = False) -> tuple[Any, str]:
+    """A variable, or one of its components, with its label.
+
+    **Arguments:** `argument`: name of the argument in a message; `vectors`: whether the message lists vectors, too.
+    """
+    if not isinstance(name, str):
+        raise ValueError(
+            f"{argument} = {shown(name)} must be the name of a quantity, such as {next(iter(table.variables))!r}"
+        )
     variable, _, component = name.partition(".")
     dims = table.inner.get(variable, ())
     if variable in table.variables and not component and not dims:
@@ -244,7 +282,7 @@ def _column(table: Labelled, argument: str, name: str) -> tuple[Any, str]:
         place = int(np.flatnonzero(table.coords[dims[0]] == component)[0])
         name, bracket, unit = table.label(variable).rpartition(" [")
         return table[variable][:, place], f"{name}, {component}{bracket}{unit}" if bracket else f"{unit}, {component}"
-    candidates = [variable_name for variable_name in table.variables if variable_name not in table.inner]
+    candidates = [variable_name for variable_name in table.variables if vectors or variable_name not in table.inner]
     candidates += [
         f"{variable_name}.{part}" for variable_name, dims in table.inner.items() for part in table.coords[dims[0]]
     ]

@@ -1,4 +1,4 @@
-"""Views of a run: a page, an animation, a plot of its curves."""
+"""Views of a run: a page, an animation, the curves of the page."""
 
 import abc
 from collections.abc import Sequence
@@ -66,30 +66,24 @@ class Viewable(abc.ABC):
         require_file(path, "path", ".gif", ".mp4")
         write_animation(self._stages(others, overlaid), path, None if times is None else np.asarray(times, dtype=float))
 
-    @status_line("drawing")
-    def plot(self, others: Sequence[Any] = ()) -> Any:
-        """Draw the curves of the page over time (needs matplotlib).
-
-        **Arguments:** `others`: as for `view`.
-
-        **Returns:** a matplotlib figure.
-
-        **Raises:** `ValueError` for a batch of runs.
-
-        **Example:** `examples/a_page.py`.
-        """
-        require_package("matplotlib", "plot", "plot")
-        return draw_curves(self._stages(others))
+    def overview(self, runs: Sequence[Any], labels: list[str], unit: Any, ax: Any) -> Any:
+        """Draw the curves of the page of this run and others over time; arguments as for `plot`."""
+        if ax is not None:
+            raise ValueError("ax takes one quantity: name it, as in plot('energy', ax=ax)")
+        return draw_curves(self.stages(runs[1:]), labels, unit)
 
     def _stages(self, others: Sequence[Any], overlaid: bool = False) -> list[Stage]:
         """The stages, after a check that the others are runs of the same package."""
-        if isinstance(others, Viewable):
-            raise ValueError("others = a run must be a list of runs: write others=[run]")
-        if not isinstance(others, list | tuple):
-            raise ValueError(f"others = {shown(others)} must be a list of runs, such as [run]")
-        for k, other in enumerate(others):
-            if getattr(type(other), "stages", None) is not type(self).stages:
-                raise ValueError(
-                    f"others[{k}] = {shown(other)} must be a run of the same package, as simulate returns it"
-                )
-        return self.stages(others, overlaid)
+        return self.stages(require_others(self, others, "stages"), overlaid)
+
+
+def require_others(run: Any, others: Any, method: str) -> Sequence[Any]:
+    """Raise `ValueError` unless the others are a list of runs that share a method with the run; return them."""
+    if isinstance(others, type(run)):
+        raise ValueError("others = a run must be a list of runs: write others=[run]")
+    if not isinstance(others, list | tuple):
+        raise ValueError(f"others = {shown(others)} must be a list of runs, such as [run]")
+    for k, other in enumerate(others):
+        if getattr(type(other), method, None) is not getattr(type(run), method):
+            raise ValueError(f"others[{k}] = {shown(other)} must be a run of the same package, as simulate returns it")
+    return others

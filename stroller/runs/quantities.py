@@ -1,12 +1,13 @@
 """The quantities of a run of the stroller, with units and names, and the table of a run."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from nonholonomic.geometry import Plane
 from nonholonomic.parameters import description
-from nonholonomic.sweeps import Quantity, Table, run_table
+from nonholonomic.sweeps import Quantity, Table, chosen, run_table
 from nonholonomic.validation import require_one_run
 
 QUANTITIES = {
@@ -31,7 +32,7 @@ QUANTITIES = {
 }
 
 
-def table_of(runs: list[Any], names: list[str], request: dict[str, Any]) -> Table:
+def table_of(runs: list[Any], names: list[str], request: dict[str, Any], only: Sequence[str] = ()) -> Table:
     """All quantities of several runs with the same times, over these times.
 
     **Arguments:**
@@ -39,6 +40,7 @@ def table_of(runs: list[Any], names: list[str], request: dict[str, Any]) -> Tabl
     - `runs`: the trajectories.
     - `names`: names of the runs, without spaces, for the axis "ride"; empty for a single run.
     - `request`: plain data that describes the computation.
+    - `only`: names of quantities, as for `chosen`.
     """
     flat = {isinstance(run.spec.ride.scene.surface, Plane) for run in runs}
     # On grounds of different kinds, a place has no common unit.
@@ -47,17 +49,17 @@ def table_of(runs: list[Any], names: list[str], request: dict[str, Any]) -> Tabl
     coords = {"ride": np.array(names)} if names else {}
     coords |= {"time": np.asarray(runs[0].t), "coordinate": np.array(places)}
     coords |= {"component": np.array(("x", "y", "z")), "axle": np.array(("rear", "front"))}
-    quantities = QUANTITIES | {"place": QUANTITIES["place"]._replace(unit=unit)}
+    quantities = chosen(QUANTITIES | {"place": QUANTITIES["place"]._replace(unit=unit)}, only)
     of_runs = {name: [np.asarray(quantity.of(name, run)) for run in runs] for name, quantity in quantities.items()}
     values = {name: np.stack(of_each) if names else of_each[0] for name, of_each in of_runs.items()}
     return run_table(quantities, coords, values, [*(["ride"] if names else []), "time"], request)
 
 
-def table_of_one(run: Any) -> Table:
-    """All quantities of a run, over its times.
+def table_of_one(run: Any, only: Sequence[str] = ()) -> Table:
+    """Quantities of a run, over its times. **Arguments:** `only`: names of quantities, as for `chosen`.
 
     **Raises:** `ValueError` for a batch of runs.
     """
     require_one_run(run, "to_table", "; stroller.sweep makes a table of many")
     request = description("scene", run.spec.ride.scene) | {"status": run.status}
-    return table_of([run], [], request)
+    return table_of([run], [], request, only)

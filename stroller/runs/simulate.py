@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
 
 import diffrax
 import equinox as eqx
@@ -22,7 +21,7 @@ from ..model.scene import Scene
 from .checks import check_options, check_run
 from .ride import Ride, RideSpec, as_module, traced_ride
 from .steps import followed
-from .trajectory import Trajectory, read_off
+from .trajectory import Trajectory, read_off, read_off_compiled
 
 #: Default number of times to report.
 DEFAULT_TIMES = 201
@@ -98,13 +97,10 @@ def _concrete(ride: Ride, times: Float[Array, " times"]) -> Trajectory:
     """The run of concrete numbers."""
     spec = RideSpec.of(ride)
     if not isinstance(ride.settings.for_steps_alone, diffrax.AbstractERK | ImplicitMidpoint):
-        return _read_off(spec, times, *_sampled(ride, times))
+        return read_off_compiled(spec, times, *_sampled(ride, times))
     steps, stats = followed(spec)
-    return dataclasses.replace(_read_off(spec, times, steps.at(spec, np.asarray(times)), stats), steps=steps)
+    return dataclasses.replace(read_off_compiled(spec, times, steps.at(spec, np.asarray(times)), stats), steps=steps)
 
-
-# Compiled functions also accept NumPy arrays.
-_read_off: Callable[..., Trajectory] = eqx.filter_jit(read_off)
 
 # Steps of other implicit solvers cannot be repeated cheaply, so they end on the times.
 _sampled = eqx.filter_jit(functools.partial(traced_ride, adjoint=None))

@@ -1,19 +1,19 @@
 """One run of the stroller and its quantities."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_vectors
 from nonholonomic.progress import status_line
 from nonholonomic.sweeps import Table, Tabular
-from nonholonomic.validation import is_traced
+from nonholonomic.validation import is_traced, require, require_increasing, require_one_run, require_outside
 from nonholonomic.views import Stage, Viewable
 
 from ..model.dynamics import Power, State, padded
@@ -23,7 +23,7 @@ from .crossings import crossings, watched
 from .quantities import QUANTITIES, table_of_one
 from .ride import CONTACT_ROUND_OFF, MOST_GRIP, RANK_LOST, RideSpec, Stats
 from .steps import Steps, followed
-from .view import as_stages
+from .view import as_stages, names_of
 
 
 class Trajectory(Viewable, Tabular, eqx.Module):
@@ -128,6 +128,24 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         remark = f": the {slips} wheels would slip, because tyres provide at most {MOST_GRIP:g}" if slips else ""
         return f"needed friction up to {text}{remark}"
 
+    def at(self, times: Float[ArrayLike, " times"]) -> "Trajectory":
+        """The same ride at other times, as accurate as the integration.
+
+        **Arguments:** `times`: increasing, within [0, the end of the ride] [s]; or one time, for a ride of one time.
+
+        **Raises:** `ValueError` for times outside the ride, inside a transformation, and for a batch.
+        """
+        require_outside((self.t, times), "at", "times= of simulate")
+        require_one_run(self, "at", "")
+        run = self.with_steps()
+        assert run.steps is not None
+        require(times, "times", at_least=0.0, at_most=run.steps.times[-1], why="the ride ends there")
+        times = np.atleast_1d(np.asarray(times, dtype=float))
+        require_increasing(times, "times")
+        return dataclasses.replace(
+            read_off_compiled(self.spec, times, run.steps.at(self.spec, times), self.stats), steps=run.steps
+        )
+
     def with_steps(self) -> "Trajectory":
         """The same run with its steps."""
         return self if self.steps is not None else dataclasses.replace(self, steps=followed(self.spec)[0])
@@ -178,6 +196,12 @@ class Trajectory(Viewable, Tabular, eqx.Module):
     def to_table(self) -> Table:
         return table_of_one(self)
 
+    def table_of(self, names: Sequence[str]) -> Table:
+        return table_of_one(self, names)
+
+    def labels_of(self, runs: list[Any]) -> list[str]:
+        return names_of(runs) if len(runs) > 1 else [""]
+
     def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
         return as_stages([self, *others], overlaid)
 
@@ -190,7 +214,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         jackknives = self.jackknifed_at
         lines = [
             f"Trajectory of {self.t.size} times, {float(self.t[0]):g} s to {float(self.t[-1]):g} s: {self.status}",
-            f"  steps           {int(self.stats.steps)}, of which {int(self.stats.rejected)} rejected",
+            f"  steps           {int(self.stats.steps)} accepted, {int(self.stats.rejected)} rejected",
             f"  end             place {shown(self.place[-1])}, heading {float(self.heading[-1]):.6g} rad, "
             f"speed {float(self.speed[-1]):.6g} m/s, steering {float(self.steering[-1]):.6g} rad",
             f"  energy          {float(self.energy[0]):.6g} J to {float(self.energy[-1]):.6g} J, "
@@ -262,6 +286,10 @@ def read_off(
     """The trajectory of the given states at the given times."""
     arrays = quantities_of(spec.ride.scene, spec.ride.input, t, states)
     return Trajectory(**arrays, stats=stats, spec=spec, steps=None)
+
+
+# Compiled functions also accept NumPy arrays.
+read_off_compiled: Callable[..., Trajectory] = eqx.filter_jit(read_off)
 
 
 def quantities_of(

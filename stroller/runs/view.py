@@ -49,12 +49,17 @@ GREEN, BLUE, VIOLET, GOLD = 0x1F8A4C, 0x1B6CA8, 0x7B4FA3, 0xE0A100
 
 def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     """Rides as stages: one stage for each, or a common one for overlaid rides."""
+    names = names_of(runs)
+    return grouped([list(enumerate(runs))] if overlaid else [[numbered_run] for numbered_run in enumerate(runs)], names)
+
+
+def names_of(runs: list[Any]) -> list[str]:
+    """Names of rides, by what differs in their durations, scenes and launches."""
     for run in runs:
         require_one_run(run, "a picture", ", and pass the others as others=")
     rides = [run.spec.ride for run in runs]
-    starts = [f"ride of {float(run.t[-1]):.3g} s" for run in runs]
-    names = distinguishing_labels(starts, [ride.scene for ride in rides], [ride.launch for ride in rides])
-    return grouped([list(enumerate(runs))] if overlaid else [[numbered_run] for numbered_run in enumerate(runs)], names)
+    starts = [(f"ride of {float(run.t[-1]):.3g} s",) for run in runs]
+    return distinguishing_labels(starts, [ride.scene for ride in rides], [ride.launch for ride in rides])
 
 
 def grouped(groups: list[list[tuple[int, Any]]], names: list[str]) -> list[Stage]:

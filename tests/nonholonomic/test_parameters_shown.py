@@ -7,7 +7,15 @@ import pytest
 
 import stroller
 import tippe
-from nonholonomic.parameters import as_html, as_text, distinguishing_labels, in_lines, readable_unit, text_as_html
+from nonholonomic.parameters import (
+    as_html,
+    as_text,
+    distinguishing_labels,
+    in_lines,
+    in_unit,
+    readable_unit,
+    text_as_html,
+)
 
 
 @pytest.mark.parametrize(
@@ -58,10 +66,21 @@ def test_runs_are_told_apart_by_what_differs():
         tippe.Scene(body, tippe.Plane(), tippe.Viscous(0.3)),
         tippe.Scene(body, tippe.Plane(), tippe.Viscous(0.2)),
     ]
-    assert distinguishing_labels(["a", "a"], scenes) == ["a, mu 0.3 s/m", "a, mu 0.2 s/m"]
+    assert distinguishing_labels([("a", "b")] * 2, scenes) == ["mu 0.3 s/m", "mu 0.2 s/m"]
+    assert distinguishing_labels([("a", "b"), ("a", "c")], scenes) == ["b, mu 0.3 s/m", "c, mu 0.2 s/m"]
     scenes[1] = tippe.Scene(body, tippe.Cylinder(0.3), tippe.Viscous(0.3))
-    assert distinguishing_labels(["a", "b"], scenes) == ["a, Plane", "b, Cylinder"]
-    assert distinguishing_labels(["a", "b", "a"], [scenes[0]] * 3) == ["a (1)", "b", "a (2)"]
+    assert distinguishing_labels([("a",), ("b",)], scenes) == ["a, Plane", "b, Cylinder"]
+    assert distinguishing_labels([("a",), ("b",), ("a",)], [scenes[0]] * 3) == ["a (1)", "b", "a (2)"]
+    assert distinguishing_labels([("a", "b")], scenes[:1]) == ["a, b"]
+
+
+def test_numbers_are_shown_in_other_units():
+    assert in_unit("rad", "deg") == ("deg", pytest.approx(180.0 / np.pi))
+    assert in_unit("rad s-1", "deg") == ("deg/s", pytest.approx(180.0 / np.pi))
+    assert in_unit("rad s-1", ["deg", "rpm"]) == ("rpm", pytest.approx(30.0 / np.pi))
+    assert in_unit("1/s", "ms") == ("1/s", 1.0)
+    assert in_unit("1", "deg") == ("1", 1.0)
+    assert readable_unit("deg/s") == "deg/s"
 
 
 def test_no_public_object_shows_the_shapes_of_its_arrays():

@@ -47,6 +47,15 @@ def test_a_ride_goes_to_xarray_a_file_and_a_picture(tmp_path):
     assert data["side_force"].dims == ("time", "axle")
     assert data["speed"].attrs == {"units": "m s-1", "long_name": "speed v"}
     assert list(data["coordinate"].values) == ["x", "y"]
+    assert list(run.to_dataframe()["side_force.rear"]) == list(run.side_force[:, 0])
+    assert f"{int(run.stats.steps)} accepted, {int(run.stats.rejected)} rejected" in str(run)
+    assert run.plot("heading", unit="deg").axes[0].get_ylabel() == "heading ψ [deg]"
+    # The same ride at other times.
+    later = run.at([0.25, 0.5, 1.0])
+    np.testing.assert_array_equal(later.position[1:], run.position)
+    np.testing.assert_array_equal(run.at(0.25).speed, later.speed[:1])
+    with pytest.raises(ValueError, match=r"times = 1\.5 must be at most 1\.0 \(the ride ends there\)"):
+        run.at(1.5)
     run.save(tmp_path / "ride.h5")
     with xarray.open_dataset(tmp_path / "ride.h5", engine="h5netcdf") as dataset:
         np.testing.assert_array_equal(dataset["position"], run.position)

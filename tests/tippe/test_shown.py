@@ -91,8 +91,90 @@ def test_a_portrait_draws_one_quantity_over_another(run):
 
 
 def test_a_run_shows_itself(run):
-    assert "completed" not in repr(run)
-    assert "ran to 1 s" in run._repr_html_()
+    assert "completed at 1 s" in repr(run)
+    assert "completed at 1 s" in run._repr_html_()
+
+
+def test_a_run_tells_whether_the_top_turned_over(run):
+    assert "not turned over\n" in str(run)
+    inverted = tippe.simulate(run.scene, tippe.Launch(2.9, 300.0), 1.0, tolerance=1e-6)
+    assert f"turned over at {inverted.inversion_time:.6g} s" in str(inverted)
+    assert 0.0 < inverted.inversion_time < 1.0
+    group_I = tippe.Top(**GOOD | {"offset": 0.002, "I1": 2.5e-6})
+    upright = tippe.simulate(
+        tippe.Scene(group_I, friction=tippe.Viscous(0.3)), tippe.Launch(0.1, 155.0), 1.0, tolerance=1e-6
+    )
+    assert "not turned over: a top of group I (tippe.steady.group) cannot" in str(upright)
+    sliding = tippe.simulate(tippe.Scene(rutstam_top()), tippe.Launch(0.1, 155.0), 0.1, tolerance=1e-6)
+    assert "not turned over: without friction no top turns over" in str(sliding)
+
+
+def test_one_time_is_a_time(run):
+    assert_close(run.at(0.5).theta, run.at([0.5]).theta)
+    assert run.at(0.5).position.shape == (1, 3)
+
+
+def test_a_run_goes_to_pandas(run):
+    frame = run.to_dataframe()
+    assert_close(frame["position.x"], run.position[:, 0])
+    assert frame.attrs["units"]["theta"] == "rad"
+    with pytest.raises(AttributeError, match=re.escape("no 'to_datafrme'; did you mean 'to_dataframe'? It has theta")):
+        _ = run.to_datafrme
+    with pytest.raises(AttributeError, match=re.escape("no 'xqxqx'. It has theta, eta")):
+        _ = run.xqxqx
+
+
+def test_quantities_are_drawn_over_time_by_name_and_in_degrees(run):
+    panels = run.plot("theta", "position", unit="deg").axes
+    assert_close(panels[0].get_lines()[0].get_ydata(), np.degrees(run.theta))
+    assert [panel.get_ylabel() for panel in panels] == ["inclination θ [deg]", "position of the centre [m]"]
+    assert panels[1].get_xlabel() == "time [s]"
+    assert [text.get_text() for text in panels[1].get_legend().get_texts()] == ["x", "y", "z"]
+    assert_close(panels[1].get_lines()[1].get_ydata(), run.position[:, 1])
+    (component,) = run.plot(["position.y"], unit=("cm", "ms")).axes
+    assert (component.get_ylabel(), component.get_xlabel()) == ("position of the centre, y [cm]", "time [ms]")
+    assert_close(component.get_lines()[0].get_xydata(), np.stack([1e3 * run.t, 100.0 * run.position[:, 1]], axis=-1))
+    (spin,) = run.plot("spin", unit=["deg", "rpm"]).axes
+    assert spin.get_ylabel() == "spin ω₃ [rpm]"
+    portrait = run.portrait(unit="deg").axes[0]
+    assert_close(portrait.get_lines()[0].get_ydata(), np.degrees(run.theta_rate))
+    assert portrait.get_ylabel() == "θ' [deg/s]"
+    curves = run.plot(unit="deg").axes
+    assert curves[0].get_ylabel() == "θ, normal to axis [deg]"
+
+
+def test_labels_are_what_differs(run):
+    scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.2))
+    other = tippe.simulate(scene, tippe.Launch(0.1, 155.0), 1.0, tolerance=1e-6)
+
+    def texts(**options):
+        return [
+            text.get_text() for text in run.plot("theta", others=[other], **options).axes[0].get_legend().get_texts()
+        ]
+
+    assert texts() == ["mu 0.3 s/m", "mu 0.2 s/m"]
+    assert texts(label=["rough", "smooth"]) == ["rough", "smooth"]
+    legend = run.plot(others=[other]).legends[0]
+    assert [text.get_text() for text in legend.get_texts()] == ["mu 0.3 s/m", "mu 0.2 s/m"]
+    (panel,) = run.plot("theta", label="my top").axes
+    assert panel.get_legend().get_texts()[0].get_text() == "my top"
+    assert run.plot("theta").axes[0].get_legend() is None
+    assert other.plot("energy", ax=panel) is panel
+    assert len(panel.get_lines()) == 2
+
+
+def test_plots_that_cannot_be_drawn_are_refused(run):
+    for arguments, options, message in (
+        (("tehta",), {}, "quantity = 'tehta' must be one of theta, .*did you mean 'theta'"),
+        (("theta",), {"unit": "degree"}, "unit = 'degree' must be one of s, ms, .*did you mean 'deg'"),
+        (("theta", "spin"), {"ax": object()}, "ax takes one quantity, not 2: theta, spin"),
+        ((), {"ax": object()}, "ax takes one quantity: name it"),
+        ((run,), {}, r"others = a run must be a list of runs: write others=\[run\]"),
+        (("theta",), {"label": ["a", "b"]}, r"label = \['a', 'b'\] must have 1 texts"),
+        (("theta", 3.0), {}, r"quantity = 3\.0 must be the name of a quantity, such as 'theta'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            run.plot(*arguments, **options)
 
 
 @pytest.mark.parametrize(("command", "package"), [(main, tippe)])

@@ -23,11 +23,14 @@ from nonholonomic.sweeps import Table, Tabular
 from nonholonomic.validation import is_traced, require, require_increasing
 from nonholonomic.views import Stage, Viewable
 
+from ..model.body import AbstractBody
+from ..model.friction import Frictionless
 from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
 from ..model.top import Top
+from ..steady import group
 from .quantities import OF_ONE_RUN, QUANTITIES, table_of
-from .view import as_stages
+from .view import as_stages, names_of
 
 #: The angle [rad] that counts as inverted by default.
 INVERTED = 0.95 * math.pi
@@ -203,20 +206,26 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
     def at(self, times: Float[ArrayLike, " times"]) -> Self:
         """The same run at other times, from the dense output.
 
-        **Arguments:** `times`: increasing, within [0, `end_time`] [s].
+        **Arguments:** `times`: increasing, within [0, `end_time`] [s]; or one time, for a run of one time.
 
         **Raises:** `ValueError` for times outside the run, or if the run was made inside a transformation.
         """
         if self.dense is None:
             raise ValueError("a run made inside jit, vmap or grad has no dense output: pass `times` to simulate")
         require(times, "times", at_least=0.0, at_most=self.end_time, why="the run ends there")
-        times = np.asarray(times, dtype=float)
+        times = np.atleast_1d(np.asarray(times, dtype=float))
         require_increasing(times, "times")
         return self.resampled(times)
 
     @status_line("reading off")
     def to_table(self) -> Table:
         return table_of(self)
+
+    def table_of(self, names: Sequence[str]) -> Table:
+        return table_of(self, names)
+
+    def labels_of(self, runs: list[Any]) -> list[str]:
+        return names_of(runs) if len(runs) > 1 else [""]
 
     def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
         return as_stages([self, *others], overlaid)
@@ -273,16 +282,31 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         axes = self.scene.frame.axes(self._place, self._path)
         return jnp.stack([dot(vector, directions) for directions in zip(*axes, strict=True)], axis=-1)
 
+    @property
+    def _whether_it_turned_over(self) -> str:
+        """Whether and when the top turned over, as text."""
+        body, time = self.scene.body, self.inversion_time
+        stem = isinstance(body, Top) and body.stem is not None
+        if np.isfinite(time):
+            return f"turned over{' onto its stem' if stem else ''} at {time:.6g} s"
+        reason = ""
+        if isinstance(self.scene.friction, Frictionless):
+            reason = ": without friction no top turns over"
+        elif self.scene.level and isinstance(body, Top) and group(body) == "I":
+            reason = ": a top of group I (tippe.steady.group) cannot"
+        return f"not turned over{reason}"
+
     @status_line("reading off")
     def __str__(self) -> str:
         if is_traced(self.t) or self.t.ndim > 1:
             return f"Trajectory of {self.t.shape} times"
         word = self.status if isinstance(self.status, str) else Status(int(self.status)).word
-        ending = {"completed": "ran to", "contact_lost": "lost contact at"}.get(word, f"{word} at")
         lines = [
-            f"Trajectory of {len(self.t)} times, {ending} {float(self.end_time):.6g} s",
+            f"Trajectory of {len(self.t)} times, {word} at {float(self.end_time):.6g} s",
             f"  theta: {float(self.theta[0]):.6g} to {float(self.theta[-1]):.6g} rad",
         ]
+        if self.dense is not None and isinstance(self.scene.body, AbstractBody):
+            lines.append(f"  {self._whether_it_turned_over}")
         if word == "contact_lost" and self.scene.contact == "stop" and isinstance(self.scene.body, Top):
             lines.append("  to continue through the flight, use a Scene with contact='hybrid'")
         if "axis_drift" in self.stats:

@@ -1,11 +1,12 @@
 """The quantities of a run of a tippe top, with units and names, and the table of a run."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from nonholonomic.parameters import description
-from nonholonomic.sweeps import Quantity, Table, run_table
+from nonholonomic.sweeps import Quantity, Table, chosen, run_table
 from nonholonomic.validation import require_one_run
 
 from ..model.rigid_body import AbstractRigidBody
@@ -43,10 +44,10 @@ OF_RIGID_BODIES = {
 }
 
 
-def table_of(run: Any) -> Table:
-    """All quantities of a run, over its times.
+def table_of(run: Any, names: Sequence[str] = ()) -> Table:
+    """Quantities of a run, over its times.
 
-    **Arguments:** `run`: a `Trajectory` or a `HybridTrajectory`, not a batch.
+    **Arguments:** `run`: a `Trajectory` or a `HybridTrajectory`, not a batch; `names`: as for `chosen`.
 
     **Raises:** `ValueError` for a batch of runs.
     """
@@ -54,6 +55,7 @@ def table_of(run: Any) -> Table:
     quantities = QUANTITIES | OF_ONE_RUN
     if isinstance(run.scene.body, AbstractRigidBody):
         quantities |= OF_RIGID_BODIES
+    quantities = chosen(quantities, names)
     dims = [quantity.components for quantity in quantities.values() if quantity.components is not None]
     coords = {"time": np.asarray(run.t)} | {dim: np.array(COMPONENTS[dim]) for dim in dict.fromkeys(dims)}
     values = {name: np.asarray(quantity.of(name, run)) for name, quantity in quantities.items()}

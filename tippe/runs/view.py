@@ -116,12 +116,16 @@ _rotation_rate = eqx.filter_jit(lambda run: jnp.linalg.norm(run.angular_velocity
 
 def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     """Runs as stages: one stage for each, or a common one for overlaid runs."""
+    motions_by_name = [(name, run.scene, motion(run)) for name, run in zip(names_of(runs), runs, strict=True)]
+    return stages([motions_by_name] if overlaid else [[run] for run in motions_by_name])
+
+
+def names_of(runs: list[Any]) -> list[str]:
+    """Names of runs, by what differs in their launches and scenes."""
     for run in runs:
         require_one_run(run, "a picture", ", and pass the others as others=")
-    starts = [f"θ(0) = {float(run.theta[0]):.3g} rad, {float(run.spin[0]):.4g} rad/s" for run in runs]
-    names = distinguishing_labels(starts, [run.scene for run in runs])
-    motions_by_name = [(name, run.scene, motion(run)) for name, run in zip(names, runs, strict=True)]
-    return stages([motions_by_name] if overlaid else [[run] for run in motions_by_name])
+    starts = [(f"θ(0) = {float(run.theta[0]):.3g} rad", f"{float(run.spin[0]):.4g} rad/s") for run in runs]
+    return distinguishing_labels(starts, [run.scene for run in runs])
 
 
 def motion(run: Any) -> DrawnMotion[np.ndarray]:

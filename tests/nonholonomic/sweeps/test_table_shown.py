@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import xarray
 from cheap_sweep import cheap_sweep
+from close import assert_close
 
 from nonholonomic.sweeps import Table
 
@@ -53,10 +54,27 @@ def test_a_picture_is_cut_where_it_says(table):
     assert [text.get_text() for text in drawing.get_legend().get_texts()] == [f"friction μ = {mu:g} s/m" for mu in MU]
     figure = table.plot("time", at={"mu": 0.19})
     drawing = figure.axes[0]
-    assert drawing.get_title() == "friction μ = 0.2 s/m"
+    assert drawing.get_title() == "friction μ = 0.2 s/m (nearest to 0.19)"
+    assert table.plot("time", at={"mu": 0.2}).axes[0].get_title() == "friction μ = 0.2 s/m"
     assert (drawing.get_xlabel(), drawing.get_ylabel()) == ("θ(0) [rad]", "spin [rad/s]")
     assert figure.axes[1].get_ylabel() == "inversion time [s]"
     np.testing.assert_array_equal(np.asarray(drawing.collections[0].get_array()), table.time[:, 1].T)
+
+
+def test_axes_labels_and_units_are_chosen(table):
+    lines = table.plot(x="mu", at={"spin": 70.0}, label="a top", unit="deg").axes[0]
+    assert (lines.get_xlabel(), lines.get_ylabel()) == ("friction μ [s/m]", "inversion time [s]")
+    texts = [text.get_text() for text in lines.get_legend().get_texts()]
+    assert texts == [f"a top, θ(0) = {theta:.4g} deg" for theta in np.degrees(THETA)]
+    assert_close(lines.get_lines()[2].get_xydata(), np.stack([MU, table.time[2, :, 1]], axis=-1))
+    chart = table.plot(x="spin", y="theta", unit=["deg", "rpm"], label="a top").axes[0]
+    assert (chart.get_xlabel(), chart.get_ylabel()) == ("spin [rpm]", "θ(0) [deg]")
+    assert chart.get_title() == "a top, friction μ = 0.1 s/m"
+    np.testing.assert_array_equal(np.asarray(chart.collections[0].get_array())[2], table.time[2, 0])
+    # A value of `at` has the unit of the table.
+    assert table.plot(at={"theta": 0.2}, unit="deg").axes[0].get_title() == "θ(0) = 11.46 deg"
+    (single,) = table.plot(at={"mu": 0.1, "spin": 60.0}, label="mine").axes
+    assert single.get_legend().get_texts()[0].get_text() == "mine"
 
 
 def test_colours_lie_between_quantiles_and_may_be_logarithmic(table):
@@ -88,6 +106,12 @@ def test_it_draws_in_given_axes_and_shows_itself(table):
     [
         ({"at": {"colour": 1.0}}, "at: 'colour' must be one of theta, mu, spin"),
         ({"at": {"theta": 0.1, "mu": 0.1, "spin": 60.0}}, "leaves no axis to draw over"),
+        ({"at": {"mu": 0.9}}, "at: mu = 0.9 must be between the ends of the axis, 0.1 and 0.3"),
+        ({"at": {"mu": "x"}}, "at: mu = 'x' is not a number"),
+        ({"x": "tehta"}, "x = 'tehta' must be one of theta, mu, spin; did you mean 'theta'"),
+        ({"x": "mu", "y": "mu"}, "x = 'mu' must not be named in at, nor be both x and y"),
+        ({"x": "mu", "at": {"mu": 0.1}}, "x = 'mu' must not be named in at"),
+        ({"unit": "degrees"}, "unit = 'degrees' must be one of"),
         ({"variable": "status"}, "variable = 'status' must be a numeric variable"),
     ],
 )
