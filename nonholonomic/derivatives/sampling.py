@@ -16,16 +16,16 @@ from .differentiable import AbstractDifferentiableSolve, differentiable_solve
 class ProblemSpec(eqx.Module):
     """How to build a problem from numbers and how to integrate it, except for the tolerance."""
 
-    build: Callable[[Any, Any], Any] = eqx.field(static=True)
+    build: Callable[..., Any] = eqx.field(static=True)
     # JAX's PyTreeDef, which type checkers take for a variable.
     structure: Any = eqx.field(static=True)
     rest: Any
     settings: Settings
     grid: Float[Array, " steps"] | None
 
-    def built(self, numbers: tuple[Array, ...], extra: Any) -> Any:
-        """Build the problem from the modules, with their numbers replaced, and from the extra argument of `build`."""
-        return self.build(eqx.combine(jax.tree.unflatten(self.structure, numbers), self.rest), extra)
+    def built(self, numbers: tuple[Array, ...], *extra: Any) -> Any:
+        """Build the problem from the modules, with their numbers replaced, and from the extra arguments of `build`."""
+        return self.build(eqx.combine(jax.tree.unflatten(self.structure, numbers), self.rest), *extra)
 
 
 class AbstractSampling(AbstractDifferentiableSolve):
@@ -47,7 +47,7 @@ class AbstractSampling(AbstractDifferentiableSolve):
 
 def solve_for_samples(
     sampling: Callable[[int, ProblemSpec, Any], AbstractSampling],
-    build: Callable[[Any, Any], Any],
+    build: Callable[..., Any],
     modules: Any,
     times: Float[Array, " times"],
     t1: Float[Array, ""],
@@ -57,7 +57,7 @@ def solve_for_samples(
     """Solve for the samples of a run.
 
     **Arguments:** `sampling`: a function that returns the solve, given its first three fields; `build`: a function that
-    returns the problem, given the modules and an extra argument of the solve (the function is compared by identity);
+    returns the problem, given the modules and extra arguments of the solve (the function is compared by identity);
     other arguments as for `sampled_run`.
     """
     numbers, static = eqx.partition(modules, eqx.is_inexact_array)

@@ -3,9 +3,9 @@ derivatives.
 
 `solve_hybrid` integrates an ensemble of runs, each through the modes of a system (`traced_solve_hybrid` inside other
 transformed functions); `solve_hybrid_dense` integrates a single run with its path. `solve_hybrid_with_tangents` carries
-tangents through every reset by the saltation matrix, and `hybrid_samples` returns states at times, with their
-derivatives. A run that is not over after `MOST_ROUNDS` modes is `UNRESOLVED`; `BETWEEN` is the number of the segment of a
-`HybridPath` between two modes.
+tangents through every reset by the saltation matrix. `solve_hybrid_with_samples` returns the states of an ensemble at
+times, and `hybrid_samples` those of a run inside a transformation, both with their derivatives. A run that is not over
+after `MOST_ROUNDS` modes is `UNRESOLVED`; `BETWEEN` is the number of the segment of a `HybridPath` between two modes.
 
 **Example:** two bouncing balls. The event is the highest point: the velocity falls through zero.
 
@@ -55,5 +55,6 @@ from .path import Segment as Segment
 from .path import solve_hybrid_dense as solve_hybrid_dense
 from .samples import HybridSamples as HybridSamples
 from .samples import hybrid_samples as hybrid_samples
+from .samples import solve_hybrid_with_samples as solve_hybrid_with_samples
 from .tangents import solve_hybrid_with_tangents as solve_hybrid_with_tangents
 from .tangents import traced_solve_hybrid_with_tangents as traced_solve_hybrid_with_tangents

@@ -1,6 +1,7 @@
 """The interface of a mode: its equations of motion, and its transition to the next mode."""
 
 import abc
+from collections.abc import Callable
 from typing import Any, ClassVar, Generic, NamedTuple
 
 import equinox as eqx
@@ -142,6 +143,19 @@ class AbstractHoppingMode(AbstractBatchedMode):
     @abc.abstractmethod
     def motion_in(self, stretch: Any) -> Any:
         """The argument of `between` for a stretch that begins."""
+
+
+def over_cells(function: Callable[..., Any], mode: AbstractBatchedMode) -> Callable[..., Any]:
+    """Map a function of the mode of one run, and of more arguments, over cells, which are in the last axis of every
+    array."""
+
+    def cells_axis(leaf: Any) -> int | None:
+        return -1 if eqx.is_array(leaf) and leaf.ndim else None
+
+    def mapped(*arguments: Any) -> Any:
+        return eqx.filter_vmap(function, in_axes=(cells_axis, *[-1] * len(arguments)), out_axes=-1)(mode, *arguments)
+
+    return mapped
 
 
 def mode_of_cells(mode: AbstractBatchedMode, cell: Int[Numbers, " selected"]) -> AbstractBatchedMode:

@@ -89,19 +89,34 @@ class VariationalMode(AbstractBatchedMode):
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """The reset map of the mode itself, with variations. The last row of the counters counts grazing events."""
-        return self.reset_with_path(state, left, lambda mode, record, left: ())[0]
+        return self.reset_with_path(state, left, lambda mode, state, left: (mode.reset_map(state, left), ()))[0]
 
     def reset_with_path(
-        self, state: Float[Array, "components cells"], left: Float[Array, " cells"], read_path: Callable[..., Any]
+        self, state: Float[Array, "components cells"], left: Float[Array, " cells"], reset_with_path: Callable[..., Any]
     ) -> tuple[Transition, Any, Any]:
-        """The transition by the mode's `reset_map`, and numbers computed from its path.
+        """The transition, and numbers that describe its path.
 
-        **Arguments:** `read_path`: function of the mode, the `TransitionPath` and `left` that returns a tree of numbers.
+        **Arguments:** `reset_with_path`: function of the mode, the state and `left` that returns the mode's `Transition`
+        and a tree of numbers.
 
         **Returns:** the `Transition`; the numbers; and their variations, with the tangents first.
         """
         primal, *variations = self.parts(state)
         primal, duration, count = primal[:-1], primal[-1], len(variations)
+        if not variations:
+            # Nothing is differentiated, so no event is grazing.
+            transition, path = reset_with_path(self.mode, primal, left)
+            no_grazes, clock = jnp.zeros_like(transition.counts[:1]), jnp.zeros_like(duration)
+            return (
+                transition._replace(
+                    state=with_row(transition.state, clock),
+                    counts=jnp.concatenate([transition.counts, no_grazes]),
+                    record=None,
+                    log_rates=None,
+                ),
+                path,
+                jax.tree.map(lambda value: jnp.zeros((0, *value.shape)), path),
+            )
         numbers, build = self._active_numbers()
         zero_rates = [jnp.zeros_like(number) for number in numbers]
         rates = self.mode.problem(primal).field(duration, primal)
@@ -113,10 +128,8 @@ class VariationalMode(AbstractBatchedMode):
         delays, log_rates = self._delays(primal, duration, [*directions, (rates, *zero_rates)])
 
         def reset(primal: Float[Array, "components cells"], left: Float[Array, " cells"], *numbers: Array) -> Any:
-            mode = build(*numbers)
-            transition = mode.reset_map(primal, left)
+            transition, path = reset_with_path(build(*numbers), primal, left)
             reset_log_rates = jnp.zeros_like(left) if transition.log_rates is None else transition.log_rates
-            path = read_path(mode, transition.record, left)
             return (transition.state, transition.elapsed, reset_log_rates, path), transition._replace(
                 record=None, log_rates=None
             )

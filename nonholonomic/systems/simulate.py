@@ -126,7 +126,7 @@ def _problem(cells: Cells, count: int | None) -> ModeProblem:
 
 
 def _modes(
-    cells: Cells, tolerance: Array
-) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " 1"], Float[Array, "components 1"]]:
-    """The modes of one run, the index of its first mode, and its start."""
-    return cells.modes(1)
+    cells: Cells, tolerance: Array, count: int
+) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"], Float[Array, "components cells"]]:
+    """The modes of some runs, the index of each first mode, and the starts."""
+    return cells.modes(count)

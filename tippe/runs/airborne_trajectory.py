@@ -133,12 +133,15 @@ class StickSlipArenaTrajectory(ArenaTrajectory):
         return ArenaTrajectory.work_in(piece)
 
 
-def arena_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int[Array, "1"], Float[Array, "19 1"]]:
-    """The modes of one launch of a hybrid scene on any arena, the index of the first, and its initial state.
+def arena_modes(
+    modules: tuple[Scene, Launch], tolerance: Any, cells: int = 1
+) -> tuple[Any, Int[Array, " cells"], Float[Array, "19 cells"]]:
+    """The modes of launches of a hybrid scene on any arena, the index of each first mode, and the initial states.
 
-    **Arguments:** `modules`: scene and launch; `tolerance`: relative tolerance of the integration.
+    **Arguments:** `modules`: scene and launch; `tolerance`: relative tolerance of the integration; `cells`: number of
+    launches.
     """
-    problem = _start(*modules)
+    problem = _start(*modules, cells)
     modes = airborne.modes if modules[0].body.stem is None else airborne_stem.modes
     if modules[0].friction.set_valued:
         modes = stick_slip_modes
@@ -146,10 +149,10 @@ def arena_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int
 
 
 @compiled_setup
-def _start(scene: Scene[Top], launch: Launch) -> InversionProblem:
-    """The launch as one cell, with the passive quadratures."""
-    state, scales = trajectory_problem((scene, launch)).start()
-    return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
+def _start(scene: Scene[Top], launch: Launch, cells: int) -> InversionProblem:
+    """The launches, with the passive quadratures."""
+    state, scales = trajectory_problem((scene, launch), cells).start()
+    return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state, scales)
 
 
 def simulate_airborne(scene: Scene[Top], launch: Launch, t1: float, times: Any, settings: Settings) -> ArenaTrajectory:

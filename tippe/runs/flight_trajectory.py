@@ -187,22 +187,24 @@ class HybridTrajectory(AbstractTrajectory):
         return f"{text}\n  unresolved: {self._reason()}" if self.status == Status.UNRESOLVED.word else text
 
 
-def level_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int[Array, "1"], Float[Array, "15 1"]]:
-    """The modes of one launch of a hybrid scene on a level plane, the index of the first, and its initial state.
+def level_modes(
+    modules: tuple[Scene, Launch], tolerance: Any, cells: int = 1
+) -> tuple[Any, Int[Array, " cells"], Float[Array, "15 cells"]]:
+    """The modes of launches of a hybrid scene on a level plane, the index of each first mode, and the initial states.
 
-    **Arguments:** `modules`: scene and launch; `tolerance`: no mode needs it.
+    **Arguments:** `modules`: scene and launch; `tolerance`: no mode needs it; `cells`: number of launches.
     """
-    problem = _start(*modules)
+    problem = _start(*modules, cells)
     return (*modes(modules[0], problem, tolerance, last=False, with_quadratures=True), problem.states)
 
 
 @compiled_setup
-def _start(scene: Scene[Top], launch: Launch) -> InversionProblem:
-    """The launch as one cell, with the passive quadratures, whose position is that of the centre of mass."""
-    state, scales = trajectory_problem((scene, launch)).start()
+def _start(scene: Scene[Top], launch: Launch, cells: int) -> InversionProblem:
+    """The launches, with the passive quadratures, whose position is that of the centre of mass."""
+    state, scales = trajectory_problem((scene, launch), cells).start()
     place = state[8:10] - scene.body.offset * state[2:4]
     state = jnp.concatenate([state[:8], place, state[10:]])
-    return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
+    return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state, scales)
 
 
 def simulate_hybrid(scene: Scene[Top], launch: Launch, t1: float, times: Any, settings: Settings) -> HybridTrajectory:

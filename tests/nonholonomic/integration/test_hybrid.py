@@ -10,10 +10,12 @@ from close import assert_close
 from nonholonomic.hybrid import (
     BETWEEN,
     AbstractBatchedMode,
+    AbstractHoppingMode,
     Transition,
     TransitionPath,
     solve_hybrid,
     solve_hybrid_dense,
+    solve_hybrid_with_samples,
 )
 from nonholonomic.integration import AbstractProblem, Settings
 from nonholonomic.integration.status import CROSSED, REACHED_END, RUNNING, UNRESOLVED
@@ -44,7 +46,7 @@ class Motion(AbstractProblem):
         return None
 
     def domain_margin(self, time, state):
-        return state[0] if self.falls else None
+        return state[0] if self.falls else 1.0 + 0.0 * state[0]
 
 
 class Fall(AbstractBatchedMode):
@@ -93,7 +95,9 @@ class Rest(AbstractBatchedMode):
         return Motion(state, jnp.asarray(0.0), False)
 
     def reset_map(self, state, left):
-        raise AssertionError("nothing ends it")
+        """Nothing ends it."""
+        none = jnp.zeros(left.shape, int)
+        return Transition(none, state, 0.0 * left, none, jnp.full_like(left, jnp.nan), none[None])
 
 
 class Ball(NamedTuple):
@@ -193,6 +197,102 @@ def test_a_single_ball_at_any_time():
     assert_close(path.at(times[is_rising]), expected[:, is_rising], atol=1e-13)
     assert set(path.numbers(times)) == {FALLING, RESTING, BETWEEN}
     assert path.at(np.zeros(0)).shape == (3, 0)
+
+
+def sampled(kind, times, tangents=()):
+    """All balls at the given times: (shown, times, balls) and the mode; and what `solve_hybrid_with_samples` returns."""
+    heights = padded(HEIGHTS)
+    modes = (kind(jnp.asarray(padded(RESTITUTIONS)), jnp.full(CELLS + PADDING, jnp.inf)), Rest())
+    state, first = np.stack([heights, 0.0 * heights, 0.0 * heights]), np.full(CELLS + PADDING, FALLING)
+    options = (modes, first, state, jnp.asarray(times), 4.0, CELLS, SETTINGS)
+    samples, slopes = solve_hybrid_with_samples(*options, counters=1, tangents=tangents)
+    return np.moveaxis(samples.shown[:CELLS], 0, -1), samples, slopes
+
+
+class Hop(NamedTuple):
+    """A flight of a ball from the ground to the ground or to the horizon."""
+
+    speed: jnp.ndarray
+    count: jnp.ndarray
+    elapsed: jnp.ndarray
+    passed: jnp.ndarray
+    open: jnp.ndarray
+
+
+class Bounces(Fall, AbstractHoppingMode):
+    """All bounces in closed form."""
+
+    most_hops = 100
+
+    def lost(self, state):
+        height, velocity, count = state
+        speed = jnp.sqrt(velocity**2 + 2.0 * GRAVITY * height)
+        rebound, overrun = self.restitution * speed, (speed + velocity) / GRAVITY
+        return Hop(rebound, count + 1.0, overrun, 0.0 * count, rebound >= CLOSING)
+
+    def hop(self, stretch, left):
+        whole = 2.0 * stretch.speed / GRAVITY
+        passed = jnp.minimum(whole, left - stretch.elapsed)
+        end = stretch._replace(elapsed=stretch.elapsed + passed, passed=passed)
+        rebound, lands = self.restitution * stretch.speed, passed == whole
+        after = (rebound, stretch.count + 1.0, end.elapsed, 0.0 * passed, lands & (rebound >= CLOSING))
+        following = Hop(*(jnp.where(lands, a, b) for a, b in zip(after, (*end[:4], False), strict=True)))
+        return end, Hop(*(jnp.where(stretch.open, a, b) for a, b in zip(following, stretch, strict=True)))
+
+    def motion_in(self, stretch):
+        return 0.0 * stretch.elapsed, stretch.speed, stretch.count
+
+    def closed(self, stretch):
+        rests = stretch.speed < CLOSING
+        state = self.between(self.motion_in(stretch), stretch.passed) * jnp.stack([~rests, ~rests, rests | True])
+        return Transition(
+            jnp.where(rests, RESTING, FALLING),
+            state,
+            stretch.elapsed,
+            jnp.where(rests, RUNNING, REACHED_END),
+            jnp.full_like(stretch.speed, jnp.inf),
+            stretch.count.astype(int)[None],
+        )
+
+
+@pytest.mark.parametrize("kind", [Fall, Bounces])
+def test_many_balls_at_given_times(kind):
+    """Falling, on recorded or unrecorded ways between two modes, and at rest, with times of their own or in common."""
+    times = np.linspace(0.0, 4.0, 60)
+    rows, samples, _ = sampled(kind, times)
+    expected = np.array([[ball.state(time) for time in times] for ball in BALLS]).T
+    assert_close(rows, expected, atol=2e-12)
+    numbers = np.asarray(samples.number[:CELLS])
+    assert set(numbers.ravel()) == {FALLING, RESTING, BETWEEN}
+    assert np.all(numbers[:, 0] == FALLING)
+    own_times = times[:, None] * np.linspace(0.5, 1.0, CELLS + PADDING)
+    own_rows, _, _ = sampled(kind, own_times)
+    expected = np.array([[ball.state(time) for time in own_times[:, k]] for k, ball in enumerate(BALLS)])
+    assert_close(own_rows, np.moveaxis(expected, (0, 1, 2), (2, 1, 0)), atol=2e-12)
+
+
+@pytest.mark.parametrize("kind", [Fall, Bounces])
+def test_the_slopes_of_many_balls_at_given_times(kind):
+    """By the restitution, between and after bounces: the closed form's differences."""
+    times = np.array([0.5, 1.0, 1.5])
+    unit = jnp.asarray(padded(np.ones(CELLS)))
+    tangents = (((kind(unit, jnp.zeros(CELLS + PADDING)), Rest()), None),)
+    _, _, (slopes,) = sampled(kind, times, tangents)
+    changes = [
+        [
+            [Ball(ball.height, ball.restitution + change).state(time)[row] for change in (-1e-6, 1e-6)]
+            for row in range(2)
+        ]
+        for ball in BALLS
+        for time in times
+    ]
+    expected = (np.diff(changes, axis=-1)[..., 0] / 2e-6).reshape(CELLS, 3, 2)
+    away = np.array(
+        [[min(abs(ball.bounce(k) - time) for k in range(1, 60)) > 1e-4 for time in times] for ball in BALLS]
+    )
+    assert away.mean() > 0.9
+    computed = np.moveaxis(np.asarray(slopes.shown[:CELLS, :2]), 1, 2)
+    assert_close(computed[away], expected[away], rtol=1e-4, atol=1e-5)
 
 
 def test_a_single_ball_ends_as_it_does_in_a_table():

@@ -39,6 +39,8 @@ class Turns(AbstractProblem):
 
     state: jnp.ndarray
     clock: int
+    # A callback is no part of a single kernel.
+    fits_one_kernel = False
 
     def start(self):
         return self.state, jnp.ones_like(self.state)
@@ -73,16 +75,18 @@ class Turn(AbstractBatchedMode):
         )
 
 
-def turning(first, tolerance):
+def turning(first, tolerance, cells):
     """From the number of the first clock to the modes, the first of them, and the state."""
-    clocks = jnp.where(jnp.arange(2) == first, OWN, OTHER)
-    return (Turn(0), Turn(1)), first.astype(int)[None], jnp.concatenate([clocks, jnp.array([1.0, 0.0])])[:, None]
+    first = jnp.broadcast_to(first, cells)
+    clocks = jnp.where(jnp.arange(2)[:, None] == first, OWN, OTHER)
+    start = jnp.concatenate([clocks, jnp.ones((1, cells)), jnp.zeros((1, cells))])
+    return (Turn(0), Turn(1)), first.astype(int), start
 
 
 def test_a_single_run_is_watched_little_further_than_its_steps():
     """Room for 128 steps is reserved in a mode, each watched at eight places; with room for 2048, tops whose flights are
     short crawled."""
-    modes, _, state = turning(jnp.asarray(0.0), 1e-6)
+    modes, _, state = turning(jnp.asarray(0.0), 1e-6, 1)
     path = solve_hybrid_dense(modes, 0, state[:, 0], 0.32, Settings(1e-6), counters=1)
     assert path.status == REACHED_END
     assert path.counts.tolist() == [6]
