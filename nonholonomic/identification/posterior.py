@@ -14,7 +14,7 @@ from ..progress import status_line
 from ..validation import require, shown
 from .likelihood import Measurements
 from .problem import Problem
-from .unknown import as_free
+from .unknown import as_free, as_gaussian
 
 #: The log density of a parameter: (mean, standard deviation) of a Gaussian, or a function of the parameter.
 Prior = tuple[float, float] | Callable[[Float[Array, ""]], Float[Array, ""]]
@@ -62,17 +62,18 @@ class LogDensity(eqx.Module):
         `series_units`: the unit of each series of the measurements, if known.
         """
         unknowns = as_free(free)
-        all_priors = {name: unknown.prior for name, unknown in unknowns.items() if unknown.prior is not None} | dict(
-            priors or {}
-        )
+        of_unknowns = {name: unknown.prior for name, unknown in unknowns.items() if unknown.prior is not None}
+        all_priors: dict[str, Any] = of_unknowns | dict(priors or {})
         for name, prior in all_priors.items():
             if name not in unknowns:
                 raise ValueError(f"priors: {name!r} must be one of {', '.join(unknowns)}")
             if not callable(prior):
-                if np.shape(prior) != (2,):
+                if np.shape(prior) not in ((), (2,)):
                     raise ValueError(
-                        f"priors: {name!r} = {shown(prior)} must be a mean and a standard deviation, or a function"
+                        f"priors: {name!r} = {shown(prior)} must be a mean and a standard deviation, only the standard "
+                        "deviation, or a function"
                     )
+                all_priors[name] = prior = as_gaussian(prior, unknowns[name].start)
                 require(prior[1], f"standard deviation of the prior of {name}", above=0.0)
         series, estimated = np.asarray(measurements.series), np.asarray(measurements.estimated)
         leaves = {name: _as_leaves(prior) for name, prior in all_priors.items()}

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..parameters import numbers, one_line, with_numbers
-from ..validation import as_number, as_number_or_none, require, shown
+from ..validation import as_number, as_number_or_none, require, shown, warn
 from ..xla_cpu import greatest
 from .likelihood import Measurements
 
@@ -33,6 +33,7 @@ class Quantities:
     - `columns`: name of a quantity with several columns -> their names.
     - `units`: name of a column -> its SI unit.
     - `angles`: columns with a period of a whole turn.
+    - `usual`: column of an angle -> a magnitude [rad] that it rarely exceeds.
 
     **Example:**
 
@@ -44,6 +45,7 @@ class Quantities:
     columns: Mapping[str, tuple[str, ...]]
     units: Mapping[str, str]
     angles: frozenset[str]
+    usual: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def of(self, quantity: Any) -> tuple[str, ...]:
         """The columns of a quantity, of a column, or of a tuple of them.
@@ -136,10 +138,24 @@ class AbstractRecording(eqx.Module):
             if np.shape(self.error) not in ((), shape[1:], shape):
                 raise ValueError(f"error must be one number, one for each column, or of shape {shape}")
             require(np.broadcast_to(self.error, shape)[seen], "error", above=0.0)
+        self._suspect_degrees()
         if self.student is not None:
             require(self.student, "student", above=0.0)
             if np.ndim(self.student) != 0:
                 raise ValueError(f"student must be one number, not of shape {np.shape(self.student)}")
+
+    def _suspect_degrees(self) -> None:
+        """Warn of angles that are unusually large for radians."""
+        samples = np.abs(np.asarray(self.value)).reshape(len(self.times), -1)
+        for name, limit in self.quantities.usual.items():
+            if name not in self.columns:
+                continue
+            greatest_angle = np.nanmax(samples[:, self.columns.index(name)], initial=0.0)
+            if greatest_angle > limit:
+                warn(
+                    f"{name} = {greatest_angle:g} rad is large; recorded angles are in radians: did you mean "
+                    f"np.radians({name})?"
+                )
 
     @property
     def columns(self) -> tuple[str, ...]:

@@ -20,7 +20,8 @@ class Free(NamedTuple):
 
     - `start`: value from which the fit starts, strictly within the bounds.
     - `lower`, `upper`: bounds, which a fit approaches but does not reach.
-    - `prior`: mean and standard deviation of a Gaussian prior of the parameter itself, or `None`.
+    - `prior`: mean and standard deviation of a Gaussian prior of the parameter itself; or only the standard deviation,
+      if the mean is `start`; or `None`.
 
     **Example:**
 
@@ -36,13 +37,18 @@ class Free(NamedTuple):
     start: float
     lower: float = -math.inf
     upper: float = math.inf
-    prior: tuple[float, float] | None = None
+    prior: tuple[float, float] | float | None = None
+
+    @property
+    def gaussian(self) -> tuple[float, float] | None:
+        """Mean and standard deviation of the prior."""
+        return as_gaussian(self.prior, self.start)
 
     @property
     def unit(self) -> float:
         """The unit of changes of the parameter: the size of the start value; if this is 0, the prior's standard
         deviation, or 1."""
-        return abs(self.start) or (self.prior[1] if self.prior else 1.0)
+        return abs(self.start) or (self.gaussian[1] if self.gaussian else 1.0)
 
     @property
     def positive(self) -> bool:
@@ -56,6 +62,11 @@ class Free(NamedTuple):
     def coordinate(self, value: Any) -> Float[Array, "..."]:
         """The coordinate of a value strictly within the bounds; the inverse of `value`."""
         return Unknown.of(self).coordinate(value)
+
+
+def as_gaussian(prior: Any, start: float) -> Any:
+    """Mean and standard deviation of a prior that may be only a standard deviation about the start value."""
+    return (start, prior) if prior is not None and np.ndim(prior) == 0 else prior
 
 
 class Unknown(eqx.Module):
@@ -80,7 +91,7 @@ class Unknown(eqx.Module):
         program."""
         numbers = (free.start, free.unit, free.lower, free.upper)
         start, unit, lower, upper = (np.asarray(number, float) for number in numbers)
-        prior = None if free.prior is None else np.asarray(free.prior, float)
+        prior = None if free.gaussian is None else np.asarray(free.gaussian, float)
         return cls(start, unit, lower, upper, prior, math.isfinite(free.lower), math.isfinite(free.upper))
 
     @property
@@ -133,13 +144,18 @@ def as_free(free: Any, lower: dict[str, float] | None = None) -> dict[str, Free]
         if np.ndim(unknown.start) != 0:
             raise ValueError(f"start of {name} must be one number, not of shape {np.shape(unknown.start)}")
         require(unknown.start, f"start of {name}", above=unknown.lower, below=unknown.upper, why="the bounds")
+        prior = None
         if unknown.prior is not None:
-            if np.shape(unknown.prior) != (2,):
-                raise ValueError(f"prior of {name} = {shown(unknown.prior)} must be a mean and a standard deviation")
-            require(unknown.prior[0], f"mean of the prior of {name}")
-            require(unknown.prior[1], f"standard deviation of the prior of {name}", above=0.0)
+            if np.shape(unknown.prior) not in ((), (2,)):
+                raise ValueError(
+                    f"prior of {name} = {shown(unknown.prior)} must be a mean and a standard deviation, or only the standard "
+                    "deviation"
+                )
+            prior = as_gaussian(unknown.prior, float(unknown.start))
+            require(prior[0], f"mean of the prior of {name}")
+            require(prior[1], f"standard deviation of the prior of {name}", above=0.0)
         unknowns[name] = unknown._replace(
-            start=float(unknown.start), lower=float(unknown.lower), upper=float(unknown.upper)
+            start=float(unknown.start), lower=float(unknown.lower), upper=float(unknown.upper), prior=prior
         )
     return unknowns
 

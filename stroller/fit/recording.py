@@ -9,7 +9,7 @@ from nonholonomic.identification import AbstractRecording, Quantities, as_quanti
 from nonholonomic.validation import as_number, as_number_or_none, require_kind
 
 from ..model.input import Input
-from ..model.launch import Launch
+from ..model.launch import USUAL, Launch
 
 #: The quantities of a ride that can be recorded, with the names of a `Trajectory`'s properties.
 QUANTITIES = Quantities(
@@ -17,6 +17,7 @@ QUANTITIES = Quantities(
     units=dict.fromkeys(("x", "y", "z"), "m")
     | {"heading": "rad", "steering": "rad", "speed": "m/s", "yaw_rate": "rad/s", "steering_rate": "rad/s"},
     angles=frozenset({"heading"}),
+    usual=USUAL,
 )
 
 
@@ -62,7 +63,7 @@ class Recording(AbstractRecording):
 
 def read_recording(
     path: Any,
-    columns: Any,
+    columns: Any = None,
     fps: float | None = None,
     *,
     launch: Launch,
@@ -70,21 +71,24 @@ def read_recording(
     input: Input | None = None,
     t0: float = 0.0,
     student: float | None = None,
+    decimal: str = ".",
 ) -> Recording:
     """A recording of a ride from a text file of columns with a header line (CSV).
 
     **Arguments:**
 
-    - `path`: path of the file. Columns are separated by commas, semicolons, tabs or blanks; empty cells and `nan` are
-      missing samples; lines that begin with # are ignored.
+    - `path`: path of the file. Columns are separated by commas, semicolons, tabs or blanks; empty cells, `nan`, `n/a` and
+      `-` are missing samples; lines that begin with # are ignored.
     - `columns`: quantity -> (header of its column, unit): `"time"`, or `"frame"`, and any of `"x"`, `"y"`, `"z"`,
       `"heading"`, `"steering"`, `"speed"`, `"yaw_rate"`, `"steering_rate"`. Units are s, ms, min; rad, deg, rev; rad/s,
       deg/s, rpm, rev/s; m, cm, mm; m/s, cm/s, mm/s, km/h; or a factor that converts the file's numbers to SI units,
-      such as metres per pixel.
+      such as metres per pixel. If the header has the unit, as "speed [km/h]", the header is enough. By default, the
+      columns whose headers are quantities with units, such as "time [s]" and "speed [km/h]".
     - `fps`: frames per second, if there is no `"time"`. If there is no `"frame"` either, every line is a frame.
     - `launch`: a `Launch`, with guesses for unknown numbers; `input`, `t0`, `student`: as for `Recording`.
     - `error`: quantity -> (standard error or the header of its column, unit); with `None`, errors are estimated from
       the residuals.
+    - `decimal`: "," if the file has decimal commas.
 
     **Returns:** a `Recording`.
 
@@ -100,5 +104,5 @@ def read_recording(
     >>> print(ride.times, ride.value.round(2))
     [0. 1. 2.] [1.5  1.39 1.31]
     """
-    table = read_columns(path, columns, fps, error, QUANTITIES)
+    table = read_columns(path, columns, fps, error, QUANTITIES, decimal)
     return Recording(launch, *table, input=input, t0=t0, student=student)

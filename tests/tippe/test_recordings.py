@@ -7,6 +7,7 @@ import pytest
 from tops import rutstam_top
 from viscous_top import Body, azimuth, follow, start, theta
 
+import stroller
 import tippe
 from tippe.fit.identify import unknowns_of
 
@@ -94,6 +95,7 @@ def test_missing_samples_are_left_out_and_unknown_errors_are_found(fit):
     assert len(fit.verdict.series) == 4
 
 
+TIMED = {"time": ("t", "s"), "theta": ("tilt", "deg")}
 HEADERS = "t,tilt,x\n0.0,5,1\n0.1,6,2\n"
 
 
@@ -104,18 +106,90 @@ HEADERS = "t,tilt,x\n0.0,5,1\n0.1,6,2\n"
         (HEADERS, {"theta": ("tilt", "mm")}, 25.0, "unit of theta = 'mm' must be one of rad, deg, rev"),
         (HEADERS, {"theta": ("angle", "deg")}, 25.0, "'angle' must be one of the headers of"),
         (HEADERS, {"theta": "tilt"}, 25.0, r"'theta' = 'tilt' must be \(header, unit\)"),
-        (HEADERS, {"phi": ("tilt", "deg")}, 25.0, "quantity = 'phi'"),
+        (HEADERS, {"phi": ("tilt", "deg")}, 25.0, "columns: 'phi' must be one of time, frame, theta"),
+        (HEADERS, {"t": ("t", "s")}, None, "columns: 't' must be one of time, frame, theta, .*; did you mean 'time'"),
         (HEADERS, {"position": ("x", "m")}, 25.0, "'position' must be a single column"),
         (HEADERS, {"theta": ("tilt", "deg")}, None, "fps must be given"),
         (HEADERS, {"time": ("t", "s"), "theta": ("tilt", "deg")}, 25.0, "fps = 25.0 must be omitted"),
         (HEADERS.replace("6", "six"), {"theta": ("tilt", "deg")}, 25.0, "tilt = 'six' in line 3"),
         (HEADERS + "1\n", {"theta": ("tilt", "deg")}, 25.0, "line 4 has 1 cells, not 3"),
+        # The numbers of lines are those of the file.
+        ("# a film\n\n" + HEADERS.replace("6", "six"), {"theta": ("tilt", "deg")}, 25.0, "tilt = 'six' in line 5"),
+        ("# a film\n" + HEADERS + "\n1\n", {"theta": ("tilt", "deg")}, 25.0, "line 6 has 1 cells, not 3"),
+        (HEADERS.replace(",", ";").replace("0.1", "0,1"), TIMED, None, "t = '0,1' in line 3 .* pass decimal=','"),
+        (
+            "t,tilt\n0,1,5\n",
+            TIMED,
+            None,
+            "line 2 has 3 cells, not 2; to read decimal commas, separate the columns by semic",
+        ),
+        (
+            "t,tilt\n0,1\n",
+            None,
+            None,
+            "no header is the name of a quantity with its unit, such as 'theta .deg.': pass columns",
+        ),
+        ("time,theta [deg]\n0,1\n", None, None, "the header 'time' must have a unit, such as 'time .s.'"),
+        ("t,tilt [mm]\n0,1\n", {"theta": "tilt"}, 25.0, "unit of theta = 'mm' must be one of rad"),
+        (HEADERS, {"theta": ("tlit", "deg")}, 25.0, "'tlit' must be one of the headers of .*; did you mean 'tilt'"),
     ],
 )
 def test_files_that_cannot_be_read_are_refused(tmp_path, text, columns, fps, message):
     (tmp_path / "film.csv").write_text(text)
     with pytest.raises(ValueError, match=message):
         tippe.read_recording(tmp_path / "film.csv", columns, fps, launch=tippe.Launch(0.1, 100.0))
+
+
+FILES = {
+    "a spreadsheet with decimal commas": ("Zeit;tilt (°)\r\n0,1;5,7\r\n0,2;n/a\r\n0,3;6,3\r\n", ","),
+    "units in headers": ("# film 3\n\nZeit / ms\ttilt [deg]\n100\t5.7\n200\t-\n300\t6.3\n", "."),
+    "blanks": ("time [s]   theta [deg]\n0.1  5.7\n0.2  NaN\n0.3  6.3\n", "."),
+}
+COLUMNS = {
+    "a spreadsheet with decimal commas": {"time": ("Zeit", "s"), "theta": "tilt"},
+    "units in headers": {"time": "Zeit", "theta": "tilt [deg]"},
+    "blanks": None,
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252", "utf-16"])
+def test_a_class_has_files_of_its_own(tmp_path, name, encoding):
+    text, decimal = FILES[name]
+    (tmp_path / "film.csv").write_bytes(text.encode(encoding))
+    film = tippe.read_recording(tmp_path / "film.csv", COLUMNS[name], launch=tippe.Launch(0.1, 100.0), decimal=decimal)
+    np.testing.assert_allclose(film.times, [0.1, 0.3])
+    np.testing.assert_allclose(film.value, np.radians([5.7, 6.3]))
+
+
+def test_angles_in_degrees_are_suspected():
+    """An inclination of more than pi is refused, a large direction is suspected only: it may count turns."""
+    launch, times = tippe.Launch(0.1, 100.0), [0.0, 0.1]
+    with pytest.warns(
+        UserWarning, match=r"azimuth = 170 rad is large; recorded angles are in radians: did you mean np"
+    ):
+        tippe.Recording(launch, times, [[0.1, 20.0], [0.1, -170.0]], 0.01, ("theta", "azimuth"))
+    ride = stroller.Launch((0.0, 0.0), 0.0, 1.0)
+    with pytest.warns(UserWarning, match="steering = 25 rad is large"):
+        stroller.Recording(ride, times, [np.nan, 25.0], 0.01, "steering")
+
+
+def test_a_prior_may_be_a_standard_deviation_about_the_start(rutstam_scene):
+    film = tippe.Recording(tippe.Launch(0.1, 9.0), [0.0, 1.0], [0.1, 0.2], 0.1)
+    short, full = (unknowns_of(rutstam_scene, (film,), {"mu": tippe.Free(0.3, prior=p)}) for p in (0.1, (0.3, 0.1)))
+    assert short == full
+    assert tippe.Free(0.0, prior=0.2).unit == 0.2
+    densities = [tippe.log_density(rutstam_scene, film, {"mu": 0.3}, {"mu": prior}) for prior in (0.1, (0.3, 0.1))]
+    assert [float(np.asarray(part)) for part in densities[0].priors["scene.friction.mu"]] == [0.3, 0.1]
+    for prior, message in (
+        (
+            (0.1, 0.2, 0.3),
+            "prior of mu = .0.1, 0.2, 0.3. must be a mean and a standard deviation, or only",
+        ),
+        (-0.1, "standard deviation of the prior of mu = -0.1 must be greater"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            unknowns_of(rutstam_scene, (film,), {"mu": tippe.Free(0.3, prior=prior)})
 
 
 @pytest.mark.parametrize(

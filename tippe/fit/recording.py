@@ -19,6 +19,7 @@ QUANTITIES = Quantities(
     | dict.fromkeys(("x", "y", "z"), "m")
     | dict.fromkeys(("axis_x", "axis_y", "axis_z"), "1"),
     angles=frozenset({"azimuth", "eta"}),
+    usual={"azimuth": 4.0 * math.pi, "eta": 4.0 * math.pi},
 )
 
 #: Distance [rad] by which a recorded theta may be outside [0, pi] if its errors are smaller or unknown.
@@ -76,29 +77,32 @@ class Recording(AbstractRecording):
 
 def read_recording(
     path: Any,
-    columns: Any,
+    columns: Any = None,
     fps: float | None = None,
     *,
     launch: Launch,
     error: Any = None,
     t0: float = 0.0,
     student: float | None = None,
+    decimal: str = ".",
 ) -> Recording:
     """A recording of a top from a text file of columns with a header line (CSV).
 
     **Arguments:**
 
-    - `path`: path of the file. Columns are separated by commas, semicolons, tabs or blanks; empty cells and `nan` are
-      missing samples; lines that begin with # are ignored.
+    - `path`: path of the file. Columns are separated by commas, semicolons, tabs or blanks; empty cells, `nan`, `n/a` and
+      `-` are missing samples; lines that begin with # are ignored.
     - `columns`: quantity -> (header of its column, unit): `"time"`, or `"frame"`, and any of `"theta"`, `"azimuth"`,
       `"eta"`, `"spin"`, `"x"`, `"y"`, `"z"`, `"axis_x"`, `"axis_y"`, `"axis_z"`. Units are s, ms, min; rad, deg, rev;
       rad/s, deg/s, rpm, rev/s; m, cm, mm; 1, %; or a factor that converts the file's numbers to SI units, such as
-      metres per pixel.
+      metres per pixel. If the header has the unit, as "tilt [deg]", the header is enough. By default, the columns whose
+      headers are quantities with units, such as "time [s]" and "theta [deg]".
     - `fps`: frames per second, if there is no `"time"`. If there is no `"frame"` either, every line is a frame.
     - `launch`: a `Launch`, with guesses for unknown numbers.
     - `error`: quantity -> (standard error or the header of its column, unit); with `None`, errors are estimated from
       the residuals.
     - `t0`, `student`: as for `Recording`.
+    - `decimal`: "," if the file has decimal commas.
 
     **Returns:** a `Recording`.
 
@@ -115,5 +119,5 @@ def read_recording(
     >>> print(film.times, film.value.round(4))
     [0.   0.04] [0.0995 0.11  ]
     """
-    table = read_columns(path, columns, fps, error, QUANTITIES)
+    table = read_columns(path, columns, fps, error, QUANTITIES, decimal)
     return Recording(launch, *table, t0, student)

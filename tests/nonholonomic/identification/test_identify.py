@@ -184,7 +184,7 @@ def test_a_direction_that_the_data_cannot_see_is_named():
         ({"free": {"x": [1.0, 2.0]}}, "must be one number"),
         ({"free": {"x": Free(-1.0, lower=0.0)}}, "start of x = -1.0 must be greater than 0.0"),
         ({"free": {"x": Free(1.0, prior=(0.0, 0.0))}}, "standard deviation of the prior of x"),
-        ({"free": {"x": Free(1.0, prior=3.0)}}, "must be a mean and a standard deviation"),
+        ({"free": {"x": Free(1.0, prior=(1.0, 2.0, 3.0))}}, "must be a mean and a standard deviation"),
         ({"starts": 0}, "starts = 0"),
         ({"spread": 1.0}, "spread = 1.0"),
         ({"seed": -1}, "seed = -1"),
