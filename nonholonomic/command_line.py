@@ -60,15 +60,18 @@ def run_and_exit(main: Callable[[], int], program: str) -> NoReturn:
     sys.exit(status)
 
 
-def closing_lines(runs: int, start_time: float, paths: Iterable[Any], page: str, read: bool = False) -> str:
+def closing_lines(runs: int, start_time: float, paths: Iterable[Any], page: str, read_from: Any = None) -> str:
     """The last lines of a command line.
 
     **Arguments:** `runs`: number of runs; `start_time`: the start of the call, by `time.perf_counter`; `paths`: the
-    files; `page`: what the page shows, and its path; `read`: whether all results are those of an earlier call.
+    files; `page`: what the page shows, and its path; `read_from`: the folder from which all results were read, or `None`.
     """
     duration = time.perf_counter() - start_time
     files = ", ".join(map(str, paths))
-    included = "as computed earlier by the same command" if read else "compilation included"
+    included = "compilation included"
+    if read_from is not None:
+        # Another installation of the same version may have stored them.
+        included = f"read from {read_from}, where an earlier run stored the results of these options"
     return f"\n{runs} runs in {duration:.1f} s, {included}. Wrote {files}.\n{page}"
 
 

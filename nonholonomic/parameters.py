@@ -253,10 +253,12 @@ def require_unit(unit: Any) -> None:
         raise ValueError(f"unit = {shown(unit)} must be one of {', '.join(known)}, or a list of them{hint}")
 
 
-def as_text(value: Any, unit: str = "1") -> str:
-    """A value as text: a number to six digits with its unit, or the first and last numbers of an array."""
+def as_text(value: Any, unit: str | None = "1") -> str:
+    """A value as text: a number to six digits with its unit, or the first and last numbers of an array. Without a unit,
+    the numbers of a module have no units either."""
     if isinstance(value, eqx.Module):
-        return repr(value)
+        return repr(value) if unit is not None else one_line(value, with_units=False)
+    unit = unit or "1"
     if isinstance(value, Tracer):
         return f"traced {value.aval.str_short()}"
     suffix = readable_unit(unit)
@@ -292,16 +294,17 @@ def shown(value: Any) -> str:
     return as_text(value) if isinstance(value, jax.Array | np.ndarray | eqx.Module) or callable(value) else repr(value)
 
 
-def contents(module: Any) -> list[tuple[str, str]]:
+def contents(module: Any, with_units: bool = True) -> list[tuple[str, str]]:
     """The fields of a module as (name, value as text); omitted fields are left out."""
     fields = [(field.name, getattr(module, field.name, None)) for field in dataclasses.fields(module)]
     units = getattr(module, "units", {})
-    return [(name, as_text(value, units.get(name, "1"))) for name, value in fields if value is not None]
+    fields = [(name, value, units.get(name, "1") if with_units else None) for name, value in fields]
+    return [(name, as_text(value, unit)) for name, value, unit in fields if value is not None]
 
 
-def one_line(module: Any) -> str:
+def one_line(module: Any, with_units: bool = True) -> str:
     """A module in one line: `Plane(tilt=0.05 rad)`."""
-    return f"{type(module).__name__}({', '.join(f'{name}={text}' for name, text in contents(module))})"
+    return f"{type(module).__name__}({', '.join(f'{name}={text}' for name, text in contents(module, with_units))})"
 
 
 def in_lines(title: str, rows: list[tuple[str, str]]) -> str:

@@ -4,6 +4,7 @@ Traced numbers pass these checks. A module states the ranges of its numbers once
 range raise an error; traced numbers out of range make `legal` false and the results NaN.
 """
 
+import contextlib
 import dataclasses
 import functools
 import inspect
@@ -259,14 +260,13 @@ def require_file(path: Any, name: str, *endings: str) -> Path:
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:
-    """Warn at the line of the user's code that led to the warning, so that Python shows the warning once for each such
-    line."""
+    """Warn at the user's line that led here, so that Python shows the warning once for each such line."""
     frame = sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in NO_CODE_OF_A_USER:
         frame = frame.f_back
-    where = frame.f_globals
-    registry = where.setdefault("__warningregistry__", {})
-    warnings.warn_explicit(message, category, frame.f_code.co_filename, frame.f_lineno, where.get("__name__"), registry)
+    registry = frame.f_globals.setdefault("__warningregistry__", {})
+    place = (frame.f_code.co_filename, frame.f_lineno, frame.f_globals.get("__name__"))
+    warnings.warn_explicit(message, category, *place, registry)
 
 
 def require_package(name: str, extra: str, purpose: str) -> None:
@@ -325,13 +325,11 @@ class Bounded(eqx.Module):
 
     def suspicion(self) -> str | None:
         """A possible mistake in legal numbers, such as another unit, as text; `None` if there is none."""
-        return None
 
     def __check_init__(self):
         self._require_one_shape()
         require_all(self.bounds())
-        suspicion = self.suspicion()
-        if suspicion is not None:
+        if (suspicion := self.suspicion()) is not None:
             warn(suspicion)
 
     def _require_one_shape(self) -> None:
@@ -354,15 +352,23 @@ class Bounded(eqx.Module):
                 "for a grid of all combinations, use a table, such as inversion_table"
             ) from None
 
+    @property
+    def _has_units(self) -> bool:
+        """Whether the numbers have their units: a gradient, whose numbers may be out of range, has others."""
+        with contextlib.suppress(ValueError):
+            require_all(all_bounds(self))
+            return True
+        return False
+
     def __repr__(self) -> str:
-        return one_line(self)
+        return one_line(self, self._has_units)
 
     def __str__(self) -> str:
         parts = any(isinstance(getattr(self, field.name, None), eqx.Module) for field in dataclasses.fields(self))
-        return in_lines(type(self).__name__, contents(self)) if parts else one_line(self)
+        return in_lines(type(self).__name__, contents(self, self._has_units)) if parts else repr(self)
 
     def _repr_html_(self) -> str:
-        return as_html(type(self).__name__, contents(self))
+        return as_html(type(self).__name__, contents(self, self._has_units))
 
 
 def require_all(bounds: Iterable[Bound]) -> None:

@@ -289,7 +289,7 @@ def main(arguments: list[str] | None = None) -> int:
         print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
     *paths, page_path = (options.out / name for name in ("rides.h5", "rides.png", "index.html") if name in files)
     see = f"To see it, open {page_path}{'' if can_view() else f'. {NO_VIEW}'}"
-    print(closing_lines(2 * len(scenes(options)), start_time, paths, see, read))
+    print(closing_lines(2 * len(scenes(options)), start_time, paths, see, cache if read else None))
     return 0
 
 

@@ -312,7 +312,7 @@ def main(arguments: list[str] | None = None) -> int:
         raise KeyboardInterrupt(saved(options)) from None
     cells = sum(table.status.size for table in arenas.values())
     see = f"To see the top climb onto its stem, open {path}{'' if can_view() else f'. {NO_VIEW}'}"
-    print(closing_lines(cells, start_time, paths, see, read))
+    print(closing_lines(cells, start_time, paths, see, cache if read else None))
     return 0
 
 

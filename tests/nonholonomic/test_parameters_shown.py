@@ -52,6 +52,20 @@ def test_traced_numbers_say_that_they_are():
     assert shown_values == ["Viscous(mu=traced float64[])"]
 
 
+def test_a_gradient_has_no_units_of_parameters():
+    body = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    scene = tippe.Scene(body, friction=tippe.Viscous(0.3))
+    gradient = jax.grad(lambda scene: scene.body.mass * scene.gravity / scene.friction.mu**2)(scene)
+    assert repr(gradient.friction) == "Viscous(mu=-14.5333)"
+    # The gradient with respect to gravity is positive, but that with respect to mu, in the same scene, is not.
+    assert "gravity   0.222222\n" in str(gradient)
+    assert "Top(mass=109, radius=0, offset=0, I1=0, I3=0)" in str(gradient)
+    assert "gravity=0.222222," in repr(gradient)
+    assert "<td" in gradient._repr_html_()
+    assert "kg" not in gradient._repr_html_()
+    assert "gravity   9.81 m/s²" in str(scene)
+
+
 def test_html_escapes_and_lines_are_aligned():
     assert "<td" in as_html("a < b", [("x", "<1>")])
     assert "a &lt; b" in as_html("a < b", [("x", "<1>")])

@@ -147,7 +147,7 @@ def test_what_an_arena_does_not_have_is_refused():
         (bowl, tippe.Launch(0.1, 1.0, eta=0.3), r"eta = 0\.3 must be"),
         (bowl, tippe.Launch(0.1, 1.0, place=(0.1, 0.1, 0.5)), "from the surface"),
         (ball, tippe.Launch(0.1, 1.0, place=(0.1, 4.0)), r"place\[1\] = 4\.0 must be at most"),
-        (level, tippe.Launch(0.1, 1.0), r"place = None must be \(x, y, z\)"),
+        (level, tippe.Launch(0.1, 1.0), r"place must be given, as \(x, y, z\)"),
         (level, tippe.Launch(0.1, 1.0, place=(0.0, 0.0)), r"must be \(x \[m\], y \[m\], z \[m\]\)"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -180,7 +180,7 @@ def test_main_job(tmp_path, capsys, monkeypatch):
     assert main([*arguments, "--out", str(tmp_path / "again")]) == 0
     again = capsys.readouterr().out
     assert again[: again.index("4 runs")] == printed[: printed.index("4 runs")]
-    assert "as computed earlier by the same command" in again
+    assert "where an earlier run stored the results of these options" in again
     for name in ("rides.h5", "rides.png", "index.html"):
         assert (tmp_path / "again" / name).read_bytes() == (tmp_path / name).read_bytes()
 

@@ -116,7 +116,7 @@ def test_the_same_command_reads_its_results_in_another_folder(tmp_path, capsys, 
         monkeypatch.setattr(job, name, none)
     assert main([*arguments, "--out", str(tmp_path / "b")]) == 0
     again = capsys.readouterr().out
-    assert "as computed earlier by the same command" in again
+    assert f"read from {tmp_path}, where an earlier run stored the results of these options" in again
     assert again[: again.index("8 runs")] == first[: first.index("8 runs")]
     for name in ("plane.h5", "cylinder.h5", "index.html", "theta.png"):
         assert (tmp_path / "b" / name).read_bytes() == (tmp_path / "a" / name).read_bytes()

@@ -215,7 +215,7 @@ class Scene(Bounded, Generic[Body]):
         names, kind = [name for name, _ in surface.coordinates], type(surface).__name__
         if launch.place is None:
             if len(names) == 3:
-                raise ValueError(f"place = None must be (x, y, z) on a {kind}, which has no coordinate eta")
+                raise ValueError(f"place must be given, as (x, y, z), on a {kind}, which has no coordinate eta")
             if "eta" not in names and not isinstance(self.frame, PlaneFrame):
                 yield Bound(launch.eta, "eta", at_least=0.0, at_most=0.0, why=f"a place on a {kind} is given by place")
             return

@@ -23,7 +23,9 @@ def check_parts(scene: Any) -> None:
     if scene.contact not in ("stop", "hybrid"):
         raise ValueError(f"contact = {shown(scene.contact)} must be 'stop' or 'hybrid'")
     if scene.restitution is not None and scene.contact == "stop":
-        raise ValueError(f"restitution = {shown(scene.restitution)} must be omitted for contact = 'stop'")
+        raise ValueError(
+            f"restitution = {shown(scene.restitution)} needs contact='hybrid', because a run without flights has no impacts"
+        )
     if isinstance(scene.friction, NoSlip) and not isinstance(scene.body, AbstractRigidBody):
         raise ValueError(
             f"friction = NoSlip() must be another law for a {type(scene.body).__name__}, such as Coulomb; describe the "
@@ -38,7 +40,10 @@ def check_parts(scene: Any) -> None:
             "with two contacts it is undetermined which one sticks"
         )
     if scene.contact == "stop" and scene.body.stem is not None:
-        raise ValueError("contact = 'stop' must be 'hybrid' for a top with a stem")
+        raise ValueError(
+            "a top with a stem needs contact='hybrid', as in Scene(top, contact='hybrid'): it hops from its sphere onto its "
+            "stem; the default, 'stop', ends a run where the contact is lost"
+        )
 
 
 def _check_convex(scene: Any) -> None:
