@@ -155,7 +155,11 @@ def after_step(
     bracket, guess, is_located = refine(
         lane_state.bracketing, lane_state.bracket, lane_state.margin, margin, tried_length
     )
-    hit = running & is_located
+    # A step that starts within round-off before an event is cut again and again, until it is round-off too: the event is
+    # there.
+    eps = jnp.finfo(lane_state.time.dtype).eps
+    at_start = free & crosses_inside & (tried_length * negative <= 8.0 * eps * jnp.maximum(lane_state.time, 1e-3))
+    hit = (running & is_located) | at_start
     bracketing = (lane_state.bracketing | (free & is_beyond)) & ~hit
     moved = forward | hit
     time = jnp.where(moved, lane_state.time + tried_length, lane_state.time)
@@ -167,8 +171,8 @@ def after_step(
     ended = running & (status == RUNNING) & moved & (time >= control.t1)
     steps = lane_state.steps + running
     # Written so that a NaN length counts as stuck.
-    shortest = 8.0 * jnp.finfo(time.dtype).eps * jnp.maximum(time, 1e-3)
-    stuck = free & ~forward & ~bracketing & ~(length > shortest)
+    shortest = 8.0 * eps * jnp.maximum(time, 1e-3)
+    stuck = free & ~forward & ~bracketing & ~hit & ~(length > shortest)
     stuck |= forward & (time == lane_state.time) & (tried_length > 0.0)
     failed = running & (status == RUNNING) & ~ended & (stuck | (steps >= control.max_steps))
     status = jnp.where(failed, FAILED, jnp.where(ended, REACHED_END, status))
