@@ -48,7 +48,7 @@ def browser(*arguments: str) -> Chrome:
 
 def main() -> None:
     """Write the picture."""
-    run = tippe.simulate(tippe.presets.classroom(), tippe.Launch.degrees(theta=6, rpm=1900), 4.0, tolerance=1e-7)
+    run = tippe.simulate(tippe.presets.classroom_scene(), tippe.Launch.degrees(theta=6, rpm=1900), 4.0, tolerance=1e-7)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "top.html"
         run.view(path)

@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import html
+import inspect
 import math
 import re
 from collections.abc import Iterable, Sequence
@@ -158,6 +159,17 @@ def likely(name: Any, known: Iterable[str]) -> str:
     anagrams = [candidate for candidate in names if sorted(candidate) == sorted(str(name))]
     matches = anagrams or difflib.get_close_matches(str(name), names, 1)
     return f"; did you mean {matches[0]!r}?" if matches else ""
+
+
+def likely_fix(value: Any) -> str:
+    """A hint for a function or a class instead of its result, a body instead of a scene, or a scene instead of a body."""
+    if inspect.isclass(value):
+        return f"; did you mean {value.__name__}(...)?"
+    if isinstance(value, eqx.Module) and hasattr(value, "body"):
+        return "; the body of this scene is its .body"
+    if isinstance(value, eqx.Module) and hasattr(value, "mass"):
+        return "; put this body into one, as in Scene(body)"
+    return f"; did you mean {value.__name__}()?" if inspect.isfunction(value) else ""
 
 
 def _replaced(name: str, tree: Any, values: dict[str, Any]) -> Any:

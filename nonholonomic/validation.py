@@ -7,7 +7,6 @@ range raise an error; traced numbers out of range make `legal` false and the res
 import contextlib
 import dataclasses
 import functools
-import inspect
 import operator
 import sys
 import tempfile
@@ -24,7 +23,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from .parameters import as_html, contents, in_lines, one_line, shown
+from .parameters import as_html, contents, in_lines, likely_fix, one_line, shown
 
 #: Addition to the message about an angle that may be in degrees.
 IN_DEGREES = "; angles are in radians: did you mean np.radians({})?"
@@ -158,15 +157,7 @@ def require_kind(value: Any, name: str, kind: type, example: str = "", several: 
         raise ValueError(
             f"{name} is a {package_of_value}.{kind_name} and must be a {package_of_kind}.{kind_name}: each package has its own"
         )
-    raise ValueError(f"{name} = {shown(value)} must be a {kind_name}{example}{uncalled(value)}")
-
-
-def uncalled(value: Any) -> str:
-    """A hint if the value is a function or a class instead of its result, such as `tippe.presets.wooden` for
-    `tippe.presets.wooden()`."""
-    if inspect.isclass(value):
-        return f"; did you mean {value.__name__}(...)?"
-    return f"; did you mean {value.__name__}()?" if inspect.isfunction(value) else ""
+    raise ValueError(f"{name} = {shown(value)} must be a {kind_name}{example}{likely_fix(value)}")
 
 
 def require_one_run(run: Any, action: str, many: str) -> None:

@@ -1,4 +1,7 @@
-"""Ready-made strollers and rides.
+"""Ready-made strollers and scenes.
+
+`light` and `loaded` return a `Stroller`, `slope` and `bowl` a `Scene`, whose stroller is its `.body`. Each has a second
+name that says so: `light_stroller`, `loaded_stroller`, `slope_scene` and `bowl_scene`.
 
 The papers on the stroller state no numbers. We chose ordinary values; no stroller was measured.
 
@@ -67,3 +70,7 @@ def bowl() -> Scene:
     Spheroid(equatorial=6 m, polar=3 m)
     """
     return Scene(light(), Spheroid(6.0, 3.0), Damping(2.0, 1.0, 0.2, 0.05), side="inside")
+
+
+light_stroller, loaded_stroller = light, loaded
+slope_scene, bowl_scene = slope, bowl

@@ -1,4 +1,7 @@
-"""Ready-made tops from a classroom and from the literature, each with its source.
+"""Ready-made tops and a scene, from a classroom and from the literature, each with its source.
+
+`wooden`, `rutstam`, `cohen` and `leine_glocker` return a `Top`, and `classroom` returns a `Scene`, whose top is its
+`.body`. Each has a second name that says so: `wooden_top`, ..., `classroom_scene`.
 
 The tippe tops that Cross filmed (Am. J. Phys. 81 (2013) 280; Phys. Teach. 51 (2013) 144) are missing, because we do not
 know their dimensions. Use `Top.turned` for a top whose shape you can measure.
@@ -94,3 +97,7 @@ def leine_glocker() -> Top:
     Stem(radius=0.005 m, offset=0.016 m)
     """
     return Top(0.006, 0.015, 0.003, 8e-7, 7e-7, Stem(0.005, 0.016))
+
+
+wooden_top, rutstam_top, cohen_top, leine_glocker_top = wooden, rutstam, cohen, leine_glocker
+classroom_scene = classroom

@@ -66,6 +66,43 @@ def top() -> Any:
     return figure
 
 
+def turned() -> Any:
+    """The section of a top turned from one material, with the lengths that `Top.turned` takes."""
+    figure, ax = empty(6.4, 5.4)
+    R, cut, stem, length, hole, depth = 1.0, 0.75, 0.25, 0.6, 0.6, 1.0
+    rim, tip = np.sqrt(R**2 - cut**2), cut + length - stem
+    turn = np.linspace(np.arccos(cut), 2.0 * np.pi - np.arccos(cut), 200)
+    cap = np.linspace(0.0, np.pi, 60)
+    half = [(rim, cut), (hole, cut), (hole, cut - depth), (stem, cut - depth), (stem, tip)]
+    outline = [*half, *zip(stem * np.cos(cap), tip + stem * np.sin(cap), strict=True)]
+    outline += [(-x, y) for x, y in reversed(half)] + list(zip(-np.sin(turn[::-1]), np.cos(turn), strict=True))[::-1]
+    ax.fill(*np.transpose(outline), facecolor="#f4e9d2", edgecolor=BODY, linewidth=1.4)
+    ax.plot(np.sin(turn), np.cos(turn), color=BODY, linewidth=1.4)
+    ax.plot([0.0, 0.0], [-1.15, tip + stem + 0.2], color=PLAIN, linewidth=0.7, linestyle="-.")
+    ax.plot(0.0, 0.0, "o", color=PLAIN, markersize=4)
+    ax.text(-0.05, 0.1, "$O$", fontsize=12, ha="right")
+    for height in (0.0, cut):
+        ax.plot([0.0 if height == 0.0 else rim, 1.75], [height] * 2, color="0.7", linewidth=0.7)
+    ax.plot([0.0, 1.75], [tip + stem] * 2, color="0.7", linewidth=0.7)
+    ax.plot([-1.75, -stem], [cut - depth] * 2, color="0.7", linewidth=0.7)
+    ax.plot([-1.75, -rim], [cut] * 2, color="0.7", linewidth=0.7)
+    spans = [
+        ((1.15, 0.0), (1.15, cut), "cut", (1.2, 0.35)),
+        ((1.65, cut), (1.65, tip + stem), "stem_length", (1.7, 1.02)),
+    ]
+    spans += [((-1.3, cut), (-1.3, cut - depth), "hole_depth", (-1.35, 0.2))]
+    spans += [
+        ((0.0, 0.95), (stem, 0.95), "stem_radius", (0.32, 0.93)),
+        ((0.0, -0.12), (hole, -0.12), "hole_radius", (0.05, -0.37)),
+    ]
+    spans += [((0.0, 0.0), (-np.sin(2.2), np.cos(2.2)), "radius", (-0.6, -0.62))]
+    for begin, end, words, place in spans:
+        ax.annotate("", end, begin, arrowprops={"arrowstyle": "<|-|>", "color": PLAIN, "shrinkA": 0, "shrinkB": 0})
+        ax.text(*place, words, fontsize=11, family="monospace", va="center", ha="right" if place[0] < -1.0 else "left")
+    ax.set(xlim=(-2.3, 2.75), ylim=(-1.2, 1.6))
+    return figure
+
+
 def torque() -> Any:
     """Slip, friction and torque of a tilted, fast top: seen along the slip, and from above."""
     figure, (side, above) = plt.subplots(1, 2, figsize=(9.0, 4.4), layout="constrained")

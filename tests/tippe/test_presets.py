@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from close import assert_close
 
+import stroller
 import tippe
 from tippe import presets, steady
 
@@ -60,6 +61,39 @@ def test_a_turned_top_has_the_mass_properties_of_its_shape(shape):
     tip = shape["cut"] + shape["stem_length"] - shape["stem_radius"]
     assert_close(top.stem.offset, tip - height, rtol=1e-9)
     assert float(top.stem.radius) == shape["stem_radius"]
+
+
+def test_a_turned_top_may_be_weighed():
+    by_density = tippe.Top.turned(density=700.0, **SHAPE)
+    assert_close(
+        jax.tree.leaves(tippe.Top.turned(mass=by_density.mass, **SHAPE)), jax.tree.leaves(by_density), rtol=1e-14
+    )
+    slope = jax.grad(lambda mass: tippe.Top.turned(mass=mass, **SHAPE).I1)(0.02)
+    assert_close(slope, by_density.I1 / by_density.mass, rtol=1e-12)
+    for arguments, message in (
+        ({}, r"takes density \[kg/m\^3\] or mass \[kg\], not neither"),
+        ({"density": 700.0, "mass": 0.02}, "not both"),
+        ({"mass": 0.0}, "mass = 0.0 must be greater than 0.0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            tippe.Top.turned(**SHAPE, **arguments)
+
+
+def test_presets_say_what_they_are():
+    for name in ("wooden", "rutstam", "cohen", "leine_glocker"):
+        assert isinstance(getattr(presets, f"{name}_top")(), tippe.Top)
+    for name in ("light", "loaded"):
+        assert isinstance(getattr(stroller.presets, f"{name}_stroller")(), stroller.Stroller)
+    assert isinstance(presets.classroom_scene(), tippe.Scene)
+    assert isinstance(stroller.presets.slope_scene(), stroller.Scene)
+    assert isinstance(stroller.presets.bowl_scene(), stroller.Scene)
+    # One for the other is answered by the way from one to the other.
+    with pytest.raises(ValueError, match=r"must be a Scene; put this body into one, as in Scene\(body\)"):
+        tippe.simulate(presets.rutstam_top(), tippe.Launch(0.1, 155.0), 1.0)
+    with pytest.raises(ValueError, match=r"must be a Top, .*; the body of this scene is its \.body"):
+        tippe.Scene(presets.classroom_scene())
+    with pytest.raises(ValueError, match=r"must be a Scene; put this body into one, as in Scene\(body\)"):
+        stroller.simulate(stroller.presets.light_stroller(), stroller.Launch((0.0, 0.0), 0.3, 2.0), 1.0)
 
 
 def test_a_ball_that_is_hardly_cut_is_a_ball():

@@ -3,7 +3,8 @@
 from typing import Any
 
 from nonholonomic.geometry import AbstractSurface, Plane
-from nonholonomic.validation import require_kind, shown, uncalled
+from nonholonomic.parameters import likely_fix
+from nonholonomic.validation import require_kind, shown
 
 from .body import AbstractBody
 from .friction import A_LAW, AbstractFriction, NoSlip
@@ -14,7 +15,7 @@ from .top import Top
 def check_parts(scene: Any) -> None:
     """Raise `ValueError` if a part of a scene is of the wrong kind, or does not allow another part or an option."""
     if not isinstance(scene.body, AbstractBody | AbstractRigidBody):
-        kinds = f"a Top, a SpheroidBody, a ConvexBody, an Ellipsoid or a RigidBody{uncalled(scene.body)}"
+        kinds = f"a Top, a SpheroidBody, a ConvexBody, an Ellipsoid or a RigidBody{likely_fix(scene.body)}"
         raise ValueError(f"body = {shown(scene.body)} must be {kinds}")
     require_kind(scene.surface, "surface", AbstractSurface, ", such as tippe.Plane() or tippe.Cylinder(0.3)")
     require_kind(scene.friction, "friction", AbstractFriction, A_LAW)

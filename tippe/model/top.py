@@ -100,8 +100,9 @@ class Top(AbstractBody):
     def turned(
         cls,
         radius: Any,
-        density: Any,
+        density: Any = None,
         *,
+        mass: Any = None,
         cut: Any,
         stem_radius: Any,
         stem_length: Any,
@@ -118,7 +119,8 @@ class Top(AbstractBody):
         **Arguments:** (lengths in metres)
 
         - `radius`: radius of the sphere.
-        - `density`: density of the material [kg/m^3]: beech 700, acrylic 1180, aluminium 2700.
+        - `density`: density of the material [kg/m^3]: beech 700, acrylic 1180, aluminium 2700; or, instead, `mass`: mass
+          of the whole top [kg].
         - `cut`: height of the flat above the centre of the sphere, less than `radius`; the sphere is cut off above the
           flat.
         - `stem_radius`: radius of the stem, which is a cylinder that ends in a half ball.
@@ -129,7 +131,7 @@ class Top(AbstractBody):
         **Returns:** a `Top`.
 
         **Raises:** `ValueError` for a shape that cannot be turned, whose centre of mass lies above the centre of the
-        sphere, or whose rim would touch the table before its stem.
+        sphere, or whose rim would touch the table before its stem; and unless there is one of `density` and `mass`.
 
         The formulas are the integrals over thin discs (Landau and Lifshitz, Mechanics, section 32), in `tippe/model/turned.py`.
 
@@ -146,8 +148,11 @@ class Top(AbstractBody):
 
         ```
         """
-        require(density, "density", above=0.0)
-        if not is_traced(density) and np.any(np.asarray(density) < LEAST_DENSITY):
+        if (density is None) == (mass is None):
+            wrong = "neither" if density is None else "both"
+            raise ValueError(f"Top.turned takes density [kg/m^3] or mass [kg], not {wrong}")
+        require(density if mass is None else mass, "density" if mass is None else "mass", above=0.0)
+        if density is not None and not is_traced(density) and np.any(np.asarray(density) < LEAST_DENSITY):
             min_density = float(np.min(density))
             warn(
                 f"density = {min_density:g} kg/m^3 is less than that of balsa wood, 100 kg/m^3: was it in g/cm^3? "
@@ -161,7 +166,7 @@ class Top(AbstractBody):
         require(offset, "offset", at_least=0.0, why=reason)
         transverse = moments.transverse - moments.volume * offset**2
         stem = Stem(shape.stem_radius, shape.tip + offset)
-        density = as_number(density)
+        density = as_number(density) if mass is None else as_number(mass) / moments.volume
         return cls(density * moments.volume, shape.radius, offset, density * transverse, density * moments.axial, stem)
 
     def __check_init__(self):
