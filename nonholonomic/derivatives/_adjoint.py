@@ -9,7 +9,8 @@ fixed, as in `variation.py`.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax
@@ -34,14 +35,14 @@ Measured = Callable[[Any, LaneState], Lanes]
 
 
 class StepRecorder(AbstractRecorder):
-    """Records where each step began, and its length."""
+    """Records where each step began, and its length; the derivatives begin at the ends of the runs."""
 
     # As many iterations as fit in the caches with their record; a period ends with a refill.
     period: ClassVar[int] = 128
     refill_cost = 2.0
 
     def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: None) -> StepRecord:
-        leaves = (lane_state.time, _without_probe(lane_state).state, lane_state.length)
+        leaves = (lane_state.time, without_probe(lane_state).state, lane_state.length)
         return StepRecord(*(jnp.zeros((self.period, *leaf.shape), leaf.dtype) for leaf in leaves))
 
     def has_room(self, record: StepRecord, iteration: Int[Array, ""]) -> Bool[Array, ""]:
@@ -52,8 +53,21 @@ class StepRecorder(AbstractRecorder):
     ) -> tuple[LaneState, StepRecord]:
         next_state = try_step(*in_lanes, lane_state)
         length = jnp.where(next_state.time > lane_state.time, length_to_try(in_lanes[1], lane_state), 0.0)
-        entry = StepRecord(lane_state.time, _without_probe(lane_state).state, length)
+        entry = StepRecord(lane_state.time, without_probe(lane_state).state, length)
         return next_state, jax.tree.map(functools.partial(written_in_place, at=iteration), record, entry)
+
+    def steps(self, record: Any) -> StepRecord:
+        """The steps in the record of a period."""
+        return record
+
+    def arriving(self, lane_state: LaneState, steps: StepRecord) -> Float[Array, "iterations components lanes"] | None:
+        """The derivatives of the measured quantity with respect to the states at the ends of the steps, apart from those
+        through later states; `None` if the quantity depends only on the ends of the runs."""
+        return None
+
+    def share_of_end(self, lane_state: LaneState) -> Lanes:
+        """The factor of the measured quantity at the end of the runs in the lanes."""
+        return jnp.ones_like(lane_state.time)
 
 
 class Backward(NamedTuple):
@@ -84,6 +98,7 @@ def solve_with_adjoint(
     settings: Settings,
     *,
     measured: Measured,
+    recorder: StepRecorder | None = None,
     one_kernel: bool = False,
 ) -> tuple[Outcome, Float[Array, "components cells"], Any]:
     """Run every cell to its end, and differentiate a quantity at the end with respect to the problem's parameters.
@@ -91,25 +106,28 @@ def solve_with_adjoint(
     **Arguments:** as for `ensemble_solve`, except `nonterminal`, and
 
     - `problem`: without tangents.
-    - `moving`: a tree of booleans like the problem: the leaves, scalars or (cells,), with respect to which to
-      differentiate.
+    - `moving`: a tree of booleans like the problem: the leaves with respect to which to differentiate, scalars or
+      (..., cells).
     - `probe`: a tangent of the inner problem. Its variation is also integrated and takes part in step-size control, so
       that the steps suit tangents even where the state is at rest.
     - `measured`: the quantity to differentiate.
+    - `recorder`: the recorder of the steps, which may add derivatives at the ends of the steps.
 
     **Returns:** the `Outcome`, without crossing times; the derivatives of every cell with respect to its initial state;
     and those with respect to the parameters, one per cell, in a tree like the problem with `None` for the other leaves.
-
-    **Raises:** `ValueError` for a chosen leaf that has several components.
     """
     components, size = problem.start()[0].shape
     numbers, problem_with_probe = _with_probe(problem, moving, probe, size)
     scheduler = LaneScheduler.of(problem_with_probe, t1, cells, settings, one_kernel=one_kernel, n_blocks=2)
-    passes = Passes(scheduler, moving, measured)
-    run = passes.start(components + len(jax.tree.leaves(numbers)))
+    passes = Passes(scheduler, moving, measured, StepRecorder() if recorder is None else recorder)
+    leaves, structure = jax.tree.flatten(numbers)
+    ends = np.cumsum([components, *(leaf.size // size for leaf in leaves)])
+    run = passes.start(int(ends[-1]))
     run = jax.lax.while_loop(lambda run: uncounted(run.limit > 0, run.outcome.steps[0]), passes.there_and_back, run)
-    by_number = jax.tree.unflatten(jax.tree.structure(numbers), list(run.gradient[components:]))
-    return run.outcome._replace(state=run.outcome.state[:components]), run.gradient[:components], by_number
+    parts = [run.gradient[start:end] for start, end in itertools.pairwise(ends)]
+    by_number = [part.reshape(leaf.shape) for part, leaf in zip(parts, leaves, strict=True)]
+    outcome = run.outcome._replace(state=run.outcome.state[:components])
+    return outcome, run.gradient[:components], jax.tree.unflatten(structure, by_number)
 
 
 def _with_probe(problem: VariationalProblem, moving: Any, probe: Any, size: int) -> tuple[Any, VariationalProblem]:
@@ -118,10 +136,7 @@ def _with_probe(problem: VariationalProblem, moving: Any, probe: Any, size: int)
     **Arguments:** as for `solve_with_adjoint`; `size`: number of cells, padding included.
     """
     numbers, static = eqx.partition(problem, moving)
-    for leaf in jax.tree.leaves(numbers):
-        if jnp.shape(leaf) not in ((), (size,)):
-            raise ValueError(f"moving: a number must be a scalar or ({size},), not of shape {jnp.shape(leaf)}")
-    numbers = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (size,)), numbers)
+    numbers = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*jnp.shape(leaf)[:-1], size)), numbers)
     problem = eqx.combine(numbers, static)
     # The chosen parameters now have one value per cell, so their rates must, too.
     probe = jax.tree.map(
@@ -137,20 +152,19 @@ def _with_probe(problem: VariationalProblem, moving: Any, probe: Any, size: int)
 class Passes:
     """The forward pass, which computes periods, and the backward pass, which carries derivatives through them.
 
-    `moving`, `measured`: as for `solve_with_adjoint`.
+    `moving`, `measured`, `recorder`: as for `solve_with_adjoint`.
     """
 
     scheduler: LaneScheduler
     moving: Any
     measured: Measured
-
-    recorder: ClassVar[StepRecorder] = StepRecorder()
+    recorder: StepRecorder
 
     def start(self, rows: int) -> Backward:
         """Both passes before the first period. **Arguments:** `rows`: number of rows of the derivatives."""
         scheduler, start = self.scheduler, self.scheduler.start()
         in_lanes = scheduler.in_lanes(start.lane_state)
-        record = jax.eval_shape(lambda: self.recorder.begin(in_lanes, start.lane_state, None))
+        record = jax.eval_shape(lambda: self.recorder.steps(self.recorder.begin(in_lanes, start.lane_state, None)))
         dtype = start.lane_state.state.dtype
         return Backward(
             frontier=start,
@@ -183,12 +197,12 @@ class Passes:
 
     def forward(self, run: Backward) -> Backward:
         """Compute the next period, and record its steps."""
-        lanes_after, steps = self.scheduler.run(run.frontier, self.recorder)
+        lanes_after, record = self.scheduler.run(run.frontier, self.recorder)
         return run._replace(
             frontier=self.scheduler.refill(lanes_after),
             number=run.number + 1,
             checkpoints=run.checkpoints.added(run.number, (run.frontier, lanes_after)),
-            latest_steps=run.latest_steps.added(run.frontier.iterations, steps),
+            latest_steps=run.latest_steps.added(run.frontier.iterations, self.recorder.steps(record)),
             outcome=self.scheduler.store(run.outcome, lanes_after.lane_state),
         )
 
@@ -203,7 +217,7 @@ class Passes:
         scheduler, (number, (lanes_before, lanes_after)) = self.scheduler, run.checkpoints.latest()
         steps = run.latest_steps.of_period(lanes_before.iterations, self.recorder.period)
         count = lanes_after.iterations - lanes_before.iterations
-        adjoint = _taken_back(scheduler, self.moving, self.measured, lanes_after.lane_state, steps, count, run.adjoint)
+        adjoint = self.taken_back(lanes_after.lane_state, steps, count, run.adjoint)
         # A cell that had made no step was at its start.
         at_its_start = (lanes_before.lane_state.steps == 0) & (lanes_before.lane_state.cell < scheduler.cells)
         cell = jnp.where(at_its_start, lanes_before.lane_state.cell, scheduler.capacity)
@@ -211,56 +225,58 @@ class Passes:
         checkpoints = run.checkpoints.without_latest()
         return run._replace(limit=number, checkpoints=checkpoints, adjoint=adjoint, gradient=gradient)
 
+    def taken_back(
+        self, lane_state: LaneState, steps: StepRecord, count: Int[Array, ""], adjoint: Float[Array, "rows lanes"]
+    ) -> Float[Array, "rows lanes"]:
+        """Carry the derivatives from the end of a period to its start; in lanes that have ended, the derivatives begin
+        there.
+        """
+        weights, lane_state = Weights.of(self.scheduler.control.tableau), without_probe(lane_state)
+        # Selected here: XLA 0.10.2 aborts on a kernel that takes the initial states of all cells if they are constants.
+        problem = dataclasses.replace(self.scheduler.in_lanes(lane_state)[0], tangents=())
+        arriving, share = self.recorder.arriving(lane_state, steps), self.recorder.share_of_end(lane_state)
+        record = (steps.time, steps.state, steps.length, arriving)
 
-def _without_probe(lane_state: LaneState) -> LaneState:
+        def loop(carry: Any) -> Any:
+            lane_state, share, record, count, adjoint = carry
+            ended = lane_state.status != RUNNING
+            adjoint = jnp.where(ended, _at_the_end(problem, self.moving, self.measured, lane_state, share), adjoint)
+
+            def step(carry: Any) -> Any:
+                index, adjoint, memory = carry
+                *point, at_end = jax.tree.map(functools.partial(read, index=index - 1), record)
+                if at_end is not None:
+                    adjoint = jnp.concatenate([adjoint[: len(at_end)] + at_end, adjoint[len(at_end) :]])
+                return index - 1, *step_taken_back(weights, problem, self.moving, *point, adjoint, memory)
+
+            memory = StageMemory.of(len(weights.fractions), lane_state.state)
+            return jax.lax.while_loop(lambda carry: carry[0] > 0, step, (count, adjoint, memory))[1]
+
+        return self.scheduler.in_kernel(loop)((lane_state, share, record, count, adjoint))
+
+
+def without_probe(lane_state: LaneState) -> LaneState:
     """The lanes with the states alone, without the variations."""
     return lane_state._replace(state=lane_state.state[: lane_state.state.shape[0] // 2])
 
 
-def _taken_back(
-    scheduler: LaneScheduler,
-    moving: Any,
-    measured: Measured,
-    lane_state: LaneState,
-    record: StepRecord,
-    count: Int[Array, ""],
-    adjoint: Float[Array, "rows lanes"],
-) -> Float[Array, "rows lanes"]:
-    """Carry the derivatives from the end of a period to its start; in lanes that have ended, the derivatives begin
-    there.
-    """
-    weights = Weights.of(scheduler.control.tableau)
-    # Selected here: XLA 0.10.2 aborts on a kernel that takes the initial states of all cells if they are constants.
-    problem = dataclasses.replace(scheduler.in_lanes(lane_state)[0], tangents=())
-    lane_state = _without_probe(lane_state)
-
-    def loop(carry: Any) -> Any:
-        lane_state, record, count, adjoint = carry
-        ended = lane_state.status != RUNNING
-        adjoint = jnp.where(ended, _at_the_end(problem, moving, measured, lane_state), adjoint)
-
-        def step(carry: Any) -> Any:
-            index, *sums = carry
-            step_record = jax.tree.map(functools.partial(read, index=index - 1), record)
-            return index - 1, *step_taken_back(weights, problem, moving, *step_record, *sums)
-
-        memory = StageMemory.of(len(weights.fractions), lane_state.state)
-        return jax.lax.while_loop(lambda carry: carry[0] > 0, step, (count, adjoint, memory))[1]
-
-    return scheduler.in_kernel(loop)((lane_state, record, count, adjoint))
-
-
 def _at_the_end(
-    problem: AbstractProblem, moving: Any, measured: Measured, lane_state: LaneState
+    problem: AbstractProblem, moving: Any, measured: Measured, lane_state: LaneState, share: Lanes
 ) -> Float[Array, "rows lanes"]:
-    """The derivatives of the measured quantity with respect to the final state and the parameters."""
+    """The derivatives with respect to the final state and the parameters. **Arguments:** `share`: as `shares_of_ends`."""
     numbers, static = eqx.partition(problem, moving)
 
     def value(numbers: Any, state: States) -> Lanes:
         return measured(eqx.combine(numbers, static), lane_state._replace(state=state))
 
-    by_number, by_state = jax.vjp(value, numbers, lane_state.state)[1](jnp.ones_like(lane_state.time))
-    return jnp.concatenate([by_state, *(row[None] for row in jax.tree.leaves(by_number))])
+    by_number, by_state = jax.vjp(value, numbers, lane_state.state)[1](share)
+    return _rows(by_state, by_number)
+
+
+def _rows(by_state: States | Sequence[Lanes], by_number: Any) -> Float[Array, "rows lanes"]:
+    """Derivatives with respect to the state and the parameters in one array."""
+    leaves = jax.tree.leaves(by_number)
+    return jnp.concatenate([*(row[None] for row in by_state), *(leaf.reshape(-1, leaf.shape[-1]) for leaf in leaves)])
 
 
 class Weights(NamedTuple):
@@ -348,12 +364,12 @@ def step_taken_back(
 
     def pull(
         stage_time: Lanes, numbers: Any, parts: tuple[Lanes, ...], by_rate: tuple[Lanes, ...]
-    ) -> tuple[Lanes, ...]:
+    ) -> Float[Array, "rows lanes"]:
         def field(numbers: Any, parts: tuple[Lanes, ...]) -> States:
             return eqx.combine(numbers, static).field(stage_time, parts)
 
         by_number, by_part = jax.vjp(field, numbers, parts)[1](jnp.stack(by_rate))
-        return (*by_part, *jax.tree.leaves(by_number))
+        return _rows(by_part, by_number)
 
     def stage_taken_back(count: Int[Array, ""], carry: Any) -> Any:
         stage, (by_stage, total) = stages - 1 - count, carry
@@ -363,7 +379,7 @@ def step_taken_back(
             stage_time, numbers, tuple(jnp.unstack(read(stage_states, index=stage))), tuple(jnp.unstack(by_rate))
         )
         # If no step was made, values may not be finite.
-        term = jax.lax.optimization_barrier(jnp.where(length > 0.0, jnp.stack(term), 0.0))
+        term = jax.lax.optimization_barrier(jnp.where(length > 0.0, term, 0.0))
         return written_in_place(by_stage, term[:components], at=stage + 1), total + term
 
     zero_state, ends = jnp.zeros_like(state), written_in_place(memory.adjoints, adjoint[:components], at=start)

@@ -5,6 +5,7 @@ used.
 `partial_eval.dce_rules`, as in its own `scan`.
 """
 
+import abc
 import dataclasses
 import functools
 from typing import Any
@@ -19,6 +20,35 @@ from jax.interpreters import batching, mlir, partial_eval
 from jaxtyping import Array, Float
 
 from ..xla_cpu import compiled_alone, compiled_quickly
+
+
+class AbstractLinearSolve(eqx.Module):
+    """A solve whose last arguments are tangents or cotangents: the outputs are linear functions of them."""
+
+    #: The leaves that are differentiated, and the number of the last arguments.
+    active: eqx.AbstractVar[tuple[int, ...]]
+    linear: eqx.AbstractVar[int]
+
+    #: The cost for one member of a batch of the last arguments, in units of the cost of the derivatives with respect to a
+    #: number.
+    cost: eqx.AbstractClassVar[int]
+
+    @abc.abstractmethod
+    def from_slopes(self, selection: Any, *arguments: Float[Array, "..."]) -> list[Array]:
+        """The selected outputs for a single cell, from the derivatives with respect to every number."""
+
+    def over_cells(self, selection: Any, batch_flags: tuple[bool, ...], *arguments: Float[Array, "..."]) -> list[Array]:
+        """`from_slopes` for some cells."""
+        if not any(batch_flags):
+            return [part[None] for part in self.from_slopes(selection, *arguments)]
+        axes = tuple(0 if flag else None for flag in batch_flags)
+        return jax.vmap(functools.partial(self.from_slopes, selection), axes)(*arguments)
+
+    def prefers_slopes(self, arguments: Any, axes: Any, cells: int, batch_flags: tuple[bool, ...], size: int) -> bool:
+        """Whether a batch has the same runs for all members, which cost more than the derivatives with respect to every
+        number."""
+        sizes = [arguments[k].size // (cells if batch_flags[k] else 1) for k in self.active]
+        return all(axis is None for axis in axes[: -self.linear]) and sum(sizes) <= size * self.cost
 
 
 # Compared by identity: JAX hashes the request, and its fields may not be hashable.
@@ -44,7 +74,7 @@ class Request:
 
     def parts(self, cells: int, *leaves: Float[Array, "..."]) -> list[Array]:
         """The selected parts that are not `None`."""
-        parts = _flat(self.tree(cells, *leaves))[0]
+        parts = flat(self.tree(cells, *leaves))[0]
         selected = parts if self.selection is None else [parts[k] for k in self.selection]
         return [part for part in selected if part is not None]
 
@@ -54,13 +84,11 @@ def solve_one(request: Request, *leaves: Float[Array, "..."]) -> Any:
 
     **Arguments:** `request`: a request for all parts; `leaves`: numbers of a single cell.
     """
-    shapes, structure = _flat(jax.eval_shape(functools.partial(_compiled_tree, request.solve, request.active), *leaves))
+    shapes, structure = flat(jax.eval_shape(functools.partial(_compiled_tree, request.solve, request.active), *leaves))
     present = [k for k, shape in enumerate(shapes) if shape is not None]
     kinds = tuple(ShapedArray(shapes[k].shape[1:], shapes[k].dtype) for k in present)
     request = dataclasses.replace(request, selection=tuple(present))
-    outputs = iter(
-        _solve_cells.bind(*leaves, request=request, cells=1, batch_flags=(False,) * len(leaves), kinds=kinds)
-    )
+    outputs = iter(solve_cells.bind(*leaves, request=request, cells=1, batch_flags=(False,) * len(leaves), kinds=kinds))
     return jax.tree.unflatten(structure, [None if shape is None else next(outputs)[0] for shape in shapes])
 
 
@@ -86,18 +114,18 @@ _parts_of_one = compiled_quickly(_parts)
 _parts_of_many = compiled_alone(_parts)
 
 
-def _flat(tree: Any) -> tuple[list[Any], Any]:
+def flat(tree: Any) -> tuple[list[Any], Any]:
     """The parts of a tree and its structure, in which `None` counts as a part."""
     return jax.tree.flatten(tree, is_leaf=lambda part: part is None)
 
 
 #: The parts that a `Request` wants of a number of cells. `batch_flags` marks the leaves that have a value per cell; `kinds`
 #: holds the shapes and dtypes of the parts of one cell.
-_solve_cells = Primitive("solve_cells")
-_solve_cells.multiple_results = True
+solve_cells = Primitive("solve_cells")
+solve_cells.multiple_results = True
 
 
-@_solve_cells.def_impl
+@solve_cells.def_impl
 def _run(*leaves: Array, request: Request, cells: int, batch_flags: Any, kinds: Any) -> list[Array]:
     # Python numbers would become part of the program.
     arrays = [leaf if isinstance(leaf, jax.Array) else jax.device_put(np.asarray(leaf)) for leaf in leaves]
@@ -105,7 +133,7 @@ def _run(*leaves: Array, request: Request, cells: int, batch_flags: Any, kinds: 
     return compiled(request.solve, request.active, request.selection, cells, arrays)
 
 
-@_solve_cells.def_abstract_eval
+@solve_cells.def_abstract_eval
 def _shaped(
     *leaves: Any, request: Request, cells: int, batch_flags: Any, kinds: tuple[ShapedArray, ...]
 ) -> list[ShapedArray]:
@@ -116,7 +144,7 @@ def _traced(*leaves: Array, request: Request, cells: int, batch_flags: Any, kind
     return request.parts(cells, *leaves)
 
 
-mlir.register_lowering(_solve_cells, mlir.lower_fun(_traced, multiple_results=True))
+mlir.register_lowering(solve_cells, mlir.lower_fun(_traced, multiple_results=True))
 
 
 def _batched(
@@ -126,6 +154,11 @@ def _batched(
     size = next(leaf.shape[axis] for leaf, axis in zip(leaves, axes, strict=True) if axis is not None)
     if size == 0:
         return [jnp.zeros((0, cells, *kind.shape), kind.dtype) for kind in kinds], [0] * len(kinds)
+    if isinstance(request.solve, AbstractLinearSolve) and request.solve.prefers_slopes(
+        leaves, axes, cells, batch_flags, size
+    ):
+        of_one = functools.partial(request.solve.over_cells, request.selection, batch_flags)
+        return jax.vmap(of_one, axes)(*leaves), [0] * len(kinds)
 
     def joined(leaf: Array, has_batch: bool, axis: Any) -> Array:
         if axis is None:
@@ -135,13 +168,13 @@ def _batched(
 
     merged_flags = tuple(flag or axis is not None for flag, axis in zip(batch_flags, axes, strict=True))
     merged_leaves = map(joined, leaves, batch_flags, axes)
-    outputs = _solve_cells.bind(
+    outputs = solve_cells.bind(
         *merged_leaves, request=request, cells=size * cells, batch_flags=merged_flags, kinds=kinds
     )
     return [part.reshape(size, cells, *part.shape[1:]) for part in outputs], [0] * len(outputs)
 
 
-batching.primitive_batchers[_solve_cells] = _batched
+batching.primitive_batchers[solve_cells] = _batched
 
 
 def _only_read(use: list[bool], *arguments: Any) -> tuple[list[bool], Any]:
@@ -159,4 +192,4 @@ def _only_read(use: list[bool], *arguments: Any) -> tuple[list[bool], Any]:
     return [True] * len(equation.invars), new
 
 
-partial_eval.dce_rules[_solve_cells] = _only_read
+partial_eval.dce_rules[solve_cells] = _only_read

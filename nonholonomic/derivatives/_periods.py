@@ -21,11 +21,13 @@ STEPS_KEPT, MAX_BYTES = 1024, {"cpu": 1 << 26}
 
 
 class StepRecord(NamedTuple):
-    """The steps of a period: where each step began, and its length, 0 for a lane that did not move."""
+    """The steps of a period: where each step began, and its length, 0 for a lane that did not move. `sample` is the index
+    of the sample on which the step ended, the number of samples if there is none; `None` for runs without samples."""
 
     time: Float[Array, "iterations lanes"]
     state: Float[Array, "iterations components lanes"]
     length: Float[Array, "iterations lanes"]
+    sample: Int[Array, "iterations lanes"] | None = None
 
 
 #: A period without its steps: the lanes before it, and after it but before their refill.
@@ -84,10 +86,10 @@ class LatestSteps(NamedTuple):
     def none(cls, example: StepRecord, cells: int) -> "LatestSteps":
         """No steps. **Arguments:** `example`: the steps of a period, for the shapes; `cells`: number of cells."""
         period, lanes = example.length.shape
-        bytes_of_step = sum(leaf.dtype.itemsize * leaf.size for leaf in example) // period
+        bytes_of_step = sum(leaf.dtype.itemsize * leaf.size for leaf in jax.tree.leaves(example)) // period
         max_steps = MAX_BYTES.get(jax.default_backend(), 1 << 31) // bytes_of_step
         size = period + max(period, min(max_steps, STEPS_KEPT * -(-cells // lanes)))
-        room = StepRecord(*(jnp.zeros((size, *leaf.shape[1:]), leaf.dtype) for leaf in example))
+        room = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape[1:]), leaf.dtype), example)
         return cls(jnp.zeros((), int), room)
 
     def added(self, first: Int[Array, ""], steps: StepRecord) -> "LatestSteps":

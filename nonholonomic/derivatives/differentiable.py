@@ -7,6 +7,7 @@ one ensemble.
 
 import abc
 import functools
+import math
 from collections.abc import Callable
 from typing import Any, ClassVar, Self
 
@@ -17,7 +18,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..validation import is_traced
-from ._batched_primitive import Request, solve_one
+from ._batched_primitive import Request, flat, solve_one
+from ._linear import Tangents, product, push_forward
 from .slopes import tangents_of
 from .variation import tangent_scale
 
@@ -36,6 +38,10 @@ class AbstractDifferentiableSolve(eqx.Module):
 
     #: Whether a batch is run as one ensemble; otherwise each run is separate, with a single cell.
     in_blocks: ClassVar[bool] = True
+
+    #: With more numbers than this, `push_forward` and `pull_back` take the place of the derivatives with respect to every
+    #: number.
+    most_slopes: ClassVar[float] = math.inf
 
     movable: eqx.AbstractVar[int]
 
@@ -57,6 +63,26 @@ class AbstractDifferentiableSolve(eqx.Module):
         **Arguments:** `active`: the leaves with respect to which to differentiate; `nested`: whether the outputs will
         be differentiated again, in forward mode; `cells`, `leaves`: as for `solve`.
         """
+
+    def differentiable(self, primal: Primal) -> Primal:
+        """The primal with `None` for parts that are not differentiable."""
+        return primal
+
+    def push_forward(
+        self,
+        active: tuple[int, ...],
+        cells: int,
+        leaves: tuple[Float[Array, "..."], ...],
+        tangents: tuple[Float[Array, "..."], ...],
+    ) -> Primal:
+        """The tangent of the primal along tangents of the active leaves, which may be the same for all cells."""
+        raise NotImplementedError
+
+    def pull_back(
+        self, active: tuple[int, ...], cells: int, leaves: tuple[Float[Array, "..."], ...], cotangents: Primal
+    ) -> list[Float[Array, "cells ..."]]:
+        """The cotangents of the active leaves in every cell, from those of the primal, `None` for parts without one."""
+        raise NotImplementedError
 
     def for_parts(self, wanted: tuple[int, ...]) -> Self:
         """A solve that may replace outputs that are not wanted by `None`; by default it replaces none.
@@ -90,8 +116,13 @@ def differentiable_solve(solve: AbstractDifferentiableSolve, *leaves: Float[Arra
         if not active:
             value = primal(*leaves)
             return value, jax.tree.map(jnp.zeros_like, value)
-        value, slopes = _value_and_tangents(solve, active)(*leaves)
         active_tangents = [tangents[i] for i in active]
+        if sum(tangent.size for tangent in active_tangents) > solve.most_slopes:
+            value = primal(*leaves)
+            linear_solve = Tangents(solve, active, flat(value)[1], _value_and_tangents)
+            change = push_forward(linear_solve, leaves, active_tangents, value)
+            return value, jax.tree.map(functools.partial(_where_present, solve), value, change)
+        value, slopes = _value_and_tangents(solve, active)(*leaves)
         # Derivatives are `None` where the primal has an array that is not differentiated.
         return value, jax.tree.map(lambda part, *rates: _change(solve, part, rates, active_tangents), value, *slopes)
 
@@ -105,6 +136,13 @@ def _canonical(leaves: tuple[Any, ...]) -> list[Any]:
     return [jnp.array(leaf) if is_traced(leaf) else leaf for leaf in leaves]
 
 
+def _where_present(solve: AbstractDifferentiableSolve, value: Array, change: Array | None) -> Any:
+    """The tangent of an output, 0 where it is absent; a symbolic zero if the output is not differentiable."""
+    if change is None:
+        return jax.custom_derivatives.zero_from_primal(value, symbolic_zeros=True)
+    return jnp.where(solve.absent(value), 0.0, change)
+
+
 def _change(solve: AbstractDifferentiableSolve, value: Array, slopes: tuple[Any, ...], tangents: list[Array]) -> Any:
     if slopes[0] is None:
         return jax.custom_derivatives.zero_from_primal(value, symbolic_zeros=True)
@@ -114,10 +152,7 @@ def _change(solve: AbstractDifferentiableSolve, value: Array, slopes: tuple[Any,
         # Selected before and after, so that an infinite tangent or cotangent of an absent output is dropped, not
         # multiplied.
         factor = jnp.where(jnp.all(is_absent), 0.0, tangent)
-        product = slope * factor
-        # Where the derivative is zero, a NaN cotangent, such as that of theta at the pole, has no effect.
-        product = jnp.where(slope == 0.0, 0.0, product).sum(axis=tuple(range(jnp.ndim(value), jnp.ndim(product))))
-        return jnp.where(is_absent, 0.0, product)
+        return jnp.where(is_absent, 0.0, product(slope, factor))
 
     return sum(share(slope, tangent) for slope, tangent in zip(slopes, tangents, strict=True))
 
@@ -215,6 +250,47 @@ def tangents_by(
             ]
 
     return rebuilt(*point), tangents_of(rebuilt, point, tangents), gather
+
+
+def by_active(
+    build: Callable[[tuple[Array, ...], int | None], Any],
+    active: tuple[int, ...],
+    leaves: tuple[Array, ...],
+    cells: int,
+) -> tuple[Callable[..., Any], tuple[Float[Array, "... cells"], ...]]:
+    """A problem as a function of its active leaves, and these leaves with one value per cell, the cells last.
+
+    **Arguments:** as for `tangents_by`.
+    """
+
+    def rebuilt(*moving: Array) -> Any:
+        arguments = list(leaves)
+        for i, leaf in zip(active, moving, strict=True):
+            arguments[i] = leaf
+        return build(tuple(arguments), cells)
+
+    return rebuilt, tuple(jnp.broadcast_to(leaves[i], (cells,)) for i in active)
+
+
+def tangent_along(
+    build: Callable[[tuple[Array, ...], int | None], Any],
+    active: tuple[int, ...],
+    leaves: tuple[Array, ...],
+    tangents: tuple[Array, ...],
+    cells: int,
+) -> tuple[Any, Any, Float[Array, " cells"]]:
+    """Build a problem and its tangent in one direction of its leaves, which is scaled by the size of the leaves.
+
+    **Arguments:** as for `tangents_by`; `tangents`: those of the active leaves.
+
+    **Returns:** the problem, the tangent, and the size of the direction in every cell.
+    """
+    rebuilt, point = by_active(build, active, leaves, cells)
+    directions = [jnp.broadcast_to(tangent, (cells,)) for tangent in tangents]
+    ratios = [jnp.abs(tangent) / tangent_scale(leaf) for tangent, leaf in zip(directions, point, strict=True)]
+    size = functools.reduce(jnp.maximum, ratios)
+    scaled = tuple(jnp.where(size > 0.0, tangent / jnp.where(size > 0.0, size, 1.0), 0.0) for tangent in directions)
+    return rebuilt(*point), tangents_of(rebuilt, point, [scaled])[0], size
 
 
 def _by_entries(size: Array, *parts: Array) -> Array:

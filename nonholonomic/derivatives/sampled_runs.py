@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import diffrax
 import equinox as eqx
@@ -14,7 +14,8 @@ from ..integration import AbstractProblem, CoreProblem, Settings, sample, solve_
 from ..integration.dense import SampledSolution
 from ..integration.problem import event_time
 from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END
-from .differentiable import tangents_by
+from ._sampled_adjoint import samples_pulled_back
+from .differentiable import by_active, tangent_along, tangents_by
 from .lyapunov import probed
 from .sampling import AbstractSampling, ProblemSpec, solve_for_samples
 from .variation import VariationalProblem, in_groups
@@ -182,6 +183,8 @@ class BlockSampling(AbstractSampling):
     places: Any = eqx.field(static=True)
     core_only: bool = eqx.field(static=True, default=False)
 
+    most_slopes: ClassVar[float] = 2
+
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
         build, numbers, arguments, settings = self._builder(leaves)
         return _samples_and_slopes(VariationalProblem(build(numbers, cells), (), False), arguments, settings)[0]
@@ -197,6 +200,31 @@ class BlockSampling(AbstractSampling):
 
         samples, slopes = in_groups(run, tangents)
         return samples, gather(slopes)
+
+    def differentiable(self, primal: SampledRun) -> SampledRun:
+        return SampledRun(*primal[: -len(NOT_DIFFERENTIATED)], *NOT_DIFFERENTIATED)
+
+    def push_forward(
+        self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], tangents: tuple[Array, ...]
+    ) -> SampledRun:
+        build, numbers, arguments, settings = self._builder(leaves)
+        problem, direction, size = tangent_along(build, active, numbers, tangents, cells)
+        _, (slope,) = _samples_and_slopes(VariationalProblem(problem, (direction,), False), arguments, settings)
+        return jax.tree.map(lambda part: part * size.reshape(-1, *[1] * (part.ndim - 1)), slope)
+
+    def pull_back(
+        self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], cotangents: SampledRun
+    ) -> list[Float[Array, "cells ..."]]:
+        solve = dataclasses.replace(self, core_only=True) if cotangents.quadratures is None else self
+        build, numbers, (times, t1, tolerance), settings = solve._builder(leaves)
+        by_point = samples_pulled_back(
+            *by_active(build, active, numbers, cells),
+            cotangents[:3],
+            times if times.ndim == 1 else times.T,
+            t1,
+            settings.with_tolerance(jnp.min(tolerance)),
+        )
+        return [jnp.moveaxis(part, -1, 0) for part in by_point]
 
     def for_parts(self, wanted: tuple[int, ...]) -> Self:
         fields = SampledRun._fields

@@ -5,18 +5,18 @@ each run takes one backward pass (`_adjoint.py`).
 """
 
 import functools
-import math
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.extend.core import Literal
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
-from ..integration import AbstractProblem, LaneState, Outcome, Settings
+from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, States
 from ..integration.ensemble import with_crossing_times
 from ..integration.scheduler import LaneScheduler
 from ..integration.status import CROSSED, REACHED_END
@@ -91,7 +91,7 @@ def _slopes_by_adjoint(
     problem: AbstractProblem, tangents: tuple[Any, ...], ends_on_event: bool, *options: Any
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """The result of `slopes_by_variations`, at a cost that does not depend on the number of tangents."""
-    moving = _moving(problem, tangents[0])
+    moving = moving_leaves(problem, tangents[0], _field_and_event)
     # Without tangents, a `VariationalProblem` is the problem itself, with the option not to end on its event.
     ended, by_start, by_number = solve_with_adjoint(
         VariationalProblem(problem, (), ends_on_event),
@@ -114,43 +114,57 @@ def _slopes_by_adjoint(
 
 
 def _mixed(tangents: tuple[Any, ...]) -> Any:
-    """A mixture of some tangents, with shares that are unlikely to cancel. The mixture is about as large as each tangent,
-    so that steps are as short as for one tangent.
-    """
-    shares = [(0.5 + math.modf(0.618 * k)[0]) / len(tangents) for k in range(len(tangents))]
+    """A mixture of some tangents."""
+    shares = shares_of(len(tangents)).tolist()
     return jax.tree.map(lambda *rates: sum(c * rate for c, rate in zip(shares, rates, strict=True)), *tangents)
 
 
-def _event_time(variational: VariationalProblem, lane_state: LaneState) -> Float[Array, " lanes"]:
-    """Zero of the event function for lanes that have ended on the event (implicit function theorem).
-
-    First order, unlike `crossing_time`: the event is located to 1e-10 of a step, and its time is not differentiated
-    again.
+def shares_of(count: int) -> Float[np.ndarray, " count"]:
+    """Shares for a mixture of some tangents that are unlikely to cancel. The mixture is about as large as each tangent, so
+    that steps are as short as for one tangent.
     """
-    crossing, rate = variational.problem.event_function, variational.problem.field(lane_state.time, lane_state.state)
-    fall = stop_gradient(jax.jvp(crossing, (stop_gradient(lane_state.state),), (rate,))[1])
-    value = crossing(lane_state.state)
-    assert value is not None
-    return lane_state.time - value / jnp.where(fall == 0.0, 1.0, fall)
+    return (0.5 + np.modf(0.618 * np.arange(count))[0]) / count
 
 
-def _moving(problem: AbstractProblem, direction: Any) -> Any:
-    """The leaves that a tangent moves, as far as the field or the event function depends on them."""
-    leaves, structure = jax.tree.flatten(problem)
-    states = problem.start()[0]
+def _event_time(variational: VariationalProblem, lane_state: LaneState) -> Float[Array, " lanes"]:
+    """Zero of the event function for lanes that have ended on the event."""
+    problem = variational.problem
+    return time_of_zero(problem, problem.event_function, lane_state.time, lane_state.state)
 
-    def seen(*leaves: Any) -> Any:
-        rebuilt = jax.tree.unflatten(structure, leaves)
-        return rebuilt.field(jnp.zeros_like(states[0]), states), rebuilt.event_function(states)
 
-    closed = jax.make_jaxpr(seen)(*leaves)
+def time_of_zero(problem: AbstractProblem, function: Callable[[Any], Any], time: Lanes, state: States) -> Lanes:
+    """The time at which a function of the state vanishes, for a state at the zero (implicit function theorem).
+
+    First order, unlike `event_time`: the event is located to 1e-10 of a step, and its time is not differentiated again.
+    """
+    fall = stop_gradient(jax.jvp(function, (stop_gradient(state),), (problem.field(time, state),))[1])
+    return time - function(state) / jnp.where(fall == 0.0, 1.0, fall)
+
+
+def _field_and_event(problem: AbstractProblem, states: States) -> Any:
+    return problem.field(jnp.zeros_like(states[0]), states), problem.event_function(states)
+
+
+def moving_leaves(problem: AbstractProblem, direction: Any, functions: Callable[[AbstractProblem, States], Any]) -> Any:
+    """The leaves that a tangent moves, as far as some functions of problem and states depend on them, as a tree of
+    booleans."""
+    arrays, static = eqx.partition(problem, eqx.is_array)
+    leaves, structure = jax.tree.flatten(arrays)
+
+    def values(*leaves: Any) -> Any:
+        return functions(eqx.combine(jax.tree.unflatten(structure, leaves), static), problem.start()[0])
+
+    closed = jax.make_jaxpr(values)(*leaves)
     dependencies = set(closed.jaxpr.outvars)
     for equation in reversed(closed.jaxpr.eqns):
         if not dependencies.isdisjoint(equation.outvars):
             dependencies |= {variable for variable in equation.invars if not isinstance(variable, Literal)}
     is_dependency = jax.tree.unflatten(structure, [variable in dependencies for variable in closed.jaxpr.invars])
     return jax.tree.map(
-        lambda rate, is_used: is_used and rate is not None, direction, is_dependency, is_leaf=lambda rate: rate is None
+        lambda rate, is_used: bool(is_used) and rate is not None,
+        direction,
+        is_dependency,
+        is_leaf=lambda rate: rate is None,
     )
 
 

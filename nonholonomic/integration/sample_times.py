@@ -69,6 +69,11 @@ class SampleTimes(eqx.Module):
         """The index of the first sample after the start in every lane."""
         return self.first[self._cell(lane_state)]
 
+    def after(self, time: Lanes, lane_state: LaneState) -> Int[Array, " lanes"]:
+        """The index of the first sample after a time in every lane."""
+        times = self.times[:, None] if self.times.ndim == 1 else self.times[:, self._cell(lane_state)]
+        return jnp.sum(times <= time, axis=0)
+
     def time_of(self, sample: Int[Array, " lanes"], lane_state: LaneState) -> Lanes:
         """The time of a sample in every lane, infinite after the last one."""
         index = jnp.minimum(sample, len(self) - 1)

@@ -20,7 +20,7 @@ from .sample_times import Collected, Read, Rows, SampleTimes, components
 from .scheduler import AbstractRecorder, InLanes, LaneScheduler, Outcome
 from .settings import Settings
 from .status import FAILED, REACHED_END, RUNNING
-from .step import LaneState, try_step
+from .step import LaneState, length_to_try, try_step
 
 #: Largest factor by which a step is stretched to end on a sample: its error stays below the tolerance, because steps
 #: are proposed with a margin of `step.SAFETY`.
@@ -54,25 +54,42 @@ class SampleRecorder(AbstractRecorder):
     def step(
         self, in_lanes: InLanes, lane_state: LaneState, record: Record, iteration: Int[Array, ""]
     ) -> tuple[LaneState, Record]:
-        (problem, control, atol), (accepted, sample, rows) = in_lanes, record
-        next_time = self.times.time_of(sample, lane_state)
-        target = jnp.minimum(next_time, control.t1)
-        even_length = _even(lane_state.length, target - lane_state.time, lane_state.bracketing)
-        # The step after a rejected step is shorter on purpose, because it may have to end on a minimum of a margin.
-        length = jnp.where(accepted, even_length, jnp.minimum(even_length, lane_state.length))
-        lane_state = lane_state._replace(length=length)
-        new_lanes = try_step(problem, control._replace(t1=target), atol, lane_state)
-        at_target = (lane_state.status == RUNNING) & (new_lanes.status == REACHED_END)
-        is_sample = at_target & (new_lanes.time >= next_time)
-        goes_on = at_target & (new_lanes.time < control.t1)
-        status = jnp.where(new_lanes.steps < control.max_steps, RUNNING, FAILED)
-        new_lanes = new_lanes._replace(status=jnp.where(goes_on, status, new_lanes.status))
+        accepted, sample, rows = record
+        new_lanes, _, is_sample = step_towards_sample(self.times, in_lanes, lane_state, accepted, sample)
         entry = Rows(new_lanes.state, jnp.where(is_sample, sample, len(self.times)))
         rows = jax.tree.map(functools.partial(written_in_place, at=iteration), rows, entry)
         return new_lanes, Record(new_lanes.time > lane_state.time, sample + is_sample, rows)
 
     def collect(self, collected: Collected, record: Record, ended: LaneState, refilled: LaneState) -> Collected:
         return self.times.collect(collected, record.rows, record.sample, ended, refilled)
+
+
+def step_towards_sample(
+    times: SampleTimes,
+    in_lanes: InLanes,
+    lane_state: LaneState,
+    accepted: Bool[Array, " lanes"],
+    sample: Int[Array, " lanes"],
+) -> tuple[LaneState, Lanes, Bool[Array, " lanes"]]:
+    """Try a step in every lane that does not pass its next sample.
+
+    **Arguments:** `accepted`: whether the previous step was accepted; `sample`: the index of the next sample.
+
+    **Returns:** the lanes after the step; the length that was tried [s]; and whether the step ended on the sample.
+    """
+    problem, control, atol = in_lanes
+    next_time = times.time_of(sample, lane_state)
+    target = jnp.minimum(next_time, control.t1)
+    even_length = _even(lane_state.length, target - lane_state.time, lane_state.bracketing)
+    # The step after a rejected step is shorter on purpose, because it may have to end on a minimum of a margin.
+    length = jnp.where(accepted, even_length, jnp.minimum(even_length, lane_state.length))
+    lane_state, control_to_target = lane_state._replace(length=length), control._replace(t1=target)
+    new_lanes = try_step(problem, control_to_target, atol, lane_state)
+    at_target = (lane_state.status == RUNNING) & (new_lanes.status == REACHED_END)
+    goes_on = at_target & (new_lanes.time < control.t1)
+    status = jnp.where(new_lanes.steps < control.max_steps, RUNNING, FAILED)
+    new_lanes = new_lanes._replace(status=jnp.where(goes_on, status, new_lanes.status))
+    return new_lanes, length_to_try(control_to_target, lane_state), at_target & (new_lanes.time >= next_time)
 
 
 def solve_with_samples(

@@ -1,0 +1,172 @@
+"""The derivatives of a sum over the samples of a run with respect to any number of parameters, by one backward pass.
+
+The run is repeated, with steps that also suit a tangent, and its steps are recorded (`_adjoint.py`). The backward pass
+adds the cotangent of each sample where it passes the sample's time. Neither the cost nor the memory depends on the number
+of parameters, apart from the field's own share.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..integration import AbstractProblem, Lanes, LaneState, Settings, States
+from ..integration.sample_times import SampleTimes, components
+from ..integration.samples import step_towards_sample
+from ..integration.scheduler import InLanes
+from ..integration.status import FAILED, LEFT_DOMAIN
+from ..xla_cpu import written_in_place
+from ._adjoint import StepRecorder, solve_with_adjoint, without_probe
+from ._periods import StepRecord
+from .slopes import moving_leaves, shares_of, tangents_of, time_of_zero
+from .variation import VariationalProblem, tangent_scale
+
+
+class SampledCotangents(NamedTuple):
+    """The cotangents of the samples, and of the time at which a run leaves the domain."""
+
+    states: Float[Array, "cells times components"]
+    end_time: Float[Array, " cells"]
+
+    @classmethod
+    def of(
+        cls,
+        problem: AbstractProblem,
+        times: int,
+        core: Float[Array, "cells times components"] | None,
+        quadratures: Float[Array, "cells times quadratures"] | None,
+        end_time: Float[Array, " cells"] | None,
+    ) -> "SampledCotangents":
+        """The cotangents of a problem's core components, quadratures and end time, zero where they are `None`."""
+        components, cells = problem.start()[0].shape
+        leading = components if problem.leading is None else problem.leading
+        states = [
+            jnp.zeros((cells, times, size)) if part is None else part
+            for part, size in ((core, leading), (quadratures, components - leading))
+        ]
+        return cls(jnp.concatenate(states, axis=-1), jnp.zeros(cells) if end_time is None else end_time)
+
+
+class SampledStepRecord(NamedTuple):
+    """The steps of a period; whether the last step was accepted, and the index of the next sample, in every lane."""
+
+    accepted: Bool[Array, " lanes"]
+    sample: Int[Array, " lanes"]
+    steps: StepRecord
+
+
+class SampledStepRecorder(StepRecorder):
+    """Records steps that end on the samples; the cotangents of the samples enter where the steps end."""
+
+    times: SampleTimes
+    cotangents: SampledCotangents
+
+    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: None) -> SampledStepRecord:
+        steps = super().begin(in_lanes, lane_state, collected)
+        sample = self.times.after(lane_state.time, lane_state)
+        samples = jnp.zeros((self.period, *sample.shape), sample.dtype)
+        return SampledStepRecord(jnp.ones(sample.shape, bool), sample, steps._replace(sample=samples))
+
+    def step(
+        self, in_lanes: InLanes, lane_state: LaneState, record: SampledStepRecord, iteration: Int[Array, ""]
+    ) -> tuple[LaneState, SampledStepRecord]:
+        accepted, sample, steps = record
+        next_state, length, is_sample = step_towards_sample(self.times, in_lanes, lane_state, accepted, sample)
+        has_moved = next_state.time > lane_state.time
+        entry = StepRecord(
+            lane_state.time,
+            without_probe(lane_state).state,
+            jnp.where(has_moved, length, 0.0),
+            jnp.where(is_sample, sample, len(self.times)),
+        )
+        steps = jax.tree.map(functools.partial(written_in_place, at=iteration), steps, entry)
+        return next_state, SampledStepRecord(has_moved, sample + is_sample, steps)
+
+    def steps(self, record: SampledStepRecord) -> StepRecord:
+        return record.steps
+
+    def arriving(self, lane_state: LaneState, steps: StepRecord) -> Float[Array, "iterations components lanes"]:
+        rows = self.cotangents.states.at[self._cell(lane_state), steps.sample].get(mode="fill", fill_value=0.0)
+        return jnp.moveaxis(rows, -1, 1)
+
+    def share_of_end(self, lane_state: LaneState) -> Lanes:
+        leaves = (lane_state.status == LEFT_DOMAIN) & (lane_state.time > 0.0)
+        return jnp.where(leaves, self.cotangents.end_time[self._cell(lane_state)], 0.0)
+
+    def _cell(self, lane_state: LaneState) -> Int[Array, " lanes"]:
+        return jnp.minimum(lane_state.cell, len(self.cotangents.end_time) - 1)
+
+
+def samples_pulled_back(
+    build: Callable[..., AbstractProblem],
+    point: tuple[Float[Array, "... cells"], ...],
+    cotangents: tuple[Array | None, Array | None, Array | None],
+    times: Float[Array, "times *cells"],
+    t1: Float[Array, "..."],
+    settings: Settings,
+) -> list[Float[Array, "... cells"]]:
+    """The cotangents of a problem's numbers from those of its samples.
+
+    **Arguments:**
+
+    - `build`: numbers -> problem; `point`: the numbers, with the cells last.
+    - `cotangents`: those of the core components and of the quadratures at the times, (cells, times, ...), 0 after the end
+      of a run; and those of the time at which the run leaves the domain, (cells,). `None` if they vanish.
+    - `times`, `t1`, `settings`: as for `solve_with_samples`.
+
+    **Returns:** the cotangents, in the shapes of the numbers; NaN in cells that fail with the steps that suit the tangent.
+    """
+    problem, cells = build(*point), point[0].shape[-1]
+    arriving = SampledCotangents.of(problem, len(times), *cotangents)
+    probe = tangents_of(build, point, [tuple(_mixture(point))])[0]
+    moving = moving_leaves(problem, probe, _field_and_margin)
+    outcome, by_start, by_number = solve_with_adjoint(
+        VariationalProblem(problem, (), False),
+        VariationalProblem(moving, (), False),
+        probe,
+        t1,
+        jnp.asarray(cells),
+        settings,
+        measured=_end_time,
+        recorder=SampledStepRecorder(SampleTimes.of(times, cells, components), arriving),
+        one_kernel=True,
+    )
+    sample_times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), cells)).T
+    initial = jnp.where((sample_times <= 0.0)[..., None], arriving.states, 0.0)
+    is_lost = jnp.any(jnp.any(arriving.states != 0.0, axis=-1) & (sample_times > outcome.end_time[:, None]), axis=1)
+    by_start = by_start + jnp.sum(initial, axis=1).T
+
+    def numbers_and_start(*point: Float[Array, "... cells"]) -> Any:
+        problem = build(*point)
+        return eqx.filter(problem, moving), problem.start()[0]
+
+    by_point = jax.vjp(numbers_and_start, *point)[1]((by_number.problem, by_start))
+    return [jnp.where(is_lost & (outcome.status == FAILED), jnp.nan, part) for part in by_point]
+
+
+def _mixture(point: tuple[Float[Array, "... cells"], ...]) -> list[Float[Array, "... cells"]]:
+    """A direction that moves every number by a share of its own size."""
+    counts = [number[..., 0].size for number in point]
+    shares = np.split(shares_of(sum(counts)), np.cumsum(counts)[:-1])
+    return [
+        jnp.asarray(share).reshape(*number.shape[:-1], 1) * tangent_scale(number)
+        for share, number in zip(shares, point, strict=True)
+    ]
+
+
+def _field_and_margin(problem: AbstractProblem, states: States) -> Any:
+    time = jnp.zeros_like(states[0])
+    return problem.field(time, states), problem.domain_margin(time, states)
+
+
+def _end_time(variational: VariationalProblem, lane_state: LaneState) -> Lanes:
+    """The time at which a run leaves the domain."""
+    problem, time = variational.problem, lane_state.time
+    if problem.domain_margin(time, lane_state.state) is None:
+        return jnp.zeros_like(time)
+    return time_of_zero(problem, lambda state: problem.domain_margin(time, state), time, lane_state.state)

@@ -1,0 +1,126 @@
+"""Derivatives of sampled runs by one backward pass, on a problem with a closed form, in every composition of transformations."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from close import assert_close
+
+import nonholonomic.derivatives.sampled_runs as sampled_runs
+from nonholonomic.derivatives import sampled_run
+from nonholonomic.integration import AbstractProblem, Settings
+
+TIMES = jnp.array([0.0, 0.4, 1.0, 1.7])
+#: Rate, height, growth and patience of five runs; the guard ends the last two before the last sample.
+POINTS = jnp.array(
+    [[1.0, 2.0, 0.7, 9.0], [0.3, 1.5, -0.2, 9.0], [2.0, 0.5, 0.1, 9.0], [0.8, 1.0, 0.4, 1.3], [1.5, 3.0, 0.0, 0.7]]
+)
+
+
+class Decays(AbstractProblem):
+    """y' = -rate (1 + growth t) y from y = height, a clock, and the area under y, which is passive; the guard is up at
+    the time `patience`."""
+
+    numbers: tuple[jax.Array, ...]
+
+    @property
+    def leading(self):
+        return 2
+
+    def start(self):
+        zero = jnp.zeros_like(self.numbers[1])
+        return jnp.stack([self.numbers[1], zero, zero]), jnp.stack([zero + 1.0] * 3)
+
+    def field(self, time, state):
+        rate, _, growth, _ = self.numbers
+        return jnp.stack([-rate * (1.0 + growth * time) * state[0], jnp.ones_like(state[0]), state[0]])
+
+    def event_function(self, state):
+        return None
+
+    def domain_margin(self, time, state):
+        return self.numbers[3] - state[1]
+
+
+def build(numbers, cells):
+    shape = () if cells is None else (cells,)
+    return Decays(tuple(jnp.broadcast_to(number, shape) for number in numbers))
+
+
+def loss(numbers, times=TIMES):
+    """A sum over the samples, the areas and the end of a run, whose samples after its end are missing."""
+    run = sampled_run(build, numbers, times, jnp.asarray(2.0), Settings(1e-11))
+    heights, areas = (jnp.where(jnp.isnan(part), 0.0, part) for part in (run.states[:, 0], run.quadratures[:, 0]))
+    return jnp.sum(jnp.arange(1.0, 5.0) * heights**2) + jnp.sum(areas**3) + run.end_time**2
+
+
+def exact(numbers):
+    """The same from the closed form; areas by a quadrature of high order."""
+    rate, height, growth, patience = numbers
+    nodes, weights = np.polynomial.legendre.leggauss(30)
+    moments = 0.5 * TIMES[:, None] * (1.0 + nodes)
+    heights, inside = (height * jnp.exp(-rate * (t + 0.5 * growth * t**2)) for t in (TIMES, moments))
+    areas = 0.5 * TIMES * (inside @ weights)
+    reached = TIMES <= patience
+    terms = jnp.where(reached, jnp.arange(1.0, 5.0) * heights**2 + areas**3, 0.0)
+    return jnp.sum(terms) + jnp.minimum(patience, 2.0) ** 2
+
+
+def of_points(function):
+    return lambda points: jax.vmap(lambda point: function(tuple(point)))(points)
+
+
+EXPECTED = jax.jit(jax.vmap(jax.grad(lambda point: exact(tuple(point)))))(POINTS)
+
+
+def batch_of_gradients(points):
+    return jax.vmap(jax.grad(lambda point: loss(tuple(point))))(points)
+
+
+def gradient_of_a_batch(points):
+    return jax.grad(lambda points: jnp.sum(of_points(loss)(points)))(points)
+
+
+def forward(points):
+    return jax.vmap(jax.jacfwd(lambda point: loss(tuple(point))))(points)
+
+
+def in_one_direction_each(points):
+    basis = jnp.broadcast_to(jnp.eye(4)[:, None], (4, *points.shape))
+    return jax.vmap(lambda tangent: jax.jvp(of_points(loss), (points,), (tangent,))[1], out_axes=1)(basis)
+
+
+def one_by_one(points):
+    return jax.lax.map(jax.grad(lambda point: loss(tuple(point))), points)
+
+
+def of_all_outputs(points):
+    return jax.vmap(jax.jacrev(lambda point: loss(tuple(point))[None]))(points)[:, 0]
+
+
+@pytest.mark.parametrize(
+    "transformed", [batch_of_gradients, gradient_of_a_batch, forward, in_one_direction_each, one_by_one, of_all_outputs]
+)
+def test_every_composition_gives_the_derivatives_of_the_closed_form(transformed):
+    assert_close(jax.jit(transformed)(POINTS), EXPECTED, rtol=1e-8, atol=1e-9)
+
+
+def test_numbers_shared_by_all_runs_have_the_sum_of_their_derivatives():
+    def total(shared, heights):
+        return jnp.sum(jax.vmap(lambda height: loss((shared[0], height, *shared[1:])))(heights))
+
+    shared, heights = jnp.array([0.8, 0.4, 1.3]), jnp.array([1.0, 2.5, 0.6])
+    points = jnp.stack([jnp.full(3, 0.8), heights, jnp.full(3, 0.4), jnp.full(3, 1.3)], axis=1)
+    expected = jax.vmap(jax.grad(lambda point: exact(tuple(point))))(points)
+    by_shared, by_height = jax.jit(jax.grad(total, (0, 1)))(shared, heights)
+    assert_close(by_shared, expected.sum(axis=0)[jnp.array([0, 2, 3])], rtol=1e-8)
+    assert_close(by_height, expected[:, 1], rtol=1e-8)
+
+
+def test_a_direction_costs_one_variation_and_a_second_derivative_is_taken_forward():
+    point, direction = tuple(POINTS[0]), (0.3, -1.0, 0.5, 0.0)
+    slope = jax.jit(lambda point: jax.jvp(loss, (point,), (direction,))[1])(point)
+    assert_close(slope, jnp.dot(EXPECTED[0], jnp.array(direction)), rtol=1e-8)
+    curvature = jax.jit(jax.jacfwd(jax.grad(lambda point: loss(tuple(point)))))(POINTS[0])
+    assert_close(curvature, jax.hessian(lambda point: exact(tuple(point)))(POINTS[0]), rtol=1e-7, atol=1e-7)
