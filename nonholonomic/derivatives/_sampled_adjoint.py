@@ -170,3 +170,21 @@ def _end_time(variational: VariationalProblem, lane_state: LaneState) -> Lanes:
     if problem.domain_margin(time, lane_state.state) is None:
         return jnp.zeros_like(time)
     return time_of_zero(problem, lambda state: problem.domain_margin(time, state), time, lane_state.state)
+
+
+def is_reversible(problem: AbstractProblem) -> bool:
+    """Whether the field of a single run has a backward pass; a loop without a fixed number of iterations has none."""
+    arrays, static = eqx.partition(problem, eqx.is_inexact_array)
+
+    def pulled_back(arrays: Any, state: States) -> Any:
+        def field(arrays: Any, state: States) -> States:
+            return eqx.combine(arrays, static).field(jnp.zeros_like(state[0]), state)
+
+        rates, pull = jax.vjp(field, arrays, state)
+        return pull(jnp.ones_like(rates))
+
+    try:
+        jax.eval_shape(pulled_back, arrays, problem.start()[0])
+    except ValueError:
+        return False
+    return True

@@ -7,7 +7,6 @@ one ensemble.
 
 import abc
 import functools
-import math
 from collections.abc import Callable
 from typing import Any, ClassVar, Self
 
@@ -39,10 +38,6 @@ class AbstractDifferentiableSolve(eqx.Module):
     #: Whether a batch is run as one ensemble; otherwise each run is separate, with a single cell.
     in_blocks: ClassVar[bool] = True
 
-    #: With more numbers than this, `push_forward` and `pull_back` take the place of the derivatives with respect to every
-    #: number.
-    most_slopes: ClassVar[float] = math.inf
-
     movable: eqx.AbstractVar[int]
 
     @abc.abstractmethod
@@ -63,6 +58,11 @@ class AbstractDifferentiableSolve(eqx.Module):
         **Arguments:** `active`: the leaves with respect to which to differentiate; `nested`: whether the outputs will
         be differentiated again, in forward mode; `cells`, `leaves`: as for `solve`.
         """
+
+    def prefers_adjoint(self, active: tuple[int, ...], leaves: tuple[Float[Array, "..."], ...]) -> bool:
+        """Whether `push_forward` and `pull_back` take the place of the derivatives with respect to every active leaf;
+        by default they do not. **Arguments:** as for `value_and_tangents`, for a single run."""
+        return False
 
     def differentiable(self, primal: Primal) -> Primal:
         """The primal with `None` for parts that are not differentiable."""
@@ -117,7 +117,7 @@ def differentiable_solve(solve: AbstractDifferentiableSolve, *leaves: Float[Arra
             value = primal(*leaves)
             return value, jax.tree.map(jnp.zeros_like, value)
         active_tangents = [tangents[i] for i in active]
-        if sum(tangent.size for tangent in active_tangents) > solve.most_slopes:
+        if solve.prefers_adjoint(active, leaves):
             value = primal(*leaves)
             linear_solve = Tangents(solve, active, flat(value)[1], _value_and_tangents)
             change = push_forward(linear_solve, leaves, active_tangents, value)
@@ -201,12 +201,11 @@ def tangents_by(
     **Arguments:**
 
     - `build`: (leaves, cells) -> problem.
-    - `active`, `leaves`: the leaves to move, and all leaves. With `cells`, a leaf is a scalar or an array with one
-      number per cell. Without `cells`, a leaf is an array of any shape, and each entry has its own tangent.
+    - `active`, `leaves`: the leaves to move, and all leaves, of any shape. With `cells`, a leaf is a scalar or has the
+      cells in its last axis. Each entry of a leaf has its own tangent.
 
-    **Returns:** the problem; its tangents; and a function that turns derivatives along the tangents (trees of arrays)
-    into derivatives with respect to each leaf, the leaf's own axes last (with `cells` there are none, and the cells
-    come first).
+    **Returns:** the problem; its tangents; and a function that turns derivatives along the tangents (trees of arrays,
+    with `cells` in the first axis) into derivatives with respect to each leaf, the leaf's own axes last.
 
     **Example:** the tangent of a problem moves its rate by its own size.
 
@@ -215,50 +214,42 @@ def tangents_by(
     [1. 2.]
     """
 
-    def rebuilt(*moving: Array) -> Any:
-        arguments = list(leaves)
-        for i, leaf in zip(active, moving, strict=True):
-            arguments[i] = leaf
-        return build(tuple(arguments), cells)
-
-    point = tuple(leaves[i] for i in active)
+    rebuilt, point = by_active(build, active, leaves, cells)
     sizes = [tangent_scale(leaf) for leaf in point]
     zeros = tuple(jnp.zeros_like(size) for size in sizes)
+    own_shapes = [size.shape if cells is None else size.shape[:-1] for size in sizes]
+    entries = [(k, index) for k, shape in enumerate(own_shapes) for index in np.ndindex(shape)]
 
-    def along(k: int, tangent: Array) -> tuple[Array, ...]:
-        return (*zeros[:k], tangent, *zeros[k + 1 :])
+    def along(k: int, index: tuple[int, ...]) -> tuple[Array, ...]:
+        return (*zeros[:k], zeros[k].at[index].set(sizes[k][index]), *zeros[k + 1 :])
 
-    if cells is not None:
-        tangents = [along(k, size) for k, size in enumerate(sizes)]
+    def gather(slopes: list[Primal]) -> list[Primal]:
+        by_entry = [
+            jax.tree.map(functools.partial(_by_size, sizes[k][index]), slope)
+            for (k, index), slope in zip(entries, slopes, strict=True)
+        ]
 
-        def gather(slopes: list[Primal]) -> list[Primal]:
-            return [
-                jax.tree.map(functools.partial(_by_cells, size), slope)
-                for slope, size in zip(slopes, sizes, strict=True)
-            ]
-    else:
-        entries = [(k, index) for k, size in enumerate(sizes) for index in np.ndindex(size.shape)]
-        tangents = [along(k, zeros[k].at[index].set(sizes[k][index])) for k, index in entries]
+        def of_leaf(k: int, shape: tuple[int, ...]) -> Primal:
+            parts = [slope for (leaf, _), slope in zip(entries, by_entry, strict=True) if leaf == k]
+            return jax.tree.map(lambda *parts: jnp.stack(parts, axis=-1).reshape(*parts[0].shape, *shape), *parts)
 
-        def gather(slopes: list[Primal]) -> list[Primal]:
-            by_leaf = [
-                [slope for (k, _), slope in zip(entries, slopes, strict=True) if k == i] for i in range(len(sizes))
-            ]
-            return [
-                jax.tree.map(functools.partial(_by_entries, size), *entries_of_leaf)
-                for size, entries_of_leaf in zip(sizes, by_leaf, strict=True)
-            ]
+        return [of_leaf(k, shape) for k, shape in enumerate(own_shapes)]
 
-    return rebuilt(*point), tangents_of(rebuilt, point, tangents), gather
+    return rebuilt(*point), tangents_of(rebuilt, point, [along(*entry) for entry in entries]), gather
+
+
+def _by_size(size: Array, part: Array) -> Array:
+    """Convert a derivative along a number to one with respect to it; the number is a scalar or has one value per cell."""
+    return part / size.reshape((-1,) + (1,) * (part.ndim - 1) if size.ndim else ())
 
 
 def by_active(
     build: Callable[[tuple[Array, ...], int | None], Any],
     active: tuple[int, ...],
     leaves: tuple[Array, ...],
-    cells: int,
-) -> tuple[Callable[..., Any], tuple[Float[Array, "... cells"], ...]]:
-    """A problem as a function of its active leaves, and these leaves with one value per cell, the cells last.
+    cells: int | None,
+) -> tuple[Callable[..., Any], tuple[Float[Array, "..."], ...]]:
+    """A problem as a function of its active leaves, and these leaves; with `cells`, they have the cells in the last axis.
 
     **Arguments:** as for `tangents_by`.
     """
@@ -269,7 +260,12 @@ def by_active(
             arguments[i] = leaf
         return build(tuple(arguments), cells)
 
-    return rebuilt, tuple(jnp.broadcast_to(leaves[i], (cells,)) for i in active)
+    return rebuilt, tuple(leaves[i] if cells is None else over_cells(leaves[i], cells) for i in active)
+
+
+def over_cells(leaf: Float[Array, "..."], cells: int) -> Float[Array, "... cells"]:
+    """A leaf with the cells in its last axis, from such a leaf or a scalar."""
+    return jnp.broadcast_to(leaf, (*jnp.shape(leaf)[:-1], cells))
 
 
 def tangent_along(
@@ -286,19 +282,8 @@ def tangent_along(
     **Returns:** the problem, the tangent, and the size of the direction in every cell.
     """
     rebuilt, point = by_active(build, active, leaves, cells)
-    directions = [jnp.broadcast_to(tangent, (cells,)) for tangent in tangents]
+    directions = [over_cells(tangent, cells) for tangent in tangents]
     ratios = [jnp.abs(tangent) / tangent_scale(leaf) for tangent, leaf in zip(directions, point, strict=True)]
-    size = functools.reduce(jnp.maximum, ratios)
+    size = functools.reduce(jnp.maximum, [jnp.max(ratio.reshape(-1, cells), axis=0) for ratio in ratios])
     scaled = tuple(jnp.where(size > 0.0, tangent / jnp.where(size > 0.0, size, 1.0), 0.0) for tangent in directions)
     return rebuilt(*point), tangents_of(rebuilt, point, [scaled])[0], size
-
-
-def _by_entries(size: Array, *parts: Array) -> Array:
-    """Convert derivatives along the entries of a leaf to derivatives with respect to the leaf, whose axes come last."""
-    return jnp.stack(parts, axis=-1).reshape(*parts[0].shape, *size.shape) / size
-
-
-def _by_cells(size: Array, part: Array) -> Array:
-    """Convert derivatives along a leaf to derivatives with respect to it; the leaf has one number for all cells or one
-    per cell."""
-    return part / size.reshape((-1,) + (1,) * (part.ndim - 1))

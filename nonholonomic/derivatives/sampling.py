@@ -22,6 +22,8 @@ class ProblemSpec(eqx.Module):
     rest: Any
     settings: Settings
     grid: Float[Array, " steps"] | None
+    # The numbers of axes of the modules' numbers, without an axis of cells.
+    axes: tuple[int, ...] = eqx.field(static=True)
 
     def built(self, numbers: tuple[Array, ...], *extra: Any) -> Any:
         """Build the problem from the modules, with their numbers replaced, and from the extra arguments of `build`."""
@@ -64,7 +66,8 @@ def solve_for_samples(
     leaves, structure = jax.tree.flatten(numbers)
     # Arrays, such as those of the solver, may be traced, so they belong to the leaves.
     arrays, spec = eqx.partition(
-        ProblemSpec(build, structure, static, settings.with_tolerance(None), grid), eqx.is_array
+        ProblemSpec(build, structure, static, settings.with_tolerance(None), grid, tuple(map(jnp.ndim, leaves))),
+        eqx.is_array,
     )
     arrays_of_spec, places = jax.tree.flatten(arrays)
     return differentiable_solve(

@@ -16,8 +16,9 @@ from nonholonomic.integration.status import REACHED_END
 
 from ..model.dynamics import Dynamics, State
 from ..model.heading import Projected
-from ..model.input import Formula, Input
+from ..model.input import Formula, Input, at_start
 from ..model.launch import Launch
+from ..model.per_ride import PerRide
 from ..model.scene import Scene
 
 #: Reduced mass, relative to its largest value, below which the constraints count as having lost rank.
@@ -43,6 +44,10 @@ class RideProblem(AbstractProblem):
     press: Float[Array, "..."]
     watched: bool = eqx.field(static=True)
     guarded: bool = eqx.field(static=True)
+
+    @property
+    def fits_one_kernel(self) -> bool:
+        return not isinstance(self.input, PerRide) or self.input.elementary
 
     @classmethod
     def single(cls, scene: Scene, launch: Launch, controls: Input | None) -> "RideProblem":
@@ -121,14 +126,20 @@ class RideSpec(eqx.Module):
 
 
 def as_module(controls: Input | None, scene: Scene, launch: Launch) -> Any:
-    """An input as a module whose numbers are leaves; a function is traced once, with scalar arguments."""
-    if controls is None or isinstance(controls, eqx.Module):
+    """An input as a module whose numbers are leaves. A function, or a module with arrays, is traced once, with scalar
+    arguments, because it is written for a single ride."""
+    if controls is None or (isinstance(controls, eqx.Module) and not has_arrays(controls)):
         return controls
 
     def motion(scene: Scene, launch: Launch) -> Any:
         return scene.dynamics.geometry(scene.state(launch, True)).motion
 
     return Formula.of(controls, jnp.zeros(()), eqx.filter_eval_shape(motion, scene, launch))
+
+
+def has_arrays(tree: Any) -> bool:
+    """Whether some leaf is an array with axes."""
+    return any(eqx.is_array(leaf) and leaf.ndim > 0 for leaf in jax.tree.leaves(tree))
 
 
 def ride_problem(modules: tuple[Scene, Launch, Input | None], cells: int | None) -> RideProblem:
@@ -140,11 +151,16 @@ def traced_ride(
     ride: Ride, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None
 ) -> tuple[State, Stats]:
     """The states of a ride at `times`, and its statistics, inside a transformation."""
-    modules = (ride.scene, ride.launch, ride.input)
+    modules, arguments = (ride.scene, ride.launch, ride.input), (times, ride.t1, ride.settings)
     if adjoint is None:
-        sampled = sampled_run(ride_problem, modules, times, ride.t1, ride.settings, ride.grid)
+        if isinstance(ride.input, Formula) and not has_arrays(modules[:2]):
+            t, motion = eqx.filter_eval_shape(at_start, ride.scene, ride.launch)
+            modules = (ride.scene, ride.launch, PerRide.of(ride.input, t, motion))
+        sampled = sampled_run(
+            ride_problem, modules, *arguments, ride.grid, arrays_in_lanes=isinstance(modules[2], PerRide)
+        )
     else:
-        arguments = (times, ride.t1, ride.settings, adjoint, ride.grid)
+        arguments = (*arguments, adjoint, ride.grid)
         sampled = sampled_run_by_diffrax(ride_problem(modules, None), *arguments)
     return sampled.states.T, stats_of(sampled)
 

@@ -51,12 +51,12 @@ def simulate(
     - `tolerance`: relative tolerance of an adaptive solver, in [1e-14, 1e-2]; the absolute tolerance is a tenth of it,
       in units of the scene's magnitudes.
     - `solver`: any adaptive solver of Diffrax for ordinary differential equations, or an `ImplicitMidpoint`; by default
-      `diffrax.Dopri8()`; inside transformations without `adjoint`, if all numbers are scalars,
+      `diffrax.Dopri8()`; inside transformations without `adjoint`, if all numbers of scene and launch are scalars,
       `nonholonomic.integration.Oscillatory8()`.
     - `max_steps`: a run that needs more steps fails; at least 1.
     - `adjoint`: an adjoint method of Diffrax, such as `RecursiveCheckpointAdjoint()`, with which Diffrax
-      differentiates. This is cheaper for a loss function with many parameters, such as the weights of an input. By
-      default, this package computes forward and reverse derivatives, at the cost of about one run for each parameter.
+      differentiates. By default, this package computes forward and reverse derivatives; the gradient of a loss function
+      costs about five runs, whatever the number of parameters, which may be arrays, such as the weights of an input.
 
     **Returns:** a `Trajectory`; its `status` states how the run ended.
 

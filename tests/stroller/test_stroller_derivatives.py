@@ -79,6 +79,23 @@ class Steps(eqx.Module):
         return 1.0, jnp.sum(weights * self.torques, axis=-1)
 
 
+@pytest.mark.parametrize("as_input", [lambda steps: steps, lambda steps: lambda t, motion: steps(t, motion)])
+def test_arrays_in_the_inputs_of_a_batch_have_the_slopes_of_their_own_rides(as_input):
+    """A module with an array, and a function that holds one: as a batch like ride by ride, and as differences."""
+
+    def end(torques, speed):
+        launch = Launch((0.0, 0.0), 0.3, speed)
+        ride = stroller.simulate(DAMPED, launch, 2.0, input=as_input(Steps(torques)), times=[1.0, 2.0], tolerance=1e-10)
+        return jnp.sum(ride.position[:, 1]) + ride.steering[-1]
+
+    torques, speeds = jnp.linspace(-0.1, 0.1, 12).reshape(3, 4), jnp.array([1.0, 2.0, 3.0])
+    ends = jax.jit(jax.vmap(end))
+    gradients = jax.jit(jax.vmap(jax.grad(end)))(torques, speeds)
+    for k in range(4):
+        expected = extrapolated(lambda value, k=k: ends(torques.at[:, k].add(value), speeds), 0.0, 1e-3)
+        np.testing.assert_allclose(gradients[:, k], expected, rtol=1e-7, atol=1e-10)
+
+
 @pytest.mark.slow
 def test_an_array_in_the_input_has_a_slope_for_each_entry():
     def end(torques):

@@ -1,0 +1,77 @@
+"""Inputs that are written for a single ride, for many rides at once."""
+
+import contextlib
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from nonholonomic.systems.components import TooLarge, by_components
+from nonholonomic.systems.tracing import is_elementary, spelled_out
+
+from .input import Input, Motion
+
+#: Inputs with more numbers than this stay in arrays: element by element they would take long to compile.
+MOST_ELEMENTS = 256
+
+
+class PerRide(eqx.Module):
+    """An input that is evaluated ride by ride. For many rides, its arrays, such as the knots of a spline or the weights of a
+    network, have the rides in the last axis; its scalars have one value per ride or one for all.
+
+    - `elementary`: whether the input consists of operations that fit a single kernel.
+    """
+
+    input: Any
+    elementary: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, controls: Input, t: Any, motion: Any) -> "PerRide":
+        """The input of a single ride, with arguments of these types."""
+        arrays, static = eqx.partition(controls, eqx.is_inexact_array)
+
+        def spelled(arrays: Any, t: Any, motion: Any) -> Any:
+            return spelled_out(lambda *parts: eqx.combine(parts[0], static)(*parts[1:]))(arrays, t, motion)
+
+        zeros = jax.tree.map(lambda shape: jnp.zeros(shape.shape), (t, motion))
+        return cls(controls, is_elementary(spelled, arrays, *zeros))
+
+    def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        moving, structure = jax.tree.flatten((t, motion))
+        moving = jnp.broadcast_arrays(*moving)
+        if moving[0].ndim == 0:
+            return self.input(t, motion)
+        arrays, static = eqx.partition(self.input, eqx.is_inexact_array)
+        numbers, of_numbers = jax.tree.flatten(arrays)
+
+        def of_ride(numbers: list[Array], moving: list[Array]) -> Any:
+            controls = eqx.combine(jax.tree.unflatten(of_numbers, numbers), static)
+            return tuple(controls(*jax.tree.unflatten(structure, moving)))
+
+        shapes = [number.shape[:-1] for number in numbers]
+        if sum(map(math.prod, shapes)) <= MOST_ELEMENTS:
+            with contextlib.suppress(TooLarge):
+                return _by_elements(of_ride, numbers, shapes, moving)
+        axes = [-1 if number.ndim else None for number in numbers]
+        return jax.vmap(spelled_out(of_ride), in_axes=(axes, 0))(numbers, moving)
+
+
+def _by_elements(of_ride: Any, numbers: list[Array], shapes: list[tuple[int, ...]], moving: list[Array]) -> Any:
+    """The input with every number of an array as a vector of rides."""
+
+    def of_elements(elements: list[list[Array]], moving: list[Array]) -> Any:
+        return of_ride([jnp.stack(part).reshape(shape) for part, shape in zip(elements, shapes, strict=True)], moving)
+
+    elements = [[number] if number.ndim == 0 else _rows(number) for number in numbers]
+    scalars = jax.tree.map(lambda part: jax.ShapeDtypeStruct((), part.dtype), (elements, moving))
+    results = by_components(of_elements, *scalars)(elements, moving)
+    return jax.tree.map(lambda part: jnp.broadcast_to(part, moving[0].shape), results)
+
+
+def _rows(number: Float[Array, "... rides"]) -> list[Float[Array, " rides"]]:
+    """The elements of an array in all rides, by an operation whose derivative joins all elements at once."""
+    flat = number.reshape(-1, number.shape[-1])
+    return [row[0] for row in jax.lax.split(flat, (1,) * len(flat))]
