@@ -30,10 +30,10 @@ from .model.launch import Launch
 from .model.scene import Scene
 from .papers import tables as paper_tables
 from .runs.explore import live_run, stage_at_start
-from .runs.observables import INVERTED
 from .runs.plot import Panel, draw_launches
 from .runs.table import inversion_table
 from .runs.theta_over_time import theta_over_time
+from .runs.turned_over import angle_of
 
 TOPS = {top.__name__: top for top in (presets.wooden, presets.rutstam, presets.cohen, presets.leine_glocker)}
 
@@ -88,13 +88,15 @@ def scene(options: argparse.Namespace, arena: str) -> Scene:
 
 def remark(options: argparse.Namespace) -> str:
     """An explanation of the times in the tables."""
-    counts = f"A top has turned over when theta first exceeds {math.degrees(INVERTED):.0f} deg."
+    angle = f"{math.degrees(angle_counted(options)):.0f} deg"
     if TOPS[options.top]().stem is None:
-        return counts
-    return (
-        f"{counts} Where a time is several times those beside it, the top lands on its stem just as early, but with a smaller "
-        "theta, and then rises slowly."
-    )
+        return f"A top has turned over when theta first exceeds {angle}."
+    return f"A top has turned over when its stem first carries it; on a table the stem touches at {angle}."
+
+
+def angle_counted(options: argparse.Namespace) -> float:
+    """The inclination [rad] beyond which the top has turned over on a table."""
+    return float(angle_of(scene(options, "plane"), None))
 
 
 def middle(values: list[float]) -> float:
@@ -246,14 +248,17 @@ def report(options: argparse.Namespace, arenas: dict[str, Table]) -> str:
 
 def picture(options: argparse.Namespace, times: Any, theta: Any, end: float) -> Any:
     """theta(t) of the displayed launch, which has turned over at `end` [s]."""
-    start = f"{options.rpm:g} rpm, θ(0) = {middle(options.theta):g}°"
+    angle, start = angle_counted(options), f"{options.rpm:g} rpm, θ(0) = {middle(options.theta):g}°"
     title = f"{options.top} top, {start}, mu = {middle(options.mu):g}, on a table"
     if end <= times[-1]:
         # Between the times, theta may be above the angle only for a moment.
         index = np.searchsorted(times, end)
-        times, theta = np.insert(times, index, end), np.insert(theta, index, INVERTED)
+        times, theta = np.insert(times, index, end), np.insert(theta, index, max(angle, np.interp(end, times, theta)))
     panel = Panel(title, times, theta[None], theta[:1], np.array([end if end <= times[-1] else np.inf]))
-    return draw_launches([panel], INVERTED, "The dot is the first time above the dashed angle.")
+    dot = "is the first time above the dashed angle."
+    if TOPS[options.top]().stem is not None:
+        dot = "is the time at which the stem first carries the top. On the dashed line, sphere and stem touch together."
+    return draw_launches([panel], angle, f"The dot {dot}")
 
 
 def write_page(options: argparse.Namespace, arenas: dict[str, Table], live: str, drawing: Path | None) -> Path:

@@ -12,10 +12,12 @@ from nonholonomic.integration import Settings
 from nonholonomic.parameters import numbers, with_numbers
 
 from ..model.scene import Scene
+from ..modes.inversion_problem import StemContact
 from ..runs.cells import InversionRuns
 from ..runs.extended_times import beyond_horizon
 from ..runs.run_kind import run_kind_of
 from ..runs.trajectory import simulate
+from ..runs.turned_over import angle_of, event_of
 from .inversion_times import InversionTimes
 from .recording import Recording
 
@@ -78,8 +80,9 @@ class HybridModel(NamedTuple):
             for name, value in of_launch.items()
         }
         columns |= {name: np.repeat([row[name] for row in rows], launches) for name in rows[0] if name != "t0"}
-        t1, angle = float(data.t1), float(data.angle)
-        runs = InversionRuns(run_kind_of(self.scene), t1, angle, "first", Settings(self.tolerance), "ensemble", [])
+        t1, angle, event = float(data.t1), float(angle_of(self.scene, data.angle)), event_of(self.scene, data.angle)
+        event = event if isinstance(event, StemContact) else angle
+        runs = InversionRuns(run_kind_of(self.scene), t1, event, "first", Settings(self.tolerance), "ensemble", [])
         count = launches * len(rows)
         variables = runs.results({"scene": self.scene, "launch": data.launch}, columns, count)
         later = np.asarray(_beyond_horizon(variables["end_theta"], columns["launch.theta"], angle, t1))

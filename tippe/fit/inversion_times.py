@@ -17,6 +17,7 @@ from ..model.launch import Launch, as_launch
 from ..model.scene import Scene
 from ..runs.checks import check_event
 from ..runs.extended_times import extended_inversion_time
+from ..runs.turned_over import angle_of
 
 #: Parameters by name, one value per row.
 Values = dict[str, Float[Array, " rows"]]
@@ -37,7 +38,7 @@ class InversionTimes(eqx.Module):
       far off.
     - `until`: time [s] until which you watched a launch that did not invert, a scalar or (launches,); `t1` by default.
       The likelihood of such a launch is the probability of a time beyond `until`.
-    - `angle`: angle [rad] that counted as inverted.
+    - `angle`: angle [rad] that counted as inverted; by default as for `inversion_time`.
     - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for data with outliers;
       `None` for Gaussian errors.
 
@@ -57,7 +58,7 @@ class InversionTimes(eqx.Module):
     error: Float[Array, "..."] = eqx.field(converter=as_number)
     t1: Float[Array, ""] = eqx.field(converter=as_number)
     until: Any = eqx.field(converter=as_number_or_none, default=None)
-    angle: Float[Array, ""] = eqx.field(converter=as_number, default=0.95 * math.pi)
+    angle: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     units: ClassVar[dict[str, str]] = {"time": "s", "error": "s", "t1": "s", "until": "s", "angle": "rad"}
 
@@ -140,7 +141,8 @@ class InversionTimes(eqx.Module):
 
         def time_of_lane(lane: dict[str, Array]) -> Float[Array, ""]:
             roots = with_numbers({"scene": scene, "launch": _one_of(self.launch)}, lane)
-            return extended_inversion_time(roots["scene"], roots["launch"], self.t1, self.angle, tolerance)
+            angle = angle_of(roots["scene"], self.angle)
+            return extended_inversion_time(roots["scene"], roots["launch"], self.t1, angle, tolerance)
 
         return jax.vmap(time_of_lane)(lanes).reshape(rows, launches)
 

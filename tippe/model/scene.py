@@ -154,6 +154,11 @@ class Scene(Bounded, Generic[Body]):
         return frame_of(self.surface, side, distance, pull)
 
     @property
+    def has_stem(self) -> bool:
+        """Whether the body is a top with a stem."""
+        return isinstance(self.body, Top) and self.body.stem is not None
+
+    @property
     def level(self) -> bool:
         """Whether the arena is a level plane."""
         return isinstance(self.surface, Plane) and self.surface.tilt is None

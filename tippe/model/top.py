@@ -192,6 +192,18 @@ class Top(AbstractBody):
         return self.radius
 
     @property
+    def stem_angle(self) -> Float[Array, "..."]:
+        """The inclination theta [rad] at which sphere and stem touch a level plane together; the stem alone carries the
+        top at larger angles. NaN without a stem.
+
+        The centre of mass is at the heights R - a cos(theta) and R_s - a_s cos(theta) above the plane when the sphere or
+        the stem touches, so cos(theta) = (R_s - R) / (a_s - a).
+        """
+        if self.stem is None:
+            return jnp.full(jnp.shape(self.radius), jnp.nan)
+        return jnp.arccos((self.stem.radius - self.radius) / (self.stem.offset - self.offset))
+
+    @property
     def offset_of_path(self) -> Float[Array, "..."]:
         return self.offset
 

@@ -2,12 +2,12 @@
 a stem, see `airborne_stem.py`).
 
 In contact the state is that of `tippe/model/state.py` with a `CarriedFrame`, 14 components. In flight it is, in the
-surface's axes, the position of the centre of mass [m], its velocity [m/s], the axis, the angular momentum about it, and
-two zeros. A flight ends where the distance of the centre of a sphere from the arena equals its radius again; then that
-sphere strikes the tangent plane there (`impact.py`). theta is measured from the normal below the top's own sphere,
-whichever sphere touches. A single run whose path is kept has five more components: the vector c of
-`trajectory_problem.py`, which is expressed in the frame during contact and in the surface's axes in flight; the
-rotation angle of the top about its axis [rad]; and the work of friction and impacts [J].
+surface's axes, the position of the centre of mass [m], its velocity [m/s], the axis, the angular momentum about it, the
+number of the sphere that touched last, and a zero. A flight ends where the distance of the centre of a sphere from the
+arena equals its radius again; then that sphere strikes the tangent plane there (`impact.py`). theta is measured from
+the normal below the top's own sphere, whichever sphere touches. A single run whose path is kept has five more
+components: the vector c of `trajectory_problem.py`, which is expressed in the frame during contact and in the surface's
+axes in flight; the rotation angle of the top about its axis [rad]; and the work of friction and impacts [J].
 """
 
 import dataclasses
@@ -53,6 +53,9 @@ SLIDING, FLYING, ON_STEM, STRIKING = range(4)
 
 #: Number of components of a state, without the passive quadratures that may follow.
 OWN = 14
+
+#: The component of a state in flight with the number of the sphere that touched last, in the order of `balls`.
+LAST_BALL = 12
 
 #: Largest distance of a sphere from the arena at the end of its flight, as a fraction of its radius, and largest
 #: difference of the normal there from that of the contact. Located landings are within 1e-9.

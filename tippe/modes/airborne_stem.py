@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from nonholonomic.geometry import scale, sum_vectors, vector_of
 from nonholonomic.hybrid import Transition
 from nonholonomic.integration import AbstractProblem
-from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED
+from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED
 from nonholonomic.xla_cpu import compiled_setup, greatest
 
 from ..model.scene import Scene
@@ -25,6 +25,7 @@ from ..model.state import COS_THETA
 from ..model.top import Top
 from .airborne import (
     FLYING,
+    LAST_BALL,
     ON_STEM,
     OWN,
     SLIDING,
@@ -46,7 +47,7 @@ from .airborne import (
 from .flying_mode import AbstractFlyingMode
 from .free_body import Ball, FreeBody, balls, gap_rate
 from .impact import CLOSING_SPEED, TOUCHING, resolve_impact
-from .inversion_problem import InversionProblem
+from .inversion_problem import InversionProblem, beyond_on_stem
 from .trajectory_problem import Quadratures
 
 #: Largest overlap of the other sphere with the arena while it lifts off, as a fraction of R: its landing may be located
@@ -70,7 +71,8 @@ class OneOfTwo(InversionProblem):
         # theta is measured from the normal below the top's own sphere; if this sphere slides, the state contains
         # cos(theta).
         cosine_of_theta = _cosine_beside(self.scene, self.contact_ball, self.other_ball, state)
-        return jnp.where(self.on_stem, cosine_of_theta, state[COS_THETA]) - self.cos_angle
+        value = jnp.where(self.on_stem, cosine_of_theta, state[COS_THETA]) - self.cos_angle
+        return beyond_on_stem(value, self.on_stem, self.stem_counts)
 
     def domain_margin(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
         return functools.reduce(jnp.minimum, self.margins(time, state))
@@ -112,7 +114,12 @@ class SlideOnOne(AbstractFlyingMode):
         contact_ball, other_ball = self.spheres
         contact = (standing(self.scene, contact_ball), self.cos_angle, state[:OWN], self.scales[:OWN])
         problem = OneOfTwo(
-            *contact, scene=self.scene, contact_ball=contact_ball, other_ball=other_ball, on_stem=self.number == 1
+            *contact,
+            scene=self.scene,
+            contact_ball=contact_ball,
+            other_ball=other_ball,
+            on_stem=self.number == 1,
+            stem_counts=self.stem_counts,
         )
         return self.extended(problem, Quadratures(self.scene.body.I3), state)
 
@@ -129,9 +136,10 @@ class SlideOnOne(AbstractFlyingMode):
         dynamics, zero = standing(self.scene, contact_ball), jnp.zeros_like(state[0])
         lands = clearance(self.scene, contact_ball, other_ball, state) <= dynamics.contact_margin(state[:OWN])
         ends = (dynamics.loss(state[:OWN]) > 0) & ~lands
+        flight = lift_off(self.scene, state, self.with_quadratures, contact_ball).at[LAST_BALL].set(self.number)
         return Transition(
             mode=jnp.where(ends, jnp.where(self.number == 0, SLIDING, ON_STEM), jnp.where(lands, STRIKING, FLYING)),
-            state=jnp.where(ends, state, lift_off(self.scene, state, self.with_quadratures, contact_ball)),
+            state=jnp.where(ends, state, flight),
             elapsed=zero,
             status=jnp.where(ends, LEFT_DOMAIN, RUNNING),
             crossing_time=jnp.full_like(zero, jnp.inf),
@@ -142,10 +150,11 @@ class SlideOnOne(AbstractFlyingMode):
 class FlyBoth(Fly):
     """Flying over the arena, with two spheres that can land; or the instant before an impact, if it `strikes`.
 
-    `strikes` is an array, so that one program serves both.
+    `strikes` is an array, so that one program serves both. With `last`, a run continues through the event.
     """
 
     strikes: Bool[Array, ""]
+    last: bool = eqx.field(static=True)
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         return self.extended(self.flight(state, self.strikes), QuadraturesInFlight(self.scene.body), state)
@@ -170,12 +179,17 @@ class FlyBoth(Fly):
         impact = resolve_arena_impact(scene, flying, ground, free, contact_ball, other_ball)
         flies = impact.rebounds | impact.throws
         slides = jnp.where(number == 0, SLIDING, ON_STEM)
+        state_after = self.after_impact(state, flying.place, ground, free, impact.free, flies)
+        status = jnp.where(misses | impact.rests, UNRESOLVED, jnp.where(impact.fails, FAILED, RUNNING))
+        takes_over = jnp.zeros(zero.shape, bool)
+        if self.stem_counts is not None:
+            takes_over = (state[LAST_BALL] == 0.0) & ((number == 1) | impact.rests) & ~misses & (self.stem_counts > 0.0)
         return Transition(
             mode=jnp.where(impact.throws, STRIKING, jnp.where(impact.rebounds, FLYING, slides)),
-            state=self.after_impact(state, flying.place, ground, free, impact.free, flies),
+            state=jnp.where(flies, state_after.at[LAST_BALL].set(number), state_after),
             elapsed=zero,
-            status=jnp.where(misses | impact.rests, UNRESOLVED, jnp.where(impact.fails, FAILED, RUNNING)),
-            crossing_time=jnp.full_like(zero, jnp.inf),
+            status=status if self.last else jnp.where(takes_over, CROSSED, status),
+            crossing_time=jnp.where(takes_over, 0.0, jnp.inf),
             counts=(impact.rebounds & ~impact.throws).astype(int)[None],
         )
 
@@ -236,8 +250,9 @@ def modes(
     foot.
     """
     arguments = (scene, problem.scales, problem.cos_angle, with_quadratures)
-    slides = [SlideOnOne(*arguments, jnp.asarray(number)) for number in (0, 1)]
-    flies, strikes = (FlyBoth(*arguments, jnp.asarray(strikes)) for strikes in (False, True))
+    event = {"stem_counts": problem.stem_counts}
+    slides = [SlideOnOne(*arguments, jnp.asarray(number), **event) for number in (0, 1)]
+    flies, strikes = (FlyBoth(*arguments, jnp.asarray(strikes), last, **event) for strikes in (False, True))
     return (slides[0], flies, slides[1], strikes), _first_mode(scene, problem.states)
 
 

@@ -154,6 +154,27 @@ def _with_other(
     )
 
 
+def stem_takes_over(
+    air: Air, strikes: Bool[Array, " cells"], air_landed: Air, stem_counts: Float[Array, "..."], last: bool
+) -> Air:
+    """The top after an impact, with the event that the stem begins to carry it: the stem bears a force or an impulse, and
+    the sphere was the last to touch before.
+
+    **Arguments:** `air`: the top before the flight, if any, and the impact; `strikes`: mask of the tops whose stem is the
+    sphere that strikes; `air_landed`: the top after the impact; `stem_counts`: as for `InversionProblem`; `last`:
+    whether the run continues.
+    """
+    # A sphere that is about to strike without a flight is not the sphere that touched last.
+    last_ball = jnp.where(air.falls, 1 - air.ball, air.ball)
+    comes_to_rest_on_stem = ~air_landed.open & (air_landed.ball != 0)
+    takes_over = (last_ball == 0) & (strikes | comes_to_rest_on_stem) & (stem_counts > 0.0)
+    return air_landed._replace(
+        crossing_time=jnp.where(takes_over, air_landed.elapsed, air_landed.crossing_time),
+        status=air_landed.status if last else jnp.where(takes_over, CROSSED, air_landed.status),
+        open=air_landed.open if last else air_landed.open & ~takes_over,
+    )
+
+
 def quadratures_after(
     body: Top, free: FreeBody, quadratures: Float[Array, "7 ..."], time: Float[Array, "..."]
 ) -> Float[Array, "7 ..."]:

@@ -1,5 +1,7 @@
 """Common base of all modes of runs with flights."""
 
+from typing import Any
+
 import equinox as eqx
 from jaxtyping import Array, Float
 
@@ -15,6 +17,7 @@ class AbstractFlyingMode(AbstractBatchedMode):
 
     - `scene`: a scene with `contact="hybrid"`; `scales`: magnitudes that scale absolute errors of the state.
     - `cos_angle`: cosine of the theta that is the event.
+    - `stem_counts`: as for `InversionProblem`; `None` for a top without a stem.
     - `with_quadratures`: whether this is a single run whose path is kept, with passive quadratures after its state.
     """
 
@@ -22,6 +25,7 @@ class AbstractFlyingMode(AbstractBatchedMode):
     scales: Float[Array, "components cells"]
     cos_angle: Float[Array, "..."]
     with_quadratures: bool = eqx.field(static=True)
+    stem_counts: Any = eqx.field(kw_only=True, default=None)
 
     def extended(
         self, problem: AbstractProblem, passive: AbstractPassive, state: Float[Array, "components cells"]

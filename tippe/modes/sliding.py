@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.hybrid import AbstractHoppingMode, Transition, TransitionPath
 from nonholonomic.integration import AbstractProblem
@@ -33,6 +33,7 @@ from .bouncing import (
     own_and_other,
     quadratures_after,
     select,
+    stem_takes_over,
     take_flight,
 )
 from .flight import cone, flown
@@ -46,7 +47,7 @@ from .free_body import (
     shown,
     standing_on,
 )
-from .inversion_problem import InversionProblem
+from .inversion_problem import InversionProblem, beyond_on_stem
 from .leaning import LeaningDynamics, at_rest
 from .trajectory_problem import Quadratures
 
@@ -64,6 +65,10 @@ class SlidingOnOne(InversionProblem):
 
     contact_ball: Ball = eqx.field(kw_only=True)
     other_ball: Ball = eqx.field(kw_only=True)
+    on_stem: Bool[Array, ""] = eqx.field(kw_only=True)
+
+    def event_function(self, state: Float[Array, "components cells"]) -> Cells:
+        return beyond_on_stem(super().event_function(state), self.on_stem, self.stem_counts)
 
     def domain_margin(self, time: Cells, state: Float[Array, "components cells"]) -> Cells:
         return least(*self.margins(time, state))
@@ -91,7 +96,13 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
         problem = (
             InversionProblem(*contact)
             if other_ball is None
-            else SlidingOnOne(*contact, contact_ball=contact_ball, other_ball=other_ball)
+            else SlidingOnOne(
+                *contact,
+                contact_ball=contact_ball,
+                other_ball=other_ball,
+                on_stem=self.number == 1,
+                stem_counts=self.stem_counts,
+            )
         )
         return self.extended(problem, Quadratures(self.scene.body.I3, of_mass=True), state)
 
@@ -135,10 +146,15 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
 
     def hop(self, air: Air, left: Cells) -> tuple[Air, Air]:
         """One flight of a top whose contact is open, and the impact at its end."""
-        air_after, air_landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
-        if air.falls is not None:
-            air_after, air_landed = select(air.falls, air, air_after), air.falls | air_landed
-        return air_after, select(air.open, select(air_landed, land(self.scene, air_after), air_after), air)
+        air_after, has_landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
+        if air.falls is None:
+            air_landed = land(self.scene, air_after)
+        else:
+            air_after, has_landed = select(air.falls, air, air_after), air.falls | has_landed
+            air_landed = land(self.scene, air_after)
+            if self.stem_counts is not None:
+                air_landed = stem_takes_over(air, air_after.ball == 1, air_landed, self.stem_counts, self.last)
+        return air_after, select(air.open, select(has_landed, air_landed, air_after), air)
 
     def motion_in(self, air: Air) -> tuple[FreeBody, Float[Array, "7 cells"] | None]:
         return air.free, air.quadratures
@@ -152,12 +168,20 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
         return Transition(air.ball, state, air.elapsed, status, air.crossing_time, counts, log_rates=air.log_rates)
 
 
+class LeaningProblem(InversionProblem):
+    """Sliding on both spheres until theta reaches an angle or one of the contacts ends."""
+
+    def event_function(self, state: Float[Array, "components cells"]) -> Cells:
+        return beyond_on_stem(super().event_function(state), jnp.asarray(True), self.stem_counts)
+
+
 class Lean(AbstractFlyingMode):
     """Sliding on both spheres; numbered after the modes of the single spheres."""
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         dynamics: Any = LeaningDynamics.of(self.scene)
-        problem = InversionProblem(dynamics, self.cos_angle, state[:OWN], self.scales[:OWN])
+        contact = (dynamics, self.cos_angle, state[:OWN], self.scales[:OWN])
+        problem = LeaningProblem(*contact, stem_counts=self.stem_counts)
         return self.extended(problem, Quadratures(self.scene.body.I3, of_mass=True), state)
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
@@ -189,10 +213,11 @@ def modes(
       `AbstractFlyingMode`.
     """
     spheres, arguments = balls(scene.body), (scene, problem.scales, problem.cos_angle, with_quadratures)
-    slides = tuple(Slide(*arguments, jnp.asarray(number), last) for number in range(len(spheres)))
+    event = {"stem_counts": problem.stem_counts}
+    slides = tuple(Slide(*arguments, jnp.asarray(number), last, **event) for number in range(len(spheres)))
     if len(spheres) == 1:
         return slides, jnp.zeros(problem.states.shape[1:], int)
-    return (*slides, Lean(*arguments)), _first_mode(scene.body, problem.states)
+    return (*slides, Lean(*arguments, **event)), _first_mode(scene.body, problem.states)
 
 
 @compiled_setup

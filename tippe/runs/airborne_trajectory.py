@@ -25,6 +25,7 @@ from ..modes.airborne import (
     FLYING,
     ON_STEM,
     STRIKING,
+    FlightState,
     as_free_body,
     below,
     carried_frame,
@@ -82,18 +83,28 @@ class ArenaTrajectory(HybridTrajectory):
             slip = jnp.where(self.contact == 1, jnp.stack([of_stem.x, of_stem.y]), slip)
         return slip.T
 
+    @of_each_run
+    def _stem_gap(self) -> Float[Array, " times"]:
+        """Distance of the stem from the arena [m]."""
+        return below(self.scene, self._flying, balls(self.scene.body)[1]).gap
+
+    @property
+    def _flying(self) -> FlightState:
+        """The top as if in flight, also in contact."""
+        scene, place, (distance, rate) = self.scene, parts(self._states).place, self.above
+        main = balls(scene.body)[0]
+        # The flying top is treated as one whose own sphere is larger by the distance, so that this sphere touches.
+        flying = flight_state(lift_off(scene, self._states, False, Ball(main.offset, main.radius + distance)))
+        normal_velocity = scale(rate, carried_frame(scene).normal(place[:3]))
+        return flying._replace(velocity=vector_of(sum_vectors(flying.velocity, normal_velocity)))
+
     @property
     def _on_stem(self) -> Motion:
         """The motion on the stem, at times at which the stem touches; the first tangent is the projection of the
         reported one."""
-        scene, place = self.scene, parts(self._states).place
-        (distance, rate), main, stem = self.above, *balls(scene.body)
-        # The flying top is treated as one whose own sphere is larger by the distance, so that this sphere touches.
-        flying = flight_state(lift_off(scene, self._states, False, Ball(main.offset, main.radius + distance)))
-        frame = carried_frame(scene)
-        flying = flying._replace(velocity=vector_of(sum_vectors(flying.velocity, scale(rate, frame.normal(place[:3])))))
+        scene, flying, stem = self.scene, self._flying, balls(self.scene.body)[1]
         ground = below(scene, flying, stem)
-        ground = ground._replace(axes=frame.own_axes((*ground.foot, *place[3:])))
+        ground = ground._replace(axes=carried_frame(scene).own_axes((*ground.foot, *parts(self._states).place[3:])))
         return standing(scene, stem).motion(in_contact(ground, as_free_body(scene, flying, ground, stem)))
 
     @property

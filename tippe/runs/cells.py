@@ -15,17 +15,21 @@ from nonholonomic.sweeps import Variable
 from nonholonomic.validation import as_number
 
 from ..model.contact_dynamics import LOSSES
+from ..model.launch import Launch
 from ..model.scene import Scene
 from ..modes import airborne_ends
-from ..modes.inversion_problem import InversionProblem
-from .inversion import Inversions, checked, is_inverted
-from .run_kind import COUNTED, HYBRID, WORDS, RunKind
+from ..modes.inversion_problem import InversionProblem, StemContact
+from .inversion import Inversions, carried_by_stem, checked, is_inverted
+from .run_kind import COUNTED, HYBRID, WORDS, RunKind, run_kind_of
 from .sensitivities import sensitivities_of_cells
 from .time_error import errors_of, second_tolerance
 
 TIMES = {"time": "inversion time", "first_time": "first inversion time", "last_time": "last inversion time"}
 
-NAMES = TIMES | {"end_time": "end of the run", "end_theta": "θ at the end of the run"}
+#: The variable with the time at which the stem first carries the top, and its description.
+STEM_TIME = {"stem_time": "time at which the stem first carries the top"}
+
+NAMES = TIMES | STEM_TIME | {"end_time": "end of the run", "end_theta": "θ at the end of the run"}
 
 # Compiled once for all chunks.
 _loss = eqx.filter_jit(lambda dynamics, state: dynamics.loss(state))
@@ -41,8 +45,9 @@ def at_the_end(
     tolerance: Float[Array, ""],
 ) -> tuple[Int[Array, " cells"], Bool[Array, " cells"], Float[Array, " cells"]]:
     """The status of all cells, which of them count as inverted, and theta [rad] at the end of each."""
+    carried = carried_by_stem(run_kind_of(scene), problem, outcome)
     outcome = checked(scene, problem, outcome, tolerance)
-    return outcome.status, is_inverted(outcome, problem, last), scene.theta(jnp.asarray(outcome.state))
+    return outcome.status, is_inverted(outcome, problem, last, carried), scene.theta(jnp.asarray(outcome.state))
 
 
 #: The word for a run's status if it has not inverted; `not_inverted` for all others.
@@ -63,15 +68,21 @@ def too_many_steps(t1: float, max_steps: int, end: float) -> str:
 
 class InversionRuns(NamedTuple):
     """The requested variables of every cell of a table; see `inversion_table`. `angle` is `None` for a table of
-    reversal times."""
+    reversal times; `has_stem` is true for a top with a stem."""
 
     run_kind: RunKind
     t1: float
-    angle: float | None
+    angle: float | StemContact | None
     crossing: str
     settings: Settings
     method: str
     slopes_by: list[str]
+    has_stem: bool = False
+
+    @property
+    def bounded_times(self) -> tuple[str, ...]:
+        """All variables that are times of events."""
+        return (*self.times, *STEM_TIME) if self.has_stem else self.times
 
     @property
     def times(self) -> tuple[str, ...]:
@@ -86,8 +97,8 @@ class InversionRuns(NamedTuple):
     @property
     def variables(self) -> dict[str, Variable]:
         """The table's variables, without errors and derivatives."""
-        names = TIMES if self.angle is not None else {"time": "reversal time"}
-        times = {name: Variable("s", np.float64, long_name=names[name]) for name in self.times}
+        names = NAMES if self.angle is not None else {"time": "reversal time"}
+        times = {name: Variable("s", np.float64, long_name=names[name]) for name in self.bounded_times}
         grazes = Variable("1", np.int8, long_name="whether an event on the way was grazing")
         return (
             times
@@ -98,7 +109,7 @@ class InversionRuns(NamedTuple):
     @property
     def error_variables(self) -> dict[str, Variable]:
         """The table's variables that describe the accuracy of other variables (`time_error.py`)."""
-        bounds = dict.fromkeys((*self.times, "end_time"), "s") | {"end_theta": "rad"}
+        bounds = dict.fromkeys((*self.bounded_times, "end_time"), "s") | {"end_theta": "rad"}
         variables = {
             name: Variable(unit, np.float64, long_name=f"error of the {NAMES[name]}") for name, unit in bounds.items()
         }
@@ -140,11 +151,25 @@ class InversionRuns(NamedTuple):
                 if isinstance(outcome, HybridOutcome)
                 else np.where(variables["status"] == WORDS.index("unresolved"), np.inf, outcome.first_crossing)
             )
+        if self.has_stem:
+            variables["stem_time"] = self._stem_time(scene, launch, variables, count, size)
         inverted = variables["status"] == WORDS.index("inverted")
         variables |= {name: np.where(inverted, slope, 0.0) for name, slope in slopes.items()}
         if slopes and not self.run_kind.smooth:
             variables["grazes"] = (inverted & grazing).astype(np.int8)
         return variables
+
+    def _stem_time(
+        self, scene: Scene, launch: Launch, variables: dict[str, Any], count: int, size: int
+    ) -> Float[np.ndarray, " cells"]:
+        """The time at which the stem first carries the top, infinite if it does not. If this is not an event of the run
+        itself, it needs a run of its own."""
+        if isinstance(self.angle, StemContact) and self.crossing != "last":
+            return variables[self.times[0]]
+        problem, tolerance = InversionProblem.of(scene, launch, StemContact(), size), self.settings.tolerance
+        outcome = Inversions.of(scene, problem, tolerance, False).solve(self.t1, count, self.settings)
+        assert isinstance(outcome, HybridOutcome)
+        return _time_of_first(checked(scene, problem, outcome, tolerance))
 
     def _named(
         self,
@@ -207,7 +232,7 @@ class InversionJob(NamedTuple):
             settings = runs.settings.with_tolerance(as_number(second_tolerance(float(runs.settings.tolerance))))
             second = runs._replace(settings=settings, slopes_by=[]).results(self.roots, columns, count)
             silent = tuple(words.index(word) for word in ("failed", "unresolved") if word in words)
-            variables |= errors_of(variables, second, runs.times, runs.run_kind.counts, silent)
+            variables |= errors_of(variables, second, runs.bounded_times, runs.run_kind.counts, silent)
         return variables
 
 

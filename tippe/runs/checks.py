@@ -18,6 +18,8 @@ from ..model.friction import Frictionless
 from ..model.launch import Launch
 from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
+from ..modes.inversion_problem import StemContact
+from .turned_over import angle_of
 
 
 @eqx.filter_jit
@@ -67,20 +69,23 @@ def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, angle: An
     """Warn if the scene has no friction, or if the top stands exactly upright on a level plane or is inverted already.
 
     **Arguments:** `launch`: its theta is ignored; `theta`: one angle or several [rad]; `angle`: the angle to be
-    reached.
+    reached, or `None` (`turned_over.py`).
     """
     if isinstance(scene.friction, Frictionless):
         warn(
             "friction = Frictionless(): without friction no top turns over; give the scene a law, such as "
             "tippe.Scene(top, friction=tippe.Viscous(0.3))"
         )
-    if isinstance(scene.body, AbstractRigidBody) or is_traced(theta) or is_traced(angle):
+    limit = angle_of(scene, angle)
+    if isinstance(scene.body, AbstractRigidBody) or is_traced(theta) or is_traced(limit):
         return
-    if np.any(np.asarray(theta) >= angle):
+    if np.any(np.asarray(theta) >= np.min(limit)):
         start = np.max(np.asarray(theta))
+        on_stem = angle is None and scene.has_stem
+        reached = "the angle at which the stem touches a level plane" if on_stem else "the angle to be reached"
         warn(
-            f"theta = {start:g} rad is not below the angle to be reached, {angle:.4g} rad: the top is inverted from the "
-            f"start{IN_DEGREES.format(f'{start:g}')}"
+            f"theta = {start:g} rad is not below {reached}, {float(np.min(limit)):.4g} rad: the top "
+            f"{'stands on its stem' if on_stem else 'is inverted'} from the start{IN_DEGREES.format(f'{start:g}')}"
         )
     at_rest = launch.velocity is None and launch.angular_velocity is None
     if scene.level and at_rest and np.any(np.asarray(theta) == 0.0):
@@ -89,7 +94,7 @@ def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, angle: An
 
 def event_bounds(angle: Any) -> Iterator[Bound]:
     """The range of the angle [rad] to be reached, if there is one."""
-    if angle is not None:
+    if angle is not None and not isinstance(angle, StemContact):
         yield Bound(angle, "angle", above=0.0, at_most=math.pi, unit="rad")
 
 
@@ -104,6 +109,15 @@ def check_smooth(scene: Scene, caller: str) -> None:
         )
 
 
+def check_last_on_stem(event: Any, last: bool) -> None:
+    """Raise `ValueError` for the derivative of the time at which a stem takes over for the last time."""
+    if last and isinstance(event, StemContact):
+        raise ValueError(
+            "crossing = 'last' has no derivatives for the contact of a stem: give an angle, such as angle=0.95 * math.pi, or "
+            "take crossing = 'first'"
+        )
+
+
 def check_reversible(launch: Launch, values: dict[str, Any]) -> None:
     """Raise `ValueError` for a launch without spin, because there is no spin to reverse.
 
@@ -115,9 +129,10 @@ def check_reversible(launch: Launch, values: dict[str, Any]) -> None:
 
 
 def check_event(angle: Any, crossing: Any, known: tuple[str, ...] = ("first", "last")) -> None:
-    """Raise `ValueError` unless the angle is in (0, pi] and the crossing is a known word."""
-    require(angle, "angle", above=0.0, at_most=math.pi, unit="rad")
-    if np.ndim(angle) != 0:
+    """Raise `ValueError` unless the angle is `None` or in (0, pi], and the crossing is a known word."""
+    if angle is not None:
+        require(angle, "angle", above=0.0, at_most=math.pi, unit="rad")
+    if angle is not None and np.ndim(angle) != 0:
         raise ValueError(f"angle must be one number, not of shape {np.shape(angle)}")
     if crossing not in known:
         raise ValueError(f"crossing = {shown(crossing)} must be {' or '.join(map(repr, known))}")

@@ -45,12 +45,12 @@ from .flight_trajectory import HybridTrajectory, level_modes
 from .launches import LONG_NAMES, UNITS
 from .quantities import OF_RIGID_BODIES, QUANTITIES
 from .trajectory import Trajectory, parts_of, simulate
+from .turned_over import event_of
 from .view import AXIS, BESIDE, DrawnMotion, aside, curve_of_rotation, show
 
 Numbers = Float[Array, " numbers"]
 
-#: The angle that counts as inverted [rad], and the tolerance, in the page.
-ANGLE = 0.95 * math.pi
+#: The tolerance in the page.
 TOLERANCE = 1e-7
 
 #: Tolerance of the runs that determine the drawn part of the arena.
@@ -78,9 +78,10 @@ def explore(
     """Make a page with sliders that simulates the top in the browser while you move a slider. The page is one file that
     needs no network; a notebook shows the returned `Page`. The equations of motion, the Runge-Kutta pair, the step-size
     control and the location of the event are generated from those of `inversion_table`, or, under `NoSlip`, of
-    `reversal_table`, so times and statuses are the same, at a tolerance of 1e-7. The page also computes a map of these
-    times over two of the sliders; click on the map to set both. The address of the page contains the slider values, so
-    that you can copy a link to a run. Press space to play or pause, and r to reset the sliders.
+    `reversal_table`, so times and statuses are the same, at a tolerance of 1e-7: for a top with a stem, the time at
+    which the stem first carries it. The page also computes a map of these times over two of the sliders; click on the
+    map to set both. The address of the page contains the slider values, so that you can copy a link to a run. Press
+    space to play or pause, and r to reset the sliders.
 
     **Arguments:**
 
@@ -129,7 +130,7 @@ def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float
     roots = {"scene": scene, "launch": launch}
     ranges = default_ranges(scene, launch) if sliders is None else sliders
     # The position of the stem's end is relative to the centre of mass, so another offset would change the shape.
-    paths_drawn = ("scene.body.stem.", "scene.body.offset") if has_stem(scene) else ()
+    paths_drawn = ("scene.body.stem.", "scene.body.offset") if scene.has_stem else ()
     knobs = sliders_of(ranges, roots, LONG_NAMES, UNITS | scene.body.units | scene.friction.units, paths_drawn)
 
     def modules(values: Numbers) -> tuple[Scene, Launch]:
@@ -149,7 +150,7 @@ def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float
         allowed=allowed,
         answer=Answer("reversal time", "s", answer, REVERSED)
         if reverses(scene)
-        else Answer("inversion time", "s", answer),
+        else Answer("time until its stem carries it" if scene.has_stem else "inversion time", "s", answer),
         motion=motion,
         summaries=tuple(
             Summary(quantities[name].long_name, readable_unit(quantities[name].unit), row)
@@ -175,7 +176,7 @@ def smooth_simulators(
 
 def event_problem(scene: Scene, launch: Launch) -> InversionProblem:
     """The motion up to the inversion, or, without slip, to the reversal of the spin."""
-    return InversionProblem.of(scene, launch, None if reverses(scene) else ANGLE, 1)
+    return InversionProblem.of(scene, launch, None if reverses(scene) else event_of(scene, None), 1)
 
 
 def is_rigid(scene: Scene) -> bool:
@@ -195,7 +196,7 @@ def hybrid_simulators(
 
     def to_inversion(values: Numbers) -> Any:
         scene, launch = modules(values)
-        problem = InversionProblem.of(scene, launch, ANGLE, 1)
+        problem = InversionProblem.of(scene, launch, event_of(scene, None), 1)
         return (*modes(scene, problem, TOLERANCE, last=False), problem.states)
 
     def moment(values: Numbers, number: Any, rows: Any, time: Any) -> Frame:
@@ -226,11 +227,6 @@ def flies(scene: Scene) -> bool:
     return scene.contact == "hybrid"
 
 
-def has_stem(scene: Scene) -> bool:
-    """Whether the body is a top with a stem."""
-    return isinstance(scene.body, Top) and scene.body.stem is not None
-
-
 def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float]]:
     """The default sliders: theta, spin, friction, and the offset of a top without a stem, around their own values."""
     theta, spin = float(launch.theta), float(launch.spin)
@@ -242,7 +238,7 @@ def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float
     ranges = {"theta": (min(0.02, theta), max(0.6, theta)), "spin": tuple(sorted((0.4 * spin, 1.4 * spin)))}
     if spin == 0.0:
         ranges["spin"] = (0.0, 200.0)
-    values, parts = numbers("scene", scene), {"mu": (0.1, 3.0)} | ({} if has_stem(scene) else {"offset": (0.5, 1.5)})
+    values, parts = numbers("scene", scene), {"mu": (0.1, 3.0)} | ({} if scene.has_stem else {"offset": (0.5, 1.5)})
     for name, (low, high) in parts.items():
         path = next((path for path in values if path.endswith(f".{name}")), None)
         if path is not None and values[path] > 0.0:

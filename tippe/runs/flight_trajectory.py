@@ -24,8 +24,9 @@ from ..model.dynamics import NO_COSINE
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.top import Top
+from ..modes.bouncing import height
 from ..modes.free_body import Ball, FreeBody, as_free_body, balls, energy, energy_in, standing_on
-from ..modes.impact import approach
+from ..modes.impact import TOUCHING, approach
 from ..modes.inversion_problem import InversionProblem
 from ..modes.leaning import BOTH
 from ..modes.sliding import MOST_BOUNCES, modes
@@ -56,6 +57,7 @@ class HybridTrajectory(AbstractTrajectory):
     - `hops`: start and end [s] of each flight until `end_time`, one row per flight; a table counts only the flights
       before the inversion. When the speed of bounces has decreased to 1e-5 sqrt(g R), the top counts as in contact,
       although the remaining bounces would take e / (1 - e) times as long as the last one (restitution e).
+    - `stem_time`: when the stem of a top first carries it [s].
     - `work`: work of friction and of the impacts [J].
     - `stats`: accepted and rejected steps, the greatest drift of |e|, the greatest energy residual |E - E(0) - work| and
       the energy lost in impacts [J].
@@ -100,6 +102,37 @@ class HybridTrajectory(AbstractTrajectory):
     def above(self) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, " times"]]:
         """Distance of the top's own sphere from the plane [m] and its rate [m/s]."""
         return self.distance[0], self.distance[1]
+
+    @property
+    def inversion_time(self) -> float:
+        return self.stem_time if self.scene.has_stem else super().inversion_time
+
+    @property
+    def stem_time(self) -> float:
+        """Time [s] at which the stem first carries the top, as it bears a force or, in a bounce, an impulse; infinite if
+        the stem does not touch by the end, or if there is no stem.
+
+        **Raises:** as for `inversion_time`.
+        """
+        if self.dense is None:
+            raise ValueError("a run made inside jit, vmap or grad has no dense output: use tippe.inversion_time there")
+        if not self.scene.has_stem:
+            return np.inf
+        segments = self.dense.segments
+        on_stem = [segment.begin for segment in segments if self.touching(np.asarray(segment.number)) >= 1]
+        # The stem may bounce before it slides. Values at the end of a flight are those before the impact.
+        ends = np.unique([segment.end for segment in segments])
+        first = min([*on_stem, np.inf])
+        ends = ends[ends < min(first, self.end_time)]
+        if not ends.size:
+            return float(first)
+        strokes = ends[np.asarray(self.resampled(ends)._stem_gap) < TOUCHING * float(self.scene.body.radius)]
+        return float(min([*strokes, first]))
+
+    @of_each_run
+    def _stem_gap(self) -> Float[Array, " times"]:
+        """Distance of the stem from the arena [m]."""
+        return self.above[0] + height(*balls(self.scene.body), self._states)
 
     @property
     def _states(self) -> Float[Array, "components times"]:

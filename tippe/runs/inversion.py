@@ -26,6 +26,7 @@ from nonholonomic.integration import Outcome, Settings, solve_ensemble, traced_s
 from nonholonomic.integration.status import CROSSED, FAILED, REACHED_END, UNRESOLVED
 
 from ..model.scene import Scene
+from ..modes.airborne import LAST_BALL, ON_STEM, SLIDING
 from ..modes.airborne_ends import on_the_ground
 from ..modes.inversion_problem import InversionProblem
 from .energy import has_grown
@@ -139,10 +140,29 @@ def checked(
     return outcome._replace(state=on_the_ground(scene, state, mode)) if kind.flight_state else outcome
 
 
-def is_inverted(outcome: Outcome | HybridOutcome, problem: InversionProblem, last: bool) -> Bool[Array, " cells"]:
-    """The cells that count as inverted: the top reached the angle or, if the last crossing counts, ends above the
-    angle."""
+def carried_by_stem(
+    kind: RunKind, problem: InversionProblem, outcome: Outcome | HybridOutcome
+) -> Bool[Array, " cells"] | None:
+    """The cells whose stem was the last to touch, of an outcome before `checked`; `None` for a top without a stem."""
+    if problem.stem_counts is None:
+        return None
+    assert isinstance(outcome, HybridOutcome)
+    if not kind.flight_state:
+        return jnp.asarray(outcome.mode) != 0
+    flies = (outcome.mode != SLIDING) & (outcome.mode != ON_STEM)
+    return jnp.asarray((outcome.mode == ON_STEM) | (flies & (outcome.state[LAST_BALL] == 1.0)))
+
+
+def is_inverted(
+    outcome: Outcome | HybridOutcome, problem: InversionProblem, last: bool, carried: Bool[Array, " cells"] | None
+) -> Bool[Array, " cells"]:
+    """The cells that count as inverted: the event happened or, if the last crossing counts, the run ends beyond it.
+
+    **Arguments:** `carried`: as returned by `carried_by_stem`.
+    """
     if not last:
         return outcome.status == CROSSED
     is_above = problem.event_function(jnp.asarray(outcome.state)) <= 0.0
+    if carried is not None:
+        is_above = jnp.where(problem.stem_counts > 0.0, carried, is_above)
     return (outcome.status == REACHED_END) & is_above & jnp.isfinite(outcome.crossing_time)

@@ -1,6 +1,5 @@
 """The time of inversion of one launch, as a function for `jit`, `vmap`, `grad`, `jvp` and their compositions."""
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,11 +19,19 @@ from nonholonomic.validation import as_number, is_traced, warn
 
 from ..model.launch import Launch
 from ..model.scene import Scene
-from ..modes.inversion_problem import InversionProblem
+from ..modes.inversion_problem import InversionProblem, StemContact
 from .cells import InversionRuns, too_many_steps
-from .checks import check_event, check_run, nan_if_illegal, permitted, warn_if_it_cannot_invert
-from .inversion import Inversions, checked, is_inverted, traced
+from .checks import (
+    check_event,
+    check_last_on_stem,
+    check_run,
+    nan_if_illegal,
+    permitted,
+    warn_if_it_cannot_invert,
+)
+from .inversion import Inversions, carried_by_stem, checked, is_inverted, traced
 from .run_kind import check_differentiable, run_kind_of, why_unresolved
+from .turned_over import event_of
 
 
 @status_line("simulating")
@@ -32,12 +39,12 @@ def inversion_time(
     scene: Scene,
     launch: Launch,
     t1: float,
-    angle: Float[ArrayLike, ""] = 0.95 * math.pi,
+    angle: Float[ArrayLike, ""] | None = None,
     tolerance: float = 1e-9,
     crossing: str = "first",
     solver: diffrax.AbstractERK | None = None,
 ) -> Float[Array, ""]:
-    """Time at which theta reaches an angle; works under `jit`, `vmap`, `grad`, `jvp` and their compositions.
+    """Time at which the top has turned over; works under `jit`, `vmap`, `grad`, `jvp` and their compositions.
 
     The derivative comes from the implicit function theorem at the event; it is 0 if the result is infinite. Together
     with derivatives, a time costs two to three times as much for one parameter, four times for two, and six to eight
@@ -47,10 +54,11 @@ def inversion_time(
 
     - `scene`, `launch`: as for `simulate`; all numbers must be scalars.
     - `t1`: horizon [s], positive.
-    - `angle`: angle [rad] to be reached, in (0, pi].
+    - `angle`: angle [rad] that theta reaches, in (0, pi]. By default, a top with a stem has turned over when the stem
+      first carries it, and any other body when theta reaches 0.95 pi.
     - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
     - `crossing`: "first" for the first time theta reaches the angle, "last" for the crossing after which theta stays
-      above the angle until `t1`.
+      above the angle until `t1`; for the contact of a stem, the time after which the sphere does not touch until `t1`.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
       `nonholonomic.integration.Oscillatory8()`.
 
@@ -62,8 +70,8 @@ def inversion_time(
     derivative is NaN; the variable `grazes` of `inversion_table` reports this.
 
     **Raises:** `ValueError` for arguments outside these ranges, for a run that needs more than 2 000 000 steps, for
-    second derivatives through changes of mode, and for derivatives with both `contact="hybrid"` and `SetValuedCoulomb`,
-    because an impact may stop a slip.
+    second derivatives through changes of mode, for derivatives with both `contact="hybrid"` and `SetValuedCoulomb`,
+    because an impact may stop a slip, and for derivatives of the last contact of a stem.
 
     **Example:**
 
@@ -82,18 +90,19 @@ def inversion_time(
     settings = Settings(tolerance, solver)
     explicit_tableau(settings.for_lanes)
     warn_if_it_cannot_invert(scene, launch, launch.theta, angle)
-    return first_or_last_time(scene, launch, t1, as_number(angle), crossing, settings)
+    return first_or_last_time(scene, launch, t1, event_of(scene, angle), crossing, settings)
 
 
 def first_or_last_time(
     scene: Scene,
     launch: Launch,
     t1: float,
-    angle: Float[Array, ""] | None,
+    angle: Float[Array, ""] | StemContact | None,
     crossing: str,
     settings: Settings,
 ) -> Float[Array, ""]:
-    """The time at which theta reaches an angle, or, without an angle, at which the spin about the normal reverses.
+    """The time at which theta reaches an angle, or at which the stem carries the top, or, without an angle, at which the
+    spin about the normal reverses.
 
     **Arguments:** as for `inversion_time`, checked.
     """
@@ -103,7 +112,7 @@ def first_or_last_time(
     solve = InversionSolve(len(leaves) - 2, structure, settings.with_tolerance(None), crossing == "last", unchecked)
     time = differentiable_solve(solve, *leaves)
     if not is_traced(time) and not unchecked and np.isnan(time):
-        concrete_angle = None if angle is None else np.asarray(angle).item()
+        concrete_angle = angle if angle is None or isinstance(angle, StemContact) else np.asarray(angle).item()
         explain_failure(scene, launch, float(t1), concrete_angle, crossing, settings)
     return nan_if_illegal(time, structure, unchecked, leaves)
 
@@ -112,7 +121,7 @@ def explain_failure(
     scene: Scene,
     launch: Launch,
     t1: float,
-    angle: float | None,
+    angle: float | StemContact | None,
     crossing: str,
     settings: Settings,
 ) -> None:
@@ -162,6 +171,7 @@ class InversionSolve(AbstractDifferentiableSolve):
         moving = (*leaves[: self.movable], tolerance)
         inversions, tangents, gather = tangents_by(self._inversions, active, moving, cells)
         check_differentiable(self._modules(leaves)[0])
+        check_last_on_stem(self._modules(leaves)[2], self.last)
         if nested and not inversions.kind.smooth:
             raise ValueError(
                 "second derivatives are not available through changes of mode: contact = 'hybrid', SetValuedCoulomb"
@@ -192,8 +202,9 @@ class InversionSolve(AbstractDifferentiableSolve):
         slopes: list[Float[Array, " cells"]],
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
         """The times of inversion and their derivatives: infinite and 0 where there is none, NaN where the run failed."""
-        outcome = checked(self._modules(leaves)[0], inversions.problem, outcome, tolerance)
-        inverted = is_inverted(outcome, inversions.problem, self.last)
+        scene, carried = self._modules(leaves)[0], carried_by_stem(inversions.kind, inversions.problem, outcome)
+        outcome = checked(scene, inversions.problem, outcome, tolerance)
+        inverted = is_inverted(outcome, inversions.problem, self.last, carried)
         is_good = is_legal & (outcome.status != FAILED) & (outcome.status != UNRESOLVED)
         time = jnp.where(is_good, jnp.where(inverted, outcome.crossing_time, jnp.inf), jnp.nan)
         return time, [jnp.where(is_good, jnp.where(inverted, slope, 0.0), jnp.nan) for slope in slopes]

@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-import math
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Self
 
@@ -30,10 +29,8 @@ from ..model.scene import Scene
 from ..model.top import Top
 from ..steady import group
 from .quantities import OF_ONE_RUN, QUANTITIES, table_of
+from .turned_over import INVERTED
 from .view import as_stages, names_of
-
-#: The angle [rad] that counts as inverted by default.
-INVERTED = 0.95 * math.pi
 
 #: Distance from the angle [rad] within which a step is checked in parts, and the number of parts.
 NEAR, LOOKS = 0.3, 8
@@ -120,8 +117,9 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
 
     @property
     def inversion_time(self) -> float:
-        """Time [s] at which theta first reaches 0.95 pi, like `tippe.inversion_time`; infinite if theta does not reach
-        this angle by the end. The time is located on the run's dense output, to the tolerance of the run.
+        """Time [s] at which the top has turned over, like `tippe.inversion_time`: theta first reaches 0.95 pi or, for a
+        top with a stem, the stem first carries the top (`stem_time`). Infinite if this does not happen by the end. The
+        time is located on the run's dense output, to the tolerance of the run.
 
         **Raises:** `ValueError` for a run that was made inside a transformation, and for a batch.
         """

@@ -14,7 +14,7 @@ from nonholonomic.parameters import full_name, numbers, with_numbers
 from nonholonomic.sweeps import Variable
 from nonholonomic.validation import shown
 
-from ..modes.inversion_problem import InversionProblem
+from ..modes.inversion_problem import InversionProblem, StemContact
 from .inversion import Inversions
 
 
@@ -62,7 +62,7 @@ def sensitivities_of_cells(
     roots: dict[str, Any],
     columns: dict[str, Any],
     names: list[str],
-    angle: float | None,
+    angle: float | StemContact | None,
     t1: float,
     settings: Settings,
     *,
@@ -81,8 +81,8 @@ def sensitivities_of_cells(
     **Returns:** the outcome; name of the variable -> derivatives (size,); and the cells whose derivatives are NaN
     because an earlier event was grazing.
     """
-    numbers = (None if angle is None else jnp.asarray(angle, float), settings.tolerance)
-    inversions, tangents, scales = _with_tangents(roots, columns, names, *numbers, size, last)
+    event = angle if angle is None or isinstance(angle, StemContact) else jnp.asarray(angle, float)
+    inversions, tangents, scales = _with_tangents(roots, columns, names, event, settings.tolerance, size, last)
     outcome, slopes, grazing = inversions.solve_with_tangents(tangents, t1, count, settings)
     by_number = [np.asarray(slope) / np.asarray(scale) for slope, scale in zip(slopes, scales, strict=True)]
     return outcome, dict(zip(sensitivity_columns(names), by_number, strict=True)), grazing
@@ -93,7 +93,7 @@ def _with_tangents(
     roots: dict[str, Any],
     columns: dict[str, Any],
     names: list[str],
-    angle: Float[Array, ""] | None,
+    angle: Float[Array, ""] | StemContact | None,
     tolerance: Float[Array, ""],
     size: int,
     last: bool,

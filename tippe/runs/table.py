@@ -1,7 +1,6 @@
 """Tables of inversion times over the grid of launches and friction."""
 
 import hashlib
-import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from typing import Any, NamedTuple
@@ -15,11 +14,13 @@ from nonholonomic.sweeps import Axis, Table, Variable, sweep
 from nonholonomic.validation import require_flag, require_outside, require_whole, shown, warn
 
 from ..model.scene import Scene
+from ..modes.inversion_problem import StemContact
 from .cells import InversionJob, InversionRuns, ScatteredJob, too_many_steps
-from .checks import check_event, check_reversible, warn_if_it_cannot_invert
+from .checks import check_event, check_last_on_stem, check_reversible, warn_if_it_cannot_invert
 from .launches import described, launches, rows
 from .run_kind import RunKind, check_differentiable, reversal_kind_of, run_kind_of, why_unresolved
 from .sensitivities import sensitivity_names, sensitivity_variables
+from .turned_over import event_of
 
 
 def inversion_table(
@@ -30,7 +31,7 @@ def inversion_table(
     eta: Any = 0.0,
     mu: Any = None,
     t1: float,
-    angle: float = 0.95 * math.pi,
+    angle: float | None = None,
     tolerance: float = 1e-9,
     crossing: str = "first",
     path: Any = None,
@@ -54,11 +55,13 @@ def inversion_table(
       friction law, by default that of the scene. Each list or array becomes an axis of the table, in the order (theta,
       eta, mu, spin, azimuth).
     - `t1`: horizon [s].
-    - `angle`: angle [rad] that counts as inverted.
+    - `angle`: angle [rad] that counts as inverted. By default, a top with a stem counts as inverted when the stem first
+      carries it, and any other body when theta reaches 0.95 pi.
     - `tolerance`: relative tolerance of the integration.
     - `crossing`: "first" for the first time theta reaches the angle; "last" for the crossing after which theta stays
-      above the angle until `t1` (if theta oscillates, first crossings are ill-conditioned); "both" for both times from
-      one run: the variables `first_time` and `last_time` replace `time`, and the status is that of the last crossing.
+      above the angle until `t1` (if theta oscillates, first crossings are ill-conditioned), or, for the contact of a
+      stem, the time after which the sphere does not touch until `t1`; "both" for both times from one run: the variables
+      `first_time` and `last_time` replace `time`, and the status is that of the last crossing.
     - `path`: HDF5 file to write, chunk by chunk. Repeat the same call to resume an interrupted table.
     - `axes`: additional axes, name of a parameter -> values. The end of a full name is enough if it is unique, such as
       `{"offset": [0.005, 0.006]}` for `"scene.body.offset"`.
@@ -83,6 +86,8 @@ def inversion_table(
     **Returns:** a `Table` with the variables
 
     - `time` [s]: the inversion time, infinite if the top did not invert.
+    - `stem_time` [s], for a top with a stem: when the stem first carries it, infinite if it does not by `t1`, whatever the
+      angle. In a flight the stem carries nothing until it lands.
     - `status`: "inverted", "not_inverted" by `t1`, "contact_lost", "failed", "jammed", or "unresolved" (the energy grows;
       with `contact="hybrid"`, also 10 000 flights in a row, or sphere and stem on the plane together with so much
       friction that the forces are undetermined; with `SetValuedCoulomb`, also too many changes between slip and rolling).
@@ -133,7 +138,11 @@ def inversion_table(
         raise ValueError(f"crossing = {shown(crossing)} must be 'first' for method = 'diffrax'")
     launch_values = {"theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
     options = TableOptions(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
-    return event_table(scene, launch_values, axes, t1, angle, options, crossing, method)
+    event = event_of(scene, angle)
+    event = event if isinstance(event, StemContact) else float(event)
+    if sensitivities:
+        check_last_on_stem(event, crossing == "last")
+    return event_table(scene, launch_values, axes, t1, event, options, crossing, method)
 
 
 class TableOptions(NamedTuple):
@@ -155,12 +164,13 @@ def event_table(
     launch_values: dict[str, Any],
     axes: dict[str, Any] | None,
     t1: float,
-    angle: float | None,
+    angle: float | StemContact | None,
     options: TableOptions,
     crossing: str = "first",
     method: str = "ensemble",
 ) -> Table:
-    """The table of the times at which theta reaches an angle or, without an angle, the spin about the normal reverses.
+    """The table of the times at which theta reaches an angle, at which the stem carries the top, or, without an angle,
+    at which the spin about the normal reverses.
 
     **Arguments:** as for `inversion_table`; `launch_values`: name of a launch's parameter, or "mu" -> a number or a
     list.
@@ -184,10 +194,10 @@ def event_table(
     if angle is None:
         check_reversible(roots["launch"], axis_values)
     else:
-        angle = float(angle)
         theta = axis_values.get("launch.theta", roots["launch"].theta)
-        warn_if_it_cannot_invert(scene, roots["launch"], theta, angle)
-    runs = InversionRuns(run_kind, float(t1), angle, crossing, settings, method, paths)
+        limit = None if isinstance(angle, StemContact) else angle
+        warn_if_it_cannot_invert(scene, roots["launch"], theta, limit)
+    runs = InversionRuns(run_kind, float(t1), angle, crossing, settings, method, paths, scene.has_stem)
     job = InversionJob(runs, roots, errors)
     request = described(roots, grid) | request_of(runs, options)
     variables = runs.variables | (runs.error_variables if errors else {})
@@ -210,7 +220,9 @@ def request_of(runs: InversionRuns, options: TableOptions) -> dict[str, Any]:
     """The request for a table as plain data, without the scene and the launch."""
     settings = runs.settings
     integrator = settings.for_single_runs if runs.method == "diffrax" else settings.for_lanes
-    event = {"event": "reversal"} if runs.angle is None else {"angle": runs.angle}
+    event = {"angle": runs.angle}
+    if runs.angle is None or isinstance(runs.angle, StemContact):
+        event = {"event": "reversal" if runs.angle is None else "contact of the stem"}
     request = {"t1": runs.t1, **event, "tolerance": float(options.tolerance), "crossing": runs.crossing}
     request |= {"solver": type(integrator).__name__, "method": runs.method}
     # Requests of earlier versions, with which a table may resume, lack these unless they were set.
