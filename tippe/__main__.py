@@ -33,7 +33,7 @@ from .runs.explore import live_run, stage_at_start
 from .runs.plot import Panel, draw_launches
 from .runs.table import inversion_table
 from .runs.theta_over_time import theta_over_time
-from .runs.turned_over import angle_of
+from .runs.turned_over import INVERTED
 
 TOPS = {top.__name__: top for top in (presets.wooden, presets.rutstam, presets.cohen, presets.leine_glocker)}
 
@@ -96,7 +96,8 @@ def remark(options: argparse.Namespace) -> str:
 
 def angle_counted(options: argparse.Namespace) -> float:
     """The inclination [rad] beyond which the top has turned over on a table."""
-    return float(angle_of(scene(options, "plane"), None))
+    top = TOPS[options.top]()
+    return INVERTED if top.stem is None else float(top.stem_angle)
 
 
 def middle(values: list[float]) -> float:

@@ -84,7 +84,8 @@ def test_a_cell_does_not_depend_on_its_neighbours(hopping_table):
 @pytest.mark.parametrize("number", range(5, 9))
 def test_coulomb_hops_and_the_stem(number):
     case = CASES[number]
-    table = tippe.inversion_table(scene_of(case), theta=case.theta, spin=[case.spin], t1=case.t1, tolerance=1e-11)
+    arguments = {"t1": case.t1, "angle": case.angle, "tolerance": 1e-11}
+    table = tippe.inversion_table(scene_of(case), theta=case.theta, spin=[case.spin], **arguments)
     check_against_reference(table, (0,), REFERENCE[number])
 
 

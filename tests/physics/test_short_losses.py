@@ -143,6 +143,7 @@ def test_a_short_blow_of_the_stem_is_not_passed_over():
         theta=1.8143792934635274,
         spin=234.84726553806723,
         t1=0.8,
+        angle=0.95 * np.pi,
         axes={f"launch.angular_velocity[{k}]": rate for k, rate in enumerate(turning)},
     )
     assert int(table["hops"]) == 23

@@ -82,17 +82,18 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys, monkeypatch, rut
 
 
 @pytest.mark.slow
-def test_the_wooden_top_turns_over_in_four_fifths_of_the_launches(tmp_path, capsys):
-    """On the table and in the cylinder; each cell is a number or a word, and the page's top stands on its stem in the end."""
+def test_the_wooden_top_turns_over(tmp_path, capsys):
+    """On the table and in the cylinder. The last cell of the cylinder stands on its stem for seconds before 171 deg."""
     assert main(["--out", str(tmp_path)]) == 0
     for arena in ("plane", "cylinder"):
         table = tippe.Table.load(tmp_path / f"{arena}.h5")
-        assert np.mean(table.status == "inverted") >= 0.8
+        assert (table.status == "inverted").all()
+        np.testing.assert_array_equal(table.time, table.stem_time)
+        # Neighbours differ little: no cell waits for an angle.
+        assert np.abs(np.diff(np.log(table.time), axis=0)).max() < 0.3
     printed = capsys.readouterr().out
     assert "nan" not in printed
-    assert "A top has turned over when theta first exceeds 171 deg. Where a time is several times" in printed
-    # Such a time, in the last cell of the cylinder: the top is on its stem as soon as the others, but below 171 deg.
-    assert table.time[-1, -1] > 3.0 * table.time[-2, -1]
+    assert "A top has turned over when its stem first carries it; on a table the stem touches at 133 deg." in printed
     scene = job.scene(job.parser().parse_args(["--mu", "0.5"]), "cylinder")
     times = np.array([3.0, 6.0, 10.0])
     theta = theta_over_time(scene, tippe.Launch.degrees(18, 1900), times, 1e-6, ("launch.theta", "scene.friction.mu"))
