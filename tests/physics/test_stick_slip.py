@@ -166,6 +166,30 @@ def test_a_table_is_what_its_runs_are():
         assert table.sticks[place] == run.stats["sticks"]
 
 
+def test_a_table_says_that_a_slipping_top_lost_contact():
+    """Its state was once read as that of a rolling top, so that its energy seemed to have grown."""
+    top, theta, spin = tippe.Top(0.02, 0.02, 0.006, 2.994e-6, 3.2e-6), 1.5169230769230766, 312.3076923076923
+    scene = scene_of(top, 0.3)
+    table = tippe.inversion_table(scene, theta=[1.2, 1.4, theta, 1.7], spin=[200.0, 250.0, 300.0, spin], t1=0.9)
+    assert table.status[2, 3] == "contact_lost"
+    assert "unresolved" not in table.status
+    run = tippe.simulate(scene, tippe.Launch(theta, spin), 0.9)
+    assert_close(table.end_time[2, 3], run.end_time, rtol=1e-7)
+    assert_close(table.end_theta[2, 3], run.theta[-1], atol=1e-7)
+
+
+def test_slips_that_barely_leave_the_friction_cone():
+    """Once in each turn the force of rolling leaves the cone for 0.2 ms and by 4e-6 of the weight, and the top slips by 1e-12
+    m. Where such a slip ended, the force of rolling could still be beyond the cone."""
+    top, launch = tippe.Top(0.02, 0.02, 0.006, 2.994e-6, 3.2e-6), tippe.Launch(0.2338461538461538, 266.1538461538462)
+    run = tippe.simulate(scene_of(top, 0.05), launch, 1.15)
+    assert run.status == "completed"
+    assert run.stats["sticks"] > 3
+    assert run.stats["energy_residual"] < 1e-9 * float(run.energy[0])
+    finer = tippe.simulate(scene_of(top, 0.05), launch, 1.15, tolerance=1e-10)
+    assert_close(run.axis[-1], finer.axis[-1], atol=1e-6)
+
+
 @pytest.mark.slow
 def test_the_error_of_many_slips_falls_with_the_tolerance_and_is_known():
     """A top that sticks and slips in the cylinder, whose every new slip once began with an error that no tolerance reached;

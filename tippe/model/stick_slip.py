@@ -234,15 +234,19 @@ class ContactMode(AbstractDynamics):
         else:
             sticks = stick_slip.rolling.grip(stopped_state, stick_slip.mu) >= 0.0
             lost = stick_slip.slipping.contact_margin(core_state) <= self.slip_left(core_state)
-            # A slip that only reverses continues through zero, which it reaches in its remaining time.
+            # A slip that reverses continues through zero, which it reaches in its remaining time. A slip along which the
+            # force of rolling pulls does not reverse: it begins anew.
             speed, change = self._slowing(core_state)
-            slows = change < 0.0
-            wait = jnp.where(slows & ~sticks & ~lost, -speed / jnp.where(slows, change, 1.0), 0.0)
+            slip, (F1, F2, _) = stick_slip.slipping.motion(core_state).slip, stick_slip.rolling.reaction(stopped_state)
+            reverses = (change < 0.0) & (slip.x * F1 + slip.y * F2 > 0.0)
+            wait = jnp.where(reverses & ~sticks & ~lost, -speed / jnp.where(reverses, change, 1.0), 0.0)
             wait = jnp.minimum(wait, left)
             stopped_state = stopped_state + wait * stick_slip.rolling.field(
                 stopped_state + 0.5 * wait * stick_slip.rolling.field(stopped_state)
             )
             quadratures = quadratures + wait * slipping(state)[size:]
+            # Until then, the force of rolling may have returned into the friction cone.
+            sticks = stick_slip.rolling.grip(stopped_state, stick_slip.mu) >= 0.0
         new_state = jnp.concatenate([stopped_state, quadratures])
         slips = ~(sticks | lost)
         max_duration = jnp.where(slips, left - wait, 0.0)

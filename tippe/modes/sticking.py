@@ -89,7 +89,7 @@ class StickSlipMode(AbstractBatchedMode):
         status = jnp.where(change.elapsed >= left, REACHED_END, RUNNING)
         status = jnp.where(change.lost, LEFT_DOMAIN, jnp.where(ends, CROSSED, status))
         return Transition(
-            mode=jnp.where(is_beyond, int(self.kind.rolls), jnp.where(change.rolls, ROLLING, SLIPPING)),
+            mode=jnp.where(is_beyond | change.lost, int(self.kind.rolls), jnp.where(change.rolls, ROLLING, SLIPPING)),
             state=jnp.where(is_beyond, state, jnp.where(ends, onset.at(fraction), change.state)),
             elapsed=jnp.where(ends, crossing, change.elapsed),
             status=status,
