@@ -161,13 +161,16 @@ def likely(name: Any, known: Iterable[str]) -> str:
     return f"; did you mean {matches[0]!r}?" if matches else ""
 
 
-def likely_fix(value: Any) -> str:
-    """A hint for a function or a class instead of its result, a body instead of a scene, or a scene instead of a body."""
+def likely_fix(value: Any, wanted: str = "") -> str:
+    """A hint for a function or a class instead of its result, a body instead of a scene, or a scene instead of a body.
+
+    **Arguments:** `wanted`: name of the class that the value should have.
+    """
     if inspect.isclass(value):
         return f"; did you mean {value.__name__}(...)?"
     if isinstance(value, eqx.Module) and hasattr(value, "body"):
         return "; the body of this scene is its .body"
-    if isinstance(value, eqx.Module) and hasattr(value, "mass"):
+    if wanted == "Scene" and isinstance(value, eqx.Module) and hasattr(value, "mass"):
         return "; put this body into one, as in Scene(body)"
     return f"; did you mean {value.__name__}()?" if inspect.isfunction(value) else ""
 

@@ -157,7 +157,7 @@ def require_kind(value: Any, name: str, kind: type, example: str = "", several: 
         raise ValueError(
             f"{name} is a {package_of_value}.{kind_name} and must be a {package_of_kind}.{kind_name}: each package has its own"
         )
-    raise ValueError(f"{name} = {shown(value)} must be a {kind_name}{example}{likely_fix(value)}")
+    raise ValueError(f"{name} = {shown(value)} must be a {kind_name}{example}{likely_fix(value, kind_name)}")
 
 
 def require_one_run(run: Any, action: str, many: str) -> None:

@@ -27,6 +27,10 @@ SUSPECTED = {
         lambda: stroller.Launch((0.0, 0.0), 90.0, 1.0),
         "heading = 90 rad is large; angles are in radians: did you mean np.radians(90)?",
     ),
+    "a speed in km/h": (
+        lambda: stroller.Launch((0.0, 0.0), 0.0, [1.0, -90.0]),
+        "speed = 90 m/s is fast: was it in km/h? 90 km/h are 25 m/s",
+    ),
     "a steering angle in degrees": (
         lambda: stroller.Launch((0.0, 0.0), 0.0, 1.0, steering=[0.1, -30.0]),
         "steering = 30 rad is large; angles are in radians: did you mean np.radians(30)?",

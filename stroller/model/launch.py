@@ -31,6 +31,10 @@ def as_place(value: Any) -> Any:
     return tuple(as_number(number) for number in numbers)
 
 
+#: Speeds above this [m/s] suggest kilometres per hour.
+FASTEST = 60.0
+
+
 class Launch(Bounded):
     """A launch: position of the rear axle, heading, speed and steering.
 
@@ -78,6 +82,10 @@ class Launch(Bounded):
             raise ValueError(f"place = {shown(self.place)} must be a pair of numbers, or (x, y, z) [m]")
 
     def suspicion(self) -> str | None:
+        if isinstance(self.speed, jax.Array) and not is_traced(self.speed) and self.speed.size:
+            fastest = float(np.max(np.abs(self.speed)))
+            if fastest > FASTEST:
+                return f"speed = {fastest:g} m/s is fast: was it in km/h? {fastest:g} km/h are {fastest / 3.6:.4g} m/s"
         for name, limit in USUAL.items():
             value = getattr(self, name)
             if is_traced(value) or not isinstance(value, jax.Array) or value.size == 0:

@@ -168,6 +168,8 @@ def test_slopes_of_the_times_are_those_of_central_differences(rutstam_scene, tab
     [
         (lambda: tippe.InversionTimes(LAUNCH, [1.0, 2.0], 0.1, t1=5.0), "launch.theta must be one number"),
         (lambda: tippe.InversionTimes(LAUNCH, [1.0, 2.0, 3.0, 9.0], 0.1, t1=5.0), "time = 9.0 must be less than 5.0"),
+        (lambda: tippe.InversionTimes(LAUNCH, [1.0] * 4, -0.1, t1=5.0), "error = -0.1 must be greater than 0.0"),
+        (lambda: tippe.InversionTimes(LAUNCH, [1.0] * 4, [0.1, 0.1, 0.0, 0.1], t1=5.0), "error = 0.0 must be greater"),
         (lambda: tippe.InversionTimes(LAUNCH, 1.0, 0.1, t1=5.0), "time must be a non-empty list"),
         (lambda: tippe.InversionTimes(LAUNCH, [(2.0, 1.0)] * 4, 0.1, t1=5.0), "two in order"),
         (lambda: tippe.InversionTimes(LAUNCH, [1.0, 2.0, 3.0, np.nan], 0.1, t1=5.0), "infinite where"),

@@ -82,6 +82,7 @@ class InversionTimes(eqx.Module):
         require(first, "time", at_least=0.0, at_most=self.t1, why="t1")
         if np.any(last < first):
             raise ValueError(f"time = {measured[np.argmax(last < first)]} must be a time, or two in order")
+        require(self.error, "error", above=0.0)
         if self.student is not None:
             require(self.student, "student", above=0.0)
         key = numbers("launch", self.launch) | {"error": self.error, "until": self.until}
