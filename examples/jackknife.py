@@ -20,4 +20,4 @@ def draw() -> Any:
 
 
 if __name__ == "__main__":
-    draw().savefig("parking.png", dpi=150)
+    draw().savefig("jackknife.png", dpi=150)
