@@ -114,6 +114,11 @@ PAGES = {
         ":doc:`runs <simulate>` and `plot` of :doc:`tables <sweeps>`.",
         ["tippe.explore", "stroller.explore"],
     ),
+    "planning": Page(
+        "Motion planning",
+        "Plan the drive of a stroller to a goal, around obstacles and within limits.",
+        of("stroller", "plan Plan Goal Box Disc Footprint Limits"),
+    ),
     "engine": Page(
         "The engine",
         "Use these names to write a model that is as fast as the top and the stroller; its functions take all runs at once. "

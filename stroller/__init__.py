@@ -28,6 +28,13 @@ from .model.input import Steady as Steady
 from .model.launch import Launch as Launch
 from .model.scene import Scene as Scene
 from .model.stroller import Stroller as Stroller
+from .planning.goal import Goal as Goal
+from .planning.goal import Limits as Limits
+from .planning.obstacles import Box as Box
+from .planning.obstacles import Disc as Disc
+from .planning.obstacles import Footprint as Footprint
+from .planning.plan import plan as plan
+from .planning.result import Plan as Plan
 from .runs.explore import explore as explore
 from .runs.simulate import simulate as simulate
 from .runs.table import Table as Table

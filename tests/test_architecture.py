@@ -28,7 +28,7 @@ HEIGHT = {
 }
 
 #: The same for the rooms of a vehicle.
-VEHICLE_HEIGHT = {"model": 0, "modes": 1, "steady": 1, "runs": 2, "fit": 3}
+VEHICLE_HEIGHT = {"model": 0, "modes": 1, "steady": 1, "runs": 2, "fit": 3, "planning": 3}
 
 #: Rooms that check what the others compute; papers may use witnesses, and command lines, which show the papers' tables
 #: beside their own, may use papers.

@@ -1,0 +1,124 @@
+"""The candidates of a plan: paths from the search, driven within the given time, as unknowns of the optimiser."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..model.dynamics import padded
+from .chart import Chart
+from .goal import Limits
+from .guess import smoothed, timed
+from .obstacles import Obstacles
+from .problem import Problem
+from .search import Costs, Ground, Path, search
+from .spline import ORDER
+from .transcription import Scales, Task
+
+#: Number of intervals of a plan.
+INTERVALS = 64
+
+#: Distance to keep from obstacles while planning, in units of the footprint's length, and the share of every limit's
+#: range to keep in reserve: the check examines the ride between the points at which the optimiser looks.
+RESERVE, LIMIT_RESERVE = 0.04, 0.01
+
+#: Curvature of the arcs of a search in units of the greatest one, because the fork takes time to turn.
+SEARCH_CURVATURE = 0.85
+
+#: Neighbouring knots over which the steering angle and the speed of a path are averaged.
+SMOOTHING = (2, 1)
+
+
+class Outline(NamedTuple):
+    """A problem as the search and the optimiser need it: the poses of start and goal in the ground's axes, the map of the
+    ground, the obstacles as arrays, and the clearance [m] to keep."""
+
+    problem: Problem
+    start: Any
+    goal: Any
+    chart: Chart
+    obstacles: Obstacles
+    clearance: float
+
+    @classmethod
+    def of(cls, problem: Problem) -> "Outline":
+        """The outline of a problem."""
+        start, end = problem.start_pose, problem.goal_pose
+        surface, axes = problem.scene.surface, problem.scene.surface.axes
+        chart = Chart.between(surface, problem.scene.dynamics.side, start[:axes], end[:axes])
+        keep = min(RESERVE * float(problem.footprint.length), 0.5 * problem.clearance_at_ends)
+        return cls(problem, start, end, chart, Obstacles.of(problem.obstacles), keep)
+
+    def task(self, way: float, t1: float, clearance: float) -> Task:
+        """The task of the optimiser for drives of the length `way` [m]."""
+        problem, body = self.problem, self.problem.scene.body
+        speed = max(way, float(body.wheelbase)) / t1
+        low, high = problem.limits.arrays(LIMIT_RESERVE)
+        launch = problem.launch
+        front_speed = launch.speed / jnp.cos(launch.steering)
+        force = float(body.mass) * speed / min(1.0, 0.1 * t1)
+        return Task(
+            dynamics=problem.scene.dynamics,
+            footprint=problem.footprint,
+            obstacles=self.obstacles,
+            start=(self.start, launch.steering, launch.steering_rate, front_speed),
+            goal=(self.goal, problem.goal.speed),
+            has_heading=jnp.asarray(0.0 if problem.goal.heading is None else 1.0),
+            low=jnp.asarray(low),
+            high=jnp.asarray(high),
+            clearance=jnp.asarray(clearance),
+            scales=Scales(body.wheelbase, jnp.asarray(speed), jnp.asarray(force)),
+            with_grip=problem.limits.grip is not None,
+        )
+
+    def paths(self, costs: list[Costs]) -> list[Path]:
+        """A path for each of several prices; straight to the goal where the search finds none."""
+        start, goal = self.chart.point(self.start), self.chart.point(self.goal)
+        ground = Ground.of(np.stack([start, goal]), self.obstacles, self.problem.footprint)
+        curvature = SEARCH_CURVATURE * greatest_curvature(self.problem)
+        has_heading = self.problem.goal.heading is not None
+        found = [search(ground, start, goal, has_heading, curvature, prices)[0] for prices in costs]
+        return [straight(start, goal) if path is None else path for path in found]
+
+    def unknowns(self, path: Path, t1: float) -> Float[np.ndarray, "rows unknowns"]:
+        """A path, driven within `t1`, as unknowns of the optimiser (see `transcription.py`)."""
+        wheelbase = float(self.problem.scene.body.wheelbase)
+        points, speed, curvature = timed(path, INTERVALS + 1, t1, wheelbase)
+        steering = smoothed(np.arctan(wheelbase * curvature), SMOOTHING[0])
+        front_speed = smoothed(speed, SMOOTHING[1]) / np.cos(steering)
+        poses = np.asarray(self.chart.poses(jnp.asarray(points)))
+        poses = np.concatenate([poses, poses[-1:], poses[-1:]])
+        splines = np.pad(np.stack([steering, front_speed], axis=1), ((1, ORDER - 3), (0, 0)), mode="edge")
+        return np.concatenate([poses, splines], axis=1)
+
+    def lines(self, unknowns: Float[np.ndarray, "candidates rows unknowns"]) -> Float[np.ndarray, "candidates knots 3"]:
+        """The positions [m] of candidates at their knots, in the fixed frame."""
+        surface = self.problem.scene.surface
+        components = jnp.moveaxis(jnp.asarray(unknowns[:, : INTERVALS + 1, : surface.axes]), -1, 0)
+        return np.stack([np.asarray(part) for part in surface.in_fixed_frame(padded(components))], axis=-1)
+
+
+def greatest_curvature(problem: Problem) -> float:
+    """The greatest curvature [1/m] that the limit of the steering angle allows on either side."""
+    low, high = Limits(steering=problem.limits.steering).arrays(LIMIT_RESERVE)
+    return float(np.tan(min(-low[0], high[0]))) / float(problem.scene.body.wheelbase)
+
+
+def straight(start: Any, goal: Any) -> Path:
+    """The straight line between two points, whatever is in between."""
+    away = goal[:2] - start[:2]
+    heading = float(np.arctan2(away[1], away[0]))
+    poses = np.array([[*start[:2], heading], [*goal[:2], heading]])
+    return Path(poses, np.ones(1), np.zeros(1), np.array([max(float(np.hypot(*away)), 1e-3)]))
+
+
+def prices(outline: Outline, count: int, batch: int, rng: np.random.Generator) -> list[Costs]:
+    """What the searches of a batch minimise: ordinary prices first, then random ones."""
+    length, keep = float(outline.problem.footprint.length), outline.clearance
+    if batch == 0:
+        usual = [Costs(1.5 * length, 0.1, 1.0, 0.9 * keep), Costs(0.5 * length, 0.3, 1.5, 1.8 * keep)]
+        return [usual[k % 2] for k in range(count)]
+    spread = np.exp(rng.normal(size=(count, 4)) * np.array([1.0, 0.7, 0.5, 0.5]))
+    middle = np.array([length, 0.2, 1.2, 0.7 * keep])
+    return [Costs(*map(float, row)) for row in middle * spread]

@@ -1,0 +1,213 @@
+"""Obstacles and the footprint of the stroller, in the horizontal plane."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nonholonomic.validation import Bound, Bounded, as_number, require_kind, shown
+
+from ..model.stroller import Stroller
+from .polygons import disc_distance, separation, signed_distance
+
+#: The numbers of boxes and of discs are padded to a multiple of this, so that other problems use the same programs.
+PADDING = 8
+
+#: Distance [m] of the obstacles that pad a list.
+FAR = 1e5
+
+#: Length, width and rear overhang of the drawn vehicle, in units of the wheelbase.
+DRAWN = (1.4, 0.87, 0.2)
+
+
+def as_pair(value: Any) -> Any:
+    """Two numbers as a tuple of arrays; anything else stays unchanged, for later checks."""
+    try:
+        return tuple(as_number(number) for number in tuple(value))
+    except TypeError:
+        return value
+
+
+def require_pair(value: Any, name: str, example: str) -> None:
+    """Raise `ValueError` unless the value is a pair of single numbers."""
+    if not (isinstance(value, tuple) and len(value) == 2 and all(np.shape(number) == () for number in value)):
+        raise ValueError(f"{name} = {shown(value)} must be a pair of numbers, such as {example}")
+
+
+class Box(Bounded):
+    """A rectangular obstacle in the coordinates x and y.
+
+    **Arguments:**
+
+    - `centre`: its middle (x, y) [m].
+    - `size`: its lengths [m] along its own two axes, positive.
+    - `angle`: angle [rad] from x to its first axis.
+
+    **Raises:** `ValueError` for numbers out of range.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> stroller.Box(centre=(1.0, 0.3), size=(0.5, 0.25))
+    Box(centre=(1, 0.3) m, size=(0.5, 0.25) m, angle=0 rad)
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"centre": "m", "size": "m", "angle": "rad"}
+
+    centre: tuple[Float[Array, ""], ...] = eqx.field(converter=as_pair)
+    size: tuple[Float[Array, ""], ...] = eqx.field(converter=as_pair)
+    angle: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
+
+    def __check_init__(self):
+        require_pair(self.centre, "centre", "(1.0, 0.5)")
+        require_pair(self.size, "size", "(0.5, 0.25)")
+
+    def bounds(self) -> Iterator[Bound]:
+        for name in ("centre", "size"):
+            numbers = getattr(self, name)
+            for k, number in enumerate(numbers if isinstance(numbers, tuple) else ()):
+                yield Bound(number, f"{name}[{k}]", above=0.0 if name == "size" else None)
+        yield Bound(self.angle, "angle")
+
+    @property
+    def corners(self) -> Float[np.ndarray, "4 2"]:
+        """The corners [m], counterclockwise."""
+        cosine, sine = np.cos(float(self.angle)), np.sin(float(self.angle))
+        own = np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]]) * np.array(self.size, dtype=float) / 2.0
+        return np.array(self.centre, dtype=float) + own @ np.array([[cosine, sine], [-sine, cosine]])
+
+    def distance(self, polygon: Float[np.ndarray, "*n 4 2"]) -> Float[np.ndarray, "*n"]:
+        """The exact distance [m] of polygons from the box, negative where they overlap."""
+        return signed_distance(polygon, self.corners)
+
+
+class Disc(Bounded):
+    """A round obstacle in the coordinates x and y.
+
+    **Arguments:**
+
+    - `centre`: its middle (x, y) [m].
+    - `radius`: its radius [m], positive.
+
+    **Raises:** `ValueError` for numbers out of range.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> stroller.Disc(centre=(1.0, 0.3), radius=0.2)
+    Disc(centre=(1, 0.3) m, radius=0.2 m)
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"centre": "m", "radius": "m"}
+
+    centre: tuple[Float[Array, ""], ...] = eqx.field(converter=as_pair)
+    radius: Float[Array, ""] = eqx.field(converter=as_number)
+
+    def __check_init__(self):
+        require_pair(self.centre, "centre", "(1.0, 0.5)")
+
+    def bounds(self) -> Iterator[Bound]:
+        for k, number in enumerate(self.centre if isinstance(self.centre, tuple) else ()):
+            yield Bound(number, f"centre[{k}]")
+        yield Bound(self.radius, "radius", above=0.0)
+
+    def distance(self, polygon: Float[np.ndarray, "*n 4 2"]) -> Float[np.ndarray, "*n"]:
+        """The exact distance [m] of polygons from the disc, negative where they overlap."""
+        return disc_distance(polygon, np.array(self.centre, dtype=float), float(self.radius))
+
+
+class Footprint(Bounded):
+    """The rectangle that must not touch an obstacle, as seen from above.
+
+    **Arguments:**
+
+    - `length`, `width`: its size [m] along and across the heading, positive.
+    - `rear`: distance [m] from its rear end to the rear axle, in [0, `length`].
+
+    **Raises:** `ValueError` for numbers out of range.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> stroller.Footprint(length=0.5, width=0.25, rear=0.1)
+    Footprint(length=0.5 m, width=0.25 m, rear=0.1 m)
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"length": "m", "width": "m", "rear": "m"}
+
+    length: Float[Array, ""] = eqx.field(converter=as_number)
+    width: Float[Array, ""] = eqx.field(converter=as_number)
+    rear: Float[Array, ""] = eqx.field(converter=as_number)
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.length, "length", above=0.0)
+        yield Bound(self.width, "width", above=0.0)
+        yield Bound(self.rear, "rear", at_least=0.0)
+        yield Bound(self.rear, "rear", at_most=self.length, why="the length")
+
+    @classmethod
+    def of(cls, body: Stroller) -> "Footprint":
+        """The footprint of the vehicle that the pages draw."""
+        return cls(*(part * body.wheelbase for part in DRAWN))
+
+    def corners(self, place: Any, heading: Any, left: Any) -> Any:
+        """The corners [m], (..., 4, 2), counterclockwise.
+
+        **Arguments:** `place`: the rear axle (..., 2) [m]; `heading`, `left`: unit vectors of the stroller, seen from
+        above, (..., 2).
+        """
+        front, half = self.length - self.rear, self.width / 2.0
+        along = np.array([1.0, 1.0, 0.0, 0.0])[:, None] * front - np.array([0.0, 0.0, 1.0, 1.0])[:, None] * self.rear
+        across = np.array([-1.0, 1.0, 1.0, -1.0])[:, None] * half
+        return place[..., None, :] + along * heading[..., None, :] + across * left[..., None, :]
+
+
+class Obstacles(eqx.Module):
+    """The obstacles as arrays, padded: corners of the boxes (boxes, 4, 2), centres (discs, 2) and radii of the discs."""
+
+    boxes: Float[Array, "boxes 4 2"]
+    centres: Float[Array, "discs 2"]
+    radii: Float[Array, " discs"]
+
+    @classmethod
+    def of(cls, obstacles: Sequence[Box | Disc]) -> "Obstacles":
+        """Boxes and discs as arrays, padded."""
+        boxes = [box.corners for box in obstacles if isinstance(box, Box)]
+        discs = [[*disc.centre, disc.radius] for disc in obstacles if isinstance(disc, Disc)]
+        boxes += [Box((FAR, FAR), (1.0, 1.0)).corners] * (-len(boxes) % PADDING)
+        discs += [[FAR, FAR, 1.0]] * (-len(discs) % PADDING)
+        circles = jnp.asarray(np.array(discs, dtype=float).reshape(-1, 3))
+        return cls(jnp.asarray(np.array(boxes, dtype=float).reshape(-1, 4, 2)), circles[:, :2], circles[:, 2])
+
+    def gaps(self, corners: Any) -> Any:
+        """A lower bound [m] of the distance of footprints (..., 4, 2) from every obstacle, with a slope everywhere."""
+        xp = np if isinstance(corners, np.ndarray) else jnp
+        boxes = separation(corners[..., None, :, :], self.boxes)
+        discs = disc_distance(corners[..., None, :, :], self.centres, self.radii)
+        return xp.concatenate([boxes, discs], axis=-1)
+
+
+def require_obstacles(obstacles: Any) -> tuple[Box | Disc, ...]:
+    """A list of obstacles as a tuple; raise `ValueError` for anything else."""
+    if isinstance(obstacles, Box | Disc):
+        raise ValueError("obstacles = one obstacle must be a list: write obstacles=[obstacle]")
+    try:
+        parts = tuple(obstacles)
+    except TypeError:
+        raise ValueError(f"obstacles = {obstacles!r} must be a list of Box and Disc") from None
+    for k, part in enumerate(parts):
+        if not isinstance(part, Disc):
+            require_kind(part, f"obstacles[{k}]", Box, " or a Disc")
+    return parts

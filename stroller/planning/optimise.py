@@ -1,0 +1,146 @@
+"""Optimisation of all candidates together: an augmented Lagrangian, minimised by damped Gauss-Newton steps.
+
+Method: Nocedal and Wright, Numerical Optimization (2006), chapters 10 and 17. JAX evaluates the residuals and their
+slopes in lanes; SciPy solves the banded equations of all lanes as one system.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+
+from .spline import ORDER
+from .transcription import Residuals, Task, interval_residuals, residuals, windows
+
+#: Penalties of the constraints, in turn, and the number of Gauss-Newton steps with each.
+PENALTIES = (100.0, 300.0, 1e3, 1e3, 1e3, 1e3)
+STEPS_EACH = 8
+
+#: Violation of the constraints of a solution, and relative change of the objective at which the optimiser stops.
+FEASIBLE, SETTLED = 2e-4, 0.02
+
+#: Bounds of the damping.
+LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e6
+
+
+class Candidates(NamedTuple):
+    """Candidates in lanes: unknowns (lanes, rows, unknowns) and durations (lanes,) [s]."""
+
+    unknowns: Any
+    durations: Any
+
+
+class Multipliers(NamedTuple):
+    """Multipliers in units of the penalty, shaped as the constraints."""
+
+    equalities: Any
+    inequalities: Any
+
+
+def _penalised(found: Residuals, multipliers: Multipliers, penalty: Any) -> Any:
+    """The residuals of the augmented Lagrangian, as one list per interval."""
+    root = jnp.sqrt(penalty)
+    shifted = found.inequalities + multipliers.inequalities
+    broken = jnp.where(shifted < 0.0, shifted, 0.0)
+    return jnp.concatenate([root * (found.equalities + multipliers.equalities), root * broken, found.objective], -1)
+
+
+@eqx.filter_jit
+def _normal_equations(candidates: Candidates, task: Task, multipliers: Multipliers, penalty: Any) -> Any:
+    """Merit (lanes,), gradient (lanes, rows, unknowns), and lower band of the Gauss-Newton matrix of every lane."""
+
+    def of_lane(unknowns, t1, multipliers):
+        rows, width = unknowns.shape
+        intervals = rows - ORDER + 1
+
+        # The poses of the third and the fourth row of a window have no influence.
+        used = np.array([k for k in range(ORDER * width) if k < 2 * width or k % width >= width - 2])
+
+        def of_interval(window, multipliers, index):
+            def terms(numbers):
+                changed = window.ravel().at[used].set(numbers).reshape(window.shape)
+                found = interval_residuals(changed, task, index, intervals, t1 / intervals)
+                value = _penalised(found, multipliers, penalty)
+                return value, value
+
+            slope, value = jax.jacfwd(terms, has_aux=True)(window.ravel()[used])
+            return value @ value, slope.T @ value, slope.T @ slope
+
+        merit, gradient, matrix = jax.vmap(of_interval)(windows(unknowns), multipliers, jnp.arange(intervals))
+        number = np.arange(intervals)[:, None] * width + used
+        total = jnp.zeros(rows * width).at[number].add(gradient)
+        row, column = np.tril_indices(len(used))
+        band = jnp.zeros((ORDER * width, rows * width))
+        band = band.at[(used[row] - used[column])[None], number[:, column]].add(matrix[:, row, column])
+        return merit.sum(), total, band
+
+    return jax.vmap(of_lane)(*candidates, multipliers)
+
+
+@eqx.filter_jit
+def constraints(candidates: Candidates, task: Task) -> Residuals:
+    """The residuals of every lane."""
+    return jax.vmap(lambda unknowns, t1: residuals(unknowns, task, t1))(*candidates)
+
+
+def _step(band: np.ndarray, gradient: np.ndarray, damping: np.ndarray) -> np.ndarray:
+    """Damped Gauss-Newton steps of all lanes, solved as one banded system."""
+    lanes, width, count = band.shape
+    matrix = band.copy()
+    matrix[:, 0] += damping[:, None] * (1.0 + 0.0 * band[:, 0]) + 1e-12
+    joined = matrix.transpose(1, 0, 2).reshape(width, lanes * count)
+    return -scipy.linalg.solveh_banded(joined, gradient.reshape(-1), lower=True).reshape(lanes, count)
+
+
+def _minimise(candidates: Candidates, task: Task, multipliers: Multipliers, penalty: float) -> Candidates:
+    """Gauss-Newton steps for a given penalty; a step that does not lower the merit is repeated with more damping."""
+    # A Python number would be a constant of the program.
+    weight = jnp.asarray(penalty)
+    merit, gradient, band = map(np.asarray, _normal_equations(candidates, task, multipliers, weight))
+    merit, gradient, band = merit.copy(), gradient.copy(), band.copy()
+    unknowns, damping = np.asarray(candidates.unknowns).copy(), np.full(len(merit), 1e-3)
+    for _ in range(STEPS_EACH):
+        step = _step(band, gradient, damping).reshape(unknowns.shape)
+        trial = candidates._replace(unknowns=unknowns + step)
+        new = tuple(map(np.asarray, _normal_equations(trial, task, multipliers, weight)))
+        better = np.isfinite(new[2]).all((1, 2)) & (new[0] < merit)
+        for old, part in zip((merit, gradient, band, unknowns), (*new, trial.unknowns), strict=True):
+            old[better] = part[better]
+        damping = np.clip(np.where(better, damping / 5.0, damping * 8.0), LEAST_DAMPING, MOST_DAMPING)
+    return candidates._replace(unknowns=unknowns)
+
+
+def violation(found: Residuals) -> np.ndarray:
+    """The greatest violation of a constraint in every lane, in the units of the residuals."""
+    equalities, inequalities = np.asarray(found.equalities), np.asarray(found.inequalities)
+    return np.maximum(np.abs(equalities).max((1, 2)), -inequalities.min((1, 2)).clip(max=0.0))
+
+
+def objective(found: Residuals) -> np.ndarray:
+    """The objective of every lane."""
+    return np.sum(np.asarray(found.objective) ** 2, axis=(1, 2))
+
+
+def optimise(candidates: Candidates, task: Task) -> tuple[Candidates, np.ndarray, np.ndarray]:
+    """Minimise the effort of all candidates under the constraints, until the best one no longer changes.
+
+    **Returns:** the candidates, and the violation and the objective of each.
+    """
+    found = constraints(candidates, task)
+    multipliers = Multipliers(jnp.zeros_like(found.equalities), jnp.zeros_like(found.inequalities))
+    values = np.full(len(candidates.durations), np.inf)
+    for last, penalty in zip((PENALTIES[0], *PENALTIES), PENALTIES, strict=False):
+        multipliers = Multipliers(*(part * (last / penalty) for part in multipliers))
+        candidates = _minimise(candidates, task, multipliers, penalty)
+        found, before = constraints(candidates, task), values
+        values = objective(found)
+        if np.any((violation(found) < FEASIBLE) & (np.abs(values - before) < SETTLED * values)):
+            break
+        multipliers = Multipliers(
+            multipliers.equalities + found.equalities,
+            jnp.minimum(multipliers.inequalities + found.inequalities, 0.0),
+        )
+    return candidates, violation(found), values

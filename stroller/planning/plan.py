@@ -1,0 +1,183 @@
+"""Plan a drive to a goal."""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from nonholonomic.progress import status_line
+from nonholonomic.validation import require_flag, require_whole
+
+from ..model.launch import Launch
+from ..model.scene import Scene
+from ..runs.trajectory import Trajectory
+from .candidates import Outline, prices
+from .check import Verdict, checked_run
+from .drive import Drive, drive_along
+from .goal import Goal, Limits
+from .obstacles import Footprint
+from .optimise import Candidates, optimise
+from .problem import checked_problem
+from .result import Plan
+
+#: Candidates that are optimised together.
+LANES = 2
+
+#: Tolerance of the run that confirms a plan.
+CONFIRMED = 1e-9
+
+#: A candidate with a greater violation of the constraints (see `optimise.py`) is not worth a run if there is a better one.
+HOPELESS = 0.05
+
+#: How often the clearance is increased for a candidate that touches an obstacle between the optimiser's points.
+MORE_CLEARANCE = 2
+
+#: Rounds in which the duration is shortened, and the least share of the duration that is tried.
+ROUNDS, LEAST_SHARE = 5, 0.05
+
+MINIMISED = ("effort", "time")
+
+
+class Attempt(NamedTuple):
+    """An optimised candidate that was driven: its input and duration [s], its unknowns, its run and what it achieves."""
+
+    drive: Drive
+    t1: float
+    unknowns: Any
+    run: Trajectory
+    verdict: Verdict
+
+    @property
+    def rank(self) -> tuple[float, float]:
+        """The attempt with the least rank is the best."""
+        return self.verdict.excess, self.verdict.effort
+
+
+def plan(
+    scene: Scene,
+    launch: Launch,
+    goal: Goal,
+    t1: Float[ArrayLike, ""],
+    *,
+    obstacles: Any = (),
+    limits: Limits | None = None,
+    footprint: Footprint | None = None,
+    minimise: str = "effort",
+    starts: int = 64,
+    seed: int = 0,
+    tolerance: float = 1e-6,
+    progress: bool = True,
+) -> Plan:
+    """Plan a drive from a launch to a goal, around obstacles and within limits.
+
+    A search over arcs that the stroller can drive, forwards and in reverse, finds paths around the obstacles; an
+    optimiser turns them into drives of the full dynamics that meet all constraints; and a run at a tolerance of 1e-9
+    with an exact collision check of the whole footprint confirms the result.
+
+    **Arguments:**
+
+    - `scene`: a `Scene` on any ground, with an intrinsic heading.
+    - `launch`: the `Launch` at which the drive begins.
+    - `goal`: a `Goal`.
+    - `t1`: duration of the drive [s], positive.
+    - `obstacles`: a list of `Box` and `Disc`, on a ground whose places are (x, y) [m].
+    - `limits`: `Limits` of steering angle, speed, force, torque and grip.
+    - `footprint`: the `Footprint` that must not touch an obstacle; by default that of the drawn vehicle, 1.4 wheelbases
+      long and 0.87 wide.
+    - `minimise`: "effort", the integral of the squared force and of the squared torque divided by the wheelbase; or
+      "time", for which `t1` is the longest duration.
+    - `starts`: greatest number of candidates; the search ends with the first ones that solve the problem.
+    - `seed`: seed of the random choices among paths.
+    - `tolerance`: relative tolerance of the runs that compare candidates, in [1e-14, 1e-2].
+    - `progress`: whether to show a status line.
+
+    **Returns:** a `Plan`. If no candidate solves the problem, `reached` is false, and the plan is the best attempt.
+
+    **Raises:** `ValueError` for arguments out of range, a start or a goal that touches an obstacle or breaks a limit, and a
+    goal outside the ground.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=5.0, wheelbase=0.25, inertia=0.1, steering_inertia=0.005)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 0.5, 0.1, 0.05))
+    >>> gap = [stroller.Box((1.1, 0.3), (0.5, 0.25)), stroller.Box((2.7, 0.3), (0.5, 0.25))]
+    >>> start, goal = stroller.Launch((0.7, 0.8), 0.0, 0.0), stroller.Goal((1.8, 0.3), heading=0.0)
+    >>> plan = stroller.plan(scene, start, goal, 12.0, obstacles=gap, limits=stroller.Limits(steering=1.0))
+    >>> plan.reached, bool(plan.clearance > 0.0)
+    (True, True)
+
+    ```
+    """
+    if minimise not in MINIMISED:
+        raise ValueError(f"minimise = {minimise!r} must be one of {', '.join(map(repr, MINIMISED))}")
+    require_whole(starts, "starts", 1)
+    require_whole(seed, "seed", 0)
+    require_flag(progress, "progress")
+    problem = checked_problem(scene, launch, goal, t1, obstacles, limits, footprint, tolerance)
+    duration = float(np.asarray(t1))
+    with status_line("planning", progress):
+        outline = Outline.of(problem)
+        attempts, tried = [], []
+        for attempt in _attempts(outline, duration, starts, np.random.default_rng(seed), tolerance, tried):
+            attempts.append(attempt)
+            if not attempt.verdict.hindrances:
+                break
+        best = min(attempts, key=lambda attempt: attempt.rank)
+        if minimise == "time" and not best.verdict.hindrances:
+            best = _shortened(outline, best, tolerance)
+        run, verdict = checked_run(problem, best.drive, best.t1, CONFIRMED)
+    return Plan(best.drive, best.t1, run, verdict, problem, jnp.asarray(outline.lines(np.concatenate(tried))))
+
+
+def _attempts(
+    outline: Outline, t1: float, starts: int, rng: np.random.Generator, tolerance: float, tried: list[Any]
+) -> Iterator[Attempt]:
+    """Attempts at a problem, best first in each batch of candidates; all optimised candidates are added to `tried`."""
+    for batch in range(-(-starts // LANES)):
+        paths = outline.paths(prices(outline, LANES, batch, rng))
+        way = min(float(path.length.sum()) for path in paths)
+        candidates = Candidates(np.stack([outline.unknowns(path, t1) for path in paths]), np.full(LANES, t1))
+        clearance = outline.clearance
+        for _ in range(MORE_CLEARANCE + 1):
+            candidates, violation, objective = optimise(candidates, outline.task(way, t1, clearance))
+            tried.append(candidates.unknowns)
+            order = np.lexsort((objective, violation > HOPELESS))
+            attempts = []
+            for lane in order:
+                if attempts and violation[lane] > HOPELESS:
+                    break
+                attempts.append(_driven(outline, candidates.unknowns[lane], t1, tolerance))
+                yield attempts[-1]
+            overlap = -max(attempt.verdict.clearance for attempt in attempts)
+            if overlap <= 0.0 or violation.min() > HOPELESS:
+                break
+            clearance += overlap + 0.5 * outline.clearance
+
+
+def _driven(outline: Outline, unknowns: Any, t1: float, tolerance: float) -> Attempt:
+    """An optimised candidate, driven."""
+    dynamics = outline.problem.scene.dynamics
+    drive = drive_along(dynamics, outline.start, unknowns[:, -2], unknowns[:, -1], t1)
+    return Attempt(drive, t1, unknowns, *checked_run(outline.problem, drive, t1, tolerance))
+
+
+def _shortened(outline: Outline, best: Attempt, tolerance: float) -> Attempt:
+    """A solution in less time: the same drive, faster, optimised again for several durations in turn."""
+    too_short, way = LEAST_SHARE * best.t1, float(np.trapezoid(np.abs(best.run.speed), best.run.t))
+    for _ in range(ROUNDS):
+        durations = too_short + (best.t1 - too_short) * np.arange(1, LANES + 1) / (LANES + 1)
+        faster = np.stack([best.unknowns] * LANES)
+        faster[:, :, -1] *= (best.t1 / durations)[:, None]
+        task = outline.task(way, best.t1, outline.clearance)
+        candidates, violation, _ = optimise(Candidates(faster, durations), task)
+        for lane in np.flatnonzero(violation < HOPELESS):
+            attempt = _driven(outline, candidates.unknowns[lane], float(durations[lane]), tolerance)
+            if not attempt.verdict.hindrances:
+                best = attempt
+                break
+        too_short = float(max(durations[durations < best.t1], default=too_short))
+    return best

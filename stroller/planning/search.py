@@ -1,0 +1,245 @@
+"""A path around obstacles: hybrid A* over arcs that the stroller can drive, forwards and backwards.
+
+Method: Dolgov et al., Int. J. Robotics Research 29 (2010) 485. Nodes keep exact poses; a grid of places, headings and
+directions of travel keeps the cheapest node of each cell. Nodes are expanded many at a time, in NumPy.
+"""
+
+import heapq
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import scipy.sparse
+from jaxtyping import Bool, Float
+
+from .obstacles import Footprint, Obstacles
+
+#: Headings of the grid, cells along the longer side of the region, nodes expanded at a time, and most of them in all.
+HEADINGS, MOST_CELLS, BATCH, MOST_NODES = 24, 128, 48, 400_000
+
+#: Curvatures of the arcs in units of the greatest one, and the most by which an arc turns [rad].
+CURVATURES, MOST_TURN = (-1.0, -0.5, 0.0, 0.5, 1.0), 0.5
+
+#: Points of each arc that must be free.
+SAMPLES = 3
+
+#: How close a path must come to the goal: in units of a cell, and in units of a heading of the grid.
+ARRIVAL = (1.0, 0.8)
+
+
+class Path(NamedTuple):
+    """A path: places and headings (points, 3) [m, rad], and for each piece between them its direction of travel (1 or
+    -1), curvature [1/m] and length [m]."""
+
+    poses: Float[np.ndarray, "points 3"]
+    direction: Float[np.ndarray, " pieces"]
+    curvature: Float[np.ndarray, " pieces"]
+    length: Float[np.ndarray, " pieces"]
+
+
+class Costs(NamedTuple):
+    """What a search minimises beside the length: the price [m] of a change of direction, of a full turn of the wheel, and
+    how many times the length in reverse counts; and the distance [m] to keep from obstacles."""
+
+    reversal: float
+    turning: float
+    backwards: float
+    clearance: float
+
+
+class Ground(NamedTuple):
+    """The region of a search: lower corner and size (2,) [m], side of a cell [m], and what must not be touched."""
+
+    low: Float[np.ndarray, " 2"]
+    size: Float[np.ndarray, " 2"]
+    cell: float
+    obstacles: Obstacles
+    footprint: Footprint
+
+    @classmethod
+    def of(cls, poses: Float[np.ndarray, "poses 3"], obstacles: Obstacles, footprint: Footprint) -> "Ground":
+        """A region around the start, the goal and all obstacles."""
+        boxes, centres = np.asarray(obstacles.boxes).reshape(-1, 2), np.asarray(obstacles.centres)
+        radii = np.asarray(obstacles.radii)[:, None]
+        points = np.concatenate([poses[:, :2], boxes, centres - radii, centres + radii])
+        points = points[np.abs(points).max(axis=1) < 1e4]
+        # NumPy would otherwise dispatch every operation with these to JAX.
+        obstacles, footprint = jax.tree.map(np.asarray, (obstacles, footprint))
+        reach = 2.5 * float(footprint.length)
+        low, high = points.min(axis=0) - reach, points.max(axis=0) + reach
+        cell = max(0.2 * float(footprint.length), float((high - low).max()) / MOST_CELLS)
+        return cls(low, high - low, cell, obstacles, footprint)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """The number of cells in each direction."""
+        return tuple(np.ceil(self.size / self.cell).astype(int) + 1)  # pyright: ignore[reportReturnType]
+
+    def is_free(self, poses: Float[np.ndarray, "*n 3"], clearance: float) -> Bool[np.ndarray, "*n"]:
+        """Whether the footprint is inside the region and keeps its distance from all obstacles."""
+        x, y, heading = poses[..., 0], poses[..., 1], poses[..., 2]
+        place = poses[..., :2] - self.low
+        inside = np.all((place >= 0.0) & (place <= self.size), axis=-1, keepdims=True)[..., 0]
+        length, rear = float(self.footprint.length), float(self.footprint.rear)
+        ahead = length / 2.0 - rear
+        centre = np.stack([x + ahead * np.cos(heading), y + ahead * np.sin(heading)], axis=-1)
+        free, radius = inside.copy(), 0.5 * np.hypot(length, float(self.footprint.width)) + clearance
+        if not len(self.obstacles.boxes) and not len(self.obstacles.radii):
+            return free
+        near = np.argwhere(self.distance(centre) < radius)
+        index = tuple(near.T)
+        close = poses[index]
+        forward = np.stack([np.cos(close[:, 2]), np.sin(close[:, 2])], axis=-1)
+        left = np.stack([-forward[:, 1], forward[:, 0]], axis=-1)
+        corners = self.footprint.corners(close[:, :2], forward, left)
+        free[index] &= self.obstacles.gaps(corners).min(axis=-1) > clearance
+        return free
+
+    def distance(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+        """A lower bound [m] of the distance of points from all obstacles, exact outside of them."""
+        boxes = np.asarray(self.obstacles.boxes)
+        middle, side = boxes.mean(axis=1), boxes[:, 0] - boxes[:, 3]
+        length = np.linalg.norm(side, axis=-1)
+        axis = side / length[:, None]
+        width = np.linalg.norm(boxes[:, 1] - boxes[:, 0], axis=-1)
+        away = points[..., None, :] - middle
+        along = np.abs((away * axis).sum(-1)) - length / 2.0
+        across = np.abs(away[..., 1] * axis[:, 0] - away[..., 0] * axis[:, 1]) - width / 2.0
+        gaps = np.hypot(along.clip(0.0), across.clip(0.0))
+        discs = np.linalg.norm(points[..., None, :] - np.asarray(self.obstacles.centres), axis=-1)
+        discs = discs - np.asarray(self.obstacles.radii)
+        return np.concatenate([gaps, discs, np.full((*gaps.shape[:-1], 1), np.inf)], axis=-1).min(axis=-1)
+
+    def way_to(self, place: Float[np.ndarray, " 2"], clearance: float) -> Float[np.ndarray, "x y"]:
+        """Length [m] of the shortest way of a disc as wide as the vehicle from every cell to a place; infinite if there is
+        none."""
+        nx, ny = self.shape
+        x, y = np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij")
+        points = self.low + self.cell * (np.stack([x, y], axis=-1) + 0.5)
+        half = 0.5 * float(self.footprint.width) + clearance
+        free = self.distance(points) > half - 0.7 * self.cell
+        number = np.arange(nx * ny).reshape(nx, ny)
+        starts, ends, lengths = [], [], []
+        for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
+            here = (slice(0, nx - dx), slice(max(0, -dy), ny - max(0, dy)))
+            there = (slice(dx, nx), slice(max(0, dy), ny + min(0, dy)))
+            both = free[here] & free[there]
+            starts.append(number[here][both])
+            ends.append(number[there][both])
+            lengths.append(np.full(both.sum(), self.cell * np.hypot(dx, dy)))
+        links = (np.concatenate(starts), np.concatenate(ends))
+        graph = scipy.sparse.csr_array((np.concatenate(lengths), links), shape=(nx * ny, nx * ny))
+        goal = np.clip(((place - self.low) / self.cell).astype(int), 0, np.array(self.shape) - 1)
+        way = scipy.sparse.csgraph.dijkstra(graph, directed=False, indices=number[tuple(goal)])
+        return way.reshape(nx, ny)
+
+
+def arcs(ground: Ground, curvature: float) -> Float[np.ndarray, "arcs 3"]:
+    """The arcs of a step: direction of travel, curvature and length."""
+    step = 1.5 * ground.cell
+    bends = curvature * np.array(CURVATURES)
+    length = np.minimum(step, MOST_TURN / np.maximum(np.abs(bends), 1e-9))
+    return np.array([[sign, k, s] for sign in (1.0, -1.0) for k, s in zip(bends, length, strict=True)])
+
+
+def driven(poses: Float[np.ndarray, "*n 3"], direction, curvature, length) -> Float[np.ndarray, "*n 3"]:
+    """Poses at the ends of arcs."""
+    turn = direction * curvature * length
+    heading = poses[..., 2] + turn / 2.0
+    chord = direction * length * np.sinc(turn / (2.0 * np.pi))
+    return np.stack(
+        [poses[..., 0] + chord * np.cos(heading), poses[..., 1] + chord * np.sin(heading), poses[..., 2] + turn],
+        axis=-1,
+    )
+
+
+class Tree:
+    """The nodes of a search, in growing arrays."""
+
+    def __init__(self, start: Float[np.ndarray, " 3"]):
+        self.pose = np.zeros((4096, 3))
+        self.cost, self.parent, self.arc = np.zeros(4096), np.full(4096, -1), np.full(4096, -1)
+        self.pose[0], self.count = start, 1
+
+    def add(self, pose, cost, parent, arc) -> np.ndarray:
+        """Add nodes; returns their numbers."""
+        number = np.arange(self.count, self.count + len(pose))
+        while number.size and number[-1] >= len(self.pose):
+            self.pose, self.cost = np.concatenate([self.pose, self.pose]), np.concatenate([self.cost, self.cost])
+            self.parent, self.arc = np.concatenate([self.parent] * 2), np.concatenate([self.arc] * 2)
+        self.pose[number], self.cost[number], self.parent[number], self.arc[number] = pose, cost, parent, arc
+        self.count += len(pose)
+        return number
+
+    def branch(self, node: int) -> list[int]:
+        """The nodes from the start to a node."""
+        nodes = [node]
+        while self.parent[nodes[-1]] >= 0:
+            nodes.append(int(self.parent[nodes[-1]]))
+        return nodes[::-1]
+
+
+def search(
+    ground: Ground, start: np.ndarray, goal: np.ndarray, has_heading: bool, curvature: float, costs: Costs
+) -> tuple[Path | None, float]:
+    """The cheapest path that the search finds from one pose (3,) to another, or `None`; and the distance [m] from the
+    goal to the nearest pose it came to."""
+    moves, tree, way = arcs(ground, curvature), Tree(start), ground.way_to(goal[:2], costs.clearance)
+    nx, ny = ground.shape
+    best = np.full(nx * ny * HEADINGS * 2, np.inf)
+    pieces = np.arange(1, SAMPLES + 1) / SAMPLES
+    frontier, nearest = [(0.0, 0)], np.inf
+    factor = np.where(moves[:, 0] < 0.0, costs.backwards, 1.0)
+    price = moves[:, 2] * factor * (1.0 + costs.turning * np.abs(moves[:, 1]) / curvature)
+    while frontier and tree.count < MOST_NODES:
+        nodes = np.array([heapq.heappop(frontier)[1] for _ in range(min(BATCH, len(frontier)))])
+        nodes = nodes[tree.cost[nodes] <= best[_cell(ground, tree, moves, nodes)] + 1e-12] if nodes[0] else nodes
+        if not nodes.size:
+            continue
+        parent, arc = (part.ravel() for part in np.meshgrid(nodes, np.arange(len(moves)), indexing="ij"))
+        direction, curvature_of_arc, length = moves[arc].T[:, :, None]
+        poses = driven(tree.pose[parent][:, None], direction, curvature_of_arc, length * pieces)
+        previous = tree.arc[parent]
+        reverses = (previous >= 0) & (moves[previous, 0] != moves[arc, 0])
+        bend = np.where(previous >= 0, np.abs(moves[previous, 1] - moves[arc, 1]) / curvature, 0.0)
+        cost = tree.cost[parent] + price[arc] + costs.reversal * reverses + 0.5 * costs.turning * ground.cell * bend
+        free = ground.is_free(poses, costs.clearance).all(axis=1)
+        pose, cost, parent, arc = poses[free, -1], cost[free], parent[free], arc[free]
+        cell = _number(ground, pose, moves[arc, 0])
+        ahead = way[tuple(_place(ground, pose).T)]
+        order = np.lexsort((cost, cell))
+        _, first = np.unique(cell[order], return_index=True)
+        keep = order[first]
+        keep = keep[(cost[keep] < best[cell[keep]] - 1e-9) & np.isfinite(ahead[keep])]
+        best[cell[keep]] = cost[keep]
+        numbers = tree.add(pose[keep], cost[keep], parent[keep], arc[keep])
+        away = np.linalg.norm(pose[keep, :2] - goal[:2], axis=-1)
+        nearest = min(nearest, away.min(initial=np.inf))
+        turn = np.abs((pose[keep, 2] - goal[2] + np.pi) % (2.0 * np.pi) - np.pi) * has_heading
+        arrived = (away < ARRIVAL[0] * ground.cell) & (turn < ARRIVAL[1] * 2.0 * np.pi / HEADINGS)
+        if arrived.any():
+            node = numbers[arrived][np.argmin((cost[keep] + away + 0.3 * turn)[arrived])]
+            return _path(tree, moves, int(node)), 0.0
+        for entry in zip((cost[keep] + ahead[keep]).tolist(), numbers.tolist(), strict=True):
+            heapq.heappush(frontier, entry)
+    return None, float(nearest)
+
+
+def _place(ground: Ground, pose: np.ndarray) -> np.ndarray:
+    return np.clip(((pose[:, :2] - ground.low) / ground.cell).astype(int), 0, np.array(ground.shape) - 1)
+
+
+def _number(ground: Ground, pose: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    place, (_, ny) = _place(ground, pose), ground.shape
+    heading = np.floor(pose[:, 2] / (2.0 * np.pi) * HEADINGS + 0.5).astype(int) % HEADINGS
+    return ((place[:, 0] * ny + place[:, 1]) * HEADINGS + heading) * 2 + (direction > 0.0)
+
+
+def _cell(ground: Ground, tree: Tree, moves: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    return _number(ground, tree.pose[nodes], moves[tree.arc[nodes], 0])
+
+
+def _path(tree: Tree, moves: np.ndarray, node: int) -> Path:
+    branch = np.array(tree.branch(node))
+    used = moves[tree.arc[branch[1:]]]
+    return Path(tree.pose[branch], used[:, 0], used[:, 1], used[:, 2])

@@ -1,0 +1,257 @@
+"""Plans: closed forms of their parts, and plans that are driven again and checked by other means."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from close import assert_close
+
+import stroller
+from stroller.planning.drive import drive_along
+from stroller.planning.inverse import Rates, actuation
+from stroller.planning.polygons import disc_distance, separation, signed_distance
+from stroller.planning.spline import evaluate, interpolate
+
+BODY = stroller.Stroller(mass=5.0, wheelbase=0.25, inertia=0.1, steering_inertia=0.005)
+SCENE = stroller.Scene(BODY, friction=stroller.Damping(2.0, 0.5, 0.1, 0.05))
+FOOTPRINT = stroller.Footprint(length=0.5, width=0.25, rear=0.1)
+LIMITS = stroller.Limits(steering=np.pi / 3.0, speed=(-0.5, 0.8))
+OPTIONS = {"limits": LIMITS, "footprint": FOOTPRINT, "progress": False}
+
+
+def room(x0, x1, y0, y1):
+    """Four walls."""
+    middle = ((x0 + x1) / 2.0, (y0 + y1) / 2.0)
+    along, across = x1 - x0 + 0.2, y1 - y0
+    lower, upper = [stroller.Box((middle[0], y), (along, 0.1)) for y in (y0 - 0.05, y1 + 0.05)]
+    return [lower, upper, *(stroller.Box((x, middle[1]), (0.1, across)) for x in (x0 - 0.05, x1 + 0.05))]
+
+
+#: Start, goal, obstacles and duration of problems that a straight line does not solve.
+GAP = [stroller.Box((1.1, 0.3), (0.5, 0.25)), stroller.Box((2.7, 0.3), (0.5, 0.25)), *room(0.0, 3.0, 0.0, 1.2)]
+CASES = {
+    "parallel parking": ((0.7, 0.8, 0.0), (1.9, 0.3, 0.0), GAP, 12.0),
+    "turn on the spot": ((1.1, 1.1, 0.0), (1.1, 1.1, np.pi), room(0.0, 2.2, 0.0, 2.2), 20.0),
+    "kinked corridor": (
+        (0.4, 0.4, 0.0),
+        (3.3, 2.4, 0.0),
+        [stroller.Box((1.2, 1.7), (2.4, 1.8)), stroller.Box((3.4, 0.75), (1.0, 1.5)), *room(0.0, 3.9, 0.0, 2.9)],
+        20.0,
+    ),
+    "trap": (
+        (2.0, 1.5, np.pi),
+        (4.0, 1.5, 0.0),
+        [stroller.Box((2.6, 1.5), (0.1, 1.6)), *(stroller.Box((2.0, y), (1.2, 0.1)) for y in (0.75, 2.25))],
+        25.0,
+    ),
+}
+
+
+def planned(name, **options):
+    start, goal, obstacles, t1 = CASES[name]
+    launch, target = stroller.Launch(start[:2], start[2], 0.0), stroller.Goal(goal[:2], goal[2])
+    return launch, target, stroller.plan(SCENE, launch, target, t1, obstacles=obstacles, **OPTIONS, **options)
+
+
+def depth_in(box, points):
+    """How deep points are inside a box, negative outside: in the box's own axes, without polygons."""
+    cosine, sine = np.cos(float(box.angle)), np.sin(float(box.angle))
+    away = points - np.array(box.centre, dtype=float)
+    own = np.stack([cosine * away[..., 0] + sine * away[..., 1], cosine * away[..., 1] - sine * away[..., 0]], axis=-1)
+    return np.min(np.array(box.size, dtype=float) / 2.0 - np.abs(own), axis=-1)
+
+
+def edge_of_footprint(run):
+    """Points all around the footprint at the times of a run."""
+    part = np.linspace(0.0, 1.0, 21)
+    x, y = -0.1 + 0.5 * part, -0.125 + 0.25 * part
+    around = [(x, 0 * x - 0.125), (x, 0 * x + 0.125), (0 * y - 0.1, y), (0 * y + 0.4, y)]
+    own = np.concatenate([np.stack(side, axis=-1) for side in around])
+    heading = np.asarray(run.heading)[:, None]
+    along, across = own[:, 0], own[:, 1]
+    turned = [along * np.cos(heading) - across * np.sin(heading), along * np.sin(heading) + across * np.cos(heading)]
+    return np.asarray(run.place)[:, None] + np.stack(turned, axis=-1)
+
+
+def assert_solves(plan, launch, goal, obstacles):
+    """Drive a plan again, and look at its end, its limits and every point of its edge."""
+    assert plan.reached, str(plan)
+    run = stroller.simulate(SCENE, launch, plan.t1, plan.input, times=np.linspace(0.0, plan.t1, 801), tolerance=1e-9)
+    assert np.hypot(*(run.place[-1] - np.array(goal.place))) < 0.05
+    assert abs(np.angle(np.exp(1j * (run.heading[-1] - goal.heading)))) < 0.05
+    assert abs(run.speed[-1]) < 0.05
+    assert np.max(np.abs(run.steering)) < np.pi / 3.0
+    assert -0.5 < np.min(run.speed) < np.max(run.speed) < 0.8
+    edge = edge_of_footprint(run)
+    assert max(depth_in(box, edge).max() for box in obstacles) < 0.0
+    assert plan.clearance > 0.0
+
+
+@pytest.mark.parametrize("name", ["parallel parking", "turn on the spot"])
+def test_a_plan_reaches_its_goal_without_touching_anything(name):
+    launch, goal, plan = planned(name)
+    assert_solves(plan, launch, goal, CASES[name][2])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["kinked corridor", "trap"])
+def test_a_plan_finds_the_way(name):
+    launch, goal, plan = planned(name)
+    assert_solves(plan, launch, goal, CASES[name][2])
+
+
+def test_another_problem_compiles_nothing(caplog):
+    planned("parallel parking")
+    with jax.log_compiles():
+        launch, goal = stroller.Launch((0.6, 0.8), 0.1, 0.0), stroller.Goal((1.9, 0.3), 0.0)
+        plan = stroller.plan(SCENE, launch, goal, 11.0, obstacles=GAP[:4], **OPTIONS)
+    assert plan.reached
+    compiled = [text for text in caplog.messages if "Finished XLA compilation" in text]
+    assert compiled == []
+
+
+def test_a_plan_shows_what_it_achieves(tmp_path):
+    _, _, plan = planned("parallel parking")
+    lines = str(plan).splitlines()
+    assert lines[0] == "Plan of 12 s: reaches the goal"
+    assert any(line.startswith("  speed      margin 0.") for line in lines)
+    figure = plan.plot()
+    assert [line.get_label() for line in figure.axes[1].lines] == ["speed [m/s]", "steering angle [rad]"]
+    page = plan.view(tmp_path / "plan.html")
+    assert (tmp_path / "plan.html").read_text() == page.html
+    assert all(f'"{name}"' in page.html for name in ("obstacles", "candidates", "footprint", "goal"))
+
+
+def test_what_is_out_of_reach_is_said():
+    """Ten metres in three seconds, at 0.8 m/s at most."""
+    launch, goal = stroller.Launch((0.0, 0.0), 0.0, 0.0), stroller.Goal((10.0, 0.0), 0.0)
+    plan = stroller.plan(SCENE, launch, goal, 3.0, obstacles=GAP[:1], starts=2, **OPTIONS)
+    assert not plan.reached
+    assert plan.hindrances
+    assert "does not reach the goal" in str(plan)
+    assert all(f"  hindrance  {words}" in str(plan) for words in plan.hindrances)
+
+
+def test_less_time_is_less():
+    launch, goal = stroller.Launch((0.0, 0.0), 0.0, 0.0), stroller.Goal((1.0, 0.0), 0.0)
+    plan = stroller.plan(SCENE, launch, goal, 10.0, obstacles=GAP[:1], minimise="time", **OPTIONS)
+    assert plan.reached
+    # 0.95 m, which is close enough, takes more than 1.18 s at 0.8 m/s.
+    assert 1.18 < plan.t1 < 4.0
+
+
+START, GOAL = stroller.Launch((0.7, 0.8), 0.0, 0.0), stroller.Goal((1.9, 0.3), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"goal": stroller.Goal((1.1, 0.3), 0.0)}, "goal: at place .* overlaps obstacles"),
+        ({"goal": stroller.Goal((1.1, 0.3))}, "goal: at place .* overlaps obstacles"),
+        ({"launch": stroller.Launch((0.7, 0.3), 0.0, 0.0)}, "launch: at place .* overlaps obstacles"),
+        ({"launch": stroller.Launch((0.7, 0.8), 0.0, 1.0)}, r"launch.speed = 1.0 must be at most 0.8 \(limits"),
+        ({"launch": stroller.Launch((0.7, 0.8), 0.0, 0.0, -1.2)}, "launch.steering = -1.2 must be at least"),
+        ({"goal": stroller.Goal((1.9, 0.3), 0.0, speed=-0.7)}, "goal.speed = -0.7 must be at least -0.5"),
+        ({"goal": START}, "goal = .* must be a Goal"),
+        ({"t1": 0.0}, "t1 = 0.0 must be greater than 0"),
+        ({"minimise": "energy"}, "minimise = 'energy' must be one of 'effort', 'time'"),
+        ({"starts": 0}, "starts = 0 must be a whole number"),
+        ({"obstacles": GAP[0]}, r"write obstacles=\[obstacle\]"),
+        ({"obstacles": [1.0]}, r"obstacles\[0\] = 1.0 must be a Box or a Disc"),
+        ({"limits": 1.0}, "limits = 1.0 must be a Limits"),
+    ],
+)
+def test_a_bad_problem_is_refused_before_anything_compiles(changed, message, caplog):
+    arguments = {"launch": START, "goal": GOAL, "t1": 12.0, "obstacles": GAP} | OPTIONS | changed
+    with jax.log_compiles(), pytest.raises(ValueError, match=message):
+        stroller.plan(SCENE, **arguments)
+    assert not [text for text in caplog.messages if "Finished XLA compilation" in text and "normal" in text]
+
+
+def test_obstacles_need_x_and_y():
+    with pytest.raises(ValueError, match="obstacles: a Spheroid names its places"):
+        stroller.plan(
+            stroller.presets.bowl(),
+            stroller.Launch((0.0, -1.0), 0.0, 0.0),
+            stroller.Goal((1.0, -1.0)),
+            5.0,
+            obstacles=GAP,
+        )
+
+
+def test_a_goal_is_on_the_ground():
+    with pytest.raises(ValueError, match="goal: distance"):
+        stroller.plan(
+            stroller.presets.bowl(), stroller.Launch((0.0, -1.0), 0.0, 0.0), stroller.Goal((0.0, 0.0, 1.0)), 5.0
+        )
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: stroller.Box((0.0, 0.0), (1.0, 0.0)), r"size\[1\] = 0.0 must be greater than 0"),
+        (lambda: stroller.Box(0.0, (1.0, 1.0)), "centre = 0.0 must be a pair of numbers"),
+        (lambda: stroller.Disc((0.0, 0.0), -1.0), "radius = -1.0 must be greater than 0"),
+        (lambda: stroller.Footprint(0.5, 0.2, 0.6), "rear = 0.6 must be at most 0.5"),
+        (lambda: stroller.Limits(speed=(0.5, -0.5)), r"speed\[1\] = -0.5 must be greater than 0.5"),
+        (lambda: stroller.Limits(speed="fast"), "speed = .* must be a bound"),
+        (lambda: stroller.Goal((0.0, 0.0), within=0.0), "within = 0.0 must be greater than 0"),
+        (lambda: stroller.Goal(1.0), "place = 1.0 must be a pair of numbers"),
+    ],
+)
+def test_bad_parts_are_refused(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()
+
+
+SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+DIAMOND = np.sqrt(2.0) * np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
+
+
+def test_distances_of_polygons_have_closed_forms():
+    """Face to face, corner to corner, corner to face, overlap; and the same for a disc."""
+    shifts = np.array([[3.0, 0.5], [4.0, 5.0], [1.5, 0.2]])
+    exact = signed_distance(SQUARE, SQUARE + shifts[:, None])
+    assert_close(exact, [1.0, np.hypot(2.0, 3.0), -0.5], atol=1e-9)
+    assert_close(signed_distance(SQUARE, DIAMOND + np.array([3.0, 0.3])), 2.0 - np.sqrt(2.0), atol=1e-9)
+    assert np.all(separation(SQUARE, SQUARE + shifts[:, None]) <= exact + 1e-12)
+    centres = np.array([[3.0, 0.0], [4.0, 5.0], [0.5, 0.0]])
+    assert_close(disc_distance(SQUARE, centres, 0.25), [1.75, 4.75, -0.75], atol=1e-8)
+
+
+def test_a_spline_passes_through_its_values():
+    values = np.sin(np.arange(9.0))
+    coefficients = jnp.asarray(interpolate(values))
+    parts = np.arange(9.0) / 8.0
+    assert_close(evaluate(coefficients, parts), values, atol=1e-12)
+    at, step = 0.37, 1e-5
+    slope = (evaluate(coefficients, at + step) - evaluate(coefficients, at - step)) / (2.0 * step) / 8.0
+    assert_close(evaluate(coefficients, at, 1), slope, rtol=1e-7)
+
+
+def test_inverse_dynamics_on_a_circle_is_the_balance_of_friction():
+    """At constant speed and angle the drive only replaces what the wheels and the yaw lose."""
+    phi, w = 0.4, 0.6
+    v, yaw = w * np.cos(phi), w * np.sin(phi) / 0.25
+    needed = actuation(SCENE.dynamics, jnp.array([0.3, 0.1, 1.0, 0.0]), Rates(phi, 0.0, 0.0, w, 0.0), False)
+    assert_close(needed.force, (2.0 * v**2 + 0.5 * w**2 + 0.1 * yaw**2) / v, rtol=1e-12)
+    assert_close(needed.torque, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("fork", [pytest.param("relative", marks=pytest.mark.slow), "absolute"])
+def test_a_drive_moves_as_planned(fork):
+    """Inside a spheroid, with a heavy fork: the run has the planned angle and speed, without help from the feedback."""
+    body = stroller.Stroller(mass=5.0, wheelbase=0.25, inertia=0.1, steering_inertia=0.02, steering_spring=0.03)
+    scene = stroller.Scene(body, stroller.Spheroid(6.0, 3.0), stroller.Damping(2.0), side="inside", fork=fork)
+    launch = stroller.Launch((0.0, -1.2), 0.3, 0.0)
+    position, east, north = scene.surface.chart(launch.place)
+    pose = jnp.stack([*position, *(jnp.cos(0.3) * a + jnp.sin(0.3) * b for a, b in zip(east, north, strict=True))])
+    knots = np.linspace(0.0, np.pi, 67)
+    angle, speed = 0.5 * np.sin(knots) ** 2, 0.8 * np.sin(knots) ** 2
+    angle[:3], speed[:3] = 0.0, 0.0
+    drive = drive_along(scene.dynamics, pose, angle, speed, 6.0)
+    run = stroller.simulate(scene, launch, 6.0, drive, times=np.linspace(0.0, 6.0, 13), tolerance=1e-9)
+    planned_angle, _, planned_speed, _, _ = drive.reference(run.t)
+    assert_close(run.steering, planned_angle, atol=2e-4)
+    assert_close(run.front_speed, planned_speed, atol=2e-4)
+    assert np.max(np.abs(run.energy_residual)) < 1e-6
