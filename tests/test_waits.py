@@ -47,7 +47,7 @@ CALLS = {
         "stroller.fit.identify",
         "_unknowns_of",
     ),
-    "any fit": (lambda: identify(None, DECAY, {"x": 1.0}), "nonholonomic.identification.identify", "draw_starts"),
+    "any fit": (lambda: identify(None, DECAY, {"x": 1.0}), "nonholonomic.identification.identify", "region_of"),
     "its end": (lambda: fitted(), "nonholonomic.identification.identify", "summarise"),
     "density": (lambda: LogDensity.__call__(stub("predict"), np.zeros(1)), None, None),
     "gradient": (

@@ -3,26 +3,28 @@
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import numpy as np
 
 from ..progress import status_line
 from ..validation import require, require_flag, require_whole, shown, warn
-from .levenberg_marquardt import Ends, minimise
-from .likelihood import Measurements, down_weighted, estimated_errors
-from .problem import Linearised, Problem, linearise
+from .exploration import ROWS, Explorer, Weighted
+from .likelihood import Measurements
+from .posterior import LogDensity
+from .problem import Problem, deviances
+from .refinement import Minima, refine
+from .region import region_of
 from .result import Identification, summarise
-from .unknown import as_free, draw_starts
+from .unknown import as_free
 from .verdict import FitWarning
-
-#: Unknown errors and parameters are estimated in turns, until no error changes by more than this fraction.
-ROUNDS, SETTLED = 10, 0.01
-
-#: The fractions of a recording that are fitted before the whole.
-PARTS = (0.1, 0.25, 0.5)
 
 #: Step of differences in the coordinates: 1 % of a positive parameter. Differences smooth over narrower structure.
 DIFFERENCE = 0.01
+
+#: Greatest number of steps by slopes before an exploration, where predictions may be a staircase.
+FEW_STEPS = 6
+
+#: Points of the exploration that are better than all minima by more than this in -2 log likelihood are refined, too.
+IMPROVED = 0.1
 
 
 def identify(
@@ -30,7 +32,7 @@ def identify(
     measurements: Measurements,
     free: dict[str, Any],
     *,
-    starts: int = 1,
+    starts: int = 16,
     spread: float = 2.0,
     seed: int = 0,
     max_steps: int = 60,
@@ -38,22 +40,28 @@ def identify(
     labels: tuple[str, ...] | None = None,
     progress: bool = True,
 ) -> Identification:
-    """Find the parameters of a model that make measurements most likely.
+    """Find the parameters of a model that make measurements most likely, and how far the measurements determine them.
 
-    Levenberg-Marquardt runs from every start at once, on the residuals of the data (`likelihood.py`) and of the priors.
-    It finds a local minimum near each start; the result is the best minimum and reports where the other starts ended.
+    The search has three steps, all in batches. It compares hundreds of quasi-random candidates in a region around the start
+    values (`region.py`), refines the best by Levenberg-Marquardt (`refinement.py`), and explores the likelihood around all
+    minima by adaptive importance sampling (`exploration.py`), until errors and intervals rest on at least 400 effective
+    draws. Slopes make the search fast; they do not enter errors and intervals unless the likelihood is that of a linear
+    model.
 
     **Arguments:**
 
     - `model`: function from parameters, name -> (rows,), to predictions (rows, n); `jax.vmap` converts a function of
-      one set of parameters. With exact `slopes`, JAX differentiates the model in forward mode.
+      one set of parameters. With exact `slopes`, JAX differentiates the model in forward mode. A row of NaN may give NaN.
     - `measurements`: `Measurements` of shape (n,).
     - `free`: name -> a `Free`, or only the start value.
-    - `starts`: number of start points: the start values, and others drawn around them.
-    - `spread`: range of the drawn points, as a factor greater than 1 in either direction; `seed`: seed of the draw.
-    - `max_steps`: a fit that needs more steps has not converged.
+    - `starts`: number of candidates that are refined.
+    - `spread`: how far from its start value an unknown with one bound is searched, as a factor greater than 1 in either
+      direction. Priors and two bounds take precedence. A number of a launch is searched within 10 %, and `t0` within 2 % of
+      the duration of the recording. Refinement and exploration may leave this region.
+    - `seed`: seed of candidates and draws.
+    - `max_steps`: a refinement that needs more steps has not converged.
     - `slopes`: "exact", by automatic differentiation; or "differences", central differences of 1 % in every parameter,
-      for a model whose derivative does not exist or is not smooth. Each step then takes 2 k + 1 runs for k parameters.
+      for a model whose derivative does not exist or is not smooth. Errors and intervals are the same.
     - `labels`: (n,), names of the measurements in the result.
     - `progress`: whether to show progress, on a terminal or in a notebook.
 
@@ -83,53 +91,38 @@ def identify(
         raise ValueError(f"labels must be {count}, one for each measurement, not {len(labels)}")
     problem = Problem(model, tuple(unknowns.items()), step)
     with status_line("fitting", progress):
-        start_points = draw_starts(unknowns, starts, spread, seed)
-        ends, at_ends = _fitted(problem, start_points, measurements, max_steps, progress)
-        for _ in range(ROUNDS if np.any(np.asarray(measurements.estimated)) else 0):
-            best = int(np.argmin(at_ends.deviance))
-            errors = estimated_errors(measurements, at_ends.prediction[best], len(unknowns))
-            change = np.max(np.abs(np.log(errors / np.asarray(measurements.error))))
-            measurements = measurements.with_errors(errors)
-            if change > SETTLED:
-                ends = minimise(problem, ends.coordinates, measurements, max_steps=max_steps, progress=progress)
-            at_ends = linearise(problem, ends.coordinates, measurements)
-            if change <= SETTLED:
-                break
-        if not np.any(np.isfinite(at_ends.prediction)):
+        region = region_of(unknowns, spread, float(np.max(np.asarray(measurements.time))))
+        explorer = Explorer.of(LogDensity.of(model, measurements, unknowns), measurements, region, seed)
+        pool = explorer.begin(seed)
+        if not np.any(np.isfinite(pool.predictions)):
             raise ValueError("model: no start led to finite predictions")
-        result = summarise(problem, measurements, labels, start_points, ends.coordinates, ends.converged, at_ends)
+        recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
+        steps = max_steps if recorded else min(max_steps, FEW_STEPS)
+        minima = refine(problem, pool.candidates(starts), measurements, steps, progress, in_parts=recorded)
+        if recorded:
+            around = refine(problem, minima.between(), minima.measurements, steps, progress, in_parts=False)
+            minima = minima.joined(around)
+        # Along a direction without any slope, the likelihood has no end that an exploration could find.
+        has_end = bool(np.all(np.isfinite(minima.covariance(minima.best))))
+        sample = explorer.explore(pool, minima.components, progress) if has_end else Weighted.of(pool)
+        minima = _improved(problem, minima, sample, max_steps, progress)
+        result = summarise(problem, labels, minima, explorer, sample)
     if not result.verdict.good:
         warn("; ".join(result.verdict.concerns), FitWarning)
     return result
 
 
-def _fitted(
-    problem: Problem, start_points: Any, measurements: Measurements, max_steps: int, progress: bool
-) -> tuple[Ends, Linearised]:
-    """The ends of the fits. Recordings are also fitted in stages, to longer and longer parts; the better of the two
-    ends counts.
-
-    Predicted late samples can be wrong by whole turns, and would then lead to another minimum.
-    """
-    ends = minimise(problem, start_points, measurements, max_steps=max_steps, progress=progress)
-    at_ends = linearise(problem, ends.coordinates, measurements)
-    duration = float(np.max(np.asarray(measurements.time)))
-    if not duration > 0.0:
-        return ends, at_ends
-    coordinates = start_points
-    for part in PARTS:
-        early_measurements = down_weighted(measurements, part * duration)
-        coordinates = minimise(
-            problem, coordinates, early_measurements, max_steps=max_steps, progress=progress
-        ).coordinates
-    ends_by_parts = minimise(problem, coordinates, measurements, max_steps=max_steps, progress=progress)
-    by_parts = linearise(problem, ends_by_parts.coordinates, measurements)
-    improves = by_parts.deviance < at_ends.deviance
-
-    def chosen(new: Any, old: Any) -> Any:
-        return np.where(improves.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
-
-    return jax.tree.map(chosen, ends_by_parts, ends), jax.tree.map(chosen, by_parts, at_ends)
+def _improved(problem: Problem, minima: Minima, sample: Weighted, max_steps: int, progress: bool) -> Minima:
+    """The minima, refined to the end; from the best points of the exploration if these are better."""
+    rows = len(minima.starts)
+    best = sample.pool.points[np.argsort(-sample.pool.log_density)[:rows]]
+    if np.min(deviances(problem, best, minima.measurements)) < np.min(minima.deviance) - IMPROVED:
+        later = refine(problem, best, minima.measurements, min(max_steps, FEW_STEPS), progress, in_parts=False)
+        return later if np.min(later.deviance) < np.min(minima.deviance) else minima
+    if minima.converged[minima.best]:
+        return minima
+    later = refine(problem, minima.coordinates, minima.measurements, max_steps, progress, in_parts=False)
+    return later._replace(starts=minima.starts)
 
 
 def check_search(starts: Any, spread: Any, seed: Any, max_steps: Any, progress: Any) -> None:
@@ -137,6 +130,8 @@ def check_search(starts: Any, spread: Any, seed: Any, max_steps: Any, progress: 
     data."""
     for name, value, lower in (("starts", starts, 1), ("seed", seed, 0), ("max_steps", max_steps, 1)):
         require_whole(value, name, lower)
+    if starts > ROWS:
+        raise ValueError(f"starts = {starts} must be at most {ROWS}, the number of candidates")
     require(spread, "spread", above=1.0)
     require_flag(progress, "progress")
 

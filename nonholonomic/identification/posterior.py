@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..progress import status_line
 from ..validation import require, shown
 from .likelihood import Measurements
-from .problem import Problem
+from .problem import Problem, predictions
 from .unknown import as_free, as_gaussian
 
 #: The log density of a parameter: (mean, standard deviation) of a Gaussian, or a function of the parameter.
@@ -133,6 +133,20 @@ class LogDensity(eqx.Module):
         """The model's predictions for all measurements, at several sets of coordinates."""
         return self.problem.predict(coordinates[:, : len(self.problem.names)])
 
+    def predictions(self, coordinates: Float[np.ndarray, "rows unknowns"]) -> Float[np.ndarray, "rows n"]:
+        """The predictions of the model as NumPy arrays, also of a model that cannot be traced; NaN for NaN.
+
+        **Raises:** `ValueError` if the model does not return one prediction per measurement.
+        """
+        prediction, shape = predictions(self.problem, coordinates), (len(coordinates), self.measurements.value.size)
+        if prediction.shape != shape:
+            raise ValueError(f"model must predict {shape} for {shape[0]} sets, not {prediction.shape}")
+        return prediction
+
+    def log_priors(self, coordinates: Float[np.ndarray, "rows unknowns"]) -> Float[np.ndarray, " rows"]:
+        """The log density of the priors in the coordinates, in every row."""
+        return np.asarray(_log_priors(self, coordinates))
+
     @status_line("simulating")
     def replicate(self, coordinates: Float[Array, "rows unknowns"], seed: int = 0) -> Float[np.ndarray, "rows n"]:
         """New measurements drawn from the predictions and their errors; limits are replaced by values."""
@@ -176,12 +190,20 @@ class LogDensity(eqx.Module):
                 value, slope = jax.value_and_grad(unknown.value)(coordinates[k])
                 log_density: Any = prior(value) if callable(prior) else _normal(value, *prior)
                 total += log_density + jnp.log(jnp.abs(slope))
+            elif unknown.has_lower and unknown.has_upper:
+                # Uniform between two bounds; in the coordinate, the prior would have no finite integral.
+                total += jnp.log(jnp.abs(jax.grad(unknown.value)(coordinates[k])))
         return total
 
 
 @eqx.filter_jit
 def _predicted(density: LogDensity, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
     return density.predict(coordinates)
+
+
+@eqx.filter_jit
+def _log_priors(density: LogDensity, coordinates: Float[Array | np.ndarray, "rows unknowns"]) -> Float[Array, " rows"]:
+    return jax.vmap(density._log_prior)(coordinates)
 
 
 @eqx.filter_jit

@@ -41,8 +41,14 @@ class Problem(eqx.Module):
         return tuple(zip(self.names, self.unknowns, strict=True))
 
     def values(self, coordinates: Float[Array, "... unknowns"]) -> Float[Array, "... unknowns"]:
-        """The parameters at given coordinates."""
-        return jnp.stack([unknown.value(coordinates[..., k]) for k, unknown in enumerate(self.unknowns)], axis=-1)
+        """The parameters at given coordinates, a NumPy array for a NumPy array."""
+        stack: Any = np.stack if isinstance(coordinates, np.ndarray) else jnp.stack
+        return stack([unknown.value(coordinates[..., k]) for k, unknown in enumerate(self.unknowns)], axis=-1)
+
+    def slopes(self, coordinates: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, " unknowns"]:
+        """The slopes of the parameters with respect to their coordinates."""
+        pairs = zip(coordinates, self.unknowns, strict=True)
+        return np.array([float(jax.grad(unknown.value)(coordinate)) for coordinate, unknown in pairs])
 
     def predict(self, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
         """The model's predictions in every row."""
@@ -139,6 +145,12 @@ def predictions_and_slopes(problem: Problem, coordinates: Rows, mask: Any = None
     return _differences(problem, problem.step, points)
 
 
+def predictions(problem: Problem, coordinates: Rows) -> np.ndarray:
+    """Predictions without slopes, for every row of coordinates; rows of NaN take no time."""
+    predict = Problem.predict if getattr(problem.model, "on_host", False) else _predicted
+    return np.asarray(predict(problem, jnp.asarray(coordinates)))
+
+
 def linearise(problem: Problem, coordinates: Any, measurements: Measurements, mask: Any = None) -> Linearised:
     """Predictions, residuals and their slopes.
 
@@ -156,14 +168,21 @@ def linearise(problem: Problem, coordinates: Any, measurements: Measurements, ma
     shape = (len(coordinates), measurements.value.shape[-1])
     if prediction.shape != shape:
         raise ValueError(f"model must predict {shape} for {shape[0]} sets, not {prediction.shape}")
-    residual, by_prediction, root = _compared(measurements, prediction)
+    residual, by_prediction, root = compared(measurements, prediction)
     prior, by_coordinate = map(np.asarray, _priors(problem.unknowns, jnp.asarray(coordinates, float)))
     return Linearised(
         prediction, residual, by_prediction[..., None] * slopes, root[..., None] * slopes, prior, by_coordinate
     )
 
 
-def _compared(measurements: Measurements, prediction: Float[np.ndarray, "rows n"]) -> list[np.ndarray]:
+def deviances(problem: Problem, coordinates: Rows, measurements: Measurements) -> Float[np.ndarray, " rows"]:
+    """-2 log posterior in every row, up to a constant, without slopes."""
+    residual = compared(measurements, predictions(problem, coordinates))[0]
+    prior = np.asarray(_priors(problem.unknowns, jnp.asarray(coordinates, float))[0])
+    return np.sum(residual**2, axis=1) + np.sum(prior**2, axis=1)
+
+
+def compared(measurements: Measurements, prediction: Float[np.ndarray, "rows n"]) -> list[np.ndarray]:
     """Residuals, their slopes with respect to the predictions, and the roots of the expected information.
 
     All are element by element. One padded list of numbers lets one program serve fits of many sizes.

@@ -3,8 +3,6 @@
 import dataclasses
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -12,58 +10,19 @@ from ..parameters import full_name, text_as_html
 from ..progress import status_line
 from ..validation import require_package, shown
 from ..views import draw_fit
-from .levenberg_marquardt import minimise
+from .distribution import Distribution
+from .exploration import Explorer, Weighted
+from .identifiability import Identifiability, identifiability
+from .identifiability import coordinate_covariance as coordinate_covariance
 from .likelihood import Measurements
-from .problem import Linearised, Problem, linearise
-from .verdict import CLOSE, RIVAL, SAME, Verdict, judge
+from .problem import Problem
+from .profile import Profile, profiled
+from .refinement import Minima
+from .shape import Minimum, minima_of, remarks
+from .verdict import CLOSE, SAME, Evidence, Verdict, judge
 
-#: Singular values below this fraction of the largest belong to directions that the data do not determine at all.
-NO_SLOPE = 1e-7
-
-#: A combination of parameters counts as undetermined if its relative error exceeds this.
-UNSEEN = 1.0
-
-#: Greatest number of rows of the residual table in a summary, and least share of a parameter that a combination lists.
-MOST_ROWS, LEAST_SHARE = 24, 0.02
-
-
-class Profile(NamedTuple):
-    """The profile likelihood of one parameter.
-
-    - `values`: (points,), the values at which the parameter was held.
-    - `deviance`: (points,), -2 log likelihood above its minimum, with all other parameters fitted again.
-    - `estimates`: name -> (points,), estimates of the other parameters.
-    - `converged`: (points,), whether these fits converged.
-    """
-
-    values: Float[np.ndarray, " points"]
-    deviance: Float[np.ndarray, " points"]
-    estimates: dict[str, Float[np.ndarray, " points"]]
-    converged: np.ndarray
-
-
-class Identifiability(NamedTuple):
-    """The combinations of parameters that the data determine, and those that they do not determine, to first order and
-    without priors.
-
-    They come from the singular values of the slopes of the residuals with respect to relative changes: changes of the
-    logarithm for a parameter that cannot be negative, otherwise changes in units of `Free.unit`.
-
-    - `singular_values`: (unknowns,), decreasing; the inverse of a value is the relative error of its combination of
-      parameters.
-    - `directions`: (unknowns, unknowns), the combinations, one per row.
-    - `words`: the combinations as text: which parameters change together, and by how much.
-    """
-
-    singular_values: Float[np.ndarray, " unknowns"]
-    directions: Float[np.ndarray, "unknowns unknowns"]
-    words: tuple[str, ...]
-
-    @property
-    def unseen(self) -> tuple[str, ...]:
-        """The combinations whose errors exceed their own size."""
-        least = max(1.0 / UNSEEN, NO_SLOPE * self.singular_values[0])
-        return tuple(word for value, word in zip(self.singular_values, self.words, strict=True) if value < least)
+#: Greatest number of rows of the residual table in a summary.
+MOST_ROWS = 24
 
 
 class ResidualRow(NamedTuple):
@@ -97,16 +56,23 @@ class ResidualRow(NamedTuple):
 class Identification:
     """Parameters identified from measurements.
 
-    - `estimates`, `standard_errors`: name -> number. The errors come from the Gauss-Newton matrix of data and priors;
-      they are infinite for a parameter that takes part in an undetermined direction.
+    - `estimates`, `standard_errors`: name -> number. The errors are standard deviations over the likelihood times the
+      priors, by importance sampling; they are infinite for a parameter that takes part in an undetermined direction, and
+      NaN if the exploration of the likelihood ended early. The estimate is the most likely point; where the likelihood is
+      not that of a linear model, it is a likely point near the mean.
     - `covariance`: (unknowns, unknowns), in the order of `estimates`. Parameters with infinite error have covariance 0.
-    - `deviance`: -2 log likelihood of data and priors at the estimate, up to a constant: the sum of squared residuals.
+    - `most_likely`, `slope_errors`: name -> number, the point of the greatest likelihood, and the errors by the slopes of the
+      predictions there (Gauss-Newton). These errors are wrong where predictions are a staircase.
+    - `deviance`: -2 log likelihood of data and priors at the most likely point, up to a constant: the sum of squared
+      residuals.
     - `degrees`: measurements and priors less unknowns.
     - `identifiability`: an `Identifiability`; `residuals`: a `ResidualRow` for every measurement.
-    - `status`: "converged" or why not; `starts`, `ends`: name -> (starts,), where each fit began and ended;
+    - `status`: "converged" or why not; `starts`, `ends`: name -> (starts,), where the refinement of each candidate began and
+      ended;
       `end_deviances`: (starts,); `statuses`: "converged", "not_converged" or "failed" for each start.
     - `verdict`: a `Verdict`, whether the fit can be believed.
     - `coordinates`, `coordinate_covariance`: estimates and covariance in the coordinates of the fit.
+    - `distribution`: the `Distribution` of the coordinates, with its weighted points.
 
     **Example:** the fit of the subpackage's example.
 
@@ -117,6 +83,8 @@ class Identification:
     estimates: dict[str, float]
     standard_errors: dict[str, float]
     covariance: Float[np.ndarray, "unknowns unknowns"]
+    most_likely: dict[str, float]
+    slope_errors: dict[str, float]
     deviance: float
     degrees: int
     identifiability: Identifiability
@@ -129,27 +97,33 @@ class Identification:
     verdict: Verdict
     coordinates: Float[np.ndarray, " unknowns"]
     coordinate_covariance: Float[np.ndarray, "unknowns unknowns"]
+    distribution: Distribution = dataclasses.field(repr=False)
     problem: Problem = dataclasses.field(repr=False)
     measurements: Measurements = dataclasses.field(repr=False)
+    explorer: Explorer = dataclasses.field(repr=False)
 
     def interval(self, name: str, deviations: float = 1.96) -> tuple[float, float]:
-        """The confidence interval of a parameter, symmetric in its coordinate and so within its bounds.
+        """The central interval of a parameter: the likelihood, times the priors, leaves equal probabilities below and
+        above it.
 
         **Arguments:** `name`: name of the parameter, or the end of its name; `deviations`: half the width in standard
-        errors, 1.96 for 95 %.
+        errors of a normal distribution with the same probability, 1.96 for 95 %, 1 for 68 %.
+
+        **Returns:** the two ends; NaN if the exploration of the likelihood ended early, as the verdict then says.
 
         **Raises:** `ValueError` for a name that was not free.
         """
         k = self._place(name)
-        free = self.problem.unknowns[k]
-        reach = deviations * np.sqrt(self.coordinate_covariance[k, k])
         with np.errstate(over="ignore"):
-            low, high = (float(free.value(np.asarray(self.coordinates[k] + side * reach))) for side in (-1.0, 1.0))
-        return low, high
+            ends = self.problem.unknowns[k].value(np.array(self.distribution.interval(k, deviations)))
+        return float(ends[0]), float(ends[1])
 
     @status_line("fitting again")
     def profile(self, name: str, values: Any = None) -> Profile:
-        """The profile likelihood of a parameter: all others are fitted again, for all its values at once.
+        """The profile likelihood of a parameter: the best likelihood with all other parameters free, for each of its
+        values.
+
+        Batches of runs look for the best other parameters, and least squares refine them where the model has slopes.
 
         **Arguments:**
 
@@ -158,28 +132,24 @@ class Identification:
 
         **Returns:** a `Profile`.
 
-        **Raises:** `ValueError` for a name that was not free, and for a parameter with an infinite error if `values` is
+        **Raises:** `ValueError` for a name that was not free, and for a parameter without a finite error if `values` is
         missing.
         """
         k = self._place(name)
         free = self.problem.unknowns[k]
         if values is None:
-            if not np.isfinite(self.standard_errors[self.problem.names[k]]):
-                raise ValueError(f"values must be given for {name!r}, whose standard error is infinite")
+            error = self.standard_errors[self.problem.names[k]]
+            if not np.isfinite(error):
+                word = "infinite" if np.isinf(error) else "unknown"
+                raise ValueError(f"values must be given for {name!r}, whose standard error is {word}")
             reach = 3.0 * np.sqrt(self.coordinate_covariance[k, k])
-            values = np.asarray(free.value(jnp.asarray(self.coordinates[k] + np.linspace(-reach, reach, 13))))
+            values = np.asarray(free.value(self.coordinates[k] + np.linspace(-reach, reach, 13)))
         values = np.atleast_1d(np.asarray(values, float))
         if not np.all((values > free.lower) & (values < free.upper)):
             raise ValueError(
                 f"values = {shown(values)} must lie within the bounds ({free.lower}, {free.upper}) of {name!r}"
             )
-        starts = np.tile(self.coordinates, (len(values), 1))
-        starts[:, k] = np.asarray(free.coordinate(values))
-        ends = minimise(self.problem, starts, self.measurements, fixed=k)
-        optima = np.asarray(self.problem.values(jnp.asarray(ends.coordinates)))
-        deviance = deviance_of(self.problem, ends.coordinates, self.measurements) - self.deviance
-        others = {other: optima[:, i] for i, other in enumerate(self.problem.names) if i != k}
-        return Profile(values, deviance, others, ends.converged)
+        return profiled(self, k, values)
 
     @property
     def correlation(self) -> Float[np.ndarray, "unknowns unknowns"]:
@@ -234,129 +204,85 @@ class Identification:
         return "\n".join(lines)
 
 
-def deviance_of(problem: Problem, coordinates: Any, measurements: Measurements) -> Float[np.ndarray, " rows"]:
-    """-2 log likelihood of every row; infinite instead of NaN."""
-    deviance = linearise(problem, coordinates, measurements).deviance
-    return np.where(np.isfinite(deviance), deviance, np.inf)
-
-
-def coordinate_covariance(jacobian: Float[np.ndarray, "residuals unknowns"]) -> Float[np.ndarray, "unknowns unknowns"]:
-    """The inverse of the Gauss-Newton matrix J^T J; infinite for unknowns that take part in an undetermined direction.
-
-    To find these directions, every unknown is measured in units of its own error with the other unknowns held fixed.
-    """
-    norms = np.linalg.norm(jacobian, axis=0)
-    norms = np.where(norms > 0.0, norms, 1.0)
-    values, directions = _singular(jacobian / norms)
-    seen = values > NO_SLOPE * max(values[0], 1e-300)
-    covariance = (directions[seen].T / values[seen] ** 2) @ directions[seen] / np.outer(norms, norms)
-    is_undetermined = np.any(np.abs(directions[~seen]) > 1e-6, axis=0)
-    covariance[is_undetermined, :] = covariance[:, is_undetermined] = 0.0
-    covariance[is_undetermined, is_undetermined] = np.inf
-    return covariance
-
-
-def _singular(slopes: Float[np.ndarray, "n unknowns"]) -> tuple[np.ndarray, np.ndarray]:
-    """Singular values and right singular vectors (one per row), as many as there are unknowns."""
-    unknowns = slopes.shape[1]
-    _, values, directions = np.linalg.svd(slopes, full_matrices=len(slopes) < unknowns)
-    return np.concatenate([values, np.zeros(unknowns - len(values))]), directions
-
-
-def identifiability(problem: Problem, estimates: Any, slopes: Any, jacobian: Any) -> Identifiability:
-    """Singular values of the slopes of the residuals with respect to relative changes of the parameters, with their
-    directions as text.
-
-    **Arguments:** `estimates`: (unknowns,); `slopes`: (unknowns,), of the parameters with respect to their coordinates;
-    `jacobian`: (n, unknowns), of the residuals with respect to the coordinates.
-    """
-    units = np.array(
-        [abs(x) if unknown.positive else unknown.unit for x, unknown in zip(estimates, problem.unknowns, strict=True)]
-    )
-    relative = np.asarray(jacobian) * units / np.where(slopes == 0.0, 1.0, slopes)
-    values, directions = _singular(relative)
-    words = tuple(_in_words(problem, direction) for direction in directions)
-    return Identifiability(values, directions, words)
-
-
-def _in_words(problem: Problem, direction: Float[np.ndarray, " unknowns"]) -> str:
-    """The parameters that change together: in per cent if a parameter cannot be negative, otherwise in hundredths of
-    its unit."""
-    largest = np.argmax(np.abs(direction))
-    parts = []
-    for share, (name, free) in zip(direction / direction[largest], problem.free, strict=True):
-        if abs(share) >= LEAST_SHARE:
-            parts.append(f"{name} {share:+.2g} %" if free.positive else f"{name} {0.01 * share * free.unit:+.2g}")
-    return ", ".join(parts)
-
-
 def summarise(
-    problem: Problem,
-    measurements: Measurements,
-    labels: tuple[str, ...],
-    starts: Float[np.ndarray, "starts unknowns"],
-    ends: Float[np.ndarray, "starts unknowns"],
-    converged: np.ndarray,
-    at_ends: Linearised,
+    problem: Problem, labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample: Weighted
 ) -> Identification:
-    """The result of fits from several starts: the best fit, with a record of the other fits."""
-    valid = np.any(np.isfinite(at_ends.prediction), axis=1) & np.all(np.isfinite(ends), axis=1)
-    deviances = np.where(valid & np.isfinite(at_ends.deviance), at_ends.deviance, np.inf)
+    """The result of a search and an exploration: the best fit, errors and intervals, and a record of all ends."""
+    names, best, measurements = problem.names, ends.best, ends.measurements
+    deviances, linearised = ends.deviance, ends.linearised
     statuses = tuple(
         "failed" if np.isinf(deviance) else "converged" if has_converged else "not_converged"
-        for deviance, has_converged in zip(deviances, converged, strict=True)
+        for deviance, has_converged in zip(deviances, ends.converged, strict=True)
     )
-    best = int(np.argmin(deviances))
-    optimum, names = ends[best], problem.names
-    values = np.asarray(problem.values(jnp.asarray(ends)))
-    slopes = np.array(
-        [
-            float(jax.grad(unknown.value)(coordinate))
-            for coordinate, unknown in zip(optimum, problem.unknowns, strict=True)
-        ]
+    optimum, by_slopes = ends.coordinates[best], ends.covariance(best)
+    distribution = Distribution.of(optimum, by_slopes, sample)
+    values, start_values, likely, estimates = (
+        np.asarray(problem.values(np.asarray(points)))
+        for points in (ends.coordinates, ends.starts, optimum, distribution.estimate)
     )
-    covariance = coordinate_covariance(at_ends.whole_information[best])
-    with np.errstate(invalid="ignore"):
-        by_value = np.where(covariance == 0.0, 0.0, covariance * np.outer(slopes, slopes))
-    start_values = np.asarray(problem.values(jnp.asarray(starts)))
+    slopes = problem.slopes(optimum)
+    covariance = distribution.covariance_of_values(problem, slopes)
     numbers = (
         measurements.value,
         measurements.error,
-        at_ends.prediction[best],
-        at_ends.residual[best],
+        linearised.prediction[best],
+        linearised.residual[best],
         measurements.upper,
     )
     table = zip(labels, *(np.asarray(part).tolist() for part in numbers), strict=True)
-    combinations = identifiability(problem, values[best], slopes, at_ends.information[best])
-    priors, limits = at_ends.prior.shape[-1], int(np.sum(np.asarray(measurements.censored)))
+    combinations = identifiability(problem, likely, slopes, linearised.information[best])
+    priors, limits = linearised.prior.shape[-1], int(np.sum(np.asarray(measurements.censored)))
     degrees = len(labels) + priors - len(names)
+    # Where the weights hold, a search by slopes that got stuck on a stair does not matter.
+    status = "converged" if distribution.kind == "weights" else statuses[best]
+    evidence = Evidence(
+        status,
+        agreement(ends.coordinates, deviances, by_slopes, best),
+        len(deviances),
+        combinations.unseen,
+        distribution.kind != "none",
+        sample.effective,
+        sample.k,
+        *_shape(explorer, sample, distribution, by_slopes),
+    )
+    with np.errstate(invalid="ignore"):
+        slope_covariance = np.where(by_slopes == 0.0, 0.0, by_slopes * np.outer(slopes, slopes))
+
+    def by_name(numbers: np.ndarray) -> dict[str, Any]:
+        return dict(zip(names, numbers.tolist() if numbers.ndim == 1 else numbers, strict=True))
+
     return Identification(
-        estimates=dict(zip(names, values[best].tolist(), strict=True)),
-        standard_errors=dict(zip(names, np.sqrt(np.diag(by_value)).tolist(), strict=True)),
-        covariance=by_value,
+        estimates=by_name(estimates),
+        standard_errors=by_name(np.sqrt(np.diag(covariance))),
+        covariance=covariance,
+        most_likely=by_name(likely),
+        slope_errors=by_name(np.sqrt(np.diag(slope_covariance))),
         deviance=float(deviances[best]),
         degrees=degrees,
         identifiability=combinations,
         residuals=tuple(ResidualRow(*row) for row in table),
-        status=statuses[best],
-        starts=dict(zip(names, start_values.T, strict=True)),
-        ends=dict(zip(names, values.T, strict=True)),
+        status=status,
+        starts=by_name(start_values.T),
+        ends=by_name(values.T),
         end_deviances=deviances,
         statuses=statuses,
-        verdict=judge(
-            measurements,
-            at_ends.prediction[best],
-            at_ends.residual[best],
-            degrees - limits,
-            agreement(ends, deviances, covariance, best),
-            combinations.unseen,
-            statuses[best],
-        ),
-        coordinates=optimum,
-        coordinate_covariance=covariance,
+        verdict=judge(measurements, linearised.prediction[best], linearised.residual[best], degrees - limits, evidence),
+        coordinates=distribution.estimate,
+        coordinate_covariance=distribution.covariance,
+        distribution=distribution,
         problem=problem,
         measurements=measurements,
+        explorer=explorer,
     )
+
+
+def _shape(
+    explorer: Explorer, sample: Weighted, distribution: Distribution, by_slopes: np.ndarray
+) -> tuple[tuple[Minimum, ...], tuple[str, ...], tuple[str, ...]]:
+    """The minima that the data allow, and concerns and notes about the shape of the likelihood."""
+    if distribution.kind == "weights":
+        return minima_of(explorer, sample), *remarks(explorer, sample, distribution, by_slopes)
+    return (), (), ()
 
 
 def agreement(
@@ -364,9 +290,8 @@ def agreement(
     deviances: Float[np.ndarray, " starts"],
     covariance: Float[np.ndarray, "unknowns unknowns"],
     best: int,
-) -> tuple[int, int, int]:
-    """Three numbers of starts: those that ended at the best minimum, those that ended elsewhere with nearly the same
-    likelihood, and all."""
+) -> int:
+    """The number of ends that are at the best minimum."""
     errors = np.sqrt(np.diag(covariance))
     with np.errstate(invalid="ignore"):
         distances = np.abs(ends - ends[best]) / errors
@@ -374,5 +299,4 @@ def agreement(
     is_close = np.all(np.where(np.isfinite(errors), distances, 0.0) < CLOSE, axis=1) | (
         deviances < deviances[best] + SAME
     )
-    agree = is_close & (deviances < deviances[best] + 1.0)
-    return int(np.sum(agree)), int(np.sum(~agree & (deviances < deviances[best] + RIVAL))), len(ends)
+    return int(np.sum(is_close & (deviances < deviances[best] + 1.0)))

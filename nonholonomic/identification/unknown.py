@@ -4,7 +4,6 @@ import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -100,13 +99,15 @@ class Unknown(eqx.Module):
         return bool(self.lower >= 0.0)
 
     def value(self, coordinate: Float[Array | np.ndarray, "..."]) -> Any:
-        """The parameter at a coordinate."""
+        """The parameter at a coordinate; in NumPy for a NumPy array, because JAX would compile for every shape."""
+        xp: Any = np if isinstance(coordinate, np.ndarray) and isinstance(self.lower, np.ndarray) else jnp
         if self.has_lower and self.has_upper:
-            return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(coordinate)
+            # 1 / (1 + exp(-x)) without an overflow.
+            return self.lower + (self.upper - self.lower) * 0.5 * (1.0 + xp.tanh(0.5 * coordinate))
         if self.has_lower:
-            return self.lower + jnp.exp(coordinate)
+            return self.lower + xp.exp(coordinate)
         if self.has_upper:
-            return self.upper - jnp.exp(-coordinate)
+            return self.upper - xp.exp(-coordinate)
         return self.start + self.unit * coordinate
 
     def coordinate(self, value: Any) -> Float[Array, "..."]:
@@ -158,21 +159,3 @@ def as_free(free: Any, lower: dict[str, float] | None = None) -> dict[str, Free]
             start=float(unknown.start), lower=float(unknown.lower), upper=float(unknown.upper), prior=prior
         )
     return unknowns
-
-
-def draw_starts(free: dict[str, Free], count: int, spread: float, seed: int) -> Float[np.ndarray, "count unknowns"]:
-    """Coordinates of several starts: first the start values, then others around them.
-
-    A parameter fitted in its logarithm is drawn uniformly in the logarithm, up to a factor `spread` in either
-    direction; any other parameter is drawn from an interval whose half width is the change of its start by that factor.
-    """
-    centre = np.array([float(unknown.coordinate(unknown.start)) for unknown in free.values()])
-    reach = np.array(
-        [
-            math.log(spread) if math.isfinite(unknown.lower) or math.isfinite(unknown.upper) else spread - 1.0
-            for unknown in free.values()
-        ]
-    )
-    coordinates = centre + reach * np.random.default_rng(seed).uniform(-1.0, 1.0, (count, len(free)))
-    coordinates[0] = centre
-    return coordinates

@@ -1,7 +1,7 @@
-"""Judge a fit: the size and order of its residuals, the agreement of its starts, and the undetermined combinations."""
+"""Judge a fit: the size and order of its residuals, the minima that the data allow, and the undetermined combinations."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -18,11 +18,10 @@ FAR = 4.0
 #: sign.
 NEGLIGIBLE = 1e-3
 
-#: Ends whose -2 log likelihoods differ by less than this are the same minimum. An end within `RIVAL` of the best
-#: explains the data nearly as well, like a parameter that is two standard errors off.
-SAME, RIVAL = 0.1, 4.0
+#: Ends whose -2 log likelihoods differ by less than this are the same minimum.
+SAME = 0.1
 
-#: Starts agree on a minimum if all their parameters agree to this many standard errors.
+#: Ends agree on a minimum if all their parameters agree to this many standard errors.
 CLOSE = 0.5
 
 
@@ -56,9 +55,13 @@ class Verdict(NamedTuple):
     - `p_value`: probability of residuals this large or larger if the model and the errors are right (chi squared of the
       measurements that are not limits); NaN if errors were estimated or no degree of freedom is left.
     - `series`: a `Series` for each series of measurements.
-    - `agree`, `starts`: number of starts that reached the same minimum, and number of all starts.
+    - `agree`, `starts`: number of refined candidates that reached the best minimum, and number of all.
     - `undetermined`: the parameters that the data do not determine, in words.
     - `concerns`: the concerns, in words; empty for a flawless fit.
+    - `notes`: what is special about the likelihood, in words; errors and intervals take account of it.
+    - `effective`, `k`: effective number of draws behind errors and intervals, and the shape of the tail of their weights
+      (Pareto k-hat): below 0.7, they can be trusted.
+    - `minima`: the minima that the data allow, as `Minimum`, the most probable first.
     """
 
     p_value: float
@@ -67,6 +70,10 @@ class Verdict(NamedTuple):
     starts: int
     undetermined: tuple[str, ...]
     concerns: tuple[str, ...]
+    notes: tuple[str, ...]
+    effective: float
+    k: float
+    minima: tuple[Any, ...]
 
     @property
     def good(self) -> bool:
@@ -83,7 +90,30 @@ class Verdict(NamedTuple):
             f"{series.runs} runs of {series.count} signs (p = {series.p_value:.2g})" for series in self.series
         )
         lines = [f"  {scatter}", f"  {signs}" if signs else "", f"  {self.agree} of {self.starts} starts agree"]
+        lines.append(f"  errors from {self.effective:.0f} effective draws (k-hat {self.k:.2f})")
+        lines += [f"  note: {note}" for note in self.notes]
         return "\n".join([*filter(None, lines), *(f"  BUT {concern}" for concern in self.concerns)])
+
+
+class Evidence(NamedTuple):
+    """What the exploration of the likelihood tells about a fit.
+
+    - `status`: status of the fit; `agree`, `starts`: as for `Verdict`; `undetermined`: combinations of parameters, in
+      words.
+    - `trusted`: whether the weights can be trusted; `effective`, `k`, `minima`: as for `Verdict`.
+    - `concerns`, `notes`: remarks on the shape of the likelihood.
+    """
+
+    status: str
+    agree: int
+    starts: int
+    undetermined: tuple[str, ...]
+    trusted: bool
+    effective: float
+    k: float
+    minima: tuple[Any, ...]
+    concerns: tuple[str, ...]
+    notes: tuple[str, ...]
 
 
 def judge(
@@ -91,9 +121,7 @@ def judge(
     prediction: Float[np.ndarray, " n"],
     residual: Float[np.ndarray, " n"],
     degrees: int,
-    agreement: tuple[int, int, int],
-    undetermined: tuple[str, ...],
-    status: str,
+    evidence: Evidence,
 ) -> Verdict:
     """Judge a fit.
 
@@ -101,8 +129,7 @@ def judge(
 
     - `measurements`, `prediction`, `residual`: (n,).
     - `degrees`: measurements and priors less unknowns, without limits.
-    - `agreement`: three numbers of starts, as returned by `result.agreement`.
-    - `undetermined`: combinations of parameters, in words; `status`: status of the fit.
+    - `evidence`: an `Evidence`.
 
     **Returns:** a `Verdict`.
     """
@@ -114,11 +141,8 @@ def judge(
     parts = [scores[exact & (numbers == number)] for number in np.unique(numbers)]
     series = tuple(runs for runs in map(runs_of_signs, parts) if runs.count > 1)
     p_values = [runs_of_signs(part).p_value for part in parts if np.any(np.abs(part) > NEGLIGIBLE)]
-    agree, rivals, starts = agreement
     limits = np.abs(residual[~exact])
-    concerns = []
-    if status != "converged":
-        concerns.append("the fit has not converged: allow more steps (max_steps), or start closer")
+    concerns = _concerns_of_search(evidence)
     if not np.all(np.isfinite(prediction[exact])):
         missing = int(np.sum(~np.isfinite(prediction[exact])))
         concerns.append(f"the model has no prediction for {missing} measurements: its run ends earlier, or fails")
@@ -135,12 +159,34 @@ def judge(
             f"the residuals keep their sign for too long (p = {p_trend:.2g}): the model misses a trend, or "
             "errors are correlated"
         )
-    if rivals:
-        concerns.append(f"{rivals} of {starts} starts ended elsewhere and explain the data nearly as well")
-    if starts > 1 and agree == 1:
-        concerns.append(f"only one of {starts} starts ended here: there may be better minima; give more starts")
-    concerns += [f"the data do not determine {words}" for words in undetermined]
-    return Verdict(p_value, series, agree, starts, undetermined, tuple(concerns))
+    concerns += [*evidence.concerns, *(f"the data do not determine {words}" for words in evidence.undetermined)]
+    return Verdict(
+        p_value,
+        series,
+        evidence.agree,
+        evidence.starts,
+        evidence.undetermined,
+        tuple(concerns),
+        evidence.notes,
+        evidence.effective,
+        evidence.k,
+        evidence.minima,
+    )
+
+
+def _concerns_of_search(evidence: Evidence) -> list[str]:
+    """The concerns about the search and the weights."""
+    concerns = []
+    if evidence.status != "converged":
+        concerns.append("the fit has not converged: allow more steps (max_steps), or start closer")
+    if not evidence.trusted:
+        concerns.append(
+            f"there are no errors and intervals: the exploration ended with {evidence.effective:.0f} effective draws "
+            f"(k-hat {evidence.k:.2f}); start closer, give bounds or priors, or fix numbers"
+        )
+    if len(evidence.minima) > 1:
+        concerns.append(f"the data allow {len(evidence.minima)} minima: " + "; ".join(map(str, evidence.minima)))
+    return concerns
 
 
 def normal_scores(measurements: Measurements, prediction: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

@@ -53,7 +53,7 @@ def identify(
     data: Any,
     free: dict[str, Any],
     *,
-    starts: int = 1,
+    starts: int = 16,
     spread: float = 2.0,
     seed: int = 0,
     tolerance: float = 1e-8,

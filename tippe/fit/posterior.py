@@ -16,7 +16,7 @@ def log_density(
     """The log of the posterior density of a scene's parameters, as a function of unbounded coordinates.
 
     The coordinate of a parameter that cannot be negative is its logarithm (see `Free`). A parameter without a prior has
-    a flat prior in its coordinate.
+    a flat prior in its coordinate; between two bounds, the prior is uniform in the parameter itself.
 
     **Arguments:**
 

@@ -44,20 +44,19 @@ def test_a_good_fit_has_nothing_against_it_and_its_p_value_is_that_of_chi_square
     assert "3 of 3 starts agree" in str(fit)
 
 
-def test_a_wrong_minimum_is_told_although_the_fit_converged():
-    """As one did by a factor in the rate: -2 log likelihood 170 at 115 measurements."""
+def test_the_search_finds_the_minimum_from_a_start_in_another_one():
+    """Least squares from the rate 9 alone end at a -2 log likelihood of 170 for 115 measurements."""
+    fit = identify(oscillation, recorded(), {"height": 0.8, "rate": 9.0})
+    assert abs(fit.estimates["rate"] - 6.0) < 4.0 * fit.standard_errors["rate"]
+    assert fit.verdict.good
+
+
+def test_a_wrong_model_is_told_although_the_fit_converged():
     with pytest.warns(FitWarning, match="residuals are too large"):
-        fit = identify(oscillation, recorded(), {"height": 0.8, "rate": 9.0})
-    assert fit.status == "converged"
+        fit = identify(oscillation, recorded(), {"height": 0.8, "rate": Free(9.0, 8.0, 10.0)})
     assert fit.deviance / fit.degrees > 1.4
     assert fit.verdict.p_value < 0.01
     assert not fit.verdict.good
-
-
-def test_starts_that_disagree_are_told():
-    with pytest.warns(FitWarning, match="only one of 2 starts ended here"):
-        fit = identify(oscillation, recorded(), {"height": 1.0, "rate": Free(6.0, 0.0)}, starts=2, spread=2.0, seed=1)
-    assert fit.verdict.agree == 1
 
 
 def test_a_trend_that_the_model_misses_shows_in_the_runs_where_the_errors_are_too_large():

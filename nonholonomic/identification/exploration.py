@@ -1,0 +1,222 @@
+"""Explore a posterior by adaptive importance sampling, with a batch of runs in every round.
+
+All points keep their predictions, so the weights of all of them are computed again, at no cost, whenever the proposals
+change (Cornuet, Marin, Mira and Robert, "Adaptive multiple importance sampling", Scand. J. Stat. 39 (2012) 798). Until
+the proposals cover the posterior, the likelihood is tempered: the powers of early measurements grow first, because late
+samples of a recording can be wrong by whole turns.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..progress import Progress
+from .likelihood import Measurements
+from .marginal import log_likelihoods
+from .mixture import Mixture, fitted
+from .pareto import smoothed_weights
+from .posterior import LogDensity
+from .region import Region
+
+#: Number of points in a round; all rounds use one program. A round of the search by slopes uses fewer.
+ROWS = 512
+
+#: An exploration ends with at least this many effective draws and a shape k of the weights below `MOST_K`, or after
+#: `ROUNDS` rounds.
+ENOUGH, MOST_K, ROUNDS = 400.0, 0.7, 24
+
+#: Effective number of points to which the likelihood is tempered, for each unknown, and at least.
+TEMPERED, LEAST_TEMPERED = 20.0, 80.0
+
+#: Number of groups of measurements, in the order of their times, and the number of groups whose powers grow together.
+GROUPS, FRONT = 32, 8
+
+#: Components of the proposals, and the share of the draws that the ends of the search by slopes keep.
+COMPONENTS, KEPT = 8, 0.15
+
+#: Powers of the density to which the two halves of the proposals are fitted. The flatter half reaches beyond the posterior, to
+#: other minima and into the tails.
+POWERS = (1.0, 0.4)
+
+
+class Pool(NamedTuple):
+    """All points so far.
+
+    - `points`: (n, unknowns), coordinates; `predictions`: (n, measurements).
+    - `groups`: (n, groups), log likelihoods of groups of measurements; `log_prior`, `log_density`: (n,), of the posterior,
+      averaged over unknown errors.
+    - `log_proposal`: (n,), log of the density from which all points together were drawn, times n.
+    - `proposals`: pairs of a number of points and the distribution from which they were drawn.
+    """
+
+    points: Float[np.ndarray, "n unknowns"]
+    predictions: Float[np.ndarray, "n measurements"]
+    groups: Float[np.ndarray, "n groups"]
+    log_prior: Float[np.ndarray, " n"]
+    log_density: Float[np.ndarray, " n"]
+    log_proposal: Float[np.ndarray, " n"]
+    proposals: tuple[tuple[int, Any], ...]
+
+    def candidates(self, count: int) -> Float[np.ndarray, "count unknowns"]:
+        """Points from which to refine: the first; then, in turn, the best for all measurements and for the early ones."""
+        totals = np.cumsum(self.groups, axis=1) + self.log_prior[:, None]
+        columns = sorted({totals.shape[1] - 1, *(totals.shape[1] * part // 8 for part in (0, 1, 2, 4))}, reverse=True)
+        ranked = np.stack([np.argsort(-totals[:, column]) for column in columns], axis=1).reshape(-1)
+        return self.points[list(dict.fromkeys([0, *ranked.tolist()]))[:count]]
+
+    @property
+    def deviance(self) -> Float[np.ndarray, " n"]:
+        """-2 log likelihood of every point, with errors as guessed."""
+        return -2.0 * np.sum(self.groups, axis=1)
+
+    def log_weights(self, progress: float) -> Float[np.ndarray, " n"]:
+        """Log weights of the points. With `progress` from 0 to 1, the powers of the measurements grow from 0 to 1; from 1 to
+        2, guessed errors become unknown errors."""
+        if progress >= 2.0:
+            return self.log_density - self.log_proposal
+        count = self.groups.shape[1]
+        front = min(FRONT, count)
+        place = min(progress, 1.0) * (count + front - 1)
+        powers = np.clip((place - np.arange(count)) / front, 0.0, 1.0)
+        tempered = self.groups @ powers + self.log_prior
+        if progress > 1.0:
+            tempered = (2.0 - progress) * tempered + (progress - 1.0) * self.log_density
+        return tempered - self.log_proposal
+
+
+class Explorer(NamedTuple):
+    """What is explored, and where: a density, the region of the search, and the group of every measurement."""
+
+    density: LogDensity
+    measurements: Measurements
+    region: Region
+    group: np.ndarray
+    random: np.random.Generator
+
+    @classmethod
+    def of(cls, density: LogDensity, measurements: Measurements, region: Region, seed: int) -> "Explorer":
+        """An explorer with measurements grouped by their times."""
+        times = np.asarray(measurements.time)
+        distinct = np.unique(times)
+        count = min(GROUPS, len(distinct))
+        group = (np.searchsorted(distinct, times) * count) // len(distinct)
+        return cls(density, measurements, region, group, np.random.default_rng(seed))
+
+    def begin(self, seed: int) -> Pool:
+        """A pool of quasi-random points in the region."""
+        size, values, groups = len(self.region.middle), self.measurements.value.size, int(np.max(self.group)) + 1
+        shapes = ((0, size), (0, values), (0, groups), (0,), (0,), (0,))
+        empty = Pool(*(np.zeros(shape) for shape in shapes), proposals=())
+        return self.extended(empty, self.region.points(ROWS if size > 2 else ROWS // 2, seed), self.region)
+
+    def extended(self, pool: Pool, points: Float[np.ndarray, "rows unknowns"], proposal: Any) -> Pool:
+        """The pool with points that were drawn from a proposal."""
+        inside = self.region.contains(points)
+        # The program is compiled for `ROWS` rows; rows of NaN take no time.
+        batch = np.full((ROWS, points.shape[1]), np.nan)
+        batch[: len(points)][inside] = points[inside]
+        predictions = self.density.predictions(batch)[: len(points)]
+        each, likelihood = log_likelihoods(self.measurements, predictions)
+        groups = np.stack([np.sum(each[:, self.group == k], axis=1) for k in range(pool.groups.shape[1])], axis=1)
+        prior = np.where(inside, self.density.log_priors(batch)[: len(points)], -np.inf)
+        proposals = (*pool.proposals, (len(points), proposal))
+        old = np.logaddexp(pool.log_proposal, math.log(len(points)) + proposal.log_density(pool.points))
+        new = np.logaddexp.reduce([math.log(n) + other.log_density(points) for n, other in proposals], axis=0)
+        parts = (points, predictions, groups, prior, likelihood + prior)
+        grown = (np.concatenate(pair) for pair in zip(pool, parts, strict=False))
+        return Pool(*grown, log_proposal=np.concatenate([old, new]), proposals=proposals)
+
+    def explore(self, pool: Pool, minima: Mixture | None, progress: bool) -> "Weighted":
+        """Adapt proposals to the posterior, round by round.
+
+        **Arguments:** `pool`: from `begin`; `minima`: a component around each minimum that is known, or `None`;
+        `progress`: whether to show progress.
+        """
+        with Progress(ROUNDS, "round", shown=progress) as display:
+            display.begin()
+            for turn in range(ROUNDS + 1):
+                result = Weighted.of(pool)
+                if turn == ROUNDS or (turn > 0 and result.enough):
+                    return result
+                pool = self.extended(pool, *self._proposed(pool, minima))
+                display.advance(1)
+        raise AssertionError
+
+    def _proposed(self, pool: Pool, minima: Mixture | None) -> tuple[np.ndarray, Mixture]:
+        """The points of the next round, and the mixture they are drawn from."""
+        least = max(LEAST_TEMPERED, TEMPERED * pool.points.shape[1])
+        halves = [
+            fitted(pool.points, tempered_weights(pool, least, power), COMPONENTS, self.random) for power in POWERS
+        ]
+        mixture = halves[0].joined(halves[1], 0.5)
+        if minima is not None:
+            mixture = mixture.joined(minima, 0.6 if len(pool.proposals) == 1 else KEPT)
+        # The last round draws what is missing, with some to spare.
+        current = Weighted.of(pool)
+        rate = current.effective / max(len(current.weights) - pool.proposals[0][0], 1)
+        missing = 1.25 * (ENOUGH - current.effective) / max(rate, 1e-3) if len(pool.proposals) > 1 else np.inf
+        count = ROWS if current.k >= MOST_K else int(np.clip(missing, ROWS // 8, ROWS))
+        return mixture.draw(count, self.random), mixture
+
+
+class Weighted(NamedTuple):
+    """A weighted sample of a posterior.
+
+    - `pool`: the points; `weights`: (n,), Pareto-smoothed, with the sum 1.
+    - `k`: shape of the weights' tail; `effective`: the effective number of draws.
+    """
+
+    pool: Pool
+    weights: Float[np.ndarray, " n"]
+    k: float
+    effective: float
+
+    @classmethod
+    def of(cls, pool: Pool) -> "Weighted":
+        logs = pool.log_weights(2.0)
+        weights, k = smoothed_weights(np.where(np.isfinite(logs), logs, -np.inf))
+        return cls(pool, weights, k, effective_number(weights))
+
+    @property
+    def enough(self) -> bool:
+        """Whether means and quantiles over the weights can be trusted."""
+        return self.effective >= ENOUGH and self.k < MOST_K
+
+    @property
+    def runs(self) -> int:
+        """Number of parameter sets for which the model ran."""
+        return len(self.weights)
+
+
+def normalised(log_weights: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Weights with the sum 1."""
+    logs = np.where(np.isfinite(log_weights), log_weights, -np.inf)
+    weights = np.exp(logs - np.max(logs))
+    return weights / np.sum(weights)
+
+
+def effective_number(weights: Float[np.ndarray, " n"]) -> float:
+    """Number of independent draws that are worth as much as weighted ones (Kish)."""
+    return float(1.0 / np.sum(weights**2))
+
+
+def tempered_weights(pool: Pool, least: float, power: float) -> Float[np.ndarray, " n"]:
+    """Weights of a power of the density, as close to the posterior as at least so many effective draws allow."""
+
+    def weights_at(progress: float) -> Float[np.ndarray, " n"]:
+        # The density is flatter, the distribution of the points is what it is.
+        logs = power * (pool.log_weights(progress) + pool.log_proposal) - pool.log_proposal
+        return normalised(logs)
+
+    weights, low, high = weights_at(2.0), 0.0, 2.0
+    if effective_number(weights) >= least:
+        return weights
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        if effective_number(weights_at(middle)) >= least:
+            low = middle
+        else:
+            high = middle
+    return weights_at(low)

@@ -1,0 +1,91 @@
+"""Intervals contain the truth as often as they say, from starts elsewhere, where slopes mislead and minima are many."""
+
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nonholonomic.identification import FitWarning, Measurements, identify
+from nonholonomic.identification.pareto import smoothed_weights
+
+pytestmark = pytest.mark.newest
+
+X = np.linspace(0.5, 1.5, 8)
+TRUTH, ERROR, TOOTH = 2.0, 0.05, 0.1
+
+
+def teeth(p):
+    """Lines whose slope at every place is four times the trend, like inversion times over a nutation period."""
+    trend = p["rate"][:, None] * X
+    phase = 37.0 * trend + np.arange(8.0)
+    return trend + TOOTH * (phase - jnp.floor(phase) - 0.5)
+
+
+def fits(count, model=teeth, **options):
+    """Fits of noisy data from random starts within a factor of 1.3 of the truth."""
+    random = np.random.default_rng(5)
+    exact = np.asarray(model({"rate": jnp.array([TRUTH])}))[0]
+    for _ in range(count):
+        data = Measurements(exact + ERROR * random.normal(size=8), ERROR)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FitWarning)
+            yield identify(model, data, {"rate": TRUTH * 1.3 ** random.uniform(-1.0, 1.0)}, progress=False, **options)
+
+
+@pytest.mark.parametrize("slopes", ["exact", "differences"])
+def test_intervals_cover_the_truth_on_a_staircase(slopes):
+    """Of 40 intervals of 95 %, 34 or more contain it with a probability of 0.997; by slopes, 20 do."""
+    results = list(fits(40, slopes=slopes))
+    wide = sum(low <= TRUTH <= high for low, high in (fit.interval("rate") for fit in results))
+    narrow = sum(low <= TRUTH <= high for low, high in (fit.interval("rate", 1.0) for fit in results))
+    near = sum(abs(fit.estimates["rate"] - TRUTH) < fit.standard_errors["rate"] for fit in results)
+    assert wide >= 34
+    assert 18 <= narrow <= 36
+    assert 18 <= near <= 36
+    by_slopes = sum(abs(fit.most_likely["rate"] - TRUTH) < 1.96 * fit.slope_errors["rate"] for fit in results)
+    assert by_slopes < 30
+    assert sum("slopes understate the errors" in str(fit.verdict) for fit in results) >= 20
+    assert all(fit.verdict.effective >= 400.0 and fit.verdict.k < 0.7 for fit in results)
+
+
+def test_two_starts_give_the_same_posterior():
+    exact = np.asarray(teeth({"rate": jnp.array([TRUTH])}))[0]
+    data = Measurements(exact + ERROR * np.random.default_rng(0).normal(size=8), ERROR)
+    first, second = (identify(teeth, data, {"rate": start}) for start in (1.5, 2.6))
+    grid = np.linspace(1.5, 2.5, 20001)
+    logs = -0.5 * np.sum(
+        ((np.asarray(teeth({"rate": jnp.asarray(grid)})) - np.asarray(data.value)) / ERROR) ** 2, axis=1
+    )
+    weights = np.exp(logs - np.max(logs)) / grid
+    cumulative = np.cumsum(weights) / np.sum(weights)
+    expected = np.interp([0.025, 0.975], cumulative, grid)
+    width = expected[1] - expected[0]
+    for fit in (first, second):
+        assert np.all(np.abs(np.array(fit.interval("rate")) - expected) < 0.15 * width)
+
+
+def test_several_minima_are_told_with_their_weights():
+    """The sign of a number that enters by its square is not determined."""
+    data = Measurements(np.full(5, 4.0), 0.5)
+    with pytest.warns(FitWarning, match="the data allow 2 minima: x") as record:
+        fit = identify(lambda p: jnp.repeat(p["x"][:, None] ** 2, 5, axis=1), data, {"x": 1.0}, spread=5.0)
+    assert "weight" in str(record[0].message)
+    values = sorted(minimum.estimates["x"] for minimum in fit.verdict.minima)
+    np.testing.assert_allclose(values, [-2.0, 2.0], atol=0.05)
+    np.testing.assert_allclose([minimum.weight for minimum in fit.verdict.minima], 0.5, atol=0.1)
+
+
+def test_a_number_that_only_a_limit_bounds_is_told():
+    data = Measurements([1.0], 0.1, censored=True)
+    with pytest.warns(FitWarning, match="do not (bound|determine) x"):
+        identify(lambda p: p["x"][:, None], data, {"x": 2.0})
+
+
+def test_smoothed_weights_know_a_heavy_tail():
+    """Weights of a Pareto distribution with the shape 0.5 are fine, with the shape 1 they are not."""
+    uniform = np.random.default_rng(0).uniform(size=4000)
+    for shape in (0.3, 1.0):
+        weights, k = smoothed_weights(-shape * np.log(uniform))
+        assert abs(k - shape) < 0.15
+        assert abs(np.sum(weights) - 1.0) < 1e-12
