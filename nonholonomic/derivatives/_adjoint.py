@@ -9,8 +9,7 @@ fixed, as in `variation.py`.
 
 import dataclasses
 import functools
-import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax
@@ -70,13 +69,19 @@ class StepRecorder(AbstractRecorder):
         return jnp.ones_like(lane_state.time)
 
 
+class Derivatives(NamedTuple):
+    """Derivatives of the measured quantity with respect to the state and to the parameters, a tree of arrays."""
+
+    state: Float[Array, "components lanes"]
+    numbers: Any
+
+
 class Backward(NamedTuple):
     """State of the forward pass and of the backward pass.
 
     `frontier` holds the lanes at the start of the next period to compute, and `number` its number. The backward pass takes
-    the period before number `limit` next. `adjoint` holds, for the cell in each lane, the derivatives of the measured
-    quantity: the first rows are those with respect to the state, the others those with respect to the parameters.
-    `gradient` holds the derivatives of every cell with respect to its initial state.
+    the period before number `limit` next. `adjoint` holds the derivatives for the cell in each lane, `gradient` those of
+    every cell with respect to its initial state.
     """
 
     frontier: SchedulerState
@@ -85,8 +90,8 @@ class Backward(NamedTuple):
     checkpoints: Checkpoints
     latest_steps: LatestSteps
     outcome: Outcome
-    adjoint: Float[Array, "rows lanes"]
-    gradient: Float[Array, "rows cells"]
+    adjoint: Derivatives
+    gradient: Derivatives
 
 
 def solve_with_adjoint(
@@ -120,14 +125,9 @@ def solve_with_adjoint(
     numbers, problem_with_probe = _with_probe(problem, moving, probe, size)
     scheduler = LaneScheduler.of(problem_with_probe, t1, cells, settings, one_kernel=one_kernel, n_blocks=2)
     passes = Passes(scheduler, moving, measured, StepRecorder() if recorder is None else recorder)
-    leaves, structure = jax.tree.flatten(numbers)
-    ends = np.cumsum([components, *(leaf.size // size for leaf in leaves)])
-    run = passes.start(int(ends[-1]))
+    run = passes.start(numbers)
     run = jax.lax.while_loop(lambda run: uncounted(run.limit > 0, run.outcome.steps[0]), passes.there_and_back, run)
-    parts = [run.gradient[start:end] for start, end in itertools.pairwise(ends)]
-    by_number = [part.reshape(leaf.shape) for part, leaf in zip(parts, leaves, strict=True)]
-    outcome = run.outcome._replace(state=run.outcome.state[:components])
-    return outcome, run.gradient[:components], jax.tree.unflatten(structure, by_number)
+    return run.outcome._replace(state=run.outcome.state[:components]), run.gradient.state, run.gradient.numbers
 
 
 def _with_probe(problem: VariationalProblem, moving: Any, probe: Any, size: int) -> tuple[Any, VariationalProblem]:
@@ -160,12 +160,12 @@ class Passes:
     measured: Measured
     recorder: StepRecorder
 
-    def start(self, rows: int) -> Backward:
-        """Both passes before the first period. **Arguments:** `rows`: number of rows of the derivatives."""
+    def start(self, numbers: Any) -> Backward:
+        """Both passes before the first period. **Arguments:** `numbers`: the parameters, with one value per cell."""
         scheduler, start = self.scheduler, self.scheduler.start()
         in_lanes = scheduler.in_lanes(start.lane_state)
+        state, states = (without_probe(lanes).state for lanes in (start.lane_state, scheduler.fresh))
         record = jax.eval_shape(lambda: self.recorder.steps(self.recorder.begin(in_lanes, start.lane_state, None)))
-        dtype = start.lane_state.state.dtype
         return Backward(
             frontier=start,
             number=jnp.zeros((), int),
@@ -173,8 +173,8 @@ class Passes:
             checkpoints=Checkpoints.none((start, start)),
             latest_steps=LatestSteps.none(record, scheduler.capacity),
             outcome=scheduler.empty(),
-            adjoint=jnp.zeros((rows, scheduler.lanes), dtype),
-            gradient=jnp.zeros((rows, scheduler.capacity), dtype),
+            adjoint=jax.tree.map(jnp.zeros_like, Derivatives(state, scheduler.pick(numbers, start.lane_state.cell))),
+            gradient=jax.tree.map(jnp.zeros_like, Derivatives(states, numbers)),
         )
 
     def there_and_back(self, run: Backward) -> Backward:
@@ -221,13 +221,15 @@ class Passes:
         # A cell that had made no step was at its start.
         at_its_start = (lanes_before.lane_state.steps == 0) & (lanes_before.lane_state.cell < scheduler.cells)
         cell = jnp.where(at_its_start, lanes_before.lane_state.cell, scheduler.capacity)
-        gradient = run.gradient.at[:, cell].set(adjoint, mode="drop")
+        gradient = jax.tree.map(
+            lambda of_cells, of_lanes: of_cells.at[..., cell].set(of_lanes, mode="drop"), run.gradient, adjoint
+        )
         checkpoints = run.checkpoints.without_latest()
         return run._replace(limit=number, checkpoints=checkpoints, adjoint=adjoint, gradient=gradient)
 
     def taken_back(
-        self, lane_state: LaneState, steps: StepRecord, count: Int[Array, ""], adjoint: Float[Array, "rows lanes"]
-    ) -> Float[Array, "rows lanes"]:
+        self, lane_state: LaneState, steps: StepRecord, count: Int[Array, ""], adjoint: Derivatives
+    ) -> Derivatives:
         """Carry the derivatives from the end of a period to its start; in lanes that have ended, the derivatives begin
         there.
         """
@@ -240,13 +242,15 @@ class Passes:
         def loop(carry: Any) -> Any:
             lane_state, share, record, count, adjoint = carry
             ended = lane_state.status != RUNNING
-            adjoint = jnp.where(ended, _at_the_end(problem, self.moving, self.measured, lane_state, share), adjoint)
+            at_end = _at_the_end(problem, self.moving, self.measured, lane_state, share)
+            adjoint = jax.tree.map(functools.partial(jnp.where, ended), at_end, adjoint)
 
             def step(carry: Any) -> Any:
                 index, adjoint, memory = carry
-                *point, at_end = jax.tree.map(functools.partial(read, index=index - 1), record)
+                time, state, length, at_end = jax.tree.map(functools.partial(read, index=index - 1), record)
                 if at_end is not None:
-                    adjoint = jnp.concatenate([adjoint[: len(at_end)] + at_end, adjoint[len(at_end) :]])
+                    adjoint = adjoint._replace(state=adjoint.state + at_end)
+                point = (time, state, length)
                 return index - 1, *step_taken_back(weights, problem, self.moving, *point, adjoint, memory)
 
             memory = StageMemory.of(len(weights.fractions), lane_state.state)
@@ -262,21 +266,15 @@ def without_probe(lane_state: LaneState) -> LaneState:
 
 def _at_the_end(
     problem: AbstractProblem, moving: Any, measured: Measured, lane_state: LaneState, share: Lanes
-) -> Float[Array, "rows lanes"]:
-    """The derivatives with respect to the final state and the parameters. **Arguments:** `share`: as `shares_of_ends`."""
+) -> Derivatives:
+    """The derivatives with respect to the final state and the parameters. **Arguments:** `share`: as `share_of_end`."""
     numbers, static = eqx.partition(problem, moving)
 
     def value(numbers: Any, state: States) -> Lanes:
         return measured(eqx.combine(numbers, static), lane_state._replace(state=state))
 
     by_number, by_state = jax.vjp(value, numbers, lane_state.state)[1](share)
-    return _rows(by_state, by_number)
-
-
-def _rows(by_state: States | Sequence[Lanes], by_number: Any) -> Float[Array, "rows lanes"]:
-    """Derivatives with respect to the state and the parameters in one array."""
-    leaves = jax.tree.leaves(by_number)
-    return jnp.concatenate([*(row[None] for row in by_state), *(leaf.reshape(-1, leaf.shape[-1]) for leaf in leaves)])
+    return Derivatives(by_state, by_number)
 
 
 class Weights(NamedTuple):
@@ -328,9 +326,9 @@ def step_taken_back(
     time: Lanes,
     state: States,
     length: Lanes,
-    adjoint: Float[Array, "rows lanes"],
+    adjoint: Derivatives,
     memory: StageMemory,
-) -> tuple[Float[Array, "rows lanes"], StageMemory]:
+) -> tuple[Derivatives, StageMemory]:
     """Carry derivatives from the end of a Runge-Kutta step to its start (Hager, Numer. Math. 87 (2000) 247).
 
     The stages are computed in loops, as in `explicit_step`.
@@ -341,13 +339,13 @@ def step_taken_back(
     - `problem`, `moving`: the problem, with leaves that are scalars or have one number per lane; the leaves with
       respect to which to differentiate.
     - `time`, `state`, `length`: where the step starts, and its length; 0 if no step was made.
-    - `adjoint`: derivatives at the end of the step, with respect to the state and the parameters.
+    - `adjoint`: derivatives at the end of the step.
     - `memory`: memory for the stages.
 
     **Returns:** the derivatives at the start, and the memory for reuse.
     """
     numbers, static = eqx.partition(problem, moving)
-    components, stages = state.shape[0], len(weights.fractions)
+    stages = len(weights.fractions)
     fractions = jnp.asarray(weights.fractions)
 
     def stage_made(stage: Int[Array, ""], carry: tuple[Stages, Stages]) -> tuple[Stages, Stages]:
@@ -362,26 +360,29 @@ def step_taken_back(
     initial_stages = written_in_place(memory.states, state, at=start), memory.rates
     stage_states, rates = over_stages(stages - 1, stage_made, initial_stages)
 
-    def pull(
-        stage_time: Lanes, numbers: Any, parts: tuple[Lanes, ...], by_rate: tuple[Lanes, ...]
-    ) -> Float[Array, "rows lanes"]:
+    def pull(stage_time: Lanes, numbers: Any, parts: tuple[Lanes, ...], by_rate: tuple[Lanes, ...]) -> Any:
         def field(numbers: Any, parts: tuple[Lanes, ...]) -> States:
             return eqx.combine(numbers, static).field(stage_time, parts)
 
         by_number, by_part = jax.vjp(field, numbers, parts)[1](jnp.stack(by_rate))
-        return _rows(by_part, by_number)
+        return jnp.stack(by_part), by_number
 
     def stage_taken_back(count: Int[Array, ""], carry: Any) -> Any:
         stage, (by_stage, total) = stages - 1 - count, carry
         by_rate = jax.lax.optimization_barrier(moved_state(stage, weights.shares, zero_state, length, by_stage))
         stage_time = time + fractions[stage] * length
-        term = pull(
+        by_state, by_number = pull(
             stage_time, numbers, tuple(jnp.unstack(read(stage_states, index=stage))), tuple(jnp.unstack(by_rate))
         )
         # If no step was made, values may not be finite.
-        term = jax.lax.optimization_barrier(jnp.where(length > 0.0, term, 0.0))
-        return written_in_place(by_stage, term[:components], at=stage + 1), total + term
+        by_state = jax.lax.optimization_barrier(jnp.where(length > 0.0, by_state, 0.0))
+        total = jax.tree.map(
+            lambda sum_so_far, term: sum_so_far + jnp.where(length > 0.0, term, 0.0),
+            total,
+            Derivatives(by_state, by_number),
+        )
+        return written_in_place(by_stage, by_state, at=stage + 1), total
 
-    zero_state, ends = jnp.zeros_like(state), written_in_place(memory.adjoints, adjoint[:components], at=start)
-    adjoints, total = over_stages(stages, stage_taken_back, (ends, jnp.zeros_like(adjoint)))
-    return adjoint + total, StageMemory(stage_states, rates, adjoints)
+    zero_state, ends = jnp.zeros_like(state), written_in_place(memory.adjoints, adjoint.state, at=start)
+    adjoints, total = over_stages(stages, stage_taken_back, (ends, adjoint))
+    return total, StageMemory(stage_states, rates, adjoints)

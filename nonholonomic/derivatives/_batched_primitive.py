@@ -25,13 +25,17 @@ from ..xla_cpu import compiled_alone, compiled_quickly
 class AbstractLinearSolve(eqx.Module):
     """A solve whose last arguments are tangents or cotangents: the outputs are linear functions of them."""
 
-    #: The leaves that are differentiated, and the number of the last arguments.
+    #: The leaves that are differentiated.
     active: eqx.AbstractVar[tuple[int, ...]]
-    linear: eqx.AbstractVar[int]
 
     #: The cost for one member of a batch of the last arguments, in units of the cost of the derivatives with respect to a
     #: number.
     cost: eqx.AbstractClassVar[int]
+
+    @property
+    @abc.abstractmethod
+    def linear(self) -> int:
+        """The number of the last arguments."""
 
     @abc.abstractmethod
     def from_slopes(self, selection: Any, *arguments: Float[Array, "..."]) -> list[Array]:

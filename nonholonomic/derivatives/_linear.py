@@ -21,14 +21,14 @@ from ._batched_primitive import AbstractLinearSolve, Request, flat, solve_cells
 class Tangents(AbstractLinearSolve):
     """The tangents of a solve's outputs, as a solve whose last arguments are the tangents of the active leaves.
 
-    - `of`: the `AbstractDifferentiableSolve`; `active`: the leaves that have a tangent.
+    - `active`: the leaves that have a tangent; `of`: the `AbstractDifferentiableSolve`.
     - `structure`: the structure of the primal, in which `None` counts as a part.
     - `differentiated`: function of `of` and `active` that returns a function of a single cell's leaves, whose results are
       the primal and its derivatives with respect to the active leaves.
     """
 
-    of: Any
     active: tuple[int, ...] = eqx.field(static=True)
+    of: Any
     structure: Any = eqx.field(static=True)
     differentiated: Any = eqx.field(static=True)
 
@@ -46,13 +46,13 @@ class Tangents(AbstractLinearSolve):
         return self.differentiated(self.of, self.active)(*leaves)[1]
 
     def for_parts(self, wanted: tuple[int, ...]) -> Self:
-        return type(self)(self.of.for_parts(wanted), self.active, self.structure, self.differentiated)
+        return type(self)(self.active, self.of.for_parts(wanted), self.structure, self.differentiated)
 
     def from_slopes(self, selection: Any, *arguments: Float[Array, "..."]) -> list[Array]:
         leaves, tangents = arguments[: -self.linear], arguments[-self.linear :]
-        slopes = [flat(slope)[0] for slope in self.slopes(leaves)]
+        slopes, zero = [flat(slope)[0] for slope in self.slopes(leaves)], jnp.zeros(())
         return [
-            sum((product(slope[k], tangent) for slope, tangent in zip(slopes, tangents, strict=True)), jnp.zeros(()))
+            sum((product(slope[k], tangent) for slope, tangent in zip(slopes, tangents, strict=True)), zero)
             for k in selection
         ]
 
@@ -63,14 +63,11 @@ class Cotangents(AbstractLinearSolve):
     - `tangents`: the solve for the tangents of the outputs; `parts`: the indices of the outputs that have a cotangent.
     """
 
+    active: tuple[int, ...] = eqx.field(static=True)
     tangents: Tangents
     parts: tuple[int, ...] = eqx.field(static=True)
 
     cost: ClassVar[int] = 4
-
-    @property
-    def active(self) -> tuple[int, ...]:
-        return self.tangents.active
 
     @property
     def linear(self) -> int:
@@ -87,13 +84,16 @@ class Cotangents(AbstractLinearSolve):
 
     def from_slopes(self, selection: Any, *arguments: Float[Array, "..."]) -> list[Array]:
         leaves, cotangents = arguments[: -self.linear], arguments[-self.linear :]
-        slopes = [flat(slope)[0] for slope in self.tangents.slopes(leaves)]
+        slopes, zero = [flat(slope)[0] for slope in self.tangents.slopes(leaves)], jnp.zeros(())
 
         def share(slope: Array, cotangent: Array) -> Array:
             return product(jnp.moveaxis(slope, range(cotangent.ndim), range(-cotangent.ndim, 0)), cotangent)
 
         return [
-            sum(share(slopes[k][part], cotangent) for part, cotangent in zip(self.parts, cotangents, strict=True))
+            sum(
+                (share(slopes[k][part], cotangent) for part, cotangent in zip(self.parts, cotangents, strict=True)),
+                zero,
+            )
             for k in selection
         ]
 
@@ -149,7 +149,7 @@ def _transposed(
     outputs = solve_cells.bind(
         *leaves,
         *present.values(),
-        request=Request(Cotangents(tangents, tuple(present)), None, tuple(range(linear))),
+        request=Request(Cotangents(tangents.active, tangents, tuple(present)), None, tuple(range(linear))),
         cells=cells,
         batch_flags=(*batch_flags[: len(leaves)], *(True for _ in present)),
         kinds=tuple(ShapedArray(aval.shape[flag:], aval.dtype) for aval, flag in zip(avals, flags, strict=True)),

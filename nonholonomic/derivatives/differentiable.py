@@ -119,7 +119,7 @@ def differentiable_solve(solve: AbstractDifferentiableSolve, *leaves: Float[Arra
         active_tangents = [tangents[i] for i in active]
         if solve.prefers_adjoint(active, leaves):
             value = primal(*leaves)
-            linear_solve = Tangents(solve, active, flat(value)[1], _value_and_tangents)
+            linear_solve = Tangents(active, solve, flat(value)[1], _value_and_tangents)
             change = push_forward(linear_solve, leaves, active_tangents, value)
             return value, jax.tree.map(functools.partial(_where_present, solve), value, change)
         value, slopes = _value_and_tangents(solve, active)(*leaves)

@@ -214,17 +214,18 @@ class BlockSampling(AbstractSampling):
         if sum(leaves[k].size for k in active) <= MOST_FORWARD:
             return False
         numbers, _, spec = self._sorted(leaves)
-        problem = spec.built(numbers, None)
-        return problem.fits_one_kernel and is_reversible(problem)
+        return is_reversible(spec.built(numbers, None))
 
     def differentiable(self, primal: SampledRun) -> SampledRun:
-        return SampledRun(*primal[: -len(NOT_DIFFERENTIATED)], *NOT_DIFFERENTIATED)
+        return SampledRun(primal.states, primal.quadratures, primal.end_time, *NOT_DIFFERENTIATED)
 
     def push_forward(
         self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], tangents: tuple[Array, ...]
     ) -> SampledRun:
         build, numbers, arguments, settings = self._builder(leaves, cells)
-        directions = [_cells_last(part, self.spec.axes[k], cells) for k, part in zip(active, tangents, strict=True)]
+        directions = tuple(
+            _cells_last(part, self.spec.axes[k], cells) for k, part in zip(active, tangents, strict=True)
+        )
         problem, direction, size = tangent_along(build, active, numbers, directions, cells)
         _, (slope,) = _samples_and_slopes(VariationalProblem(problem, (direction,), False), arguments, settings)
         return jax.tree.map(lambda part: part * size.reshape(-1, *[1] * (part.ndim - 1)), slope)

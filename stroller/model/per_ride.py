@@ -1,7 +1,6 @@
 """Inputs that are written for a single ride, for many rides at once."""
 
 import contextlib
-import math
 from typing import Any
 
 import equinox as eqx
@@ -10,9 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic.systems.components import TooLarge, by_components
+from nonholonomic.systems.last_axis import over_last_axis
 from nonholonomic.systems.tracing import is_elementary, spelled_out
 
-from .input import Input, Motion
+from .input import Motion
 
 #: Inputs with more numbers than this stay in arrays: element by element they would take long to compile.
 MOST_ELEMENTS = 256
@@ -22,22 +22,29 @@ class PerRide(eqx.Module):
     """An input that is evaluated ride by ride. For many rides, its arrays, such as the knots of a spline or the weights of a
     network, have the rides in the last axis; its scalars have one value per ride or one for all.
 
-    - `elementary`: whether the input consists of operations that fit a single kernel.
+    - `by_elements`: whether every number of an array is a vector of rides; larger inputs stay in arrays.
     """
 
     input: Any
-    elementary: bool = eqx.field(static=True)
+    by_elements: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, controls: Input, t: Any, motion: Any) -> "PerRide":
+    def of(cls, controls: Any, t: Any, motion: Any) -> "PerRide":
         """The input of a single ride, with arguments of these types."""
+        sizes = [leaf.size for leaf in jax.tree.leaves(controls) if eqx.is_inexact_array(leaf)]
+        if sum(sizes) > MOST_ELEMENTS:
+            return cls(controls, False)
         arrays, static = eqx.partition(controls, eqx.is_inexact_array)
 
-        def spelled(arrays: Any, t: Any, motion: Any) -> Any:
-            return spelled_out(lambda *parts: eqx.combine(parts[0], static)(*parts[1:]))(arrays, t, motion)
+        def of_ride(arrays: Any, moving: Any) -> Any:
+            return spelled_out(lambda *parts: eqx.combine(parts[0], static)(*parts[1]))(arrays, moving)
 
-        zeros = jax.tree.map(lambda shape: jnp.zeros(shape.shape), (t, motion))
-        return cls(controls, is_elementary(spelled, arrays, *zeros))
+        moving = jax.tree.map(lambda shape: jnp.zeros(shape.shape), (t, motion))
+        many = jax.tree.map(lambda leaf: leaf[..., None], (arrays, moving))
+        with contextlib.suppress(TooLarge):
+            jax.eval_shape(lambda parts: cls(eqx.combine(parts[0], static), True)(*parts[1]), many)
+            return cls(controls, is_elementary(of_ride, arrays, moving))
+        return cls(controls, False)
 
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         moving, structure = jax.tree.flatten((t, motion))
@@ -52,11 +59,13 @@ class PerRide(eqx.Module):
             return tuple(controls(*jax.tree.unflatten(structure, moving)))
 
         shapes = [number.shape[:-1] for number in numbers]
-        if sum(map(math.prod, shapes)) <= MOST_ELEMENTS:
-            with contextlib.suppress(TooLarge):
-                return _by_elements(of_ride, numbers, shapes, moving)
+        if self.by_elements:
+            return _by_elements(of_ride, numbers, shapes, moving)
+        own = jax.tree.map(lambda part: jax.ShapeDtypeStruct(part.shape[:-1], part.dtype), (numbers, moving))
+        with contextlib.suppress(TooLarge):
+            return over_last_axis(of_ride, *own)(numbers, moving)
         axes = [-1 if number.ndim else None for number in numbers]
-        return jax.vmap(spelled_out(of_ride), in_axes=(axes, 0))(numbers, moving)
+        return jax.vmap(of_ride, in_axes=(axes, 0))(numbers, moving)
 
 
 def _by_elements(of_ride: Any, numbers: list[Array], shapes: list[tuple[int, ...]], moving: list[Array]) -> Any:

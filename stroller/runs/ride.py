@@ -47,7 +47,7 @@ class RideProblem(AbstractProblem):
 
     @property
     def fits_one_kernel(self) -> bool:
-        return not isinstance(self.input, PerRide) or self.input.elementary
+        return not isinstance(self.input, PerRide) or self.input.by_elements
 
     @classmethod
     def single(cls, scene: Scene, launch: Launch, controls: Input | None) -> "RideProblem":
@@ -134,7 +134,8 @@ def as_module(controls: Input | None, scene: Scene, launch: Launch) -> Any:
     def motion(scene: Scene, launch: Launch) -> Any:
         return scene.dynamics.geometry(scene.state(launch, True)).motion
 
-    return Formula.of(controls, jnp.zeros(()), eqx.filter_eval_shape(motion, scene, launch))
+    single: Any = controls
+    return Formula.of(single, jnp.zeros(()), eqx.filter_eval_shape(motion, scene, launch))
 
 
 def has_arrays(tree: Any) -> bool:

@@ -96,6 +96,35 @@ def test_arrays_in_the_inputs_of_a_batch_have_the_slopes_of_their_own_rides(as_i
         np.testing.assert_allclose(gradients[:, k], expected, rtol=1e-7, atol=1e-10)
 
 
+class Network(eqx.Module):
+    """A network with 303 weights, too many to be written out number by number."""
+
+    layers: tuple[jax.Array, ...]
+
+    def __call__(self, t, motion):
+        inner, outer = self.layers
+        force, torque = outer @ jnp.tanh(inner @ jnp.stack([jnp.sin(t), motion.speed, motion.steering]))[:2]
+        return 1.0 + force, torque
+
+
+def test_the_weights_of_a_network_have_slopes():
+    random = np.random.default_rng(0)
+    weights = tuple(jnp.asarray(random.normal(size=(2, *shape))) for shape in ((99, 3), (2, 2)))
+
+    def end(weights):
+        launch = Launch((0.0, 0.0), 0.3, 1.0)
+        ride = stroller.simulate(DAMPED, launch, 1.0, input=Network(weights), times=[0.5, 1.0], tolerance=1e-10)
+        return jnp.sum(ride.position[:, 1])
+
+    ends, gradients = jax.jit(jax.vmap(end)), jax.jit(jax.vmap(jax.grad(end)))(weights)
+    for layer, entry in ((0, (1, 2)), (1, (1, 0))):
+
+        def moved(value, layer=layer, entry=entry):
+            return ends(tuple(w.at[:, *entry].add(value) if k == layer else w for k, w in enumerate(weights)))
+
+        np.testing.assert_allclose(gradients[layer][:, *entry], extrapolated(moved, 0.0, 1e-3), rtol=1e-7)
+
+
 @pytest.mark.slow
 def test_an_array_in_the_input_has_a_slope_for_each_entry():
     def end(torques):
