@@ -116,8 +116,8 @@ PAGES = {
     ),
     "planning": Page(
         "Motion planning",
-        "Plan the drive of a stroller to a goal, around obstacles and within limits.",
-        of("stroller", "plan Plan Goal Box Disc Footprint Limits"),
+        "Plan the drive of a stroller to a goal, around obstacles and within limits, and keep a ride on the plan.",
+        of("stroller", "plan Plan Goal Box Disc Footprint Limits track"),
     ),
     "engine": Page(
         "The engine",

@@ -35,6 +35,7 @@ from .planning.obstacles import Disc as Disc
 from .planning.obstacles import Footprint as Footprint
 from .planning.plan import plan as plan
 from .planning.result import Plan as Plan
+from .planning.track import track as track
 from .runs.explore import explore as explore
 from .runs.simulate import simulate as simulate
 from .runs.table import Table as Table

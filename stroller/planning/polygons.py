@@ -19,7 +19,7 @@ def _least(values: Any, axis: int) -> Any:
     JAX divides the derivative of `min` by the number of values that equal the result: if XLA computes a value again and
     rounds it differently, that number is zero.
     """
-    xp = np if isinstance(values, np.ndarray) else jnp
+    xp: Any = np if isinstance(values, np.ndarray) else jnp
     return xp.take_along_axis(values, xp.expand_dims(values.argmin(axis), axis), axis).squeeze(axis)
 
 
