@@ -11,31 +11,34 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.identification import Draws, LogDensity
-from nonholonomic.identification.sampling import learn
-from nonholonomic.identification.surrogate import Surrogate
 
 #: Greatest number of doublings of a walk.
 DEEPEST = 6
 
 
 class InPoints(eqx.Module):
-    """A density as a function of a surrogate's points, whose volumes equal those of coordinates up to a factor."""
+    """A density as a function of points, which are coordinates in units of a fit's errors along its principal directions."""
 
     density: LogDensity
-    surrogate: Surrogate
+    centre: Float[Array, " unknowns"]
+    root: Float[Array, "unknowns unknowns"]
+
+    def at(self, point: Float[Array, "... unknowns"]) -> Float[Array, "... unknowns"]:
+        """The coordinates of points."""
+        return self.centre + point @ self.root.T
 
     def __call__(self, point: Float[Array, " unknowns"]) -> Float[Array, ""]:
-        return self.density(self.surrogate.at(point))
+        return self.density(self.at(point))
 
 
 def plain(library: str, density: LogDensity, fit: Any, warmup: int, draws: int) -> tuple[Draws, int]:
     """Draws by the no-U-turn sampler of a library with the gradient of the density, and the number of leaps for these
     draws."""
-    surrogate_around = Surrogate.around(density, fit.coordinates, fit.coordinate_covariance)
-    surrogate, walk, runs = learn(surrogate_around, 4, np.random.default_rng(0))
-    points, leaps = BY[library](InPoints(density, surrogate), walk.points, warmup, draws)
-    coordinates = np.asarray(surrogate.at(jnp.asarray(points)))
-    return Draws.of(density, coordinates, math.nan, runs + leaps), leaps
+    root = np.linalg.cholesky(fit.coordinate_covariance)
+    in_points = InPoints(density, jnp.asarray(fit.coordinates), jnp.asarray(root))
+    starts = jnp.asarray(np.random.default_rng(0).normal(size=(4, len(root))))
+    points, leaps = BY[library](in_points, starts, warmup, draws)
+    return Draws.of(density, np.asarray(in_points.at(jnp.asarray(points))), math.nan, leaps), leaps
 
 
 def by_numpyro(density: InPoints, starts: Any, warmup: int, draws: int) -> tuple[np.ndarray, int]:

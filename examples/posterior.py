@@ -34,9 +34,8 @@ def free_numbers() -> dict[str, tippe.Free]:
 
 def main(path: str | None = None) -> None:
     data, free = measured(), free_numbers()
-    fit = tippe.identify(scene(0.3, 0.0035), data, free)
     density = tippe.log_density(scene(0.3, 0.0035), data, free)
-    draws = sample(density, fit.coordinates, fit.coordinate_covariance)
+    draws = sample(density)
     print(draws)
     replicas = density.replicate(draws.coordinates.reshape(-1, len(free))[::10])
     coverage = np.mean((np.sort(replicas, axis=0)[2] < data.time) & (data.time < np.sort(replicas, axis=0)[-3]))

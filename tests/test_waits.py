@@ -119,13 +119,9 @@ def test_a_long_call_says_what_it_does_and_leaves_nothing_behind(name, monkeypat
 
 def test_sampling_says_what_it_does_after_its_last_step(monkeypatch):
     module = importlib.import_module("nonholonomic.identification.sampling")
-    walk = module.Walk(np.zeros((4, 1)), None)
-    monkeypatch.setattr(module.Surrogate, "around", lambda *_: None)
-    monkeypatch.setattr(module, "learn", lambda *_: (SimpleNamespace(to_power=lambda power: None), walk, 1))
-    monkeypatch.setattr(module, "_with_ratio", lambda *_: (np.zeros((4, 1)), np.zeros(4)))
-    monkeypatch.setattr(module, "_walked", lambda *_: walk)
+    monkeypatch.setattr(module, "drawn", lambda *_: (np.zeros((4, 2, 1)), 0.5, 1))
     monkeypatch.setattr(module.Draws, "of", waits)
     terminal = watched(monkeypatch)
     with pytest.raises(Enough):
-        module.sample(None, None, None, warmup=1, draws=2)
+        module.sample(None, warmup=1, draws=2)
     assert words(terminal)[-1] == "diagnosing"

@@ -113,18 +113,12 @@ class Explorer(NamedTuple):
 
     def extended(self, pool: Pool, points: Float[np.ndarray, "rows unknowns"], proposal: Any) -> Pool:
         """The pool with points that were drawn from a proposal."""
-        inside = self.region.contains(points)
-        # The program is compiled for `ROWS` rows; rows of NaN take no time.
-        batch = np.full((ROWS, points.shape[1]), np.nan)
-        batch[: len(points)][inside] = points[inside]
-        predictions = self.density.predictions(batch)[: len(points)]
-        each, likelihood = log_likelihoods(self.measurements, predictions)
+        predictions, each, prior, log_density = self.evaluated(points)
         groups = np.stack([np.sum(each[:, self.group == k], axis=1) for k in range(pool.groups.shape[1])], axis=1)
-        prior = np.where(inside, self.density.log_priors(batch)[: len(points)], -np.inf)
         proposals = (*pool.proposals, (len(points), proposal))
         old = np.logaddexp(pool.log_proposal, math.log(len(points)) + proposal.log_density(pool.points))
         new = np.logaddexp.reduce([math.log(n) + other.log_density(points) for n, other in proposals], axis=0)
-        parts = (points, predictions, groups, prior, likelihood + prior)
+        parts = (points, predictions, groups, prior, log_density)
         grown = (np.concatenate(pair) for pair in zip(pool, parts, strict=False))
         return Pool(*grown, log_proposal=np.concatenate([old, new]), proposals=proposals)
 
@@ -146,19 +140,36 @@ class Explorer(NamedTuple):
 
     def _proposed(self, pool: Pool, minima: Mixture | None) -> tuple[np.ndarray, Mixture]:
         """The points of the next round, and the mixture they are drawn from."""
-        least = max(LEAST_TEMPERED, TEMPERED * pool.points.shape[1])
-        halves = [
-            fitted(pool.points, tempered_weights(pool, least, power), COMPONENTS, self.random) for power in POWERS
-        ]
-        mixture = halves[0].joined(halves[1], 0.5)
-        if minima is not None:
-            mixture = mixture.joined(minima, 0.6 if len(pool.proposals) == 1 else KEPT)
+        share = 0.6 if len(pool.proposals) == 1 else KEPT
+        mixture = self.proposal(pool, minima, share)
         # The last round draws what is missing, with some to spare.
         current = Weighted.of(pool)
         rate = current.effective / max(len(current.weights) - pool.proposals[0][0], 1)
         missing = 1.25 * (ENOUGH - current.effective) / max(rate, 1e-3) if len(pool.proposals) > 1 else np.inf
         count = ROWS if current.k >= MOST_K else int(np.clip(missing, ROWS // 8, ROWS))
         return mixture.draw(count, self.random), mixture
+
+    def proposal(self, pool: Pool, minima: Mixture | None, share: float = KEPT) -> Mixture:
+        """The mixture that fits the points so far best; the components around known minima get a share of it."""
+        least = max(LEAST_TEMPERED, TEMPERED * pool.points.shape[1])
+        halves = [
+            fitted(pool.points, tempered_weights(pool, least, power), COMPONENTS, self.random) for power in POWERS
+        ]
+        mixture = halves[0].joined(halves[1], 0.5)
+        return mixture if minima is None else mixture.joined(minima, share)
+
+    def evaluated(
+        self, points: Float[np.ndarray, "rows unknowns"]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Predictions, log likelihoods of all measurements, log priors and log densities of at most `ROWS` points."""
+        inside = self.region.contains(points)
+        # The program is compiled for `ROWS` rows; rows of NaN take no time.
+        batch = np.full((ROWS, points.shape[1]), np.nan)
+        batch[: len(points)][inside] = points[inside]
+        predictions = self.density.predictions(batch)[: len(points)]
+        each, likelihood = log_likelihoods(self.measurements, predictions)
+        prior = np.where(inside, self.density.log_priors(batch)[: len(points)], -np.inf)
+        return predictions, each, prior, likelihood + prior
 
 
 class Weighted(NamedTuple):

@@ -7,24 +7,18 @@ import numpy as np
 
 from ..progress import status_line
 from ..validation import require, require_flag, require_whole, shown, warn
-from .exploration import ROWS, Explorer, Weighted
+from .exploration import ROWS, Explorer
 from .likelihood import Measurements
 from .posterior import LogDensity
-from .problem import Problem, deviances
-from .refinement import Minima, refine
+from .problem import Problem
 from .region import region_of
 from .result import Identification, summarise
+from .search import Search, search
 from .unknown import as_free
 from .verdict import FitWarning
 
 #: Step of differences in the coordinates: 1 % of a positive parameter. Differences smooth over narrower structure.
 DIFFERENCE = 0.01
-
-#: Greatest number of steps by slopes before an exploration, where predictions may be a staircase.
-FEW_STEPS = 6
-
-#: Points of the exploration that are better than all minima by more than this in -2 log likelihood are refined, too.
-IMPROVED = 0.1
 
 
 def identify(
@@ -93,36 +87,11 @@ def identify(
     with status_line("fitting", progress):
         region = region_of(unknowns, spread, float(np.max(np.asarray(measurements.time))))
         explorer = Explorer.of(LogDensity.of(model, measurements, unknowns), measurements, region, seed)
-        pool = explorer.begin(seed)
-        if not np.any(np.isfinite(pool.predictions)):
-            raise ValueError("model: no start led to finite predictions")
-        recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
-        steps = max_steps if recorded else min(max_steps, FEW_STEPS)
-        minima = refine(problem, pool.candidates(starts), measurements, steps, progress, in_parts=recorded)
-        if recorded:
-            around = refine(problem, minima.between(), minima.measurements, steps, progress, in_parts=False)
-            minima = minima.joined(around)
-        # Along a direction without any slope, the likelihood has no end that an exploration could find.
-        has_end = bool(np.all(np.isfinite(minima.covariance(minima.best))))
-        sample = explorer.explore(pool, minima.components, progress) if has_end else Weighted.of(pool)
-        minima = _improved(problem, minima, sample, max_steps, progress)
+        minima, sample = search(problem, explorer, Search(starts, max_steps, seed, progress))
         result = summarise(problem, labels, minima, explorer, sample)
     if not result.verdict.good:
         warn("; ".join(result.verdict.concerns), FitWarning)
     return result
-
-
-def _improved(problem: Problem, minima: Minima, sample: Weighted, max_steps: int, progress: bool) -> Minima:
-    """The minima, refined to the end; from the best points of the exploration if these are better."""
-    rows = len(minima.starts)
-    best = sample.pool.points[np.argsort(-sample.pool.log_density)[:rows]]
-    if np.min(deviances(problem, best, minima.measurements)) < np.min(minima.deviance) - IMPROVED:
-        later = refine(problem, best, minima.measurements, min(max_steps, FEW_STEPS), progress, in_parts=False)
-        return later if np.min(later.deviance) < np.min(minima.deviance) else minima
-    if minima.converged[minima.best]:
-        return minima
-    later = refine(problem, minima.coordinates, minima.measurements, max_steps, progress, in_parts=False)
-    return later._replace(starts=minima.starts)
 
 
 def check_search(starts: Any, spread: Any, seed: Any, max_steps: Any, progress: Any) -> None:

@@ -82,8 +82,8 @@ def test_draws_have_the_mean_and_the_covariance_of_the_regression(draws):
     fit, density, posterior = draws
     assert all(value < 1.02 for value in posterior.r_hat.values())
     assert all(value > 400.0 for value in posterior.ess.values())
-    # Straight predictions are polynomials, and proposals are only a little wider than the density.
-    assert posterior.accepted > 0.8
+    # Proposals are heavy-tailed, and half of them come from a flatter density.
+    assert posterior.accepted > 0.4
     for name, value in posterior.values.items():
         error = fit.standard_errors[name]
         assert abs(value.mean() - fit.estimates[name]) < 4.0 * error / np.sqrt(posterior.ess[name])
@@ -134,6 +134,33 @@ def test_draws_that_could_not_be_judged_are_refused_at_once(change, message):
         sample(**({"density": density, "centre": np.zeros(2), "covariance": np.eye(2)} | change))
 
 
+def test_chains_visit_all_minima_without_a_fit():
+    """The square of a number leaves its sign open; a fit knows only one of the signs."""
+    data, free = Measurements(np.full(5, 4.0), 0.5), {"x": Free(1.0, prior=(0.5, 2.0))}
+    density = LogDensity.of(lambda p: jnp.repeat(p["x"][:, None] ** 2, 5, axis=1), data, free)
+    grid = np.linspace(-4.0, 4.0, 4001)
+    logs = -0.5 * 5.0 * ((grid**2 - 4.0) / 0.5) ** 2 - 0.5 * ((grid - 0.5) / 2.0) ** 2
+    expected = np.sum(np.exp(logs)[grid > 0.0]) / np.sum(np.exp(logs))
+    for options in ({}, {"centre": [0.5], "covariance": [[0.01]], "seed": 1}):
+        posterior = sample(density, **options, progress=False)
+        assert posterior.r_hat["x"] < 1.02
+        assert posterior.ess["x"] > 200.0
+        assert abs(np.mean(posterior.values["x"] > 0.0) - expected) < 4.0 * 0.5 / np.sqrt(posterior.ess["x"])
+
+
+def test_draws_of_unknown_errors_have_their_distribution():
+    """Student's t for the mean of ten values, and the root of an inverse chi squared for their error."""
+    value = 1.0 + 0.3 * np.random.default_rng(4).normal(size=10)
+    data = Measurements(value, 1.0, estimated=True)
+    density = LogDensity.of(lambda p: jnp.repeat(p["mean"][:, None], 10, axis=1), data, {"mean": 0.5})
+    posterior = sample(density, progress=False)
+    scale = np.std(value, ddof=1)
+    deviation = scale / np.sqrt(10.0) * np.sqrt(9.0 / 7.0)
+    assert_close(np.std(posterior.values["mean"]), deviation, rtol=0.15)
+    shares = np.quantile(posterior.values["error[0]"], [0.1, 0.5, 0.9])
+    assert_close(shares, scale * np.sqrt(9.0 / scipy.stats.chi2.ppf([0.9, 0.5, 0.1], 9)), rtol=0.08)
+
+
 def test_unknown_errors_are_drawn_too():
     value = 1.0 + 0.3 * np.random.default_rng(4).normal(size=60)
     data = Measurements(value, 1.0, estimated=True)
@@ -158,12 +185,12 @@ def rough(p):
 
 
 @pytest.mark.slow
-def test_draws_are_from_a_density_that_the_surrogate_misses():
-    """Against quadrature, where the polynomials are wrong by up to half an error, and priors are of the parameters."""
+def test_draws_are_from_a_rough_density():
+    """Against quadrature, without a fit, where the roughness is half an error, and priors are of the parameters."""
     error, free = 0.2, {"height": Free(1.0, 0.0, prior=(1.0, 0.3)), "rate": Free(1.0, 0.0, prior=(1.0, 0.4))}
     exact = np.asarray(decay({"height": jnp.array([1.2]), "rate": jnp.array([0.7])}))[0]
     density = LogDensity.of(rough, Measurements(exact, error), free)
-    posterior = sample(density, density.start, np.diag([0.1, 0.2]), progress=False)
+    posterior = sample(density, progress=False)
     grid = np.stack(np.meshgrid(np.linspace(-1.5, 1.5, 101), np.linspace(-3.0, 2.0, 401), indexing="ij"), axis=-1)
     flat = jnp.asarray(grid.reshape(-1, 2))
     logs = np.asarray(
@@ -172,7 +199,6 @@ def test_draws_are_from_a_density_that_the_surrogate_misses():
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     values = {name: np.asarray(value) for name, value in density.values(flat).items()}
-    assert posterior.accepted < 0.8
     # The contribution of the roughness to the density; a smooth surrogate would give 0.
     for name, of in (
         *((name, lambda v, n=name: v[n]) for name in values),
@@ -183,6 +209,7 @@ def test_draws_are_from_a_density_that_the_surrogate_misses():
         ess = min(posterior.ess.values())
         assert abs(np.mean(of(posterior.values)) - mean) < 4.0 * deviations / np.sqrt(ess), name
         assert_close(np.std(of(posterior.values)), deviations, rtol=0.1)
+    assert all(value < 1.02 for value in posterior.r_hat.values())
     assert abs(np.sum(weights * np.sin(40.0 * values["rate"]))) > 0.2
 
 

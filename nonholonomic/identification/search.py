@@ -1,0 +1,60 @@
+"""The search for all minima of a likelihood, and the exploration of its surroundings."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from .exploration import Explorer, Weighted
+from .problem import Problem, deviances
+from .refinement import Minima, refine
+
+#: Greatest number of steps by slopes before an exploration, where predictions may be a staircase.
+FEW_STEPS = 6
+
+#: Points of the exploration that are better than all minima by more than this in -2 log likelihood are refined, too.
+IMPROVED = 0.1
+
+
+class Search(NamedTuple):
+    """How to search: the number of refined candidates, the greatest number of steps of a refinement, the seed, and whether to
+    show progress."""
+
+    starts: int
+    max_steps: int
+    seed: int
+    progress: bool
+
+
+def search(problem: Problem, explorer: Explorer, options: Search) -> tuple[Minima, Weighted]:
+    """Compare candidates, refine the best, and explore the likelihood around all minima.
+
+    **Raises:** `ValueError` if no candidate has a finite prediction.
+    """
+    measurements, (starts, max_steps, seed, progress) = explorer.measurements, options
+    pool = explorer.begin(seed)
+    if not np.any(np.isfinite(pool.predictions)):
+        raise ValueError("model: no start led to finite predictions")
+    recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
+    steps = max_steps if recorded else min(max_steps, FEW_STEPS)
+    minima = refine(problem, pool.candidates(starts), measurements, steps, progress, in_parts=recorded)
+    if recorded:
+        around = refine(problem, minima.between(), minima.measurements, steps, progress, in_parts=False)
+        minima = minima.joined(around)
+    # Along a direction without any slope, the likelihood has no end that an exploration could find.
+    has_end = bool(np.all(np.isfinite(minima.covariance(minima.best))))
+    sample = explorer.explore(pool, minima.components, progress) if has_end else Weighted.of(pool)
+    return _improved(problem, minima, sample, options), sample
+
+
+def _improved(problem: Problem, minima: Minima, sample: Weighted, options: Search) -> Minima:
+    """The minima, refined to the end; from the best points of the exploration if these are better."""
+    rows, max_steps = len(minima.starts), options.max_steps
+    best = sample.pool.points[np.argsort(-sample.pool.log_density)[:rows]]
+    if np.min(deviances(problem, best, minima.measurements)) < np.min(minima.deviance) - IMPROVED:
+        few = min(max_steps, FEW_STEPS)
+        later = refine(problem, best, minima.measurements, few, options.progress, in_parts=False)
+        return later if np.min(later.deviance) < np.min(minima.deviance) else minima
+    if minima.converged[minima.best]:
+        return minima
+    later = refine(problem, minima.coordinates, minima.measurements, max_steps, options.progress, in_parts=False)
+    return later._replace(starts=minima.starts)
