@@ -26,7 +26,7 @@ from nonholonomic.derivatives import VariationalProblem, tangents_of
 from nonholonomic.geometry import AbstractSurface
 from nonholonomic.integration import AbstractProblem, Oscillatory8, Settings, solve_ensemble
 from nonholonomic.parameters import with_numbers
-from stroller.runs.table import RideProblem
+from stroller.model.ride import RideProblem
 from tippe.modes.inversion_problem import InversionProblem
 from tippe.runs.run_kind import run_kind_of
 

@@ -12,7 +12,7 @@ from peers import NUMPY, Task
 import stroller
 import tippe
 from nonholonomic.integration import AbstractProblem
-from stroller.runs.table import RideProblem
+from stroller.model.ride import RideProblem
 from tippe.modes.inversion_problem import InversionProblem
 
 ANGLE = 0.95 * math.pi

@@ -68,6 +68,7 @@ PAGES = {
         "Single runs",
         "Simulate one run, and read its motion, forces and energy.",
         [
+            *of("nonholonomic", "simulate Trajectory"),
             *of("tippe", "simulate Trajectory HybridTrajectory"),
             *of("stroller", "simulate Trajectory Motion Steady ImplicitMidpoint"),
             "tippe.Status",
@@ -78,6 +79,7 @@ PAGES = {
         "Simulate many runs at once, in memory or into a file. :doc:`tables` lists the variables, the statuses and the file "
         "format.",
         [
+            "nonholonomic.sweep",
             *of("tippe", "inversion_table reversal_table trajectory_table"),
             "stroller.sweep",
             "tippe.Table",
@@ -86,8 +88,9 @@ PAGES = {
     ),
     "derivatives": Page(
         "Times, derivatives and stability",
-        "Differentiable inversion times, Lyapunov exponents and steady states.",
+        "Differentiable times of events, Lyapunov exponents and steady states.",
         [
+            *of("nonholonomic", "event_time lyapunov_exponent"),
             *of(
                 "tippe",
                 "inversion_time reversal_time extended_inversion_time lyapunov_exponent LyapunovExponent steady",
@@ -104,6 +107,7 @@ PAGES = {
         "Fitting",
         "Estimate parameters from recordings and measured times.",
         [
+            *of("nonholonomic", "identify Recording EventTimes"),
             *of("tippe", "identify Recording read_recording InversionTimes Free log_density FitWarning"),
             *of("stroller", "identify Recording read_recording"),
         ],
@@ -112,7 +116,7 @@ PAGES = {
         "Interactive pages",
         "Pages with sliders. To draw a run or a table, call its own methods: see `view`, `animate`, `plot` and `portrait` of "
         ":doc:`runs <simulate>` and `plot` of :doc:`tables <sweeps>`.",
-        ["tippe.explore", "stroller.explore"],
+        ["nonholonomic.explore", "tippe.explore", "stroller.explore"],
     ),
     "planning": Page(
         "Motion planning",
@@ -169,11 +173,11 @@ PAGES = {
     ),
     "own_systems": Page(
         "Your own systems",
-        "Run, time, sweep and fit systems that you write.",
-        of(
-            "nonholonomic",
-            "AbstractMode Hybrid AbstractSystem simulate Trajectory event_time sweep Recording identify",
-        ),
+        "The classes of systems that you write. The functions of `nonholonomic` run, time, sweep and fit them.",
+        [
+            *of("nonholonomic", "AbstractMode Hybrid AbstractSystem"),
+            *of("nonholonomic.runs", "AbstractModel model_of"),
+        ],
     ),
 }
 

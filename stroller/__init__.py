@@ -14,6 +14,7 @@ from nonholonomic.geometry import Torus as Torus
 from nonholonomic.identification import Free as Free
 from nonholonomic.integration import ImplicitMidpoint as ImplicitMidpoint
 from nonholonomic.integration.status import Status as Status
+from nonholonomic.sweeps import Table as Table
 
 from . import presets as presets
 from .fit.identify import identify as identify
@@ -36,11 +37,10 @@ from .planning.obstacles import Footprint as Footprint
 from .planning.plan import plan as plan
 from .planning.result import Plan as Plan
 from .planning.track import track as track
-from .runs.explore import explore as explore
-from .runs.simulate import simulate as simulate
-from .runs.table import Table as Table
-from .runs.table import sweep as sweep
 from .runs.trajectory import Trajectory as Trajectory
+from .runs.verbs import explore as explore
+from .runs.verbs import simulate as simulate
+from .runs.verbs import sweep as sweep
 
 # `import *` exports the names above, and not the subpackages.
 __all__ = [

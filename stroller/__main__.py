@@ -30,8 +30,8 @@ from .model.scene import FORKS, Scene
 from .model.stroller import Stroller
 from .runs.plot import draw_rides
 from .runs.quantities import table_of
-from .runs.simulate import simulate
 from .runs.trajectory import Trajectory
+from .runs.verbs import simulate
 from .runs.view import grouped
 
 RIDES = ("without friction", "with friction")

@@ -19,12 +19,14 @@ HEIGHT = {
     "geometry": 0,
     "integration": 0,
     "formulations": 0,
+    "lanes": 0,
     "derivatives": 1,
     "hybrid": 2,
     "views": 3,
     "sweeps": 4,
     "identification": 5,
-    "systems": 6,
+    "runs": 6,
+    "systems": 7,
 }
 
 #: The same for the rooms of a vehicle.

@@ -1,7 +1,6 @@
 """The axes of a table, named by the ends of the full names of numbers."""
 
 import dataclasses
-import importlib
 import re
 
 import equinox as eqx
@@ -11,6 +10,7 @@ import pytest
 from never_run import PRAM, RIDE, TOP
 from tops import rutstam_top
 
+import nonholonomic.sweeps
 import stroller
 import tippe
 from nonholonomic.parameters import numbers
@@ -82,8 +82,7 @@ def test_only_what_can_be_varied_is_suggested():
 
 
 def test_the_axes_of_rides_may_be_named_by_their_ends_too(monkeypatch):
-    table = importlib.import_module("stroller.runs.table")
-    monkeypatch.setattr(table, "computed", lambda job, grid, *_, **__: [axis.number for axis in grid])
+    monkeypatch.setattr(nonholonomic.sweeps, "sweep", lambda job, grid, *_, **__: [axis.number for axis in grid])
     assert stroller.sweep(PRAM, RIDE, 1.0, axes={"speed": [1.0, 2.0], "place[1]": [0.0, 1.0], "wheelbase": [0.6]}) == [
         "launch.speed",
         "launch.place[1]",

@@ -14,7 +14,7 @@ from tops import rutstam_top
 
 import stroller
 import tippe
-from stroller.runs.table import RideProblem
+from stroller.model.ride import RideProblem
 from tippe.modes.coulomb_impact import Skid
 from tippe.modes.free_body import FreeBody, balls
 from tippe.modes.impact import Impact, approach

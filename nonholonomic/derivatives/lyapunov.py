@@ -24,14 +24,16 @@ class VariedProblem(AbstractProblem):
 
     **Arguments:**
 
-    - `problem`: an autonomous problem; only its field and its domain margin are used.
+    - `problem`: a problem; only its field and its domain margin are used.
     - `states`: the problem's state, the tangent and the growth of every cell.
     - `magnitudes`: magnitudes of the problem's own components.
+    - `begin`: the time of the problem [s] at the start.
     """
 
     problem: AbstractProblem
     states: Float[Array, "twice_components_and_one cells"]
     magnitudes: Float[Array, "components cells"]
+    begin: Float[Array, ""] | None = None
 
     def start(self) -> tuple[Float[Array, "all cells"], Float[Array, "all cells"]]:
         unit_scales = jnp.ones((self.states.shape[0] - len(self.magnitudes), *self.states.shape[1:]))
@@ -39,6 +41,7 @@ class VariedProblem(AbstractProblem):
 
     def field(self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]) -> Float[Array, "all lanes"]:
         size = len(self.magnitudes)
+        time = time if self.begin is None else time + self.begin
         y, w = state[:size], state[size:-1]
         rate, carried = jax.jvp(lambda point: self.problem.field(time, point), (y,), (w * self.magnitudes,))
         carried = carried / self.magnitudes
@@ -51,11 +54,13 @@ class VariedProblem(AbstractProblem):
     def domain_margin(
         self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]
     ) -> Float[Array, " lanes"] | None:
+        time = time if self.begin is None else time + self.begin
         return self.problem.domain_margin(time, state[: len(self.magnitudes)])
 
     def margins(
         self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]
     ) -> tuple[Float[Array, " lanes"], ...]:
+        time = time if self.begin is None else time + self.begin
         return self.problem.margins(time, state[: len(self.magnitudes)])
 
 
@@ -93,7 +98,7 @@ def growth(
     stretches: int,
     settings: Settings,
 ) -> Growth:
-    """Integrate every cell of an autonomous problem together with a tangent.
+    """Integrate every cell of a problem together with a tangent.
 
     **Arguments:**
 
@@ -121,7 +126,8 @@ def growth(
     with Progress(stretches, "stretch") as display:
         for number in range(stretches):
             unit = direction / jnp.linalg.norm(direction, axis=0)
-            variational = VariedProblem(problem, jnp.concatenate([start, unit, jnp.zeros((1, cells))]), magnitudes)
+            states = jnp.concatenate([start, unit, jnp.zeros((1, cells))])
+            variational = VariedProblem(problem, states, magnitudes, number * stretch)
             outcome, _ = solve_ensemble(variational, stretch, jnp.asarray(cells), settings)
             alive = (status == RUNNING) | (status == REACHED_END)
             logarithms.append(np.where(alive, outcome.state[-1], 0.0))

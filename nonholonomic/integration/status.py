@@ -28,6 +28,7 @@ class Status(enum.IntEnum):
       undetermined.
     - `UNRESOLVED`: the model determines no motion, or the run changed its mode too often. `FAILED`: the integration
       failed. `ILLEGAL`: a number inside a transformation is out of range, and all results are NaN.
+    - `EVENT`: the run reached the event of a table, and ended there. `STOPPED`: a mode without a reset ended.
     - `PENDING`: a cell of a table that has not been computed.
 
     **Example:**
@@ -55,6 +56,8 @@ class Status(enum.IntEnum):
     RANK_LOST = 9
     REVERSED = 10
     NOT_REVERSED = 11
+    EVENT = 12
+    STOPPED = 13
 
     @property
     def word(self) -> str:

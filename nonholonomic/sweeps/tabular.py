@@ -2,7 +2,8 @@
 
 import abc
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 from ..parameters import likely, readable_unit, require_unit, shown, text_as_html
@@ -113,6 +114,9 @@ class Tabular(abc.ABC):
 
     #: The names that a message for an unknown attribute lists; empty for the ordinary message.
     readable: ClassVar[tuple[str, ...]] = ()
+
+    #: The quantities that `run[name]` returns.
+    quantities: ClassVar[Mapping[str, Quantity]] = MappingProxyType({})
 
     @property
     @abc.abstractmethod
@@ -226,6 +230,15 @@ class Tabular(abc.ABC):
         require_unit(unit)
         x, y = x or self.portrait_axes[0], y or self.portrait_axes[1]
         return draw_portrait(self.table_of((x, y)).drawn_in(unit, x, y), x, y, ax)
+
+    def __getitem__(self, name: str) -> Any:
+        """A quantity by its name, also inside transformations.
+
+        **Raises:** `KeyError` for an unknown quantity.
+        """
+        if name not in self.quantities:
+            raise KeyError(f"{name!r} must be one of {', '.join(self.quantities)}{likely(name, self.quantities)}")
+        return self.quantities[name].of(name, self)
 
     def __getattr__(self, name: str) -> Any:
         # Python calls this for unknown names, and for known names whose property raised an AttributeError, which is

@@ -5,7 +5,6 @@ layout as equations written for the engine: components along the first axis, lan
 time is an additional component of the state.
 """
 
-import contextlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,10 +17,9 @@ from jaxtyping import Array, Bool, Float, Int
 from ..hybrid import AbstractBatchedMode, Transition
 from ..integration import AbstractProblem, Lanes, States
 from ..integration.status import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
-from .components import TooLarge, by_components
+from ..lanes.components import over_lanes
 from .form import Form, OfRun
 from .mode import State
-from .tracing import spelled_out
 
 #: A function counts as zero if changing every component of the state by this fraction of its size could make it zero.
 #: The first fraction is for the end of a mode, which is located only to 1e-10 of a step, so that a long step leaves an
@@ -75,16 +73,7 @@ class ModeProblem(AbstractProblem):
         def of_run(numbers: Sequence[Array], parts: tuple[Array, ...]) -> Any:
             return function(numbers, *time_and_state(self.form, parts))
 
-        parts = tuple(state)
-        numbers = tuple(jax.ShapeDtypeStruct((), jnp.asarray(number).dtype) for number in self.numbers)
-        shapes = (numbers, tuple(jax.ShapeDtypeStruct((), part.dtype) for part in parts))
-        with contextlib.suppress(TooLarge):
-            results = by_components(of_run, *shapes)(self.numbers, parts)
-            return jax.tree.map(lambda result: jnp.broadcast_to(result, parts[0].shape), results)
-        if parts[0].ndim == 0:
-            return spelled_out(of_run)(self.numbers, parts)
-        axes = tuple(0 if jnp.ndim(number) else None for number in self.numbers)
-        return jax.vmap(spelled_out(of_run), in_axes=(axes, 0))(self.numbers, parts)
+        return over_lanes(of_run, self.numbers, tuple(state))
 
 
 def time_and_state(form: Form, parts: tuple[Array, ...]) -> tuple[Array, State]:

@@ -3,43 +3,32 @@ tracing."""
 
 import dataclasses
 import functools
-import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
+from ..lanes.tracing import depends_on_first, is_elementary, spelled_out
+from ..runs.parameters import TreeForm
 from ..validation import UNTRACEABLE, shown
 from .mode import Hybrid, State
-from .tracing import depends_on_first, is_elementary, spelled_out
 
 #: A function of the numbers, the time and the state of one run.
 OfRun = Callable[[Sequence[Array], Array, State], Any]
 
 
-def is_number(leaf: Any) -> bool:
-    """Whether a leaf of a system is a number or an array of numbers, which may differ from cell to cell."""
-    return eqx.is_array(leaf) or isinstance(leaf, np.ndarray | np.inexact | float)
-
-
 @dataclasses.dataclass(frozen=True)
 class Form:
-    """A hybrid system without its numbers. The numbers are listed one by one, in order within each array.
+    """A hybrid system without its numbers.
 
-    - `structure`: structure of the tree of numbers; `kinds`: shape and type of each leaf.
-    - `static_leaves`, `static_structure`: the leaves that are not numbers.
+    - `tree`: the form of the `Hybrid`.
     - `modes`: number of modes; `first`: mode in which runs start; `has_event`: whether there is an event.
     - `size`: number of components of the state.
     """
 
-    structure: Any
-    kinds: tuple[tuple[tuple[int, ...], Any], ...]
-    static_leaves: tuple[Hashable, ...]
-    static_structure: Any
+    tree: TreeForm
     modes: int
     first: int
     has_event: bool
@@ -48,26 +37,12 @@ class Form:
     @classmethod
     def of(cls, hybrid: Hybrid, size: int) -> tuple["Form", tuple[Array, ...]]:
         """The form of a system with states of the given size, and its numbers."""
-        tree, static = eqx.partition(hybrid, is_number)
-        leaves, structure = jax.tree.flatten(tree)
-        arrays = [jnp.asarray(leaf) for leaf in leaves]
-        static_leaves, static_structure = jax.tree.flatten(static)
-        kinds = tuple((array.shape, array.dtype) for array in arrays)
-        modes = (len(hybrid.modes), hybrid.first, hybrid.event is not None)
-        form = cls(structure, kinds, tuple(static_leaves), static_structure, *modes, size)
-        return form, tuple(
-            number for array in arrays for number in (jnp.unstack(array.ravel()) if array.ndim else [array])
-        )
+        tree, numbers = TreeForm.of(hybrid)
+        return cls(tree, len(hybrid.modes), hybrid.first, hybrid.event is not None, size), numbers
 
     def system(self, numbers: Sequence[Array]) -> Hybrid:
         """The system with the given numbers, each a scalar."""
-        leaves, first = [], 0
-        for shape, _ in self.kinds:
-            end = first + math.prod(shape)
-            leaves.append(jnp.stack(numbers[first:end]).reshape(shape) if shape else numbers[first])
-            first = end
-        static = jax.tree.unflatten(self.static_structure, self.static_leaves)
-        return eqx.combine(jax.tree.unflatten(self.structure, leaves), static)
+        return self.tree.tree(numbers)
 
     def function(self, name: str, mode: int = 0) -> OfRun:
         """One of the user's functions: "field", "margin" or "reset" of a mode, or "event"."""
@@ -83,9 +58,8 @@ class Form:
     @property
     def arguments(self) -> tuple[Any, ...]:
         """The shapes of the functions' arguments."""
-        types = [jax.ShapeDtypeStruct((), kind) for shape, kind in self.kinds for _ in range(math.prod(shape))]
         real = jnp.result_type(float)
-        return tuple(types), jax.ShapeDtypeStruct((), real), jax.ShapeDtypeStruct((self.size,), real)
+        return self.tree.types, jax.ShapeDtypeStruct((), real), jax.ShapeDtypeStruct((self.size,), real)
 
     @property
     def traits(self) -> "Traits":

@@ -1,8 +1,7 @@
 """Systems that can be run: hybrid systems, and mechanical systems converted to hybrid ones."""
 
-import dataclasses
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,18 +10,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..formulations import AbstractFormulation, AbstractSystem, Hamel, Lagrange
-from ..integration.checks import run_bounds
-from ..validation import UNTRACEABLE, as_number, is_traced, require, require_all, shown
-from .engine import Cells
+from ..validation import UNTRACEABLE, as_number, is_traced, require, shown
 from .form import Form
 from .mode import AbstractMode, Event, Hybrid, State
-from .tracing import with_own_numbers
 
 #: Largest relative violation of the constraints by a start's velocity.
 VIOLATION = 1e-9
-
-#: Argument type of `simulate`, `event_time`, `sweep` and `identify`.
-System = Hybrid | AbstractSystem
 
 
 class MechanicalMode(AbstractMode):
@@ -55,63 +48,16 @@ def formulation_of(system: AbstractSystem) -> AbstractFormulation:
     return Hamel(system) if has_frame or has_lagrangian else Lagrange(system)
 
 
-class Run(NamedTuple):
-    """A run in the form for the engine; `formulation`: the formulation of a mechanical system, which defines the state,
-    or `None`."""
-
-    cells: Cells
-    formulation: AbstractFormulation | None
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names of the components of a state in tables."""
-        if self.formulation is None:
-            return tuple(f"y{k}" for k in range(self.cells.form.size))
-        return tuple(f"{name}{k}" for name in ("q", "rate") for k in range(self.formulation.system.dimension))
-
-    def shown(self, state: Float[Array, " components"]) -> State:
-        """A state of the engine in the user's components."""
-        state = state[: self.cells.form.size]
-        return state if self.formulation is None else jnp.concatenate(self.formulation.split(state))
-
-
-def run_of(system: System, start: Any, event: Event | None) -> Run:
-    """A run of a system from a start, with an event, by default the system's own."""
-    if isinstance(system, AbstractSystem):
-        formulation = formulation_of(system)
-        q, rate = (as_number(part) for part in start)
-        state = formulation.state(q, rate)
-        if event is not None:
-            event = with_own_numbers(event, jnp.zeros(()), jnp.concatenate([q, rate]))
-            event = MechanicalEvent(formulation, event)
-        hybrid = Hybrid([MechanicalMode(formulation)], event)
-    else:
-        formulation, state = None, as_number(start)
-        hybrid = system
-        if event is not None:
-            hybrid = dataclasses.replace(system, event=with_own_numbers(event, jnp.zeros(()), state))
-    form, numbers = Form.of(hybrid, state.size)
-    form.traits  # noqa: B018  Traced here, so that what is wrong with a user's function is said before anything compiles.
-    return Run(Cells(numbers, tuple(jnp.unstack(state)), form), formulation)
-
-
-def check_run(system: Any, start: Any, t1: Any, tolerance: Any) -> None:
-    """Raise `ValueError` unless the arguments are a system, a start of this system, a positive horizon and a legal
-    tolerance."""
-    if not isinstance(system, Hybrid | AbstractSystem):
-        hint = "; wrap modes in nonholonomic.Hybrid([...])" if isinstance(system, AbstractMode) else ""
-        raise ValueError(f"system = {shown(system)} must be a Hybrid or an AbstractSystem{hint}")
+def check_start(system: Hybrid | AbstractSystem, start: Any) -> None:
+    """Raise `ValueError` unless the start is one of this system."""
     if isinstance(system, AbstractSystem):
         _check_mechanical_start(system, start)
     else:
         _check_vector(start, "start", None)
-    require_all(run_bounds(t1, tolerance))
-    for name, number in {"t1": t1, "tolerance": tolerance}.items():
-        if np.ndim(number) != 0:
-            raise ValueError(f"{name} must be one number, not of shape {np.shape(number)}; jax.vmap or sweep runs many")
 
 
 def _check_vector(value: Any, name: str, size: int | None) -> None:
+    value = as_number(value)
     require(value, name)
     shape = f"({'components' if size is None else size},)"
     if np.ndim(value) != 1 or np.size(value) == 0 or size not in (None, np.size(value)):

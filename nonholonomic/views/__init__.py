@@ -22,6 +22,7 @@ from .series import draw_series as draw_series
 from .stage import COLOURS as COLOURS
 from .stage import DARK as DARK
 from .stage import PALE as PALE
+from .stage import Arena as Arena
 from .stage import Arrow as Arrow
 from .stage import Body as Body
 from .stage import Curve as Curve

@@ -24,7 +24,7 @@ from nonholonomic.validation import as_number, require_kind
 
 from ..model.launch import Launch
 from ..model.scene import Scene
-from ..runs.simulate import simulate
+from ..runs.verbs import simulate
 from .recording import Recording
 
 

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.systems.components import TooLarge, by_components
-from nonholonomic.systems.last_axis import over_last_axis
-from nonholonomic.systems.tracing import is_elementary, spelled_out
+from nonholonomic.lanes.components import TooLarge, by_components
+from nonholonomic.lanes.last_axis import over_last_axis
+from nonholonomic.lanes.tracing import is_elementary, spelled_out
 
 from .input import Motion
 

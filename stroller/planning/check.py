@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from ..runs.simulate import simulate
 from ..runs.trajectory import Trajectory
+from ..runs.verbs import simulate
 from .goal import Limits
 from .obstacles import Footprint
 from .problem import Problem

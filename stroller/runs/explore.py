@@ -3,7 +3,6 @@
 import math
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -12,9 +11,7 @@ from nonholonomic.geometry import Plane
 from nonholonomic.integration import AbstractPassive, ExtendedProblem, LaneState, Settings
 from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, Status
 from nonholonomic.parameters import numbers, with_numbers
-from nonholonomic.progress import status_line
-from nonholonomic.validation import require_file
-from nonholonomic.views import Page, Stage, arena
+from nonholonomic.views import Stage, arena
 from nonholonomic.views.explore import (
     Answer,
     Frame,
@@ -22,21 +19,16 @@ from nonholonomic.views.explore import (
     Simulator,
     Slider,
     Summary,
-    ends_of,
-    live_page,
     quaternion,
-    sliders_of,
 )
 
 from ..model.dynamics import State
 from ..model.input import Input
 from ..model.launch import Launch
+from ..model.ride import RideProblem, as_module
 from ..model.scene import DRIVES, Scene
-from .checks import check_run
-from .ride import RideProblem, as_module
-from .simulate import simulate
-from .table import LONG_NAMES, UNITS
-from .trajectory import quantities_of
+from .state import RideState
+from .trajectory import Trajectory
 from .view import RADIUS, TRACK
 
 Numbers = Float[Array, " numbers"]
@@ -50,65 +42,6 @@ SHOWN = ("position", "direction", "steering", "speed", "front_speed", "energy", 
 
 #: Greatest number of steps of a run in the page; they take some hundred milliseconds.
 MOST_STEPS_OF_A_PAGE = 50_000
-
-
-@status_line("writing a page")
-def explore(
-    scene: Scene,
-    launch: Launch,
-    path: Any = None,
-    sliders: dict[str, tuple[float, float]] | None = None,
-    t1: float = 8.0,
-    input: Input | None = None,
-) -> Page:
-    """Make a page with sliders that simulates the ride in the browser while you move a slider.
-
-    The page is one file that needs no network; a notebook shows the returned `Page`. The equations of motion, the
-    Runge-Kutta pair and the step-size control are generated from those of `simulate` and of tables, at a tolerance of
-    1e-7. The page also computes a map, over two of the sliders, of the distance between the ends of the ride; click on
-    the map to set both sliders. The address of the page contains the slider values, so that you can copy a link to a
-    ride. Press space to play or pause, and r to reset the sliders.
-
-    **Arguments:**
-
-    - `scene`, `launch`, `input`: the ride at the start, as for `simulate`.
-    - `path`: file to write the page to, or `None`.
-    - `sliders`: name of a parameter -> (lowest, highest) value. The end of a name is enough if only one parameter
-      matches, such as "launch.speed", "launch.steering" or "inertia". By default speed, steering angle, heading and
-      friction.
-    - `t1`: horizon [s].
-
-    **Returns:** a `Page`, with its `html`.
-
-    **Raises:** `ValueError` for arguments out of range, an unknown slider, or equations with an operation of JAX that cannot
-    be written in JavaScript; `ModuleNotFoundError` if the library for views is not installed; `OSError` if the file cannot be
-    written.
-
-    **Example:** a page with two sliders.
-
-    ```
-    >>> import stroller
-    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
-    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
-    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
-    >>> page = stroller.explore(scene, launch, sliders={"speed": (0.5, 3.0), "launch.steering": (-0.5, 0.5)}, t1=2.0)
-    >>> len(page.html) < 2.5e6
-    True
-
-    ```
-    """
-    if path is not None:
-        require_file(path, "path", ".html", ".htm")
-    check_run(scene, launch, t1, input, TOLERANCE)
-    roots: dict[str, Any] = {"scene": scene, "launch": launch}
-    if isinstance(input, eqx.Module):
-        roots["input"] = input
-    knobs = sliders_of(default_ranges(scene, launch) if sliders is None else sliders, roots, LONG_NAMES, UNITS)
-    shapes = [roots, *(with_numbers(roots, {path: end}) for path, end in ends_of(knobs))]
-    page = live_page(live_run(roots, knobs, float(t1), input), stage(shapes, float(t1), input))
-    if path is not None:
-        page.save(path)
-    return page
 
 
 def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float, input: Any) -> LiveRun:
@@ -183,19 +116,18 @@ def outcome(problem: RideProblem, lane: LaneState) -> tuple[Int[Array, ""], Floa
     return status, jnp.where(status == int(Status.COMPLETED), jnp.sqrt(sum(squares))[0], jnp.inf)
 
 
-def stage(runs: list[dict[str, Any]], t1: float, controls: Any) -> Stage:
-    """The stage of the first scene and launch, on a part of the ground that contains the rides of all given scenes and
-    launches."""
-    rides = [simulate(run["scene"], run["launch"], t1, run.get("input", controls), tolerance=DRAWN) for run in runs]
-    (first,), length = rides[0].stages(), float(runs[0]["scene"].body.wheelbase)
+def stage(rides: list[Trajectory]) -> Stage:
+    """The stage of the first ride, on a part of the ground that contains all rides."""
+    (first,), scene = rides[0].stages(), rides[0].spec.ride.scene
+    length = float(scene.body.wheelbase)
     points = np.concatenate([np.asarray(ride.position) for ride in rides])
-    return first._replace(arena=arena(runs[0]["scene"].surface, points, first.arena.normal, 3.0 * length, length))
+    return first._replace(arena=arena(scene.surface, points, first.arena.normal, 3.0 * length, length))
 
 
 def frame(scene: Scene, controls: Input | None, lane: LaneState) -> Frame:
     """The drawn quantities of a stroller at one time, in the order of `view.show`."""
-    arrays = quantities_of(scene, controls, lane.time, lane.state[:-3])
-    outputs = {name: arrays[name][0] for name in SHOWN}
+    state = RideState(scene, controls, lane.time, lane.state[:-3])
+    outputs = {name: getattr(state, name)[0] for name in SHOWN}
     length, position, heading = scene.body.wheelbase, outputs["position"], outputs["direction"]
     normal = scene.surface.sign(scene.side, DRIVES) * fixed_normal(scene, position)
     x = heading / jnp.linalg.norm(heading)

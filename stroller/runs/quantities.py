@@ -31,6 +31,9 @@ QUANTITIES = {
     "normal_force": Quantity("N", "normal force"),
 }
 
+#: Names of the components of vectors, by dimension.
+VECTORS = {"component": ("x", "y", "z"), "axle": ("rear", "front")}
+
 
 def table_of(runs: list[Any], names: list[str], request: dict[str, Any], only: Sequence[str] = ()) -> Table:
     """All quantities of several runs with the same times, over these times.
@@ -48,7 +51,7 @@ def table_of(runs: list[Any], names: list[str], request: dict[str, Any], only: S
     places, unit = (("first", "second"), "m or rad") if flat else (places, unit)
     coords = {"ride": np.array(names)} if names else {}
     coords |= {"time": np.asarray(runs[0].t), "coordinate": np.array(places)}
-    coords |= {"component": np.array(("x", "y", "z")), "axle": np.array(("rear", "front"))}
+    coords |= {dim: np.array(names) for dim, names in VECTORS.items()}
     quantities = chosen(QUANTITIES | {"place": QUANTITIES["place"]._replace(unit=unit)}, only)
     of_runs = {name: [np.asarray(quantity.of(name, run)) for run in runs] for name, quantity in quantities.items()}
     values = {name: np.stack(of_each) if names else of_each[0] for name, of_each in of_runs.items()}

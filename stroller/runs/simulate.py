@@ -1,83 +1,44 @@
-"""Simulate a ride."""
+"""One ride: with its steps outside of transformations, and sampled inside."""
 
 import dataclasses
 import functools
+from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from nonholonomic.integration import ImplicitMidpoint, Settings
 from nonholonomic.integration.checks import legal_run, require_times
-from nonholonomic.progress import status_line
+from nonholonomic.runs import sampled
 from nonholonomic.validation import as_known, is_traced, nan_unless
 
-from ..model.input import Input
-from ..model.launch import Launch
-from ..model.scene import Scene
-from .checks import check_options, check_run
-from .ride import Ride, RideSpec, as_module, traced_ride
+from ..model.dynamics import State
+from ..model.input import Formula, at_start
+from ..model.per_ride import PerRide
+from ..model.ride import has_arrays
+from .checks import check_options
+from .ride import Ride, RideSpec, Stats, stats_of
 from .steps import followed
 from .trajectory import Trajectory, read_off, read_off_compiled
 
-#: Default number of times to report.
-DEFAULT_TIMES = 201
+#: Default number of times to report, and default limit of the steps of a ride.
+DEFAULT_TIMES, DEFAULT_STEPS = 201, 65536
 
 
-@status_line("simulating")
-def simulate(
-    scene: Scene,
-    launch: Launch,
-    t1: Float[ArrayLike, ""],
-    input: Input | None = None,
-    times: Float[ArrayLike, " times"] | None = None,
-    tolerance: float | Float[Array, ""] = 1e-9,
-    solver: diffrax.AbstractSolver | None = None,
-    max_steps: int = 65536,
-    adjoint: diffrax.AbstractAdjoint | None = None,
+def ride(
+    model: Any,
+    t1: Any,
+    times: Any,
+    tolerance: Any,
+    solver: diffrax.AbstractSolver | None,
+    max_steps: int,
+    adjoint: diffrax.AbstractAdjoint | None,
 ) -> Trajectory:
-    """Simulate a ride from a launch until `t1`.
-
-    **Arguments:**
-
-    - `scene`: a `Scene`.
-    - `launch`: a `Launch`.
-    - `t1`: end of the run [s], positive.
-    - `input`: a function `(t, motion) -> (drive force [N], steering torque [N m])` (see `input.py`), or `None`.
-    - `times`: times [s] to report, increasing, within [0, t1]; by default 201 equally spaced ones.
-    - `tolerance`: relative tolerance of an adaptive solver, in [1e-14, 1e-2]; the absolute tolerance is a tenth of it,
-      in units of the scene's magnitudes.
-    - `solver`: any adaptive solver of Diffrax for ordinary differential equations, or an `ImplicitMidpoint`; by default
-      `diffrax.Dopri8()`; inside transformations without `adjoint`, if all numbers of scene and launch are scalars,
-      `nonholonomic.integration.Oscillatory8()`.
-    - `max_steps`: a run that needs more steps fails; at least 1.
-    - `adjoint`: an adjoint method of Diffrax, such as `RecursiveCheckpointAdjoint()`, with which Diffrax
-      differentiates. By default, this package computes forward and reverse derivatives; the gradient of a loss function
-      costs about five runs, whatever the number of parameters, which may be arrays, such as the weights of an input.
-
-    **Returns:** a `Trajectory`; its `status` states how the run ended.
-
-    **Raises:** `ValueError` for arguments out of range, lists in place of numbers, an illegal launch, times that do not
-    increase, a solver without an error estimate, and an input that is not a function, cannot be traced, or is not
-    finite at the start.
-
-    **Example:**
-
-    ```
-    >>> import stroller
-    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
-    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
-    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
-    >>> run = stroller.simulate(scene, launch, 1.0, stroller.Steady(1.0, 0.1), times=[0.5, 1.0], tolerance=1e-6)
-    >>> print(f"{run.speed[-1]:.3f} m/s, {run.heading[-1]:.3f} rad, {run.status}")
-    1.472 m/s, 0.980 rad, completed
-
-    ```
-    """
-    check_run(scene, launch, t1, input, tolerance)
+    """The trajectory of a `RideModel`. **Arguments:** as for `stroller.simulate`; the model was checked."""
     check_options(solver, max_steps, adjoint)
     end, grid = as_known(t1), None
     times = _evenly_spaced(end) if times is None else as_known(times)
@@ -87,10 +48,10 @@ def simulate(
         max_steps = grid.size
     settings = Settings(tolerance, solver, max_steps=max_steps)
     # Inside a transformation, this traces all numbers, even if they are known.
-    ride = Ride(scene, launch, as_module(input, scene, launch), jnp.add(end, 0.0), settings, grid)
-    if any(is_traced(leaf) for leaf in jax.tree.leaves((ride, times))):
-        return _legal_or_nan(ride, times, adjoint)
-    return _concrete(ride, times)
+    specification = Ride(model, jnp.add(end, 0.0), settings, grid)
+    if any(is_traced(leaf) for leaf in jax.tree.leaves((specification, times))):
+        return _legal_or_nan(specification, times, adjoint)
+    return _concrete(specification, times)
 
 
 def _concrete(ride: Ride, times: Float[Array, " times"]) -> Trajectory:
@@ -102,25 +63,33 @@ def _concrete(ride: Ride, times: Float[Array, " times"]) -> Trajectory:
     return dataclasses.replace(read_off_compiled(spec, times, steps.at(spec, np.asarray(times)), stats), steps=steps)
 
 
+def _traced(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None) -> tuple[State, Stats]:
+    """The states of a ride at `times`, and its statistics, inside a transformation."""
+    model = ride.model
+    if adjoint is None and isinstance(model.input, Formula) and not has_arrays((model.scene, model.launch)):
+        t, motion = eqx.filter_eval_shape(at_start, model.scene, model.launch)
+        model = dataclasses.replace(model, input=PerRide.of(model.input, t, motion))
+    in_lanes = isinstance(model.input, PerRide)
+    run = sampled(model, None, times, ride.t1, ride.settings, ride.grid, adjoint, arrays_in_lanes=in_lanes)
+    return run.rows, stats_of(run.outcome)
+
+
 # Steps of other implicit solvers cannot be repeated cheaply, so they end on the times.
-_sampled = eqx.filter_jit(functools.partial(traced_ride, adjoint=None))
+_sampled = eqx.filter_jit(functools.partial(_traced, adjoint=None))
 
 
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
 @eqx.filter_jit
 def _legal_or_nan(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None) -> Trajectory:
     """The run, or NaN and `finished` false if a traced number is out of range."""
-    may_start = ride.scene.may_start(ride.launch, ride.input)
-    is_legal, t1, tolerance = legal_run(may_start, ride.t1, ride.settings.tolerance, times)
+    is_legal, t1, tolerance = legal_run(ride.model.legal(), ride.t1, ride.settings.tolerance, times)
     legal_ride, run_times = ride._replace(settings=ride.settings.with_tolerance(tolerance)), times
     if ride.grid is None:
         legal_ride, run_times = legal_ride._replace(t1=t1), jnp.where(is_legal, times, 0.0)
     if adjoint is not None:
         # A run with illegal numbers never begins, but Diffrax would differentiate it.
-        legal_ride = legal_ride._replace(
-            **nan_unless(is_legal, {"scene": ride.scene, "launch": ride.launch, "input": ride.input})
-        )
-    run = read_off(RideSpec.of(ride), run_times, *traced_ride(legal_ride, run_times, adjoint))
+        legal_ride = legal_ride._replace(model=nan_unless(is_legal, ride.model))
+    run = read_off(RideSpec.of(ride), run_times, *_traced(legal_ride, run_times, adjoint))
     stats = run.stats._replace(finished=run.stats.finished & is_legal)
     return eqx.tree_at(lambda trajectory: (trajectory.t, trajectory.stats), nan_unless(is_legal, run), (times, stats))
 

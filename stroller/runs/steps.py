@@ -17,7 +17,8 @@ from nonholonomic.integration import explicit_tableau, follow, sample
 from nonholonomic.xla_cpu import compiled_quickly
 
 from ..model.dynamics import State
-from .ride import RideProblem, RideSpec, Stats
+from ..model.ride import RideProblem
+from .ride import RideSpec, Stats
 
 Lanes = Float[np.ndarray, " lanes"]
 States = Float[np.ndarray, "components lanes"]

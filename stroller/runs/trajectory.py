@@ -5,23 +5,21 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_vectors
 from nonholonomic.progress import status_line
-from nonholonomic.sweeps import Table, Tabular
+from nonholonomic.sweeps import Quantity, Table, Tabular
 from nonholonomic.validation import is_traced, require, require_increasing, require_one_run, require_outside
 from nonholonomic.views import Stage, Viewable
 
-from ..model.dynamics import Power, State, padded
-from ..model.input import Input
-from ..model.scene import Scene
+from ..model.dynamics import Power
+from ..model.ride import CONTACT_ROUND_OFF, RANK_LOST
 from .crossings import crossings, watched
 from .quantities import QUANTITIES, table_of_one
-from .ride import CONTACT_ROUND_OFF, MOST_GRIP, RANK_LOST, RideSpec, Stats
+from .ride import MOST_GRIP, RideSpec, Stats
+from .state import RideState, grip, spread
 from .steps import Steps, followed
 from .view import as_stages, names_of
 
@@ -82,6 +80,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
     steps: Steps | None
 
     readable: ClassVar[tuple[str, ...]] = tuple(QUANTITIES)
+    quantities: ClassVar[dict[str, Quantity]] = QUANTITIES
 
     @property
     def portrait_axes(self) -> tuple[str, str]:
@@ -106,8 +105,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
 
     def grip(self) -> Float[Array, "times 2"]:
         """Coefficient of friction that each axle needs to avoid slip; infinite for a force without a load."""
-        force = jnp.abs(self.side_force)
-        return jnp.where(force == 0.0, 0.0, force / jnp.maximum(self.load, 0.0))
+        return grip(self.side_force, self.load)
 
     @property
     def loaded_axles(self) -> tuple[str, ...]:
@@ -241,42 +239,6 @@ def shown(numbers: Float[Array, " n"]) -> str:
     return f"({', '.join(f'{float(number):.6g}' for number in numbers)})"
 
 
-def side_slip(scene: Scene, rate: State, state: State) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Speeds [m/s] at which the rear axle and the front wheel slip sideways when the state changes at `rate`.
-
-    They come from the rates of the position r and of the heading, with the front wheel l ahead of the rear axle.
-    """
-    dynamics, body = scene.dynamics, scene.body
-
-    def heading_components(state):
-        return [component for component in dynamics.geometry(state).motion.heading if component is not None]
-
-    g = dynamics.geometry(state)
-    velocity = dynamics.unpack(rate)[0]
-    heading_rate = padded(jax.jvp(heading_components, (state,), (rate,))[1])
-    if scene.heading == "projected":
-        heading, left = g.motion.heading, (-g.motion.heading[1], g.motion.heading[0], None)
-    else:
-        heading, left = g.direction, g.left
-    sideways = sum_vectors(scale(-g.sine, heading), scale(g.cosine, left))
-    front = sum_vectors(velocity, scale(multiply(body.wheelbase, dot(heading_rate, left)), left))
-    return dot(velocity, left), dot(front, sideways)
-
-
-def spread(component: Component, example: Float[Array, "..."]) -> Float[Array, "..."]:
-    """A component as an array, with zeros if it vanishes identically."""
-    return jnp.zeros_like(example) if component is None else jnp.broadcast_to(component, example.shape)
-
-
-def side_force(
-    scene: Scene, t: Float[Array, " times"], states: Float[Array, "components times"], controls: Input | None
-) -> tuple[Float[Array, " times"], Float[Array, " times"]]:
-    """Side forces [N] on the rear axle and the front wheel, to the left of each."""
-    if scene.heading == "intrinsic" or isinstance(scene.surface, Plane):
-        return scene.dynamics.side_force(t, states, controls)
-    return scene.dynamics.projected_side_force(t, states, controls)
-
-
 def read_off(
     spec: RideSpec,
     t: Float[Array, " times"],
@@ -284,49 +246,10 @@ def read_off(
     stats: Stats,
 ) -> Trajectory:
     """The trajectory of the given states at the given times."""
-    arrays = quantities_of(spec.ride.scene, spec.ride.input, t, states)
+    state = RideState(spec.ride.scene, spec.ride.input, t, states)
+    arrays = {field.name: getattr(state, field.name) for field in dataclasses.fields(Trajectory)[:-3]}
     return Trajectory(**arrays, stats=stats, spec=spec, steps=None)
 
 
 # Compiled functions also accept NumPy arrays.
 read_off_compiled: Callable[..., Trajectory] = eqx.filter_jit(read_off)
-
-
-def quantities_of(
-    scene: Scene, controls: Input | None, t: Float[Array, " times"], states: Float[Array, "components times"]
-) -> dict[str, Any]:
-    """The quantities of a `Trajectory`, by name, of the given states at the given times."""
-    dynamics, surface = scene.dynamics, scene.surface
-    integrated, states = states, scene.dynamics.righted(states)
-    g = dynamics.geometry(states)
-    motion, example = g.motion, states[0]
-    place = surface.place_at(motion.position)
-    _, east, north = surface.chart(place)
-    power = dynamics.power(g, dynamics.forces(t, g, controls))
-    normal_force = spread(g.normal_force, example)
-    front_load = spread(g.front_load, example)
-
-    def columns(*components):
-        return jnp.stack([spread(component, example) for component in components], axis=-1)
-
-    return dict(
-        t=t,
-        place=columns(*place),
-        position=columns(*surface.in_fixed_frame(motion.position)),
-        heading=dynamics.heading.angle(motion.heading, east, north),
-        direction=columns(*surface.in_fixed_frame(motion.heading)),
-        steering=motion.steering,
-        speed=motion.speed,
-        front_speed=motion.front_speed,
-        steering_rate=spread(motion.steering_rate, example),
-        yaw_rate=motion.yaw_rate,
-        energy=scene.energy(states),
-        work=scene.work(states),
-        power=Power(*(spread(part, example) for part in power)),
-        side_force=columns(*side_force(scene, t, states, controls)),
-        normal_force=normal_force,
-        load=columns(normal_force - front_load, front_load),
-        constraint=columns(*side_slip(scene, dynamics.field(t, states, controls), states)),
-        departure=spread(surface.offset(motion.position), example),
-        state=integrated.T,
-    )

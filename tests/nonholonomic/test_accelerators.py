@@ -13,7 +13,7 @@ import stroller
 import tippe
 from nonholonomic.integration import Oscillatory8, Settings
 from nonholonomic.integration.ensemble import ensemble_solve
-from stroller.runs.table import RideProblem
+from stroller.model.ride import RideProblem
 from tippe.modes.inversion_problem import InversionProblem
 from tippe.runs.run_kind import run_kind_of
 

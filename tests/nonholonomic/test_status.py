@@ -9,7 +9,7 @@ import nonholonomic
 import stroller
 import tippe
 from nonholonomic.sweeps import Table, Variable, axis, sweep
-from stroller.runs.table import WORDS as OF_RIDES
+from stroller.runs.verbs import FORM
 from tippe.runs import run_kind
 from tippe.runs.trajectory_table import WORDS as OF_TRAJECTORIES
 
@@ -39,6 +39,8 @@ def test_both_packages_hand_out_one_list_whose_integers_do_not_change():
         "rank_lost": 9,
         "reversed": 10,
         "not_reversed": 11,
+        "event": 12,
+        "stopped": 13,
     }
     assert all(Status.of(word) is status for word, status in zip(words, Status, strict=True))
 
@@ -53,14 +55,14 @@ def test_all_tables_use_words_of_the_list():
     kinds = [kind for kind in vars(run_kind).values() if isinstance(kind, run_kind.RunKind)]
     assert len(kinds) == 8
     words_of_list = {status.word for status in Status}
-    for words in (OF_RIDES, OF_TRAJECTORIES, *(kind.words for kind in kinds)):
+    for words in (FORM.words, OF_TRAJECTORIES, *(kind.words for kind in kinds)):
         assert words_of_list.issuperset(words)
         assert len(set(words)) == len(words)
     # Each file states the meanings of its integers; these integers are the oldest.
     words = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit", "unresolved")
     assert words == run_kind.WORDS
     assert OF_TRAJECTORIES[:4] == ("completed", "contact_lost", "failed", "jammed")
-    assert OF_RIDES == ("completed", "contact_lost", "rank_lost", "failed")
+    assert FORM.words == ("completed", "contact_lost", "rank_lost", "failed")
 
 
 def swept(words, path, fails_at=np.inf):

@@ -17,10 +17,10 @@ from random_scenes import Batch, batch
 import tippe
 from nonholonomic.integration import Settings
 from nonholonomic.parameters import with_numbers
+from nonholonomic.runs.errors import errors_of, second_tolerance
 from nonholonomic.xla_cpu import compile_quickly
 from tippe.runs.cells import InversionRuns
 from tippe.runs.run_kind import run_kind_of
-from tippe.runs.time_error import errors_of, second_tolerance
 
 ANGLE, TOLERANCE = 0.95 * np.pi, 1e-9
 

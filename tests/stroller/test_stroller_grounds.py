@@ -25,8 +25,8 @@ from stroller import (
     Torus,
 )
 from stroller.__main__ import GROUNDS, main, parser, scenes
-from stroller.runs.ride import RideProblem
-from stroller.runs.table import named_axes
+from stroller.model.ride import RideProblem
+from stroller.runs.model import RideModel
 
 BODY = Stroller(1.7, 0.3, 0.4, 0.05)
 
@@ -84,8 +84,9 @@ def test_a_place_may_be_a_point_in_space(surface, place):
 
 def test_numbers_of_a_place_are_named_as_the_surface_names_them():
     def names(surface, place):
-        numbers = {f"launch.place[{k}]": [0.1] for k in range(len(place))}
-        return [(axis.name, axis.unit) for axis in named_axes(numbers, surface, Launch(place, 0.0, 1.0))]
+        model = RideModel.of(Scene(BODY, surface), Launch(place, 0.0, 1.0), None)
+        labels = model.label([f"launch.place[{k}]" for k in range(len(place))])
+        return [(name, unit) for name, unit, _ in labels.values()]
 
     assert names(Cylinder(1.0), (0.0, 0.0)) == [("y0", "m"), ("eta0", "rad")]
     assert names(Torus(2.0, 1.0), (0.0, 0.0)) == [("mu0", "rad"), ("eta0", "rad")]

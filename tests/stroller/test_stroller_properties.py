@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from nonholonomic.integration import Settings, solve_ensemble
 from nonholonomic.integration.status import LEFT_DOMAIN, REACHED_END
 from stroller import Damping, Launch, Plane, RollingResistance, Scene, Sphere, Spheroid, Stroller
-from stroller.runs.table import RideProblem
+from stroller.model.ride import RideProblem
 
 HORIZON = 0.25
 

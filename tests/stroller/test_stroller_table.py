@@ -12,7 +12,7 @@ import stroller
 from stroller import Damping, Launch, Plane, Scene, Sphere, Spheroid, Steady, Stroller, Table
 from stroller import __main__ as job
 from stroller.__main__ import main
-from stroller.runs.table import named_axes
+from stroller.runs.model import RideModel
 
 BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05)
 LAUNCH = Launch((0.3, -0.6), 0.5, 1.5, 0.2, 0.1)
@@ -129,8 +129,8 @@ def test_a_map_shows_its_values_and_is_grey_only_where_there_is_none(places):
 
 
 def test_axes_of_one_name_are_told_apart():
-    grid = named_axes({"launch.steering": [0.1], "scene.friction.steering": [0.2]}, stroller.Plane(), LAUNCH)
-    assert [(axis.name, axis.unit) for axis in grid] == [("launch_steering", "rad"), ("friction_steering", "N m s")]
+    labels = RideModel.of(BOWL, LAUNCH, None).label(["launch.steering", "scene.friction.steering"])
+    assert [label[:2] for label in labels.values()] == [("launch_steering", "rad"), ("friction_steering", "N m s")]
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,11 @@ from tops import rutstam_top
 
 import tippe
 from nonholonomic.integration import Settings
+from nonholonomic.runs.errors import FINER, SAFETY, SAFETY_OF_HISTORIES, error_bound, errors_of, second_tolerance
 from nonholonomic.sweeps.digits import concise, concise_strings
 from tippe import steady
 from tippe.runs.cells import InversionJob, InversionRuns
 from tippe.runs.run_kind import run_kind_of
-from tippe.runs.time_error import FINER, SAFETY, SAFETY_OF_HISTORIES, error_bound, errors_of, second_tolerance
 
 SCENE = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
 ANGLE = np.pi - 0.1

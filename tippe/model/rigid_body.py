@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Vector, dot, scale, sum_vectors, vector_of
-from nonholonomic.systems.components import TooLarge, by_components
-from nonholonomic.systems.tracing import with_own_numbers
+from nonholonomic.lanes.components import TooLarge, by_components
+from nonholonomic.lanes.tracing import with_own_numbers
 from nonholonomic.validation import UNTRACEABLE, Bound, Bounded, as_number, is_traced, shown
 
 from .inertia import Inertia

@@ -11,6 +11,7 @@ from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import Outcome, Settings, solve_by_diffrax
 from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED, Status
 from nonholonomic.parameters import with_numbers
+from nonholonomic.runs.errors import errors_of, second_tolerance
 from nonholonomic.sweeps import Variable
 from nonholonomic.validation import as_number
 
@@ -22,7 +23,6 @@ from ..modes.inversion_problem import InversionProblem, StemContact
 from .inversion import Inversions, carried_by_stem, checked, is_inverted
 from .run_kind import COUNTED, HYBRID, WORDS, RunKind, run_kind_of
 from .sensitivities import sensitivities_of_cells
-from .time_error import errors_of, second_tolerance
 
 TIMES = {"time": "inversion time", "first_time": "first inversion time", "last_time": "last inversion time"}
 
@@ -232,7 +232,8 @@ class InversionJob(NamedTuple):
             settings = runs.settings.with_tolerance(as_number(second_tolerance(float(runs.settings.tolerance))))
             second = runs._replace(settings=settings, slopes_by=[]).results(self.roots, columns, count)
             silent = tuple(words.index(word) for word in ("failed", "unresolved") if word in words)
-            variables |= errors_of(variables, second, runs.bounded_times, runs.run_kind.counts, silent)
+            bounded = (*runs.bounded_times, "end_time", "end_theta")
+            variables |= errors_of(variables, second, bounded, runs.run_kind.counts, silent)
         return variables
 
 

@@ -18,7 +18,7 @@ from nonholonomic.integration import DenseSolution
 from nonholonomic.integration.status import Status
 from nonholonomic.integration.zeros import few_trials
 from nonholonomic.progress import status_line
-from nonholonomic.sweeps import Table, Tabular
+from nonholonomic.sweeps import Quantity, Table, Tabular
 from nonholonomic.validation import is_traced, require, require_increasing
 from nonholonomic.views import Stage, Viewable
 
@@ -84,6 +84,7 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
     by_time: ClassVar[tuple[str, ...]] = ("t", "states", "cyclic", "spin_angle", "work")
 
     readable: ClassVar[tuple[str, ...]] = (*QUANTITIES, *OF_ONE_RUN)
+    quantities: ClassVar[dict[str, Quantity]] = QUANTITIES | OF_ONE_RUN
 
     @property
     def portrait_axes(self) -> tuple[str, str]:

@@ -22,9 +22,9 @@ from tops import rutstam_top
 import nonholonomic
 import stroller
 import tippe
+from nonholonomic.runs.table import TableJob
 from nonholonomic.sweeps import Table, running
 from nonholonomic.sweeps.dispatch import ExecutorBroken, handed_out
-from nonholonomic.systems.sweep import SweepJob
 
 HERE = Path(__file__).parent
 
@@ -235,7 +235,7 @@ def test_a_user_s_system_is_computed_by_other_processes(processes, monkeypatch):
     """Results are bit-identical to those of this process, which computes nothing meanwhile."""
     start, axes = (np.zeros(3), np.array([1.0, 0.0, 0.0])), {"rate[2]": [0.5, 1.0], "ahead": [0.2, 0.3]}
     expected = nonholonomic.sweep(Sleigh(), start, 2.0, axes=axes, progress=False)
-    monkeypatch.setattr(SweepJob, "__call__", None)
+    monkeypatch.setattr(TableJob, "__call__", None)
     assert_same_bits(nonholonomic.sweep(Sleigh(), start, 2.0, axes=axes, executor=processes, progress=False), expected)
 
 

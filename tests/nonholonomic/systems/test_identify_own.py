@@ -7,7 +7,7 @@ from close import assert_close
 from own_modes import Ball, Sleigh, Slip, Stick
 
 from nonholonomic import Hybrid, Recording, identify, simulate
-from nonholonomic.systems.numbers import Named
+from nonholonomic.runs.parameters import Parameters
 
 
 @pytest.mark.slow
@@ -23,14 +23,14 @@ def test_the_restitution_of_a_ball_from_its_heights():
 
 def test_a_quantity_that_the_system_does_not_have_is_named():
     data = Recording((np.zeros(3), np.zeros(3)), [1.0], [0.0], 1.0)
-    with pytest.raises(ValueError, match="quantity = 'y0' must name components of the state: q0, q1, q2, rate0"):
+    with pytest.raises(ValueError, match="quantity: 'y0' must be one of q0, q1, q2, rate0"):
         identify(Sleigh(), data, {"ahead": 0.3})
 
 
 def test_one_number_of_all_modes_is_replaced_in_all():
-    numbers = Named.of({"system": Hybrid([Stick(), Slip()])})
+    numbers = Parameters.of({"system": Hybrid([Stick(), Slip()])})
     assert "system.modes[*].belt" in numbers.known
-    system = numbers.tree(numbers.replaced({"system.modes[*].belt": 0.7}))["system"]
+    system = numbers.replaced({"system.modes[*].belt": 0.7}).tree["system"]
     assert [mode.belt for mode in system.modes] == [0.7, 0.7]
     data = Recording([0.0, 0.5], [1.0], [0.0], 1.0)
     with pytest.raises(ValueError, match=r"'system.modes\[0\].belt' is named twice, alone and for all modes"):

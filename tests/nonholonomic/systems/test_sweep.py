@@ -13,8 +13,8 @@ from own_modes import GRAVITY, Ball, Bounces, Sleigh, Slip, Stick, bounce
 import nonholonomic
 from nonholonomic import AbstractMode, Hybrid, sweep
 from nonholonomic.integration import Settings
-from nonholonomic.systems.numbers import Named
-from nonholonomic.systems.sweep import SweepJob
+from nonholonomic.runs import TableForm, model_of
+from nonholonomic.runs.table import TableJob
 
 HEIGHTS, RESTITUTIONS = np.array([0.5, 1.0, 2.0]), np.array([0.7, 0.8])
 BALL = Hybrid([Ball()], event=Bounces(3.0))
@@ -54,11 +54,11 @@ def test_a_table_of_bounces_and_its_derivatives(table):
 
 
 def test_a_job_may_be_sent_to_another_process():
-    numbers = Named.of({"system": BALL, "start": jnp.array([1.0, 0.0, 0.0]), "event": None})
-    job = SweepJob(numbers, 1.4, Settings(1e-9), ())
-    copy = pickle.loads(pickle.dumps(job))
-    assert copy.parameters.names == job.parameters.names
-    assert_close(copy.parameters.values, job.parameters.values)
+    model = model_of(BALL, jnp.array([1.0, 0.0, 0.0]))
+    job = TableJob(model, TableForm(model.words), 1.4, "first", Settings(1e-9))
+    copy = pickle.loads(pickle.dumps(job)).model.parameters
+    assert copy.names == model.parameters.names
+    assert_close(copy.values, model.parameters.values)
 
 
 class Middle(eqx.Module):

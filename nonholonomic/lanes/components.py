@@ -6,6 +6,7 @@ a separate number: zeros and ones disappear, and repeated expressions are comput
 that is not finite still makes a result NaN.
 """
 
+import contextlib
 import functools
 import itertools
 import math
@@ -21,6 +22,7 @@ from jaxtyping import Array
 
 from ..validation import is_traced
 from ..xla_cpu import stored
+from .tracing import spelled_out
 
 #: Operations on numbers, element by element.
 BY_ELEMENT = """
@@ -75,6 +77,24 @@ def by_components(function: Callable[..., Any], *shapes: Any) -> Callable[..., A
         return jax.tree.unflatten(jax.tree.structure(shape), [jnp.asarray(number) for number in numbers])
 
     return evaluated
+
+
+def over_lanes(function: Callable[..., Any], numbers: tuple[Array, ...], parts: tuple[Array, ...]) -> Any:
+    """A function of one run, evaluated in every lane.
+
+    **Arguments:** `function`: a function of the numbers and of the components of the state, all scalars; `numbers`: each
+    a scalar or one number per lane; `parts`: the components, one number per lane, or scalars for a single run.
+
+    **Returns:** the results, scalars in place of which each lane has its own.
+    """
+    shapes = tuple(tuple(jax.ShapeDtypeStruct((), jnp.asarray(x).dtype) for x in xs) for xs in (numbers, parts))
+    with contextlib.suppress(TooLarge):
+        results = by_components(function, *shapes)(numbers, parts)
+        return jax.tree.map(lambda result: jnp.broadcast_to(result, parts[0].shape), results)
+    if parts[0].ndim == 0:
+        return spelled_out(function)(numbers, parts)
+    axes = tuple(0 if jnp.ndim(number) else None for number in numbers)
+    return jax.vmap(spelled_out(function), in_axes=(axes, 0))(numbers, parts)
 
 
 def _elements(number: Array) -> Elements:

@@ -1,19 +1,21 @@
 """One run of a user's system at given times."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
-from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED
+from ..integration import Settings
+from ..integration.status import Status
 from ..sweeps import Table, Tabular
-from ..validation import is_traced
-from ..views import new_figure
-
-#: The words for how a run without an event ends, by code.
-WORDS = {REACHED_END: "completed", LEFT_DOMAIN: "stopped", FAILED: "failed", UNRESOLVED: "unresolved"}
+from ..validation import is_traced, require, require_increasing
+from ..views import Page, Stage, Viewable, new_figure
+from .explore import explore_model
+from .model import AbstractModel
+from .portrait import portraits
 
 #: Why a run ended early, by its word.
 REASONS = {
@@ -22,7 +24,7 @@ REASONS = {
 }
 
 
-class Trajectory(Tabular, eqx.Module):
+class Trajectory(Viewable, Tabular, eqx.Module):
     """A run of your own system at given times. The times are the first axis of the arrays; `jax.vmap` adds an axis
     before it.
 
@@ -32,8 +34,9 @@ class Trajectory(Tabular, eqx.Module):
     - `mode`: index of the mode, (times,), -1 after the end.
     - `end_time`: time at which the run ended [s]; `switches`: number of resets.
     - `steps`, `rejected`: numbers of all integration steps and of rejected steps.
-    - `code`: the status as an integer.
-    - `names`: names of the components in tables.
+    - `code`: the status as an integer of `Status`.
+    - `names`: names of the components in tables; `run[name]` is a component at the times.
+    - `model`, `t1`, `settings`: the model, the horizon and the settings of the integration.
 
     **Example:**
 
@@ -60,6 +63,9 @@ class Trajectory(Tabular, eqx.Module):
     steps: Int[Array, ""]
     rejected: Int[Array, ""]
     code: Int[Array, ""]
+    model: AbstractModel
+    t1: Float[Array, ""]
+    settings: Settings
     names: tuple[str, ...] = eqx.field(static=True)
 
     @property
@@ -71,7 +77,7 @@ class Trajectory(Tabular, eqx.Module):
         """
         if is_traced(self.code):
             return self.code
-        words = np.vectorize(WORDS.get, otypes=[object])(np.asarray(self.code))
+        words = np.vectorize(lambda code: Status(code).word, otypes=[object])(np.asarray(self.code))
         return str(words) if words.ndim == 0 else words.astype(str)
 
     @property
@@ -90,10 +96,36 @@ class Trajectory(Tabular, eqx.Module):
         columns = dict(zip(self.names, np.asarray(self.state).T, strict=True)) | {"mode": np.asarray(self.mode)}
         return Table({"time": np.asarray(self.t)}, columns, {"time": "s"}, {"status": self.status})
 
+    def __getitem__(self, name: str) -> Float[Array, " times"]:
+        if name not in self.names:
+            raise KeyError(f"{name!r} must be one of {', '.join(self.names)}")
+        return self.state[..., self.names.index(name)]
+
+    def at(self, times: Float[ArrayLike, " times"]) -> "Trajectory":
+        """The same run at other times; the run is repeated.
+
+        **Arguments:** `times`: increasing, within [0, `end_time`] [s].
+
+        **Raises:** `ValueError` for times outside the run, and for a batch of runs.
+        """
+        if is_traced(self.code) or np.ndim(self.code):
+            raise ValueError("at takes one run outside jit, vmap and grad: pass times= to simulate there")
+        require(times, "times", at_least=0.0, at_most=self.end_time, why="the run ends there")
+        times = np.asarray(times, dtype=float)
+        require_increasing(times, "times")
+        return self.model.simulate(self.t1, times, self.settings.tolerance, self.settings.solver, None)
+
+    def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
+        return portraits([self, *others], overlaid)
+
+    def explore(self, path: Any = None, sliders: dict[str, tuple[float, float]] | None = None) -> Page:
+        """A page with sliders that simulates the run in the browser; see `nonholonomic.explore`."""
+        return explore_model(self.model, path, sliders, float(self.t1))
+
     def overview(self, runs: list[Any], labels: list[str], unit: Any, ax: Any) -> Any:
         """Draw all components of a run in one picture, or a panel for each component of several runs."""
         if len(runs) > 1 or unit is not None:
-            return super().overview(runs, labels, unit, ax)
+            return Tabular.overview(self, runs, labels, unit, ax)
         figure = new_figure()
         axes: Any = figure.add_subplot() if ax is None else ax
         for name, component in zip(self.names, np.asarray(self.state).T, strict=True):

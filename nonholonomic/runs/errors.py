@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
-from nonholonomic.integration.checks import TIGHTEST
+from ..integration.checks import TIGHTEST
 
 #: Ratio of the tolerance of the first run to that of the second. With a pair of eighth order, the second run costs 1.8
 #: times as much as the first. The error of the second run is a hundredth of that of the first, so the difference of the
@@ -59,7 +59,7 @@ def error_bound(
 def errors_of(
     first: dict[str, Num[np.ndarray, " cells"]],
     second: dict[str, Num[np.ndarray, " cells"]],
-    times: tuple[str, ...],
+    bounded: tuple[str, ...],
     counts: tuple[str, ...],
     silent: tuple[int, ...],
 ) -> dict[str, Num[np.ndarray, " cells"]]:
@@ -68,10 +68,10 @@ def errors_of(
     **Arguments:**
 
     - `first`, `second`: the variables of the two runs of every cell.
-    - `times`, `counts`: names of the variables that are times of crossings, and of those that count events.
+    - `bounded`, `counts`: names of the variables that get bounds, and of those that count events.
     - `silent`: status codes of runs without a result; two such runs count as disagreeing.
 
-    **Returns:** bounds for the times, `end_time` and `end_theta`; for each count the difference of the runs; and 1 as
+    **Returns:** bounds; for each count the difference of the runs; and 1 as
     `status_error` if the runs disagree on the status or one is silent.
     """
     agree = (first["status"] == second["status"]) & ~np.isin(first["status"], silent)
@@ -79,8 +79,6 @@ def errors_of(
     is_same = (
         np.all([difference == 0 for difference in differences.values()], axis=0) if counts else np.ones_like(agree)
     )
-    bounds = {
-        name: error_bound(first[name], second[name], agree, is_same) for name in (*times, "end_time", "end_theta")
-    }
+    bounds = {name: error_bound(first[name], second[name], agree, is_same) for name in bounded}
     errors = bounds | {"status": (~agree).astype(np.int8)} | differences
     return {f"{name}_error": np.asarray(error) for name, error in errors.items()}

@@ -6,74 +6,105 @@
 import dataclasses
 import math
 import re
-from collections.abc import Iterable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Hashable, Iterable, Iterator, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import DictKey, GetAttrKey, KeyPath, SequenceKey
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from ..parameters import full_name
-from .form import is_number
 
 
-class Named(NamedTuple):
-    """The numbers of a tree, one by one, and the tree as a function of these numbers.
+def is_number(leaf: Any) -> bool:
+    """Whether a leaf of a tree is a number or an array of numbers, which may differ from cell to cell."""
+    return eqx.is_array(leaf) or isinstance(leaf, np.ndarray | np.inexact | float)
 
-    `names` and `values`: names and values of the numbers, in the same order; `places`: the index of the number at each
-    place in the tree; `shapes`: the shapes of the arrays that contain the numbers.
+
+@dataclasses.dataclass(frozen=True)
+class TreeForm:
+    """A tree without its numbers, which are listed one by one, in order within each array.
+
+    - `structure`: structure of the tree of numbers; `kinds`: shape and type of each leaf.
+    - `static_leaves`, `static_structure`: the leaves that are not numbers.
     """
 
-    names: tuple[str, ...]
-    values: tuple[Array, ...]
-    places: tuple[int, ...]
-    shapes: tuple[tuple[int, ...], ...]
     structure: Any
-    static: Any
+    kinds: tuple[tuple[tuple[int, ...], Any], ...]
+    static_leaves: tuple[Hashable, ...]
+    static_structure: Any
 
     @classmethod
-    def of(cls, tree: dict[str, Any], shared: Iterable[str] = ()) -> "Named":
-        """The numbers of several named trees. **Arguments:** `shared`: names such as `"system.modes[*].drag"`, each of
-        which becomes one number, with the value in the first of the modes."""
+    def of(cls, tree: Any) -> tuple["TreeForm", tuple[Array, ...]]:
+        """The form of a tree, and its numbers."""
         numbers, static = eqx.partition(tree, is_number)
-        leaves, structure = jax.tree_util.tree_flatten_with_path(numbers)
-        names, values, shapes = [], [], []
-        for path, leaf in leaves:
-            array = np.asarray(leaf) if not isinstance(leaf, jax.Array) else leaf
-            name = _name(path)
-            names += [name + "".join(f"[{k}]" for k in index) for index in np.ndindex(array.shape)]
-            values += [jnp.asarray(array[index]) for index in np.ndindex(array.shape)]
-            shapes.append(array.shape)
-        merged_names = [_of_all_modes(name) if _of_all_modes(name) in shared else name for name in names]
-        first = {name: k for k, name in reversed(list(enumerate(merged_names)))}
-        indices = sorted(first.values())
-        places = tuple(indices.index(first[name]) for name in merged_names)
-        return cls(
-            tuple(merged_names[k] for k in indices),
-            tuple(values[k] for k in indices),
-            places,
-            tuple(shapes),
-            structure,
-            static,
+        leaves, structure = jax.tree.flatten(numbers)
+        arrays = [jnp.asarray(leaf) for leaf in leaves]
+        static_leaves, static_structure = jax.tree.flatten(static)
+        kinds = tuple((array.shape, array.dtype) for array in arrays)
+        return cls(structure, kinds, tuple(static_leaves), static_structure), tuple(
+            number for array in arrays for number in (jnp.unstack(array.ravel()) if array.ndim else [array])
         )
 
-    def tree(self, values: tuple[Array, ...]) -> dict[str, Any]:
-        """The trees for other values of the numbers."""
+    def tree(self, numbers: Sequence[Array]) -> Any:
+        """The tree with the given numbers, each a scalar."""
         leaves, first = [], 0
-        for shape in self.shapes:
-            part = [values[k] for k in self.places[first : first + math.prod(shape)]]
-            leaves.append(jnp.stack(part).reshape(shape) if shape else part[0])
-            first += len(part)
-        return eqx.combine(jax.tree.unflatten(self.structure, leaves), self.static)
+        for shape, _ in self.kinds:
+            end = first + math.prod(shape)
+            leaves.append(jnp.stack(numbers[first:end]).reshape(shape) if shape else numbers[first])
+            first = end
+        static = jax.tree.unflatten(self.static_structure, self.static_leaves)
+        return eqx.combine(jax.tree.unflatten(self.structure, leaves), static)
 
-    def replaced(self, changes: dict[str, Any]) -> tuple[Array, ...]:
-        """The numbers with replacements, by name; a name such as `"system.modes[*].drag"` replaces several."""
-        return tuple(
+    @property
+    def types(self) -> tuple[jax.ShapeDtypeStruct, ...]:
+        """The types of the numbers."""
+        return tuple(jax.ShapeDtypeStruct((), kind) for shape, kind in self.kinds for _ in range(math.prod(shape)))
+
+
+class Parameters(eqx.Module):
+    """The numbers of a tree of a user's modules, one by one, by name.
+
+    - `values`: the numbers, scalars or arrays with one number per cell; `names`: their names, in the same order.
+    - `form`: the rest of the tree.
+    """
+
+    values: tuple[Float[Array, "..."], ...]
+    names: tuple[str, ...] = eqx.field(static=True)
+    form: TreeForm = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, tree: dict[str, Any]) -> "Parameters":
+        """The numbers of several named trees."""
+        form, values = TreeForm.of(tree)
+        leaves, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(tree, is_number))
+        names = [
+            _name(path) + "".join(f"[{k}]" for k in index)
+            for path, leaf in leaves
+            for index in np.ndindex(np.shape(leaf))
+        ]
+        return cls(values, tuple(names), form)
+
+    @property
+    def tree(self) -> dict[str, Any]:
+        """The trees, for values that are scalars."""
+        return self.form.tree(self.values)
+
+    def replaced(self, changes: dict[str, Any]) -> "Parameters":
+        """The parameters with replacements, by name; a name such as `"system.modes[*].drag"` replaces several."""
+        values = tuple(
             changes.get(name, changes.get(_of_all_modes(name), value))
             for name, value in zip(self.names, self.values, strict=True)
+        )
+        return dataclasses.replace(self, values=values)
+
+    def value(self, name: str) -> Array:
+        """The value of a parameter; of the first of several."""
+        return next(
+            value for own, value in zip(self.names, self.values, strict=True) if name in (own, _of_all_modes(own))
         )
 
     @property
@@ -100,7 +131,7 @@ class Named(NamedTuple):
     def _undeclared(self, name: str) -> str:
         """A hint for the name of an attribute that is an integer, or that has no type in its class."""
         end = name.rsplit(".", 1)[-1]
-        for module in _modules(self.tree(self.values)):
+        for module in _modules(self.tree):
             value = getattr(module, end, None)
             if isinstance(value, int | float) and not isinstance(value, bool):
                 if end in {field.name for field in dataclasses.fields(module)}:

@@ -1,0 +1,30 @@
+"""The questions about runs, once for every model: a run, the time of an event, tables, fits, exponents, pages.
+
+An `AbstractModel` answers what one system is: its modes for a start, its quantities, its words for how a run ends, and its
+parameters by name. `model_of` finds the model of a scene or of a user's own system.
+"""
+
+from ..hybrid.saltation import UNMEASURED as UNMEASURED
+from ..hybrid.saltation import Clock as Clock
+from .event import EventFunction as EventFunction
+from .event import with_event as with_event
+from .event_time import event_time as event_time
+from .explore import explore as explore
+from .explore import explore_model as explore_model
+from .identify import EventTimes as EventTimes
+from .identify import Recording as Recording
+from .identify import identify as identify
+from .lyapunov import LyapunovExponent as LyapunovExponent
+from .lyapunov import direction_of_start as direction_of_start
+from .lyapunov import exponent_of_model as exponent_of_model
+from .lyapunov import lyapunov_exponent as lyapunov_exponent
+from .model import AbstractModel as AbstractModel
+from .model import Names as Names
+from .model import model_of as model_of
+from .simulate import sampled as sampled
+from .simulate import simulate as simulate
+from .sweep import Options as Options
+from .sweep import sweep as sweep
+from .sweep import table_of as table_of
+from .table import TableForm as TableForm
+from .trajectory import Trajectory as Trajectory

@@ -1,0 +1,302 @@
+"""Estimate parameters of any model from recorded runs and from times of events."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Hashable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..identification import (
+    AbstractDataModel,
+    AbstractRecording,
+    Identification,
+    Measurements,
+    Quantities,
+    as_quantity,
+    as_sources,
+    fit_data,
+    free_numbers,
+    model_times,
+    search_options,
+)
+from ..integration import Settings
+from ..integration.checks import tolerance_bound
+from ..integration.settings import MOST_STEPS
+from ..parameters import likely
+from ..progress import status_line
+from ..validation import as_number, as_number_or_none, nan_unless, require, shown
+from .checks import check_run, require_event
+from .event_time import time_of_event
+from .model import AbstractModel, model_of
+from .parameters import require_apart
+from .simulate import sampled
+
+#: Quantities with a period of a whole turn.
+ANGLES = frozenset({"azimuth", "eta", "heading", "spin_angle"})
+
+
+@dataclasses.dataclass(frozen=True)
+class AnyQuantities(Quantities):
+    """Quantities of a model that is not yet known: names, or components of vectors such as "position.x"."""
+
+    def of(self, quantity: Any) -> tuple[str, ...]:
+        names = quantity if isinstance(quantity, tuple) else (quantity,)
+        if not names or not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
+            raise ValueError(
+                f"quantity = {shown(quantity)} must name quantities, such as 'theta' or ('q0', 'q1'), each once"
+            )
+        return names
+
+
+class Recording(AbstractRecording):
+    """A recorded run: quantities of a state, sampled at the times of a clock.
+
+    **Arguments:**
+
+    - `launch`: the start, as for `simulate`.
+    - `times`: (times,), increasing.
+    - `value`: (times,) for a single quantity, (times, columns) for several; NaN where a sample is missing.
+    - `error`: standard errors: a scalar, (columns,), or of the shape of `value`; with `None`, they are estimated for
+      each column from the residuals.
+    - `quantity`: names of the recorded quantities, such as "theta", "speed", "y0" or ("q0", "q1"); a component of a
+      vector is "position.x".
+    - `t0`: the clock's reading at the start.
+    - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for outliers; `None`:
+      Gaussian.
+    - `input`: the input of a stroller.
+
+    **Raises:** `ValueError` for shapes that do not fit.
+
+    **Example:**
+
+    >>> import nonholonomic
+    >>> heights = nonholonomic.Recording([1.0, 0.0], [0.1, 0.2], [0.95, 0.80], 0.01, "y0")
+    >>> heights.labels
+    ('y0(0.1 s)', 'y0(0.2 s)')
+    """
+
+    quantity: str | tuple[str, ...] = eqx.field(static=True, default="y0", converter=as_quantity)
+    t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
+    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
+    input: Any = None
+    quantities: ClassVar[Quantities] = AnyQuantities({}, {}, ANGLES)
+
+    @property
+    def series_units(self) -> tuple[str, ...]:
+        return ("1",) * len(self.columns)
+
+    def model(self, system: Any) -> AbstractModel:
+        """The model of the recorded run, checked."""
+        model = model_of(system, self.launch, None, self.input).without_event()
+        known = [*model.quantities, *_components(model)]
+        for name in self.columns:
+            if name not in known:
+                raise ValueError(f"quantity: {name!r} must be one of {', '.join(known)}{likely(name, known)}")
+            if "." not in name and model.quantities[name].components is not None:
+                raise ValueError(f"quantity: {name!r} has several components: name them, such as '{name}.x'")
+        return model
+
+    def predicted(self, model: AbstractModel, t0: Array, settings: Settings) -> Float[Array, " samples"]:
+        """The predicted samples of one run, ordered by time."""
+        times = model_times(self.times, t0)
+        names = tuple(dict.fromkeys(column.partition(".")[0] for column in self.columns))
+        run = sampled(model, names, times, times[-1], settings)
+        values = model.read(names, times, run.rows, run.mode)
+        columns = []
+        for column in self.columns:
+            name, _, component = column.partition(".")
+            value = values[name]
+            dims = model.quantities[name].components
+            columns.append(value if dims is None else value[:, model.components[dims].index(component)])
+        return jnp.stack(columns, axis=-1).reshape(-1)
+
+
+def _components(model: AbstractModel) -> list[str]:
+    """The names of the components of all vectors of a model."""
+    return [
+        f"{name}.{component}"
+        for name, quantity in model.quantities.items()
+        if quantity.components is not None
+        for component in model.components[quantity.components]
+    ]
+
+
+class EventTimes(eqx.Module):
+    """Measured times of the event of a run.
+
+    **Arguments:**
+
+    - `launch`: the start, as for `simulate`.
+    - `time`: measured times [s], (n,), of runs from the same start.
+    - `error`: standard errors [s]: a scalar, or (n,).
+    - `t1`: horizon [s] of the runs.
+    - `event`: a function `event(t, motion)`, as for `event_time`; by default the event of the system itself.
+    - `input`: the input of a stroller.
+
+    **Raises:** `ValueError` for shapes that do not fit.
+
+    **Example:**
+
+    >>> import nonholonomic
+    >>> falls = nonholonomic.EventTimes([1.0, 0.0], [0.45, 0.46], 0.005, t1=2.0, event=lambda t, y: y[0])
+    >>> falls.labels
+    ('time 1', 'time 2')
+    """
+
+    launch: Any
+    time: Float[Array, " n"] = eqx.field(converter=as_number)
+    error: Float[Array, "..."] = eqx.field(converter=as_number)
+    t1: Float[Array, ""] = eqx.field(converter=as_number)
+    event: Callable[..., Any] | None = None
+    input: Any = None
+
+    def __check_init__(self):
+        require(self.time, "time", above=0.0)
+        require(self.t1, "t1", above=0.0)
+        require(self.error, "error", above=0.0)
+        if np.ndim(self.time) != 1 or not np.size(self.time):
+            raise ValueError(f"time must be a list of measured times, not of shape {np.shape(self.time)}")
+        if np.shape(self.error) not in ((), np.shape(self.time)):
+            raise ValueError(f"error must be one number or of shape {np.shape(self.time)}, not {np.shape(self.error)}")
+
+    @property
+    def size(self) -> int:
+        """Number of predictions."""
+        return np.size(self.time)
+
+    @property
+    def seen(self) -> Int[np.ndarray, " n"]:
+        """Indices of the measured predictions."""
+        return np.arange(self.size)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """A label for each time."""
+        return tuple(f"time {k + 1}" for k in range(self.size))
+
+    @property
+    def series_units(self) -> tuple[str, ...]:
+        """The unit of the only series."""
+        return ("s",)
+
+    @property
+    def measurements(self) -> Measurements:
+        """The times as measurements."""
+        time = np.asarray(self.time)
+        return Measurements(time, np.broadcast_to(self.error, time.shape), student=math.inf)
+
+    def model(self, system: Any) -> AbstractModel:
+        """The model of the timed run, checked."""
+        model = model_of(system, self.launch, self.event, self.input)
+        require_event(model)
+        return model
+
+    def predicted(self, model: AbstractModel, t0: Array, settings: Settings) -> Float[Array, " n"]:
+        """The predicted time of one run, for every measurement."""
+        time = time_of_event(model, self.t1, settings, False)
+        return jnp.broadcast_to(jnp.where(jnp.isfinite(time), time, jnp.nan), (self.size,))
+
+
+class RunModel(AbstractDataModel):
+    """Predictions of all recordings and times of a system; `models`: the model of each, by its place in `data`."""
+
+    models: tuple[AbstractModel, ...]
+    data: tuple[Recording | EventTimes, ...]
+    seen: Int[Array, " n"]
+    settings: Settings
+
+    def together(self, source: Any, values: dict[str, Array]) -> Hashable:
+        return None
+
+    def predict(self, sources: list[tuple[Any, dict[str, Array]]], rows: int) -> list[Float[Array, "rows samples"]]:
+        """Every row of a set of data is a lane of one ensemble."""
+        return [self._rows(model, source, values) for model, (source, values) in zip(self.models, sources, strict=True)]
+
+    def _rows(self, model: AbstractModel, source: Any, values: dict[str, Array]) -> Float[Array, "rows samples"]:
+        def of_row(row: dict[str, Array]) -> Float[Array, " samples"]:
+            moved = model.replaced({name: value for name, value in row.items() if name != "t0"})
+            clock = row.get("t0", getattr(source, "t0", jnp.zeros(())))
+            return nan_unless(moved.legal(), source.predicted(moved, clock, self.settings))
+
+        return jax.vmap(of_row)(values)
+
+
+def identify(
+    system: Any,
+    data: Any,
+    free: dict[str, Any],
+    *,
+    starts: int = 16,
+    spread: float = 2.0,
+    seed: int = 0,
+    tolerance: float = 1e-8,
+    max_steps: int = 60,
+    progress: bool = True,
+) -> Identification:
+    """Estimate parameters and starts of a system from recorded runs and times of events, with errors and undetermined
+    combinations.
+
+    **Arguments:**
+
+    - `system`: a scene, a `Hybrid`, or an `AbstractSystem`, with the values of the parameters that are not free.
+    - `data`: a `Recording` or an `EventTimes`, or a list of several to be fitted together.
+    - `free`: full name of a parameter -> a `nonholonomic.Free` or only the start value. Examples of names are
+      `"scene.friction.mu"` or `"system.modes[0].drag"`, or `"drag"` if no other name ends so, `"modes[*].drag"` for all
+      modes that have a drag, `"launch.theta"`, `"start[0]"`, `"start.q[0]"` and `"t0"`, the reading of a recording's
+      clock at the start. `"start[0]"` and `"t0"` are the same in all recordings; `"data[1].start[0]"` belongs to the
+      second recording, and `"data[*].t0"` is a separate parameter for each. In systems with resets, `"t0"` cannot be
+      free.
+    - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
+    - `tolerance`: relative tolerance of the integration.
+
+    **Returns:** an `Identification` with its `verdict`; a doubtful fit gives a `FitWarning`.
+
+    **Raises:** `ValueError` for arguments out of range or an unknown name.
+
+    **Example:**
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> class Decay(nonholonomic.AbstractMode):
+    ...     rate: float
+    ...
+    ...     def field(self, t, y):
+    ...         return -self.rate * y
+    >>> data = nonholonomic.Recording([1.0], [0.5, 1.0, 1.5], [0.37, 0.135, 0.05], 0.005)
+    >>> fit = nonholonomic.identify(nonholonomic.Hybrid([Decay(1.0)]), data, {"rate": 1.0}, progress=False)
+    >>> print(f"{fit.estimates['system.modes[0].rate']:.2f}")
+    1.99
+
+    ```
+    """
+    search = search_options(starts, spread, seed, max_steps, progress)
+    data = as_sources(data, Recording | EventTimes, "a nonholonomic.Recording or EventTimes")
+    tolerance_bound(tolerance).require()
+    models = tuple(source.model(system) for source in data)
+    for source, model in zip(data, models, strict=True):
+        check_run(model, source.t1 if isinstance(source, EventTimes) else source.times[-1], tolerance)
+    own = [[name for name in model.known if name.startswith(("start", "launch"))] for model in models]
+    shared = [name for name in models[0].known if name not in own[0]]
+    names_of_data = [
+        [*names, "t0"] if isinstance(source, Recording) else names for names, source in zip(own, data, strict=True)
+    ]
+
+    def check(values: dict[str, float]) -> None:
+        models[0].require_values({name: value for name, value in values.items() if name != "t0"})
+
+    settings = Settings(tolerance, max_steps=MOST_STEPS)
+    with status_line("fitting", progress):
+        unknowns = free_numbers(free, shared, names_of_data, check)
+        require_apart("free", unknowns)
+        return fit_data(
+            lambda indices: RunModel(models=models, data=data, seen=jnp.asarray(indices), settings=settings),
+            data,
+            unknowns,
+            search,
+        )

@@ -1,0 +1,209 @@
+"""The interface between a model and the questions about its runs."""
+
+import abc
+import functools
+from collections.abc import Iterable
+from typing import Any, ClassVar, Self
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Bool, Float, Int
+
+from ..hybrid import AbstractBatchedMode, HybridOutcome
+from ..integration import AbstractProblem, Outcome
+from ..sweeps import Axis, Quantity, Variable
+from ..validation import shown
+from ..views import Stage
+from ..views.explore import LiveRun
+
+#: The names of the quantities that will be read, which choose the layout of the state; `None` for all quantities, with
+#: the path of the run.
+Names = tuple[str, ...] | None
+
+#: The modes of a run, the index of the first mode of each cell, and the initial states.
+Start = tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"], Float[Array, "components cells"]]
+
+
+class AbstractModel(eqx.Module):
+    """A system, its start, its input and its event. A model knows its modes and quantities, and no solver, table, file or
+    page.
+
+    The leaves are numbers: scalars, or arrays with one number per cell. States have the shape (components, cells).
+    """
+
+    #: A `runs.event.EventFunction`, or `None` for the event of the model itself.
+    event: eqx.AbstractVar[Any]
+
+    #: Names of the components of vectors, by dimension, such as {"component": ("x", "y", "z")}.
+    components: ClassVar[dict[str, tuple[str, ...]]] = {}
+
+    #: Whether a run continues through the event of the model itself.
+    continues: ClassVar[bool] = False
+
+    #: The names that choose a layout in which states of nearby runs can be compared.
+    comparable: ClassVar[Names] = ()
+
+    #: Smallest number of cells in a chunk of a large table; `None` for the default.
+    least_chunk: ClassVar[int | None] = None
+
+    # The parameters by name.
+
+    @abc.abstractmethod
+    def full_name(self, argument: str, name: str) -> str:
+        """The full name of a parameter for its name or its unambiguous end; raises `ValueError` that names the
+        argument."""
+
+    @property
+    @abc.abstractmethod
+    def known(self) -> list[str]:
+        """The full names of the parameters; those of the start begin with "start" or "launch"."""
+
+    @abc.abstractmethod
+    def value(self, name: str) -> Any:
+        """The value of a parameter by its full name."""
+
+    @abc.abstractmethod
+    def replaced(self, values: dict[str, Any]) -> Self:
+        """The model with other values, scalars or one per cell, of some parameters; the modules check concrete values."""
+
+    @abc.abstractmethod
+    def label(self, names: list[str]) -> dict[str, tuple[str, str, str]]:
+        """For each full name the name of an axis, its unit, and a description."""
+
+    @abc.abstractmethod
+    def description(self) -> dict[str, Any]:
+        """The model as plain data, for the request of a table."""
+
+    # Whether a run may begin.
+
+    @abc.abstractmethod
+    def check(self) -> None:
+        """Raise `ValueError` unless the concrete numbers allow a run."""
+
+    def require_values(self, values: dict[str, Any]) -> None:
+        """Raise `ValueError` unless the modules allow these values of parameters."""
+        self.replaced(values)
+
+    def check_axes(self, grid: list[Axis], cells: Iterable[dict[str, Any]]) -> None:
+        """Raise `ValueError` unless the model may run for the cells of a grid; `cells`: columns of their parameters."""
+        for columns in cells:
+            self.replaced(columns).check()
+
+    @abc.abstractmethod
+    def legal(self) -> Bool[Array, "..."]:
+        """Whether the numbers, which may be traced, allow a run."""
+
+    # The motion.
+
+    @property
+    @abc.abstractmethod
+    def smooth(self) -> bool:
+        """Whether a run is a single mode without a reset map."""
+
+    @property
+    @abc.abstractmethod
+    def has_event(self) -> bool:
+        """Whether there is an event."""
+
+    def require_differentiable(self, nested: bool) -> None:
+        """Raise `ValueError` unless runs have derivatives; `nested`: second derivatives."""
+        if nested and not self.smooth:
+            raise ValueError(
+                "second derivatives are not available through resets; take differences of a gradient instead"
+            )
+
+    @property
+    def counters(self) -> dict[str, str]:
+        """Name and description of each row of `Transition.counts`."""
+        return {}
+
+    @abc.abstractmethod
+    def problem(self, cells: int | None, names: Names) -> AbstractProblem:
+        """The motion of a smooth model, with the event of the model itself unless it has another."""
+
+    def modes(self, cells: int, tolerance: Any, names: Names, continues: bool) -> Start:
+        """The modes of a model that is not smooth, and the start in them; `continues`: whether a run continues through
+        its event."""
+        raise NotImplementedError(f"{type(self).__name__} is smooth and has no modes")
+
+    @abc.abstractmethod
+    def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Any:
+        """The run as a trajectory. **Arguments:** as for `nonholonomic.simulate`."""
+
+    @abc.abstractmethod
+    def page(self, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
+        """The contents of a page with sliders, and the stage on which it draws the run."""
+
+    @abc.abstractmethod
+    def without_event(self) -> "AbstractModel":
+        """The same model without an event that ends a run."""
+
+    @abc.abstractmethod
+    def direction(self, cells: int) -> Float[Array, "components cells"]:
+        """A generic change of the initial states, tangent to the set of possible states."""
+
+    # What a state means.
+
+    @property
+    @abc.abstractmethod
+    def quantities(self) -> dict[str, Quantity]:
+        """The quantities of a state, by name."""
+
+    @abc.abstractmethod
+    def read(
+        self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: Any
+    ) -> dict[str, Array]:
+        """The named quantities of states, (*cells, ...).
+
+        **Arguments:** `time`: times [s]; `rows`: the states of the problem or, if the model is not smooth, the output
+        rows of its modes; `mode`: the indices of these modes, or `None`.
+        """
+
+    @property
+    @abc.abstractmethod
+    def words(self) -> tuple[str, ...]:
+        """The words for how a run ends, in the order of the integers in files."""
+
+    @abc.abstractmethod
+    def ended(self, outcome: Outcome | HybridOutcome, tolerance: Any) -> Int[Array, " cells"]:
+        """How each run has ended, as an integer of `Status`."""
+
+    @property
+    @abc.abstractmethod
+    def ends(self) -> dict[str, Variable]:
+        """The variables of a table that describe the end of a run."""
+
+    @abc.abstractmethod
+    def at_end(self, outcome: Outcome | HybridOutcome, start: Float[Array, "components cells"]) -> dict[str, Array]:
+        """The values of `ends`, for the outcome and the initial states of some cells."""
+
+
+@functools.singledispatch
+def model_of(system: Any, start: Any, event: Any = None, input: Any = None) -> AbstractModel:
+    """The model of a system, for the functions of this room.
+
+    Each kind of system registers its own function.
+
+    **Arguments:**
+
+    - `system`, `start`: a scene and a launch, or your own system and its initial state.
+    - `event`: a function of time and motion, or `None` for the event of the system itself.
+    - `input`: the input of a driven system, or `None`.
+
+    **Raises:** `ValueError` for another kind of system, or an illegal start.
+
+    **Example:**
+
+    >>> from nonholonomic.runs import model_of
+    >>> model_of(3.0, [1.0])
+    Traceback (most recent call last):
+    ValueError: system = 3.0 must be a tippe.Scene, a stroller.Scene, a nonholonomic.Hybrid or an AbstractSystem
+    """
+    raise ValueError(
+        f"system = {shown(system)} must be a tippe.Scene, a stroller.Scene, a nonholonomic.Hybrid or an AbstractSystem"
+    )
+
+
+def of_run(model: AbstractModel, cell: Any) -> AbstractModel:
+    """The model of one of many cells."""
+    return jax.tree.map(lambda leaf: leaf[cell] if eqx.is_array(leaf) and leaf.ndim else leaf, model)

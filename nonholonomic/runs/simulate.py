@@ -1,0 +1,178 @@
+"""Simulate one run of any model."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from ..derivatives import sampled_run, sampled_run_by_diffrax
+from ..hybrid import HybridOutcome, hybrid_samples
+from ..integration import AbstractProblem, Settings, explicit_tableau
+from ..integration.checks import legal_run, require_times
+from ..integration.status import Status
+from ..progress import status_line
+from ..validation import as_known, as_number, is_traced, nan_unless
+from .checks import check_run
+from .event import problem_of
+from .model import AbstractModel, Names, model_of
+from .samples import mode_at, modes_of_run, outcome_of
+from .trajectory import Trajectory
+
+#: Default number of times to report.
+DEFAULT_TIMES = 201
+
+
+@status_line("simulating")
+def simulate(
+    system: Any,
+    start: Any,
+    t1: Float[ArrayLike, ""],
+    times: Float[ArrayLike, " times"] | None = None,
+    tolerance: Float[ArrayLike, ""] = 1e-9,
+    solver: diffrax.AbstractSolver | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    input: Any = None,
+) -> Any:
+    """Simulate one run of a system to `t1`; works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and their compositions.
+
+    A run continues through all resets and through the system's event. Derivatives use the saltation matrix at resets.
+
+    **Arguments:**
+
+    - `system`, `start`, `tolerance`, `input`: as for `event_time`.
+    - `t1`: end of the run [s], positive.
+    - `times`: times [s] to report, increasing, within [0, t1]; by default those of `tippe.simulate` for a top, and
+      otherwise 201 equally spaced ones.
+    - `solver`: an explicit Runge-Kutta solver of Diffrax; for scenes as for `tippe.simulate` and `stroller.simulate`.
+    - `adjoint`: for scenes, an adjoint method of Diffrax.
+
+    **Returns:** a `tippe.Trajectory`, a `stroller.Trajectory` or, for your own system, a `nonholonomic.Trajectory`;
+    `run[name]` is a quantity at the times, and `status` states how the run ended.
+
+    **Raises:** `ValueError` for arguments out of range, times that do not increase, functions that return a wrong type
+    or shape, and second derivatives through resets.
+
+    **Example:** a pendulum as an `AbstractSystem`.
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> class Pendulum(nonholonomic.AbstractSystem):
+    ...     length: float
+    ...     dimension = 1
+    ...
+    ...     def metric(self, q):
+    ...         return jnp.array([[self.length**2]])
+    ...
+    ...     def potential(self, q):
+    ...         return -9.81 * self.length * jnp.cos(q[0])
+    >>> run = nonholonomic.simulate(Pendulum(length=1.0), ([0.1], [0.0]), t1=2.0, times=[1.0, 2.0])
+    >>> print(f"{run.status}, {run.state[-1, 0]:.6f} rad, {run.state[-1, 1]:.6f} rad/s")
+    completed, 0.099974 rad, 0.007169 rad/s
+
+    ```
+    """
+    model = model_of(system, start, None, input)
+    return model.simulate(t1, times, tolerance, solver, adjoint)
+
+
+def simulate_model(
+    model: AbstractModel, t1: Any, times: Any, tolerance: Any, solver: diffrax.AbstractSolver | None = None
+) -> Trajectory:
+    """The run of a model at given times, or at equally spaced ones. **Arguments:** as for `simulate`."""
+    check_run(model, t1, tolerance)
+    end = as_known(t1)
+    if times is None:
+        times = jnp.linspace(0.0, end, DEFAULT_TIMES) if is_traced(end) else np.linspace(0.0, end, DEFAULT_TIMES)
+    require_times(times, t1)
+    settings = Settings(tolerance, solver)
+    explicit_tableau(settings.for_lanes)
+    return _sampled(model, as_number(times), as_number(t1), settings)
+
+
+class SampledRows(eqx.Module):
+    """A run at given times, inside a transformation.
+
+    - `rows`: the output rows, (rows, times), NaN after the end; `mode`: the index of the mode at each time, or `None`.
+    - `outcome`: how the run ended, as that of one cell.
+    """
+
+    rows: Float[Array, "rows times"]
+    mode: Int[Array, " times"] | None
+    outcome: HybridOutcome[Array]
+
+
+def sampled(
+    model: AbstractModel,
+    names: Names,
+    times: Float[Array, " times"],
+    t1: Float[Array, ""],
+    settings: Settings,
+    grid: Float[Array, " steps"] | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    arrays_in_lanes: bool = False,
+) -> SampledRows:
+    """A run at given times, with derivatives that take part in step-size control.
+
+    **Arguments:**
+
+    - `names`: the quantities that will be read, or `None`.
+    - `grid`: the ends of the steps [s] of a solver without an error estimate; `adjoint`: how Diffrax differentiates.
+    - `arrays_in_lanes`: as for `sampled_run`; the others as for `simulate`, legal.
+    """
+    if not model.smooth:
+        samples = hybrid_samples(modes_of_run, (model, names), times, t1, settings, len(model.counters))
+        of_one_cell = jax.tree.map(lambda part: part[None], samples)
+        return SampledRows(samples.shown, mode_at(samples.number), outcome_of(of_one_cell))
+    if adjoint is None:
+        run = sampled_run(problem_of_run, (model, names), times, t1, settings, grid, arrays_in_lanes=arrays_in_lanes)
+    else:
+        run = sampled_run_by_diffrax(problem_of_run((model, names), None), times, t1, settings, adjoint, grid)
+    states = run.states if run.quadratures is None else jnp.concatenate([run.states, run.quadratures], axis=-1)
+    status, accepted, rejected = (
+        jax.lax.stop_gradient(part).astype(int)[None] for part in (run.status, run.accepted, run.rejected)
+    )
+    ending = (jnp.full(1, jnp.inf), run.end_time[None], run.end_state[:, None])
+    none = jnp.zeros((0, 1), int)
+    outcome = HybridOutcome(status, *ending, accepted + rejected, rejected, jnp.zeros_like(status), none)
+    return SampledRows(states.T, None, outcome)
+
+
+def problem_of_run(modules: tuple[AbstractModel, Names], cells: int | None) -> AbstractProblem:
+    """The problem of a run, as `sampled_run` builds it."""
+    model, names = modules
+    return problem_of(model, cells, names)
+
+
+@eqx.filter_jit
+def _sampled(
+    model: AbstractModel, times: Float[Array, " times"], t1: Float[Array, ""], settings: Settings
+) -> Trajectory:
+    """The run, or NaN and "failed" if a traced number is out of range."""
+    is_legal, horizon, tolerance = legal_run(model.legal(), t1, settings.tolerance, times)
+    legal_settings, legal_times = settings.with_tolerance(tolerance), jnp.where(is_legal, times, 0.0)
+    samples = sampled(model, None, legal_times, horizon, legal_settings)
+    outcome = samples.outcome
+    names = tuple(model.quantities)
+    values = model.read(names, times, nan_unless(is_legal, samples.rows), samples.mode)
+    status = model.ended(outcome, tolerance)[0]
+    is_reached = jnp.all(jnp.isfinite(samples.rows), axis=0)
+    mode = jnp.where(is_reached, 0, -1) if samples.mode is None else samples.mode
+    return Trajectory(
+        t=times,
+        state=jnp.stack([values[name] for name in names], axis=-1),
+        mode=mode,
+        end_time=nan_unless(is_legal, outcome.end_time[0]),
+        switches=sum((count[0] for count in outcome.counts), jnp.zeros((), int)),
+        steps=outcome.steps[0],
+        rejected=outcome.rejected[0],
+        code=jnp.where(is_legal, status, int(Status.FAILED)),
+        model=model,
+        t1=t1,
+        settings=settings,
+        names=names,
+    )

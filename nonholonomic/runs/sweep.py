@@ -1,0 +1,260 @@
+"""Tables of many runs of any model, over a grid of its parameters and starts."""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from typing import Any, NamedTuple
+
+import diffrax
+import numpy as np
+
+from .. import sweeps
+from ..integration import Settings, explicit_tableau
+from ..integration.checks import require_times
+from ..integration.settings import DEFAULT_MAX_STEPS
+from ..parameters import likely
+from ..sweeps import Axis, Table, Variable, axis, chunk_for, size_of
+from ..validation import as_number, require_flag, require_outside, require_whole, shown
+from .checks import check_run, require_event
+from .model import AbstractModel, model_of
+from .samples import Samples
+from .table import ScatteredJob, TableForm, TableJob
+
+#: Greatest number of values in the samples of a chunk: 256 MB.
+MOST_SAMPLED = 1 << 25
+
+
+class Options(NamedTuple):
+    """The options of every table; see `sweep`."""
+
+    tolerance: float = 1e-9
+    solver: diffrax.AbstractERK | None = None
+    max_steps: int = DEFAULT_MAX_STEPS
+    scattered: bool = False
+    errors: bool = False
+    sensitivities: Sequence[str] = ()
+    path: Any = None
+    progress: bool = True
+    executor: Executor | None = None
+
+    @property
+    def settings(self) -> Settings:
+        """The settings of the integration, checked."""
+        require_whole(self.max_steps, "max_steps", 1)
+        settings = Settings(self.tolerance, self.solver, max_steps=int(self.max_steps))
+        explicit_tableau(settings.for_lanes)
+        return settings
+
+
+def sweep(
+    system: Any,
+    start: Any,
+    t1: float,
+    *,
+    axes: dict[str, Any],
+    event: Callable[..., Any] | None = None,
+    crossing: str = "first",
+    times: Any = None,
+    quantities: Sequence[str] = (),
+    errors: bool = False,
+    sensitivities: Sequence[str] = (),
+    scattered: bool = False,
+    max_steps: int = DEFAULT_MAX_STEPS,
+    tolerance: float = 1e-9,
+    solver: diffrax.AbstractERK | None = None,
+    path: Any = None,
+    progress: bool = True,
+    executor: Executor | None = None,
+    input: Any = None,
+) -> Table:
+    """Event times, ends and samples of all runs over a grid of parameters, in one batched call on all cores.
+
+    **Arguments:**
+
+    - `system`, `start`, `event`, `tolerance`, `solver`, `input`: as for `event_time`. Without an event, runs end at `t1`.
+    - `t1`: horizon [s].
+    - `axes`: full name of a parameter -> values, such as `{"scene.friction.mu": [0.1, 0.2]}` or
+      `{"system.modes[0].drag": [0.1, 0.2], "start[1]": [0.0, 1.0]}`; the end of a name is enough if it is unique. The
+      start of an `AbstractSystem` has the names `"start.q[0]"` and `"start.rate[0]"`, and parameters of an event that is
+      an `equinox.Module` have names such as `"event.level"`. `"modes[*].drag"` gives all modes that have a drag the same
+      value. The first axis varies slowest.
+    - `crossing`: "first"; "last" for the last fall of the event function through zero, after which the function stays
+      below zero until `t1`; "both" for both times from one run.
+    - `times`, `quantities`: times [s] within [0, t1] and names of quantities, to sample every run.
+    - `errors`: whether to run every cell again at a hundredth of the tolerance, for error bounds.
+    - `sensitivities`: names of the parameters with respect to which the times are differentiated.
+    - `scattered`: whether the lists are columns of equal length instead of axes of a grid.
+    - `max_steps`: a run that needs more steps, including rejected ones, fails; at least 1. In a run with resets, the
+      limit applies to each time in a mode.
+    - `path`: HDF5 file to write, chunk by chunk. Repeat the same call to resume an interrupted sweep.
+    - `progress`: whether to show progress, on a terminal or in a notebook.
+    - `executor`: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes`; by default a thread
+      for each core. For other processes, define classes and functions at the top level of a module.
+
+    **Returns:** a `Table` with `time` [s] of the event, infinite without one; `status`: "event", "completed" if the run
+    reached `t1`, "stopped" if a mode without a reset ended, "failed", "unresolved", or a word of the system; `end_time`
+    [s]; the state at the end, such as `y0`, `q0` and `rate0`, or `end_theta`; `steps` and `rejected`; and for a system
+    with resets their number, such as `switches`. With `sensitivities`, the table also contains the derivative of `time`
+    with respect to each parameter, such as `time_by_drag` for `"system.modes[0].drag"`, and for a system with resets
+    `grazes`: 1 if the derivative is NaN because the margin of a mode only touched zero. With `errors`, `time_error` and
+    so on are bounds: infinite if the two runs disagree on the status. With `times`, the table contains the quantities,
+    NaN after the end of a run, in place of the ends; without an event, runs are only sampled.
+
+    **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
+    `RuntimeError` for an executor that breaks down, or a worker with other versions.
+
+    **Example:**
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> class Decay(nonholonomic.AbstractMode):
+    ...     rate: float
+    ...
+    ...     def field(self, t, y):
+    ...         return -self.rate * y
+    >>> decay = nonholonomic.Hybrid([Decay(rate=2.0)], event=lambda t, y: y[0] - 0.5)
+    >>> table = nonholonomic.sweep(decay, [1.0], t1=1.0, axes={"rate": [0.5, 1.0, 2.0]}, progress=False)
+    >>> print(table.time.round(6), table.status)
+    [     inf 0.693147 0.346574] ['completed' 'event' 'event']
+
+    ```
+    """
+    require_outside((system, start, t1, axes, input), "sweep", "simulate or event_time")
+    if not isinstance(axes, dict) or not all(isinstance(name, str) for name in axes):
+        raise ValueError(f"axes = {shown(axes)} must be a dictionary, name of a number -> values")
+    if crossing not in ("first", "last", "both"):
+        raise ValueError(f"crossing = {shown(crossing)} must be 'first', 'last' or 'both'")
+    model = model_of(system, start, event, input)
+    check_run(model, t1, tolerance)
+    samples = samples_of(model, times, quantities, t1)
+    options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
+    named = {model.full_name("axes", name): values for name, values in axes.items()}
+    if len(named) < len(axes):
+        raise ValueError(f"axes = {', '.join(axes)}: a number is named twice")
+    timed = samples is None or event is not None
+    return table_of(model, named, float(t1), crossing, options, TableForm(model.words), samples=samples, timed=timed)
+
+
+def samples_of(model: AbstractModel, times: Any, quantities: Any, t1: Any) -> Samples | None:
+    """The samples of a table, checked."""
+    if times is None and not len(quantities):
+        return None
+    if times is None or isinstance(quantities, str) or not isinstance(quantities, Sequence) or not quantities:
+        raise ValueError(f"quantities = {shown(quantities)} must be a list of names, with the times to sample them")
+    known = list(model.quantities)
+    for name in quantities:
+        if name not in known:
+            raise ValueError(f"quantities: {name!r} must be one of {', '.join(known)}{likely(name, known)}")
+        if list(quantities).count(name) > 1:
+            raise ValueError(f"quantities: {name!r} must be named only once")
+    require_times(as_number(times), t1)
+    return Samples(np.asarray(times, float), tuple(quantities))
+
+
+def table_of(
+    model: AbstractModel,
+    axes: dict[str, Any],
+    t1: float,
+    crossing: str,
+    options: Options,
+    form: TableForm,
+    *,
+    samples: Samples | None = None,
+    timed: bool = True,
+) -> Table:
+    """The table of a model. **Arguments:** `axes`: full name of a parameter -> values; the others as for `TableJob`."""
+    sensitivities = full_sensitivities(model, options.sensitivities)
+    if sensitivities:
+        require_event(model, "sensitivities are those of the event's time: ")
+        model.require_differentiable(False)
+        if crossing == "both":
+            raise ValueError(
+                "crossing = 'both' must be 'first' or 'last' for sensitivities, which differentiate one time"
+            )
+    labels = model.label([*axes, *(name for name in sensitivities if name not in axes)])
+    grid = [axis(labels[name][0], name, labels[name][1], values, labels[name][2]) for name, values in axes.items()]
+    slopes = {name: f"time_by_{labels[name][0]}" for name in sensitivities}
+    job = TableJob(model, form, t1, crossing, options.settings, slopes, options.errors, samples, timed)
+    variables = job.variables
+    for name, slope in slopes.items():
+        unit = labels[name][1]
+        unit = "s" if unit == "1" else f"s ({unit})-1"
+        variables |= {slope: Variable(unit, np.float64, long_name=f"{form.event} time by {name}")}
+    request = model.description() | {name: "an axis" for name in axes} | {"t1": t1}
+    if crossing != "first":
+        request |= {"crossing": crossing}
+    if samples is not None:
+        request |= {"quantities": list(samples.names)}
+    return run(job, grid, variables, request | request_of(options, sensitivities), options)
+
+
+def full_sensitivities(model: AbstractModel, names: Any) -> list[str]:
+    """The full names of the parameters with respect to which to differentiate, checked."""
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"sensitivities = {shown(names)} must be a list of names, such as ['scene.friction.mu']")
+    full_names = [model.full_name("sensitivities", name) for name in names]
+    if len(set(full_names)) < len(full_names):
+        raise ValueError(f"sensitivities = {shown(names)} must name every parameter only once")
+    return full_names
+
+
+def request_of(options: Options, sensitivities: list[str]) -> dict[str, Any]:
+    """The options as plain data. Requests of earlier versions lack those that were not set."""
+    request = {"tolerance": float(options.tolerance), "solver": type(options.settings.for_lanes).__name__}
+    if options.max_steps != DEFAULT_MAX_STEPS:
+        request |= {"max_steps": int(options.max_steps)}
+    if options.errors:
+        request |= {"errors": True}
+    if sensitivities:
+        request |= {"sensitivities": sensitivities}
+    return request
+
+
+def run(
+    job: TableJob, grid: list[Axis], variables: dict[str, Variable], request: dict[str, Any], options: Options
+) -> Table:
+    """Check the cells of a grid, and compute them."""
+    require_flag(options.errors, "errors")
+    require_flag(options.scattered, "scattered")
+    work: Any = job
+    if options.scattered:
+        columns = rows(grid)
+        job.model.check_axes(grid, [columns])
+        request |= {"cells": digest(columns)}
+        variables = {axis.name: Variable(axis.unit, np.float64, long_name=axis.long_name) for axis in grid} | variables
+        work = ScatteredJob(job, columns, {axis.number: axis.name for axis in grid})
+        grid = [Axis("cell", "cell", "1", np.arange(len(grid[0].values)), "cell")]
+    else:
+        job.model.check_axes(grid, sweeps.cells_to_check(grid))
+    cells, least = size_of(grid), job.model.least_chunk
+    chunk = max(least, chunk_for(cells)) if least is not None and cells > 4 * least else None
+    inner, most = [], None
+    if job.samples is not None:
+        inner = job.samples.inner(job.model)
+        # A run has about a dozen components.
+        most = max(16, 1 << (MOST_SAMPLED // (12 * len(job.samples.times))).bit_length() - 1)
+    running = {"path": options.path, "progress": options.progress, "executor": options.executor}
+    return sweeps.sweep(work, grid, variables, request, chunk=chunk, most=most, inner=inner, **running)
+
+
+def rows(lists: list[Axis]) -> dict[str, Any]:
+    """The numbers of scattered cells: full name -> one value per cell.
+
+    **Raises:** `ValueError` unless there are lists, all of equal length.
+    """
+    lengths = {grid_axis.name: len(grid_axis.values) for grid_axis in lists}
+    if len(set(lengths.values())) != 1:
+        lengths_text = ", ".join(f"{name} of {length}" for name, length in lengths.items()) or "none"
+        raise ValueError(
+            f"scattered = True takes lists of one length, not {lengths_text}; the other numbers are scalars"
+        )
+    return {grid_axis.number: grid_axis.values for grid_axis in lists}
+
+
+def digest(columns: dict[str, Any]) -> str:
+    """A checksum of the columns and their names."""
+    checksum = hashlib.sha256()
+    for name, values in columns.items():
+        checksum.update(name.encode() + np.ascontiguousarray(values, float).tobytes())
+    return checksum.hexdigest()[:16]

@@ -1,0 +1,273 @@
+"""The cells of a table of any model: event times, how and where runs end, samples, error bounds and derivatives."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..derivatives import tangent_scale, tangents_of
+from ..hybrid import HybridOutcome
+from ..integration import Outcome, Settings
+from ..integration.status import Status
+from ..sweeps import Variable
+from ..validation import as_number
+from .ensemble import Ensemble, status_of
+from .errors import errors_of, second_tolerance
+from .model import AbstractModel
+from .samples import Samples, solve_samples
+
+#: Descriptions of the counters of every run.
+COUNTED = {"steps": "steps", "rejected": "rejected steps"}
+
+
+class TableForm(NamedTuple):
+    """The names in a table of a kind of model.
+
+    - `words`: the words for how a run ends, in the order of the integers in files; `named`: statuses with a word of their
+      own, by the word of `Status`.
+    - `event`: what the event is, for descriptions of variables.
+    - `run`: the word for a run in descriptions.
+    - `time`: name of the variable of the event's time; `order`: the variables in order, by default as they come.
+    - `nan_if_failed`: whether the time of a run without a result is NaN; otherwise it is infinite.
+    """
+
+    words: tuple[str, ...]
+    named: dict[str, str] | None = None
+    event: str = "event"
+    nan_if_failed: bool = True
+    time: str = "time"
+    run: str = "run"
+    order: tuple[str, ...] | None = None
+
+    @property
+    def codes(self) -> np.ndarray:
+        """The integer of a file for each integer of `Status` from 0 on; -1 for statuses without a word."""
+        words = [(self.named or {}).get(status.word, status.word) for status in sorted(Status)[1:]]
+        return np.array([self.words.index(word) if word in self.words else -1 for word in words], np.int8)
+
+    def code(self, status: Status) -> int:
+        """The integer of a file for a status."""
+        return int(self.codes[int(status)])
+
+
+class TableJob(NamedTuple):
+    """The computation for every cell, as data that can be sent to another process.
+
+    - `model`: with scalars; `form`: the names in the table.
+    - `t1`: horizon [s]; `crossing`: "first", "last" or "both"; `settings`: those of the integration.
+    - `slopes`: full name of a parameter -> name of the variable with the derivative of the time.
+    - `errors`: whether to run every cell again at another tolerance.
+    - `samples`: the quantities at given times, or `None`; `timed`: whether runs are timed, not only sampled.
+    """
+
+    model: AbstractModel
+    form: TableForm
+    t1: float
+    crossing: str
+    settings: Settings
+    slopes: dict[str, str] | None = None
+    errors: bool = False
+    samples: Samples | None = None
+    timed: bool = True
+
+    @property
+    def times(self) -> tuple[str, ...]:
+        """The variables that are times of events."""
+        if not self.model.has_event and self.form.order is None:
+            return ()
+        return ("first_time", "last_time") if self.crossing == "both" else (self.form.time,)
+
+    @property
+    def continues(self) -> bool:
+        """Whether a run continues through its event."""
+        own = self.model.continues and self.model.event is None and self.model.has_event
+        return self.crossing != "first" or own
+
+    @property
+    def variables(self) -> dict[str, Variable]:
+        """The variables of the table, without derivatives."""
+        if not self.timed:
+            return self.samples.variables(self.model) | self._ending({}) if self.samples is not None else {}
+        event = self.form.event
+        words = {f"{name}_time": f"{name} {event} time" for name in ("first", "last")}
+        words[self.form.time] = {"event": "time of the event", "loss of contact": event}.get(event, f"{event} time")
+        variables = {name: Variable("s", np.float64, long_name=words[name]) for name in self.times}
+        variables |= self._ending({} if self.samples is not None else self.model.ends)
+        if self.slopes and not self.model.smooth:
+            variables |= {"grazes": Variable("1", np.int8, long_name="whether an event on the way was grazing")}
+        if self.errors:
+            variables |= self._error_variables(variables)
+        if self.samples is not None:
+            variables |= self.samples.variables(self.model)
+        return variables if self.form.order is None else {name: variables[name] for name in self.form.order}
+
+    def _ending(self, ends: dict[str, Variable]) -> dict[str, Variable]:
+        """The variables that describe how a run ended."""
+        counts = COUNTED | self.model.counters
+        return (
+            {
+                "status": Variable("1", np.int8, self.form.words, long_name=f"how the {self.form.run} ended"),
+                "end_time": Variable("s", np.float64, long_name=f"end of the {self.form.run}"),
+            }
+            | ends
+            | {name: Variable("1", np.int64, long_name=words) for name, words in counts.items()}
+        )
+
+    @property
+    def bounded(self) -> tuple[str, ...]:
+        """The variables that get error bounds."""
+        return (*self.times, "end_time", *(() if self.samples is not None else self.model.ends))
+
+    def _error_variables(self, variables: dict[str, Variable]) -> dict[str, Variable]:
+        """The variables that describe the accuracy of others (`errors.py`)."""
+        errors = {
+            name: Variable(variables[name].unit, np.float64, long_name=f"error of the {variables[name].long_name}")
+            for name in self.bounded
+        }
+        errors |= {"status": Variable("1", np.int8, long_name="whether the two runs disagree on the status")}
+        errors |= {
+            name: Variable("1", np.int64, long_name=f"difference of the two runs in {words}")
+            for name, words in self.model.counters.items()
+        }
+        return {f"{name}_error": variable for name, variable in errors.items()}
+
+    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+        """The variables of some cells, of which only the first `count` are run."""
+        size = next((len(values) for values in columns.values()), 1)
+        cells = self.model.replaced(columns)
+        sampled: dict[str, Any] = {}
+        if self.samples is not None:
+            status, sampled = solve_samples(cells, self.samples, self.t1, size, count, self.settings)
+            sampled["status"] = self.form.codes[np.asarray(status)]
+        if not self.timed:
+            return sampled
+        variables = self._results(cells, columns, size, count, self.settings, self.slopes)
+        if self.errors:
+            settings = self.settings.with_tolerance(as_number(second_tolerance(float(self.settings.tolerance))))
+            second = self._results(cells, columns, size, count, settings, None)
+            silent = tuple(self.form.code(status) for status in (Status.FAILED, Status.UNRESOLVED))
+            variables |= errors_of(variables, second, self.bounded, tuple(self.model.counters), silent)
+        names = () if self.samples is None else self.samples.names
+        return variables | {name: sampled[name] for name in names}
+
+    def _results(
+        self,
+        cells: AbstractModel,
+        columns: dict[str, Any],
+        size: int,
+        count: int,
+        settings: Settings,
+        slopes: dict[str, str] | None,
+    ) -> dict[str, Any]:
+        """The variables of one run of every cell."""
+
+        def ensemble_of(continues: bool) -> Ensemble:
+            return Ensemble.of(cells, size, settings.tolerance, continues)
+
+        derivatives, grazing = {}, False
+        if slopes:
+            names = tuple(slopes)
+            ensemble, tangents, scales = _with_tangents(
+                self.model, columns, names, settings.tolerance, size, self.continues
+            )
+            outcome, along, grazing = ensemble.solve_with_tangents(tangents, self.t1, count, settings)
+            derivatives = {
+                slopes[name]: np.asarray(slope) / np.asarray(scale)
+                for name, slope, scale in zip(names, along, scales, strict=True)
+            }
+        else:
+            ensemble = ensemble_of(self.continues)
+            outcome = ensemble.solve(self.t1, count, settings)
+        status, ends = _at_the_end(cells, ensemble, outcome, settings.tolerance)
+        codes = self.form.codes[np.asarray(status)]
+        has_event = np.asarray(status) == Status.EVENT
+        variables = {}
+        if self.times:
+            time: Any = np.where(has_event, outcome.crossing_time, np.inf)
+            if self.continues and self.crossing == "first" and isinstance(outcome, Outcome):
+                time = outcome.first_crossing
+            variables[self.times[-1]] = self._silenced(np.asarray(time), np.asarray(status))
+        variables |= {"status": codes, "end_time": np.asarray(outcome.end_time)}
+        if self.samples is None:
+            variables |= {name: np.asarray(values) for name, values in ends.items()}
+        variables |= {"steps": np.asarray(outcome.steps), "rejected": np.asarray(outcome.rejected)}
+        if isinstance(outcome, HybridOutcome):
+            variables |= dict(zip(self.model.counters, outcome.counts, strict=True))
+        if self.crossing == "both":
+            variables["first_time"] = self._first_times(outcome, cells, ensemble_of, status, count, settings)
+        variables |= {name: np.where(has_event, slope, 0.0) for name, slope in derivatives.items()}
+        if slopes and not self.model.smooth:
+            variables["grazes"] = (has_event & np.asarray(grazing)).astype(np.int8)
+        return variables
+
+    def _first_times(
+        self, outcome: Any, cells: AbstractModel, ensemble_of: Any, status: Any, count: int, settings: Settings
+    ) -> Float[np.ndarray, " cells"]:
+        """The times of the first events of runs that continue through them."""
+        if not isinstance(outcome, HybridOutcome):
+            is_unresolved = np.asarray(status) == Status.UNRESOLVED
+            return np.where(is_unresolved, np.inf, np.asarray(outcome.first_crossing))
+        # With several modes, the first event needs a separate solve, which ends there.
+        ensemble = ensemble_of(False)
+        first = ensemble.solve(self.t1, count, settings)
+        status = np.asarray(_at_the_end(cells, ensemble, first, settings.tolerance)[0])
+        return np.where(status == Status.EVENT, first.crossing_time, np.inf)
+
+    def _silenced(self, time: Float[np.ndarray, " cells"], status: np.ndarray) -> Float[np.ndarray, " cells"]:
+        if not self.form.nan_if_failed:
+            return time
+        return np.where(np.isin(status, (Status.FAILED, Status.UNRESOLVED)), np.nan, time)
+
+
+# Compiled once for all chunks.
+@eqx.filter_jit
+def _at_the_end(
+    cells: AbstractModel, ensemble: Ensemble, outcome: Outcome | HybridOutcome, tolerance: Float[Array, ""]
+) -> tuple[Array, dict[str, Array]]:
+    """The `Status` of all cells, and the variables that describe their ends."""
+    return status_of(cells, ensemble, outcome, tolerance), cells.at_end(outcome, ensemble.starts)
+
+
+@eqx.filter_jit
+def _with_tangents(
+    model: AbstractModel,
+    columns: dict[str, Any],
+    names: tuple[str, ...],
+    tolerance: Float[Array, ""],
+    size: int,
+    continues: bool,
+) -> tuple[Ensemble, tuple[Any, ...], list[Float[Array, "..."]]]:
+    """The runs of all cells, the tangents along the named parameters, and the scale of each tangent."""
+
+    def build(*moving: Array) -> Ensemble:
+        cells = model.replaced(columns | dict(zip(names, moving, strict=True)))
+        return Ensemble.of(cells, size, tolerance, continues)
+
+    cells = model.replaced(columns)
+    point = tuple(jnp.asarray(cells.value(name), float) for name in names)
+    scales = [tangent_scale(value) for value in point]
+    tangents = [
+        tuple(scale if row == k else jnp.zeros_like(scale) for k, scale in enumerate(scales))
+        for row in range(len(names))
+    ]
+    return build(*point), tangents_of(build, point, tangents), scales
+
+
+class ScatteredJob(NamedTuple):
+    """A job whose cells are listed in columns, one row per cell. The results include the columns.
+
+    `columns`: full name of a number -> its value in every cell; `names`: full name -> name of the variable.
+    """
+
+    job: TableJob
+    columns: dict[str, Any]
+    names: dict[str, str]
+
+    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+        """The variables of some cells, of which only the first `count` are run."""
+        values_of_columns = {number: values[columns["cell"]] for number, values in self.columns.items()}
+        return self.job(values_of_columns, count) | {
+            self.names[number]: values for number, values in values_of_columns.items()
+        }

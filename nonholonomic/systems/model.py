@@ -1,0 +1,249 @@
+"""A user's own system as a model: its numbers by name, its modes, and its components."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..formulations import AbstractFormulation, AbstractSystem
+from ..hybrid import HybridOutcome
+from ..integration import AbstractProblem, Outcome
+from ..integration.status import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED, Status
+from ..lanes.tracing import dependent_outputs, with_own_numbers
+from ..runs.lyapunov import direction_of_start
+from ..runs.model import AbstractModel, Names, Start, model_of
+from ..runs.parameters import Parameters, check_again, has_checks, require_apart, short_names
+from ..runs.simulate import simulate_model
+from ..runs.trajectory import Trajectory
+from ..sweeps import Axis, Quantity, Variable
+from ..validation import as_number, shown
+from ..views import Stage
+from ..views.explore import LiveRun
+from .engine import Cells
+from .form import Form
+from .mode import AbstractMode, Event, Hybrid
+from .page import page_of
+from .system import MechanicalEvent, MechanicalMode, check_start, formulation_of
+
+#: The statuses, by the code of the integration, of runs that did not reach their horizon.
+STATUSES = {
+    CROSSED: Status.EVENT,
+    LEFT_DOMAIN: Status.STOPPED,
+    FAILED: Status.FAILED,
+    UNRESOLVED: Status.UNRESOLVED,
+}
+
+
+class OwnModel(AbstractModel):
+    """A `Hybrid` or an `AbstractSystem`, its start and its event, which is a part of `parameters`.
+
+    `form`: the form of the hybrid system; `components_of`: the names of the components of a state.
+    """
+
+    parameters: Parameters
+    form: Form = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+    event: None = None
+
+    least_chunk = 1024
+
+    @classmethod
+    def of(cls, tree: dict[str, Any]) -> "OwnModel":
+        """The model of a system, its start and its event."""
+        hybrid, state, formulation = assembled(tree)
+        form = Form.of(hybrid, state.size)[0]
+        form.traits  # noqa: B018  Traced here, so that what is wrong with a user's function is said before anything compiles.
+        if formulation is None:
+            names = tuple(f"y{k}" for k in range(form.size))
+        else:
+            names = tuple(f"{name}{k}" for name in ("q", "rate") for k in range(formulation.system.dimension))
+        return cls(parameters=Parameters.of(tree), form=form, names=names)
+
+    def __reduce__(self) -> Any:
+        # The structure of a tree with a user's classes cannot be pickled, but the tree can.
+        return OwnModel.of, (self.parameters.tree,)
+
+    def full_name(self, argument: str, name: str) -> str:
+        return self.parameters.full_name(argument, name)
+
+    @property
+    def known(self) -> list[str]:
+        return self.parameters.known
+
+    def value(self, name: str) -> Array:
+        return self.parameters.value(name)
+
+    def replaced(self, values: dict[str, Any]) -> "OwnModel":
+        new_values = {name: jnp.asarray(value, float) for name, value in values.items()}
+        return dataclasses.replace(self, parameters=self.parameters.replaced(new_values))
+
+    def label(self, names: list[str]) -> dict[str, tuple[str, str, str]]:
+        require_apart("axes and sensitivities", names)
+        return {name: (short, "1", "") for name, short in short_names(names).items()}
+
+    def description(self) -> dict[str, Any]:
+        tree = self.parameters.tree
+        system, event = tree["system"], tree["event"]
+        event = system.event if isinstance(system, Hybrid) else event
+        name = None if event is None else getattr(event, "__qualname__", type(event).__name__)
+        values = zip(self.parameters.names, self.parameters.values, strict=True)
+        return {"system": type(system).__name__, "event": name} | {name: float(value) for name, value in values}
+
+    def check(self) -> None:
+        """The start and the system were checked when the model was made."""
+
+    def require_values(self, values: dict[str, Any]) -> None:
+        check_again(self.replaced(values).parameters.tree)
+
+    def check_axes(self, grid: list[Axis], cells: Any) -> None:
+        tree = self.parameters.tree
+        for axis in grid if has_checks(tree["system"]) or has_checks(tree["event"]) else ():
+            for value in axis.values:
+                self.require_values({axis.number: value})
+
+    def legal(self) -> Bool[Array, "..."]:
+        starts = [
+            value for name, value in zip(self.parameters.names, self.parameters.values, strict=True) if "start" in name
+        ]
+        return functools.reduce(jnp.logical_and, map(jnp.isfinite, starts))
+
+    @property
+    def smooth(self) -> bool:
+        return self.form.traits.smooth
+
+    @property
+    def has_event(self) -> bool:
+        return self.form.has_event
+
+    @property
+    def counters(self) -> dict[str, str]:
+        return {} if self.smooth else {"switches": "resets"}
+
+    def problem(self, cells: int | None, names: Names) -> AbstractProblem:
+        return self._cells(cells).problem(cells)
+
+    def modes(self, cells: int, tolerance: Any, names: Names, continues: bool) -> Start:
+        return self._cells(cells).modes(cells)
+
+    def _cells(self, size: int | None) -> Cells:
+        """The runs in the form for the engine, with an axis of cells for the numbers that differ."""
+        values = self.parameters.values
+
+        def of_one(*numbers: Array) -> Cells:
+            hybrid, state, _ = assembled(self.parameters.form.tree(numbers))
+            form, own = Form.of(hybrid, state.size)
+            return Cells(own, tuple(jnp.unstack(state)), form)
+
+        moving = [k for k, value in enumerate(values) if jnp.ndim(value)]
+        if not moving:
+            return of_one(*values)
+
+        def of_moving(*numbers: Array) -> Cells:
+            all_values = list(values)
+            for k, number in zip(moving, numbers, strict=True):
+                all_values[k] = number
+            return of_one(*all_values)
+
+        point = [values[k] for k in moving]
+        first = [number[0] for number in point]
+        single, batch = of_moving(*first), jax.vmap(of_moving, axis_size=size)(*point)
+        depends = dependent_outputs(of_moving, *first)
+        leaves = zip(jax.tree.leaves(batch), jax.tree.leaves(single), depends, strict=True)
+        return jax.tree.unflatten(jax.tree.structure(single), [a if d else b for a, b, d in leaves])
+
+    def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Trajectory:
+        return simulate_model(self.without_event(), t1, times, tolerance, solver)
+
+    def page(self, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
+        return page_of(self, sliders, t1)
+
+    def without_event(self) -> "OwnModel":
+        """The same model without an event."""
+        tree = self.parameters.tree
+        system = tree["system"]
+        system = dataclasses.replace(system, event=None) if isinstance(system, Hybrid) else system
+        return OwnModel.of(tree | {"system": system, "event": None})
+
+    def direction(self, cells: int) -> Float[Array, "components cells"]:
+        starts = [name for name in self.known if name.startswith("start")]
+        return direction_of_start(self, starts, cells)
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        return {name: Quantity("1", name) for name in self.names}
+
+    def read(
+        self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: Any
+    ) -> dict[str, Array]:
+        return {name: part for name, part in zip(self.names, self.components_of(rows), strict=True) if name in names}
+
+    def components_of(self, rows: Float[Array, "rows *cells"]) -> Float[Array, "components *cells"]:
+        """States of the engine in the user's components."""
+
+        def of_one(state: Array, *numbers: Array) -> Array:
+            state = state[: self.form.size]
+            formulation = assembled(self.parameters.form.tree(numbers))[2]
+            return state if formulation is None else jnp.concatenate(formulation.split(state))
+
+        values = self.parameters.values
+        if rows.ndim == 1:
+            return of_one(rows, *values)
+        axes = tuple(0 if jnp.ndim(value) else None for value in values)
+        return jax.vmap(of_one, in_axes=(1, *axes), out_axes=1)(rows, *values)
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        return ("event", "completed", "stopped", "failed", "unresolved")
+
+    def ended(self, outcome: Outcome | HybridOutcome, tolerance: Any) -> Int[Array, " cells"]:
+        status = jnp.full(jnp.shape(outcome.status), int(Status.COMPLETED))
+        for code, ended in STATUSES.items():
+            status = jnp.where(outcome.status == code, int(ended), status)
+        return status
+
+    @property
+    def ends(self) -> dict[str, Variable]:
+        return {name: Variable("1", np.float64, long_name=f"{name} at the end") for name in self.names}
+
+    def at_end(self, outcome: Outcome | HybridOutcome, start: Array) -> dict[str, Array]:
+        return dict(zip(self.names, self.components_of(jnp.asarray(outcome.state)), strict=True))
+
+
+def assembled(tree: dict[str, Any]) -> tuple[Hybrid, Array, AbstractFormulation | None]:
+    """A system as a `Hybrid`, the state at its start, and the formulation of a mechanical system."""
+    system, start, event = tree["system"], tree["start"], tree["event"]
+    if isinstance(system, Hybrid):
+        return system, start, None
+    formulation = formulation_of(system)
+    event = None if event is None else MechanicalEvent(formulation, event)
+    return Hybrid([MechanicalMode(formulation)], event), formulation.state(start["q"], start["rate"]), formulation
+
+
+@model_of.register(Hybrid)
+def _(system: Hybrid, start: Any, event: Event | None = None, input: Any = None) -> OwnModel:
+    check_start(system, start)
+    state = as_number(start)
+    if event is not None:
+        system = dataclasses.replace(system, event=with_own_numbers(event, jnp.zeros(()), state))
+    return OwnModel.of({"system": system, "start": state, "event": None})
+
+
+@model_of.register(AbstractSystem)
+def _(system: AbstractSystem, start: Any, event: Event | None = None, input: Any = None) -> OwnModel:
+    check_start(system, start)
+    q, rate = (as_number(part) for part in start)
+    if event is not None:
+        event = with_own_numbers(event, jnp.zeros(()), jnp.concatenate([q, rate]))
+    return OwnModel.of({"system": system, "start": {"q": q, "rate": rate}, "event": event})
+
+
+@model_of.register(AbstractMode)
+def _(system: AbstractMode, start: Any, event: Event | None = None, input: Any = None) -> OwnModel:
+    raise ValueError(
+        f"system = {shown(system)} must be a Hybrid or an AbstractSystem; wrap modes in nonholonomic.Hybrid([...])"
+    )

@@ -1,0 +1,292 @@
+"""The stroller as a model for the functions of `nonholonomic.runs`."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from nonholonomic.geometry import Plane
+from nonholonomic.hybrid import HybridOutcome
+from nonholonomic.integration import AbstractProblem, ExtendedProblem, Outcome
+from nonholonomic.integration.checks import run_bounds
+from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, Status
+from nonholonomic.parameters import description, full_name, numbers, with_numbers
+from nonholonomic.runs import (
+    UNMEASURED,
+    AbstractModel,
+    Clock,
+    EventFunction,
+    Names,
+    direction_of_start,
+    model_of,
+    with_event,
+)
+from nonholonomic.sweeps import Quantity, Variable
+from nonholonomic.validation import require_all, require_kind, require_scalars
+from nonholonomic.views import Stage
+from nonholonomic.views.explore import LiveRun, ends_of, sliders_of
+
+from ..model.friction import Damping, RollingResistance
+from ..model.input import Input, Steady, check_input
+from ..model.launch import Launch
+from ..model.ride import RideProblem, as_module
+from ..model.scene import Scene
+from ..model.stroller import Stroller
+from .explore import DRAWN, default_ranges, live_run, stage
+from .quantities import QUANTITIES, VECTORS
+from .simulate import DEFAULT_STEPS, ride
+from .state import TIMED, RideState
+from .trajectory import Trajectory
+
+#: Names of the coordinates of a place in the fixed frame.
+FIXED = (("x", "m"), ("y", "m"), ("z", "m"))
+
+UNITS = Stroller.units | Scene.units | Damping.units | RollingResistance.units | Steady.units | Launch.units
+UNITS |= {"tilt": "rad", "radius": "m", "equatorial": "m", "polar": "m", "ring": "m", "tube": "m", "p": "m"}
+
+#: Descriptions of the axes.
+LONG_NAMES = {"steering_inertia": "inertia of the fork", "steering_spring": "spring of the fork"}
+LONG_NAMES |= {
+    "steering": "steering angle φ(0)",
+    "speed": "speed v(0)",
+    "heading": "heading ψ(0)",
+    "steering_rate": "steering rate φ'(0)",
+    "mass": "mass m",
+}
+LONG_NAMES |= {
+    "x0": "x(0)",
+    "y0": "y(0)",
+    "z0": "z(0)",
+    "mu0": "μ(0)",
+    "eta0": "η(0)",
+    "force": "drive force",
+    "torque": "steering torque",
+}
+
+#: The numbers of a ride's end.
+ENDS = {
+    "x": Variable("m", np.float64, long_name="x"),
+    "y": Variable("m", np.float64, long_name="y"),
+    "z": Variable("m", np.float64, long_name="height z"),
+    "heading": Variable("rad", np.float64, long_name="heading ψ"),
+    "end_steering": Variable("rad", np.float64, long_name="steering angle φ at the end"),
+    "end_speed": Variable("m s-1", np.float64, long_name="speed at the end"),
+    "energy": Variable("J", np.float64, long_name="energy at the end"),
+    "residual": Variable("J", np.float64, long_name="energy less work"),
+}
+
+#: Names that no axis may have.
+TAKEN = (*ENDS, "contact_time", "end_time", "status", "steps", "rejected")
+
+
+class Original:
+    """A user's input before it was traced, for files and for other processes. All are equal: the traced input decides
+    whether a program is compiled again."""
+
+    def __init__(self, controls: Any):
+        self.input = controls
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Original)
+
+    def __hash__(self) -> int:
+        return 0
+
+
+class RideModel(AbstractModel):
+    """A ride, or the rides of many cells: scene, launch and input, and the event. Without another event, the event is
+    that the ground would have to pull; a ride continues through this event.
+
+    `original`: the user's input, if it was traced.
+    """
+
+    scene: Scene
+    launch: Launch
+    input: Any
+    event: EventFunction | None = None
+    original: "Original | None" = eqx.field(static=True, default=None)
+
+    continues = True
+    # Nothing is watched.
+    comparable = ("speed",)
+
+    @classmethod
+    def of(cls, scene: Scene, launch: Launch, controls: Any, event: Any = None) -> AbstractModel:
+        """The model of a ride, with a user's event if there is one."""
+        module = as_module(controls, scene, launch)
+        original = None if module is controls else Original(controls)
+        ride = cls(scene=scene, launch=launch, input=module, original=original)
+        return with_event(ride, event)
+
+    def __reduce__(self) -> Any:
+        # A traced function cannot be pickled, so each process traces it.
+        controls = self.input if self.original is None else self.original.input
+        event = None if self.event is None else self.event.function
+        return RideModel.of, (self.scene, self.launch, controls, event)
+
+    @property
+    def roots(self) -> dict[str, Any]:
+        """The trees whose numbers are parameters."""
+        module = {} if self.input is None or self.original is not None else {"input": self.input}
+        return {"scene": self.scene, "launch": self.launch} | module
+
+    def full_name(self, argument: str, name: str) -> str:
+        return full_name(argument, name, self.known)
+
+    @property
+    def known(self) -> list[str]:
+        """The full names of the parameters that can be varied: single numbers, including omitted ones, which are 0."""
+        values = {name: value for root, tree in self.roots.items() for name, value in numbers(root, tree).items()}
+        level = isinstance(self.scene.surface, Plane)
+        return [
+            name for name, value in values.items() if np.ndim(value) == 0 and (level or name != "scene.body.centre")
+        ]
+
+    def value(self, name: str) -> Any:
+        if name.startswith("event.") and self.event is not None:
+            return self.event.parameters.value(name)
+        root = name.partition(".")[0]
+        value = numbers(root, self.roots[root])[name]
+        return jnp.zeros(()) if value is None else value
+
+    def replaced(self, values: dict[str, Any]) -> "RideModel":
+        own = {name: value for name, value in values.items() if not name.startswith("event.")}
+        event = self.event if self.event is None else self.event.replaced(values)
+        return dataclasses.replace(self, **with_numbers(self.roots, own), event=event)
+
+    def label(self, names: list[str]) -> dict[str, tuple[str, str, str]]:
+        """The name of an axis is the last part of its full name, or the last two parts if one is ambiguous. Numbers of a
+        place have the surface's names, followed by a zero: `x0`."""
+        surface, place = self.scene.surface, self.launch.place
+        last_names = [name.rsplit(".", 1)[-1] for name in names]
+        coordinates = surface.coordinates if len(place) == len(surface.coordinates) else FIXED
+        places = dict(zip([f"launch.place[{k}]" for k in range(len(place))], coordinates, strict=True))
+        labels = {}
+        for full, last in zip(names, last_names, strict=True):
+            name, unit = last, UNITS.get(last, "1")
+            if full in places:
+                name, unit = places[full][0] + "0", places[full][1]
+            elif last_names.count(last) > 1 or last in TAKEN:
+                name = "_".join(full.split(".")[-2:])
+            if full.endswith("steering"):
+                unit = "N m s" if "friction" in full else "rad"
+            labels[full] = (name, unit, LONG_NAMES.get(name, name.replace("_", " ")))
+        return labels
+
+    def description(self) -> dict[str, Any]:
+        launch = dataclasses.replace(self.launch, place=(0.0, 0.0))
+        request = description("scene", self.scene) | description("launch", launch)
+        request |= {"launch.place": [float(part) for part in self.launch.place]}
+        controls = self.input if self.original is None else self.original.input
+        if isinstance(controls, eqx.Module):
+            request |= {"input": description("input", controls)}
+        else:
+            request |= {"input": "none" if controls is None else getattr(controls, "__qualname__", repr(controls))}
+        return request if self.event is None else request | {"event": self.event.name}
+
+    def check(self) -> None:
+        self.scene.check(self.launch)
+
+    def legal(self) -> Bool[Array, "..."]:
+        return self.scene.may_start(self.launch, self.input)
+
+    @property
+    def smooth(self) -> bool:
+        return True
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        return ("completed", "contact_lost", "rank_lost", "failed", "event")
+
+    @property
+    def has_event(self) -> bool:
+        return self.event is not None or not isinstance(self.scene.surface, Plane)
+
+    def problem(self, cells: int | None, names: Names) -> AbstractProblem:
+        if cells is None:
+            ride = RideProblem.single(self.scene, self.launch, self.input)
+        else:
+            watched = self.event is None and names is not None and not names
+            ride = RideProblem.of(self.scene, self.launch, self.input, cells, watched)
+        if not self._has_clock(names):
+            return ride
+        clock = jnp.zeros_like(ride.states[:1])
+        return ExtendedProblem(ride, Clock(), clock, clock + UNMEASURED)
+
+    def _has_clock(self, names: Names) -> bool:
+        """Whether the state ends with the time, which quantities need that depend on the input."""
+        return self.input is not None and names is not None and not TIMED.isdisjoint(names)
+
+    def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Trajectory:
+        require_all(run_bounds(t1, tolerance))
+        return ride(self, t1, times, tolerance, solver, DEFAULT_STEPS, adjoint)
+
+    def page(self, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
+        ranges = default_ranges(self.scene, self.launch) if sliders is None else sliders
+        knobs = sliders_of(ranges, self.roots, LONG_NAMES, UNITS)
+        models = [self, *(self.replaced({path: end}) for path, end in ends_of(knobs))]
+        rides = [model.simulate(t1, None, DRAWN, None, None) for model in models]
+        return live_run(self.roots, knobs, t1, self.input), stage(rides)
+
+    def without_event(self) -> "RideModel":
+        return dataclasses.replace(self, event=None)
+
+    def direction(self, cells: int) -> Float[Array, "components cells"]:
+        starts = [name for name in self.known if name.startswith("launch.")]
+        return direction_of_start(self, starts, cells)
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        return QUANTITIES
+
+    @property
+    def components(self) -> dict[str, tuple[str, ...]]:
+        return VECTORS | {"coordinate": tuple(name for name, _ in self.scene.surface.coordinates)}
+
+    def read(
+        self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: Any
+    ) -> dict[str, Array]:
+        size = len(jax.eval_shape(lambda: self.scene.state(self.launch, self.input is not None)))
+        time = rows[size] if len(rows) > size else time
+        state = RideState(self.scene, self.input, time, rows[:size])
+        return {name: QUANTITIES[name].of(name, state) for name in names}
+
+    def ended(self, outcome: Outcome | HybridOutcome, tolerance: Any) -> Int[Array, " cells"]:
+        lost = self.event is None and jnp.isfinite(outcome.crossing_time)
+        status = jnp.where(lost | (outcome.status == CROSSED), int(Status.EVENT), int(Status.COMPLETED))
+        status = jnp.where(outcome.status == LEFT_DOMAIN, int(Status.RANK_LOST), status)
+        return jnp.where(outcome.status == FAILED, int(Status.FAILED), status)
+
+    @property
+    def ends(self) -> dict[str, Variable]:
+        return ENDS
+
+    def at_end(self, outcome: Outcome | HybridOutcome, start: Float[Array, "components cells"]) -> dict[str, Array]:
+        scene, surface = self.scene, self.scene.surface
+        size = len(jax.eval_shape(lambda: scene.state(self.launch, self.input is not None)))
+        states = scene.dynamics.righted(outcome.state[:size])
+        motion = scene.dynamics.geometry(states).motion
+        _, east, north = surface.chart(surface.place_at(motion.position))
+        energy = scene.energy(states)
+        position = surface.in_fixed_frame(motion.position)
+        return dict(zip("xyz", position, strict=True)) | {
+            "heading": scene.dynamics.heading.angle(motion.heading, east, north),
+            "end_steering": motion.steering,
+            "end_speed": motion.speed,
+            "energy": energy,
+            "residual": energy - scene.energy(start[:size]) - scene.work(states),
+        }
+
+
+@model_of.register(Scene)
+def _(system: Scene, start: Any, event: Any = None, input: Input | None = None) -> AbstractModel:
+    require_kind(start, "start", Launch)
+    lists = "axes of sweep take lists, and jax.vmap maps over them"
+    require_scalars(numbers("scene", system, functions=False) | numbers("launch", start), lists)
+    system.check(start)
+    check_input(input, system, start)
+    return RideModel.of(system, start, input, event)

@@ -1,0 +1,113 @@
+"""Every function of `nonholonomic` answers for every kind of model."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from close import assert_close
+from models import CASES
+
+import nonholonomic
+
+QUIET = dict(progress=False, tolerance=1e-8)
+
+
+@pytest.fixture(params=CASES, scope="module")
+def case(request):
+    return CASES[request.param]
+
+
+@pytest.fixture(scope="module")
+def table(case):
+    axes = {case.parameter: case.value * np.array([1.0 - 1e-3, 1.0, 1.0 + 1e-3])}
+    options = dict(event=case.event, sensitivities=[case.parameter], errors=True, **QUIET)
+    return nonholonomic.sweep(case.system, case.start, case.t1, axes=axes, **options)
+
+
+@pytest.fixture(scope="module")
+def samples(case):
+    axes, times = {case.parameter: case.value * np.array([1.0, 1.01])}, np.linspace(0.1, 0.5, 5)
+    options = dict(axes=axes, times=times, quantities=[case.quantity], **QUIET)
+    return nonholonomic.sweep(case.system, case.start, 0.5, **options)
+
+
+def test_the_time_of_an_event_is_that_of_a_table(case, table):
+    time = nonholonomic.event_time(case.system, case.start, case.t1, event=case.event, tolerance=1e-8)
+    assert set(table.status) == {"event"}
+    assert_close(table.time[1], time, rtol=1e-9)
+
+
+def test_the_slopes_of_a_table_are_those_of_differences(case, table):
+    axis = table[next(iter(table.coords))]
+    slope = (table.time[2] - table.time[0]) / (axis[2] - axis[0])
+    assert_close(table[f"time_by_{case.parameter}"][1], slope, rtol=1e-4)
+
+
+def test_the_bounds_of_a_table_hold(case, table):
+    exact = nonholonomic.event_time(case.system, case.start, case.t1, event=case.event, tolerance=1e-12)
+    assert 0.0 < table.time_error[1] < 1e-5
+    assert abs(table.time[1] - float(exact)) <= table.time_error[1]
+
+
+def test_the_quantity_of_a_run_is_that_of_the_samples(case, samples):
+    times = np.asarray(samples.coords["time"])
+    run = nonholonomic.simulate(case.system, case.start, 0.5, times=times, tolerance=1e-8)
+    assert samples[case.quantity].shape == (2, 5)
+    assert_close(samples[case.quantity][0], run[case.quantity], rtol=1e-6, atol=1e-8)
+    assert_close(run.at(times[1:3])[case.quantity], run[case.quantity][1:3], rtol=1e-6, atol=1e-8)
+    assert case.quantity in run.to_xarray()
+
+
+def test_runs_in_transformations_have_quantities(case, samples):
+    def last(scale):
+        start = jax.tree.map(lambda x: x * scale, case.start)
+        return nonholonomic.simulate(case.system, start, 0.5, times=jnp.array([0.3, 0.5]), tolerance=1e-8)[
+            case.quantity
+        ]
+
+    assert_close(jax.jit(jax.vmap(last))(jnp.ones(2))[1, 1], samples[case.quantity][0, -1], rtol=1e-6, atol=1e-8)
+
+
+def test_tables_are_scattered_and_resumed_and_limit_their_steps(case, table, tmp_path):
+    def sweep(**more):
+        axes = {case.parameter: case.value * np.array([1.0 - 1e-3, 1.0])}
+        return nonholonomic.sweep(case.system, case.start, case.t1, axes=axes, event=case.event, **QUIET, **more)
+
+    path = tmp_path / "times.h5"
+    first, again = sweep(scattered=True, path=path), sweep(scattered=True, path=path)
+    assert_close(first.time, table.time[:2], rtol=1e-9)
+    assert np.array_equal(first.time, again.time)
+    assert set(sweep(max_steps=3).status) == {"failed"}
+
+
+def test_the_last_crossing_is_that_after_which_the_event_function_stays_below_zero(case, table):
+    time = nonholonomic.event_time(case.system, case.start, case.t1, case.event, 1e-8, crossing="last")
+    assert_close(time, table.time[1], rtol=1e-8)
+
+
+def test_parameters_are_found_in_recordings_and_times(case):
+    times = np.linspace(0.05, 0.7, 14)
+    value = np.asarray(nonholonomic.simulate(case.system, case.start, 0.7, times=times)[case.quantity])
+    error = 1e-4 * max(np.ptp(value), 1e-3)
+    data = nonholonomic.Recording(case.start, times, value, error=error, quantity=case.quantity)
+    fit = nonholonomic.identify(case.system, data, {case.parameter: 1.02 * case.value}, starts=2, progress=False)
+    assert_close(next(iter(fit.estimates.values())), case.value, rtol=1e-4)
+    time = float(nonholonomic.event_time(case.system, case.start, case.t1, event=case.event))
+    data = nonholonomic.EventTimes(case.start, [time], error=1e-5, t1=case.t1, event=case.event)
+    fit = nonholonomic.identify(case.system, data, {case.parameter: 1.005 * case.value}, starts=2, progress=False)
+    assert_close(next(iter(fit.estimates.values())), case.value, rtol=1e-3)
+
+
+def test_runs_have_a_lyapunov_exponent(case):
+    result = nonholonomic.lyapunov_exponent(case.system, case.start, case.t1, tolerance=1e-7)
+    assert np.isfinite(result.exponent)
+    assert str(result.status) == "completed"
+
+
+def test_runs_are_drawn_and_explored(case, tmp_path):
+    path = tmp_path / "page.html"
+    sliders = {case.parameter: (0.9 * case.value, 1.1 * case.value)}
+    nonholonomic.explore(case.system, case.start, path, sliders=sliders, t1=0.5)
+    assert "range" in path.read_text()
+    nonholonomic.simulate(case.system, case.start, 0.5, tolerance=1e-7).view(path)
+    assert "three" in path.read_text()
