@@ -13,8 +13,8 @@ from .page import ANGLE, centre_and_extent, view_from
 from .plot import new_figure
 from .stage import Curve, Show, Stage, css, finite, matrices, nearest
 
-#: Frames per second, default number of frames, and dots per inch.
-RATE, FRAMES, DOTS = 25, 150, 80
+#: Dots per inch.
+DOTS = 80
 
 #: Number of characters for which a legend has room.
 WIDTH = 90
@@ -78,7 +78,27 @@ def _draw_curve(panel: Any, shows: list[Show], label: str) -> None:
         panel.set_ylim(middle - min_range, middle + min_range)
 
 
-def write_animation(stages: list[Stage], path: Any, times: Times | None) -> None:
+def rate_of(kind: str, fps: float) -> float:
+    """The frames per second of a file of a kind, ".gif" or ".mp4"; a GIF counts hundredths of a second, at least two."""
+    return 100.0 / max(2, round(100.0 / fps)) if kind == ".gif" else fps
+
+
+def frame_times(last: float, speed: float, rate: float) -> Times:
+    """The times [s] of the frames of a run that ends at `last`, at a speed relative to real time."""
+    return np.minimum(np.arange(int(np.ceil(last * rate / speed - 1e-9)) + 1) * speed / rate, last)
+
+
+def speed_as_text(times: Times, rate: float) -> str:
+    """The speed of an animation relative to real time; empty if it varies."""
+    # The last frame may be shorter.
+    steps = np.diff(times[:-1] if len(times) > 2 else times)
+    if not len(steps) or np.ptp(steps) > 1e-6 * steps[0]:
+        return ""
+    speed = steps[0] * rate
+    return ", real time" if abs(speed - 1.0) < 5e-3 else f", {speed:.3g} times real time"
+
+
+def write_animation(stages: list[Stage], path: Any, times: Times | None, speed: float = 1.0, fps: float = 25.0) -> None:
     """Write an animation of stages side by side, with their curves below.
 
     **Arguments:** as for `Viewable.animate`.
@@ -90,7 +110,9 @@ def write_animation(stages: list[Stage], path: Any, times: Times | None) -> None
     if kind is None or not kind.isAvailable():
         raise ValueError(f"path = {str(path)!r} must end in .gif, or in .mp4 where ffmpeg is installed")
     last = max(float(show.times[-1]) for stage in stages for show in stage.shows)
-    times = np.linspace(0.0, last, FRAMES) if times is None else times
+    rate = rate_of(Path(path).suffix, fps)
+    times = frame_times(last, speed, rate) if times is None else times
+    as_text = speed_as_text(times, rate)
     labels = _labels([show for stage in stages for show in stage.shows])
     figure = new_figure(max(8.0, 5.0 * len(stages)), 6.0)
     grid = figure.add_gridspec(2, len(stages) * len(labels), height_ratios=(3.2, 1.0))
@@ -115,14 +137,15 @@ def write_animation(stages: list[Stage], path: Any, times: Times | None) -> None
             space.draw(frame)
         for cursor in cursors:
             cursor.set_xdata([times[frame]] * 2)
-        clock.set_text(f"{times[frame]:.3f} s")
+        clock.set_text(f"{times[frame]:.3f} s{as_text}")
         return []
 
     # Compute the margins once: if they were computed for every frame, the picture would shake.
     update(0)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
-    FuncAnimation(figure, update, frames=len(times)).save(path, writer=kind(fps=RATE), dpi=DOTS)
+    # Matplotlib truncates the duration of a frame to milliseconds.
+    FuncAnimation(figure, update, frames=len(times)).save(path, writer=kind(fps=rate * (1.0 - 1e-9)), dpi=DOTS)
 
 
 class _Space:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..progress import status_line
-from ..validation import require_file, require_package, shown
+from ..validation import require, require_file, require_increasing, require_package, shown
 from .animation import draw_curves, write_animation
 from .page import Page, page
 from .stage import Stage
@@ -49,22 +49,44 @@ class Viewable(abc.ABC):
         return html_page
 
     @status_line("drawing")
-    def animate(self, path: Any, times: Any = None, others: Sequence[Any] = (), overlaid: bool = False) -> None:
-        """Write an animation for slides, with 25 frames per second (needs matplotlib).
+    def animate(
+        self,
+        path: Any,
+        times: Any = None,
+        others: Sequence[Any] = (),
+        overlaid: bool = False,
+        speed: float | None = None,
+        fps: float = 25.0,
+    ) -> None:
+        """Write an animation for slides (needs matplotlib). It plays the run in real time unless you give a `speed`; the
+        picture states time and speed.
 
         **Arguments:**
 
         - `path`: file with a name that ends in .gif, or in .mp4 if ffmpeg is installed.
-        - `times`: time [s] of each frame; by default 150 over the whole run.
+        - `times`: increasing times [s] of the frames; by default the whole run at the given speed.
         - `others`, `overlaid`: as for `view`.
+        - `speed`: seconds of the run per second of the animation, 1 by default; 0.1 is ten times slower than reality. With
+          `times`, the speed follows from `times` and `fps`.
+        - `fps`: frames per second. A GIF shows each frame for a whole number of hundredths of a second, at least two, so it
+          gets the nearest possible rate.
 
-        **Raises:** `ValueError` for another file type or a batch of runs; `OSError` if the file cannot be written.
+        **Raises:** `ValueError` for another file type, a batch of runs, numbers out of range, or both `times` and `speed`;
+        `OSError` if the file cannot be written.
 
         **Example:** `examples/a_page.py`.
         """
         require_package("matplotlib", "plot", "animate")
         require_file(path, "path", ".gif", ".mp4")
-        write_animation(self._stages(others, overlaid), path, None if times is None else np.asarray(times, dtype=float))
+        require(fps, "fps", above=0.0)
+        if speed is not None:
+            require(speed, "speed", above=0.0)
+        if times is not None:
+            if speed is not None:
+                raise ValueError("speed follows from times and fps: omit speed, or omit times")
+            times = np.asarray(times, dtype=float)
+            require_increasing(times, "times")
+        write_animation(self._stages(others, overlaid), path, times, 1.0 if speed is None else float(speed), float(fps))
 
     def overview(self, runs: Sequence[Any], labels: list[str], unit: Any, ax: Any) -> Any:
         """Draw the curves of the page of this run and others over time; arguments as for `plot`."""

@@ -164,6 +164,7 @@ def stem_takes_over(
     sphere that strikes; `air_landed`: the top after the impact; `stem_counts`: as for `InversionProblem`; `last`:
     whether the run continues.
     """
+    assert air.falls is not None
     # A sphere that is about to strike without a flight is not the sphere that touched last.
     last_ball = jnp.where(air.falls, 1 - air.ball, air.ball)
     comes_to_rest_on_stem = ~air_landed.open & (air_landed.ball != 0)

@@ -132,7 +132,8 @@ class HybridTrajectory(AbstractTrajectory):
     @of_each_run
     def _stem_gap(self) -> Float[Array, " times"]:
         """Distance of the stem from the arena [m]."""
-        return self.above[0] + height(*balls(self.scene.body), self._states)
+        main, stem = balls(self.scene.body)
+        return self.above[0] + height(main, stem, self._states)
 
     @property
     def _states(self) -> Float[Array, "components times"]:

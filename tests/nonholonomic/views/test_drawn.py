@@ -24,8 +24,9 @@ from nonholonomic.views import (
     page,
     turned,
 )
-from nonholonomic.views.animation import draw_curves, write_animation
+from nonholonomic.views.animation import draw_curves, frame_times, rate_of, speed_as_text, write_animation
 from nonholonomic.views.stage import matrices
+from nonholonomic.views.viewable import Viewable
 
 SURFACES = (
     (Plane(), (0.3, 0.1)),
@@ -99,6 +100,53 @@ def test_an_animation_moves(tmp_path):
     assert all(np.mean(np.abs(a - b)) > 0.5 for a, b in zip(pictures, pictures[1:], strict=False))
     with pytest.raises(ValueError, match=r"ball\.avi' must end in \.gif"):
         write_animation([rolling()], tmp_path / "ball.avi", None)
+
+
+class Rolling(Viewable):
+    """A run with the stage of `rolling`."""
+
+    def stages(self, others=(), overlaid=False):
+        return [rolling()]
+
+
+def test_an_animation_plays_in_real_time(tmp_path):
+    """By the delays in the file: two seconds last two seconds, or one at twice the speed."""
+    for options, frames, seconds in (({"fps": 5}, 11, 2.0), ({"fps": 20.0, "speed": 4.0}, 11, 0.5)):
+        Rolling().animate(tmp_path / "ball.gif", **options)
+        with Image.open(tmp_path / "ball.gif") as picture:
+            assert picture.n_frames == frames
+            delays = []
+            for frame in range(frames):
+                picture.seek(frame)
+                delays.append(picture.info["duration"] / 1000.0)
+        # The last frame shows the end.
+        assert sum(delays[:-1]) == pytest.approx(seconds)
+
+
+def test_the_picture_states_the_speed():
+    np.testing.assert_allclose(frame_times(8.0, 1.0, 25.0), np.linspace(0.0, 8.0, 201), rtol=1e-12)
+    assert frame_times(0.1, 1.0, 4.0).tolist() == [0.0, 0.1]
+    assert speed_as_text(frame_times(8.0, 1.0, 25.0), 25.0) == ", real time"
+    assert speed_as_text(np.linspace(3.5, 5.5, 251), 25.0) == ", 0.2 times real time"
+    assert speed_as_text(np.array([0.0, 1.0, 3.0, 4.0]), 25.0) == ""
+    # A GIF counts hundredths of a second.
+    assert rate_of(".gif", 30.0) == pytest.approx(100.0 / 3.0)
+    assert rate_of(".gif", 100.0) == 50.0
+    assert rate_of(".mp4", 30.0) == 30.0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"fps": 0.0}, r"fps = 0\.0 must be greater than 0"),
+        ({"speed": -1.0}, r"speed = -1\.0 must be greater than 0"),
+        ({"speed": 1.0, "times": [0.0, 1.0]}, "speed follows from times and fps: omit speed, or omit times"),
+        ({"times": [1.0, 0.0]}, "times"),
+    ],
+)
+def test_what_cannot_be_animated_is_refused(options, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        Rolling().animate(tmp_path / "ball.gif", **options)
 
 
 def test_curves_are_drawn_and_what_is_constant_is_flat():
