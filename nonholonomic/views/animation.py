@@ -188,8 +188,12 @@ class _Space:
             if trace.shown
         ]
         self.traces = [axes.plot([], [], [], color=css(c), linewidth=0.9, zorder=z)[0] for c, z in lines]
-        arrows = [arrow.colour for show in stage.shows for arrow in show.arrows if arrow.shown]
-        self.arrows = [axes.plot([], [], [], color=css(c), linewidth=2.2, zorder=3)[0] for c in arrows]
+        arrows = [arrow for show in stage.shows for arrow in show.arrows if arrow.shown]
+        # The bodies are at 4.
+        self.arrows = [
+            axes.plot([], [], [], color=css(arrow.colour), linewidth=2.2, zorder=5 if arrow.through else 3)[0]
+            for arrow in arrows
+        ]
         self.solids = axes.add_collection3d(Poly3DCollection([np.zeros((3, 3))], linewidths=0.3, zorder=4))
 
     def draw(self, frame: int) -> None:

@@ -37,8 +37,11 @@ Numbers = Float[Array, " numbers"]
 TOLERANCE = 1e-7
 DRAWN = 1e-5
 
+#: Number of curves of `view.show` that the page computes.
+CURVES = 4
+
 #: The quantities of a ride that the page draws.
-SHOWN = ("position", "direction", "steering", "speed", "front_speed", "energy", "normal_force", "side_force")
+SHOWN = ("position", "direction", "steering", "speed", "front_speed", "energy", "normal_force", "load", "side_force")
 
 #: Greatest number of steps of a run in the page; they take some hundred milliseconds.
 MOST_STEPS_OF_A_PAGE = 50_000
@@ -150,7 +153,8 @@ def frame(scene: Scene, controls: Input | None, lane: LaneState) -> Frame:
         ),
         traces=((contacts[0], None), (contacts[1], None)),
         arrows=(
-            (axle - 1.4 * half * y, outputs["normal_force"] * z),
+            (contacts[0], outputs["load"][0] * z),
+            (contacts[1], outputs["load"][1] * z),
             (contacts[0], outputs["side_force"][0] * y),
             (contacts[1], outputs["side_force"][1] * left),
         ),

@@ -48,8 +48,12 @@ FIXED = (("x", "m"), ("y", "m"), ("z", "m"))
 UNITS = Stroller.units | Scene.units | Damping.units | RollingResistance.units | Steady.units | Launch.units
 UNITS |= {"tilt": "rad", "radius": "m", "equatorial": "m", "polar": "m", "ring": "m", "tube": "m", "p": "m"}
 
+# The launch has a number of the same short name.
+UNITS |= {"scene.friction.steering": "N m s"}
+
 #: Descriptions of the axes.
-LONG_NAMES = {"steering_inertia": "inertia of the fork", "steering_spring": "spring of the fork"}
+LONG_NAMES = {"scene.friction.steering": "damping of the steering"}
+LONG_NAMES |= {"steering_inertia": "inertia of the fork", "steering_spring": "spring of the fork"}
 LONG_NAMES |= {
     "steering": "steering angle φ(0)",
     "speed": "speed v(0)",
@@ -167,14 +171,14 @@ class RideModel(AbstractModel):
         places = dict(zip([f"launch.place[{k}]" for k in range(len(place))], coordinates, strict=True))
         labels = {}
         for full, last in zip(names, last_names, strict=True):
-            name, unit = last, UNITS.get(last, "1")
+            name, unit = last, UNITS.get(full, UNITS.get(last, "1"))
             if full in places:
                 name, unit = places[full][0] + "0", places[full][1]
             elif last_names.count(last) > 1 or last in TAKEN:
                 name = "_".join(full.split(".")[-2:])
             if full.endswith("steering"):
                 unit = "N m s" if "friction" in full else "rad"
-            labels[full] = (name, unit, LONG_NAMES.get(name, name.replace("_", " ")))
+            labels[full] = (name, unit, LONG_NAMES.get(full, LONG_NAMES.get(name, name.replace("_", " "))))
         return labels
 
     def description(self) -> dict[str, Any]:

@@ -110,7 +110,7 @@ def show(run: Any, number: int, name: str) -> Show:
     forces, scale = reader(run.side_force), WEIGHT * length / weight
     contacts = (position + 0.02 * radius * z, position + length * x + 0.02 * radius * z)
     grip = np.asarray(run.grip())[:, : len(run.loaded_axles)]
-    push = reader(run.normal_force)[:, None] * z
+    loads = reader(run.load)
     return Show(
         name,
         colour,
@@ -133,8 +133,12 @@ def show(run: Any, number: int, name: str) -> Show:
             Trace("path of the front wheel", contacts[1], BLUE, 0.025 * length),
         ),
         (
-            # Above the axle, the basket would hide it.
-            Arrow("normal force", axle - 1.4 * half * y, push, "N", scale, VIOLET, 0.035 * length),
+            Arrow(
+                "normal force, rear", contacts[0], loads[:, :1] * z, "N", scale, VIOLET, 0.035 * length, through=True
+            ),
+            Arrow(
+                "normal force, front", contacts[1], loads[:, 1:] * z, "N", scale, VIOLET, 0.035 * length, through=True
+            ),
             Arrow("side force, rear", contacts[0], forces[:, :1] * y, "N", scale, GOLD, 0.035 * length, 2.0 * length),
             Arrow(
                 "side force, front", contacts[1], forces[:, 1:] * left, "N", scale, GOLD, 0.035 * length, 2.0 * length

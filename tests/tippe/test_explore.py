@@ -266,8 +266,26 @@ def test_a_phone_in_portrait_shows_all_controls(browser, page):
         uncovered = browser.execute_script(CONTROLS)
         assert len(uncovered) > 6
         assert all(uncovered)
+        # Without scrolling, a viewer sees the picture and moves the sliders; no text needs more than its line.
+        low = browser.execute_script(
+            "return [...document.querySelectorAll('#knobs input')].map((one) => one.getBoundingClientRect().bottom)"
+        )
+        assert max(low) < 800
+        lines = browser.execute_script("return document.getElementById('clock').getClientRects()[0].height")
+        assert lines < 30
     finally:
         browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def test_sliders_have_names(browser, page):
+    """As a screen reader says them: without their values, which it says besides."""
+    knobs = browser.find_elements("css selector", "#knobs input")
+    assert [knob.accessible_name for knob in knobs][:2] == ["θ(0)", "spin ω₃(0)"]
+    assert all(knob.accessible_name for knob in browser.find_elements("css selector", "input, select, button"))
+    # The names of the curves take one line beside their values.
+    assert browser.execute_script(
+        "return [...document.querySelectorAll('.strip .head')].every((one) => one.clientHeight < 30)"
+    )
 
 
 def test_keys_play_and_reset(browser, page):
@@ -341,6 +359,8 @@ def test_in_the_browser_the_wooden_top_hops_and_climbs_onto_its_stem(browser):
     assert hops == len(run.hops) >= 3
     samples, rows = run.at(times), np.array(rows)
     np.testing.assert_allclose(rows[:, 3:6], samples.position, atol=CLOSE)
+    # The normal force acts where the trace of the contact ends.
+    np.testing.assert_array_equal(rows[:, 19:22], rows[:, 10:13])
     theta, energy, _, force = rows[:, -5:-1].T
     np.testing.assert_allclose(theta, samples.theta, atol=5e-6)
     np.testing.assert_allclose(energy, samples.energy, rtol=CLOSE)

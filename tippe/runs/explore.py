@@ -46,7 +46,7 @@ from .launches import LONG_NAMES, UNITS
 from .quantities import OF_RIGID_BODIES, QUANTITIES
 from .trajectory import Trajectory, parts_of, simulate
 from .turned_over import event_of
-from .view import AXIS, BESIDE, DrawnMotion, aside, curve_of_rotation, show
+from .view import AXIS, DrawnMotion, curve_of_rotation, show
 
 Numbers = Float[Array, " numbers"]
 
@@ -336,7 +336,7 @@ def frame(scene: Scene, run: Any) -> Frame:
         bodies=((motion.position, quaternion(motion.rotation)),),
         traces=((arrow_start, None), (AXIS * radius * motion.axis, motion.position)),
         arrows=(
-            (arrow_start + BESIDE * radius * aside(motion.normal[None])[0], motion.normal_force * motion.normal),
+            (arrow_start, motion.normal_force * motion.normal),
             (arrow_start, motion.slip),
             (centre, weight),
             (centre, motion.angular_velocity),

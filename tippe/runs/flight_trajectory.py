@@ -130,7 +130,7 @@ class HybridTrajectory(AbstractTrajectory):
         return float(min([*strokes, first]))
 
     @of_each_run
-    def _stem_gap(self) -> Float[Array, " times"]:
+    def _stem_gap(self) -> Float[Any, " times"]:
         """Distance of the stem from the arena [m]."""
         main, stem = balls(self.scene.body)
         return self.above[0] + height(main, stem, self._states)

@@ -28,7 +28,6 @@ from nonholonomic.views import (
     striped,
     turned,
 )
-from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.body import AbstractBody
 from ..model.rigid_body import AbstractRigidBody
@@ -44,9 +43,6 @@ LEAST_FRAMES = 400
 #: Lengths in units of the radius: of the drawn axis from the centre, and of the arrows for the weight, for the longest
 #: slip, and for the angular velocity and momentum at the start.
 AXIS, WEIGHT, SLIP, SPIN = 1.6, 1.5, 2.0, 2.5
-
-#: Distance of the drawn normal force from the contact, in units of the radius.
-BESIDE = 1.35
 
 #: Slips above this quantile are clipped; otherwise the large slips at the start would make all others invisible.
 COMMON_SLIP = 0.9
@@ -179,15 +175,13 @@ def curve_of_rotation(scene: Scene, motion: DrawnMotion[Any]) -> tuple[str, Any]
 def arrows(motion: DrawnMotion[np.ndarray], offset: float, radius: float, weight: float) -> tuple[Arrow, ...]:
     """Forces and slip at the contact, weight, angular velocity and momentum at the centre of mass."""
     arrow_start = motion.contact + 0.02 * radius * motion.normal
-    # Inside the sphere it would be invisible.
-    label_place = arrow_start + BESIDE * radius * np.asarray(aside(motion.normal))
     centre = motion.position - offset * motion.axis
     speed = np.linalg.norm(motion.slip, axis=-1)
     common = max(float(np.quantile(speed, COMMON_SLIP)), 1e-12)
     weight_vector = np.broadcast_to([0.0, 0.0, -weight], centre.shape)
     push, width = motion.normal_force[:, None] * motion.normal, 0.05 * radius
     arrows = [
-        Arrow("normal force", label_place, push, "N", WEIGHT * radius / weight, VIOLET, width),
+        Arrow("normal force", arrow_start, push, "N", WEIGHT * radius / weight, VIOLET, width, through=True),
         Arrow("slip", arrow_start, motion.slip, "m/s", SLIP * radius / common, GOLD, width, SLIP * radius),
         Arrow(
             "weight at the centre of mass",
@@ -224,15 +218,6 @@ def stages(groups: list[list[tuple[str, Scene, DrawnMotion]]]) -> list[Stage]:
         all_stages.append(Stage("; ".join(name for name, _, _ in group), ground, shows))
         number += len(group)
     return all_stages
-
-
-@compiled_setup
-def aside(normal: Float[Array | np.ndarray, "times 3"]) -> Float[Array, "times 3"]:
-    """Unit vectors across the normal: the projection of x, or of y where the normal is along x."""
-    x, y = jnp.array([[1.0, 0.0, 0.0]]), jnp.array([[0.0, 1.0, 0.0]])
-    guide = jnp.where(jnp.abs(normal[:, :1]) < 0.9, x, y)
-    tangent = guide - jnp.sum(guide * normal, axis=-1, keepdims=True) * normal
-    return tangent / jnp.linalg.norm(tangent, axis=-1, keepdims=True)
 
 
 def meshes(body: AbstractBody | AbstractRigidBody, colour: int) -> tuple[Mesh, ...]:

@@ -18,7 +18,8 @@
   const knobs = sliders.map((slider, k) => {
     const label = element("label", document.getElementById("knobs")), title = element("span", label, { textContent: slider.label });
     const shown = element("output", label);
-    const input = element("input", label, { type: "range", min: 0, max: 1000, step: 1, name: slider.name });
+    // Without a name of its own, the slider would be called by its value, too.
+    const input = element("input", label, { type: "range", min: 0, max: 1000, step: 1, name: slider.name, ariaLabel: slider.label });
     input.addEventListener("input", () => {
       const part = Number(input.value) / 1000;
       set(values.map((value, j) => (j === k ? slider.low + part * (slider.high - slider.low) : value)), input);
@@ -55,7 +56,7 @@
       const all = run.curves[curve].values, [begin, end] = [all[0], all[all.length - 1]];
       const drift = Math.max(...all.map((one) => Math.abs(one - begin))) / Math.abs(begin);
       if (drift < 1e-5) return `<dt>${label}</dt><dd>${digits(begin)} ${unit}</dd><dt></dt><dd>constant to ${drift.toExponential(0)}</dd>`;
-      return `<dt>${label}</dt><dd>${digits(begin)} → ${digits(end)} ${unit}</dd>`;
+      return `<dt>${label}</dt><dd><span>${digits(begin)} →</span> <span>${digits(end)} ${unit}</span></dd>`;
     });
     const big = Number.isFinite(found) ? `${digits(found)} ${facts.answer.unit}` : word;
     result.innerHTML = `<span>${facts.answer.label}</span><strong>${big}</strong>` +

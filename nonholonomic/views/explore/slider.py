@@ -33,7 +33,7 @@ def sliders_of(
 
     - `ranges`: name of a parameter -> (lowest, highest) value.
     - `roots`: "scene" and "launch".
-    - `labels`, `units`: labels and units of parameters, by their short names.
+    - `labels`, `units`: labels and units of parameters, by their full or their short names.
     - `drawn`: parameters, in addition to `DRAWN`, that change the drawn meshes.
 
     **Raises:** `ValueError` for an unknown name, an illegal range, and numbers that the modules do not allow.
@@ -62,8 +62,9 @@ def sliders_of(
         for end in (low, high):
             # The modules check the number.
             with_numbers(roots, {path: end})
-        unit = readable_unit(units.get(label_name, "1"))
-        sliders.append(Slider(name, path, labels.get(label_name, label_name.replace("_", " ")), unit, low, high, value))
+        unit = readable_unit(units.get(path, units.get(label_name, "1")))
+        label = labels.get(path, labels.get(label_name, label_name.replace("_", " ")))
+        sliders.append(Slider(name, path, label, unit, low, high, value))
     return tuple(sliders)
 
 
