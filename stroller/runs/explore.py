@@ -124,7 +124,10 @@ def stage(rides: list[Trajectory]) -> Stage:
     (first,), scene = rides[0].stages(), rides[0].spec.ride.scene
     length = float(scene.body.wheelbase)
     points = np.concatenate([np.asarray(ride.position) for ride in rides])
-    return first._replace(arena=arena(scene.surface, points, first.arena.normal, 3.0 * length, length))
+    # The page would not update the curve of the friction that the tyres need, which `frame` does not compute.
+    shows = tuple(show._replace(curves=show.curves[:CURVES]) for show in first.shows)
+    ground = arena(scene.surface, points, first.arena.normal, 3.0 * length, length)
+    return first._replace(shows=shows, arena=ground)
 
 
 def frame(scene: Scene, controls: Input | None, lane: LaneState) -> Frame:

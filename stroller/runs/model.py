@@ -176,8 +176,6 @@ class RideModel(AbstractModel):
                 name, unit = places[full][0] + "0", places[full][1]
             elif last_names.count(last) > 1 or last in TAKEN:
                 name = "_".join(full.split(".")[-2:])
-            if full.endswith("steering"):
-                unit = "N m s" if "friction" in full else "rad"
             labels[full] = (name, unit, LONG_NAMES.get(full, LONG_NAMES.get(name, name.replace("_", " "))))
         return labels
 
