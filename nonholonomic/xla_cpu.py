@@ -6,7 +6,6 @@ and `benchmarks/work_precision.py` measure all of them together.
 
 import functools
 import os
-import warnings
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -19,6 +18,8 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import mlir, partial_eval
 from jaxlib.version import __version__ as jaxlib_version
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from .validation import warn
 
 Result = TypeVar("Result")
 
@@ -271,10 +272,9 @@ def _knows_the_attributes() -> bool:
     minor = int(jaxlib_version.split(".")[1])
     if jaxlib_version.startswith("0.") and 10 <= minor <= 12:
         return True
-    warnings.warn(
+    warn(
         f"loops are compiled without XLA's kernel attributes, which are tested with jaxlib 0.10 to 0.12, but not with "
         f"{jaxlib_version}: results are the same, but tables may take up to 2.5 times as long. "
-        "If that matters, install one of these versions.",
-        stacklevel=2,
+        "If that matters, install one of these versions."
     )
     return False

@@ -217,8 +217,8 @@ REFUSED = {
     ),
     "times that are no numbers": (lambda: followed().at("a"), "times = 'a' is not a number"),
     "no angle": (
-        lambda: tippe.inversion_table(TOP, theta=0.1, spin=155.0, t1=1.0, angle=None),
-        "angle = None is not a number",
+        lambda: tippe.inversion_table(TOP, theta=0.1, spin=155.0, t1=1.0, angle="171 deg"),
+        "angle = '171 deg' is not a number",
     ),
     "a number too large for a float": (
         lambda: tippe.Launch(0.1, 10**400),

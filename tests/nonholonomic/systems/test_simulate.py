@@ -87,6 +87,20 @@ def test_a_printed_run_states_why_it_ended():
     assert "without end" not in str(simulate(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.0, times=[0.0, 1.0]))
 
 
+def test_components_are_drawn_over_time():
+    run = simulate(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.0, times=[0.0, 1.0])
+    (panel,) = run.plot().axes
+    assert [text.get_text() for text in panel.get_legend().get_texts()] == ["y0", "y1", "y2"]
+    assert run.plot(ax=panel) is panel
+    # As in earlier versions, the axes may come without their name.
+    assert run.plot(panel) is panel
+    heights, speeds = run.plot("y0", "y1", others=[run], unit="ms").axes
+    assert (heights.get_ylabel(), speeds.get_xlabel()) == ("y0", "time [ms]")
+    assert [text.get_text() for text in heights.get_legend().get_texts()] == ["run 1", "run 2"]
+    assert_close(speeds.get_lines()[0].get_ydata(), run.state[:, 1])
+    assert list(run.to_dataframe().columns) == ["time", "y0", "y1", "y2", "mode"]
+
+
 def broken(kind, **functions):
     """A mode or a system of which some functions are replaced."""
     return type("Broken", (kind,), functions)()
