@@ -13,6 +13,7 @@ from tops import rutstam_top
 import nonholonomic
 import stroller
 import tippe
+from nonholonomic.identification.identify import check_search
 from nonholonomic.identification.unknown import as_free
 from nonholonomic.validation import shown
 from nonholonomic.views import Page
@@ -263,6 +264,71 @@ EMPTY = {
 def test_an_empty_list_is_no_number(name):
     with pytest.raises(ValueError, match=re.escape(f"{name} = [] must be a number, not an empty list")):
         EMPTY[name]()
+
+
+#: Functions that check their arguments before anything compiles, and legal arguments.
+CHECKED = {
+    "Top": (tippe.Top, {"mass": 0.02, "radius": 0.02, "offset": 0.006, "I1": 3e-6, "I3": 3.2e-6, "stem": None}),
+    "Scene": (tippe.Scene, {"body": TOP.body, "surface": TOP.surface, "friction": TOP.friction, "restitution": None}),
+    "Launch": (tippe.Launch, {"theta": 0.1, "spin": 1.0, "place": None, "velocity": None, "angular_velocity": None}),
+    "degrees": (tippe.Launch.degrees, {"theta": 6.0, "rpm": 1500.0}),
+    "Coulomb": (tippe.Coulomb, {"mu": 0.3, "slip_speed": 0.01}),
+    "Torus": (tippe.Torus, {"ring": 1.0, "tube": 0.3}),
+    "Graph": (nonholonomic.Graph, {"height": lambda x, y: 0.0 * x}),
+    "InversionTimes": (
+        tippe.InversionTimes,
+        {"launch": LAUNCH, "time": [5.0], "error": 0.1, "t1": 8.0, "until": None, "angle": 2.9, "student": None},
+    ),
+    "Recording": (
+        tippe.Recording,
+        {"launch": LAUNCH, "times": [0.1, 0.2], "value": [0.1, 0.2], "error": 0.1, "quantity": "theta", "t0": 0.0},
+    ),
+    "Stroller": (stroller.Stroller, {"mass": 12.0, "wheelbase": 0.7, "inertia": 1.5, "steering_inertia": 0.05}),
+    "scene of a stroller": (
+        stroller.Scene,
+        {"body": PRAM.body, "surface": PRAM.surface, "side": None, "fork": "relative"},
+    ),
+    "launch of a stroller": (stroller.Launch, {"place": (0.0, 0.0), "heading": 0.3, "speed": 1.0}),
+    "Hybrid": (nonholonomic.Hybrid, {"modes": [], "event": None}),
+    "as_free": (as_free, {"free": {"mu": tippe.Free(0.3)}}),
+    "check_search": (check_search, {"starts": 1, "spread": 2.0, "seed": 0, "max_steps": 9, "progress": False}),
+    "plot": (small_table().plot, {"variable": "time", "at": None, "x": None, "label": None, "unit": None}),
+    "plot of a run": (
+        lambda **options: run_of_nothing().plot("t", **options),
+        {"others": (), "unit": None, "label": None},
+    ),
+}
+
+#: What may be passed by mistake.
+MISTAKES = [
+    [jnp.array(1.5)],
+    (jnp.array(1.5),) * 4,
+    {"a": jnp.array(1.5)},
+    jnp.array([1.0, 2.0]),
+    jnp.array(-3.0),
+    jnp.array(jnp.nan),
+    np.float64(-1.0),
+    [jnp.array(1.0), "x"],
+    np.array(["a"]),
+    jnp.ones((1, 2)),
+    tippe.Viscous(0.3),
+]
+
+
+@pytest.mark.parametrize("name", CHECKED)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_whatever_is_passed_by_mistake_is_refused_in_words(name):
+    """Whatever is not legal raises a `ValueError`, and no message shows an array of JAX or the address of an object."""
+    call, arguments = CHECKED[name]
+    messages = []
+    for argument in arguments:
+        for mistake in MISTAKES:
+            try:
+                call(**(arguments | {argument: mistake}))
+            except ValueError as error:
+                messages.append(str(error))
+    assert len(messages) > len(arguments)
+    assert [text for text in messages if "Array(" in text or "dtype=" in text or "object at 0x" in text] == []
 
 
 #: Values as messages show them, with the text.

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..progress import status_line
-from ..validation import require, require_flag, require_whole, shown, warn
+from ..validation import require, require_flag, require_scalars, require_whole, shown, warn
 from .exploration import ROWS, Explorer
 from .likelihood import Measurements
 from .posterior import LogDensity
@@ -102,6 +102,7 @@ def check_search(starts: Any, spread: Any, seed: Any, max_steps: Any, progress: 
     if starts > ROWS:
         raise ValueError(f"starts = {starts} must be at most {ROWS}, the number of candidates")
     require(spread, "spread", above=1.0)
+    require_scalars({"spread": spread}, "it spreads the starts of all parameters")
     require_flag(progress, "progress")
 
 
@@ -111,6 +112,6 @@ def step_of(slopes: str) -> float | None:
     **Raises:** `ValueError` for an unknown kind.
     """
     ways = {"exact": None, "differences": DIFFERENCE}
-    if slopes not in ways:
+    if not isinstance(slopes, str) or slopes not in ways:
         raise ValueError(f"slopes = {shown(slopes)} must be one of {', '.join(map(repr, ways))}")
     return ways[slopes]

@@ -202,8 +202,8 @@ class Tabular(abc.ABC):
             else:
                 quantities, others = (), first
         runs = [self, *require_others(self, others, "to_table")]
-        labels = [label] if isinstance(label, str) else list(label or self.labels_of(runs))
-        if len(labels) != len(runs):
+        labels = self.labels_of(runs) if label is None else [label] if isinstance(label, str) else label
+        if not isinstance(labels, list | tuple) or [type(text) for text in labels] != [str] * len(runs):
             raise ValueError(f"label = {shown(label)} must have {len(runs)} texts, one for each run")
         if not quantities:
             return self.overview(runs, labels, unit, ax)

@@ -77,6 +77,17 @@ class AbstractMode(eqx.Module):
         return None
 
 
+def require_event(event: Any) -> None:
+    """Raise `ValueError` unless the event is a function."""
+    if not callable(event):
+        raise ValueError(f"event = {shown(event)} must be a function event(t, y) of time and state, or None")
+
+
+def as_modes(modes: Any) -> Any:
+    """A list of modes as a tuple; anything else stays unchanged, for later checks."""
+    return tuple(modes) if isinstance(modes, list | tuple) else modes
+
+
 class Hybrid(eqx.Module):
     """A hybrid system: modes of one state, and the event to be timed.
 
@@ -107,17 +118,19 @@ class Hybrid(eqx.Module):
     ```
     """
 
-    modes: tuple[AbstractMode, ...] = eqx.field(converter=lambda modes: tuple(modes))
+    modes: tuple[AbstractMode, ...] = eqx.field(converter=as_modes)
     event: Event | None = None
     first: int = eqx.field(static=True, default=0)
 
     def __check_init__(self):
+        if not isinstance(self.modes, tuple):
+            raise ValueError(f"modes = {shown(self.modes)} must be a list of modes, such as [Flying(), Sliding()]")
         illegal = [mode for mode in self.modes if not isinstance(mode, AbstractMode)]
         if not self.modes or illegal:
-            problem = f"modes holds {illegal[0]!r}" if illegal else "modes is empty"
+            problem = f"modes holds {shown(illegal[0])}" if illegal else "modes is empty"
             raise ValueError(f"{problem}: it must hold one AbstractMode or more, such as [Flying(), Sliding()]")
-        if self.event is not None and not callable(self.event):
-            raise ValueError(f"event = {shown(self.event)} must be a function event(t, y) of time and state, or None")
+        if self.event is not None:
+            require_event(self.event)
         if not isinstance(self.first, int) or not 0 <= self.first < len(self.modes):
             raise ValueError(
                 f"first = {shown(self.first)} must be the number of a mode, from 0 to {len(self.modes) - 1}"

@@ -100,7 +100,7 @@ def draw_table(
     **Raises:** `ValueError` as `Table.plot`.
     """
     variable = _first_number(table) if variable is None else variable
-    values = table.variables.get(variable)
+    values = table.variables.get(variable) if isinstance(variable, str) else None
     if values is None or values.dtype.kind == "U":
         names = [name for name, values in table.variables.items() if values.dtype.kind != "U"]
         raise ValueError(
@@ -109,6 +109,8 @@ def draw_table(
     dims = table.dims(variable)
     if not dims:
         raise ValueError("a table of one cell has nothing to draw")
+    if not isinstance(label, str | None):
+        raise ValueError(f"label = {shown(label)} must be a text")
     names, cut = _drawn(table, variable, at or {}, x, y)
     visible = _slice(np.where(np.isfinite(values), values, np.nan), dims, names, cut)
     figure, drawing = _drawing(ax)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from nonholonomic.identification import Measurements
 from nonholonomic.parameters import numbers, one_line, with_numbers
-from nonholonomic.validation import as_number, as_number_or_none, require, require_kind
+from nonholonomic.validation import as_number, as_number_or_none, require, require_kind, shown
 
 from ..model.launch import Launch, as_launch
 from ..model.scene import Scene
@@ -68,6 +68,8 @@ class InversionTimes(eqx.Module):
     def __check_init__(self):
         require_kind(self.launch, "launch", Launch, " or a list of launches")
         shape = np.shape(self.time)
+        if not isinstance(self.time, jax.Array):
+            raise ValueError(f"time = {shown(self.time)} must be a list of numbers")
         if len(shape) not in (1, 2) or shape[0] == 0 or shape[1:] not in ((), (2,)):
             raise ValueError(f"time must be a non-empty list of times or of pairs of them, not of shape {shape}")
         require(self.t1, "t1", above=0.0)
