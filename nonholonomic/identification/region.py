@@ -75,8 +75,8 @@ def _ends(name: str, unknown: Free, spread: float, duration: float) -> tuple[flo
     if all(bounded) and unknown.prior is None:
         return -5.0, 5.0
     kind = name.split("].")[-1] if name.startswith("data[") else name
-    if unknown.prior is not None:
-        middle, reach = unknown.prior[0], DEVIATIONS * unknown.prior[1]
+    if unknown.gaussian is not None:
+        middle, reach = unknown.gaussian[0], DEVIATIONS * unknown.gaussian[1]
     elif kind == "t0" and duration > 0.0:
         middle, reach = unknown.start, OF_DURATION * duration
     elif kind.startswith(("launch", "start")):

@@ -104,14 +104,14 @@ class Trajectory(Viewable, Tabular, eqx.Module):
     def at(self, times: Float[ArrayLike, " times"]) -> "Trajectory":
         """The same run at other times; the run is repeated.
 
-        **Arguments:** `times`: increasing, within [0, `end_time`] [s].
+        **Arguments:** `times`: increasing, within [0, `end_time`] [s]; or one time, for a run of one time.
 
         **Raises:** `ValueError` for times outside the run, and for a batch of runs.
         """
         if is_traced(self.code) or np.ndim(self.code):
             raise ValueError("at takes one run outside jit, vmap and grad: pass times= to simulate there")
         require(times, "times", at_least=0.0, at_most=self.end_time, why="the run ends there")
-        times = np.asarray(times, dtype=float)
+        times = np.atleast_1d(np.asarray(times, dtype=float))
         require_increasing(times, "times")
         return self.model.simulate(self.t1, times, self.settings.tolerance, self.settings.solver, None)
 
@@ -122,7 +122,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         """A page with sliders that simulates the run in the browser; see `nonholonomic.explore`."""
         return explore_model(self.model, path, sliders, float(self.t1))
 
-    def overview(self, runs: list[Any], labels: list[str], unit: Any, ax: Any) -> Any:
+    def overview(self, runs: list[Any], labels: Sequence[str], unit: Any, ax: Any) -> Any:
         """Draw all components of a run in one picture, or a panel for each component of several runs."""
         if len(runs) > 1 or unit is not None:
             return Tabular.overview(self, runs, labels, unit, ax)

@@ -161,7 +161,7 @@ class Tabular(abc.ABC):
         """Labels that tell runs of this kind apart; an empty one for a single run."""
         return [""] if len(runs) == 1 else [f"run {k + 1}" for k in range(len(runs))]
 
-    def overview(self, runs: list[Any], labels: list[str], unit: Any, ax: Any) -> Any:
+    def overview(self, runs: list[Any], labels: Sequence[str], unit: Any, ax: Any) -> Any:
         """Draw what is most important in this run and others; arguments as for `plot`."""
         names = [name for name, values in self.to_table().variables.items() if values.dtype.kind == "f"]
         return draw_series([run.to_table().drawn_in(unit, *names) for run in runs], names, labels, ax)

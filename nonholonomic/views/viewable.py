@@ -88,7 +88,7 @@ class Viewable(abc.ABC):
             require_increasing(times, "times")
         write_animation(self._stages(others, overlaid), path, times, 1.0 if speed is None else float(speed), float(fps))
 
-    def overview(self, runs: Sequence[Any], labels: list[str], unit: Any, ax: Any) -> Any:
+    def overview(self, runs: Sequence[Any], labels: Sequence[str], unit: Any, ax: Any) -> Any:
         """Draw the curves of the page of this run and others over time; arguments as for `plot`."""
         if ax is not None:
             raise ValueError("ax takes one quantity: name it, as in plot('energy', ax=ax)")
