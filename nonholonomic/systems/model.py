@@ -26,7 +26,7 @@ from ..views import Stage
 from ..views.explore import LiveRun
 from .engine import Cells
 from .form import Form
-from .mode import AbstractMode, Event, Hybrid
+from .mode import AbstractMode, Event, Hybrid, require_event
 from .page import page_of
 from .system import MechanicalEvent, MechanicalMode, check_start, formulation_of
 
@@ -229,6 +229,7 @@ def _(system: Hybrid, start: Any, event: Event | None = None, input: Any = None)
     check_start(system, start)
     state = as_number(start)
     if event is not None:
+        require_event(event)
         system = dataclasses.replace(system, event=with_own_numbers(event, jnp.zeros(()), state))
     return OwnModel.of({"system": system, "start": state, "event": None})
 
@@ -238,6 +239,7 @@ def _(system: AbstractSystem, start: Any, event: Event | None = None, input: Any
     check_start(system, start)
     q, rate = (as_number(part) for part in start)
     if event is not None:
+        require_event(event)
         event = with_own_numbers(event, jnp.zeros(()), jnp.concatenate([q, rate]))
     return OwnModel.of({"system": system, "start": {"q": q, "rate": rate}, "event": event})
 
