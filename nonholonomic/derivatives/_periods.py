@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..integration.scheduler import SchedulerState
 from ..xla_cpu import written_in_place
@@ -21,13 +21,17 @@ STEPS_KEPT, MAX_BYTES = 1024, {"cpu": 1 << 26}
 
 
 class StepRecord(NamedTuple):
-    """The steps of a period: where each step began, and its length, 0 for a lane that did not move. `sample` is the index
-    of the sample on which the step ended, the number of samples if there is none; `None` for runs without samples."""
+    """The steps of a period: where each step began, and its length, 0 for a lane that did not move.
+
+    For runs with samples, `sample` is the index of the sample on which the step ended, the number of samples if there is
+    none; and `fixed` are the components that the tangent does not move there.
+    """
 
     time: Float[Array, "iterations lanes"]
     state: Float[Array, "iterations components lanes"]
     length: Float[Array, "iterations lanes"]
     sample: Int[Array, "iterations lanes"] | None = None
+    fixed: Bool[Array, "iterations components lanes"] | None = None
 
 
 #: A period without its steps: the lanes before it, and after it but before their refill.

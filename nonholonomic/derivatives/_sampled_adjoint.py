@@ -69,20 +69,21 @@ class SampledStepRecorder(StepRecorder):
     def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: None) -> SampledStepRecord:
         steps = super().begin(in_lanes, lane_state, collected)
         sample = self.times.after(lane_state.time, lane_state)
-        samples = jnp.zeros((self.period, *sample.shape), sample.dtype)
-        return SampledStepRecord(jnp.ones(sample.shape, bool), sample, steps._replace(sample=samples))
+        samples, fixed = jnp.zeros(steps.length.shape, sample.dtype), jnp.zeros(steps.state.shape, bool)
+        return SampledStepRecord(jnp.ones(sample.shape, bool), sample, steps._replace(sample=samples, fixed=fixed))
 
     def step(
         self, in_lanes: InLanes, lane_state: LaneState, record: SampledStepRecord, iteration: Int[Array, ""]
     ) -> tuple[LaneState, SampledStepRecord]:
         accepted, sample, steps = record
         next_state, length, is_sample = step_towards_sample(self.times, in_lanes, lane_state, accepted, sample)
-        has_moved = next_state.time > lane_state.time
+        has_moved, state = next_state.time > lane_state.time, without_probe(lane_state).state
         entry = StepRecord(
             lane_state.time,
-            without_probe(lane_state).state,
+            state,
             jnp.where(has_moved, length, 0.0),
             jnp.where(is_sample, sample, len(self.times)),
+            next_state.state[len(state) :] == 0.0,
         )
         steps = jax.tree.map(functools.partial(written_in_place, at=iteration), steps, entry)
         return next_state, SampledStepRecord(has_moved, sample + is_sample, steps)
@@ -92,7 +93,8 @@ class SampledStepRecorder(StepRecorder):
 
     def arriving(self, lane_state: LaneState, steps: StepRecord) -> Float[Array, "iterations components lanes"]:
         rows = self.cotangents.states.at[self._cell(lane_state), steps.sample].get(mode="fill", fill_value=0.0)
-        return jnp.moveaxis(rows, -1, 1)
+        # Where the derivative is zero, a NaN cotangent, such as that of theta at the pole, has no effect.
+        return jnp.where(steps.fixed, 0.0, jnp.moveaxis(rows, -1, 1))
 
     def share_of_end(self, lane_state: LaneState) -> Lanes:
         leaves = (lane_state.status == LEFT_DOMAIN) & (lane_state.time > 0.0)
@@ -137,7 +139,8 @@ def samples_pulled_back(
         one_kernel=True,
     )
     sample_times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), cells)).T
-    initial = jnp.where((sample_times <= 0.0)[..., None], arriving.states, 0.0)
+    is_moved = VariationalProblem(problem, (probe,), False).start()[0][len(by_start) :] != 0.0
+    initial = jnp.where((sample_times <= 0.0)[..., None] & is_moved.T[:, None], arriving.states, 0.0)
     is_lost = jnp.any(jnp.any(arriving.states != 0.0, axis=-1) & (sample_times > outcome.end_time[:, None]), axis=1)
     by_start = by_start + jnp.sum(initial, axis=1).T
 

@@ -117,6 +117,7 @@ class CoreProblem(AbstractProblem):
         return self.whole.margins(time, self._longer(state))
 
     def _longer(self, state: States) -> States:
+        state = jnp.stack(state) if isinstance(state, tuple) else state
         missing = len(self.whole.start()[0]) - self.size
         return jnp.concatenate([state, jnp.zeros((missing, *state.shape[1:]))])
 
