@@ -81,13 +81,13 @@ class Plan(eqx.Module):
 
     def __str__(self) -> str:
         units = {name: readable_unit(unit) for name, unit in self.problem.limits.units.items()}
-        goal = self.problem.goal
+        goal, count = self.problem.goal, len(self.problem.obstacles)
         place, heading, speed = self.errors
         turn = "" if goal.heading is None else f"heading {heading:.2g} rad, "
         lines = [
             f"Plan of {self.t1:.4g} s: {'reaches the goal' if self.reached else 'does not reach the goal'}",
             f"  end        place off by {place:.2g} m, {turn}speed {speed:.2g} m/s; allowed {float(goal.within):g}",
-            f"  clearance  {self.clearance:.3g} m from {len(self.problem.obstacles)} obstacles",
+            *([f"  clearance  {self.clearance:.3g} m from {count} obstacles"] if count else []),
             *(f"  {name:9s}  margin {margin:.3g} {units[name]}".rstrip() for name, margin in self.margins.items()),
             f"  effort     {self.effort:.4g} N² s",
             f"  tried      {len(self.candidates)} candidates",
