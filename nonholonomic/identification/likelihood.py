@@ -88,7 +88,7 @@ class Measurements(eqx.Module):
             raise ValueError(f"upper = {shown(upper)} must be at least value")
         for name in ("period", "student"):
             if not np.all(np.asarray(arguments[name]) > 0.0):
-                raise ValueError(f"{name} = {arguments[name]!r} must be positive, or infinite")
+                raise ValueError(f"{name} = {shown(arguments[name])} must be positive, or infinite")
 
         def each(argument: Any, kind: Any) -> Any:
             return jnp.broadcast_to(jnp.asarray(argument, kind), shape)

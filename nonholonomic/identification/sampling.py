@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from ..parameters import readable_unit
 from ..progress import status_line
-from ..validation import require_flag, require_package, require_whole
+from ..validation import require_flag, require_package, require_whole, shown
 from .exploration import ROWS, Explorer
 from .marginal import draw_errors
 from .mixture import Mixture
@@ -174,7 +174,7 @@ def _component(density: LogDensity, centre: Any, covariance: Any) -> Mixture:
             f"covariance must be finite and of shape {(numbers, numbers)}: the data do not determine all numbers"
         )
     if np.shape(centre) != (numbers,):
-        raise ValueError(f"centre = {centre!r} must be of shape {(numbers,)}")
+        raise ValueError(f"centre = {shown(centre)} must be of shape {(numbers,)}")
     return Mixture(np.ones(1), np.asarray(centre, float)[None], np.linalg.cholesky(covariance)[None])
 
 

@@ -117,7 +117,7 @@ def with_event(model: AbstractModel, event: Any) -> AbstractModel:
     except jax.errors.JAXTypeError as error:
         raise ValueError(f"event(t, motion) {UNTRACEABLE}") from error
     if getattr(result, "shape", None) != () or not jnp.issubdtype(result.dtype, jnp.floating):
-        raise ValueError(f"event(t, motion) must return one float, not {result!r}")
+        raise ValueError(f"event(t, motion) must return one float, not {shown(result)}")
     names = tuple(used)
     values = jax.eval_shape(lambda t, rows: model.read(names, t, rows, index), t, rows_of(model, names))
     example = (jnp.zeros(()), jax.tree.map(lambda value: jnp.zeros(value.shape, value.dtype), values))

@@ -206,7 +206,7 @@ def require_obstacles(obstacles: Any) -> tuple[Box | Disc, ...]:
     try:
         parts = tuple(obstacles)
     except TypeError:
-        raise ValueError(f"obstacles = {obstacles!r} must be a list of Box and Disc") from None
+        raise ValueError(f"obstacles = {shown(obstacles)} must be a list of Box and Disc") from None
     for k, part in enumerate(parts):
         if not isinstance(part, Disc):
             require_kind(part, f"obstacles[{k}]", Box, " or a Disc")

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from nonholonomic.progress import status_line
-from nonholonomic.validation import require_flag, require_whole
+from nonholonomic.validation import require_flag, require_whole, shown
 
 from ..model.launch import Launch
 from ..model.scene import Scene
@@ -113,7 +113,7 @@ def plan(
     ```
     """
     if minimise not in MINIMISED:
-        raise ValueError(f"minimise = {minimise!r} must be one of {', '.join(map(repr, MINIMISED))}")
+        raise ValueError(f"minimise = {shown(minimise)} must be one of {', '.join(map(repr, MINIMISED))}")
     require_whole(starts, "starts", 1)
     require_whole(seed, "seed", 0)
     require_flag(progress, "progress")
