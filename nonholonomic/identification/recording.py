@@ -163,6 +163,19 @@ class AbstractRecording(eqx.Module):
         return self.quantities.of(self.quantity)
 
     @property
+    def length(self) -> int:
+        """Number of times."""
+        return len(self.times)
+
+    def lane(self, size: int) -> dict[str, Array]:
+        """The clock of a run that shares an ensemble with other recordings, of at most `size` times."""
+        return {"times": lengthened(self.times, size), "t0": self.t0}
+
+    def part(self, predictions: Float[Array, "rows size columns"]) -> Float[Array, "rows samples"]:
+        """The predicted samples, ordered by time, of the predictions of a lane."""
+        return predictions[:, : self.length].reshape(len(predictions), -1)
+
+    @property
     def size(self) -> int:
         """Number of predictions, including those of missing samples."""
         return np.size(self.value)
@@ -269,7 +282,7 @@ def predicted(
     lane_numbers |= {"t0": lanes([recording.t0 for recording, _ in recordings])}
     lane_numbers |= {name: lanes([values[name] for _, values in recordings]) for name in recordings[0][1]}
     # Shorter recordings are extended by an instant, so that all have the same number of times.
-    clock = jnp.stack([_lengthened(recording.times, size) for recording, _ in recordings])
+    clock = jnp.stack([lengthened(recording.times, size) for recording, _ in recordings])
 
     def samples_of_lane(lane: Values, times: Float[Array, " times"]) -> Float[Array, "times columns"]:
         values = {name: value for name, value in lane.items() if name != "t0"}
@@ -287,6 +300,6 @@ def predicted(
     return parts
 
 
-def _lengthened(times: Float[Array, " times"], count: int) -> Float[Array, " count"]:
+def lengthened(times: Float[Array, " times"], count: int) -> Float[Array, " count"]:
     """The times, followed by additional times shortly after the last one."""
     return jnp.concatenate([times, times[-1] + AT_ONCE * jnp.arange(1, 1 + count - len(times))])

@@ -13,7 +13,9 @@ from .explore import explore as explore
 from .explore import explore_model as explore_model
 from .identify import EventTimes as EventTimes
 from .identify import Recording as Recording
+from .identify import fit_runs as fit_runs
 from .identify import identify as identify
+from .identify import predicted_columns as predicted_columns
 from .lyapunov import LyapunovExponent as LyapunovExponent
 from .lyapunov import direction_of_start as direction_of_start
 from .lyapunov import exponent_of_model as exponent_of_model

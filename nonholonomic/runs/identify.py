@@ -101,19 +101,22 @@ class Recording(AbstractRecording):
                 raise ValueError(f"quantity: {name!r} has several components: name them, such as '{name}.x'")
         return model
 
-    def predicted(self, model: AbstractModel, t0: Array, settings: Settings) -> Float[Array, " samples"]:
-        """The predicted samples of one run, ordered by time."""
-        times = model_times(self.times, t0)
-        names = tuple(dict.fromkeys(column.partition(".")[0] for column in self.columns))
-        run = sampled(model, names, times, times[-1], settings)
-        values = model.read(names, times, run.rows, run.mode)
+    def predicted(self, model: AbstractModel, lane: dict[str, Array], settings: Settings) -> Array:
+        return predicted_columns(self, model, lane, settings)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The quantities to which the columns belong."""
+        return tuple(dict.fromkeys(column.partition(".")[0] for column in self.columns))
+
+    def columns_of(self, model: AbstractModel, values: dict[str, Array]) -> list[Float[Array, " times"]]:
+        """The columns of the recording from the values of quantities."""
         columns = []
         for column in self.columns:
             name, _, component = column.partition(".")
-            value = values[name]
             dims = model.quantities[name].components
-            columns.append(value if dims is None else value[:, model.components[dims].index(component)])
-        return jnp.stack(columns, axis=-1).reshape(-1)
+            columns.append(values[name] if dims is None else values[name][:, model.components[dims].index(component)])
+        return columns
 
 
 def _components(model: AbstractModel) -> list[str]:
@@ -170,6 +173,11 @@ class EventTimes(eqx.Module):
         return np.size(self.time)
 
     @property
+    def length(self) -> int:
+        """Number of times in a lane."""
+        return 1
+
+    @property
     def seen(self) -> Int[np.ndarray, " n"]:
         """Indices of the measured predictions."""
         return np.arange(self.size)
@@ -196,34 +204,79 @@ class EventTimes(eqx.Module):
         require_event(model)
         return model
 
-    def predicted(self, model: AbstractModel, t0: Array, settings: Settings) -> Float[Array, " n"]:
-        """The predicted time of one run, for every measurement."""
-        time = time_of_event(model, self.t1, settings, False)
-        return jnp.broadcast_to(jnp.where(jnp.isfinite(time), time, jnp.nan), (self.size,))
+    def lane(self, size: int) -> dict[str, Array]:
+        """The numbers of the run that are not parameters."""
+        return {"t1": self.t1}
+
+    def predicted(self, model: AbstractModel, lane: dict[str, Array], settings: Settings) -> Float[Array, ""]:
+        """The time of one run; NaN without an event."""
+        time = time_of_event(model, lane["t1"], settings, False)
+        return jnp.where(jnp.isfinite(time), time, jnp.nan)
+
+    def part(self, predictions: Float[Array, " rows"]) -> Float[Array, "rows n"]:
+        """The predictions for every measurement."""
+        return jnp.broadcast_to(predictions[:, None], (len(predictions), self.size))
+
+
+class Source(eqx.Module):
+    """A set of data and the model of its run."""
+
+    data: Any
+    model: AbstractModel
+
+    @property
+    def key(self) -> Hashable:
+        """Sets of data with equal keys are lanes of one ensemble."""
+        arrays = jax.tree.structure(eqx.filter(self.model, eqx.is_array))
+        columns = getattr(self.data, "columns", None)
+        return type(self.data), arrays, columns, id(getattr(self.data, "event", None))
 
 
 class RunModel(AbstractDataModel):
-    """Predictions of all recordings and times of a system; `models`: the model of each, by its place in `data`."""
+    """Predictions of several sets of data of a system."""
 
-    models: tuple[AbstractModel, ...]
-    data: tuple[Recording | EventTimes, ...]
+    data: tuple[Source, ...]
     seen: Int[Array, " n"]
     settings: Settings
 
-    def together(self, source: Any, values: dict[str, Array]) -> Hashable:
-        return None
+    def together(self, source: Source, values: dict[str, Array]) -> Hashable:
+        return source.key, tuple(values)
 
-    def predict(self, sources: list[tuple[Any, dict[str, Array]]], rows: int) -> list[Float[Array, "rows samples"]]:
-        """Every row of a set of data is a lane of one ensemble."""
-        return [self._rows(model, source, values) for model, (source, values) in zip(self.models, sources, strict=True)]
+    def predict(self, sources: list[tuple[Source, dict[str, Array]]], rows: int) -> list[Float[Array, "rows samples"]]:
+        """Every row of every set of data is a lane."""
+        first, count = sources[0][0], len(sources)
+        size = max(source.data.length for source, _ in sources)
 
-    def _rows(self, model: AbstractModel, source: Any, values: dict[str, Array]) -> Float[Array, "rows samples"]:
-        def of_row(row: dict[str, Array]) -> Float[Array, " samples"]:
-            moved = model.replaced({name: value for name, value in row.items() if name != "t0"})
-            clock = row.get("t0", getattr(source, "t0", jnp.zeros(())))
-            return nan_unless(moved.legal(), source.predicted(moved, clock, self.settings))
+        def lanes(of_each: list[Array]) -> Array:
+            """One row after the other; each number is a scalar or has one value per row."""
+            return jnp.stack([jnp.broadcast_to(number, (rows,)) for number in of_each], axis=1).reshape(-1)
 
-        return jax.vmap(of_row)(values)
+        arrays, static = eqx.partition([source.model for source, _ in sources], eqx.is_array)
+        models = jax.tree.map(lambda *leaves: lanes([*leaves]), *arrays)
+        values = {name: lanes([values[name] for _, values in sources]) for name in sources[0][1]}
+        numbers = [source.data.lane(size) for source, _ in sources]
+        inputs = jax.tree.map(lambda *parts: jnp.tile(jnp.stack(parts), (rows,) + (1,) * jnp.ndim(parts[0])), *numbers)
+
+        def of_lane(model: Any, values: dict[str, Array], lane: dict[str, Array]) -> Array:
+            clock = {"t0": values["t0"]} if "t0" in values else {}
+            moved = eqx.combine(model, static[0]).replaced(
+                {name: value for name, value in values.items() if name != "t0"}
+            )
+            return nan_unless(moved.legal(), first.data.predicted(moved, lane | clock, self.settings))
+
+        predictions = jax.vmap(of_lane)(models, values, inputs)
+        by_source = predictions.reshape(rows, count, *predictions.shape[1:])
+        return [source.data.part(by_source[:, k]) for k, (source, _) in enumerate(sources)]
+
+
+def predicted_columns(
+    recording: Any, model: AbstractModel, lane: dict[str, Array], settings: Settings
+) -> Float[Array, "times columns"]:
+    """The columns of a recording of one run."""
+    times = model_times(lane["times"], lane["t0"])
+    run = sampled(model, recording.names, times, times[-1], settings)
+    values = model.read(recording.names, times, run.rows, run.mode)
+    return jnp.stack(recording.columns_of(model, values), axis=-1)
 
 
 def identify(
@@ -277,25 +330,34 @@ def identify(
     """
     search = search_options(starts, spread, seed, max_steps, progress)
     data = as_sources(data, Recording | EventTimes, "a nonholonomic.Recording or EventTimes")
+    return fit_runs(system, data, free, tolerance, search)
+
+
+def fit_runs(
+    system: Any, data: tuple[Any, ...], free: dict[str, Any], tolerance: Any, search: dict[str, Any]
+) -> Identification:
+    """Fit sets of data of runs. **Arguments:** as for `identify`; `search`: `search_options`."""
     tolerance_bound(tolerance).require()
     models = tuple(source.model(system) for source in data)
     for source, model in zip(data, models, strict=True):
-        check_run(model, source.t1 if isinstance(source, EventTimes) else source.times[-1], tolerance)
+        check_run(model, source.t1 if isinstance(source, EventTimes) else source.times[-1] - source.t0, tolerance)
     own = [[name for name in model.known if name.startswith(("start", "launch"))] for model in models]
     shared = [name for name in models[0].known if name not in own[0]]
     names_of_data = [
-        [*names, "t0"] if isinstance(source, Recording) else names for names, source in zip(own, data, strict=True)
+        [*names, "t0"] if isinstance(source, AbstractRecording) else names
+        for names, source in zip(own, data, strict=True)
     ]
 
     def check(values: dict[str, float]) -> None:
         models[0].require_values({name: value for name, value in values.items() if name != "t0"})
 
     settings = Settings(tolerance, max_steps=MOST_STEPS)
-    with status_line("fitting", progress):
+    with status_line("fitting", search["progress"]):
         unknowns = free_numbers(free, shared, names_of_data, check)
         require_apart("free", unknowns)
+        sources = tuple(Source(source, model) for source, model in zip(data, models, strict=True))
         return fit_data(
-            lambda indices: RunModel(models=models, data=data, seen=jnp.asarray(indices), settings=settings),
+            lambda indices: RunModel(data=sources, seen=jnp.asarray(indices), settings=settings),
             data,
             unknowns,
             search,

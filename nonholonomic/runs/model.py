@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
-import jax
 from jaxtyping import Array, Bool, Float, Int
 
 from ..hybrid import AbstractBatchedMode, HybridOutcome
@@ -112,6 +111,15 @@ class AbstractModel(eqx.Module):
                 "second derivatives are not available through resets; take differences of a gradient instead"
             )
 
+    def for_lanes(self) -> "AbstractModel":
+        """The model in a form that is fastest where runs in transformations share lanes."""
+        return self
+
+    @property
+    def arrays_in_lanes(self) -> bool:
+        """Whether arrays among the leaves have the lanes in their last axis."""
+        return False
+
     @property
     def counters(self) -> dict[str, str]:
         """Name and description of each row of `Transition.counts`."""
@@ -202,8 +210,3 @@ def model_of(system: Any, start: Any, event: Any = None, input: Any = None) -> A
     raise ValueError(
         f"system = {shown(system)} must be a tippe.Scene, a stroller.Scene, a nonholonomic.Hybrid or an AbstractSystem"
     )
-
-
-def of_run(model: AbstractModel, cell: Any) -> AbstractModel:
-    """The model of one of many cells."""
-    return jax.tree.map(lambda leaf: leaf[cell] if eqx.is_array(leaf) and leaf.ndim else leaf, model)

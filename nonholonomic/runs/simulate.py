@@ -114,7 +114,6 @@ def sampled(
     settings: Settings,
     grid: Float[Array, " steps"] | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
-    arrays_in_lanes: bool = False,
 ) -> SampledRows:
     """A run at given times, with derivatives that take part in step-size control.
 
@@ -122,14 +121,16 @@ def sampled(
 
     - `names`: the quantities that will be read, or `None`.
     - `grid`: the ends of the steps [s] of a solver without an error estimate; `adjoint`: how Diffrax differentiates.
-    - `arrays_in_lanes`: as for `sampled_run`; the others as for `simulate`, legal.
+    - The others as for `simulate`, legal.
     """
     if not model.smooth:
         samples = hybrid_samples(modes_of_run, (model, names), times, t1, settings, len(model.counters))
         of_one_cell = jax.tree.map(lambda part: part[None], samples)
         return SampledRows(samples.shown, mode_at(samples.number), outcome_of(of_one_cell))
     if adjoint is None:
-        run = sampled_run(problem_of_run, (model, names), times, t1, settings, grid, arrays_in_lanes=arrays_in_lanes)
+        prepared = model.for_lanes()
+        lanes = {"arrays_in_lanes": prepared.arrays_in_lanes}
+        run = sampled_run(problem_of_run, (prepared, names), times, t1, settings, grid, **lanes)
     else:
         run = sampled_run_by_diffrax(problem_of_run((model, names), None), times, t1, settings, adjoint, grid)
     states = run.states if run.quadratures is None else jnp.concatenate([run.states, run.quadratures], axis=-1)

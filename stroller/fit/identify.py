@@ -1,51 +1,13 @@
 """Estimate parameters of a stroller, its ground and its launch from recorded rides."""
 
-from collections.abc import Hashable
 from typing import Any
 
-import equinox as eqx
-import numpy as np
-from jaxtyping import Array, Float, Int
+from nonholonomic.identification import Identification, as_sources, search_options
+from nonholonomic.runs import fit_runs
+from nonholonomic.validation import require_kind
 
-from nonholonomic.identification import (
-    AbstractDataModel,
-    Free,
-    Identification,
-    as_sources,
-    fit_data,
-    predicted,
-    scene_unknowns,
-    search_options,
-)
-from nonholonomic.integration.checks import tolerance_bound
-from nonholonomic.parameters import numbers
-from nonholonomic.progress import status_line
-from nonholonomic.validation import as_number, require_kind
-
-from ..model.launch import Launch
 from ..model.scene import Scene
-from ..runs.verbs import simulate
 from .recording import Recording
-
-
-class SceneModel(AbstractDataModel):
-    """Predictions of all recordings of a scene."""
-
-    scene: Scene
-    data: tuple[Recording, ...]
-    seen: Int[Array | np.ndarray, " n"]
-    tolerance: Float[Array, ""] = eqx.field(converter=as_number)
-
-    def together(self, source: Recording, values: dict[str, Array]) -> Hashable:
-        return id(source.input), tuple(numbers("launch", source.launch)), tuple(values)
-
-    def predict(self, sources: list[tuple[Recording, Any]], rows: int) -> list[Float[Array, "rows samples"]]:
-        first = sources[0][0]
-
-        def run(scene: Scene, launch: Launch, times: Float[Array, " times"]) -> Any:
-            return simulate(scene, launch, times[-1], first.input, times, self.tolerance)
-
-        return predicted(self.scene, sources, rows, run)
 
 
 def identify(
@@ -93,22 +55,5 @@ def identify(
     ```
     """
     search = search_options(starts, spread, seed, max_steps, progress)
-    with status_line("fitting", progress):
-        require_kind(scene, "scene", Scene)
-        data = as_sources(data, Recording, "a Recording")
-        tolerance_bound(tolerance).require()
-        for recording in data:
-            scene.check(recording.launch)
-        unknowns = _unknowns_of(scene, data, free)
-        return fit_data(
-            lambda indices: SceneModel(scene=scene, data=data, seen=indices, tolerance=tolerance),
-            data,
-            unknowns,
-            search,
-        )
-
-
-def _unknowns_of(scene: Scene, data: tuple[Recording, ...], free: Any) -> dict[str, Free]:
-    """Check the unknowns of a scene and its data, and return them by their full names."""
-    names_of_data = [[*numbers("launch", recording.launch), "t0"] for recording in data]
-    return scene_unknowns(free, scene, data[0].launch, list(numbers("scene", scene)), names_of_data)
+    require_kind(scene, "scene", Scene)
+    return fit_runs(scene, as_sources(data, Recording, "a Recording"), free, tolerance, search)

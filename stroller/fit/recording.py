@@ -6,10 +6,14 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from nonholonomic.identification import AbstractRecording, Quantities, as_quantity, read_columns
+from nonholonomic.integration import Settings
+from nonholonomic.runs import AbstractModel, predicted_columns
 from nonholonomic.validation import as_number, as_number_or_none, require_kind
 
 from ..model.input import Input
 from ..model.launch import USUAL, Launch
+from ..model.scene import Scene
+from ..runs.model import RideModel
 
 #: The quantities of a ride that can be recorded, with the names of a `Trajectory`'s properties.
 QUANTITIES = Quantities(
@@ -56,6 +60,25 @@ class Recording(AbstractRecording):
     t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     quantities: ClassVar[Quantities] = QUANTITIES
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The quantities to which the columns belong."""
+        return tuple(dict.fromkeys("position" if column in "xyz" else column for column in self.columns))
+
+    def model(self, scene: Scene) -> AbstractModel:
+        """The model of the recorded ride, checked."""
+        scene.check(self.launch)
+        return RideModel.of(scene, self.launch, self.input)
+
+    def columns_of(self, model: AbstractModel, values: dict[str, Array]) -> list[Float[Array, " times"]]:
+        """The columns of the recording from the values of quantities."""
+        components = dict(zip("xyz", values["position"].T, strict=True)) if "position" in values else {}
+        return [(values | components)[column] for column in self.columns]
+
+    def predicted(self, model: AbstractModel, lane: dict[str, Array], settings: Settings) -> Array:
+        """The columns of one ride."""
+        return predicted_columns(self, model, lane, settings)
 
     def __check_init__(self):
         require_kind(self.launch, "launch", Launch, several="identify takes a list of recordings")

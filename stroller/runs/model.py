@@ -31,9 +31,10 @@ from nonholonomic.views import Stage
 from nonholonomic.views.explore import LiveRun, ends_of, sliders_of
 
 from ..model.friction import Damping, RollingResistance
-from ..model.input import Input, Steady, check_input
+from ..model.input import Formula, Input, Steady, at_start, check_input
 from ..model.launch import Launch
-from ..model.ride import RideProblem, as_module
+from ..model.per_ride import PerRide
+from ..model.ride import RideProblem, as_module, has_arrays
 from ..model.scene import Scene
 from ..model.stroller import Stroller
 from .explore import DRAWN, default_ranges, live_run, stage
@@ -203,6 +204,16 @@ class RideModel(AbstractModel):
     @property
     def words(self) -> tuple[str, ...]:
         return ("completed", "contact_lost", "rank_lost", "failed", "event")
+
+    def for_lanes(self) -> "RideModel":
+        if not isinstance(self.input, Formula) or has_arrays((self.scene, self.launch)):
+            return self
+        t, motion = eqx.filter_eval_shape(at_start, self.scene, self.launch)
+        return dataclasses.replace(self, input=PerRide.of(self.input, t, motion))
+
+    @property
+    def arrays_in_lanes(self) -> bool:
+        return isinstance(self.input, PerRide)
 
     @property
     def has_event(self) -> bool:

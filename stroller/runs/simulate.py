@@ -17,9 +17,6 @@ from nonholonomic.runs import sampled
 from nonholonomic.validation import as_known, is_traced, nan_unless
 
 from ..model.dynamics import State
-from ..model.input import Formula, at_start
-from ..model.per_ride import PerRide
-from ..model.ride import has_arrays
 from .checks import check_options
 from .ride import Ride, RideSpec, Stats, stats_of
 from .steps import followed
@@ -65,12 +62,7 @@ def _concrete(ride: Ride, times: Float[Array, " times"]) -> Trajectory:
 
 def _traced(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None) -> tuple[State, Stats]:
     """The states of a ride at `times`, and its statistics, inside a transformation."""
-    model = ride.model
-    if adjoint is None and isinstance(model.input, Formula) and not has_arrays((model.scene, model.launch)):
-        t, motion = eqx.filter_eval_shape(at_start, model.scene, model.launch)
-        model = dataclasses.replace(model, input=PerRide.of(model.input, t, motion))
-    in_lanes = isinstance(model.input, PerRide)
-    run = sampled(model, None, times, ride.t1, ride.settings, ride.grid, adjoint, arrays_in_lanes=in_lanes)
+    run = sampled(ride.model, None, times, ride.t1, ride.settings, ride.grid, adjoint)
     return run.rows, stats_of(run.outcome)
 
 
