@@ -199,12 +199,13 @@ def value_in_lanes(model: AbstractModel, mode: AbstractBatchedMode | None, index
 class EventMode(AbstractBatchedMode):
     """A mode with a user's event. The event also happens at a reset that lets its function jump through zero.
 
-    `modes`: all modes of the model, by their index.
+    `modes`: all modes of the model, by their index; `continues`: whether a run continues through its event.
     """
 
     modes: tuple[AbstractBatchedMode, ...]
     model: AbstractModel
     index: int = eqx.field(static=True)
+    continues: bool = eqx.field(static=True)
 
     def problem(self, state: Float[Array, "components cells"]) -> EventProblem:
         core, clock = self._parts(state)
@@ -223,9 +224,9 @@ class EventMode(AbstractBatchedMode):
         jumps = (before > 0.0) & (after <= 0.0) & (transition.status == RUNNING)
         # A run that ends between two modes is in neither.
         return transition._replace(
-            mode=jnp.where(jumps, len(self.modes), transition.mode),
+            mode=jnp.where(jumps & (not self.continues), len(self.modes), transition.mode),
             state=new_state,
-            status=jnp.where(jumps, CROSSED, transition.status),
+            status=jnp.where(jumps & (not self.continues), CROSSED, transition.status),
             crossing_time=jnp.where(jumps, transition.elapsed, jnp.inf),
         )
 
@@ -258,5 +259,5 @@ def modes_of(model: AbstractModel, cells: int, tolerance: Any, names: Names, con
     names = None if names is None else (*names, *(name for name in model.event.names if name not in names))
     modes, first, states = model.modes(cells, tolerance, names, continues)
     clock = jnp.zeros((int(model.event.depends_on_time), states.shape[1]))
-    with_events = tuple(EventMode(modes, model, index) for index in range(len(modes)))
+    with_events = tuple(EventMode(modes, model, index, continues) for index in range(len(modes)))
     return with_events, first, jnp.concatenate([states, clock])

@@ -84,12 +84,16 @@ def time_and_state(form: Form, parts: tuple[Array, ...]) -> tuple[Array, State]:
 
 
 class BatchedMode(AbstractBatchedMode):
-    """A user's mode as a mode of the engine, for cells with `numbers` and `scales` as in `ModeProblem`."""
+    """A user's mode as a mode of the engine, for cells with `numbers` and `scales` as in `ModeProblem`.
+
+    `continues`: whether a run continues through its event.
+    """
 
     numbers: tuple[Float[Array, "..."], ...]
     scales: Float[Array, "components cells"]
     form: Form = eqx.field(static=True)
     mode: int = eqx.field(static=True)
+    continues: bool = eqx.field(static=True, default=False)
 
     def problem(self, state: Float[Array, "components cells"]) -> ModeProblem:
         return ModeProblem(self.numbers, state, self.scales, self.form, self.mode)
@@ -136,6 +140,9 @@ class BatchedMode(AbstractBatchedMode):
         ends = event.is_near_zero(state, ROUND_OFF) & (slope_before < 0.0)
         jumps = ~ends & (value_before > 0.0) & (event.value(state_after) <= 0.0)
         crossed = ends | jumps
+        if self.continues:
+            crossing_time = jnp.where(crossed, delay, jnp.inf)
+            return Transition(number, state_after, delay, status, crossing_time, zero[None] + 1)
         return Transition(
             mode=jnp.where(ends, self.mode, jnp.where(jumps, form.modes, number)),
             state=jnp.where(ends, state, state_after),
@@ -205,9 +212,9 @@ class Cells(eqx.Module):
         return ModeProblem(self.numbers, *self.states(cells), self.form, self.form.first)
 
     def modes(
-        self, cells: int
+        self, cells: int, continues: bool = False
     ) -> tuple[tuple[BatchedMode, ...], Int[Array, " cells"], Float[Array, "components cells"]]:
         """The modes of a system with resets, the index of the first mode, and the initial states in it."""
         states, scales = self.states(cells)
-        phases = tuple(BatchedMode(self.numbers, scales, self.form, mode) for mode in range(self.form.modes))
+        phases = tuple(BatchedMode(self.numbers, scales, self.form, mode, continues) for mode in range(self.form.modes))
         return phases, jnp.full(cells, self.form.first), states

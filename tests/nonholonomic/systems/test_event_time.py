@@ -198,3 +198,11 @@ def test_wrong_functions_are_refused_before_anything_compiles():
         simulate(Sleigh(), (np.zeros(3), np.array([0.0, 1.0, 0.0])), 1.0)
     with pytest.raises(ValueError, match=r"start: q must be of shape \(3,\)"):
         simulate(Sleigh(), (np.zeros(2), np.zeros(3)), 1.0)
+
+
+def test_the_last_crossing_may_be_at_a_reset():
+    """The event is at the second bounce, and the run continues through it."""
+    ball = Hybrid([Ball()])
+    time = event_time(ball, START, 1.6, event=lambda t, y: 1.5 - y[2], crossing="last")
+    ground = np.sqrt(2.0 * START[0] / GRAVITY)
+    assert_close(time, ground * (1.0 + 2.0 * 0.8), rtol=1e-9)
