@@ -97,6 +97,10 @@ def test_components_are_drawn_over_time():
     heights, speeds = run.plot("y0", "y1", others=[run], unit="ms").axes
     assert (heights.get_ylabel(), speeds.get_xlabel()) == ("y0", "time [ms]")
     assert [text.get_text() for text in heights.get_legend().get_texts()] == ["run 1", "run 2"]
+    higher = simulate(Hybrid([Ball()]), [2.0, 0.0, 0.0], 1.0, times=[0.0, 1.0])
+    labels = [text.get_text() for text in run.plot("y0", others=[higher]).axes[0].get_legend().get_texts()]
+    assert labels == ["start[0] 1", "start[0] 2"]
+    assert run.at(1.0).state.shape == (1, 3)
     assert_close(speeds.get_lines()[0].get_ydata(), run.state[:, 1])
     assert list(run.to_dataframe().columns) == ["time", "y0", "y1", "y2", "mode"]
 
