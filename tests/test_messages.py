@@ -116,6 +116,10 @@ REFUSED = {
         lambda: tippe.Recording([LAUNCH], [0.1], [0.1], 0.01),
         "launch must be one Launch, not a list of 1; identify takes a list of recordings",
     ),
+    "a list of launches for event times": (
+        lambda: nonholonomic.EventTimes([LAUNCH, LAUNCH], [1.0, 2.0], 0.1, t1=5.0),
+        "launch must be one launch, not a list of 2: make an EventTimes of each, and pass identify a list of them",
+    ),
     "launches of several numbers": (
         lambda: tippe.InversionTimes([LAUNCH, tippe.Launch([0.1, 0.2], 100.0)], [1.0, 2.0], 0.1, t1=5.0),
         "launch: theta must be one number in each of the list, not of shape (2,)",

@@ -159,6 +159,11 @@ class EventTimes(eqx.Module):
     input: Any = None
 
     def __check_init__(self):
+        if isinstance(self.launch, list | tuple) and any(isinstance(part, eqx.Module) for part in self.launch):
+            raise ValueError(
+                f"launch must be one launch, not a list of {len(self.launch)}: make an EventTimes of each, and pass identify a "
+                "list of them"
+            )
         require(self.time, "time", above=0.0)
         require(self.t1, "t1", above=0.0)
         require(self.error, "error", above=0.0)

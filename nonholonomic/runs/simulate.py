@@ -15,7 +15,7 @@ from ..integration import AbstractProblem, Settings, explicit_tableau
 from ..integration.checks import legal_run, require_times
 from ..integration.status import Status
 from ..progress import status_line
-from ..validation import as_known, as_number, is_traced, nan_unless
+from ..validation import as_known, as_number, is_traced, nan_unless, require_scalars
 from .checks import check_run
 from .event import problem_of
 from .model import AbstractModel, Names, model_of
@@ -76,6 +76,7 @@ def simulate(
 
     ```
     """
+    require_scalars({"t1": t1, "tolerance": tolerance}, "jax.vmap or sweep runs many")
     model = model_of(system, start, None, input)
     return model.simulate(t1, times, tolerance, solver, adjoint)
 

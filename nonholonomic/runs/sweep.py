@@ -145,9 +145,9 @@ def samples_of(model: AbstractModel, times: Any, quantities: Any, t1: Any) -> Sa
     known = list(model.quantities)
     for name in quantities:
         if name not in known:
-            raise ValueError(f"quantities: {name!r} must be one of {', '.join(known)}{likely(name, known)}")
+            raise ValueError(f"quantities: {shown(name)} must be one of {', '.join(known)}{likely(name, known)}")
         if list(quantities).count(name) > 1:
-            raise ValueError(f"quantities: {name!r} must be named only once")
+            raise ValueError(f"quantities: {shown(name)} must be named only once")
     require_times(as_number(times), t1)
     return Samples(np.asarray(times, float), tuple(quantities))
 
