@@ -26,6 +26,9 @@ RESERVE, LIMIT_RESERVE = 0.04, 0.01
 #: Curvature of the arcs of a search in units of the greatest one, because the fork takes time to turn.
 SEARCH_CURVATURE = 0.85
 
+#: By how much a drive may be shorter than the path of a search, which consists of arcs.
+OPTIMISTIC = 0.8
+
 #: Neighbouring knots over which the steering angle and the speed of a path are averaged.
 SMOOTHING = (2, 1)
 
@@ -72,14 +75,27 @@ class Outline(NamedTuple):
             with_grip=problem.limits.grip is not None,
         )
 
-    def paths(self, costs: list[Costs]) -> list[Path]:
-        """A path for each of several prices; straight to the goal where the search finds none."""
+    def paths(self, costs: list[Costs], t1: float) -> tuple[list[Path], str | None]:
+        """A path for each of several prices, straight to the goal where the search finds none; and a reason, in words, why
+        none can be driven within `t1`, if there is one."""
         start, goal = self.chart.point(self.start), self.chart.point(self.goal)
         ground = Ground.of(np.stack([start, goal]), self.obstacles, self.problem.footprint)
         curvature = SEARCH_CURVATURE * greatest_curvature(self.problem)
         has_heading = self.problem.goal.heading is not None
-        found = [search(ground, start, goal, has_heading, curvature, prices)[0] for prices in costs]
-        return [straight(start, goal) if path is None else path for path in found]
+        results = [search(ground, start, goal, has_heading, curvature, prices) for prices in costs]
+        paths = [path for path, _ in results if path is not None]
+        if not paths:
+            nearest = min(distance for _, distance in results)
+            reason = f"no path around the obstacles was found; the nearest ended {nearest:.2g} m from the goal"
+            return [straight(start, goal)] * len(costs), reason
+        low, high = self.problem.limits.ranges().get("speed", (-np.inf, np.inf))
+        way, fastest = min(float(path.length.sum()) for path in paths), max(-low, high)
+        reason = None
+        if OPTIMISTIC * way > fastest * t1:
+            reason = (
+                f"the shortest path that was found, {way:.3g} m, takes {way / fastest:.3g} s at the limit of the speed"
+            )
+        return [path or paths[0] for path, _ in results], reason
 
     def unknowns(self, path: Path, t1: float) -> Float[np.ndarray, "rows unknowns"]:
         """A path, driven within `t1`, as unknowns of the optimiser (see `transcription.py`)."""

@@ -34,10 +34,20 @@ HOPELESS = 0.05
 #: How often the clearance is increased for a candidate that touches an obstacle between the optimiser's points.
 MORE_CLEARANCE = 2
 
+#: Batches without a path that can be driven in time, after which the search ends.
+PATIENCE = 1
+
 #: Rounds in which the duration is shortened, and the least share of the duration that is tried.
 ROUNDS, LEAST_SHARE = 5, 0.05
 
 MINIMISED = ("effort", "time")
+
+
+class Log(NamedTuple):
+    """The unknowns of all optimised candidates, batch by batch, and the reasons why batches cannot succeed."""
+
+    tried: list[Any]
+    reasons: list[str]
 
 
 class Attempt(NamedTuple):
@@ -121,8 +131,8 @@ def plan(
     duration = float(np.asarray(t1))
     with status_line("planning", progress):
         outline = Outline.of(problem)
-        attempts, tried = [], []
-        for attempt in _attempts(outline, duration, starts, np.random.default_rng(seed), tolerance, tried):
+        attempts, log = [], Log([], [])
+        for attempt in _attempts(outline, duration, starts, np.random.default_rng(seed), tolerance, log):
             attempts.append(attempt)
             if not attempt.verdict.hindrances:
                 break
@@ -130,21 +140,26 @@ def plan(
         if minimise == "time" and not best.verdict.hindrances:
             best = _shortened(outline, best, tolerance)
         run, verdict = checked_run(problem, best.drive, best.t1, CONFIRMED)
-    return Plan(best.drive, best.t1, run, verdict, problem, jnp.asarray(outline.lines(np.concatenate(tried))))
+    if verdict.hindrances:
+        verdict = verdict._replace(hindrances=(*verdict.hindrances, *log.reasons[:1]))
+    return Plan(best.drive, best.t1, run, verdict, problem, jnp.asarray(outline.lines(np.concatenate(log.tried))))
 
 
 def _attempts(
-    outline: Outline, t1: float, starts: int, rng: np.random.Generator, tolerance: float, tried: list[Any]
+    outline: Outline, t1: float, starts: int, rng: np.random.Generator, tolerance: float, log: Log
 ) -> Iterator[Attempt]:
-    """Attempts at a problem, best first in each batch of candidates; all optimised candidates are added to `tried`."""
+    """Attempts at a problem, best first in each batch of candidates."""
     for batch in range(-(-starts // LANES)):
-        paths = outline.paths(prices(outline, LANES, batch, rng))
+        paths, reason = outline.paths(prices(outline, LANES, batch, rng), t1)
+        log.reasons.extend([reason] if reason else [])
+        if len(log.reasons) > PATIENCE:
+            return
         way = min(float(path.length.sum()) for path in paths)
         candidates = Candidates(np.stack([outline.unknowns(path, t1) for path in paths]), np.full(LANES, t1))
         clearance = outline.clearance
         for _ in range(MORE_CLEARANCE + 1):
             candidates, violation, objective = optimise(candidates, outline.task(way, t1, clearance))
-            tried.append(candidates.unknowns)
+            log.tried.append(candidates.unknowns)
             order = np.lexsort((objective, violation > HOPELESS))
             attempts = []
             for lane in order:

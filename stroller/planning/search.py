@@ -23,6 +23,9 @@ CURVATURES, MOST_TURN = (-1.0, -0.5, 0.0, 0.5, 1.0), 0.5
 #: Points of each arc that must be free.
 SAMPLES = 3
 
+#: Difference of costs [m] that is round-off.
+TIE = 1e-9
+
 #: How close a path must come to the goal: in units of a cell, and in units of a heading of the grid.
 ARRIVAL = (1.0, 0.8)
 
@@ -179,64 +182,82 @@ class Tree:
         return nodes[::-1]
 
 
+class Children(NamedTuple):
+    """The free ends of arcs from some nodes: poses (children, 3), costs [m], numbers of the parents and of the arcs."""
+
+    pose: np.ndarray
+    cost: np.ndarray
+    parent: np.ndarray
+    arc: np.ndarray
+
+    def only(self, which: np.ndarray) -> "Children":
+        """Some of the children."""
+        return Children(*(part[which] for part in self))
+
+
 def search(
     ground: Ground, start: np.ndarray, goal: np.ndarray, has_heading: bool, curvature: float, costs: Costs
 ) -> tuple[Path | None, float]:
     """The cheapest path that the search finds from one pose (3,) to another, or `None`; and the distance [m] from the
-    goal to the nearest pose it came to."""
+    goal to the nearest place it came to."""
     moves, tree, way = arcs(ground, curvature), Tree(start), ground.way_to(goal[:2], costs.clearance)
-    nx, ny = ground.shape
-    best = np.full(nx * ny * HEADINGS * 2, np.inf)
-    pieces = np.arange(1, SAMPLES + 1) / SAMPLES
-    frontier, nearest = [(0.0, 0)], np.inf
-    factor = np.where(moves[:, 0] < 0.0, costs.backwards, 1.0)
-    price = moves[:, 2] * factor * (1.0 + costs.turning * np.abs(moves[:, 1]) / curvature)
+    best = np.full(np.prod(ground.shape) * HEADINGS * 2, np.inf)
+    frontier, nearest = [(0.0, 0)], float(np.linalg.norm(start[:2] - goal[:2]))
     while frontier and tree.count < MOST_NODES:
         nodes = np.array([heapq.heappop(frontier)[1] for _ in range(min(BATCH, len(frontier)))])
-        nodes = nodes[tree.cost[nodes] <= best[_cell(ground, tree, moves, nodes)] + 1e-12] if nodes[0] else nodes
+        cells = _cells(ground, tree.pose[nodes], moves[tree.arc[nodes], 0])
+        # A cheaper node of the same cell has replaced the others. The start has no cell.
+        nodes = nodes[(nodes == 0) | (tree.cost[nodes] <= best[cells] + TIE)]
         if not nodes.size:
             continue
-        parent, arc = (part.ravel() for part in np.meshgrid(nodes, np.arange(len(moves)), indexing="ij"))
-        direction, curvature_of_arc, length = moves[arc].T[:, :, None]
-        poses = driven(tree.pose[parent][:, None], direction, curvature_of_arc, length * pieces)
-        previous = tree.arc[parent]
-        reverses = (previous >= 0) & (moves[previous, 0] != moves[arc, 0])
-        bend = np.where(previous >= 0, np.abs(moves[previous, 1] - moves[arc, 1]) / curvature, 0.0)
-        cost = tree.cost[parent] + price[arc] + costs.reversal * reverses + 0.5 * costs.turning * ground.cell * bend
-        free = ground.is_free(poses, costs.clearance).all(axis=1)
-        pose, cost, parent, arc = poses[free, -1], cost[free], parent[free], arc[free]
-        cell = _number(ground, pose, moves[arc, 0])
-        ahead = way[tuple(_place(ground, pose).T)]
-        order = np.lexsort((cost, cell))
-        _, first = np.unique(cell[order], return_index=True)
-        keep = order[first]
-        keep = keep[(cost[keep] < best[cell[keep]] - 1e-9) & np.isfinite(ahead[keep])]
-        best[cell[keep]] = cost[keep]
-        numbers = tree.add(pose[keep], cost[keep], parent[keep], arc[keep])
-        away = np.linalg.norm(pose[keep, :2] - goal[:2], axis=-1)
-        nearest = min(nearest, away.min(initial=np.inf))
-        turn = np.abs((pose[keep, 2] - goal[2] + np.pi) % (2.0 * np.pi) - np.pi) * has_heading
+        children = _children(ground, tree, moves, nodes, curvature, costs)
+        ahead = way[tuple(_places(ground, children.pose).T)]
+        cells = _cells(ground, children.pose, moves[children.arc, 0])
+        order = np.lexsort((children.cost, cells))
+        kept = order[np.unique(cells[order], return_index=True)[1]]
+        kept = kept[(children.cost[kept] < best[cells[kept]] - TIE) & np.isfinite(ahead[kept])]
+        best[cells[kept]] = children.cost[kept]
+        children, ahead = children.only(kept), ahead[kept]
+        numbers = tree.add(*children)
+        away = np.linalg.norm(children.pose[:, :2] - goal[:2], axis=-1)
+        turn = np.abs((children.pose[:, 2] - goal[2] + np.pi) % (2.0 * np.pi) - np.pi) * has_heading
+        nearest = float(away.min(initial=nearest))
         arrived = (away < ARRIVAL[0] * ground.cell) & (turn < ARRIVAL[1] * 2.0 * np.pi / HEADINGS)
         if arrived.any():
-            node = numbers[arrived][np.argmin((cost[keep] + away + 0.3 * turn)[arrived])]
-            return _path(tree, moves, int(node)), 0.0
-        for entry in zip((cost[keep] + ahead[keep]).tolist(), numbers.tolist(), strict=True):
+            missing = children.cost + away + turn / curvature
+            return _path(tree, moves, int(numbers[arrived][np.argmin(missing[arrived])])), 0.0
+        for entry in zip((children.cost + ahead).tolist(), numbers.tolist(), strict=True):
             heapq.heappush(frontier, entry)
-    return None, float(nearest)
+    return None, nearest
 
 
-def _place(ground: Ground, pose: np.ndarray) -> np.ndarray:
+def _children(
+    ground: Ground, tree: Tree, moves: np.ndarray, nodes: np.ndarray, curvature: float, costs: Costs
+) -> Children:
+    """The ends of all arcs from some nodes that touch no obstacle."""
+    parent, arc = (part.ravel() for part in np.meshgrid(nodes, np.arange(len(moves)), indexing="ij"))
+    direction, bend, length = moves[arc].T
+    parts = np.arange(1, SAMPLES + 1) / SAMPLES
+    poses = driven(tree.pose[parent][:, None], direction[:, None], bend[:, None], length[:, None] * parts)
+    previous, is_start = moves[tree.arc[parent]], tree.arc[parent] < 0
+    reversal = np.where(is_start, 0.0, previous[:, 0] != direction)
+    wheel_turn = np.where(is_start, 0.0, np.abs(previous[:, 1] - bend) / curvature)
+    price = length * np.where(direction < 0.0, costs.backwards, 1.0) * (1.0 + costs.turning * np.abs(bend) / curvature)
+    cost = tree.cost[parent] + price + costs.reversal * reversal + 0.5 * costs.turning * ground.cell * wheel_turn
+    free = ground.is_free(poses, costs.clearance).all(axis=1)
+    return Children(poses[:, -1], cost, parent, arc).only(np.asarray(free))
+
+
+def _places(ground: Ground, pose: np.ndarray) -> np.ndarray:
+    """The cells of x and y."""
     return np.clip(((pose[:, :2] - ground.low) / ground.cell).astype(int), 0, np.array(ground.shape) - 1)
 
 
-def _number(ground: Ground, pose: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    place, (_, ny) = _place(ground, pose), ground.shape
+def _cells(ground: Ground, pose: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """The numbers of the cells of places, headings and directions of travel."""
+    place, (_, ny) = _places(ground, pose), ground.shape
     heading = np.floor(pose[:, 2] / (2.0 * np.pi) * HEADINGS + 0.5).astype(int) % HEADINGS
     return ((place[:, 0] * ny + place[:, 1]) * HEADINGS + heading) * 2 + (direction > 0.0)
-
-
-def _cell(ground: Ground, tree: Tree, moves: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    return _number(ground, tree.pose[nodes], moves[tree.arc[nodes], 0])
 
 
 def _path(tree: Tree, moves: np.ndarray, node: int) -> Path:
