@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from .per_run import AbstractHeld, Numbers
+
 
 def numbers(root: str, tree: Any, functions: bool = True) -> dict[str, Any]:
     """Every parameter of a tree of modules under its dotted name.
@@ -28,16 +30,28 @@ def numbers(root: str, tree: Any, functions: bool = True) -> dict[str, Any]:
     **Returns:** dotted name -> number, in the order in which the modules declare them; `None` for an optional number
     that was omitted.
     """
-    values = {}
+    values, tree = {}, _itself(tree)
     for field in dataclasses.fields(tree):
         name, value = f"{root}.{field.name}", getattr(tree, field.name)
-        if isinstance(value, eqx.Module):
+        if isinstance(value, Numbers):
+            values |= dict(zip(_entries(name, value), value.numbers, strict=True))
+        elif isinstance(value, eqx.Module):
             values |= numbers(name, value, functions) if functions or not callable(value) else {}
         elif isinstance(value, tuple):
             values |= {f"{name}[{k}]": part for k, part in enumerate(value) if _is_number(part)}
         elif _is_number(value) or (value is None and field.name in getattr(tree, "units", {})):
             values[name] = value
     return values
+
+
+def _itself(tree: Any) -> Any:
+    """The user's module itself for a module that is evaluated over lanes."""
+    return tree.function if isinstance(tree, AbstractHeld) else tree
+
+
+def _entries(name: str, array: Numbers) -> list[str]:
+    """The names of the numbers of an array, such as `knots[2]`."""
+    return [name + "".join(f"[{k}]" for k in index) for index in np.ndindex(array.shape)]
 
 
 def _is_number(value: Any) -> bool:
@@ -176,11 +190,16 @@ def likely_fix(value: Any, wanted: str = "") -> str:
 
 
 def _replaced(name: str, tree: Any, values: dict[str, Any]) -> Any:
+    if isinstance(tree, AbstractHeld):
+        return type(tree)(_replaced(name, tree.function, values))
     changes = {}
     for field in dataclasses.fields(tree):
         path_of_field, value = f"{name}.{field.name}", getattr(tree, field.name)
         if path_of_field in values:
             changes[field.name] = values[path_of_field]
+        elif isinstance(value, Numbers):
+            entries = zip(_entries(path_of_field, value), value.numbers, strict=True)
+            changes[field.name] = Numbers(tuple(values.get(entry, part) for entry, part in entries), value.shape)
         elif isinstance(value, tuple):
             parts = tuple(values.get(f"{path_of_field}[{k}]", part) for k, part in enumerate(value))
             if any(f"{path_of_field}[{k}]" in values for k in range(len(value))):
@@ -195,10 +214,13 @@ def description(root: str, tree: Any) -> dict[str, Any]:
 
     A function is described by its name alone.
     """
+    tree = _itself(tree)
     fields: dict[str, Any] = {root: type(tree).__name__}
     for field in dataclasses.fields(tree):
         name, value = f"{root}.{field.name}", getattr(tree, field.name)
-        if isinstance(value, eqx.Module):
+        if isinstance(value, Numbers):
+            fields[name] = np.asarray(value).tolist()
+        elif isinstance(value, eqx.Module):
             fields |= description(name, value)
         elif isinstance(value, tuple):
             fields[name] = [np.asarray(part).tolist() for part in value]
@@ -271,6 +293,7 @@ def require_unit(unit: Any) -> None:
 def as_text(value: Any, unit: str | None = "1") -> str:
     """A value as text: a number to six digits with its unit, or the first and last numbers of an array. Without a unit,
     the numbers of a module have no units either."""
+    value = value.array if isinstance(value, Numbers) else value
     if isinstance(value, eqx.Module):
         return repr(value) if unit is not None else one_line(value, with_units=False)
     unit = unit or "1"

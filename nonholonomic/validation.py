@@ -24,6 +24,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from .parameters import as_html, contents, in_lines, likely_fix, one_line, shown
+from .per_run import is_users
 
 #: Addition to the message about an angle that may be in degrees.
 IN_DEGREES = "; angles are in radians: did you mean np.radians({})?"
@@ -324,7 +325,10 @@ class Bounded(eqx.Module):
             warn(suspicion)
 
     def _require_one_shape(self) -> None:
-        """Raise `ValueError` if the module's own numbers are lists of different lengths, or empty."""
+        """Raise `ValueError` if the module's own numbers are lists of different lengths, or empty. The arrays of a user's
+        class may have any shapes."""
+        if is_users(type(self)):
+            return
         shapes = {}
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)

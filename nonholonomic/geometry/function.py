@@ -1,7 +1,6 @@
 """User functions for surfaces: convert them to modules with visible parameters, check them, and differentiate them."""
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -11,6 +10,8 @@ import numpy as np
 from jax.core import eval_jaxpr
 from jaxtyping import Array, Float
 
+from ..lanes.objects import Held
+from ..per_run import gathered, parted, spread
 from ..validation import UNTRACEABLE, as_number, is_traced, shown
 
 
@@ -40,76 +41,6 @@ class Closure(eqx.Module):
         return jnp.vectorize(value)(*self.numbers, *at)
 
 
-class Numbers(eqx.Module):
-    """An array as separate numbers, each a leaf, and its shape."""
-
-    numbers: tuple[Any, ...]
-    shape: tuple[int, ...] = eqx.field(static=True)
-
-    @property
-    def array(self) -> Array:
-        """The array."""
-        return gathered(self.numbers, [self.shape])[0]
-
-
-class Held(eqx.Module):
-    """A function that is a module with arrays. Each number of these arrays is a leaf, as in a `Closure`.
-
-    `function` is the module with `Numbers` in place of its arrays. This object has the attributes of the module, too.
-    """
-
-    function: eqx.Module
-
-    @classmethod
-    def of(cls, function: eqx.Module) -> "Held":
-        """Convert a module whose arrays hold the numbers of a single function, not one number per lane."""
-
-        def parted(leaf: Any) -> Any:
-            return Numbers(spread([leaf]), leaf.shape) if eqx.is_array(leaf) and leaf.ndim else leaf
-
-        return cls(jax.tree.map(parted, function))
-
-    def __call__(self, *at: Float[Array, "..."]) -> Float[Array, "..."]:
-        scalars, structure = jax.tree.flatten(self)
-
-        def value(*numbers: Float[Array, ""]) -> Float[Array, ""]:
-            return jax.tree.unflatten(structure, numbers[: len(scalars)]).whole(*numbers[len(scalars) :])
-
-        return jnp.vectorize(value)(*scalars, *at)
-
-    @property
-    def whole(self) -> Any:
-        """The module with its arrays."""
-
-        def joined(leaf: Any) -> Any:
-            return leaf.array if isinstance(leaf, Numbers) else leaf
-
-        return jax.tree.map(joined, self.function, is_leaf=lambda leaf: isinstance(leaf, Numbers))
-
-    def __repr__(self) -> str:
-        return repr(self.whole)
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_") or name == "function":
-            raise AttributeError(name)
-        return getattr(self.whole, name)
-
-
-def spread(arrays: Sequence[Array]) -> tuple[Array, ...]:
-    """The numbers of arrays, one by one."""
-    return tuple(number for array in arrays for number in (jnp.unstack(array.ravel()) if array.ndim else (array,)))
-
-
-def gathered(numbers: Sequence[Array], shapes: Sequence[tuple[int, ...]]) -> list[Array]:
-    """The arrays with the given shapes, from their `spread` numbers."""
-    arrays, first = [], 0
-    for shape in shapes:
-        end = first + math.prod(shape)
-        arrays.append(jnp.stack(numbers[first:end]).reshape(shape) if shape else numbers[first])
-        first = end
-    return arrays
-
-
 def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module:
     """Convert a function of lengths [m] to a module whose parameters are arrays.
 
@@ -137,7 +68,7 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module
     if isinstance(value, eqx.Module):
         # If the parameters have one number per lane, so have the results.
         arrays = results[0].shape == () and len(shapes) > 1 and not isinstance(value, Held)
-        return Held.of(value) if arrays else value
+        return Held(parted(value)) if arrays else value
     closes_over = any(is_traced(constant) for constant in traced.consts)
     return Closure(spread(traced.consts), traced.jaxpr) if closes_over else Plain(value)
 

@@ -18,6 +18,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 
+from ..lanes.objects import held, map_methods
 from ..validation import Bound, Bounded, shown
 from .vector import Component, Vector, dot, scale, subtract
 
@@ -31,6 +32,11 @@ ROUND_OFF = 1e-9
 CLOSED: Mapping[str, float] = {"outside": 1.0, "inside": -1.0}
 OPEN: Mapping[str, float] = {"above": 1.0}
 DIVIDED: Mapping[str, float] = {"positive": 1.0}
+
+
+#: The methods of a user's surface that are mapped over lanes.
+MAPPED = ("normal", "normal_rate", "bending", "elevation", "gaussian_curvature", "nearest", "onto", "ball_gap")
+MAPPED += ("offset", "distance", "place_at", "charted", "chart")
 
 
 class BallGap(NamedTuple):
@@ -61,6 +67,10 @@ class AbstractSurface(Bounded):
 
     ```
     """
+
+    def __init_subclass__(cls, **options: Any):
+        super().__init_subclass__(**options)
+        map_methods(cls, MAPPED)
 
     #: How many of a position's three components do not vanish identically.
     axes: ClassVar[int] = 3
@@ -194,3 +204,10 @@ class AbstractSurface(Bounded):
     def in_own_axes(self, vector: Vector) -> Vector:
         """Components in the surface's axes of a vector in the fixed frame."""
         return vector
+
+
+def as_surface(surface: Any) -> Any:
+    """A user's surface with every number of its arrays as a leaf, in a scene with many lanes; anything else unchanged."""
+    if not isinstance(surface, AbstractSurface):
+        return surface
+    return held(surface, lambda surface: surface.normal((jnp.zeros(()), jnp.zeros(()), jnp.ones(()))))

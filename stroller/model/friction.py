@@ -2,13 +2,14 @@
 
 import abc
 from collections.abc import Iterator
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Component
+from nonholonomic.lanes.objects import held, map_methods
 from nonholonomic.validation import Bound, Bounded, as_number
 from nonholonomic.xla_cpu import greatest
 
@@ -56,6 +57,10 @@ class AbstractFriction(Bounded):
     ```
     """
 
+    def __init_subclass__(cls, **options: Any):
+        super().__init_subclass__(**options)
+        map_methods(cls, ["drag"])
+
     #: Whether the law can dissipate energy; if not, its work is not recorded.
     dissipates: ClassVar[bool] = True
 
@@ -69,6 +74,13 @@ class AbstractFriction(Bounded):
 
         **Returns:** a `Drag`; a component is `None` where it vanishes identically.
         """
+
+
+def as_law(law: Any) -> Any:
+    """A user's law with every number of its arrays as a leaf; anything else unchanged."""
+    if not isinstance(law, AbstractFriction):
+        return law
+    return held(law, lambda law: law.drag(WheelMotion(*(jnp.zeros(()),) * len(WheelMotion._fields))))
 
 
 class Frictionless(AbstractFriction):

@@ -46,6 +46,15 @@ class PerRide(eqx.Module):
             return cls(controls, is_elementary(of_ride, arrays, moving))
         return cls(controls, False)
 
+    def of_cells(self, cells: int) -> "PerRide":
+        """The same input for a number of rides."""
+
+        def spread(leaf: Any) -> Any:
+            is_array = eqx.is_inexact_array(leaf) and leaf.ndim
+            return jnp.broadcast_to(leaf[..., None], (*leaf.shape, cells)) if is_array else leaf
+
+        return PerRide(jax.tree.map(spread, self.input), self.by_elements)
+
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         moving, structure = jax.tree.flatten((t, motion))
         moving = jnp.broadcast_arrays(*moving)

@@ -6,16 +6,19 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Plane
 from nonholonomic.integration import AbstractProblem
+from nonholonomic.lanes.objects import Held
+from nonholonomic.per_run import is_array, is_users, parted
 
 from .dynamics import Dynamics, State
 from .heading import Projected
-from .input import Formula, Input
+from .input import Formula, Input, at_start
 from .launch import Launch
-from .per_ride import PerRide
+from .per_ride import MOST_ELEMENTS, PerRide
 from .scene import Scene
 
 #: Reduced mass, relative to its largest value, below which the constraints count as having lost rank.
@@ -57,6 +60,10 @@ class RideProblem(AbstractProblem):
         def spread(states):
             return jnp.broadcast_to(states.reshape(states.shape[0], -1), (states.shape[0], cells))
 
+        if isinstance(controls, Formula) and has_arrays(controls):
+            t, motion = eqx.filter_eval_shape(at_start, scene, launch)
+            of_one_ride = jax.tree.map(lambda part: jax.ShapeDtypeStruct((), part.dtype), (t, motion))
+            controls = PerRide.of(controls, *of_one_ride).of_cells(cells)
         ride = cls.single(scene, launch, controls)
         guarded, watched = (
             isinstance(ride.dynamics.heading, Projected),
@@ -82,16 +89,26 @@ class RideProblem(AbstractProblem):
 
 
 def as_module(controls: Input | None, scene: Scene, launch: Launch) -> Any:
-    """An input as a module whose numbers are leaves. A function, or a module with arrays, is traced once, with scalar
-    arguments, because it is written for a single ride."""
-    if controls is None or (isinstance(controls, eqx.Module) and not has_arrays(controls)):
+    """An input as a module whose numbers are leaves, evaluated for single rides. A function, or a module with many numbers, is
+    traced once, with scalar arguments."""
+    if controls is None or isinstance(controls, Held | Formula):
         return controls
+    if isinstance(controls, eqx.Module):
+        if not (is_users(type(controls)) or has_arrays(controls)):
+            return controls
+        if numbers_in(controls) <= MOST_ELEMENTS:
+            return Held(parted(controls))
 
     def motion(scene: Scene, launch: Launch) -> Any:
         return scene.dynamics.geometry(scene.state(launch, True)).motion
 
     single: Any = controls
     return Formula.of(single, jnp.zeros(()), eqx.filter_eval_shape(motion, scene, launch))
+
+
+def numbers_in(tree: Any) -> int:
+    """How many numbers a tree holds."""
+    return sum(np.size(leaf) for leaf in jax.tree.leaves(tree) if is_array(leaf))
 
 
 def has_arrays(tree: Any) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from nonholonomic.geometry import AbstractQuadric, AbstractSurface, Plane, Sphere, Torus, stacked
+from nonholonomic.geometry.surface import as_surface
 from nonholonomic.validation import (
     Bound,
     Bounded,
@@ -22,7 +23,7 @@ from nonholonomic.validation import (
 )
 
 from .dynamics import Dynamics, State
-from .friction import AbstractFriction, Frictionless
+from .friction import AbstractFriction, Frictionless, as_law
 from .heading import Intrinsic, Projected
 from .launch import Launch, as_launch
 from .stroller import Stroller
@@ -91,8 +92,8 @@ class Scene(Bounded):
     units: ClassVar[dict[str, str]] = {"gravity": "m s-2"}
 
     body: Stroller
-    surface: AbstractSurface = Plane()
-    friction: AbstractFriction = Frictionless()
+    surface: AbstractSurface = eqx.field(converter=as_surface, default=Plane())
+    friction: AbstractFriction = eqx.field(converter=as_law, default=Frictionless())
     gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81)
     side: str | None = eqx.field(static=True, default=None)
     fork: str = eqx.field(static=True, default="relative")

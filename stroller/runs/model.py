@@ -14,6 +14,7 @@ from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import AbstractProblem, ExtendedProblem, Outcome
 from nonholonomic.integration.checks import run_bounds
 from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, Status
+from nonholonomic.lanes.objects import Held
 from nonholonomic.parameters import description, full_name, numbers, with_numbers
 from nonholonomic.runs import (
     UNMEASURED,
@@ -123,7 +124,7 @@ class RideModel(AbstractModel):
     def of(cls, scene: Scene, launch: Launch, controls: Any, event: Any = None) -> AbstractModel:
         """The model of a ride, with a user's event if there is one."""
         module = as_module(controls, scene, launch)
-        original = None if module is controls else Original(controls)
+        original = None if isinstance(module, Held) or module is controls else Original(controls)
         ride = cls(scene=scene, launch=launch, input=module, original=original)
         return with_event(ride, event)
 
@@ -206,10 +207,11 @@ class RideModel(AbstractModel):
         return ("completed", "contact_lost", "rank_lost", "failed", "event")
 
     def for_lanes(self) -> "RideModel":
-        if not isinstance(self.input, Formula) or has_arrays((self.scene, self.launch)):
+        if not isinstance(self.input, Formula | Held) or has_arrays((self.scene, self.launch)):
             return self
         t, motion = eqx.filter_eval_shape(at_start, self.scene, self.launch)
-        return dataclasses.replace(self, input=PerRide.of(self.input, t, motion))
+        controls = self.input.whole if isinstance(self.input, Held) else self.input
+        return dataclasses.replace(self, input=PerRide.of(controls, t, motion))
 
     @property
     def arrays_in_lanes(self) -> bool:

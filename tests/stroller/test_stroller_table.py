@@ -3,6 +3,8 @@
 import dataclasses
 import json
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ import stroller
 from stroller import Damping, Launch, Plane, Scene, Sphere, Spheroid, Steady, Stroller, Table
 from stroller import __main__ as job
 from stroller.__main__ import main
+from stroller.friction import Drag
 from stroller.runs.model import RideModel
 
 BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05)
@@ -68,6 +71,53 @@ def test_table_is_labelled_and_its_file_opens_in_xarray(bowl):
         np.testing.assert_array_equal(dataset["end_speed"].values, table.end_speed)
         assert dataset["wheelbase"].attrs["units"] == "m"
     np.testing.assert_array_equal(Table.load(path).x, table.x)
+
+
+class Driver(eqx.Module):
+    """A drive force through smooth knots over time."""
+
+    knots: jax.Array
+    force: jax.Array
+    gain: float = 1.0
+
+    def __call__(self, t, motion):
+        weights = jnp.exp(-20.0 * (t - self.knots) ** 2)
+        return self.gain * jnp.sum(weights * self.force) / jnp.sum(weights), -motion.steering
+
+
+class Curve(stroller.AbstractFriction):
+    """A resistance as measured, by speed."""
+
+    speeds: jax.Array
+    drags: jax.Array
+
+    def drag(self, wheels):
+        return Drag(rear=-jnp.interp(wheels.rear_speed, self.speeds, self.drags))
+
+
+@pytest.mark.parametrize("count", [8, pytest.param(300, marks=pytest.mark.slow)])
+def test_inputs_and_laws_with_arrays_are_evaluated_ride_by_ride(count):
+    """As many rides as knots were once paired with them; the curve is a straight line, on which the law is `Damping`."""
+    driver = Driver(jnp.linspace(0.0, 1.0, count), jnp.linspace(1.0, 3.0, count))
+    speeds, launch = np.linspace(0.5, 2.0, 8), Launch((0.0, 0.0), 0.3, 1.0)
+    axes, curve = {"launch.speed": speeds}, np.array([0.0, 1.0, 3.0])
+    tables = [
+        stroller.sweep(Scene(BODY, friction=law), launch, 1.0, input=driver, axes=axes, progress=False)
+        for law in (Damping(0.5), Curve(curve, 0.5 * curve))
+    ]
+    np.testing.assert_allclose(tables[1].end_speed, tables[0].end_speed, rtol=1e-12)
+    for k in (0, 7):
+        ride = dataclasses.replace(launch, speed=speeds[k])
+        run = stroller.simulate(Scene(BODY, friction=Damping(0.5)), ride, 1.0, driver, times=[1.0], tolerance=1e-11)
+        np.testing.assert_allclose(tables[0].end_speed[k], run.speed[0], rtol=1e-8)
+    if count == 8:
+        axes = {"input.force[3]": [1.0, 2.0], "drags[1]": [0.5, 0.6]}
+        table = stroller.sweep(
+            Scene(BODY, friction=Curve(curve, 0.5 * curve)), launch, 1.0, input=driver, axes=axes, progress=False
+        )
+        assert list(table.coords) == ["force[3]", "drags[1]"]
+        assert np.all(np.diff(table.end_speed, axis=0) > 0.0)
+        assert np.all(np.diff(table.end_speed, axis=1) < 0.0)
 
 
 def test_a_sweep_without_axes_is_a_single_ride():

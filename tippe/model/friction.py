@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import sum_vectors
+from nonholonomic.lanes.objects import held, map_methods
 from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require_kind, shown
 
 from .contact_load import ContactLoad, Slip
@@ -46,6 +47,7 @@ class AbstractFriction(Bounded):
 
     def __init_subclass__(cls, **options: Any):
         super().__init_subclass__(**options)
+        map_methods(cls, ["per_normal_force"])
         # A law derived from another one must declare this again.
         if "per_normal_force" in cls.__dict__ and "isotropic" not in cls.__dict__:
             # The types only know the property of the base class.
@@ -57,7 +59,7 @@ class AbstractFriction(Bounded):
     def suspicion(self) -> str | None:
         # The laws of this package oppose every slip. Traced numbers have no values to judge.
         is_own = str(type(self).per_normal_force.__module__).startswith("tippe.")
-        return None if is_own or any(is_traced(leaf) for leaf in jax.tree.leaves(self)) else drive(self)
+        return None if is_own or any(is_traced(leaf) for leaf in jax.tree.leaves(self)) else drive(as_law(self))
 
     @property
     def uses_spin(self) -> bool:
@@ -81,6 +83,14 @@ class AbstractFriction(Bounded):
 
         **Returns:** a `ContactLoad`.
         """
+
+
+def as_law(law: Any) -> Any:
+    """A user's law with every number of its arrays as a leaf; anything else unchanged."""
+    if not isinstance(law, AbstractFriction):
+        return law
+    zero = jnp.zeros(())
+    return held(law, lambda law: law.per_normal_force(Slip(zero, zero, (zero, zero, zero))))
 
 
 class Frictionless(AbstractFriction):

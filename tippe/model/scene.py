@@ -30,12 +30,13 @@ from nonholonomic.geometry import (
     sum_vectors,
     vector_of,
 )
+from nonholonomic.geometry.surface import as_surface
 from nonholonomic.parameters import numbers
 from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require_all, shown
 
 from .body import AbstractBody
 from .dynamics import TURNING, Dynamics
-from .friction import AbstractFriction, Frictionless, NoSlip
+from .friction import AbstractFriction, Frictionless, NoSlip, as_law
 from .launch import Launch, as_launch
 from .rigid_body import AbstractRigidBody
 from .rigid_dynamics import AbstractRigidDynamics, rigid_dynamics
@@ -104,8 +105,8 @@ class Scene(Bounded, Generic[Body]):
     units: ClassVar[dict[str, str]] = {"gravity": "m s-2", "restitution": "1"}
 
     body: Body
-    surface: AbstractSurface = Plane()
-    friction: AbstractFriction = Frictionless()
+    surface: AbstractSurface = eqx.field(converter=as_surface, default=Plane())
+    friction: AbstractFriction = eqx.field(converter=as_law, default=Frictionless())
     gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81)
     contact: str = eqx.field(static=True, default="stop")
     restitution: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)

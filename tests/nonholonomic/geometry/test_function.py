@@ -49,8 +49,8 @@ def test_a_ground_with_arrays_is_described_printed_and_sent_as_others_are():
     """As the request of a table, which is JSON; as text; and to another process."""
     ground = Graph(Bowl(BENDS, 1.0))
     text = json.loads(json.dumps(description("ground", ground)))
-    assert text["ground.height.function"] == "Bowl"
-    assert text["ground.height.function.bends.numbers"] == BENDS.ravel().tolist()
+    assert text["ground.height"] == "Bowl"
+    assert text["ground.height.bends"] == BENDS.tolist()
     assert repr(ground.height).startswith("Bowl(")
     assert_close(pickle.loads(pickle.dumps(ground)).ground(0.1, 0.3), heights(0.1, 0.3), rtol=1e-14)
 
