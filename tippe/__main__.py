@@ -168,12 +168,23 @@ def sliders(options: argparse.Namespace) -> str:
 
 
 def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str, Table], Any, str]:
-    """The table of each arena, theta(t) of the displayed launch, and the page with sliders.
+    """The table of each arena, theta(t) of the displayed launch, and the page with sliders. Each table is printed as soon
+    as it is computed, that of the plane first.
 
     They are computed in parallel, because the compiler uses little more than one core. **Arguments:** `cache`: folder for
     results that later commands with the same options read.
     """
     times = np.linspace(0.0, min(SHOWN, options.t1), SAMPLES)
+    display, unprinted, reports = Progress(3, "job", "compiling"), list(ARENAS), {}
+
+    def table_of(arena: str) -> Table:
+        result = table(options, arena, cache)
+        # One thread at a time.
+        with display.aside():
+            reports[arena] = report(options, arena, result)
+            while unprinted and unprinted[0] in reports:
+                print(reports[unprinted.pop(0)], flush=True)
+        return result
 
     def angles() -> dict[str, bytes]:
         run, axes = (scene(options, "plane"), launch_shown(options)), ("launch.theta", "scene.friction.mu")
@@ -181,7 +192,7 @@ def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str,
 
     def on_plane() -> tuple[Table, Any]:
         # Compute the table first, because the picture uses its programs.
-        plane = table(options, "plane", cache)
+        plane = table_of("plane")
         if not has_matplotlib():
             return plane, None
         return plane, json.loads(kept_files(cache, facts(options, "theta"), angles)["theta"])
@@ -191,10 +202,10 @@ def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str,
             return ""
         return kept_files(cache, facts(options, "page"), lambda: {"page": sliders(options).encode()})["page"].decode()
 
-    jobs = (functools.partial(table, options, "cylinder", cache), on_plane, live)
+    jobs = (lambda: table_of("cylinder"), on_plane, live)
     threads = ThreadPoolExecutor(2)
     try:
-        with Progress(len(jobs), "job", "compiling") as display:
+        with display:
             display.begin()
             futures: list[Any] = [threads.submit(job) for job in jobs]
             for future in as_completed(futures):
@@ -236,15 +247,12 @@ def headings(options: argparse.Namespace) -> dict[str, str]:
     }
 
 
-def report(options: argparse.Namespace, arenas: dict[str, Table]) -> str:
-    """The tables as text."""
-    lines = []
-    for name, heading in headings(options).items():
-        rows = rows_of(options, arenas[name])
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines += ["", f"Time until it has turned over, {heading}"]
-        lines += ["  ".join(entry.rjust(width) for entry, width in zip(row, widths, strict=True)) for row in rows]
-    return "\n".join([*lines, "", remark(options)])
+def report(options: argparse.Namespace, arena: str, table: Table) -> str:
+    """The table of an arena as text."""
+    rows = rows_of(options, table)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(entry.rjust(width) for entry, width in zip(row, widths, strict=True)) for row in rows]
+    return "\n".join(["", f"Time until it has turned over, {headings(options)[arena]}", *lines])
 
 
 def picture(options: argparse.Namespace, times: Any, theta: Any, end: float) -> Any:
@@ -296,7 +304,7 @@ def main(arguments: list[str] | None = None) -> int:
         require_folder(options.out, "--out")
         read = all(are_kept(cache, facts(options, arena)) for arena in ARENAS)
         arenas, samples, live = computed(options, cache)
-        print(report(options, arenas), flush=True)
+        print(f"\n{remark(options)}", flush=True)
         with status_line("drawing") as line:
             paths, drawing = [options.out / f"{arena}.h5" for arena in arenas], None
             if samples is None:

@@ -205,7 +205,8 @@ def solve_hybrid(
     - `modes`: the modes; `mode` and `Transition.mode` are indices into them.
     - `mode`, `state`: initial mode and state of every cell.
     - `t1`: horizon [s], one number for all cells or one per cell.
-    - `cells`: number of cells to run; the rest is padding. With 0, the programs are only compiled.
+    - `cells`: number of cells to run; the rest is padding. With 0, programs are only compiled, but not those of rare
+      modes.
     - `settings`: their solver must be an explicit Runge-Kutta solver of Diffrax.
     - `counters`: number of counters, the rows of `Transition.counts`.
     - `nonterminal`, `n_blocks`: as for `solve_ensemble`.
@@ -241,10 +242,10 @@ def solve_hybrid(
         return (HybridOutcome(*(_with(*values, selected) for values in zip(runs, new, strict=True))),)
 
     if cells == 0:
-        # Compile all programs by running no cells: two at once, because the compiler uses little more than one core.
-        inputs = _gathered(runs, np.arange(0), t1)
+        # Compile the programs by running no cells: two at once, because the compiler uses little more than one core.
+        inputs, common = _gathered(runs, np.arange(0), t1), [mode for mode in modes if not mode.rare]
         with ThreadPoolExecutor(2) as threads:
-            list(threads.map(lambda call: call[0](call[1], 0, *inputs), itertools.product((solve, reset), modes)))
+            list(threads.map(lambda call: call[0](call[1], 0, *inputs), itertools.product((solve, reset), common)))
     programs = (functools.partial(advanced, solve, after_solve), functools.partial(advanced, reset, after_reset))
     return host_rounds((runs,), [(number,) for number in range(len(modes))], *programs, most_rounds)[0]
 

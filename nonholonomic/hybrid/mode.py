@@ -67,6 +67,11 @@ class AbstractBatchedMode(eqx.Module):
     [-9.81 -9.81]
     """
 
+    @property
+    def rare(self) -> bool:
+        """Whether few runs enter the mode: its programs are compiled when a run enters it, not beforehand."""
+        return False
+
     @abc.abstractmethod
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         """The motion in this mode from the given states; the mode ends where the problem's domain margin vanishes."""

@@ -73,6 +73,10 @@ class VariationalMode(AbstractBatchedMode):
     tolerance: Float[Array, ""]
     ends_on_event: bool = eqx.field(static=True)
 
+    @property
+    def rare(self) -> bool:
+        return self.mode.rare
+
     def problem(self, state: Float[Array, "components cells"]) -> VariationalProblem:
         primal, *variations = self.parts(state)
         numbers, build = self._active_numbers()

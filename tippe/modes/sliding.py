@@ -178,6 +178,11 @@ class LeaningProblem(InversionProblem):
 class Lean(AbstractFlyingMode):
     """Sliding on both spheres; numbered after the modes of the single spheres."""
 
+    @property
+    def rare(self) -> bool:
+        # Few tops come to rest on both spheres.
+        return True
+
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         dynamics: Any = LeaningDynamics.of(self.scene)
         contact = (dynamics, self.cos_angle, state[:OWN], self.scales[:OWN])

@@ -1,10 +1,10 @@
 """theta over time of one launch with flights, from the programs of its table."""
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -19,6 +19,7 @@ from ..model.scene import Scene
 from ..modes.inversion_problem import InversionProblem
 from .cells import at_the_end
 from .inversion import Inversions
+from .turned_over import event_of
 
 
 def theta_over_time(
@@ -36,8 +37,10 @@ def theta_over_time(
     values = {path: value for root, tree in roots.items() for path, value in numbers(root, tree).items()}
     size, settings = chunk_for(1), Settings(tolerance)
     cells = with_numbers(roots, {name: np.full(size, float(values[name])) for name in axes})
-    # No inclination exceeds pi, so no run ends before its time.
-    problem = InversionProblem.of(cells["scene"], cells["launch"], math.pi, size)
+    problem = InversionProblem.of(cells["scene"], cells["launch"], event_of(scene, None), size)
+    # No inclination exceeds pi, so no run ends before its time, in the programs of the table.
+    no_stem = None if problem.stem_counts is None else jnp.zeros(())
+    problem = dataclasses.replace(problem, cos_angle=jnp.asarray(-1.0), stem_counts=no_stem)
     runs = Inversions.of(cells["scene"], problem, settings.tolerance, False)
     parts = -(-len(times) // size)
     ends = np.pad(times, (0, size * parts - len(times)), mode="edge").reshape(size, parts)

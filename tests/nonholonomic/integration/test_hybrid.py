@@ -147,6 +147,29 @@ def table(t1, bounces, most_rounds=200):
     return solve_hybrid(modes, start, state, t1, CELLS, SETTINGS, counters=1, most_rounds=most_rounds)
 
 
+def test_a_rare_mode_is_compiled_when_a_run_enters_it():
+    """A run of no cells compiles the other modes only, and the results are those of modes that are not rare."""
+    traced = []
+
+    class RareRest(Rest):
+        @property
+        def rare(self):
+            return True
+
+        def problem(self, state):
+            traced.append(state.shape)
+            return super().problem(state)
+
+    modes = (Fall(jnp.asarray(padded(RESTITUTIONS)), jnp.full(CELLS + PADDING, np.inf)), RareRest())
+    heights, start = padded(HEIGHTS), np.full(CELLS + PADDING, FALLING)
+    state = np.stack([heights, 0.0 * heights, 0.0 * heights])
+    solve_hybrid(modes, start, state, 20.0, 0, SETTINGS, counters=1)
+    assert not traced
+    runs = solve_hybrid(modes, start, state, 20.0, CELLS, SETTINGS, counters=1)
+    assert traced
+    np.testing.assert_array_equal(runs.state, table(20.0, np.full(CELLS, np.inf)).state)
+
+
 def single(ball, t1, bounces=np.inf):
     modes = (Fall(jnp.array([ball.restitution]), jnp.array([float(bounces)])), Rest())
     return solve_hybrid_dense(modes, FALLING, jnp.array([ball.height, 0.0, 0.0]), t1, SETTINGS, counters=1)
