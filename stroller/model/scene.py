@@ -173,12 +173,12 @@ class Scene(Bounded):
         sine = xp.sin(xp.asarray(last)) if len(launch.place) == 2 else xp.asarray(last) / xp.asarray(polar)
         return xp.abs(sine) < RIGHT_ANGLE
 
-    def may_start(self, launch: Launch, *modules: Any) -> Bool[Array, ""]:
-        """Whether the numbers of the scene, a launch and other modules are legal; for traced numbers, which `check`
-        ignores."""
+    def may_start(self, launch: Launch, *modules: Any) -> Bool[Array, "*cells"]:
+        """Whether the numbers of the scene, a launch and other modules are legal, cell by cell; for traced numbers,
+        which `check` ignores."""
         bounds = [bound for module in (self, launch, *modules) for bound in all_bounds(module)]
         is_stuck = jnp.asarray(self.sideways(launch) | self.level(launch))
-        return jnp.all(legal([*bounds, *self.start_bounds(launch)]) & ~is_stuck)
+        return legal([*bounds, *self.start_bounds(launch)]) & ~is_stuck
 
     def state(self, launch: Launch, driven: bool = False) -> State:
         """The state at the start of a run (see `dynamics.py` for its components).
