@@ -228,7 +228,8 @@ MEMBERS = {
     "nonholonomic.identification.AbstractDataModel": "together predict",
     "nonholonomic.identification.LogDensity": "of names units start values predict replicate",
     "nonholonomic.sweeps.Tabular": "readable portrait_axes to_table to_xarray save portrait",
-    "nonholonomic.derivatives.AbstractDifferentiableSolve": "in_blocks movable absent solve value_and_tangents for_parts",
+    "nonholonomic.derivatives.AbstractDifferentiableSolve": "in_blocks movable absent solve value_and_tangents prefers_adjoint "
+    "differentiable push_forward pull_back for_parts",
     "nonholonomic.Trajectory": "status to_table to_xarray save portrait plot",
 }
 

@@ -92,6 +92,7 @@ class SampledStepRecorder(StepRecorder):
         return record.steps
 
     def arriving(self, lane_state: LaneState, steps: StepRecord) -> Float[Array, "iterations components lanes"]:
+        assert steps.fixed is not None
         rows = self.cotangents.states.at[self._cell(lane_state), steps.sample].get(mode="fill", fill_value=0.0)
         # Where the derivative is zero, a NaN cotangent, such as that of theta at the pole, has no effect.
         return jnp.where(steps.fixed, 0.0, jnp.moveaxis(rows, -1, 1))
