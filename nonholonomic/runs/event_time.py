@@ -7,6 +7,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..derivatives import AbstractDifferentiableSolve, differentiable_solve, tangents_by
@@ -15,7 +16,7 @@ from ..integration import Outcome, Settings, explicit_tableau
 from ..integration.checks import legal_run
 from ..integration.status import Status
 from ..progress import status_line
-from ..validation import as_number, shown
+from ..validation import as_number, is_traced, shown, warn
 from .checks import check_run, require_event
 from .ensemble import Ensemble, status_of, traced_leaves
 from .model import AbstractModel, model_of
@@ -63,9 +64,9 @@ def event_time(
     - `input`: the input of a stroller.
 
     **Returns:** the time [s]; infinite if there is no event by `t1` or if the run ends before the event; NaN if the
-    integration failed, if resets follow one another without end, or if numbers inside a transformation are out of
-    range. If the margin of a mode only touches zero, so that the mode may or may not end within the tolerance,
-    derivatives are NaN.
+    integration failed or if resets follow one another without end, with a warning that says so, or if numbers inside a
+    transformation are out of range. If the margin of a mode only touches zero, so that the mode may or may not end
+    within the tolerance, derivatives are NaN.
 
     **Raises:** `ValueError` for arguments out of range, functions that return a wrong type or shape, and second
     derivatives through resets.
@@ -104,7 +105,22 @@ def event_time(
     require_event(model)
     settings = Settings(tolerance, solver)
     explicit_tableau(settings.for_lanes)
-    return time_of_event(model, t1, settings, crossing == "last")
+    time = time_of_event(model, t1, settings, crossing == "last")
+    if not is_traced(time) and np.ndim(time) == 0 and np.isnan(time):
+        _warn_of_failure(model, float(t1), settings, crossing == "last")
+    return time
+
+
+def _warn_of_failure(model: AbstractModel, t1: float, settings: Settings, last: bool) -> None:
+    """Warn of a run without a result: this repeats the run to find how it ended."""
+    ensemble = Ensemble.of(model, 1, settings.tolerance, last)
+    outcome = ensemble.solve(t1, 1, settings)
+    word = Status(int(np.ravel(status_of(model, ensemble, outcome, settings.tolerance))[0])).word
+    end = np.ravel(outcome.end_time)[0]
+    warn(
+        f"the time of the event is NaN: the run ended as {word!r} at {end:.6g} s; nonholonomic.simulate returns the run up to "
+        "there, and states the reason"
+    )
 
 
 def time_of_event(model: AbstractModel, t1: Any, settings: Settings, last: bool) -> Float[Array, ""]:

@@ -206,3 +206,19 @@ def test_the_last_crossing_may_be_at_a_reset():
     time = event_time(ball, START, 1.6, event=lambda t, y: 1.5 - y[2], crossing="last")
     ground = np.sqrt(2.0 * START[0] / GRAVITY)
     assert_close(time, ground * (1.0 + 2.0 * 0.8), rtol=1e-9)
+
+
+def test_a_time_that_is_nan_is_explained():
+    class Lost(Ball):
+        def reset(self, t, y):
+            return y, 5
+
+    with pytest.warns(UserWarning, match=r"the run ended as 'failed' at 0\.45152\d s; nonholonomic\.simulate returns"):
+        time = event_time(Hybrid([Lost()], event=Bounces(3.0)), START, 2.0)
+    assert np.isnan(time)
+
+
+def test_a_start_may_be_a_list_of_traced_numbers():
+    fall = jax.vmap(lambda height: event_time(Hybrid([Ball()], event=Bounces(1.0)), [height, 0.0, 0.0], 2.0))
+    heights = jnp.array([0.5, 1.0])
+    assert_close(fall(heights), jnp.sqrt(2.0 * heights / GRAVITY), rtol=1e-12)
