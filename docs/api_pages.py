@@ -185,7 +185,7 @@ PAGES = {
 RUN = "to_table to_xarray save view animate plot portrait"
 TOP = (
     "theta theta_rate eta azimuth spin position velocity normal axis angular_velocity angular_momentum slip normal_force "
-    "energy jellett inversion_time"
+    "energy jellett jellett_drift inversion_time"
 )
 
 #: The members that users need; classes that are not listed show none.

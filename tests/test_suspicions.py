@@ -78,11 +78,9 @@ LINES = {line for call, _ in SUSPECTED.values() for *_, line in call.__code__.co
 @pytest.fixture
 def nothing_runs(monkeypatch):
     """What would run says that it was asked to."""
+    monkeypatch.setattr(importlib.import_module("tippe.runs.inversion_time"), "time_of_event", lambda *_: jnp.inf)
     monkeypatch.setattr(
-        importlib.import_module("tippe.runs.inversion_time"), "differentiable_solve", lambda *_: jnp.inf
-    )
-    monkeypatch.setattr(
-        importlib.import_module("tippe.runs.table"), "sweep", lambda *_, **__: table_of_times([5.0], [9])
+        importlib.import_module("tippe.runs.table"), "compute_table", lambda *_, **__: table_of_times([5.0], [9])
     )
 
 
@@ -139,8 +137,8 @@ def programs_of_its_own():
 
 @pytest.mark.usefixtures("programs_of_its_own")
 def test_a_time_that_takes_too_many_steps_is_an_error_that_says_how_many(monkeypatch):
-    for module in ("tippe.runs.inversion_time", "tippe.runs.cells"):
-        monkeypatch.setattr(importlib.import_module(module), "Settings", functools.partial(Settings, max_steps=40))
+    module = importlib.import_module("tippe.runs.inversion_time")
+    monkeypatch.setattr(module, "Settings", functools.partial(Settings, max_steps=40))
     message = (
         r"t1 = 100000 s is too long: the run needs more than 40 steps, which reached only 0\.\d+ s; take a shorter t1"
     )

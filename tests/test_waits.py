@@ -31,15 +31,15 @@ CALLS = {
     "inversion_time": (
         lambda: tippe.inversion_time(TOP, LAUNCH, 8.0),
         "tippe.runs.inversion_time",
-        "differentiable_solve",
+        "time_of_event",
     ),
     "extended": (
         lambda: tippe.extended_inversion_time(TOP, LAUNCH, 8.0),
         "tippe.runs.extended_times",
         "differentiable_solve",
     ),
-    "simulate": (lambda: tippe.simulate(TOP, LAUNCH, 1.0), "tippe.runs.trajectory", "follow"),
-    "exponent": (lambda: tippe.lyapunov_exponent(TOP, LAUNCH, 1.0), "tippe.runs.lyapunov", "generic_direction"),
+    "simulate": (lambda: tippe.simulate(TOP, LAUNCH, 1.0), "tippe.runs.simulate", "follow"),
+    "exponent": (lambda: tippe.lyapunov_exponent(TOP, LAUNCH, 1.0), "tippe.runs.lyapunov", "exponent_of_model"),
     "ride": (lambda: stroller.simulate(STROLLER, RIDE, 1.0), "stroller.runs.simulate", "_concrete"),
     "identify": (lambda: tippe.identify(TOP, TIMES, {"mu": 0.3}), "tippe.fit.identify", "unknowns_of"),
     "stroller identify": (

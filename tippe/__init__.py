@@ -14,6 +14,7 @@ from nonholonomic.geometry import Torus as Torus
 from nonholonomic.identification import FitWarning as FitWarning
 from nonholonomic.identification import Free as Free
 from nonholonomic.integration.status import Status as Status
+from nonholonomic.runs import LyapunovExponent as LyapunovExponent
 from nonholonomic.sweeps import Table as Table
 
 from . import presets as presets
@@ -39,18 +40,17 @@ from .model.rigid_body import RigidBody as RigidBody
 from .model.scene import Scene as Scene
 from .model.top import Stem as Stem
 from .model.top import Top as Top
-from .runs.explore import explore as explore
 from .runs.extended_times import extended_inversion_time as extended_inversion_time
 from .runs.flight_trajectory import HybridTrajectory as HybridTrajectory
 from .runs.inversion_time import inversion_time as inversion_time
-from .runs.lyapunov import LyapunovExponent as LyapunovExponent
 from .runs.lyapunov import lyapunov_exponent as lyapunov_exponent
 from .runs.reversal import reversal_table as reversal_table
 from .runs.reversal import reversal_time as reversal_time
 from .runs.table import inversion_table as inversion_table
 from .runs.trajectory import Trajectory as Trajectory
-from .runs.trajectory import simulate as simulate
 from .runs.trajectory_table import trajectory_table as trajectory_table
+from .runs.verbs import explore as explore
+from .runs.verbs import simulate as simulate
 
 # `import *` exports the names above, and not the subpackages.
 __all__ = [

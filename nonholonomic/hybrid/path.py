@@ -54,7 +54,7 @@ class Segment(NamedTuple):
 class HybridPath(NamedTuple):
     """A hybrid run: its segments in order, how and when [s] it ended, its final state, and its cost.
 
-    `status` is a code as in a `HybridOutcome`; `counts` holds the counters.
+    `status` is a code as in a `HybridOutcome`, and `mode` the index of the last mode; `counts` holds the counters.
 
     **Example:** as for `solve_hybrid_dense`.
 
@@ -71,6 +71,7 @@ class HybridPath(NamedTuple):
     counts: Int[np.ndarray, " counters"]
     accepted: int
     rejected: int
+    mode: int
 
     @property
     def left_domain(self) -> bool:
@@ -213,7 +214,8 @@ def solve_hybrid_dense(
     )
     if not (np.isfinite(runs.state).all() and np.isfinite(end_time)):
         end_time = segments[-1].end
-    return HybridPath(segments, status, end_time, runs.state[:, 0], runs.counts[:, 0], steps - rejected, rejected)
+    ending = (runs.state[:, 0], runs.counts[:, 0], steps - rejected, rejected, runs.mode[0].item())
+    return HybridPath(segments, status, end_time, *ending)
 
 
 def _outcome(path: DenseSolution) -> Outcome[np.ndarray]:

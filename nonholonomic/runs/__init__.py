@@ -6,9 +6,11 @@ parameters by name. `model_of` finds the model of a scene or of a user's own sys
 
 from ..hybrid.saltation import UNMEASURED as UNMEASURED
 from ..hybrid.saltation import Clock as Clock
+from .ensemble import Ensemble as Ensemble
 from .event import EventFunction as EventFunction
 from .event import with_event as with_event
 from .event_time import event_time as event_time
+from .event_time import time_of_event as time_of_event
 from .explore import explore as explore
 from .explore import explore_model as explore_model
 from .identify import EventTimes as EventTimes
@@ -22,11 +24,16 @@ from .lyapunov import exponent_of_model as exponent_of_model
 from .lyapunov import lyapunov_exponent as lyapunov_exponent
 from .model import AbstractModel as AbstractModel
 from .model import Names as Names
+from .model import Start as Start
 from .model import model_of as model_of
+from .samples import Samples as Samples
 from .simulate import sampled as sampled
 from .simulate import simulate as simulate
 from .sweep import Options as Options
+from .sweep import compute_table as compute_table
 from .sweep import sweep as sweep
 from .sweep import table_of as table_of
 from .table import TableForm as TableForm
+from .table import TableJob as TableJob
+from .table import at_the_end as at_the_end
 from .trajectory import Trajectory as Trajectory

@@ -5,12 +5,14 @@ differentiated. If the function depends on time, a clock is added to the state.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..hybrid import AbstractBatchedMode, Transition
@@ -184,16 +186,27 @@ class EventProblem(AbstractProblem):
 
 def value_in_lanes(model: AbstractModel, mode: AbstractBatchedMode | None, index: int | None, state: States) -> Lanes:
     """The event function of states, which end with the time if the function depends on it."""
-    leaves, structure = jax.tree.flatten((model, mode))
+    event: Any = model.event
+    rows, time = (state[:-1], state[-1]) if event.depends_on_time else (state, jnp.full_like(state[0], jnp.nan))
+    rows = jnp.stack(tuple(rows))
+    if mode is not None:
+        rows = mode.shown(rows) if rows.ndim == 2 else mode.shown(rows[:, None])[:, 0]
+    values = model.read(event.names, time, rows, index)
+    leaves, structure = jax.tree.flatten(event)
+    # The components of every value, lane by lane.
+    shapes = {name: value.shape[time.ndim :] for name, value in values.items()}
+    parts = [values[name][(..., *component)] for name, shape in shapes.items() for component in np.ndindex(shape)]
 
     def of_run(leaves: Any, parts: tuple[Array, ...]) -> Float[Array, ""]:
-        model, mode = jax.tree.unflatten(structure, leaves)
-        clocked = model.event.depends_on_time
-        rows = jnp.stack(parts[:-1] if clocked else parts)
-        rows = rows if mode is None else mode.shown(rows[:, None])[:, 0]
-        return _value(model, index, parts[-1] if clocked else jnp.asarray(jnp.nan), rows)
+        time, *components = parts
+        values, first = {}, 0
+        for name, shape in shapes.items():
+            end = first + math.prod(shape)
+            values[name] = jnp.stack(components[first:end]).reshape(shape) if shape else components[first]
+            first = end
+        return jax.tree.unflatten(structure, leaves)(time, values)
 
-    return over_lanes(of_run, tuple(leaves), tuple(state))
+    return over_lanes(of_run, tuple(leaves), (time, *parts))
 
 
 class EventMode(AbstractBatchedMode):

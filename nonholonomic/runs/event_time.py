@@ -105,7 +105,7 @@ def event_time(
     require_event(model)
     settings = Settings(tolerance, solver)
     explicit_tableau(settings.for_lanes)
-    time = time_of_event(model, t1, settings, crossing == "last")
+    time = _compiled(model, as_number(t1), settings, crossing == "last", traced_leaves((model, t1, tolerance)))
     if not is_traced(time) and np.ndim(time) == 0 and np.isnan(time):
         _warn_of_failure(model, float(t1), settings, crossing == "last")
     return time
@@ -123,17 +123,16 @@ def _warn_of_failure(model: AbstractModel, t1: float, settings: Settings, last: 
     )
 
 
-def time_of_event(model: AbstractModel, t1: Any, settings: Settings, last: bool) -> Float[Array, ""]:
-    """The time of the event of a model. **Arguments:** as for `event_time`, checked."""
-    unchecked = traced_leaves((model, t1, settings.tolerance))
-    return _time(model, as_number(t1), settings, last, unchecked)
-
-
-# Compile the whole, so that further calls with the same functions need no tracing.
-@eqx.filter_jit
-def _time(
-    model: AbstractModel, t1: Float[Array, ""], settings: Settings, last: bool, unchecked: bool
+def time_of_event(
+    model: AbstractModel, t1: Any, settings: Settings, last: bool, unchecked: bool | None = None
 ) -> Float[Array, ""]:
+    """The time of the event of a model.
+
+    **Arguments:** as for `event_time`, checked; `last`: whether the last crossing counts; `unchecked`: whether nothing has
+    checked the numbers, by default if some are traced.
+    """
+    unchecked = traced_leaves((model, t1, settings.tolerance)) if unchecked is None else unchecked
+    t1 = as_number(t1)
     arrays, rest = eqx.partition(model, eqx.is_array)
     leaves, structure = jax.tree.flatten(arrays)
     is_float = tuple(eqx.is_inexact_array(leaf) for leaf in leaves)
@@ -141,6 +140,10 @@ def _time(
     others = [leaf for leaf in leaves if not eqx.is_inexact_array(leaf)]
     solve = EventTime(len(floats), structure, is_float, rest, settings.with_tolerance(None), last, unchecked)
     return differentiable_solve(solve, *floats, *others, t1, settings.tolerance)
+
+
+# Compile the whole, so that further calls with the same functions need no tracing.
+_compiled = eqx.filter_jit(time_of_event)
 
 
 class EventTime(AbstractDifferentiableSolve):
@@ -174,7 +177,7 @@ class EventTime(AbstractDifferentiableSolve):
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
         is_legal, t1, settings = self._permitted(leaves)
         model = self._model(leaves)
-        model.require_differentiable(nested)
+        model.require_differentiable(nested, self.last)
 
         def build(floats: tuple[Array, ...], cells: int | None) -> Ensemble:
             return self._ensemble(self._model((*floats, *leaves[self.movable :])), cells, settings)

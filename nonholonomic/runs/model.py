@@ -104,8 +104,14 @@ class AbstractModel(eqx.Module):
     def has_event(self) -> bool:
         """Whether there is an event."""
 
-    def require_differentiable(self, nested: bool) -> None:
-        """Raise `ValueError` unless runs have derivatives; `nested`: second derivatives."""
+    @property
+    def further_times(self) -> dict[str, tuple[str, "AbstractModel"]]:
+        """Further variables of a table that are times: name -> (description, the model with its event)."""
+        return {}
+
+    def require_differentiable(self, nested: bool, continues: bool = False) -> None:
+        """Raise `ValueError` unless runs have derivatives; `nested`: second derivatives; `continues`: whether runs
+        continue through the event."""
         if nested and not self.smooth:
             raise ValueError(
                 "second derivatives are not available through resets; take differences of a gradient instead"

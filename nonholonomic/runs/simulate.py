@@ -98,11 +98,14 @@ def simulate_model(
 class SampledRows(eqx.Module):
     """A run at given times, inside a transformation.
 
-    - `rows`: the output rows, (rows, times), NaN after the end; `mode`: the index of the mode at each time, or `None`.
+    - `rows`: the output rows, (rows, times), NaN after the end, of a smooth run without passive components; `passive`:
+      the passive components of a smooth run, if any, which are not integrated unless they are used.
+    - `mode`: the index of the mode at each time, or `None`.
     - `outcome`: how the run ended, as that of one cell.
     """
 
     rows: Float[Array, "rows times"]
+    passive: Float[Array, "rows times"] | None
     mode: Int[Array, " times"] | None
     outcome: HybridOutcome[Array]
 
@@ -127,21 +130,21 @@ def sampled(
     if not model.smooth:
         samples = hybrid_samples(modes_of_run, (model, names), times, t1, settings, len(model.counters))
         of_one_cell = jax.tree.map(lambda part: part[None], samples)
-        return SampledRows(samples.shown, mode_at(samples.number), outcome_of(of_one_cell))
+        return SampledRows(samples.shown, None, mode_at(samples.number), outcome_of(of_one_cell))
     if adjoint is None:
         prepared = model.for_lanes()
         lanes = {"arrays_in_lanes": prepared.arrays_in_lanes}
         run = sampled_run(problem_of_run, (prepared, names), times, t1, settings, grid, **lanes)
     else:
         run = sampled_run_by_diffrax(problem_of_run((model, names), None), times, t1, settings, adjoint, grid)
-    states = run.states if run.quadratures is None else jnp.concatenate([run.states, run.quadratures], axis=-1)
     status, accepted, rejected = (
         jax.lax.stop_gradient(part).astype(int)[None] for part in (run.status, run.accepted, run.rejected)
     )
     ending = (jnp.full(1, jnp.inf), run.end_time[None], run.end_state[:, None])
     none = jnp.zeros((0, 1), int)
     outcome = HybridOutcome(status, *ending, accepted + rejected, rejected, jnp.zeros_like(status), none)
-    return SampledRows(states.T, None, outcome)
+    passive = None if run.quadratures is None else run.quadratures.T
+    return SampledRows(run.states.T, passive, None, outcome)
 
 
 def problem_of_run(modules: tuple[AbstractModel, Names], cells: int | None) -> AbstractProblem:

@@ -167,7 +167,7 @@ def table_of(
     sensitivities = full_sensitivities(model, options.sensitivities)
     if sensitivities:
         require_event(model, "sensitivities are those of the event's time: ")
-        model.require_differentiable(False)
+        model.require_differentiable(False, crossing == "last")
         if crossing == "both":
             raise ValueError(
                 "crossing = 'both' must be 'first' or 'last' for sensitivities, which differentiate one time"
@@ -186,7 +186,7 @@ def table_of(
         request |= {"crossing": crossing}
     if samples is not None:
         request |= {"quantities": list(samples.names)}
-    return run(job, grid, variables, request | request_of(options, sensitivities), options)
+    return compute_table(job, grid, variables, request | request_of(options, sensitivities), options)
 
 
 def full_sensitivities(model: AbstractModel, names: Any) -> list[str]:
@@ -211,7 +211,7 @@ def request_of(options: Options, sensitivities: list[str]) -> dict[str, Any]:
     return request
 
 
-def run(
+def compute_table(
     job: TableJob, grid: list[Axis], variables: dict[str, Variable], request: dict[str, Any], options: Options
 ) -> Table:
     """Check the cells of a grid, and compute them."""

@@ -3,13 +3,14 @@
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..derivatives import tangent_scale, tangents_of
 from ..hybrid import HybridOutcome
-from ..integration import Outcome, Settings
+from ..integration import Outcome, Settings, solve_by_diffrax
 from ..integration.status import Status
 from ..sweeps import Variable
 from ..validation import as_number
@@ -60,6 +61,7 @@ class TableJob(NamedTuple):
     - `slopes`: full name of a parameter -> name of the variable with the derivative of the time.
     - `errors`: whether to run every cell again at another tolerance.
     - `samples`: the quantities at given times, or `None`; `timed`: whether runs are timed, not only sampled.
+    - `by_diffrax`: whether Diffrax solves smooth runs, one by one, as a slow reference.
     """
 
     model: AbstractModel
@@ -71,6 +73,7 @@ class TableJob(NamedTuple):
     errors: bool = False
     samples: Samples | None = None
     timed: bool = True
+    by_diffrax: bool = False
 
     @property
     def times(self) -> tuple[str, ...]:
@@ -94,6 +97,10 @@ class TableJob(NamedTuple):
         words = {f"{name}_time": f"{name} {event} time" for name in ("first", "last")}
         words[self.form.time] = {"event": "time of the event", "loss of contact": event}.get(event, f"{event} time")
         variables = {name: Variable("s", np.float64, long_name=words[name]) for name in self.times}
+        variables |= {
+            name: Variable("s", np.float64, long_name=long_name)
+            for name, (long_name, _) in self.model.further_times.items()
+        }
         variables |= self._ending({} if self.samples is not None else self.model.ends)
         if self.slopes and not self.model.smooth:
             variables |= {"grazes": Variable("1", np.int8, long_name="whether an event on the way was grazing")}
@@ -118,7 +125,12 @@ class TableJob(NamedTuple):
     @property
     def bounded(self) -> tuple[str, ...]:
         """The variables that get error bounds."""
-        return (*self.times, "end_time", *(() if self.samples is not None else self.model.ends))
+        return (
+            *self.times,
+            *self.model.further_times,
+            "end_time",
+            *(() if self.samples is not None else self.model.ends),
+        )
 
     def _error_variables(self, variables: dict[str, Variable]) -> dict[str, Variable]:
         """The variables that describe the accuracy of others (`errors.py`)."""
@@ -135,6 +147,9 @@ class TableJob(NamedTuple):
 
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
         """The variables of some cells, of which only the first `count` are run."""
+        if self.by_diffrax and count == 0:
+            # Diffrax always computes a whole chunk, so a call only to compile would compute the first chunk twice.
+            return {}
         size = next((len(values) for values in columns.values()), 1)
         cells = self.model.replaced(columns)
         sampled: dict[str, Any] = {}
@@ -179,8 +194,12 @@ class TableJob(NamedTuple):
             }
         else:
             ensemble = ensemble_of(self.continues)
-            outcome = ensemble.solve(self.t1, count, settings)
-        status, ends = _at_the_end(cells, ensemble, outcome, settings.tolerance)
+            if self.by_diffrax:
+                assert ensemble.problem is not None
+                outcome = solve_by_diffrax(ensemble.problem, jnp.asarray(self.t1), settings)
+            else:
+                outcome = ensemble.solve(self.t1, count, settings)
+        status, ends = at_the_end(cells, ensemble, outcome, settings.tolerance)
         codes = self.form.codes[np.asarray(status)]
         has_event = np.asarray(status) == Status.EVENT
         variables = {}
@@ -196,24 +215,34 @@ class TableJob(NamedTuple):
         if isinstance(outcome, HybridOutcome):
             variables |= dict(zip(self.model.counters, outcome.counts, strict=True))
         if self.crossing == "both":
-            variables["first_time"] = self._first_times(outcome, cells, ensemble_of, status, count, settings)
+            variables["first_time"] = self._first_times(outcome, cells, status, size, count, settings)
+        for name, (_, other) in cells.further_times.items():
+            is_same = jax.tree.structure(other) == jax.tree.structure(cells) and self.crossing != "last"
+            first = self.times[0] if is_same else None
+            variables[name] = variables[first] if first else self._first_event(other, size, count, settings)
         variables |= {name: np.where(has_event, slope, 0.0) for name, slope in derivatives.items()}
         if slopes and not self.model.smooth:
             variables["grazes"] = (has_event & np.asarray(grazing)).astype(np.int8)
         return variables
 
     def _first_times(
-        self, outcome: Any, cells: AbstractModel, ensemble_of: Any, status: Any, count: int, settings: Settings
+        self, outcome: Any, cells: AbstractModel, status: Any, size: int, count: int, settings: Settings
     ) -> Float[np.ndarray, " cells"]:
         """The times of the first events of runs that continue through them."""
         if not isinstance(outcome, HybridOutcome):
             is_unresolved = np.asarray(status) == Status.UNRESOLVED
             return np.where(is_unresolved, np.inf, np.asarray(outcome.first_crossing))
         # With several modes, the first event needs a separate solve, which ends there.
-        ensemble = ensemble_of(False)
-        first = ensemble.solve(self.t1, count, settings)
-        status = np.asarray(_at_the_end(cells, ensemble, first, settings.tolerance)[0])
-        return np.where(status == Status.EVENT, first.crossing_time, np.inf)
+        return self._first_event(cells, size, count, settings)
+
+    def _first_event(
+        self, cells: AbstractModel, size: int, count: int, settings: Settings
+    ) -> Float[np.ndarray, " cells"]:
+        """The times of the events of runs that end there, infinite in cells that end otherwise."""
+        ensemble = Ensemble.of(cells, size, settings.tolerance, False)
+        outcome = ensemble.solve(self.t1, count, settings)
+        status = np.asarray(at_the_end(cells, ensemble, outcome, settings.tolerance)[0])
+        return np.where(status == Status.EVENT, outcome.crossing_time, np.inf)
 
     def _silenced(self, time: Float[np.ndarray, " cells"], status: np.ndarray) -> Float[np.ndarray, " cells"]:
         if not self.form.nan_if_failed:
@@ -223,7 +252,7 @@ class TableJob(NamedTuple):
 
 # Compiled once for all chunks.
 @eqx.filter_jit
-def _at_the_end(
+def at_the_end(
     cells: AbstractModel, ensemble: Ensemble, outcome: Outcome | HybridOutcome, tolerance: Float[Array, ""]
 ) -> tuple[Array, dict[str, Array]]:
     """The `Status` of all cells, and the variables that describe their ends."""

@@ -18,7 +18,8 @@ from .tasks import versions
 class Quantity(NamedTuple):
     """A quantity of a run: its unit, a description, and the dimension of its components if it is a vector.
 
-    `read` returns the values from a run; by default, they are the property with the name of the quantity.
+    `read` returns the values from a run; by default, they are the property with the name of the quantity. `needs` names
+    what the quantity needs in addition to the state, in the terms of its model.
 
     **Example:**
 
@@ -31,6 +32,7 @@ class Quantity(NamedTuple):
     long_name: str
     components: str | None = None
     read: Callable[[Any], Any] | None = None
+    needs: frozenset[str] = frozenset()
 
     @property
     def label(self) -> str:

@@ -10,8 +10,8 @@ import stroller
 import tippe
 from nonholonomic.sweeps import Table, Variable, axis, sweep
 from stroller.runs.verbs import FORM
-from tippe.runs import run_kind
-from tippe.runs.trajectory_table import WORDS as OF_TRAJECTORIES
+from tippe.runs.model import INVERSIONS, REVERSALS
+from tippe.runs.trajectory_table import FORM as OF_TRAJECTORIES
 
 pytestmark = pytest.mark.newest
 
@@ -52,16 +52,14 @@ def test_words_of_earlier_versions_are_understood_and_others_refused():
 
 
 def test_all_tables_use_words_of_the_list():
-    kinds = [kind for kind in vars(run_kind).values() if isinstance(kind, run_kind.RunKind)]
-    assert len(kinds) == 8
     words_of_list = {status.word for status in Status}
-    for words in (FORM.words, OF_TRAJECTORIES, *(kind.words for kind in kinds)):
+    for words in (FORM.words, OF_TRAJECTORIES.words, INVERSIONS.words, REVERSALS.words):
         assert words_of_list.issuperset(words)
         assert len(set(words)) == len(words)
     # Each file states the meanings of its integers; these integers are the oldest.
     words = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit", "unresolved")
-    assert words == run_kind.WORDS
-    assert OF_TRAJECTORIES[:4] == ("completed", "contact_lost", "failed", "jammed")
+    assert words == INVERSIONS.words
+    assert OF_TRAJECTORIES.words[:4] == ("completed", "contact_lost", "failed", "jammed")
     assert FORM.words == ("completed", "contact_lost", "rank_lost", "failed")
 
 
@@ -88,7 +86,7 @@ def test_a_file_with_the_words_of_earlier_versions_is_read_with_those_of_today(t
     assert table.words["status"][0] == "completed"
     assert table.to_xarray()["status"].values[0] == "completed"
     # The same call finds all of it done.
-    assert swept(OF_TRAJECTORIES, tmp_path / "old.h5", fails_at=0).status.tolist() == table.status.tolist()
+    assert swept(OF_TRAJECTORIES.words, tmp_path / "old.h5", fails_at=0).status.tolist() == table.status.tolist()
     table.save(tmp_path / "new.h5")
     with xarray.open_dataset(tmp_path / "new.h5", engine="h5netcdf") as dataset:
         assert dataset["status"].attrs["flag_meanings"].split()[0] == "completed"
@@ -99,5 +97,5 @@ def test_a_sweep_that_was_begun_with_the_former_words_goes_on_with_all_of_today(
         swept(FORMER, tmp_path / "old.h5", fails_at=8)
     part = Table.load(tmp_path / "old.h5")
     assert set(part.status) <= {"completed", "contact_lost", "failed", "jammed", "pending"}
-    table = swept(OF_TRAJECTORIES, tmp_path / "old.h5")
-    assert table.status.tolist() == [*2 * OF_TRAJECTORIES[:4], "completed", *3 * ["does_not_fit"]]
+    table = swept(OF_TRAJECTORIES.words, tmp_path / "old.h5")
+    assert table.status.tolist() == [*2 * OF_TRAJECTORIES.words[:4], "completed", *3 * ["does_not_fit"]]

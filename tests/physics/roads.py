@@ -17,10 +17,10 @@ from random_scenes import Batch, batch
 import tippe
 from nonholonomic.integration import Settings
 from nonholonomic.parameters import with_numbers
+from nonholonomic.runs import TableJob
 from nonholonomic.runs.errors import errors_of, second_tolerance
 from nonholonomic.xla_cpu import compile_quickly
-from tippe.runs.cells import InversionRuns
-from tippe.runs.run_kind import run_kind_of
+from tippe.runs.model import INVERSIONS, TopModel
 
 ANGLE, TOLERANCE = 0.95 * np.pi, 1e-9
 
@@ -44,17 +44,15 @@ CODES = {
 
 def table_of(scenes: Batch, count: int, t1: float) -> dict[str, np.ndarray]:
     """The table of these scenes, with errors, and the status as words."""
-    kind = run_kind_of(scenes.scene)
-    roots = {"scene": scenes.scene, "launch": scenes.launch}
+    model = TopModel.timed(scenes.scene, scenes.launch, ANGLE)
     first, second = (
-        InversionRuns(kind, t1, ANGLE, "first", Settings(tolerance), "ensemble", []).results(
-            roots, scenes.columns, count
-        )
+        TableJob(model, INVERSIONS, t1, "first", Settings(tolerance))(scenes.columns, count)
         for tolerance in (TOLERANCE, second_tolerance(TOLERANCE))
     )
-    silent = tuple(kind.words.index(word) for word in ("failed", "unresolved"))
-    words = np.array(kind.words)[first["status"]]
-    return first | errors_of(first, second, ("time",), kind.counts, silent) | {"word": words}
+    silent = tuple(INVERSIONS.words.index(word) for word in ("failed", "unresolved"))
+    words = np.array(INVERSIONS.words)[first["status"]]
+    bounds = errors_of(first, second, ("time", "end_time", "end_theta"), tuple(model.counters), silent)
+    return first | bounds | {"word": words}
 
 
 def scene_and_launch(scenes: Batch, cell: int) -> tuple[tippe.Scene, tippe.Launch]:

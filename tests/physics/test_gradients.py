@@ -11,7 +11,8 @@ from tops import rutstam_top
 
 import tippe
 from nonholonomic.integration import Oscillatory8, Settings
-from tippe.runs.sensitivities import sensitivities_of_cells
+from nonholonomic.runs import TableJob
+from tippe.runs.model import INVERSIONS, TopModel
 
 ROWS = list(csv.DictReader(Path(__file__).with_name("gradient_reference.csv").read_text().splitlines()))
 
@@ -20,13 +21,11 @@ def relative_errors(family: str, tolerance: float) -> np.ndarray:
     """Of the derivatives by mu, theta, spin and offset in every scene of a family."""
     rows = [row for row in ROWS if row["family"] == family]
     names = list(MOVED.values())
-    options = {"count": len(rows), "size": len(rows), "last": False}
-    settings = Settings(tolerance, Oscillatory8())
-    _, derivatives, _ = sensitivities_of_cells(
-        roots_of(rows[0]), columns_of(rows), names, ANGLE, 8.0, settings, **options
-    )
+    model = TopModel.timed(**roots_of(rows[0]), angle=ANGLE)
+    settings, slopes = Settings(tolerance, Oscillatory8()), {name: name for name in names}
+    table = TableJob(model, INVERSIONS, 8.0, "first", settings, slopes)(columns_of(rows), len(rows))
     expected = np.array([[float(row[f"by_{name}"]) for row in rows] for name in MOVED])
-    return np.abs(np.stack(list(derivatives.values())) / expected - 1.0)
+    return np.abs(np.stack([table[name] for name in names]) / expected - 1.0)
 
 
 @pytest.mark.parametrize(

@@ -3,9 +3,12 @@
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import pytest
 from own_modes import Ball, Sleigh
+from tops import rutstam_top
 
 import stroller
+import tippe
 from nonholonomic import Hybrid
 
 
@@ -25,10 +28,62 @@ CART = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia
 BOWL = stroller.Scene(CART, stroller.Spheroid(6.0, 3.0), stroller.Damping(2.0, 1.0, 0.2, 0.05), side="inside")
 RIDE = stroller.Launch((0.0, -0.8), 0.3, 2.0)
 
+TOP, ROCKER = (
+    rutstam_top(),
+    tippe.Ellipsoid(
+        1.0, (0.2, 0.03, 0.02), (0.0, 0.0, -0.01), [[2e-4, -2e-5, 0.0], [-2e-5, 1.6e-3, 0.0], [0.0, 0.0, 1.7e-3]]
+    ),
+)
+
+
+def rises(t: Any, motion: Any) -> Any:
+    """theta exceeds 0.3 rad."""
+    return 0.3 - motion.theta
+
+
+#: Kinds of tops whose programs take long to compile.
+OF_MODES = {
+    "hopping top": Case(
+        tippe.Scene(TOP, friction=tippe.Viscous(0.3), contact="hybrid", restitution=0.4),
+        tippe.Launch(0.2, 280.0),
+        6.0,
+        rises,
+        "mu",
+        0.3,
+        "theta",
+    ),
+    "sticking top": Case(
+        tippe.Scene(TOP, friction=tippe.SetValuedCoulomb(0.3)),
+        tippe.Launch(0.35, 100.0),
+        1.0,
+        lambda t, motion: motion.theta - 0.345,
+        "mu",
+        0.3,
+        "theta",
+    ),
+    "rattleback": Case(
+        tippe.Scene(ROCKER, friction=tippe.NoSlip()),
+        tippe.Launch(0.02, -5.0),
+        4.0,
+        lambda t, motion: -motion.normal_spin,
+        "mass",
+        1.0,
+        "theta",
+    ),
+}
+
 CASES = {
+    "top": Case(
+        tippe.Scene(TOP, friction=tippe.Viscous(0.3)), tippe.Launch(0.2, 155.0), 3.0, rises, "mu", 0.3, "theta"
+    ),
     "stroller": Case(BOWL, RIDE, 2.5, lambda t, motion: motion.speed - 1.0, "rolling", 2.0, "speed"),
     "modes": Case(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.0, lambda t, y: 0.3 - y[0], "restitution", 0.8, "y0"),
     "mechanics": Case(
         Sleigh(), ([0.0, 0.0, 0.0], jnp.array([0.5, 0.0, 2.0])), 2.0, lambda t, y: 1.0 - y[2], "ahead", 0.3, "q2"
     ),
 }
+
+CASES |= OF_MODES
+
+#: The names of all cases, for a parametrization.
+NAMES = [pytest.param(name, marks=pytest.mark.slow if name in OF_MODES else ()) for name in CASES]

@@ -109,8 +109,6 @@ BAD = [
     ({"scene": 1.0}, "scene = 1.0 must be a Scene"),
     ({"launch": None}, "launch = None must be a Launch"),
     ({"launch": tippe.Launch([[0.1, 0.2]], 1.0)}, "scalars or one number per launch"),
-    ({"scene": tippe.Scene(rutstam_top(), contact="hybrid")}, "have no exponents"),
-    ({"scene": tippe.Scene(rutstam_top(), friction=tippe.SetValuedCoulomb(0.3))}, "have no exponents"),
 ]
 
 

@@ -9,11 +9,11 @@ from tops import rutstam_top
 
 import tippe
 from nonholonomic.integration import Settings
+from nonholonomic.runs import TableJob
 from nonholonomic.runs.errors import FINER, SAFETY, SAFETY_OF_HISTORIES, error_bound, errors_of, second_tolerance
 from nonholonomic.sweeps.digits import concise, concise_strings
 from tippe import steady
-from tippe.runs.cells import InversionJob, InversionRuns
-from tippe.runs.run_kind import run_kind_of
+from tippe.runs.model import INVERSIONS, TopModel
 
 SCENE = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
 ANGLE = np.pi - 0.1
@@ -176,16 +176,16 @@ def test_a_cell_that_fails_is_in_doubt():
 def test_agreement_on_no_answer_is_no_agreement(monkeypatch):
     """Two runs that both failed, or both were given up, do not make it certain that there is no time."""
     scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3), contact="hybrid")
-    words = run_kind_of(scene).words
+    words = INVERSIONS.words
 
     def results(runs, *_):
         ends = {"end_time": np.ones(len(words)), "end_theta": np.ones(len(words)), "hops": np.zeros(len(words), int)}
         times = {name: np.full(len(words), np.inf) for name in runs.times}
         return times | ends | {"status": np.arange(len(words), dtype=np.int8)}
 
-    monkeypatch.setattr(InversionRuns, "results", results)
-    runs = InversionRuns(run_kind_of(scene), 1.0, ANGLE, "both", Settings(1e-9), "ensemble", [])
-    outcome = InversionJob(runs, {"scene": scene}, errors=True)({}, len(words))
+    monkeypatch.setattr(TableJob, "_results", results)
+    model = TopModel.timed(scene, tippe.Launch(0.1, 100.0), ANGLE)
+    outcome = TableJob(model, INVERSIONS, 1.0, "both", Settings(1e-9), errors=True)({}, len(words))
     for name in ("first_time", "last_time"):
         is_doubtful = np.isinf(outcome[f"{name}_error"])
         assert {word for word, doubt in zip(words, is_doubtful, strict=True) if doubt} == {"failed", "unresolved"}
@@ -207,19 +207,18 @@ def test_the_file_keeps_the_errors(tmp_path):
 def runs_of(kind, count, tolerances):
     """The variables of random scenes of a kind (`random_scenes.py`) at each tolerance, and how many things are counted."""
     scene, launch, columns = batch(kind, count)
-    kind, roots = run_kind_of(scene), {"scene": scene, "launch": launch}
+    model = TopModel.timed(scene, launch, 0.95 * np.pi)
 
     def results(tolerance):
-        runs = InversionRuns(kind, 8.0, 0.95 * np.pi, "first", Settings(tolerance), "ensemble", [])
-        return runs.results(roots, columns, count)
+        return TableJob(model, INVERSIONS, 8.0, "first", Settings(tolerance))(columns, count)
 
-    return {tolerance: results(tolerance) for tolerance in tolerances}, kind.counts
+    return {tolerance: results(tolerance) for tolerance in tolerances}, tuple(model.counters)
 
 
 def judged(first, second, true, counts):
     """How many times a table with errors has, how many err by more than the bound, for how many the bound is more than 30
     times the error, and how many cells have a wrong status of which nothing is said."""
-    bounds = errors_of(first, second, ("time",), counts, (3, 6))
+    bounds = errors_of(first, second, ("time", "end_time", "end_theta"), counts, (3, 6))
     finite = np.isfinite(first["time"]) & np.isfinite(true["time"]) & np.isfinite(bounds["time_error"])
     bound = bounds["time_error"][finite]
     error = np.abs(first["time"][finite] - true["time"][finite])

@@ -242,21 +242,48 @@ def test_it_is_drawn_over_time(table):
     ids=str,
 )
 def test_what_is_refused_before_anything_compiles(scene, change, told, monkeypatch):
-    monkeypatch.setattr("tippe.runs.trajectory_cells.launches_with", lambda *_: pytest.fail("it was run"))
+    monkeypatch.setattr("tippe.runs.trajectory_table.compute_table", lambda *_: pytest.fail("it was run"))
     arguments = {"scene": scene, "theta": 0.1, "spin": 100.0, "times": TIMES} | change
     with pytest.raises(ValueError, match=re.escape(told)):
         tippe.trajectory_table(arguments.pop("scene"), **arguments)
 
 
+#: Scenes whose runs have several modes; the horizon includes a change of mode.
+IN_MODES = {
+    "flights": (
+        tippe.Plane(),
+        tippe.Viscous(0.3),
+        {"contact": "hybrid", "restitution": 0.4},
+        [280.0, 290.0],
+        0.1,
+        "hops",
+    ),
+    "sticks": (tippe.Plane(), tippe.SetValuedCoulomb(0.3), {}, [100.0, 101.0], 0.35, "sticks"),
+    "flights in a cylinder": (
+        tippe.Cylinder(0.3),
+        tippe.Viscous(0.3),
+        {"contact": "hybrid", "restitution": 0.4},
+        [280.0, 290.0],
+        0.1,
+        "hops",
+    ),
+}
+
+
 @pytest.mark.parametrize(
-    ("change", "told"),
-    [
-        ({"contact": "hybrid"}, "contact = 'hybrid' must be 'stop' for trajectory_table: simulate samples"),
-        ({"friction": tippe.SetValuedCoulomb(0.3)}, "friction = SetValuedCoulomb must be a law with a single mode"),
-    ],
-    ids=["hybrid", "set-valued"],
+    "name", [pytest.param(name, marks=pytest.mark.slow if " " in name else ()) for name in IN_MODES]
 )
-def test_scenes_whose_runs_have_phases_are_refused(change, told):
-    scene = tippe.Scene(rutstam_top(), tippe.Plane(), **{"friction": tippe.Viscous(0.3)} | change)
-    with pytest.raises(ValueError, match=told):
-        tippe.trajectory_table(scene, theta=0.1, spin=100.0, times=TIMES)
+def test_runs_of_several_modes_are_those_of_simulate(name):
+    """In contact, in the air, slipping and rolling."""
+    surface, friction, options, spins, theta, counter = IN_MODES[name]
+    scene, times = tippe.Scene(rutstam_top(), surface, friction, **options), np.linspace(0.0, 0.6, 7)
+    names = ["theta", "position", "normal_force", "energy", "work", "slip"]
+    table = tippe.trajectory_table(scene, theta=theta, spin=spins, times=times, quantities=names, tolerance=1e-8)
+    assert (table.status == "completed").all()
+    for k, spin in enumerate(spins):
+        run = tippe.simulate(scene, tippe.Launch(theta, spin), times[-1], times, tolerance=1e-10)
+        for quantity in names:
+            expected = np.asarray(getattr(run, quantity))
+            assert_close(table[quantity][k], expected, atol=1e-4 * np.max(np.abs(expected)))
+        count = len(run.hops) if counter == "hops" else run.stats["sticks"]
+        assert table[counter][k] == count

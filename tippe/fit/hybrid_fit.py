@@ -10,14 +10,13 @@ from jaxtyping import Float
 from nonholonomic.identification import of_data
 from nonholonomic.integration import Settings
 from nonholonomic.parameters import numbers, with_numbers
+from nonholonomic.runs import TableJob
 
 from ..model.scene import Scene
-from ..modes.inversion_problem import StemContact
-from ..runs.cells import InversionRuns
 from ..runs.extended_times import beyond_horizon
-from ..runs.run_kind import run_kind_of
-from ..runs.trajectory import simulate
+from ..runs.model import INVERSIONS, TopModel
 from ..runs.turned_over import angle_of, event_of
+from ..runs.verbs import simulate
 from .inversion_times import InversionTimes
 from .recording import Recording
 
@@ -81,13 +80,11 @@ class HybridModel(NamedTuple):
         }
         columns |= {name: np.repeat([row[name] for row in rows], launches) for name in rows[0] if name != "t0"}
         t1, angle, event = float(data.t1), float(angle_of(self.scene, data.angle)), event_of(self.scene, data.angle)
-        event = event if isinstance(event, StemContact) else angle
-        runs = InversionRuns(run_kind_of(self.scene), t1, event, "first", Settings(self.tolerance), "ensemble", [])
-        count = launches * len(rows)
-        variables = runs.results({"scene": self.scene, "launch": data.launch}, columns, count)
+        model, settings = TopModel.timed(self.scene, data.launch, event), Settings(self.tolerance)
+        variables = TableJob(model, INVERSIONS, t1, "first", settings)(columns, launches * len(rows))
         later = np.asarray(_beyond_horizon(variables["end_theta"], columns["launch.theta"], angle, t1))
         time = np.where(np.isfinite(variables["time"]), variables["time"], later)
-        has_failed = np.asarray(variables["status"]) == runs.run_kind.words.index("failed")
+        has_failed = np.asarray(variables["status"]) == INVERSIONS.words.index("failed")
         return np.where(has_failed, np.nan, time).reshape(len(rows), launches)
 
     def _samples(self, data: Recording, row: dict[str, float]) -> Float[np.ndarray, " size"]:

@@ -26,7 +26,7 @@ from ..model.scene import Scene
 from ..runs.checks import check_run, check_smooth
 from ..runs.launches import variable_numbers
 from ..runs.run_kind import run_kind_of
-from ..runs.trajectory import simulate
+from ..runs.verbs import simulate
 from .hybrid_fit import HybridModel
 from .inversion_times import InversionTimes, Values
 from .recording import Recording

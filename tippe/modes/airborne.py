@@ -12,7 +12,7 @@ axes in flight; the rotation angle of the top about its axis [rad]; and the work
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -44,7 +44,7 @@ from .coulomb_impact import resolve_coulomb_impact
 from .flying_mode import AbstractFlyingMode
 from .free_body import Ball, FreeBody, axis_rate, balls, energy, gap_rate, standing_on, still_parting
 from .impact import CLOSING_SPEED, resolve_impact
-from .inversion_problem import InversionProblem
+from .inversion_problem import InversionProblem, beyond_on_stem
 from .trajectory_problem import Quadratures, c_rate
 
 #: The mode numbers. The last two are those of a top with a stem: the stem slides; or a sphere is about to strike, and
@@ -197,6 +197,8 @@ class FlightProblem(AbstractProblem):
     scales: Float[Array, "components cells"]
     acceleration: Vector
     strikes: Bool[Array, ""] | None = None
+    # As for `InversionProblem`.
+    stem_counts: Any = None
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales
@@ -207,7 +209,8 @@ class FlightProblem(AbstractProblem):
         return stacked((*flying.velocity, *self.acceleration, *e_dot, None, None, None, None, None), state)
 
     def event_function(self, state):
-        return cosine(self.scene, flight_state(state)) - self.cos_angle
+        value = cosine(self.scene, flight_state(state)) - self.cos_angle
+        return beyond_on_stem(value, state[LAST_BALL] == 1.0, self.stem_counts)
 
     def domain_margin(self, time, state):
         return functools.reduce(jnp.minimum, self.margins(time, state))
@@ -291,7 +294,9 @@ class Fly(AbstractFlyingMode):
         one = jnp.ones_like(velocity)
         rows = [one * self.scene.body.radius] * 3 + [velocity] * 3 + [one] * 3 + [momentum] * 3 + [one] * 2
         acceleration = scale(-1.0 * self.scene.gravity, self.scene.surface.up)
-        return FlightProblem(self.scene, self.cos_angle, state[:OWN], jnp.stack(rows), acceleration, strikes)
+        return FlightProblem(
+            self.scene, self.cos_angle, state[:OWN], jnp.stack(rows), acceleration, strikes, self.stem_counts
+        )
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         flying = flight_state(state)

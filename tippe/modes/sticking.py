@@ -156,12 +156,13 @@ def _first_mode(stick_slip: StickSlip, states: Float[Array, "components cells"])
 
 def contact_modes(
     run: TrajectoryProblem, tolerance: Any
-) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, "1"], Float[Array, "components 1"]]:
-    """The modes of one run whose path is kept, the index of the first mode, and the initial state.
+) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"], Float[Array, "components cells"]]:
+    """The modes of runs whose path is kept, the index of each first mode, and the initial states.
 
-    **Arguments:** `run`: a run in a scene with `SetValuedCoulomb`; `tolerance`: relative tolerance of the integration.
+    **Arguments:** `run`: one run, or the runs of some cells, in a scene with `SetValuedCoulomb`; `tolerance`: relative
+    tolerance of the integration.
     """
-    state, scales = (values[:, None] for values in run.start())
+    state, scales = (values if values.ndim == 2 else values[:, None] for values in run.start())
     problem = InversionProblem(run.problem.dynamics, jnp.asarray(NO_COSINE), state[: run.leading], scales)
     assert isinstance(run.passive, Quadratures)
     return (*modes(None, problem, tolerance, False, run.passive, run.leading), state)

@@ -33,7 +33,7 @@ from ..model.scene import Scene
 from ..model.top import Top
 from ..runs.plot import Panel, draw_launches
 from ..runs.table import inversion_table
-from ..runs.trajectory import simulate
+from ..runs.verbs import simulate
 from ..runs.view import DrawnMotion, stages
 from . import paper
 

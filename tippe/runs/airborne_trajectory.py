@@ -9,12 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.geometry import scale, sum_vectors, vector_of
-from nonholonomic.hybrid import BETWEEN, Segment, hybrid_samples, solve_hybrid_dense
-from nonholonomic.integration import Settings
-from nonholonomic.integration.status import Status
+from nonholonomic.hybrid import BETWEEN, Segment
 from nonholonomic.xla_cpu import compiled_setup
 
-from ..model.contact_dynamics import LOSSES, Motion
+from ..model.contact_dynamics import Motion
 from ..model.dynamics import NO_COSINE
 from ..model.launch import Launch
 from ..model.scene import Scene
@@ -34,12 +32,12 @@ from ..modes.airborne import (
     lift_off,
     standing,
 )
-from ..modes.airborne_ends import energy_in, lifted, loss
+from ..modes.airborne_ends import lifted
 from ..modes.airborne_stick_slip import modes as stick_slip_modes
 from ..modes.free_body import Ball, balls
 from ..modes.inversion_problem import InversionProblem
 from ..modes.trajectory_problem import trajectory_problem
-from .flight_trajectory import STATUS, HybridTrajectory, flights_of, has_grown_between, sampled_flights
+from .flight_trajectory import HybridTrajectory
 from .observables import of_each_run
 
 #: A sphere is at the arena if its distance is below this fraction of its radius, at the end of a run.
@@ -164,34 +162,3 @@ def _start(scene: Scene[Top], launch: Launch, cells: int) -> InversionProblem:
     """The launches, with the passive quadratures."""
     state, scales = trajectory_problem((scene, launch), cells).start()
     return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state, scales)
-
-
-def simulate_airborne(scene: Scene[Top], launch: Launch, t1: float, times: Any, settings: Settings) -> ArenaTrajectory:
-    """Simulate one launch of a hybrid scene whose flights are integrated. **Arguments:** as for `simulate`, already
-    checked."""
-    batched_modes, first, state = arena_modes((scene, launch), settings.tolerance)
-    exact = scene.friction.set_valued
-    start = int(np.asarray(first)[0]), np.asarray(state)[:, 0]
-    path = solve_hybrid_dense(batched_modes, *start, t1, settings, counters=1 + exact)
-    status = STATUS[path.status]
-    if status == Status.JAMMED:
-        status = LOSSES[int(loss(scene, jnp.asarray(path.state)))]
-    hops = np.array(
-        [(segment.begin, segment.end) for segment in path.mode_segments if segment.number == FLYING]
-    ).reshape(-1, 2)
-    kind = StickSlipArenaTrajectory if exact else ArenaTrajectory
-    run = flights_of(kind, scene, path, status.word, hops, times, settings.tolerance)
-    if exact:
-        run.stats["sticks"] = int(path.counts[1])
-    return run
-
-
-def sampled_airborne(scene: Scene[Top], launch: Launch, times: Any, t1: Any, settings: Settings) -> ArenaTrajectory:
-    """Simulate one launch of a hybrid scene inside a transformation, where flights are integrated. **Arguments:** as
-    for `simulate`, already checked."""
-    samples = hybrid_samples(arena_modes, (scene, launch), times, t1, settings, counters=1)
-    codes = jnp.array([int(status) for status in LOSSES])
-    energy_grew = has_grown_between(
-        scene, arena_modes((scene, launch), settings.tolerance), samples, energy_in, settings
-    )
-    return sampled_flights(ArenaTrajectory, scene, times, samples, codes[loss(scene, samples.end_state)], energy_grew)

@@ -14,19 +14,15 @@ from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import LaneState, Settings, crossing_time
 from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED, Status
 from nonholonomic.parameters import numbers, readable_unit, with_numbers
-from nonholonomic.progress import status_line
-from nonholonomic.validation import all_bounds, legal, require_file
-from nonholonomic.views import Page, Stage, arena
+from nonholonomic.validation import all_bounds, legal
+from nonholonomic.views import Stage, arena
 from nonholonomic.views.explore import (
     Answer,
     Frame,
     HybridSimulator,
     LiveRun,
     Simulator,
-    Slider,
     Summary,
-    ends_of,
-    live_page,
     quaternion,
     sliders_of,
 )
@@ -44,7 +40,7 @@ from .checks import check_reversible, check_run
 from .flight_trajectory import HybridTrajectory, level_modes
 from .launches import LONG_NAMES, UNITS
 from .quantities import OF_RIGID_BODIES, QUANTITIES
-from .trajectory import Trajectory, parts_of, simulate
+from .trajectory import Trajectory, parts_of
 from .turned_over import event_of
 from .view import AXIS, DrawnMotion, curve_of_rotation, show
 
@@ -65,60 +61,6 @@ MOST_STEPS_OF_A_PAGE = 50_000
 
 #: The words for the statuses of runs that end with a reversal of the spin.
 REVERSED = {int(Status.INVERTED): "reversed", int(Status.NOT_INVERTED): "not_reversed"}
-
-
-@status_line("writing a page")
-def explore(
-    scene: Scene,
-    launch: Launch,
-    path: Any = None,
-    sliders: dict[str, tuple[float, float]] | None = None,
-    t1: float = 8.0,
-) -> Page:
-    """Make a page with sliders that simulates the top in the browser while you move a slider. The page is one file that
-    needs no network; a notebook shows the returned `Page`. The equations of motion, the Runge-Kutta pair, the step-size
-    control and the location of the event are generated from those of `inversion_table`, or, under `NoSlip`, of
-    `reversal_table`, so times and statuses are the same, at a tolerance of 1e-7: for a top with a stem, the time at
-    which the stem first carries it. The page also computes a map of these times over two of the sliders; click on the
-    map to set both. The address of the page contains the slider values, so that you can copy a link to a run. Press
-    space to play or pause, and r to reset the sliders.
-
-    **Arguments:**
-
-    - `scene`, `launch`: the run at the start; all numbers must be scalars; `contact` must be "stop" unless the arena is
-      a level plane, and the friction law must have a single mode.
-    - `path`: file to write the page to, or `None`.
-    - `sliders`: name of a parameter -> (lowest, highest) value. The end of a name is enough if only one parameter
-      matches, such as "theta", "spin", "mu", "friction.mu" or "offset". By default theta, spin, the coefficient of
-      friction and, for a top without a stem, the offset; under `NoSlip` theta and spin in both senses.
-    - `t1`: horizon [s].
-
-    **Returns:** a `Page`, with its `html`.
-
-    **Raises:** `ValueError` for arguments out of range, an unknown slider, or equations with an operation of JAX that cannot
-    be written in JavaScript; `ModuleNotFoundError` if the library for views is not installed; `OSError` if the file cannot be
-    written.
-
-    **Example:** a page with two sliders.
-
-    ```
-    >>> import tippe
-    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
-    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
-    >>> page = tippe.explore(scene, tippe.Launch(0.1, 155.0), sliders={"theta": (0.05, 0.5), "spin": (60.0, 200.0)})
-    >>> len(page.html) < 2.5e6
-    True
-
-    ```
-    """
-    if path is not None:
-        require_file(path, "path", ".html", ".htm")
-    live = live_run(scene, launch, sliders, t1)
-    stage = stage_at_start(scene, launch, t1) if flies(scene) else stage_of_runs(scene, launch, live.sliders, float(t1))
-    page = live_page(live, stage)
-    if path is not None:
-        page.save(path)
-    return page
 
 
 def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float]] | None, t1: float) -> LiveRun:
@@ -270,13 +212,10 @@ def hybrid_outcome(runs: HybridOutcome) -> tuple[Int[Array, ""], Float[Array, ""
     return status, jnp.where(inverted, runs.crossing_time[0], jnp.inf)
 
 
-def stage_of_runs(scene: Scene, launch: Launch, knobs: tuple[Slider, ...], t1: float) -> Stage:
-    """The run at the start, on a part of the arena that also contains the runs at the ends of the sliders."""
-    roots = {"scene": scene, "launch": launch}
-    shapes = [roots, *(with_numbers(roots, {path: end}) for path, end in ends_of(knobs))]
-    paths = [simulate(run["scene"], run["launch"], t1, tolerance=DRAWN) for run in shapes]
-    (first,), size = paths[0].stages(), float(scene.body.size)
-    points = np.concatenate([np.asarray(path.contact) for path in paths])
+def stage_of_runs(runs: list[Trajectory]) -> Stage:
+    """The first run, on a part of the arena that also contains the others."""
+    (first,), scene = runs[0].stages(), runs[0].scene
+    points, size = np.concatenate([np.asarray(run.contact) for run in runs]), float(scene.body.size)
     return first._replace(arena=arena(scene.surface, points, first.arena.normal, 4.0 * size, 2.5 * size))
 
 

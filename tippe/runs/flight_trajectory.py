@@ -5,19 +5,14 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from nonholonomic.hybrid import (
     BETWEEN,
     MOST_ROUNDS,
-    HybridPath,
-    HybridSamples,
     Segment,
-    hybrid_samples,
-    solve_hybrid_dense,
 )
-from nonholonomic.integration import Settings
-from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED, Status
+from nonholonomic.integration.status import UNRESOLVED, Status
 from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.dynamics import NO_COSINE
@@ -25,22 +20,14 @@ from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.top import Top
 from ..modes.bouncing import height
-from ..modes.free_body import Ball, FreeBody, as_free_body, balls, energy, energy_in, standing_on
+from ..modes.free_body import Ball, FreeBody, as_free_body, balls, energy, standing_on
 from ..modes.impact import TOUCHING, approach
 from ..modes.inversion_problem import InversionProblem
 from ..modes.leaning import BOTH
 from ..modes.sliding import MOST_BOUNCES, modes
 from ..modes.trajectory_problem import trajectory_problem
-from .energy import has_grown, if_balanced, why_unbalanced
+from .energy import why_unbalanced
 from .observables import AbstractTrajectory, of_each_run
-
-#: The words for users, by the code of the integration.
-STATUS = {
-    REACHED_END: Status.COMPLETED,
-    LEFT_DOMAIN: Status.JAMMED,
-    FAILED: Status.FAILED,
-    UNRESOLVED: Status.UNRESOLVED,
-}
 
 
 class HybridTrajectory(AbstractTrajectory):
@@ -93,6 +80,7 @@ class HybridTrajectory(AbstractTrajectory):
     end_time: Any = None
     stats: dict[str, Any] = eqx.field(default_factory=dict)
     dense: Any = None
+    start: Any = None
     hops: Float[np.ndarray, "hops 2"] | None = None
 
     unused = (*AbstractTrajectory.unused, "hops")
@@ -239,76 +227,3 @@ def _start(scene: Scene[Top], launch: Launch, cells: int) -> InversionProblem:
     place = state[8:10] - scene.body.offset * state[2:4]
     state = jnp.concatenate([state[:8], place, state[10:]])
     return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state, scales)
-
-
-def simulate_hybrid(scene: Scene[Top], launch: Launch, t1: float, times: Any, settings: Settings) -> HybridTrajectory:
-    """Run one launch of a hybrid scene until `t1`. **Arguments:** as for `simulate`, already checked."""
-    batched_modes, first, state = level_modes((scene, launch), settings.tolerance)
-    start = int(np.asarray(first)[0]), np.asarray(state)[:, 0]
-    path = solve_hybrid_dense(batched_modes, *start, t1, settings, counters=1)
-    flights = [(segment.begin, segment.end) for segment in path.segments if segment.number == BETWEEN]
-    hops = np.array(flights).reshape(-1, 2)
-    return flights_of(HybridTrajectory, scene, path, STATUS[path.status].word, hops, times, settings.tolerance)
-
-
-def sampled_hybrid(scene: Scene[Top], launch: Launch, times: Any, t1: Any, settings: Settings) -> HybridTrajectory:
-    """Run one launch of a hybrid scene inside a transformation. **Arguments:** as for `simulate`, already checked."""
-    samples = hybrid_samples(level_modes, (scene, launch), times, t1, settings, counters=1)
-    energy_grew = has_grown_between(
-        scene, level_modes((scene, launch), settings.tolerance), samples, energy_in, settings
-    )
-    return sampled_flights(HybridTrajectory, scene, times, samples, jnp.asarray(int(Status.JAMMED)), energy_grew)
-
-
-def has_grown_between(scene: Scene[Top], built: Any, samples: HybridSamples, energies: Any, settings: Settings) -> Any:
-    """Whether a sampled run has ended with more energy than it began with.
-
-    **Arguments:** `built`: the modes, the index of the first mode, and the state; `energies`: function that returns the
-    least and the greatest energy of a state in a mode.
-    """
-    _, first, state = built
-    end_energy, _ = energies(scene, samples.end_state[:, None], samples.end_mode[None].astype(int))
-    return has_grown(scene, energies(scene, state, first)[1], end_energy, settings.tolerance)[0]
-
-
-def sampled_flights(
-    kind: type[Any],
-    scene: Scene[Top],
-    times: Any,
-    samples: HybridSamples,
-    lost: Int[Array, ""],
-    energy_grew: Bool[Array, ""],
-) -> Any:
-    """A trajectory of the given class, a `HybridTrajectory`, from samples. `lost` is the status code for a run that left
-    its domain, and `energy_grew` whether the run has gained energy.
-    """
-    # After the end, no sphere touches.
-    number = jnp.where(jnp.isnan(samples.number), BETWEEN, samples.number).astype(int)
-    ended = {code: jnp.asarray(int(status)) for code, status in STATUS.items()} | {LEFT_DOMAIN: lost}
-    ended |= {code: jnp.where(energy_grew, int(Status.UNRESOLVED), ended[code]) for code in (REACHED_END, LEFT_DOMAIN)}
-    status = sum(jnp.where(samples.status == code, index, 0) for code, index in ended.items())
-    stats = {"accepted": samples.steps - samples.rejected, "rejected": samples.rejected, "hops": samples.counts[0]}
-    stats = {name: count.astype(int) for name, count in stats.items()}
-    return kind(times, scene, *kind.parts_of(samples.shown), kind.touching(number), status, samples.end_time, stats)
-
-
-def flights_of(
-    kind: type[Any],
-    scene: Scene[Top],
-    path: HybridPath,
-    status: str,
-    hops: Float[np.ndarray, "hops 2"],
-    times: Any,
-    tolerance: float | Float[Array, ""],
-) -> Any:
-    """A trajectory of the given class, a `HybridTrajectory`, along a path, at given times or at those of its steps.
-
-    A run whose energy does not balance the work of friction and impacts ends as "unresolved".
-    """
-    parts, contact = kind.parts_of(path.at(path.times)), kind.touching(path.numbers(path.times))
-    run = kind(path.times, scene, *parts, contact, status, path.end_time, dense=path, hops=hops)
-    in_contact = sum(kind.work_in(segment) for segment in path.segments)
-    # The remaining work is that of the impacts.
-    run = run.with_stats(path, impact_loss=float(in_contact - path.state[-1]))
-    run = if_balanced(run, tolerance)
-    return run if times is None else run.resampled(np.asarray(times)[np.asarray(times) <= run.end_time])

@@ -28,7 +28,7 @@ from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
 from ..model.top import Top
 from ..steady import group
-from .quantities import OF_ONE_RUN, QUANTITIES, table_of
+from .quantities import QUANTITIES, table_of
 from .turned_over import INVERTED
 from .view import as_stages, names_of
 
@@ -76,6 +76,8 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
     end_time: eqx.AbstractVar[Any]
     stats: eqx.AbstractVar[dict[str, Any]]
     dense: eqx.AbstractVar[Any]
+    # The state at the launch.
+    start: eqx.AbstractVar[Any]
 
     #: The fields that no observable needs.
     unused: ClassVar[tuple[str, ...]] = ("status", "end_time", "stats", "dense")
@@ -83,8 +85,8 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
     #: The fields with a value for each time, along the last axis.
     by_time: ClassVar[tuple[str, ...]] = ("t", "states", "cyclic", "spin_angle", "work")
 
-    readable: ClassVar[tuple[str, ...]] = (*QUANTITIES, *OF_ONE_RUN)
-    quantities: ClassVar[dict[str, Quantity]] = QUANTITIES | OF_ONE_RUN
+    readable: ClassVar[tuple[str, ...]] = tuple(QUANTITIES)
+    quantities: ClassVar[dict[str, Quantity]] = QUANTITIES
 
     @property
     def portrait_axes(self) -> tuple[str, str]:
@@ -201,6 +203,12 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         """Jellett's quantity of the top's own sphere [kg m^3/s]; constant on the plane while friction acts at a point
         of this sphere, but not while a stem touches."""
         return self.scene.jellett(self.states)
+
+    @of_each_run
+    def jellett_drift(self) -> Float[Array, " times"]:
+        """Change of Jellett's quantity since the launch, relative to its value there [1]."""
+        start = self.scene.jellett(self.start)
+        return (self.jellett - start) / jnp.abs(start)
 
     def at(self, times: Float[ArrayLike, " times"]) -> Self:
         """The same run at other times, from the dense output.

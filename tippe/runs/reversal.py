@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from nonholonomic.integration import Settings, explicit_tableau
 from nonholonomic.integration.settings import DEFAULT_MAX_STEPS
 from nonholonomic.progress import status_line
+from nonholonomic.runs import Options
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import require_kind, require_outside
 
@@ -18,7 +19,7 @@ from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
 from .checks import check_reversible, check_run
 from .inversion_time import first_or_last_time
-from .table import TableOptions, event_table
+from .table import event_table
 
 
 @status_line("simulating")
@@ -117,7 +118,7 @@ def reversal_table(
     require_kind(scene, "scene", Scene)
     require_rigid(scene)
     launch_values = {"theta": theta, "mu": mu, "spin": spin, "azimuth": azimuth}
-    options = TableOptions(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
+    options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
     return event_table(scene, launch_values, axes, t1, None, options)
 
 

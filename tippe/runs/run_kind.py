@@ -1,28 +1,24 @@
-"""The kinds of runs: one smooth motion, or several modes of contact and flight; and the variables of a table for
-each."""
+"""The kinds of runs: one smooth motion, or several modes of contact and flight."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.hybrid import AbstractBatchedMode
-from nonholonomic.sweeps import Variable
 
 from ..model.scene import Scene
 from ..modes import airborne, airborne_ends, airborne_stem, airborne_stick_slip, free_body, sliding, sticking
 
 
 class RunKind(NamedTuple):
-    """How to run a kind of scene: its status words, its counters besides steps, and its modes.
+    """How to run a kind of scene: its counters besides steps, and its modes.
 
     `modes` is a function of (scene, problem, tolerance, last) that returns the modes and the index of each cell's first
     mode; `None` for smooth runs. `energy_in` is a function of (scene, state, mode) that returns the least and the
     greatest energy [J] that the state may have. `flight_state` is true if states in flight have another layout.
     """
 
-    words: tuple[str, ...]
     counts: tuple[str, ...]
     modes: Callable[..., tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]] | None
     energy_in: Callable[..., tuple[Float[Array, " cells"], Float[Array, " cells"]]]
@@ -33,20 +29,9 @@ class RunKind(NamedTuple):
         """Whether a run is one smooth motion."""
         return self.modes is None
 
-    @property
-    def variables(self) -> dict[str, Variable]:
-        """The table's variables in addition to the times."""
-        counts = ("steps", "rejected", *self.counts)
-        return {
-            "status": Variable("1", np.int8, self.words, long_name="how the run ended"),
-            "end_time": Variable("s", np.float64, long_name="end of the run"),
-            "end_theta": Variable("rad", np.float64, long_name="θ at the end of the run"),
-            **{name: Variable("1", np.int64, long_name=COUNTED[name]) for name in counts},
-        }
-
 
 #: Descriptions of the counters of a run.
-COUNTED = {"steps": "steps", "rejected": "rejected steps", "hops": "flights", "sticks": "changes from slip to rolling"}
+COUNTED = {"hops": "flights", "sticks": "changes from slip to rolling"}
 
 
 def energy_of_state(
@@ -57,24 +42,12 @@ def energy_of_state(
     return total, total
 
 
-#: The words of tables, in the order of the integers in their files, which is older than `Status`.
-WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit", "unresolved")
-
-SMOOTH = RunKind(WORDS, (), None, energy_of_state)
-REVERSAL = RunKind(("reversed", "not_reversed", *WORDS[2:]), (), None, energy_of_state)
-STICK_SLIP = RunKind(WORDS, ("sticks",), sticking.modes, sticking.energy_in)
-STICK_SLIP_REVERSAL = STICK_SLIP._replace(words=REVERSAL.words)
-HYBRID = RunKind(WORDS, ("hops",), sliding.modes, free_body.energy_in)
-AIRBORNE = RunKind(WORDS, ("hops",), airborne.modes, airborne_ends.energy_in, flight_state=True)
-ON_STEM_TOO = RunKind(WORDS, ("hops",), airborne_stem.modes, airborne_ends.energy_in, flight_state=True)
-STICK_SLIP_FLY = RunKind(
-    WORDS, ("hops", "sticks"), airborne_stick_slip.modes, airborne_ends.energy_in, flight_state=True
-)
-
-
-def reversal_kind_of(scene: Scene[Any]) -> RunKind:
-    """The run kind of a scene until the spin about the normal reverses."""
-    return STICK_SLIP_REVERSAL if scene.friction.set_valued else REVERSAL
+SMOOTH = RunKind((), None, energy_of_state)
+STICK_SLIP = RunKind(("sticks",), sticking.modes, sticking.energy_in)
+HYBRID = RunKind(("hops",), sliding.modes, free_body.energy_in)
+AIRBORNE = RunKind(("hops",), airborne.modes, airborne_ends.energy_in, flight_state=True)
+ON_STEM_TOO = RunKind(("hops",), airborne_stem.modes, airborne_ends.energy_in, flight_state=True)
+STICK_SLIP_FLY = RunKind(("hops", "sticks"), airborne_stick_slip.modes, airborne_ends.energy_in, flight_state=True)
 
 
 def run_kind_of(scene: Scene[Any]) -> RunKind:

@@ -2,20 +2,11 @@
 
 from typing import Any
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
-from nonholonomic.derivatives import tangent_scale, tangents_of
-from nonholonomic.hybrid import HybridOutcome
-from nonholonomic.integration import Outcome, Settings
-from nonholonomic.parameters import full_name, numbers, with_numbers
+from nonholonomic.parameters import full_name, numbers
 from nonholonomic.sweeps import Variable
 from nonholonomic.validation import shown
-
-from ..modes.inversion_problem import InversionProblem, StemContact
-from .inversion import Inversions
 
 
 def sensitivity_names(roots: dict[str, Any], names: Any) -> list[str]:
@@ -56,61 +47,3 @@ def sensitivity_variables(names: list[str], units: dict[str, str], event: str = 
         slope: Variable(unit(name), np.float64, long_name=f"{event} time by {name}")
         for slope, name in zip(sensitivity_columns(names), names, strict=True)
     }
-
-
-def sensitivities_of_cells(
-    roots: dict[str, Any],
-    columns: dict[str, Any],
-    names: list[str],
-    angle: float | StemContact | None,
-    t1: float,
-    settings: Settings,
-    *,
-    count: int,
-    size: int,
-    last: bool,
-) -> tuple[Outcome | HybridOutcome, dict[str, Any], Any]:
-    """The outcome of every cell, and the derivative of its crossing time with respect to every parameter, 0 if there is
-    no crossing.
-
-    **Arguments:** as for `inversion_table`, and
-
-    - `columns`: full name of a parameter -> its value in every cell; only `count` of the `size` cells are run.
-    - `names`: full names of the parameters with respect to which to differentiate.
-
-    **Returns:** the outcome; name of the variable -> derivatives (size,); and the cells whose derivatives are NaN
-    because an earlier event was grazing.
-    """
-    event = angle if angle is None or isinstance(angle, StemContact) else jnp.asarray(angle, float)
-    inversions, tangents, scales = _with_tangents(roots, columns, names, event, settings.tolerance, size, last)
-    outcome, slopes, grazing = inversions.solve_with_tangents(tangents, t1, count, settings)
-    by_number = [np.asarray(slope) / np.asarray(scale) for slope, scale in zip(slopes, scales, strict=True)]
-    return outcome, dict(zip(sensitivity_columns(names), by_number, strict=True)), grazing
-
-
-@eqx.filter_jit
-def _with_tangents(
-    roots: dict[str, Any],
-    columns: dict[str, Any],
-    names: list[str],
-    angle: Float[Array, ""] | StemContact | None,
-    tolerance: Float[Array, ""],
-    size: int,
-    last: bool,
-) -> tuple[Inversions, tuple[Any, ...], list[Float[Array, "..."]]]:
-    """The launches of all cells, the tangents along the named parameters, and the scale of each tangent."""
-
-    def build(*moving: Any) -> Inversions:
-        cells = with_numbers(roots, columns | dict(zip(names, moving, strict=True)))
-        problem = InversionProblem.of(cells["scene"], cells["launch"], angle, size)
-        return Inversions.of(cells["scene"], problem, tolerance, last)
-
-    cells = with_numbers(roots, columns)
-    values = {name: value for root, tree in cells.items() for name, value in numbers(root, tree).items()}
-    point = tuple(jnp.asarray(values[name], float) for name in names)
-    scales = [tangent_scale(value) for value in point]
-    tangents = [
-        tuple(scale if row == k else jnp.zeros_like(scale) for k, scale in enumerate(scales))
-        for row in range(len(names))
-    ]
-    return build(*point), tangents_of(build, point, tangents), scales

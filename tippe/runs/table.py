@@ -1,26 +1,34 @@
 """Tables of inversion times over the grid of launches and friction."""
 
-import hashlib
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import numpy as np
 
-from nonholonomic.integration import Settings, explicit_tableau
+from nonholonomic.integration import explicit_tableau
 from nonholonomic.integration.settings import DEFAULT_MAX_STEPS
-from nonholonomic.sweeps import Axis, Table, Variable, sweep
-from nonholonomic.validation import require_flag, require_outside, require_whole, shown, warn
+from nonholonomic.runs import Options, TableJob, compute_table
+from nonholonomic.sweeps import Table
+from nonholonomic.validation import require_flag, require_outside, shown, warn
 
 from ..model.scene import Scene
 from ..modes.inversion_problem import StemContact
-from .cells import InversionJob, InversionRuns, ScatteredJob, too_many_steps
-from .checks import check_event, check_last_on_stem, check_reversible, warn_if_it_cannot_invert
-from .launches import described, launches, rows
-from .run_kind import RunKind, check_differentiable, reversal_kind_of, run_kind_of, why_unresolved
-from .sensitivities import sensitivity_names, sensitivity_variables
+from .checks import check_event, check_reversible, warn_if_it_cannot_invert
+from .launches import described, launches
+from .model import INVERSIONS, REVERSALS, TopModel
+from .run_kind import why_unresolved
+from .sensitivities import sensitivity_columns, sensitivity_names, sensitivity_variables
 from .turned_over import event_of
+
+
+def too_many_steps(t1: float, max_steps: int, end: float) -> str:
+    """Message for a run that needs more than the allowed steps."""
+    return (
+        f"t1 = {t1:g} s is too long: the run needs more than {max_steps:_} steps, which reached only {end:.4g} s; "
+        "take a shorter t1 or a larger tolerance"
+    ).replace("_", " ")
 
 
 def inversion_table(
@@ -137,26 +145,8 @@ def inversion_table(
     if method == "diffrax" and crossing != "first":
         raise ValueError(f"crossing = {shown(crossing)} must be 'first' for method = 'diffrax'")
     launch_values = {"theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
-    options = TableOptions(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
-    event = event_of(scene, angle)
-    event = event if isinstance(event, StemContact) else float(event)
-    if sensitivities:
-        check_last_on_stem(event, crossing == "last")
-    return event_table(scene, launch_values, axes, t1, event, options, crossing, method)
-
-
-class TableOptions(NamedTuple):
-    """The options of every table of times; see `inversion_table`."""
-
-    tolerance: float
-    solver: diffrax.AbstractERK | None
-    max_steps: int
-    scattered: bool
-    errors: bool
-    sensitivities: Sequence[str]
-    path: Any
-    progress: bool
-    executor: Executor | None
+    options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
+    return event_table(scene, launch_values, axes, t1, event_of(scene, angle), options, crossing, method)
 
 
 def event_table(
@@ -164,8 +154,8 @@ def event_table(
     launch_values: dict[str, Any],
     axes: dict[str, Any] | None,
     t1: float,
-    angle: float | StemContact | None,
-    options: TableOptions,
+    angle: Any,
+    options: Options,
     crossing: str = "first",
     method: str = "ensemble",
 ) -> Table:
@@ -175,18 +165,17 @@ def event_table(
     **Arguments:** as for `inversion_table`; `launch_values`: name of a launch's parameter, or "mu" -> a number or a
     list.
     """
-    tolerance, solver, max_steps, scattered, errors, sensitivities, *_ = options
-    require_flag(errors, "errors")
-    require_flag(scattered, "scattered")
-    roots, grid, units = launches(scene, launch_values, axes, t1, tolerance, scattered=scattered)
-    require_whole(max_steps, "max_steps", 1)
-    settings = Settings(tolerance, solver, max_steps=int(max_steps))
-    explicit_tableau(settings.for_single_runs if method == "diffrax" else settings.for_lanes)
-    paths = sensitivity_names(roots, sensitivities)
-    run_kind = run_kind_of(scene) if angle is not None else reversal_kind_of(scene)
-    if paths:
-        check_differentiable(scene)
-    if not run_kind.smooth and method == "diffrax":
+    require_flag(options.errors, "errors")
+    require_flag(options.scattered, "scattered")
+    roots, grid, units = launches(scene, launch_values, axes, t1, options.tolerance, scattered=options.scattered)
+    by_diffrax, settings = method == "diffrax", options.settings
+    integrator = settings.for_single_runs if by_diffrax else settings.for_lanes
+    explicit_tableau(integrator)
+    names = sensitivity_names(roots, options.sensitivities)
+    model = TopModel.timed(**roots, angle=angle)
+    if names:
+        model.require_differentiable(False, crossing == "last")
+    if not model.smooth and by_diffrax:
         raise ValueError(
             "method = 'diffrax' does not support runs of several modes: contact = 'hybrid' or SetValuedCoulomb"
         )
@@ -195,44 +184,31 @@ def event_table(
         check_reversible(roots["launch"], axis_values)
     else:
         theta = axis_values.get("launch.theta", roots["launch"].theta)
-        limit = None if isinstance(angle, StemContact) else angle
+        limit = None if isinstance(angle, StemContact) else float(angle)
         warn_if_it_cannot_invert(scene, roots["launch"], theta, limit)
-    runs = InversionRuns(run_kind, float(t1), angle, crossing, settings, method, paths, scene.has_stem)
-    job = InversionJob(runs, roots, errors)
-    request = described(roots, grid) | request_of(runs, options)
-    variables = runs.variables | (runs.error_variables if errors else {})
-    variables |= sensitivity_variables(paths, units, "reversal" if angle is None else "inversion")
-    if scattered:
-        columns = rows(grid)
-        request |= {"cells": digest(columns)}
-        variables = {axis.name: Variable(axis.unit, np.float64, long_name=axis.long_name) for axis in grid} | variables
-        job = ScatteredJob(job, columns, {axis.number: axis.name for axis in grid})
-        grid = [Axis("cell", "cell", "1", np.arange(len(grid[0].values)), "cell")]
-    running = {"path": options.path, "progress": options.progress, "executor": options.executor}
-    table = sweep(job, grid, variables, request, **running)
-    warn_of_long_runs(table, float(t1), max_steps)
-    if run_kind.smooth:
-        warn_of_unresolved_runs(table, run_kind)
-    return table
-
-
-def request_of(runs: InversionRuns, options: TableOptions) -> dict[str, Any]:
-    """The request for a table as plain data, without the scene and the launch."""
-    settings = runs.settings
-    integrator = settings.for_single_runs if runs.method == "diffrax" else settings.for_lanes
-    event = {"angle": runs.angle}
-    if runs.angle is None or isinstance(runs.angle, StemContact):
-        event = {"event": "reversal" if runs.angle is None else "contact of the stem"}
-    request = {"t1": runs.t1, **event, "tolerance": float(options.tolerance), "crossing": runs.crossing}
-    request |= {"solver": type(integrator).__name__, "method": runs.method}
+    form = REVERSALS if angle is None else INVERSIONS
+    slopes = dict(zip(names, sensitivity_columns(names), strict=True))
+    job = TableJob(model, form, float(t1), crossing, settings, slopes, options.errors, by_diffrax=by_diffrax)
+    request = described(roots, grid) | {"t1": float(t1)}
+    if angle is None or isinstance(angle, StemContact):
+        request |= {"event": "reversal" if angle is None else "contact of the stem"}
+    else:
+        request |= {"angle": float(angle)}
+    request |= {"tolerance": float(options.tolerance), "crossing": crossing}
+    request |= {"solver": type(integrator).__name__, "method": method}
     # Requests of earlier versions, with which a table may resume, lack these unless they were set.
     if options.max_steps != DEFAULT_MAX_STEPS:
         request |= {"max_steps": int(options.max_steps)}
     if options.errors:
         request |= {"errors": True}
-    if runs.slopes_by:
-        request |= {"sensitivities": runs.slopes_by}
-    return request
+    if names:
+        request |= {"sensitivities": names}
+    variables = job.variables | sensitivity_variables(names, units, form.event)
+    table = compute_table(job, grid, variables, request, options)
+    warn_of_long_runs(table, float(t1), options.max_steps)
+    if model.smooth:
+        warn_of_unresolved_runs(table, model)
+    return table
 
 
 def warn_of_long_runs(table: Table, t1: float, max_steps: int) -> None:
@@ -245,19 +221,11 @@ def warn_of_long_runs(table: Table, t1: float, max_steps: int) -> None:
         warn(f"{is_long.sum()} of {is_long.size} runs have failed: {too_many_steps(t1, max_steps, end)}")
 
 
-def warn_of_unresolved_runs(table: Table, run_kind: RunKind) -> None:
+def warn_of_unresolved_runs(table: Table, model: TopModel) -> None:
     """Warn of unresolved runs, with the reason. Tables whose variables stay in the file are not checked."""
     if not isinstance(table.variables, dict):
         return
     unresolved = np.asarray(table.variables["status"] == "unresolved")
     if unresolved.any():
         number = f"{unresolved.sum()} of {unresolved.size} runs are unresolved"
-        warn(f"{number}: {why_unresolved(run_kind)}")
-
-
-def digest(columns: dict[str, Any]) -> str:
-    """A checksum of the columns and their names."""
-    digest = hashlib.sha256()
-    for name, values in columns.items():
-        digest.update(name.encode() + np.ascontiguousarray(values, float).tobytes())
-    return digest.hexdigest()[:16]
+        warn(f"{number}: {why_unresolved(model.kind)}")

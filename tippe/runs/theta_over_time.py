@@ -12,13 +12,12 @@ from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import Settings
 from nonholonomic.integration.status import REACHED_END
 from nonholonomic.parameters import numbers, with_numbers
+from nonholonomic.runs import Ensemble, at_the_end
 from nonholonomic.sweeps import chunk_for
 
 from ..model.launch import Launch
 from ..model.scene import Scene
-from ..modes.inversion_problem import InversionProblem
-from .cells import at_the_end
-from .inversion import Inversions
+from .model import TopModel
 from .turned_over import event_of
 
 
@@ -37,20 +36,20 @@ def theta_over_time(
     values = {path: value for root, tree in roots.items() for path, value in numbers(root, tree).items()}
     size, settings = chunk_for(1), Settings(tolerance)
     cells = with_numbers(roots, {name: np.full(size, float(values[name])) for name in axes})
-    problem = InversionProblem.of(cells["scene"], cells["launch"], event_of(scene, None), size)
+    model = TopModel.timed(**cells, angle=event_of(scene, None))
+    ensemble = Ensemble.of(model, size, settings.tolerance, False)
     # No inclination exceeds pi, so no run ends before its time, in the programs of the table.
-    no_stem = None if problem.stem_counts is None else jnp.zeros(())
-    problem = dataclasses.replace(problem, cos_angle=jnp.asarray(-1.0), stem_counts=no_stem)
-    runs = Inversions.of(cells["scene"], problem, settings.tolerance, False)
+    never = {"cos_angle": jnp.asarray(-1.0)} | ({"stem_counts": jnp.zeros(())} if scene.has_stem else {})
+    modes = tuple(dataclasses.replace(mode, **never) for mode in ensemble.modes or ())
+    ensemble = dataclasses.replace(ensemble, modes=modes)
     parts = -(-len(times) // size)
     ends = np.pad(times, (0, size * parts - len(times)), mode="edge").reshape(size, parts)
     rows, goes = [], np.ones(size, bool)
     for spans in np.diff(ends, axis=1, prepend=0.0).T:
-        outcome: Any = runs.solve(spans, size, settings)
+        outcome: Any = ensemble.solve(spans, size, settings)
         assert isinstance(outcome, HybridOutcome)
-        theta = np.asarray(at_the_end(cells["scene"], problem, outcome, False, settings.tolerance)[2])
+        theta = np.asarray(at_the_end(model, ensemble, outcome, settings.tolerance)[1]["end_theta"])
         rows.append(theta if not rows else np.where(goes, theta, rows[-1]))
         goes &= outcome.status == REACHED_END
-        onward = dataclasses.replace(problem, states=outcome.state)
-        runs = dataclasses.replace(runs, problem=onward, first=outcome.mode)
+        ensemble = dataclasses.replace(ensemble, states=outcome.state, first=outcome.mode)
     return np.stack(rows, axis=1).ravel()[: len(times)]

@@ -5,14 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from close import assert_close
-from models import CASES
+from models import CASES, NAMES
 
 import nonholonomic
 
 QUIET = dict(progress=False, tolerance=1e-8)
 
 
-@pytest.fixture(params=CASES, scope="module")
+@pytest.fixture(params=NAMES, scope="module")
 def case(request):
     return CASES[request.param]
 

@@ -120,7 +120,7 @@ def test_a_small_grid_is_checked_whole_and_a_large_one_at_its_edges_and_corners(
 
 def test_a_billion_cells_are_refused_at_once(monkeypatch):
     """Values that are illegal only in combination, in one corner of the grid."""
-    monkeypatch.setattr("tippe.runs.table.sweep", lambda *_, **__: pytest.fail("it was run"))
+    monkeypatch.setattr("tippe.runs.table.compute_table", lambda *_, **__: pytest.fail("it was run"))
     scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3))
     axes = {"scene.body.radius": np.linspace(0.02, 0.01, 100), "scene.body.offset": np.linspace(0.001, 0.011, 100)}
     start_time = time.process_time()

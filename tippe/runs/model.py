@@ -1,0 +1,355 @@
+"""The top as a model for the functions of `nonholonomic.runs`."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from nonholonomic.geometry import Plane
+from nonholonomic.hybrid import BETWEEN, HybridOutcome
+from nonholonomic.integration import AbstractProblem, CoreProblem, Outcome
+from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED, Status
+from nonholonomic.parameters import description, full_name, numbers, with_numbers
+from nonholonomic.runs import AbstractModel, EventFunction, Names, Start, TableForm, model_of, with_event
+from nonholonomic.sweeps import Quantity, Variable
+from nonholonomic.validation import all_bounds, legal, require_kind, require_scalars
+from nonholonomic.views import Stage
+from nonholonomic.views.explore import LiveRun, ends_of
+
+from ..model.contact_dynamics import LOSSES
+from ..model.directions import generic_direction
+from ..model.dynamics import NO_COSINE
+from ..model.friction import NoSlip
+from ..model.launch import Launch
+from ..model.scene import Scene
+from ..modes.airborne_ends import loss as flight_loss
+from ..modes.airborne_ends import on_the_ground
+from ..modes.inversion_problem import InversionProblem, StemContact
+from ..modes.sticking import contact_modes
+from ..modes.trajectory_problem import BEHIND_PATH, TrajectoryProblem, trajectory_problem
+from .airborne_trajectory import ArenaTrajectory, StickSlipArenaTrajectory, arena_modes
+from .checks import check_last_on_stem, event_bounds
+from .energy import has_grown
+from .explore import DRAWN, live_run, stage_at_start, stage_of_runs
+from .flight_trajectory import HybridTrajectory, level_modes
+from .launches import LONG_NAMES, NUMBERS_OF_A_LAUNCH, SEVERAL, UNITS, variable_numbers
+from .quantities import COMPONENTS, DIRECTION, ON_CURVED, PASSIVE, PATH, quantities_of
+from .run_kind import COUNTED, HYBRID, RunKind, check_differentiable, run_kind_of
+from .simulate import simulate_launch
+from .trajectory import Trajectory, parts_of
+from .turned_over import INVERTED, event_of
+
+#: The words of tables, in the order of the integers in their files, which is older than `Status`.
+WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit", "unresolved")
+
+#: The names in tables of inversion times and of reversal times.
+INVERSIONS = TableForm(WORDS, {"event": "inverted", "completed": "not_inverted"}, "inversion", nan_if_failed=False)
+REVERSALS = TableForm(
+    ("reversed", "not_reversed", *WORDS[2:]),
+    {"event": "reversed", "completed": "not_reversed"},
+    "reversal",
+    nan_if_failed=False,
+)
+
+#: The statuses of runs, by the code of the integration; a run that left its domain has one of `LOSSES`.
+STATUSES = {
+    REACHED_END: Status.COMPLETED,
+    CROSSED: Status.EVENT,
+    LEFT_DOMAIN: Status.JAMMED,
+    FAILED: Status.FAILED,
+    UNRESOLVED: Status.UNRESOLVED,
+}
+
+#: A tilt [rad] that no number shows: a plane with a tilt has the equations for any arena.
+NO_TILT = 1e-300
+
+
+class TopModel(AbstractModel):
+    """A launch in a scene, or the launches of many cells, and the event.
+
+    Without another event, runs end when theta reaches `angle` [rad]; when the stem first carries the top, if `angle` is
+    a `StemContact`; or, with `reverses`, when the spin about the arena's normal reverses.
+    """
+
+    scene: Scene
+    launch: Launch
+    angle: Any = None
+    event: EventFunction | None = None
+    reverses: bool = eqx.field(static=True, default=False)
+
+    components = COMPONENTS
+    comparable = ("direction",)
+
+    @classmethod
+    def of(cls, scene: Scene, launch: Launch, event: Any = None) -> AbstractModel:
+        """The model of a launch, with a user's event if there is one."""
+        if event is None:
+            reverses = isinstance(scene.friction, NoSlip)
+            return cls.timed(scene, launch, None if reverses else event_of(scene, None))
+        return with_event(cls(scene=_integrated(scene), launch=launch), event)
+
+    @classmethod
+    def timed(cls, scene: Scene, launch: Launch, angle: Any) -> "TopModel":
+        """The model of a launch until theta reaches an angle [rad], until the stem carries the top (`StemContact`), or,
+        without an angle, until the spin reverses."""
+        event = angle if angle is None or isinstance(angle, StemContact) else jnp.asarray(angle, float)
+        return cls(scene=scene, launch=launch, angle=event, reverses=angle is None)
+
+    def __reduce__(self) -> Any:
+        # A traced function cannot be pickled, so each process traces it.
+        if self.event is not None:
+            return TopModel.of, (self.scene, self.launch, self.event.function)
+        return (
+            (TopModel.timed, (*self.roots.values(), self.angle))
+            if self.has_event
+            else (_sampled, (*self.roots.values(),))
+        )
+
+    def without_event(self) -> "TopModel":
+        return TopModel(scene=_integrated(self.scene), launch=self.launch)
+
+    def direction(self, cells: int) -> Float[Array, "components cells"]:
+        return generic_direction(self.scene, self.launch, cells)
+
+    @property
+    def roots(self) -> dict[str, Any]:
+        """The trees whose numbers are parameters."""
+        return {"scene": self.scene, "launch": self.launch}
+
+    def full_name(self, argument: str, name: str) -> str:
+        own = [] if self.event is None else self.event.parameters.known
+        if argument == "axes":
+            return full_name(argument, name, [*self.known, *own])
+        values = {name: value for root, tree in self.roots.items() for name, value in numbers(root, tree).items()}
+        return full_name(argument, name, [*(name for name, value in values.items() if value is not None), *own])
+
+    @property
+    def known(self) -> list[str]:
+        """The full names of the parameters that can be varied: single numbers, including omitted ones, which are 0."""
+        present = numbers("launch", self.launch)
+        return [*variable_numbers(self.scene), *(name for name in NUMBERS_OF_A_LAUNCH if name in present)]
+
+    def value(self, name: str) -> Any:
+        if self.event is not None and name.startswith("event."):
+            return self.event.parameters.value(name)
+        root = name.partition(".")[0]
+        value = numbers(root, self.roots[root])[name]
+        return jnp.zeros(()) if value is None else value
+
+    def replaced(self, values: dict[str, Any]) -> "TopModel":
+        own = {name: value for name, value in values.items() if not name.startswith("event.")}
+        event = self.event if self.event is None else self.event.replaced(values)
+        return dataclasses.replace(self, **with_numbers(self.roots, own), event=event)
+
+    def label(self, names: list[str]) -> dict[str, tuple[str, str, str]]:
+        coordinates = list(self.scene.surface.coordinates)
+        if "launch.place[2]" in numbers("launch", self.launch) and len(coordinates) == 2:
+            coordinates = [("x", "m"), ("y", "m"), ("z", "m")]
+        of_vectors = {
+            f"launch.{name}[{k}]": label
+            for name, labels in {"place": coordinates, **SEVERAL}.items()
+            for k, label in enumerate(labels)
+        }
+        units = UNITS | self.scene.body.units | self.scene.friction.units | dict(of_vectors.values())
+        shorts = {name: of_vectors.get(name, (name.rsplit(".", 1)[-1],))[0] for name in names}
+        taken = (*self.quantities, "time", "status", "end_time", *self.ends, *self.counters, "steps", "rejected")
+        labels = {}
+        for name, short in shorts.items():
+            is_unique = list(shorts.values()).count(short) == 1 and short not in taken
+            labels[name] = (short if is_unique else name, units.get(short, "1"), LONG_NAMES.get(short, short))
+        return labels
+
+    def description(self) -> dict[str, Any]:
+        request = {path: value for name, root in self.roots.items() for path, value in description(name, root).items()}
+        return request if self.event is None else request | {"event": self.event.name}
+
+    def check(self) -> None:
+        self.scene.check_start(self.launch)
+
+    def legal(self) -> Bool[Array, "..."]:
+        scene, launch = self.scene, self.launch
+        bounds = (*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch), *event_bounds(self.angle))
+        is_legal = legal(bounds)
+        return is_legal & (scene.dynamics.normal_spin(scene.state(launch)) != 0.0) if self.reverses else is_legal
+
+    @property
+    def kind(self) -> RunKind:
+        """The kind of runs."""
+        return run_kind_of(self.scene)
+
+    @property
+    def smooth(self) -> bool:
+        return self.kind.smooth
+
+    @property
+    def has_event(self) -> bool:
+        return self.event is not None or self.angle is not None or self.reverses
+
+    @property
+    def counters(self) -> dict[str, str]:
+        return {name: COUNTED[name] for name in self.kind.counts}
+
+    def require_differentiable(self, nested: bool, continues: bool = False) -> None:
+        check_differentiable(self.scene)
+        check_last_on_stem(self.angle, continues)
+        if nested and not self.smooth:
+            raise ValueError(
+                "second derivatives are not available through changes of mode: contact = 'hybrid', SetValuedCoulomb"
+            )
+
+    @property
+    def further_times(self) -> dict[str, tuple[str, AbstractModel]]:
+        if not self.scene.has_stem or self.event is not None:
+            return {}
+        on_stem = TopModel.timed(self.scene, self.launch, StemContact())
+        return {"stem_time": ("time at which the stem first carries the top", on_stem)}
+
+    def _times_own_event(self, names: Names) -> bool:
+        """Whether runs end on the event of the model itself; runs that are sampled do not."""
+        return self.event is None and self.has_event and names is not None and not names
+
+    def problem(self, cells: int | None, names: Names) -> AbstractProblem:
+        scene, launch = self.scene, self.launch
+        if self._times_own_event(names):
+            assert cells is not None
+            return InversionProblem.of(scene, launch, self.angle, cells)
+        if names == self.comparable:
+            assert cells is not None
+            # A turning frame turns by a different angle for each launch, and the difference would count as divergence.
+            problem = InversionProblem.of(scene, launch, INVERTED, cells)
+            return dataclasses.replace(problem, dynamics=scene.dynamics, cos_angle=jnp.asarray(NO_COSINE))
+        run = trajectory_problem((scene, launch), cells)
+        if names is None or any(self.quantities[name].needs >= PASSIVE for name in names):
+            return run
+        return with_parts(run, scene, names)
+
+    def modes(self, cells: int, tolerance: Any, names: Names, continues: bool) -> Start:
+        scene, launch = self.scene, self.launch
+        if self._times_own_event(names) or names == self.comparable:
+            assert self.kind.modes is not None
+            angle = INVERTED if names else self.angle
+            problem = InversionProblem.of(scene, launch, angle, cells)
+            if names:
+                problem = dataclasses.replace(problem, cos_angle=jnp.asarray(NO_COSINE))
+            return (*self.kind.modes(scene, problem, tolerance, continues), problem.states)
+        if scene.contact == "stop":
+            return contact_modes(trajectory_problem((scene, launch), cells), tolerance)
+        return (level_modes if scene.flies_in_closed_form else arena_modes)((scene, launch), tolerance, cells)
+
+    def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Any:
+        return simulate_launch(self, t1, times, tolerance, solver, adjoint)
+
+    def page(self, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
+        live = live_run(self.scene, self.launch, sliders, t1)
+        if self.scene.contact == "hybrid":
+            return live, stage_at_start(self.scene, self.launch, t1)
+        models = [self, *(self.replaced({path: end}) for path, end in ends_of(live.sliders))]
+        return live, stage_of_runs([model.simulate(t1, None, DRAWN, None, None) for model in models])
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        return quantities_of(self.scene)
+
+    def read(
+        self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: Any
+    ) -> dict[str, Array]:
+        run = dataclasses.replace(self._moment(rows, mode), start=self.scene.state(self.launch))
+        return {name: getattr(run, name) for name in names}
+
+    def _moment(self, rows: Float[Array, "rows *cells"], mode: Any) -> Any:
+        """The states as a trajectory without times."""
+        scene, zeros = self.scene, jnp.zeros(rows.shape[1:])
+        if scene.contact == "hybrid":
+            kind: Any = self.flights
+            number = jnp.broadcast_to(BETWEEN if mode is None else mode, zeros.shape)
+            return kind(zeros, scene, *kind.parts_of(rows), kind.touching(number))
+        core = len(scene.state(self.launch))
+        missing = core + len(scene.start(self.launch)[1]) + BEHIND_PATH - len(rows)
+        # Rows without a path, or without rotation and work, end earlier.
+        rows = jnp.concatenate([rows, jnp.zeros((missing, *zeros.shape))]) if missing > 0 else rows
+        return Trajectory(zeros, scene, *parts_of(core, rows))
+
+    @property
+    def flights(self) -> type[HybridTrajectory]:
+        """The class of trajectories of a hybrid scene."""
+        if self.scene.flies_in_closed_form:
+            return HybridTrajectory
+        return StickSlipArenaTrajectory if self.scene.friction.set_valued else ArenaTrajectory
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        return ("event", "completed", *WORDS[2:])
+
+    def ended(self, outcome: Outcome | HybridOutcome, tolerance: Any) -> Int[Array, " cells"]:
+        scene, kind = self.scene, self.kind
+        cells = outcome.status.shape[0]
+        start = InversionProblem.of(scene, self.launch, None if self.reverses else INVERTED, cells)
+        first, mode = None, None
+        if isinstance(outcome, HybridOutcome) and kind.modes is not None:
+            first, mode = kind.modes(scene, start, tolerance, False)[1], outcome.mode
+        state = jnp.asarray(outcome.state)[: len(start.states)]
+        energy_before = kind.energy_in(scene, start.states, first)[1]
+        energy_after = kind.energy_in(scene, state, mode)[0]
+        grown = has_grown(scene, energy_before, energy_after, tolerance) & (outcome.status != FAILED)
+        if kind is not HYBRID:
+            # A run with flights over a level plane continues when contact is lost, and its ball fits everywhere.
+            codes = jnp.array([int(status) for status in LOSSES])
+            lost = codes[flight_loss(scene, state) if kind.flight_state else scene.dynamics.loss(state)]
+        else:
+            lost = int(Status.JAMMED)
+        status = jnp.zeros((cells,), int)
+        for code, ended in STATUSES.items():
+            status = jnp.where(outcome.status == code, lost if code == LEFT_DOMAIN else int(ended), status)
+        return jnp.where(grown, int(Status.UNRESOLVED), status)
+
+    @property
+    def ends(self) -> dict[str, Variable]:
+        return {"end_theta": Variable("rad", np.float64, long_name="θ at the end of the run")}
+
+    def at_end(self, outcome: Any, start: Float[Array, "components cells"]) -> dict[str, Array]:
+        state = jnp.asarray(outcome.state)[: len(start)]
+        if self.kind.flight_state:
+            state = on_the_ground(self.scene, state, outcome.mode)
+        return {"end_theta": self.scene.theta(state)}
+
+
+def _sampled(scene: Scene, launch: Launch) -> TopModel:
+    """The model of a launch without an event."""
+    return TopModel(scene=scene, launch=launch)
+
+
+def _integrated(scene: Scene) -> Scene:
+    """A scene whose flights, if any, are integrated. A flight in closed form can end only at an angle, not at another event
+    or time interval."""
+    if scene.contact == "hybrid" and scene.flies_in_closed_form:
+        return eqx.tree_at(lambda scene: scene.surface, scene, Plane(NO_TILT))
+    return scene
+
+
+def with_parts(run: TrajectoryProblem, scene: Scene, names: tuple[str, ...]) -> CoreProblem:
+    """A run with the parts that the named quantities need.
+
+    Only some quantities need the path, and few need rotation or work. On the plane, a run without path, rotation and
+    work takes half the time. If no quantity has a direction, the frame turns on the level plane, and samples are thirty
+    to a hundred times as accurate.
+    """
+    needs = frozenset().union(*(quantities_of(scene)[name].needs for name in names))
+    if scene.level and DIRECTION.isdisjoint(needs):
+        turning = eqx.tree_at(lambda run: run.problem.dynamics, run, scene.turning_dynamics)
+        return CoreProblem(turning, run.leading)
+    path = PATH if isinstance(scene.surface, Plane) else PATH | ON_CURVED
+    return CoreProblem(run, run.leading if path.isdisjoint(needs) else len(run.start()[0]) - BEHIND_PATH)
+
+
+@model_of.register(Scene)
+def _(system: Scene, start: Any, event: Any = None, input: Any = None) -> AbstractModel:
+    require_kind(start, "start", Launch)
+    if input is not None:
+        raise ValueError("input must be None for a tippe.Scene: nothing drives a top")
+    lists = "axes of sweep take lists, and jax.vmap maps over them"
+    require_scalars(numbers("scene", system, functions=False) | numbers("launch", start), lists)
+    system.check_start(start)
+    return TopModel.of(system, start, event)
