@@ -138,6 +138,6 @@ def _require_free(problem: Problem) -> None:
             nearest = int(np.argmin(gaps))
             place = ", ".join(f"{float(number):g}" for number in getattr(problem, name).place)
             raise ValueError(
-                f"{name}: at place = ({place}) the footprint overlaps obstacles[{nearest}] by {abs(gaps[nearest]):.3g} m: move the "
-                f"{name} or the obstacle, or pass a smaller footprint"
+                f"{name}: at place = ({place}) the footprint overlaps obstacles[{nearest}] by {abs(gaps[nearest]):.3g} m: "
+                f"move the {name} or the obstacle, or pass a smaller footprint"
             )
