@@ -15,8 +15,9 @@ from .problem import Linearised, Problem, linearise
 #: Unknown errors and parameters are estimated in turns, until no error changes by more than this fraction.
 ROUNDS, SETTLED = 10, 0.01
 
-#: The fractions of a recording that are fitted before the whole.
-PARTS = (0.1, 0.25, 0.5)
+#: The fractions of a recording that are fitted before the whole, and the greatest number of steps for each, and for the whole
+#: at once.
+PARTS, STEPS_OF_PART, STEPS_AT_ONCE = (0.1, 0.25, 0.5), 8, 15
 
 #: Greatest number of minima around which an exploration begins; how much worse than the best they may be, in -2 log
 #: likelihood; and their least distance, in standard errors.
@@ -135,7 +136,8 @@ def _fitted(
 
     Predicted late samples can be wrong by whole turns, and would then lead to another minimum.
     """
-    ends = minimise(problem, starts, measurements, max_steps=max_steps, progress=progress)
+    steps = min(max_steps, STEPS_AT_ONCE) if in_parts else max_steps
+    ends = minimise(problem, starts, measurements, max_steps=steps, progress=progress)
     at_ends = linearise(problem, ends.coordinates, measurements)
     duration = float(np.max(np.asarray(measurements.time)))
     if not (in_parts and duration > 0.0):
@@ -144,9 +146,9 @@ def _fitted(
     for part in PARTS:
         early_measurements = down_weighted(measurements, part * duration)
         coordinates = minimise(
-            problem, coordinates, early_measurements, max_steps=max_steps, progress=progress
+            problem, coordinates, early_measurements, max_steps=min(max_steps, STEPS_OF_PART), progress=progress
         ).coordinates
-    ends_by_parts = minimise(problem, coordinates, measurements, max_steps=max_steps, progress=progress)
+    ends_by_parts = minimise(problem, coordinates, measurements, max_steps=2 * steps, progress=progress)
     by_parts = linearise(problem, ends_by_parts.coordinates, measurements)
     improves = by_parts.deviance < at_ends.deviance
 

@@ -8,8 +8,9 @@ from .exploration import Explorer, Weighted
 from .problem import Problem, deviances
 from .refinement import Minima, refine
 
-#: Greatest number of steps by slopes before an exploration, where predictions may be a staircase.
-FEW_STEPS = 6
+#: Greatest number of steps by slopes before an exploration: where predictions may be a staircase, and between the minima of
+#: a recording.
+FEW_STEPS, BETWEEN = 6, 20
 
 #: Points of the exploration that are better than all minima by more than this in -2 log likelihood are refined, too.
 IMPROVED = 0.1
@@ -38,6 +39,7 @@ def search(problem: Problem, explorer: Explorer, options: Search) -> tuple[Minim
     steps = max_steps if recorded else min(max_steps, FEW_STEPS)
     minima = refine(problem, pool.candidates(starts), measurements, steps, progress, in_parts=recorded)
     if recorded:
+        steps = min(max_steps, BETWEEN)
         around = refine(problem, minima.between(), minima.measurements, steps, progress, in_parts=False)
         minima = minima.joined(around)
     # Along a direction without any slope, the likelihood has no end that an exploration could find.

@@ -3,11 +3,12 @@ JAX's transformations."""
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from nonholonomic.identification import of_data
+from nonholonomic.identification import of_data, predicted
 from nonholonomic.integration import Settings
 from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.runs import TableJob
@@ -20,15 +21,29 @@ from ..runs.verbs import simulate
 from .inversion_times import InversionTimes
 from .recording import Recording
 
+#: Number of rows of a recording that are simulated together: as many as a fit explores at once. Rows of NaN take no time.
+BATCH = 512
+
 _beyond_horizon = jax.jit(beyond_horizon)
+
+
+@eqx.filter_jit
+def _samples_of_batch(scene: Scene, data: Recording, tolerance: Any, columns: dict[str, Any]) -> Any:
+    """The samples of a recording in every row of a batch; NaN for illegal parameters, and after the end of a run."""
+
+    def run(scene: Scene, launch: Any, times: Any) -> Any:
+        return simulate(scene, launch, times[-1], times, tolerance)
+
+    return predicted(scene, [(data, columns)], BATCH, run)[0]
 
 
 class HybridModel(NamedTuple):
     """Predictions of all data for a scene with flights, impacts, stick and slip; `SceneModel` does the same for smooth
     scenes.
 
-    Times are computed as in tables, in one ensemble; recordings are simulated one by one. For parameters that are
-    illegal in the scene, there are no predictions.
+    Times are computed as in tables, in one ensemble, and the runs of a recording as lanes of one program; only recordings
+    with `SetValuedCoulomb` are simulated one by one. For parameters that are illegal in the scene, there are no
+    predictions.
     """
 
     scene: Scene
@@ -48,6 +63,8 @@ class HybridModel(NamedTuple):
     def _of(self, k: int, rows: list[dict[str, float]]) -> Float[np.ndarray, "rows size"]:
         """The predictions of one set of data in every row."""
         data, predictions = self.data[k], np.full((len(rows), self.data[k].size), np.nan)
+        if isinstance(data, Recording) and not self.scene.friction.set_valued:
+            return self._samples_in_lanes(data, rows)
         allowed = [i for i, row in enumerate(rows) if self._allows(data, row)]
         if allowed and isinstance(data, InversionTimes):
             # Legal rows run in the place of illegal ones, so that every call has the same number of cells and is
@@ -58,6 +75,19 @@ class HybridModel(NamedTuple):
             for i in allowed:
                 predictions[i] = self._samples(data, rows[i])
         return predictions
+
+    def _samples_in_lanes(self, data: Recording, rows: list[dict[str, float]]) -> Float[np.ndarray, "rows size"]:
+        """The samples of all rows, in batches of one size, so that one program serves them all."""
+        names, parts = list(rows[0]), []
+        values = np.array([[row[name] for name in names] for row in rows])
+        for first in range(0, len(rows), BATCH):
+            batch = np.full((BATCH, len(names)), np.nan)
+            part = values[first : first + BATCH]
+            batch[: len(part)] = part
+            columns = {name: batch[:, k] for k, name in enumerate(names)}
+            samples = _samples_of_batch(self.scene, data, np.asarray(self.tolerance), columns)
+            parts.append(np.asarray(samples)[: len(part)])
+        return np.concatenate(parts)
 
     def _allows(self, data: Any, row: dict[str, float]) -> bool:
         try:

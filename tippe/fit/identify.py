@@ -79,10 +79,9 @@ def identify(
       are the same in all data; `"data[1].launch.azimuth"` belongs to the second set of data, and `"data[*].t0"` is a
       separate parameter for each recording. Parameters that cannot be negative are fitted by their logarithms.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
-    - `slopes`: "exact", the derivatives of the equations; or "differences", central differences of 1 % in every
-      parameter, which smooth over the jumps of the times. Differences take 2 k + 1 runs for k parameters and simulate
-      recordings one by one. By default, slopes are exact if a run is one smooth motion, and differences through
-      flights, impacts, stick and slip.
+    - `slopes`: "exact", the derivatives of the equations; or "differences", central differences in every parameter. Slopes
+      only guide the search; errors and intervals do not depend on them. By default, slopes are exact if a run is one
+      smooth motion, and differences through flights, impacts, stick and slip.
     - `tolerance`: relative tolerance of the integration.
 
     **Returns:** an `Identification` with its `verdict`; a doubtful fit gives a `FitWarning`.
