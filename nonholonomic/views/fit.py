@@ -43,14 +43,17 @@ def draw_fit(fit: Fit) -> Any:
 
     names = list(fit.estimates)
     profiled = [name for name in names if np.isfinite(fit.standard_errors[name])][:MOST_PROFILES]
-    lower = len(profiled) + 1
+    # The correlations of one number say nothing.
+    correlated = len(names) > 1
+    lower = len(profiled) + correlated or 1
     figure = Figure(figsize=(max(9.0, 2.6 * lower), 8.5), layout="constrained")
     grid = figure.add_gridspec(3, lower, height_ratios=(2.0, 1.0, 1.6))
     _draw_data(fit, figure.add_subplot(grid[0, :]))
     _draw_residuals(fit, figure.add_subplot(grid[1, :]))
     for k, name in enumerate(profiled):
         _draw_profile(fit, name, figure.add_subplot(grid[2, k]))
-    _draw_correlation(fit, names, figure.add_subplot(grid[2, lower - 1]))
+    if correlated:
+        _draw_correlation(fit, names, figure.add_subplot(grid[2, lower - 1]))
     figure.suptitle("; ".join(fit.verdict.concerns) or "no concerns about this fit", fontsize=9, wrap=True)
     return figure
 
