@@ -13,6 +13,7 @@ use `jax.vmap` for many. The models of the vehicles are faster and do not use th
 """
 
 import abc
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -55,6 +56,10 @@ class AbstractSystem(eqx.Module):
 
     ```
     """
+
+    #: Names of the coordinates, such as ("x", "angle"), in tables and pictures, where their rates are "x_rate" and so on; by
+    #: default "q0" and "rate0" and so on.
+    names: ClassVar[tuple[str, ...] | None] = None
 
     @property
     @abc.abstractmethod

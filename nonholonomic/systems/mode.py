@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -18,6 +18,7 @@ Event = Callable[[Float[Array, ""], State], Float[Array, ""]]
 class AbstractMode(eqx.Module):
     """A mode of a hybrid system: its equations of motion, its end, and the next mode. Subclass it, declare the
     parameters of your model as attributes, and write functions of a single time and a single state with `jax.numpy`.
+    A class attribute such as `names = ("height", "velocity")` names the components of the state.
     You can sweep, fit and differentiate every attribute that is a float or an array. A mode that never ends needs only
     the method `field`.
 
@@ -45,6 +46,10 @@ class AbstractMode(eqx.Module):
 
     ```
     """
+
+    #: Names of the components of the state, such as ("height", "velocity"), in tables and pictures; by default "y0", "y1"
+    #: and so on. One mode of a `Hybrid` is enough.
+    names: ClassVar[tuple[str, ...] | None] = None
 
     @abc.abstractmethod
     def field(self, t: Float[Array, ""], y: State) -> State:

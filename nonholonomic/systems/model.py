@@ -55,14 +55,10 @@ class OwnModel(AbstractModel):
     @classmethod
     def of(cls, tree: dict[str, Any]) -> "OwnModel":
         """The model of a system, its start and its event."""
-        hybrid, state, formulation = assembled(tree)
+        hybrid, state, _ = assembled(tree)
         form = Form.of(hybrid, state.size)[0]
         form.traits  # noqa: B018  Traced here, so that what is wrong with a user's function is said before anything compiles.
-        if formulation is None:
-            names = tuple(f"y{k}" for k in range(form.size))
-        else:
-            names = tuple(f"{name}{k}" for name in ("q", "rate") for k in range(formulation.system.dimension))
-        return cls(parameters=Parameters.of(tree), form=form, names=names)
+        return cls(parameters=Parameters.of(tree), form=form, names=names_of(tree["system"], form.size))
 
     def __reduce__(self) -> Any:
         # The structure of a tree with a user's classes cannot be pickled, but the tree can.
@@ -249,3 +245,31 @@ def _(system: AbstractMode, start: Any, event: Event | None = None, input: Any =
     raise ValueError(
         f"system = {shown(system)} must be a Hybrid or an AbstractSystem; wrap modes in nonholonomic.Hybrid([...])"
     )
+
+
+#: Names of other columns of tables and trajectories.
+TAKEN = ("time", "status", "end_time", "steps", "rejected", "switches", "mode", "grazes")
+
+
+def names_of(system: Any, size: int) -> tuple[str, ...]:
+    """The names of the components of a state: those of the system or of its first mode that has some, or `y0` and so on, or
+    `q0` and `rate0` and so on.
+
+    **Raises:** `ValueError` for a wrong number of names, names that are not different words, and names of other columns.
+    """
+    if isinstance(system, Hybrid):
+        owner = next((mode for mode in system.modes if mode.names is not None), None)
+        names = tuple(f"y{k}" for k in range(size)) if owner is None else owner.names
+    else:
+        owner, size = system, system.dimension
+        names = system.names
+        if names is None:
+            return tuple(f"{name}{k}" for name in ("q", "rate") for k in range(size))
+    legal = isinstance(names, tuple | list) and all(isinstance(name, str) and name.isidentifier() for name in names)
+    if not legal or len(set(names)) != size or len(names) != size or not set(names).isdisjoint(TAKEN):
+        kind = "component of the state" if isinstance(system, Hybrid) else "coordinate"
+        raise ValueError(
+            f"{type(owner).__name__}.names = {shown(names)} must be {size} different words, one for each {kind}, and none of "
+            f"{', '.join(TAKEN)}"
+        )
+    return tuple(names) if isinstance(system, Hybrid) else (*names, *(f"{name}_rate" for name in names))

@@ -9,7 +9,7 @@ import pytest
 from close import assert_close
 from own_modes import GRAVITY, Ball, Sleigh, Slip, Stick, bounce, final_turn
 
-from nonholonomic import AbstractMode, Hybrid, simulate
+from nonholonomic import AbstractMode, Hybrid, simulate, sweep
 from nonholonomic.formulations import Hamel, Lagrange, Routhian
 from nonholonomic.systems.system import formulation_of
 
@@ -184,3 +184,28 @@ def test_derivatives_that_do_not_exist_through_resets_are_refused_in_words():
         jax.grad(lambda t1: simulate(ball, start, t1, times=t1 * TIMES / 1.5).state[0, 0])(1.5)
     with pytest.raises(ValueError, match="changes of mode; take differences of a gradient instead"):
         jax.grad(jax.grad(lambda height: states(height, 0.8)[-1, 0]))(1.0)
+
+
+class NamedBall(Ball):
+    names = ("height", "velocity", "bounces")
+
+
+class NamedSleigh(Sleigh):
+    names = ("x", "y", "heading")
+
+
+def test_components_have_the_names_of_the_system():
+    run = simulate(Hybrid([NamedBall()]), [1.0, 0.0, 0.0], 2.0, times=TIMES)
+    assert list(run.to_table().variables) == ["height", "velocity", "bounces", "mode"]
+    assert_close(run["height"], run.state[:, 0])
+    table = sweep(Hybrid([NamedBall()]), [1.0, 0.0, 0.0], 0.3, axes={"start[0]": [1.0, 2.0]}, progress=False)
+    assert_close(table.height, np.array([1.0, 2.0]) - 0.5 * GRAVITY * 0.09, rtol=1e-12)
+    turning = simulate(NamedSleigh(), ([0.0, 0.0, 0.0], [1.0, 0.0, 1.3]), 0.5, times=[0.5])
+    assert list(turning.names) == ["x", "y", "heading", "x_rate", "y_rate", "heading_rate"]
+
+
+@pytest.mark.parametrize("words", [("height",), ("height", "height", "bounces"), ("height", "time", "bounces"), "abc"])
+def test_wrong_names_are_refused(words):
+    wrong = type("Wrong", (Ball,), {"names": words})
+    with pytest.raises(ValueError, match=r"Wrong\.names = .* must be 3 different words, one for each component"):
+        simulate(Hybrid([wrong()]), [1.0, 0.0, 0.0], 2.0)
