@@ -203,7 +203,8 @@ def _predicted(density: LogDensity, coordinates: Float[Array, "rows unknowns"]) 
 
 @eqx.filter_jit
 def _log_priors(density: LogDensity, coordinates: Float[Array | np.ndarray, "rows unknowns"]) -> Float[Array, " rows"]:
-    return jax.vmap(density._log_prior)(coordinates)
+    of_row: Callable[..., Array] = density._log_prior
+    return jax.vmap(of_row)(coordinates)
 
 
 @eqx.filter_jit

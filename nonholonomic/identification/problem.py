@@ -40,7 +40,7 @@ class Problem(eqx.Module):
         """The free parameters, each with its name."""
         return tuple(zip(self.names, self.unknowns, strict=True))
 
-    def values(self, coordinates: Float[Array, "... unknowns"]) -> Float[Array, "... unknowns"]:
+    def values(self, coordinates: Float[Array | np.ndarray, "... unknowns"]) -> Any:
         """The parameters at given coordinates, a NumPy array for a NumPy array."""
         stack: Any = np.stack if isinstance(coordinates, np.ndarray) else jnp.stack
         return stack([unknown.value(coordinates[..., k]) for k, unknown in enumerate(self.unknowns)], axis=-1)

@@ -61,7 +61,8 @@ class Minima(NamedTuple):
             return np.concatenate([mine, others])[order]
 
         mine, others = ((m.starts, m.coordinates, m.converged, m.linearised) for m in (self, other))
-        return Minima(*jax.tree.map(chosen, mine, others), self.measurements)
+        starts, coordinates, converged, linearised = jax.tree.map(chosen, mine, others)
+        return Minima(starts, coordinates, converged, linearised, self.measurements)
 
     def between(self) -> Float[np.ndarray, "rows unknowns"]:
         """Points between the best end and the others, and beyond it, the nearest first.

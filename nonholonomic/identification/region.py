@@ -1,7 +1,7 @@
 """The region in which a fit looks for minima: a box in the coordinates of the unknowns."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -32,7 +32,9 @@ class Region(NamedTuple):
         """Quasi-random points that fill the box, `count` a power of two; the first is the middle."""
         from scipy.stats import qmc
 
-        unit = qmc.Sobol(len(self.middle), seed=seed).random(count)
+        # SciPy 1.15 renamed the argument, and accepts both names.
+        options: dict[str, Any] = {"seed": seed}
+        unit = qmc.Sobol(len(self.middle), **options).random(count)
         unit[0] = 0.5
         return self.middle + (2.0 * unit - 1.0) * self.half_width
 

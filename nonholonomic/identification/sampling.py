@@ -156,7 +156,7 @@ def explorer_of(density: LogDensity, seed: int) -> Explorer:
     free = {}
     for name, unknown in density.problem.free:
         prior = density.priors.get(name)
-        gaussian = prior if np.shape(prior) == (2,) and not callable(prior) else None
+        gaussian = None if prior is None or callable(prior) else (float(prior[0]), float(prior[1]))
         start, lower, upper = (float(number) for number in (unknown.start, unknown.lower, unknown.upper))
         free[name] = Free(start, lower, upper, gaussian)
     duration = float(np.max(np.asarray(density.measurements.time)))
