@@ -22,7 +22,11 @@ def smoothed_weights(log_weights: Float[np.ndarray, " n"]) -> tuple[Float[np.nda
         shape, scale = _generalised_pareto(excess)
         if np.isfinite(shape):
             quantiles = (np.arange(count) + 0.5) / count
-            smooth = scale * np.expm1(-shape * np.log1p(-quantiles)) / shape if shape else -scale * np.log1p(-quantiles)
+            smooth = (
+                scale * np.expm1(np.minimum(-shape * np.log1p(-quantiles), 700.0)) / shape
+                if shape
+                else -scale * np.log1p(-quantiles)
+            )
             # No weight is larger than the largest of the weights.
             weights[tail] = np.minimum(cutoff + smooth, 1.0)
     return weights / np.sum(weights), float(shape)
