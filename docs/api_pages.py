@@ -148,7 +148,7 @@ PAGES = {
                 "nonholonomic.hybrid",
                 "AbstractBatchedMode AbstractHoppingMode Transition TransitionPath solve_hybrid traced_solve_hybrid "
                 "HybridOutcome solve_hybrid_with_tangents traced_solve_hybrid_with_tangents solve_hybrid_dense HybridPath "
-                "Segment solve_hybrid_with_samples hybrid_samples HybridSamples",
+                "Segment hybrid_resets solve_hybrid_with_samples hybrid_samples HybridSamples",
             ),
             "nonholonomic.derivatives",
             *of(

@@ -2,10 +2,11 @@
 derivatives.
 
 `solve_hybrid` integrates an ensemble of runs, each through the modes of a system (`traced_solve_hybrid` inside other
-transformed functions); `solve_hybrid_dense` integrates a single run with its path. `solve_hybrid_with_tangents` carries
-tangents through every reset by the saltation matrix. `solve_hybrid_with_samples` returns the states of an ensemble at
-times, and `hybrid_samples` those of a run inside a transformation, both with their derivatives. A run that is not over
-after `MOST_ROUNDS` modes is `UNRESOLVED`; `BETWEEN` is the number of the segment of a `HybridPath` between two modes.
+transformed functions); `solve_hybrid_dense` integrates a single run with its path, and `hybrid_resets` returns the
+resets of one. `solve_hybrid_with_tangents` carries tangents through every reset by the saltation matrix.
+`solve_hybrid_with_samples` returns the states of an ensemble at times, and `hybrid_samples` those of a run inside a
+transformation, both with their derivatives. A run that is not over after `MOST_ROUNDS` modes is `UNRESOLVED`; `BETWEEN`
+is the number of the segment of a `HybridPath` between two modes.
 
 **Example:** two bouncing balls. The event is the highest point: the velocity falls through zero.
 
@@ -53,6 +54,7 @@ from .path import BETWEEN as BETWEEN
 from .path import HybridPath as HybridPath
 from .path import Segment as Segment
 from .path import solve_hybrid_dense as solve_hybrid_dense
+from .resets import hybrid_resets as hybrid_resets
 from .samples import HybridSamples as HybridSamples
 from .samples import hybrid_samples as hybrid_samples
 from .samples import solve_hybrid_with_samples as solve_hybrid_with_samples

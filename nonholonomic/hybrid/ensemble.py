@@ -166,14 +166,14 @@ def after_reset(
 
 
 @eqx.filter_jit
-def _problem(
+def problem_of_cells(
     mode: AbstractBatchedMode, cell: Int[Numbers, " cells"], state: Float[Numbers, "components cells"]
 ) -> AbstractProblem:
     return mode_of_cells(mode, cell).problem(jnp.asarray(state))
 
 
 @compiled_quickly
-def _reset_map(
+def reset_of_cells(
     mode: AbstractBatchedMode,
     cell: Int[Array, " cells"],
     state: Float[Array, "components cells"],
@@ -225,10 +225,10 @@ def solve_hybrid(
 
     def solve(mode: AbstractBatchedMode, count: int, cell: Any, state: Any, left: Any) -> Outcome:
         options = {"nonterminal": nonterminal, "n_blocks": n_blocks}
-        return solve_ensemble(_problem(mode, cell, state), left, np.asarray(count), settings, **options)[0]
+        return solve_ensemble(problem_of_cells(mode, cell, state), left, np.asarray(count), settings, **options)[0]
 
     def reset(mode: AbstractBatchedMode, count: int, cell: Any, state: Any, left: Any) -> Transition:
-        return _reset_map(mode, cell, state, left)
+        return reset_of_cells(mode, cell, state, left)
 
     def advanced(
         program: Callable[..., Any], update: Any, numbers: Sequence[int], carry: Carry, mask: Bool[np.ndarray, " cells"]

@@ -1,5 +1,6 @@
 """One run of a user's system at given times."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,6 +18,7 @@ from ..views import Page, Stage, Viewable, new_figure
 from .explore import explore_model
 from .model import AbstractModel
 from .portrait import portraits
+from .resets import resets_of, with_resets
 
 #: Why a run ended early, by its word.
 REASONS = {
@@ -38,6 +40,8 @@ class Trajectory(Viewable, Tabular, eqx.Module):
     - `code`: the status as an integer of `Status`.
     - `names`: names of the components in tables; `run[name]` is a component at the times.
     - `model`, `t1`, `settings`: the model, the horizon and the settings of the integration.
+
+    Pictures also show the states before and after each reset, whatever the times.
 
     **Example:**
 
@@ -85,6 +89,15 @@ class Trajectory(Viewable, Tabular, eqx.Module):
     def portrait_axes(self) -> tuple[str, str]:
         return self.names[0], self.names[-1]
 
+    @functools.cached_property
+    def resets(self) -> Table:
+        """The resets of the run, a `Table` with a row for each: its `time` [s], the indices `mode_before` and
+        `mode_after`, and the components of the state, such as `y0_before` and `y0_after`. The run is repeated for it.
+
+        **Raises:** `ValueError` inside transformations and for a batch of runs: `mode` and `switches` are there.
+        """
+        return resets_of(self)
+
     def to_table(self) -> Table:
         """The run as a `Table` over its times.
 
@@ -117,7 +130,11 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         return self.model.simulate(self.t1, times, self.settings.tolerance, self.settings.solver, None)
 
     def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
-        return portraits([self, *others], overlaid)
+        return portraits([with_resets(run) for run in (self, *others)], overlaid)
+
+    def table_of(self, names: Sequence[str]) -> Table:
+        """The table that pictures draw, with the states before and after each reset."""
+        return with_resets(self).to_table()
 
     def explore(self, path: Any = None, sliders: dict[str, tuple[float, float]] | None = None) -> Page:
         """A page with sliders that simulates the run in the browser; see `nonholonomic.explore`."""
@@ -135,11 +152,12 @@ class Trajectory(Viewable, Tabular, eqx.Module):
     def overview(self, runs: list[Any], labels: Sequence[str], unit: Any, ax: Any) -> Any:
         """Draw all components of a run in one picture, or a panel for each component of several runs."""
         if len(runs) > 1 or unit is not None:
-            return Tabular.overview(self, runs, labels, unit, ax)
+            return Tabular.overview(self, [with_resets(run) for run in runs], labels, unit, ax)
         figure = new_figure()
         axes: Any = figure.add_subplot() if ax is None else ax
-        for name, component in zip(self.names, np.asarray(self.state).T, strict=True):
-            axes.plot(np.asarray(self.t), component, label=name)
+        drawn = with_resets(self)
+        for name, component in zip(self.names, np.asarray(drawn.state).T, strict=True):
+            axes.plot(np.asarray(drawn.t), component, label=name)
         axes.set_xlabel("time [s]")
         axes.legend()
         return figure if ax is None else ax

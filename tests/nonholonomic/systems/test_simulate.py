@@ -101,8 +101,44 @@ def test_components_are_drawn_over_time():
     labels = [text.get_text() for text in run.plot("y0", others=[higher]).axes[0].get_legend().get_texts()]
     assert labels == ["start[0] 1", "start[0] 2"]
     assert run.at(1.0).state.shape == (1, 3)
-    assert_close(speeds.get_lines()[0].get_ydata(), run.state[:, 1])
+    assert_close(speeds.get_lines()[0].get_ydata()[[0, -1]], run.state[:, 1])
     assert list(run.to_dataframe().columns) == ["time", "y0", "y1", "y2", "mode"]
+
+
+def test_resets_are_listed_and_drawn():
+    """A ball strikes the ground at its closed-form times; its lines reach the ground and jump there."""
+    run = simulate(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.5, times=[0.0, 1.0, 1.5])
+    times = [bounce(1.0, 0.8, GRAVITY, number) for number in (1, 2)]
+    speeds = math.sqrt(2.0 * GRAVITY) * 0.8 ** np.arange(3)
+    resets = run.resets
+    assert_close(resets["time"], times, rtol=1e-9)
+    assert resets["mode_before"].tolist() == resets["mode_after"].tolist() == [0, 0]
+    assert_close(resets["y0_before"], np.zeros(2), atol=1e-9)
+    assert_close(resets["y1_before"], -speeds[:2], rtol=1e-9)
+    assert_close(resets["y1_after"], speeds[1:], rtol=1e-9)
+    (velocity,) = run.plot("y1").axes[0].get_lines()
+    assert_close(velocity.get_xdata(), np.repeat([0.0, times[0], 1.0, times[1], 1.5], [1, 2, 1, 2, 1]), rtol=1e-9)
+    assert_close(velocity.get_ydata()[[1, 2, 4, 5]], [-speeds[0], speeds[1], -speeds[1], speeds[2]], rtol=1e-9)
+    heights = [run.plot().axes[0].get_lines()[0].get_ydata(), run.portrait().axes[0].get_lines()[0].get_xdata()]
+    heights.append(run.stages()[0].shows[0].curves[0].values)
+    for drawn in heights:
+        assert len(drawn) == 7
+        assert_close(np.sort(drawn)[:4], np.zeros(4), atol=1e-9)
+    assert len(run.to_table()["y0"]) == 3
+
+
+def test_resets_state_the_modes_and_need_one_run():
+    run = simulate(Hybrid([Stick(), Slip()]), [0.0, 0.5], 5.0, times=[0.0, 5.0])
+    assert (run.resets["mode_before"].tolist(), run.resets["mode_after"].tolist()) == ([0], [1])
+    assert_close(run.resets["y0_after"], [1.0], atol=1e-9)
+    assert len(simulate(Hybrid([Melting()]), [1.0], 0.5).resets["time"]) == 0
+    with pytest.raises(ValueError, match="resets takes one run outside jit"):
+        jax.vmap(lambda height: states_of(height).resets)(jnp.ones(2))
+
+
+def states_of(height):
+    """A ball's run from a height."""
+    return simulate(Hybrid([Ball()]), jnp.stack([height, 0.0 * height, 0.0 * height]), 1.5, times=TIMES)
 
 
 def broken(kind, **functions):
