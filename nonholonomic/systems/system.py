@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from ..formulations import AbstractFormulation, AbstractSystem, Hamel, Lagrange
 from ..validation import UNTRACEABLE, as_number, is_traced, require, shown
 from .form import Form
+from .misspelt import warn_of_misspelt_methods
 from .mode import AbstractMode, Event, Hybrid, State
 
 #: Largest relative violation of the constraints by a start's velocity.
@@ -49,10 +50,13 @@ def formulation_of(system: AbstractSystem) -> AbstractFormulation:
 
 
 def check_start(system: Hybrid | AbstractSystem, start: Any) -> None:
-    """Raise `ValueError` unless the start is one of this system."""
+    """Raise `ValueError` unless the start is one of this system, and warn of misspelt methods."""
     if isinstance(system, AbstractSystem):
+        warn_of_misspelt_methods(system, AbstractSystem)
         _check_mechanical_start(system, start)
     else:
+        for mode in system.modes:
+            warn_of_misspelt_methods(mode, AbstractMode)
         _check_vector(start, "start", None)
 
 

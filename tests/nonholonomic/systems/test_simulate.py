@@ -1,6 +1,7 @@
 """Trajectories of users' own systems against closed forms, with their derivatives through resets."""
 
 import math
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from own_modes import GRAVITY, Ball, Sleigh, Slip, Stick, bounce, final_turn
 
 from nonholonomic import AbstractMode, Hybrid, simulate, sweep
 from nonholonomic.formulations import Hamel, Lagrange, Routhian
-from nonholonomic.systems.system import formulation_of
+from nonholonomic.systems.system import check_start, formulation_of
 
 TIMES = jnp.array([0.3, 0.7, 1.1, 1.5])
 
@@ -139,6 +140,32 @@ def test_resets_state_the_modes_and_need_one_run():
 def states_of(height):
     """A ball's run from a height."""
     return simulate(Hybrid([Ball()]), jnp.stack([height, 0.0 * height, 0.0 * height]), 1.5, times=TIMES)
+
+
+def test_a_misspelt_method_is_reported():
+    """Only where the class does not define the method itself, and no other method calls this one."""
+    force = broken(Sleigh, forces=lambda self, t, q, rate: -rate)
+    with pytest.warns(UserWarning, match=r"^Broken\.forces is never called; did you mean force\?$"):
+        check_start(force, (np.zeros(3), np.zeros(3)))
+    with pytest.warns(UserWarning, match=r"Broken\.margins is never called; did you mean margin\?"):
+        check_start(Hybrid([Melting(), broken(Decay, margins=lambda self, t, y: y[0])]), np.ones(1))
+    helpers = {
+        "forces": lambda self, q: -q,
+        "force": lambda self, t, q, rate: self.forces(q),
+        "speed": lambda self: 1.0,
+    }
+    called = {"resets": lambda self, y: y, "field": lambda self, t, y: -self.resets(y)}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_start(broken(Sleigh, **helpers), (np.zeros(3), np.zeros(3)))
+        check_start(Hybrid([broken(Decay, **called), Ball()]), np.ones(1))
+
+
+class Decay(AbstractMode):
+    """A mode that never ends."""
+
+    def field(self, t, y):
+        return -y
 
 
 def broken(kind, **functions):
