@@ -44,8 +44,8 @@ CALLS = {
     "identify": (lambda: tippe.identify(TOP, TIMES, {"mu": 0.3}), "tippe.fit.identify", "unknowns_of"),
     "stroller identify": (
         lambda: stroller.identify(STROLLER, RECORDING, {"mass": 12.0}),
-        "stroller.fit.identify",
-        "_unknowns_of",
+        "nonholonomic.runs.identify",
+        "free_numbers",
     ),
     "any fit": (lambda: identify(None, DECAY, {"x": 1.0}), "nonholonomic.identification.identify", "region_of"),
     "its end": (lambda: fitted(), "nonholonomic.identification.identify", "summarise"),

@@ -58,12 +58,12 @@ def map_methods(kind: type, names: Sequence[str]) -> None:
 
 def held(value: Any, evaluate: Callable[[Any], Any]) -> Any:
     """A user's object with `Numbers` in place of its arrays if these hold the numbers of a single run. Arrays with one
-    number per lane stay as they are, and so does any other object.
+    number per lane stay as they are, and so do these packages' own objects.
 
     **Arguments:** `evaluate`: evaluates the object for single numbers; if a result is an array, the object has one number
     per lane.
     """
-    if not any(is_array(leaf) and leaf.ndim for leaf in jax.tree.leaves(value)):
+    if not is_users(type(value)) or not any(is_array(leaf) and leaf.ndim for leaf in jax.tree.leaves(value)):
         return value
     try:
         results = jax.eval_shape(lambda: evaluate(value))

@@ -107,7 +107,7 @@ def event_time(
     explicit_tableau(settings.for_lanes)
     time = _compiled(model, as_number(t1), settings, crossing == "last", traced_leaves((model, t1, tolerance)))
     if not is_traced(time) and np.ndim(time) == 0 and np.isnan(time):
-        _warn_of_failure(model, float(t1), settings, crossing == "last")
+        _warn_of_failure(model, float(np.asarray(t1)), settings, crossing == "last")
     return time
 
 

@@ -10,6 +10,7 @@ from ..parameters import likely, readable_unit, require_unit, shown, text_as_htm
 from ..progress import status_line
 from ..validation import require_package
 from ..views import draw_portrait, draw_series, require_others
+from ._file import table_path
 from .layout import Values
 from .table import Table
 from .tasks import versions
@@ -145,7 +146,8 @@ class Tabular(abc.ABC):
 
         **Raises:** `OSError` that names the path if the file cannot be written; `ValueError` for a batch of runs.
         """
-        self.to_table().save(path)
+        file = table_path(path)
+        self.to_table().save(file)
 
     def to_dataframe(self) -> Any:
         """The run as a `pandas.DataFrame` (needs pandas): a row for each time, a column for each quantity or component.

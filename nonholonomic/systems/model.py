@@ -259,7 +259,9 @@ def names_of(system: Any, size: int) -> tuple[str, ...]:
     """
     if isinstance(system, Hybrid):
         owner = next((mode for mode in system.modes if mode.names is not None), None)
-        names = tuple(f"y{k}" for k in range(size)) if owner is None else owner.names
+        names = None if owner is None else owner.names
+        if names is None:
+            return tuple(f"y{k}" for k in range(size))
     else:
         owner, size = system, system.dimension
         names = system.names

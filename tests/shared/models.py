@@ -74,7 +74,7 @@ OF_MODES = {
 
 CASES = {
     "top": Case(
-        tippe.Scene(TOP, friction=tippe.Viscous(0.3)), tippe.Launch(0.2, 155.0), 3.0, rises, "mu", 0.3, "theta"
+        tippe.Scene(TOP, friction=tippe.Viscous(0.3)), tippe.Launch(0.2, 155.0), 4.0, rises, "mu", 0.3, "theta"
     ),
     "stroller": Case(BOWL, RIDE, 2.5, lambda t, motion: motion.speed - 1.0, "rolling", 2.0, "speed"),
     "modes": Case(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.0, lambda t, y: 0.3 - y[0], "restitution", 0.8, "y0"),

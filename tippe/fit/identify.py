@@ -1,5 +1,6 @@
 """Estimate parameters of a top, its arena and its launches from inversion times and recorded motion."""
 
+import dataclasses
 from collections.abc import Hashable
 from typing import Any
 
@@ -26,6 +27,7 @@ from ..model.scene import Scene
 from ..runs.checks import check_run, check_smooth
 from ..runs.launches import variable_numbers
 from ..runs.run_kind import run_kind_of
+from ..runs.turned_over import angle_of
 from ..runs.verbs import simulate
 from .hybrid_fit import HybridModel
 from .inversion_times import InversionTimes, Values
@@ -128,7 +130,14 @@ def checked_data(scene: Scene, data: Any, tolerance: float, caller: str | None) 
         check_smooth(scene, caller)
     data = as_sources(data, InversionTimes | Recording, "an InversionTimes or a Recording")
     check_run(scene, Launch(0.0, 0.0), 1.0, tolerance)
-    return data
+    return tuple(_with_angle(scene, source) for source in data)
+
+
+def _with_angle(scene: Scene, source: Any) -> Any:
+    """The data with the default angle written out, so that one program serves every angle. With a stem, there is none."""
+    if isinstance(source, Recording) or source.angle is not None or scene.has_stem:
+        return source
+    return dataclasses.replace(source, angle=angle_of(scene, None))
 
 
 def unknowns_of(scene: Scene, data: tuple[Any, ...], free: Any) -> dict[str, Free]:
