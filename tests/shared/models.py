@@ -41,6 +41,11 @@ def rises(t: Any, motion: Any) -> Any:
     return 0.3 - motion.theta
 
 
+def loses_energy(t: Any, motion: Any) -> Any:
+    """Friction has taken 2.5 % of the energy: an event that, unlike an angle, does not follow the nutation."""
+    return motion.energy - 0.0402
+
+
 #: Kinds of tops whose programs take long to compile.
 OF_MODES = {
     "hopping top": Case(
@@ -74,7 +79,7 @@ OF_MODES = {
 
 CASES = {
     "top": Case(
-        tippe.Scene(TOP, friction=tippe.Viscous(0.3)), tippe.Launch(0.2, 155.0), 4.0, rises, "mu", 0.3, "theta"
+        tippe.Scene(TOP, friction=tippe.Viscous(0.3)), tippe.Launch(0.2, 155.0), 1.0, loses_energy, "mu", 0.3, "theta"
     ),
     "stroller": Case(BOWL, RIDE, 2.5, lambda t, motion: motion.speed - 1.0, "rolling", 2.0, "speed"),
     "modes": Case(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.0, lambda t, y: 0.3 - y[0], "restitution", 0.8, "y0"),
