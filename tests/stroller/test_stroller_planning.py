@@ -1,5 +1,6 @@
 """Plans: closed forms of their parts, and plans that are driven again and checked by other means."""
 
+import importlib
 import re
 
 import jax
@@ -9,9 +10,11 @@ import pytest
 from close import assert_close
 
 import stroller
+from stroller.planning.candidates import Outline, prices
 from stroller.planning.drive import drive_along
 from stroller.planning.inverse import Rates, actuation
 from stroller.planning.polygons import disc_distance, separation, signed_distance
+from stroller.planning.problem import checked_problem
 from stroller.planning.spline import evaluate, interpolate
 
 BODY = stroller.Stroller(mass=5.0, wheelbase=0.25, inertia=0.1, steering_inertia=0.005)
@@ -78,7 +81,7 @@ def edge_of_footprint(run):
 def assert_solves(plan, launch, goal, obstacles):
     """Drive a plan again, and look at its end, its limits and every point of its edge."""
     assert plan.reached, str(plan)
-    run = stroller.simulate(SCENE, launch, plan.t1, plan.input, times=np.linspace(0.0, plan.t1, 801), tolerance=1e-9)
+    run = stroller.simulate(SCENE, launch, plan.t1, plan.input, times=np.linspace(0.0, plan.t1, 2001), tolerance=1e-9)
     assert np.hypot(*(run.place[-1] - np.array(goal.place))) < 0.05
     assert abs(np.angle(np.exp(1j * (run.heading[-1] - goal.heading)))) < 0.05
     assert abs(run.speed[-1]) < 0.05
@@ -89,21 +92,26 @@ def assert_solves(plan, launch, goal, obstacles):
     assert plan.clearance > 0.0
 
 
-@pytest.mark.parametrize("name", ["parallel parking", "turn on the spot"])
-def test_a_plan_reaches_its_goal_without_touching_anything(name):
-    launch, goal, plan = planned(name)
-    assert_solves(plan, launch, goal, CASES[name][2])
+@pytest.fixture(scope="module")
+def parked():
+    """The launch, the goal and the plan of parallel parking."""
+    return planned("parallel parking")
+
+
+def test_a_plan_parks_without_touching_anything(parked):
+    launch, goal, plan = parked
+    assert_solves(plan, launch, goal, GAP)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["kinked corridor", "trap"])
+@pytest.mark.parametrize("name", ["turn on the spot", "kinked corridor", "trap"])
 def test_a_plan_finds_the_way(name):
     launch, goal, plan = planned(name)
     assert_solves(plan, launch, goal, CASES[name][2])
 
 
+@pytest.mark.usefixtures("parked")
 def test_another_problem_compiles_nothing(caplog):
-    planned("parallel parking")
     with jax.log_compiles():
         launch, goal = stroller.Launch((0.6, 0.8), 0.1, 0.0), stroller.Goal((1.9, 0.3), 0.0)
         plan = stroller.plan(SCENE, launch, goal, 11.0, obstacles=GAP[:4], **OPTIONS)
@@ -112,8 +120,8 @@ def test_another_problem_compiles_nothing(caplog):
     assert compiled == []
 
 
-def test_a_plan_shows_what_it_achieves(tmp_path):
-    _, _, plan = planned("parallel parking")
+def test_a_plan_shows_what_it_achieves(parked, tmp_path):
+    _, _, plan = parked
     lines = str(plan).splitlines()
     assert lines[0] == "Plan of 12 s: reaches the goal"
     assert any(line.startswith("  speed      margin 0.") for line in lines)
@@ -127,21 +135,34 @@ def test_a_plan_shows_what_it_achieves(tmp_path):
 def test_what_is_out_of_reach_is_said():
     """Ten metres in three seconds, at 0.8 m/s at most."""
     launch, goal = stroller.Launch((0.0, 0.0), 0.0, 0.0), stroller.Goal((10.0, 0.0), 0.0)
-    plan = stroller.plan(SCENE, launch, goal, 3.0, obstacles=GAP[:1], **OPTIONS)
+    plan = stroller.plan(SCENE, launch, goal, 3.0, obstacles=GAP[:1], starts=2, **OPTIONS)
     assert not plan.reached
     assert re.search(r"shortest path that was found, (9.9|10)\S* m, takes 12\.\d s at the limit", plan.hindrances[-1])
     assert "does not reach the goal" in str(plan)
     assert all(f"  hindrance  {words}" in str(plan) for words in plan.hindrances)
 
 
+WALLED_IN = (stroller.Launch((-2.0, 0.5), 0.0, 0.0), stroller.Goal((0.5, 0.5), 0.0), room(0.0, 1.2, 0.0, 1.0))
+
+
+def test_the_search_says_that_a_goal_is_walled_in():
+    launch, goal, walls = WALLED_IN
+    outline = Outline.of(checked_problem(SCENE, launch, goal, 12.0, walls, LIMITS, FOOTPRINT, 1e-6))
+    _, reason = outline.paths(prices(outline, 1, 0, np.random.default_rng(0)), 12.0)
+    assert re.match(r"no path around the obstacles was found; the nearest ended \S+ m from the goal", reason)
+
+
+@pytest.mark.slow
 def test_a_goal_that_is_walled_in_is_not_reached():
-    launch, goal = stroller.Launch((-2.0, 0.5), 0.0, 0.0), stroller.Goal((0.5, 0.5), 0.0)
-    plan = stroller.plan(SCENE, launch, goal, 12.0, obstacles=room(0.0, 1.2, 0.0, 1.0), **OPTIONS)
+    launch, goal, walls = WALLED_IN
+    plan = stroller.plan(SCENE, launch, goal, 12.0, obstacles=walls, **OPTIONS)
     assert not plan.reached
     assert "no path around the obstacles was found; the nearest ended" in plan.hindrances[-1]
 
 
-def test_less_time_is_less():
+@pytest.mark.parametrize("rounds", [1, pytest.param(5, marks=pytest.mark.slow)])
+def test_less_time_is_less(rounds, monkeypatch):
+    monkeypatch.setattr(importlib.import_module("stroller.planning.plan"), "ROUNDS", rounds)
     launch, goal = stroller.Launch((0.0, 0.0), 0.0, 0.0), stroller.Goal((1.0, 0.0), 0.0)
     plan = stroller.plan(SCENE, launch, goal, 10.0, obstacles=GAP[:1], minimise="time", **OPTIONS)
     assert plan.reached
