@@ -222,7 +222,11 @@ def row_of(setting: Setting, random: np.random.Generator) -> dict[str, Any]:
     """A fit as a row of the file."""
     begin = time.process_time()
     fit = setting.trial(random)
-    row: dict[str, Any] = {"seconds": time.process_time() - begin, "effective": fit.verdict.effective, "k": fit.verdict.k}
+    row: dict[str, Any] = {
+        "seconds": time.process_time() - begin,
+        "effective": fit.verdict.effective,
+        "k": fit.verdict.k,
+    }
     row["kind"], row["minima"] = fit.distribution.kind, len(fit.verdict.minima)
     for unknown, value in setting.truth.items():
         name = next(key for key in fit.estimates if key.endswith(unknown))
