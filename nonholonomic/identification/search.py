@@ -54,8 +54,12 @@ def search(problem: Problem, explorer: Explorer, options: Search) -> tuple[Minim
 def _improved(problem: Problem, minima: Minima, sample: Weighted, options: Search) -> Minima:
     """The minima, the best of them refined to the end; from the best points of the exploration if these are better."""
     rows, max_steps = len(minima.starts), options.max_steps
-    best = sample.pool.points[np.argsort(-sample.pool.log_density)[:rows]]
-    if np.min(deviances(problem, best, minima.measurements)) < np.min(minima.deviance) - IMPROVED:
+    pool, order = sample.pool, np.argsort(-sample.pool.log_density)[:rows]
+    best = pool.points[order]
+    if (
+        np.min(deviances(problem, best, pool.predictions[order], minima.measurements))
+        < np.min(minima.deviance) - IMPROVED
+    ):
         few = min(max_steps, FEW_STEPS)
         later = refine(problem, best, minima.measurements, few, options.progress, False, np.arange(rows) < LAST)
         return later if np.min(later.deviance) < np.min(minima.deviance) else minima
