@@ -13,137 +13,19 @@ use `jax.vmap` for many. The models of the vehicles are faster and do not use th
 """
 
 import abc
-from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..geometry import solve
 from ..validation import as_number, is_traced, require, warn
 from .brackets import Coordinates, lie_brackets
+from .system import AbstractSystem, within_constraints
 
 #: Relative violation of the constraints above which a start gives a warning.
 START_TOLERANCE = 1e-9
-
-
-class AbstractSystem(eqx.Module):
-    """A mechanical system with n coordinates and k linear constraints on its velocity.
-
-    Subclass it, declare the numbers of your model as fields, set `dimension` to the number of coordinates, and write functions
-    of one set of coordinates: the `metric`, and as needed `potential`, `constraints`, `force` and `frame`. The equations of
-    motion follow; `nonholonomic.simulate`, `event_time`, `sweep` and `identify` run them.
-
-    **Example:** a bead on a parabolic wire z = x^2 / 2, which oscillates in about 2 pi / sqrt(g).
-
-    ```
-    >>> import jax.numpy as jnp
-    >>> import nonholonomic
-    >>> class Bead(nonholonomic.AbstractSystem):
-    ...     gravity: float = 9.81
-    ...     dimension = 1
-    ...
-    ...     def metric(self, q):
-    ...         return (1.0 + q[0] ** 2)[None, None]
-    ...
-    ...     def potential(self, q):
-    ...         return 0.5 * self.gravity * q[0] ** 2
-    >>> quarter = nonholonomic.event_time(Bead(), ([0.01], [0.0]), t1=5.0, event=lambda t, y: y[0])
-    >>> print(f"{4.0 * quarter:.4f} s, small oscillations: {2.0 * jnp.pi / jnp.sqrt(9.81):.4f} s")
-    2.0061 s, small oscillations: 2.0061 s
-
-    ```
-    """
-
-    #: Names of the coordinates, such as ("x", "angle"), in tables and pictures, where their rates are "x_rate" and so on; by
-    #: default "q0" and "rate0" and so on.
-    names: ClassVar[tuple[str, ...] | None] = None
-
-    @property
-    @abc.abstractmethod
-    def dimension(self) -> int:
-        """Number n of coordinates."""
-
-    @property
-    def freedom(self) -> int:
-        """Number n - k of independent velocities."""
-        q = jax.ShapeDtypeStruct((self.dimension,), jnp.result_type(float))
-        return self.dimension - jax.eval_shape(self.constraints, q).shape[0]
-
-    @abc.abstractmethod
-    def metric(self, q: Coordinates) -> Float[Array, "n n"]:
-        """Kinetic metric G(q): the kinetic energy is q'.G q' / 2."""
-
-    def potential(self, q: Coordinates) -> Float[Array, ""]:
-        """Potential energy V(q); zero by default."""
-        return jnp.zeros((), q.dtype)
-
-    def constraints(self, q: Coordinates) -> Float[Array, "k n"]:
-        """One-forms W(q), one per row, that vanish on every allowed velocity; none by default."""
-        return jnp.zeros((0, q.size), q.dtype)
-
-    def frame(self, q: Coordinates) -> Float[Array, "n n"]:
-        """Frame fields E(q), one per column; W annihilates the first n - k. By default, the coordinate fields."""
-        return jnp.eye(q.size, dtype=q.dtype)
-
-    def force(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
-        """Generalised force f(t, q, q') in addition to that of the potential; zero by default."""
-        return jnp.zeros_like(q)
-
-    def lagrangian(self, q: Coordinates, rate: Coordinates) -> Float[Array, ""]:
-        """The Lagrangian L(q, q') = q'.G q' / 2 - V."""
-        return 0.5 * rate @ self.metric(q) @ rate - self.potential(q)
-
-    def energy(self, q: Coordinates, rate: Coordinates) -> Float[Array, ""]:
-        """Energy q'.dL/dq' - L; for a Lagrangian quadratic in q', kinetic plus potential energy."""
-        return jax.grad(self.lagrangian, argnums=1)(q, rate) @ rate - self.lagrangian(q, rate)
-
-
-class Routhian(AbstractSystem):
-    """A system with one cyclic coordinate eliminated, at a given momentum, R = L - beta psi'.
-
-    The coordinate is cyclic if neither metric, potential nor force depends on it, and the force has no component along
-    it. The reduced Lagrangian has terms linear in the velocity, which `Hamel` accepts.
-
-    **Arguments:**
-
-    - `full`: the unconstrained system to reduce.
-    - `cyclic`: index of the cyclic coordinate.
-    - `momentum`: its constant momentum beta.
-    """
-
-    full: AbstractSystem
-    cyclic: int = eqx.field(static=True)
-    momentum: Float[Array, ""] = eqx.field(converter=as_number)
-
-    def __check_init__(self):
-        require(self.momentum, "momentum")
-
-    @property
-    def dimension(self) -> int:
-        return self.full.dimension - 1
-
-    def complete(self, q: Coordinates, rate: Coordinates) -> tuple[Coordinates, Coordinates]:
-        """All coordinates and velocities, with the cyclic coordinate at 0 and its velocity from the momentum."""
-        q = jnp.insert(q, self.cyclic, 0.0)
-        rate = jnp.insert(rate, self.cyclic, 0.0)
-        row = self.full.metric(q)[self.cyclic]
-        return q, rate.at[self.cyclic].set((self.momentum - row @ rate) / row[self.cyclic])
-
-    def metric(self, q: Coordinates) -> Float[Array, "m m"]:
-        full_metric = self.full.metric(jnp.insert(q, self.cyclic, 0.0))
-        free = np.delete(np.arange(len(full_metric)), self.cyclic)
-        column = full_metric[free, self.cyclic]
-        return full_metric[np.ix_(free, free)] - jnp.outer(column, column) / full_metric[self.cyclic, self.cyclic]
-
-    def lagrangian(self, q: Coordinates, rate: Coordinates) -> Float[Array, ""]:
-        q, rate = self.complete(q, rate)
-        return self.full.lagrangian(q, rate) - self.momentum * rate[self.cyclic]
-
-    def force(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
-        return jnp.delete(self.full.force(t, *self.complete(q, rate)), self.cyclic)
 
 
 class AbstractFormulation(eqx.Module):
@@ -261,6 +143,7 @@ class Hamel(AbstractFormulation):
     system: AbstractSystem
 
     def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
+        rate = within_constraints(self.system, q, rate)
         return jnp.concatenate([q, solve(self.system.frame(q), rate)[: self.system.freedom]])
 
     def quasi_velocity(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:

@@ -6,7 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..geometry import solve
-from .formulation import AbstractSystem, AbstractVelocityFormulation, Coordinates
+from .brackets import Coordinates
+from .formulation import AbstractVelocityFormulation
+from .system import AbstractSystem
 
 
 class Lagrange(AbstractVelocityFormulation):

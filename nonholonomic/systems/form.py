@@ -45,7 +45,8 @@ class Form:
         return self.tree.tree(numbers)
 
     def function(self, name: str, mode: int = 0) -> OfRun:
-        """One of the user's functions: "field", "margin" or "reset" of a mode, or "event"."""
+        """One of the user's functions: "field", "margin" or "reset" of a mode, or "event"; or "entered", which projects the
+        state after a reset to a mode onto its constraints."""
 
         def called(numbers: Sequence[Array], t: Array, y: State) -> Any:
             system = self.system(numbers)
@@ -73,12 +74,14 @@ class Traits(NamedTuple):
     - `depends_on_time`: whether a function depends on time, which is then an additional component of the state.
     - `elementary`: whether all functions that are evaluated within steps fit a single kernel.
     - `ends`, `resets`: for each mode, whether it has a margin, and whether it also has a reset.
+    - `projected`: for each mode, whether it has constraints that a state may violate.
     """
 
     depends_on_time: bool
     elementary: bool
     ends: tuple[bool, ...]
     resets: tuple[bool, ...]
+    projected: tuple[bool, ...]
 
     @property
     def smooth(self) -> bool:
@@ -113,12 +116,14 @@ def _traits(form: Form) -> Traits:
         return lambda t, y, *numbers: [function(numbers, t, y) for function in functions]
 
     numbers, t, y = form.arguments
+    modes = form.system([jnp.zeros((), kind.dtype) for kind in numbers]).modes
     depends_on_time = depends_on_first(combined([*step_functions, *reset_functions]), t, y, *numbers)
     return Traits(
         depends_on_time,
         is_elementary(spelled_out(combined(step_functions)), t, y, *numbers),
         tuple(ends),
         tuple(resets),
+        tuple(getattr(mode, "is_projected", False) for mode in modes),
     )
 
 

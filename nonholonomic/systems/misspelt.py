@@ -14,7 +14,7 @@ SIMILARITY = 0.75
 
 def warn_of_misspelt_methods(part: Any, base: type) -> None:
     """Warn of every method of a mode or a system that resembles a method of its base class which the class does not
-    define, unless another method of the class calls it.
+    define, unless another method of the class calls it; and of a reset without a margin.
 
     **Arguments:** `part`: an object of a user's class; `base`: `AbstractMode` or `AbstractSystem`.
     """
@@ -28,6 +28,10 @@ def warn_of_misspelt_methods(part: Any, base: type) -> None:
         others = (function for other, function in methods.items() if other != name)
         if matches and not name.startswith("_") and not any(name in _names(other.__code__) for other in others):
             warn(f"{kind.__name__}.{name} is never called; did you mean {matches[0]}?")
+    if "reset" not in free and "margin" in free:
+        warn(
+            f"{kind.__name__}.reset is never called: write margin as well, which falls to zero where the reset happens"
+        )
 
 
 def _names(code: CodeType) -> set[str]:

@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from ..formulations import AbstractSystem
 from ..validation import shown
 
 State = Float[Array, " components"]
@@ -98,7 +99,9 @@ class Hybrid(eqx.Module):
 
     **Arguments:**
 
-    - `modes`: the modes, whose states have the same components.
+    - `modes`: the modes, whose states have the same components. A mode can also be an `AbstractSystem` without a
+      Lagrangian of its own: its state is its coordinates, followed by their rates, and its `reset` may return
+      `(q, rate, number)` with the index of the next mode. A run then starts from the state or from a pair (q, rate).
     - `event`: a function of time [s] and state, `event(t, y)`, or `None`. The event is the first time after the start
       at which the function falls through zero, along the motion or by a reset. An `equinox.Module` can have its own
       parameters.
@@ -123,14 +126,14 @@ class Hybrid(eqx.Module):
     ```
     """
 
-    modes: tuple[AbstractMode, ...] = eqx.field(converter=as_modes)
+    modes: tuple[AbstractMode | AbstractSystem, ...] = eqx.field(converter=as_modes)
     event: Event | None = None
     first: int = eqx.field(static=True, default=0)
 
     def __check_init__(self):
         if not isinstance(self.modes, tuple):
             raise ValueError(f"modes = {shown(self.modes)} must be a list of modes, such as [Flying(), Sliding()]")
-        illegal = [mode for mode in self.modes if not isinstance(mode, AbstractMode)]
+        illegal = [mode for mode in self.modes if not isinstance(mode, AbstractMode | AbstractSystem)]
         if not self.modes or illegal:
             problem = f"modes holds {shown(illegal[0])}" if illegal else "modes is empty"
             raise ValueError(f"{problem}: it must hold one AbstractMode or more, such as [Flying(), Sliding()]")

@@ -28,7 +28,7 @@ from .engine import Cells
 from .form import Form
 from .mode import AbstractMode, Event, Hybrid, require_event
 from .page import page_of
-from .system import MechanicalEvent, MechanicalMode, check_start, formulation_of
+from .system import MechanicalEvent, MechanicalMode, check_start, formulation_of, is_pair, with_modes_of_systems
 
 #: The statuses, by the code of the integration, of runs that did not reach their horizon.
 STATUSES = {
@@ -214,7 +214,8 @@ def assembled(tree: dict[str, Any]) -> tuple[Hybrid, Array, AbstractFormulation 
     """A system as a `Hybrid`, the state at its start, and the formulation of a mechanical system."""
     system, start, event = tree["system"], tree["start"], tree["event"]
     if isinstance(system, Hybrid):
-        return system, start, None
+        state = jnp.concatenate([start["q"], start["rate"]]) if isinstance(start, dict) else start
+        return with_modes_of_systems(system), state, None
     formulation = formulation_of(system)
     event = None if event is None else MechanicalEvent(formulation, event)
     return Hybrid([MechanicalMode(formulation)], event), formulation.state(start["q"], start["rate"]), formulation
@@ -223,11 +224,21 @@ def assembled(tree: dict[str, Any]) -> tuple[Hybrid, Array, AbstractFormulation 
 @model_of.register(Hybrid)
 def _(system: Hybrid, start: Any, event: Event | None = None, input: Any = None) -> OwnModel:
     check_start(system, start)
-    state = as_number(start)
+    pair = (
+        dict(zip(("q", "rate"), map(as_number, start), strict=True))
+        if _takes_pairs(system) and is_pair(start)
+        else None
+    )
+    state = as_number(start) if pair is None else jnp.concatenate([*pair.values()])
     if event is not None:
         require_event(event)
         system = dataclasses.replace(system, event=with_own_numbers(event, jnp.zeros(()), state))
-    return OwnModel.of({"system": system, "start": state, "event": None})
+    return OwnModel.of({"system": system, "start": state if pair is None else pair, "event": None})
+
+
+def _takes_pairs(system: Hybrid) -> bool:
+    """Whether a mechanical system is among the modes, so that a state is (q, rate)."""
+    return any(isinstance(mode, AbstractSystem) for mode in system.modes)
 
 
 @model_of.register(AbstractSystem)
@@ -253,25 +264,24 @@ TAKEN = ("time", "status", "end_time", "steps", "rejected", "switches", "mode", 
 
 def names_of(system: Any, size: int) -> tuple[str, ...]:
     """The names of the components of a state: those of the system or of its first mode that has some, or `y0` and so on, or
-    `q0` and `rate0` and so on.
+    `q0` and `rate0` and so on for a mechanical system.
 
     **Raises:** `ValueError` for a wrong number of names, names that are not different words, and names of other columns.
     """
-    if isinstance(system, Hybrid):
-        owner = next((mode for mode in system.modes if mode.names is not None), None)
-        names = None if owner is None else owner.names
-        if names is None:
-            return tuple(f"y{k}" for k in range(size))
-    else:
-        owner, size = system, system.dimension
-        names = system.names
-        if names is None:
-            return tuple(f"{name}{k}" for name in ("q", "rate") for k in range(size))
+    modes: Any = system.modes if isinstance(system, Hybrid) else (system,)
+    mechanical: Any = next((mode for mode in modes if isinstance(mode, AbstractSystem)), None)
+    owner: Any = next((mode for mode in modes if mode.names is not None), mechanical)
+    if owner is None:
+        return tuple(f"y{k}" for k in range(size))
+    if owner.names is None:
+        return tuple(f"{name}{k}" for name in ("q", "rate") for k in range(owner.dimension))
+    names, has_rates = owner.names, isinstance(owner, AbstractSystem)
+    size = owner.dimension if has_rates else size
     legal = isinstance(names, tuple | list) and all(isinstance(name, str) and name.isidentifier() for name in names)
     if not legal or len(set(names)) != size or len(names) != size or not set(names).isdisjoint(TAKEN):
-        kind = "component of the state" if isinstance(system, Hybrid) else "coordinate"
+        kind = "coordinate" if has_rates else "component of the state"
         raise ValueError(
             f"{type(owner).__name__}.names = {shown(names)} must be {size} different words, one for each {kind}, and none of "
             f"{', '.join(TAKEN)}"
         )
-    return tuple(names) if isinstance(system, Hybrid) else (*names, *(f"{name}_rate" for name in names))
+    return (*names, *(f"{name}_rate" for name in names)) if has_rates else tuple(names)

@@ -1,5 +1,6 @@
 """Systems that can be run: hybrid systems, and mechanical systems converted to hybrid ones."""
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..formulations import AbstractFormulation, AbstractSystem, Hamel, Lagrange
+from ..formulations.system import within_constraints
 from ..validation import UNTRACEABLE, as_number, is_traced, require, shown
 from .form import Form
 from .misspelt import warn_of_misspelt_methods
@@ -20,12 +22,34 @@ VIOLATION = 1e-9
 
 
 class MechanicalMode(AbstractMode):
-    """The motion of a mechanical system, in the state of one of its formulations."""
+    """The motion of a mechanical system, in the state of one of its formulations, as mode `number` of a hybrid system."""
 
     formulation: AbstractFormulation
+    number: int = eqx.field(static=True, default=0)
 
     def field(self, t: Float[Array, ""], y: State) -> State:
         return self.formulation.field(t, y)
+
+    def margin(self, t: Float[Array, ""], y: State) -> Float[Array, ""] | None:
+        return self.formulation.system.margin(t, *self.formulation.split(y))
+
+    def reset(self, t: Float[Array, ""], y: State) -> tuple[State, Any] | None:
+        following = self.formulation.system.reset(t, *self.formulation.split(y))
+        if following is None:
+            return None
+        q, rate, *number = following
+        return self.formulation.state(q, rate), number[0] if number else self.number
+
+    @property
+    def is_projected(self) -> bool:
+        """Whether a state may violate the constraints, so that `entered` projects it."""
+        system = self.formulation.system
+        return isinstance(self.formulation, Lagrange) and system.freedom < system.dimension
+
+    def entered(self, t: Float[Array, ""], y: State) -> State:
+        """The state after a reset to this mode, with rates that obey the constraints."""
+        q, rate = self.formulation.split(y)
+        return self.formulation.state(q, within_constraints(self.formulation.system, q, rate))
 
 
 class MechanicalEvent(eqx.Module):
@@ -49,15 +73,50 @@ def formulation_of(system: AbstractSystem) -> AbstractFormulation:
     return Hamel(system) if has_frame or has_lagrangian else Lagrange(system)
 
 
+def with_modes_of_systems(hybrid: Hybrid) -> Hybrid:
+    """The hybrid system with the equations of motion of the mechanical systems among its modes, for states (q, rate)."""
+    modes = tuple(
+        MechanicalMode(Lagrange(mode), number) if isinstance(mode, AbstractSystem) else mode
+        for number, mode in enumerate(hybrid.modes)
+    )
+    return dataclasses.replace(hybrid, modes=modes)
+
+
+def is_pair(start: Any) -> bool:
+    """Whether a start is a pair (q, rate) of vectors."""
+    return isinstance(start, tuple | list) and len(start) == 2 and all(np.ndim(as_number(part)) == 1 for part in start)
+
+
 def check_start(system: Hybrid | AbstractSystem, start: Any) -> None:
     """Raise `ValueError` unless the start is one of this system, and warn of misspelt methods."""
-    if isinstance(system, AbstractSystem):
-        warn_of_misspelt_methods(system, AbstractSystem)
-        _check_mechanical_start(system, start)
+    modes = [system] if isinstance(system, AbstractSystem) else system.modes
+    for mode in modes:
+        warn_of_misspelt_methods(mode, AbstractSystem if isinstance(mode, AbstractSystem) else AbstractMode)
+    mechanical = {number: mode for number, mode in enumerate(modes) if isinstance(mode, AbstractSystem)}
+    sizes = {mode.dimension for mode in mechanical.values()}
+    if len(sizes) > 1:
+        raise ValueError(
+            f"the systems among the modes must have one number of coordinates, not {', '.join(map(str, sorted(sizes)))}"
+        )
+    (size,) = sizes or (None,)
+    if isinstance(system, AbstractSystem) and not (isinstance(start, tuple | list) and len(start) == 2):
+        raise ValueError(f"start = {shown(start)} must be a pair (q, rate) of coordinates and their rates")
+    if isinstance(system, AbstractSystem) or (mechanical and is_pair(start)):
+        for name, part in zip(("q", "rate"), start, strict=True):
+            _check_vector(part, f"start: {name}", size)
     else:
-        for mode in system.modes:
-            warn_of_misspelt_methods(mode, AbstractMode)
-        _check_vector(start, "start", None)
+        _check_vector(start, "start", None if size is None else 2 * size)
+    for number, mode in mechanical.items():
+        prefix = "" if mode is system else f"modes[{number}]."
+        if prefix and type(mode).lagrangian is not AbstractSystem.lagrangian:
+            raise ValueError(
+                f"{prefix}lagrangian: a system with a Lagrangian of its own cannot be a mode; write metric and potential"
+            )
+        form = Form.of(Hybrid([MechanicalMode(Lagrange(mode))]), 2 * mode.dimension)[0]
+        _check_functions(form, prefix)
+    first = modes[0] if isinstance(system, AbstractSystem) else system.modes[system.first]
+    if isinstance(first, AbstractSystem):
+        _check_constraints(first, *(start if is_pair(start) else jnp.split(as_number(start), 2)))
 
 
 def _check_vector(value: Any, name: str, size: int | None) -> None:
@@ -69,11 +128,11 @@ def _check_vector(value: Any, name: str, size: int | None) -> None:
 
 
 @functools.lru_cache(maxsize=256)
-def _check_mechanical_functions(form: Form) -> None:
+def _check_functions(form: Form, prefix: str) -> None:
     """Raise `ValueError` that names a function of a system that JAX cannot trace or that returns a wrong shape.
 
     **Arguments:** `form`: that of a `Hybrid` of one `MechanicalMode`, so that a system with other numbers is not traced
-    again.
+    again; `prefix`: that of the names of the functions.
     """
     n = form.size // 2
     numbers, t, _ = form.arguments
@@ -84,10 +143,16 @@ def _check_mechanical_functions(form: Form) -> None:
         "constraints(q)": (
             (q,),
             f"of shape (k, {n}), a row for each constraint",
-            lambda shape: len(shape) == 2 and shape[1] == n,
+            lambda shape: shape is not None and len(shape) == 2 and shape[1] == n,
         ),
         "frame(q)": ((q,), f"of shape ({n}, {n})", lambda shape: shape == (n, n)),
         "force(t, q, rate)": ((t, q, q), f"of shape ({n},)", lambda shape: shape in ((), (1,), (n,))),
+        "margin(t, q, rate)": ((t, q, q), "one number or None", lambda shape: shape in ((), None)),
+        "reset(t, q, rate)": (
+            (t, q, q),
+            f"(q, rate), both of shape ({n},), or None; as a mode of a Hybrid also (q, rate, number of the next mode)",
+            lambda shape: shape is None or (shape[:2] == ((n,), (n,)) and shape[2:] in ((), ((),))),
+        ),
     }
 
     def called(method: str, numbers: Any, *arguments: Any) -> Any:
@@ -98,19 +163,24 @@ def _check_mechanical_functions(form: Form) -> None:
         try:
             result = jax.eval_shape(functools.partial(called, name.partition("(")[0]), numbers, *arguments)
         except jax.errors.JAXTypeError as error:
-            raise ValueError(f"{name} {UNTRACEABLE}") from error
-        shape = getattr(result, "shape", None)
-        if shape is None or not fits(shape):
-            raise ValueError(f"{name} must be {expected_shape}, not {result if shape is None else shape}")
+            raise ValueError(f"{prefix}{name} {UNTRACEABLE}") from error
+        shape = _shape_of(result)
+        if name.startswith("margin") and result is None:
+            break  # Nothing calls the reset.
+        if not fits(shape):
+            raise ValueError(f"{prefix}{name} must be {expected_shape}, not {shown(result) if shape == '' else shape}")
 
 
-def _check_mechanical_start(system: AbstractSystem, start: Any) -> None:
-    if not isinstance(start, tuple | list) or len(start) != 2:
-        raise ValueError(f"start = {shown(start)} must be a pair (q, rate) of coordinates and their rates")
-    for name, part in zip(("q", "rate"), start, strict=True):
-        _check_vector(part, f"start: {name}", system.dimension)
-    _check_mechanical_functions(Form.of(Hybrid([MechanicalMode(Lagrange(system))]), 2 * system.dimension)[0])
-    q, rate = (as_number(part) for part in start)
+def _shape_of(result: Any) -> Any:
+    """The shape of an array, a tuple of those of several arrays, `None` for `None`, and "" for anything else."""
+    if isinstance(result, tuple):
+        return tuple(map(_shape_of, result))
+    return None if result is None else getattr(result, "shape", "")
+
+
+def _check_constraints(system: AbstractSystem, q: Any, rate: Any) -> None:
+    """Raise `ValueError` if the rates of a start violate the constraints, or if the frame does not fit them."""
+    q, rate = as_number(q), as_number(rate)
     constraints = system.constraints(q)
     if not constraints.size:
         return

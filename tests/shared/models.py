@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import pytest
-from own_modes import Ball, Sleigh
+from own_modes import Ball, Bumper, Sleigh
 from tops import rutstam_top
 
 import stroller
@@ -88,7 +88,15 @@ CASES = {
     ),
 }
 
-CASES |= OF_MODES
+#: The union of the last two, whose parts the others test.
+IMPACTS = {
+    "impacts": Case(
+        Bumper(), ([0.0, 0.0, 0.0], jnp.array([3.0, 0.0, 0.5])), 1.5, lambda t, y: y[0] - 0.4, "restitution", 0.7, "x"
+    )
+}
+
+SLOW = OF_MODES | IMPACTS
+CASES |= SLOW
 
 #: The names of all cases, for a parametrization.
-NAMES = [pytest.param(name, marks=pytest.mark.slow if name in OF_MODES else ()) for name in CASES]
+NAMES = [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in CASES]

@@ -97,3 +97,39 @@ def final_turn(sleigh, rate):
     """
     turning = sleigh.inertia + sleigh.mass * sleigh.ahead**2
     return jnp.pi / (2.0 * sleigh.ahead) * jnp.sqrt(turning / sleigh.mass) * jnp.sign(rate)
+
+
+class Bumper(Sleigh):
+    """Chaplygin's sleigh with a bumper ahead of its blade that strikes a wall at x = wall."""
+
+    wall: float = 1.0
+    bumper: float = 0.2
+    restitution: float = 0.7
+
+    names = ("x", "y", "heading")
+
+    def margin(self, t, q, rate):
+        return self.wall - q[0] - self.bumper * jnp.cos(q[2])
+
+    def reset(self, t, q, rate):
+        return q, self.impact(t, q, rate, self.restitution)
+
+
+def after_impact(sleigh, heading, speed, time):
+    """Heading, forward velocity and turn rate of a `Bumper` at a time after its impact, if it starts straight from (0, 0).
+
+    With the turn rate w and J = I + m a^2, the kinetic energy is (m v^2 + J w^2) / 2, and the impulse of the wall changes
+    (m v, J w) along (-cos(heading), b sin(heading)), the slopes of the bumper's distance. Afterwards v' = a w^2 and
+    J w' = -m a v w, hence v = V tanh(k t), w = W sech(k t) with V = W sqrt(J / m) and k = a W sqrt(m / J).
+    """
+    m, a, b = sleigh.mass, sleigh.ahead, sleigh.bumper
+    c, s, turning = jnp.cos(heading), jnp.sin(heading), sleigh.inertia + m * a**2
+    impact = (sleigh.wall - b * c) / (speed * c)
+    impulse = (1.0 + sleigh.restitution) * speed * c / (c**2 / m + (b * s) ** 2 / turning)
+    v, w = speed - impulse * c / m, impulse * b * s / turning
+    top = jnp.sqrt(m / turning * v**2 + w**2)
+    k = a * top * jnp.sqrt(m / turning)
+    phase = jnp.arctanh(v / (top * jnp.sqrt(turning / m)))
+    later = phase + k * (time - impact)
+    turn = 2.0 * top / k * (jnp.arctan(jnp.tanh(later / 2.0)) - jnp.arctan(jnp.tanh(phase / 2.0)))
+    return jnp.stack([heading + turn, top * jnp.sqrt(turning / m) * jnp.tanh(later), top / jnp.cosh(later)])

@@ -132,6 +132,17 @@ def test_a_plan_shows_what_it_achieves(parked, tmp_path):
     assert all(f'"{name}"' in page.html for name in ("obstacles", "candidates", "footprint", "goal"))
 
 
+def test_a_table_drives_a_plan_as_a_single_ride_does(parked):
+    """The splines of a plan belong to a ride, whatever the number of cells: their coefficients are not one per cell."""
+    launch, _, plan = parked
+    run = stroller.simulate(SCENE, launch, plan.t1, plan.input, times=[plan.t1])
+    axes = {"body.mass": [5.0, 5.1, 5.0]}
+    table = stroller.sweep(SCENE, launch, plan.t1, axes=axes, input=plan.input, progress=False)
+    ends = np.stack([table.x, table.y], axis=-1)
+    assert_close(ends[[0, 2]], np.tile(run.place[-1], (2, 1)), atol=1e-7)
+    assert np.hypot(*(ends[1] - ends[0])) > 1e-5
+
+
 def test_what_is_out_of_reach_is_said():
     """Ten metres in three seconds, at 0.8 m/s at most."""
     launch, goal = stroller.Launch((0.0, 0.0), 0.0, 0.0), stroller.Goal((10.0, 0.0), 0.0)
