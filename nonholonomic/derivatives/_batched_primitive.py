@@ -78,7 +78,9 @@ class Request:
 
     def parts(self, cells: int, *leaves: Float[Array, "..."]) -> list[Array]:
         """The selected parts that are not `None`."""
-        parts = flat(self.tree(cells, *leaves))[0]
+        # The trace that gave the shapes of a single cell serves again: of derivatives through flights, it is half of the wait.
+        tree = _compiled_tree(self.solve, self.active, *leaves) if cells == 1 else self.tree(cells, *leaves)
+        parts = flat(tree)[0]
         selected = parts if self.selection is None else [parts[k] for k in self.selection]
         return [part for part in selected if part is not None]
 
@@ -88,7 +90,9 @@ def solve_one(request: Request, *leaves: Float[Array, "..."]) -> Any:
 
     **Arguments:** `request`: a request for all parts; `leaves`: numbers of a single cell.
     """
-    shapes, structure = flat(jax.eval_shape(functools.partial(_compiled_tree, request.solve, request.active), *leaves))
+    # Without weak types, as when the program is traced.
+    typed = (jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+    shapes, structure = flat(jax.eval_shape(functools.partial(_compiled_tree, request.solve, request.active), *typed))
     present = [k for k, shape in enumerate(shapes) if shape is not None]
     kinds = tuple(ShapedArray(shapes[k].shape[1:], shapes[k].dtype) for k in present)
     request = dataclasses.replace(request, selection=tuple(present))
@@ -98,7 +102,7 @@ def solve_one(request: Request, *leaves: Float[Array, "..."]) -> Any:
 
 @eqx.filter_jit
 def _compiled_tree(solve: Any, active: tuple[int, ...] | None, *leaves: Float[Array, "..."]) -> Any:
-    """The outputs for a single cell; never run, but JAX caches their shapes for equal solves."""
+    """The outputs for a single cell, traced once for equal solves: for the shapes, and as a part of a program."""
     return Request(solve, active).tree(1, *leaves)
 
 

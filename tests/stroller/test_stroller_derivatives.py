@@ -79,7 +79,11 @@ class Steps(eqx.Module):
         return 1.0, jnp.sum(weights * self.torques, axis=-1)
 
 
-@pytest.mark.parametrize("as_input", [lambda steps: steps, lambda steps: lambda t, motion: steps(t, motion)])
+@pytest.mark.parametrize(
+    "as_input",
+    [pytest.param(lambda steps: steps, marks=pytest.mark.slow), lambda steps: lambda t, motion: steps(t, motion)],
+    ids=["module", "function"],
+)
 def test_arrays_in_the_inputs_of_a_batch_have_the_slopes_of_their_own_rides(as_input):
     """A module with an array, and a function that holds one: as a batch like ride by ride, and as differences."""
 
