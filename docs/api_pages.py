@@ -108,7 +108,7 @@ PAGES = {
         "Estimate parameters from recordings and measured times.",
         [
             *of("nonholonomic", "identify Recording EventTimes"),
-            *of("tippe", "identify Recording read_recording InversionTimes Free log_density FitWarning"),
+            *of("tippe", "identify Recording read_recording InversionTimes ReversalTimes Free log_density FitWarning"),
             *of("stroller", "identify Recording read_recording"),
         ],
     ),
@@ -209,6 +209,7 @@ MEMBERS = {
     "tippe.Table": "shape dims long_names load save to_xarray to_dataframe plot digits",
     "tippe.LyapunovExponent": "exponent error status end_time steps times running",
     "tippe.InversionTimes": "measurements predict",
+    "tippe.ReversalTimes": "measurements predict",
     "tippe.Free": "start lower upper prior unit",
     "nonholonomic.AbstractMode": "field margin reset",
     "nonholonomic.AbstractSystem": "dimension metric potential constraints frame force margin reset impact lagrangian "

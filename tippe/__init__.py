@@ -21,6 +21,7 @@ from . import presets as presets
 from . import steady as steady
 from .fit.identify import identify as identify
 from .fit.inversion_times import InversionTimes as InversionTimes
+from .fit.inversion_times import ReversalTimes as ReversalTimes
 from .fit.posterior import log_density as log_density
 from .fit.recording import Recording as Recording
 from .fit.recording import read_recording as read_recording

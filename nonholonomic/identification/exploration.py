@@ -20,7 +20,8 @@ from .pareto import smoothed_weights
 from .posterior import LogDensity
 from .region import Region
 
-#: Number of points in a round; all rounds use one program. A round of the search by slopes uses fewer.
+#: Number of points in a round; all rounds use one program. With a single unknown, half as many are enough. A round of the
+#: search by slopes uses fewer.
 ROWS = 512
 
 #: An exploration ends with at least this many effective draws and a shape k of the weights below `MOST_K`, or after
@@ -104,12 +105,17 @@ class Explorer(NamedTuple):
         group = (np.searchsorted(distinct, times) * count) // len(distinct)
         return cls(density, measurements, region, group, np.random.default_rng(seed))
 
+    @property
+    def rows(self) -> int:
+        """Number of points in a round."""
+        return ROWS if len(self.region.middle) > 1 else ROWS // 2
+
     def begin(self, seed: int) -> Pool:
         """A pool of quasi-random points in the region."""
         size, values, groups = len(self.region.middle), self.measurements.value.size, int(np.max(self.group)) + 1
         shapes = ((0, size), (0, values), (0, groups), (0,), (0,), (0,))
         empty = Pool(*(np.zeros(shape) for shape in shapes), proposals=())
-        return self.extended(empty, self.region.points(ROWS if size > 2 else ROWS // 2, seed), self.region)
+        return self.extended(empty, self.region.points(ROWS if size > 2 else self.rows // 2, seed), self.region)
 
     def extended(self, pool: Pool, points: Float[np.ndarray, "rows unknowns"], proposal: Any) -> Pool:
         """The pool with points that were drawn from a proposal."""
@@ -146,7 +152,7 @@ class Explorer(NamedTuple):
         current = Weighted.of(pool)
         rate = current.effective / max(len(current.weights) - pool.proposals[0][0], 1)
         missing = 1.25 * (ENOUGH - current.effective) / max(rate, 1e-3) if len(pool.proposals) > 1 else np.inf
-        count = ROWS if current.k >= MOST_K else int(np.clip(missing, ROWS // 8, ROWS))
+        count = self.rows if current.k >= MOST_K else int(np.clip(missing, self.rows // 8, self.rows))
         return mixture.draw(count, self.random), mixture
 
     def proposal(self, pool: Pool, minima: Mixture | None, share: float = KEPT) -> Mixture:

@@ -60,6 +60,7 @@ def minimise(
     measurements: Measurements,
     *,
     fixed: int | None = None,
+    rows: Any = None,
     max_steps: int = 60,
     progress: bool = False,
 ) -> Ends:
@@ -71,25 +72,28 @@ def minimise(
     - `starts`: coordinates, (rows, unknowns).
     - `measurements`: (n,), the same for all rows, or (rows, n).
     - `fixed`: index of an unknown that keeps its start value, or `None`.
+    - `rows`: (rows,), which of the rows to fit, by default all; the others stay at their starts.
     - `max_steps`: a row that needs more steps has not converged.
     - `progress`: whether to show, on a terminal or in a notebook, how many rows are done.
 
     **Returns:** the `Ends`.
     """
     coordinates = np.array(starts, float)
-    rows, unknowns = coordinates.shape
-    measurements = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (rows, leaf.shape[-1])), measurements)
+    count, unknowns = coordinates.shape
+    measurements = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, leaf.shape[-1])), measurements)
     moving = np.array([k for k in range(unknowns) if k != fixed], int)
     bounded = [unknown.has_lower or unknown.has_upper for unknown in problem.unknowns]
     reach = np.where(bounded, FARTHEST, np.inf)[moving]
-    done, steps = np.zeros(rows, bool), np.zeros(rows, int)
-    with Progress(rows, "fit", shown=progress) as display:
+    done = np.zeros(count, bool) if rows is None else ~np.asarray(rows)
+    has_converged, steps = np.zeros(count, bool), np.zeros(count, int)
+    with Progress(int(np.sum(~done)), "fit", shown=progress) as display:
         current = _Fit.of(linearise(problem, coordinates, measurements), moving)
         display.begin()
-        scale, damping = np.zeros((rows, len(moving))), np.full(rows, FIRST_DAMPING)
+        scale, damping = np.zeros((count, len(moving))), np.full(count, FIRST_DAMPING)
         free = max(current.residual.shape[1] - len(moving), 1)
         history = [current.deviance]
-        done |= _promise(current) < CONVERGED
+        has_converged |= ~done & (_promise(current) < CONVERGED)
+        done |= has_converged
         for step in range(1, max_steps + 1):
             if done.all():
                 break
@@ -111,8 +115,9 @@ def minimise(
                 excess = np.maximum(current.deviance - BAD * free, 1.0)
                 ended |= history[-1 - PATIENCE] - current.deviance < STALLED * excess
             display.advance(int(np.sum(ended & ~done)), steps=step)
+            has_converged |= ~done & ended
             done |= ended
-    return Ends(coordinates, done, steps)
+    return Ends(coordinates, has_converged, steps)
 
 
 class _Fit(NamedTuple):

@@ -175,9 +175,11 @@ def linearise(problem: Problem, coordinates: Any, measurements: Measurements, ma
     )
 
 
-def deviances(problem: Problem, coordinates: Rows, measurements: Measurements) -> Float[np.ndarray, " rows"]:
-    """-2 log posterior in every row, up to a constant, without slopes."""
-    residual = compared(measurements, predictions(problem, coordinates))[0]
+def deviances(
+    problem: Problem, coordinates: Rows, prediction: Float[np.ndarray, "rows n"], measurements: Measurements
+) -> Float[np.ndarray, " rows"]:
+    """-2 log posterior in every row, up to a constant, from the predictions of the rows."""
+    residual = compared(measurements, prediction)[0]
     prior = np.asarray(_priors(problem.unknowns, jnp.asarray(coordinates, float))[0])
     return np.sum(residual**2, axis=1) + np.sum(prior**2, axis=1)
 

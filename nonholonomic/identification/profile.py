@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from .exploration import ROWS
 from .levenberg_marquardt import minimise
-from .problem import deviances, linearise
+from .problem import deviances, linearise, predictions
 
 #: Number of batches in which the other parameters are searched, and by how much the search narrows in each.
 BATCHES, NARROWER = 3, 0.4
@@ -81,6 +81,6 @@ def _deviances(fit: Any, coordinates: Float[np.ndarray, "rows unknowns"]) -> Flo
     """-2 log likelihood in every row, infinite instead of NaN, in batches of the size of an exploration's."""
     padding = np.full((-len(coordinates) % ROWS, coordinates.shape[1]), np.nan)
     batches = np.concatenate([coordinates, padding]).reshape(-1, ROWS, coordinates.shape[1])
-    parts = [deviances(fit.problem, batch, fit.measurements) for batch in batches]
+    parts = [deviances(fit.problem, batch, predictions(fit.problem, batch), fit.measurements) for batch in batches]
     deviance = np.concatenate(parts)[: len(coordinates)]
     return np.where(np.isfinite(deviance), deviance, np.inf)

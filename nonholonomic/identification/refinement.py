@@ -108,21 +108,27 @@ class Minima(NamedTuple):
 
 
 def refine(
-    problem: Problem, starts: Any, measurements: Measurements, max_steps: int, progress: bool, in_parts: bool
+    problem: Problem,
+    starts: Any,
+    measurements: Measurements,
+    max_steps: int,
+    progress: bool,
+    in_parts: bool,
+    rows: Any = None,
 ) -> Minima:
     """Fit every row, and estimate unknown errors from the residuals of the best.
 
     **Arguments:** `starts`: coordinates, (rows, unknowns); `in_parts`: whether recordings are also fitted in stages; the
     others as for `minimise`.
     """
-    ends, at_ends = _fitted(problem, starts, measurements, max_steps, progress, in_parts)
+    ends, at_ends = _fitted(problem, starts, measurements, max_steps, progress, in_parts, rows)
     for _ in range(ROUNDS if np.any(np.asarray(measurements.estimated)) else 0):
         best = int(np.argmin(at_ends.deviance))
         errors = estimated_errors(measurements, at_ends.prediction[best], len(problem.names))
         change = np.max(np.abs(np.log(errors / np.asarray(measurements.error))))
         measurements = measurements.with_errors(errors)
         if change > SETTLED:
-            ends = minimise(problem, ends.coordinates, measurements, max_steps=max_steps, progress=progress)
+            ends = minimise(problem, ends.coordinates, measurements, rows=rows, max_steps=max_steps, progress=progress)
         at_ends = linearise(problem, ends.coordinates, measurements)
         if change <= SETTLED:
             break
@@ -130,7 +136,13 @@ def refine(
 
 
 def _fitted(
-    problem: Problem, starts: Any, measurements: Measurements, max_steps: int, progress: bool, in_parts: bool
+    problem: Problem,
+    starts: Any,
+    measurements: Measurements,
+    max_steps: int,
+    progress: bool,
+    in_parts: bool,
+    rows: Any,
 ) -> tuple[Ends, Linearised]:
     """The ends of the fits. Recordings are also fitted in stages, to longer and longer parts; the better of the two
     ends counts.
@@ -138,7 +150,7 @@ def _fitted(
     Predicted late samples can be wrong by whole turns, and would then lead to another minimum.
     """
     steps = min(max_steps, STEPS_AT_ONCE) if in_parts else max_steps
-    ends = minimise(problem, starts, measurements, max_steps=steps, progress=progress)
+    ends = minimise(problem, starts, measurements, rows=rows, max_steps=steps, progress=progress)
     at_ends = linearise(problem, ends.coordinates, measurements)
     duration = float(np.max(np.asarray(measurements.time)))
     if not (in_parts and duration > 0.0):

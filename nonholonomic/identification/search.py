@@ -12,6 +12,9 @@ from .refinement import Minima, refine
 #: a recording.
 FEW_STEPS, BETWEEN = 6, 20
 
+#: Number of minima that are refined to the end after an exploration.
+LAST = 4
+
 #: Points of the exploration that are better than all minima by more than this in -2 log likelihood are refined, too.
 IMPROVED = 0.1
 
@@ -49,14 +52,19 @@ def search(problem: Problem, explorer: Explorer, options: Search) -> tuple[Minim
 
 
 def _improved(problem: Problem, minima: Minima, sample: Weighted, options: Search) -> Minima:
-    """The minima, refined to the end; from the best points of the exploration if these are better."""
+    """The minima, the best of them refined to the end; from the best points of the exploration if these are better."""
     rows, max_steps = len(minima.starts), options.max_steps
-    best = sample.pool.points[np.argsort(-sample.pool.log_density)[:rows]]
-    if np.min(deviances(problem, best, minima.measurements)) < np.min(minima.deviance) - IMPROVED:
+    pool, order = sample.pool, np.argsort(-sample.pool.log_density)[:rows]
+    best = pool.points[order]
+    if (
+        np.min(deviances(problem, best, pool.predictions[order], minima.measurements))
+        < np.min(minima.deviance) - IMPROVED
+    ):
         few = min(max_steps, FEW_STEPS)
-        later = refine(problem, best, minima.measurements, few, options.progress, in_parts=False)
+        later = refine(problem, best, minima.measurements, few, options.progress, False, np.arange(rows) < LAST)
         return later if np.min(later.deviance) < np.min(minima.deviance) else minima
     if minima.converged[minima.best]:
         return minima
-    later = refine(problem, minima.coordinates, minima.measurements, max_steps, options.progress, in_parts=False)
-    return later._replace(starts=minima.starts)
+    last = np.isin(np.arange(rows), np.argsort(minima.deviance)[:LAST])
+    later = refine(problem, minima.coordinates, minima.measurements, max_steps, options.progress, False, last)
+    return later._replace(starts=minima.starts, converged=minima.converged | later.converged)

@@ -13,7 +13,7 @@ import optimistix
 from jaxtyping import Array, Bool, Float, Int
 
 from ..compiled_programs import padded
-from .problem import AbstractProblem
+from .problem import AbstractProblem, margin_at_start
 from .settings import Settings
 from .zeros import halved
 
@@ -83,7 +83,7 @@ def _start(
 ) -> tuple[Float[Array, " components"], Float[Array, " components"], Float[Array, ""] | None]:
     """State, scales and domain margin at the start: one program, where JAX would compile each of their operations."""
     state, scales = problem.start()
-    return jnp.asarray(state), jnp.asarray(scales), problem.domain_margin(time, state)
+    return jnp.asarray(state), jnp.asarray(scales), margin_at_start(problem, time, state)
 
 
 def _control(settings: Settings, scales: Float[Array, " components"]) -> diffrax.PIDController:
@@ -271,7 +271,7 @@ def sample(
     [[0.367879 0.135335]]
     """
     state, scales = problem.start()
-    margin = problem.domain_margin(jnp.zeros_like(t1), state)
+    margin = margin_at_start(problem, jnp.zeros_like(t1), state)
     watched = margin is not None
     # Diffrax detects only changes of the margin's sign, so a run that starts outside the domain must end at once.
     at_once = jnp.zeros((), bool) if margin is None else margin <= 0.0

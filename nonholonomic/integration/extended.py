@@ -7,7 +7,7 @@ from typing import Generic, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .problem import AbstractProblem
 from .runge_kutta import Lanes, States
@@ -83,6 +83,9 @@ class ExtendedProblem(AbstractProblem, Generic[Core]):
 
     def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
         return self.problem.domain_margin(time, state[: self.leading])
+
+    def lost_at_start(self, state: States) -> Bool[Array, "..."] | None:
+        return self.problem.lost_at_start(state[: self.leading])
 
     def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
         return self.problem.margins(time, state[: self.leading])

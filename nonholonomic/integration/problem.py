@@ -7,7 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .runge_kutta import Lanes, States, lesser
 
@@ -67,6 +67,12 @@ class AbstractProblem(eqx.Module):
     def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
         """A function of order 1 that is positive while the model holds; `None` if the model always holds."""
 
+    def lost_at_start(self, state: States) -> Bool[Array, "..."] | None:
+        """A mask of the lanes whose model ceases to hold at the start, though their domain margin is positive by an
+        allowance for round-off; `None` if the margin alone decides.
+        """
+        return None
+
     def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
         """The smooth functions of which `domain_margin` is the least; a step searches each of them for a missed double root."""
         domain_margin = self.domain_margin(time, state)
@@ -113,6 +119,9 @@ class CoreProblem(AbstractProblem):
     def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
         return self.whole.domain_margin(time, self._longer(state))
 
+    def lost_at_start(self, state: States) -> Bool[Array, "..."] | None:
+        return self.whole.lost_at_start(self._longer(state))
+
     def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
         return self.whole.margins(time, self._longer(state))
 
@@ -120,6 +129,12 @@ class CoreProblem(AbstractProblem):
         state = jnp.stack(state) if isinstance(state, tuple) else state
         missing = len(self.whole.start()[0]) - self.size
         return jnp.concatenate([state, jnp.zeros((missing, *state.shape[1:]))])
+
+
+def margin_at_start(problem: AbstractProblem, time: Lanes, state: States) -> Lanes | None:
+    """The domain margin at the start, at most 0 where the model ceases to hold at once."""
+    margin, lost = problem.domain_margin(time, state), problem.lost_at_start(state)
+    return margin if margin is None or lost is None else jnp.where(lost, jnp.minimum(margin, 0.0), margin)
 
 
 def least_margin(problem: AbstractProblem, side: Lanes, time: Lanes, state: States, rate: States) -> Lanes:

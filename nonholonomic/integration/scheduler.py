@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..xla_cpu import in_one_kernel
 from .event import Bracket
-from .problem import AbstractProblem, least_margin
+from .problem import AbstractProblem, least_margin, margin_at_start
 from .runge_kutta import Lanes, States, explicit_order, explicit_tableau, first_length, memory_for_stages
 from .settings import Settings
 from .status import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING
@@ -286,8 +286,10 @@ def _fresh_lanes(
         valid = _holds(problem, lambda point: problem.domain_margin(zero, point), states, rates, lengths)
         side = jnp.ones_like(zero) if before_event is None else jnp.where(before_event, 1.0, -1.0).astype(zero.dtype)
         status = jnp.full(zero.shape, RUNNING) if valid is None else jnp.where(valid, RUNNING, LEFT_DOMAIN)
+        lost = problem.lost_at_start(states)
+        status = status if lost is None else jnp.where(lost, LEFT_DOMAIN, status)
         return _lanes_at_start(problem, states, rates, lengths, side, status, jnp.full_like(zero, jnp.inf))
-    crossing, domain_margin = problem.event_function(states), problem.domain_margin(zero, states)
+    crossing, domain_margin = problem.event_function(states), margin_at_start(problem, zero, states)
     is_beyond = false
     if crossing is not None:
         # Exactly on the event, the direction of the motion decides.

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..hybrid import AbstractBatchedMode, Transition
 from ..hybrid.saltation import UNMEASURED
@@ -176,6 +176,9 @@ class EventProblem(AbstractProblem):
 
     def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
         return self.motion.domain_margin(time, self._core(state))
+
+    def lost_at_start(self, state: States) -> Bool[Array, "..."] | None:
+        return self.motion.lost_at_start(self._core(state))
 
     def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
         return self.motion.margins(time, self._core(state))

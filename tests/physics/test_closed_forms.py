@@ -10,6 +10,7 @@ from close import assert_close
 from scipy.special import ellipk
 from tops import homogeneous_ball, rutstam_top
 
+import nonholonomic
 import tippe
 from nonholonomic.integration import Settings, follow
 from tippe.modes.trajectory_problem import trajectory_problem
@@ -113,3 +114,19 @@ def test_the_wall_start_presses_on_the_arena_at_once():
         A = a * math.sin(theta) ** 2 / I1
         expected = 1.5 * m * GRAVITY**2 * 4e-6 / (0.28 * (1.0 + m * a * A))
         assert_close(run.normal_force[0], expected, rtol=5e-3)
+
+
+@pytest.mark.parametrize(
+    "friction", [tippe.Viscous(0.3), tippe.SetValuedCoulomb(0.3), tippe.NoSlip()], ids=["slides", "sticks", "rolls"]
+)
+def test_a_sphere_on_a_vertical_wall_loses_contact_at_once(friction):
+    """Nothing presses it on the wall: N = 0 for ever, and a spin about the normal does not change that."""
+    sphere = tippe.Top(0.02, 0.02, 0.0, 3.2e-6, 3.2e-6)
+    if isinstance(friction, tippe.NoSlip):
+        sphere = tippe.Ellipsoid(0.02, (0.02, 0.02, 0.02), (0.0, 0.0, 0.0), 3.2e-6 * np.eye(3))
+    scene = tippe.Scene(sphere, tippe.Plane(math.pi / 2.0), friction)
+    run = tippe.simulate(scene, tippe.Launch(0.0, 20.0), 0.5)
+    assert (run.status, run.end_time) == ("contact_lost", 0.0)
+    table = nonholonomic.sweep(scene, tippe.Launch(0.0, 20.0), 0.5, axes={"spin": [10.0, 20.0]}, progress=False)
+    assert list(table.status) == 2 * ["contact_lost"]
+    assert list(table.end_time) == [0.0, 0.0]

@@ -194,7 +194,7 @@ def test_bad_unknowns_are_refused_before_anything_runs(rutstam_scene, free, mess
     data = tippe.InversionTimes(LAUNCH, [1.0, 2.0, 3.0, 4.0], 0.1, t1=5.0)
     with pytest.raises(ValueError, match=message):
         tippe.identify(rutstam_scene, data, free)
-    with pytest.raises(ValueError, match="must be an InversionTimes or a Recording"):
+    with pytest.raises(ValueError, match="must be an InversionTimes, a ReversalTimes or a Recording"):
         tippe.identify(rutstam_scene, 3.0, {"mu": 0.2})
 
 

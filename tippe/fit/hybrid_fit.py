@@ -4,7 +4,6 @@ JAX's transformations."""
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -14,17 +13,12 @@ from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.runs import TableJob
 
 from ..model.scene import Scene
-from ..runs.extended_times import beyond_horizon
-from ..runs.model import INVERSIONS, TopModel
-from ..runs.turned_over import angle_of, event_of
 from ..runs.verbs import simulate
-from .inversion_times import InversionTimes
+from .inversion_times import AbstractTimes
 from .recording import Recording
 
-#: Number of rows of a recording that are simulated together: as many as a fit explores at once. Rows of NaN take no time.
-BATCH = 512
-
-_beyond_horizon = jax.jit(beyond_horizon)
+#: Number of rows that one program simulates together: as many as a fit explores at once, or a few.
+BATCH, FEW = 512, 64
 
 
 @eqx.filter_jit
@@ -66,11 +60,10 @@ class HybridModel(NamedTuple):
         if isinstance(data, Recording) and not self.scene.friction.set_valued:
             return self._samples_in_lanes(data, rows)
         allowed = [i for i, row in enumerate(rows) if self._allows(data, row)]
-        if allowed and isinstance(data, InversionTimes):
-            # Legal rows run in the place of illegal ones, so that every call has the same number of cells and is
-            # compiled once.
-            all_rows = [rows[i] if i in allowed else rows[allowed[0]] for i in range(len(rows))]
-            predictions[allowed] = self._times(data, all_rows)[allowed]
+        if allowed and isinstance(data, AbstractTimes):
+            legal = [rows[i] for i in allowed]
+            batches = [legal[first : first + BATCH] for first in range(0, len(legal), BATCH)]
+            predictions[allowed] = np.concatenate([self._times(data, batch) for batch in batches])
         elif allowed:
             for i in allowed:
                 predictions[i] = self._samples(data, rows[i])
@@ -100,22 +93,23 @@ class HybridModel(NamedTuple):
         scene_row = {name: value for name, value in row.items() if name != "t0"}
         return with_numbers({"scene": self.scene, "launch": data.launch}, scene_row)
 
-    def _times(self, data: InversionTimes, rows: list[dict[str, float]]) -> Float[np.ndarray, "rows launches"]:
-        """Times continued beyond the horizon, as by `extended_inversion_time`."""
-        launches = data.size
+    def _times(self, data: AbstractTimes, rows: list[dict[str, float]]) -> Float[np.ndarray, "rows launches"]:
+        """The predicted times of at most `BATCH` rows."""
+        launches, count = data.size, len(rows)
+        # Two numbers of cells, hence two programs, serve all calls; only the first cells run.
+        size = FEW if count <= FEW else BATCH
+        rows = rows + [rows[0]] * (size - count)
         of_launch = {name: value for name, value in numbers("launch", data.launch).items() if value is not None}
         columns = {
             name: np.tile(np.broadcast_to(np.asarray(value), (launches,)), len(rows))
             for name, value in of_launch.items()
         }
         columns |= {name: np.repeat([row[name] for row in rows], launches) for name in rows[0] if name != "t0"}
-        t1, angle, event = float(data.t1), float(angle_of(self.scene, data.angle)), event_of(self.scene, data.angle)
-        model, settings = TopModel.timed(self.scene, data.launch, event), Settings(self.tolerance)
-        variables = TableJob(model, INVERSIONS, t1, "first", settings)(columns, launches * len(rows))
-        later = np.asarray(_beyond_horizon(variables["end_theta"], columns["launch.theta"], angle, t1))
-        time = np.where(np.isfinite(variables["time"]), variables["time"], later)
-        has_failed = np.asarray(variables["status"]) == INVERSIONS.words.index("failed")
-        return np.where(has_failed, np.nan, time).reshape(len(rows), launches)
+        job = TableJob(data.timed(self.scene), data.form, float(data.t1), "first", Settings(self.tolerance))
+        cells = job(columns, launches * count)
+        time = np.asarray(data.of_cells(self.scene, cells, columns["launch.theta"]))
+        has_failed = np.asarray(cells["status"]) == data.form.words.index("failed")
+        return np.where(has_failed, np.nan, time).reshape(size, launches)[:count]
 
     def _samples(self, data: Recording, row: dict[str, float]) -> Float[np.ndarray, " size"]:
         """The samples of one run. Samples before the launch equal those at the launch; samples after the run's end are

@@ -30,7 +30,7 @@ from ..runs.run_kind import run_kind_of
 from ..runs.turned_over import angle_of
 from ..runs.verbs import simulate
 from .hybrid_fit import HybridModel
-from .inversion_times import InversionTimes, Values
+from .inversion_times import AbstractTimes, InversionTimes, Values
 from .recording import Recording
 
 
@@ -43,8 +43,8 @@ class SceneModel(AbstractDataModel):
     tolerance: Float[Array, ""] = eqx.field(converter=as_number)
 
     def together(self, source: Any, values: Values) -> Hashable:
-        if isinstance(source, InversionTimes):
-            return InversionTimes
+        if isinstance(source, AbstractTimes):
+            return type(source)
         names = tuple(name for name, value in numbers("launch", source.launch).items() if value is not None)
         return names, tuple(values)
 
@@ -75,7 +75,7 @@ def identify(
     **Arguments:**
 
     - `scene`: a `Scene`, with the values of the parameters that are not free.
-    - `data`: an `InversionTimes` or a `Recording`, or a list of several, which are fitted together.
+    - `data`: an `InversionTimes`, a `ReversalTimes` or a `Recording`, or a list of several, which are fitted together.
     - `free`: full name of a parameter -> a `Free` or only the start value: `"scene.friction.mu"`, or `"friction.mu"` if
       no other name ends so. A parameter of the launch, and `"t0"`, the reading of a recording's clock at the launch,
       are the same in all data; `"data[1].launch.azimuth"` belongs to the second set of data, and `"data[*].t0"` is a
@@ -128,14 +128,17 @@ def checked_data(scene: Scene, data: Any, tolerance: float, caller: str | None) 
     require_kind(scene, "scene", Scene)
     if caller is not None:
         check_smooth(scene, caller)
-    data = as_sources(data, InversionTimes | Recording, "an InversionTimes or a Recording")
+    data = as_sources(data, AbstractTimes | Recording, "an InversionTimes, a ReversalTimes or a Recording")
     check_run(scene, Launch(0.0, 0.0), 1.0, tolerance)
+    for source in data:
+        if isinstance(source, AbstractTimes):
+            source.check(scene)
     return tuple(_with_angle(scene, source) for source in data)
 
 
 def _with_angle(scene: Scene, source: Any) -> Any:
     """The data with the default angle written out, so that one program serves every angle. With a stem, there is none."""
-    if isinstance(source, Recording) or source.angle is not None or scene.has_stem:
+    if not isinstance(source, InversionTimes) or source.angle is not None or scene.has_stem:
         return source
     return dataclasses.replace(source, angle=angle_of(scene, None))
 

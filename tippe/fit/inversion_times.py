@@ -1,5 +1,6 @@
-"""Measured inversion times of launches."""
+"""Measured times of launches: of inversion, and of reversal."""
 
+import abc
 import math
 from typing import Any, ClassVar
 
@@ -11,56 +12,40 @@ from jaxtyping import Array, Float
 
 from nonholonomic.identification import Measurements
 from nonholonomic.parameters import numbers, one_line, with_numbers
+from nonholonomic.runs import TableForm
 from nonholonomic.validation import as_number, as_number_or_none, require, require_kind, shown
 
 from ..model.launch import Launch, as_launch
 from ..model.scene import Scene
-from ..runs.checks import check_event
-from ..runs.extended_times import extended_inversion_time
-from ..runs.turned_over import angle_of
+from ..runs.checks import check_event, check_reversible
+from ..runs.extended_times import beyond_horizon, extended_inversion_time
+from ..runs.model import INVERSIONS, REVERSALS, TopModel
+from ..runs.reversal import require_rigid, reversal_time
+from ..runs.turned_over import angle_of, event_of
 
 #: Parameters by name, one value per row.
 Values = dict[str, Float[Array, " rows"]]
 
 
-class InversionTimes(eqx.Module):
-    """Measured inversion times of launches. As a parameter varies, the time jumps by a nutation period, so its slope
-    differs from its trend; the time is smooth only if theta grows monotonically. Small initial angles, target angles of
-    0.6 to 0.8 pi, and several launches keep the jumps below the errors.
+_beyond_horizon = jax.jit(beyond_horizon)
 
-    **Arguments:**
 
-    - `launch`: a list of launches; or one `Launch` whose numbers are scalars or arrays (launches,).
-    - `time`: (launches,) [s], infinite for a top that did not invert while you watched; or (launches, 2), two times
-      between which the top inverted: (0, a) before a, (b, inf) later than b, (a, b) between a and b, (t, t) at t.
-    - `error`: standard errors [s], a scalar or (launches,); for a limit, the error of the clock.
-    - `t1`: horizon of the model's runs [s]: choose several times the longest measured time, because start values may be
-      far off.
-    - `until`: time [s] until which you watched a launch that did not invert, a scalar or (launches,); `t1` by default.
-      The likelihood of such a launch is the probability of a time beyond `until`.
-    - `angle`: angle [rad] that counted as inverted; by default as for `inversion_time`.
-    - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for data with outliers;
-      `None` for Gaussian errors.
+class AbstractTimes(eqx.Module):
+    """Measured times of an event of launches.
 
-    **Raises:** `ValueError` for numbers out of range or shapes that do not fit.
-
-    **Example:** the second launch inverted between two frames, the third had not inverted after 6 s.
-
-    >>> import numpy as np, tippe
-    >>> launch = tippe.Launch(theta=0.1, spin=[150.0, 120.0, 60.0])
-    >>> data = tippe.InversionTimes(launch, [(5.2, 5.2), (5.4, 5.6), (6.0, np.inf)], error=0.02, t1=20.0)
-    >>> data.measurements.censored.tolist()
-    [False, True, True]
+    - `launch`, `time`, `error`, `t1`, `until`: as for `InversionTimes`.
+    - `student`: degrees of freedom of Student's t distribution of the errors, or `None`.
+    - `form`: names in a table of such times.
     """
+
+    student: eqx.AbstractVar[Any]
+    form: eqx.AbstractClassVar[TableForm]
 
     launch: Launch = eqx.field(converter=as_launch)
     time: Float[Array, "launches *two"] = eqx.field(converter=as_number)
     error: Float[Array, "..."] = eqx.field(converter=as_number)
     t1: Float[Array, ""] = eqx.field(converter=as_number)
     until: Any = eqx.field(converter=as_number_or_none, default=None)
-    angle: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
-    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
-    units: ClassVar[dict[str, str]] = {"time": "s", "error": "s", "t1": "s", "until": "s", "angle": "rad"}
 
     def __repr__(self) -> str:
         return one_line(self)
@@ -73,10 +58,9 @@ class InversionTimes(eqx.Module):
         if len(shape) not in (1, 2) or shape[0] == 0 or shape[1:] not in ((), (2,)):
             raise ValueError(f"time must be a non-empty list of times or of pairs of them, not of shape {shape}")
         require(self.t1, "t1", above=0.0)
-        check_event(self.angle, "first")
         measured = np.asarray(self.time)
         if np.any(np.isnan(measured)):
-            raise ValueError("time must be numbers, infinite where a launch did not invert")
+            raise ValueError("time must be numbers, infinite where the event did not happen")
         if self.until is not None:
             require(self.until, "until", above=0.0, at_most=self.t1, why="t1")
         first, last = self._limits
@@ -134,6 +118,25 @@ class InversionTimes(eqx.Module):
         )
         return tuple(f"theta {theta:.4g}, spin {spin:.4g}" for theta, spin in zip(*columns[:2], strict=True))
 
+    def check(self, scene: Scene) -> None:
+        """Raise `ValueError` unless the scene has such events."""
+
+    def timed(self, scene: Scene) -> TopModel:
+        """The model of the launch whose runs end on the event."""
+        return TopModel.timed(scene, self.launch, self._event(scene))
+
+    @abc.abstractmethod
+    def _event(self, scene: Scene) -> Any:
+        """What ends a run, as for `TopModel.timed`."""
+
+    @abc.abstractmethod
+    def of_run(self, scene: Scene, launch: Launch, tolerance: Float[Array, ""]) -> Float[Array, ""]:
+        """The predicted time of one launch."""
+
+    @abc.abstractmethod
+    def of_cells(self, scene: Scene, cells: dict[str, Any], theta: Any) -> Any:
+        """The predicted times from the cells of a table, whose launches began at `theta`."""
+
     def predict(
         self, scene: Scene, values: Values, rows: int, tolerance: Float[Array, ""]
     ) -> Float[Array, "rows launches"]:
@@ -144,10 +147,103 @@ class InversionTimes(eqx.Module):
 
         def time_of_lane(lane: dict[str, Array]) -> Float[Array, ""]:
             roots = with_numbers({"scene": scene, "launch": _one_of(self.launch)}, lane)
-            angle = angle_of(roots["scene"], self.angle)
-            return extended_inversion_time(roots["scene"], roots["launch"], self.t1, angle, tolerance)
+            return self.of_run(roots["scene"], roots["launch"], tolerance)
 
         return jax.vmap(time_of_lane)(lanes).reshape(rows, launches)
+
+
+class InversionTimes(AbstractTimes):
+    """Measured inversion times of launches. As a parameter varies, the time jumps by a nutation period, so its slope
+    differs from its trend; the time is smooth only if theta grows monotonically. Small initial angles, target angles of
+    0.6 to 0.8 pi, and several launches keep the jumps below the errors.
+
+    **Arguments:**
+
+    - `launch`: a list of launches; or one `Launch` whose numbers are scalars or arrays (launches,).
+    - `time`: (launches,) [s], infinite for a top that did not invert while you watched; or (launches, 2), two times
+      between which the top inverted: (0, a) before a, (b, inf) later than b, (a, b) between a and b, (t, t) at t.
+    - `error`: standard errors [s], a scalar or (launches,); for a limit, the error of the clock.
+    - `t1`: horizon of the model's runs [s]: choose several times the longest measured time, because start values may be
+      far off.
+    - `until`: time [s] until which you watched a launch that did not invert, a scalar or (launches,); `t1` by default.
+      The likelihood of such a launch is the probability of a time beyond `until`.
+    - `angle`: angle [rad] that counted as inverted; by default as for `inversion_time`.
+    - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for data with outliers;
+      `None` for Gaussian errors.
+
+    **Raises:** `ValueError` for numbers out of range or shapes that do not fit.
+
+    **Example:** the second launch inverted between two frames, the third had not inverted after 6 s.
+
+    >>> import numpy as np, tippe
+    >>> launch = tippe.Launch(theta=0.1, spin=[150.0, 120.0, 60.0])
+    >>> data = tippe.InversionTimes(launch, [(5.2, 5.2), (5.4, 5.6), (6.0, np.inf)], error=0.02, t1=20.0)
+    >>> data.measurements.censored.tolist()
+    [False, True, True]
+    """
+
+    angle: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
+    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
+    units: ClassVar[dict[str, str]] = {"time": "s", "error": "s", "t1": "s", "until": "s", "angle": "rad"}
+    form = INVERSIONS
+
+    def __check_init__(self):
+        check_event(self.angle, "first")
+
+    def _event(self, scene: Scene) -> Any:
+        return event_of(scene, self.angle)
+
+    def of_run(self, scene: Scene, launch: Launch, tolerance: Float[Array, ""]) -> Float[Array, ""]:
+        return extended_inversion_time(scene, launch, self.t1, angle_of(scene, self.angle), tolerance)
+
+    def of_cells(self, scene: Scene, cells: dict[str, Any], theta: Any) -> Any:
+        """Times continued beyond the horizon, as by `extended_inversion_time`."""
+        later = _beyond_horizon(cells["end_theta"], theta, float(angle_of(scene, self.angle)), float(self.t1))
+        return np.where(np.isfinite(cells["time"]), cells["time"], np.asarray(later))
+
+
+class ReversalTimes(AbstractTimes):
+    """Measured times at which bodies such as a rattleback reversed their spin (see `reversal_time`).
+
+    **Arguments:**
+
+    - `launch`, `time`, `error`, `t1`, `until`, `student`: as for `InversionTimes`; a time is infinite if the spin did not
+      reverse while you watched.
+
+    **Raises:** `ValueError` for numbers out of range or shapes that do not fit.
+
+    **Example:** the product of inertia of a rattleback from three times.
+
+    ```
+    >>> import tippe
+    >>> inertia = [[2e-4, -2e-5, 0.0], [-2e-5, 1.6e-3, 0.0], [0.0, 0.0, 1.7e-3]]
+    >>> body = tippe.Ellipsoid(1.0, (0.2, 0.03, 0.02), (0.0, 0.0, -0.01), inertia)
+    >>> scene = tippe.Scene(body, friction=tippe.NoSlip())
+    >>> launch = tippe.Launch(theta=0.02, spin=[-4.0, -5.0, -6.0])
+    >>> data = tippe.ReversalTimes(launch, time=[2.11, 2.60, 2.98], error=0.02, t1=8.0)
+    >>> fit = tippe.identify(scene, data, {"inertia.xy": -1.8e-5}, tolerance=1e-6, progress=False)
+    >>> print(f"{fit.estimates['scene.body.inertia.xy']:.2e} kg m2")
+    -2.00e-05 kg m2
+
+    ```
+    """
+
+    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
+    units: ClassVar[dict[str, str]] = {"time": "s", "error": "s", "t1": "s", "until": "s"}
+    form = REVERSALS
+
+    def check(self, scene: Scene) -> None:
+        require_rigid(scene)
+        check_reversible(self.launch, {})
+
+    def _event(self, scene: Scene) -> Any:
+        return None
+
+    def of_run(self, scene: Scene, launch: Launch, tolerance: Float[Array, ""]) -> Float[Array, ""]:
+        return reversal_time(scene, launch, self.t1, tolerance)
+
+    def of_cells(self, scene: Scene, cells: dict[str, Any], theta: Any) -> Any:
+        return cells["time"]
 
 
 def _launches(launch: Launch, count: int, rows: int) -> Values:

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.geometry import Component, Tangent, multiply, stacked
 from nonholonomic.integration.status import Status
@@ -23,6 +23,12 @@ JAMMED = 1e-4
 #: moves as the square root of the remaining time, so a run ends too early by about 0.1 s times the square of this
 #: value.
 FITS = 1e-4
+
+#: Normal force as a fraction of the weight that round-off leaves of N = 0.
+NO_LOAD = 1e-12
+
+#: How far a motion is followed, as a fraction of the state's magnitudes, to see whether a contact without load gains one.
+AHEAD = 1e-3
 
 #: The ways in which a contact can end; the index is the code of the word.
 LOSSES = (Status.CONTACT_LOST, Status.JAMMED, Status.DOES_NOT_FIT)
@@ -69,6 +75,13 @@ class AbstractDynamics(eqx.Module):
     def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
         """The smooth functions whose least value is the contact margin."""
 
+    def unloaded(
+        self, state: Float[Array, "components ..."], scales: Float[Array, "components ..."]
+    ) -> Bool[Array, "..."] | None:
+        """A mask of the states whose contact carries no load and is about to carry none; `None` if the contact margin
+        alone decides."""
+        return None
+
     def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """Rate of change of the state, (components, ...)."""
         return stacked(self.motion(state).rate, state)
@@ -91,8 +104,14 @@ class AbstractContactDynamics(AbstractDynamics):
         a start with N = 0; the excess of the Painlevé factor over `JAMMED`; and the excess of the room over `FITS`, if
         the arena has places where the ball does not fit."""
         motion = self.motion(state)
-        lost, jammed = motion.normal_force / self.weight + 1e-12, motion.painleve_factor - JAMMED
+        lost, jammed = motion.normal_force / self.weight + NO_LOAD, motion.painleve_factor - JAMMED
         return (lost, jammed) if motion.room is None else (lost, jammed, motion.room - FITS)
+
+    def unloaded(
+        self, state: Float[Array, "components ..."], scales: Float[Array, "components ..."]
+    ) -> Bool[Array, "..."]:
+        """See `AbstractDynamics.unloaded`."""
+        return carries_no_load(self, self.weight, state, scales)
 
     def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
         """How a contact with zero margin has ended: a code in `LOSSES`."""
@@ -100,3 +119,23 @@ class AbstractContactDynamics(AbstractDynamics):
         # At the located end, the margin is round-off of either sign; if another margin has vanished, N is many times
         # the weight.
         return len(others) - jnp.argmin(jnp.stack([*others[::-1], jnp.maximum(lost, 0.0)]), axis=0)
+
+
+def carries_no_load(
+    dynamics: AbstractDynamics,
+    weight: Float[Array, "..."],
+    state: Float[Array, "components ..."],
+    scales: Float[Array, "components ..."],
+) -> Bool[Array, "..."]:
+    """A mask of the states with N = 0, up to round-off, whose motion does not increase N.
+
+    On a wall the first derivative of N may vanish too; so the state moves on by the midpoint rule, by the part `AHEAD`
+    of the magnitudes `scales`, to see whether N grows.
+    """
+    state, scales = jnp.asarray(state), jnp.asarray(scales)
+    motion = dynamics.motion(state)
+    rate = stacked(motion.rate, state)
+    fastest = jnp.max(jnp.abs(rate) / scales, axis=0)
+    time = AHEAD / jnp.where(fastest > 0.0, fastest, 1.0)
+    later = dynamics.motion(state + time * dynamics.field(state + 0.5 * time * rate))
+    return (jnp.abs(motion.normal_force) <= NO_LOAD * weight) & ~(later.normal_force > NO_LOAD * weight)

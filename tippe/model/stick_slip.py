@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from nonholonomic.geometry import AbstractFrame
 from nonholonomic.xla_cpu import greatest
 
-from .contact_dynamics import FITS, AbstractDynamics, Motion
+from .contact_dynamics import FITS, NO_LOAD, AbstractDynamics, Motion, carries_no_load
 from .contact_load import Slip
 from .dynamics import Dynamics
 from .friction import AbstractFriction, Frictionless, SetValuedCoulomb, length
@@ -103,7 +103,7 @@ class StickSlip(AbstractDynamics):
         """Normal force as a fraction of the weight, plus a round-off allowance for a start with N = 0 exactly; and the
         remaining room, if the arena has places where the body does not fit."""
         motion = self.motion(state)
-        margin = motion.normal_force / (self.slipping.mass * self.slipping.gravity) + 1e-12
+        margin = motion.normal_force / (self.slipping.mass * self.slipping.gravity) + NO_LOAD
         return (margin,) if motion.room is None else (margin, motion.room - FITS)
 
     def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
@@ -187,6 +187,12 @@ class ContactMode(AbstractDynamics):
             return (grip,) if room is None else (grip, room - FITS)
         return (*self.stick_slip.slipping.margins(state), self.slip_left(state))
 
+    def unloaded(
+        self, state: Float[Array, "components ..."], scales: Float[Array, "components ..."]
+    ) -> Bool[Array, "..."]:
+        """See `AbstractDynamics.unloaded`."""
+        return carries_no_load(self, self.stick_slip.slipping.weight, state, scales)
+
     def normal_spin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """As `StickSlip.normal_spin`."""
         return self.stick_slip.normal_spin(state)
@@ -229,6 +235,7 @@ class ContactMode(AbstractDynamics):
             sticks = zero > 0.0
             # The mode ended because of the grip or the room, or there was no contact to begin with, as after an impact.
             room, lost = stick_slip.rolling.motion(core_state).room, stick_slip.lifts_off(stopped_state)
+            lost |= self.unloaded(core_state, scales[:size])
             lost = lost if room is None else lost | (room - FITS <= stick_slip.grip_left(core_state))
             wait = zero
         else:

@@ -241,7 +241,7 @@ class ArenaSlide(AbstractFlyingMode):
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         dynamics = self.scene.dynamics
         assert isinstance(dynamics, Dynamics)
-        problem = InversionProblem(dynamics, self.cos_angle, state[:OWN], self.scales[:OWN])
+        problem = InversionProblem(dynamics, self.cos_angle, state[:OWN], self.scales[:OWN], flies=True)
         return self.extended(problem, Quadratures(self.scene.body.I3), state)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:

@@ -120,6 +120,7 @@ class SlideOnOne(AbstractFlyingMode):
             other_ball=other_ball,
             on_stem=self.number == 1,
             stem_counts=self.stem_counts,
+            flies=True,
         )
         return self.extended(problem, Quadratures(self.scene.body.I3), state)
 

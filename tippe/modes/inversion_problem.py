@@ -38,6 +38,8 @@ class InversionProblem(AbstractProblem):
     spin: Float[Array, "..."] | None = None
     # An array for a top with a stem, or `None`.
     stem_counts: Any = None
+    # Whether a flight follows where the contact is lost.
+    flies: bool = eqx.field(static=True, default=False, kw_only=True)
 
     @classmethod
     def of(
@@ -66,6 +68,10 @@ class InversionProblem(AbstractProblem):
         self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]
     ) -> Float[Array, " lanes"]:
         return self.dynamics.contact_margin(state)
+
+    def lost_at_start(self, state: Float[Array, "components lanes"]) -> Bool[Array, " lanes"] | None:
+        # A top that may fly slides on without load: both are the same motion.
+        return None if self.flies else self.dynamics.unloaded(state, self.scales)
 
     def margins(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> tuple[Any, ...]:
         return self.dynamics.margins(state)

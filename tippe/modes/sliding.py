@@ -94,7 +94,7 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
         contact_ball, other_ball = own_and_other(balls(self.scene.body), self.number)
         contact = (standing_on(self.scene.dynamics, contact_ball), self.cos_angle, state[:OWN], self.scales[:OWN])
         problem = (
-            InversionProblem(*contact)
+            InversionProblem(*contact, flies=True)
             if other_ball is None
             else SlidingOnOne(
                 *contact,
@@ -102,6 +102,7 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
                 other_ball=other_ball,
                 on_stem=self.number == 1,
                 stem_counts=self.stem_counts,
+                flies=True,
             )
         )
         return self.extended(problem, Quadratures(self.scene.body.I3, of_mass=True), state)

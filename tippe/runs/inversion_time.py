@@ -82,7 +82,7 @@ def inversion_time(
 def first_or_last_time(
     scene: Scene,
     launch: Launch,
-    t1: float,
+    t1: float | Float[Array, ""],
     angle: Float[Array, ""] | StemContact | None,
     crossing: str,
     settings: Settings,

@@ -26,8 +26,8 @@ from .table import event_table
 def reversal_time(
     scene: Scene,
     launch: Launch,
-    t1: float,
-    tolerance: float = 1e-9,
+    t1: float | Float[Array, ""],
+    tolerance: float | Float[Array, ""] = 1e-9,
     solver: diffrax.AbstractERK | None = None,
 ) -> Float[Array, ""]:
     """Time at which the spin about the arena's normal first vanishes; works under `jit`, `vmap`, `grad`, `jvp` and their
