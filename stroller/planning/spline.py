@@ -4,8 +4,10 @@ A spline with n coefficients has n - 3 intervals; between two knots it depends o
 Guide to Splines (2001), chapter X).
 """
 
+from functools import partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -28,6 +30,8 @@ def weighted(weights: list[Any], coefficients: Any) -> Any:
     return sum(weight * coefficients[k] for k, weight in enumerate(weights))
 
 
+# Every run of a plan traces its input several times; `jit` keeps the trace.
+@partial(jax.jit, static_argnames="derivative", inline=True)
 def evaluate(coefficients: Any, part: Any, derivative: int = 0) -> Any:
     """The value of a spline, or of its derivative, at parts of its whole length, held constant beyond its ends.
 

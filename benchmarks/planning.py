@@ -1,0 +1,210 @@
+"""Plans of random problems: `stroller.plan` beside CasADi with IPOPT and a kinodynamic planner of OMPL.
+
+    pip install casadi ompl
+    python benchmarks/planning.py [--problems 200] [--ipopt 40] [--ompl 12] [--curved 100]
+
+Problems on the plane have 3 to 8 boxes in a square of 6 m and a vehicle of 0.5 m by 0.25 m, with a steering angle of at most
+60 degrees and a speed between -0.5 and 0.8 m/s; the drive takes 25 s. Those on curved ground have no obstacles. Every
+answer drives the stroller in `simulate` at a tolerance of 1e-9, by an input that `stroller.plan` makes of a steering angle and
+a speed, and the same check judges its run: its end, its limits and the distance between the whole footprint and the boxes.
+
+Time is CPU time of a problem, without compilation, which the wall time of a first call contains. CasADi solves a direct collocation of the same
+dynamics from the straight line, and from the path that our search finds, whose time is included. OMPL's planner decides the
+duration itself. Effort is that of the run, relative to the effort of `stroller.plan` for the same problem (median).
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from measure import machine, table, write_csv
+
+import stroller
+from stroller.planning.candidates import Outline, prices
+from stroller.planning.check import checked_run
+from stroller.planning.drive import drive_along
+from stroller.planning.problem import Problem, checked_problem
+from stroller.planning.spline import interpolate
+
+BODY = stroller.Stroller(mass=5.0, wheelbase=0.25, inertia=0.1, steering_inertia=0.005)
+FRICTION = stroller.Damping(2.0, 0.5, 0.1, 0.05)
+LIMITS = stroller.Limits(steering=np.pi / 3.0, speed=(-0.5, 0.8))
+FOOTPRINT = stroller.Footprint(length=0.5, width=0.25, rear=0.1)
+T1, CONFIRMED = 25.0, 1e-9
+
+#: Side of the square [m], number of boxes, their sides [m], least distance of the ends [m] and least clearance there [m].
+SIDE, BOXES, SIDES, APART, FREE = 6.0, (3, 8), (0.3, 1.5), 2.0, 0.05
+
+GROUNDS = {
+    "inside a spheroid": stroller.Scene(BODY, stroller.Spheroid(6.0, 3.0), FRICTION, side="inside"),
+    "hills": stroller.Scene(BODY, stroller.Graph(lambda x, y: 0.2 * jnp.cos(x) * jnp.sin(y)), FRICTION),
+}
+
+
+class Outcome(NamedTuple):
+    """What a planner achieves: whether its run reaches the goal, its CPU time and wall time [s], and its effort."""
+
+    reached: bool
+    cpu: float
+    wall: float
+    effort: float
+
+
+def pose(random: np.random.Generator, low: Any, high: Any) -> tuple[tuple[float, float], float]:
+    """A random place and heading."""
+    x, y = random.uniform(low, high)
+    return (float(x), float(y)), float(random.uniform(-np.pi, np.pi))
+
+
+def on_plane(seed: int) -> Iterator[Problem]:
+    """Random problems on the plane."""
+    random, scene = np.random.default_rng(seed), stroller.Scene(BODY, friction=FRICTION)
+    while True:
+        boxes = [
+            stroller.Box(random.uniform(0.0, SIDE, 2), random.uniform(*SIDES, 2), random.uniform(0.0, np.pi))
+            for _ in range(random.integers(BOXES[0], BOXES[1] + 1))
+        ]
+        start, goal = (pose(random, (0.0, 0.0), (SIDE, SIDE)) for _ in range(2))
+        if np.hypot(*np.subtract(start[0], goal[0])) < APART:
+            continue
+        launch, target = stroller.Launch(*start, 0.0), stroller.Goal(*goal)
+        problem = Problem(scene, launch, target, tuple(boxes), LIMITS, FOOTPRINT)
+        if problem.clearance_at_ends > FREE:
+            yield problem
+
+
+def on_ground(name: str, seed: int) -> Iterator[Problem]:
+    """Random problems without obstacles, on one of the `GROUNDS`."""
+    random, scene = np.random.default_rng(seed), GROUNDS[name]
+    low, high = ((-1.0, -1.3), (1.0, -0.7)) if name == "inside a spheroid" else ((-2.5, -2.5), (2.5, 2.5))
+    while True:
+        start, goal = (pose(random, low, high) for _ in range(2))
+        problem = Problem(scene, stroller.Launch(*start, 0.0), stroller.Goal(*goal), (), LIMITS, FOOTPRINT)
+        axes = scene.surface.axes
+        if np.linalg.norm(np.asarray(problem.start_pose - problem.goal_pose)[:axes]) > APART / 2.0:
+            yield problem
+
+
+def measured(solve: Callable[[], Any]) -> tuple[Any, float, float]:
+    """A result, its CPU time and its wall time [s]."""
+    cpu, wall = time.process_time(), time.perf_counter()
+    result = solve()
+    return result, time.process_time() - cpu, time.perf_counter() - wall
+
+
+def by_us(problem: Problem) -> Outcome:
+    """The outcome of `stroller.plan`."""
+    scene, launch, goal, obstacles, limits, footprint = problem
+    options = {"obstacles": obstacles, "limits": limits, "footprint": footprint, "progress": False}
+    plan, cpu, wall = measured(lambda: stroller.plan(scene, launch, goal, T1, **options))
+    return Outcome(plan.reached, cpu, wall, plan.effort)
+
+
+def judged(problem: Problem, answer: Any, cpu: float, wall: float) -> Outcome:
+    """The outcome of an answer of another planner, or of `None`."""
+    if answer is None:
+        return Outcome(False, cpu, wall, np.nan)
+    start = checked_problem(*problem[:3], answer.t1, *problem[3:], CONFIRMED).start_pose
+    splines = [interpolate(part) for part in (answer.steering, answer.front_speed)]
+    drive = drive_along(problem.scene.dynamics, start, *splines, answer.t1)
+    _, verdict = checked_run(problem, drive, answer.t1, CONFIRMED)
+    return Outcome(not verdict.hindrances, cpu, wall, verdict.effort)
+
+
+def by_casadi(problem: Problem, with_path: bool, seconds: float) -> Outcome:
+    """The outcome of CasADi with IPOPT; building its program is compilation and is not counted."""
+    from planning_peers import casadi_program
+
+    outline, path, searched = Outline.of(problem), None, (0.0, 0.0)
+    if with_path:
+        (paths, _), *searched = measured(lambda: outline.paths(prices(outline, 1, 0, np.random.default_rng(0)), T1))
+        path = paths[0]
+    solve = casadi_program(problem, T1, path, outline.clearance, seconds)
+    answer, cpu, wall = measured(solve)
+    return judged(problem, answer, cpu + searched[0], wall + searched[1])
+
+
+def by_ompl(problem: Problem, seconds: float) -> Outcome:
+    """The outcome of OMPL's kinodynamic planner."""
+    from planning_peers import by_ompl
+
+    return judged(problem, *measured(lambda: by_ompl(problem, seconds)))
+
+
+def row_of(problems: str, planner: str, outcomes: list[Outcome], ours: list[Outcome], first: float) -> dict[str, str]:
+    """A row of the table."""
+    cpu, wall = (np.array([getattr(outcome, name) for outcome in outcomes]) for name in ("cpu", "wall"))
+    both = [
+        (own.effort, other.effort) for own, other in zip(ours, outcomes, strict=False) if own.reached and other.reached
+    ]
+    ratio = np.median([other / own for own, other in both]) if both else np.nan
+    return {
+        "problems": f"{len(outcomes)} {problems}",
+        "planner": planner,
+        "reached": f"{100.0 * np.mean([outcome.reached for outcome in outcomes]):.1f} %",
+        "CPU s: median": f"{np.median(cpu):.2f}",
+        "90 %": f"{np.percentile(cpu, 90):.1f}",
+        "wall s: median": f"{np.median(wall):.2f}",
+        "effort": f"{ratio:.2f} of {len(both)}",
+        "first call, wall s": f"{first:.1f}",
+    }
+
+
+def compared(
+    name: str, problems: list[Problem], planners: dict[str, tuple[Callable[[Problem], Outcome], int]]
+) -> list[dict[str, str]]:
+    """A row for each planner, which solves the first problem once more before the others."""
+    rows, ours = [], []
+    for planner, (solve, count) in planners.items():
+        if not count:
+            continue
+        _, _, first = measured(lambda solve=solve: solve(problems[0]))
+        outcomes = [solve(problem) for problem in problems[:count]]
+        ours = ours or outcomes
+        rows.append(row_of(name, planner, outcomes, ours, first))
+        missed = [seed for seed, outcome in enumerate(outcomes) if not outcome.reached]
+        print(table(rows[-1:]), f"\nnot reached: {missed}", flush=True)
+    return rows
+
+
+def main() -> None:
+    """Measure, print and write."""
+    command = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    command.add_argument("--problems", type=int, default=200)
+    command.add_argument("--ipopt", type=int, default=40, help="problems that CasADi with IPOPT solves")
+    command.add_argument("--ompl", type=int, default=12, help="problems that OMPL solves")
+    command.add_argument("--curved", type=int, default=100)
+    command.add_argument(
+        "--seconds", type=float, default=20.0, help="most CPU time of another planner for a problem [s]"
+    )
+    command.add_argument("--seed", type=int, default=0)
+    command.add_argument("--out", type=Path, default=Path("planning.csv"))
+    options = command.parse_args()
+    print(machine())
+    rows: list[dict[str, str]] = []
+    counts = {"plane": options.problems} | dict.fromkeys(GROUNDS, options.curved)
+    for name, count in counts.items():
+        if not count:
+            continue
+        source = on_plane(options.seed) if name == "plane" else on_ground(name, options.seed)
+        problems = [next(source) for _ in range(count)]
+        planners: dict[str, Any] = {"stroller.plan": (by_us, count)}
+        if name == "plane" and find_spec("casadi") and find_spec("ompl"):
+            most = options.seconds
+            planners |= {
+                "IPOPT from our path": (lambda problem: by_casadi(problem, True, most), options.ipopt),
+                "IPOPT from a line": (lambda problem: by_casadi(problem, False, most), options.ipopt),
+                "OMPL's RRT": (lambda problem: by_ompl(problem, most), options.ompl),
+            }
+        rows += compared(name, problems, planners)
+    print(table(rows))
+    write_csv(options.out, rows)
+
+
+if __name__ == "__main__":
+    main()
