@@ -8,14 +8,16 @@ Problems on the plane have 3 to 8 boxes in a square of 6 m and a vehicle of 0.5 
 answer drives the stroller in `simulate` at a tolerance of 1e-9, by an input that `stroller.plan` makes of a steering angle and
 a speed, and the same check judges its run: its end, its limits and the distance between the whole footprint and the boxes.
 
-Time is CPU time of a problem, without compilation, which the wall time of a first call contains. CasADi solves a direct collocation of the same
-dynamics from the straight line, and from the path that our search finds, whose time is included. OMPL's planner decides the
-duration itself. Effort is that of the run, relative to the effort of `stroller.plan` for the same problem (median).
+Time is CPU time of a problem, without compilation, which the wall time of a first call contains. CasADi solves a direct
+collocation of the same dynamics from the straight line, and from the path that our search finds, whose time is included.
+OMPL's planner decides the duration itself. Effort is that of the run, relative to the effort of `stroller.plan` for the same
+problem (median). Ctrl-C ends a group of problems early, with a table of those that are solved.
 """
 
 import argparse
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,7 +30,7 @@ import stroller
 from stroller.planning.candidates import Outline, prices
 from stroller.planning.check import checked_run
 from stroller.planning.drive import drive_along
-from stroller.planning.problem import Problem, checked_problem
+from stroller.planning.problem import Problem
 from stroller.planning.spline import interpolate
 
 BODY = stroller.Stroller(mass=5.0, wheelbase=0.25, inertia=0.1, steering_inertia=0.005)
@@ -109,9 +111,8 @@ def judged(problem: Problem, answer: Any, cpu: float, wall: float) -> Outcome:
     """The outcome of an answer of another planner, or of `None`."""
     if answer is None:
         return Outcome(False, cpu, wall, np.nan)
-    start = checked_problem(*problem[:3], answer.t1, *problem[3:], CONFIRMED).start_pose
     splines = [interpolate(part) for part in (answer.steering, answer.front_speed)]
-    drive = drive_along(problem.scene.dynamics, start, *splines, answer.t1)
+    drive = drive_along(problem.scene.dynamics, problem.start_pose, splines[0], splines[1], answer.t1)
     _, verdict = checked_run(problem, drive, answer.t1, CONFIRMED)
     return Outcome(not verdict.hindrances, cpu, wall, verdict.effort)
 
@@ -156,20 +157,25 @@ def row_of(problems: str, planner: str, outcomes: list[Outcome], ours: list[Outc
 
 
 def compared(
-    name: str, problems: list[Problem], planners: dict[str, tuple[Callable[[Problem], Outcome], int]]
+    name: str, problems: Iterator[Problem], planners: dict[str, tuple[Callable[[Problem], Outcome], int]]
 ) -> list[dict[str, str]]:
     """A row for each planner, which solves the first problem once more before the others."""
-    rows, ours = [], []
-    for planner, (solve, count) in planners.items():
-        if not count:
-            continue
-        _, _, first = measured(lambda solve=solve: solve(problems[0]))
-        outcomes = [solve(problem) for problem in problems[:count]]
-        ours = ours or outcomes
-        rows.append(row_of(name, planner, outcomes, ours, first))
-        missed = [seed for seed, outcome in enumerate(outcomes) if not outcome.reached]
-        print(table(rows[-1:]), f"\nnot reached: {missed}", flush=True)
-    return rows
+    outcomes: dict[str, list[Outcome]] = {planner: [] for planner, (_, count) in planners.items() if count}
+    first: dict[str, float] = {}
+    try:
+        for number in range(max(count for _, count in planners.values())):
+            problem = next(problems)
+            for planner in outcomes:
+                solve, count = planners[planner]
+                if planner not in first:
+                    first[planner] = measured(partial(solve, problem))[2]
+                if number < count:
+                    outcomes[planner].append(solve(problem))
+                    print(name, number, planner, outcomes[planner][-1], flush=True)
+    except KeyboardInterrupt:
+        pass
+    (ours, *_) = outcomes.values()
+    return [row_of(name, planner, solved, ours, first[planner]) for planner, solved in outcomes.items() if solved]
 
 
 def main() -> None:
@@ -192,16 +198,14 @@ def main() -> None:
         if not count:
             continue
         source = on_plane(options.seed) if name == "plane" else on_ground(name, options.seed)
-        problems = [next(source) for _ in range(count)]
         planners: dict[str, Any] = {"stroller.plan": (by_us, count)}
         if name == "plane" and find_spec("casadi") and find_spec("ompl"):
-            most = options.seconds
             planners |= {
-                "IPOPT from our path": (lambda problem: by_casadi(problem, True, most), options.ipopt),
-                "IPOPT from a line": (lambda problem: by_casadi(problem, False, most), options.ipopt),
-                "OMPL's RRT": (lambda problem: by_ompl(problem, most), options.ompl),
+                "IPOPT from our path": (lambda problem: by_casadi(problem, True, options.seconds), options.ipopt),
+                "IPOPT from a line": (lambda problem: by_casadi(problem, False, options.seconds), options.ipopt),
+                "OMPL's RRT": (lambda problem: by_ompl(problem, options.seconds), options.ompl),
             }
-        rows += compared(name, problems, planners)
+        rows += compared(name, source, planners)
     print(table(rows))
     write_csv(options.out, rows)
 

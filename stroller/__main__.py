@@ -1,4 +1,5 @@
-"""The main job, `python -m stroller`: rides on some surfaces, with and without friction, and their audit."""
+"""The main job, `python -m stroller`: a stroller that parks, rides on some surfaces, with and without friction, and their
+audit."""
 
 import argparse
 import sys
@@ -28,6 +29,11 @@ from .model.friction import Damping
 from .model.launch import Launch
 from .model.scene import FORKS, Scene
 from .model.stroller import Stroller
+from .planning.drawing import draw_plan, planned_stage
+from .planning.goal import Goal, Limits
+from .planning.obstacles import Box
+from .planning.plan import plan
+from .planning.result import Plan
 from .runs.plot import draw_rides
 from .runs.quantities import table_of
 from .runs.trajectory import Trajectory
@@ -86,9 +92,9 @@ def parser() -> argparse.ArgumentParser:
     """The options of the main job; the defaults are those of a light stroller."""
     command = argparse.ArgumentParser(
         prog="python -m stroller",
-        description="Rides of a stroller on a plane and inside a spheroid, or on the surfaces named, with and without "
-        "friction, steered alternately left and right, and pulled. Prints the energy audit of both integrators, writes an "
-        "HDF5 file and a picture.",
+        description="A planned drive of a stroller into a gap; and rides on a plane and inside a spheroid, or on the surfaces "
+        "named, with and without friction, steered alternately left and right, and pulled. Prints the energy audit of both "
+        "integrators, writes an HDF5 file and pictures.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     command.add_argument("--version", action="version", version=f"nonholonomic {__version__}")
@@ -180,6 +186,24 @@ def audited(options: argparse.Namespace, helm: Helm, name: tuple[str, str]) -> t
     return runs["Dopri8"], audit(", ".join(name), runs)
 
 
+def parked(options: argparse.Namespace) -> Plan:
+    """A planned drive into a gap between two strollers, on a level plane."""
+    length = options.wheelbase
+    body = Stroller(options.mass, length, options.inertia, options.steering_inertia)
+    scene = Scene(body, friction=Damping(*options.damping), gravity=options.gravity, fork=options.fork)
+    others = [Box((x * length, 0.0), (1.4 * length, 0.87 * length)) for x in (-2.2, 0.0, 3.7)]
+    kerb = Box((0.75 * length, -0.95 * length), (8.0 * length, 0.4 * length))
+    return plan(
+        scene,
+        Launch((2.9 * length, 1.5 * length), 0.0, 0.0),
+        Goal((1.35 * length, 0.0), 0.0),
+        15.0,
+        obstacles=[*others, kerb],
+        limits=Limits(steering=1.0, speed=(-2.0 * length, 3.0 * length)),
+        progress=False,
+    )
+
+
 def table(options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory]) -> Table:
     """The rides as a table over ride and time."""
     request = {name: value for name, value in vars(options).items() if name != "out"}
@@ -188,33 +212,39 @@ def table(options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory])
 
 
 def write_page(
-    options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory], words: list[str], drawing: Path | None
+    options: argparse.Namespace,
+    parking: Plan,
+    rides: dict[tuple[str, str], Trajectory],
+    words: list[str],
+    drawings: dict[str, Path],
 ) -> Path:
-    """Write the page of the main job: the moving rides if three.js is installed, the audit, and the plot if there is
-    one."""
+    """Write the page of the main job: the moving plan and rides if three.js is installed, the audit, and the drawings by
+    their headings."""
     groups: dict[str, list[tuple[int, Trajectory]]] = {}
     for number, ((ground, _), run) in enumerate(rides.items()):
         groups.setdefault(ground, []).append((number, run))
     viewed = []
     if can_view():
         # The title of the stage names the ground of both rides; the name of each ride is beside it.
-        viewed = [
+        viewed = [planned_stage(parking)]
+        viewed += [
             stage._replace(title=ground)
             for ground, stage in zip(groups, grouped(list(groups.values()), [ride for _, ride in rides]), strict=True)
         ]
     note = "" if viewed else f'<p class="note">{NO_VIEW}</p>'
-    sections = "<h2>Energy against work</h2><pre>" + escape("\n".join(words)) + "</pre>"
-    sections += "" if drawing is None else "<h2>Paths, speeds, energies, side forces</h2>" + picture_as_html(drawing)
+    pictures = [f"<h2>{heading}</h2>{picture_as_html(drawing)}" for heading, drawing in drawings.items()]
+    audit_section = "<h2>Energy against work</h2><pre>" + escape("\n".join(words)) + "</pre>"
     path = options.out / "index.html"
-    page(viewed, "Rides of a stroller", 1.0, note, sections).save(path)
+    sections = "".join([*pictures[:1], audit_section, *pictures[1:]])
+    page(viewed, "A stroller parks, and rides", 1.0, note, sections).save(path)
     return path
 
 
-def simulated(options: argparse.Namespace) -> tuple[dict[tuple[str, str], Trajectory], list[str]]:
-    """The rides, and the lines of their audit, which are printed as the rides end."""
+def simulated(options: argparse.Namespace) -> tuple[Plan, dict[tuple[str, str], Trajectory], list[str]]:
+    """The plan, the rides, and the lines of their audit and of the plan, which are printed as the rides end."""
     rides, audits, helm, scenes_to_run = {}, [], Helm(options.force, options.steer, options.period), scenes(options)
     # Compile in parallel, because the compiler uses little more than one core. The two rides of a ground share one program.
-    with Progress(len(scenes_to_run) + 1, "ride") as display, ThreadPoolExecutor(2) as threads:
+    with Progress(len(scenes_to_run) + 2, "ride") as display, ThreadPoolExecutor(2) as threads:
         display.begin()
         locks = {ground: Lock() for ground, _ in scenes_to_run}
 
@@ -226,6 +256,7 @@ def simulated(options: argparse.Namespace) -> tuple[dict[tuple[str, str], Trajec
             name: threads.submit(in_turn, name) for name in sorted(scenes_to_run, key=lambda name: RIDES.index(name[1]))
         }
         curves = threads.submit(tolerance_curve, options, helm)
+        planned = threads.submit(parked, options)
         for name in scenes_to_run:
             rides[name], lines = futures[name].result()
             audits += lines
@@ -234,26 +265,31 @@ def simulated(options: argparse.Namespace) -> tuple[dict[tuple[str, str], Trajec
             display.advance(1)
         curve = ["", *curves.result()]
         display.advance(1)
+        parking = planned.result()
+        display.advance(1)
+        curve += ["", f"Parking: {parking}"]
         with display.aside():
             print("\n".join(curve), flush=True)
-    return rides, [*audits, *curve]
+    return parking, rides, [*audits, *curve]
 
 
 def computed(options: argparse.Namespace) -> dict[str, bytes]:
-    """Simulate the rides, print their audit, and write all files.
+    """Plan the drive, simulate the rides, print their audit, and write all files.
 
     **Returns:** name -> contents of each file, and of the audit.
     """
-    rides, audits = simulated(options)
+    parking, rides, audits = simulated(options)
     with status_line("drawing"):
-        paths, drawing = [options.out / "rides.h5"], None
+        paths, drawings = [options.out / "rides.h5"], dict[str, Path]()
         table(options, rides).save(paths[0])
         if has_matplotlib():
-            drawing = options.out / "rides.png"
             grounds = {ground: scene.surface for (ground, _), (scene, _) in scenes(options).items()}
-            draw_rides(grounds, rides).savefig(drawing, dpi=110)
-            paths.append(drawing)
-        paths.append(write_page(options, rides, [HEADING, *audits], drawing))
+            figures = {"parked.png": draw_plan(parking), "rides.png": draw_rides(grounds, rides)}
+            for name, figure in figures.items():
+                figure.savefig(options.out / name, dpi=110)
+            paths += [options.out / name for name in figures]
+            drawings |= zip(("Parking", "Paths, speeds, energies, side forces"), paths[1:], strict=True)
+        paths.append(write_page(options, parking, rides, [HEADING, *audits], drawings))
     return {AUDIT: "\n".join(audits).encode()} | {path.name: path.read_bytes() for path in paths}
 
 
@@ -287,7 +323,9 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     if not has_matplotlib():
         print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
-    *paths, page_path = (options.out / name for name in ("rides.h5", "rides.png", "index.html") if name in files)
+    *paths, page_path = (
+        options.out / name for name in ("rides.h5", "parked.png", "rides.png", "index.html") if name in files
+    )
     see = f"To see it, open {page_path}{'' if can_view() else f'. {NO_VIEW}'}"
     print(closing_lines(2 * len(scenes(options)), start_time, paths, see, cache if read else None))
     return 0

@@ -35,8 +35,8 @@ SCRIPTS = ("stage.js", "strips.js", "player.js")
 LINES = 0x7C8896
 BACKGROUND = 0xFBFBFA
 
-#: Opening angle of the camera [deg], and its height above the ground in units of its distance along the ground.
-ANGLE, RISE = 35.0, 0.30
+#: Opening angle of the camera [deg].
+ANGLE = 35.0
 
 
 class Page(NamedTuple):
@@ -289,7 +289,7 @@ def view_from(stage: Stage) -> tuple[list[float], bool]:
     normal = stage.arena.normal
     view_axis = np.array([0.35, -1.0, 0.0])
     view_axis = view_axis - (view_axis @ normal) * normal
-    direction = RISE * normal + view_axis / np.linalg.norm(view_axis)
+    direction = stage.rise * normal + view_axis / np.linalg.norm(view_axis)
     distance = 1.05 * (reach + 1.6 * size) / np.sin(np.radians(ANGLE) / 2.0)
     place = middle + distance * direction / np.linalg.norm(direction)
     return [*place.tolist(), *middle.tolist(), 0.0, 0.0, 1.0], follow

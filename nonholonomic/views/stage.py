@@ -105,12 +105,13 @@ class Arena(NamedTuple):
 
 class Stage(NamedTuple):
     """An arena and the runs on it, seen by one camera, which follows runs that go far, or all runs if `follows` is
-    true."""
+    true; `rise` is its height above the ground in units of its distance along the ground."""
 
     title: str
     arena: Arena
     shows: tuple[Show, ...]
     follows: bool = False
+    rise: float = 0.3
 
 
 #: Colours of a page's runs, for the curves and one half of the body; arrows have other colours.

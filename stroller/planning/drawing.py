@@ -16,6 +16,9 @@ from .obstacles import Box, Disc
 #: Heights of drawn obstacles, and radii of drawn lines, in units of the wheelbase.
 HEIGHT, THIN, RAISED = 0.5, 0.008, 0.03
 
+#: Height of the camera in units of its distance along the ground, from which obstacles do not hide the stroller.
+RISE = 1.2
+
 #: Sides of a drawn disc, and outlines of the footprint in a plot.
 SIDES, OUTLINES = 48, 13
 
@@ -86,7 +89,8 @@ def planned_stage(plan: Any) -> Stage:
     low = np.concatenate([np.asarray(own), np.full((4, 1), -0.17 * length)], axis=1)
     edge = Body("footprint", vehicle.position, vehicle.orientation, (frame_of(low, 0.0, 1.5 * THIN * length, DARK),))
     title = f"plan of {plan.t1:.3g} s: {'reaches the goal' if plan.reached else 'does not reach the goal'}"
-    return stage._replace(title=title, arena=ground, shows=(show._replace(bodies=(*show.bodies, edge, *bodies)),))
+    shows = (show._replace(bodies=(*show.bodies, edge, *bodies)),)
+    return stage._replace(title=title, arena=ground, shows=shows, rise=RISE)
 
 
 def on_ground(surface: AbstractSurface, points: np.ndarray) -> Float[np.ndarray, "points 3"]:

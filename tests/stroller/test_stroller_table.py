@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import equinox as eqx
 import jax
@@ -216,9 +217,11 @@ def test_main_job(tmp_path, capsys, monkeypatch):
     audit = [line.split() for line in printed.splitlines() if "midpoint" in line]
     assert len(audit) == 2
     assert all(float(columns[-5]) < 1e-11 for columns in audit)
-    assert (tmp_path / "rides.png").stat().st_size > 10_000
+    assert "Parking: Plan of 15 s: reaches the goal" in printed
+    assert all((tmp_path / name).stat().st_size > 10_000 for name in ("parked.png", "rides.png"))
     page = (tmp_path / "index.html").read_text()
     assert 'id="floats"' in page
+    assert re.findall(r'"title": "([^"]+)"', page) == ["plan of 15 s: reaches the goal", "inside the spheroid"]
     assert audit[0][-1] in page
     assert f"To see it, open {tmp_path / 'index.html'}" in printed
     with xarray.open_dataset(tmp_path / "rides.h5", engine="h5netcdf") as dataset:
@@ -231,7 +234,7 @@ def test_main_job(tmp_path, capsys, monkeypatch):
     again = capsys.readouterr().out
     assert again[: again.index("4 runs")] == printed[: printed.index("4 runs")]
     assert "where an earlier run stored the results of these options" in again
-    for name in ("rides.h5", "rides.png", "index.html"):
+    for name in ("rides.h5", "parked.png", "rides.png", "index.html"):
         assert (tmp_path / "again" / name).read_bytes() == (tmp_path / name).read_bytes()
 
 
