@@ -32,6 +32,8 @@ ELEMENTWISE |= {name: f"Math.{name}({{}}, {{}})" for name in ("max", "min", "pow
 ELEMENTWISE |= {"neg": "-{}", "square": "{0} * {0}", "rsqrt": "1 / Math.sqrt({})", "exp2": "Math.pow(2, {})"}
 ELEMENTWISE |= {"clamp": "Math.min(Math.max({1}, {0}), {2})", "logistic": "1 / (1 + Math.exp(-{}))"}
 ELEMENTWISE |= {"is_finite": "Number.isFinite({})"}
+# The order in which `jnp.searchsorted` and `jnp.interp` sort: NaN comes last.
+ELEMENTWISE |= {"lt_to": "{0} < {1} || ({1} != {1} && {0} == {0})", "le_to": "{0} <= {1} || {1} != {1}"}
 CHOICE = "{0} ? {2} : {1}"
 
 #: Elementwise operations that Python evaluates if all numbers are known, mostly for indices.

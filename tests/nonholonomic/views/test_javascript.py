@@ -86,12 +86,18 @@ def array_work(x):
     )
 
 
+def looked_up(x):
+    """In a table with equal and unequal steps, within it and beyond its ends, and where a number lies in a list."""
+    places, values = jnp.array([-0.5, 0.0, 0.1, 0.3, 1.0]), jnp.array([0.0, 1.0, -2.0, 4.0, 3.0])
+    return jax.vmap(lambda place: jnp.interp(place, places, values))(x), jnp.searchsorted(places, x, side="right")
+
+
 def slopes(x):
     """The derivative of a function by automatic differentiation."""
     return jax.grad(lambda y: jnp.sin(y[0]) * y[1] ** 3 / jnp.sqrt(1.0 + y[2] ** 2))(x)
 
 
-FUNCTIONS = [loop, until, newton, of_two, of_three, everything, array_work, slopes]
+FUNCTIONS = [loop, until, newton, of_two, of_three, everything, array_work, looked_up, slopes]
 
 
 @pytest.fixture(scope="module")
