@@ -61,6 +61,9 @@ window.views = window.views || {};
         // Draw values that are constant except for round-off as a constant.
         const least = 1e-3 * Math.max(Math.abs(low), Math.abs(high)) || 1;
         if (!(high - low > least)) { low -= least; high += least; }
+        // Label the round-off of a body at the ground as 0.
+        const rounded = (end) => Math.abs(end) < 1e-8 * (high - low) ? 0 : end;
+        [low, high] = [rounded(low), rounded(high)];
         Object.assign(strip, { low, high, pale: null });
       }
     }

@@ -209,6 +209,16 @@ def test_keys_move_time_and_a_click_on_a_curve_seeks(browser):
     assert browser.execute_script("return player.time()") == pytest.approx((width / 2 - 58) / (width - 62), abs=0.01)
 
 
+def test_round_off_at_the_end_of_a_curve_is_labelled_as_zero(browser):
+    """A body at the ground is at 0 m, and not at -1.15e-10 m."""
+    script = (
+        "const run = { times: [0, 1, 2], colour: 'red', curves: [{ label: 'height', values: [1, -1.15e-10, 0.5] }] };"
+        "const { low, high } = new views.Strips(document.createElement('div'), () => [run], () => 0).strips[0];"
+        "return [low, high]"
+    )
+    assert browser.execute_script(script) == [0.0, 1.0]
+
+
 def test_a_run_is_replaced_while_the_page_is_open(browser, top):
     """As a live simulation does it: other times, poses and curves in the same stage."""
     value_before = browser.execute_script("return player.duration()")
