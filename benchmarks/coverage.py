@@ -8,7 +8,7 @@ within a factor of 1.5. The settings:
 
 - `times`, `late`: eight inversion times at 0.7 pi and at 0.95 pi;
 - `outliers`: the late times with outliers and `student=4`; `censored`: the latest two are only known to be later;
-- `hops`: two times of a top that hops; `stick`: four times of a top with set-valued friction;
+- `hops`: two times of a top that hops; `stick`: four times, at 0.6 pi, of a top with set-valued friction;
 - `reversal`: four reversal times of a rattleback;
 - `film`: theta of a top, with unknown friction, spin and clock; `wooden`: theta of a wooden top that hops;
 - `ride`: the speed of a stroller, with unknown rolling friction and launch speed;
@@ -85,27 +85,28 @@ def times(
     return Setting({"friction.mu": MU, "offset": OFFSET}, trial)
 
 
-def modal_times(scene: tippe.Scene, launch: tippe.Launch, error: float, t1: float, tolerance: float) -> Setting:
+def modal_times(scene: tippe.Scene, launch: tippe.Launch, error: float, t1: float, angle: float) -> Setting:
     """Friction from the times of a top whose runs have several modes."""
     columns = {"theta": np.broadcast_to(launch.theta, np.shape(launch.spin)), "spin": launch.spin}
-    table = tippe.inversion_table(scene, **columns, t1=t1, scattered=True, progress=False)
+    table = tippe.inversion_table(scene, **columns, t1=t1, angle=angle, scattered=True, progress=False)
     exact = np.asarray(table["time"])
 
     def trial(random: np.random.Generator) -> Any:
-        data = tippe.InversionTimes(launch, exact + error * random.normal(size=exact.size), error, t1=t1)
-        return tippe.identify(scene, data, {"friction.mu": near(random, MU)}, tolerance=tolerance, progress=False)
+        measured = exact + error * random.normal(size=exact.size)
+        data = tippe.InversionTimes(launch, measured, error, t1=t1, angle=angle)
+        return tippe.identify(scene, data, {"friction.mu": near(random, MU)}, tolerance=1e-6, progress=False)
 
     return Setting({"friction.mu": float(scene.friction.mu)}, trial)
 
 
 def hops() -> Setting:
     scene = tippe.Scene(scene_of(MU, OFFSET).body, friction=tippe.Viscous(MU), contact="hybrid")
-    return modal_times(scene, tippe.Launch(0.1, np.array([180.0, 200.0])), 0.02, 12.0, 1e-6)
+    return modal_times(scene, tippe.Launch(0.1, np.array([180.0, 200.0])), 0.02, 12.0, 0.95 * np.pi)
 
 
 def stick() -> Setting:
     scene = tippe.Scene(scene_of(MU, OFFSET).body, friction=tippe.SetValuedCoulomb(MU))
-    return modal_times(scene, tippe.Launch(0.1, np.linspace(120.0, 150.0, 4)), 0.02, 12.0, 1e-6)
+    return modal_times(scene, tippe.Launch(1.5, np.linspace(100.0, 150.0, 4)), 0.01, 2.0, 0.6 * np.pi)
 
 
 def reversal() -> Setting:

@@ -18,9 +18,6 @@ LINEAR = 0.1
 #: points of nearly the same likelihood; then the estimate is a likely point near the mean, with this weight of the distance.
 NEAR, CENTRAL = 0.5, 4.0
 
-#: The shortest interval replaces the central one if it is shorter by this factor.
-SHORTER = 0.75
-
 
 class Distribution(NamedTuple):
     """The distribution of the coordinates.
@@ -66,20 +63,14 @@ class Distribution(NamedTuple):
         return cls("weights", best, covariance, points, weights)
 
     def interval(self, k: int, deviations: float) -> tuple[float, float]:
-        """The interval of a coordinate with the probability of so many deviations of a normal distribution.
-
-        It leaves equal probabilities below and above, unless another interval of the same probability is much shorter, as
-        between several minima.
-        """
+        """The interval of a coordinate with the probability of so many deviations of a normal distribution, and equal
+        probabilities below and above."""
         if self.kind != "weights":
             reach = deviations * math.sqrt(self.covariance[k, k])
             return float(self.estimate[k] - reach), float(self.estimate[k] + reach)
         outside = math.erfc(deviations / math.sqrt(2.0))
-        below = outside * np.append(np.linspace(0.0, 1.0, 101), 0.5)
-        low, high = quantiles(self.points[:, k], self.weights, np.stack([below, 1.0 - outside + below]))
-        shortest = int(np.argmin(high - low))
-        best = shortest if (high - low)[shortest] < SHORTER * (high - low)[-1] else -1
-        return float(low[best]), float(high[best])
+        low, high = quantiles(self.points[:, k], self.weights, np.array([0.5 * outside, 1.0 - 0.5 * outside]))
+        return float(low), float(high)
 
     def covariance_of_values(
         self, problem: Problem, slopes: Float[np.ndarray, " unknowns"]
@@ -87,7 +78,7 @@ class Distribution(NamedTuple):
         """The covariance of the parameters themselves, whose slopes with respect to the coordinates are given.
 
         The standard error of a parameter is half the width of its 68 % interval, which is the standard deviation of a normal
-        distribution, and does not depend on the distance of other minima.
+        distribution, and hardly depends on the distance of improbable minima.
         """
         if self.kind == "weights":
             covariance = weighted_covariance(np.asarray(problem.values(self.points)), self.weights)[1]
