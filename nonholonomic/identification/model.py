@@ -4,6 +4,7 @@ Each of these fits adds the names of its parameters and the prediction of a set 
 """
 
 import abc
+import dataclasses
 from collections.abc import Callable, Hashable
 from typing import Any
 
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ..validation import shown
-from .data import joined, of_data
+from .data import joined, of_data, series_units
 from .identify import check_search, identify
 from .result import Identification
 from .unknown import Free
@@ -36,6 +37,15 @@ class AbstractDataModel(eqx.Module):
 
     data: eqx.AbstractVar[tuple[Any, ...]]
     seen: eqx.AbstractVar[Int[Array, " n"]]
+
+    @property
+    def recorded(self) -> tuple[Any, ...]:
+        """The sets of data, for curves between their samples."""
+        return self.data
+
+    def with_recorded(self, recorded: tuple[Any, ...]) -> "AbstractDataModel":
+        """The model of other sets of data of the same shapes."""
+        return dataclasses.replace(self, data=recorded)
 
     @abc.abstractmethod
     def together(self, source: Any, values: Values) -> Hashable:
@@ -113,4 +123,5 @@ def fit_data(
     0.997
     """
     measurements, labels, seen = joined(data)
-    return identify(build(seen), measurements, unknowns, slopes=slopes, labels=labels, **search)
+    fit = identify(build(seen), measurements, unknowns, slopes=slopes, labels=labels, **search)
+    return dataclasses.replace(fit, series_units=series_units(data))

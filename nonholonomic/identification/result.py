@@ -10,6 +10,7 @@ from ..parameters import full_name, text_as_html
 from ..progress import status_line
 from ..validation import require_package, shown
 from ..views import draw_fit
+from .curve import fine_predictions
 from .distribution import Distribution
 from .exploration import Explorer, Weighted
 from .identifiability import Identifiability, identifiability
@@ -73,6 +74,7 @@ class Identification:
     - `verdict`: a `Verdict`, whether the fit can be believed.
     - `coordinates`, `coordinate_covariance`: estimates and covariance in the coordinates of the fit.
     - `distribution`: the `Distribution` of the coordinates, with its weighted points.
+    - `series_units`: the unit of each series of the measurements, if known.
 
     **Example:** the fit of the subpackage's example.
 
@@ -101,6 +103,7 @@ class Identification:
     problem: Problem = dataclasses.field(repr=False)
     measurements: Measurements = dataclasses.field(repr=False)
     explorer: Explorer = dataclasses.field(repr=False)
+    series_units: tuple[str, ...] = ()
 
     def interval(self, name: str, deviations: float = 1.96) -> tuple[float, float]:
         """The central interval of a parameter: the likelihood, times the priors, leaves equal probabilities below and
@@ -128,7 +131,7 @@ class Identification:
         **Arguments:**
 
         - `name`: name of the parameter, or the end of its name.
-        - `values`: values at which to hold the parameter, by default 13 within three standard errors.
+        - `values`: values at which to hold the parameter, by default 13 in its interval of three standard errors (99.7 %).
 
         **Returns:** a `Profile`.
 
@@ -142,14 +145,28 @@ class Identification:
             if not np.isfinite(error):
                 word = "infinite" if np.isinf(error) else "unknown"
                 raise ValueError(f"values must be given for {name!r}, whose standard error is {word}")
-            reach = 3.0 * np.sqrt(self.coordinate_covariance[k, k])
-            values = np.asarray(free.value(self.coordinates[k] + np.linspace(-reach, reach, 13)))
+            values = np.linspace(*self.interval(name, 3.0), 13)
         values = np.atleast_1d(np.asarray(values, float))
         if not np.all((values > free.lower) & (values < free.upper)):
             raise ValueError(
                 f"values = {shown(values)} must lie within the bounds ({free.lower}, {free.upper}) of {name!r}"
             )
         return profiled(self, k, values)
+
+    @property
+    def curves(self) -> tuple[Float[np.ndarray, "slices n"], Float[np.ndarray, "slices n"]]:
+        """Times since the first sample of each recording [s] and predictions, at and between the samples, at the most likely
+        point; empty without recordings.
+
+        **Example:** the decay of the subpackage's example, whose first sample is at 1 s.
+
+        >>> times, values = fit.curves
+        >>> decay = jnp.exp(-fit.most_likely["scene.rate"] * (1.0 + times))
+        >>> values.shape, bool(jnp.allclose(values, decay))
+        ((16, 3), True)
+        """
+        pairs = zip(self.problem.unknowns, self.most_likely.values(), strict=True)
+        return fine_predictions(self.problem, np.array([float(unknown.coordinate(value)) for unknown, value in pairs]))
 
     @property
     def correlation(self) -> Float[np.ndarray, "unknowns unknowns"]:

@@ -244,6 +244,14 @@ class RunModel(AbstractDataModel):
     seen: Int[Array, " n"]
     settings: Settings
 
+    @property
+    def recorded(self) -> tuple[Any, ...]:
+        return tuple(source.data for source in self.data)
+
+    def with_recorded(self, recorded: tuple[Any, ...]) -> "RunModel":
+        pairs = zip(recorded, self.data, strict=True)
+        return dataclasses.replace(self, data=tuple(Source(data, source.model) for data, source in pairs))
+
     def together(self, source: Source, values: dict[str, Array]) -> Hashable:
         return source.key, tuple(values)
 

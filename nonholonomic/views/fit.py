@@ -5,8 +5,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from ..parameters import readable_unit
+
 #: Greatest number of drawn profiles, and the rise of -2 log likelihood at the end of a 95 % interval.
 MOST_PROFILES, INTERVAL = 6, 3.84
+
+#: With at most this many measurements without a time, their labels are drawn.
+MOST_LABELS = 12
 
 
 class Fit(Protocol):
@@ -26,6 +31,12 @@ class Fit(Protocol):
 
     @property
     def correlation(self) -> np.ndarray: ...
+
+    @property
+    def curves(self) -> tuple[np.ndarray, np.ndarray]: ...
+
+    @property
+    def series_units(self) -> tuple[str, ...]: ...
 
     @property
     def verdict(self) -> Any: ...
@@ -64,6 +75,17 @@ def _series(fit: Fit) -> list[np.ndarray]:
     return [np.flatnonzero(numbers == number) for number in np.unique(numbers)]
 
 
+def _names(fit: Fit) -> list[str]:
+    """The quantity of each series with its unit, such as "theta [rad]"."""
+    names = []
+    for k, indices in enumerate(_series(fit)):
+        label = fit.residuals[indices[0]].label
+        unit = fit.series_units[k] if k < len(fit.series_units) else ""
+        quantity = label.partition("(")[0] if "(" in label else "time" if unit == "s" else "measured"
+        names.append(f"{quantity} [{readable_unit(unit)}]" if readable_unit(unit) else quantity)
+    return names
+
+
 def _abscissa(fit: Fit) -> tuple[np.ndarray, str]:
     """The abscissa of every measurement: its time, if it has one."""
     times = np.asarray(fit.measurements.time)
@@ -72,7 +94,7 @@ def _abscissa(fit: Fit) -> tuple[np.ndarray, str]:
 
 def _draw_data(fit: Fit, axes: Any) -> None:
     places, label = _abscissa(fit)
-    rows = fit.residuals
+    rows, names, (times, curves) = fit.residuals, _names(fit), fit.curves
     value = np.array([row.value if np.isfinite(row.value) else row.upper for row in rows])
     errors, predicted = (np.array([getattr(row, name) for row in rows]) for name in ("error", "prediction"))
     censored = np.array([row.censored for row in rows])
@@ -80,13 +102,22 @@ def _draw_data(fit: Fit, axes: Any) -> None:
     value = value + np.asarray(fit.measurements.whole_periods(predicted - value))
     for k, indices in enumerate(_series(fit)):
         colour, exact, limits = f"C{k}", indices[~censored[indices]], indices[censored[indices]]
-        name = rows[indices[0]].label.split("(")[0]
-        axes.errorbar(places[exact], value[exact], errors[exact], fmt=".", color=colour, alpha=0.5, label=name)
+        axes.errorbar(places[exact], value[exact], errors[exact], fmt=".", color=colour, alpha=0.5, label=names[k])
         axes.plot(places[limits], value[limits], "^", color=colour, alpha=0.5)
-        axes.plot(places[indices], predicted[indices], "-" if label.startswith("time") else "x", color=colour)
+        if len(curves):
+            moments = times[:, indices].T.reshape(-1)
+            axes.plot(moments, curves[:, indices].T.reshape(-1), "-", color=colour, linewidth=1.2)
+        else:
+            axes.plot(places[indices], predicted[indices], "x", color=colour)
     axes.set_xlabel(label)
-    axes.set_ylabel("measured, predicted (lines, crosses)")
-    axes.legend(fontsize=8)
+    if not np.any(np.asarray(fit.measurements.time)) and len(rows) <= MOST_LABELS:
+        axes.set_xticks(places, [row.label for row in rows], rotation=20, ha="right", fontsize=8)
+        axes.set_xlabel("")
+    drawn = "curve" if len(curves) else "crosses"
+    axes.set_title(f"dots: measured; {drawn}: predicted", fontsize=9)
+    axes.set_ylabel(names[0] if len(set(names)) == 1 else "measured")
+    if len(set(names)) > 1:
+        axes.legend(fontsize=8)
 
 
 def _draw_residuals(fit: Fit, axes: Any) -> None:

@@ -48,6 +48,15 @@ class HybridModel(NamedTuple):
     #: The model runs mode by mode and cannot be traced.
     on_host = True
 
+    @property
+    def recorded(self) -> tuple[Any, ...]:
+        """The sets of data, for curves between their samples."""
+        return self.data
+
+    def with_recorded(self, recorded: tuple[Any, ...]) -> "HybridModel":
+        """The model of other sets of data of the same shapes."""
+        return self._replace(data=recorded)
+
     def __call__(self, parameters: dict[str, Any]) -> Float[np.ndarray, "rows n"]:
         columns = {name: np.asarray(values) for name, values in parameters.items()}
         rows = [{name: float(values[i]) for name, values in columns.items()} for i in range(_count(columns))]

@@ -212,20 +212,14 @@ class ReversalTimes(AbstractTimes):
 
     **Raises:** `ValueError` for numbers out of range or shapes that do not fit.
 
-    **Example:** the product of inertia of a rattleback from three times.
+    **Example:** three times of a rattleback, which did not reverse in the other sense within 6 s. The product of inertia, or
+    any other number of the stone, is then an unknown of `identify(scene, data, {"inertia.xy": -1.8e-5})`.
 
-    ```
     >>> import tippe
-    >>> inertia = [[2e-4, -2e-5, 0.0], [-2e-5, 1.6e-3, 0.0], [0.0, 0.0, 1.7e-3]]
-    >>> body = tippe.Ellipsoid(1.0, (0.2, 0.03, 0.02), (0.0, 0.0, -0.01), inertia)
-    >>> scene = tippe.Scene(body, friction=tippe.NoSlip())
-    >>> launch = tippe.Launch(theta=0.02, spin=[-4.0, -5.0, -6.0])
-    >>> data = tippe.ReversalTimes(launch, time=[2.11, 2.60, 2.98], error=0.02, t1=8.0)
-    >>> fit = tippe.identify(scene, data, {"inertia.xy": -1.8e-5}, tolerance=1e-6, progress=False)
-    >>> print(f"{fit.estimates['scene.body.inertia.xy']:.2e} kg m2")
-    -2.00e-05 kg m2
-
-    ```
+    >>> launch = tippe.Launch(theta=0.02, spin=[-4.0, -5.0, -6.0, 5.0])
+    >>> data = tippe.ReversalTimes(launch, [2.11, 2.60, 2.98, float("inf")], error=0.02, t1=8.0, until=6.0)
+    >>> data.measurements.censored.tolist()
+    [False, False, False, True]
     """
 
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
