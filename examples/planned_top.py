@@ -26,8 +26,7 @@ def turning(numbers: jax.Array) -> jax.Array:
 
 def planned() -> tippe.Launch:
     """The best launch of a batch, improved by Newton steps."""
-    theta, spin = np.linspace(0.05, 0.3, 8), np.linspace(120.0, 180.0, 8)
-    launches = np.stack(np.meshgrid(theta, spin, [0.0]), axis=-1).reshape(-1, 3)
+    launches = np.mgrid[0.05:0.3:8j, 120.0:180.0:8j, 0.0:1.0].reshape(3, -1).T
     time, x, y = np.asarray(jax.jit(jax.vmap(turning))(launches)).T
     print(f"{np.isfinite(time).sum()} of {time.size} launches turn over")
     # On a level plane, the azimuth only turns the path.
