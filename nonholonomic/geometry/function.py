@@ -21,7 +21,9 @@ class Plain(eqx.Module):
     function: Callable[..., Any] = eqx.field(static=True)
 
     def __call__(self, *at: Float[Array, "..."]) -> Float[Array, "..."]:
-        return self.function(*at)
+        value, shape = jnp.asarray(self.function(*at)), jnp.broadcast_shapes(*map(jnp.shape, at))
+        # A constant is the same in every lane.
+        return value if value.shape == shape else jnp.broadcast_to(value, shape)
 
 
 class Closure(eqx.Module):

@@ -163,6 +163,7 @@ SAME = [
 LIMITS = [
     (Sphere(1.4), Spheroid(1.4, 1.4 * (1.0 + 1e-9)), 1e-8),
     (Plane(), Graph(Waves(0.0, 1.0, np.zeros(2))), 1e-15),
+    (Plane(), Graph(lambda x, y: 0.0), 1e-15),
     (Plane(), Graph(Waves(1e-9, 1.0, np.zeros(2))), 1e-8),
     (Plane(), Paraboloid(1e9), 1e-8),
 ]
