@@ -12,7 +12,7 @@ within a factor of 1.5. The settings:
 - `reversal`: four reversal times of a rattleback;
 - `film`: theta of a top, with unknown friction, spin and clock; `wooden`: theta of a wooden top that hops;
 - `ride`: the speed of a stroller, with unknown rolling friction and launch speed;
-- `own`: the heights of a bouncing ball of one's own, with unknown restitution and drag.
+- `own`: the heights of a bouncing ball of one's own, with unknown restitution and height at the start.
 
 Every fit is appended to the file of rows at once; a second call continues where the first ended. `--report` prints the
 table of the rows with the binomial errors of the fractions.
@@ -188,16 +188,16 @@ class Ball(nonholonomic.AbstractMode):
 
 
 def own() -> Setting:
-    """Restitution and drag of a ball from its height at 40 times, over four bounces."""
+    """Restitution and the height at the start from the height at 40 times, over three bounces."""
     ball, start, clock = nonholonomic.Hybrid([Ball(0.8, 0.2)]), [1.0, 0.0], 0.05 * np.arange(1, 41)
     exact = np.asarray(nonholonomic.simulate(ball, start, 2.0, times=clock)["y0"])
-    truth = {"restitution": 0.8, "drag": 0.2}
+    truth = {"restitution": 0.8, "start[0]": 1.0}
 
     def trial(random: np.random.Generator) -> Any:
         data = nonholonomic.Recording(start, clock, exact + 0.03 * random.normal(size=40), 0.03, "y0")
         free = {
             "restitution": tippe.Free(min(near(random, 0.8), 0.95), 0.0, 1.0),
-            "drag": tippe.Free(near(random, 0.2), 0.0),
+            "start[0]": near(random, 1.0, 1.05),
         }
         return nonholonomic.identify(ball, data, free, progress=False)
 
@@ -254,7 +254,8 @@ def measure(name: str, repeats: int, path: Path) -> None:
 
 def rows_of(path: Path, name: str) -> list[dict[str, Any]]:
     lines = path.read_text().splitlines() if path.exists() else []
-    return [row for row in map(json.loads, lines) if row["setting"] == name]
+    rows = [row for row in map(json.loads, lines) if row["setting"] == name]
+    return [*{row["number"]: row for row in rows}.values()]
 
 
 def report(name: str, rows: list[dict[str, Any]]) -> None:

@@ -37,7 +37,8 @@ def _generalised_pareto(excess: Float[np.ndarray, " n"]) -> tuple[float, float]:
     (2009) 316), with the shape drawn to 0.5 like 10 of the numbers."""
     count = len(excess)
     grid = 30 + int(np.sqrt(count))
-    quartile = excess[max(int(count / 4 + 0.5) - 1, 0)]
+    # Of a very heavy tail, most numbers are negligible.
+    quartile = max(excess[max(int(count / 4 + 0.5) - 1, 0)], 1e-9 * excess[-1])
     inverse = 1.0 / excess[-1] + (1.0 - np.sqrt(grid / (np.arange(1, grid + 1) - 0.5))) / (3.0 * quartile)
     shapes = np.mean(np.log1p(-inverse[:, None] * excess), axis=1)
     logs = count * (np.log(-inverse / shapes) - shapes - 1.0)
