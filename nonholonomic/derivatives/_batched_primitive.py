@@ -19,7 +19,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir, partial_eval
 from jaxtyping import Array, Float
 
-from ..xla_cpu import compiled_alone, compiled_quickly
+from ..xla_cpu import compiled_alone, compiled_for_one
 
 
 class AbstractLinearSolve(eqx.Module):
@@ -118,7 +118,7 @@ def _parts(
 
 #: For one run: a hybrid scene compiles in half the time, with a third of the memory and of the mappings (289 instead of
 #: 818), and runs equally fast; 256 runs at once would take 2.5 times as long.
-_parts_of_one = compiled_quickly(_parts)
+_parts_of_one = compiled_for_one(_parts)
 _parts_of_many = compiled_alone(_parts)
 
 

@@ -16,7 +16,7 @@ from ..integration import Outcome, Settings, explicit_tableau
 from ..integration.checks import legal_run
 from ..integration.status import Status
 from ..progress import status_line
-from ..validation import as_number, is_traced, shown, warn
+from ..validation import as_number, is_traced, nan_unless, shown, warn
 from .checks import check_run, require_event
 from .ensemble import Ensemble, status_of, traced_leaves
 from .model import AbstractModel, model_of
@@ -221,5 +221,5 @@ class EventTime(AbstractDifferentiableSolve):
         status = status_of(self._model(leaves), ensemble, outcome, settings.tolerance)
         is_good = is_legal & (status != int(SILENT[0])) & (status != int(SILENT[1]))
         has_event = status == int(Status.EVENT)
-        time = jnp.where(is_good, jnp.where(has_event, outcome.crossing_time, jnp.inf), jnp.nan)
-        return time, [jnp.where(is_good, jnp.where(has_event, slope, 0.0), jnp.nan) for slope in slopes]
+        time = jnp.where(has_event, outcome.crossing_time, jnp.inf)
+        return nan_unless(is_good, (time, [jnp.where(has_event, slope, 0.0) for slope in slopes]))
