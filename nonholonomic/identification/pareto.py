@@ -42,7 +42,7 @@ def _generalised_pareto(excess: Float[np.ndarray, " n"]) -> tuple[float, float]:
     inverse = 1.0 / excess[-1] + (1.0 - np.sqrt(grid / (np.arange(1, grid + 1) - 0.5))) / (3.0 * quartile)
     shapes = np.mean(np.log1p(-inverse[:, None] * excess), axis=1)
     logs = count * (np.log(-inverse / shapes) - shapes - 1.0)
-    share = 1.0 / np.sum(np.exp(logs - logs[:, None]), axis=1)
+    share = np.exp(logs - np.max(logs))
     mean = np.sum(inverse * share) / np.sum(share)
     shape = np.mean(np.log1p(-mean * excess))
     return float((count * shape + 5.0) / (count + 10.0)), float(-shape / mean)

@@ -112,3 +112,6 @@ def test_smoothed_weights_know_a_heavy_tail():
         weights, k = smoothed_weights(-shape * np.log(uniform))
         assert abs(k - shape) < 0.15
         assert abs(np.sum(weights) - 1.0) < 1e-12
+    # Three weights outweigh all others by 300 orders of magnitude.
+    logs = np.concatenate([[0.0, -1.0, -2.0], np.linspace(-700.0, -300.0, 397), np.full(1600, -800.0)])
+    assert np.isfinite(smoothed_weights(logs)[1])
