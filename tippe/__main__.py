@@ -30,6 +30,7 @@ from .model.launch import Launch
 from .model.scene import Scene
 from .papers import tables as paper_tables
 from .runs.explore import live_run, stage_at_start
+from .runs.model import TopModel
 from .runs.plot import Panel, draw_launches
 from .runs.table import inversion_table
 from .runs.theta_over_time import theta_over_time
@@ -162,9 +163,9 @@ def launch_shown(options: argparse.Namespace) -> Launch:
 
 def sliders(options: argparse.Namespace) -> str:
     """The page of the top with sliders, with a placeholder for the contents below."""
-    run = (scene(options, "plane"), launch_shown(options))
+    model = TopModel(scene=scene(options, "plane"), launch=launch_shown(options))
     t1 = min(SHOWN, options.t1)
-    return live_page(live_run(*run, None, t1)._replace(title=TITLE), stage_at_start(*run, t1), 0.2, BELOW).html
+    return live_page(live_run(model, None, t1)._replace(title=TITLE), stage_at_start(model, t1), 0.2, BELOW).html
 
 
 def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str, Table], Any, str]:

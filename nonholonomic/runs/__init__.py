@@ -23,6 +23,7 @@ from .lyapunov import direction_of_start as direction_of_start
 from .lyapunov import exponent_of_model as exponent_of_model
 from .lyapunov import lyapunov_exponent as lyapunov_exponent
 from .model import AbstractModel as AbstractModel
+from .model import AbstractSceneModel as AbstractSceneModel
 from .model import Names as Names
 from .model import Start as Start
 from .model import model_of as model_of

@@ -1,15 +1,18 @@
 """The interface between a model and the questions about its runs."""
 
 import abc
+import dataclasses
 import functools
 from collections.abc import Iterable
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..hybrid import AbstractBatchedMode, HybridOutcome
 from ..integration import AbstractProblem, Outcome
+from ..parameters import numbers, with_numbers
 from ..sweeps import Axis, Quantity, Variable
 from ..validation import shown
 from ..views import Stage
@@ -190,6 +193,27 @@ class AbstractModel(eqx.Module):
     @abc.abstractmethod
     def at_end(self, outcome: Outcome | HybridOutcome, start: Float[Array, "components cells"]) -> dict[str, Array]:
         """The values of `ends`, for the outcome and the initial states of some cells."""
+
+
+class AbstractSceneModel(AbstractModel):
+    """A model whose parameters are those of a few named trees, such as a scene and a launch, and of a user's event."""
+
+    @property
+    @abc.abstractmethod
+    def roots(self) -> dict[str, Any]:
+        """The trees whose numbers are parameters, which are fields of the model."""
+
+    def value(self, name: str) -> Any:
+        if name.startswith("event.") and self.event is not None:
+            return self.event.parameters.value(name)
+        root = name.partition(".")[0]
+        value = numbers(root, self.roots[root])[name]
+        return jnp.zeros(()) if value is None else value
+
+    def replaced(self, values: dict[str, Any]) -> Self:
+        own = {name: value for name, value in values.items() if not name.startswith("event.")}
+        event = self.event if self.event is None else self.event.replaced(values)
+        return dataclasses.replace(self, **with_numbers(self.roots, own), event=event)
 
 
 @functools.singledispatch

@@ -274,8 +274,13 @@ def read_chunk(folder: Path, layout: Layout, chunk: int) -> dict[str, Values] | 
 
 
 def same_request(left: str, right: str) -> str | None:
-    """The first difference between two requests (JSON), in words; `None` if they are the same."""
-    first, second = json.loads(left), json.loads(right)
+    """The first difference between two requests (JSON), in words; `None` if they are the same.
+
+    Earlier versions wrote an empty list for options that requests of this version omit.
+    """
+    first, second = (
+        {name: value for name, value in json.loads(request).items() if value != []} for request in (left, right)
+    )
     for name in [*first, *(name for name in second if name not in first)]:
         if first.get(name) != second.get(name):
             return f"{name} is {first.get(name)!r} in the file and {second.get(name)!r} here"

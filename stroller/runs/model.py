@@ -15,10 +15,11 @@ from nonholonomic.integration import AbstractProblem, ExtendedProblem, Outcome
 from nonholonomic.integration.checks import run_bounds
 from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, Status
 from nonholonomic.lanes.objects import Held
-from nonholonomic.parameters import description, full_name, numbers, with_numbers
+from nonholonomic.parameters import description, full_name, numbers
 from nonholonomic.runs import (
     UNMEASURED,
     AbstractModel,
+    AbstractSceneModel,
     Clock,
     EventFunction,
     Names,
@@ -103,7 +104,7 @@ class Original:
         return 0
 
 
-class RideModel(AbstractModel):
+class RideModel(AbstractSceneModel):
     """A ride, or the rides of many cells: scene, launch and input, and the event. Without another event, the event is
     that the ground would have to pull; a ride continues through this event.
 
@@ -151,18 +152,6 @@ class RideModel(AbstractModel):
         return [
             name for name, value in values.items() if np.ndim(value) == 0 and (level or name != "scene.body.centre")
         ]
-
-    def value(self, name: str) -> Any:
-        if name.startswith("event.") and self.event is not None:
-            return self.event.parameters.value(name)
-        root = name.partition(".")[0]
-        value = numbers(root, self.roots[root])[name]
-        return jnp.zeros(()) if value is None else value
-
-    def replaced(self, values: dict[str, Any]) -> "RideModel":
-        own = {name: value for name, value in values.items() if not name.startswith("event.")}
-        event = self.event if self.event is None else self.event.replaced(values)
-        return dataclasses.replace(self, **with_numbers(self.roots, own), event=event)
 
     def label(self, names: list[str]) -> dict[str, tuple[str, str, str]]:
         """The name of an axis is the last part of its full name, or the last two parts if one is ambiguous. Numbers of a

@@ -12,6 +12,7 @@ from tops import rutstam_top
 import tippe
 from nonholonomic.views.explore import programs
 from tippe.runs.explore import TOLERANCE, live_run
+from tippe.runs.model import TopModel
 
 pytestmark = needs_browser
 
@@ -24,6 +25,17 @@ RANGES = {"theta": (0.02, 0.6), "spin": (60.0, 200.0), "mu": (0.05, 1.0)}
 def hills(x, y):
     return x * x + 0.8 * y * y + 0.1 * jnp.sin(3.0 * x) * y * y
 
+
+#: Scene, launch and horizon [s] of tops that stick, and that fly over an arena.
+STICKING = (tippe.Scene(rutstam_top(), friction=tippe.SetValuedCoulomb(0.3)), tippe.Launch(0.35, 100.0), 2.0)
+ARENA_FLIGHTS = {
+    "cylinder": (tippe.presets.classroom(tippe.Cylinder(0.3)), tippe.Launch(0.1, 199.0, eta=0.1), 3.0),
+    "sticking and flying": (
+        tippe.Scene(rutstam_top(), friction=tippe.SetValuedCoulomb(0.3), contact="hybrid", restitution=0.4),
+        tippe.Launch(0.1, 280.0),
+        3.0,
+    ),
+}
 
 PLACED = {"place": (0.1, 0.05)}
 ARENAS = {
@@ -79,7 +91,7 @@ def answers(browser, page_run, values: np.ndarray) -> np.ndarray:
 )
 def test_the_browser_says_what_the_table_says(browser, arena, law):
     scene, launch, grid = launches_of(arena, law, CASES.index((arena, law)))
-    page_run = live_run(scene, launch, RANGES, HORIZONS[law])
+    page_run = live_run(TopModel(scene=scene, launch=launch), RANGES, HORIZONS[law])
     table = table_of(scene, launch, grid, HORIZONS[law])
     theta, mu, spin = (values.ravel() for values in np.meshgrid(grid["theta"], grid["mu"], grid["spin"], indexing="ij"))
     status, time, end, angle = answers(browser, page_run, np.stack([theta, spin, mu], axis=-1))
@@ -94,7 +106,7 @@ def test_the_browser_says_what_the_table_says(browser, arena, law):
 @pytest.mark.slow
 def test_the_browser_says_when_rattlebacks_reverse(browser):
     """The times of `reversal_table`, for both senses; the words are those of reversals, and a spin of 0 is not allowed."""
-    page_run = live_run(rattleback(), tippe.Launch(0.02, -5.0), None, 4.0)
+    page_run = live_run(TopModel(scene=rattleback(), launch=tippe.Launch(0.02, -5.0)), None, 4.0)
     assert [slider.path for slider in page_run.sliders] == ["launch.theta", "launch.spin"]
     grid = {"theta": np.linspace(0.005, 0.06, 4), "spin": np.array([-8.0, -6.0, -3.0, 3.0])}
     table = tippe.reversal_table(rattleback(), **grid, t1=4.0, tolerance=TOLERANCE, progress=False)
@@ -306,7 +318,7 @@ def test_keys_play_and_reset(browser, page):
 
 
 def test_numbers_that_do_not_fit_together_are_refused_in_the_page(browser, rutstam_scene):
-    page_run = live_run(rutstam_scene, tippe.Launch(0.1, 155.0), {"theta": (0.05, 0.5)}, 7.0)
+    page_run = live_run(TopModel(scene=rutstam_scene, launch=tippe.Launch(0.1, 155.0)), {"theta": (0.05, 0.5)}, 7.0)
     browser.get("about:blank")
     script = f"{programs(page_run)} return [[0.3], [-0.3], [4.0]].map((values) => Boolean(live.allowed(values, [])[0]))"
     assert browser.execute_script(script) == [True, False, False]
@@ -329,12 +341,8 @@ def test_what_is_no_slider_is_refused(rutstam_scene, change, message):
         tippe.explore(rutstam_scene, tippe.Launch(0.1, 155.0), **change)
 
 
-def test_flights_of_curved_arenas_and_sticking_are_refused(rutstam_scene):
+def test_a_page_without_the_shape_of_a_stem_refuses_its_offset():
     launch = tippe.Launch(0.1, 155.0)
-    with pytest.raises(ValueError, match="contact = 'hybrid' must be 'stop' for explore on a Cylinder"):
-        tippe.explore(tippe.presets.classroom(tippe.Cylinder(0.3)), launch)
-    with pytest.raises(ValueError, match="SetValuedCoulomb must be a law without modes"):
-        tippe.explore(tippe.Scene(rutstam_top(), friction=tippe.SetValuedCoulomb(0.3)), launch)
     with pytest.raises(ValueError, match="offset changes the drawn arena or body"):
         tippe.explore(tippe.presets.classroom(), launch, sliders={"body.offset": (0.001, 0.002)})
 
@@ -342,7 +350,10 @@ def test_flights_of_curved_arenas_and_sticking_are_refused(rutstam_scene):
 def test_in_the_browser_the_wooden_top_hops_and_climbs_onto_its_stem(browser):
     """As `simulate` has it: through flights, impacts and changes of contact, to the end on its stem."""
     scene, launch = tippe.presets.classroom(), tippe.Launch.degrees(theta=6, rpm=1900)
-    page_run, times = live_run(scene, launch, None, 4.0), np.array([0.0, 0.5, 2.6, 2.78, 2.85, 4.0])
+    page_run, times = (
+        live_run(TopModel(scene=scene, launch=launch), None, 4.0),
+        np.array([0.0, 0.5, 2.6, 2.78, 2.85, 4.0]),
+    )
     run = tippe.simulate(scene, launch, 4.0, tolerance=1e-10)
     browser.get("about:blank")
     (status, time), end, hops, rows = browser.execute_script(
@@ -367,6 +378,26 @@ def test_in_the_browser_the_wooden_top_hops_and_climbs_onto_its_stem(browser):
     np.testing.assert_allclose(force, samples.normal_force, atol=1e-5 * float(samples.normal_force[0]))
 
 
+@pytest.mark.parametrize("kind", ["sticking", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ARENA_FLIGHTS)])
+def test_in_the_browser_tops_stick_and_fly_over_arenas_as_runs_do(browser, kind):
+    scene, launch, t1 = {"sticking": STICKING, **ARENA_FLIGHTS}[kind]
+    page_run, times = live_run(TopModel(scene=scene, launch=launch), None, t1), np.linspace(0.0, 0.9 * t1, 7)
+    run = tippe.simulate(scene, launch, t1, tolerance=1e-9)
+    browser.get("about:blank")
+    counts, rows = browser.execute_script(
+        f"""{programs(page_run)}
+        const values = live.facts.sliders.map((slider) => slider.value), moves = integrator(live.motion);
+        const run = moves.trajectory(values, "frame"), at = live.motion.runs.counts;
+        return [moves.run(values).slice(at, at + {len(TopModel(scene=scene, launch=launch).counters)}),
+          run.read({times.tolist()}).map((row) => [...row])]"""
+    )
+    samples, rows = run.at(times), np.array(rows)
+    np.testing.assert_allclose(rows[:, 3:6], samples.position, atol=CLOSE)
+    np.testing.assert_allclose(rows[:, -5], samples.theta, atol=5e-6)
+    np.testing.assert_allclose(rows[:, -4], samples.energy, rtol=CLOSE)
+    assert counts[-1] == (run.stats["sticks"] if scene.friction.set_valued else len(run.hops)) > 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["wooden", "bouncing"])
 def test_the_browser_flies_as_the_table_does(browser, kind):
@@ -382,7 +413,7 @@ def test_the_browser_flies_as_the_table_does(browser, kind):
     theta, mu, spin = (values.ravel() for values in np.meshgrid(grid["theta"], grid["mu"], grid["spin"], indexing="ij"))
     runs = json.dumps(np.stack([theta, spin, mu], axis=-1).tolist())
     browser.get("about:blank")
-    script = f"""{programs(live_run(scene, launch, ranges, 5.0))}
+    script = f"""{programs(live_run(TopModel(scene=scene, launch=launch), ranges, 5.0))}
         const asks = integrator(live.answer), at = live.answer.runs, text = (x) => Number.isFinite(x) ? x : String(x);
         return {runs}.map((values) => {{
           const runs = asks.run(values);

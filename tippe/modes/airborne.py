@@ -351,7 +351,8 @@ class Fly(AbstractFlyingMode):
         c_vector = vector_of(state[OWN + k] for k in range(3))
         c_vector = jnp.where(flies, jnp.stack(c_vector), jnp.stack(to_frame(c_vector, ground.axes)))
         energy_change = energy(self.scene.body, 0.0, body_after) - energy(self.scene.body, 0.0, body_before)
-        return jnp.concatenate([state_after, c_vector, state[OWN + 3 :].at[1].add(energy_change)])
+        spin_angle, work = state[OWN + 3 :]
+        return jnp.concatenate([state_after, c_vector, jnp.stack([spin_angle, work + energy_change])])
 
 
 def modes(

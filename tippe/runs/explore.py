@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import LaneState, Settings, crossing_time
-from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED, Status
+from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, Status
 from nonholonomic.parameters import numbers, readable_unit, with_numbers
 from nonholonomic.validation import all_bounds, legal
 from nonholonomic.views import Stage, arena
@@ -34,15 +34,15 @@ from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
 from ..model.top import Top
 from ..modes.inversion_problem import InversionProblem
-from ..modes.sliding import Slide, modes
+from ..modes.sliding import Slide
 from ..modes.trajectory_problem import TrajectoryProblem, trajectory_problem
 from .checks import check_reversible, check_run
-from .flight_trajectory import HybridTrajectory, level_modes
 from .launches import LONG_NAMES, UNITS
 from .quantities import OF_RIGID_BODIES, QUANTITIES
 from .trajectory import Trajectory, parts_of
 from .turned_over import event_of
 from .view import AXIS, DrawnMotion, curve_of_rotation, show
+from .view import motion as drawn_motion
 
 Numbers = Float[Array, " numbers"]
 
@@ -63,10 +63,10 @@ MOST_STEPS_OF_A_PAGE = 50_000
 REVERSED = {int(Status.INVERTED): "reversed", int(Status.NOT_INVERTED): "not_reversed"}
 
 
-def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float]] | None, t1: float) -> LiveRun:
-    """The contents of the page. **Arguments:** as for `explore`."""
+def live_run(model: Any, sliders: dict[str, tuple[float, float]] | None, t1: float) -> LiveRun:
+    """The contents of the page. **Arguments:** `model`: a `TopModel` without an event; the others as for `explore`."""
+    scene, launch = model.scene, model.launch
     check_run(scene, launch, t1, TOLERANCE)
-    check_modes(scene)
     if reverses(scene):
         check_reversible(launch, {})
     roots = {"scene": scene, "launch": launch}
@@ -85,7 +85,8 @@ def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float
         return is_legal & (scene.dynamics.normal_spin(scene.state(launch)) != 0.0) if reverses(scene) else is_legal
 
     settings, quantities = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE), QUANTITIES | OF_RIGID_BODIES
-    answer, motion = (hybrid_simulators if flies(scene) else smooth_simulators)(modules, float(t1), settings)
+    simulators = smooth_simulators if model.smooth else hybrid_simulators
+    answer, motion = simulators(model, modules, float(t1), settings)
     return LiveRun(
         title=f"{'Rigid body' if is_rigid(scene) else 'Tippe top'} on a {type(scene.surface).__name__.lower()}",
         sliders=knobs,
@@ -102,7 +103,7 @@ def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float
 
 
 def smooth_simulators(
-    modules: Callable[[Numbers], tuple[Scene, Launch]], t1: float, settings: Settings
+    model: Any, modules: Callable[[Numbers], tuple[Scene, Launch]], t1: float, settings: Settings
 ) -> tuple[Simulator, Simulator]:
     """The simulators of a smooth run: one up to the inversion, and one for the drawn run."""
 
@@ -111,14 +112,15 @@ def smooth_simulators(
 
     readings = {"outcome": lambda values, problem, lane: outcome(problem, lane)}
     return (
-        Simulator(lambda values: event_problem(*modules(values)), t1, settings, readings),
+        Simulator(lambda values: timed(model, modules(values)).problem(1, ()), t1, settings, readings),
         Simulator(lambda values: trajectory_problem(modules(values), 1), t1, settings, {"frame": moment}),
     )
 
 
-def event_problem(scene: Scene, launch: Launch) -> InversionProblem:
-    """The motion up to the inversion, or, without slip, to the reversal of the spin."""
-    return InversionProblem.of(scene, launch, None if reverses(scene) else event_of(scene, None), 1)
+def timed(model: Any, modules: tuple[Scene, Launch]) -> Any:
+    """The `TopModel` of a launch up to the inversion, or, without slip, to the reversal of the spin."""
+    scene, launch = modules
+    return type(model).timed(scene, launch, None if reverses(scene) else event_of(scene, None))
 
 
 def is_rigid(scene: Scene) -> bool:
@@ -132,41 +134,30 @@ def reverses(scene: Scene) -> bool:
 
 
 def hybrid_simulators(
-    modules: Callable[[Numbers], tuple[Scene, Launch]], t1: float, settings: Settings
+    model: Any, modules: Callable[[Numbers], tuple[Scene, Launch]], t1: float, settings: Settings
 ) -> tuple[HybridSimulator, HybridSimulator]:
-    """The same for runs with flights, impacts and a stem, on a level plane."""
+    """The same for runs with flights, impacts, a stem, or stick and slip."""
 
-    def to_inversion(values: Numbers) -> Any:
+    def start(model: Any, names: Any) -> Any:
+        return model.modes(1, jnp.asarray(TOLERANCE), names, False)
+
+    def sampled(values: Numbers) -> Any:
         scene, launch = modules(values)
-        problem = InversionProblem.of(scene, launch, event_of(scene, None), 1)
-        return (*modes(scene, problem, TOLERANCE, last=False), problem.states)
+        return dataclasses.replace(model, scene=scene, launch=launch)
 
     def moment(values: Numbers, number: Any, rows: Any, time: Any) -> Frame:
-        return hybrid_frame(modules(values)[0], number, rows, time)
+        return frame(modules(values)[0], sampled(values).moment(rows, number))
 
-    readings = {"outcome": lambda values, runs: hybrid_outcome(runs)}
+    def last(values: Numbers, runs: HybridOutcome) -> tuple[Int[Array, ""], Float[Array, ""]]:
+        return hybrid_outcome(timed(model, modules(values)), runs)
+
+    counters = len(model.counters)
     return (
-        HybridSimulator(to_inversion, t1, settings, 1, readings),
-        HybridSimulator(lambda values: level_modes(modules(values), TOLERANCE), t1, settings, 1, {}, moment),
+        HybridSimulator(
+            lambda values: start(timed(model, modules(values)), ()), t1, settings, counters, {"outcome": last}
+        ),
+        HybridSimulator(lambda values: start(sampled(values), None), t1, settings, counters, {}, moment),
     )
-
-
-def check_modes(scene: Scene) -> None:
-    """Raise `ValueError` for a scene whose runs have modes that the page does not support."""
-    if flies(scene) and not scene.level:
-        raise ValueError(
-            f"contact = 'hybrid' must be 'stop' for explore on a {type(scene.surface).__name__}: the page supports flights "
-            "over a level Plane only; show one run with its flights by simulate(...).view()"
-        )
-    if scene.friction.set_valued:
-        raise ValueError(
-            f"friction = {type(scene.friction).__name__} must be a law without modes for explore, such as Coulomb"
-        )
-
-
-def flies(scene: Scene) -> bool:
-    """Whether runs continue through flights and impacts."""
-    return scene.contact == "hybrid"
 
 
 def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float]]:
@@ -203,25 +194,25 @@ def outcome(problem: InversionProblem, lane: LaneState) -> tuple[Int[Array, ""],
     return jnp.where(inverted, int(Status.INVERTED), status)[0], jnp.where(inverted, time, jnp.inf)[0]
 
 
-def hybrid_outcome(runs: HybridOutcome) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """The same for a run with flights."""
-    ended = {CROSSED: Status.INVERTED, LEFT_DOMAIN: Status.JAMMED, FAILED: Status.FAILED, UNRESOLVED: Status.UNRESOLVED}
-    status, inverted = jnp.asarray(int(Status.NOT_INVERTED)), runs.status[0] == CROSSED
-    for code, word in ended.items():
-        status = jnp.where(runs.status[0] == code, int(word), status)
-    return status, jnp.where(inverted, runs.crossing_time[0], jnp.inf)
+def hybrid_outcome(model: Any, runs: HybridOutcome) -> tuple[Int[Array, ""], Float[Array, ""]]:
+    """The same for a run of a `TopModel` with several modes."""
+    status = model.ended(runs, TOLERANCE)[0]
+    for ended, word in ((Status.EVENT, Status.INVERTED), (Status.COMPLETED, Status.NOT_INVERTED)):
+        status = jnp.where(status == int(ended), int(word), status)
+    return status, jnp.where(runs.status[0] == CROSSED, runs.crossing_time[0], jnp.inf)
 
 
 def stage_of_runs(runs: list[Trajectory]) -> Stage:
     """The first run, on a part of the arena that also contains the others."""
     (first,), scene = runs[0].stages(), runs[0].scene
-    points, size = np.concatenate([np.asarray(run.contact) for run in runs]), float(scene.body.size)
+    points, size = np.concatenate([drawn_motion(run).contact for run in runs]), float(scene.body.size)
     return first._replace(arena=arena(scene.surface, points, first.arena.normal, 4.0 * size, 2.5 * size))
 
 
-def stage_at_start(scene: Scene[Top], launch: Launch, t1: float) -> Stage:
-    """A top on a level plane at its launch; the page replaces it by a simulated run before it is visible."""
-    start = DrawnMotion(*(np.repeat(np.asarray(part), 2, axis=0) for part in _motion_at_start(scene, launch)))
+def stage_at_start(model: Any, t1: float) -> Stage:
+    """The top of a `TopModel` on a level plane at its launch; the page replaces it by a simulated run before it is visible."""
+    scene = model.scene
+    start = DrawnMotion(*(np.repeat(np.asarray(part), 2, axis=0) for part in _motion_at_start(model)))
     initial_show, size = show(scene, start._replace(times=np.array([0.0, 1.0])), 0, ""), float(scene.body.size)
     # Slips grow as the top rises; a slip at half the speed of the equator gets the longest arrow.
     normal_force, slip, *arrows = initial_show.arrows
@@ -236,30 +227,20 @@ def stage_at_start(scene: Scene[Top], launch: Launch, t1: float) -> Stage:
 
 
 @eqx.filter_jit
-def _motion_at_start(scene: Scene[Top], launch: Launch) -> DrawnMotion[Array]:
-    modes, number, state = level_modes((scene, launch), TOLERANCE)
-    assert isinstance(modes[0], Slide)
+def _motion_at_start(model: Any) -> DrawnMotion[Array]:
+    modes, number, state = model.modes(1, jnp.asarray(TOLERANCE), None, False)
     # The other tops stand on their stem.
-    rows = dataclasses.replace(modes[0], number=number).shown(state)
-    return DrawnMotion.of(hybrid_moment(scene, number, rows, jnp.zeros(1)))
+    rows = (
+        dataclasses.replace(modes[0], number=number).shown(state)
+        if isinstance(modes[0], Slide)
+        else modes[0].shown(state)
+    )
+    return DrawnMotion.of(model.moment(rows, number))
 
 
 def smooth_frame(scene: Scene, problem: TrajectoryProblem, lane: LaneState) -> Frame:
     """The drawn quantities of a top at one time in contact."""
     return frame(scene, Trajectory(lane.time, scene, *parts_of(problem.leading, lane.state)))
-
-
-def hybrid_frame(scene: Scene, number: Int[Array, "1"], rows: Float[Array, "17 1"], time: Float[Array, "1"]) -> Frame:
-    """The drawn quantities of a top at one time in contact or in flight; `rows` are the output rows of the modes."""
-    return frame(scene, hybrid_moment(scene, number, rows, time))
-
-
-def hybrid_moment(
-    scene: Scene[Top], number: Int[Array, "1"], rows: Float[Array, "17 1"], time: Float[Array, "1"]
-) -> HybridTrajectory:
-    """A run in contact or in flight, at a single time."""
-    kind: Any = HybridTrajectory
-    return kind(time, scene, *kind.parts_of(rows), number)
 
 
 def frame(scene: Scene, run: Any) -> Frame:

@@ -12,8 +12,17 @@ from nonholonomic.geometry import Plane
 from nonholonomic.hybrid import BETWEEN, HybridOutcome
 from nonholonomic.integration import AbstractProblem, CoreProblem, Outcome
 from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED, Status
-from nonholonomic.parameters import description, full_name, numbers, with_numbers
-from nonholonomic.runs import AbstractModel, EventFunction, Names, Start, TableForm, model_of, with_event
+from nonholonomic.parameters import description, full_name, numbers
+from nonholonomic.runs import (
+    AbstractModel,
+    AbstractSceneModel,
+    EventFunction,
+    Names,
+    Start,
+    TableForm,
+    model_of,
+    with_event,
+)
 from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.validation import all_bounds, legal, require_kind, require_scalars
 from nonholonomic.views import Stage
@@ -67,7 +76,7 @@ STATUSES = {
 NO_TILT = 1e-300
 
 
-class TopModel(AbstractModel):
+class TopModel(AbstractSceneModel):
     """A launch in a scene, or the launches of many cells, and the event.
 
     Without another event, runs end when theta reaches `angle` [rad]; when the stem first carries the top, if `angle` is
@@ -131,18 +140,6 @@ class TopModel(AbstractModel):
         """The full names of the parameters that can be varied: single numbers, including omitted ones, which are 0."""
         present = numbers("launch", self.launch)
         return [*variable_numbers(self.scene), *(name for name in NUMBERS_OF_A_LAUNCH if name in present)]
-
-    def value(self, name: str) -> Any:
-        if self.event is not None and name.startswith("event."):
-            return self.event.parameters.value(name)
-        root = name.partition(".")[0]
-        value = numbers(root, self.roots[root])[name]
-        return jnp.zeros(()) if value is None else value
-
-    def replaced(self, values: dict[str, Any]) -> "TopModel":
-        own = {name: value for name, value in values.items() if not name.startswith("event.")}
-        event = self.event if self.event is None else self.event.replaced(values)
-        return dataclasses.replace(self, **with_numbers(self.roots, own), event=event)
 
     def label(self, names: list[str]) -> dict[str, tuple[str, str, str]]:
         coordinates = list(self.scene.surface.coordinates)
@@ -243,9 +240,9 @@ class TopModel(AbstractModel):
         return simulate_launch(self, t1, times, tolerance, solver, adjoint)
 
     def page(self, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
-        live = live_run(self.scene, self.launch, sliders, t1)
-        if self.scene.contact == "hybrid":
-            return live, stage_at_start(self.scene, self.launch, t1)
+        live = live_run(self, sliders, t1)
+        if self.scene.contact == "hybrid" and self.scene.level:
+            return live, stage_at_start(self, t1)
         models = [self, *(self.replaced({path: end}) for path, end in ends_of(live.sliders))]
         return live, stage_of_runs([model.simulate(t1, None, DRAWN, None, None) for model in models])
 
@@ -256,10 +253,10 @@ class TopModel(AbstractModel):
     def read(
         self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: Any
     ) -> dict[str, Array]:
-        run = dataclasses.replace(self._moment(rows, mode), start=self.scene.state(self.launch))
+        run = dataclasses.replace(self.moment(rows, mode), start=self.scene.state(self.launch))
         return {name: getattr(run, name) for name in names}
 
-    def _moment(self, rows: Float[Array, "rows *cells"], mode: Any) -> Any:
+    def moment(self, rows: Float[Array, "rows *cells"], mode: Any) -> Any:
         """The states as a trajectory without times."""
         scene, zeros = self.scene, jnp.zeros(rows.shape[1:])
         if scene.contact == "hybrid":

@@ -88,8 +88,7 @@ def explore(
 
     **Arguments:**
 
-    - `scene`, `launch`: the run at the start; all numbers must be scalars; `contact` must be "stop" unless the arena is
-      a level plane, and the friction law must have a single mode.
+    - `scene`, `launch`: the run at the start; all numbers must be scalars.
     - `path`: file to write the page to, or `None`.
     - `sliders`: name of a parameter -> (lowest, highest) value. The end of a name is enough if only one parameter
       matches, such as "theta", "spin", "mu", "friction.mu" or "offset". By default theta, spin, the coefficient of

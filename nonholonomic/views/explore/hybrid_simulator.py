@@ -143,7 +143,7 @@ def _alike(modes: tuple[AbstractBatchedMode, ...]) -> list[list[int]]:
     groups: dict[Any, list[int]] = {}
     for number, mode in enumerate(modes):
         leaves, tree = jax.tree.flatten(mode)
-        groups.setdefault((tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves)), []).append(number)
+        groups.setdefault((tree, tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)), []).append(number)
     return list(groups.values())
 
 

@@ -66,8 +66,8 @@ SAME = ("stop_gradient", "optimization_barrier", "copy", "copy_p", "reduce_preci
 REDUCTIONS = {"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min"}
 REDUCTIONS |= {"reduce_and": "and", "reduce_or": "or"}
 
-#: Loops with at most this many iterations are unrolled.
-WRITTEN_OUT = 16
+#: Loops with at most this many iterations are unrolled, unless that writes more than this many statements.
+WRITTEN_OUT, MOST_STATEMENTS = 16, 4000
 
 #: Marks the exit of a loop among the names.
 LEAVES = "break"
@@ -328,7 +328,8 @@ class _Block:
         if "ft_in" in counts:  # jax 0.11 and later
             first, count, _ = map(len, counts["ft_in"].unpack())
         constants, carry, rows = inputs[:first], inputs[first : first + count], inputs[first + count :]
-        if not rows and len(_opened(jaxpr)[0].outvars) == count and length > WRITTEN_OUT:
+        unrolled = length <= WRITTEN_OUT and length * _statements(jaxpr) <= MOST_STATEMENTS
+        if not rows and len(_opened(jaxpr)[0].outvars) == count and not unrolled:
             head = f"for (let k = 0; k < {length}; k++)"
             return self.loop(head, carry, lambda block, carry: block.call(jaxpr, [*constants, *carry]))
         rows_of_steps: list[Any] = [None] * length
@@ -366,6 +367,20 @@ def _flat(values: Sequence[Value]) -> list[Number]:
 def _opened(jaxpr: Any) -> tuple[Any, Sequence[Any]]:
     """A jaxpr without its constants, and the constants."""
     return (jaxpr.jaxpr, jaxpr.consts) if isinstance(jaxpr, ClosedJaxpr) else (jaxpr, ())
+
+
+def _statements(jaxpr: Any) -> int:
+    """About how many statements a jaxpr takes: one for each number that it computes."""
+    total = 0
+    for equation in _opened(jaxpr)[0].eqns:
+        inner = [leaf for leaf in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_jaxpr) if _is_jaxpr(leaf)]
+        numbers = sum(math.prod(atom.aval.shape) for atom in equation.outvars)
+        total += sum(map(_statements, inner)) * equation.params.get("length", 1) if inner else numbers
+    return total
+
+
+def _is_jaxpr(value: Any) -> bool:
+    return hasattr(value, "eqns") or isinstance(value, ClosedJaxpr)
 
 
 def _indented(lines: list[str]) -> list[str]:
