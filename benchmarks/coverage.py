@@ -269,7 +269,9 @@ def report(name: str, rows: list[dict[str, Any]]) -> None:
             [abs(each["estimate"] - each["truth"]) < each["error"] for each in numbers],
         ]
         shares = np.mean(hits, axis=1)
-        errors = np.sqrt(shares * (1.0 - shares) / count)
+        # Laplace's rule: that all fits hit does not mean that the share is known exactly.
+        expected = (shares * count + 1.0) / (count + 2.0)
+        errors = np.sqrt(expected * (1.0 - expected) / count)
         parts = " | ".join(f"{100.0 * s:.0f} ± {100.0 * e:.0f} %" for s, e in zip(shares, errors, strict=True))
         print(f"| {name} | {unknown} | {count} | {parts} | {seconds:.1f} |", flush=True)
 
