@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 
 #: Number of coefficients on which an interval depends.
 ORDER = 4
@@ -45,10 +46,11 @@ def evaluate(coefficients: Any, part: Any, derivative: int = 0) -> Any:
 
 def interpolate(values: np.ndarray) -> np.ndarray:
     """Coefficients of the spline through values (knots, ...) at its knots, without curvature at the ends."""
-    count = len(values)
-    rows = np.zeros((count + 2, count + 2))
-    for row in range(count):
-        rows[row + 1, row : row + 3] = 1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0
-    rows[0, :3] = rows[-1, -3:] = 1.0, -2.0, 1.0
+    count = len(values) + 2
+    # The diagonals of the matrix, from the second above to the second below.
+    diagonals = np.zeros((5, count))
+    diagonals[1:4, :] = np.array([[1.0], [4.0], [1.0]]) / 6.0
+    diagonals[2, 0], diagonals[1, 1], diagonals[0, 2] = 1.0, -2.0, 1.0
+    diagonals[2, -1], diagonals[3, -2], diagonals[4, -3] = 1.0, -2.0, 1.0
     ends = np.zeros_like(values[:1])
-    return np.linalg.solve(rows, np.concatenate([ends, values, ends]))
+    return scipy.linalg.solve_banded((2, 2), diagonals, np.concatenate([ends, values, ends]))
