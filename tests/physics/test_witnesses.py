@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import tippe
-from nonholonomic.formulations import formulation
+from nonholonomic import formulations
 from tippe.witnesses import euler_angles, poincare, quadrature, reduced
 
 STATES = 1000
@@ -136,10 +136,10 @@ def test_the_general_formulations_give_the_accelerations_of_the_frictionless_top
     scenes, states = legal_cases(arena, "frictionless")
     chart, expected, _, lengths = from_vector_form(scenes, states)
     for kind in (
-        formulation.Multipliers,
-        formulation.Hamel,
-        formulation.ConstrainedConnection,
-        formulation.ReducedBracket,
+        formulations.Multipliers,
+        formulations.Hamel,
+        formulations.ConstrainedConnection,
+        formulations.ReducedBracket,
     ):
 
         @eqx.filter_jit
@@ -161,8 +161,8 @@ def test_the_general_reduction_by_a_cyclic_angle_gives_the_accelerations_of_the_
     def accelerations(scene, angles):
         q, rate = poincare.from_angles(angles)
         system = poincare.TopSystem(scene)
-        reduced_system = formulation.Routhian(system, poincare.PSI, system.metric(q)[poincare.PSI] @ rate)
-        return formulation.Hamel(reduced_system).acceleration(0.0, q[: poincare.PSI], rate[: poincare.PSI])
+        reduced_system = formulations.Routhian(system, poincare.PSI, system.metric(q)[poincare.PSI] @ rate)
+        return formulations.Hamel(reduced_system).acceleration(0.0, q[: poincare.PSI], rate[: poincare.PSI])
 
     acceleration = accelerations(scenes, chart)
     # psi'' is not among the equations; it follows from the momentum.
@@ -190,7 +190,7 @@ def test_the_nonholonomic_formulations_give_the_accelerations_of_the_rolling_top
 
     angles, rates = chart(scenes, rolling)
     lengths = jnp.stack([jnp.ones(STATES), jnp.ones(STATES), scenes.body.radius], axis=1)
-    for kind in (formulation.Multipliers, formulation.Hamel, formulation.ConstrainedConnection):
+    for kind in (formulations.Multipliers, formulations.Hamel, formulations.ConstrainedConnection):
 
         @eqx.filter_jit
         @eqx.filter_vmap
