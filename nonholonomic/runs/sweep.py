@@ -219,7 +219,7 @@ def compute_table(
     require_flag(options.scattered, "scattered")
     work: Any = job
     if options.scattered:
-        columns = rows(grid)
+        columns = sweeps.scattered_cells(grid)
         job.model.check_axes(grid, [columns])
         request |= {"cells": digest(columns)}
         variables = {axis.name: Variable(axis.unit, np.float64, long_name=axis.long_name) for axis in grid} | variables
@@ -236,20 +236,6 @@ def compute_table(
         most = max(16, 1 << (MOST_SAMPLED // (12 * len(job.samples.times))).bit_length() - 1)
     running = {"path": options.path, "progress": options.progress, "executor": options.executor}
     return sweeps.sweep(work, grid, variables, request, chunk=chunk, most=most, inner=inner, **running)
-
-
-def rows(lists: list[Axis]) -> dict[str, Any]:
-    """The numbers of scattered cells: full name -> one value per cell.
-
-    **Raises:** `ValueError` unless there are lists, all of equal length.
-    """
-    lengths = {grid_axis.name: len(grid_axis.values) for grid_axis in lists}
-    if len(set(lengths.values())) != 1:
-        lengths_text = ", ".join(f"{name} of {length}" for name, length in lengths.items()) or "none"
-        raise ValueError(
-            f"scattered = True takes lists of one length, not {lengths_text}; the other numbers are scalars"
-        )
-    return {grid_axis.number: grid_axis.values for grid_axis in lists}
 
 
 def digest(columns: dict[str, Any]) -> str:

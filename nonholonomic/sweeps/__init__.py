@@ -22,6 +22,7 @@ from .grid import Axis as Axis
 from .grid import Variable as Variable
 from .grid import axis as axis
 from .grid import cells_to_check as cells_to_check
+from .grid import scattered_cells as scattered_cells
 from .grid import size_of as size_of
 from .processes import local_processes as local_processes
 from .running import chunk_for as chunk_for

@@ -117,3 +117,27 @@ def cells_to_check(axes: list[Axis]) -> Iterator[dict[str, Values]]:
         yield constants | {axis.number: axis.values}
     corners = np.array(list(itertools.product(*((axis.values.min(), axis.values.max()) for axis in axes))))
     yield {axis.number: corner for axis, corner in zip(axes, corners.T, strict=True)}
+
+
+def scattered_cells(axes: list[Axis]) -> dict[str, Values]:
+    """The numbers of cells that are scattered instead of on a grid: the first of all axes, the second, and so on.
+
+    **Arguments:** `axes`: a list of numbers for each variable.
+
+    **Returns:** full name -> one value per cell.
+
+    **Raises:** `ValueError` unless there are lists, all of equal length.
+
+    **Example:**
+
+    >>> from nonholonomic.sweeps import scattered_cells
+    >>> scattered_cells(axes[:1])["system.rate"]
+    array([1., 2.])
+    """
+    lengths = {axis.name: len(axis.values) for axis in axes}
+    if len(set(lengths.values())) != 1:
+        lengths_text = ", ".join(f"{name} of {length}" for name, length in lengths.items()) or "none"
+        raise ValueError(
+            f"scattered = True takes lists of one length, not {lengths_text}; the other numbers are scalars"
+        )
+    return {axis.number: axis.values for axis in axes}

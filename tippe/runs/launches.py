@@ -8,7 +8,7 @@ import numpy as np
 
 from nonholonomic.integration.checks import require_run
 from nonholonomic.parameters import description, full_axes, numbers, with_numbers
-from nonholonomic.sweeps import Axis, axis, cells_to_check
+from nonholonomic.sweeps import Axis, axis, cells_to_check, scattered_cells
 from nonholonomic.validation import require_kind, shown
 
 from ..model.launch import Launch
@@ -115,24 +115,10 @@ def launches(
     # The numbers of axes are 0 here, which may not be a place on the arena; starts are checked cell by cell.
     require_run(roots["scene"], roots["launch"], t1, tolerance, (Scene, Launch), LISTS)
     # The modules check their numbers, which may be illegal only in combination.
-    for cells in [rows(grid)] if scattered else cells_to_check(grid):
+    for cells in [scattered_cells(grid)] if scattered else cells_to_check(grid):
         looked_at = with_numbers(roots, cells)
         looked_at["scene"].check_start(looked_at["launch"])
     return roots, grid, units
-
-
-def rows(lists: list[Axis]) -> dict[str, Any]:
-    """The numbers of scattered cells: full name -> one value per cell.
-
-    **Raises:** `ValueError` unless there are lists, all of equal length.
-    """
-    lengths = {grid_axis.name: len(grid_axis.values) for grid_axis in lists}
-    if len(set(lengths.values())) != 1:
-        lengths_text = ", ".join(f"{name} of {length}" for name, length in lengths.items()) or "none"
-        raise ValueError(
-            f"scattered = True takes lists of one length, not {lengths_text}; the other numbers are scalars"
-        )
-    return {grid_axis.number: grid_axis.values for grid_axis in lists}
 
 
 def _with_room(scene: Scene, values: Collection[str]) -> tuple[Launch, dict[str, tuple[str, str]]]:
