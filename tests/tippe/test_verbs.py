@@ -30,6 +30,7 @@ def theta_of_sticking_top(spin, **options):
     return run.theta
 
 
+@pytest.mark.slow
 def test_a_batch_of_tops_that_stick():
     """It is that of single runs."""
     thetas = jax.jit(jax.vmap(theta_of_sticking_top))(jnp.array([100.0, 101.0]))

@@ -107,6 +107,7 @@ def test_numbers_shared_by_all_runs_have_the_sum_of_their_derivatives():
     assert_close(by_height, expected[:, 1], rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_direction_costs_one_variation_and_a_second_derivative_is_taken_forward():
     point, direction = tuple(POINTS[0]), (0.3, -1.0, 0.5, 0.0)
     slope = jax.jit(lambda point: jax.jvp(loss, (point,), (direction,))[1])(point)
