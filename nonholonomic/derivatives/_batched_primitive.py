@@ -116,8 +116,8 @@ def _parts(
     return Request(solve, active, selection).parts(cells, *leaves)
 
 
-#: For one run: a hybrid scene compiles in half the time, with a third of the memory and of the mappings (289 instead of
-#: 818), and runs equally fast; 256 runs at once would take 2.5 times as long.
+#: One run is not worth the optimisations (`compiled_for_one`), of which a hybrid scene would also need three times the memory;
+#: 256 runs at once take 2.5 times as long without them.
 _parts_of_one = compiled_for_one(_parts)
 _parts_of_many = compiled_alone(_parts)
 

@@ -107,21 +107,26 @@ class Minima(NamedTuple):
         return Mixture(np.full(len(centres), 1.0 / len(centres)), np.stack(centres), np.stack(roots))
 
 
-def refine(
-    problem: Problem,
-    starts: Any,
-    measurements: Measurements,
-    max_steps: int,
-    progress: bool,
-    in_parts: bool,
-    rows: Any = None,
-) -> Minima:
+class Refinement(NamedTuple):
+    """How to refine.
+
+    - `max_steps`, `progress`, `rows`: as for `minimise`.
+    - `in_parts`: whether recordings are also fitted in stages, all rows of them.
+    """
+
+    max_steps: int
+    progress: bool
+    in_parts: bool = False
+    rows: Any = None
+
+
+def refine(problem: Problem, starts: Any, measurements: Measurements, options: Refinement) -> Minima:
     """Fit every row, and estimate unknown errors from the residuals of the best.
 
-    **Arguments:** `starts`: coordinates, (rows, unknowns); `in_parts`: whether recordings are also fitted in stages; the
-    others as for `minimise`.
+    **Arguments:** `starts`: coordinates, (rows, unknowns); the others as for `minimise`.
     """
-    ends, at_ends = _fitted(problem, starts, measurements, max_steps, progress, in_parts, rows)
+    max_steps, progress, _, rows = options
+    ends, at_ends = _fitted(problem, starts, measurements, options)
     for _ in range(ROUNDS if np.any(np.asarray(measurements.estimated)) else 0):
         best = int(np.argmin(at_ends.deviance))
         errors = estimated_errors(measurements, at_ends.prediction[best], len(problem.names))
@@ -135,20 +140,13 @@ def refine(
     return Minima(np.asarray(starts), ends.coordinates, ends.converged, at_ends, measurements)
 
 
-def _fitted(
-    problem: Problem,
-    starts: Any,
-    measurements: Measurements,
-    max_steps: int,
-    progress: bool,
-    in_parts: bool,
-    rows: Any,
-) -> tuple[Ends, Linearised]:
+def _fitted(problem: Problem, starts: Any, measurements: Measurements, options: Refinement) -> tuple[Ends, Linearised]:
     """The ends of the fits. Recordings are also fitted in stages, to longer and longer parts; the better of the two
     ends counts.
 
     Predicted late samples can be wrong by whole turns, and would then lead to another minimum.
     """
+    max_steps, progress, in_parts, rows = options
     steps = min(max_steps, STEPS_AT_ONCE) if in_parts else max_steps
     ends = minimise(problem, starts, measurements, rows=rows, max_steps=steps, progress=progress)
     at_ends = linearise(problem, ends.coordinates, measurements)

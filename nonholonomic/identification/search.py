@@ -6,7 +6,7 @@ import numpy as np
 
 from .exploration import Explorer, Weighted
 from .problem import Problem, deviances
-from .refinement import Minima, refine
+from .refinement import Minima, Refinement, refine
 
 #: Greatest number of steps by slopes before an exploration: where predictions may be a staircase, and between the minima of
 #: a recording.
@@ -40,10 +40,10 @@ def search(problem: Problem, explorer: Explorer, options: Search) -> tuple[Minim
         raise ValueError("model: no start led to finite predictions")
     recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
     steps = max_steps if recorded else min(max_steps, FEW_STEPS)
-    minima = refine(problem, pool.candidates(starts), measurements, steps, progress, in_parts=recorded)
+    minima = refine(problem, pool.candidates(starts), measurements, Refinement(steps, progress, in_parts=recorded))
     if recorded:
         steps = min(max_steps, BETWEEN)
-        around = refine(problem, minima.between(), minima.measurements, steps, progress, in_parts=False)
+        around = refine(problem, minima.between(), minima.measurements, Refinement(steps, progress))
         minima = minima.joined(around)
     # Along a direction without any slope, the likelihood has no end that an exploration could find.
     has_end = bool(np.all(np.isfinite(minima.covariance(minima.best))))
@@ -56,15 +56,13 @@ def _improved(problem: Problem, minima: Minima, sample: Weighted, options: Searc
     rows, max_steps = len(minima.starts), options.max_steps
     pool, order = sample.pool, np.argsort(-sample.pool.log_density)[:rows]
     best = pool.points[order]
-    if (
-        np.min(deviances(problem, best, pool.predictions[order], minima.measurements))
-        < np.min(minima.deviance) - IMPROVED
-    ):
-        few = min(max_steps, FEW_STEPS)
-        later = refine(problem, best, minima.measurements, few, options.progress, False, np.arange(rows) < LAST)
+    deviance = deviances(problem, best, pool.predictions[order], minima.measurements)
+    if np.min(deviance) < np.min(minima.deviance) - IMPROVED:
+        few = Refinement(min(max_steps, FEW_STEPS), options.progress, rows=np.arange(rows) < LAST)
+        later = refine(problem, best, minima.measurements, few)
         return later if np.min(later.deviance) < np.min(minima.deviance) else minima
     if minima.converged[minima.best]:
         return minima
     last = np.isin(np.arange(rows), np.argsort(minima.deviance)[:LAST])
-    later = refine(problem, minima.coordinates, minima.measurements, max_steps, options.progress, False, last)
+    later = refine(problem, minima.coordinates, minima.measurements, Refinement(max_steps, options.progress, rows=last))
     return later._replace(starts=minima.starts, converged=minima.converged | later.converged)

@@ -131,9 +131,10 @@ class BatchedMode(AbstractBatchedMode):
         t, y = time_and_state(form, tuple(state))
         state_after, number = form.function("reset", self.mode)(numbers, t, y)
         number = jnp.asarray(number).astype(int)
-        for mode in [mode for mode, is_projected in enumerate(form.traits.projected) if is_projected]:
-            projected = form.function("entered", mode)(numbers, t, state_after)
-            state_after = jnp.where(number == mode, projected, state_after)
+        for mode, is_projected in enumerate(form.traits.projected):
+            if is_projected:
+                projected = form.function("entered", mode)(numbers, t, state_after)
+                state_after = jnp.where(number == mode, projected, state_after)
         state_after = jnp.concatenate([state_after, state[form.size :]])
         status = jnp.where((number >= 0) & (number < form.modes), RUNNING, FAILED)
         if not form.has_event:
