@@ -211,6 +211,22 @@ class Cells(eqx.Module):
         clock = jnp.zeros((1, *shape))
         return jnp.concatenate([states, clock]), jnp.concatenate([scales, clock + UNMEASURED])
 
+    def within_constraints(self, changes: Float[Array, "components cells"]) -> Float[Array, "components cells"]:
+        """Changes of the states at the start, projected onto those that the constraints of the first mode allow."""
+        form = self.form
+        if not form.traits.projected[form.first]:
+            return changes
+        entered = form.function("entered", form.first)
+
+        def of_one(numbers: Sequence[Array], state: Array, change: Array) -> Array:
+            t, y = time_and_state(form, tuple(state))
+            _, allowed = jax.jvp(lambda y: entered(numbers, t, y), (y,), (change[: form.size],))
+            return jnp.concatenate([allowed, change[form.size :]])
+
+        axes = tuple(0 if jnp.ndim(number) else None for number in self.numbers)
+        states, _ = self.states(changes.shape[1])
+        return jax.vmap(of_one, in_axes=(axes, 1, 1), out_axes=1)(self.numbers, states, changes)
+
     def problem(self, cells: int | None) -> ModeProblem:
         """The problem of a system whose runs are smooth."""
         return ModeProblem(self.numbers, *self.states(cells), self.form, self.form.first)

@@ -167,7 +167,7 @@ class OwnModel(AbstractModel):
 
     def direction(self, cells: int) -> Float[Array, "components cells"]:
         starts = [name for name in self.known if name.startswith("start")]
-        return direction_of_start(self, starts, cells)
+        return self._cells(cells).within_constraints(direction_of_start(self, starts, cells))
 
     @property
     def quantities(self) -> dict[str, Quantity]:
