@@ -1,6 +1,6 @@
 """The page of a user's own system: the equations for the browser, and the point that shows the state."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +14,9 @@ from ..validation import shown
 from ..views import Stage
 from ..views.explore import Answer, Frame, HybridSimulator, LiveRun, Simulator, Slider, Summary, ends_of
 
+if TYPE_CHECKING:
+    from .model import OwnModel
+
 #: The tolerance in the page, and that of the runs that determine the drawn part of the plane.
 TOLERANCE, DRAWN = 1e-7, 1e-5
 
@@ -24,7 +27,7 @@ MOST_STEPS_OF_A_PAGE = 50_000
 DEFAULT_SLIDERS, TURNS = 3, 40.0
 
 
-def sliders_of(model: Any, ranges: Any) -> tuple[Slider, ...]:
+def sliders_of(model: "OwnModel", ranges: Any) -> tuple[Slider, ...]:
     """The sliders for the ranges that a user passes; by default, for the first parameters from half to twice their values."""
     if ranges is None:
         names = [name for name in model.parameters.known if "[*]" not in name and float(model.value(name))]
@@ -47,8 +50,8 @@ def sliders_of(model: Any, ranges: Any) -> tuple[Slider, ...]:
     return tuple(sliders)
 
 
-def page_of(model: Any, ranges: Any, t1: float) -> tuple[LiveRun, Stage]:
-    """The page of an `OwnModel`."""
+def page_of(model: "OwnModel", ranges: Any, t1: float) -> tuple[LiveRun, Stage]:
+    """The page of a model: its run, and the plane on which it is drawn."""
     sliders = sliders_of(model, ranges)
     models = [model, *(model.replaced({path: end}) for path, end in ends_of(sliders))]
     runs = [one.simulate(t1, None, DRAWN, None, None) for one in models]
@@ -57,7 +60,7 @@ def page_of(model: Any, ranges: Any, t1: float) -> tuple[LiveRun, Stage]:
     settings = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE)
     names = model.names
 
-    def at(values: Float[Array, " numbers"]) -> Any:
+    def at(values: Float[Array, " numbers"]) -> "OwnModel":
         return model.replaced({slider.path: value for slider, value in zip(sliders, values, strict=True)})
 
     def frame(values: Float[Array, " numbers"], number: Any, rows: Float[Array, "rows 1"], time: Any) -> Frame:
@@ -88,7 +91,7 @@ def page_of(model: Any, ranges: Any, t1: float) -> tuple[LiveRun, Stage]:
 
     free = model.without_event()
 
-    def free_at(values: Float[Array, " numbers"]) -> Any:
+    def free_at(values: Float[Array, " numbers"]) -> "OwnModel":
         return free.replaced({slider.path: value for slider, value in zip(sliders, values, strict=True)})
 
     if model.smooth:
@@ -96,7 +99,7 @@ def page_of(model: Any, ranges: Any, t1: float) -> tuple[LiveRun, Stage]:
         motion: Any = Simulator(lambda values: free_at(values).problem(1, None), t1, settings, {"frame": lane_frame})
     else:
 
-        def start(model: Any) -> Any:
+        def start(model: "OwnModel") -> Any:
             return model.modes(1, settings.tolerance, None, False)
 
         counters = len(model.counters)

@@ -1,13 +1,13 @@
 """Predictions for fits of runs with several modes. These fits use central differences, and their models run outside
 JAX's transformations."""
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from nonholonomic.identification import of_data, predicted
+from nonholonomic.identification import AbstractDataModel, predicted
 from nonholonomic.integration import Settings
 from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.runs import TableJob
@@ -31,7 +31,7 @@ def _samples_of_batch(scene: Scene, data: Recording, tolerance: Any, columns: di
     return predicted(scene, [(data, columns)], BATCH, run)[0]
 
 
-class HybridModel(NamedTuple):
+class HybridModel(AbstractDataModel):
     """Predictions of all data for a scene with flights, impacts, stick and slip; `SceneModel` does the same for smooth
     scenes.
 
@@ -42,30 +42,26 @@ class HybridModel(NamedTuple):
 
     scene: Scene
     data: tuple[Any, ...]
-    seen: Float[np.ndarray, " n"]
+    seen: Int[np.ndarray, " n"]
     tolerance: float
 
     #: The model runs mode by mode and cannot be traced.
-    on_host = True
+    on_host: ClassVar[bool] = True
 
-    @property
-    def recorded(self) -> tuple[Any, ...]:
-        """The sets of data, for curves between their samples."""
-        return self.data
+    def together(self, source: Any, values: dict[str, Any]) -> int:
+        """Each set of data is predicted for itself."""
+        return id(source)
 
-    def with_recorded(self, recorded: tuple[Any, ...]) -> "HybridModel":
-        """The model of other sets of data of the same shapes."""
-        return self._replace(data=recorded)
+    def predict(self, sources: list[tuple[Any, dict[str, Any]]], rows: int) -> list[Float[np.ndarray, "rows size"]]:
+        columns = [(data, {name: np.asarray(part) for name, part in values.items()}) for data, values in sources]
+        return [
+            self._of(data, [{name: float(part[i]) for name, part in values.items()} for i in range(rows)])
+            for data, values in columns
+        ]
 
-    def __call__(self, parameters: dict[str, Any]) -> Float[np.ndarray, "rows n"]:
-        columns = {name: np.asarray(values) for name, values in parameters.items()}
-        rows = [{name: float(values[i]) for name, values in columns.items()} for i in range(_count(columns))]
-        parts = [self._of(k, [of_data(row, k) for row in rows]) for k in range(len(self.data))]
-        return np.concatenate(parts, axis=1)[:, np.asarray(self.seen)]
-
-    def _of(self, k: int, rows: list[dict[str, float]]) -> Float[np.ndarray, "rows size"]:
+    def _of(self, data: Any, rows: list[dict[str, float]]) -> Float[np.ndarray, "rows size"]:
         """The predictions of one set of data in every row."""
-        data, predictions = self.data[k], np.full((len(rows), self.data[k].size), np.nan)
+        predictions = np.full((len(rows), data.size), np.nan)
         if isinstance(data, Recording) and not self.scene.friction.set_valued:
             return self._samples_in_lanes(data, rows)
         allowed = [i for i, row in enumerate(rows) if self._allows(data, row)]
@@ -134,7 +130,3 @@ class HybridModel(NamedTuple):
             [np.asarray(data.quantities.samples(run_samples, name)) for name in data.columns], axis=-1
         )
         return samples[inverse].reshape(-1)
-
-
-def _count(columns: dict[str, np.ndarray]) -> int:
-    return len(next(iter(columns.values())))

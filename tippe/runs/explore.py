@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -44,6 +44,9 @@ from .turned_over import event_of
 from .view import AXIS, DrawnMotion, curve_of_rotation, show
 from .view import motion as drawn_motion
 
+if TYPE_CHECKING:
+    from .model import TopModel
+
 Numbers = Float[Array, " numbers"]
 
 #: The tolerance in the page.
@@ -63,8 +66,8 @@ MOST_STEPS_OF_A_PAGE = 50_000
 REVERSED = {int(Status.INVERTED): "reversed", int(Status.NOT_INVERTED): "not_reversed"}
 
 
-def live_run(model: Any, sliders: dict[str, tuple[float, float]] | None, t1: float) -> LiveRun:
-    """The contents of the page. **Arguments:** `model`: a `TopModel` without an event; the others as for `explore`."""
+def live_run(model: "TopModel", sliders: dict[str, tuple[float, float]] | None, t1: float) -> LiveRun:
+    """The contents of the page. **Arguments:** `model`: without an event; the others as for `explore`."""
     scene, launch = model.scene, model.launch
     check_run(scene, launch, t1, TOLERANCE)
     if reverses(scene):
@@ -103,7 +106,7 @@ def live_run(model: Any, sliders: dict[str, tuple[float, float]] | None, t1: flo
 
 
 def smooth_simulators(
-    model: Any, modules: Callable[[Numbers], tuple[Scene, Launch]], t1: float, settings: Settings
+    model: "TopModel", modules: Callable[[Numbers], tuple[Scene, Launch]], t1: float, settings: Settings
 ) -> tuple[Simulator, Simulator]:
     """The simulators of a smooth run: one up to the inversion, and one for the drawn run."""
 
@@ -117,8 +120,8 @@ def smooth_simulators(
     )
 
 
-def timed(model: Any, modules: tuple[Scene, Launch]) -> Any:
-    """The `TopModel` of a launch up to the inversion, or, without slip, to the reversal of the spin."""
+def timed(model: "TopModel", modules: tuple[Scene, Launch]) -> "TopModel":
+    """The model of a launch up to the inversion, or, without slip, to the reversal of the spin."""
     scene, launch = modules
     return type(model).timed(scene, launch, None if reverses(scene) else event_of(scene, None))
 
@@ -134,14 +137,14 @@ def reverses(scene: Scene) -> bool:
 
 
 def hybrid_simulators(
-    model: Any, modules: Callable[[Numbers], tuple[Scene, Launch]], t1: float, settings: Settings
+    model: "TopModel", modules: Callable[[Numbers], tuple[Scene, Launch]], t1: float, settings: Settings
 ) -> tuple[HybridSimulator, HybridSimulator]:
     """The same for runs with flights, impacts, a stem, or stick and slip."""
 
-    def start(model: Any, names: Any) -> Any:
+    def start(model: "TopModel", names: Any) -> Any:
         return model.modes(1, jnp.asarray(TOLERANCE), names, False)
 
-    def sampled(values: Numbers) -> Any:
+    def sampled(values: Numbers) -> "TopModel":
         scene, launch = modules(values)
         return dataclasses.replace(model, scene=scene, launch=launch)
 
@@ -194,8 +197,8 @@ def outcome(problem: InversionProblem, lane: LaneState) -> tuple[Int[Array, ""],
     return jnp.where(inverted, int(Status.INVERTED), status)[0], jnp.where(inverted, time, jnp.inf)[0]
 
 
-def hybrid_outcome(model: Any, runs: HybridOutcome) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """The same for a run of a `TopModel` with several modes."""
+def hybrid_outcome(model: "TopModel", runs: HybridOutcome) -> tuple[Int[Array, ""], Float[Array, ""]]:
+    """The same for a run with several modes."""
     status = model.ended(runs, TOLERANCE)[0]
     for ended, word in ((Status.EVENT, Status.INVERTED), (Status.COMPLETED, Status.NOT_INVERTED)):
         status = jnp.where(status == int(ended), int(word), status)
@@ -209,8 +212,8 @@ def stage_of_runs(runs: list[Trajectory]) -> Stage:
     return first._replace(arena=arena(scene.surface, points, first.arena.normal, 4.0 * size, 2.5 * size))
 
 
-def stage_at_start(model: Any, t1: float) -> Stage:
-    """The top of a `TopModel` on a level plane at its launch; the page replaces it by a simulated run before it is visible."""
+def stage_at_start(model: "TopModel", t1: float) -> Stage:
+    """The top on a level plane at its launch; the page replaces it by a simulated run before it is visible."""
     scene = model.scene
     start = DrawnMotion(*(np.repeat(np.asarray(part), 2, axis=0) for part in _motion_at_start(model)))
     initial_show, size = show(scene, start._replace(times=np.array([0.0, 1.0])), 0, ""), float(scene.body.size)
@@ -227,7 +230,7 @@ def stage_at_start(model: Any, t1: float) -> Stage:
 
 
 @eqx.filter_jit
-def _motion_at_start(model: Any) -> DrawnMotion[Array]:
+def _motion_at_start(model: "TopModel") -> DrawnMotion[Array]:
     modes, number, state = model.modes(1, jnp.asarray(TOLERANCE), None, False)
     # The other tops stand on their stem.
     rows = (
