@@ -121,5 +121,7 @@ def test_the_examples_of_the_engine_give_what_they_say(room):
     """They go on from the example of their room."""
     namespace: dict[str, Any] = {}
     assert not complaints(inspect.getdoc(importlib.import_module(room)) or "", namespace, room)
-    for name in ENGINE[room]:
-        assert not complaints(inspect.getdoc(resolve(name)) or "", dict(namespace), name)
+    texts = {name: inspect.getdoc(resolve(name)) or "" for name in ENGINE[room]}
+    # Two forms of a function share their example, which runs once.
+    for name in {text.partition(">>>")[2]: name for name, text in texts.items()}.values():
+        assert not complaints(texts[name], dict(namespace), name)

@@ -14,6 +14,7 @@ from roads import compare_roads
 AIRBORNE = ["cylinder-viscous-hybrid", "sphere-coulomb-hybrid"]
 
 
+@pytest.mark.slow
 def test_all_roads_lead_to_the_same_answer():
     """The short form: 24 tops on the plane, of which two run by themselves as well."""
     findings, counts = compare_roads("plane-viscous-stop", 24, 2)

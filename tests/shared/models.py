@@ -95,8 +95,11 @@ IMPACTS = {
     )
 }
 
-SLOW = OF_MODES | IMPACTS
-CASES |= SLOW
+CASES |= OF_MODES | IMPACTS
+
+#: The cases of the ordinary run: others have tests of their own, or take long to compile.
+ORDINARY = ("top", "modes", "mechanics")
+
 
 #: The names of all cases, for a parametrization.
-NAMES = [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in CASES]
+NAMES = [pytest.param(name, marks=() if name in ORDINARY else pytest.mark.slow) for name in CASES]

@@ -378,7 +378,8 @@ def test_in_the_browser_the_wooden_top_hops_and_climbs_onto_its_stem(browser):
     np.testing.assert_allclose(force, samples.normal_force, atol=1e-5 * float(samples.normal_force[0]))
 
 
-@pytest.mark.parametrize("kind", ["sticking", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ARENA_FLIGHTS)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["sticking", *ARENA_FLIGHTS])
 def test_in_the_browser_tops_stick_and_fly_over_arenas_as_runs_do(browser, kind):
     scene, launch, t1 = {"sticking": STICKING, **ARENA_FLIGHTS}[kind]
     page_run, times = live_run(TopModel(scene=scene, launch=launch), None, t1), np.linspace(0.0, 0.9 * t1, 7)

@@ -147,6 +147,7 @@ def test_theta_over_time_is_that_of_the_run(rutstam_scene):
     np.testing.assert_allclose(theta, run.theta, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_picture_and_page_share_their_programs(caplog):
     """The page shows a shorter time, and other jobs have another tolerance; neither is compiled anew."""
     drawn(parser().parse_args(SMALL[1:]), 12.0)

@@ -48,6 +48,7 @@ def test_a_table_and_its_derivatives():
     assert_close(slope, expected.time_by_mu, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_time_and_its_gradient():
     def time(values):
         scene = tippe.Scene(rutstam_top(), tippe.Plane(), Curve(jnp.asarray(SPEEDS), values))

@@ -15,7 +15,7 @@ HOPS = list(csv.DictReader((Path(__file__).parents[1] / "physics" / "hop_referen
 def fit_of_friction(rows, **options):
     scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3), contact="hybrid")
     times = np.array([float(row["time"]) for row in rows])
-    data = tippe.InversionTimes(tippe.Launch(0.1, [float(row["spin"]) for row in rows]), times, 0.02, t1=12.0)
+    data = tippe.InversionTimes(tippe.Launch(0.1, [float(row["spin"]) for row in rows]), times, 0.02, t1=8.0)
     return tippe.identify(scene, data, {"mu": 0.25}, **options)
 
 

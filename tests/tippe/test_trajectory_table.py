@@ -271,7 +271,7 @@ IN_MODES = {
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if " " in name else ()) for name in IN_MODES]
+    "name", [pytest.param(name, marks=() if name == "flights" else pytest.mark.slow) for name in IN_MODES]
 )
 def test_runs_of_several_modes_are_those_of_simulate(name):
     """In contact, in the air, slipping and rolling."""

@@ -15,6 +15,7 @@ HOPPING = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3), contact="hybri
 STICKING = tippe.Scene(rutstam_top(), friction=tippe.SetValuedCoulomb(0.3))
 
 
+@pytest.mark.slow
 def test_an_angle_as_an_event_of_ones_own():
     """A top with integrated flights reaches an angle when a top with flights in closed form does."""
     launch = tippe.Launch(0.1, 280.0)

@@ -100,7 +100,7 @@ def identify(
     >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
     >>> launch = tippe.Launch(theta=[0.2, 0.2, 0.3, 0.2], spin=[155.0, 140.0, 110.0, 60.0])
     >>> data = tippe.InversionTimes(launch, time=[5.60, 5.53, 5.52, float("inf")], error=0.05, t1=8.0)
-    >>> found = tippe.identify(scene, data, {"friction.mu": 0.25}, progress=False)
+    >>> found = tippe.identify(scene, data, {"friction.mu": 0.25}, tolerance=1e-6, progress=False)
     >>> print(f"{found.estimates['scene.friction.mu']:.3f} s/m, {found.status}")
     0.300 s/m, converged
 

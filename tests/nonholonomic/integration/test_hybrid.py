@@ -280,7 +280,7 @@ class Bounces(Fall, AbstractHoppingMode):
 
 @pytest.mark.parametrize("kind", [Fall, Bounces])
 def test_many_balls_at_given_times(kind):
-    """Falling, on recorded or unrecorded ways between two modes, and at rest, with times of their own or in common."""
+    """Falling, on recorded or unrecorded ways between two modes, and at rest."""
     times = np.linspace(0.0, 4.0, 60)
     rows, samples, _ = sampled(kind, times)
     expected = np.array([[ball.state(time) for time in times] for ball in BALLS]).T
@@ -288,13 +288,18 @@ def test_many_balls_at_given_times(kind):
     numbers = np.asarray(samples.number[:CELLS])
     assert set(numbers.ravel()) == {FALLING, RESTING, BETWEEN}
     assert np.all(numbers[:, 0] == FALLING)
+
+
+@pytest.mark.parametrize("kind", [Fall, pytest.param(Bounces, marks=pytest.mark.slow)])
+def test_many_balls_at_times_of_their_own(kind):
+    times = np.linspace(0.0, 4.0, 60)
     own_times = times[:, None] * np.linspace(0.5, 1.0, CELLS + PADDING)
     own_rows, _, _ = sampled(kind, own_times)
     expected = np.array([[ball.state(time) for time in own_times[:, k]] for k, ball in enumerate(BALLS)])
     assert_close(own_rows, np.moveaxis(expected, (0, 1, 2), (2, 1, 0)), atol=2e-12)
 
 
-@pytest.mark.parametrize("kind", [Fall, Bounces])
+@pytest.mark.parametrize("kind", [pytest.param(Fall, marks=pytest.mark.slow), Bounces])
 def test_the_slopes_of_many_balls_at_given_times(kind):
     """By the restitution, between and after bounces: the closed form's differences."""
     times = np.array([0.5, 1.0, 1.5])

@@ -85,6 +85,11 @@ def test_the_last_crossing_is_that_after_which_the_event_function_stays_below_ze
     assert_close(time, table.time[1], rtol=1e-8)
 
 
+#: Fits of the top have tests of their own.
+FITTED = [pytest.param(name, marks=() if name in ("modes", "mechanics") else pytest.mark.slow) for name in CASES]
+
+
+@pytest.mark.parametrize("case", FITTED, indirect=True)
 def test_parameters_are_found_in_recordings_and_times(case):
     # The bounds keep a ball from landing again and again without end.
     free = {case.parameter: nonholonomic.Free(1.01 * case.value, 0.5 * case.value, 2.0 * case.value)}

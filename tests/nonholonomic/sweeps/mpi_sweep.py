@@ -1,4 +1,4 @@
-"""A table by MPI: `mpirun -n 3 python -m mpi4py.futures mpi_sweep.py FOLDER`; the first process feeds, the others compute."""
+"""A table by MPI: `mpirun -n 2 python -m mpi4py.futures mpi_sweep.py FOLDER`; the first process feeds, the other computes."""
 
 import os
 import sys
@@ -25,4 +25,4 @@ if __name__ == "__main__":
         tippe.inversion_table(scene, **launches, t1=8.0, path=Path(sys.argv[1]) / "table.h5", executor=executor)
         workers = set(executor.map(process, range(20)))
     assert os.getpid() not in workers
-    assert 1 <= len(workers) <= 2
+    assert len(workers) == 1

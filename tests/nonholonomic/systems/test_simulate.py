@@ -51,6 +51,8 @@ def test_stick_and_slip_where_the_end_of_sticking_is_tangential():
     elapsed = np.array([1.0, 3.0])
     assert_close(run.state[1:, 0], 1.0 + 0.5 * np.sin(elapsed), atol=1e-9)
     assert_close(run.state[1:, 1], 0.5 * np.cos(elapsed), atol=1e-9)
+    assert (run.resets["mode_before"].tolist(), run.resets["mode_after"].tolist()) == ([0], [1])
+    assert_close(run.resets["y0_after"], [1.0], atol=1e-9)
 
 
 class Melting(AbstractMode):
@@ -70,6 +72,7 @@ def test_a_mode_without_a_reset_stops_the_run():
     assert_close(run.state[0], 0.5, rtol=1e-12)
     assert np.isnan(run.state[1]).all()
     assert run.mode.tolist() == [0, -1]
+    assert len(simulate(Hybrid([Melting()]), jnp.array([1.0]), 0.5, times=jnp.array([0.25, 0.5])).resets["time"]) == 0
 
 
 def test_resets_without_end_are_unresolved():
@@ -128,11 +131,7 @@ def test_resets_are_listed_and_drawn():
     assert len(run.to_table()["y0"]) == 3
 
 
-def test_resets_state_the_modes_and_need_one_run():
-    run = simulate(Hybrid([Stick(), Slip()]), [0.0, 0.5], 5.0, times=[0.0, 5.0])
-    assert (run.resets["mode_before"].tolist(), run.resets["mode_after"].tolist()) == ([0], [1])
-    assert_close(run.resets["y0_after"], [1.0], atol=1e-9)
-    assert len(simulate(Hybrid([Melting()]), [1.0], 0.5).resets["time"]) == 0
+def test_resets_need_one_run():
     with pytest.raises(ValueError, match="resets takes one run outside jit"):
         jax.vmap(lambda height: states_of(height).resets)(jnp.ones(2))
 
