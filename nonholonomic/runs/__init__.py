@@ -13,6 +13,7 @@ from .event_time import event_time as event_time
 from .event_time import time_of_event as time_of_event
 from .explore import explore as explore
 from .explore import explore_model as explore_model
+from .explore import page_of as page_of
 from .identify import EventTimes as EventTimes
 from .identify import Recording as Recording
 from .identify import fit_runs as fit_runs
@@ -32,6 +33,7 @@ from .simulate import sampled as sampled
 from .simulate import simulate as simulate
 from .sweep import Options as Options
 from .sweep import compute_table as compute_table
+from .sweep import full_sensitivities as full_sensitivities
 from .sweep import sweep as sweep
 from .sweep import table_of as table_of
 from .table import TableForm as TableForm

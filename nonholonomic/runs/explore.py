@@ -1,12 +1,13 @@
 """A page with sliders that simulates any model in the browser."""
 
+import functools
 from typing import Any
 
 from ..integration.checks import run_bounds
 from ..progress import status_line
 from ..validation import require_all, require_file
-from ..views import Page
-from ..views.explore import live_page
+from ..views import Page, Stage
+from ..views.explore import LiveRun, live_page
 from .model import AbstractModel, model_of
 
 
@@ -71,7 +72,34 @@ def explore_model(model: AbstractModel, path: Any, sliders: Any, t1: float) -> P
         require_file(path, "path", ".html", ".htm")
     require_all(run_bounds(t1, 1e-9))
     model.check()
-    html_page = live_page(*model.page(sliders, t1))
+    html_page = live_page(*page_of(model, sliders, t1))
     if path is not None:
         html_page.save(path)
     return html_page
+
+
+@functools.singledispatch
+def page_of(model: AbstractModel, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
+    """The contents of the page of a model, and the stage on which the page draws the run.
+
+    Each kind of model registers its own function.
+
+    **Arguments:** as for `explore`.
+
+    **Raises:** `ValueError` for an unknown slider, and for numbers that are out of range.
+
+    **Example:**
+
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> from nonholonomic.runs import model_of, page_of
+    >>> class Decay(nonholonomic.AbstractMode):
+    ...     rate: float = 2.0
+    ...
+    ...     def field(self, t, y):
+    ...         return -self.rate * y
+    >>> live, stage = page_of(model_of(nonholonomic.Hybrid([Decay()]), [1.0]), {"rate": (1.0, 3.0)}, 1.0)
+    >>> [slider.label for slider in live.sliders]
+    ['rate']
+    """
+    raise NotImplementedError(f"{type(model).__name__} has no page")

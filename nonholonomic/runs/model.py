@@ -15,8 +15,6 @@ from ..integration import AbstractProblem, Outcome
 from ..parameters import numbers, with_numbers
 from ..sweeps import Axis, Quantity, Variable
 from ..validation import shown
-from ..views import Stage
-from ..views.explore import LiveRun
 
 #: The names of the quantities that will be read, which choose the layout of the state; `None` for all quantities, with
 #: the path of the run.
@@ -146,10 +144,6 @@ class AbstractModel(eqx.Module):
     @abc.abstractmethod
     def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Any:
         """The run as a trajectory. **Arguments:** as for `nonholonomic.simulate`."""
-
-    @abc.abstractmethod
-    def page(self, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
-        """The contents of a page with sliders, and the stage on which it draws the run."""
 
     @abc.abstractmethod
     def without_event(self) -> "AbstractModel":

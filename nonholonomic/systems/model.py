@@ -22,12 +22,9 @@ from ..runs.simulate import simulate_model
 from ..runs.trajectory import Trajectory
 from ..sweeps import Axis, Quantity, Variable
 from ..validation import as_number, shown
-from ..views import Stage
-from ..views.explore import LiveRun
 from .engine import Cells
 from .form import Form
 from .mode import AbstractMode, Event, Hybrid, require_event
-from .page import page_of
 from .system import MechanicalEvent, MechanicalMode, check_start, formulation_of, is_pair, with_modes_of_systems
 
 #: The statuses, by the code of the integration, of runs that did not reach their horizon.
@@ -154,9 +151,6 @@ class OwnModel(AbstractModel):
 
     def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Trajectory:
         return simulate_model(self.without_event(), t1, times, tolerance, solver)
-
-    def page(self, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
-        return page_of(self, sliders, t1)
 
     def without_event(self) -> "OwnModel":
         """The same model without an event."""

@@ -1,6 +1,6 @@
 """The page of a user's own system: the equations for the browser, and the point that shows the state."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,13 +9,12 @@ from jaxtyping import Array, Float
 from ..hybrid import HybridOutcome
 from ..integration import LaneState, Settings
 from ..integration.status import CROSSED, FAILED, UNRESOLVED
+from ..runs.explore import page_of
 from ..runs.portrait import RADIUS, frame_of, plane_points, portraits
 from ..validation import shown
 from ..views import Stage
 from ..views.explore import Answer, Frame, HybridSimulator, LiveRun, Simulator, Slider, Summary, ends_of
-
-if TYPE_CHECKING:
-    from .model import OwnModel
+from .model import OwnModel
 
 #: The tolerance in the page, and that of the runs that determine the drawn part of the plane.
 TOLERANCE, DRAWN = 1e-7, 1e-5
@@ -27,7 +26,7 @@ MOST_STEPS_OF_A_PAGE = 50_000
 DEFAULT_SLIDERS, TURNS = 3, 40.0
 
 
-def sliders_of(model: "OwnModel", ranges: Any) -> tuple[Slider, ...]:
+def sliders_of(model: OwnModel, ranges: Any) -> tuple[Slider, ...]:
     """The sliders for the ranges that a user passes; by default, for the first parameters from half to twice their values."""
     if ranges is None:
         names = [name for name in model.parameters.known if "[*]" not in name and float(model.value(name))]
@@ -50,7 +49,8 @@ def sliders_of(model: "OwnModel", ranges: Any) -> tuple[Slider, ...]:
     return tuple(sliders)
 
 
-def page_of(model: "OwnModel", ranges: Any, t1: float) -> tuple[LiveRun, Stage]:
+@page_of.register(OwnModel)
+def live_run(model: OwnModel, ranges: Any, t1: float) -> tuple[LiveRun, Stage]:
     """The page of a model: its run, and the plane on which it is drawn."""
     sliders = sliders_of(model, ranges)
     models = [model, *(model.replaced({path: end}) for path, end in ends_of(sliders))]
@@ -60,7 +60,7 @@ def page_of(model: "OwnModel", ranges: Any, t1: float) -> tuple[LiveRun, Stage]:
     settings = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE)
     names = model.names
 
-    def at(values: Float[Array, " numbers"]) -> "OwnModel":
+    def at(values: Float[Array, " numbers"]) -> OwnModel:
         return model.replaced({slider.path: value for slider, value in zip(sliders, values, strict=True)})
 
     def frame(values: Float[Array, " numbers"], number: Any, rows: Float[Array, "rows 1"], time: Any) -> Frame:
@@ -91,7 +91,7 @@ def page_of(model: "OwnModel", ranges: Any, t1: float) -> tuple[LiveRun, Stage]:
 
     free = model.without_event()
 
-    def free_at(values: Float[Array, " numbers"]) -> "OwnModel":
+    def free_at(values: Float[Array, " numbers"]) -> OwnModel:
         return free.replaced({slider.path: value for slider, value in zip(sliders, values, strict=True)})
 
     if model.smooth:
@@ -99,7 +99,7 @@ def page_of(model: "OwnModel", ranges: Any, t1: float) -> tuple[LiveRun, Stage]:
         motion: Any = Simulator(lambda values: free_at(values).problem(1, None), t1, settings, {"frame": lane_frame})
     else:
 
-        def start(model: "OwnModel") -> Any:
+        def start(model: OwnModel) -> Any:
             return model.modes(1, settings.tolerance, None, False)
 
         counters = len(model.counters)

@@ -11,6 +11,7 @@ from nonholonomic.geometry import Plane
 from nonholonomic.integration import AbstractPassive, ExtendedProblem, LaneState, Settings
 from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, Status
 from nonholonomic.parameters import numbers, with_numbers
+from nonholonomic.runs import page_of
 from nonholonomic.views import Stage, arena
 from nonholonomic.views.explore import (
     Answer,
@@ -19,7 +20,9 @@ from nonholonomic.views.explore import (
     Simulator,
     Slider,
     Summary,
+    ends_of,
     quaternion,
+    sliders_of,
 )
 
 from ..model.dynamics import State
@@ -27,6 +30,7 @@ from ..model.input import Input
 from ..model.launch import Launch
 from ..model.ride import RideProblem, as_module
 from ..model.scene import DRIVES, Scene
+from .model import LONG_NAMES, UNITS, RideModel
 from .state import RideState
 from .trajectory import Trajectory
 from .view import RADIUS, TRACK
@@ -45,6 +49,15 @@ SHOWN = ("position", "direction", "steering", "speed", "front_speed", "energy", 
 
 #: Greatest number of steps of a run in the page; they take some hundred milliseconds.
 MOST_STEPS_OF_A_PAGE = 50_000
+
+
+@page_of.register(RideModel)
+def _(model: RideModel, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
+    ranges = default_ranges(model.scene, model.launch) if sliders is None else sliders
+    knobs = sliders_of(ranges, model.roots, LONG_NAMES, UNITS)
+    models = [model, *(model.replaced({path: end}) for path, end in ends_of(knobs))]
+    rides = [one.simulate(t1, None, DRAWN, None, None) for one in models]
+    return live_run(model.roots, knobs, t1, model.input), stage(rides)
 
 
 def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float, input: Any) -> LiveRun:

@@ -29,8 +29,6 @@ from nonholonomic.runs import (
 )
 from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.validation import require_all, require_kind, require_scalars
-from nonholonomic.views import Stage
-from nonholonomic.views.explore import LiveRun, ends_of, sliders_of
 
 from ..model.friction import Damping, RollingResistance
 from ..model.input import Formula, Input, Steady, at_start, check_input
@@ -39,7 +37,6 @@ from ..model.per_ride import PerRide
 from ..model.ride import RideProblem, as_module, has_arrays
 from ..model.scene import Scene
 from ..model.stroller import Stroller
-from .explore import DRAWN, default_ranges, live_run, stage
 from .quantities import QUANTITIES, VECTORS
 from .simulate import DEFAULT_STEPS, ride
 from .state import TIMED, RideState
@@ -228,13 +225,6 @@ class RideModel(AbstractSceneModel):
     def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Trajectory:
         require_all(run_bounds(t1, tolerance))
         return ride(self, t1, times, tolerance, solver, DEFAULT_STEPS, adjoint)
-
-    def page(self, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
-        ranges = default_ranges(self.scene, self.launch) if sliders is None else sliders
-        knobs = sliders_of(ranges, self.roots, LONG_NAMES, UNITS)
-        models = [self, *(self.replaced({path: end}) for path, end in ends_of(knobs))]
-        rides = [model.simulate(t1, None, DRAWN, None, None) for model in models]
-        return live_run(self.roots, knobs, t1, self.input), stage(rides)
 
     def without_event(self) -> "RideModel":
         return dataclasses.replace(self, event=None)

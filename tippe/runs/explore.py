@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import LaneState, Settings, crossing_time
 from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, Status
 from nonholonomic.parameters import numbers, readable_unit, with_numbers
+from nonholonomic.runs import page_of
 from nonholonomic.validation import all_bounds, legal
 from nonholonomic.views import Stage, arena
 from nonholonomic.views.explore import (
@@ -23,6 +24,7 @@ from nonholonomic.views.explore import (
     LiveRun,
     Simulator,
     Summary,
+    ends_of,
     quaternion,
     sliders_of,
 )
@@ -38,14 +40,12 @@ from ..modes.sliding import Slide
 from ..modes.trajectory_problem import TrajectoryProblem, trajectory_problem
 from .checks import check_reversible, check_run
 from .launches import LONG_NAMES, UNITS
+from .model import TopModel
 from .quantities import OF_RIGID_BODIES, QUANTITIES
 from .trajectory import Trajectory, parts_of
 from .turned_over import event_of
 from .view import AXIS, DrawnMotion, curve_of_rotation, show
 from .view import motion as drawn_motion
-
-if TYPE_CHECKING:
-    from .model import TopModel
 
 Numbers = Float[Array, " numbers"]
 
@@ -66,7 +66,16 @@ MOST_STEPS_OF_A_PAGE = 50_000
 REVERSED = {int(Status.INVERTED): "reversed", int(Status.NOT_INVERTED): "not_reversed"}
 
 
-def live_run(model: "TopModel", sliders: dict[str, tuple[float, float]] | None, t1: float) -> LiveRun:
+@page_of.register(TopModel)
+def _(model: TopModel, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
+    live = live_run(model, sliders, t1)
+    if model.scene.contact == "hybrid" and model.scene.level:
+        return live, stage_at_start(model, t1)
+    models = [model, *(model.replaced({path: end}) for path, end in ends_of(live.sliders))]
+    return live, stage_of_runs([one.simulate(t1, None, DRAWN, None, None) for one in models])
+
+
+def live_run(model: TopModel, sliders: dict[str, tuple[float, float]] | None, t1: float) -> LiveRun:
     """The contents of the page. **Arguments:** `model`: without an event; the others as for `explore`."""
     scene, launch = model.scene, model.launch
     check_run(scene, launch, t1, TOLERANCE)
@@ -106,7 +115,7 @@ def live_run(model: "TopModel", sliders: dict[str, tuple[float, float]] | None, 
 
 
 def smooth_simulators(
-    model: "TopModel", modules: Callable[[Numbers], tuple[Scene, Launch]], t1: float, settings: Settings
+    model: TopModel, modules: Callable[[Numbers], tuple[Scene, Launch]], t1: float, settings: Settings
 ) -> tuple[Simulator, Simulator]:
     """The simulators of a smooth run: one up to the inversion, and one for the drawn run."""
 
@@ -115,15 +124,15 @@ def smooth_simulators(
 
     readings = {"outcome": lambda values, problem, lane: outcome(problem, lane)}
     return (
-        Simulator(lambda values: timed(model, modules(values)).problem(1, ()), t1, settings, readings),
+        Simulator(lambda values: timed(modules(values)).problem(1, ()), t1, settings, readings),
         Simulator(lambda values: trajectory_problem(modules(values), 1), t1, settings, {"frame": moment}),
     )
 
 
-def timed(model: "TopModel", modules: tuple[Scene, Launch]) -> "TopModel":
+def timed(modules: tuple[Scene, Launch]) -> TopModel:
     """The model of a launch up to the inversion, or, without slip, to the reversal of the spin."""
     scene, launch = modules
-    return type(model).timed(scene, launch, None if reverses(scene) else event_of(scene, None))
+    return TopModel.timed(scene, launch, None if reverses(scene) else event_of(scene, None))
 
 
 def is_rigid(scene: Scene) -> bool:
@@ -137,14 +146,14 @@ def reverses(scene: Scene) -> bool:
 
 
 def hybrid_simulators(
-    model: "TopModel", modules: Callable[[Numbers], tuple[Scene, Launch]], t1: float, settings: Settings
+    model: TopModel, modules: Callable[[Numbers], tuple[Scene, Launch]], t1: float, settings: Settings
 ) -> tuple[HybridSimulator, HybridSimulator]:
     """The same for runs with flights, impacts, a stem, or stick and slip."""
 
-    def start(model: "TopModel", names: Any) -> Any:
+    def start(model: TopModel, names: Any) -> Any:
         return model.modes(1, jnp.asarray(TOLERANCE), names, False)
 
-    def sampled(values: Numbers) -> "TopModel":
+    def sampled(values: Numbers) -> TopModel:
         scene, launch = modules(values)
         return dataclasses.replace(model, scene=scene, launch=launch)
 
@@ -152,13 +161,11 @@ def hybrid_simulators(
         return frame(modules(values)[0], sampled(values).moment(rows, number))
 
     def last(values: Numbers, runs: HybridOutcome) -> tuple[Int[Array, ""], Float[Array, ""]]:
-        return hybrid_outcome(timed(model, modules(values)), runs)
+        return hybrid_outcome(timed(modules(values)), runs)
 
     counters = len(model.counters)
     return (
-        HybridSimulator(
-            lambda values: start(timed(model, modules(values)), ()), t1, settings, counters, {"outcome": last}
-        ),
+        HybridSimulator(lambda values: start(timed(modules(values)), ()), t1, settings, counters, {"outcome": last}),
         HybridSimulator(lambda values: start(sampled(values), None), t1, settings, counters, {}, moment),
     )
 
@@ -197,7 +204,7 @@ def outcome(problem: InversionProblem, lane: LaneState) -> tuple[Int[Array, ""],
     return jnp.where(inverted, int(Status.INVERTED), status)[0], jnp.where(inverted, time, jnp.inf)[0]
 
 
-def hybrid_outcome(model: "TopModel", runs: HybridOutcome) -> tuple[Int[Array, ""], Float[Array, ""]]:
+def hybrid_outcome(model: TopModel, runs: HybridOutcome) -> tuple[Int[Array, ""], Float[Array, ""]]:
     """The same for a run with several modes."""
     status = model.ended(runs, TOLERANCE)[0]
     for ended, word in ((Status.EVENT, Status.INVERTED), (Status.COMPLETED, Status.NOT_INVERTED)):
@@ -212,7 +219,7 @@ def stage_of_runs(runs: list[Trajectory]) -> Stage:
     return first._replace(arena=arena(scene.surface, points, first.arena.normal, 4.0 * size, 2.5 * size))
 
 
-def stage_at_start(model: "TopModel", t1: float) -> Stage:
+def stage_at_start(model: TopModel, t1: float) -> Stage:
     """The top on a level plane at its launch; the page replaces it by a simulated run before it is visible."""
     scene = model.scene
     start = DrawnMotion(*(np.repeat(np.asarray(part), 2, axis=0) for part in _motion_at_start(model)))
@@ -230,7 +237,7 @@ def stage_at_start(model: "TopModel", t1: float) -> Stage:
 
 
 @eqx.filter_jit
-def _motion_at_start(model: "TopModel") -> DrawnMotion[Array]:
+def _motion_at_start(model: TopModel) -> DrawnMotion[Array]:
     modes, number, state = model.modes(1, jnp.asarray(TOLERANCE), None, False)
     # The other tops stand on their stem.
     rows = (

@@ -25,8 +25,6 @@ from nonholonomic.runs import (
 )
 from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.validation import all_bounds, legal, require_kind, require_scalars
-from nonholonomic.views import Stage
-from nonholonomic.views.explore import LiveRun, ends_of
 
 from ..model.contact_dynamics import LOSSES
 from ..model.directions import generic_direction
@@ -42,7 +40,6 @@ from ..modes.trajectory_problem import BEHIND_PATH, TrajectoryProblem, trajector
 from .airborne_trajectory import ArenaTrajectory, StickSlipArenaTrajectory, arena_modes
 from .checks import check_last_on_stem, event_bounds
 from .energy import has_grown
-from .explore import DRAWN, live_run, stage_at_start, stage_of_runs
 from .flight_trajectory import HybridTrajectory, level_modes
 from .launches import LONG_NAMES, NUMBERS_OF_A_LAUNCH, SEVERAL, UNITS, variable_numbers
 from .quantities import COMPONENTS, DIRECTION, ON_CURVED, PASSIVE, PATH, quantities_of
@@ -238,13 +235,6 @@ class TopModel(AbstractSceneModel):
 
     def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Any:
         return simulate_launch(self, t1, times, tolerance, solver, adjoint)
-
-    def page(self, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
-        live = live_run(self, sliders, t1)
-        if self.scene.contact == "hybrid" and self.scene.level:
-            return live, stage_at_start(self, t1)
-        models = [self, *(self.replaced({path: end}) for path, end in ends_of(live.sliders))]
-        return live, stage_of_runs([model.simulate(t1, None, DRAWN, None, None) for model in models])
 
     @property
     def quantities(self) -> dict[str, Quantity]:

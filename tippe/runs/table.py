@@ -9,8 +9,8 @@ import numpy as np
 
 from nonholonomic.integration import explicit_tableau
 from nonholonomic.integration.settings import DEFAULT_MAX_STEPS
-from nonholonomic.runs import Options, TableJob, compute_table
-from nonholonomic.sweeps import Table
+from nonholonomic.runs import Options, TableJob, compute_table, full_sensitivities
+from nonholonomic.sweeps import Table, Variable
 from nonholonomic.validation import require_flag, require_outside, shown, warn
 
 from ..model.scene import Scene
@@ -19,7 +19,6 @@ from .checks import check_event, check_reversible, warn_if_it_cannot_invert
 from .launches import described, launches
 from .model import INVERSIONS, REVERSALS, TopModel
 from .run_kind import why_unresolved
-from .sensitivities import sensitivity_columns, sensitivity_names, sensitivity_variables
 from .turned_over import event_of
 
 
@@ -171,8 +170,8 @@ def event_table(
     by_diffrax, settings = method == "diffrax", options.settings
     integrator = settings.for_single_runs if by_diffrax else settings.for_lanes
     explicit_tableau(integrator)
-    names = sensitivity_names(roots, options.sensitivities)
     model = TopModel.timed(**roots, angle=angle)
+    names = full_sensitivities(model, options.sensitivities)
     if names:
         model.require_differentiable(False, crossing == "last")
     if not model.smooth and by_diffrax:
@@ -187,8 +186,9 @@ def event_table(
         limit = None if isinstance(angle, StemContact) else float(angle)
         warn_if_it_cannot_invert(scene, roots["launch"], theta, limit)
     form = REVERSALS if angle is None else INVERSIONS
-    slopes = dict(zip(names, sensitivity_columns(names), strict=True))
-    job = TableJob(model, form, float(t1), crossing, settings, slopes, options.errors, by_diffrax=by_diffrax)
+    slopes = slope_variables(names, units, form.event)
+    slope_names = dict(zip(names, slopes, strict=True))
+    job = TableJob(model, form, float(t1), crossing, settings, slope_names, options.errors, by_diffrax=by_diffrax)
     request = described(roots, grid) | {"t1": float(t1)}
     if angle is None or isinstance(angle, StemContact):
         request |= {"event": "reversal" if angle is None else "contact of the stem"}
@@ -203,12 +203,26 @@ def event_table(
         request |= {"errors": True}
     if names:
         request |= {"sensitivities": names}
-    variables = job.variables | sensitivity_variables(names, units, form.event)
-    table = compute_table(job, grid, variables, request, options)
+    table = compute_table(job, grid, job.variables | slopes, request, options)
     warn_of_long_runs(table, float(t1), options.max_steps)
     if model.smooth:
         warn_of_unresolved_runs(table, model)
     return table
+
+
+def slope_variables(names: list[str], units: dict[str, str], event: str) -> dict[str, Variable]:
+    """The variables for the derivatives with respect to parameters: `time_by_mu` for `scene.friction.mu`, or the full name if
+    two parameters share a name.
+
+    **Arguments:** `names`: full names; `units`: units by short names; `event`: description of the event.
+    """
+    shorts, variables = [name.rsplit(".", 1)[-1] for name in names], {}
+    for name, short in zip(names, shorts, strict=True):
+        unit = units.get(short, "1")
+        slope = "time_by_" + (short if shorts.count(short) == 1 else name.replace(".", "_"))
+        unit = "s" if unit == "1" else f"s ({unit})-1"
+        variables[slope] = Variable(unit, np.float64, long_name=f"{event} time by {name}")
+    return variables
 
 
 def warn_of_long_runs(table: Table, t1: float, max_steps: int) -> None:
