@@ -56,8 +56,7 @@ def inversion_time(
     derivative is NaN; the variable `grazes` of `inversion_table` reports this.
 
     **Raises:** `ValueError` for arguments outside these ranges, for a run that needs more than 2 000 000 steps, for
-    second derivatives through changes of mode, for derivatives with both `contact="hybrid"` and `SetValuedCoulomb`,
-    because an impact may stop a slip, and for derivatives of the last contact of a stem.
+    second derivatives through changes of mode, and for derivatives of the last contact of a stem.
 
     **Example:**
 

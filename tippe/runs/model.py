@@ -43,7 +43,7 @@ from .energy import has_grown
 from .flight_trajectory import HybridTrajectory, level_modes
 from .launches import LONG_NAMES, NUMBERS_OF_A_LAUNCH, SEVERAL, UNITS, variable_numbers
 from .quantities import COMPONENTS, DIRECTION, ON_CURVED, PASSIVE, PATH, quantities_of
-from .run_kind import COUNTED, HYBRID, RunKind, check_differentiable, run_kind_of
+from .run_kind import COUNTED, HYBRID, RunKind, run_kind_of
 from .simulate import simulate_launch
 from .trajectory import Trajectory, parts_of
 from .turned_over import INVERTED, event_of
@@ -187,7 +187,6 @@ class TopModel(AbstractSceneModel):
         return {name: COUNTED[name] for name in self.kind.counts}
 
     def require_differentiable(self, nested: bool, continues: bool = False) -> None:
-        check_differentiable(self.scene)
         check_last_on_stem(self.angle, continues)
         if nested and not self.smooth:
             raise ValueError(

@@ -70,11 +70,3 @@ def why_unresolved(kind: RunKind) -> str:
     )
     reasons = "the model does not determine the motion from there on, or the mode changed too often, or"
     return grown if kind.smooth else f"{reasons} {grown}; tippe.simulate states which"
-
-
-def check_differentiable(scene: Scene[Any]) -> None:
-    """Raise `ValueError` for a scene whose modes do not support derivatives."""
-    if run_kind_of(scene) is STICK_SLIP_FLY:
-        raise ValueError(
-            "friction = SetValuedCoulomb with contact = 'hybrid' has no derivatives, because an impact may stop a slip"
-        )

@@ -108,8 +108,7 @@ def inversion_table(
       the differences of the two runs; `status_error` is 1 if the runs disagree on the status or failed.
       `Table.digits("time")` shows the correct digits.
     - `time_by_mu` and so on, with `sensitivities`: the derivative of `time` with respect to each parameter; 0 if the top
-      did not invert. Derivatives pass through flights, impacts, stick and slip; there are none for `SetValuedCoulomb`
-      with `contact="hybrid"`.
+      did not invert. Derivatives pass through flights, impacts, stick and slip.
     - `grazes`, with `sensitivities`: 1 if an earlier event, such as a landing, was grazing, so that within the tolerance
       it may not happen; the derivative is then NaN.
 
