@@ -67,6 +67,7 @@ def threshold_scan():
     return factors, steps * spin, table
 
 
+@pytest.mark.slow
 def test_across_the_threshold_the_derivative_is_right_or_flagged(threshold_scan):
     """Above, it agrees with differences as the time grows without bound; below, and where contact is lost, the cell says so
     and the slope is 0."""

@@ -15,7 +15,7 @@ SLOW = (
     *("leaning_for_ever", "over_the_crest", "no_room", "a_thousand_seconds_in_a_bowl"),
     *("jellett_through_hops", "hops", "explicit_at_a_hundredth", "rate_of_the_rise", "just_above_the_threshold"),
     *("upright_almost", "explicit_at_a_thousandth", "explicit_at_a_ten_thousandth", "just_below_the_threshold"),
-    "jellett_under_torque",
+    *("jellett_under_torque", "implicit_at_a_tenth"),
 )
 
 ROWS = [

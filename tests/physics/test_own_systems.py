@@ -84,6 +84,7 @@ class Disc2D(AbstractMode):
         return y * jnp.array([1.0, 1.0, 1.0, -1.0]), 0
 
 
+@pytest.mark.slow
 def test_the_gradient_of_an_elastic_impact_is_exact():
     """From (-1, 1) with (2, -2) for 1 s: the final height is 2 r - y0 - v, so its gradient is (0, -1) (issue 97 of nimble)."""
 

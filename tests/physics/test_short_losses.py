@@ -125,6 +125,7 @@ def first_loss(body: Body, state: np.ndarray, t1: float) -> float:
     return np.inf
 
 
+@pytest.mark.slow
 def test_a_short_blow_of_the_stem_is_not_passed_over():
     """An audit by another program, event by event: 23 flights, one of them after a blow at 0.58203 s, and theta at the end."""
     stem = tippe.Stem(0.0055656721255288935, 0.015480433625075098)

@@ -55,6 +55,7 @@ def test_jackknifes_are_found_between_steps_of_any_length():
         np.testing.assert_allclose(run.jackknifed_at, expected, atol=atol)
 
 
+@pytest.mark.slow
 def test_contact_is_lost_as_the_fall_along_a_meridian_has_it():
     """Straight down a sphere v^2 = v0^2 + 2 g R (cos a0 - cos a), and the ground pulls from v^2 = g R cos a on.
 

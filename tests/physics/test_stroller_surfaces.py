@@ -63,7 +63,7 @@ STEERED = {
 }
 
 
-@pytest.mark.parametrize("name", STEERED)
+@pytest.mark.parametrize("name", ["torus", pytest.param("graph", marks=pytest.mark.slow)])
 def test_a_steered_ride_is_that_of_a_rigid_body_with_multipliers(name):
     """With gravity, damping, spring, drive and torque, fork turning with the frame: motion and all forces."""
     surface, place, level, sign = STEERED[name]

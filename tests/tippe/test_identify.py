@@ -90,6 +90,7 @@ def test_another_start_other_bounds_data_and_tolerance_compile_nothing(exact_fit
     assert second_fit.estimates["scene.friction.mu"] < 0.298
 
 
+@pytest.mark.slow
 def test_noisy_times_give_unbiased_friction_within_its_errors(exact_fit):
     """Twelve tables, in short for the 200 below; what the launches have in common is compiled once.
 

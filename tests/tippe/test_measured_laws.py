@@ -13,7 +13,7 @@ from tops import rutstam_top
 import tippe
 from tippe.friction import AbstractFriction, ContactLoad
 
-SPEEDS, MU = np.array([0.0, 0.1, 0.3, 1.0, 20.0]), 0.3
+SPEEDS, MU = np.array([0.0, 0.3, 20.0]), 0.3
 VISCOUS = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(MU))
 
 
@@ -40,7 +40,7 @@ def scene_of(mu, **options):
 def test_a_table_and_its_derivatives():
     """The derivative with respect to mu is that along all values of the curve, each in proportion to its speed."""
     options = {"theta": [0.1, 0.2], "spin": 155.0, "t1": 8.0, "progress": False}
-    names = [f"friction.values[{k}]" for k in range(1, 5)]
+    names = [f"friction.values[{k}]" for k in (1, 2)]
     table = tippe.inversion_table(scene_of(MU), **options, sensitivities=names)
     expected = tippe.inversion_table(VISCOUS, **options, sensitivities=["mu"])
     assert_close(table.time, expected.time, rtol=1e-7)

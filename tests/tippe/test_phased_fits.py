@@ -26,6 +26,7 @@ def check(fit, greatest_error):
     assert abs(fit.estimates["scene.friction.mu"] - float(HOPS[0]["mu"])) < 3.0 * error
 
 
+@pytest.mark.slow
 def test_friction_from_times_of_tops_that_hop():
     """Two launches, of 7 and 23 flights. The slope of such a time by friction has the wrong sign; differences have not."""
     assert min(float(row["flights"]) for row in HOPS[:2]) > 6.0

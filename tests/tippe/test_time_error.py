@@ -228,6 +228,7 @@ def judged(first, second, true, counts):
     return np.array([finite.sum(), (error > bound).sum(), (bound > 30.0 * (error + 1e-13)).sum(), is_unseen.sum()])
 
 
+@pytest.mark.slow
 def test_the_bound_holds_in_random_scenes():
     """The short form of the study below: 200 tops on the plane, of which fifty invert."""
     runs, counts = runs_of("plane-viscous-stop", 200, (1e-8, 1e-10, 1e-13))

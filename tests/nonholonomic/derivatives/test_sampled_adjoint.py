@@ -90,7 +90,14 @@ def of_all_outputs(points):
     return jax.vmap(jax.jacrev(lambda point: loss(tuple(point))[None]))(points)[:, 0]
 
 
-@pytest.mark.parametrize("transformed", [batch_of_gradients, gradient_of_a_batch, forward, of_all_outputs])
+@pytest.mark.parametrize(
+    "transformed",
+    [
+        batch_of_gradients,
+        forward,
+        *(pytest.param(by, marks=pytest.mark.slow) for by in (gradient_of_a_batch, of_all_outputs)),
+    ],
+)
 def test_every_composition_gives_the_derivatives_of_the_closed_form(transformed):
     assert_close(jax.jit(transformed)(POINTS), EXPECTED, rtol=1e-8, atol=1e-9)
 

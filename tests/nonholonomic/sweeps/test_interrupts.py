@@ -142,7 +142,7 @@ def blocks(path: Path) -> list[Path]:
     return list(path.with_name(f"{path.name}.blocks").glob("*.npz"))
 
 
-@pytest.mark.parametrize("way", ["threads", "processes"])
+@pytest.mark.parametrize("way", ["threads", pytest.param("processes", marks=pytest.mark.slow)])
 def test_a_table_says_what_is_saved_and_goes_on_from_there(way, tmp_path):
     path = tmp_path / "table.h5"
     process = run(tmp_path, THREADS if way == "threads" else PROCESSES, str(path), str(tmp_path))

@@ -66,6 +66,7 @@ def energy_and_constraint(run, word):
     return run.model.parameters.tree["system"].energy(*jnp.split(state, 2)), Sleigh().constraints(state[:3]) @ state[3:]
 
 
+@pytest.mark.slow
 def test_an_impact_keeps_the_constraint_and_with_restitution_one_the_energy():
     sleigh, start = sleigh_and_start(POINT)
     bounced = simulate(Bumper(restitution=1.0), start, TIME, times=[TIME])
