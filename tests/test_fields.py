@@ -188,10 +188,14 @@ OTHERS = (
     stroller.Graph(lambda x, y: 0.1 * x * x - 0.2 * y * y),
     stroller.Implicit(lambda x, y, z: x * x + y * y + z * z - 4.0),
 )
-#: Every ground with every heading and friction; a fork without a spring needs no other ground.
-PARTS = list(itertools.product(GROUNDS, FRICTIONS, (20.0,), ("intrinsic", "projected")))
+#: Every ground with every heading, and every friction; all pairs of both are slow.
+PARTS = list(itertools.product(GROUNDS, FRICTIONS[1:2], (20.0,), ("intrinsic", "projected")))
+PARTS += itertools.product(GROUNDS[1:2], FRICTIONS[::2], (20.0,), ("intrinsic",))
+#: A fork without a spring needs no other ground.
 PARTS += itertools.product(GROUNDS[1:2], FRICTIONS[:2], (0.0,), ("intrinsic",))
 PARTS += itertools.product(OTHERS, FRICTIONS[1:2], (20.0,), ("intrinsic",))
+PAIRS = itertools.product(GROUNDS, FRICTIONS[::2], (20.0,), ("intrinsic", "projected"))
+PARTS += [pytest.param(*parts, marks=pytest.mark.slow) for parts in PAIRS if parts not in PARTS]
 
 
 @pytest.mark.parametrize(("ground", "friction", "spring", "heading"), PARTS, ids=name_of)

@@ -118,7 +118,10 @@ def test_the_wall_start_presses_on_the_arena_at_once():
 
 @pytest.mark.parametrize(
     "friction",
-    [tippe.Viscous(0.3), pytest.param(tippe.SetValuedCoulomb(0.3), marks=pytest.mark.slow), tippe.NoSlip()],
+    [
+        tippe.Viscous(0.3),
+        *(pytest.param(law, marks=pytest.mark.slow) for law in (tippe.SetValuedCoulomb(0.3), tippe.NoSlip())),
+    ],
     ids=["slides", "sticks", "rolls"],
 )
 def test_a_sphere_on_a_vertical_wall_loses_contact_at_once(friction):

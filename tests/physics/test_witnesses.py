@@ -302,6 +302,7 @@ def test_trajectories_of_all_formulations_in_the_cylinder_agree_for_five_seconds
             np.testing.assert_allclose(trajectory[row], expected[row], rtol=0.0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_jelletts_quantity_in_the_cylinder_drifts_by_r_times_l_dot_n_prime():
     """J - J0 = integral of R L.n' dt to 1e-9 of J0, with n' = -S V, and J changes much (`tippe.md`, section 1)."""
     scene = tippe.Scene(top(235 / 625), tippe.Cylinder(0.2), tippe.Viscous(0.3))

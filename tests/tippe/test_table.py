@@ -119,6 +119,7 @@ def test_starts_beyond_the_end_by_vmapped_diffrax():
         np.testing.assert_array_equal(slow[name], fast[name])
 
 
+@pytest.mark.slow
 def test_contact_is_lost_where_the_normal_force_first_vanishes(rutstam_scene_module):
     table = tippe.inversion_table(rutstam_scene_module, theta=[0.1], spin=[190.0], t1=12.0, tolerance=1e-10)
     run = tippe.simulate(rutstam_scene_module, tippe.Launch(0.1, 190.0), 12.0, tolerance=1e-10)

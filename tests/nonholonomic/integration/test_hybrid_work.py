@@ -83,6 +83,7 @@ def turning(first, tolerance, cells):
     return (Turn(0), Turn(1)), first.astype(int), start
 
 
+@pytest.mark.slow
 def test_a_single_run_is_watched_little_further_than_its_steps():
     """Room for 128 steps is reserved in a mode, each watched at eight places; with room for 2048, tops whose flights are
     short crawled."""
