@@ -1,6 +1,5 @@
 """Plan a top: which launch makes it turn over at a given time and place? A batch, then Newton steps, then a check."""
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +16,7 @@ GOAL, UNITS = np.array([5.0, 0.3, 0.2]), (0.1, 0.02)
 def turning(numbers: jax.Array) -> jax.Array:
     """The time [s] and the place (x, y) [m] at which the axis is first level, for an inclination, a spin and an azimuth."""
     launch = tippe.Launch(numbers[0], numbers[1], azimuth=numbers[2])
-    run = tippe.simulate(SCENE, launch, T1, times=TIMES, tolerance=1e-8, adjoint=diffrax.ForwardMode())
+    run = tippe.simulate(SCENE, launch, T1, times=TIMES, tolerance=1e-8)
     after = jnp.argmax(run.theta > ANGLE)
     share = (ANGLE - run.theta[after - 1]) / (run.theta[after] - run.theta[after - 1])
     rows = jnp.column_stack([TIMES, run.position[:, :2]])
