@@ -135,6 +135,7 @@ def programs_of_its_own():
     jax.clear_caches()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("programs_of_its_own")
 def test_a_time_that_takes_too_many_steps_is_an_error_that_says_how_many(monkeypatch):
     module = importlib.import_module("tippe.runs.inversion_time")

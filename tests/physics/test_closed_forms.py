@@ -80,6 +80,7 @@ def test_a_frictionless_ball_swings_as_a_pendulum(arena):
     assert_close(x, [0.0, 0.18 * math.sin(1.2)], atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:surface.radius = .* is larger than a room")
 def test_the_cylinder_tends_to_the_plane():
     """Radius 1e4 R: e after 0.2 s differs from the plane's as 1/radius (section 7, row 11)."""

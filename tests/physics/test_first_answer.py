@@ -4,6 +4,7 @@ import first_answer
 import pytest
 
 
+@pytest.mark.slow
 def test_two_programs_have_the_same_answer_and_say_what_they_waited_for(tmp_path):
     """heyoka, the third, is no test dependency."""
     first_answer.write_task(1, tmp_path)

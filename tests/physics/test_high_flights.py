@@ -162,6 +162,7 @@ class Mistaken(tippe.Paraboloid):
         return 0.5 * position[2]
 
 
+@pytest.mark.slow
 def test_a_run_whose_energy_does_not_balance_is_unresolved():
     """The same run in a bowl that states its heights is whole."""
     launch = tippe.Launch(0.4, 100.0, place=(0.1, 0.0), velocity=(0.0, 0.2))

@@ -112,6 +112,7 @@ def test_parallel_is_a_relative_equilibrium(speed):
     np.testing.assert_allclose(run.place[:60, 0], 0.3 + speed * run.t[:60] / h_mu, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_small_oscillation_about_a_parallel():
     """Row 9: at g = 0 its frequency is v sqrt(K + (S / h_mu)^2); from the eigenvalues of the reduced motion."""
     eta, v = 0.6, 1.3

@@ -175,6 +175,7 @@ def test_a_jam_is_where_the_normal_force_is_infinite():
         assert -1e-14 < exact[0] - time < 1e-3 * JAMMED**2
 
 
+@pytest.mark.slow
 def test_a_run_and_its_derivative_tell_of_the_jam():
     scene, exact = jamming_scene(), reference_jam(SPIN)
     run = tippe.simulate(scene, tippe.Launch(THETA, SPIN), t1=0.1)

@@ -178,6 +178,7 @@ def rolling_chart(scene, state):
     return euler_angles.from_vector_state(scene, jnp.concatenate([velocity[:2], axis, momentum]))
 
 
+@pytest.mark.slow
 def test_the_nonholonomic_formulations_give_the_accelerations_of_the_rolling_top():
     """Slip forbidden by multipliers, in Hamel's frame, or by a connection: 1000 random states of the rolling top."""
     scenes, states = legal_cases("plane", "frictionless")

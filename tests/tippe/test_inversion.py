@@ -181,6 +181,7 @@ def test_other_solvers_agree(solver):
     assert_close(value, time_of(), rtol=30.0 * tolerance * 100.0)
 
 
+@pytest.mark.slow
 def test_first_and_last_crossing_in_the_cylinder():
     """Down the wall theta swings past the angle and back; the last up-crossing is that of the trajectory."""
     scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Viscous(0.3))

@@ -141,6 +141,7 @@ def test_a_further_axis_by_its_path(rutstam_scene_module):
     assert_close(table.time[1], 5.9693, atol=6e-5)
 
 
+@pytest.mark.slow
 def test_grids_larger_than_a_block_are_cut_and_joined(rutstam_scene_module, monkeypatch):
     """The order of cells survives blocks, threads and refilled lanes."""
     monkeypatch.setattr(sweeping, "chunk_for", lambda cells: 16)

@@ -136,6 +136,7 @@ def test_the_second_tolerance_is_one_that_can_be_integrated_with(tolerance, seco
     assert second_tolerance(tolerance) >= 1e-14
 
 
+@pytest.mark.slow
 def test_a_hop_is_no_reason_for_a_lesser_error():
     """A top that flies: 6e-9 s off at the default tolerance, by the same top at 1e-13; the bound says so, and so do those of
     the end and the number of flights."""

@@ -130,6 +130,7 @@ def thetas_of_a_top_that_starts_along_the_normal(theta=0.0, azimuth=0.0, mu=0.3,
     return tippe.simulate(scene, tippe.Launch(theta, 155.0, eta, azimuth), 2.0, times=times).theta
 
 
+@pytest.mark.slow
 def test_theta_by_theta_at_the_pole_is_the_one_sided_derivative():
     """In all azimuths alike.
 

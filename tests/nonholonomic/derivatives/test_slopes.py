@@ -90,7 +90,7 @@ def compiled_anew():
     [
         (MANY, False, diffrax.Dopri8()),
         pytest.param(MANY, True, diffrax.Tsit5(), marks=pytest.mark.slow),
-        (MOVED, False, diffrax.Dopri8()),
+        pytest.param(MOVED, False, diffrax.Dopri8(), marks=pytest.mark.slow),
         (("height", "rate"), True, diffrax.Dopri8()),
         pytest.param(("height", "height"), False, diffrax.Tsit5(), marks=pytest.mark.slow),
         pytest.param(("growth",), False, diffrax.Dopri8(), marks=pytest.mark.slow),

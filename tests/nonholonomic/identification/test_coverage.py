@@ -37,7 +37,7 @@ def fits(count, model=teeth, **options):
             yield truth, identify(model, data, {"rate": start}, progress=False, **options)
 
 
-@pytest.mark.parametrize("slopes", ["exact", "differences"])
+@pytest.mark.parametrize("slopes", ["exact", pytest.param("differences", marks=pytest.mark.slow)])
 def test_intervals_cover_the_truth_on_a_staircase(slopes):
     """Of 24 intervals of 95 %, 20 or more contain it with a probability of 0.994; by exact slopes, 12 do."""
     results = list(fits(24, slopes=slopes))

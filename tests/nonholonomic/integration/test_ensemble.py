@@ -258,9 +258,11 @@ class Growing(AbstractProblem):
 @pytest.mark.parametrize(
     "solver",
     [
-        *(pytest.param(solver, marks=pytest.mark.slow) for solver in (diffrax.Bosh3(), diffrax.Dopri5())),
+        *(
+            pytest.param(solver, marks=pytest.mark.slow)
+            for solver in (diffrax.Bosh3(), diffrax.Dopri5(), diffrax.Dopri8())
+        ),
         diffrax.Tsit5(),
-        diffrax.Dopri8(),
         Oscillatory8(),
     ],
 )

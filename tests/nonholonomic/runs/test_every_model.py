@@ -24,11 +24,9 @@ def table(case):
     return nonholonomic.sweep(case.system, case.start, case.t1, axes=axes, **options)
 
 
-#: What tops have tests of their own for.
-of_own_systems = pytest.mark.parametrize(
-    "case",
-    [pytest.param(name, marks=() if name in ("modes", "mechanics") else pytest.mark.slow) for name in CASES],
-    indirect=True,
+#: Of these the ordinary run has the cheapest case; tops and mechanical systems have tests of their own.
+of_own_modes = pytest.mark.parametrize(
+    "case", [pytest.param(name, marks=() if name == "modes" else pytest.mark.slow) for name in CASES], indirect=True
 )
 
 
@@ -57,7 +55,7 @@ def test_the_bounds_of_a_table_hold(case, table):
     assert abs(table.time[1] - float(exact)) <= table.time_error[1]
 
 
-@of_own_systems
+@of_own_modes
 def test_the_quantity_of_a_run_is_that_of_the_samples(case, samples):
     times = np.asarray(samples.coords["time"])
     run = nonholonomic.simulate(case.system, case.start, 0.5, times=times, tolerance=1e-8)
@@ -67,7 +65,7 @@ def test_the_quantity_of_a_run_is_that_of_the_samples(case, samples):
     assert case.quantity in run.to_xarray()
 
 
-@of_own_systems
+@of_own_modes
 def test_runs_in_transformations_have_quantities(case, samples):
     def last(scale):
         start = jax.tree.map(lambda x: x * scale, case.start)
@@ -78,7 +76,7 @@ def test_runs_in_transformations_have_quantities(case, samples):
     assert_close(jax.jit(jax.vmap(last))(jnp.ones(2))[1, 1], samples[case.quantity][0, -1], rtol=1e-6, atol=1e-8)
 
 
-@of_own_systems
+@of_own_modes
 def test_tables_are_scattered_and_resumed_and_limit_their_steps(case, table, tmp_path):
     def sweep(**more):
         axes = {case.parameter: case.value * np.array([1.0 - 1e-3, 1.0])}
@@ -91,13 +89,13 @@ def test_tables_are_scattered_and_resumed_and_limit_their_steps(case, table, tmp
     assert set(sweep(max_steps=3).status) == {"failed"}
 
 
-@of_own_systems
+@of_own_modes
 def test_the_last_crossing_is_that_after_which_the_event_function_stays_below_zero(case, table):
     time = nonholonomic.event_time(case.system, case.start, case.t1, case.event, 1e-8, crossing="last")
     assert_close(time, table.time[1], rtol=1e-8)
 
 
-@of_own_systems
+@of_own_modes
 def test_parameters_are_found_in_recordings_and_times(case):
     # The bounds keep a ball from landing again and again without end.
     free = {case.parameter: nonholonomic.Free(1.01 * case.value, 0.5 * case.value, 2.0 * case.value)}
@@ -113,14 +111,14 @@ def test_parameters_are_found_in_recordings_and_times(case):
     assert_close(next(iter(fit.estimates.values())), case.value, rtol=1e-3)
 
 
-@of_own_systems
+@of_own_modes
 def test_runs_have_a_lyapunov_exponent(case):
     result = nonholonomic.lyapunov_exponent(case.system, case.start, case.t1, tolerance=1e-7)
     assert np.isfinite(result.exponent)
     assert str(result.status) == "completed"
 
 
-@of_own_systems
+@of_own_modes
 def test_runs_are_drawn_and_explored(case, tmp_path):
     path = tmp_path / "page.html"
     sliders = {case.parameter: (0.9 * case.value, 1.1 * case.value)}

@@ -96,6 +96,7 @@ def test_whoever_computes_a_table_gets_the_same_bits(way, many_blocks, by_thread
     assert_same_bits(table, by_threads)
 
 
+@pytest.mark.slow
 def test_mpi_gives_the_same_bits_too(tmp_path, by_threads):
     beside_python = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     mpirun = shutil.which("mpirun", path=beside_python)
