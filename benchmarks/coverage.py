@@ -1,10 +1,11 @@
-"""How often intervals of fits contain the truth, and estimates lie within one standard error of it, with default options, from
-random starts.
+"""How often intervals of fits contain the truth, and estimates lie within one standard error of it, with default options.
 
-    nice python benchmarks/coverage.py [times late ... own] [--repeats 200] [--rows coverage.jsonl] [--report]
+    nice python benchmarks/coverage.py [times late ... own] [--drawn] [--repeats 200] [--rows coverage.jsonl] [--report]
 
-Starts are drawn within a factor of 1.5 of the friction, 12 % of the offset and 5 % of the spin; numbers of other models
-within a factor of 1.5. The settings:
+The truth is the same in all repeats, and starts are drawn within a factor of 1.5 of the friction, 12 % of the offset and
+5 % of the spin; numbers of other models within a factor of 1.5. With `--drawn`, fits start from the same values, and the
+truth is drawn from Gaussian priors, which the fits are given: intervals of the right posterior then contain the truth as often
+as they say, also where the data say little. The settings:
 
 - `times`, `late`: eight inversion times at 0.7 pi and at 0.95 pi;
 - `outliers`: the late times with outliers and `student=4`; `censored`: the latest two are only known to be later;
@@ -19,6 +20,7 @@ table of the rows with the binomial errors of the fractions.
 """
 
 import argparse
+import dataclasses
 import json
 import time
 import warnings
@@ -37,138 +39,189 @@ warnings.simplefilter("ignore", tippe.FitWarning)
 MU, OFFSET, SPIN = 0.3, 0.006, 150.0
 WOODEN = {"cut": 0.015, "stem_radius": 0.005, "stem_length": 0.012, "hole_radius": 0.012, "hole_depth": 0.020}
 
-#: The inertia of Kane and Levinson's rattleback [kg m^2].
-STONE = [[2e-4, -2e-5, 0.0], [-2e-5, 1.6e-3, 0.0], [0.0, 0.0, 1.7e-3]]
+#: The product of inertia of Kane and Levinson's rattleback [kg m^2].
+XY = -2e-5
 
-#: A fit of one noisy data set.
-Trial = Callable[[np.random.Generator], Any]
+
+class Number(NamedTuple):
+    """An unknown: its value; the greatest factor or difference of a start; and bounds, if they are given to the fit."""
+
+    value: float
+    factor: float = 1.5
+    difference: float = 0.0
+    bounds: tuple[float, float] = (-np.inf, np.inf)
+
+    def start(self, random: np.random.Generator) -> tippe.Free:
+        """A start near the value."""
+        place = random.uniform(-1.0, 1.0)
+        start = self.value + self.difference * place if self.difference else self.value * self.factor**place
+        return tippe.Free(min(start, 0.95 * self.bounds[1]), *self.bounds)
+
+    def prior(self) -> tippe.Free:
+        """A prior with a standard deviation of half the reach of the starts."""
+        deviation = 0.5 * (self.difference or abs(self.value) * np.log(self.factor))
+        return tippe.Free(self.value, *self.bounds, prior=(self.value, deviation))
+
+    def draw(self, random: np.random.Generator) -> float:
+        """A value from the prior, with the sign of the mean."""
+        mean, deviation = self.prior().prior
+        while not (self.bounds[0] < (drawn := random.normal(mean, deviation)) < self.bounds[1] and drawn * mean >= 0.0):
+            pass
+        return drawn
 
 
 class Setting(NamedTuple):
-    """The true values of the unknowns, by the ends of their names, and the fit of a noisy data set."""
+    """The unknowns, by names that `identify` knows; the exact measurements, a function of their values; the data, exact
+    measurements with noise; and the fit of data from a start."""
 
-    truth: dict[str, float]
-    trial: Trial
+    unknowns: dict[str, Number]
+    exact: Callable[..., np.ndarray]
+    data: Callable[[np.ndarray, np.random.Generator], Any]
+    fit: Callable[[Any, dict[str, tippe.Free]], Any]
 
 
 def scene_of(mu: float, offset: float) -> tippe.Scene:
     return tippe.Scene(tippe.Top(0.02, 0.02, offset, 2.994e-6, 3.2e-6), friction=tippe.Viscous(mu))
 
 
-def near(random: np.random.Generator, value: float, factor: float = 1.5) -> float:
-    """A start within a factor of the truth."""
-    return value * factor ** random.uniform(-1.0, 1.0)
-
-
 def times(
     theta: tuple[float, float], angle: float, error: float, student: float | None = None, latest: int = 0
 ) -> Setting:
     """Friction and offset from eight times, of which the `latest` are limits."""
-    thetas, spins = np.linspace(*theta, 8), np.linspace(140.0, 170.0, 8)
-    columns = {"theta": thetas, "spin": spins}
-    table = tippe.inversion_table(scene_of(MU, OFFSET), **columns, t1=20.0, angle=angle, scattered=True, progress=False)
-    exact = np.asarray(table["time"])
+    launch, t1 = tippe.Launch(np.linspace(*theta, 8), np.linspace(140.0, 170.0, 8)), 20.0
+    columns = {"theta": launch.theta, "spin": launch.spin, "t1": t1, "angle": angle, "scattered": True}
 
-    def trial(random: np.random.Generator) -> Any:
+    def exact(**values: float) -> np.ndarray:
+        return np.asarray(tippe.inversion_table(scene_of(*values.values()), **columns, progress=False)["time"])
+
+    def data(exact: np.ndarray, random: np.random.Generator) -> Any:
         noise = random.normal(size=8)
         if student is not None:
             noise = noise / np.sqrt(random.chisquare(student, 8) / student)
-        measured, until = exact + error * noise, np.full(8, 20.0)
+        measured, until = exact + error * noise, np.full(8, t1)
         if latest:
             horizon = np.sort(exact)[-latest] - 0.5 * error
             measured, until = np.where(measured > horizon, np.inf, measured), np.full(8, horizon)
-        launch = tippe.Launch(thetas, spins)
-        data = tippe.InversionTimes(launch, measured, error, t1=20.0, until=until, angle=angle, student=student)
-        mu, offset = near(random, MU), near(random, OFFSET, 1.12)
-        return tippe.identify(scene_of(mu, offset), data, {"mu": mu, "offset": offset}, progress=False)
+        return tippe.InversionTimes(launch, measured, error, t1=t1, until=until, angle=angle, student=student)
 
-    return Setting({"friction.mu": MU, "offset": OFFSET}, trial)
+    def fit(data: tippe.InversionTimes, free: dict[str, tippe.Free]) -> Any:
+        return tippe.identify(scene_of(free["friction.mu"].start, free["offset"].start), data, free, progress=False)
+
+    return Setting({"friction.mu": Number(MU), "offset": Number(OFFSET, 1.12)}, exact, data, fit)
 
 
-def modal_times(scene: tippe.Scene, launch: tippe.Launch, error: float, t1: float, angle: float) -> Setting:
+def modal_times(
+    scene: Callable[[float], tippe.Scene], launch: tippe.Launch, error: float, t1: float, angle: float
+) -> Setting:
     """Friction from the times of a top whose runs have several modes."""
     columns = {"theta": np.broadcast_to(launch.theta, np.shape(launch.spin)), "spin": launch.spin}
-    table = tippe.inversion_table(scene, **columns, t1=t1, angle=angle, scattered=True, progress=False)
-    exact = np.asarray(table["time"])
+    columns |= {"t1": t1, "angle": angle, "scattered": True}
 
-    def trial(random: np.random.Generator) -> Any:
+    def exact(**values: float) -> np.ndarray:
+        return np.asarray(tippe.inversion_table(scene(*values.values()), **columns, progress=False)["time"])
+
+    def data(exact: np.ndarray, random: np.random.Generator) -> Any:
         measured = exact + error * random.normal(size=exact.size)
-        data = tippe.InversionTimes(launch, measured, error, t1=t1, angle=angle)
-        return tippe.identify(scene, data, {"friction.mu": near(random, MU)}, tolerance=1e-6, progress=False)
+        return tippe.InversionTimes(launch, measured, error, t1=t1, angle=angle)
 
-    return Setting({"friction.mu": float(scene.friction.mu)}, trial)
+    def fit(data: tippe.InversionTimes, free: dict[str, tippe.Free]) -> Any:
+        return tippe.identify(scene(MU), data, free, tolerance=1e-6, progress=False)
+
+    return Setting({"friction.mu": Number(MU)}, exact, data, fit)
 
 
 def hops() -> Setting:
-    scene = tippe.Scene(scene_of(MU, OFFSET).body, friction=tippe.Viscous(MU), contact="hybrid")
+    def scene(mu: float) -> tippe.Scene:
+        return tippe.Scene(scene_of(MU, OFFSET).body, friction=tippe.Viscous(mu), contact="hybrid")
+
     return modal_times(scene, tippe.Launch(0.1, np.array([180.0, 200.0])), 0.02, 12.0, 0.95 * np.pi)
 
 
 def stick() -> Setting:
-    scene = tippe.Scene(scene_of(MU, OFFSET).body, friction=tippe.SetValuedCoulomb(MU))
+    def scene(mu: float) -> tippe.Scene:
+        return tippe.Scene(scene_of(MU, OFFSET).body, friction=tippe.SetValuedCoulomb(mu))
+
     return modal_times(scene, tippe.Launch(1.5, np.linspace(100.0, 150.0, 4)), 0.01, 2.0, 0.6 * np.pi)
 
 
 def reversal() -> Setting:
     """The product of inertia of a rattleback from four times."""
-    body = tippe.Ellipsoid(1.0, (0.2, 0.03, 0.02), (0.0, 0.0, -0.01), STONE)
-    scene = tippe.Scene(body, friction=tippe.NoSlip())
-    thetas, spins = np.linspace(0.015, 0.025, 4), np.array([-4.0, -4.5, -5.0, -5.5])
-    table = tippe.reversal_table(scene, theta=thetas, spin=spins, t1=8.0, scattered=True, progress=False)
-    exact = np.asarray(table["time"])
+    launch, t1 = tippe.Launch(np.linspace(0.015, 0.025, 4), np.array([-4.0, -4.5, -5.0, -5.5])), 8.0
 
-    def trial(random: np.random.Generator) -> Any:
-        launch = tippe.Launch(thetas, spins)
-        data = tippe.ReversalTimes(launch, exact + 0.02 * random.normal(size=4), 0.02, t1=8.0)
-        return tippe.identify(scene, data, {"inertia.xy": near(random, -2e-5)}, tolerance=1e-6, progress=False)
+    def scene(xy: float) -> tippe.Scene:
+        inertia = np.array([[2e-4, xy, 0.0], [xy, 1.6e-3, 0.0], [0.0, 0.0, 1.7e-3]])
+        return tippe.Scene(tippe.Ellipsoid(1.0, (0.2, 0.03, 0.02), (0.0, 0.0, -0.01), inertia), friction=tippe.NoSlip())
 
-    return Setting({"inertia.xy": -2e-5}, trial)
+    def exact(**values: float) -> np.ndarray:
+        columns = {"theta": launch.theta, "spin": launch.spin, "t1": t1, "scattered": True}
+        return np.asarray(tippe.reversal_table(scene(*values.values()), **columns, progress=False)["time"])
+
+    def data(exact: np.ndarray, random: np.random.Generator) -> Any:
+        return tippe.ReversalTimes(launch, exact + 0.02 * random.normal(size=4), 0.02, t1=t1)
+
+    def fit(data: tippe.ReversalTimes, free: dict[str, tippe.Free]) -> Any:
+        return tippe.identify(scene(XY), data, free, tolerance=1e-6, progress=False)
+
+    return Setting({"inertia.xy": Number(XY)}, exact, data, fit)
 
 
-def film(scene: tippe.Scene, launch: tippe.Launch, clock: np.ndarray, error: float, with_clock: bool) -> Setting:
-    """Friction and spin from a film of theta, and perhaps the clock's reading at the launch."""
-    exact = np.asarray(tippe.simulate(scene, launch, float(clock[-1]), tolerance=1e-10).at(clock).theta)
-    truth = {"friction.mu": float(scene.friction.mu), "launch.spin": float(launch.spin)} | (
-        {"t0": 0.0} if with_clock else {}
-    )
+def film(
+    scene: tippe.Scene, launch: tippe.Launch, clock: np.ndarray, error: float, unknowns: dict[str, Number]
+) -> Setting:
+    """Unknowns from a film of theta."""
 
-    def trial(random: np.random.Generator) -> Any:
-        measured = exact + error * random.normal(size=exact.size)
-        data = tippe.Recording(launch, clock, measured, error, "theta")
-        free = {"friction.mu": near(random, truth["friction.mu"])}
-        free["launch.spin"] = truth["launch.spin"] * (1.0 + 0.05 * random.uniform(-1.0, 1.0))
-        if with_clock:
-            free["t0"] = 0.03 * random.uniform(-1.0, 1.0)
+    def exact(**values: float) -> np.ndarray:
+        true = dataclasses.replace(launch, **{name[7:]: values[name] for name in values if name.startswith("launch.")})
+        other = dataclasses.replace(scene, friction=dataclasses.replace(scene.friction, mu=values["friction.mu"]))
+        moments = clock - values.get("t0", 0.0)
+        run = tippe.simulate(other, true, moments[-1], tolerance=1e-10)
+        before = np.full(np.sum(moments < 0.0), launch.theta)
+        return np.concatenate([before, run.at(moments[moments >= 0.0]).theta])
+
+    def data(exact: np.ndarray, random: np.random.Generator) -> Any:
+        return tippe.Recording(launch, clock, exact + error * random.normal(size=exact.size), error, "theta")
+
+    def fit(data: tippe.Recording, free: dict[str, tippe.Free]) -> Any:
         return tippe.identify(scene, data, free, progress=False)
 
-    return Setting(truth, trial)
+    return Setting(unknowns, exact, data, fit)
 
 
 def smooth_film() -> Setting:
-    launch = tippe.Launch(0.1, SPIN, azimuth=0.3)
-    return film(scene_of(MU, OFFSET), launch, np.arange(360) / 120.0, 0.02, True)
+    launch, clock = tippe.Launch(0.1, SPIN, azimuth=0.3), np.arange(360) / 120.0
+    unknowns = {"friction.mu": Number(MU), "launch.spin": Number(SPIN, difference=0.05 * SPIN)}
+    return film(scene_of(MU, OFFSET), launch, clock, 0.02, unknowns | {"t0": Number(0.0, difference=0.03)})
 
 
 def wooden() -> Setting:
     top = tippe.Top.turned(0.020, 700.0, **WOODEN)
     scene = tippe.Scene(top, friction=tippe.Coulomb(MU, 0.05), contact="hybrid")
-    return film(scene, tippe.Launch(0.1222, 219.9), np.arange(104) / 30.0, np.radians(2.0), False)
+    unknowns = {"friction.mu": Number(MU), "launch.spin": Number(219.9, difference=0.05 * 219.9)}
+    return film(scene, tippe.Launch(0.1222, 219.9), np.arange(104) / 30.0, np.radians(2.0), unknowns)
 
 
 def ride() -> Setting:
     """Rolling friction and the speed at the launch from the speed at 30 times."""
     body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
-    scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
-    launch, clock = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0), 0.1 * np.arange(1, 31)
-    exact = np.asarray(stroller.simulate(scene, launch, 3.0, times=clock).speed)
-    truth = {"friction.rolling": 2.0, "launch.speed": 2.0}
+    clock = 0.1 * np.arange(1, 31)
 
-    def trial(random: np.random.Generator) -> Any:
-        data = stroller.Recording(launch, clock, exact + 0.05 * random.normal(size=30), 0.05, "speed")
-        free = {name: near(random, value, 1.5 if name == "friction.rolling" else 1.05) for name, value in truth.items()}
-        return stroller.identify(scene, data, free, progress=False)
+    def scene(rolling: float) -> stroller.Scene:
+        return stroller.Scene(body, friction=stroller.Damping(rolling, 1.0, 0.2, 0.05))
 
-    return Setting(truth, trial)
+    def launch(speed: float) -> stroller.Launch:
+        return stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=speed)
+
+    def exact(**values: float) -> np.ndarray:
+        rolling, speed = values.values()
+        return np.asarray(stroller.simulate(scene(rolling), launch(speed), 3.0, times=clock).speed)
+
+    def data(exact: np.ndarray, random: np.random.Generator) -> Any:
+        return stroller.Recording(launch(2.0), clock, exact + 0.05 * random.normal(size=30), 0.05, "speed")
+
+    def fit(data: stroller.Recording, free: dict[str, tippe.Free]) -> Any:
+        return stroller.identify(scene(2.0), data, free, progress=False)
+
+    return Setting({"friction.rolling": Number(2.0), "launch.speed": Number(2.0, 1.05)}, exact, data, fit)
 
 
 class Ball(nonholonomic.AbstractMode):
@@ -189,19 +242,20 @@ class Ball(nonholonomic.AbstractMode):
 
 def own() -> Setting:
     """Restitution and the height at the start from the height at 40 times, over three bounces."""
-    ball, start, clock = nonholonomic.Hybrid([Ball(0.8, 0.2)]), [1.0, 0.0], 0.05 * np.arange(1, 41)
-    exact = np.asarray(nonholonomic.simulate(ball, start, 2.0, times=clock)["y0"])
-    truth = {"restitution": 0.8, "start[0]": 1.0}
+    clock = 0.05 * np.arange(1, 41)
 
-    def trial(random: np.random.Generator) -> Any:
-        data = nonholonomic.Recording(start, clock, exact + 0.03 * random.normal(size=40), 0.03, "y0")
-        free = {
-            "restitution": tippe.Free(min(near(random, 0.8), 0.95), 0.0, 1.0),
-            "start[0]": near(random, 1.0, 1.05),
-        }
-        return nonholonomic.identify(ball, data, free, progress=False)
+    def exact(**values: float) -> np.ndarray:
+        restitution, height = values.values()
+        ball = nonholonomic.Hybrid([Ball(restitution, 0.2)])
+        return np.asarray(nonholonomic.simulate(ball, [height, 0.0], 2.0, times=clock)["y0"])
 
-    return Setting(truth, trial)
+    def data(exact: np.ndarray, random: np.random.Generator) -> Any:
+        return nonholonomic.Recording([1.0, 0.0], clock, exact + 0.03 * random.normal(size=40), 0.03, "y0")
+
+    def fit(data: nonholonomic.Recording, free: dict[str, tippe.Free]) -> Any:
+        return nonholonomic.identify(nonholonomic.Hybrid([Ball(0.8, 0.2)]), data, free, progress=False)
+
+    return Setting({"restitution": Number(0.8, bounds=(0.0, 1.0)), "start[0]": Number(1.0, 1.05)}, exact, data, fit)
 
 
 SETTINGS: dict[str, Callable[[], Setting]] = {
@@ -219,17 +273,20 @@ SETTINGS: dict[str, Callable[[], Setting]] = {
 }
 
 
-def row_of(setting: Setting, random: np.random.Generator) -> dict[str, Any]:
+def row_of(setting: Setting, random: np.random.Generator, drawn: bool = False) -> dict[str, Any]:
     """A fit as a row of the file."""
+    values = {name: number.draw(random) if drawn else number.value for name, number in setting.unknowns.items()}
+    data = setting.data(setting.exact(**values), random)
+    free = {name: number.prior() if drawn else number.start(random) for name, number in setting.unknowns.items()}
     begin = time.process_time()
-    fit = setting.trial(random)
+    fit = setting.fit(data, free)
     row: dict[str, Any] = {
         "seconds": time.process_time() - begin,
         "effective": fit.verdict.effective,
         "k": fit.verdict.k,
     }
     row["kind"], row["minima"] = fit.distribution.kind, len(fit.verdict.minima)
-    for unknown, value in setting.truth.items():
+    for unknown, value in values.items():
         name = next(key for key in fit.estimates if key.endswith(unknown))
         row[unknown] = {
             "truth": value,
@@ -241,15 +298,20 @@ def row_of(setting: Setting, random: np.random.Generator) -> dict[str, Any]:
     return row
 
 
-def measure(name: str, repeats: int, path: Path) -> None:
-    """Fit until the file has `repeats` rows of a setting; the noise and the start of a row depend only on its number."""
-    done = {row["number"] for row in rows_of(path, name)}
+def measure(name: str, repeats: int, path: Path, drawn: bool) -> None:
+    """Fit until the file has `repeats` rows of a setting; the truth, noise and start of a row depend only on its number."""
+    done = {row["number"] for row in rows_of(path, label(name, drawn))}
     setting = SETTINGS[name]() if len(done) < repeats else None
     for number in range(repeats):
         if setting is not None and number not in done:
-            row = {"setting": name, "number": number} | row_of(setting, np.random.default_rng(number))
+            row = row_of(setting, np.random.default_rng(number), drawn)
             with path.open("a") as file:
-                file.write(json.dumps(row) + "\n")
+                file.write(json.dumps({"setting": label(name, drawn), "number": number} | row) + "\n")
+
+
+def label(name: str, drawn: bool) -> str:
+    """The name of a setting in the rows."""
+    return f"{name}, drawn" if drawn else name
 
 
 def rows_of(path: Path, name: str) -> list[dict[str, Any]]:
@@ -280,14 +342,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("settings", nargs="*", default=list(SETTINGS))
     parser.add_argument("--repeats", type=int, default=200)
+    parser.add_argument("--drawn", action="store_true", help="draw the truth from priors instead of the starts")
     parser.add_argument("--rows", type=Path, default=Path("coverage.jsonl"))
     parser.add_argument("--report", action="store_true", help="only print the table of the rows")
     options = parser.parse_args()
     for name in options.settings:
         if not options.report:
-            measure(name, options.repeats, options.rows)
-        if rows := rows_of(options.rows, name):
-            report(name, rows)
+            measure(name, options.repeats, options.rows, options.drawn)
+        for named in (name, label(name, True)):
+            if rows := rows_of(options.rows, named):
+                report(named, rows)
 
 
 if __name__ == "__main__":
