@@ -6,11 +6,10 @@ import numpy as np
 
 from .exploration import Explorer, Weighted
 from .problem import Problem, deviances
-from .refinement import Minima, Refinement, refine
+from .refinement import Minima, Refinement, refine, stages_of
 
-#: Greatest number of steps by slopes before an exploration: where predictions may be a staircase, and between the minima of
-#: a recording.
-FEW_STEPS, BETWEEN = 6, 20
+#: Greatest number of steps by slopes before an exploration, where predictions may be a staircase.
+FEW_STEPS = 6
 
 #: Number of minima that are refined to the end after an exploration.
 LAST = 4
@@ -42,7 +41,7 @@ def search(problem: Problem, explorer: Explorer, options: Search) -> tuple[Minim
     steps = max_steps if recorded else min(max_steps, FEW_STEPS)
     minima = refine(problem, pool.candidates(starts), measurements, Refinement(steps, progress, in_parts=recorded))
     if recorded:
-        steps = min(max_steps, BETWEEN)
+        steps = min(max_steps, stages_of(problem).between)
         around = refine(problem, minima.between(), minima.measurements, Refinement(steps, progress))
         minima = minima.joined(around)
     # Along a direction without any slope, the likelihood has no end that an exploration could find.

@@ -138,7 +138,8 @@ def solve_with_samples(
 
 
 def _even(length: Lanes, left: Lanes, bracketing: Array) -> Lanes:
-    """The length of a step, changed a little if one or two steps then end on the next sample."""
+    """The length of a step, changed a little if one or two steps then end on the next sample; NaN if the time of the sample
+    is NaN, so that the run ends."""
     reach = STRETCH * length
-    fitting = jnp.where(reach >= left, left, jnp.where(2.0 * reach >= left, 0.5 * left, length))
+    fitting = jnp.where(reach >= left, left, jnp.where(2.0 * reach >= left, 0.5 * left, jnp.minimum(length, left)))
     return jnp.where(bracketing, length, fitting)
