@@ -107,9 +107,9 @@ PAGES = {
         "Fitting",
         "Estimate parameters from recordings and measured times.",
         [
-            *of("nonholonomic", "identify Recording EventTimes"),
+            *of("nonholonomic", "identify Recording EventTimes log_density"),
             *of("tippe", "identify Recording read_recording InversionTimes ReversalTimes Free log_density FitWarning"),
-            *of("stroller", "identify Recording read_recording"),
+            *of("stroller", "identify Recording read_recording log_density"),
         ],
     ),
     "views": Page(
@@ -167,7 +167,7 @@ PAGES = {
             *of(
                 "nonholonomic.identification",
                 "AbstractRecording Quantities as_quantity read_columns model_times predicted AbstractDataModel scene_unknowns "
-                "free_numbers search_options as_sources fit_data identify Identification Measurements joined of_data "
+                "free_numbers search_options as_sources fit_data posterior_of_data identify Identification Measurements joined of_data "
                 "series_units LogDensity sample Draws",
             ),
         ],

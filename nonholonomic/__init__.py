@@ -38,6 +38,7 @@ from .runs import Trajectory as Trajectory
 from .runs import event_time as event_time
 from .runs import explore as explore
 from .runs import identify as identify
+from .runs import log_density as log_density
 from .runs import lyapunov_exponent as lyapunov_exponent
 from .runs import simulate as simulate
 from .runs import sweep as sweep

@@ -54,6 +54,7 @@ from .likelihood import Measurements as Measurements
 from .model import AbstractDataModel as AbstractDataModel
 from .model import as_sources as as_sources
 from .model import fit_data as fit_data
+from .model import posterior_of_data as posterior_of_data
 from .model import search_options as search_options
 from .posterior import LogDensity as LogDensity
 from .recording import AbstractRecording as AbstractRecording

@@ -10,16 +10,11 @@ from ..validation import require, require_flag, require_scalars, require_whole, 
 from .exploration import ROWS, Explorer
 from .likelihood import Measurements
 from .posterior import LogDensity
-from .problem import Problem
 from .region import region_of
 from .result import Identification, summarise
 from .search import Search, search
 from .unknown import as_free
 from .verdict import FitWarning
-
-#: Step of differences in the coordinates: 1 % of a positive parameter. Differences smooth over narrower structure. The
-#: valleys of recordings are narrower, and their predictions are smooth.
-DIFFERENCE, OF_RECORDING = 0.01, 3e-4
 
 
 def identify(
@@ -78,21 +73,19 @@ def identify(
     0.99 +- 0.05, good: True
     """
     check_search(starts, spread, seed, max_steps, progress)
-    step, unknowns = step_of(slopes), as_free(free)
+    unknowns = as_free(free)
     if not isinstance(measurements, Measurements) or measurements.value.ndim != 1:
         raise ValueError(f"measurements = {shown(measurements)} must be Measurements of shape (n,)")
     count = measurements.value.size
     labels = tuple(f"#{i + 1}" for i in range(count)) if labels is None else tuple(labels)
     if len(labels) != count:
         raise ValueError(f"labels must be {count}, one for each measurement, not {len(labels)}")
-    recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
-    step = OF_RECORDING if step is not None and recorded else step
-    problem = Problem(model, tuple(unknowns.items()), step)
     with status_line("fitting", progress):
         region = region_of(unknowns, spread, float(np.max(np.asarray(measurements.time))))
-        explorer = Explorer.of(LogDensity.of(model, measurements, unknowns), measurements, region, seed)
-        minima, sample = search(problem, explorer, Search(starts, max_steps, seed, progress))
-        result = summarise(problem, labels, minima, explorer, sample)
+        density = LogDensity.of(model, measurements, unknowns, slopes=slopes)
+        explorer = Explorer.of(density, measurements, region, seed)
+        minima, sample = search(density.problem, explorer, Search(starts, max_steps, seed, progress))
+        result = summarise(density.problem, labels, minima, explorer, sample)
     if not result.verdict.good:
         warn("; ".join(result.verdict.concerns), FitWarning)
     return result
@@ -108,14 +101,3 @@ def check_search(starts: Any, spread: Any, seed: Any, max_steps: Any, progress: 
     require(spread, "spread", above=1.0)
     require_scalars({"spread": spread}, "it spreads the starts of all parameters")
     require_flag(progress, "progress")
-
-
-def step_of(slopes: str) -> float | None:
-    """The step of the differences for a kind of slopes; `None` for automatic differentiation.
-
-    **Raises:** `ValueError` for an unknown kind.
-    """
-    ways = {"exact": None, "differences": DIFFERENCE}
-    if not isinstance(slopes, str) or slopes not in ways:
-        raise ValueError(f"slopes = {shown(slopes)} must be one of {', '.join(map(repr, ways))}")
-    return ways[slopes]

@@ -12,9 +12,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from ..parameters import full_name
 from ..validation import shown
 from .data import joined, of_data, series_units
 from .identify import check_search, identify
+from .posterior import LogDensity
 from .result import Identification
 from .unknown import Free
 
@@ -100,6 +102,34 @@ def search_options(starts: Any, spread: Any, seed: Any, max_steps: Any, progress
     """
     check_search(starts, spread, seed, max_steps, progress)
     return {"starts": starts, "spread": spread, "seed": seed, "max_steps": max_steps, "progress": progress}
+
+
+def posterior_of_data(
+    build: Callable[[Any], Any],
+    data: tuple[Any, ...],
+    unknowns: dict[str, Free],
+    priors: Any = None,
+    slopes: str = "exact",
+) -> LogDensity:
+    """The posterior of a model, given sets of data.
+
+    **Arguments:** `build`: function from the indices of measured predictions to the model; `priors`: name or end of a name
+    -> prior, in addition to those of `unknowns`; the others as for `identify`.
+
+    **Raises:** `ValueError` for priors that are no dictionary, or of an unknown name.
+
+    **Example:**
+
+    >>> posterior_of_data(lambda seen: Model(scene, data, jnp.asarray(seen)), data, free, {"rate": (1.0, 0.5)})
+    LogDensity of scene.rate, given 3 measurements
+    """
+    if priors is not None and not isinstance(priors, dict):
+        raise ValueError(
+            f"priors = {shown(priors)} must be a dictionary, name of a number -> (mean, standard deviation)"
+        )
+    by_name = {full_name("priors", name, list(unknowns)): prior for name, prior in (priors or {}).items()}
+    measurements, _, seen = joined(data)
+    return LogDensity.of(build(seen), measurements, unknowns, by_name, series_units(data), slopes)
 
 
 def fit_data(

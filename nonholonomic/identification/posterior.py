@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..progress import status_line
 from ..validation import require, shown
 from .likelihood import Measurements
-from .problem import Problem, predictions
+from .problem import Problem, predictions, step_of
 from .unknown import as_free, as_gaussian
 
 #: The log density of a parameter: (mean, standard deviation) of a Gaussian, or a function of the parameter.
@@ -24,8 +24,9 @@ class LogDensity(eqx.Module):
     """The log of a posterior density, up to a constant, as a function of coordinates (unknowns,) without bounds.
 
     You can differentiate it in forward and reverse mode, compile it, and batch it with `jax.vmap`, so that the runs of
-    all chains advance together. Unknown errors are also unknowns: the coordinate of each is its logarithm, with a flat
-    prior. Where the model has no prediction, the value is about -1e8, without a slope.
+    all chains advance together; only for tops with several modes, it has values alone. Unknown errors are also unknowns:
+    the coordinate of each is its logarithm, with a flat prior. Where the model has no prediction, the value is about
+    -1e8, without a slope.
 
     - `names`: names of the unknowns, in the order of the coordinates; `start`: (unknowns,), coordinates at which to
       start.
@@ -55,10 +56,11 @@ class LogDensity(eqx.Module):
         free: Any,
         priors: Any = None,
         series_units: tuple[str, ...] = (),
+        slopes: str = "exact",
     ) -> "LogDensity":
         """The posterior of a model.
 
-        **Arguments:** `model`, `measurements`, `free`: as for `identify`; `priors`: as for `tippe.log_density`;
+        **Arguments:** `model`, `measurements`, `free`, `slopes`: as for `identify`; `priors`: as for `tippe.log_density`;
         `series_units`: the unit of each series of the measurements, if known.
         """
         unknowns = as_free(free)
@@ -78,7 +80,7 @@ class LogDensity(eqx.Module):
         series, estimated = np.asarray(measurements.series), np.asarray(measurements.estimated)
         leaves = {name: _as_leaves(prior) for name, prior in all_priors.items()}
         return cls(
-            Problem(model, tuple(unknowns.items())),
+            Problem(model, tuple(unknowns.items()), step_of(slopes, measurements)),
             measurements,
             leaves,
             tuple(np.unique(series[estimated]).tolist()),
@@ -150,7 +152,8 @@ class LogDensity(eqx.Module):
     @status_line("simulating")
     def replicate(self, coordinates: Float[Array, "rows unknowns"], seed: int = 0) -> Float[np.ndarray, "rows n"]:
         """New measurements drawn from the predictions and their errors; limits are replaced by values."""
-        random, predicted = np.random.default_rng(seed), np.asarray(_predicted(self, jnp.asarray(coordinates)))
+        points = np.asarray(coordinates)[:, : len(self.problem.names)]
+        random, predicted = np.random.default_rng(seed), self.predictions(points)
         heavy = np.isfinite(freedom := np.asarray(self.measurements.student))
         noise = random.normal(size=predicted.shape)
         noise /= np.where(
@@ -194,11 +197,6 @@ class LogDensity(eqx.Module):
                 # Uniform between two bounds; in the coordinate, the prior would have no finite integral.
                 total += jnp.log(jnp.abs(jax.grad(unknown.value)(coordinates[k])))
         return total
-
-
-@eqx.filter_jit
-def _predicted(density: LogDensity, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
-    return density.predict(coordinates)
 
 
 @eqx.filter_jit

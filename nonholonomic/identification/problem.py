@@ -10,10 +10,27 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..compiled_programs import padded
+from ..validation import is_traced, shown
 from .likelihood import Measurements
 from .unknown import Free, Unknown
 
 Rows = Float[np.ndarray, "rows unknowns"]
+
+#: Step of differences in the coordinates: 1 % of a positive parameter. Differences smooth over narrower structure. The
+#: valleys of recordings are narrower, and their predictions are smooth.
+DIFFERENCE, OF_RECORDING = 0.01, 3e-4
+
+
+def step_of(slopes: str, measurements: Measurements) -> float | None:
+    """The step of the differences for a kind of slopes; `None` for automatic differentiation.
+
+    **Raises:** `ValueError` for an unknown kind.
+    """
+    recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
+    ways = {"exact": None, "differences": OF_RECORDING if recorded else DIFFERENCE}
+    if not isinstance(slopes, str) or slopes not in ways:
+        raise ValueError(f"slopes = {shown(slopes)} must be one of {', '.join(map(repr, ways))}")
+    return ways[slopes]
 
 
 class Problem(eqx.Module):
@@ -50,8 +67,21 @@ class Problem(eqx.Module):
         pairs = zip(coordinates, self.unknowns, strict=True)
         return np.array([float(jax.grad(unknown.value)(coordinate)) for coordinate, unknown in pairs])
 
+    @property
+    def on_host(self) -> bool:
+        """Whether the model cannot be traced."""
+        return getattr(self.model, "on_host", False)
+
     def predict(self, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
-        """The model's predictions in every row."""
+        """The model's predictions in every row.
+
+        **Raises:** `ValueError` inside a transformation, if the model cannot be traced.
+        """
+        if self.on_host and is_traced(coordinates):
+            raise ValueError(
+                "a model of tops with several modes cannot be compiled or differentiated: use `sample`, or a sampler that "
+                "needs values only"
+            )
         values = self.values(coordinates)
         return self.model({name: values[:, k] for k, name in enumerate(self.names)})
 
@@ -116,7 +146,7 @@ def _differences(problem: Problem, step: float, coordinates: Rows) -> tuple[np.n
     """Predictions and central differences; if a side has no prediction, its slope is 0."""
     rows, unknowns = coordinates.shape
     offsets = step * np.concatenate([np.zeros((1, unknowns)), np.eye(unknowns), -np.eye(unknowns)])
-    predict = Problem.predict if getattr(problem.model, "on_host", False) else _predicted
+    predict = Problem.predict if problem.on_host else _predicted
     predictions = np.asarray(predict(problem, jnp.asarray((coordinates[:, None] + offsets).reshape(-1, unknowns))))
     values, values_above, values_below = np.split(
         predictions.reshape(rows, len(offsets), -1), [1, 1 + unknowns], axis=1
@@ -147,7 +177,7 @@ def predictions_and_slopes(problem: Problem, coordinates: Rows, mask: Any = None
 
 def predictions(problem: Problem, coordinates: Rows) -> np.ndarray:
     """Predictions without slopes, for every row of coordinates; rows of NaN take no time."""
-    predict = Problem.predict if getattr(problem.model, "on_host", False) else _predicted
+    predict = Problem.predict if problem.on_host else _predicted
     return np.asarray(predict(problem, jnp.asarray(coordinates)))
 
 

@@ -6,6 +6,9 @@ parameters by name. `model_of` finds the model of a scene or of a user's own sys
 
 from ..hybrid.saltation import UNMEASURED as UNMEASURED
 from ..hybrid.saltation import Clock as Clock
+from .data import EventTimes as EventTimes
+from .data import Recording as Recording
+from .data import predicted_columns as predicted_columns
 from .ensemble import Ensemble as Ensemble
 from .event import EventFunction as EventFunction
 from .event import with_event as with_event
@@ -14,11 +17,10 @@ from .event_time import time_of_event as time_of_event
 from .explore import explore as explore
 from .explore import explore_model as explore_model
 from .explore import page_of as page_of
-from .identify import EventTimes as EventTimes
-from .identify import Recording as Recording
 from .identify import fit_runs as fit_runs
 from .identify import identify as identify
-from .identify import predicted_columns as predicted_columns
+from .identify import log_density as log_density
+from .identify import posterior_of_runs as posterior_of_runs
 from .lyapunov import LyapunovExponent as LyapunovExponent
 from .lyapunov import direction_of_start as direction_of_start
 from .lyapunov import exponent_of_model as exponent_of_model

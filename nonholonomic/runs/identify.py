@@ -1,226 +1,35 @@
-"""Estimate parameters of any model from recorded runs and from times of events."""
+"""Estimate parameters of any model from recorded runs and from times of events, and their posterior."""
 
 import dataclasses
-import math
 from collections.abc import Callable, Hashable
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..identification import (
     AbstractDataModel,
     AbstractRecording,
+    Free,
     Identification,
-    Measurements,
-    Quantities,
-    as_quantity,
+    LogDensity,
     as_sources,
     fit_data,
     free_numbers,
-    model_times,
+    posterior_of_data,
     search_options,
 )
 from ..integration import Settings
 from ..integration.checks import tolerance_bound
 from ..integration.settings import MOST_STEPS
-from ..parameters import likely
 from ..progress import status_line
-from ..validation import as_number, as_number_or_none, nan_unless, require, shown
-from .checks import check_run, require_event
-from .event_time import time_of_event
-from .model import AbstractModel, model_of
+from ..validation import nan_unless
+from .checks import check_run
+from .data import EventTimes, Recording
+from .model import AbstractModel
 from .parameters import require_apart
-from .simulate import sampled
-
-#: Quantities with a period of a whole turn.
-ANGLES = frozenset({"azimuth", "eta", "heading", "spin_angle"})
-
-
-@dataclasses.dataclass(frozen=True)
-class AnyQuantities(Quantities):
-    """Quantities of a model that is not yet known: names, or components of vectors such as "position.x"."""
-
-    def of(self, quantity: Any) -> tuple[str, ...]:
-        names = quantity if isinstance(quantity, tuple) else (quantity,)
-        if not names or not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
-            raise ValueError(
-                f"quantity = {shown(quantity)} must name quantities, such as 'theta' or ('q0', 'q1'), each once"
-            )
-        return names
-
-
-class Recording(AbstractRecording):
-    """A recorded run: quantities of a state, sampled at the times of a clock.
-
-    **Arguments:**
-
-    - `launch`: the start, as for `simulate`.
-    - `times`: (times,), increasing.
-    - `value`: (times,) for a single quantity, (times, columns) for several; NaN where a sample is missing.
-    - `error`: standard errors: a scalar, (columns,), or of the shape of `value`; with `None`, they are estimated for
-      each column from the residuals.
-    - `quantity`: names of the recorded quantities, such as "theta", "speed", "y0" or ("q0", "q1"); a component of a
-      vector is "position.x".
-    - `t0`: the clock's reading at the start.
-    - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for outliers; `None`:
-      Gaussian.
-    - `input`: the input of a stroller.
-
-    **Raises:** `ValueError` for shapes that do not fit.
-
-    **Example:**
-
-    >>> import nonholonomic
-    >>> heights = nonholonomic.Recording([1.0, 0.0], [0.1, 0.2], [0.95, 0.80], 0.01, "y0")
-    >>> heights.labels
-    ('y0(0.1 s)', 'y0(0.2 s)')
-    """
-
-    quantity: str | tuple[str, ...] = eqx.field(static=True, default="y0", converter=as_quantity)
-    t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
-    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
-    input: Any = None
-    quantities: ClassVar[Quantities] = AnyQuantities({}, {}, ANGLES)
-
-    @property
-    def series_units(self) -> tuple[str, ...]:
-        return ("1",) * len(self.columns)
-
-    def model(self, system: Any) -> AbstractModel:
-        """The model of the recorded run, checked."""
-        model = model_of(system, self.launch, None, self.input).without_event()
-        known = [*model.quantities, *_components(model)]
-        for name in self.columns:
-            if name not in known:
-                raise ValueError(f"quantity: {name!r} must be one of {', '.join(known)}{likely(name, known)}")
-            if "." not in name and model.quantities[name].components is not None:
-                raise ValueError(f"quantity: {name!r} has several components: name them, such as '{name}.x'")
-        return model
-
-    def predicted(self, model: AbstractModel, lane: dict[str, Array], settings: Settings) -> Array:
-        return predicted_columns(self, model, lane, settings)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The quantities to which the columns belong."""
-        return tuple(dict.fromkeys(column.partition(".")[0] for column in self.columns))
-
-    def columns_of(self, model: AbstractModel, values: dict[str, Array]) -> list[Float[Array, " times"]]:
-        """The columns of the recording from the values of quantities."""
-        columns = []
-        for column in self.columns:
-            name, _, component = column.partition(".")
-            dims = model.quantities[name].components
-            columns.append(values[name] if dims is None else values[name][:, model.components[dims].index(component)])
-        return columns
-
-
-def _components(model: AbstractModel) -> list[str]:
-    """The names of the components of all vectors of a model."""
-    return [
-        f"{name}.{component}"
-        for name, quantity in model.quantities.items()
-        if quantity.components is not None
-        for component in model.components[quantity.components]
-    ]
-
-
-class EventTimes(eqx.Module):
-    """Measured times of the event of a run.
-
-    **Arguments:**
-
-    - `launch`: the start, as for `simulate`.
-    - `time`: measured times [s], (n,), of runs from the same start.
-    - `error`: standard errors [s]: a scalar, or (n,).
-    - `t1`: horizon [s] of the runs.
-    - `event`: a function `event(t, motion)`, as for `event_time`; by default the event of the system itself.
-    - `input`: the input of a stroller.
-
-    **Raises:** `ValueError` for shapes that do not fit.
-
-    **Example:**
-
-    >>> import nonholonomic
-    >>> falls = nonholonomic.EventTimes([1.0, 0.0], [0.45, 0.46], 0.005, t1=2.0, event=lambda t, y: y[0])
-    >>> falls.labels
-    ('time 1', 'time 2')
-    """
-
-    launch: Any
-    time: Float[Array, " n"] = eqx.field(converter=as_number)
-    error: Float[Array, "..."] = eqx.field(converter=as_number)
-    t1: Float[Array, ""] = eqx.field(converter=as_number)
-    event: Callable[..., Any] | None = None
-    input: Any = None
-
-    def __check_init__(self):
-        if isinstance(self.launch, list | tuple) and any(isinstance(part, eqx.Module) for part in self.launch):
-            raise ValueError(
-                f"launch must be one launch, not a list of {len(self.launch)}: make an EventTimes of each, and pass identify a "
-                "list of them"
-            )
-        require(self.time, "time", above=0.0)
-        require(self.t1, "t1", above=0.0)
-        require(self.error, "error", above=0.0)
-        if np.ndim(self.time) != 1 or not np.size(self.time):
-            raise ValueError(f"time must be a list of measured times, not of shape {np.shape(self.time)}")
-        if np.shape(self.error) not in ((), np.shape(self.time)):
-            raise ValueError(f"error must be one number or of shape {np.shape(self.time)}, not {np.shape(self.error)}")
-
-    @property
-    def size(self) -> int:
-        """Number of predictions."""
-        return np.size(self.time)
-
-    @property
-    def length(self) -> int:
-        """Number of times in a lane."""
-        return 1
-
-    @property
-    def seen(self) -> Int[np.ndarray, " n"]:
-        """Indices of the measured predictions."""
-        return np.arange(self.size)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """A label for each time."""
-        return tuple(f"time {k + 1}" for k in range(self.size))
-
-    @property
-    def series_units(self) -> tuple[str, ...]:
-        """The unit of the only series."""
-        return ("s",)
-
-    @property
-    def measurements(self) -> Measurements:
-        """The times as measurements."""
-        time = np.asarray(self.time)
-        return Measurements(time, np.broadcast_to(self.error, time.shape), student=math.inf)
-
-    def model(self, system: Any) -> AbstractModel:
-        """The model of the timed run, checked."""
-        model = model_of(system, self.launch, self.event, self.input)
-        require_event(model)
-        return model
-
-    def lane(self, size: int) -> dict[str, Array]:
-        """The numbers of the run that are not parameters."""
-        return {"t1": self.t1}
-
-    def predicted(self, model: AbstractModel, lane: dict[str, Array], settings: Settings) -> Float[Array, ""]:
-        """The time of one run; NaN without an event."""
-        time = time_of_event(model, lane["t1"], settings, False)
-        return jnp.where(jnp.isfinite(time), time, jnp.nan)
-
-    def part(self, predictions: Float[Array, " rows"]) -> Float[Array, "rows n"]:
-        """The predictions for every measurement."""
-        return jnp.broadcast_to(predictions[:, None], (len(predictions), self.size))
 
 
 class Source(eqx.Module):
@@ -282,16 +91,6 @@ class RunModel(AbstractDataModel):
         return [source.data.part(by_source[:, k]) for k, (source, _) in enumerate(sources)]
 
 
-def predicted_columns(
-    recording: Any, model: AbstractModel, lane: dict[str, Array], settings: Settings
-) -> Float[Array, "times columns"]:
-    """The columns of a recording of one run."""
-    times = model_times(lane["times"], lane["t0"])
-    run = sampled(model, recording.names, times, times[-1], settings)
-    values = model.read(recording.names, times, run.rows, run.mode)
-    return jnp.stack(recording.columns_of(model, values), axis=-1)
-
-
 def identify(
     system: Any,
     data: Any,
@@ -346,10 +145,58 @@ def identify(
     return fit_runs(system, data, free, tolerance, search)
 
 
+def log_density(
+    system: Any, data: Any, free: dict[str, Any], priors: dict[str, Any] | None = None, *, tolerance: float = 1e-8
+) -> LogDensity:
+    """The log of the posterior density of a system's parameters, as a function of unbounded coordinates.
+
+    **Arguments:** `system`, `data`, `free`, `tolerance`: as for `identify`; `priors`: as for `tippe.log_density`.
+
+    **Returns:** a `LogDensity`, for `nonholonomic.identification.sample` and any other sampler.
+
+    **Raises:** `ValueError` for arguments out of range or an unknown name.
+
+    **Example:** the rate of a decay.
+
+    ```
+    >>> import nonholonomic
+    >>> from nonholonomic.identification import sample
+    >>> class Decay(nonholonomic.AbstractMode):
+    ...     rate: float
+    ...
+    ...     def field(self, t, y):
+    ...         return -self.rate * y
+    >>> data = nonholonomic.Recording([1.0], [0.5, 1.0, 1.5], [0.37, 0.135, 0.05], 0.005)
+    >>> density = nonholonomic.log_density(nonholonomic.Hybrid([Decay(1.0)]), data, {"rate": 1.0})
+    >>> draws = sample(density, draws=200, progress=False)
+    >>> print(f"{draws.values['system.modes[0].rate'].mean():.2f}")
+    1.99
+
+    ```
+    """
+    data = as_sources(data, Recording | EventTimes, "a nonholonomic.Recording or EventTimes")
+    return posterior_of_runs(system, data, free, priors, tolerance)
+
+
 def fit_runs(
     system: Any, data: tuple[Any, ...], free: dict[str, Any], tolerance: Any, search: dict[str, Any]
 ) -> Identification:
     """Fit sets of data of runs. **Arguments:** as for `identify`; `search`: `search_options`."""
+    with status_line("fitting", search["progress"]):
+        return fit_data(*_prepared(system, data, free, tolerance), search)
+
+
+def posterior_of_runs(
+    system: Any, data: tuple[Any, ...], free: dict[str, Any], priors: dict[str, Any] | None, tolerance: Any
+) -> LogDensity:
+    """The posterior, given sets of data of runs. **Arguments:** as for `log_density`."""
+    return posterior_of_data(*_prepared(system, data, free, tolerance), priors)
+
+
+def _prepared(
+    system: Any, data: tuple[Any, ...], free: dict[str, Any], tolerance: Any
+) -> tuple[Callable[[Any], RunModel], tuple[Any, ...], dict[str, Free]]:
+    """The predictions of the measured indices, the data and the unknowns, all checked."""
     tolerance_bound(tolerance).require()
     models = tuple(source.model(system) for source in data)
     for source, model in zip(data, models, strict=True):
@@ -364,14 +211,8 @@ def fit_runs(
     def check(values: dict[str, float]) -> None:
         models[0].require_values({name: value for name, value in values.items() if name != "t0"})
 
+    unknowns = free_numbers(free, shared, names_of_data, check)
+    require_apart("free", unknowns)
+    sources = tuple(Source(source, model) for source, model in zip(data, models, strict=True))
     settings = Settings(tolerance, max_steps=MOST_STEPS)
-    with status_line("fitting", search["progress"]):
-        unknowns = free_numbers(free, shared, names_of_data, check)
-        require_apart("free", unknowns)
-        sources = tuple(Source(source, model) for source, model in zip(data, models, strict=True))
-        return fit_data(
-            lambda indices: RunModel(data=sources, seen=jnp.asarray(indices), settings=settings),
-            data,
-            unknowns,
-            search,
-        )
+    return lambda seen: RunModel(data=sources, seen=jnp.asarray(seen), settings=settings), data, unknowns

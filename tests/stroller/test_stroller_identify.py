@@ -30,6 +30,11 @@ def test_damping_from_recorded_speeds(tmp_path, caplog):
         second_fit = stroller.identify(scene(), data, {"rolling": 1.5, "t0": 0.85}, tolerance=1e-7)
     assert not [text for text in caplog.messages if "Finished XLA compilation" in text]
     assert_close(list(second_fit.estimates.values()), [2.0, 0.9], rtol=1e-4)
+    posterior = stroller.log_density(scene(), data, {"rolling": 1.5, "t0": 0.85}, tolerance=1e-7)
+    # Exact data: the density falls from its maximum by half the squared residuals.
+    residuals = posterior.predict(posterior.start[None])[0] - speeds
+    fall = float(posterior(second_fit.coordinates) - posterior(posterior.start))
+    assert_close(fall, 0.5 * np.sum((residuals / 0.01) ** 2), rtol=1e-3)
 
 
 @pytest.mark.slow
@@ -46,8 +51,11 @@ def test_damping_and_wheelbase_from_an_exact_path():
 def test_what_cannot_be_fitted_is_refused():
     data = stroller.Recording(LAUNCH, TIMES, np.zeros((3, 3)), 0.01)
     for free, message in (({"drag": 1.0}, "must be one of"), ({"wheelbase": -1.0}, "wheelbase")):
-        with pytest.raises(ValueError, match=message):
-            stroller.identify(scene(), data, free)
+        for use in (stroller.identify, stroller.log_density):
+            with pytest.raises(ValueError, match=message):
+                use(scene(), data, free)
+    with pytest.raises(ValueError, match="priors: 'drag' must be one of"):
+        stroller.log_density(scene(), data, {"rolling": 2.0}, {"drag": 0.1})
     with pytest.raises(ValueError, match="starts = 0 must be"):
         stroller.identify(scene(), "no data", {"wheelbase": 1.0}, starts=0)
     with pytest.raises(ValueError, match="must be a Recording"):

@@ -8,6 +8,7 @@ import pytest
 from tops import rutstam_top
 
 import tippe
+from nonholonomic.identification import sample
 
 HOPS = list(csv.DictReader((Path(__file__).parents[1] / "physics" / "hop_reference.csv").read_text().splitlines()))[:4]
 
@@ -37,3 +38,28 @@ def test_friction_from_times_of_tops_that_hop():
 def test_friction_from_times_of_tops_that_hop_often():
     """Four launches, of 7 to 77 flights."""
     check(fit_of_friction(HOPS, tolerance=1e-7), 1e-3)
+
+
+def test_draws_of_a_top_that_sticks_are_those_of_its_fit():
+    """Friction from the time at 0.6 pi. Its posterior cannot be differentiated."""
+    scene = tippe.Scene(rutstam_top(), friction=tippe.SetValuedCoulomb(0.3))
+
+    def data(time):
+        return tippe.InversionTimes(tippe.Launch(1.5, [120.0]), [time], 0.01, t1=2.0, angle=0.6 * np.pi)
+
+    def density(time, mu):
+        return tippe.log_density(scene, data(time), {"mu": mu}, tolerance=1e-6)
+
+    # So many rows, here and in the fit, that one program serves all.
+    exact = density(1.0, 0.3).predictions(np.full((80, 1), np.log(0.3)))[0, 0]
+    fit = tippe.identify(scene, data(exact), {"mu": 0.27}, starts=24, tolerance=1e-6, progress=False)
+    low, high = fit.interval("mu")
+    assert low < 0.3 < high
+    posterior = density(exact, 0.35)
+    draws = sample(posterior, fit.coordinates, fit.coordinate_covariance, draws=400, progress=False)
+    ends = np.quantile(draws.values["scene.friction.mu"], [0.025, 0.975])
+    assert np.max(np.abs(ends - [low, high])) < 0.15 * (high - low)
+    repeated = posterior.replicate(np.full((80, 1), np.log(0.3)))[:, 0]
+    assert abs(np.mean(repeated) - exact) < 4.0 * 0.01 / np.sqrt(80)
+    with pytest.raises(ValueError, match="cannot be compiled or differentiated: use `sample`"):
+        posterior.value_and_gradient(posterior.start)

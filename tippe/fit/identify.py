@@ -109,17 +109,19 @@ def identify(
     search = search_options(starts, spread, seed, max_steps, progress)
     with status_line("fitting", progress):
         data = checked_data(scene, data, tolerance, "identify with slopes = 'exact'" if slopes == "exact" else None)
-        unknowns = unknowns_of(scene, data, free)
-        smooth = run_kind_of(scene).smooth
-        kind = SceneModel if smooth else HybridModel
-        slopes = slopes or ("exact" if smooth else "differences")
+        kind, default = model_kind_of(scene)
         return fit_data(
             lambda indices: kind(scene=scene, data=data, seen=indices, tolerance=tolerance),
             data,
-            unknowns,
+            unknowns_of(scene, data, free),
             search,
-            slopes,
+            slopes or default,
         )
+
+
+def model_kind_of(scene: Scene) -> tuple[Any, str]:
+    """The class of the predictions of a scene, and its kind of slopes."""
+    return (SceneModel, "exact") if run_kind_of(scene).smooth else (HybridModel, "differences")
 
 
 def checked_data(scene: Scene, data: Any, tolerance: float, caller: str | None) -> tuple[Any, ...]:

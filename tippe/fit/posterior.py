@@ -2,12 +2,10 @@
 
 from typing import Any
 
-from nonholonomic.identification import LogDensity, joined, series_units
-from nonholonomic.parameters import full_name
-from nonholonomic.validation import shown
+from nonholonomic.identification import LogDensity, posterior_of_data
 
 from ..model.scene import Scene
-from .identify import SceneModel, checked_data, unknowns_of
+from .identify import checked_data, model_kind_of, unknowns_of
 
 
 def log_density(
@@ -27,10 +25,10 @@ def log_density(
       priors add to those of `Free`.
 
     **Returns:** a `LogDensity`: a function of coordinates (unknowns,) for any sampler, with `value_and_gradient` for
-    samplers without JAX, `values` to convert back to parameters, `names` and `start`.
+    samplers without JAX, `values` to convert back to parameters, `names` and `start`. With flights or set-valued friction, it
+    has values only: use it with `sample`.
 
-    **Raises:** `ValueError` for arguments out of range, an unknown name, and scenes with modes that do not support
-    derivatives.
+    **Raises:** `ValueError` for arguments out of range and an unknown name.
 
     **Example:** friction from one time, with a prior of 10 %.
 
@@ -42,13 +40,12 @@ def log_density(
     >>> density.names, density.start.shape
     (('scene.friction.mu',), (1,))
     """
-    data = checked_data(scene, data, tolerance, "log_density")
-    unknowns = unknowns_of(scene, data, free)
-    if priors is not None and not isinstance(priors, dict):
-        raise ValueError(
-            f"priors = {shown(priors)} must be a dictionary, name of a number -> (mean, standard deviation)"
-        )
-    priors_by_name = {full_name("priors", name, list(unknowns)): prior for name, prior in (priors or {}).items()}
-    measurements, _, indices = joined(data)
-    model = SceneModel(scene=scene, data=data, seen=indices, tolerance=tolerance)
-    return LogDensity.of(model, measurements, unknowns, priors_by_name, series_units(data))
+    data = checked_data(scene, data, tolerance, None)
+    kind, slopes = model_kind_of(scene)
+    return posterior_of_data(
+        lambda indices: kind(scene=scene, data=data, seen=indices, tolerance=tolerance),
+        data,
+        unknowns_of(scene, data, free),
+        priors,
+        slopes,
+    )

@@ -59,6 +59,16 @@ def test_each_run_has_its_own_times():
     assert_close(samples[..., 0].T, np.cos(np.asarray(RATES) * times), atol=1e-7)
 
 
+def test_a_run_whose_times_are_unknown_ends_at_once():
+    """As in fits with an illegal clock; such a run must not hold up the others."""
+    times = np.linspace(0.3, 5.0, 7)[:, None] + np.zeros(CELLS)
+    times[:, 3] = np.nan
+    outcome, samples = run(times)
+    assert outcome.steps[3] <= 1
+    assert np.all(np.isnan(samples[3]))
+    assert np.all(np.isfinite(np.delete(np.asarray(samples), 3, axis=0)))
+
+
 def test_after_the_end_there_are_no_numbers():
     times = np.linspace(0.0, 10.0, 201)
     outcome, samples = run(times, least=0.5)

@@ -8,6 +8,7 @@ from close import assert_close
 from models import CASES, NAMES
 
 import nonholonomic
+from nonholonomic.identification import sample
 
 QUIET = dict(progress=False, tolerance=1e-8)
 
@@ -105,6 +106,11 @@ def test_parameters_are_found_in_recordings_and_times(case):
     data = nonholonomic.Recording(case.start, times, value, error=error, quantity=case.quantity)
     fit = nonholonomic.identify(case.system, data, free, starts=2, progress=False)
     assert_close(next(iter(fit.estimates.values())), case.value, rtol=1e-4)
+    draws = sample(nonholonomic.log_density(case.system, data, free), draws=200, progress=False)
+    name, value = next(iter(draws.values.items()))
+    assert_close(
+        np.quantile(value, [0.025, 0.975]), fit.interval(name), atol=0.3 * np.ptp(fit.interval(name)), rtol=0.0
+    )
     time = float(nonholonomic.event_time(case.system, case.start, case.t1, event=case.event))
     data = nonholonomic.EventTimes(case.start, [time], error=1e-5, t1=case.t1, event=case.event)
     fit = nonholonomic.identify(case.system, data, free, starts=2, progress=False)
