@@ -167,7 +167,8 @@ PAGES = {
             *of(
                 "nonholonomic.identification",
                 "AbstractRecording Quantities as_quantity read_columns model_times predicted AbstractDataModel scene_unknowns "
-                "free_numbers search_options as_sources fit_data posterior_of_data identify Identification Measurements joined of_data "
+                "free_numbers search_options as_sources fit_data posterior_of_data identify Identification Measurements "
+                "joined of_data "
                 "series_units LogDensity sample Draws",
             ),
         ],
