@@ -148,6 +148,9 @@ def test_a_top_that_slips_flies_sticks_and_rolls(arena):
     assert 0.05 < run.stats["impact_loss"] / run.energy[0] < 0.2
     flight_state = run.contact < 0
     assert_close(run.normal_force[flight_state], 0.0)
+    middles = np.array([0.5 * (piece.begin + piece.end) for piece in run.dense.mode_segments])
+    before, after = run.at(middles - 1e-6).theta, run.at(middles + 1e-6).theta
+    assert_close(run.at(middles).theta_rate, (after - before) / 2e-6, rtol=1e-5, atol=1e-3)
     assert_close(run.distance[0][~flight_state], 0.0, atol=1e-12)
     is_rolling = (run.t > run.dense.mode_segments[-2].begin) & (run.t < run.dense.mode_segments[-2].end)
     if arena:

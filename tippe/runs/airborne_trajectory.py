@@ -17,6 +17,7 @@ from ..model.dynamics import NO_COSINE
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.state import parts
+from ..model.stick_slip import StickSlip
 from ..model.top import Top
 from ..modes import airborne, airborne_stem
 from ..modes.airborne import (
@@ -58,6 +59,8 @@ class ArenaTrajectory(HybridTrajectory):
     def theta_rate(self) -> Float[Array, " times"]:
         """Rate of change of theta [rad/s]."""
         dynamics = self.scene.dynamics
+        # theta changes with velocities only, so rolling and slipping do not differ.
+        dynamics = dynamics.slipping if isinstance(dynamics, StickSlip) else dynamics
         # The frame moves with the centre of the top's sphere, also in flight.
         frame = dataclasses.replace(carried_frame(self.scene), distance=self.scene.body.radius + self.above[0])
         rates = dataclasses.replace(dynamics, frame=frame).field(self._states)
