@@ -120,6 +120,7 @@ def posterior_of_data(
 
     **Example:**
 
+    >>> from nonholonomic.identification import posterior_of_data
     >>> posterior_of_data(lambda seen: Model(scene, data, jnp.asarray(seen)), data, free, {"rate": (1.0, 0.5)})
     LogDensity of scene.rate, given 3 measurements
     """
