@@ -64,7 +64,7 @@ OF_MODES = {
     ),
     "rattleback": Case(
         tippe.Scene(ROCKER, friction=tippe.NoSlip()),
-        tippe.Launch(0.02, -5.0),
+        tippe.Launch(0.01, -5.0),
         4.0,
         lambda t, motion: -motion.normal_spin,
         "mass",
