@@ -10,8 +10,6 @@ import scipy.stats
 from nonholonomic.identification import FitWarning, Free, LogDensity, Measurements, identify, sample
 from nonholonomic.identification.pareto import smoothed_weights
 
-pytestmark = pytest.mark.newest
-
 X = np.linspace(0.5, 1.5, 8)
 TRUTH, ERROR, TOOTH = 2.0, 0.05, 0.1
 
