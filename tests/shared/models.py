@@ -13,7 +13,10 @@ from nonholonomic import Hybrid
 
 
 class Case(NamedTuple):
-    """A system, its start, its horizon and an event; the end of a parameter's name with its value; a quantity."""
+    """A system, its start, its horizon and an event; the end of a parameter's name with its value; a quantity.
+
+    `rtol`: how closely programs that choose their own steps agree; `once`: whether the event function has one zero only.
+    """
 
     system: Any
     start: Any
@@ -22,6 +25,8 @@ class Case(NamedTuple):
     parameter: str
     value: float
     quantity: str
+    rtol: float = 1e-9
+    once: bool = True
 
 
 CART = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
@@ -70,6 +75,9 @@ OF_MODES = {
         "mass",
         1.0,
         "theta",
+        # Rocking multiplies differences, and moves the spin to and fro around its reversal.
+        rtol=5e-8,
+        once=False,
     ),
 }
 

@@ -41,7 +41,7 @@ def samples(case):
 def test_the_time_of_an_event_is_that_of_a_table(case, table):
     time = nonholonomic.event_time(case.system, case.start, case.t1, event=case.event, tolerance=1e-8)
     assert set(table.status) == {"event"}
-    assert_close(table.time[1], time, rtol=1e-9)
+    assert_close(table.time[1], time, rtol=case.rtol)
 
 
 def test_the_slopes_of_a_table_are_those_of_differences(case, table):
@@ -85,7 +85,7 @@ def test_tables_are_scattered_and_resumed_and_limit_their_steps(case, table, tmp
 
     path = tmp_path / "times.h5"
     first, again = sweep(scattered=True, path=path), sweep(scattered=True, path=path)
-    assert_close(first.time, table.time[:2], rtol=1e-9)
+    assert_close(first.time, table.time[:2], rtol=case.rtol)
     assert np.array_equal(first.time, again.time)
     assert set(sweep(max_steps=3).status) == {"failed"}
 
@@ -93,7 +93,10 @@ def test_tables_are_scattered_and_resumed_and_limit_their_steps(case, table, tmp
 @of_own_modes
 def test_the_last_crossing_is_that_after_which_the_event_function_stays_below_zero(case, table):
     time = nonholonomic.event_time(case.system, case.start, case.t1, case.event, 1e-8, crossing="last")
-    assert_close(time, table.time[1], rtol=1e-8)
+    if case.once:
+        assert_close(time, table.time[1], rtol=1e-8)
+    else:
+        assert table.time[1] < time < case.t1
 
 
 @of_own_modes
