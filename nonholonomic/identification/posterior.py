@@ -140,7 +140,8 @@ class LogDensity(eqx.Module):
 
         **Raises:** `ValueError` if the model does not return one prediction per measurement.
         """
-        prediction, shape = predictions(self.problem, coordinates), (len(coordinates), self.measurements.value.size)
+        prediction = predictions(self.problem, coordinates[:, : len(self.problem.names)])
+        shape = (len(coordinates), self.measurements.value.size)
         if prediction.shape != shape:
             raise ValueError(f"model must predict {shape} for {shape[0]} sets, not {prediction.shape}")
         return prediction
@@ -152,8 +153,7 @@ class LogDensity(eqx.Module):
     @status_line("simulating")
     def replicate(self, coordinates: Float[Array, "rows unknowns"], seed: int = 0) -> Float[np.ndarray, "rows n"]:
         """New measurements drawn from the predictions and their errors; limits are replaced by values."""
-        points = np.asarray(coordinates)[:, : len(self.problem.names)]
-        random, predicted = np.random.default_rng(seed), self.predictions(points)
+        random, predicted = np.random.default_rng(seed), self.predictions(np.asarray(coordinates))
         heavy = np.isfinite(freedom := np.asarray(self.measurements.student))
         noise = random.normal(size=predicted.shape)
         noise /= np.where(

@@ -56,7 +56,7 @@ def _(model: RideModel, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
     ranges = default_ranges(model.scene, model.launch) if sliders is None else sliders
     knobs = sliders_of(ranges, model.roots, LONG_NAMES, UNITS)
     models = [model, *(model.replaced({path: end}) for path, end in ends_of(knobs))]
-    rides = [one.simulate(t1, None, DRAWN, None, None) for one in models]
+    rides = [changed.simulate(t1, None, DRAWN, None, None) for changed in models]
     return live_run(model.roots, knobs, t1, model.input), stage(rides)
 
 

@@ -1,7 +1,7 @@
 """Estimate parameters of a top, its arena and its launches from inversion times and recorded motion."""
 
 import dataclasses
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import equinox as eqx
@@ -108,20 +108,27 @@ def identify(
     """
     search = search_options(starts, spread, seed, max_steps, progress)
     with status_line("fitting", progress):
-        data = checked_data(scene, data, tolerance, "identify with slopes = 'exact'" if slopes == "exact" else None)
-        kind, default = model_kind_of(scene)
-        return fit_data(
-            lambda indices: kind(scene=scene, data=data, seen=indices, tolerance=tolerance),
-            data,
-            unknowns_of(scene, data, free),
-            search,
-            slopes or default,
-        )
+        caller = "identify with slopes = 'exact'" if slopes == "exact" else None
+        return fit_data(*prepared(scene, data, free, tolerance, caller), search, slopes or slopes_of(scene))
 
 
-def model_kind_of(scene: Scene) -> tuple[Any, str]:
-    """The class of the predictions of a scene, and its kind of slopes."""
-    return (SceneModel, "exact") if run_kind_of(scene).smooth else (HybridModel, "differences")
+def slopes_of(scene: Scene) -> str:
+    """The kind of slopes that the predictions of a scene have."""
+    return "exact" if run_kind_of(scene).smooth else "differences"
+
+
+def prepared(
+    scene: Scene, data: Any, free: Any, tolerance: float, caller: str | None
+) -> tuple[Callable[[Any], Any], tuple[Any, ...], dict[str, Free]]:
+    """The predictions of the measured indices, the data and the unknowns, all checked. **Arguments:** as for
+    `checked_data`."""
+    data = checked_data(scene, data, tolerance, caller)
+    kind = SceneModel if run_kind_of(scene).smooth else HybridModel
+
+    def build(seen: Any) -> Any:
+        return kind(scene=scene, data=data, seen=seen, tolerance=tolerance)
+
+    return build, data, unknowns_of(scene, data, free)
 
 
 def checked_data(scene: Scene, data: Any, tolerance: float, caller: str | None) -> tuple[Any, ...]:

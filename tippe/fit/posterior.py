@@ -5,7 +5,7 @@ from typing import Any
 from nonholonomic.identification import LogDensity, posterior_of_data
 
 from ..model.scene import Scene
-from .identify import checked_data, model_kind_of, unknowns_of
+from .identify import prepared, slopes_of
 
 
 def log_density(
@@ -40,12 +40,4 @@ def log_density(
     >>> density.names, density.start.shape
     (('scene.friction.mu',), (1,))
     """
-    data = checked_data(scene, data, tolerance, None)
-    kind, slopes = model_kind_of(scene)
-    return posterior_of_data(
-        lambda indices: kind(scene=scene, data=data, seen=indices, tolerance=tolerance),
-        data,
-        unknowns_of(scene, data, free),
-        priors,
-        slopes,
-    )
+    return posterior_of_data(*prepared(scene, data, free, tolerance, None), priors, slopes_of(scene))

@@ -72,7 +72,7 @@ def _(model: TopModel, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
     if model.scene.contact == "hybrid" and model.scene.level:
         return live, stage_at_start(model, t1)
     models = [model, *(model.replaced({path: end}) for path, end in ends_of(live.sliders))]
-    return live, stage_of_runs([one.simulate(t1, None, DRAWN, None, None) for one in models])
+    return live, stage_of_runs([changed.simulate(t1, None, DRAWN, None, None) for changed in models])
 
 
 def live_run(model: TopModel, sliders: dict[str, tuple[float, float]] | None, t1: float) -> LiveRun:
