@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..model.dynamics import Dynamics
+from nonholonomic.geometry import Vector, add, dot, scale, subtract, vector_of
+
+from ..model.dynamics import Dynamics, padded
 from ..model.input import Motion
 from .inverse import actuation
 from .spline import ORDER, evaluate, interpolate
@@ -24,9 +26,11 @@ FINE, FINE_STEPS = 4, 2
 class Drive(eqx.Module):
     """An input that follows a planned speed of the front wheel and a planned steering angle.
 
-    Each is a uniform cubic B-spline over `duration` [s]. `force` [N] and `torque` [N m] move the planned stroller exactly;
-    the gains pull speed [N s/m], angle [N m/rad] and rate [N m s/rad] back where rounding or a disturbance changes them,
-    because a fork in reverse is unstable by itself. Nothing corrects the place: see `track`.
+    Each is a uniform cubic B-spline over `duration` [s]. `force` [N], together with the part of the `weight` [N] (a vector in
+    the ground's axes) that acts against the actual heading, and `torque` [N m] move the planned stroller exactly. Without
+    that part, an error of the heading on a slope would change the speed, and grow. The gains pull speed [N s/m], angle
+    [N m/rad] and rate [N m s/rad] back where rounding or a disturbance changes them, because a fork in reverse is unstable
+    by itself. Nothing corrects the place: see `track`.
     """
 
     duration: Float[Array, ""]
@@ -34,12 +38,14 @@ class Drive(eqx.Module):
     front_speed: Float[Array, " coefficients"]
     force: Float[Array, " fine"]
     torque: Float[Array, " fine"]
+    weight: Vector
     speed_gain: Float[Array, ""]
     angle_gain: Float[Array, ""]
     rate_gain: Float[Array, ""]
 
     def reference(self, t: Float[Array, "..."]) -> tuple[Any, Any, Any, Any, Any]:
-        """Planned steering angle [rad], its rate [rad/s], speed of the front wheel [m/s], force [N] and torque [N m]."""
+        """Planned steering angle [rad], its rate [rad/s], speed of the front wheel [m/s], force [N] without the weight's
+        part, and torque [N m]."""
         part = jnp.asarray(t) / self.duration
         per_second = (len(self.steering) - ORDER + 1) / self.duration
         return (
@@ -50,9 +56,13 @@ class Drive(eqx.Module):
             evaluate(self.torque, part),
         )
 
+    def climbing(self, motion: Motion) -> Any:
+        """The force [N] that holds the stroller against its weight; `None` where the ground is level."""
+        return dot(self.weight, motion.heading)
+
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         angle, rate, speed, force, torque = self.reference(t)
-        force = force + self.speed_gain * (speed - motion.front_speed)
+        force = add(self.climbing(motion), force + self.speed_gain * (speed - motion.front_speed))
         torque = torque + self.angle_gain * (angle - motion.steering) + self.rate_gain * (rate - motion.steering_rate)
         return force, torque
 
@@ -88,14 +98,17 @@ def _needed(dynamics: Dynamics, pose: Any, steering: Any, front_speed: Any, t1: 
 
 def drive_along(dynamics: Dynamics, pose: Any, steering: np.ndarray, front_speed: np.ndarray, t1: float) -> Drive:
     """The input that gives a stroller, from a pose, the steering angle and the speed of two splines."""
-    force, torque, _ = _needed(dynamics, pose, steering, front_speed, jnp.asarray(t1, dtype=float))
+    force, torque, poses = _needed(dynamics, pose, steering, front_speed, jnp.asarray(t1, dtype=float))
     body = dynamics.body
+    weight = vector_of(scale(body.mass * dynamics.gravity, dynamics.up))
+    force = subtract(force, dot(weight, padded(poses[:, dynamics.surface.axes :].T)))
     return Drive(
         duration=jnp.asarray(t1, dtype=float),
         steering=jnp.asarray(steering),
         front_speed=jnp.asarray(front_speed),
         force=jnp.asarray(interpolate(np.asarray(force))),
         torque=jnp.asarray(interpolate(np.asarray(torque))),
+        weight=weight,
         speed_gain=SPEED_RATE * body.mass,
         angle_gain=STEERING_RATE**2 * body.steering_inertia,
         rate_gain=2.0 * STEERING_RATE * body.steering_inertia,

@@ -22,8 +22,8 @@ STEPS_EACH = 8
 #: Violation of the constraints of a solution, and relative change of the objective at which the optimiser stops.
 FEASIBLE, SETTLED = 2e-4, 0.02
 
-#: Bounds of the damping.
-LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e6
+#: The damping: least, first and greatest value.
+LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-6, 1.0, 1e6
 
 
 class Candidates(NamedTuple):
@@ -95,22 +95,31 @@ def _step(band: np.ndarray, gradient: np.ndarray, damping: np.ndarray) -> np.nda
     return -scipy.linalg.solveh_banded(joined, gradient.reshape(-1), lower=True).reshape(lanes, count)
 
 
-def _minimise(candidates: Candidates, task: Task, multipliers: Multipliers, penalty: float) -> Candidates:
-    """Gauss-Newton steps for a given penalty; a step that does not lower the merit is repeated with more damping."""
+def _minimise(
+    candidates: Candidates, task: Task, multipliers: Multipliers, penalty: float, damping: np.ndarray
+) -> tuple[Candidates, np.ndarray]:
+    """Gauss-Newton steps for a given penalty, and the damping after them.
+
+    The damping follows the ratio of the gain to the one that the linear model promised (Nielsen, "Damping parameter in
+    Marquardt's method", Technical University of Denmark, 1999); a step that does not lower the merit is repeated.
+    """
     # A Python number would be a constant of the program.
     weight = jnp.asarray(penalty)
-    merit, gradient, band = map(np.asarray, _normal_equations(candidates, task, multipliers, weight))
-    merit, gradient, band = merit.copy(), gradient.copy(), band.copy()
-    unknowns, damping = np.asarray(candidates.unknowns).copy(), np.full(len(merit), 1e-3)
+    merit, gradient, band = (np.array(part) for part in _normal_equations(candidates, task, multipliers, weight))
+    unknowns, growth = np.array(candidates.unknowns), np.full(len(merit), 2.0)
     for _ in range(STEPS_EACH):
-        step = _step(band, gradient, damping).reshape(unknowns.shape)
-        trial = candidates._replace(unknowns=unknowns + step)
+        step = _step(band, gradient, damping)
+        promised = np.sum(step * (damping[:, None] * step - gradient), axis=1)
+        trial = candidates._replace(unknowns=unknowns + step.reshape(unknowns.shape))
         new = tuple(map(np.asarray, _normal_equations(trial, task, multipliers, weight)))
-        better = np.isfinite(new[2]).all((1, 2)) & (new[0] < merit)
+        gain = np.where(np.isfinite(new[2]).all((1, 2)), (merit - new[0]) / promised, -1.0)
+        better = gain > 0.0
         for old, part in zip((merit, gradient, band, unknowns), (*new, trial.unknowns), strict=True):
             old[better] = part[better]
-        damping = np.clip(np.where(better, damping / 5.0, damping * 8.0), LEAST_DAMPING, MOST_DAMPING)
-    return candidates._replace(unknowns=unknowns)
+        damping = damping * np.where(better, np.maximum(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), growth)
+        damping = np.clip(damping, LEAST_DAMPING, MOST_DAMPING)
+        growth = np.where(better, 2.0, 2.0 * growth)
+    return candidates._replace(unknowns=unknowns), damping
 
 
 def violation(found: Residuals) -> np.ndarray:
@@ -129,12 +138,16 @@ def optimise(candidates: Candidates, task: Task) -> tuple[Candidates, np.ndarray
 
     **Returns:** the candidates, and the violation and the objective of each.
     """
+    # Where the weight makes the effort large, the penalties would be too weak beside it.
+    least = float(objective(constraints(candidates, task)).min())
+    task = eqx.tree_at(lambda task: task.scales.force, task, task.scales.force * np.sqrt(max(1.0, least)))
     found = constraints(candidates, task)
     multipliers = Multipliers(jnp.zeros_like(found.equalities), jnp.zeros_like(found.inequalities))
     values = np.full(len(candidates.durations), np.inf)
+    damping = np.full(len(candidates.durations), FIRST_DAMPING)
     for last, penalty in zip((PENALTIES[0], *PENALTIES), PENALTIES, strict=False):
         multipliers = Multipliers(*(part * (last / penalty) for part in multipliers))
-        candidates = _minimise(candidates, task, multipliers, penalty)
+        candidates, damping = _minimise(candidates, task, multipliers, penalty, damping)
         found, before = constraints(candidates, task), values
         values = objective(found)
         if np.any((violation(found) < FEASIBLE) & (np.abs(values - before) < SETTLED * values)):

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.interpolate import CubicSpline
 
-from nonholonomic.geometry import AbstractSurface, cross, dot, scale
+from nonholonomic.geometry import AbstractSurface, add, cross, dot, scale
 from nonholonomic.validation import require_kind
 
 from ..model.dynamics import padded
@@ -71,7 +71,7 @@ class Tracker(eqx.Module):
         steering = jnp.clip(steering, -self.most_steering, self.most_steering)
         wanted = (speed * cosine + self.along * ahead) / jnp.cos(steering)
         drive = self.drive
-        force = force + drive.speed_gain * (wanted - motion.front_speed)
+        force = add(drive.climbing(motion), force + drive.speed_gain * (wanted - motion.front_speed))
         torque = (
             torque + drive.angle_gain * (steering - motion.steering) + drive.rate_gain * (rate - motion.steering_rate)
         )

@@ -308,7 +308,8 @@ def test_inverse_dynamics_on_a_circle_is_the_balance_of_friction():
 
 @pytest.mark.parametrize("fork", [pytest.param("relative", marks=pytest.mark.slow), "absolute"])
 def test_a_drive_moves_as_planned(fork):
-    """Inside a spheroid, with a heavy fork: the run has the planned angle and speed, without help from the feedback."""
+    """Inside a spheroid, with a heavy fork: the run has the planned angle and speed, without help from the feedback; and
+    in another direction too, because the drive holds the stroller against its weight."""
     body = stroller.Stroller(mass=5.0, wheelbase=0.25, inertia=0.1, steering_inertia=0.02, steering_spring=0.03)
     scene = stroller.Scene(body, stroller.Spheroid(6.0, 3.0), stroller.Damping(2.0), side="inside", fork=fork)
     launch = stroller.Launch((0.0, -1.2), 0.3, 0.0)
@@ -323,3 +324,6 @@ def test_a_drive_moves_as_planned(fork):
     assert_close(run.steering, planned_angle, atol=2e-4)
     assert_close(run.front_speed, planned_speed, atol=2e-4)
     assert np.max(np.abs(run.energy_residual)) < 1e-6
+    elsewhere = stroller.Launch((0.0, -1.2), 1.3, 0.0)
+    run = stroller.simulate(scene, elsewhere, 6.0, drive, times=np.linspace(0.0, 6.0, 13), tolerance=1e-9)
+    assert_close(run.front_speed, planned_speed, atol=2e-2)
