@@ -18,7 +18,7 @@ from nonholonomic.sweeps import Table as Table
 
 from . import presets as presets
 from .fit.identify import identify as identify
-from .fit.posterior import log_density as log_density
+from .fit.identify import log_density as log_density
 from .fit.recording import Recording as Recording
 from .fit.recording import read_recording as read_recording
 from .model.friction import AbstractFriction as AbstractFriction

@@ -33,7 +33,7 @@ def stem_top():
 
 
 def axes_of(scene, axes):
-    _, grid, _ = launches(scene, {"theta": 0.1, "spin": 155.0, "mu": None}, axes, 1.0, 1e-9)
+    _, grid = launches(scene, {"theta": 0.1, "spin": 155.0, "mu": None}, axes, 1.0, 1e-9)
     return {axis.name: axis.number for axis in grid}
 
 
@@ -95,7 +95,7 @@ def test_the_axes_of_rides_may_be_named_by_their_ends_too(monkeypatch):
 
 def test_what_the_function_of_a_ground_holds_may_be_lists_in_tables_too():
     scene = tippe.Scene(rutstam_top(), tippe.Graph(Hill(jnp.array([0.05, 0.1]))), tippe.Viscous(0.3))
-    _, grid, _ = launches(scene, {"theta": 0.1, "spin": [100.0, 120.0]}, None, 1.0, 1e-9)
+    _, grid = launches(scene, {"theta": 0.1, "spin": [100.0, 120.0]}, None, 1.0, 1e-9)
     assert [axis.name for axis in grid] == ["spin"]
     with pytest.raises(ValueError, match=r"scene\.gravity must be one number, not of shape"):
         launches(eqx.tree_at(lambda s: s.gravity, scene, jnp.ones(2)), {"theta": 0.1, "spin": 1.0}, None, 1.0, 1e-9)

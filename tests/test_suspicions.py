@@ -78,7 +78,7 @@ LINES = {line for call, _ in SUSPECTED.values() for *_, line in call.__code__.co
 @pytest.fixture
 def nothing_runs(monkeypatch):
     """What would run says that it was asked to."""
-    monkeypatch.setattr(importlib.import_module("tippe.runs.inversion_time"), "time_of_event", lambda *_: jnp.inf)
+    monkeypatch.setattr(importlib.import_module("tippe.runs.verbs"), "time_of_event", lambda *_: jnp.inf)
     monkeypatch.setattr(
         importlib.import_module("tippe.runs.table"), "compute_table", lambda *_, **__: table_of_times([5.0], [9])
     )
@@ -138,7 +138,7 @@ def programs_of_its_own():
 @pytest.mark.slow
 @pytest.mark.usefixtures("programs_of_its_own")
 def test_a_time_that_takes_too_many_steps_is_an_error_that_says_how_many(monkeypatch):
-    module = importlib.import_module("tippe.runs.inversion_time")
+    module = importlib.import_module("tippe.runs.verbs")
     monkeypatch.setattr(module, "Settings", functools.partial(Settings, max_steps=40))
     message = (
         r"t1 = 100000 s is too long: the run needs more than 40 steps, which reached only 0\.\d+ s; take a shorter t1"

@@ -30,7 +30,7 @@ DECAY = Measurements([2.0, 1.0], [0.1, 0.1])
 CALLS = {
     "inversion_time": (
         lambda: tippe.inversion_time(TOP, LAUNCH, 8.0),
-        "tippe.runs.inversion_time",
+        "tippe.runs.verbs",
         "time_of_event",
     ),
     "extended": (
@@ -39,7 +39,7 @@ CALLS = {
         "differentiable_solve",
     ),
     "simulate": (lambda: tippe.simulate(TOP, LAUNCH, 1.0), "tippe.runs.simulate", "follow"),
-    "exponent": (lambda: tippe.lyapunov_exponent(TOP, LAUNCH, 1.0), "tippe.runs.lyapunov", "exponent_of_model"),
+    "exponent": (lambda: tippe.lyapunov_exponent(TOP, LAUNCH, 1.0), "tippe.runs.verbs", "exponent_of_model"),
     "ride": (lambda: stroller.simulate(STROLLER, RIDE, 1.0), "stroller.runs.simulate", "_concrete"),
     "identify": (lambda: tippe.identify(TOP, TIMES, {"mu": 0.3}), "tippe.fit.identify", "unknowns_of"),
     "stroller identify": (

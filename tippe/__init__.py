@@ -20,9 +20,9 @@ from nonholonomic.sweeps import Table as Table
 from . import presets as presets
 from . import steady as steady
 from .fit.identify import identify as identify
+from .fit.identify import log_density as log_density
 from .fit.inversion_times import InversionTimes as InversionTimes
 from .fit.inversion_times import ReversalTimes as ReversalTimes
-from .fit.posterior import log_density as log_density
 from .fit.recording import Recording as Recording
 from .fit.recording import read_recording as read_recording
 from .model.convex import ConvexBody as ConvexBody
@@ -43,14 +43,14 @@ from .model.top import Stem as Stem
 from .model.top import Top as Top
 from .runs.extended_times import extended_inversion_time as extended_inversion_time
 from .runs.flight_trajectory import HybridTrajectory as HybridTrajectory
-from .runs.inversion_time import inversion_time as inversion_time
-from .runs.lyapunov import lyapunov_exponent as lyapunov_exponent
-from .runs.reversal import reversal_table as reversal_table
-from .runs.reversal import reversal_time as reversal_time
 from .runs.table import inversion_table as inversion_table
+from .runs.table import reversal_table as reversal_table
+from .runs.table import trajectory_table as trajectory_table
 from .runs.trajectory import Trajectory as Trajectory
-from .runs.trajectory_table import trajectory_table as trajectory_table
 from .runs.verbs import explore as explore
+from .runs.verbs import inversion_time as inversion_time
+from .runs.verbs import lyapunov_exponent as lyapunov_exponent
+from .runs.verbs import reversal_time as reversal_time
 from .runs.verbs import simulate as simulate
 
 # `import *` exports the names above, and not the subpackages.

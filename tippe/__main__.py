@@ -29,12 +29,11 @@ from .model.friction import Coulomb
 from .model.launch import Launch
 from .model.scene import Scene
 from .papers import tables as paper_tables
+from .runs.checks import INVERTED
 from .runs.explore import live_run, stage_at_start
 from .runs.model import TopModel
-from .runs.plot import Panel, draw_launches
+from .runs.plot import Panel, draw_launches, theta_over_time
 from .runs.table import inversion_table
-from .runs.theta_over_time import theta_over_time
-from .runs.turned_over import INVERTED
 
 TOPS = {top.__name__: top for top in (presets.wooden, presets.rutstam, presets.cohen, presets.leine_glocker)}
 

@@ -34,8 +34,10 @@ from .samples import Samples as Samples
 from .simulate import sampled as sampled
 from .simulate import simulate as simulate
 from .sweep import Options as Options
+from .sweep import check_cells as check_cells
 from .sweep import compute_table as compute_table
 from .sweep import full_sensitivities as full_sensitivities
+from .sweep import samples_of as samples_of
 from .sweep import sweep as sweep
 from .sweep import table_of as table_of
 from .table import TableForm as TableForm

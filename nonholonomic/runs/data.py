@@ -14,9 +14,8 @@ from ..identification import AbstractRecording, Measurements, Quantities, as_qua
 from ..integration import Settings
 from ..parameters import likely
 from ..validation import as_number, as_number_or_none, require, shown
-from .checks import require_event
 from .event_time import time_of_event
-from .model import AbstractModel, model_of
+from .model import AbstractModel, model_of, require_event
 from .simulate import sampled
 
 #: Quantities with a period of a whole turn.

@@ -17,9 +17,8 @@ from ..integration.checks import legal_run
 from ..integration.status import Status
 from ..progress import status_line
 from ..validation import as_number, is_traced, nan_unless, shown, warn
-from .checks import check_run, require_event
 from .ensemble import Ensemble, status_of, traced_leaves
-from .model import AbstractModel, model_of
+from .model import AbstractModel, check_run, model_of, require_event
 
 #: The statuses of runs without a result.
 SILENT = (Status.FAILED, Status.UNRESOLVED)

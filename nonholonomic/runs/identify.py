@@ -26,9 +26,8 @@ from ..integration.checks import tolerance_bound
 from ..integration.settings import MOST_STEPS
 from ..progress import status_line
 from ..validation import nan_unless
-from .checks import check_run
 from .data import EventTimes, Recording
-from .model import AbstractModel
+from .model import AbstractModel, check_run
 from .parameters import require_apart
 
 

@@ -16,9 +16,8 @@ from ..hybrid.saltation import VariationalMode, variational_start
 from ..integration import Outcome, Settings, explicit_tableau
 from ..integration.status import REACHED_END, RUNNING, Status
 from ..progress import status_line
-from .checks import check_run
 from .event import modes_of
-from .model import AbstractModel, model_of
+from .model import AbstractModel, check_run, model_of
 
 #: Number of time intervals with recorded growth; half of them give the exponent and its scatter.
 STRETCHES = 32

@@ -8,13 +8,15 @@ from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..hybrid import AbstractBatchedMode, HybridOutcome
 from ..integration import AbstractProblem, Outcome
+from ..integration.checks import run_bounds
 from ..parameters import numbers, with_numbers
 from ..sweeps import Axis, Quantity, Variable
-from ..validation import shown
+from ..validation import require_all, shown
 
 #: The names of the quantities that will be read, which choose the layout of the state; `None` for all quantities, with
 #: the path of the run.
@@ -234,3 +236,20 @@ def model_of(system: Any, start: Any, event: Any = None, input: Any = None) -> A
     raise ValueError(
         f"system = {shown(system)} must be a tippe.Scene, a stroller.Scene, a nonholonomic.Hybrid or an AbstractSystem"
     )
+
+
+def check_run(model: AbstractModel, t1: Any, tolerance: Any) -> None:
+    """Raise `ValueError` unless the model may run, and horizon and tolerance are single legal numbers."""
+    model.check()
+    require_all(run_bounds(t1, tolerance))
+    for name, number in {"t1": t1, "tolerance": tolerance}.items():
+        if np.ndim(number) != 0:
+            raise ValueError(f"{name} must be one number, not of shape {np.shape(number)}; jax.vmap or sweep runs many")
+
+
+def require_event(model: AbstractModel, purpose: str = "") -> None:
+    """Raise `ValueError` unless the model has an event."""
+    if not model.has_event:
+        raise ValueError(
+            f"{purpose}event = None: the system has no event of its own; pass event=, a function of time and state"
+        )

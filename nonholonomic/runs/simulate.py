@@ -16,9 +16,8 @@ from ..integration.checks import legal_run, require_times
 from ..integration.status import Status
 from ..progress import status_line
 from ..validation import as_known, as_number, is_traced, nan_unless, require_scalars
-from .checks import check_run
 from .event import problem_of
-from .model import AbstractModel, Names, model_of
+from .model import AbstractModel, Names, check_run, model_of
 from .samples import mode_at, modes_of_run, outcome_of
 from .trajectory import Trajectory
 

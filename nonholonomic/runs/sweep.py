@@ -13,10 +13,9 @@ from ..integration import Settings, explicit_tableau
 from ..integration.checks import require_times
 from ..integration.settings import DEFAULT_MAX_STEPS
 from ..parameters import likely
-from ..sweeps import Axis, Table, Variable, axis, chunk_for, size_of
+from ..sweeps import Axis, Quantity, Table, Variable, axis, cells_to_check, chunk_for, scattered_cells, size_of
 from ..validation import as_number, require_flag, require_outside, require_whole, shown
-from .checks import check_run, require_event
-from .model import AbstractModel, model_of
+from .model import AbstractModel, check_run, model_of, require_event
 from .samples import Samples
 from .table import ScatteredJob, TableForm, TableJob
 
@@ -127,7 +126,7 @@ def sweep(
         raise ValueError(f"crossing = {shown(crossing)} must be 'first', 'last' or 'both'")
     model = model_of(system, start, event, input)
     check_run(model, t1, tolerance)
-    samples = samples_of(model, times, quantities, t1)
+    samples = samples_of(model.quantities, times, quantities, t1)
     options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
     named = {model.full_name("axes", name): values for name, values in axes.items()}
     if len(named) < len(axes):
@@ -136,13 +135,12 @@ def sweep(
     return table_of(model, named, float(t1), crossing, options, TableForm(model.words), samples=samples, timed=timed)
 
 
-def samples_of(model: AbstractModel, times: Any, quantities: Any, t1: Any) -> Samples | None:
-    """The samples of a table, checked."""
+def samples_of(known: dict[str, Quantity], times: Any, quantities: Any, t1: Any) -> Samples | None:
+    """The samples of a table, checked. **Arguments:** `known`: the quantities of the model."""
     if times is None and not len(quantities):
         return None
     if times is None or isinstance(quantities, str) or not isinstance(quantities, Sequence) or not quantities:
         raise ValueError(f"quantities = {shown(quantities)} must be a list of names, with the times to sample them")
-    known = list(model.quantities)
     for name in quantities:
         if name not in known:
             raise ValueError(f"quantities: {shown(name)} must be one of {', '.join(known)}{likely(name, known)}")
@@ -164,73 +162,71 @@ def table_of(
     timed: bool = True,
 ) -> Table:
     """The table of a model. **Arguments:** `axes`: full name of a parameter -> values; the others as for `TableJob`."""
-    sensitivities = full_sensitivities(model, options.sensitivities)
-    if sensitivities:
-        require_event(model, "sensitivities are those of the event's time: ")
-        model.require_differentiable(False, crossing == "last")
-        if crossing == "both":
-            raise ValueError(
-                "crossing = 'both' must be 'first' or 'last' for sensitivities, which differentiate one time"
-            )
+    sensitivities = full_sensitivities(model, options.sensitivities, crossing)
     labels = model.label([*axes, *(name for name in sensitivities if name not in axes)])
     grid = [axis(labels[name][0], name, labels[name][1], values, labels[name][2]) for name, values in axes.items()]
     slopes = {name: f"time_by_{labels[name][0]}" for name in sensitivities}
     job = TableJob(model, form, t1, crossing, options.settings, slopes, options.errors, samples, timed)
-    variables = job.variables
-    for name, slope in slopes.items():
-        unit = labels[name][1]
-        unit = "s" if unit == "1" else f"s ({unit})-1"
-        variables |= {slope: Variable(unit, np.float64, long_name=f"{form.event} time by {name}")}
-    request = model.description() | {name: "an axis" for name in axes} | {"t1": t1}
-    if crossing != "first":
-        request |= {"crossing": crossing}
-    if samples is not None:
-        request |= {"quantities": list(samples.names)}
-    return compute_table(job, grid, variables, request | request_of(options, sensitivities), options)
+    check_cells(model, grid, options)
+    request = {"t1": t1} | ({} if crossing == "first" else {"crossing": crossing})
+    return compute_table(job, grid, {name: labels[name][1] for name in slopes}, request, options)
 
 
-def full_sensitivities(model: AbstractModel, names: Any) -> list[str]:
+def full_sensitivities(model: AbstractModel, names: Any, crossing: str) -> list[str]:
     """The full names of the parameters with respect to which to differentiate, checked."""
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"sensitivities = {shown(names)} must be a list of names, such as ['scene.friction.mu']")
     full_names = [model.full_name("sensitivities", name) for name in names]
     if len(set(full_names)) < len(full_names):
         raise ValueError(f"sensitivities = {shown(names)} must name every parameter only once")
+    if full_names:
+        require_event(model, "sensitivities are those of the event's time: ")
+        model.require_differentiable(False, crossing == "last")
+        if crossing == "both":
+            raise ValueError(
+                "crossing = 'both' must be 'first' or 'last' for sensitivities, which differentiate one time"
+            )
     return full_names
 
 
-def request_of(options: Options, sensitivities: list[str]) -> dict[str, Any]:
-    """The options as plain data. Requests of earlier versions lack those that were not set."""
-    request = {"tolerance": float(options.tolerance), "solver": type(options.settings.for_lanes).__name__}
-    if options.max_steps != DEFAULT_MAX_STEPS:
-        request |= {"max_steps": int(options.max_steps)}
-    if options.errors:
-        request |= {"errors": True}
-    if sensitivities:
-        request |= {"sensitivities": sensitivities}
-    return request
+def check_cells(model: AbstractModel, grid: list[Axis], options: Options) -> None:
+    """Raise `ValueError` unless the model may run in every cell of a grid."""
+    require_flag(options.errors, "errors")
+    require_flag(options.scattered, "scattered")
+    model.check_axes(grid, [scattered_cells(grid)] if options.scattered else cells_to_check(grid))
 
 
 def compute_table(
-    job: TableJob, grid: list[Axis], variables: dict[str, Variable], request: dict[str, Any], options: Options
+    job: TableJob, grid: list[Axis], units: dict[str, str], request: dict[str, Any], options: Options
 ) -> Table:
-    """Check the cells of a grid, and compute them."""
-    require_flag(options.errors, "errors")
-    require_flag(options.scattered, "scattered")
+    """Compute the cells of a grid, which were checked.
+
+    **Arguments:** `units`: the units of the parameters in `job.slopes`; `request`: the request of the table, without the
+    model, the samples and the options.
+    """
+    variables, slopes = job.variables, job.slopes or {}
+    for name, slope in slopes.items():
+        unit = "s" if units[name] == "1" else f"s ({units[name]})-1"
+        variables |= {slope: Variable(unit, np.float64, long_name=f"{job.form.event} time by {name}")}
+    request = job.model.description() | {axis.number: "an axis" for axis in grid} | request
+    integrator = job.settings.for_single_runs if job.by_diffrax else job.settings.for_lanes
+    request |= {"tolerance": float(options.tolerance), "solver": type(integrator).__name__}
+    # Requests of earlier versions, with which a table may resume, lack these unless they were set.
+    request |= {"max_steps": int(options.max_steps)} if options.max_steps != DEFAULT_MAX_STEPS else {}
+    request |= {"errors": True} if options.errors else {}
+    request |= {"sensitivities": list(slopes)} if slopes else {}
     work: Any = job
     if options.scattered:
-        columns = sweeps.scattered_cells(grid)
-        job.model.check_axes(grid, [columns])
+        columns = scattered_cells(grid)
         request |= {"cells": digest(columns)}
         variables = {axis.name: Variable(axis.unit, np.float64, long_name=axis.long_name) for axis in grid} | variables
         work = ScatteredJob(job, columns, {axis.number: axis.name for axis in grid})
         grid = [Axis("cell", "cell", "1", np.arange(len(grid[0].values)), "cell")]
-    else:
-        job.model.check_axes(grid, sweeps.cells_to_check(grid))
     cells, least = size_of(grid), job.model.least_chunk
     chunk = max(least, chunk_for(cells)) if least is not None and cells > 4 * least else None
     inner, most = [], None
     if job.samples is not None:
+        request |= {"quantities": list(job.samples.names)}
         inner = job.samples.inner(job.model)
         # A run has about a dozen components.
         most = max(16, 1 << (MOST_SAMPLED // (12 * len(job.samples.times))).bit_length() - 1)

@@ -1,5 +1,6 @@
 """One run of a user's system at given times."""
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from ..hybrid import hybrid_resets
 from ..integration import Settings
 from ..integration.status import Status
 from ..parameters import as_text, distinguishing_labels
@@ -18,7 +20,6 @@ from ..views import Page, Stage, Viewable, new_figure
 from .explore import explore_model
 from .model import AbstractModel
 from .portrait import portraits
-from .resets import resets_of, with_resets
 
 #: Why a run ended early, by its word.
 REASONS = {
@@ -96,7 +97,50 @@ class Trajectory(Viewable, Tabular, eqx.Module):
 
         **Raises:** `ValueError` inside transformations and for a batch of runs: `mode` and `switches` are there.
         """
-        return resets_of(self)
+        if not self._is_one_run:
+            raise ValueError(
+                "resets takes one run outside jit, vmap and grad; run.mode and run.switches work there too"
+            )
+        resets = []
+        if not self.model.smooth and int(self.switches):
+            modes, first, states = self.model.modes(1, self.settings.tolerance, None, False)
+            start = (modes, int(np.asarray(first)[0]), np.asarray(states)[:, 0])
+            changes = hybrid_resets(*start, float(self.t1), self.settings, counters=len(self.model.counters))
+            # The end of a mode without a reset is not counted.
+            resets = [pair for pair in changes if np.any(pair[1].counts > pair[0].counts)]
+        columns = {"time": np.array([after.end_time[0] for _, after in resets], float)}
+        for k, word in enumerate(("before", "after")):
+            columns[f"mode_{word}"] = np.array([pair[k].mode[0] for pair in resets], int)
+        for k, word in enumerate(("before", "after")):
+            model: Any = self.model
+            states = [model.components_of(jnp.asarray(pair[k].state[:, 0])) for pair in resets]
+            components = np.array(states, float).reshape(-1, len(self.names))
+            columns |= {f"{name}_{word}": components[:, part] for part, name in enumerate(self.names)}
+        return Table({"reset": np.arange(1, len(resets) + 1)}, columns, {"time": "s"}, {})
+
+    @property
+    def _is_one_run(self) -> bool:
+        """Whether this is a single run outside of transformations."""
+        return not is_traced(self.code) and np.ndim(self.code) == 0
+
+    def _with_resets(self) -> "Trajectory":
+        """The run with the states before and after each reset in addition, so that its lines do not cut corners; a batch,
+        and a run of one time, stay unchanged."""
+        if not self._is_one_run or len(self.t) < 2 or not int(self.switches):
+            return self
+        resets, t = self.resets, np.asarray(self.t)
+        is_within = (resets["time"] >= t[0]) & (resets["time"] <= t[-1])
+        times = np.repeat(resets["time"][is_within], 2)
+        places = np.searchsorted(t, times, side="right")
+
+        def added(before: str, after: str) -> np.ndarray:
+            return np.stack([resets[before][is_within], resets[after][is_within]], axis=-1).reshape(-1)
+
+        states = np.stack([added(f"{name}_before", f"{name}_after") for name in self.names], axis=-1)
+        t, state, mode = np.insert(t, places, times), np.asarray(self.state), np.asarray(self.mode)
+        state = np.insert(state, places, states, axis=0)
+        mode = np.insert(mode, places, added("mode_before", "mode_after"))
+        return dataclasses.replace(self, t=t, state=state, mode=mode)
 
     def to_table(self) -> Table:
         """The run as a `Table` over its times.
@@ -122,7 +166,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
 
         **Raises:** `ValueError` for times outside the run, and for a batch of runs.
         """
-        if is_traced(self.code) or np.ndim(self.code):
+        if not self._is_one_run:
             raise ValueError("at takes one run outside jit, vmap and grad: pass times= to simulate there")
         require(times, "times", at_least=0.0, at_most=self.end_time, why="the run ends there")
         times = np.atleast_1d(np.asarray(times, dtype=float))
@@ -130,11 +174,11 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         return self.model.simulate(self.t1, times, self.settings.tolerance, self.settings.solver, None)
 
     def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
-        return portraits([with_resets(run) for run in (self, *others)], overlaid)
+        return portraits([run._with_resets() for run in (self, *others)], overlaid)
 
     def table_of(self, names: Sequence[str]) -> Table:
         """The table that pictures draw, with the states before and after each reset."""
-        return with_resets(self).to_table()
+        return self._with_resets().to_table()
 
     def explore(self, path: Any = None, sliders: dict[str, tuple[float, float]] | None = None) -> Page:
         """A page with sliders that simulates the run in the browser; see `nonholonomic.explore`."""
@@ -152,10 +196,10 @@ class Trajectory(Viewable, Tabular, eqx.Module):
     def overview(self, runs: list[Any], labels: Sequence[str], unit: Any, ax: Any) -> Any:
         """Draw all components of a run in one picture, or a panel for each component of several runs."""
         if len(runs) > 1 or unit is not None:
-            return Tabular.overview(self, [with_resets(run) for run in runs], labels, unit, ax)
+            return Tabular.overview(self, [run._with_resets() for run in runs], labels, unit, ax)
         figure = new_figure()
         axes: Any = figure.add_subplot() if ax is None else ax
-        drawn = with_resets(self)
+        drawn = self._with_resets()
         for name, component in zip(self.names, np.asarray(drawn.state).T, strict=True):
             axes.plot(np.asarray(drawn.t), component, label=name)
         axes.set_xlabel("time [s]")

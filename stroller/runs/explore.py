@@ -31,7 +31,7 @@ from ..model.launch import Launch
 from ..model.ride import RideProblem, as_module
 from ..model.scene import DRIVES, Scene
 from .model import LONG_NAMES, UNITS, RideModel
-from .state import RideState
+from .quantities import RideState
 from .trajectory import Trajectory
 from .view import RADIUS, TRACK
 

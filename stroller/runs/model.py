@@ -37,9 +37,8 @@ from ..model.per_ride import PerRide
 from ..model.ride import RideProblem, as_module, has_arrays
 from ..model.scene import Scene
 from ..model.stroller import Stroller
-from .quantities import QUANTITIES, VECTORS
+from .quantities import QUANTITIES, TIMED, VECTORS, RideState
 from .simulate import DEFAULT_STEPS, ride
-from .state import TIMED, RideState
 from .trajectory import Trajectory
 
 #: Names of the coordinates of a place in the fixed frame.

@@ -18,8 +18,7 @@ from nonholonomic.validation import as_known, is_traced, nan_unless
 
 from ..model.dynamics import State
 from .checks import check_options
-from .ride import Ride, RideSpec, Stats, stats_of
-from .steps import followed
+from .steps import Ride, RideSpec, Stats, followed, stats_of
 from .trajectory import Trajectory, read_off, read_off_compiled
 
 #: Default number of times to report, and default limit of the steps of a ride.

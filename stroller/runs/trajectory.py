@@ -16,11 +16,8 @@ from nonholonomic.views import Stage, Viewable
 
 from ..model.dynamics import Power
 from ..model.ride import CONTACT_ROUND_OFF, RANK_LOST
-from .crossings import crossings, watched
-from .quantities import QUANTITIES, table_of_one
-from .ride import MOST_GRIP, RideSpec, Stats
-from .state import RideState, grip, spread
-from .steps import Steps, followed
+from .quantities import MOST_GRIP, QUANTITIES, RideState, grip, spread, table_of_one
+from .steps import RideSpec, Stats, Steps, crossings, followed, watched
 from .view import as_stages, names_of
 
 

@@ -27,7 +27,7 @@ from nonholonomic.views import (
 )
 
 from ..model.scene import DRIVES
-from .ride import MOST_GRIP
+from .quantities import MOST_GRIP
 
 #: Drawn lengths in units of the wheelbase, the only length of the model: radius and width of the wheels, and the track.
 RADIUS, WIDTH, TRACK = 0.2, 0.07, 0.8

@@ -15,7 +15,7 @@ from tippe import __main__ as job
 from tippe.__main__ import main
 from tippe.papers.tables import drawn, parser
 from tippe.runs.observables import INVERTED
-from tippe.runs.theta_over_time import theta_over_time
+from tippe.runs.plot import theta_over_time
 
 SMALL = ["--paper", "--theta", "0.1", "0.3", "--eta", "0", "--t1", "12", "--tolerance", "1e-7"]
 

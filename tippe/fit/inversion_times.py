@@ -17,11 +17,10 @@ from nonholonomic.validation import as_number, as_number_or_none, require, requi
 
 from ..model.launch import Launch, as_launch
 from ..model.scene import Scene
-from ..runs.checks import check_event, check_reversible
+from ..runs.checks import angle_of, check_event, check_reversible, event_of, require_rigid
 from ..runs.extended_times import beyond_horizon, extended_inversion_time
 from ..runs.model import INVERSIONS, REVERSALS, TopModel
-from ..runs.reversal import require_rigid, reversal_time
-from ..runs.turned_over import angle_of, event_of
+from ..runs.verbs import reversal_time
 
 #: Parameters by name, one value per row.
 Values = dict[str, Float[Array, " rows"]]

@@ -1,4 +1,4 @@
-"""Checks of the arguments of a run, before anything compiles, and of traced arguments inside a program."""
+"""The events of a top, and checks of the arguments of a run, before anything compiles and inside a program."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -11,7 +11,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from nonholonomic.integration.checks import legal_run, require_run
-from nonholonomic.validation import IN_DEGREES, Bound, all_bounds, is_traced, legal, nan_unless, require, shown, warn
+from nonholonomic.validation import (
+    IN_DEGREES,
+    Bound,
+    all_bounds,
+    as_number,
+    is_traced,
+    legal,
+    nan_unless,
+    require,
+    shown,
+    warn,
+)
 from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.friction import Frictionless
@@ -19,7 +30,29 @@ from ..model.launch import Launch
 from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
 from ..modes.inversion_problem import StemContact
-from .turned_over import angle_of
+
+#: The inclination [rad] at which a body without a stem counts as turned over.
+INVERTED = 0.95 * math.pi
+
+
+def event_of(scene: Scene[Any], angle: Any) -> Float[Array, "..."] | StemContact:
+    """The event of a run: theta reaches the angle [rad]; or, without an angle, the top has turned over.
+
+    A top with a stem has turned over when its stem first carries it: when the stem bears a force or, as it lands, an
+    impulse. In flight nothing carries the top, whatever theta. No angle defines this event, because after a hop the stem
+    lands at a larger theta, and in a curved arena `Top.stem_angle` is not exactly the angle of the contact.
+    """
+    if angle is None and scene.has_stem:
+        return StemContact()
+    return as_number(INVERTED if angle is None else angle)
+
+
+def angle_of(scene: Scene[Any], angle: Any) -> Float[Array, "..."]:
+    """The angle [rad] itself; or, without an angle, the inclination beyond which the top has turned over on a level
+    plane."""
+    if angle is None and scene.has_stem:
+        return scene.body.stem_angle
+    return as_number(INVERTED if angle is None else angle)
 
 
 @eqx.filter_jit
@@ -69,7 +102,7 @@ def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, angle: An
     """Warn if the scene has no friction, or if the top stands exactly upright on a level plane or is inverted already.
 
     **Arguments:** `launch`: its theta is ignored; `theta`: one angle or several [rad]; `angle`: the angle to be
-    reached, or `None` (`turned_over.py`).
+    reached, or `None` (see `event_of`).
     """
     if isinstance(scene.friction, Frictionless):
         warn(
@@ -136,3 +169,13 @@ def check_event(angle: Any, crossing: Any, known: tuple[str, ...] = ("first", "l
         raise ValueError(f"angle must be one number, not of shape {np.shape(angle)}")
     if crossing not in known:
         raise ValueError(f"crossing = {shown(crossing)} must be {' or '.join(map(repr, known))}")
+
+
+def require_rigid(scene: Scene) -> None:
+    """Raise `ValueError` unless the body can reverse its spin."""
+    if not isinstance(scene.body, AbstractRigidBody):
+        kind = type(scene.body).__name__
+        raise ValueError(
+            f"body = {kind} must be an Ellipsoid or a RigidBody for times of reversal: a body of revolution keeps its "
+            "sense of rotation"
+        )

@@ -38,12 +38,11 @@ from ..model.top import Top
 from ..modes.inversion_problem import InversionProblem
 from ..modes.sliding import Slide
 from ..modes.trajectory_problem import TrajectoryProblem, trajectory_problem
-from .checks import check_reversible, check_run
+from .checks import check_reversible, check_run, event_of
 from .launches import LONG_NAMES, UNITS
 from .model import TopModel
 from .quantities import OF_RIGID_BODIES, QUANTITIES
 from .trajectory import Trajectory, parts_of
-from .turned_over import event_of
 from .view import AXIS, DrawnMotion, curve_of_rotation, show
 from .view import motion as drawn_motion
 

@@ -26,8 +26,8 @@ from ..modes.inversion_problem import InversionProblem
 from ..modes.leaning import BOTH
 from ..modes.sliding import MOST_BOUNCES, modes
 from ..modes.trajectory_problem import trajectory_problem
-from .energy import why_unbalanced
 from .observables import AbstractTrajectory, of_each_run
+from .run_kind import why_unbalanced
 
 
 class HybridTrajectory(AbstractTrajectory):

@@ -1,14 +1,14 @@
 """Build and check the grid of launches and scenes of a table."""
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import numpy as np
 
 from nonholonomic.integration.checks import require_run
-from nonholonomic.parameters import description, full_axes, numbers, with_numbers
-from nonholonomic.sweeps import Axis, axis, cells_to_check, scattered_cells
+from nonholonomic.parameters import full_axes, numbers, with_numbers
+from nonholonomic.sweeps import Axis, axis
 from nonholonomic.validation import require_kind, shown
 
 from ..model.launch import Launch
@@ -59,16 +59,38 @@ def variable_numbers(scene: Scene) -> list[str]:
     return [name for name in names if name != "scene.restitution" or scene.contact == "hybrid"]
 
 
+def labels(
+    scene: Scene, launch: Launch, names: Iterable[str], taken: Collection[str]
+) -> dict[str, tuple[str, str, str]]:
+    """For each full name of a parameter the name of an axis, its unit, and a description. The name of the axis is the last
+    part of the full name, or the full name if another of the `names` has the same last part or if it is `taken`."""
+    coordinates = list(scene.surface.coordinates)
+    if "launch.place[2]" in numbers("launch", launch) and len(coordinates) == 2:
+        coordinates = [("x", "m"), ("y", "m"), ("z", "m")]
+    components = {
+        f"launch.{name}[{k}]": label
+        for name, parts in {"place": coordinates, **SEVERAL}.items()
+        for k, label in enumerate(parts)
+    }
+    units = UNITS | scene.body.units | scene.friction.units
+    shorts = {name: name.rsplit(".", 1)[-1] for name in names}
+    shorts |= {name: label for name, (label, _) in components.items() if name in shorts}
+    # `place` replaces the argument `eta`.
+    counts = Counter(short for name, short in shorts.items() if name != "launch.eta" or launch.place is None)
+    return {
+        name: (
+            short if counts[short] == 1 and short not in taken else name,
+            components[name][1] if name in components else units.get(short, "1"),
+            LONG_NAMES.get(short, short),
+        )
+        for name, short in shorts.items()
+    }
+
+
 def launches(
-    scene: Any,
-    launch_values: dict[str, Any],
-    axes: Any,
-    t1: Any,
-    tolerance: Any,
-    taken: Collection[str] = (),
-    scattered: bool = False,
-) -> tuple[dict[str, Any], list[Axis], dict[str, str]]:
-    """The scene and launch that all cells share, and the axes of the grid; checks the cells before anything compiles.
+    scene: Any, launch_values: dict[str, Any], axes: Any, t1: Any, tolerance: Any, taken: Collection[str] = ()
+) -> tuple[dict[str, Any], list[Axis]]:
+    """The scene and launch that all cells share, and the axes of the grid.
 
     **Arguments:**
 
@@ -78,12 +100,10 @@ def launches(
     - `axes`: full name of a parameter, or its unambiguous end -> values, or `None`; the numbers of a launch's vectors
       are `"launch.place[0]"` and so on; omitted numbers are 0.
     - `t1`, `tolerance`: as for `inversion_table`.
-    - `taken`: names that no axis may have. An axis gets its full name if its short name is taken or not unique.
-    - `scattered`: whether the lists have equal length and are combined element by element: the k-th cell has the k-th
-      element of each list.
+    - `taken`: names that no axis may have, as for `labels`.
 
     **Returns:** a dictionary with "scene" and "launch", in which only the numbers that are not axes have their values,
-    for `with_numbers`; the axes, the last varying fastest; and the units of numbers by their short names.
+    for `with_numbers`; and the axes, the last varying fastest.
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis.
     """
@@ -100,43 +120,23 @@ def launches(
             raise ValueError(f"axes: {number!r} has its own argument")
     values |= axes
     scalars = {number: value for number, value in values.items() if np.ndim(value) == 0}
-    launch, axes_of_lists = _with_room(scene, values)
-    units = UNITS | scene.body.units | scene.friction.units | dict(axes_of_lists.values())
-    names = {number: axes_of_lists.get(number, (number.rsplit(".", 1)[-1],))[0] for number in values}
-    # `place` replaces the argument `eta`.
-    counts = Counter(name for number, name in names.items() if number != "launch.eta" or launch.place is None)
+    launch = _with_room(scene, values)
+    names = labels(scene, launch, values, taken)
     grid = []
-    for number, name in names.items():
+    for number, (name, unit, long_name) in names.items():
         if number not in scalars:
-            is_unique = counts[name] == 1 and name not in taken
-            unit, long_name = units.get(name, "1"), LONG_NAMES.get(name, name)
-            grid.append(axis(name if is_unique else number, number, unit, values[number], long_name))
+            grid.append(axis(name, number, unit, values[number], long_name))
     roots = with_numbers({"scene": scene, "launch": launch}, scalars)
     # The numbers of axes are 0 here, which may not be a place on the arena; starts are checked cell by cell.
     require_run(roots["scene"], roots["launch"], t1, tolerance, (Scene, Launch), LISTS)
-    # The modules check their numbers, which may be illegal only in combination.
-    for cells in [scattered_cells(grid)] if scattered else cells_to_check(grid):
-        looked_at = with_numbers(roots, cells)
-        looked_at["scene"].check_start(looked_at["launch"])
-    return roots, grid, units
+    return roots, grid
 
 
-def _with_room(scene: Scene, values: Collection[str]) -> tuple[Launch, dict[str, tuple[str, str]]]:
-    """A launch with entries for all given numbers, and the name and unit of each number of a vector."""
-    components: dict[str, tuple[str, str]] = {}
-    parts: dict[str, Any] = {}
-    coordinates = list(scene.surface.coordinates)
-    if "launch.place[2]" in values and len(coordinates) == 2:
-        coordinates = [("x", "m"), ("y", "m"), ("z", "m")]
-    for name, labels in {"place": coordinates, **SEVERAL}.items():
-        labelled = {f"launch.{name}[{k}]": label for k, label in enumerate(labels)}
-        if not labelled.keys().isdisjoint(values):
-            parts[name] = (0.0,) * len(labels)
-            components |= labelled
-    return Launch(theta=0.0, spin=0.0, **parts), components
-
-
-def described(roots: dict[str, Any], grid: list[Axis]) -> dict[str, Any]:
-    """The request for a scene and launch as plain data, without the values of axes."""
-    texts = {path: value for name, root in roots.items() for path, value in description(name, root).items()}
-    return texts | {grid_axis.number: "an axis" for grid_axis in grid}
+def _with_room(scene: Scene, values: Collection[str]) -> Launch:
+    """A launch with entries for all given numbers."""
+    sizes = {name: len(parts) for name, parts in SEVERAL.items()}
+    sizes["place"] = 3 if "launch.place[2]" in values else len(scene.surface.coordinates)
+    parts = {
+        name: (0.0,) * size for name, size in sizes.items() if any(f"launch.{name}[{k}]" in values for k in range(size))
+    }
+    return Launch(theta=0.0, spin=0.0, **parts)

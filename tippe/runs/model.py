@@ -38,15 +38,13 @@ from ..modes.inversion_problem import InversionProblem, StemContact
 from ..modes.sticking import contact_modes
 from ..modes.trajectory_problem import BEHIND_PATH, TrajectoryProblem, trajectory_problem
 from .airborne_trajectory import ArenaTrajectory, StickSlipArenaTrajectory, arena_modes
-from .checks import check_last_on_stem, event_bounds
-from .energy import has_grown
+from .checks import INVERTED, check_last_on_stem, event_bounds, event_of
 from .flight_trajectory import HybridTrajectory, level_modes
-from .launches import LONG_NAMES, NUMBERS_OF_A_LAUNCH, SEVERAL, UNITS, variable_numbers
+from .launches import NUMBERS_OF_A_LAUNCH, labels, variable_numbers
 from .quantities import COMPONENTS, DIRECTION, ON_CURVED, PASSIVE, PATH, quantities_of
-from .run_kind import COUNTED, HYBRID, RunKind, run_kind_of
+from .run_kind import COUNTED, HYBRID, RunKind, has_grown, run_kind_of
 from .simulate import simulate_launch
 from .trajectory import Trajectory, parts_of
-from .turned_over import INVERTED, event_of
 
 #: The words of tables, in the order of the integers in their files, which is older than `Status`.
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit", "unresolved")
@@ -139,22 +137,8 @@ class TopModel(AbstractSceneModel):
         return [*variable_numbers(self.scene), *(name for name in NUMBERS_OF_A_LAUNCH if name in present)]
 
     def label(self, names: list[str]) -> dict[str, tuple[str, str, str]]:
-        coordinates = list(self.scene.surface.coordinates)
-        if "launch.place[2]" in numbers("launch", self.launch) and len(coordinates) == 2:
-            coordinates = [("x", "m"), ("y", "m"), ("z", "m")]
-        of_vectors = {
-            f"launch.{name}[{k}]": label
-            for name, labels in {"place": coordinates, **SEVERAL}.items()
-            for k, label in enumerate(labels)
-        }
-        units = UNITS | self.scene.body.units | self.scene.friction.units | dict(of_vectors.values())
-        shorts = {name: of_vectors.get(name, (name.rsplit(".", 1)[-1],))[0] for name in names}
         taken = (*self.quantities, "time", "status", "end_time", *self.ends, *self.counters, "steps", "rejected")
-        labels = {}
-        for name, short in shorts.items():
-            is_unique = list(shorts.values()).count(short) == 1 and short not in taken
-            labels[name] = (short if is_unique else name, units.get(short, "1"), LONG_NAMES.get(short, short))
-        return labels
+        return labels(self.scene, self.launch, names, taken)
 
     def description(self) -> dict[str, Any]:
         request = {path: value for name, root in self.roots.items() for path, value in description(name, root).items()}

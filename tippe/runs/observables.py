@@ -28,8 +28,8 @@ from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
 from ..model.top import Top
 from ..steady import group
+from .checks import INVERTED
 from .quantities import QUANTITIES, table_of
-from .turned_over import INVERTED
 from .view import as_stages, names_of
 
 #: Distance from the angle [rad] within which a step is checked in parts, and the number of parts.

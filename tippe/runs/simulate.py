@@ -19,8 +19,8 @@ from nonholonomic.validation import as_number, is_traced, nan_unless, shown
 from nonholonomic.xla_cpu import on_device
 
 from ..modes.airborne import FLYING
-from .energy import if_balanced
 from .flight_trajectory import HybridTrajectory
+from .run_kind import if_balanced
 from .trajectory import Trajectory, parts_of
 
 

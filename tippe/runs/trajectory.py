@@ -13,8 +13,8 @@ from nonholonomic.xla_cpu import on_device
 
 from ..model.friction import length
 from ..model.scene import Scene
-from .energy import why_unbalanced
 from .observables import AbstractTrajectory, of_each_run
+from .run_kind import why_unbalanced
 
 
 class Trajectory(AbstractTrajectory):

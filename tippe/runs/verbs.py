@@ -1,20 +1,28 @@
-"""`simulate` and `explore` of tops, on the functions of `nonholonomic.runs`."""
+"""The functions for single launches, on those of `nonholonomic.runs`."""
 
 from typing import Any
 
 import diffrax
-from jaxtyping import Array, Float
+import jax
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
 
+from nonholonomic.integration import Settings, explicit_tableau
+from nonholonomic.integration.checks import tolerance_bound
 from nonholonomic.progress import status_line
-from nonholonomic.runs import explore_model
+from nonholonomic.runs import LyapunovExponent, TableJob, explore_model, exponent_of_model, time_of_event
+from nonholonomic.validation import is_traced, require, require_kind, warn
 from nonholonomic.views import Page
 
 from ..model.launch import Launch
 from ..model.scene import Scene
-from .checks import check_run
+from ..modes.inversion_problem import StemContact
+from .checks import check_event, check_reversible, check_run, event_of, require_rigid, warn_if_it_cannot_invert
 from .explore import TOLERANCE
 from .flight_trajectory import HybridTrajectory
-from .model import TopModel
+from .model import INVERSIONS, REVERSALS, TopModel
+from .run_kind import why_unresolved
+from .table import too_many_steps
 from .trajectory import Trajectory
 
 
@@ -115,3 +123,198 @@ def explore(
     """
     check_run(scene, launch, t1, TOLERANCE)
     return explore_model(TopModel(scene=scene, launch=launch), path, sliders, float(t1))
+
+
+@status_line("simulating")
+def inversion_time(
+    scene: Scene,
+    launch: Launch,
+    t1: float,
+    angle: Float[ArrayLike, ""] | None = None,
+    tolerance: float = 1e-9,
+    crossing: str = "first",
+    solver: diffrax.AbstractERK | None = None,
+) -> Float[Array, ""]:
+    """Time at which the top has turned over; works under `jit`, `vmap`, `grad`, `jvp` and their compositions.
+
+    The derivative comes from the implicit function theorem at the event; it is 0 if the result is infinite. Together
+    with derivatives, a time costs two to three times as much for one parameter, four times for two, and six to eight
+    times for more (`nonholonomic/derivatives/slopes.py`). Second derivatives use forward mode.
+
+    **Arguments:**
+
+    - `scene`, `launch`: as for `simulate`; all numbers must be scalars.
+    - `t1`: horizon [s], positive.
+    - `angle`: angle [rad] that theta reaches, in (0, pi]. By default, a top with a stem has turned over when the stem
+      first carries it, and any other body when theta reaches 0.95 pi.
+    - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
+    - `crossing`: "first" for the first time theta reaches the angle, "last" for the crossing after which theta stays
+      above the angle until `t1`; for the contact of a stem, the time after which the sphere does not touch until `t1`.
+    - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
+      `nonholonomic.integration.Oscillatory8()`.
+
+    **Returns:** the time [s]; infinite if the top has not inverted by `t1`, or loses contact or jams before; NaN
+    if the integration failed, if the run is unresolved, or if numbers inside a transformation are out of range.
+
+    With `contact="hybrid"` and `SetValuedCoulomb`, first derivatives include flights, impacts, stick and slip
+    (`nonholonomic/hybrid/saltation.py`). If an earlier event is grazing (within the tolerance, it may not happen), the
+    derivative is NaN; the variable `grazes` of `inversion_table` reports this.
+
+    **Raises:** `ValueError` for arguments outside these ranges, for a run that needs more than 2 000 000 steps, for
+    second derivatives through changes of mode, and for derivatives of the last contact of a stem.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> time = tippe.inversion_time(scene, tippe.Launch(0.1, 155.0), t1=8.0, tolerance=1e-6)
+    >>> print(f"{time:.2f} s")
+    5.97 s
+
+    ```
+    """
+    check_run(scene, launch, t1, tolerance)
+    check_event(angle, crossing)
+    settings = Settings(tolerance, solver)
+    explicit_tableau(settings.for_lanes)
+    warn_if_it_cannot_invert(scene, launch, launch.theta, angle)
+    return first_or_last_time(scene, launch, t1, event_of(scene, angle), crossing, settings)
+
+
+@status_line("simulating")
+def reversal_time(
+    scene: Scene,
+    launch: Launch,
+    t1: float | Float[Array, ""],
+    tolerance: float | Float[Array, ""] = 1e-9,
+    solver: diffrax.AbstractERK | None = None,
+) -> Float[Array, ""]:
+    """Time at which the spin about the arena's normal first vanishes; works under `jit`, `vmap`, `grad`, `jvp` and their
+    compositions.
+
+    Derivatives with respect to every number of the body, its inertia, the friction law and the launch use the implicit
+    function theorem at the event; they are 0 if the result is infinite.
+
+    **Arguments:**
+
+    - `scene`, `launch`: as for `simulate`, every number a scalar; the body is an `Ellipsoid` or a `RigidBody`, and the spin is
+      not zero.
+    - `t1`: horizon [s], positive.
+    - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
+    - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
+      `nonholonomic.integration.Oscillatory8()`.
+
+    **Returns:** the time [s]; infinite if the spin has not reversed by `t1`, or the contact was lost before; NaN if the
+    integration failed, or if numbers inside a transformation are out of range.
+
+    **Raises:** `ValueError` for arguments outside these ranges, for another body, and for a run that needs more than 2 000 000
+    steps.
+
+    **Example:** the rattleback of `Ellipsoid`.
+
+    ```
+    >>> import tippe
+    >>> inertia = [[2e-4, -2e-5, 0.0], [-2e-5, 1.6e-3, 0.0], [0.0, 0.0, 1.7e-3]]
+    >>> body = tippe.Ellipsoid(1.0, (0.2, 0.03, 0.02), (0.0, 0.0, -0.01), inertia)
+    >>> scene = tippe.Scene(body, friction=tippe.NoSlip())
+    >>> print(f"{tippe.reversal_time(scene, tippe.Launch(0.02, spin=-5.0), t1=5.0, tolerance=1e-6):.2f} s")
+    2.61 s
+
+    ```
+    """
+    check_run(scene, launch, t1, tolerance, "reversal_table takes lists, and jax.vmap maps over them")
+    require_rigid(scene)
+    check_reversible(launch, {})
+    settings = Settings(tolerance, solver)
+    explicit_tableau(settings.for_lanes)
+    return first_or_last_time(scene, launch, t1, None, "first", settings)
+
+
+def first_or_last_time(
+    scene: Scene,
+    launch: Launch,
+    t1: float | Float[Array, ""],
+    angle: Float[Array, ""] | StemContact | None,
+    crossing: str,
+    settings: Settings,
+) -> Float[Array, ""]:
+    """The time at which theta reaches an angle, or at which the stem carries the top, or, without an angle, at which the
+    spin about the normal reverses.
+
+    **Arguments:** as for `inversion_time`, checked.
+    """
+    model = TopModel.timed(scene, launch, angle)
+    time = time_of_event(model, t1, settings, crossing == "last")
+    if not any(is_traced(leaf) for leaf in jax.tree.leaves((model, t1, time, settings))) and np.isnan(time):
+        explain_failure(model, float(t1), crossing, settings)
+    return time
+
+
+def explain_failure(model: TopModel, t1: float, crossing: str, settings: Settings) -> None:
+    """Raise `ValueError` for a run that needed too many steps; warn of any other failure. This repeats the run to find
+    the cause.
+
+    **Arguments:** as for `inversion_time`.
+    """
+    form = REVERSALS if model.reverses else INVERSIONS
+    cell = {name: values[0] for name, values in TableJob(model, form, t1, crossing, settings)({}, 1).items()}
+    word = form.words[cell["status"]]
+    if word == "failed" and cell["steps"] >= settings.max_steps:
+        raise ValueError(too_many_steps(t1, settings.max_steps, cell["end_time"]))
+    reason = f": {why_unresolved(model.kind)}" if word == "unresolved" else ""
+    end = f"at {cell['end_time']:.6g} s, at {cell['end_theta']:.6g} rad"
+    warn(f"the {form.event} time is NaN: the run ended as {word!r} {end}{reason}")
+
+
+@status_line("simulating")
+def lyapunov_exponent(
+    scene: Scene,
+    launch: Launch,
+    t1: float,
+    tolerance: float = 1e-9,
+    solver: diffrax.AbstractERK | None = None,
+) -> LyapunovExponent:
+    """The largest Lyapunov exponent of one launch or of many at once, by the variational equation.
+
+    The exponent is positive if nearby launches diverge exponentially. While a top rises, the exponent is the rate of
+    the rise; in chaotic motion, the exponent stays positive as `t1` grows. Source: Benettin et al., Meccanica 15 (1980)
+    9; see `nonholonomic/derivatives/lyapunov.py`. Tangents pass
+    through flights, impacts, stick and slip by the saltation matrix.
+
+    **Arguments:**
+
+    - `scene`, `launch`: each number is a scalar or an array with one number per launch, (n,).
+    - `t1`: time [s] to follow the motion, positive.
+    - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
+    - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
+      `nonholonomic.integration.Oscillatory8()`.
+
+    **Returns:** a `LyapunovExponent`, its arrays of shape () or (n,).
+
+    **Raises:** `ValueError` for arguments outside these ranges.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> found = tippe.lyapunov_exponent(scene, tippe.Launch(1e-3, [155.0, 120.0]), t1=4.0, tolerance=1e-6)
+    >>> print(found.exponent.round(1))  # 1/s, while the top rises
+    [1.2 1.2]
+
+    ```
+    """
+    require_kind(scene, "scene", Scene)
+    require_kind(launch, "launch", Launch)
+    require(t1, "t1", above=0.0)
+    tolerance_bound(tolerance).require()
+    settings = Settings(tolerance, solver)
+    explicit_tableau(settings.for_lanes)
+    shapes = {np.shape(leaf) for leaf in jax.tree.leaves((scene, launch))} - {()}
+    if len(shapes) > 1 or any(len(shape) > 1 for shape in shapes):
+        raise ValueError(f"scene and launch must hold scalars or one number per launch, not arrays of shapes {shapes}")
+    model = TopModel(scene=scene, launch=launch).without_event()
+    return exponent_of_model(model, float(t1), settings, shapes.pop() if shapes else ())

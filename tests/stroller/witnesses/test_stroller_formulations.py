@@ -10,7 +10,7 @@ import pytest
 import stroller
 from nonholonomic.formulations import ConstrainedConnection, Hamel, Multipliers, ReducedBracket
 from stroller import Damping, Frictionless, Launch, Plane, RollingResistance, Scene, Spheroid, Stroller
-from stroller.runs.state import side_force
+from stroller.runs.quantities import side_force
 from stroller.witnesses.charts import Chart, coordinates, coordinates_and_rates
 
 FORMULATIONS = (Multipliers, Hamel, ConstrainedConnection, ReducedBracket)
