@@ -30,7 +30,7 @@ from .model.launch import Launch
 from .model.scene import Scene
 from .papers import tables as paper_tables
 from .runs.checks import INVERTED
-from .runs.explore import live_run, stage_at_start
+from .runs.explore import page_of_launch, stage_at_start
 from .runs.model import TopModel
 from .runs.plot import Panel, draw_launches, theta_over_time
 from .runs.table import inversion_table
@@ -164,7 +164,7 @@ def sliders(options: argparse.Namespace) -> str:
     """The page of the top with sliders, with a placeholder for the contents below."""
     model = TopModel(scene=scene(options, "plane"), launch=launch_shown(options))
     t1 = min(SHOWN, options.t1)
-    return live_page(live_run(model, None, t1)._replace(title=TITLE), stage_at_start(model, t1), 0.2, BELOW).html
+    return live_page(page_of_launch(model, None, t1)._replace(title=TITLE), stage_at_start(model, t1), 0.2, BELOW).html
 
 
 def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str, Table], Any, str]:

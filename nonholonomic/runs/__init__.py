@@ -12,11 +12,16 @@ from .data import predicted_columns as predicted_columns
 from .ensemble import Ensemble as Ensemble
 from .event import EventFunction as EventFunction
 from .event import with_event as with_event
+from .event_time import EventTime as EventTime
 from .event_time import event_time as event_time
 from .event_time import time_of_event as time_of_event
+from .explore import TOLERANCE as TOLERANCE
 from .explore import explore as explore
 from .explore import explore_model as explore_model
+from .explore import live_run as live_run
 from .explore import page_of as page_of
+from .explore import runs_at_ends as runs_at_ends
+from .explore import sliders_of as sliders_of
 from .identify import fit_runs as fit_runs
 from .identify import identify as identify
 from .identify import log_density as log_density

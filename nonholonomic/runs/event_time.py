@@ -130,15 +130,7 @@ def time_of_event(
     **Arguments:** as for `event_time`, checked; `last`: whether the last crossing counts; `unchecked`: whether nothing has
     checked the numbers, by default if some are traced.
     """
-    unchecked = traced_leaves((model, t1, settings.tolerance)) if unchecked is None else unchecked
-    t1 = as_number(t1)
-    arrays, rest = eqx.partition(model, eqx.is_array)
-    leaves, structure = jax.tree.flatten(arrays)
-    is_float = tuple(eqx.is_inexact_array(leaf) for leaf in leaves)
-    floats = [leaf for leaf in leaves if eqx.is_inexact_array(leaf)]
-    others = [leaf for leaf in leaves if not eqx.is_inexact_array(leaf)]
-    solve = EventTime(len(floats), structure, is_float, rest, settings.with_tolerance(None), last, unchecked)
-    return differentiable_solve(solve, *floats, *others, t1, settings.tolerance)
+    return differentiable_solve(*EventTime.of(model, t1, settings, last, unchecked))
 
 
 # Compile the whole, so that further calls with the same functions need no tracing.
@@ -162,24 +154,38 @@ class EventTime(AbstractDifferentiableSolve):
     last: bool = eqx.field(static=True)
     unchecked: bool = eqx.field(static=True)
 
+    @classmethod
+    def of(
+        cls, model: AbstractModel, t1: Any, settings: Settings, last: bool, unchecked: bool | None = None
+    ) -> tuple[Any, ...]:
+        """The solve and its leaves. **Arguments:** as for `time_of_event`."""
+        unchecked = traced_leaves((model, t1, settings.tolerance)) if unchecked is None else unchecked
+        arrays, rest = eqx.partition(model, eqx.is_array)
+        leaves, structure = jax.tree.flatten(arrays)
+        is_float = tuple(eqx.is_inexact_array(leaf) for leaf in leaves)
+        floats = [leaf for leaf in leaves if eqx.is_inexact_array(leaf)]
+        others = [leaf for leaf in leaves if not eqx.is_inexact_array(leaf)]
+        solve = cls(len(floats), structure, is_float, rest, settings.with_tolerance(None), last, unchecked)
+        return (solve, *floats, *others, as_number(t1), settings.tolerance)
+
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.isinf(value)
 
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
-        is_legal, t1, settings = self._permitted(leaves)
-        ensemble = self._ensemble(self._model(leaves), cells, settings)
+        is_legal, t1, settings = self.permitted(leaves)
+        ensemble = self._ensemble(self.model(leaves), cells, settings)
         outcome = ensemble.solve(t1, cells, settings, traced=True)
         return self._times(leaves, is_legal, settings, ensemble, outcome, [])[0]
 
     def value_and_tangents(
         self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
-        is_legal, t1, settings = self._permitted(leaves)
-        model = self._model(leaves)
+        is_legal, t1, settings = self.permitted(leaves)
+        model = self.model(leaves)
         model.require_differentiable(nested, self.last)
 
         def build(floats: tuple[Array, ...], cells: int | None) -> Ensemble:
-            return self._ensemble(self._model((*floats, *leaves[self.movable :])), cells, settings)
+            return self._ensemble(self.model((*floats, *leaves[self.movable :])), cells, settings)
 
         # Cells are independent, so varying a parameter in all of them at once gives each its own derivative.
         ensemble, tangents, gather = tangents_by(build, active, leaves[: self.movable], cells)
@@ -187,12 +193,13 @@ class EventTime(AbstractDifferentiableSolve):
         outcome, slopes, _ = ensemble.solve_with_tangents(tangents, t1, cells, settings, **options)
         return self._times(leaves, is_legal, settings, ensemble, outcome, gather([*slopes]))
 
-    def _model(self, leaves: Any) -> AbstractModel:
+    def model(self, leaves: Any) -> AbstractModel:
+        """The model of the leaves."""
         floats, others = iter(leaves[: self.movable]), iter(leaves[self.movable :])
         arrays = [next(floats if is_float else others) for is_float in self.is_float]
         return eqx.combine(jax.tree.unflatten(self.structure, arrays), self.rest)
 
-    def _permitted(self, leaves: Any) -> tuple[Bool[Array, "..."], Float[Array, "..."], Settings]:
+    def permitted(self, leaves: Any) -> tuple[Bool[Array, "..."], Float[Array, "..."], Settings]:
         """A mask of the cells with legal numbers; the horizons, 0 for all other cells; and the settings.
 
         A batch has one tolerance: the smallest.
@@ -200,7 +207,7 @@ class EventTime(AbstractDifferentiableSolve):
         *_, t1, tolerance = leaves
         is_legal = jnp.asarray(True)
         if self.unchecked:
-            is_legal, t1, tolerance = legal_run(self._model(leaves).legal(), t1, tolerance)
+            is_legal, t1, tolerance = legal_run(self.model(leaves).legal(), t1, tolerance)
         return is_legal, t1, self.settings.with_tolerance(jnp.min(tolerance))
 
     def _ensemble(self, model: AbstractModel, cells: int | None, settings: Settings) -> Ensemble:
@@ -217,7 +224,7 @@ class EventTime(AbstractDifferentiableSolve):
         slopes: list[Float[Array, " cells"]],
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
         """The times and their derivatives: infinite and 0 where there is no event, NaN where the run failed."""
-        status = status_of(self._model(leaves), ensemble, outcome, settings.tolerance)
+        status = status_of(self.model(leaves), ensemble, outcome, settings.tolerance)
         is_good = is_legal & (status != int(SILENT[0])) & (status != int(SILENT[1]))
         has_event = status == int(Status.EVENT)
         time = jnp.where(has_event, outcome.crossing_time, jnp.inf)

@@ -1,14 +1,39 @@
 """A page with sliders that simulates any model in the browser."""
 
 import functools
+import math
+from collections.abc import Callable, Mapping
 from typing import Any
 
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..integration import AbstractProblem, Settings
 from ..integration.checks import run_bounds
+from ..parameters import readable_unit
 from ..progress import status_line
-from ..validation import require_all, require_file
+from ..validation import require_all, require_file, shown
 from ..views import Page, Stage
-from ..views.explore import LiveRun, live_page
+from ..views.explore import (
+    Answer,
+    Frame,
+    HybridSimulator,
+    LiveRun,
+    Simulator,
+    Slider,
+    Summary,
+    live_page,
+)
 from .model import AbstractModel, model_of
+
+#: The tolerance in the page, and that of the runs that determine the drawn part of the arena.
+TOLERANCE, DRAWN = 1e-7, 1e-5
+
+#: Greatest number of steps of a run in the page; they take some hundred milliseconds.
+MOST_STEPS_OF_A_PAGE = 50_000
+
+#: Parameters that change the drawn meshes.
+OF_MESHES = ("scene.surface.", "scene.body.radius", "scene.body.equatorial", "scene.body.polar", "scene.body.wheelbase")
 
 
 @status_line("writing a page")
@@ -103,3 +128,115 @@ def page_of(model: AbstractModel, sliders: Any, t1: float) -> tuple[LiveRun, Sta
     ['rate']
     """
     raise NotImplementedError(f"{type(model).__name__} has no page")
+
+
+def sliders_of(model: AbstractModel, ranges: Any, drawn: tuple[str, ...] = ()) -> tuple[Slider, ...]:
+    """The sliders for the ranges that a user passes.
+
+    **Arguments:** `ranges`: name of a parameter -> (lowest, highest) value; `drawn`: parameters, in addition to
+    `OF_MESHES`, that change the drawn meshes.
+
+    **Raises:** `ValueError` for an unknown name, an illegal range, and numbers that the modules do not allow.
+    """
+    if not (isinstance(ranges, dict) and ranges and all(isinstance(name, str) for name in ranges)):
+        raise ValueError(
+            f"sliders = {shown(ranges)} must be a dictionary, name of a parameter -> (low, high), such as "
+            '{"theta": (0.05, 0.5)}'
+        )
+    sliders = []
+    for name, ends in ranges.items():
+        path = model.full_name("sliders", name)
+        if path.startswith((*OF_MESHES, *drawn)):
+            raise ValueError(
+                f"sliders[{name!r}]: {path} changes the drawn arena or body, which a page cannot change; "
+                "write a page for each value"
+            )
+        try:
+            low, high = (float(end) for end in ends)
+        except (TypeError, ValueError):
+            low, high = math.nan, math.nan
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            raise ValueError(f"sliders[{name!r}] = {shown(ends)} must be two numbers, (low, high), with low < high")
+        value = float(model.value(path))
+        if not low <= value <= high:
+            raise ValueError(
+                f"sliders[{name!r}] = {shown(ends)} must contain the parameter's own value, {value:g}: the page starts there"
+            )
+        for end in (low, high):
+            model.require_values({path: end})
+        short, unit, label = model.label([path])[path]
+        sliders.append(Slider(name, path, (label or short).replace("_", " "), readable_unit(unit), low, high, value))
+    return tuple(sliders)
+
+
+def runs_at_ends(model: AbstractModel, sliders: tuple[Slider, ...], t1: float) -> list[Any]:
+    """The run of a model, and those at both ends of every slider, which determine what part of the arena is drawn."""
+    ends = [{slider.path: end} for slider in sliders for end in (slider.low, slider.high)]
+    return [changed.simulate(t1, None, DRAWN, None, None) for changed in (model, *map(model.replaced, ends))]
+
+
+def live_run(
+    model: AbstractModel,
+    drawn: AbstractModel,
+    sliders: tuple[Slider, ...],
+    t1: float,
+    outcome: Callable[[Any, Any, Any], tuple[Array, Array]],
+    frame: Callable[[Any, Any, Any, Any], Frame],
+    *,
+    title: str,
+    answer: tuple[str, str],
+    words: Mapping[int, str] | None = None,
+    summaries: tuple[Summary, ...],
+    motion: Callable[[Any], AbstractProblem] | None = None,
+) -> LiveRun:
+    """The contents of a page of any model.
+
+    **Arguments:**
+
+    - `model`, `drawn`: the model that answers, with its event, and that of the drawn run, for the same `sliders`.
+    - `outcome`: function that returns the `Status` and the result of a run, or infinity; its arguments are the model, its
+      problem and the `LaneState` at the end of a smooth run, or the model, `None` and a `HybridOutcome`.
+    - `frame`: function that returns a frame; its arguments are the drawn model, the time, the rows of the state, and the
+      index of the mode, `None` for a smooth run.
+    - `answer`: label and unit of the result; the others as for `LiveRun` and `Answer`.
+    - `motion`: function that returns the problem of a smooth drawn run; by default that of the model.
+    """
+    settings = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE)
+
+    def at(model: Any, values: Float[Array, " numbers"]) -> Any:
+        return model.replaced({slider.path: value for slider, value in zip(sliders, values, strict=True)})
+
+    if model.smooth:
+        problem = motion or (lambda drawn: drawn.problem(1, None))
+        answering: Any = Simulator(
+            lambda values: at(model, values).problem(1, ()),
+            t1,
+            settings,
+            {"outcome": lambda values, problem, lane: outcome(at(model, values), problem, lane)},
+            model.continues and model.has_event,
+        )
+        moving: Any = Simulator(
+            lambda values: problem(at(drawn, values)),
+            t1,
+            settings,
+            {"frame": lambda values, problem, lane: frame(at(drawn, values), lane.time, lane.state, None)},
+        )
+    else:
+        counters = len(model.counters)
+        answering = HybridSimulator(
+            lambda values: at(model, values).modes(1, settings.tolerance, (), False),
+            t1,
+            settings,
+            counters,
+            {"outcome": lambda values, runs: outcome(at(model, values), None, runs)},
+        )
+        moving = HybridSimulator(
+            lambda values: at(drawn, values).modes(1, settings.tolerance, None, False),
+            t1,
+            settings,
+            counters,
+            {},
+            lambda values, mode, rows, time: frame(at(drawn, values), time, rows, mode),
+        )
+    result = Answer(*answer, answering, words or {})
+    return LiveRun(title, sliders, lambda values: jnp.all(at(model, values).legal()), result, moving, summaries)

@@ -7,4 +7,4 @@ potential, constraints and forces the equations of motion follow.
 from .mode import AbstractMode as AbstractMode
 from .mode import Hybrid as Hybrid
 from .model import OwnModel as OwnModel
-from .page import live_run as live_run
+from .page import page_of_system as page_of_system

@@ -7,39 +7,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from nonholonomic.geometry import Plane
-from nonholonomic.integration import AbstractPassive, ExtendedProblem, LaneState, Settings
-from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, Status
-from nonholonomic.parameters import numbers, with_numbers
-from nonholonomic.runs import page_of
+from nonholonomic.integration import AbstractPassive, ExtendedProblem
+from nonholonomic.integration.status import Status
+from nonholonomic.parameters import numbers
+from nonholonomic.runs import TOLERANCE, live_run, page_of, runs_at_ends, sliders_of
 from nonholonomic.views import Stage, arena
-from nonholonomic.views.explore import (
-    Answer,
-    Frame,
-    LiveRun,
-    Simulator,
-    Slider,
-    Summary,
-    ends_of,
-    quaternion,
-    sliders_of,
-)
+from nonholonomic.views.explore import Frame, LiveRun, Summary, quaternion
 
 from ..model.dynamics import State
 from ..model.input import Input
 from ..model.launch import Launch
-from ..model.ride import RideProblem, as_module
+from ..model.ride import RideProblem
 from ..model.scene import DRIVES, Scene
-from .model import LONG_NAMES, UNITS, RideModel
+from .model import RideModel
 from .quantities import RideState
 from .trajectory import Trajectory
 from .view import RADIUS, TRACK
-
-Numbers = Float[Array, " numbers"]
-
-#: The tolerance in the page, and that of the runs that determine the drawn part of the ground.
-TOLERANCE = 1e-7
-DRAWN = 1e-5
 
 #: Number of curves of `view.show` that the page computes.
 CURVES = 4
@@ -47,45 +30,24 @@ CURVES = 4
 #: The quantities of a ride that the page draws.
 SHOWN = ("position", "direction", "steering", "speed", "front_speed", "energy", "normal_force", "load", "side_force")
 
-#: Greatest number of steps of a run in the page; they take some hundred milliseconds.
-MOST_STEPS_OF_A_PAGE = 50_000
-
 
 @page_of.register(RideModel)
-def _(model: RideModel, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
-    ranges = default_ranges(model.scene, model.launch) if sliders is None else sliders
-    knobs = sliders_of(ranges, model.roots, LONG_NAMES, UNITS)
-    models = [model, *(model.replaced({path: end}) for path, end in ends_of(knobs))]
-    rides = [changed.simulate(t1, None, DRAWN, None, None) for changed in models]
-    return live_run(model.roots, knobs, t1, model.input), stage(rides)
-
-
-def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float, input: Any) -> LiveRun:
-    """The contents of the page. `roots` are the scene, the launch and the input, some of whose numbers come from
-    sliders."""
-    settings = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE)
-    controls = as_module(input, roots["scene"], roots["launch"])
-
-    def modules(values: Numbers) -> tuple[Scene, Launch, Input | None]:
-        new_roots = with_numbers(roots, {knob.path: value for knob, value in zip(knobs, values, strict=True)})
-        return new_roots["scene"], new_roots["launch"], new_roots.get("input", controls)
-
-    def moment(values: Numbers, problem: Any, lane: LaneState) -> Frame:
-        scene, _, controls = modules(values)
-        return frame(scene, controls, lane)
-
-    readings = {"outcome": lambda values, problem, lane: outcome(problem, lane)}
-    # On a plane, contact is never lost, so no event is needed.
-    watched = not isinstance(roots["scene"].surface, Plane)
-    ride = Simulator(lambda values: RideProblem.of(*modules(values), 1, watched), t1, settings, readings, watched)
-    return LiveRun(
-        title=f"Stroller on a {type(roots['scene'].surface).__name__.lower()}",
-        sliders=knobs,
-        allowed=lambda values: modules(values)[0].may_start(modules(values)[1]),
-        answer=Answer("distance from the start", "m", ride),
-        motion=Simulator(lambda values: rolling_ride(*modules(values)), t1, settings, {"frame": moment}),
+def page_of_ride(model: RideModel, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
+    """The contents of the page, and the stage."""
+    knobs = sliders_of(model, default_ranges(model.scene, model.launch) if sliders is None else sliders)
+    live = live_run(
+        model,
+        model,
+        knobs,
+        t1,
+        outcome,
+        lambda drawn, time, rows, mode: frame(drawn.scene, drawn.input, time, rows),
+        title=f"Stroller on a {type(model.scene.surface).__name__.lower()}",
+        answer=("distance from the start", "m"),
         summaries=(Summary("speed", "m/s", 0), Summary("energy", "J", 2)),
+        motion=rolling_ride,
     )
+    return live, stage(runs_at_ends(model, knobs, t1))
 
 
 def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float]]:
@@ -116,19 +78,18 @@ class WheelAngles(AbstractPassive):
         return jnp.concatenate([problem.field(time, state), speeds / (RADIUS * length)])
 
 
-def rolling_ride(scene: Scene, launch: Launch, controls: Input | None) -> ExtendedProblem[RideProblem]:
+def rolling_ride(model: RideModel) -> ExtendedProblem[RideProblem]:
     """A ride of one cell with the rolling angles of its wheels."""
-    ride = RideProblem.of(scene, launch, controls, 1, False)
+    ride = RideProblem.of(model.scene, model.launch, model.input, 1, False)
     return ExtendedProblem(ride, WheelAngles(), jnp.zeros((3, 1)), jnp.ones((3, 1)))
 
 
-def outcome(problem: RideProblem, lane: LaneState) -> tuple[Int[Array, ""], Float[Array, ""]]:
+def outcome(model: RideModel, problem: Any, lane: Any) -> tuple[Int[Array, ""], Float[Array, ""]]:
     """The `Status` of a ride and the distance of its end from its start [m], infinite if the ride is not completed."""
     first, last = problem.dynamics.unpack(problem.states)[0], problem.dynamics.unpack(lane.state)[0]
     squares = [(a - b) ** 2 for a, b in zip(first, last, strict=True) if a is not None and b is not None]
-    status = jnp.where(jnp.isfinite(lane.first_crossing), int(Status.CONTACT_LOST), int(Status.COMPLETED))
-    status = jnp.where(lane.status == LEFT_DOMAIN, int(Status.RANK_LOST), status)
-    status = jnp.where(lane.status == FAILED, int(Status.FAILED), status)[0]
+    status = model.ended(lane._replace(crossing_time=lane.first_crossing), TOLERANCE)[0]
+    status = jnp.where(status == int(Status.EVENT), int(Status.CONTACT_LOST), status)
     return status, jnp.where(status == int(Status.COMPLETED), jnp.sqrt(sum(squares))[0], jnp.inf)
 
 
@@ -143,9 +104,10 @@ def stage(rides: list[Trajectory]) -> Stage:
     return first._replace(shows=shows, arena=ground)
 
 
-def frame(scene: Scene, controls: Input | None, lane: LaneState) -> Frame:
-    """The drawn quantities of a stroller at one time, in the order of `view.show`."""
-    state = RideState(scene, controls, lane.time, lane.state[:-3])
+def frame(scene: Scene, controls: Input | None, time: Any, rows: Float[Array, "rows 1"]) -> Frame:
+    """The drawn quantities of a stroller at one time, in the order of `view.show`. The rows end with the rolling angles of
+    the wheels."""
+    state = RideState(scene, controls, time, rows[:-3])
     outputs = {name: getattr(state, name)[0] for name in SHOWN}
     length, position, heading = scene.body.wheelbase, outputs["position"], outputs["direction"]
     normal = scene.surface.sign(scene.side, DRIVES) * fixed_normal(scene, position)
@@ -157,7 +119,7 @@ def frame(scene: Scene, controls: Input | None, lane: LaneState) -> Frame:
     forward, left = cosine * x + sine * y, cosine * y - sine * x
     radius, half = RADIUS * length, 0.5 * TRACK * length
     axle, front = position + radius * z, position + length * x + radius * z
-    angles = lane.state[-3:, 0]
+    angles = rows[-3:, 0]
     contacts = (position + 0.02 * radius * z, position + length * x + 0.02 * radius * z)
     return Frame(
         normal=normal,

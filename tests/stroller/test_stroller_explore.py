@@ -8,8 +8,10 @@ import pytest
 from browser import complaints, needs_browser, open_browser, wait
 
 import stroller
-from nonholonomic.views.explore import programs, sliders_of
-from stroller.runs.explore import TOLERANCE, live_run
+from nonholonomic.runs import TOLERANCE
+from nonholonomic.views.explore import programs
+from stroller.runs.explore import page_of_ride
+from stroller.runs.model import RideModel
 
 pytestmark = needs_browser
 
@@ -47,8 +49,7 @@ def test_ten_rides_end_where_those_of_the_table_end(browser, name):
     axes = {"launch.speed": np.sort(rng.uniform(0.5, 3.0, 5)), "launch.steering": np.sort(rng.uniform(-0.5, 0.5, 2))}
     options = {"input": controls, "tolerance": TOLERANCE, "progress": False}
     table = stroller.sweep(scene, launch, 2.0, axes=axes, **options)
-    roots = {"scene": scene, "launch": launch}
-    live_page_run = live_run(roots, sliders_of(RANGES, roots, {}, {}), 2.0, controls)
+    live_page_run, _ = page_of_ride(RideModel.of(scene, launch, controls), RANGES, 2.0)
     runs = np.stack([part.ravel() for part in np.meshgrid(*axes.values(), indexing="ij")], axis=-1)
     browser.get("about:blank")
     script = f"""{programs(live_page_run)}

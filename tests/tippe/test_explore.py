@@ -10,8 +10,9 @@ from rigid import rattleback
 from tops import rutstam_top
 
 import tippe
+from nonholonomic.runs import TOLERANCE
 from nonholonomic.views.explore import programs
-from tippe.runs.explore import TOLERANCE, live_run
+from tippe.runs.explore import page_of_launch
 from tippe.runs.model import TopModel
 
 pytestmark = needs_browser
@@ -91,7 +92,7 @@ def answers(browser, page_run, values: np.ndarray) -> np.ndarray:
 )
 def test_the_browser_says_what_the_table_says(browser, arena, law):
     scene, launch, grid = launches_of(arena, law, CASES.index((arena, law)))
-    page_run = live_run(TopModel(scene=scene, launch=launch), RANGES, HORIZONS[law])
+    page_run = page_of_launch(TopModel(scene=scene, launch=launch), RANGES, HORIZONS[law])
     table = table_of(scene, launch, grid, HORIZONS[law])
     theta, mu, spin = (values.ravel() for values in np.meshgrid(grid["theta"], grid["mu"], grid["spin"], indexing="ij"))
     status, time, end, angle = answers(browser, page_run, np.stack([theta, spin, mu], axis=-1))
@@ -106,7 +107,7 @@ def test_the_browser_says_what_the_table_says(browser, arena, law):
 @pytest.mark.slow
 def test_the_browser_says_when_rattlebacks_reverse(browser):
     """The times of `reversal_table`, for both senses; the words are those of reversals, and a spin of 0 is not allowed."""
-    page_run = live_run(TopModel(scene=rattleback(), launch=tippe.Launch(0.02, -5.0)), None, 4.0)
+    page_run = page_of_launch(TopModel(scene=rattleback(), launch=tippe.Launch(0.02, -5.0)), None, 4.0)
     assert [slider.path for slider in page_run.sliders] == ["launch.theta", "launch.spin"]
     grid = {"theta": np.linspace(0.005, 0.06, 4), "spin": np.array([-8.0, -6.0, -3.0, 3.0])}
     table = tippe.reversal_table(rattleback(), **grid, t1=4.0, tolerance=TOLERANCE, progress=False)
@@ -318,7 +319,9 @@ def test_keys_play_and_reset(browser, page):
 
 
 def test_numbers_that_do_not_fit_together_are_refused_in_the_page(browser, rutstam_scene):
-    page_run = live_run(TopModel(scene=rutstam_scene, launch=tippe.Launch(0.1, 155.0)), {"theta": (0.05, 0.5)}, 7.0)
+    page_run = page_of_launch(
+        TopModel(scene=rutstam_scene, launch=tippe.Launch(0.1, 155.0)), {"theta": (0.05, 0.5)}, 7.0
+    )
     browser.get("about:blank")
     script = f"{programs(page_run)} return [[0.3], [-0.3], [4.0]].map((values) => Boolean(live.allowed(values, [])[0]))"
     assert browser.execute_script(script) == [True, False, False]
@@ -351,7 +354,7 @@ def test_in_the_browser_the_wooden_top_hops_and_climbs_onto_its_stem(browser):
     """As `simulate` has it: through flights, impacts and changes of contact, to the end on its stem."""
     scene, launch = tippe.presets.classroom(), tippe.Launch.degrees(theta=6, rpm=1900)
     page_run, times = (
-        live_run(TopModel(scene=scene, launch=launch), None, 4.0),
+        page_of_launch(TopModel(scene=scene, launch=launch), None, 4.0),
         np.array([0.0, 0.5, 2.6, 2.78, 2.85, 4.0]),
     )
     run = tippe.simulate(scene, launch, 4.0, tolerance=1e-10)
@@ -382,7 +385,7 @@ def test_in_the_browser_the_wooden_top_hops_and_climbs_onto_its_stem(browser):
 @pytest.mark.parametrize("kind", ["sticking", *ARENA_FLIGHTS])
 def test_in_the_browser_tops_stick_and_fly_over_arenas_as_runs_do(browser, kind):
     scene, launch, t1 = {"sticking": STICKING, **ARENA_FLIGHTS}[kind]
-    page_run, times = live_run(TopModel(scene=scene, launch=launch), None, t1), np.linspace(0.0, 0.9 * t1, 7)
+    page_run, times = page_of_launch(TopModel(scene=scene, launch=launch), None, t1), np.linspace(0.0, 0.9 * t1, 7)
     run = tippe.simulate(scene, launch, t1, tolerance=1e-9)
     browser.get("about:blank")
     counts, rows = browser.execute_script(
@@ -414,7 +417,7 @@ def test_the_browser_flies_as_the_table_does(browser, kind):
     theta, mu, spin = (values.ravel() for values in np.meshgrid(grid["theta"], grid["mu"], grid["spin"], indexing="ij"))
     runs = json.dumps(np.stack([theta, spin, mu], axis=-1).tolist())
     browser.get("about:blank")
-    script = f"""{programs(live_run(TopModel(scene=scene, launch=launch), ranges, 5.0))}
+    script = f"""{programs(page_of_launch(TopModel(scene=scene, launch=launch), ranges, 5.0))}
         const asks = integrator(live.answer), at = live.answer.runs, text = (x) => Number.isFinite(x) ? x : String(x);
         return {runs}.map((values) => {{
           const runs = asks.run(values);

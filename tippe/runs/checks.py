@@ -1,29 +1,22 @@
 """The events of a top, and checks of the arguments of a run, before anything compiles and inside a program."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from nonholonomic.integration.checks import legal_run, require_run
+from nonholonomic.integration.checks import require_run
 from nonholonomic.validation import (
     IN_DEGREES,
     Bound,
-    all_bounds,
     as_number,
     is_traced,
-    legal,
-    nan_unless,
     require,
     shown,
     warn,
 )
-from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.friction import Frictionless
 from ..model.launch import Launch
@@ -53,35 +46,6 @@ def angle_of(scene: Scene[Any], angle: Any) -> Float[Array, "..."]:
     if angle is None and scene.has_stem:
         return scene.body.stem_angle
     return as_number(INVERTED if angle is None else angle)
-
-
-@eqx.filter_jit
-def permitted(
-    structure: Any, unchecked: bool, leaves: Sequence[Float[Array, "..."]]
-) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, ""]]:
-    """A mask of the cells with legal numbers; the horizons, 0 for all other cells; and the tolerance of the ensemble.
-
-    The whole ensemble has a single tolerance: the smallest of a batch.
-
-    **Arguments:** `structure`, `leaves`: structure and leaves of scene, launch, angle, horizon and tolerance;
-    `unchecked`: whether some leaves were traced, so that earlier checks ignored them.
-    """
-    scene, launch, angle, t1, tolerance = jax.tree.unflatten(structure, leaves)
-    is_legal = jnp.asarray(True)
-    if unchecked:
-        bounds = (*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch), *event_bounds(angle))
-        is_legal = legal(bounds)
-        if angle is None:
-            is_legal = is_legal & (scene.dynamics.normal_spin(scene.state(launch)) != 0.0)
-        is_legal, t1, tolerance = legal_run(is_legal, t1, tolerance)
-    return is_legal, t1, jnp.min(tolerance)
-
-
-# One program if the function is called on its own, instead of one for every comparison.
-@compiled_setup
-def nan_if_illegal(time: Float[Array, ""], structure: Any, unchecked: bool, leaves: list[Any]) -> Float[Array, ""]:
-    """The time, or NaN with NaN derivatives where numbers are not legal. **Arguments:** as for `permitted`."""
-    return nan_unless(permitted(structure, unchecked, leaves)[0], time) if unchecked else time
 
 
 #: Advice in messages about lists, where a table is the better choice.

@@ -4,29 +4,24 @@ import math
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from nonholonomic.derivatives import (
-    AbstractDifferentiableSolve,
-    VariationalProblem,
-    differentiable_solve,
-    in_groups,
-    tangents_by,
-)
+from nonholonomic.derivatives import VariationalProblem, differentiable_solve, in_groups, tangents_by
 from nonholonomic.integration import Lanes, Settings, crossing_time, traced_solve_ensemble
 from nonholonomic.integration.settings import MOST_STEPS
 from nonholonomic.integration.status import CROSSED, FAILED
 from nonholonomic.progress import status_line
-from nonholonomic.validation import as_number, is_traced
+from nonholonomic.runs import EventTime
+from nonholonomic.validation import as_number
 from nonholonomic.xla_cpu import greatest, least
 
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.state import inclination, parts
 from ..modes.inversion_problem import InversionProblem
-from .checks import check_event, check_run, check_smooth, nan_if_illegal, permitted
+from .checks import check_event, check_run, check_smooth
+from .model import TopModel
 
 #: The least angle [rad] distinguished from 0 in the penalty for a top that does not invert.
 LEAST_ANGLE = 1e-6
@@ -71,58 +66,37 @@ def extended_inversion_time(
     check_run(scene, launch, t1, tolerance)
     check_event(angle, "first")
     check_smooth(scene, "extended_inversion_time")
-    leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
-    unchecked = any(is_traced(leaf) for leaf in leaves)
-    time = differentiable_solve(ExtendedSolve(len(leaves) - 2, structure, unchecked), *leaves)
-    return nan_if_illegal(time, structure, unchecked, leaves)
+    # A fit may try parameters that are far off.
+    settings = Settings(as_number(tolerance), max_steps=MOST_STEPS)
+    return differentiable_solve(*ExtendedTime.of(TopModel.timed(scene, launch, as_number(angle)), t1, settings, False))
 
 
-class ExtendedSolve(AbstractDifferentiableSolve):
-    """Extended inversion times of cells; the leaves are those of `InversionSolve`."""
-
-    movable: int
-    # JAX's PyTreeDef, which type checkers take for a variable.
-    structure: Any = eqx.field(static=True)
-    # Whether some numbers were traced and therefore could not be checked.
-    unchecked: bool = eqx.field(static=True)
+class ExtendedTime(EventTime):
+    """Extended inversion times of cells."""
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         # Every run has a time. A select on NaN would make the derivative of a failed run zero.
         return jnp.zeros(jnp.shape(value), bool)
 
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
-        return self._extended((), self._problem(leaves[: self.movable], cells), leaves, cells)[0]
+        return self._extended((), self.model(leaves).problem(cells, ()), leaves, cells)[0]
 
     def value_and_tangents(
         self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
-        problem, tangents, gather = tangents_by(self._problem, active, leaves[: self.movable], cells)
+        def build(floats: tuple[Array, ...], cells: int | None) -> Any:
+            return self.model((*floats, *leaves[self.movable :])).problem(cells, ())
 
-        def run(group: tuple[Any, ...]) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
-            return self._extended(group, problem, leaves, cells, nested)
-
-        times, slopes = in_groups(run, tangents)
+        problem, tangents, gather = tangents_by(build, active, leaves[: self.movable], cells)
+        times, slopes = in_groups(lambda group: self._extended(group, problem, leaves, cells, nested), tangents)
         return times, gather(slopes)
 
-    def _problem(self, leaves: tuple[Array, ...], cells: int | None) -> InversionProblem:
-        """The launches of some cells."""
-        assert cells is not None
-        scene, launch, angle, *_ = jax.tree.unflatten(self.structure, (*leaves, None, None))
-        return InversionProblem.of(scene, launch, angle, cells)
-
     def _extended(
-        self,
-        tangents: tuple[Any, ...],
-        problem: InversionProblem,
-        leaves: tuple[Array, ...],
-        cells: int,
-        nested: bool = False,
+        self, tangents: tuple[Any, ...], problem: Any, leaves: tuple[Array, ...], cells: int, nested: bool = False
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
         """The extended times of every cell, and their derivatives along tangents (as of `VariationalProblem`)."""
-        is_legal, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
+        is_legal, t1, settings = self.permitted(leaves)
         variational = VariationalProblem(problem, tangents, True)
-        # A fit may try parameters that are far off.
-        settings = Settings(tolerance, max_steps=MOST_STEPS)
         outcome, _ = traced_solve_ensemble(
             variational, t1, jnp.asarray(cells), settings, one_kernel=not nested, n_blocks=1 + len(tangents)
         )

@@ -6,10 +6,8 @@ from .hybrid_simulator import HybridSimulator as HybridSimulator
 from .javascript import javascript as javascript
 from .live import Answer as Answer
 from .live import LiveRun as LiveRun
+from .live import Slider as Slider
 from .live import Summary as Summary
 from .live import live_page as live_page
 from .live import programs as programs
 from .simulator import Simulator as Simulator
-from .slider import Slider as Slider
-from .slider import ends_of as ends_of
-from .slider import sliders_of as sliders_of

@@ -17,9 +17,20 @@ from .frame import Frame
 from .hybrid_simulator import HybridSimulator
 from .javascript import javascript
 from .simulator import Simulator
-from .slider import Slider
 
 Numbers = Float[Array, " numbers"]
+
+
+class Slider(NamedTuple):
+    """A slider: its `name` in the page's address, the `path` of its parameter, a `label`, its unit, its range and its value."""
+
+    name: str
+    path: str
+    label: str
+    unit: str
+    low: float
+    high: float
+    value: float
 
 
 class Answer(NamedTuple):
