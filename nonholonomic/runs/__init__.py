@@ -36,7 +36,7 @@ from .model import Names as Names
 from .model import Start as Start
 from .model import model_of as model_of
 from .samples import Samples as Samples
-from .simulate import sampled as sampled
+from .simulate import sampled_if_legal as sampled_if_legal
 from .simulate import simulate as simulate
 from .sweep import Options as Options
 from .sweep import check_cells as check_cells

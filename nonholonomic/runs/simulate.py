@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..derivatives import sampled_run, sampled_run_by_diffrax
 from ..hybrid import HybridOutcome, hybrid_samples
@@ -146,6 +146,27 @@ def sampled(
     return SampledRows(run.states.T, passive, None, outcome)
 
 
+def sampled_if_legal(
+    model: AbstractModel,
+    names: Names,
+    times: Float[Array, " times"],
+    t1: Float[Array, ""],
+    settings: Settings,
+    grid: Float[Array, " steps"] | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+) -> tuple[Bool[Array, ""], SampledRows, Settings]:
+    """Whether all numbers, which may be traced, are legal; the run, of zero length if they are not; and its settings.
+    **Arguments:** as for `sampled`."""
+    is_legal, horizon, tolerance = legal_run(model.legal(), t1, settings.tolerance, times)
+    if grid is None:
+        t1, times = horizon, jnp.where(is_legal, times, 0.0)
+    if adjoint is not None:
+        # An illegal run has zero length, but Diffrax would differentiate it.
+        model = nan_unless(is_legal, model)
+    settings = settings.with_tolerance(tolerance)
+    return is_legal, sampled(model, names, times, t1, settings, grid, adjoint), settings
+
+
 def problem_of_run(modules: tuple[AbstractModel, Names], cells: int | None) -> AbstractProblem:
     """The problem of a run, as `sampled_run` builds it."""
     model, names = modules
@@ -157,13 +178,11 @@ def _sampled(
     model: AbstractModel, times: Float[Array, " times"], t1: Float[Array, ""], settings: Settings
 ) -> Trajectory:
     """The run, or NaN and "failed" if a traced number is out of range."""
-    is_legal, horizon, tolerance = legal_run(model.legal(), t1, settings.tolerance, times)
-    legal_settings, legal_times = settings.with_tolerance(tolerance), jnp.where(is_legal, times, 0.0)
-    samples = sampled(model, None, legal_times, horizon, legal_settings)
+    is_legal, samples, legal_settings = sampled_if_legal(model, None, times, t1, settings)
     outcome = samples.outcome
     names = tuple(model.quantities)
     values = model.read(names, times, nan_unless(is_legal, samples.rows), samples.mode)
-    status = model.ended(outcome, tolerance)[0]
+    status = model.ended(outcome, legal_settings.tolerance)[0]
     is_reached = jnp.all(jnp.isfinite(samples.rows), axis=0)
     mode = jnp.where(is_reached, 0, -1) if samples.mode is None else samples.mode
     return Trajectory(

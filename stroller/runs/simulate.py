@@ -1,7 +1,6 @@
 """One ride: with its steps outside of transformations, and sampled inside."""
 
 import dataclasses
-import functools
 from typing import Any
 
 import diffrax
@@ -12,13 +11,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.integration import ImplicitMidpoint, Settings
-from nonholonomic.integration.checks import legal_run, require_times
-from nonholonomic.runs import sampled
+from nonholonomic.integration.checks import require_times
+from nonholonomic.runs import sampled_if_legal
 from nonholonomic.validation import as_known, is_traced, nan_unless
 
-from ..model.dynamics import State
 from .checks import check_options
-from .steps import Ride, RideSpec, Stats, followed, stats_of
+from .steps import Ride, RideSpec, followed, stats_of
 from .trajectory import Trajectory, read_off, read_off_compiled
 
 #: Default number of times to report, and default limit of the steps of a ride.
@@ -46,7 +44,7 @@ def ride(
     # Inside a transformation, this traces all numbers, even if they are known.
     specification = Ride(model, jnp.add(end, 0.0), settings, grid)
     if any(is_traced(leaf) for leaf in jax.tree.leaves((specification, times))):
-        return _legal_or_nan(specification, times, adjoint)
+        return _sampled(specification, times, adjoint)
     return _concrete(specification, times)
 
 
@@ -54,33 +52,18 @@ def _concrete(ride: Ride, times: Float[Array, " times"]) -> Trajectory:
     """The run of concrete numbers."""
     spec = RideSpec.of(ride)
     if not isinstance(ride.settings.for_steps_alone, diffrax.AbstractERK | ImplicitMidpoint):
-        return read_off_compiled(spec, times, *_sampled(ride, times))
+        return _sampled(ride, times, None)
     steps, stats = followed(spec)
     return dataclasses.replace(read_off_compiled(spec, times, steps.at(spec, np.asarray(times)), stats), steps=steps)
 
 
-def _traced(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None) -> tuple[State, Stats]:
-    """The states of a ride at `times`, and its statistics, inside a transformation."""
-    run = sampled(ride.model, None, times, ride.t1, ride.settings, ride.grid, adjoint)
-    return run.rows, stats_of(run.outcome)
-
-
 # Steps of other implicit solvers cannot be repeated cheaply, so they end on the times.
-_sampled = eqx.filter_jit(functools.partial(_traced, adjoint=None))
-
-
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
 @eqx.filter_jit
-def _legal_or_nan(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None) -> Trajectory:
-    """The run, or NaN and `finished` false if a traced number is out of range."""
-    is_legal, t1, tolerance = legal_run(ride.model.legal(), ride.t1, ride.settings.tolerance, times)
-    legal_ride, run_times = ride._replace(settings=ride.settings.with_tolerance(tolerance)), times
-    if ride.grid is None:
-        legal_ride, run_times = legal_ride._replace(t1=t1), jnp.where(is_legal, times, 0.0)
-    if adjoint is not None:
-        # A run with illegal numbers never begins, but Diffrax would differentiate it.
-        legal_ride = legal_ride._replace(model=nan_unless(is_legal, ride.model))
-    run = read_off(RideSpec.of(ride), run_times, *_traced(legal_ride, run_times, adjoint))
+def _sampled(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None) -> Trajectory:
+    """The run at `times`; NaN and `finished` false if a traced number is out of range."""
+    is_legal, samples, _ = sampled_if_legal(ride.model, None, times, ride.t1, ride.settings, ride.grid, adjoint)
+    run = read_off(RideSpec.of(ride), times, samples.rows, stats_of(samples.outcome))
     stats = run.stats._replace(finished=run.stats.finished & is_legal)
     return eqx.tree_at(lambda trajectory: (trajectory.t, trajectory.stats), nan_unless(is_legal, run), (times, stats))
 

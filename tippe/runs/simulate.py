@@ -1,6 +1,5 @@
 """Simulate one launch of a top: a single run with its path, or a run inside a transformation."""
 
-import dataclasses
 from typing import Any
 
 import diffrax
@@ -12,9 +11,9 @@ from jaxtyping import Array, Float
 
 from nonholonomic.hybrid import BETWEEN, HybridOutcome, HybridPath, solve_hybrid_dense
 from nonholonomic.integration import DenseSolution, Settings, explicit_tableau, follow
-from nonholonomic.integration.checks import legal_run, require_adaptive, require_adjoint, require_times
+from nonholonomic.integration.checks import require_adaptive, require_adjoint, require_times
 from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, REACHED_END, Status
-from nonholonomic.runs import sampled
+from nonholonomic.runs import sampled_if_legal
 from nonholonomic.validation import as_number, is_traced, nan_unless, shown
 from nonholonomic.xla_cpu import on_device
 
@@ -40,7 +39,7 @@ def simulate_launch(
         times = as_number(times)
         require_times(times, t1)
     if any(is_traced(leaf) for leaf in jax.tree.leaves((model, times, t1, tolerance))):
-        return _legal_or_nan(model, times, as_number(t1), settings, adjoint)
+        return _traced(model, times, as_number(t1), settings, adjoint)
     if model.smooth:
         path = follow(model.problem(None, None), float(t1), settings)
     else:
@@ -118,44 +117,31 @@ def _with_flights(model: Any, path: HybridPath, times: Any, tolerance: Any) -> H
 
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
 @eqx.filter_jit
-def _legal_or_nan(
-    model: Any, times: Any, t1: Any, settings: Settings, adjoint: diffrax.AbstractAdjoint | None
-) -> Trajectory | HybridTrajectory:
-    """The result of `_traced`, or NaN and the status "illegal" if a traced number is out of range."""
-    if times is None:
-        raise ValueError("times must be given inside jit, vmap and grad, where the number of steps is not known")
-    is_legal, t1, tolerance = legal_run(model.legal(), t1, settings.tolerance, times)
-    settings = settings.with_tolerance(tolerance)
-    if adjoint is not None:
-        # An illegal run has zero length, but Diffrax would differentiate it.
-        scene, launch = nan_unless(is_legal, (model.scene, model.launch))
-        model = dataclasses.replace(model, scene=scene, launch=launch)
-    trajectory = _traced(model, times, t1, settings, adjoint)
-    status = jnp.where(is_legal, trajectory.status, int(Status.ILLEGAL))
-    return eqx.tree_at(lambda run: (run.t, run.status), nan_unless(is_legal, trajectory), (times, status))
-
-
 def _traced(
     model: Any, times: Any, t1: Any, settings: Settings, adjoint: diffrax.AbstractAdjoint | None
 ) -> Trajectory | HybridTrajectory:
+    """The run inside a transformation; NaN and the status "illegal" if a traced number is out of range."""
+    if times is None:
+        raise ValueError("times must be given inside jit, vmap and grad, where the number of steps is not known")
     scene = model.scene
     if not model.smooth:
         if adjoint is not None:
             name = "contact = 'hybrid'" if scene.contact == "hybrid" else "SetValuedCoulomb"
             raise ValueError(f"adjoint = {adjoint!r} must be omitted for {name}")
         explicit_tableau(settings.for_lanes)
-    run = sampled(model, None, times, t1, settings, adjoint=adjoint)
+    is_legal, run, settings = sampled_if_legal(model, None, times, t1, settings, adjoint=adjoint)
     outcome = run.outcome
-    status, end_time = model.ended(outcome, settings.tolerance)[0], outcome.end_time[0]
+    status = jnp.where(is_legal, model.ended(outcome, settings.tolerance)[0], int(Status.ILLEGAL))
     rejected, start = outcome.rejected[0], scene.state(model.launch)
     stats = {"accepted": outcome.steps[0] - rejected, "rejected": rejected}
     stats |= {name: count[0] for name, count in zip(model.counters, outcome.counts, strict=True)}
+    kind: Any = Trajectory
     if scene.contact == "hybrid":
-        kind: Any = model.flights
+        kind = model.flights
         parts = (*kind.parts_of(run.rows), kind.touching(run.mode))
-        return kind(times, scene, *parts, status, end_time, stats, start=start)
-    if run.passive is None:
-        parts = parts_of(len(scene.state(model.launch)), run.rows)
+    elif run.passive is None:
+        parts = parts_of(len(start), run.rows)
     else:
         parts = (run.rows, run.passive[:-2], run.passive[-2], run.passive[-1])
-    return Trajectory(times, scene, *parts, status, end_time, stats, start=start)
+    trajectory = kind(times, scene, *parts, status, outcome.end_time[0], stats, start=start)
+    return eqx.tree_at(lambda run: (run.t, run.status), nan_unless(is_legal, trajectory), (times, status))
