@@ -111,7 +111,7 @@ class ArenaTrajectory(HybridTrajectory):
     @property
     def where_the_model_ends(self) -> str:
         body = self.scene.body
-        height = self.parts_of(self.dense.at(np.array([self.end_time])))[-1][0, 0]
+        height = self.resampled(np.array([self.end_time])).distance[0, 0]
         if body.stem is not None and abs(height) < NEAR * body.radius:
             return (
                 "sphere and stem came to rest on the arena together; sliding on both at once is implemented only for the level "
@@ -119,9 +119,10 @@ class ArenaTrajectory(HybridTrajectory):
             )
         return "a flight does not end at the arena"
 
-    @staticmethod
-    def parts_of(rows: Float[Array | np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
-        return rows[:14], rows[14:17], rows[17], rows[18], rows[19:]
+    @classmethod
+    def parts_of(cls, rows: Any, mode: Any, core: int) -> dict[str, Any]:
+        parts = {"states": rows[:14], "cyclic": rows[14:17], "spin_angle": rows[17], "work": rows[18]}
+        return parts | {"distance": rows[19:], "contact": cls.touching(mode)}
 
     @staticmethod
     def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:

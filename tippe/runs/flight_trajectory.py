@@ -1,8 +1,8 @@
 """One run through contacts, flights and impacts, with its path."""
 
+import dataclasses
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -67,20 +67,8 @@ class HybridTrajectory(AbstractTrajectory):
     ```
     """
 
-    t: Float[np.ndarray, " times"]
-    scene: Scene[Top]
-    states: Float[np.ndarray, "8 times"]
-    cyclic: Float[np.ndarray, "5 times"]
-    spin_angle: Float[np.ndarray, " times"]
-    work: Float[np.ndarray, " times"]
-    distance: Float[np.ndarray, "2 times"]
-    contact: Int[np.ndarray, " times"]
-    # The end of the run; not needed where only the times are read, as in a page.
-    status: Any = None
-    end_time: Any = None
-    stats: dict[str, Any] = eqx.field(default_factory=dict)
-    dense: Any = None
-    start: Any = None
+    distance: Any = None
+    contact: Any = None
     hops: Float[np.ndarray, "hops 2"] | None = None
 
     unused = (*AbstractTrajectory.unused, "hops")
@@ -161,20 +149,13 @@ class HybridTrajectory(AbstractTrajectory):
         flight and if both touch."""
         return jnp.stack(approach(self.scene.body, self._ball, self._free).velocity[:2], axis=-1)
 
-    def resampled(self, times: Float[np.ndarray, " times"]) -> "HybridTrajectory":
-        """The same run at other times, without checking them."""
-        arrays = (times, *self.parts_of(self.dense.at(times)), self.touching(self.dense.numbers(times)))
-        return eqx.tree_at(
-            lambda run: (run.t, run.states, run.cyclic, run.spin_angle, run.work, run.distance, run.contact),
-            self,
-            arrays,
-        )
+    def with_rows(self, times: Float[np.ndarray, " times"], rows: Any, mode: Any) -> "HybridTrajectory":
+        return dataclasses.replace(self, t=times, **self.parts_of(rows, mode, len(self.start)))
 
-    @staticmethod
-    def parts_of(rows: Float[Array | np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
-        """State, cyclic coordinates, spin angle, work, and the distance with its rate, from the output rows of the
-        modes."""
-        return rows[:8], rows[8:13], rows[13], rows[14], rows[15:]
+    @classmethod
+    def parts_of(cls, rows: Any, mode: Any, core: int) -> dict[str, Any]:
+        parts = {"states": rows[:8], "cyclic": rows[8:13], "spin_angle": rows[13], "work": rows[14]}
+        return parts | {"distance": rows[15:], "contact": cls.touching(mode)}
 
     @staticmethod
     def work_in(piece: Segment) -> float:

@@ -41,10 +41,11 @@ from .airborne_trajectory import ArenaTrajectory, StickSlipArenaTrajectory, aren
 from .checks import INVERTED, check_last_on_stem, event_bounds, event_of
 from .flight_trajectory import HybridTrajectory, level_modes
 from .launches import NUMBERS_OF_A_LAUNCH, labels, variable_numbers
+from .observables import AbstractTrajectory
 from .quantities import COMPONENTS, DIRECTION, ON_CURVED, PASSIVE, PATH, quantities_of
 from .run_kind import COUNTED, HYBRID, RunKind, has_grown, run_kind_of
 from .simulate import simulate_launch
-from .trajectory import Trajectory, parts_of
+from .trajectory import Trajectory
 
 #: The words of tables, in the order of the integers in their files, which is older than `Status`.
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit", "unresolved")
@@ -231,20 +232,21 @@ class TopModel(AbstractSceneModel):
 
     def moment(self, rows: Float[Array, "rows *cells"], mode: Any) -> Any:
         """The states as a trajectory without times."""
-        scene, zeros = self.scene, jnp.zeros(rows.shape[1:])
-        if scene.contact == "hybrid":
-            kind: Any = self.flights
-            number = jnp.broadcast_to(BETWEEN if mode is None else mode, zeros.shape)
-            return kind(zeros, scene, *kind.parts_of(rows), kind.touching(number))
+        scene, kind, zeros = self.scene, self.trajectories, jnp.zeros(rows.shape[1:])
         core = len(scene.state(self.launch))
-        missing = core + len(scene.start(self.launch)[1]) + BEHIND_PATH - len(rows)
-        # Rows without a path, or without rotation and work, end earlier.
-        rows = jnp.concatenate([rows, jnp.zeros((missing, *zeros.shape))]) if missing > 0 else rows
-        return Trajectory(zeros, scene, *parts_of(core, rows))
+        if scene.contact == "hybrid":
+            mode = jnp.broadcast_to(BETWEEN if mode is None else mode, zeros.shape)
+        else:
+            # Rows without a path, or without rotation and work, end earlier.
+            missing = core + len(scene.start(self.launch)[1]) + BEHIND_PATH - len(rows)
+            rows = jnp.concatenate([rows, jnp.zeros((missing, *zeros.shape))]) if missing > 0 else rows
+        return kind(zeros, scene, **kind.parts_of(rows, mode, core))
 
     @property
-    def flights(self) -> type[HybridTrajectory]:
-        """The class of trajectories of a hybrid scene."""
+    def trajectories(self) -> type[AbstractTrajectory]:
+        """The class of trajectories of the scene."""
+        if self.scene.contact != "hybrid":
+            return Trajectory
         if self.scene.flies_in_closed_form:
             return HybridTrajectory
         return StickSlipArenaTrajectory if self.scene.friction.set_valued else ArenaTrajectory

@@ -66,18 +66,19 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
     Vectors are arrays (times, 3) in the fixed frame (x, y, z); see `Trajectory`.
     """
 
-    t: eqx.AbstractVar[Float[Any, " times"]]
-    scene: eqx.AbstractVar[Scene]
-    states: eqx.AbstractVar[Float[Any, "components times"]]
-    cyclic: eqx.AbstractVar[Float[Any, "paths times"]]
-    spin_angle: eqx.AbstractVar[Float[Any, " times"]]
-    work: eqx.AbstractVar[Float[Any, " times"]]
-    status: eqx.AbstractVar[Any]
-    end_time: eqx.AbstractVar[Any]
-    stats: eqx.AbstractVar[dict[str, Any]]
-    dense: eqx.AbstractVar[Any]
+    t: Float[Any, " times"]
+    scene: Scene
+    states: Float[Any, "components times"]
+    cyclic: Float[Any, "paths times"]
+    spin_angle: Float[Any, " times"]
+    work: Float[Any, " times"]
+    # The end of the run; not needed where only the times are read, as in a page.
+    status: Any = None
+    end_time: Any = None
+    stats: dict[str, Any] = eqx.field(default_factory=dict)
+    dense: Any = None
     # The state at the launch.
-    start: eqx.AbstractVar[Any]
+    start: Any = None
 
     #: The fields that no observable needs.
     unused: ClassVar[tuple[str, ...]] = ("status", "end_time", "stats", "dense")
@@ -109,9 +110,23 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
     def energy(self) -> Float[Array, " times"]:
         """Kinetic and potential energy [J]."""
 
+    @classmethod
     @abc.abstractmethod
+    def parts_of(cls, rows: Float[Any, "rows times"], mode: Any, core: int) -> dict[str, Any]:
+        """The fields `by_time` but the times, from output rows.
+
+        **Arguments:** `mode`: the indices of the modes at these times, or `None` for a smooth run; `core`: the number of
+        components of the state.
+        """
+
+    @abc.abstractmethod
+    def with_rows(self, times: Float[np.ndarray, " times"], rows: Any, mode: Any) -> Self:
+        """The same run at other times, from the output rows there."""
+
     def resampled(self, times: Float[np.ndarray, " times"]) -> Self:
         """The same run at other times, without checking them."""
+        mode = self.dense.numbers(times) if isinstance(self.dense, HybridPath) else None
+        return self.with_rows(times, self.dense.at(times), mode)
 
     @of_each_run
     def theta(self) -> Float[Array, " times"]:

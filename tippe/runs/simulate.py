@@ -1,5 +1,6 @@
 """Simulate one launch of a top: a single run with its path, or a run inside a transformation."""
 
+import dataclasses
 from typing import Any
 
 import diffrax
@@ -20,7 +21,7 @@ from nonholonomic.xla_cpu import on_device
 from ..modes.airborne import FLYING
 from .flight_trajectory import HybridTrajectory
 from .run_kind import if_balanced
-from .trajectory import Trajectory, parts_of
+from .trajectory import Trajectory
 
 
 def simulate_launch(
@@ -34,7 +35,7 @@ def simulate_launch(
     """The run of a `TopModel`. **Arguments:** as for `tippe.simulate`."""
     require_adaptive(solver)
     require_adjoint(adjoint)
-    settings, scene = Settings(tolerance, solver), model.scene
+    settings = Settings(tolerance, solver)
     if times is not None:
         times = as_number(times)
         require_times(times, t1)
@@ -46,19 +47,16 @@ def simulate_launch(
         modes, first, state = model.modes(1, settings.tolerance, None, False)
         start = int(np.asarray(first)[0]), np.asarray(state)[:, 0]
         path = solve_hybrid_dense(modes, *start, float(t1), settings, counters=len(model.counters))
-    if scene.contact == "hybrid":
-        assert isinstance(path, HybridPath)
-        return _with_flights(model, path, times, settings.tolerance)
-    trajectory = _in_contact(model, path, settings.tolerance)
+    run = _along(model, path, settings.tolerance)
     if times is None:
-        return trajectory
-    times_reached = np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)]
+        return run
+    times_reached = np.asarray(times)[np.asarray(times) <= float(run.end_time)]
     if not times_reached.size:
         raise ValueError(
-            f"times = {shown(times)} are all after the end of the run at {float(trajectory.end_time):.6g} s "
-            f"({trajectory.status}): pass earlier times, or omit `times` to get those of the steps"
+            f"times = {shown(times)} are all after the end of the run at {float(run.end_time):.6g} s "
+            f"({run.status}): pass earlier times, or omit `times` to get those of the steps"
         )
-    return trajectory.at(times_reached)
+    return run.resampled(times_reached)
 
 
 @eqx.filter_jit
@@ -80,39 +78,27 @@ def _status(model: Any, path: DenseSolution | HybridPath, tolerance: Any) -> str
     return Status(int(_ended(model, outcome, jnp.asarray(tolerance)))).word
 
 
-def _in_contact(model: Any, path: DenseSolution | HybridPath, tolerance: Any) -> Trajectory:
-    """The run of a scene whose contact persists, along its path."""
-    # NumPy slices these arrays, because JAX would compile each slice again for every number of steps.
-    states = np.asarray(path.states)
-    times, end = on_device(path.times, path.times[-1])
-    counts = {"sticks": int(path.counts[0])} if isinstance(path, HybridPath) else {}
-    lean = len(model.scene.state(model.launch))
-    lean, cyclic, spin_angle, work = on_device(*parts_of(lean, states))
-    status = _status(model, path, tolerance)
-    start = model.scene.state(model.launch)
-    trajectory = Trajectory(times, model.scene, lean, cyclic, spin_angle, work, status, end, {}, path, start)
-    return if_balanced(trajectory.with_stats(path, **counts), tolerance)
-
-
-def _with_flights(model: Any, path: HybridPath, times: Any, tolerance: Any) -> HybridTrajectory:
-    """The run of a hybrid scene along its path, at given times or at those of its steps.
-
-    A run whose energy does not balance the work of friction and impacts ends as "unresolved".
-    """
-    kind: Any = model.flights
-    scene = model.scene
-    parts, contact = kind.parts_of(path.at(path.times)), kind.touching(path.numbers(path.times))
-    in_flight = BETWEEN if scene.flies_in_closed_form else FLYING
-    segments = [segment for segment in path.segments if segment.number == in_flight and segment.end > segment.begin]
-    hops = np.array([(segment.begin, segment.end) for segment in segments]).reshape(-1, 2)
+def _along(model: Any, path: DenseSolution | HybridPath, tolerance: Any) -> Any:
+    """The run along its path, at the times of its steps. A run whose energy does not balance the work of friction and
+    impacts ends as "unresolved"."""
+    scene, kind, times = model.scene, model.trajectories, path.times
+    mode, counts = (path.numbers(times), path.counts) if isinstance(path, HybridPath) else (None, ())
+    end = path.end_time if isinstance(path, HybridPath) and scene.contact == "hybrid" else on_device(times[-1])[0]
     status, start = _status(model, path, tolerance), scene.state(model.launch)
-    run = kind(path.times, scene, *parts, contact, status, path.end_time, dense=path, hops=hops, start=start)
-    in_contact = sum(kind.work_in(segment) for segment in path.segments)
-    counts = {"sticks": int(path.counts[1])} if scene.friction.set_valued else {}
-    # The remaining work is that of the impacts.
-    run = run.with_stats(path, impact_loss=float(in_contact - path.state[-1]), **counts)
-    run = if_balanced(run, tolerance)
-    return run if times is None else run.resampled(np.asarray(times)[np.asarray(times) <= run.end_time])
+    run = kind(None, scene, None, None, None, None, status, end, dense=path, start=start)
+    # NumPy slices the states, because JAX would compile each slice again for every number of steps.
+    run = run.with_rows(times, np.asarray(path.states), mode)
+    counted = {name: int(count) for name, count in zip(model.counters, counts, strict=True) if name == "sticks"}
+    if scene.contact == "hybrid":
+        assert isinstance(path, HybridPath)
+        in_flight = BETWEEN if scene.flies_in_closed_form else FLYING
+        segments = [segment for segment in path.segments if segment.number == in_flight and segment.end > segment.begin]
+        hops = np.array([(segment.begin, segment.end) for segment in segments]).reshape(-1, 2)
+        run = dataclasses.replace(run, hops=hops)
+        # The remaining work is that of the impacts.
+        in_contact = sum(kind.work_in(segment) for segment in path.segments)
+        counted = {"impact_loss": float(in_contact - path.state[-1]), **counted}
+    return if_balanced(run.with_stats(path, **counted), tolerance)
 
 
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
@@ -135,13 +121,9 @@ def _traced(
     rejected, start = outcome.rejected[0], scene.state(model.launch)
     stats = {"accepted": outcome.steps[0] - rejected, "rejected": rejected}
     stats |= {name: count[0] for name, count in zip(model.counters, outcome.counts, strict=True)}
-    kind: Any = Trajectory
-    if scene.contact == "hybrid":
-        kind = model.flights
-        parts = (*kind.parts_of(run.rows), kind.touching(run.mode))
-    elif run.passive is None:
-        parts = parts_of(len(start), run.rows)
-    else:
-        parts = (run.rows, run.passive[:-2], run.passive[-2], run.passive[-1])
-    trajectory = kind(times, scene, *parts, status, outcome.end_time[0], stats, start=start)
+    kind, rows = model.trajectories, run.rows
+    parts = kind.parts_of(rows, run.mode, len(start))
+    if run.passive is not None:
+        parts = {"states": rows, "cyclic": run.passive[:-2], "spin_angle": run.passive[-2], "work": run.passive[-1]}
+    trajectory = kind(times, scene, **parts, status=status, end_time=outcome.end_time[0], stats=stats, start=start)
     return eqx.tree_at(lambda run: (run.t, run.status), nan_unless(is_legal, trajectory), (times, status))

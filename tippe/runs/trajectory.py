@@ -1,8 +1,8 @@
 """One run of a tippe top, with its path."""
 
+import dataclasses
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -12,7 +12,6 @@ from nonholonomic.integration.status import Status
 from nonholonomic.xla_cpu import on_device
 
 from ..model.friction import length
-from ..model.scene import Scene
 from .observables import AbstractTrajectory, of_each_run
 from .run_kind import why_unbalanced
 
@@ -51,19 +50,6 @@ class Trajectory(AbstractTrajectory):
 
     ```
     """
-
-    t: Float[Array, " times"]
-    scene: Scene
-    states: Float[Array, "components times"]
-    cyclic: Float[Array, "cyclic times"]
-    spin_angle: Float[Array, " times"]
-    work: Float[Array, " times"]
-    # The end of the run; not needed where only the times are read, as in a page.
-    status: Any = None
-    end_time: Any = None
-    stats: dict[str, Any] = eqx.field(default_factory=dict)
-    dense: Any = None
-    start: Any = None
 
     @property
     def above(self) -> tuple[None, None]:
@@ -115,12 +101,10 @@ class Trajectory(AbstractTrajectory):
         unresolved = isinstance(self.status, str) and self.status == Status.UNRESOLVED.word
         return super().__str__() + (f"\n  unresolved: {why_unbalanced(self)}" if unresolved else "")
 
-    def resampled(self, times: Float[np.ndarray, " times"]) -> "Trajectory":
-        """The same run at other times, without checking them."""
-        arrays = on_device(times, *parts_of(len(self.states), self.dense.at(times)))
-        return eqx.tree_at(lambda run: (run.t, run.states, run.cyclic, run.spin_angle, run.work), self, arrays)
+    @classmethod
+    def parts_of(cls, rows: Any, mode: Any, core: int) -> dict[str, Any]:
+        return {"states": rows[:core], "cyclic": rows[core:-2], "spin_angle": rows[-2], "work": rows[-1]}
 
-
-def parts_of(lean: int, states: Any) -> tuple[Any, Any, Any, Any]:
-    """State, with its number of components, cyclic coordinates, spin angle and work, of an array (components, times)."""
-    return states[:lean], states[lean:-2], states[-2], states[-1]
+    def with_rows(self, times: Float[np.ndarray, " times"], rows: Any, mode: Any) -> "Trajectory":
+        parts = {"t": times, **self.parts_of(rows, mode, len(self.start))}
+        return dataclasses.replace(self, **dict(zip(parts, on_device(*parts.values()), strict=True)))
