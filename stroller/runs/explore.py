@@ -18,11 +18,11 @@ from ..model.dynamics import State
 from ..model.input import Input
 from ..model.launch import Launch
 from ..model.ride import RideProblem
-from ..model.scene import DRIVES, Scene
+from ..model.scene import Scene
 from .model import RideModel
 from .quantities import RideState
 from .trajectory import Trajectory
-from .view import RADIUS, TRACK
+from .view import RADIUS, TRACK, Posture, normals
 
 #: Number of curves of `view.show` that the page computes.
 CURVES = 4
@@ -109,52 +109,21 @@ def frame(scene: Scene, controls: Input | None, time: Any, rows: Float[Array, "r
     the wheels."""
     state = RideState(scene, controls, time, rows[:-3])
     outputs = {name: getattr(state, name)[0] for name in SHOWN}
-    length, position, heading = scene.body.wheelbase, outputs["position"], outputs["direction"]
-    normal = scene.surface.sign(scene.side, DRIVES) * fixed_normal(scene, position)
-    x = heading / jnp.linalg.norm(heading)
-    y = jnp.cross(normal, x)
-    y = y / jnp.linalg.norm(y)
-    z = jnp.cross(x, y)
-    cosine, sine = jnp.cos(outputs["steering"]), jnp.sin(outputs["steering"])
-    forward, left = cosine * x + sine * y, cosine * y - sine * x
-    radius, half = RADIUS * length, 0.5 * TRACK * length
-    axle, front = position + radius * z, position + length * x + radius * z
-    angles = rows[-3:, 0]
-    contacts = (position + 0.02 * radius * z, position + length * x + 0.02 * radius * z)
+    length, position = scene.body.wheelbase, outputs["position"]
+    normal = normals(jnp, scene.surface, scene.side, position)
+    posture = Posture.of(jnp, length, position, outputs["direction"], normal, outputs["steering"], rows[-3:, 0])
+    rotations = [quaternion(rotation) for rotation in posture.rotations]
+    (rear, front), load, side_force = posture.contacts, outputs["load"], outputs["side_force"]
     return Frame(
         normal=normal,
-        bodies=(
-            (axle, quaternion(jnp.stack([x, y, z], axis=-1))),
-            (axle + half * y, rolling(x, y, z, angles[0])),
-            (axle - half * y, rolling(x, y, z, angles[1])),
-            (front, rolling(forward, left, z, angles[2])),
-        ),
-        traces=((contacts[0], None), (contacts[1], None)),
+        bodies=tuple(zip(posture.places, rotations, strict=True)),
+        traces=((rear, None), (front, None)),
         arrows=(
-            (contacts[0], outputs["load"][0] * z),
-            (contacts[1], outputs["load"][1] * z),
-            (contacts[0], outputs["side_force"][0] * y),
-            (contacts[1], outputs["side_force"][1] * left),
+            (rear, load[0] * posture.up),
+            (front, load[1] * posture.up),
+            (rear, side_force[0] * posture.left[0]),
+            (front, side_force[1] * posture.left[1]),
         ),
-        curves=(
-            outputs["speed"],
-            outputs["steering"],
-            outputs["energy"],
-            outputs["normal_force"],
-        ),
-        turning_rate=jnp.maximum(jnp.abs(outputs["speed"]), jnp.abs(outputs["front_speed"])) / radius,
+        curves=(outputs["speed"], outputs["steering"], outputs["energy"], outputs["normal_force"]),
+        turning_rate=jnp.maximum(jnp.abs(outputs["speed"]), jnp.abs(outputs["front_speed"])) / (RADIUS * length),
     )
-
-
-def rolling(x: Array, y: Array, z: Array, angle: Float[Array, ""]) -> Float[Array, "4"]:
-    """The quaternion of a wheel with axes x (ahead), y (its axle) and z, that has rolled by an angle."""
-    cosine, sine = jnp.cos(angle), jnp.sin(angle)
-    return quaternion(jnp.stack([cosine * x - sine * z, y, sine * x + cosine * z], axis=-1))
-
-
-def fixed_normal(scene: Scene, position: Float[Array, "3"]) -> Float[Array, "3"]:
-    """The ground's outward normal at a point, in the fixed frame."""
-    surface = scene.surface
-    normal = surface.normal(surface.in_own_axes((position[0], position[1], position[2])))
-    x, y, z = (jnp.zeros(()) if part is None else jnp.asarray(part) + 0.0 for part in normal)
-    return jnp.stack([jnp.asarray(part) for part in surface.in_fixed_frame((x, y, z))])

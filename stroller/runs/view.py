@@ -1,6 +1,6 @@
 """The drawing of a ride: the vehicle, the traces of its wheels, forces, and curves over time."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -70,18 +70,62 @@ def grouped(groups: list[list[tuple[int, Any]]], names: list[str]) -> list[Stage
         length = float(scene.body.wheelbase)
         shows = distinguished_by_colour(tuple(show(run, k, names[k]) for k, run in group))
         points = np.concatenate([np.asarray(run.position) for _, run in group])
-        normal = normals(scene.surface, scene.side, np.asarray(group[0][1].position)[:1])[0]
+        normal = normals(np, scene.surface, scene.side, np.asarray(group[0][1].position)[:1])[0]
         ground = arena(scene.surface, points, normal, 3.0 * length, length)
         stages.append(Stage("; ".join(body.name for body in shows), ground, shows))
     return stages
 
 
-def normals(surface: AbstractSurface, side: str | None, position: np.ndarray) -> np.ndarray:
-    """Unit normals at positions (times, 3), towards the side on which the stroller is."""
+def normals(xp: Any, surface: AbstractSurface, side: str | None, position: Any) -> Any:
+    """Unit normals at positions (*times, 3), towards the side on which the stroller is. **Arguments:** `xp`: NumPy, or
+    `jax.numpy` for a page."""
     components = surface.normal(surface.in_own_axes(vector_of(position.T)))
-    zero = np.zeros(len(position))
-    filled = vector_of(zero if part is None else np.asarray(part) + zero for part in components)
-    return surface.sign(side, DRIVES) * np.stack([np.asarray(part) for part in surface.in_fixed_frame(filled)], axis=-1)
+    zero = xp.zeros(position.shape[:-1])
+    filled = vector_of(zero if part is None else xp.asarray(part) + zero for part in components)
+    return surface.sign(side, DRIVES) * xp.stack([xp.asarray(part) for part in surface.in_fixed_frame(filled)], axis=-1)
+
+
+class Posture(NamedTuple):
+    """The drawn parts of a vehicle.
+
+    - `places`, `rotations`: where frame, left, right and front wheel are, and how they are rotated.
+    - `contacts`: the points above the ground at the rear axle and the front wheel; `up`, `left`: the axes along which
+      the ground's forces act there.
+    """
+
+    places: tuple[Any, ...]
+    rotations: tuple[Any, ...]
+    contacts: tuple[Any, Any]
+    up: Any
+    left: tuple[Any, Any]
+
+    @classmethod
+    def of(
+        cls, xp: Any, length: Any, position: Any, direction: Any, normal: Any, steering: Any, angles: Any
+    ) -> "Posture":
+        """The parts of a vehicle with a wheelbase [m], for its quantities (*times, ...), the ground's normal, and the
+        angles [rad] by which left, right and front wheel have rolled. **Arguments:** `xp`: as for `normals`."""
+        x = direction / xp.linalg.norm(direction, axis=-1, keepdims=True)
+        y = xp.cross(normal, x)
+        y = y / xp.linalg.norm(y, axis=-1, keepdims=True)
+        z = xp.cross(x, y)
+        cosine, sine = xp.cos(steering)[..., None], xp.sin(steering)[..., None]
+        forward, left = cosine * x + sine * y, cosine * y - sine * x
+        radius, half = RADIUS * length, 0.5 * TRACK * length
+        axle, front = position + radius * z, position + length * x + radius * z
+
+        def rolled(ahead: Any, axis: Any, angle: Any) -> Any:
+            cosine, sine = xp.cos(angle)[..., None], xp.sin(angle)[..., None]
+            return xp.stack([cosine * ahead - sine * z, axis, sine * ahead + cosine * z], axis=-1)
+
+        wheels = (rolled(x, y, angles[0]), rolled(x, y, angles[1]), rolled(forward, left, angles[2]))
+        return cls(
+            (axle, axle + half * y, axle - half * y, front),
+            (xp.stack([x, y, z], axis=-1), *wheels),
+            (position + 0.02 * radius * z, position + length * x + 0.02 * radius * z),
+            z,
+            (y, left),
+        )
 
 
 def show(run: Any, number: int, name: str) -> Show:
@@ -89,60 +133,37 @@ def show(run: Any, number: int, name: str) -> Show:
     scene = run.spec.ride.scene
     length, colour = float(scene.body.wheelbase), COLOURS[number % len(COLOURS)]
     radius, half = RADIUS * length, TRACK * length / 2.0
-    step_times = np.asarray(run.t)
     times, reader = refined(run, radius)
-    position, direction = reader(run.position), reader(run.direction)
-    normal = reader(normals(scene.surface, scene.side, np.asarray(run.position)))
-    x = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
-    y = np.cross(normal, x)
-    y /= np.linalg.norm(y, axis=-1, keepdims=True)
-    z = np.cross(x, y)
-    steering = reader(run.steering)[:, None]
-    forward, left = np.cos(steering) * x + np.sin(steering) * y, np.cos(steering) * y - np.sin(steering) * x
-    axle, front = position + radius * z, position + length * x + radius * z
-    roll_angles = {
-        side: reader(_integral(step_times, (np.asarray(run.speed) - sign * half * np.asarray(run.yaw_rate)) / radius))
-        for side, sign in (("left", 1.0), ("right", -1.0))
-    }
-    front_angle = reader(_integral(step_times, np.asarray(run.front_speed) / radius))
-    rear = wheel(radius, WIDTH * length, (DARK, PALE))
-    weight = float(scene.body.mass * scene.gravity)
-    forces, scale = reader(run.side_force), WEIGHT * length / weight
-    contacts = (position + 0.02 * radius * z, position + length * x + 0.02 * radius * z)
+    normal = reader(normals(np, scene.surface, scene.side, np.asarray(run.position)))
+    yaw = half * np.asarray(run.yaw_rate)
+    speeds = (np.asarray(run.speed) - yaw, np.asarray(run.speed) + yaw, np.asarray(run.front_speed))
+    angles = [reader(_integral(np.asarray(run.t), speed / radius)) for speed in speeds]
+    drawn = (reader(run.position), reader(run.direction), normal, reader(run.steering))
+    posture = Posture.of(np, length, *drawn, angles)
+    wheel_mesh = wheel(radius, WIDTH * length, (DARK, PALE))
+    names = ("frame", "left wheel", "right wheel", "front wheel")
+    meshes = (frame(length, colour), wheel_mesh, wheel_mesh, wheel_mesh)
+    parts = zip(names, posture.places, posture.rotations, meshes, strict=True)
+    (rear, front), (rear_left, front_left), up = posture.contacts, posture.left, posture.up
+    loads, forces = reader(run.load), reader(run.side_force)
+    scale, width = WEIGHT * length / float(scene.body.mass * scene.gravity), 0.035 * length
     grip = np.asarray(run.grip())[:, : len(run.loaded_axles)]
-    loads = reader(run.load)
     return Show(
         name,
         colour,
         times,
         normal,
         SIZE * length,
+        tuple(Body(part, place, turned(rotation), mesh) for part, place, rotation, mesh in parts),
         (
-            Body("frame", axle, _orientation(x, y, z), frame(length, colour)),
-            Body("left wheel", axle + half * y, _rolling(x, y, z, roll_angles["left"]), rear),
-            Body("right wheel", axle - half * y, _rolling(x, y, z, roll_angles["right"]), rear),
-            Body(
-                "front wheel",
-                front,
-                _rolling(forward, left, z, front_angle),
-                wheel(radius, WIDTH * length, (DARK, PALE)),
-            ),
+            Trace("path of the rear axle", rear, GREEN, 0.05 * length),
+            Trace("path of the front wheel", front, BLUE, 0.025 * length),
         ),
         (
-            Trace("path of the rear axle", contacts[0], GREEN, 0.05 * length),
-            Trace("path of the front wheel", contacts[1], BLUE, 0.025 * length),
-        ),
-        (
-            Arrow(
-                "normal force, rear", contacts[0], loads[:, :1] * z, "N", scale, VIOLET, 0.035 * length, through=True
-            ),
-            Arrow(
-                "normal force, front", contacts[1], loads[:, 1:] * z, "N", scale, VIOLET, 0.035 * length, through=True
-            ),
-            Arrow("side force, rear", contacts[0], forces[:, :1] * y, "N", scale, GOLD, 0.035 * length, 2.0 * length),
-            Arrow(
-                "side force, front", contacts[1], forces[:, 1:] * left, "N", scale, GOLD, 0.035 * length, 2.0 * length
-            ),
+            Arrow("normal force, rear", rear, loads[:, :1] * up, "N", scale, VIOLET, width, through=True),
+            Arrow("normal force, front", front, loads[:, 1:] * up, "N", scale, VIOLET, width, through=True),
+            Arrow("side force, rear", rear, forces[:, :1] * rear_left, "N", scale, GOLD, width, 2.0 * length),
+            Arrow("side force, front", front, forces[:, 1:] * front_left, "N", scale, GOLD, width, 2.0 * length),
         ),
         (
             Curve("speed [m/s]", reader(run.speed)),
@@ -199,16 +220,6 @@ def frame(length: float, colour: int) -> tuple[Mesh, ...]:
         *posts,
         bar(handle[0], handle[1], 1.3 * thickness, DARK),
     )
-
-
-def _orientation(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    return turned(np.stack([x, y, z], axis=-1))
-
-
-def _rolling(x: np.ndarray, y: np.ndarray, z: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """A rotation about y by an angle, forwards."""
-    cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    return _orientation(cosine * x - sine * z, y, sine * x + cosine * z)
 
 
 def _integral(times: np.ndarray, rate: np.ndarray) -> np.ndarray:
