@@ -5,7 +5,7 @@ from close import assert_close
 from tops import rutstam_top
 
 import tippe
-from tippe.fit.hybrid_fit import HybridModel
+from tippe.fit.identify import HybridModel
 
 
 def test_rows_of_a_film_are_the_runs_one_by_one_and_illegal_rows_have_no_prediction():

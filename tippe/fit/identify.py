@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Hashable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import numpy as np
@@ -20,8 +20,10 @@ from nonholonomic.identification import (
     scene_unknowns,
     search_options,
 )
-from nonholonomic.parameters import numbers
+from nonholonomic.integration import Settings
+from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.progress import status_line
+from nonholonomic.runs import TableJob
 from nonholonomic.validation import as_number, require_kind
 
 from ..model.launch import Launch
@@ -30,9 +32,112 @@ from ..runs.checks import angle_of, check_run, check_smooth
 from ..runs.launches import variable_numbers
 from ..runs.run_kind import run_kind_of
 from ..runs.verbs import simulate
-from .hybrid_fit import HybridModel
 from .inversion_times import AbstractTimes, InversionTimes, Values
 from .recording import Recording
+
+#: Number of rows that one program simulates together: as many as a fit explores at once, or a few.
+BATCH, FEW = 512, 64
+
+
+@eqx.filter_jit
+def _samples_of_batch(scene: Scene, data: Recording, tolerance: Any, columns: dict[str, Any]) -> Any:
+    """The samples of a recording in every row of a batch; NaN for illegal parameters, and after the end of a run."""
+
+    def run(scene: Scene, launch: Any, times: Any) -> Any:
+        return simulate(scene, launch, times[-1], times, tolerance)
+
+    return predicted(scene, [(data, columns)], BATCH, run)[0]
+
+
+class HybridModel(AbstractDataModel):
+    """Predictions of all data for a scene with flights, impacts, stick and slip; `SceneModel` does the same for smooth
+    scenes.
+
+    Times are computed as in tables, in one ensemble, and the runs of a recording as lanes of one program; only recordings
+    with `SetValuedCoulomb` are simulated one by one. For parameters that are illegal in the scene, there are no
+    predictions.
+    """
+
+    scene: Scene
+    data: tuple[Any, ...]
+    seen: Int[np.ndarray, " n"]
+    tolerance: float
+
+    #: The model runs mode by mode and cannot be traced.
+    on_host: ClassVar[bool] = True
+
+    def together(self, source: Any, values: Values) -> int:
+        """Each set of data is predicted for itself."""
+        return id(source)
+
+    def predict(self, sources: list[tuple[Any, Values]], rows: int) -> list[Float[np.ndarray, "rows size"]]:
+        predictions = []
+        for data, values in sources:
+            columns = {name: np.asarray(part) for name, part in values.items()}
+            of_batch: Any = self._times
+            if isinstance(data, Recording):
+                # To compile lanes of runs that stick would take longer than to run them one by one.
+                of_batch = self._samples_one_by_one if self.scene.friction.set_valued else self._samples
+            batches = [slice(first, first + BATCH) for first in range(0, rows, BATCH)]
+            parts = [of_batch(data, {name: part[batch] for name, part in columns.items()}) for batch in batches]
+            predictions.append(np.concatenate(parts))
+        return predictions
+
+    def _samples(self, data: Recording, columns: dict[str, np.ndarray]) -> Float[np.ndarray, "rows size"]:
+        """The samples in at most `BATCH` rows, which are filled up to this number, so that one program serves all calls."""
+        count = len(next(iter(columns.values())))
+        filled = {name: np.pad(part, (0, BATCH - count), constant_values=np.nan) for name, part in columns.items()}
+        return np.asarray(_samples_of_batch(self.scene, data, np.asarray(self.tolerance), filled))[:count]
+
+    def _samples_one_by_one(self, data: Recording, columns: dict[str, np.ndarray]) -> Float[np.ndarray, "rows size"]:
+        """The same, run by run. Samples before the launch equal those at the launch; samples after the run's end are NaN."""
+        rows = [dict(zip(columns, row, strict=True)) for row in np.stack(list(columns.values()), axis=1).tolist()]
+        predictions = np.full((len(rows), len(data.times), len(data.columns)), np.nan)
+        for row, samples in zip(rows, predictions, strict=True):
+            t0 = row.pop("t0", float(data.t0))
+            if not self._allows(data, row):
+                continue
+            roots = with_numbers({"scene": self.scene, "launch": data.launch}, row)
+            times, inverse = np.unique(np.maximum(np.asarray(data.times) - t0, 0.0), return_inverse=True)
+            run = simulate(roots["scene"], roots["launch"], float(times[-1]), tolerance=self.tolerance)
+            reached = run.at(times[times <= float(run.end_time)])
+            values = np.stack([np.asarray(data.quantities.samples(reached, name)) for name in data.columns], axis=-1)
+            is_reached = inverse < len(values)
+            samples[is_reached] = values[inverse[is_reached]]
+        return predictions.reshape(len(rows), -1)
+
+    def _times(self, data: AbstractTimes, columns: dict[str, np.ndarray]) -> Float[np.ndarray, "rows launches"]:
+        """The times in at most `BATCH` rows; NaN for illegal parameters."""
+        count, launches = len(next(iter(columns.values()))), data.size
+        columns = {name: part for name, part in columns.items() if name != "t0"}
+        legal = np.array(
+            [self._allows(data, {name: float(part[i]) for name, part in columns.items()}) for i in range(count)]
+        )
+        predictions = np.full((count, launches), np.nan)
+        if not legal.any():
+            return predictions
+        # Two numbers of cells, hence two programs, serve all calls; only the first cells run.
+        size = FEW if legal.sum() <= FEW else BATCH
+        of_launch = {name: value for name, value in numbers("launch", data.launch).items() if value is not None}
+        cells = {
+            name: np.tile(np.broadcast_to(np.asarray(value), (launches,)), size) for name, value in of_launch.items()
+        }
+        for name, part in columns.items():
+            filled = np.pad(part[legal], (0, size - legal.sum()), constant_values=part[legal][0])
+            cells[name] = np.repeat(filled, launches)
+        job = TableJob(data.timed(self.scene), data.form, float(data.t1), "first", Settings(self.tolerance))
+        results = job(cells, launches * int(legal.sum()))
+        time = np.asarray(data.of_cells(self.scene, results, cells["launch.theta"]))
+        has_failed = np.asarray(results["status"]) == data.form.words.index("failed")
+        predictions[legal] = np.where(has_failed, np.nan, time).reshape(size, launches)[: legal.sum()]
+        return predictions
+
+    def _allows(self, data: Any, row: dict[str, float]) -> bool:
+        try:
+            with_numbers({"scene": self.scene, "launch": data.launch}, row)
+        except ValueError:
+            return False
+        return True
 
 
 class SceneModel(AbstractDataModel):
@@ -121,47 +226,30 @@ def slopes_of(scene: Scene) -> str:
 def prepared(
     scene: Scene, data: Any, free: Any, tolerance: float, caller: str | None
 ) -> tuple[Callable[[Any], Any], tuple[Any, ...], dict[str, Free]]:
-    """The predictions of the measured indices, the data and the unknowns, all checked. **Arguments:** as for
-    `checked_data`."""
-    data = checked_data(scene, data, tolerance, caller)
-    kind = SceneModel if run_kind_of(scene).smooth else HybridModel
-
-    def build(seen: Any) -> Any:
-        return kind(scene=scene, data=data, seen=seen, tolerance=tolerance)
-
-    return build, data, unknowns_of(scene, data, free)
-
-
-def checked_data(scene: Scene, data: Any, tolerance: float, caller: str | None) -> tuple[Any, ...]:
-    """Check the sets of data, and return them as a tuple; `caller`: name of the function that needs derivatives, or
-    `None`."""
+    """The predictions of the measured indices, the data and the unknowns, all checked. **Arguments:** as for `identify`;
+    `caller`: name of the function that needs derivatives, or `None`."""
     require_kind(scene, "scene", Scene)
     if caller is not None:
         check_smooth(scene, caller)
     data = as_sources(data, AbstractTimes | Recording, "an InversionTimes, a ReversalTimes or a Recording")
     check_run(scene, Launch(0.0, 0.0), 1.0, tolerance)
+    sources, names_of_data = [], []
     for source in data:
+        names = [name for name, value in numbers("launch", source.launch).items() if value is not None]
+        names_of_data.append(names + ["t0"] * isinstance(source, Recording))
         if isinstance(source, AbstractTimes):
             source.check(scene)
-    return tuple(_with_angle(scene, source) for source in data)
+        if isinstance(source, InversionTimes) and source.angle is None and not scene.has_stem:
+            # With the default angle written out, one program serves every angle.
+            source = dataclasses.replace(source, angle=angle_of(scene, None))
+        sources.append(source)
+    unknowns = scene_unknowns(free, scene, data[0].launch, list(variable_numbers(scene)), names_of_data)
+    kind: Any = SceneModel if run_kind_of(scene).smooth else HybridModel
 
+    def build(seen: Any) -> Any:
+        return kind(scene=scene, data=tuple(sources), seen=seen, tolerance=tolerance)
 
-def _with_angle(scene: Scene, source: Any) -> Any:
-    """The data with the default angle written out, so that one program serves every angle. With a stem, there is none."""
-    if not isinstance(source, InversionTimes) or source.angle is not None or scene.has_stem:
-        return source
-    return dataclasses.replace(source, angle=angle_of(scene, None))
-
-
-def unknowns_of(scene: Scene, data: tuple[Any, ...], free: Any) -> dict[str, Free]:
-    """Check the unknowns of a scene and its data, and return them by their full names."""
-    launches = [
-        [name for name, value in numbers("launch", source.launch).items() if value is not None] for source in data
-    ]
-    names_of_data = [
-        names + ["t0"] * isinstance(source, Recording) for names, source in zip(launches, data, strict=True)
-    ]
-    return scene_unknowns(free, scene, data[0].launch, list(variable_numbers(scene)), names_of_data)
+    return build, tuple(sources), unknowns
 
 
 def log_density(
