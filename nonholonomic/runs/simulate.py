@@ -148,15 +148,14 @@ def sampled(
 
 def sampled_if_legal(
     model: AbstractModel,
-    names: Names,
     times: Float[Array, " times"],
     t1: Float[Array, ""],
     settings: Settings,
     grid: Float[Array, " steps"] | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
 ) -> tuple[Bool[Array, ""], SampledRows, Settings]:
-    """Whether all numbers, which may be traced, are legal; the run, of zero length if they are not; and its settings.
-    **Arguments:** as for `sampled`."""
+    """Whether all numbers, which may be traced, are legal; the run with the rows for all quantities, of zero length if the
+    numbers are not legal; and its settings. **Arguments:** as for `sampled`."""
     is_legal, horizon, tolerance = legal_run(model.legal(), t1, settings.tolerance, times)
     if grid is None:
         t1, times = horizon, jnp.where(is_legal, times, 0.0)
@@ -164,7 +163,7 @@ def sampled_if_legal(
         # An illegal run has zero length, but Diffrax would differentiate it.
         model = nan_unless(is_legal, model)
     settings = settings.with_tolerance(tolerance)
-    return is_legal, sampled(model, names, times, t1, settings, grid, adjoint), settings
+    return is_legal, sampled(model, None, times, t1, settings, grid, adjoint), settings
 
 
 def problem_of_run(modules: tuple[AbstractModel, Names], cells: int | None) -> AbstractProblem:
@@ -178,7 +177,7 @@ def _sampled(
     model: AbstractModel, times: Float[Array, " times"], t1: Float[Array, ""], settings: Settings
 ) -> Trajectory:
     """The run, or NaN and "failed" if a traced number is out of range."""
-    is_legal, samples, legal_settings = sampled_if_legal(model, None, times, t1, settings)
+    is_legal, samples, legal_settings = sampled_if_legal(model, times, t1, settings)
     outcome = samples.outcome
     names = tuple(model.quantities)
     values = model.read(names, times, nan_unless(is_legal, samples.rows), samples.mode)

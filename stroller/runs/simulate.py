@@ -62,7 +62,7 @@ def _concrete(ride: Ride, times: Float[Array, " times"]) -> Trajectory:
 @eqx.filter_jit
 def _sampled(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None) -> Trajectory:
     """The run at `times`; NaN and `finished` false if a traced number is out of range."""
-    is_legal, samples, _ = sampled_if_legal(ride.model, None, times, ride.t1, ride.settings, ride.grid, adjoint)
+    is_legal, samples, _ = sampled_if_legal(ride.model, times, ride.t1, ride.settings, ride.grid, adjoint)
     run = read_off(RideSpec.of(ride), times, samples.rows, stats_of(samples.outcome))
     stats = run.stats._replace(finished=run.stats.finished & is_legal)
     return eqx.tree_at(lambda trajectory: (trajectory.t, trajectory.stats), nan_unless(is_legal, run), (times, stats))

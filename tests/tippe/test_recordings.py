@@ -9,7 +9,12 @@ from viscous_top import Body, azimuth, follow, start, theta
 
 import stroller
 import tippe
-from tippe.fit.identify import unknowns_of
+from tippe.fit.identify import prepared
+
+
+def unknowns_of(scene, data, free):
+    return prepared(scene, data, free, 1e-8, None)[2]
+
 
 LAUNCHES = {"theta": (0.4, 0.5), "spin": (100.0, 110.0), "azimuth": (0.7, 3.0), "t0": (0.013, 0.2), "samples": (30, 24)}
 LAUNCHES |= {"velocity[0]": (0.0, 0.08)}

@@ -115,7 +115,7 @@ def _traced(
             name = "contact = 'hybrid'" if scene.contact == "hybrid" else "SetValuedCoulomb"
             raise ValueError(f"adjoint = {adjoint!r} must be omitted for {name}")
         explicit_tableau(settings.for_lanes)
-    is_legal, run, settings = sampled_if_legal(model, None, times, t1, settings, adjoint=adjoint)
+    is_legal, run, settings = sampled_if_legal(model, times, t1, settings, adjoint=adjoint)
     outcome = run.outcome
     status = jnp.where(is_legal, model.ended(outcome, settings.tolerance)[0], int(Status.ILLEGAL))
     rejected, start = outcome.rejected[0], scene.state(model.launch)
