@@ -21,9 +21,7 @@ from tippe.modes.impact import Impact, approach
 from tippe.modes.inversion_problem import InversionProblem
 from tippe.modes.sticking import contact_modes
 from tippe.modes.trajectory_problem import trajectory_problem
-from tippe.runs.airborne_trajectory import arena_modes
-from tippe.runs.flight_trajectory import level_modes
-from tippe.runs.run_kind import run_kind_of
+from tippe.runs.run_kind import flight_modes, run_kind_of
 
 #: 16 to 44 ns for each number on a CPU, where a product takes one.
 SLOW = {"sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "exp2", "expm1"}
@@ -81,8 +79,7 @@ def table_problems(scene, launch):
 def trajectory_problems(scene, launch):
     """The problems that `simulate` integrates, with all that rides along: one, or that of every mode."""
     if scene.contact == "hybrid":
-        modes_of = level_modes if scene.flies_in_closed_form else arena_modes
-        modes, _, state = modes_of((scene, launch), 1e-9)
+        modes, _, state = flight_modes(scene, launch, 1e-9)
     else:
         run = trajectory_problem((scene, launch))
         if not scene.friction.set_valued:

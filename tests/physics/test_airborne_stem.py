@@ -19,7 +19,7 @@ import tippe
 from nonholonomic.hybrid.samples import program_groups
 from tippe.modes.airborne import ON_STEM, STRIKING
 from tippe.modes.airborne_stem import FlyBoth
-from tippe.runs.airborne_trajectory import arena_modes
+from tippe.runs.run_kind import flight_modes
 
 REFERENCE = recorded()
 STEM = tippe.Stem(radius=5e-3, offset=0.016)
@@ -98,7 +98,7 @@ def test_a_top_that_leans_ends_as_unresolved():
 
 def test_both_spheres_share_their_programs_in_a_batch():
     """Sliding on either sphere, and flying and striking, differ in the values of their arrays only."""
-    modes, _, _ = arena_modes((stem_scene(tippe.Cylinder(0.3), 0.3), tippe.Launch(0.1, 180.0)), jnp.asarray(1e-9))
+    modes, _, _ = flight_modes(stem_scene(tippe.Cylinder(0.3), 0.3), tippe.Launch(0.1, 180.0), jnp.asarray(1e-9))
     assert program_groups(modes) == [(0, 2), (1, 3)]
 
 

@@ -10,16 +10,10 @@ from jaxtyping import Array, Float, Int
 
 from nonholonomic.geometry import scale, sum_vectors, vector_of
 from nonholonomic.hybrid import BETWEEN, Segment
-from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.contact_dynamics import Motion
-from ..model.dynamics import NO_COSINE
-from ..model.launch import Launch
-from ..model.scene import Scene
 from ..model.state import parts
 from ..model.stick_slip import StickSlip
-from ..model.top import Top
-from ..modes import airborne, airborne_stem
 from ..modes.airborne import (
     FLYING,
     ON_STEM,
@@ -34,10 +28,7 @@ from ..modes.airborne import (
     standing,
 )
 from ..modes.airborne_ends import lifted
-from ..modes.airborne_stick_slip import modes as stick_slip_modes
 from ..modes.free_body import Ball, balls
-from ..modes.inversion_problem import InversionProblem
-from ..modes.trajectory_problem import trajectory_problem
 from .flight_trajectory import HybridTrajectory
 from .observables import of_each_run
 
@@ -144,25 +135,3 @@ class StickSlipArenaTrajectory(ArenaTrajectory):
         if piece.number == BETWEEN:
             return float(np.diff(piece.at(np.array([piece.begin, piece.end]))[18])[0])
         return ArenaTrajectory.work_in(piece)
-
-
-def arena_modes(
-    modules: tuple[Scene, Launch], tolerance: Any, cells: int = 1
-) -> tuple[Any, Int[Array, " cells"], Float[Array, "19 cells"]]:
-    """The modes of launches of a hybrid scene on any arena, the index of each first mode, and the initial states.
-
-    **Arguments:** `modules`: scene and launch; `tolerance`: relative tolerance of the integration; `cells`: number of
-    launches.
-    """
-    problem = _start(*modules, cells)
-    modes = airborne.modes if modules[0].body.stem is None else airborne_stem.modes
-    if modules[0].friction.set_valued:
-        modes = stick_slip_modes
-    return (*modes(modules[0], problem, tolerance, last=False, with_quadratures=True), problem.states)
-
-
-@compiled_setup
-def _start(scene: Scene[Top], launch: Launch, cells: int) -> InversionProblem:
-    """The launches, with the passive quadratures."""
-    state, scales = trajectory_problem((scene, launch), cells).start()
-    return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state, scales)

@@ -13,19 +13,12 @@ from nonholonomic.hybrid import (
     Segment,
 )
 from nonholonomic.integration.status import UNRESOLVED, Status
-from nonholonomic.xla_cpu import compiled_setup
 
-from ..model.dynamics import NO_COSINE
-from ..model.launch import Launch
-from ..model.scene import Scene
-from ..model.top import Top
 from ..modes.bouncing import height
 from ..modes.free_body import Ball, FreeBody, as_free_body, balls, energy, standing_on
 from ..modes.impact import TOUCHING, approach
-from ..modes.inversion_problem import InversionProblem
 from ..modes.leaning import BOTH
-from ..modes.sliding import MOST_BOUNCES, modes
-from ..modes.trajectory_problem import trajectory_problem
+from ..modes.sliding import MOST_BOUNCES
 from .observables import AbstractTrajectory, of_each_run
 from .run_kind import why_unbalanced
 
@@ -188,23 +181,3 @@ class HybridTrajectory(AbstractTrajectory):
     def __str__(self) -> str:
         text = f"{super().__str__()}\n  {self._flights} flights, {self.stats['impact_loss']:.3g} J lost in impacts"
         return f"{text}\n  unresolved: {self._reason()}" if self.status == Status.UNRESOLVED.word else text
-
-
-def level_modes(
-    modules: tuple[Scene, Launch], tolerance: Any, cells: int = 1
-) -> tuple[Any, Int[Array, " cells"], Float[Array, "15 cells"]]:
-    """The modes of launches of a hybrid scene on a level plane, the index of each first mode, and the initial states.
-
-    **Arguments:** `modules`: scene and launch; `tolerance`: no mode needs it; `cells`: number of launches.
-    """
-    problem = _start(*modules, cells)
-    return (*modes(modules[0], problem, tolerance, last=False, with_quadratures=True), problem.states)
-
-
-@compiled_setup
-def _start(scene: Scene[Top], launch: Launch, cells: int) -> InversionProblem:
-    """The launches, with the passive quadratures, whose position is that of the centre of mass."""
-    state, scales = trajectory_problem((scene, launch), cells).start()
-    place = state[8:10] - scene.body.offset * state[2:4]
-    state = jnp.concatenate([state[:8], place, state[10:]])
-    return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state, scales)

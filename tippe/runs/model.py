@@ -37,13 +37,13 @@ from ..modes.airborne_ends import on_the_ground
 from ..modes.inversion_problem import InversionProblem, StemContact
 from ..modes.sticking import contact_modes
 from ..modes.trajectory_problem import BEHIND_PATH, TrajectoryProblem, trajectory_problem
-from .airborne_trajectory import ArenaTrajectory, StickSlipArenaTrajectory, arena_modes
+from .airborne_trajectory import ArenaTrajectory, StickSlipArenaTrajectory
 from .checks import INVERTED, check_last_on_stem, event_bounds, event_of
-from .flight_trajectory import HybridTrajectory, level_modes
+from .flight_trajectory import HybridTrajectory
 from .launches import NUMBERS_OF_A_LAUNCH, labels, variable_numbers
 from .observables import AbstractTrajectory
 from .quantities import COMPONENTS, DIRECTION, ON_CURVED, PASSIVE, PATH, quantities_of
-from .run_kind import COUNTED, HYBRID, RunKind, has_grown, run_kind_of
+from .run_kind import COUNTED, HYBRID, RunKind, flight_modes, has_grown, run_kind_of
 from .simulate import simulate_launch
 from .trajectory import Trajectory
 
@@ -215,7 +215,7 @@ class TopModel(AbstractSceneModel):
             return (*self.kind.modes(scene, problem, tolerance, continues), problem.states)
         if scene.contact == "stop":
             return contact_modes(trajectory_problem((scene, launch), cells), tolerance)
-        return (level_modes if scene.flies_in_closed_form else arena_modes)((scene, launch), tolerance, cells)
+        return flight_modes(scene, launch, tolerance, cells)
 
     def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Any:
         return simulate_launch(self, t1, times, tolerance, solver, adjoint)

@@ -11,9 +11,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.hybrid import AbstractBatchedMode
 from nonholonomic.integration.status import Status
+from nonholonomic.runs import Start
+from nonholonomic.xla_cpu import compiled_setup
 
+from ..model.dynamics import NO_COSINE
+from ..model.launch import Launch
 from ..model.scene import Scene
+from ..model.top import Top
 from ..modes import airborne, airborne_ends, airborne_stem, airborne_stick_slip, free_body, sliding, sticking
+from ..modes.inversion_problem import InversionProblem
+from ..modes.trajectory_problem import trajectory_problem
 
 
 class RunKind(NamedTuple):
@@ -65,6 +72,25 @@ def run_kind_of(scene: Scene[Any]) -> RunKind:
     if scene.flies_in_closed_form:
         return HYBRID
     return AIRBORNE if scene.body.stem is None else ON_STEM_TOO
+
+
+def flight_modes(scene: Scene[Top], launch: Launch, tolerance: Any, cells: int = 1) -> Start:
+    """The modes of launches of a hybrid scene, with their path, rotation and work; the index of each first mode; and the
+    initial states."""
+    problem, modes = _start_of_flights(scene, launch, cells), run_kind_of(scene).modes
+    assert modes is not None
+    return (*modes(scene, problem, tolerance, last=False, with_quadratures=True), problem.states)
+
+
+@compiled_setup
+def _start_of_flights(scene: Scene[Top], launch: Launch, cells: int) -> InversionProblem:
+    """The launches, with the passive quadratures."""
+    state, scales = trajectory_problem((scene, launch), cells).start()
+    if scene.flies_in_closed_form:
+        # The path is that of the centre of mass.
+        place = state[8:10] - scene.body.offset * state[2:4]
+        state = jnp.concatenate([state[:8], place, state[10:]])
+    return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state, scales)
 
 
 def why_unresolved(kind: RunKind) -> str:
