@@ -2,9 +2,7 @@
 
 from typing import Any
 
-from nonholonomic.integration import ImplicitMidpoint
-from nonholonomic.integration.checks import require_adaptive, require_adjoint, require_run
-from nonholonomic.validation import require_whole
+from nonholonomic.integration.checks import require_run
 
 from ..model.input import check_input
 from ..model.launch import Launch
@@ -18,11 +16,3 @@ def check_run(scene: Any, launch: Any, t1: Any, input: Any, tolerance: Any) -> N
     require_run(scene, launch, t1, tolerance, (Scene, Launch), lists)
     scene.check(launch)
     check_input(input, scene, launch)
-
-
-def check_options(solver: Any, max_steps: Any, adjoint: Any) -> None:
-    """Raise `ValueError` unless the solver is adaptive or an `ImplicitMidpoint`, and the other options are in range."""
-    if not isinstance(solver, ImplicitMidpoint):
-        require_adaptive(solver, ", or an ImplicitMidpoint")
-    require_whole(max_steps, "max_steps", 1)
-    require_adjoint(adjoint)

@@ -11,11 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.integration import ImplicitMidpoint, Settings
-from nonholonomic.integration.checks import require_times
+from nonholonomic.integration.checks import require_adaptive, require_adjoint, require_times
 from nonholonomic.runs import sampled_if_legal
-from nonholonomic.validation import as_known, is_traced, nan_unless
+from nonholonomic.validation import as_known, is_traced, nan_unless, require_whole
 
-from .checks import check_options
 from .steps import Ride, RideSpec, followed, stats_of
 from .trajectory import Trajectory, read_off, read_off_compiled
 
@@ -33,7 +32,10 @@ def ride(
     adjoint: diffrax.AbstractAdjoint | None,
 ) -> Trajectory:
     """The trajectory of a `RideModel`. **Arguments:** as for `stroller.simulate`; the model was checked."""
-    check_options(solver, max_steps, adjoint)
+    if not isinstance(solver, ImplicitMidpoint):
+        require_adaptive(solver, ", or an ImplicitMidpoint")
+    require_whole(max_steps, "max_steps", 1)
+    require_adjoint(adjoint)
     end, grid = as_known(t1), None
     times = _evenly_spaced(end) if times is None else as_known(times)
     require_times(times, t1)

@@ -1,7 +1,6 @@
 """The events of a top, and checks of the arguments of a run, before anything compiles and inside a program."""
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,6 @@ from jaxtyping import Array, Float
 from nonholonomic.integration.checks import require_run
 from nonholonomic.validation import (
     IN_DEGREES,
-    Bound,
     as_number,
     is_traced,
     require,
@@ -89,12 +87,6 @@ def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, angle: An
         warn("theta = 0.0 is exactly upright, where a top stays forever: launch it at a small angle, such as 0.01 rad")
 
 
-def event_bounds(angle: Any) -> Iterator[Bound]:
-    """The range of the angle [rad] to be reached, if there is one."""
-    if angle is not None and not isinstance(angle, StemContact):
-        yield Bound(angle, "angle", above=0.0, at_most=math.pi, unit="rad")
-
-
 def check_smooth(scene: Scene, caller: str) -> None:
     """Raise `ValueError` for a scene with hybrid runs, which do not support derivatives here."""
     if scene.contact == "hybrid":
@@ -103,15 +95,6 @@ def check_smooth(scene: Scene, caller: str) -> None:
         kind = type(scene.friction).__name__
         raise ValueError(
             f"friction = {kind} must be a law with a single mode for {caller}; inversion_table supports others"
-        )
-
-
-def check_last_on_stem(event: Any, last: bool) -> None:
-    """Raise `ValueError` for the derivative of the time at which a stem takes over for the last time."""
-    if last and isinstance(event, StemContact):
-        raise ValueError(
-            "crossing = 'last' has no derivatives for the contact of a stem: give an angle, such as angle=0.95 * math.pi, or "
-            "take crossing = 'first'"
         )
 
 

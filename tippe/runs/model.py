@@ -1,6 +1,7 @@
 """The top as a model for the functions of `nonholonomic.runs`."""
 
 import dataclasses
+import math
 from typing import Any
 
 import equinox as eqx
@@ -24,7 +25,7 @@ from nonholonomic.runs import (
     with_event,
 )
 from nonholonomic.sweeps import Quantity, Variable
-from nonholonomic.validation import all_bounds, legal, require_kind, require_scalars
+from nonholonomic.validation import Bound, all_bounds, legal, require_kind, require_scalars
 
 from ..model.contact_dynamics import LOSSES
 from ..model.directions import generic_direction
@@ -38,7 +39,7 @@ from ..modes.inversion_problem import InversionProblem, StemContact
 from ..modes.sticking import contact_modes
 from ..modes.trajectory_problem import BEHIND_PATH, TrajectoryProblem, trajectory_problem
 from .airborne_trajectory import ArenaTrajectory, StickSlipArenaTrajectory
-from .checks import INVERTED, check_last_on_stem, event_bounds, event_of
+from .checks import INVERTED, event_of
 from .flight_trajectory import HybridTrajectory
 from .launches import NUMBERS_OF_A_LAUNCH, labels, variable_numbers
 from .observables import AbstractTrajectory
@@ -150,7 +151,9 @@ class TopModel(AbstractSceneModel):
 
     def legal(self) -> Bool[Array, "..."]:
         scene, launch = self.scene, self.launch
-        bounds = (*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch), *event_bounds(self.angle))
+        bounds = [*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch)]
+        if self.angle is not None and not isinstance(self.angle, StemContact):
+            bounds.append(Bound(self.angle, "angle", above=0.0, at_most=math.pi, unit="rad"))
         is_legal = legal(bounds)
         return is_legal & (scene.dynamics.normal_spin(scene.state(launch)) != 0.0) if self.reverses else is_legal
 
@@ -172,7 +175,11 @@ class TopModel(AbstractSceneModel):
         return {name: COUNTED[name] for name in self.kind.counts}
 
     def require_differentiable(self, nested: bool, continues: bool = False) -> None:
-        check_last_on_stem(self.angle, continues)
+        if continues and isinstance(self.angle, StemContact):
+            raise ValueError(
+                "crossing = 'last' has no derivatives for the contact of a stem: give an angle, such as "
+                "angle=0.95 * math.pi, or take crossing = 'first'"
+            )
         if nested and not self.smooth:
             raise ValueError(
                 "second derivatives are not available through changes of mode: contact = 'hybrid', SetValuedCoulomb"

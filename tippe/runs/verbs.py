@@ -16,7 +16,6 @@ from nonholonomic.views import Page
 
 from ..model.launch import Launch
 from ..model.scene import Scene
-from ..modes.inversion_problem import StemContact
 from .checks import check_event, check_reversible, check_run, event_of, require_rigid, warn_if_it_cannot_invert
 from .explore import TOLERANCE
 from .flight_trajectory import HybridTrajectory
@@ -177,10 +176,9 @@ def inversion_time(
     """
     check_run(scene, launch, t1, tolerance)
     check_event(angle, crossing)
-    settings = Settings(tolerance, solver)
-    explicit_tableau(settings.for_lanes)
     warn_if_it_cannot_invert(scene, launch, launch.theta, angle)
-    return first_or_last_time(scene, launch, t1, event_of(scene, angle), crossing, settings)
+    model = TopModel.timed(scene, launch, event_of(scene, angle))
+    return first_or_last_time(model, t1, crossing, Settings(tolerance, solver))
 
 
 @status_line("simulating")
@@ -227,38 +225,20 @@ def reversal_time(
     check_run(scene, launch, t1, tolerance, "reversal_table takes lists, and jax.vmap maps over them")
     require_rigid(scene)
     check_reversible(launch, {})
-    settings = Settings(tolerance, solver)
+    return first_or_last_time(TopModel.timed(scene, launch, None), t1, "first", Settings(tolerance, solver))
+
+
+def first_or_last_time(model: TopModel, t1: Any, crossing: str, settings: Settings) -> Float[Array, ""]:
+    """The time of the event of a launch. **Arguments:** as for `inversion_time`, checked.
+
+    **Raises:** `ValueError` for a run that needed too many steps. A warning states any other failure.
+    """
     explicit_tableau(settings.for_lanes)
-    return first_or_last_time(scene, launch, t1, None, "first", settings)
-
-
-def first_or_last_time(
-    scene: Scene,
-    launch: Launch,
-    t1: float | Float[Array, ""],
-    angle: Float[Array, ""] | StemContact | None,
-    crossing: str,
-    settings: Settings,
-) -> Float[Array, ""]:
-    """The time at which theta reaches an angle, or at which the stem carries the top, or, without an angle, at which the
-    spin about the normal reverses.
-
-    **Arguments:** as for `inversion_time`, checked.
-    """
-    model = TopModel.timed(scene, launch, angle)
     time = time_of_event(model, t1, settings, crossing == "last")
-    if not any(is_traced(leaf) for leaf in jax.tree.leaves((model, t1, time, settings))) and np.isnan(time):
-        explain_failure(model, float(t1), crossing, settings)
-    return time
-
-
-def explain_failure(model: TopModel, t1: float, crossing: str, settings: Settings) -> None:
-    """Raise `ValueError` for a run that needed too many steps; warn of any other failure. This repeats the run to find
-    the cause.
-
-    **Arguments:** as for `inversion_time`.
-    """
-    form = REVERSALS if model.reverses else INVERSIONS
+    if any(is_traced(leaf) for leaf in jax.tree.leaves((model, t1, time, settings))) or not np.isnan(time):
+        return time
+    # Repeat the run to find the cause.
+    t1, form = float(t1), REVERSALS if model.reverses else INVERSIONS
     cell = {name: values[0] for name, values in TableJob(model, form, t1, crossing, settings)({}, 1).items()}
     word = form.words[cell["status"]]
     if word == "failed" and cell["steps"] >= settings.max_steps:
@@ -266,6 +246,7 @@ def explain_failure(model: TopModel, t1: float, crossing: str, settings: Setting
     reason = f": {why_unresolved(model.kind)}" if word == "unresolved" else ""
     end = f"at {cell['end_time']:.6g} s, at {cell['end_theta']:.6g} rad"
     warn(f"the {form.event} time is NaN: the run ended as {word!r} {end}{reason}")
+    return time
 
 
 @status_line("simulating")
