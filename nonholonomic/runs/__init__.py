@@ -8,7 +8,6 @@ from ..hybrid.saltation import UNMEASURED as UNMEASURED
 from ..hybrid.saltation import Clock as Clock
 from .data import EventTimes as EventTimes
 from .data import Recording as Recording
-from .data import predicted_columns as predicted_columns
 from .ensemble import Ensemble as Ensemble
 from .event import EventFunction as EventFunction
 from .event import with_event as with_event
@@ -36,6 +35,7 @@ from .model import Names as Names
 from .model import Start as Start
 from .model import model_of as model_of
 from .samples import Samples as Samples
+from .simulate import evenly_spaced as evenly_spaced
 from .simulate import sampled_if_legal as sampled_if_legal
 from .simulate import simulate as simulate
 from .sweep import Options as Options

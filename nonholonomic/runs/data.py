@@ -83,9 +83,6 @@ class Recording(AbstractRecording):
                 raise ValueError(f"quantity: {name!r} has several components: name them, such as '{name}.x'")
         return model
 
-    def predicted(self, model: AbstractModel, lane: dict[str, Array], settings: Settings) -> Array:
-        return predicted_columns(self, model, lane, settings)
-
     @property
     def names(self) -> tuple[str, ...]:
         """The quantities to which the columns belong."""
@@ -195,11 +192,6 @@ class EventTimes(eqx.Module):
         """The numbers of the run that are not parameters."""
         return {"t1": self.t1}
 
-    def predicted(self, model: AbstractModel, lane: dict[str, Array], settings: Settings) -> Float[Array, ""]:
-        """The time of one run; NaN without an event."""
-        time = time_of_event(model, lane["t1"], settings, False)
-        return jnp.where(jnp.isfinite(time), time, jnp.nan)
-
     def part(self, predictions: Float[Array, " rows"]) -> Float[Array, "rows n"]:
         """The predictions for every measurement."""
         return jnp.broadcast_to(predictions[:, None], (len(predictions), self.size))
@@ -213,3 +205,11 @@ def predicted_columns(
     run = sampled(model, recording.names, times, times[-1], settings)
     values = model.read(recording.names, times, run.rows, run.mode)
     return jnp.stack(recording.columns_of(model, values), axis=-1)
+
+
+def predicted_time(
+    times: EventTimes, model: AbstractModel, lane: dict[str, Array], settings: Settings
+) -> Float[Array, ""]:
+    """The time of the event of one run; NaN without an event."""
+    time = time_of_event(model, lane["t1"], settings, False)
+    return jnp.where(jnp.isfinite(time), time, jnp.nan)

@@ -14,16 +14,7 @@ from ..parameters import readable_unit
 from ..progress import status_line
 from ..validation import require_all, require_file, shown
 from ..views import Page, Stage
-from ..views.explore import (
-    Answer,
-    Frame,
-    HybridSimulator,
-    LiveRun,
-    Simulator,
-    Slider,
-    Summary,
-    live_page,
-)
+from ..views.explore import Answer, Frame, HybridSimulator, LiveRun, Simulator, Slider, Summary, live_page
 from .model import AbstractModel, model_of
 
 #: The tolerance in the page, and that of the runs that determine the drawn part of the arena.

@@ -26,7 +26,7 @@ from ..integration.checks import tolerance_bound
 from ..integration.settings import MOST_STEPS
 from ..progress import status_line
 from ..validation import nan_unless
-from .data import EventTimes, Recording
+from .data import EventTimes, Recording, predicted_columns, predicted_time
 from .model import AbstractModel, check_run
 from .parameters import require_apart
 
@@ -83,7 +83,8 @@ class RunModel(AbstractDataModel):
             moved = eqx.combine(model, static[0]).replaced(
                 {name: value for name, value in values.items() if name != "t0"}
             )
-            return nan_unless(moved.legal(), first.data.predicted(moved, lane | clock, self.settings))
+            predict: Any = predicted_columns if isinstance(first.data, AbstractRecording) else predicted_time
+            return nan_unless(moved.legal(), predict(first.data, moved, lane | clock, self.settings))
 
         predictions = jax.vmap(of_lane)(models, values, inputs)
         by_source = predictions.reshape(rows, count, *predictions.shape[1:])

@@ -85,13 +85,16 @@ def simulate_model(
 ) -> Trajectory:
     """The run of a model at given times, or at equally spaced ones. **Arguments:** as for `simulate`."""
     check_run(model, t1, tolerance)
-    end = as_known(t1)
-    if times is None:
-        times = jnp.linspace(0.0, end, DEFAULT_TIMES) if is_traced(end) else np.linspace(0.0, end, DEFAULT_TIMES)
+    times = evenly_spaced(as_known(t1)) if times is None else times
     require_times(times, t1)
     settings = Settings(tolerance, solver)
     explicit_tableau(settings.for_lanes)
     return _sampled(model, as_number(times), as_number(t1), settings)
+
+
+def evenly_spaced(t1: Any) -> Float[Array, " times"]:
+    """The default times of output; known inside a transformation if `t1` is known."""
+    return jnp.linspace(0.0, t1, DEFAULT_TIMES) if is_traced(t1) else as_known(np.linspace(0.0, t1, DEFAULT_TIMES))
 
 
 class SampledRows(eqx.Module):

@@ -28,12 +28,7 @@ from .mode import AbstractMode, Event, Hybrid, require_event
 from .system import MechanicalEvent, MechanicalMode, check_start, formulation_of, is_pair, with_modes_of_systems
 
 #: The statuses, by the code of the integration, of runs that did not reach their horizon.
-STATUSES = {
-    CROSSED: Status.EVENT,
-    LEFT_DOMAIN: Status.STOPPED,
-    FAILED: Status.FAILED,
-    UNRESOLVED: Status.UNRESOLVED,
-}
+STATUSES = {CROSSED: Status.EVENT, LEFT_DOMAIN: Status.STOPPED, FAILED: Status.FAILED, UNRESOLVED: Status.UNRESOLVED}
 
 
 class OwnModel(AbstractModel):

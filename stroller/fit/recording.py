@@ -6,8 +6,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from nonholonomic.identification import AbstractRecording, Quantities, as_quantity, read_columns
-from nonholonomic.integration import Settings
-from nonholonomic.runs import AbstractModel, predicted_columns
+from nonholonomic.runs import AbstractModel
 from nonholonomic.validation import as_number, as_number_or_none, require_kind
 
 from ..model.input import Input
@@ -75,10 +74,6 @@ class Recording(AbstractRecording):
         """The columns of the recording from the values of quantities."""
         components = dict(zip("xyz", values["position"].T, strict=True)) if "position" in values else {}
         return [(values | components)[column] for column in self.columns]
-
-    def predicted(self, model: AbstractModel, lane: dict[str, Array], settings: Settings) -> Array:
-        """The columns of one ride."""
-        return predicted_columns(self, model, lane, settings)
 
     def __check_init__(self):
         require_kind(self.launch, "launch", Launch, several="identify takes a list of recordings")

@@ -12,14 +12,14 @@ from jaxtyping import Array, Float
 
 from nonholonomic.integration import ImplicitMidpoint, Settings
 from nonholonomic.integration.checks import require_adaptive, require_adjoint, require_times
-from nonholonomic.runs import sampled_if_legal
+from nonholonomic.runs import evenly_spaced, sampled_if_legal
 from nonholonomic.validation import as_known, is_traced, nan_unless, require_whole
 
 from .steps import Ride, RideSpec, followed, stats_of
 from .trajectory import Trajectory, read_off, read_off_compiled
 
-#: Default number of times to report, and default limit of the steps of a ride.
-DEFAULT_TIMES, DEFAULT_STEPS = 201, 65536
+#: Default limit of the steps of a ride.
+DEFAULT_STEPS = 65536
 
 
 def ride(
@@ -37,7 +37,7 @@ def ride(
     require_whole(max_steps, "max_steps", 1)
     require_adjoint(adjoint)
     end, grid = as_known(t1), None
-    times = _evenly_spaced(end) if times is None else as_known(times)
+    times = evenly_spaced(end) if times is None else as_known(times)
     require_times(times, t1)
     if isinstance(solver, ImplicitMidpoint):
         grid = even_steps(times, end, solver.step_length)
@@ -68,11 +68,6 @@ def _sampled(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.Abstrac
     run = read_off(RideSpec.of(ride), times, samples.rows, stats_of(samples.outcome))
     stats = run.stats._replace(finished=run.stats.finished & is_legal)
     return eqx.tree_at(lambda trajectory: (trajectory.t, trajectory.stats), nan_unless(is_legal, run), (times, stats))
-
-
-def _evenly_spaced(t1: Float[Array, ""]) -> Float[Array, " times"]:
-    """The default times of output; known inside a transformation if `t1` is known."""
-    return jnp.linspace(0.0, t1, DEFAULT_TIMES) if is_traced(t1) else as_known(np.linspace(0.0, t1, DEFAULT_TIMES))
 
 
 def even_steps(

@@ -237,10 +237,7 @@ def shown(numbers: Float[Array, " n"]) -> str:
 
 
 def read_off(
-    spec: RideSpec,
-    t: Float[Array, " times"],
-    states: Float[Array, "components times"],
-    stats: Stats,
+    spec: RideSpec, t: Float[Array, " times"], states: Float[Array, "components times"], stats: Stats
 ) -> Trajectory:
     """The trajectory of the given states at the given times."""
     state = RideState(spec.ride.scene, spec.ride.input, t, states)

@@ -7,11 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from nonholonomic.hybrid import (
-    BETWEEN,
-    MOST_ROUNDS,
-    Segment,
-)
+from nonholonomic.hybrid import BETWEEN, MOST_ROUNDS, Segment
 from nonholonomic.integration.status import UNRESOLVED, Status
 
 from ..modes.bouncing import height

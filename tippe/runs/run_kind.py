@@ -114,10 +114,7 @@ def allowance(scene: Scene[Any], energy: Any, tolerance: Any) -> Any:
 
 
 def has_grown(
-    scene: Scene[Any],
-    before: Float[Array, "..."],
-    after: Float[Array, "..."],
-    tolerance: float | Float[Array, "..."],
+    scene: Scene[Any], before: Float[Array, "..."], after: Float[Array, "..."], tolerance: float | Float[Array, "..."]
 ) -> Bool[Array, "..."]:
     """Whether the energy [J] at the end of a run is greater than at its start, by more than the tolerance allows: then the
     arena's heights, the law of friction or the integration is wrong. NaN counts as not grown.

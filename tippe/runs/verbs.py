@@ -251,11 +251,7 @@ def first_or_last_time(model: TopModel, t1: Any, crossing: str, settings: Settin
 
 @status_line("simulating")
 def lyapunov_exponent(
-    scene: Scene,
-    launch: Launch,
-    t1: float,
-    tolerance: float = 1e-9,
-    solver: diffrax.AbstractERK | None = None,
+    scene: Scene, launch: Launch, t1: float, tolerance: float = 1e-9, solver: diffrax.AbstractERK | None = None
 ) -> LyapunovExponent:
     """The largest Lyapunov exponent of one launch or of many at once, by the variational equation.
 
