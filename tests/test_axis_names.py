@@ -15,6 +15,7 @@ import stroller
 import tippe
 from nonholonomic.parameters import numbers
 from tippe.runs.launches import launches
+from tippe.runs.model import TopModel
 
 pytestmark = pytest.mark.newest
 
@@ -50,6 +51,13 @@ def test_an_axis_may_be_named_by_its_end():
     }
     assert axes_of(TOP, {"velocity[0]": [0.0, 0.1]}) == {"velocity_t1": "launch.velocity[0]"}
     assert list(axes_of(stemmed, {"stem.offset": [0.022, 0.023]}).values()) == ["scene.body.stem.offset"]
+
+
+def test_a_coordinate_of_the_place_does_not_lend_its_unit_to_the_friction():
+    scene = tippe.Scene(rutstam_top(), tippe.Spheroid(0.3, 0.2), tippe.Viscous(0.3))
+    labels = TopModel(scene=scene, launch=tippe.Launch(0.1, 155.0, place=(-1.2, 0.1))).label
+    assert labels(["scene.friction.mu"])["scene.friction.mu"][:2] == ("mu", "s m-1")
+    assert labels(["launch.place[0]"])["launch.place[0]"][:2] == ("mu", "rad")
 
 
 @pytest.mark.parametrize(
