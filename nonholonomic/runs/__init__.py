@@ -6,6 +6,7 @@ parameters by name. `model_of` finds the model of a scene or of a user's own sys
 
 from ..hybrid.saltation import UNMEASURED as UNMEASURED
 from ..hybrid.saltation import Clock as Clock
+from .data import AbstractEventTimes as AbstractEventTimes
 from .data import EventTimes as EventTimes
 from .data import Recording as Recording
 from .ensemble import Ensemble as Ensemble

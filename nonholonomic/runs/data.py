@@ -108,7 +108,28 @@ def _components(model: AbstractModel) -> list[str]:
     ]
 
 
-class EventTimes(eqx.Module):
+class AbstractEventTimes(eqx.Module):
+    """Measured times of an event, in one series with a prediction for each."""
+
+    time: eqx.AbstractVar[Float[Array, "n *two"]]
+
+    @property
+    def size(self) -> int:
+        """Number of predictions."""
+        return len(self.time)
+
+    @property
+    def seen(self) -> Int[np.ndarray, " n"]:
+        """Indices of the measured predictions, which are all predictions."""
+        return np.arange(self.size)
+
+    @property
+    def series_units(self) -> tuple[str, ...]:
+        """The unit of the only series of the measurements."""
+        return ("s",)
+
+
+class EventTimes(AbstractEventTimes):
     """Measured times of the event of a run.
 
     **Arguments:**
@@ -152,29 +173,14 @@ class EventTimes(eqx.Module):
             raise ValueError(f"error must be one number or of shape {np.shape(self.time)}, not {np.shape(self.error)}")
 
     @property
-    def size(self) -> int:
-        """Number of predictions."""
-        return np.size(self.time)
-
-    @property
     def length(self) -> int:
         """Number of times in a lane."""
         return 1
 
     @property
-    def seen(self) -> Int[np.ndarray, " n"]:
-        """Indices of the measured predictions."""
-        return np.arange(self.size)
-
-    @property
     def labels(self) -> tuple[str, ...]:
         """A label for each time."""
         return tuple(f"time {k + 1}" for k in range(self.size))
-
-    @property
-    def series_units(self) -> tuple[str, ...]:
-        """The unit of the only series."""
-        return ("s",)
 
     @property
     def measurements(self) -> Measurements:

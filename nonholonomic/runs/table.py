@@ -178,9 +178,6 @@ class TableJob(NamedTuple):
     ) -> dict[str, Any]:
         """The variables of one run of every cell."""
 
-        def ensemble_of(continues: bool) -> Ensemble:
-            return Ensemble.of(cells, size, settings.tolerance, continues)
-
         derivatives, grazing = {}, False
         if slopes:
             names = tuple(slopes)
@@ -193,7 +190,7 @@ class TableJob(NamedTuple):
                 for name, slope, scale in zip(names, along, scales, strict=True)
             }
         else:
-            ensemble = ensemble_of(self.continues)
+            ensemble = Ensemble.of(cells, size, settings.tolerance, self.continues)
             if self.by_diffrax:
                 assert ensemble.problem is not None
                 outcome = solve_by_diffrax(ensemble.problem, jnp.asarray(self.t1), settings)
@@ -207,7 +204,8 @@ class TableJob(NamedTuple):
             time: Any = np.where(has_event, outcome.crossing_time, np.inf)
             if self.continues and self.crossing == "first" and isinstance(outcome, Outcome):
                 time = outcome.first_crossing
-            variables[self.times[-1]] = self._silenced(np.asarray(time), np.asarray(status))
+            is_silent = self.form.nan_if_failed & np.isin(status, (Status.FAILED, Status.UNRESOLVED))
+            variables[self.times[-1]] = np.where(is_silent, np.nan, time)
         variables |= {"status": codes, "end_time": np.asarray(outcome.end_time)}
         if self.samples is None:
             variables |= {name: np.asarray(values) for name, values in ends.items()}
@@ -215,7 +213,12 @@ class TableJob(NamedTuple):
         if isinstance(outcome, HybridOutcome):
             variables |= dict(zip(self.model.counters, outcome.counts, strict=True))
         if self.crossing == "both":
-            variables["first_time"] = self._first_times(outcome, cells, status, size, count, settings)
+            if isinstance(outcome, HybridOutcome):
+                # With several modes, the first event needs a separate solve, which ends there.
+                variables["first_time"] = self._first_event(cells, size, count, settings)
+            else:
+                is_unresolved = np.asarray(status) == Status.UNRESOLVED
+                variables["first_time"] = np.where(is_unresolved, np.inf, np.asarray(outcome.first_crossing))
         for name, (_, other) in cells.further_times.items():
             is_same = jax.tree.structure(other) == jax.tree.structure(cells) and self.crossing != "last"
             first = self.times[0] if is_same else None
@@ -225,16 +228,6 @@ class TableJob(NamedTuple):
             variables["grazes"] = (has_event & np.asarray(grazing)).astype(np.int8)
         return variables
 
-    def _first_times(
-        self, outcome: Any, cells: AbstractModel, status: Any, size: int, count: int, settings: Settings
-    ) -> Float[np.ndarray, " cells"]:
-        """The times of the first events of runs that continue through them."""
-        if not isinstance(outcome, HybridOutcome):
-            is_unresolved = np.asarray(status) == Status.UNRESOLVED
-            return np.where(is_unresolved, np.inf, np.asarray(outcome.first_crossing))
-        # With several modes, the first event needs a separate solve, which ends there.
-        return self._first_event(cells, size, count, settings)
-
     def _first_event(
         self, cells: AbstractModel, size: int, count: int, settings: Settings
     ) -> Float[np.ndarray, " cells"]:
@@ -243,11 +236,6 @@ class TableJob(NamedTuple):
         outcome = ensemble.solve(self.t1, count, settings)
         status = np.asarray(at_the_end(cells, ensemble, outcome, settings.tolerance)[0])
         return np.where(status == Status.EVENT, outcome.crossing_time, np.inf)
-
-    def _silenced(self, time: Float[np.ndarray, " cells"], status: np.ndarray) -> Float[np.ndarray, " cells"]:
-        if not self.form.nan_if_failed:
-            return time
-        return np.where(np.isin(status, (Status.FAILED, Status.UNRESOLVED)), np.nan, time)
 
 
 # Compiled once for all chunks.

@@ -213,21 +213,14 @@ def assembled(tree: dict[str, Any]) -> tuple[Hybrid, Array, AbstractFormulation 
 @model_of.register(Hybrid)
 def _(system: Hybrid, start: Any, event: Event | None = None, input: Any = None) -> OwnModel:
     check_start(system, start)
-    pair = (
-        dict(zip(("q", "rate"), map(as_number, start), strict=True))
-        if _takes_pairs(system) and is_pair(start)
-        else None
-    )
+    # With a mechanical system among the modes, a state is (q, rate).
+    has_pairs = any(isinstance(mode, AbstractSystem) for mode in system.modes) and is_pair(start)
+    pair = dict(zip(("q", "rate"), map(as_number, start), strict=True)) if has_pairs else None
     state = as_number(start) if pair is None else jnp.concatenate([*pair.values()])
     if event is not None:
         require_event(event)
         system = dataclasses.replace(system, event=with_own_numbers(event, jnp.zeros(()), state))
     return OwnModel.of({"system": system, "start": state if pair is None else pair, "event": None})
-
-
-def _takes_pairs(system: Hybrid) -> bool:
-    """Whether a mechanical system is among the modes, so that a state is (q, rate)."""
-    return any(isinstance(mode, AbstractSystem) for mode in system.modes)
 
 
 @model_of.register(AbstractSystem)

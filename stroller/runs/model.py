@@ -212,14 +212,11 @@ class RideModel(AbstractSceneModel):
         else:
             watched = self.event is None and names is not None and not names
             ride = RideProblem.of(self.scene, self.launch, self.input, cells, watched)
-        if not self._has_clock(names):
+        # The state ends with the time if a quantity depends on the input.
+        if self.input is None or names is None or TIMED.isdisjoint(names):
             return ride
         clock = jnp.zeros_like(ride.states[:1])
         return ExtendedProblem(ride, Clock(), clock, clock + UNMEASURED)
-
-    def _has_clock(self, names: Names) -> bool:
-        """Whether the state ends with the time, which quantities need that depend on the input."""
-        return self.input is not None and names is not None and not TIMED.isdisjoint(names)
 
     def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Trajectory:
         require_all(run_bounds(t1, tolerance))

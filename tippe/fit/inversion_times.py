@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from nonholonomic.identification import Measurements
 from nonholonomic.parameters import numbers, one_line, with_numbers
-from nonholonomic.runs import TableForm
+from nonholonomic.runs import AbstractEventTimes, TableForm
 from nonholonomic.validation import as_number, as_number_or_none, require, require_kind, shown
 
 from ..model.launch import Launch, as_launch
@@ -29,7 +29,7 @@ Values = dict[str, Float[Array, " rows"]]
 _beyond_horizon = jax.jit(beyond_horizon)
 
 
-class AbstractTimes(eqx.Module):
+class AbstractTimes(AbstractEventTimes):
     """Measured times of an event of launches.
 
     - `launch`, `time`, `error`, `t1`, `until`: as for `InversionTimes`.
@@ -95,21 +95,6 @@ class AbstractTimes(eqx.Module):
         return Measurements(np.where(is_before, -np.inf, first), self.error, upper=last, student=student)
 
     @property
-    def series_units(self) -> tuple[str, ...]:
-        """The unit of the only series of the measurements."""
-        return ("s",)
-
-    @property
-    def size(self) -> int:
-        """Number of predictions."""
-        return len(self.time)
-
-    @property
-    def seen(self) -> np.ndarray:
-        """Indices of the measured predictions, which are all predictions."""
-        return np.arange(self.size)
-
-    @property
     def labels(self) -> tuple[str, ...]:
         """A label for each launch."""
         columns = np.broadcast_arrays(
@@ -140,12 +125,14 @@ class AbstractTimes(eqx.Module):
         self, scene: Scene, values: Values, rows: int, tolerance: Float[Array, ""]
     ) -> Float[Array, "rows launches"]:
         """Times of all launches in every row, computed as lanes of one ensemble."""
-        launches = len(self.time)
-        lanes = _launches(self.launch, launches, rows)
+        launches, numbers_of_launch = len(self.time), numbers("launch", self.launch)
+        lists = {name: value for name, value in numbers_of_launch.items() if value is not None and np.ndim(value)}
+        lanes = {name: jnp.tile(value, rows) for name, value in lists.items()}
         lanes |= {name: jnp.repeat(value, launches) for name, value in values.items() if name != "t0"}
+        first = jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[0], self.launch)
 
         def time_of_lane(lane: dict[str, Array]) -> Float[Array, ""]:
-            roots = with_numbers({"scene": scene, "launch": _one_of(self.launch)}, lane)
+            roots = with_numbers({"scene": scene, "launch": first}, lane)
             return self.of_run(roots["scene"], roots["launch"], tolerance)
 
         return jax.vmap(time_of_lane)(lanes).reshape(rows, launches)
@@ -237,14 +224,3 @@ class ReversalTimes(AbstractTimes):
 
     def of_cells(self, scene: Scene, cells: dict[str, Any], theta: Any) -> Any:
         return cells["time"]
-
-
-def _launches(launch: Launch, count: int, rows: int) -> Values:
-    """The numbers of all launches in every row that differ between launches."""
-    lists = {name: value for name, value in numbers("launch", launch).items() if value is not None and np.ndim(value)}
-    return {name: jnp.tile(value, rows) for name, value in lists.items()}
-
-
-def _one_of(launch: Launch) -> Launch:
-    """The first of several launches."""
-    return jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[0], launch)
