@@ -183,24 +183,13 @@ def arrows(motion: DrawnMotion[np.ndarray], offset: float, radius: float, weight
     arrows = [
         Arrow("normal force", arrow_start, push, "N", WEIGHT * radius / weight, VIOLET, width, through=True),
         Arrow("slip", arrow_start, motion.slip, "m/s", SLIP * radius / common, GOLD, width, SLIP * radius),
-        Arrow(
-            "weight at the centre of mass",
-            centre,
-            weight_vector,
-            "N",
-            WEIGHT * radius / weight,
-            BLACK,
-            width,
-            None,
-            True,
-            False,
-        ),
     ]
-    for name, vector, unit, colour in (
-        ("angular velocity", motion.angular_velocity, "rad/s", TEAL),
-        ("angular momentum", motion.angular_momentum, "kg m²/s", PINK),
+    for name, vector, unit, length, colour in (
+        ("weight at the centre of mass", weight_vector, "N", WEIGHT, BLACK),
+        ("angular velocity", motion.angular_velocity, "rad/s", SPIN, TEAL),
+        ("angular momentum", motion.angular_momentum, "kg m²/s", SPIN, PINK),
     ):
-        scale = SPIN * radius / max(float(np.linalg.norm(vector, axis=-1).max()), 1e-300)
+        scale = length * radius / max(float(np.linalg.norm(vector, axis=-1).max()), 1e-300)
         arrows.append(Arrow(name, centre, vector, unit, scale, colour, width, None, True, False))
     return tuple(arrows)
 
