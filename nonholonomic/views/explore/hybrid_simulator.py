@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from ...hybrid import MOST_ROUNDS, AbstractBatchedMode, AbstractHoppingMode, HybridOutcome
 from ...hybrid.ensemble import after_reset, after_solve, at_start
+from ...hybrid.samples import mode_numbered, program_groups
 from ...integration import Settings
 from ...integration.ensemble import with_crossing_times
 from ...integration.scheduler import LaneScheduler, outcome_of
@@ -60,7 +61,7 @@ class HybridSimulator(NamedTuple):
         """
         modes = eqx.filter_eval_shape(self.start, values)[0]
         runs = jax.eval_shape(self.first, values)
-        groups = _alike(modes)
+        groups = program_groups(modes)
         facts = {
             "runs": offsets_of(runs),
             "modes": [next(k for k, group in enumerate(groups) if number in group) for number in range(len(modes))],
@@ -72,17 +73,17 @@ class HybridSimulator(NamedTuple):
         functions: Functions = {"first": (self.first, (values,))}
         functions |= {name: (read, (values, runs)) for name, read in self.readings.items()}
         if self.frame is not None:
-            rows = jax.eval_shape(lambda values: self._mode(values, [0], 0).shown(self.first(values).state), values)
+            rows = jax.eval_shape(lambda values: self._mode(values, (0,), 0).shown(self.first(values).state), values)
             functions["frame"] = (self.frame, (values, runs.mode, rows, runs.end_time))
         kinds = [self._kind(values, group, modes[group[0]], runs) for group in groups]
         return as_object(facts, functions, kinds=f"[{', '.join(kinds)}]")
 
-    def _mode(self, values: Numbers, group: list[int], number: Any) -> Any:
+    def _mode(self, values: Numbers, group: tuple[int, ...], number: Any) -> Any:
         """The mode with the given index, from a group of similar modes."""
-        modes = self.start(values)[0]
-        return _chosen([modes[k] for k in group], group, number)
+        modes: Any = self.start(values)[0]
+        return mode_numbered(modes, group, number)
 
-    def _kind(self, values: Numbers, group: list[int], mode: AbstractBatchedMode, runs: HybridOutcome) -> str:
+    def _kind(self, values: Numbers, group: tuple[int, ...], mode: AbstractBatchedMode, runs: HybridOutcome) -> str:
         """The modes of one group: how they are integrated, and how they end."""
         t1 = jnp.full(1, self.t1)
 
@@ -136,24 +137,3 @@ class HybridSimulator(NamedTuple):
 def _left(t1: Float[Array, "1"], runs: HybridOutcome) -> Float[Array, "1"]:
     """Time to the horizon [s]."""
     return jnp.maximum(t1 - runs.end_time, 0.0)
-
-
-def _alike(modes: tuple[AbstractBatchedMode, ...]) -> list[list[int]]:
-    """The indices of the modes, grouped so that modes in a group differ only in numbers."""
-    groups: dict[Any, list[int]] = {}
-    for number, mode in enumerate(modes):
-        leaves, tree = jax.tree.flatten(mode)
-        groups.setdefault((tree, tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)), []).append(number)
-    return list(groups.values())
-
-
-def _chosen(modes: list[AbstractBatchedMode], numbers: list[int], number: Any) -> Any:
-    """The mode with the given index."""
-
-    def leaf(*leaves: Any) -> Any:
-        value = leaves[-1]
-        for index, candidate in list(zip(numbers, leaves, strict=True))[-2::-1]:
-            value = value if candidate is value else jnp.where(number == index, candidate, value)
-        return value
-
-    return jax.tree.map(leaf, *modes)
