@@ -29,7 +29,7 @@ def portraits(runs: list[Any], overlaid: bool, drawn: tuple[np.ndarray, np.ndarr
         centre, scale = frame_of(points) if drawn is None else drawn
         shows = tuple(show(run, number, centre, scale) for number, run in group)
         names = group[0][1].portrait_axes
-        stages.append(Stage(f"{names[1]} over {names[0]}", plane(centre, scale), shows))
+        stages.append(Stage(f"{names[1]} over {names[0]}", plane(scale), shows))
     return stages
 
 
@@ -67,7 +67,7 @@ def octahedron(colour: int) -> Mesh:
     return Mesh(vertices, np.array(corners), colour)
 
 
-def plane(centre: np.ndarray, scale: np.ndarray) -> Arena:
+def plane(scale: np.ndarray) -> Arena:
     """The drawn part of the plane, with lines at a spacing that is named."""
     corners = HALF * np.array([(-1.0, -1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 1.0, 0.0), (-1.0, 1.0, 0.0)])
     places = HALF * np.linspace(-1.0, 1.0, LINES)
