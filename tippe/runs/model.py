@@ -130,7 +130,8 @@ class TopModel(AbstractSceneModel):
         if argument == "axes":
             return full_name(argument, name, [*self.known, *own])
         values = {name: value for root, tree in self.roots.items() for name, value in numbers(root, tree).items()}
-        return full_name(argument, name, [*(name for name, value in values.items() if value is not None), *own])
+        present = [name for name, value in values.items() if value is not None and np.ndim(value) == 0]
+        return full_name(argument, name, [*present, *own])
 
     @property
     def known(self) -> list[str]:
