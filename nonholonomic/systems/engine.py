@@ -18,6 +18,7 @@ from ..hybrid import AbstractBatchedMode, Transition
 from ..integration import AbstractProblem, Lanes, States
 from ..integration.status import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
 from ..lanes.components import over_lanes
+from ..runs import UNMEASURED
 from .form import Form, OfRun
 from .mode import State
 
@@ -25,9 +26,6 @@ from .mode import State
 #: The first fraction is for the end of a mode, which is located only to 1e-10 of a step, so that a long step leaves an
 #: error; the second is for round-off.
 AT_END, ROUND_OFF = 1e-6, 1e-14
-
-#: Magnitude for errors of the time [s]: time has no error and no influence on step-size control.
-UNMEASURED = 1e9
 
 
 class ModeProblem(AbstractProblem):
