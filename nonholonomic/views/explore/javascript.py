@@ -17,6 +17,8 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
+from ...lanes.components import MOVES
+
 #: A number: a Python number if known, otherwise its name or text in JavaScript. A value is an array of numbers.
 Number = str | float
 Value = np.ndarray
@@ -44,23 +46,11 @@ KNOWN |= {"max": max, "min": min, "clamp": lambda low, value, high: min(max(valu
 KNOWN |= {CHOICE: lambda which, no, yes: yes if which else no}
 
 #: Operations that move elements; evaluated by NumPy, because JAX would compile a program for each.
-MOVES: dict[str, Callable[..., Any]] = {
-    "reshape": lambda x, new_sizes, **_: x.reshape(new_sizes),
-    "squeeze": lambda x, dimensions: np.squeeze(x, dimensions),
-    "concatenate": lambda *parts, dimension: np.concatenate(parts, dimension),
-    "stack": lambda *parts, axis=0, **_: np.stack(parts, axis),
-    "unstack": lambda x, axis=0, **_: _rows(x, axis),
-    "slice": lambda x, start_indices, limit_indices, strides: x[
-        tuple(map(slice, start_indices, limit_indices, strides or (1,) * x.ndim))
-    ],
-    "broadcast_in_dim": lambda x, shape, broadcast_dimensions, **_: np.broadcast_to(
-        np.expand_dims(x, [k for k in range(len(shape)) if k not in broadcast_dimensions]), shape
-    ),
-}
+MOVED = ("broadcast_in_dim", "concatenate", "expand_dims", "reshape", "rev", "slice", "squeeze", "stack", "transpose")
 
 #: Operations that move elements to indices given by operands, and the positions of these operands.
 INDEXED = {"dynamic_slice": slice(1, None), "dynamic_update_slice": slice(2, None), "gather": slice(1, 2)}
-INDEXED |= {"scatter": slice(1, 2)} | {name: slice(0) for name in ("pad", "split", "transpose", "rev")}
+INDEXED |= {"scatter": slice(1, 2)} | {name: slice(0) for name in ("pad", "split")}
 
 SAME = ("stop_gradient", "optimization_barrier", "copy", "copy_p", "reduce_precision")
 REDUCTIONS = {"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min"}
@@ -184,9 +174,10 @@ class _Block:
             return getattr(self, f"{name}_")(inputs, **parameters)
         if inner := [parameters[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in parameters]:
             return self.call(inner[0], inputs)
-        if name in MOVES:
-            output = MOVES[name](*inputs, **{key: parameters[key] for key in parameters if key != "sharding"})
-            return output if isinstance(output, list) else [np.asarray(output, object)]
+        if name in MOVED:
+            return [np.asarray(MOVES[name](equation, *inputs), object)]
+        if name == "unstack":
+            return _rows(inputs[0], parameters["axis"])
         if name in INDEXED:
             return self.indexed(equation, inputs, range(len(inputs))[INDEXED[name]])
         if name in REDUCTIONS:
