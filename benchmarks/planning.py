@@ -1,12 +1,14 @@
 """Plans of random problems: `stroller.plan` beside CasADi with IPOPT and a kinodynamic planner of OMPL.
 
     pip install casadi ompl
-    python benchmarks/planning.py [--problems 200] [--ipopt 40] [--ompl 12] [--curved 100]
+    python benchmarks/planning.py [--problems 200] [--ipopt 40] [--ompl 12] [--curved 100] [--learn 600]
 
 Problems on the plane have 3 to 8 boxes in a square of 6 m and a vehicle of 0.5 m by 0.25 m, with a steering angle of at most
 60 degrees and a speed between -0.5 and 0.8 m/s; the drive takes 25 s. Those on curved ground have no obstacles. Every
 answer drives the stroller in `simulate` at a tolerance of 1e-9, by an input that `stroller.plan` makes of a steering angle and
 a speed, and the same check judges its run: its end, its limits and the distance between the whole footprint and the boxes.
+In a row of its own, a planner that has learned for `--learn` seconds, from other problems of the same kind, makes the first
+proposal.
 
 Time is CPU time of a problem, without compilation, which the wall time of a first call contains. CasADi solves a direct
 collocation of the same dynamics from the straight line, and from the path that our search finds, whose time is included.
@@ -28,7 +30,7 @@ from measure import machine, table, write_csv
 
 import stroller
 from stroller.planning.candidates import Outline, prices
-from stroller.planning.check import checked_run
+from stroller.planning.check import CONFIRMED, checked_run
 from stroller.planning.drive import drive_along
 from stroller.planning.problem import Problem
 from stroller.planning.spline import interpolate
@@ -37,7 +39,7 @@ BODY = stroller.Stroller(mass=5.0, wheelbase=0.25, inertia=0.1, steering_inertia
 FRICTION = stroller.Damping(2.0, 0.5, 0.1, 0.05)
 LIMITS = stroller.Limits(steering=np.pi / 3.0, speed=(-0.5, 0.8))
 FOOTPRINT = stroller.Footprint(length=0.5, width=0.25, rear=0.1)
-T1, CONFIRMED = 25.0, 1e-9
+T1, TIGHT = 25.0, 1e-9
 
 #: Side of the square [m], number of boxes, their sides [m], least distance of the ends [m] and least clearance there [m].
 SIDE, BOXES, SIDES, APART, FREE = 6.0, (3, 8), (0.3, 1.5), 2.0, 0.05
@@ -49,12 +51,14 @@ GROUNDS = {
 
 
 class Outcome(NamedTuple):
-    """What a planner achieves: whether its run reaches the goal, its CPU time and wall time [s], and its effort."""
+    """What a planner achieves: whether its run reaches the goal, its CPU time and wall time [s], its effort, and how many
+    candidates were optimised."""
 
     reached: bool
     cpu: float
     wall: float
     effort: float
+    candidates: int = 1
 
 
 def pose(random: np.random.Generator, low: Any, high: Any) -> tuple[tuple[float, float], float]:
@@ -99,12 +103,35 @@ def measured(solve: Callable[[], Any]) -> tuple[Any, float, float]:
     return result, time.process_time() - cpu, time.perf_counter() - wall
 
 
-def by_us(problem: Problem) -> Outcome:
+def arguments(problem: Problem) -> dict[str, Any]:
+    """The arguments of `stroller.plan` for a problem, beside the scene."""
+    _, launch, goal, obstacles, limits, footprint = problem
+    return {
+        "launch": launch,
+        "goal": goal,
+        "t1": T1,
+        "obstacles": obstacles,
+        "limits": limits,
+        "footprint": footprint,
+    }
+
+
+def by_us(problem: Problem, planner: stroller.Planner | None = None) -> Outcome:
     """The outcome of `stroller.plan`."""
-    scene, launch, goal, obstacles, limits, footprint = problem
-    options = {"obstacles": obstacles, "limits": limits, "footprint": footprint, "progress": False}
-    plan, cpu, wall = measured(lambda: stroller.plan(scene, launch, goal, T1, **options))
-    return Outcome(plan.reached, cpu, wall, plan.effort)
+    plan, cpu, wall = measured(
+        lambda: stroller.plan(problem.scene, **arguments(problem), planner=planner, progress=False)
+    )
+    return Outcome(plan.reached, cpu, wall, plan.effort, len(plan.candidates))
+
+
+def learned(problems: Callable[[int], Iterator[Problem]], seconds: float, seed: int) -> stroller.Planner:
+    """A planner for problems of one kind, which are drawn with other seeds than those to be solved."""
+    scene = next(problems(seed)).scene
+
+    def drawn(random: np.random.Generator) -> dict[str, Any]:
+        return arguments(next(problems(int(random.integers(2**40, 2**41)))))
+
+    return stroller.learn_planner(scene, drawn, seconds=seconds, seed=seed)
 
 
 def judged(problem: Problem, answer: Any, cpu: float, wall: float) -> Outcome:
@@ -113,7 +140,7 @@ def judged(problem: Problem, answer: Any, cpu: float, wall: float) -> Outcome:
         return Outcome(False, cpu, wall, np.nan)
     splines = [interpolate(part) for part in (answer.steering, answer.front_speed)]
     drive = drive_along(problem.scene.dynamics, problem.start_pose, splines[0], splines[1], answer.t1)
-    _, verdict = checked_run(problem, drive, answer.t1, CONFIRMED)
+    _, verdict = checked_run(problem, drive, answer.t1, TIGHT, CONFIRMED)
     return Outcome(not verdict.hindrances, cpu, wall, verdict.effort)
 
 
@@ -151,6 +178,7 @@ def row_of(problems: str, planner: str, outcomes: list[Outcome], ours: list[Outc
         "CPU s: median": f"{np.median(cpu):.2f}",
         "90 %": f"{np.percentile(cpu, 90):.1f}",
         "wall s: median": f"{np.median(wall):.2f}",
+        "candidates: median": f"{np.median([outcome.candidates for outcome in outcomes]):g}",
         "effort": f"{ratio:.2f} of {len(both)}",
         "first call, wall s": f"{first:.1f}",
     }
@@ -185,6 +213,7 @@ def main() -> None:
     command.add_argument("--ipopt", type=int, default=40, help="problems that CasADi with IPOPT solves")
     command.add_argument("--ompl", type=int, default=12, help="problems that OMPL solves")
     command.add_argument("--curved", type=int, default=100)
+    command.add_argument("--learn", type=float, default=600.0, help="time for which a planner learns [s]; 0 for none")
     command.add_argument(
         "--seconds", type=float, default=20.0, help="most CPU time of another planner for a problem [s]"
     )
@@ -197,15 +226,18 @@ def main() -> None:
     for name, count in counts.items():
         if not count:
             continue
-        source = on_plane(options.seed) if name == "plane" else on_ground(name, options.seed)
+        kind = on_plane if name == "plane" else partial(on_ground, name)
         planners: dict[str, Any] = {"stroller.plan": (by_us, count)}
+        if options.learn:
+            planner = learned(kind, options.learn, options.seed)
+            planners["stroller.plan, learned"] = (partial(by_us, planner=planner), count)
         if name == "plane" and find_spec("casadi") and find_spec("ompl"):
             planners |= {
                 "IPOPT from our path": (lambda problem: by_casadi(problem, True, options.seconds), options.ipopt),
                 "IPOPT from a line": (lambda problem: by_casadi(problem, False, options.seconds), options.ipopt),
                 "OMPL's RRT": (lambda problem: by_ompl(problem, options.seconds), options.ompl),
             }
-        rows += compared(name, source, planners)
+        rows += compared(name, kind(options.seed), planners)
     print(table(rows))
     write_csv(options.out, rows)
 

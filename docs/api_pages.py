@@ -121,7 +121,7 @@ PAGES = {
     "planning": Page(
         "Motion planning",
         "Plan the drive of a stroller to a goal, around obstacles and within limits, and keep a ride on the plan.",
-        of("stroller", "plan Plan Goal Box Disc Footprint Limits track"),
+        of("stroller", "plan Plan Goal Box Disc Footprint Limits track learn_planner Planner"),
     ),
     "engine": Page(
         "The engine",

@@ -32,10 +32,12 @@ from .model.scene import Scene as Scene
 from .model.stroller import Stroller as Stroller
 from .planning.goal import Goal as Goal
 from .planning.goal import Limits as Limits
+from .planning.learn import learn_planner as learn_planner
 from .planning.obstacles import Box as Box
 from .planning.obstacles import Disc as Disc
 from .planning.obstacles import Footprint as Footprint
 from .planning.plan import plan as plan
+from .planning.planner import Planner as Planner
 from .planning.result import Plan as Plan
 from .planning.track import track as track
 from .runs.trajectory import Trajectory as Trajectory

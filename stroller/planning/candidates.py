@@ -53,6 +53,11 @@ class Outline(NamedTuple):
         keep = min(RESERVE * float(problem.footprint.length), 0.5 * problem.clearance_at_ends)
         return cls(problem, start, end, chart, Obstacles.of(problem.obstacles), keep)
 
+    @property
+    def distance(self) -> float:
+        """The straight distance [m] from the start to the goal."""
+        return float(np.linalg.norm(np.asarray(self.goal - self.start)[: self.problem.scene.surface.axes]))
+
     def task(self, way: float, t1: float, clearance: float) -> Task:
         """The task of the optimiser for drives of the length `way` [m]."""
         problem, body = self.problem, self.problem.scene.body

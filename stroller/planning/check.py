@@ -15,8 +15,9 @@ from .obstacles import Footprint
 from .problem import Problem
 from .transcription import seen_from_above
 
-#: Times of a run, and how many times finer its closest approaches are examined.
-TIMES, FINER = 2001, 10
+#: Times of a run that is compared with others and of one that is confirmed, and how many times finer the closest approaches
+#: are examined.
+COMPARED, CONFIRMED, FINER = 501, 2001, 10
 
 #: By how much a limit may be exceeded, in units of its range: round-off.
 ROUND_OFF = 1e-9
@@ -134,8 +135,7 @@ def effort_of(run: Trajectory) -> float:
     return float(np.trapezoid(squares, np.asarray(run.t)))
 
 
-def checked_run(problem: Problem, drive: Any, t1: float, tolerance: float) -> tuple[Trajectory, Verdict]:
-    """A run of an input, and what it achieves."""
-    times = np.linspace(0.0, t1, TIMES)
-    run = simulate(problem.scene, problem.launch, t1, drive, times=times, tolerance=tolerance)
+def checked_run(problem: Problem, drive: Any, t1: float, tolerance: float, times: int) -> tuple[Trajectory, Verdict]:
+    """A run of an input, and what it achieves at a number of times."""
+    run = simulate(problem.scene, problem.launch, t1, drive, times=np.linspace(0.0, t1, times), tolerance=tolerance)
     return run, judge(run, problem)

@@ -96,6 +96,11 @@ def _needed(dynamics: Dynamics, pose: Any, steering: Any, front_speed: Any, t1: 
     )
 
 
+def poses_along(dynamics: Dynamics, pose: Any, steering: np.ndarray, front_speed: np.ndarray, t1: float) -> np.ndarray:
+    """The poses at the knots of a drive from a pose, (knots, components)."""
+    return np.asarray(_needed(dynamics, pose, steering, front_speed, jnp.asarray(t1, dtype=float))[2])[::FINE]
+
+
 def drive_along(dynamics: Dynamics, pose: Any, steering: np.ndarray, front_speed: np.ndarray, t1: float) -> Drive:
     """The input that gives a stroller, from a pose, the steering angle and the speed of two splines."""
     force, torque, poses = _needed(dynamics, pose, steering, front_speed, jnp.asarray(t1, dtype=float))

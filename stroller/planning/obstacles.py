@@ -184,12 +184,16 @@ class Obstacles(eqx.Module):
     @classmethod
     def of(cls, obstacles: Sequence[Box | Disc]) -> "Obstacles":
         """Boxes and discs as arrays, padded."""
-        boxes = [box.corners for box in obstacles if isinstance(box, Box)]
+        boxes = np.array([box.corners for box in obstacles if isinstance(box, Box)]).reshape(-1, 4, 2)
         discs = [[*disc.centre, disc.radius] for disc in obstacles if isinstance(disc, Disc)]
-        boxes += [Box((FAR, FAR), (1.0, 1.0)).corners] * (-len(boxes) % PADDING)
-        discs += [[FAR, FAR, 1.0]] * (-len(discs) % PADDING)
-        circles = jnp.asarray(np.array(discs, dtype=float).reshape(-1, 3))
-        return cls(jnp.asarray(np.array(boxes, dtype=float).reshape(-1, 4, 2)), circles[:, :2], circles[:, 2])
+        circles = np.array(discs, dtype=float).reshape(-1, 3)
+        counts = (-(-len(some) // PADDING) * PADDING for some in (boxes, circles))
+        return with_others_far_away(boxes, circles[:, :2], circles[:, 2], *counts)
+
+    def padded(self, boxes: int, discs: int) -> "Obstacles":
+        """The obstacles with others far away, so that there are given numbers of them."""
+        arrays = np.asarray(self.boxes), np.asarray(self.centres), np.asarray(self.radii)
+        return with_others_far_away(*arrays, boxes, discs)
 
     def gaps(self, corners: Any) -> Any:
         """A lower bound [m] of the distance of footprints (..., 4, 2) from every obstacle, with a slope everywhere."""
@@ -197,6 +201,20 @@ class Obstacles(eqx.Module):
         boxes = separation(corners[..., None, :, :], self.boxes)
         discs = disc_distance(corners[..., None, :, :], self.centres, self.radii)
         return xp.concatenate([boxes, discs], axis=-1)
+
+
+def with_others_far_away(
+    boxes: np.ndarray, centres: np.ndarray, radii: np.ndarray, most_boxes: int, most_discs: int
+) -> Obstacles:
+    """Obstacles with others far away; in NumPy, because JAX would compile a program for every number of obstacles."""
+    far = Box((FAR, FAR), (1.0, 1.0)).corners
+    more_boxes, more_discs = most_boxes - len(boxes), most_discs - len(radii)
+    parts = (
+        (boxes, np.broadcast_to(far, (more_boxes, 4, 2))),
+        (centres, np.full((more_discs, 2), FAR)),
+        (radii, np.ones(more_discs)),
+    )
+    return Obstacles(*(jnp.asarray(np.concatenate(part)) for part in parts))
 
 
 def require_obstacles(obstacles: Any) -> tuple[Box | Disc, ...]:

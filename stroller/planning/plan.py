@@ -8,17 +8,18 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from nonholonomic.progress import status_line
-from nonholonomic.validation import require_flag, require_whole, shown
+from nonholonomic.validation import require_flag, require_kind, require_whole, shown
 
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..runs.trajectory import Trajectory
 from .candidates import Outline, prices
-from .check import Verdict, checked_run
+from .check import COMPARED, CONFIRMED, Verdict, checked_run
 from .drive import Drive, drive_along
 from .goal import Goal, Limits
 from .obstacles import Footprint
 from .optimise import Candidates, optimise
+from .planner import Planner, proposed
 from .problem import checked_problem
 from .result import Plan
 
@@ -26,7 +27,7 @@ from .result import Plan
 LANES = 2
 
 #: Tolerance of the run that confirms a plan.
-CONFIRMED = 1e-9
+TIGHT = 1e-9
 
 #: A candidate with a greater violation of the constraints (see `optimise.py`) is not worth a run if there is a better one.
 HOPELESS = 0.05
@@ -76,6 +77,7 @@ def plan(
     footprint: Footprint | None = None,
     minimise: str = "effort",
     starts: int = 64,
+    planner: Planner | None = None,
     seed: int = 0,
     tolerance: float = 1e-6,
     progress: bool = True,
@@ -99,6 +101,7 @@ def plan(
     - `minimise`: "effort", the integral of the squared force and of the squared torque divided by the wheelbase; or
       "time", for which `t1` is the longest duration.
     - `starts`: greatest number of candidates; the search ends with the first ones that solve the problem.
+    - `planner`: a `Planner` from `learn_planner`, whose best proposal is tried before the search begins.
     - `seed`: seed of the random choices among paths.
     - `tolerance`: relative tolerance of the runs that compare candidates, in [1e-14, 1e-2].
     - `progress`: whether to show a status line.
@@ -127,35 +130,52 @@ def plan(
     require_whole(starts, "starts", 1)
     require_whole(seed, "seed", 0)
     require_flag(progress, "progress")
+    if planner is not None:
+        require_kind(planner, "planner", Planner, ", as stroller.learn_planner returns it")
     problem = checked_problem(scene, launch, goal, t1, obstacles, limits, footprint, tolerance)
     duration = float(np.asarray(t1))
     with status_line("planning", progress):
         outline = Outline.of(problem)
         attempts, log = [], Log([], [])
-        for attempt in _attempts(outline, duration, starts, np.random.default_rng(seed), tolerance, log):
+        guesses = _guesses(outline, duration, starts, planner, np.random.default_rng(seed), log)
+        for attempt in _attempts(outline, guesses, duration, tolerance, log):
             attempts.append(attempt)
             if not attempt.verdict.hindrances:
                 break
         best = min(attempts, key=lambda attempt: attempt.rank)
         if minimise == "time" and not best.verdict.hindrances:
             best = _shortened(outline, best, tolerance)
-        run, verdict = checked_run(problem, best.drive, best.t1, CONFIRMED)
+        run, verdict = checked_run(problem, best.drive, best.t1, TIGHT, CONFIRMED)
     if verdict.hindrances:
         verdict = verdict._replace(hindrances=(*verdict.hindrances, *log.reasons[:1]))
     return Plan(best.drive, best.t1, run, verdict, problem, jnp.asarray(outline.lines(np.concatenate(log.tried))))
 
 
-def _attempts(
-    outline: Outline, t1: float, starts: int, rng: np.random.Generator, tolerance: float, log: Log
-) -> Iterator[Attempt]:
-    """Attempts at a problem, best first in each batch of candidates."""
+def _guesses(
+    outline: Outline, t1: float, starts: int, planner: Planner | None, rng: np.random.Generator, log: Log
+) -> Iterator[tuple[float, Candidates]]:
+    """Batches of candidates, each with the length [m] of its shortest way: the proposal of a planner, then what searches
+    find."""
+    if planner is not None:
+        task = outline.task(outline.distance, t1, outline.clearance)
+        if not planner.is_for(task):
+            raise ValueError("planner: it has learned on another kind of ground; learn on the ground of this scene")
+        yield outline.distance, Candidates(proposed(planner, task, t1)[None], np.full(1, t1))
+        starts -= 1
     for batch in range(-(-starts // LANES)):
         paths, reason = outline.paths(prices(outline, LANES, batch, rng), t1)
         log.reasons.extend([reason] if reason else [])
         if len(log.reasons) > PATIENCE:
             return
         way = min(float(path.length.sum()) for path in paths)
-        candidates = Candidates(np.stack([outline.unknowns(path, t1) for path in paths]), np.full(LANES, t1))
+        yield way, Candidates(np.stack([outline.unknowns(path, t1) for path in paths]), np.full(LANES, t1))
+
+
+def _attempts(
+    outline: Outline, guesses: Iterator[tuple[float, Candidates]], t1: float, tolerance: float, log: Log
+) -> Iterator[Attempt]:
+    """Attempts at a problem, best first in each batch of candidates."""
+    for way, candidates in guesses:
         clearance = outline.clearance
         for _ in range(MORE_CLEARANCE + 1):
             candidates, violation, objective = optimise(candidates, outline.task(way, t1, clearance))
@@ -177,7 +197,7 @@ def _driven(outline: Outline, unknowns: Any, t1: float, tolerance: float) -> Att
     """An optimised candidate, driven."""
     dynamics = outline.problem.scene.dynamics
     drive = drive_along(dynamics, outline.start, unknowns[:, -2], unknowns[:, -1], t1)
-    return Attempt(drive, t1, unknowns, *checked_run(outline.problem, drive, t1, tolerance))
+    return Attempt(drive, t1, unknowns, *checked_run(outline.problem, drive, t1, tolerance, COMPARED))
 
 
 def _shortened(outline: Outline, best: Attempt, tolerance: float) -> Attempt:

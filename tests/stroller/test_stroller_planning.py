@@ -2,6 +2,8 @@
 
 import importlib
 import re
+from itertools import count
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +12,11 @@ import pytest
 from close import assert_close
 
 import stroller
+from stroller.planning import learn
 from stroller.planning.candidates import Outline, prices
 from stroller.planning.drive import drive_along
 from stroller.planning.inverse import Rates, actuation
+from stroller.planning.planner import proposed
 from stroller.planning.polygons import disc_distance, separation, signed_distance
 from stroller.planning.problem import checked_problem
 from stroller.planning.spline import evaluate, interpolate
@@ -203,6 +207,55 @@ def test_tracking_brings_a_disturbed_ride_to_the_goal():
     assert storage[-1] < 1e-3 * storage[0]
 
 
+def drawn(random):
+    """A problem with a box between start and goal."""
+    goal = stroller.Goal((random.uniform(1.5, 2.5), random.uniform(-0.5, 0.5)), random.uniform(-0.5, 0.5))
+    box = stroller.Box((0.8, random.uniform(-0.6, 0.6)), (0.2, 0.2))
+    launch = stroller.Launch((0.0, 0.0), random.uniform(-0.5, 0.5), 0.0)
+    return {"launch": launch, "goal": goal, "t1": 10.0, "obstacles": [box], "limits": LIMITS, "footprint": FOOTPRINT}
+
+
+def test_a_planner_learns_and_a_plan_begins_with_its_proposal(monkeypatch):
+    """By a clock of its own, which allows about eighty steps."""
+    monkeypatch.setattr(learn, "time", SimpleNamespace(perf_counter=count().__next__))
+    monkeypatch.setattr(learn, "BATCH", 8)
+    planner = stroller.learn_planner(SCENE, drawn, seconds=100.0)
+    untrained = stroller.learn_planner(SCENE, drawn, seconds=0)
+    random = np.random.default_rng(5)
+    tasks = [learn.drawn_task(SCENE, drawn, random) for _ in range(6)]
+
+    def missed(planner):
+        ends = [proposed(planner, task, t1)[-1, :4] - np.asarray(task.goal[0]) for task, t1 in tasks]
+        return np.median(np.linalg.norm(ends, axis=1))
+
+    assert missed(planner) < 0.3 * missed(untrained)
+    plan = stroller.plan(SCENE, **drawn(random), planner=planner, progress=False)
+    assert plan.reached
+    assert len(plan.candidates) % 2 == 1
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"problems": 3}, "problems = 3 must be a function of a numpy.random.Generator"),
+        ({"problems": lambda random: {"launch": START}}, "must return a dict with launch, goal and t1"),
+        ({"problems": lambda random: drawn(random) | {"goal": GOAL, "obstacles": GAP, "t1": 0.0}}, "t1 = 0.0 must be"),
+        ({"seconds": -1.0}, "seconds = -1.0 must be at least 0"),
+        ({"scene": BODY}, "scene = .* must be a Scene"),
+    ],
+)
+def test_a_planner_cannot_learn_from_anything_else(changed, message):
+    with pytest.raises(ValueError, match=message):
+        stroller.learn_planner(**({"scene": SCENE, "problems": drawn, "seconds": 0} | changed))
+
+
+def test_a_planner_is_for_its_kind_of_ground():
+    planner = stroller.learn_planner(SCENE, drawn, seconds=0)
+    launch, goal = stroller.Launch((0.0, -1.0), 0.0, 0.0), stroller.Goal((0.2, -1.0))
+    with pytest.raises(ValueError, match="planner: it has learned on another kind of ground"):
+        stroller.plan(stroller.presets.bowl(), launch, goal, 9.0, planner=planner, progress=False)
+
+
 def test_a_tracker_needs_a_plan_on_its_ground():
     with pytest.raises(ValueError, match=r"plan = .* must be a Plan, as stroller.plan returns it"):
         stroller.track(SCENE, SCENE)
@@ -227,6 +280,7 @@ START, GOAL = stroller.Launch((0.7, 0.8), 0.0, 0.0), stroller.Goal((1.9, 0.3), 0
         ({"obstacles": GAP[0]}, r"write obstacles=\[obstacle\]"),
         ({"obstacles": [1.0]}, r"obstacles\[0\] = 1.0 must be a Box or a Disc"),
         ({"limits": 1.0}, "limits = 1.0 must be a Limits"),
+        ({"planner": 1.0}, "planner = 1.0 must be a Planner, as stroller.learn_planner returns it"),
     ],
 )
 def test_a_bad_problem_is_refused_before_anything_compiles(changed, message, caplog):
