@@ -25,12 +25,12 @@ from ..integration.scheduler import AbstractRecorder, InLanes, LaneScheduler, Sc
 from ..integration.status import RUNNING
 from ..integration.step import length_to_try, try_step
 from ..xla_cpu import uncounted, written_by_component, written_in_place
-from ._periods import Checkpoints, LatestSteps, StepRecord, read
+from .periods import Checkpoints, LatestSteps, StepRecord, read
 from .variation import VariationalProblem
 
-#: The quantity measured at the end of a run: (problem, lane state) -> a number per lane, differentiable with respect to
-#: the problem's parameters and the lanes' states.
-Measured = Callable[[Any, LaneState], Lanes]
+#: The quantities measured at the end of a run: (problem, lane state) -> a tree of arrays with the lanes last,
+#: differentiable with respect to the problem's parameters and the lanes' states.
+Measured = Callable[[Any, LaneState], Any]
 
 
 class StepRecorder(AbstractRecorder):
@@ -64,8 +64,8 @@ class StepRecorder(AbstractRecorder):
         through later states; `None` if the quantity depends only on the ends of the runs."""
         return None
 
-    def share_of_end(self, lane_state: LaneState) -> Lanes:
-        """The factor of the measured quantity at the end of the runs in the lanes."""
+    def share_of_end(self, lane_state: LaneState) -> Any:
+        """The factors of the measured quantities at the end of the runs in the lanes."""
         return jnp.ones_like(lane_state.time)
 
 
@@ -265,12 +265,12 @@ def without_probe(lane_state: LaneState) -> LaneState:
 
 
 def _at_the_end(
-    problem: AbstractProblem, moving: Any, measured: Measured, lane_state: LaneState, share: Lanes
+    problem: AbstractProblem, moving: Any, measured: Measured, lane_state: LaneState, share: Any
 ) -> Derivatives:
     """The derivatives with respect to the final state and the parameters. **Arguments:** `share`: as `share_of_end`."""
     numbers, static = eqx.partition(problem, moving)
 
-    def value(numbers: Any, state: States) -> Lanes:
+    def value(numbers: Any, state: States) -> Any:
         return measured(eqx.combine(numbers, static), lane_state._replace(state=state))
 
     by_number, by_state = jax.vjp(value, numbers, lane_state.state)[1](share)

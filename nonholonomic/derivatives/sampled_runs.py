@@ -14,9 +14,9 @@ from ..integration import AbstractProblem, CoreProblem, Settings, sample, solve_
 from ..integration.dense import SampledSolution
 from ..integration.problem import event_time
 from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END
-from ._sampled_adjoint import is_reversible, samples_pulled_back
 from .differentiable import by_active, tangent_along, tangents_by
 from .lyapunov import probed
+from .sampled_adjoint import SampledCotangents, is_reversible, samples_pulled_back
 from .sampling import AbstractSampling, ProblemSpec, solve_for_samples
 from .variation import VariationalProblem, in_groups
 
@@ -235,9 +235,11 @@ class BlockSampling(AbstractSampling):
     ) -> list[Float[Array, "cells ..."]]:
         solve = dataclasses.replace(self, core_only=True) if cotangents.quadratures is None else self
         build, numbers, (times, t1, tolerance), settings = solve._builder(leaves, cells)
+        rebuilt, point = by_active(build, active, numbers, cells)
         by_point = samples_pulled_back(
-            *by_active(build, active, numbers, cells),
-            cotangents[:3],
+            rebuilt,
+            point,
+            SampledCotangents.of(rebuilt(*point), times.shape[-1], *cotangents[:3]),
             times if times.ndim == 1 else times.T,
             t1,
             settings.with_tolerance(jnp.min(tolerance)),

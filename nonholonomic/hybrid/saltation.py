@@ -79,7 +79,7 @@ class VariationalMode(AbstractBatchedMode):
 
     def problem(self, state: Float[Array, "components cells"]) -> VariationalProblem:
         primal, *variations = self.parts(state)
-        numbers, build = self._active_numbers()
+        numbers, build = self.active_numbers()
 
         def clocked(state: Float[Array, "components cells"], *numbers: Array) -> ExtendedProblem:
             start_time = state[-1:]
@@ -88,7 +88,7 @@ class VariationalMode(AbstractBatchedMode):
             )
 
         point = (with_row(primal[:-1], jnp.zeros_like(primal[-1])), *numbers)
-        tangents = [(variation, *rates) for variation, rates in zip(variations, self._rates(), strict=True)]
+        tangents = [(variation, *rates) for variation, rates in zip(variations, self.rates(), strict=True)]
         return VariationalProblem(clocked(*point), tangents_of(clocked, point, tangents), self.ends_on_event)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
@@ -121,12 +121,12 @@ class VariationalMode(AbstractBatchedMode):
                 path,
                 jax.tree.map(lambda value: jnp.zeros((0, *value.shape)), path),
             )
-        numbers, build = self._active_numbers()
+        numbers, build = self.active_numbers()
         zero_rates = [jnp.zeros_like(number) for number in numbers]
         rates = self.mode.problem(primal).field(duration, primal)
         # The last tangent is an error of the state.
         directions = [
-            (variation[:-1], *direction) for variation, direction in zip(variations, self._rates(), strict=True)
+            (variation[:-1], *direction) for variation, direction in zip(variations, self.rates(), strict=True)
         ]
         directions.append((self._error(primal, duration, rates), *zero_rates))
         delays, log_rates = self._delays(primal, duration, [*directions, (rates, *zero_rates)])
@@ -146,7 +146,7 @@ class VariationalMode(AbstractBatchedMode):
             (direction[0] + shift * rates, -start_delay, *direction[1:])
             for direction, shift, start_delay in zip(directions, delays, start_delays, strict=True)
         ]
-        values, changes_after, transition = _along(reset, (primal, left, *numbers), after_event, has_aux=True)
+        values, changes_after, transition = along(reset, (primal, left, *numbers), after_event, has_aux=True)
         states, elapsed, reset_log_rates, changes = changes_after
         new_variations = jnp.concatenate([states, (start_delays + elapsed)[:, None]], axis=1)[:count]
         log_rates = jnp.max(jnp.abs(log_rates + reset_log_rates), axis=0)
@@ -170,7 +170,7 @@ class VariationalMode(AbstractBatchedMode):
 
         **Arguments:** `directions`: the tangents, followed by the tangent along time, which has no variations of its own.
         """
-        numbers, build = self._active_numbers()
+        numbers, build = self.active_numbers()
 
         def margin_and_rate(primal: Float[Array, "components cells"], *numbers: Array) -> tuple[Array, Array]:
             problem = build(*numbers).problem(primal)
@@ -178,7 +178,7 @@ class VariationalMode(AbstractBatchedMode):
                 lambda primal: problem.domain_margin(duration, primal), (primal,), (problem.field(duration, primal),)
             )
 
-        (_, rate), (domain_margins, changes) = _along(margin_and_rate, (primal, *numbers), directions)
+        (_, rate), (domain_margins, changes) = along(margin_and_rate, (primal, *numbers), directions)
         # A mode that ended when it began has not reached its event.
         has_delay = (duration > 0.0) & (rate != 0.0)
         safe = jnp.where(has_delay, rate, 1.0)
@@ -191,7 +191,7 @@ class VariationalMode(AbstractBatchedMode):
         """The output rows of a single run's states, and their variation at fixed times."""
         primal, *variations = self.parts(state)
         primal, duration = primal[:-1], primal[-1]
-        numbers, build = self._active_numbers()
+        numbers, build = self.active_numbers()
 
         def output(primal: Float[Array, "components times"], *numbers: Array) -> Float[Array, "shown times"]:
             return build(*numbers).shown(primal)
@@ -202,14 +202,14 @@ class VariationalMode(AbstractBatchedMode):
         # If the mode begins later, the state has advanced less at the same time.
         directions = [
             (variation[:-1] - rates * variation[-1], *rates_of_numbers)
-            for variation, rates_of_numbers in zip(variations, self._rates(), strict=True)
+            for variation, rates_of_numbers in zip(variations, self.rates(), strict=True)
         ]
-        return _along(output, (primal, *numbers), directions)
+        return along(output, (primal, *numbers), directions)
 
     def slopes(self, state: Float[Array, "components cells"]) -> Float[Array, "tangents cells"]:
         """The derivative of the time of the event at which runs have ended in this mode, or in the transition to it."""
         primal, *variations = self.parts(state)
-        numbers, build = self._active_numbers()
+        numbers, build = self.active_numbers()
 
         def time(primal: Float[Array, "components cells"], start_time: Float[Array, " cells"], *numbers: Array) -> Any:
             problem = build(*numbers).problem(primal)
@@ -225,9 +225,9 @@ class VariationalMode(AbstractBatchedMode):
 
         duration, point = primal[-1], (primal[:-1], jnp.zeros_like(primal[-1]), *numbers)
         tangents = [
-            (variation[:-1], variation[-1], *rates) for variation, rates in zip(variations, self._rates(), strict=True)
+            (variation[:-1], variation[-1], *rates) for variation, rates in zip(variations, self.rates(), strict=True)
         ]
-        return _along(time, point, tangents)[1]
+        return along(time, point, tangents)[1]
 
     def parts(self, state: Float[Array, "components cells"]) -> list[Float[Array, "components cells"]]:
         """The state with its clock, and the variations of both."""
@@ -247,14 +247,14 @@ class VariationalMode(AbstractBatchedMode):
         shares = [(-1.0) ** k * (0.5 + math.modf(0.618 * k)[0]) for k in range(len(sizes))]
         return jnp.asarray(shares)[:, None] * sizes
 
-    def _active_numbers(self) -> tuple[list[Array], Any]:
+    def active_numbers(self) -> tuple[list[Array], Any]:
         """The mode's active numbers, and the mode as a function of them."""
         if not self.tangents:
             return [], lambda: self.mode
         numbers, structure = jax.tree.flatten(where_active(self.mode, self.tangents[0]))
         return numbers, lambda *numbers: eqx.combine(jax.tree.unflatten(structure, numbers), self.mode)
 
-    def _rates(self) -> list[list[Array]]:
+    def rates(self) -> list[list[Array]]:
         """For each tangent the rates at which these numbers move."""
         return [jax.tree.leaves(direction) for direction in self.tangents]
 
@@ -266,15 +266,15 @@ def delay(function: Any, state: Float[Array, "components cells"], rates: Float[A
     return -(value - stop_gradient(value)) / stop_gradient(jnp.where(rate == 0.0, jnp.inf, rate))
 
 
-def _along(function: Any, point: tuple[Array, ...], tangents: list[tuple[Array, ...]], has_aux: bool = False) -> Any:
+def along(function: Any, point: tuple[Array, ...], tangents: list[tuple[Array, ...]], has_aux: bool = False) -> Any:
     """A function's value, its variations along tangents with these on the first axis, and its auxiliary output if any."""
 
-    def along(tangent: tuple[Array, ...]) -> Any:
+    def moved(tangent: tuple[Array, ...]) -> Any:
         return jax.jvp(function, point, tangent, has_aux=has_aux)
 
     # The function itself is computed once, whatever the number of tangents.
-    stacked = jax.tree.map(lambda *moved: jnp.stack(moved), *tangents)
-    return jax.vmap(along, out_axes=(None, 0, None) if has_aux else (None, 0))(stacked)
+    stacked = jax.tree.map(lambda *rates: jnp.stack(rates), *tangents)
+    return jax.vmap(moved, out_axes=(None, 0, None) if has_aux else (None, 0))(stacked)
 
 
 def variational_modes(

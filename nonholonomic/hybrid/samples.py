@@ -1,29 +1,37 @@
 """Hybrid runs sampled at given times: of many cells at once, and inside other transformations, with derivatives."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from ..derivatives import in_groups, tangents_by
+from ..derivatives.differentiable import by_active, tangent_along
 from ..derivatives.sampling import AbstractSampling, ProblemSpec, solve_for_samples
-from ..integration import Settings, solve_with_samples
+from ..integration import Settings
 from ..integration.status import REACHED_END
-from ..xla_cpu import compiled_alone, greatest
-from .ensemble import Carry, HybridOutcome, after_reset, after_solve, at_start, chosen, padded, traced_rounds
-from .mode import AbstractBatchedMode, mode_of_cells, over_cells
-from .path import BETWEEN
-from .saltation import VariationalMode, variational_modes, variational_start
-from .transition_rows import reset_with_rows
+from ..xla_cpu import compiled_alone
+from .ensemble import HybridOutcome, at_start, traced_rounds
+from .mode import AbstractBatchedMode, over_cells
+from .saltation import variational_modes, variational_start
+from .sampled_adjoint import hybrid_samples_pulled_back
+from .sampled_rounds import Recorded, output_rows, program_groups, sampled_rounds
+from .transition_rows import weighted
 
 #: From some modules (scene, launch, ...), the tolerance and a number of cells to the modes, the index of the first mode
 #: of every cell, and the initial states.
 Build = Callable[[Any, Array, int], tuple[tuple[AbstractBatchedMode, ...], Array, Float[Array, "components cells"]]]
 
+
+#: Up to this many numbers, the derivatives are integrated forward; with more, a gradient takes one backward pass. For 64
+#: bouncing balls, the gradient by 3 and 5 numbers costs 6 and 7 values forward, and 6 backward; for 64 hopping tops, that
+#: by 10 numbers costs 24 forward and 12 backward (jax 0.10). A single run waits for its program, not for its steps, and
+#: the backward pass takes up to twice as long to compile.
+MOST_FORWARD, MOST_FORWARD_ALONE = 6, 32
 
 #: In the derivative of `HybridSamples`: the entries that have none.
 UNCHANGED: Any = None
@@ -63,7 +71,8 @@ def hybrid_samples(
     counters: int,
 ) -> HybridSamples:
     """Run one cell through its modes inside a transformation and sample it, with derivatives that take part in
-    step-size control. A batch under `vmap` is solved as one ensemble.
+    step-size control. A batch under `vmap` is solved as one ensemble. The gradient of a function of its samples by many
+    numbers takes one backward pass.
 
     **Arguments:**
 
@@ -172,11 +181,7 @@ class HybridSampling(AbstractSampling):
             raise ValueError(
                 "second derivatives are not available through changes of mode; take differences of a gradient instead"
             )
-        numbers, horizon, settings, spec = self._parts(leaves)
-
-        def build(numbers: tuple[Array, ...], cells: int | None) -> Any:
-            return spec.built(numbers, settings.tolerance, cells)
-
+        build, numbers, horizon, settings = self._builder(leaves)
         built, tangents, gather = tangents_by(build, active, numbers, cells)
 
         def run(group: tuple[Any, ...]) -> tuple[HybridSamples, list[HybridSamples]]:
@@ -186,12 +191,94 @@ class HybridSampling(AbstractSampling):
         samples, slopes = in_groups(run, tangents)
         return samples, gather(slopes)
 
+    def prefers_adjoint(self, active: tuple[int, ...], leaves: tuple[Array, ...]) -> bool:
+        if len(active) <= MOST_FORWARD:
+            return False
+        typed = [jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves]
+        try:
+            jax.eval_shape(functools.partial(_backward, self), *typed)
+        except ValueError:
+            return False
+        return True
+
+    def differentiable(self, primal: HybridSamples) -> HybridSamples:
+        return HybridSamples(primal.shown, UNCHANGED, primal.end_time, *(UNCHANGED,) * 6)
+
+    def push_forward(
+        self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], tangents: tuple[Array, ...]
+    ) -> HybridSamples:
+        build, numbers, horizon, settings = self._builder(leaves)
+        built, direction, size = tangent_along(build, active, numbers, tangents, cells)
+        hybrid_tangent = (direction[0], direction[2])
+        _, (slope,) = _sampled_with_tangents(built, (hybrid_tangent,), horizon, cells, settings, self.counters)
+        return jax.tree.map(lambda part: part * size.reshape(-1, *[1] * (part.ndim - 1)), slope)
+
+    def pull_back(
+        self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], cotangents: HybridSamples
+    ) -> list[Float[Array, " cells"]]:
+        if cells == 1 and len(active) <= MOST_FORWARD_ALONE:
+            slopes = self.value_and_tangents(active, False, cells, *leaves)[1]
+            return [_product(slope, cotangents) for slope in slopes]
+        build, numbers, (times, t1), settings = self._builder(leaves)
+        rebuilt, point = by_active(build, active, numbers, cells)
+        times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), cells))
+        shown, end_time = cotangents.shown, cotangents.end_time
+        if shown is None:
+            modes, _, state = rebuilt(*point)
+            shown = jnp.zeros((cells, len(jax.eval_shape(modes[0].shown, state)), len(times)))
+        end_time = jnp.zeros(cells) if end_time is None else end_time
+        options = (times, jnp.broadcast_to(t1, (cells,)), settings, self.counters)
+        return hybrid_samples_pulled_back(rebuilt, point, jnp.moveaxis(shown, 0, -1), end_time, *options)
+
+    def _builder(self, leaves: tuple[Array, ...]) -> tuple[Callable[..., Any], tuple[Array, ...], Any, Settings]:
+        """A function (the modules' numbers, cells) -> modes and start; the numbers; times and horizon; the settings."""
+        numbers, horizon, settings, spec = self._parts(leaves)
+
+        def build(numbers: tuple[Array, ...], cells: int | None) -> Any:
+            return spec.built(numbers, settings.tolerance, cells)
+
+        return build, numbers, horizon, settings
+
     def _parts(self, leaves: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, Array], Settings, ProblemSpec]:
         """The modules' numbers; times and horizon; the settings; and the spec."""
         numbers, (times, t1, tolerance), spec = self._sorted(leaves)
         # One tolerance serves the whole ensemble: the smallest of the batch.
         settings = spec.settings.with_tolerance(jnp.min(tolerance))
         return numbers, (times if times.ndim == 1 else times.T, t1), settings, spec
+
+
+def _product(slope: HybridSamples, cotangents: HybridSamples) -> Float[Array, " cells"]:
+    """The derivative of a sum over samples, from their derivatives and their cotangents; a derivative that is zero counts
+    for nothing, whatever the cotangent."""
+    pairs = ((slope.shown, cotangents.shown), (slope.end_time, cotangents.end_time))
+    terms = [weighted(one, other).reshape(len(one), -1) for one, other in pairs if other is not None]
+    return sum((jnp.sum(term, axis=1) for term in terms), jnp.zeros(len(slope.end_time)))
+
+
+# Compiled, so that JAX traces it once for equal solves.
+@eqx.filter_jit
+def _backward(sampling: HybridSampling, *leaves: Array) -> list[Any]:
+    """The backward passes of the fields and of the output rows of a single run, for their shapes.
+
+    **Raises:** `ValueError` if one of them has a loop without a fixed number of iterations.
+    """
+    build, numbers, _, _ = sampling._builder(leaves)
+    modes, _, state = build(numbers, 1)
+
+    def shown(mode: AbstractBatchedMode, states: Float[Array, "components times"]) -> Float[Array, "shown times"]:
+        return mode.shown(states)
+
+    def of_mode(mode: AbstractBatchedMode) -> Any:
+        arrays, static = eqx.partition(mode, eqx.is_inexact_array)
+
+        def values(arrays: Any, state: Float[Array, "components cells"]) -> Any:
+            mode = eqx.combine(arrays, static)
+            return mode.problem(state).field(jnp.zeros_like(state[0]), state), over_cells(shown, mode)(state[:, None])
+
+        results, pull = jax.vjp(values, arrays, state)
+        return pull(jax.tree.map(jnp.ones_like, results))
+
+    return [of_mode(modes[group[0]]) for group in program_groups(modes)]
 
 
 def _sampled_with_tangents(
@@ -203,143 +290,10 @@ def _sampled_with_tangents(
     times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), size))
     variational = variational_modes(modes, tangents, settings.tolerance, False)
     start = at_start(jnp, first, variational_start(state, tangents), cells, counters + 1)
-    ended, output = _rounds_with_samples(
-        variational, start, times, jnp.broadcast_to(t1, (size,)), settings, 1 + len(tangents)
-    )
-    rows, variations = _output_rows(variational, output)
+    rounds = sampled_rounds(variational, start, times, jnp.broadcast_to(t1, (size,)), settings, 1 + len(tangents))
+    ended, output = traced_rounds(*rounds)
+    rows, variations = output_rows(variational, output)
     return _as_samples(ended, output, rows, variations, times, len(state))
-
-
-class Recorded(NamedTuple):
-    """The samples so far: states of the modes, and their mode, NaN where still missing; the output rows between modes
-    with their variations, the rows first, `None` if no mode records its path; and the time [s] of the first grazing
-    event, infinite if there was none.
-    """
-
-    state: Float[Array, "components times cells"]
-    number: Float[Array, "times cells"]
-    between: Float[Array, "values shown times cells"] | None
-    grazing_time: Float[Array, " cells"]
-
-
-def _rounds_with_samples(
-    modes: tuple[VariationalMode, ...],
-    start: HybridOutcome[Array],
-    times: Float[Array, "times cells"],
-    t1: Float[Array, " cells"],
-    settings: Settings,
-    n_blocks: int,
-) -> Carry:
-    """Run round by round, as in `traced_solve_hybrid`, with samples of every mode and of the transition to the next."""
-    size = times.shape[1]
-
-    def solve(numbers: Sequence[int], carry: Carry, active: Bool[Array, " cells"]) -> Carry:
-        def solved() -> Carry:
-            (runs, output), cell = carry, padded(active)
-            mode = mode_of_cells(mode_numbered(modes, numbers, runs.mode), cell)
-            # Runs in another mode spend no time in this one.
-            left = jnp.where(active, greatest(t1 - runs.end_time, 0.0), 0.0)
-            times_in_mode = times - runs.end_time
-            outcome, samples = solve_with_samples(
-                mode.problem(runs.state[:, cell]),
-                times_in_mode,
-                left,
-                jnp.asarray(size),
-                settings,
-                n_blocks=n_blocks,
-                one_kernel=True,
-            )
-            after = chosen(active, after_solve(jnp, runs, outcome, t1), runs)
-            is_new = active & (times_in_mode >= 0.0) & (times <= after.end_time) & jnp.isnan(output.number)
-            state = jnp.where(is_new, jnp.moveaxis(samples, -1, 0).swapaxes(1, 2), output.state)
-            return after, output._replace(state=state, number=jnp.where(is_new, runs.mode, output.number))
-
-        return jax.lax.cond(jnp.any(active), solved, lambda: carry)
-
-    def reset(numbers: Sequence[int], carry: Carry, lost: Bool[Array, " cells"]) -> Carry:
-        def after_transition() -> Carry:
-            (runs, output), cell = carry, padded(lost)
-            transition, rows = _reset(numbers, runs, cell)
-            after = chosen(lost, after_reset(jnp, runs, transition, t1), runs)
-            if rows is not None:
-                assert output.between is not None
-                is_new = lost & (times > runs.end_time) & (times <= after.end_time) & jnp.isnan(output.number)
-                output = output._replace(
-                    between=jnp.where(is_new, rows, output.between), number=jnp.where(is_new, BETWEEN, output.number)
-                )
-            grazes = after.counts[-1] > runs.counts[-1]
-            grazing_time = jnp.where(grazes, jnp.minimum(output.grazing_time, runs.end_time), output.grazing_time)
-            return after, output._replace(grazing_time=grazing_time)
-
-        return jax.lax.cond(jnp.any(lost), after_transition, lambda: carry)
-
-    def _reset(numbers: Sequence[int], runs: HybridOutcome[Array], cell: Array) -> tuple[Any, Array | None]:
-        """The transition of some cells, and its output rows with their variations."""
-
-        def with_rows(mode: AbstractBatchedMode, state: Array, left: Array) -> Any:
-            # If the event happens later, less time passes from the event to a fixed time, and to the horizon.
-            return reset_with_rows(mode, state, left, times[:, cell] - t1[cell] + left, t1[cell])
-
-        mode: Any = mode_of_cells(mode_numbered(modes, numbers, runs.mode), cell)
-        left = greatest(t1[cell] - runs.end_time[cell], 0.0)
-        transition, rows, variations = mode.reset_with_path(runs.state[:, cell], left, with_rows)
-        return transition, None if rows is None else jnp.concatenate([rows[None], variations])
-
-    groups = program_groups(modes)
-    rows = [jax.eval_shape(functools.partial(_reset, group), start, jnp.arange(size))[1] for group in groups]
-    between = next((jnp.zeros(shape.shape) for shape in rows if shape is not None), None)
-    missing = jnp.full((len(start.state), *times.shape), jnp.nan)
-    empty = Recorded(missing, missing[0], between, jnp.full(size, jnp.inf))
-    return traced_rounds((start, empty), groups, solve, reset)
-
-
-def _output_rows(
-    modes: tuple[VariationalMode, ...], output: Recorded
-) -> tuple[Float[Array, "shown times cells"], Float[Array, "tangents shown times cells"]]:
-    """The output rows, NaN where a sample is missing, and their variations."""
-
-    def of_mode(mode: VariationalMode, states: Float[Array, "components times"]) -> Any:
-        return mode.output_rows(states)
-
-    rows = jax.tree.map(jnp.full_like, jax.eval_shape(over_cells(of_mode, modes[0]), output.state), (jnp.nan, 0.0))
-    for number, mode in enumerate(modes):
-        of_this = over_cells(of_mode, mode)(output.state)
-        rows = jax.tree.map(functools.partial(jnp.where, output.number == number), of_this, rows)
-    if output.between is not None:
-        between = (output.between[0], output.between[1:])
-        rows = jax.tree.map(functools.partial(jnp.where, output.number == BETWEEN), between, rows)
-    return rows
-
-
-def program_groups(modes: tuple[AbstractBatchedMode, ...]) -> list[tuple[int, ...]]:
-    """The indices of the modes, in groups. The modes of a group differ only in the values of their arrays, so they
-    share a program."""
-    groups: list[list[int]] = []
-    for number, mode in enumerate(modes):
-        shape = _shape(mode)
-        group = next((group for group in groups if eqx.tree_equal(_shape(modes[group[0]]), shape)), None)
-        if group is None:
-            groups.append([number])
-        else:
-            group.append(number)
-    return [tuple(group) for group in groups]
-
-
-def _shape(mode: AbstractBatchedMode) -> Any:
-    """A mode with the shapes of its arrays in place of their values."""
-    return jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)) if eqx.is_array(leaf) else leaf, mode)
-
-
-def mode_numbered(modes: tuple[VariationalMode, ...], numbers: Sequence[int], selected: Array) -> Any:
-    """The mode numbered `selected` in one of the `program_groups`."""
-    mode = modes[numbers[0]]
-    for number in numbers[1:]:
-
-        def leaf(old: Any, new: Any, number: int = number) -> Any:
-            return old if old is new or not eqx.is_array(old) else jnp.where(selected == number, new, old)
-
-        mode = jax.tree.map(leaf, mode, modes[number])
-    return mode
 
 
 def _as_samples(

@@ -18,21 +18,28 @@ def reset_with_rows(
     left: Float[Array, " cells"],
     times: Float[Array, "times cells"],
     t1: Float[Array, " cells"],
-) -> tuple[Transition, Float[Array, "shown times cells"] | None]:
+    weights: Float[Array, "shown times cells"] | None = None,
+) -> tuple[Transition, Array | None]:
     """The transition to the next mode, and the output rows on the way.
 
     **Arguments:** `state`, `left`: as for `AbstractBatchedMode.reset_map`; `times`: the times of the samples [s],
-    counted from the end of the mode; `t1`: horizon [s].
+    counted from the end of the mode; `t1`: horizon [s]; `weights`: factors of the rows, if only a sum of them is needed.
 
-    **Returns:** the `Transition`, and the rows, which are meaningless at times outside the transition; `None` if the
-    mode records no path.
+    **Returns:** the `Transition`, and the rows, which are meaningless at times outside the transition, or with `weights`
+    their weighted sum in every cell; `None` if the mode records no path.
     """
     if isinstance(mode, AbstractHoppingMode):
-        return _hops_with_rows(mode, state, left, times, ROUND_OFF * t1)
+        return _hops_with_rows(mode, state, left, times, ROUND_OFF * t1, weights)
     transition = mode.reset_map(state, left)
     if transition.record is None:
         return transition, None
-    return transition, over_cells(_rows_of_path, mode)(transition.record, times)
+    rows = over_cells(_rows_of_path, mode)(transition.record, times)
+    return transition, rows if weights is None else jnp.sum(weighted(weights, rows), axis=(0, 1))
+
+
+def weighted(weights: Float[Array, "..."], values: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Values times their weights; a value without a weight may be anything."""
+    return jnp.where(weights == 0.0, 0.0, weights * values)
 
 
 def _rows_of_path(
@@ -47,12 +54,12 @@ def _rows_of_path(
 
 
 class Hops(NamedTuple):
-    """A succession of stretches: the current one, the number of stretches so far, the output rows, and the index of the
-    next sample in every cell."""
+    """A succession of stretches: the current one, the number of stretches so far, the output rows or their weighted sum,
+    and the index of the next sample in every cell."""
 
     stretch: Any
     count: Int[Array, ""]
-    rows: Float[Array, "shown times cells"]
+    rows: Float[Array, "*shown_times cells"]
     sample: Int[Array, " cells"]
 
 
@@ -62,9 +69,16 @@ def _hops_with_rows(
     left: Float[Array, " cells"],
     times: Float[Array, "times cells"],
     slack: Float[Array, " cells"],
-) -> tuple[Transition, Float[Array, "shown times cells"]]:
+    weights: Float[Array, "shown times cells"] | None,
+) -> tuple[Transition, Float[Array, "*shown_times cells"]]:
     """The stretches one by one, each with the samples inside it. No path is kept, whose length is not known."""
     cells = jnp.arange(len(left))
+
+    def with_values(rows: Array, row: Int[Array, " cells"], values: Float[Array, "shown cells"]) -> Array:
+        if weights is None:
+            return rows.at[:, row, cells].set(values, mode="drop", unique_indices=True)
+        factors = weights.at[:, row, cells].get(mode="fill", fill_value=0.0)
+        return rows + jnp.sum(weighted(factors, values), axis=0)
 
     def hop(hops: Hops) -> Hops:
         stretch, count, rows, sample = hops
@@ -85,8 +99,7 @@ def _hops_with_rows(
             inside = is_inside(sample)
             passed = jnp.where(inside, next_time(sample) - stretch.elapsed, 0.0)
             row = jnp.where(inside, sample, len(times))
-            rows = rows.at[:, row, cells].set(mode.between(motion, passed), mode="drop", unique_indices=True)
-            return rows, sample + inside
+            return with_values(rows, row, mode.between(motion, passed)), sample + inside
 
         rows, sample = jax.lax.while_loop(lambda carry: jnp.any(is_inside(carry[1])), filled, (rows, sample))
         return Hops(following, count + 1, rows, sample)
@@ -96,7 +109,7 @@ def _hops_with_rows(
 
     start = mode.lost(state)
     row = jax.eval_shape(mode.between, mode.motion_in(start), start.elapsed)
-    rows = jnp.zeros((len(row), *times.shape))
+    rows = jnp.zeros((len(row), *times.shape) if weights is None else left.shape)
     hops = Hops(start, jnp.zeros((), int), rows, jnp.sum(times <= 0.0, axis=0))
     hops = jax.lax.while_loop(goes_on, hop, hops)
     return mode.closed(hops.stretch), hops.rows

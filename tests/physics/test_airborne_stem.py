@@ -16,7 +16,7 @@ from hop_reference import CASES as ON_THE_PLANE
 from test_leaning import REFERENCE as FOUND_ON_THE_PLANE
 
 import tippe
-from nonholonomic.hybrid.samples import program_groups
+from nonholonomic.hybrid.sampled_rounds import program_groups
 from tippe.modes.airborne import ON_STEM, STRIKING
 from tippe.modes.airborne_stem import FlyBoth
 from tippe.runs.run_kind import flight_modes

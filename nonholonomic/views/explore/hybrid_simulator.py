@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from ...hybrid import MOST_ROUNDS, AbstractBatchedMode, AbstractHoppingMode, HybridOutcome
 from ...hybrid.ensemble import after_reset, after_solve, at_start
-from ...hybrid.samples import mode_numbered, program_groups
+from ...hybrid.sampled_rounds import mode_numbered, program_groups
 from ...integration import Settings
 from ...integration.ensemble import with_crossing_times
 from ...integration.scheduler import LaneScheduler, outcome_of

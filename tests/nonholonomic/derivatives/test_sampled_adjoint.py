@@ -7,7 +7,7 @@ import pytest
 from close import assert_close
 
 import nonholonomic.derivatives._adjoint as adjoint
-import nonholonomic.derivatives._periods as periods
+import nonholonomic.derivatives.periods as periods
 from nonholonomic.derivatives import sampled_run
 from nonholonomic.integration import AbstractProblem, Settings
 

@@ -9,7 +9,7 @@ import pytest
 from close import assert_close
 
 import nonholonomic.derivatives._adjoint as adjoint
-import nonholonomic.derivatives._periods as periods
+import nonholonomic.derivatives.periods as periods
 import nonholonomic.derivatives.slopes as slopes
 from nonholonomic.derivatives import tangents_of
 from nonholonomic.integration import AbstractProblem, Settings

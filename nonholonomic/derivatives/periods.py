@@ -3,13 +3,12 @@ latest ones.
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..integration.scheduler import SchedulerState
 from ..xla_cpu import written_in_place
 
 #: Number of checkpoints. With more periods, some checkpoints are dropped and computed again from an earlier one. With
@@ -34,8 +33,9 @@ class StepRecord(NamedTuple):
     fixed: Bool[Array, "iterations components lanes"] | None = None
 
 
-#: A period without its steps: the lanes before it, and after it but before their refill.
-Period = tuple[SchedulerState, SchedulerState]
+#: A period without its steps, as a tree of arrays: the lanes before it, and after it but before their refill; or other states
+#: of a run.
+Period = Any
 
 
 class Checkpoints(NamedTuple):

@@ -19,19 +19,20 @@ from ..integration import AbstractProblem, Lanes, LaneState, Settings, States
 from ..integration.sample_times import SampleTimes, components
 from ..integration.samples import step_towards_sample
 from ..integration.scheduler import InLanes
-from ..integration.status import FAILED, LEFT_DOMAIN
+from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END
 from ..xla_cpu import written_in_place
 from ._adjoint import StepRecorder, solve_with_adjoint, without_probe
-from ._periods import StepRecord
+from .periods import StepRecord
 from .slopes import moving_leaves, shares_of, tangents_of, time_of_zero
 from .variation import VariationalProblem, tangent_scale
 
 
 class SampledCotangents(NamedTuple):
-    """The cotangents of the samples, and of the time at which a run leaves the domain."""
+    """The cotangents of the samples, of the time at which a run leaves the domain, and of the state at the horizon."""
 
     states: Float[Array, "cells times components"]
     end_time: Float[Array, " cells"]
+    end_state: Float[Array, "components cells"]
 
     @classmethod
     def of(
@@ -49,7 +50,8 @@ class SampledCotangents(NamedTuple):
             jnp.zeros((cells, times, size)) if part is None else part
             for part, size in ((core, leading), (quadratures, components - leading))
         ]
-        return cls(jnp.concatenate(states, axis=-1), jnp.zeros(cells) if end_time is None else end_time)
+        end_time = jnp.zeros(cells) if end_time is None else end_time
+        return cls(jnp.concatenate(states, axis=-1), end_time, jnp.zeros((components, cells)))
 
 
 class SampledStepRecord(NamedTuple):
@@ -97,9 +99,10 @@ class SampledStepRecorder(StepRecorder):
         # Where the derivative is zero, a NaN cotangent, such as that of theta at the pole, has no effect.
         return jnp.where(steps.fixed, 0.0, jnp.moveaxis(rows, -1, 1))
 
-    def share_of_end(self, lane_state: LaneState) -> Lanes:
-        leaves = (lane_state.status == LEFT_DOMAIN) & (lane_state.time > 0.0)
-        return jnp.where(leaves, self.cotangents.end_time[self._cell(lane_state)], 0.0)
+    def share_of_end(self, lane_state: LaneState) -> tuple[Lanes, States]:
+        cell, has_left = self._cell(lane_state), (lane_state.status == LEFT_DOMAIN) & (lane_state.time > 0.0)
+        at_end = jnp.where(lane_state.status == REACHED_END, self.cotangents.end_state[:, cell], 0.0)
+        return jnp.where(has_left, self.cotangents.end_time[cell], 0.0), at_end
 
     def _cell(self, lane_state: LaneState) -> Int[Array, " lanes"]:
         return jnp.minimum(lane_state.cell, len(self.cotangents.end_time) - 1)
@@ -108,25 +111,25 @@ class SampledStepRecorder(StepRecorder):
 def samples_pulled_back(
     build: Callable[..., AbstractProblem],
     point: tuple[Float[Array, "... cells"], ...],
-    cotangents: tuple[Array | None, Array | None, Array | None],
+    cotangents: SampledCotangents,
     times: Float[Array, "times *cells"],
     t1: Float[Array, "..."],
     settings: Settings,
+    rates: list[Float[Array, "... cells"]] | None = None,
 ) -> list[Float[Array, "... cells"]]:
     """The cotangents of a problem's numbers from those of its samples.
 
     **Arguments:**
 
     - `build`: numbers -> problem; `point`: the numbers, with the cells last.
-    - `cotangents`: those of the core components and of the quadratures at the times, (cells, times, ...), 0 after the end
-      of a run; and those of the time at which the run leaves the domain, (cells,). `None` if they vanish.
+    - `cotangents`: those of the samples, 0 after the end of a run, and of the end.
     - `times`, `t1`, `settings`: as for `solve_with_samples`.
+    - `rates`: a tangent of the numbers, which the steps must suit; by default one that moves every number.
 
     **Returns:** the cotangents, in the shapes of the numbers; NaN in cells that fail with the steps that suit the tangent.
     """
     problem, cells = build(*point), point[0].shape[-1]
-    arriving = SampledCotangents.of(problem, len(times), *cotangents)
-    probe = tangents_of(build, point, [tuple(_mixture(point))])[0]
+    probe = tangents_of(build, point, [tuple(mixture(point) if rates is None else rates)])[0]
     moving = moving_leaves(problem, probe, _field_and_margin)
     outcome, by_start, by_number = solve_with_adjoint(
         VariationalProblem(problem, (), False),
@@ -135,14 +138,15 @@ def samples_pulled_back(
         t1,
         jnp.asarray(cells),
         settings,
-        measured=_end_time,
-        recorder=SampledStepRecorder(SampleTimes.of(times, cells, components), arriving),
+        measured=_end,
+        recorder=SampledStepRecorder(SampleTimes.of(times, cells, components), cotangents),
         one_kernel=True,
     )
     sample_times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), cells)).T
     is_moved = VariationalProblem(problem, (probe,), False).start()[0][len(by_start) :] != 0.0
-    initial = jnp.where((sample_times <= 0.0)[..., None] & is_moved.T[:, None], arriving.states, 0.0)
-    is_lost = jnp.any(jnp.any(arriving.states != 0.0, axis=-1) & (sample_times > outcome.end_time[:, None]), axis=1)
+    initial = jnp.where((sample_times <= 0.0)[..., None] & is_moved.T[:, None], cotangents.states, 0.0)
+    is_lost = jnp.any(jnp.any(cotangents.states != 0.0, axis=-1) & (sample_times > outcome.end_time[:, None]), axis=1)
+    is_lost |= jnp.any(cotangents.end_state != 0.0, axis=0)
     by_start = by_start + jnp.sum(initial, axis=1).T
 
     def numbers_and_start(*point: Float[Array, "... cells"]) -> Any:
@@ -153,7 +157,7 @@ def samples_pulled_back(
     return [jnp.where(is_lost & (outcome.status == FAILED), jnp.nan, part) for part in by_point]
 
 
-def _mixture(point: tuple[Float[Array, "... cells"], ...]) -> list[Float[Array, "... cells"]]:
+def mixture(point: tuple[Float[Array, "... cells"], ...]) -> list[Float[Array, "... cells"]]:
     """A direction that moves every number by a share of its own size."""
     counts = [number[..., 0].size for number in point]
     shares = np.split(shares_of(sum(counts)), np.cumsum(counts)[:-1])
@@ -168,12 +172,13 @@ def _field_and_margin(problem: AbstractProblem, states: States) -> Any:
     return problem.field(time, states), problem.domain_margin(time, states)
 
 
-def _end_time(variational: VariationalProblem, lane_state: LaneState) -> Lanes:
-    """The time at which a run leaves the domain."""
+def _end(variational: VariationalProblem, lane_state: LaneState) -> tuple[Lanes, States]:
+    """The time at which a run leaves the domain, and the state at the end."""
     problem, time = variational.problem, lane_state.time
     if problem.domain_margin(time, lane_state.state) is None:
-        return jnp.zeros_like(time)
-    return time_of_zero(problem, lambda state: problem.domain_margin(time, state), time, lane_state.state)
+        return jnp.zeros_like(time), lane_state.state
+    end_time = time_of_zero(problem, lambda state: problem.domain_margin(time, state), time, lane_state.state)
+    return end_time, lane_state.state
 
 
 def is_reversible(problem: AbstractProblem) -> bool:
