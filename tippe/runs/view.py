@@ -77,33 +77,14 @@ class DrawnMotion(NamedTuple, Generic[Numbers]):
     def of(run: Any) -> "DrawnMotion[Array]":
         """The motion of one run, inside or outside of transformations."""
         body, slip = run.scene.body, run.slip
-        zero = jnp.zeros_like(run.t)
-        position, axis, normal = run.position, run.axis, run._fixed((zero, zero, zero + 1.0))
+        position, axis, normal, zero = run.position, run.axis, run.normal, jnp.zeros_like(run.t)
         contact: Array = run.contact if not isinstance(body, Top) else position - body.radius * normal
         if isinstance(body, Top) and body.stem is not None:
             stem = position + (body.stem.offset - body.offset) * axis - body.stem.radius * normal
             contact = jnp.where((run.contact == 1)[:, None], stem, contact)
-        w = run.angular_velocity
-        if isinstance(body, AbstractRigidBody):
-            momentum = run.angular_momentum
-        else:
-            axial_part = jnp.sum(w * axis, axis=-1, keepdims=True)
-            momentum = body.I1 * w + (body.I3 - body.I1) * axial_part * axis
-        return DrawnMotion(
-            run.t,
-            position,
-            axis,
-            normal,
-            contact,
-            run._fixed((slip[:, 0], slip[:, 1], zero)),
-            run.rotation,
-            run.theta,
-            run.energy,
-            run.jellett,
-            run.normal_force,
-            w,
-            momentum,
-        )
+        parts = {"times": run.t, "position": position, "axis": axis, "normal": normal, "contact": contact}
+        parts |= {"slip": run._fixed((slip[:, 0], slip[:, 1], zero))}
+        return DrawnMotion(**parts, **{name: getattr(run, name) for name in DrawnMotion._fields if name not in parts})
 
 
 _motion = eqx.filter_jit(DrawnMotion.of)
