@@ -51,16 +51,15 @@ UNITS |= {"tilt": "rad", "radius": "m", "equatorial": "m", "polar": "m", "ring":
 UNITS |= {"scene.friction.steering": "N m s"}
 
 #: Descriptions of the axes.
-LONG_NAMES = {"scene.friction.steering": "damping of the steering"}
-LONG_NAMES |= {"steering_inertia": "inertia of the fork", "steering_spring": "spring of the fork"}
-LONG_NAMES |= {
+LONG_NAMES = {
+    "scene.friction.steering": "damping of the steering",
+    "steering_inertia": "inertia of the fork",
+    "steering_spring": "spring of the fork",
     "steering": "steering angle φ(0)",
     "speed": "speed v(0)",
     "heading": "heading ψ(0)",
     "steering_rate": "steering rate φ'(0)",
     "mass": "mass m",
-}
-LONG_NAMES |= {
     "x0": "x(0)",
     "y0": "y(0)",
     "z0": "z(0)",

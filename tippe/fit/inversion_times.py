@@ -105,13 +105,9 @@ class AbstractTimes(AbstractEventTimes):
     def check(self, scene: Scene) -> None:
         """Raise `ValueError` unless the scene has such events."""
 
+    @abc.abstractmethod
     def timed(self, scene: Scene) -> TopModel:
         """The model of the launch whose runs end on the event."""
-        return TopModel.timed(scene, self.launch, self._event(scene))
-
-    @abc.abstractmethod
-    def _event(self, scene: Scene) -> Any:
-        """What ends a run, as for `TopModel.timed`."""
 
     @abc.abstractmethod
     def of_run(self, scene: Scene, launch: Launch, tolerance: Float[Array, ""]) -> Float[Array, ""]:
@@ -176,8 +172,8 @@ class InversionTimes(AbstractTimes):
     def __check_init__(self):
         check_event(self.angle, "first")
 
-    def _event(self, scene: Scene) -> Any:
-        return event_of(scene, self.angle)
+    def timed(self, scene: Scene) -> TopModel:
+        return TopModel.timed(scene, self.launch, event_of(scene, self.angle))
 
     def of_run(self, scene: Scene, launch: Launch, tolerance: Float[Array, ""]) -> Float[Array, ""]:
         return extended_inversion_time(scene, launch, self.t1, angle_of(scene, self.angle), tolerance)
@@ -216,8 +212,8 @@ class ReversalTimes(AbstractTimes):
         require_rigid(scene)
         check_reversible(self.launch, {})
 
-    def _event(self, scene: Scene) -> Any:
-        return None
+    def timed(self, scene: Scene) -> TopModel:
+        return TopModel.timed(scene, self.launch, None)
 
     def of_run(self, scene: Scene, launch: Launch, tolerance: Float[Array, ""]) -> Float[Array, ""]:
         return reversal_time(scene, launch, self.t1, tolerance)

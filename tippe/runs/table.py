@@ -245,8 +245,11 @@ def event_table(
     job = TableJob(model, form, float(t1), crossing, settings, slopes, options.errors, by_diffrax=by_diffrax)
     table = compute_table(job, grid, units, request, options)
     warn_of_long_runs(table, float(t1), options.max_steps)
-    if model.smooth:
-        warn_of_unresolved_runs(table, model)
+    # Tables whose variables stay in the file are not checked.
+    if model.smooth and isinstance(table.variables, dict):
+        unresolved = np.asarray(table.variables["status"] == "unresolved")
+        if unresolved.any():
+            warn(f"{unresolved.sum()} of {unresolved.size} runs are unresolved: {why_unresolved(model.kind)}")
     return table
 
 
@@ -258,16 +261,6 @@ def warn_of_long_runs(table: Table, t1: float, max_steps: int) -> None:
     if is_long.any():
         end = float(np.min(table.variables["end_time"][is_long]))
         warn(f"{is_long.sum()} of {is_long.size} runs have failed: {too_many_steps(t1, max_steps, end)}")
-
-
-def warn_of_unresolved_runs(table: Table, model: TopModel) -> None:
-    """Warn of unresolved runs, with the reason. Tables whose variables stay in the file are not checked."""
-    if not isinstance(table.variables, dict):
-        return
-    unresolved = np.asarray(table.variables["status"] == "unresolved")
-    if unresolved.any():
-        number = f"{unresolved.sum()} of {unresolved.size} runs are unresolved"
-        warn(f"{number}: {why_unresolved(model.kind)}")
 
 
 def trajectory_table(
