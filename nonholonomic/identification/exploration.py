@@ -26,7 +26,7 @@ ROWS = 512
 
 #: An exploration ends with at least this many effective draws and a shape k of the weights below `MOST_K`, or after
 #: `ROUNDS` rounds.
-ENOUGH, MOST_K, ROUNDS = 400.0, 0.7, 24
+ENOUGH, MOST_K, ROUNDS = 400.0, 0.7, 40
 
 #: Effective number of points to which the likelihood is tempered, for each unknown, and at least.
 TEMPERED, LEAST_TEMPERED = 20.0, 80.0
@@ -35,7 +35,7 @@ TEMPERED, LEAST_TEMPERED = 20.0, 80.0
 GROUPS, FRONT = 32, 8
 
 #: Components of the proposals, and the share of the draws that the ends of the search by slopes keep.
-COMPONENTS, KEPT = 8, 0.15
+COMPONENTS, KEPT = 16, 0.15
 
 #: Powers of the density to which the two halves of the proposals are fitted. The flatter half reaches beyond the posterior, to
 #: other minima and into the tails.
@@ -48,6 +48,7 @@ class Pool(NamedTuple):
     - `points`: (n, unknowns), coordinates; `predictions`: (n, measurements).
     - `groups`: (n, groups), log likelihoods of groups of measurements; `log_prior`, `log_density`: (n,), of the posterior,
       averaged over unknown errors.
+    - `log_region`: (n,), 0 in the region of the search, and less outside of it.
     - `log_proposal`: (n,), log of the density from which all points together were drawn, times n.
     - `proposals`: pairs of a number of points and the distribution from which they were drawn.
     """
@@ -57,6 +58,7 @@ class Pool(NamedTuple):
     groups: Float[np.ndarray, "n groups"]
     log_prior: Float[np.ndarray, " n"]
     log_density: Float[np.ndarray, " n"]
+    log_region: Float[np.ndarray, " n"]
     log_proposal: Float[np.ndarray, " n"]
     proposals: tuple[tuple[int, Any], ...]
 
@@ -73,15 +75,15 @@ class Pool(NamedTuple):
         return -2.0 * np.sum(self.groups, axis=1)
 
     def log_weights(self, progress: float) -> Float[np.ndarray, " n"]:
-        """Log weights of the points. With `progress` from 0 to 1, the powers of the measurements grow from 0 to 1; from 1 to
-        2, guessed errors become unknown errors."""
+        """Log weights of the points. With `progress` from 0 to 1, the powers of the measurements grow from 0 to 1, and the
+        region of the search loses its weight; from 1 to 2, guessed errors become unknown errors."""
         if progress >= 2.0:
             return self.log_density - self.log_proposal
         count = self.groups.shape[1]
         front = min(FRONT, count)
         place = min(progress, 1.0) * (count + front - 1)
         powers = np.clip((place - np.arange(count)) / front, 0.0, 1.0)
-        tempered = self.groups @ powers + self.log_prior
+        tempered = self.groups @ powers + self.log_prior + max(0.0, 1.0 - progress) * self.log_region
         if progress > 1.0:
             tempered = (2.0 - progress) * tempered + (progress - 1.0) * self.log_density
         return tempered - self.log_proposal
@@ -113,7 +115,7 @@ class Explorer(NamedTuple):
     def begin(self, seed: int) -> Pool:
         """A pool of quasi-random points in the region."""
         size, values, groups = len(self.region.middle), self.measurements.value.size, int(np.max(self.group)) + 1
-        shapes = ((0, size), (0, values), (0, groups), (0,), (0,), (0,))
+        shapes = ((0, size), (0, values), (0, groups), (0,), (0,), (0,), (0,))
         empty = Pool(*(np.zeros(shape) for shape in shapes), proposals=())
         return self.extended(empty, self.region.points(ROWS if size > 2 else self.rows // 2, seed), self.region)
 
@@ -124,7 +126,7 @@ class Explorer(NamedTuple):
         proposals = (*pool.proposals, (len(points), proposal))
         old = np.logaddexp(pool.log_proposal, math.log(len(points)) + proposal.log_density(pool.points))
         new = np.logaddexp.reduce([math.log(n) + other.log_density(points) for n, other in proposals], axis=0)
-        parts = (points, predictions, groups, prior, log_density)
+        parts = (points, predictions, groups, prior, log_density, self.region.log_weight(points))
         grown = (np.concatenate(pair) for pair in zip(pool, parts, strict=False))
         return Pool(*grown, log_proposal=np.concatenate([old, new]), proposals=proposals)
 

@@ -19,22 +19,8 @@ ROUNDS, SETTLED = 10, 0.01
 PARTS = (0.1, 0.25, 0.5)
 
 
-class Stages(NamedTuple):
-    """The greatest numbers of steps: for each part of a recording, for the whole at once, and between its minima."""
-
-    of_part: int
-    at_once: int
-    between: int
-
-
-#: With derivatives; and with differences, where a step costs as much as a round of an exploration.
-WITH_DERIVATIVES, WITH_DIFFERENCES = Stages(8, 15, 20), Stages(3, 6, 6)
-
-
-def stages_of(problem: Problem) -> Stages:
-    """How long to refine the fits of recordings."""
-    return WITH_DERIVATIVES if problem.step is None else WITH_DIFFERENCES
-
+#: The greatest numbers of steps in the fit of a recording: for each part, for the whole at once, and between its minima.
+OF_PART, AT_ONCE, BETWEEN = 8, 15, 20
 
 #: Greatest number of minima around which an exploration begins; how much worse than the best they may be, in -2 log
 #: likelihood; and their least distance, in standard errors.
@@ -164,8 +150,7 @@ def _fitted(problem: Problem, starts: Any, measurements: Measurements, options: 
     Predicted late samples can be wrong by whole turns, and would then lead to another minimum.
     """
     max_steps, progress, in_parts, rows = options
-    stages = stages_of(problem)
-    steps = min(max_steps, stages.at_once) if in_parts else max_steps
+    steps = min(max_steps, AT_ONCE) if in_parts else max_steps
     ends = minimise(problem, starts, measurements, rows=rows, max_steps=steps, progress=progress)
     at_ends = linearise(problem, ends.coordinates, measurements)
     duration = float(np.max(np.asarray(measurements.time)))
@@ -175,7 +160,7 @@ def _fitted(problem: Problem, starts: Any, measurements: Measurements, options: 
     for part in PARTS:
         early_measurements = down_weighted(measurements, part * duration)
         coordinates = minimise(
-            problem, coordinates, early_measurements, max_steps=min(max_steps, stages.of_part), progress=progress
+            problem, coordinates, early_measurements, max_steps=min(max_steps, OF_PART), progress=progress
         ).coordinates
     ends_by_parts = minimise(problem, coordinates, measurements, max_steps=2 * steps, progress=progress)
     by_parts = linearise(problem, ends_by_parts.coordinates, measurements)

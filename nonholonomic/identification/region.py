@@ -18,6 +18,9 @@ OF_DURATION = 0.02
 #: A prior is searched to this many standard deviations.
 DEVIATIONS = 3.0
 
+#: Width of the soft edge of the box, in half widths.
+EDGE = 0.25
+
 #: Weights are 0 farther from the start than this many half widths: a factor of 2^10 for a positive number.
 FARTHEST = 10.0
 
@@ -42,6 +45,11 @@ class Region(NamedTuple):
         """The log density of points that are uniform in the box."""
         inside = np.all(np.abs(points - self.middle) <= self.half_width, axis=1)
         return np.where(inside, -np.sum(np.log(2.0 * self.half_width)), -np.inf)
+
+    def log_weight(self, points: Float[np.ndarray, "n unknowns"]) -> Float[np.ndarray, " n"]:
+        """0 in the box; outside, less with the square of the distance."""
+        beyond = (np.abs(points - self.middle) / self.half_width - 1.0).clip(0.0)
+        return -0.5 * np.sum((beyond / EDGE) ** 2, axis=1)
 
     def contains(self, points: Float[np.ndarray, "n unknowns"]) -> np.ndarray:
         """Which points are near enough for a weight."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from .exploration import Explorer, Weighted
 from .problem import Problem, deviances
-from .refinement import Minima, Refinement, refine, stages_of
+from .refinement import BETWEEN, Minima, Refinement, refine
 
 #: Greatest number of steps by slopes before an exploration, where predictions may be a staircase.
 FEW_STEPS = 6
@@ -29,7 +29,8 @@ class Search(NamedTuple):
 
 
 def search(problem: Problem, explorer: Explorer, options: Search) -> tuple[Minima, Weighted]:
-    """Compare candidates, refine the best, and explore the likelihood around all minima.
+    """Compare candidates, refine the best, and explore the likelihood around all minima; or explore first, where steps by
+    differences cost more.
 
     **Raises:** `ValueError` if no candidate has a finite prediction.
     """
@@ -38,11 +39,17 @@ def search(problem: Problem, explorer: Explorer, options: Search) -> tuple[Minim
     if not np.any(np.isfinite(pool.predictions)):
         raise ValueError("model: no start led to finite predictions")
     recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
+    if recorded and problem.step is not None:
+        # A step by differences takes as long as a round of the exploration, which also finds the minima.
+        sample = explorer.explore(pool, None, progress)
+        best = sample.pool.points[np.argsort(-sample.pool.log_density)[:starts]]
+        last = np.arange(starts) < LAST
+        return refine(problem, best, measurements, Refinement(max_steps, progress, rows=last)), sample
     steps = max_steps if recorded else min(max_steps, FEW_STEPS)
     minima = refine(problem, pool.candidates(starts), measurements, Refinement(steps, progress, in_parts=recorded))
     if recorded:
-        steps = min(max_steps, stages_of(problem).between)
-        around = refine(problem, minima.between(), minima.measurements, Refinement(steps, progress))
+        between = Refinement(min(max_steps, BETWEEN), progress)
+        around = refine(problem, minima.between(), minima.measurements, between)
         minima = minima.joined(around)
     # Along a direction without any slope, the likelihood has no end that an exploration could find.
     has_end = bool(np.all(np.isfinite(minima.covariance(minima.best))))
