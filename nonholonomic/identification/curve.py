@@ -13,7 +13,7 @@ from .problem import Problem, predictions
 from .recording import AbstractRecording
 
 #: Number of points of a curve, and the greatest number of predictions for each sample.
-POINTS, MOST = 300, 16
+POINTS, MOST = 1200, 16
 
 
 def fine_predictions(

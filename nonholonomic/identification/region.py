@@ -4,7 +4,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from .unknown import Free
 
@@ -50,6 +50,10 @@ class Region(NamedTuple):
         """0 in the box; outside, less with the square of the distance."""
         beyond = (np.abs(points - self.middle) / self.half_width - 1.0).clip(0.0)
         return -0.5 * np.sum((beyond / EDGE) ** 2, axis=1)
+
+    def searched(self, points: Float[np.ndarray, "n unknowns"]) -> Bool[np.ndarray, "n unknowns"]:
+        """Which coordinates are within the box."""
+        return np.abs(points - self.middle) <= self.half_width
 
     def contains(self, points: Float[np.ndarray, "n unknowns"]) -> np.ndarray:
         """Which points are near enough for a weight."""

@@ -138,6 +138,13 @@ def remarks(
         sides = high - distribution.estimate[k], distribution.estimate[k] - low
         if max(sides) > SKEWED * max(min(sides), 1e-300):
             skewed.append(name)
+    share_outside = sample.weights @ ~explorer.region.searched(sample.pool.points)
+    outside = [name for (name, _), share in zip(problem.free, share_outside, strict=True) if share > 0.5]
+    if outside:
+        notes.append(
+            f"{', '.join(outside)}: outside of the range in which minima were searched, so better ones may be missing; start "
+            "closer, or state a prior"
+        )
     if skewed:
         notes.append(
             f"the likelihood profile of {', '.join(skewed)} is no parabola: use the interval, not the standard error"
