@@ -221,13 +221,13 @@ def test_names_are_paths_or_their_ends():
 def test_the_verdict_tells_that_an_estimate_is_outside_of_the_searched_range():
     """The truth is 1; a friction-like number is searched within a factor of two of its start."""
     times = np.arange(1.0, 9.0)
-    measurements = Measurements(0.5**times + 1e-3 * np.cos(7.0 * times), 1e-3)
+    measurements = Measurements(0.5**times + 0.02 * np.cos(7.0 * times), 0.02)
 
     def fit(start):
         free = {"half_life": Free(start, lower=0.0)}
         return identify(lambda p: 0.5 ** (times / p["half_life"][:, None]), measurements, free, progress=False)
 
     far, near = fit(2.5), fit(1.5)
-    assert abs(far.estimates["half_life"] - near.estimates["half_life"]) < 0.1 * near.standard_errors["half_life"]
+    assert abs(far.estimates["half_life"] - near.estimates["half_life"]) < 0.3 * near.standard_errors["half_life"]
     assert [note for note in far.verdict.notes if note.startswith("half_life: outside of the range")]
     assert not [note for note in near.verdict.notes if "outside" in note]
