@@ -12,7 +12,7 @@ from .goal import Limits
 from .guess import smoothed, timed
 from .obstacles import Obstacles
 from .problem import Problem
-from .search import Costs, Ground, Path, search
+from .search import Costs, Ground, Path, Steps, search
 from .spline import ORDER
 from .transcription import Scales, Task
 
@@ -26,7 +26,7 @@ RESERVE, LIMIT_RESERVE = 0.04, 0.01
 #: Curvature of the arcs of a search in units of the greatest one, because the fork takes time to turn.
 SEARCH_CURVATURE = 0.85
 
-#: By how much a drive may be shorter than the path of a search, which consists of arcs.
+#: Length of the shortest drive that is expected, in units of the path of a search, which consists of arcs.
 OPTIMISTIC = 0.8
 
 #: Neighbouring knots over which the steering angle and the speed of a path are averaged.
@@ -62,8 +62,11 @@ class Outline(NamedTuple):
         """The task of the optimiser for drives of the length `way` [m]."""
         problem, body = self.problem, self.problem.scene.body
         speed = max(way, float(body.wheelbase)) / t1
+        launch, goal = problem.launch, problem.goal
+        ends = np.array([[launch.steering, launch.speed], [launch.steering, goal.speed]])
         low, high = problem.limits.arrays(LIMIT_RESERVE)
-        launch = problem.launch
+        # No drive keeps a reserve that its start or its goal does not have.
+        low[:2], high[:2] = np.minimum(low[:2], ends.min(axis=0)), np.maximum(high[:2], ends.max(axis=0))
         front_speed = launch.speed / jnp.cos(launch.steering)
         force = float(body.mass) * speed / min(1.0, 0.1 * t1)
         return Task(
@@ -71,8 +74,8 @@ class Outline(NamedTuple):
             footprint=problem.footprint,
             obstacles=self.obstacles,
             start=(self.start, launch.steering, launch.steering_rate, front_speed),
-            goal=(self.goal, problem.goal.speed),
-            has_heading=jnp.asarray(0.0 if problem.goal.heading is None else 1.0),
+            goal=(self.goal, goal.speed),
+            has_heading=jnp.asarray(0.0 if goal.heading is None else 1.0),
             low=jnp.asarray(low),
             high=jnp.asarray(high),
             clearance=jnp.asarray(clearance),
@@ -85,9 +88,9 @@ class Outline(NamedTuple):
         none can be driven within `t1`, if there is one."""
         start, goal = self.chart.point(self.start), self.chart.point(self.goal)
         ground = Ground.of(np.stack([start, goal]), self.obstacles, self.problem.footprint)
-        curvature = SEARCH_CURVATURE * greatest_curvature(self.problem)
+        steps = steps_of(self.problem)
         has_heading = self.problem.goal.heading is not None
-        results = [search(ground, start, goal, has_heading, curvature, prices) for prices in costs]
+        results = [search(ground, start, goal, has_heading, steps, prices) for prices in costs]
         paths = [path for path, _ in results if path is not None]
         if not paths:
             nearest = min(distance for _, distance in results)
@@ -120,10 +123,13 @@ class Outline(NamedTuple):
         return np.stack([np.asarray(part) for part in surface.in_fixed_frame(padded(components))], axis=-1)
 
 
-def greatest_curvature(problem: Problem) -> float:
-    """The greatest curvature [1/m] that the limit of the steering angle allows on either side."""
-    low, high = Limits(steering=problem.limits.steering).arrays(LIMIT_RESERVE)
-    return float(np.tan(min(-low[0], high[0]))) / float(problem.scene.body.wheelbase)
+def steps_of(problem: Problem) -> Steps:
+    """What the limits of steering angle and speed allow a search."""
+    angles = Limits(steering=problem.limits.steering).arrays(LIMIT_RESERVE)
+    low, high = (float(np.tan(angle[0])) / float(problem.scene.body.wheelbase) for angle in angles)
+    slowest, fastest = problem.limits.ranges().get("speed", (-np.inf, np.inf))
+    directions = tuple(sign for sign, speed in ((1.0, fastest), (-1.0, -slowest)) if speed > 0.0)
+    return Steps(max(low, SEARCH_CURVATURE * low), min(high, SEARCH_CURVATURE * high), directions)
 
 
 def straight(start: Any, goal: Any) -> Path:

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from nonholonomic.parameters import readable_unit
+
 from ..runs.trajectory import Trajectory
 from ..runs.verbs import simulate
 from .goal import Limits
@@ -19,8 +21,9 @@ from .transcription import seen_from_above
 #: are examined.
 COMPARED, CONFIRMED, FINER = 501, 2001, 10
 
-#: By how much a limit may be exceeded, in units of its range: round-off.
-ROUND_OFF = 1e-9
+#: By how much a limit may be exceeded, in units of its range: a drive keeps the speed and the angle of a plan up to small
+#: errors, and a limit may be the very value at its start or goal.
+ALLOWED = 1e-3
 
 
 class Verdict(NamedTuple):
@@ -112,6 +115,7 @@ def judge(run: Trajectory, problem: Problem) -> Verdict:
     errors, margins = errors_of(run, problem), margins_of(run, problem.limits)
     clearance, nearest = clearance_of(run, problem)
     within, length = float(problem.goal.within), float(problem.footprint.length)
+    units = {name: readable_unit(unit) for name, unit in Limits.units.items()}
     # What is wrong, each relative to what is allowed, and the words for it.
     wrong = [
         (error / within - 1.0, f"the {name} at the end is off by {error:.3g} {unit}")
@@ -119,8 +123,8 @@ def judge(run: Trajectory, problem: Problem) -> Verdict:
     ]
     wrong.append((-clearance / length, f"the footprint overlaps obstacles[{nearest}] by {-clearance:.3g} m"))
     for name, (low, high) in problem.limits.ranges().items():
-        excess = -margins[name] / (high - low) - ROUND_OFF
-        wrong.append((excess, f"the {name} exceeds its limit by {-margins[name]:.3g} {Limits.units[name]}"))
+        excess = -margins[name] / (high - low) - ALLOWED
+        wrong.append((excess, f"the {name} exceeds its limit by {-margins[name]:.3g} {units[name]}".rstrip()))
     if run.status != "completed":
         wrong.append((1.0, f"the run ends with the status {run.status!r}"))
     hindrances = tuple(words for excess, words in wrong if not excess <= 0.0)

@@ -78,6 +78,8 @@ def as_range(value: Any) -> Any:
 
 class Limits(Bounded):
     """The ranges that a plan must not leave, each a pair (low, high) or one number b for (-b, b); `None` for no limit.
+    A plan may exceed a limit by 0.001 of its range, so that a limit can be the very value at the start or at the goal, as
+    in `speed=(0.0, 0.8)` for a plan that never reverses.
 
     **Arguments:**
 

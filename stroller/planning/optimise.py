@@ -16,7 +16,7 @@ from .spline import ORDER
 from .transcription import Residuals, Task, interval_residuals, residuals, windows
 
 #: Penalties of the constraints, in turn, and the number of Gauss-Newton steps with each.
-PENALTIES = (100.0, 300.0, 1e3, 1e3, 1e3, 1e3)
+PENALTIES = (100.0, 300.0, *(1e3,) * 6)
 STEPS_EACH = 8
 
 #: Violation of the constraints of a solution, and relative change of the objective at which the optimiser stops.

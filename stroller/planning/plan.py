@@ -35,11 +35,12 @@ HOPELESS = 0.05
 #: How often the clearance is increased for a candidate that touches an obstacle between the optimiser's points.
 MORE_CLEARANCE = 2
 
-#: Batches without a path that can be driven in time, after which the search ends.
+#: Batches without a path that can be driven in time after which the search goes on; one more ends it.
 PATIENCE = 1
 
-#: Rounds in which the duration is shortened, and the least share of the duration that is tried.
-ROUNDS, LEAST_SHARE = 5, 0.05
+#: The most rounds in which the duration is shortened, the share of the duration by which it is shortened in the first ones,
+#: and the relative difference between the last one that was too short and the result.
+ROUNDS, SHORTER, CLOSE = 16, 0.5, 0.02
 
 MINIMISED = ("effort", "time")
 
@@ -99,8 +100,8 @@ def plan(
     - `footprint`: the `Footprint` that must not touch an obstacle; by default that of the drawn vehicle, 1.4 wheelbases
       long and 0.87 wide.
     - `minimise`: "effort", the integral of the squared force and of the squared torque divided by the wheelbase; or
-      "time", for which `t1` is the longest duration.
-    - `starts`: greatest number of candidates; the search ends with the first ones that solve the problem.
+      "time", for which `t1` is the longest duration, and which needs a limit of speed, force, torque or grip.
+    - `starts`: greatest number of candidates, rounded up to an even number; the search ends with the first solution.
     - `planner`: a `Planner` from `learn_planner`, whose best proposal is tried before the search begins.
     - `seed`: seed of the random choices among paths.
     - `tolerance`: relative tolerance of the runs that compare candidates, in [1e-14, 1e-2].
@@ -133,6 +134,8 @@ def plan(
     if planner is not None:
         require_kind(planner, "planner", Planner, ", as stroller.learn_planner returns it")
     problem = checked_problem(scene, launch, goal, t1, obstacles, limits, footprint, tolerance)
+    if minimise == "time" and not problem.limits.ranges().keys() - {"steering"}:
+        raise ValueError("minimise = 'time' needs a limit of speed, force, torque or grip, such as Limits(speed=1.0)")
     duration = float(np.asarray(t1))
     with status_line("planning", progress):
         outline = Outline.of(problem)
@@ -145,7 +148,9 @@ def plan(
         best = min(attempts, key=lambda attempt: attempt.rank)
         if minimise == "time" and not best.verdict.hindrances:
             best = _shortened(outline, best, tolerance)
-        run, verdict = checked_run(problem, best.drive, best.t1, TIGHT, CONFIRMED)
+        run, verdict = best.run, best.verdict
+        if verdict.hindrances:
+            run, verdict = checked_run(problem, best.drive, best.t1, TIGHT, CONFIRMED)
     if verdict.hindrances:
         verdict = verdict._replace(hindrances=(*verdict.hindrances, *log.reasons[:1]))
     return Plan(best.drive, best.t1, run, verdict, problem, jnp.asarray(outline.lines(np.concatenate(log.tried))))
@@ -194,20 +199,31 @@ def _attempts(
 
 
 def _driven(outline: Outline, unknowns: Any, t1: float, tolerance: float) -> Attempt:
-    """An optimised candidate, driven."""
+    """An optimised candidate, driven; a solution is driven again at a tight tolerance, and this run counts."""
     dynamics = outline.problem.scene.dynamics
     drive = drive_along(dynamics, outline.start, unknowns[:, -2], unknowns[:, -1], t1)
-    return Attempt(drive, t1, unknowns, *checked_run(outline.problem, drive, t1, tolerance, COMPARED))
+    run, verdict = checked_run(outline.problem, drive, t1, tolerance, COMPARED)
+    if not verdict.hindrances:
+        run, verdict = checked_run(outline.problem, drive, t1, TIGHT, CONFIRMED)
+    return Attempt(drive, t1, unknowns, run, verdict)
 
 
 def _shortened(outline: Outline, best: Attempt, tolerance: float) -> Attempt:
-    """A solution in less time: the same drive, faster, optimised again for several durations in turn."""
-    too_short, way = LEAST_SHARE * best.t1, float(np.trapezoid(np.abs(best.run.speed), best.run.t))
+    """A solution in less time: the same drive, faster, optimised again for several durations in turn.
+
+    The duration is first shortened by a constant share, and then between the shortest success and the longest failure.
+    """
+    too_short = 0.0
     for _ in range(ROUNDS):
-        durations = too_short + (best.t1 - too_short) * np.arange(1, LANES + 1) / (LANES + 1)
+        if best.t1 - too_short < CLOSE * best.t1:
+            break
+        low = max(too_short, SHORTER * best.t1)
+        parts = np.arange(LANES) / LANES if low > too_short else np.arange(1, LANES + 1) / (LANES + 1)
+        durations = low + (best.t1 - low) * parts
         faster = np.stack([best.unknowns] * LANES)
         faster[:, :, -1] *= (best.t1 / durations)[:, None]
-        task = outline.task(way, best.t1, outline.clearance)
+        way = float(np.trapezoid(np.abs(best.run.speed), best.run.t))
+        task = outline.task(way, float(durations.mean()), outline.clearance)
         candidates, violation, _ = optimise(Candidates(faster, durations), task)
         for lane in np.flatnonzero(violation < HOPELESS):
             attempt = _driven(outline, candidates.unknowns[lane], float(durations[lane]), tolerance)

@@ -22,7 +22,7 @@ class Plan(eqx.Module):
 
     - `input`: the input of the drive, an `equinox.Module` that `simulate`, `sweep` and `identify` accept;
     - `t1`: its duration [s]; `run`: its `Trajectory`;
-    - `reached`: whether the run ends at the goal, keeps all limits and touches no obstacle;
+    - `reached`: whether the run ends at the goal, keeps all limits, up to 0.001 of their ranges, and touches no obstacle;
     - `clearance`: least distance [m] of the footprint from an obstacle, negative for an overlap, infinite without
       obstacles;
     - `margins`: the distance of the run from each limit, by name, negative where the limit is exceeded;
@@ -82,12 +82,13 @@ class Plan(eqx.Module):
     def __str__(self) -> str:
         units = {name: readable_unit(unit) for name, unit in self.problem.limits.units.items()}
         goal, count = self.problem.goal, len(self.problem.obstacles)
+        obstacles = "1 obstacle" if count == 1 else f"{count} obstacles"
         place, heading, speed = self.errors
         turn = "" if goal.heading is None else f"heading {heading:.2g} rad, "
         lines = [
             f"Plan of {self.t1:.4g} s: {'reaches the goal' if self.reached else 'does not reach the goal'}",
             f"  end        place off by {place:.2g} m, {turn}speed {speed:.2g} m/s; allowed {float(goal.within):g}",
-            *([f"  clearance  {self.clearance:.3g} m from {count} obstacles"] if count else []),
+            *([f"  clearance  {self.clearance:.3g} m from {obstacles}"] if count else []),
             *(f"  {name:9s}  margin {margin:.3g} {units[name]}".rstrip() for name, margin in self.margins.items()),
             f"  effort     {self.effort:.4g} N² s",
             f"  tried      {len(self.candidates)} candidates",

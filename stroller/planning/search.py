@@ -41,8 +41,9 @@ class Path(NamedTuple):
 
 
 class Costs(NamedTuple):
-    """What a search minimises beside the length: the price [m] of a change of direction, of a full turn of the wheel, and
-    how many times the length in reverse counts; and the distance [m] to keep from obstacles."""
+    """What a search minimises beside the length: the price [m] of a change of direction; by which share the length of the
+    tightest arc counts more than that of a straight line, and the price, in cells, of turning the wheel; how many times the
+    length in reverse counts; and the distance [m] to keep from obstacles."""
 
     reversal: float
     turning: float
@@ -137,12 +138,25 @@ class Ground(NamedTuple):
         return way.reshape(nx, ny)
 
 
-def arcs(ground: Ground, curvature: float) -> Float[np.ndarray, "arcs 3"]:
+class Steps(NamedTuple):
+    """What the stroller may do: least and greatest curvature [1/m], and the directions of travel (1 or -1)."""
+
+    least: float
+    greatest: float
+    directions: tuple[float, ...]
+
+    @property
+    def sharpest(self) -> float:
+        """The greatest curvature [1/m] to either side."""
+        return max(-self.least, self.greatest)
+
+
+def arcs(ground: Ground, steps: Steps) -> Float[np.ndarray, "arcs 3"]:
     """The arcs of a step: direction of travel, curvature and length."""
     step = 1.5 * ground.cell
-    bends = curvature * np.array(CURVATURES)
+    bends = np.unique(np.clip(steps.sharpest * np.array(CURVATURES), steps.least, steps.greatest))
     length = np.minimum(step, MOST_TURN / np.maximum(np.abs(bends), 1e-9))
-    return np.array([[sign, k, s] for sign in (1.0, -1.0) for k, s in zip(bends, length, strict=True)])
+    return np.array([[sign, k, s] for sign in steps.directions for k, s in zip(bends, length, strict=True)])
 
 
 def driven(poses: Float[np.ndarray, "*n 3"], direction, curvature, length) -> Float[np.ndarray, "*n 3"]:
@@ -196,11 +210,12 @@ class Children(NamedTuple):
 
 
 def search(
-    ground: Ground, start: np.ndarray, goal: np.ndarray, has_heading: bool, curvature: float, costs: Costs
+    ground: Ground, start: np.ndarray, goal: np.ndarray, has_heading: bool, steps: Steps, costs: Costs
 ) -> tuple[Path | None, float]:
     """The cheapest path that the search finds from one pose (3,) to another, or `None`; and the distance [m] from the
     goal to the nearest place it came to."""
-    moves, tree, way = arcs(ground, curvature), Tree(start), ground.way_to(goal[:2], costs.clearance)
+    curvature = steps.sharpest
+    moves, tree, way = arcs(ground, steps), Tree(start), ground.way_to(goal[:2], costs.clearance)
     best = np.full(np.prod(ground.shape) * HEADINGS * 2, np.inf)
     frontier, nearest = [(0.0, 0)], float(np.linalg.norm(start[:2] - goal[:2]))
     while frontier and tree.count < MOST_NODES:

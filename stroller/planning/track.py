@@ -31,7 +31,8 @@ class Tracker(eqx.Module):
 
     - `drive`: the input of the plan; `pose`: splines of the planned position and heading in the ground's axes;
     - `across` [1/m^2], `turning` [1/m], `along` [1/s]: stiffness k and dampings d and c of the shaped energy;
-    - `most_steering` [rad]: bound of the steering angle; `slow` [m/s]: speed below which the damping d fades out.
+    - `least_steering`, `most_steering` [rad]: bounds of the steering angle;
+    - `slow` [m/s]: speed below which the damping d fades out.
     """
 
     drive: Drive
@@ -41,6 +42,7 @@ class Tracker(eqx.Module):
     across: Float[Array, ""]
     turning: Float[Array, ""]
     along: Float[Array, ""]
+    least_steering: Float[Array, ""]
     most_steering: Float[Array, ""]
     slow: Float[Array, ""]
     side: float = eqx.field(static=True)
@@ -68,7 +70,7 @@ class Tracker(eqx.Module):
         speed = front_speed * jnp.cos(angle)
         turn = self.across * left + self.turning * jnp.tanh(speed / self.slow) * sine
         steering = jnp.arctan(jnp.tan(angle) + self.wheelbase * turn)
-        steering = jnp.clip(steering, -self.most_steering, self.most_steering)
+        steering = jnp.clip(steering, self.least_steering, self.most_steering)
         wanted = (speed * cosine + self.along * ahead) / jnp.cos(steering)
         drive = self.drive
         force = add(drive.climbing(motion), force + drive.speed_gain * (wanted - motion.front_speed))
@@ -135,7 +137,8 @@ def track(scene: Scene, plan: Plan) -> Tracker:
         across=1.0 / (REACH * length) ** 2,
         turning=2.0 / (REACH * length),
         along=jnp.asarray(CATCHING_UP),
-        most_steering=jnp.asarray(min(-low, high)),
+        least_steering=jnp.asarray(low),
+        most_steering=jnp.asarray(high),
         slow=SLOW * length,
         side=scene.dynamics.side,
     )

@@ -21,7 +21,8 @@ from .inverse import Rates, actuation, pose_rate
 from .obstacles import Footprint, Obstacles
 from .spline import ORDER, basis, weighted
 
-#: Number of steps of the Runge-Kutta method in an interval; constraints hold at the start of each step.
+#: Number of steps of the Runge-Kutta method in an interval; constraints hold at the start of each step, and at the end of the
+#: drive.
 STEPS = 3
 
 #: Smallest normal force, in units of the weight.
@@ -62,7 +63,7 @@ class Task(eqx.Module):
 
 
 class Residuals(NamedTuple):
-    """Residuals of an interval: equalities, inequalities (at least 0) and the objective, all in natural units."""
+    """Residuals of an interval: equalities, inequalities (at least 0) and the objective, in units of the scales."""
 
     equalities: Any
     inequalities: Any
@@ -122,6 +123,7 @@ def point_residuals(task: Task, pose: Any, motion: Rates) -> tuple[Any, Any]:
 def interval_residuals(window: Any, task: Task, index: Any, intervals: int, duration: Any) -> Residuals:
     """All residuals of the interval `index` of `intervals`, from its window (4, unknowns)."""
     poses, splines = window[:, :-2], (window[:, -2], window[:, -1])
+    is_last = index == intervals - 1
 
     def step(pose, k):
         part = k / STEPS
@@ -129,10 +131,13 @@ def interval_residuals(window: Any, task: Task, index: Any, intervals: int, dura
         return drive_from(task.dynamics, pose, splines, part, 1.0 / STEPS, duration), terms
 
     end, (inequalities, effort) = jax.lax.scan(step, poses[0], jnp.arange(STEPS))
+    # No interval follows the last one.
+    at_end, _ = point_residuals(task, end, motion_at(splines, 1.0, duration))
+    inequalities = jnp.concatenate([inequalities.ravel(), jnp.where(is_last, at_end, 1.0)])
     axes, length = task.dynamics.surface.axes, task.scales.length
     units = jnp.concatenate([jnp.full(axes, length), jnp.ones(len(end) - axes)])
     first, last = motion_at(splines, 0.0, duration), motion_at(splines, 1.0, duration)
-    at_start, at_goal = jnp.where(index == 0, 1.0, 0.0), jnp.where(index == intervals - 1, 1.0, 0.0)
+    at_start, at_goal = jnp.where(index == 0, 1.0, 0.0), jnp.where(is_last, 1.0, 0.0)
     (pose, steering, steering_rate, front_speed), (goal, goal_speed) = task.start, task.goal
     starts = [first.steering - steering, (first.steering_rate - steering_rate) * duration]
     starts += [(first.front_speed - front_speed) / task.scales.speed]
@@ -144,7 +149,7 @@ def interval_residuals(window: Any, task: Task, index: Any, intervals: int, dura
     bends = splines[0][2] - 2.0 * splines[0][1] + splines[0][0], splines[1][2] - 2.0 * splines[1][1] + splines[1][0]
     smooth = SMOOTHNESS * jnp.stack([bends[0], bends[1] / task.scales.speed])
     objective = jnp.concatenate([effort.ravel() / jnp.sqrt(STEPS * intervals), smooth])
-    return Residuals(jnp.concatenate(equalities), inequalities.ravel(), objective)
+    return Residuals(jnp.concatenate(equalities), inequalities, objective)
 
 
 def windows(unknowns: Any) -> Any:
