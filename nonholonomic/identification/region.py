@@ -51,7 +51,7 @@ class Region(NamedTuple):
         beyond = (np.abs(points - self.middle) / self.half_width - 1.0).clip(0.0)
         return -0.5 * np.sum((beyond / EDGE) ** 2, axis=1)
 
-    def searched(self, points: Float[np.ndarray, "n unknowns"]) -> Bool[np.ndarray, "n unknowns"]:
+    def searched(self, points: Float[np.ndarray, "*n unknowns"]) -> Bool[np.ndarray, "*n unknowns"]:
         """Which coordinates are within the box."""
         return np.abs(points - self.middle) <= self.half_width
 

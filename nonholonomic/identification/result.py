@@ -19,7 +19,7 @@ from .likelihood import Measurements
 from .problem import Problem
 from .profile import Profile, profiled
 from .refinement import Minima
-from .shape import Minimum, minima_of, remarks
+from .shape import Minimum, minima_of, remarks, unsearched
 from .verdict import CLOSE, SAME, Evidence, Verdict, judge
 
 #: Greatest number of rows of the residual table in a summary.
@@ -297,9 +297,11 @@ def _shape(
     explorer: Explorer, sample: Weighted, distribution: Distribution, by_slopes: np.ndarray
 ) -> tuple[tuple[Minimum, ...], tuple[str, ...], tuple[str, ...]]:
     """The minima that the data allow, and concerns and notes about the shape of the likelihood."""
-    if distribution.kind == "weights":
-        return minima_of(explorer, sample), *remarks(explorer, sample, distribution, by_slopes)
-    return (), (), ()
+    notes = unsearched(explorer, distribution.estimate)
+    if distribution.kind != "weights":
+        return (), (), notes
+    concerns, others = remarks(explorer, sample, distribution, by_slopes)
+    return minima_of(explorer, sample), concerns, (*notes, *others)
 
 
 def agreement(

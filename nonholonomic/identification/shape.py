@@ -123,6 +123,18 @@ def roughness(explorer: Explorer, sample: Weighted) -> float:
     return float(np.sqrt(np.mean(np.sum(root**2 * off**2, axis=0))))
 
 
+def unsearched(explorer: Explorer, estimate: Float[np.ndarray, " unknowns"]) -> tuple[str, ...]:
+    """A note of estimates that are outside of the searched range, if there are any."""
+    is_inside = explorer.region.searched(estimate)
+    names = [name for name, inside in zip(explorer.density.problem.names, is_inside, strict=True) if not inside]
+    if not names:
+        return ()
+    return (
+        f"{', '.join(names)}: outside of the range in which minima were searched, so better ones may be missing; start "
+        "closer, or state a prior",
+    )
+
+
 def remarks(
     explorer: Explorer,
     sample: Weighted,
@@ -138,13 +150,6 @@ def remarks(
         sides = high - distribution.estimate[k], distribution.estimate[k] - low
         if max(sides) > SKEWED * max(min(sides), 1e-300):
             skewed.append(name)
-    share_outside = sample.weights @ ~explorer.region.searched(sample.pool.points)
-    outside = [name for (name, _), share in zip(problem.free, share_outside, strict=True) if share > 0.5]
-    if outside:
-        notes.append(
-            f"{', '.join(outside)}: outside of the range in which minima were searched, so better ones may be missing; start "
-            "closer, or state a prior"
-        )
     if skewed:
         notes.append(
             f"the likelihood profile of {', '.join(skewed)} is no parabola: use the interval, not the standard error"
