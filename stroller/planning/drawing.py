@@ -12,9 +12,13 @@ from nonholonomic.views.plot import new_figure
 
 from .check import corners_of
 from .obstacles import Box, Disc
+from .problem import Problem
 
 #: Heights of drawn obstacles, and radii of drawn lines, in units of the wheelbase.
 HEIGHT, THIN, RAISED = 0.5, 0.008, 0.03
+
+#: Reach of the cross at a goal without a heading, along x and y, in units of the wheelbase.
+CROSS = 0.1
 
 #: Height of the camera in units of its distance along the ground, from which obstacles do not hide the stroller.
 RISE = 1.2
@@ -53,8 +57,10 @@ def draw_plan(plan: Any) -> Any:
             above.plot(*np.concatenate([corners[number], corners[number][:1]]).T, color="C0", linewidth=0.6)
     path = np.asarray(plan.run.place if flat else plan.run.position)
     above.plot(path[:, 0], path[:, 1], color="C0", label="rear axle")
-    target = plan.problem.goal_corners
-    if flat:
+    if flat and plan.problem.goal.heading is None:
+        above.plot(*np.asarray(plan.problem.goal_pose[:2])[:, None], "x", color="C2", label="goal")
+    elif flat:
+        target = plan.problem.goal_corners
         above.plot(*np.concatenate([target, target[:1]]).T, color="C2", linewidth=1.2, label="goal")
     above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
     above.set_title("reaches the goal" if plan.reached else "; ".join(plan.hindrances), fontsize="small")
@@ -79,8 +85,7 @@ def planned_stage(plan: Any) -> Stage:
     if feet:
         still.append(("obstacles", [prism(foot, HEIGHT * length) for foot in feet]))
     if plan.problem.is_flat:
-        target = on_ground(surface, plan.problem.goal_corners)
-        still.append(("goal", [frame_of(target, 2.0 * RAISED * length, 2.0 * THIN * length, GREEN)]))
+        still.append(("goal", [goal_mark(plan.problem, 2.0 * RAISED * length, 2.0 * THIN * length)]))
     place, turn = np.zeros((count, 3)), np.tile(UNTURNED, (count, 1))
     bodies = tuple(Body(name, place, turn, tuple(meshes)) for name, meshes in still)
     vehicle = show.bodies[0]
@@ -91,6 +96,16 @@ def planned_stage(plan: Any) -> Stage:
     title = f"plan of {plan.t1:.3g} s: {'reaches the goal' if plan.reached else 'does not reach the goal'}"
     shows = (show._replace(bodies=(*show.bodies, edge, *bodies)),)
     return stage._replace(title=title, arena=ground, shows=shows, rise=RISE)
+
+
+def goal_mark(problem: Problem, raised: float, radius: float) -> Mesh:
+    """The outline of the footprint at the goal, or a cross at a goal without a heading."""
+    if problem.goal.heading is not None:
+        return frame_of(on_ground(problem.scene.surface, problem.goal_corners), raised, radius, GREEN)
+    arm = CROSS * float(problem.scene.body.wheelbase)
+    ends = np.asarray(problem.goal_pose[:2]) + arm * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
+    points = on_ground(problem.scene.surface, ends) + np.array([0.0, 0.0, raised])
+    return joined([bar(tuple(points[k]), tuple(points[k + 1]), radius, GREEN) for k in (0, 2)])
 
 
 def on_ground(surface: AbstractSurface, points: np.ndarray) -> Float[np.ndarray, "points 3"]:

@@ -1,5 +1,7 @@
 """Train a planner: a network that proposes drives."""
 
+import dataclasses
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -9,8 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nonholonomic.progress import status_line
-from nonholonomic.validation import require, require_kind, require_package, require_whole, shown
+from nonholonomic.parameters import likely
+from nonholonomic.progress import Progress, status_line
+from nonholonomic.validation import require, require_flag, require_kind, require_package, require_whole, shown
 
 from ..model.dynamics import Dynamics
 from ..model.scene import Scene
@@ -19,7 +22,7 @@ from .planner import PROPOSALS, Planner, merit
 from .problem import checked_problem
 from .transcription import Task
 
-#: Problems in a step, share of the time in which problems are drawn, steps in which the learning rate rises, and that rate.
+#: Problems in a step, share of `seconds` in which problems are drawn, steps in which the learning rate rises, and that rate.
 BATCH, DRAWING, RISE, RATE = 64, 0.2, 50, 1e-3
 
 #: Weight of the mean of all proposals beside the best one, without which some of them would never learn.
@@ -29,8 +32,17 @@ SHARE = 0.05
 PARTS = ("launch", "goal", "t1", "obstacles", "limits", "footprint")
 
 
+#: Those that a problem needs.
+NEEDED = ("launch", "goal", "t1")
+
+
 def learn_planner(
-    scene: Scene, problems: Callable[[np.random.Generator], dict[str, Any]], *, seconds: float = 600.0, seed: int = 0
+    scene: Scene,
+    problems: Callable[[np.random.Generator], dict[str, Any]],
+    *,
+    seconds: float = 600.0,
+    seed: int = 0,
+    progress: bool = True,
 ) -> Planner:
     """Train a planner on problems that it draws, through the simulation of the drives that it proposes (needs optax).
 
@@ -40,13 +52,18 @@ def learn_planner(
     how much the drive misses the goal and breaks the constraints, and its effort. The gradient goes through the
     equations of motion. No plans are needed to learn from.
 
+    The network sees the pose, the place, the heading and the speed of the goal, the time left, the limits of the steering
+    angle through the angles that it may choose, and the corners of all obstacles, those of a square for a disc. It does not
+    see the footprint and the other limits: these should be the same in all problems.
+
     **Arguments:**
 
     - `scene`: the `Scene` that is driven.
     - `problems`: a function of a `numpy.random.Generator` that returns a random problem: a `dict` with the arguments of `plan`
       by name, `launch`, `goal` and `t1`, and if needed `obstacles`, `limits` and `footprint`.
-    - `seconds`: how long to learn [s], at least 0; about a fifth of it is spent on drawing problems.
+    - `seconds`: how long to learn [s], without the time to compile, at least 0; a fifth of it is spent on drawing problems.
     - `seed`: seed of the problems and of the first weights. The result also depends on the speed of the machine.
+    - `progress`: whether to show a status line, with the number of steps and the loss.
 
     **Returns:** a `Planner`, for `plan(..., planner=planner)`. `equinox.tree_serialise_leaves` saves it, and
     `equinox.tree_deserialise_leaves` loads it into another one, such as `learn_planner(scene, problems, seconds=0)`.
@@ -73,36 +90,54 @@ def learn_planner(
     require_kind(scene, "scene", Scene)
     require(seconds, "seconds", at_least=0.0)
     require_whole(seed, "seed", 0)
-    begin, random = time.perf_counter(), np.random.default_rng(seed)
-    with status_line("learning"):
-        tasks = [drawn_task(scene, problems, random)]
-        planner = Planner.untrained(tasks[0][0], jax.random.key(seed))
-        while time.perf_counter() - begin < DRAWING * seconds or len(tasks) < BATCH * (seconds > 0.0):
-            tasks.append(drawn_task(scene, problems, random))
-        return trained(planner, scene.dynamics, tasks, random, begin, seconds) if seconds > 0.0 else planner
-
-
-def drawn_task(scene: Scene, problems: Any, random: np.random.Generator) -> tuple[Task, float]:
-    """A random problem as the optimiser needs it, and its duration [s]."""
+    require_flag(progress, "progress")
     if not callable(problems):
         raise ValueError(f"problems = {shown(problems)} must be a function of a numpy.random.Generator")
+    random = np.random.default_rng(seed)
+    with status_line("learning", progress):
+        tasks = [drawn_task(scene, problems, random, 0)]
+        planner = Planner.untrained(tasks[0][0], jax.random.key(seed))
+        begin = time.perf_counter()
+        while time.perf_counter() - begin < DRAWING * seconds or len(tasks) < BATCH * (seconds > 0.0):
+            tasks.append(drawn_task(scene, problems, random, len(tasks)))
+        if seconds == 0.0:
+            return planner
+        return trained(planner, scene.dynamics, tasks, random, (1.0 - DRAWING) * seconds, progress)
+
+
+def drawn_task(scene: Scene, problems: Any, random: np.random.Generator, number: int) -> tuple[Task, float]:
+    """A random problem as the optimiser needs it, and its duration [s]; `number` names the draw in messages."""
     parts = problems(random)
-    if not (isinstance(parts, dict) and {"launch", "goal", "t1"} <= set(parts) <= set(PARTS)):
-        raise ValueError(
-            f"problems returned {shown(parts)} and must return a dict with launch, goal and t1, and if needed obstacles, "
-            "limits and footprint"
-        )
-    given: Any = {name: parts.get(name) for name in PARTS} | {"obstacles": parts.get("obstacles", ())}
-    problem = checked_problem(scene, **given, tolerance=1e-6)
-    outline = Outline.of(problem)
-    return outline.task(outline.distance, float(given["t1"]), outline.clearance), float(given["t1"])
+    try:
+        arguments = arguments_of(parts)
+        problem = checked_problem(scene, **arguments, tolerance=1e-6)
+    except ValueError as error:
+        raise ValueError(f"problems: draw {number}: {error}") from None
+    outline, t1 = Outline.of(problem), float(arguments["t1"])
+    return outline.task(outline.distance, t1, outline.clearance), t1
+
+
+def arguments_of(parts: Any) -> dict[str, Any]:
+    """The arguments of `plan` of which a problem consists; raises `ValueError` for anything else."""
+    if not isinstance(parts, dict):
+        needed, optional = ", ".join(NEEDED), ", ".join(name for name in PARTS if name not in NEEDED)
+        raise ValueError(f"{shown(parts)} must be a dict with {needed}, and if needed {optional}")
+    for name in parts:
+        if name not in PARTS:
+            raise ValueError(f"{name!r} must be one of {', '.join(PARTS)}{likely(name, PARTS)}")
+    for name in NEEDED:
+        if name not in parts:
+            raise ValueError(f"{name!r} is missing: a problem needs {', '.join(NEEDED)}")
+    return dict.fromkeys(PARTS) | {"obstacles": ()} | parts
 
 
 def stacked(tasks: list[tuple[Task, float]]) -> tuple[Task, np.ndarray]:
     """Tasks with as many obstacles each, as arrays with one row for each of them, without their common dynamics."""
     most = [max(len(getattr(task.obstacles, name)) for task, _ in tasks) for name in ("boxes", "radii")]
+    # A task without a limit of the grip has a limit that nothing reaches.
+    with_grip = any(task.with_grip for task, _ in tasks)
     padded = [
-        eqx.tree_at(lambda task: (task.dynamics, task.obstacles), task, (None, task.obstacles.padded(*most)))
+        dataclasses.replace(task, dynamics=None, obstacles=task.obstacles.padded(*most), with_grip=with_grip)
         for task, _ in tasks
     ]
     return jax.tree.map(lambda *parts: np.stack(parts), *padded), np.array([t1 for _, t1 in tasks])
@@ -125,10 +160,10 @@ def trained(
     dynamics: Dynamics,
     tasks: list[tuple[Task, float]],
     random: np.random.Generator,
-    begin: float,
     seconds: float,
+    progress: bool,
 ) -> Planner:
-    """A planner after steps of Adam until `seconds` have passed since `begin`."""
+    """A planner after steps of Adam, for `seconds` after the first step, which compiles."""
     import optax
 
     pool, times = stacked(tasks)
@@ -136,20 +171,27 @@ def trained(
 
     @eqx.filter_jit
     def step(planner, state, tasks, t1, rate):
-        slopes = eqx.filter_grad(loss)(planner, dynamics, tasks, t1)
+        value, slopes = eqx.filter_value_and_grad(loss)(planner, dynamics, tasks, t1)
         norm = jnp.sqrt(sum(jnp.sum(part**2) for part in jax.tree.leaves(slopes)))
         # A drive that went astray has no useful slope.
         usable = jnp.where(jnp.isfinite(norm), 1.0 / jnp.maximum(norm, 1.0), 0.0)
         slopes = jax.tree.map(lambda part: jnp.where(usable > 0.0, usable * part, 0.0).astype(part.dtype), slopes)
         change, state = optimiser.update(slopes, state)
         change = jax.tree.map(lambda part: (-rate * part).astype(jnp.float32), change)
-        return eqx.apply_updates(planner, change), state
+        return eqx.apply_updates(planner, change), state, value
 
     state, number = optimiser.init(eqx.filter(planner, eqx.is_inexact_array)), 0
-    while (spent := (time.perf_counter() - begin) / seconds) < 1.0:
-        chosen = random.choice(len(tasks), BATCH, replace=False)
-        rate = RATE * min(1.0, number / RISE) * (0.5 + 0.5 * np.cos(np.pi * spent))
-        batch = jax.tree.map(lambda part, chosen=chosen: part[chosen], pool)
-        planner, state = step(planner, state, batch, times[chosen], jnp.asarray(rate))
-        number += 1
+    begin = spent = 0.0
+    with Progress(math.ceil(seconds), "s", "learning", shown=progress) as display:
+        while spent < 1.0:
+            chosen = random.choice(len(tasks), BATCH, replace=False)
+            rate = RATE * min(1.0, (number + 1) / RISE) * (0.5 + 0.5 * np.cos(np.pi * spent))
+            batch = jax.tree.map(lambda part, chosen=chosen: part[chosen], pool)
+            planner, state, value = step(planner, state, batch, times[chosen], jnp.asarray(rate))
+            value, now = float(value), time.perf_counter()
+            if number == 0:
+                begin = now
+                display.begin()
+            before, spent, number = spent, (now - begin) / seconds, number + 1
+            display.advance(int(spent * seconds) - int(before * seconds), steps=number, loss=f"{value:.3g}")
     return planner

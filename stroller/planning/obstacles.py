@@ -187,11 +187,11 @@ class Obstacles(eqx.Module):
         boxes = np.array([box.corners for box in obstacles if isinstance(box, Box)]).reshape(-1, 4, 2)
         discs = [[*disc.centre, disc.radius] for disc in obstacles if isinstance(disc, Disc)]
         circles = np.array(discs, dtype=float).reshape(-1, 3)
-        counts = (-(-len(some) // PADDING) * PADDING for some in (boxes, circles))
+        counts = (-(-len(parts) // PADDING) * PADDING for parts in (boxes, circles))
         return with_others_far_away(boxes, circles[:, :2], circles[:, 2], *counts)
 
     def padded(self, boxes: int, discs: int) -> "Obstacles":
-        """The obstacles with others far away, so that there are given numbers of them."""
+        """The obstacles with others far away, so that there are so many boxes and discs."""
         arrays = np.asarray(self.boxes), np.asarray(self.centres), np.asarray(self.radii)
         return with_others_far_away(*arrays, boxes, discs)
 

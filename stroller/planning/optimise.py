@@ -40,12 +40,14 @@ class Multipliers(NamedTuple):
     inequalities: Any
 
 
-def _penalised(found: Residuals, multipliers: Multipliers, penalty: Any) -> Any:
+def _penalised(evaluation: Residuals, multipliers: Multipliers, penalty: Any) -> Any:
     """The residuals of the augmented Lagrangian, as one list per interval."""
     root = jnp.sqrt(penalty)
-    shifted = found.inequalities + multipliers.inequalities
+    shifted = evaluation.inequalities + multipliers.inequalities
     broken = jnp.where(shifted < 0.0, shifted, 0.0)
-    return jnp.concatenate([root * (found.equalities + multipliers.equalities), root * broken, found.objective], -1)
+    return jnp.concatenate(
+        [root * (evaluation.equalities + multipliers.equalities), root * broken, evaluation.objective], -1
+    )
 
 
 @eqx.filter_jit
@@ -62,8 +64,8 @@ def _normal_equations(candidates: Candidates, task: Task, multipliers: Multiplie
         def of_interval(window, multipliers, index):
             def terms(numbers):
                 changed = window.ravel().at[used].set(numbers).reshape(window.shape)
-                found = interval_residuals(changed, task, index, intervals, t1 / intervals)
-                value = _penalised(found, multipliers, penalty)
+                evaluation = interval_residuals(changed, task, index, intervals, t1 / intervals)
+                value = _penalised(evaluation, multipliers, penalty)
                 return value, value
 
             slope, value = jax.jacfwd(terms, has_aux=True)(window.ravel()[used])
@@ -122,38 +124,39 @@ def _minimise(
     return candidates._replace(unknowns=unknowns), damping
 
 
-def violation(found: Residuals) -> np.ndarray:
+def violation(evaluation: Residuals) -> np.ndarray:
     """The greatest violation of a constraint in every lane, in the units of the residuals."""
-    equalities, inequalities = np.asarray(found.equalities), np.asarray(found.inequalities)
+    equalities, inequalities = np.asarray(evaluation.equalities), np.asarray(evaluation.inequalities)
     return np.maximum(np.abs(equalities).max((1, 2)), -inequalities.min((1, 2)).clip(max=0.0))
 
 
-def objective(found: Residuals) -> np.ndarray:
+def objective(evaluation: Residuals) -> np.ndarray:
     """The objective of every lane."""
-    return np.sum(np.asarray(found.objective) ** 2, axis=(1, 2))
+    return np.sum(np.asarray(evaluation.objective) ** 2, axis=(1, 2))
 
 
 def optimise(candidates: Candidates, task: Task) -> tuple[Candidates, np.ndarray, np.ndarray]:
-    """Minimise the effort of all candidates under the constraints, until the best one no longer changes.
+    """Minimise the effort of all candidates under the constraints, until that of a feasible one changes by less than
+    2 %, or the penalties are used up.
 
     **Returns:** the candidates, and the violation and the objective of each.
     """
     # Where the weight makes the effort large, the penalties would be too weak beside it.
     least = float(objective(constraints(candidates, task)).min())
     task = eqx.tree_at(lambda task: task.scales.force, task, task.scales.force * np.sqrt(max(1.0, least)))
-    found = constraints(candidates, task)
-    multipliers = Multipliers(jnp.zeros_like(found.equalities), jnp.zeros_like(found.inequalities))
+    evaluation = constraints(candidates, task)
+    multipliers = Multipliers(jnp.zeros_like(evaluation.equalities), jnp.zeros_like(evaluation.inequalities))
     values = np.full(len(candidates.durations), np.inf)
     damping = np.full(len(candidates.durations), FIRST_DAMPING)
     for last, penalty in zip((PENALTIES[0], *PENALTIES), PENALTIES, strict=False):
         multipliers = Multipliers(*(part * (last / penalty) for part in multipliers))
         candidates, damping = _minimise(candidates, task, multipliers, penalty, damping)
-        found, before = constraints(candidates, task), values
-        values = objective(found)
-        if np.any((violation(found) < FEASIBLE) & (np.abs(values - before) < SETTLED * values)):
+        evaluation, before = constraints(candidates, task), values
+        values = objective(evaluation)
+        if np.any((violation(evaluation) < FEASIBLE) & (np.abs(values - before) < SETTLED * values)):
             break
         multipliers = Multipliers(
-            multipliers.equalities + found.equalities,
-            jnp.minimum(multipliers.inequalities + found.inequalities, 0.0),
+            multipliers.equalities + evaluation.equalities,
+            jnp.minimum(multipliers.inequalities + evaluation.inequalities, 0.0),
         )
-    return candidates, violation(found), values
+    return candidates, violation(evaluation), values

@@ -163,10 +163,12 @@ def _guesses(
     find."""
     if planner is not None:
         task = outline.task(outline.distance, t1, outline.clearance)
-        if not planner.is_for(task):
-            raise ValueError("planner: it has learned on another kind of ground; learn on the ground of this scene")
-        yield outline.distance, Candidates(proposed(planner, task, t1)[None], np.full(1, t1))
-        starts -= 1
+        if (misfit := planner.misfit(task)) is not None:
+            raise ValueError(f"planner: {misfit}; learn in this scene")
+        proposal = proposed(planner, task, t1)
+        if proposal is not None:
+            yield outline.distance, Candidates(proposal[None], np.full(1, t1))
+            starts -= 1
     for batch in range(-(-starts // LANES)):
         paths, reason = outline.paths(prices(outline, LANES, batch, rng), t1)
         log.reasons.extend([reason] if reason else [])

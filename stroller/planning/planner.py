@@ -24,6 +24,9 @@ PARTS = 2
 #: Greatest speed of a proposal, in units of that of the straight way.
 FASTEST = 4.0
 
+#: Relative difference of wheelbases from which on a planner is for another stroller.
+OTHER_WHEELBASE = 0.1
+
 #: Neurons of the layers that see an obstacle and of those that decide.
 SEEING, DECIDING = 32, 128
 
@@ -50,7 +53,7 @@ def squeezed(lengths: Any) -> Any:
 
 
 def goal_seen(task: Task, pose: Any) -> Any:
-    """The goal as it is seen from a pose: ahead, to the left, and its heading."""
+    """The goal as it is seen from a pose, six numbers: ahead and to the left, on two scales, and its heading."""
     dynamics, axes = task.dynamics, task.dynamics.surface.axes
     place, heading = padded(pose[:axes]), padded(pose[axes:])
     left = scale(dynamics.side, cross(dynamics.surface.normal(place), heading))
@@ -72,17 +75,18 @@ def obstacles_seen(task: Task, pose: Any) -> tuple[Any, Any]:
 
 
 def numbers_seen(task: Task) -> int:
-    """How many numbers a decision depends on: the goal, the time left and three constants, the latest coefficients, the
+    """How many numbers a decision depends on: the goal, the time left and four constants, the latest coefficients, the
     number of the proposal, the pose where places differ from each other, and what is seen of all obstacles."""
     pose = 0 if isinstance(task.dynamics.surface, Plane) else len(task.start[0])
-    return 6 + 1 + 3 + 2 * (ORDER - 1) + PROPOSALS + pose + 2 * SEEING
+    return 6 + 1 + 4 + 2 * (ORDER - 1) + PROPOSALS + pose + 2 * SEEING
 
 
 class Planner(eqx.Module):
     """A network that proposes drives for problems like those on which it was trained. `learn_planner` returns it, and `plan`
     tries its best proposal first.
 
-    - `of_obstacle`: the layers that see an obstacle; `of_step`: those that decide about steering and speed.
+    - `of_obstacle`: the layers that see an obstacle; `of_step`: those that decide about steering and speed;
+    - `ground`, `wheelbase` [m]: the kind of ground and the wheelbase for which it has learned.
 
     **Example:**
 
@@ -108,6 +112,8 @@ class Planner(eqx.Module):
 
     of_obstacle: eqx.nn.MLP
     of_step: eqx.nn.MLP
+    wheelbase: float
+    ground: str = eqx.field(static=True)
 
     @classmethod
     def untrained(cls, task: Task, key: Any) -> "Planner":
@@ -118,11 +124,18 @@ class Planner(eqx.Module):
         return cls(
             eqx.nn.MLP(CORNERS, SEEING, SEEING, 2, key=first, **options),
             eqx.nn.MLP(numbers_seen(task), 2, DECIDING, 2, key=second, **options),
+            float(task.dynamics.body.wheelbase),
+            type(task.dynamics.surface).__name__,
         )
 
-    def is_for(self, task: Task) -> bool:
-        """Whether the planner has learned on a ground of this kind."""
-        return self.of_step.in_size == numbers_seen(task)
+    def misfit(self, task: Task) -> str | None:
+        """Why the planner is not for a task, in words; `None` if it has learned for its kind of ground and its wheelbase."""
+        ground, wheelbase = type(task.dynamics.surface).__name__, float(task.dynamics.body.wheelbase)
+        if ground != self.ground:
+            return f"it has learned on a {self.ground}, and the ground of this scene is a {ground}"
+        if abs(wheelbase - self.wheelbase) > OTHER_WHEELBASE * self.wheelbase:
+            return f"it has learned with a wheelbase of {self.wheelbase:g} m, and that of this scene is {wheelbase:g} m"
+        return None
 
     def decide(self, task: Task, pose: Any, known: Any) -> Any:
         """Two numbers, from a pose and what else is known."""
@@ -138,7 +151,7 @@ class Planner(eqx.Module):
         duration, change = t1 / DECISIONS, jnp.array([-1.0, 0.0, 1.0])
         low, high, speed = task.low[0], task.high[0], task.scales.speed
         which = jax.nn.one_hot(number, PROPOSALS)
-        fixed = jnp.stack([jnp.log(t1), jnp.log(speed), task.has_heading])
+        fixed = jnp.stack([jnp.log(t1), jnp.log(speed), task.has_heading, task.goal[1] / speed])
 
         def decision(carry, k):
             pose, angles, speeds = carry
@@ -189,8 +202,8 @@ def refined(coefficients: np.ndarray) -> np.ndarray:
 
 
 @eqx.filter_jit
-def _best(planner: Planner, task: Task, t1: Any) -> tuple[Any, Any]:
-    """The splines of the best proposal."""
+def _best(planner: Planner, task: Task, t1: Any) -> tuple[Any, Any, Any]:
+    """The merit and the splines of the best proposal."""
 
     def of_one(number):
         proposal = planner.propose(task, t1, number)
@@ -198,12 +211,15 @@ def _best(planner: Planner, task: Task, t1: Any) -> tuple[Any, Any]:
 
     merits, *splines = jax.vmap(of_one)(jnp.arange(PROPOSALS))
     best = jnp.argmin(jnp.where(jnp.isfinite(merits), merits, jnp.inf))
-    return splines[0][best], splines[1][best]
+    return merits[best], splines[0][best], splines[1][best]
 
 
-def proposed(planner: Planner, task: Task, t1: float) -> np.ndarray:
-    """The best proposal as unknowns of the optimiser (see `transcription.py`)."""
-    steering, front_speed = (refined(np.asarray(part)) for part in _best(planner, task, jnp.asarray(t1)))
+def proposed(planner: Planner, task: Task, t1: float) -> np.ndarray | None:
+    """The best proposal as unknowns of the optimiser (see `transcription.py`); `None` if no proposal is finite."""
+    least, *splines = _best(planner, task, jnp.asarray(t1))
+    if not np.isfinite(least):
+        return None
+    steering, front_speed = (refined(np.asarray(part)) for part in splines)
     poses = poses_along(task.dynamics, task.start[0], steering, front_speed, t1)
     poses = np.concatenate([poses, poses[-1:], poses[-1:]])
     return np.concatenate([poses, np.stack([steering, front_speed], axis=1)], axis=1)

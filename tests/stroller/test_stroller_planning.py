@@ -1,10 +1,12 @@
 """Plans: closed forms of their parts, and plans that are driven again and checked by other means."""
 
+import dataclasses
 import importlib
 import re
 from itertools import count
 from types import SimpleNamespace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +17,7 @@ import stroller
 from stroller.planning import learn
 from stroller.planning.candidates import Outline, prices, steps_of
 from stroller.planning.check import inputs_of
+from stroller.planning.drawing import planned_stage
 from stroller.planning.drive import drive_along
 from stroller.planning.inverse import Rates, actuation
 from stroller.planning.planner import proposed
@@ -138,6 +141,20 @@ def test_a_plan_shows_what_it_achieves(parked, tmp_path):
     assert all(f'"{name}"' in page.html for name in ("obstacles", "candidates", "footprint", "goal"))
 
 
+def test_a_goal_without_a_heading_is_drawn_as_a_cross(parked):
+    _, _, plan = parked
+    problem = plan.problem._replace(goal=stroller.Goal((1.9, 0.3)))
+    cross = plan.__class__(plan.input, plan.t1, plan.run, plan.verdict, problem, plan.candidates)
+    (mark,) = [line for line in cross.plot().axes[0].lines if line.get_label() == "goal"]
+    assert mark.get_marker() == "x"
+    assert_close(np.array(mark.get_data()).ravel(), [1.9, 0.3])
+    (body,) = [body for show in planned_stage(cross).shows for body in show.bodies if body.name == "goal"]
+    vertices = body.meshes[0].vertices
+    # The middle is the goal, and the arms are 0.1 wheelbases from it.
+    assert_close(vertices.mean(axis=0)[:2], [1.9, 0.3], atol=1e-9)
+    assert_close(np.ptp(vertices[:, :2], axis=0), 0.05, atol=0.01)
+
+
 def test_a_table_drives_a_plan_as_a_single_ride_does(parked):
     """The splines of a plan belong to a ride, whatever the number of cells: their coefficients are not one per cell."""
     launch, _, plan = parked
@@ -184,7 +201,8 @@ def test_a_plan_can_go_without_reverse(sign, goal):
 def test_the_wheel_can_be_limited_to_one_side():
     launch, plan = freely(stroller.Goal((2.0, 2.0)), 10.0, stroller.Limits(steering=(0.0, 1.0)))
     assert plan.reached, str(plan)
-    run = stroller.simulate(SCENE, launch, plan.t1, stroller.track(SCENE, plan), times=[plan.t1], tolerance=1e-6)
+    times = np.linspace(0.0, plan.t1, 61)
+    run = stroller.simulate(SCENE, launch, plan.t1, stroller.track(SCENE, plan), times=times, tolerance=1e-9)
     assert np.hypot(*(run.place[-1] - 2.0)) < 0.05
 
 
@@ -296,19 +314,26 @@ def drawn(random):
     return {"launch": launch, "goal": goal, "t1": 10.0, "obstacles": [box], "limits": LIMITS, "footprint": FOOTPRINT}
 
 
+def gripping(random, limits):
+    return {"limits": limits} if random.random() < 0.5 else {}
+
+
 def test_a_planner_learns_and_a_plan_begins_with_its_proposal(monkeypatch):
-    """By a clock of its own, which allows about eighty steps."""
+    """By a clock of its own, which allows eighty steps; every second problem limits the grip."""
     monkeypatch.setattr(learn, "time", SimpleNamespace(perf_counter=count().__next__))
     monkeypatch.setattr(learn, "BATCH", 8)
-    planner = stroller.learn_planner(SCENE, drawn, seconds=100.0)
+    grip = dataclasses.replace(LIMITS, grip=(0.0, 5.0))
+    planner = stroller.learn_planner(SCENE, lambda random: drawn(random) | gripping(random, grip), seconds=100.0)
     untrained = stroller.learn_planner(SCENE, drawn, seconds=0)
     random = np.random.default_rng(5)
-    tasks = [learn.drawn_task(SCENE, drawn, random) for _ in range(6)]
+    tasks = [learn.drawn_task(SCENE, drawn, random, k) for k in range(6)]
 
     def missed(planner):
         ends = [proposed(planner, task, t1)[-1, :4] - np.asarray(task.goal[0]) for task, t1 in tasks]
         return np.median(np.linalg.norm(ends, axis=1))
 
+    astray = jax.tree.map(lambda part: np.nan * part if eqx.is_inexact_array(part) else part, planner)
+    assert proposed(astray, *tasks[0]) is None
     assert missed(planner) < 0.3 * missed(untrained)
     plan = stroller.plan(SCENE, **drawn(random), planner=planner, progress=False)
     assert plan.reached
@@ -319,8 +344,10 @@ def test_a_planner_learns_and_a_plan_begins_with_its_proposal(monkeypatch):
     ("changed", "message"),
     [
         ({"problems": 3}, "problems = 3 must be a function of a numpy.random.Generator"),
-        ({"problems": lambda random: {"launch": START}}, "must return a dict with launch, goal and t1"),
-        ({"problems": lambda random: drawn(random) | {"goal": GOAL, "obstacles": GAP, "t1": 0.0}}, "t1 = 0.0 must be"),
+        ({"problems": lambda random: {"launch": START}}, "problems: draw 0: 'goal' is missing"),
+        ({"problems": lambda random: [START, GOAL, 1.0]}, "problems: draw 0: .* must be a dict with launch, goal, t1"),
+        ({"problems": lambda random: drawn(random) | {"obstacle": []}}, "'obstacle' must .*; did you mean 'obstacles'"),
+        ({"problems": lambda random: drawn(random) | {"goal": GOAL, "t1": 0.0}}, "problems: draw 0: t1 = 0.0 must be"),
         ({"seconds": -1.0}, "seconds = -1.0 must be at least 0"),
         ({"scene": BODY}, "scene = .* must be a Scene"),
     ],
@@ -330,11 +357,14 @@ def test_a_planner_cannot_learn_from_anything_else(changed, message):
         stroller.learn_planner(**({"scene": SCENE, "problems": drawn, "seconds": 0} | changed))
 
 
-def test_a_planner_is_for_its_kind_of_ground():
+def test_a_planner_is_for_its_kind_of_ground_and_its_wheelbase():
     planner = stroller.learn_planner(SCENE, drawn, seconds=0)
     launch, goal = stroller.Launch((0.0, -1.0), 0.0, 0.0), stroller.Goal((0.2, -1.0))
-    with pytest.raises(ValueError, match="planner: it has learned on another kind of ground"):
+    with pytest.raises(ValueError, match="it has learned on a Plane, and the ground of this scene is a Spheroid"):
         stroller.plan(stroller.presets.bowl(), launch, goal, 9.0, planner=planner, progress=False)
+    longer = stroller.Scene(stroller.Stroller(mass=5.0, wheelbase=0.3, inertia=0.1, steering_inertia=0.005))
+    with pytest.raises(ValueError, match=r"learned with a wheelbase of 0\.25 m, and that of this scene is 0.3 m"):
+        stroller.plan(longer, launch, goal, 9.0, planner=planner, progress=False)
 
 
 def test_a_tracker_needs_a_plan_on_its_ground():
