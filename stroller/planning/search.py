@@ -41,9 +41,14 @@ class Path(NamedTuple):
 
 
 class Costs(NamedTuple):
-    """What a search minimises beside the length: the price [m] of a change of direction; by which share the length of the
-    tightest arc counts more than that of a straight line, and the price, in cells, of turning the wheel; how many times the
-    length in reverse counts; and the distance [m] to keep from obstacles."""
+    """What a search minimises beside the length.
+
+    - `reversal`: price [m] of a change of direction.
+    - `turning`: factor without dimension: the tightest arc costs so much more in units of its length, and a turn of the wheel
+      from straight ahead to its limit costs half as many cells.
+    - `backwards`: how many times the length in reverse counts.
+    - `clearance`: distance [m] to keep from obstacles.
+    """
 
     reversal: float
     turning: float
