@@ -215,8 +215,11 @@ def test_the_wheel_can_be_limited_to_one_side():
     ],
 )
 def test_a_search_keeps_to_what_the_limits_allow(steering, speed, bends, directions):
+    """And the optimiser may use the values of launch and goal, which are 0."""
     limits = stroller.Limits(steering=steering, speed=speed)
-    steps = steps_of(checked_problem(SCENE, START, GOAL, 12.0, GAP, limits, FOOTPRINT, 1e-6))
+    problem = checked_problem(SCENE, START, GOAL, 12.0, GAP, limits, FOOTPRINT, 1e-6)
+    task, steps = Outline.of(problem).task(1.0, 12.0, 0.0), steps_of(problem)
+    assert all(low <= 0.0 <= high for low, high in zip(task.low[:2], task.high[:2], strict=True))
     moves = arcs(SimpleNamespace(cell=0.1), steps)
     assert_close(np.unique(moves[:, 1]) / steps.sharpest, bends, atol=0.02)
     assert tuple(np.unique(moves[:, 0])) == directions
