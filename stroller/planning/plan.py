@@ -38,8 +38,8 @@ MORE_CLEARANCE = 2
 #: Batches without a path that can be driven in time after which the search goes on; one more ends it.
 PATIENCE = 1
 
-#: The most rounds in which the duration is shortened, the share of the duration by which it is shortened in the first ones,
-#: and the relative difference between the last one that was too short and the result.
+#: The most rounds in which the duration is shortened, the share of the duration to which the first one shortens it, and the
+#: difference of the share from 1 at which they end.
 ROUNDS, SHORTER, CLOSE = 16, 0.5, 0.02
 
 MINIMISED = ("effort", "time")
@@ -213,24 +213,25 @@ def _driven(outline: Outline, unknowns: Any, t1: float, tolerance: float) -> Att
 def _shortened(outline: Outline, best: Attempt, tolerance: float) -> Attempt:
     """A solution in less time: the same drive, faster, optimised again for several durations in turn.
 
-    The duration is first shortened by a constant share, and then between the shortest success and the longest failure.
+    Every duration is a share of that of the best solution yet, and this solution is the first guess. The share is closer to 1
+    after a round without a solution.
     """
-    too_short = 0.0
+    share = SHORTER
     for _ in range(ROUNDS):
-        if best.t1 - too_short < CLOSE * best.t1:
-            break
-        low = max(too_short, SHORTER * best.t1)
-        parts = np.arange(LANES) / LANES if low > too_short else np.arange(1, LANES + 1) / (LANES + 1)
-        durations = low + (best.t1 - low) * parts
+        durations = best.t1 * share ** (np.arange(LANES, 0, -1) / LANES)
         faster = np.stack([best.unknowns] * LANES)
         faster[:, :, -1] *= (best.t1 / durations)[:, None]
         way = float(np.trapezoid(np.abs(best.run.speed), best.run.t))
         task = outline.task(way, float(durations.mean()), outline.clearance)
         candidates, violation, _ = optimise(Candidates(faster, durations), task)
-        for lane in np.flatnonzero(violation < HOPELESS):
-            attempt = _driven(outline, candidates.unknowns[lane], float(durations[lane]), tolerance)
-            if not attempt.verdict.hindrances:
-                best = attempt
-                break
-        too_short = float(max(durations[durations < best.t1], default=too_short))
+        attempts = (
+            _driven(outline, candidates.unknowns[lane], float(durations[lane]), tolerance)
+            for lane in np.flatnonzero(violation < HOPELESS)
+        )
+        shorter = next((attempt for attempt in attempts if not attempt.verdict.hindrances), None)
+        best = best if shorter is None else shorter
+        if shorter is None:
+            share **= 0.5 / LANES
+        if share > 1.0 - CLOSE:
+            break
     return best

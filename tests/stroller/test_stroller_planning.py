@@ -282,8 +282,11 @@ def test_less_time_is_less(rounds, monkeypatch):
 
 @pytest.mark.slow
 def test_the_shortest_time_does_not_depend_on_the_longest():
-    limits = stroller.Limits(steering=1.0, speed=1.0, force=6.0)
-    durations = [freely(stroller.Goal((4.0, 0.0)), t1, limits, minimise="time")[1].t1 for t1 in (10.0, 20.0, 40.0)]
+    limits = stroller.Limits(steering=1.0, speed=1.0, force=6.0, torque=0.5)
+    boxes = [stroller.Box((1.5, 0.2), (0.4, 0.8)), stroller.Box((2.5, -0.5), (0.4, 0.8))]
+    options = {"minimise": "time", "obstacles": boxes}
+    goal = stroller.Goal((4.0, 0.0), speed=0.5)
+    durations = [freely(goal, t1, limits, **options)[1].t1 for t1 in (10.0, 20.0, 40.0)]
     assert_close(durations, durations[0], rtol=0.05)
 
 
