@@ -324,12 +324,13 @@ def gripping(random, limits):
     return {"limits": limits} if random.random() < 0.5 else {}
 
 
-def test_a_planner_learns_and_a_plan_begins_with_its_proposal(monkeypatch):
-    """By a clock of its own, which allows eighty steps; every second problem limits the grip."""
+@pytest.mark.parametrize("more", [{}, pytest.param({"grip": (0.0, 5.0)}, marks=pytest.mark.slow)])
+def test_a_planner_learns_and_a_plan_begins_with_its_proposal(more, monkeypatch):
+    """By a clock of its own, which allows eighty steps; in the slow run, every second problem limits the grip."""
     monkeypatch.setattr(learn, "time", SimpleNamespace(perf_counter=count().__next__))
     monkeypatch.setattr(learn, "BATCH", 8)
-    grip = dataclasses.replace(LIMITS, grip=(0.0, 5.0))
-    planner = stroller.learn_planner(SCENE, lambda random: drawn(random) | gripping(random, grip), seconds=100.0)
+    others = dataclasses.replace(LIMITS, **more)
+    planner = stroller.learn_planner(SCENE, lambda random: drawn(random) | gripping(random, others), seconds=100.0)
     untrained = stroller.learn_planner(SCENE, drawn, seconds=0)
     random = np.random.default_rng(5)
     tasks = [learn.drawn_task(SCENE, drawn, random, k) for k in range(6)]
