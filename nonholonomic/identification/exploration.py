@@ -10,7 +10,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..progress import Progress
 from .likelihood import Measurements
@@ -68,6 +68,10 @@ class Pool(NamedTuple):
         columns = sorted({totals.shape[1] - 1, *(totals.shape[1] * part // 8 for part in (0, 1, 2, 4))}, reverse=True)
         ranked = np.stack([np.argsort(-totals[:, column]) for column in columns], axis=1).reshape(-1)
         return self.points[list(dict.fromkeys([0, *ranked.tolist()]))[:count]]
+
+    def most_probable(self, count: int) -> Int[np.ndarray, " count"]:
+        """The numbers of the points with the greatest density, the best first."""
+        return np.argsort(-self.log_density)[:count]
 
     @property
     def deviance(self) -> Float[np.ndarray, " n"]:

@@ -42,7 +42,7 @@ def search(problem: Problem, explorer: Explorer, options: Search) -> tuple[Minim
     if recorded and problem.step is not None:
         # A step by differences takes as long as a round of the exploration, which also finds the minima.
         sample = explorer.explore(pool, None, progress)
-        best = sample.pool.points[np.argsort(-sample.pool.log_density)[:starts]]
+        best = sample.pool.points[sample.pool.most_probable(starts)]
         last = np.arange(starts) < LAST
         return refine(problem, best, measurements, Refinement(max_steps, progress, rows=last)), sample
     steps = max_steps if recorded else min(max_steps, FEW_STEPS)
@@ -60,7 +60,7 @@ def search(problem: Problem, explorer: Explorer, options: Search) -> tuple[Minim
 def _improved(problem: Problem, minima: Minima, sample: Weighted, options: Search) -> Minima:
     """The minima, the best of them refined to the end; from the best points of the exploration if these are better."""
     rows, max_steps = len(minima.starts), options.max_steps
-    pool, order = sample.pool, np.argsort(-sample.pool.log_density)[:rows]
+    pool, order = sample.pool, sample.pool.most_probable(rows)
     best = pool.points[order]
     deviance = deviances(problem, best, pool.predictions[order], minima.measurements)
     if np.min(deviance) < np.min(minima.deviance) - IMPROVED:

@@ -31,7 +31,6 @@ SHARE = 0.05
 #: The arguments of `plan` that a problem consists of.
 PARTS = ("launch", "goal", "t1", "obstacles", "limits", "footprint")
 
-
 #: Those that a problem needs.
 NEEDED = ("launch", "goal", "t1")
 

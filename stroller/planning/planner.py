@@ -195,10 +195,10 @@ def merit(task: Task, proposal: Proposal, t1: Any) -> Any:
 
 def refined(coefficients: np.ndarray) -> np.ndarray:
     """The same spline with twice as many intervals."""
-    refined = np.empty(2 * len(coefficients) - ORDER + 1)
-    refined[::2] = (coefficients[:-1] + coefficients[1:]) / 2.0
-    refined[1::2] = (coefficients[:-2] + 6.0 * coefficients[1:-1] + coefficients[2:]) / 8.0
-    return refined
+    finer = np.empty(2 * len(coefficients) - ORDER + 1)
+    finer[::2] = (coefficients[:-1] + coefficients[1:]) / 2.0
+    finer[1::2] = (coefficients[:-2] + 6.0 * coefficients[1:-1] + coefficients[2:]) / 8.0
+    return finer
 
 
 @eqx.filter_jit

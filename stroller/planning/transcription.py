@@ -132,11 +132,11 @@ def interval_residuals(window: Any, task: Task, index: Any, intervals: int, dura
 
     end, (inequalities, effort) = jax.lax.scan(step, poses[0], jnp.arange(STEPS))
     # No interval follows the last one.
-    at_end, _ = point_residuals(task, end, motion_at(splines, 1.0, duration))
+    first, last = motion_at(splines, 0.0, duration), motion_at(splines, 1.0, duration)
+    at_end, _ = point_residuals(task, end, last)
     inequalities = jnp.concatenate([inequalities.ravel(), jnp.where(is_last, at_end, 1.0)])
     axes, length = task.dynamics.surface.axes, task.scales.length
     units = jnp.concatenate([jnp.full(axes, length), jnp.ones(len(end) - axes)])
-    first, last = motion_at(splines, 0.0, duration), motion_at(splines, 1.0, duration)
     at_start, at_goal = jnp.where(index == 0, 1.0, 0.0), jnp.where(is_last, 1.0, 0.0)
     (pose, steering, steering_rate, front_speed), (goal, goal_speed) = task.start, task.goal
     starts = [first.steering - steering, (first.steering_rate - steering_rate) * duration]

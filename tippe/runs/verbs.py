@@ -278,8 +278,8 @@ def lyapunov_exponent(
     >>> import tippe
     >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
     >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
-    >>> found = tippe.lyapunov_exponent(scene, tippe.Launch(1e-3, [155.0, 120.0]), t1=4.0, tolerance=1e-6)
-    >>> print(found.exponent.round(1))  # 1/s, while the top rises
+    >>> exponents = tippe.lyapunov_exponent(scene, tippe.Launch(1e-3, [155.0, 120.0]), t1=4.0, tolerance=1e-6)
+    >>> print(exponents.exponent.round(1))  # 1/s, while the top rises
     [1.2 1.2]
 
     ```
