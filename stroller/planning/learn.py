@@ -43,7 +43,7 @@ def learn_planner(
     seed: int = 0,
     progress: bool = True,
 ) -> Planner:
-    """Train a planner on problems that it draws, through the simulation of the drives that it proposes (needs optax).
+    """Train a network to propose drives, on random problems and through the simulation itself (needs optax).
 
     The network decides 32 times during a drive how the stroller steers and how fast it goes, from where the stroller then
     is: it sees the goal and the obstacles from there (compare Johnson et al., "Dynamically constrained motion planning
