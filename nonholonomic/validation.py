@@ -59,15 +59,15 @@ def as_number_or_none(value: Any) -> Float[Array, "..."] | None:
 def as_known(value: Any) -> Float[Array, "..."]:
     """Like `as_number`, but a concrete number stays concrete inside a transformation, where `jax.jit` would trace an
     array."""
-    if any(is_traced(leaf) for leaf in jax.tree.leaves(value)):
+    if is_traced(value):
         return as_number(value)
     with jax.ensure_compile_time_eval():
         return as_number(value)
 
 
 def is_traced(value: Any) -> bool:
-    """Whether the value is known only while JAX runs a transformation."""
-    return isinstance(value, Tracer)
+    """Whether the value, or a leaf of it, is known only while JAX runs a transformation."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value))
 
 
 def _first(numbers: np.ndarray, holds: np.ndarray) -> str:
@@ -178,7 +178,7 @@ def require_outside(values: Any, caller: str, instead: str) -> None:
     transformations.
     """
     # Inside `jit`, a new array is traced even if all its numbers are known.
-    if any(is_traced(leaf) for leaf in (as_number(0.0), *jax.tree.leaves(values))):
+    if is_traced((as_number(0.0), values)):
         raise ValueError(f"{caller} cannot be called inside jit, vmap or grad: use {instead} there")
 
 

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -23,7 +22,6 @@ from ..hybrid import (
 )
 from ..integration import AbstractProblem, Outcome, Settings, solve_ensemble, traced_solve_ensemble
 from ..integration.status import CROSSED, REACHED_END, Status
-from ..validation import is_traced
 from .event import modes_of, problem_of
 from .model import AbstractModel, Names
 
@@ -132,8 +130,3 @@ def status_of(model: AbstractModel, ensemble: Ensemble, outcome: Outcome | Hybri
     status, has_event = model.ended(outcome, tolerance), ensemble.has_event(outcome)
     is_sound = (status == int(Status.EVENT)) | (status == int(Status.COMPLETED))
     return jnp.where(is_sound & has_event, int(Status.EVENT), status)
-
-
-def traced_leaves(tree: Any) -> bool:
-    """Whether a tree has numbers that are known only while JAX runs a transformation."""
-    return any(is_traced(leaf) for leaf in jax.tree.leaves(tree))

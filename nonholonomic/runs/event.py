@@ -5,7 +5,6 @@ differentiated. If the function depends on time, a clock is added to the state.
 """
 
 import dataclasses
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -22,6 +21,7 @@ from ..integration.status import CROSSED, RUNNING
 from ..lanes.components import over_lanes
 from ..lanes.tracing import depends_on_first, is_elementary, spelled_out, with_own_numbers
 from ..parameters import likely
+from ..per_run import gathered
 from ..validation import UNTRACEABLE, shown
 from .model import AbstractModel, Names, Start
 from .parameters import Parameters
@@ -197,17 +197,17 @@ def value_in_lanes(model: AbstractModel, mode: AbstractBatchedMode | None, index
     values = model.read(event.names, time, rows, index)
     leaves, structure = jax.tree.flatten(event)
     # The components of every value, lane by lane.
-    shapes = {name: value.shape[time.ndim :] for name, value in values.items()}
-    parts = [values[name][(..., *component)] for name, shape in shapes.items() for component in np.ndindex(shape)]
+    shapes = [value.shape[time.ndim :] for value in values.values()]
+    parts = [
+        value[(..., *component)]
+        for value, shape in zip(values.values(), shapes, strict=True)
+        for component in np.ndindex(shape)
+    ]
 
     def of_run(leaves: Any, parts: tuple[Array, ...]) -> Float[Array, ""]:
         time, *components = parts
-        values, first = {}, 0
-        for name, shape in shapes.items():
-            end = first + math.prod(shape)
-            values[name] = jnp.stack(components[first:end]).reshape(shape) if shape else components[first]
-            first = end
-        return jax.tree.unflatten(structure, leaves)(time, values)
+        of_one_run = dict(zip(values, gathered(components, shapes), strict=True))
+        return jax.tree.unflatten(structure, leaves)(time, of_one_run)
 
     return over_lanes(of_run, tuple(leaves), (time, *parts))
 

@@ -17,7 +17,7 @@ from ..integration.checks import legal_run
 from ..integration.status import Status
 from ..progress import status_line
 from ..validation import as_number, is_traced, nan_unless, shown, warn
-from .ensemble import Ensemble, status_of, traced_leaves
+from .ensemble import Ensemble, status_of
 from .model import AbstractModel, check_run, model_of, require_event
 
 #: The statuses of runs without a result.
@@ -104,7 +104,7 @@ def event_time(
     require_event(model)
     settings = Settings(tolerance, solver)
     explicit_tableau(settings.for_lanes)
-    time = _compiled(model, as_number(t1), settings, crossing == "last", traced_leaves((model, t1, tolerance)))
+    time = _compiled(model, as_number(t1), settings, crossing == "last", is_traced((model, t1, tolerance)))
     if not is_traced(time) and np.ndim(time) == 0 and np.isnan(time):
         _warn_of_failure(model, float(np.asarray(t1)), settings, crossing == "last")
     return time
@@ -159,7 +159,7 @@ class EventTime(AbstractDifferentiableSolve):
         cls, model: AbstractModel, t1: Any, settings: Settings, last: bool, unchecked: bool | None = None
     ) -> tuple[Any, ...]:
         """The solve and its leaves. **Arguments:** as for `time_of_event`."""
-        unchecked = traced_leaves((model, t1, settings.tolerance)) if unchecked is None else unchecked
+        unchecked = is_traced((model, t1, settings.tolerance)) if unchecked is None else unchecked
         arrays, rest = eqx.partition(model, eqx.is_array)
         leaves, structure = jax.tree.flatten(arrays)
         is_float = tuple(eqx.is_inexact_array(leaf) for leaf in leaves)

@@ -17,6 +17,7 @@ from jax.tree_util import DictKey, GetAttrKey, KeyPath, SequenceKey
 from jaxtyping import Array, Float
 
 from ..parameters import full_name
+from ..per_run import gathered, spread
 
 
 def is_number(leaf: Any) -> bool:
@@ -45,17 +46,11 @@ class TreeForm:
         arrays = [jnp.asarray(leaf) for leaf in leaves]
         static_leaves, static_structure = jax.tree.flatten(static)
         kinds = tuple((array.shape, array.dtype) for array in arrays)
-        return cls(structure, kinds, tuple(static_leaves), static_structure), tuple(
-            number for array in arrays for number in (jnp.unstack(array.ravel()) if array.ndim else [array])
-        )
+        return cls(structure, kinds, tuple(static_leaves), static_structure), spread(arrays)
 
     def tree(self, numbers: Sequence[Array]) -> Any:
         """The tree with the given numbers, each a scalar."""
-        leaves, first = [], 0
-        for shape, _ in self.kinds:
-            end = first + math.prod(shape)
-            leaves.append(jnp.stack(numbers[first:end]).reshape(shape) if shape else numbers[first])
-            first = end
+        leaves = gathered(numbers, [shape for shape, _ in self.kinds])
         static = jax.tree.unflatten(self.static_structure, self.static_leaves)
         return eqx.combine(jax.tree.unflatten(self.structure, leaves), static)
 

@@ -5,7 +5,6 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -45,7 +44,7 @@ def ride(
     settings = Settings(tolerance, solver, max_steps=max_steps)
     # Inside a transformation, this traces all numbers, even if they are known.
     specification = Ride(model, jnp.add(end, 0.0), settings, grid)
-    if any(is_traced(leaf) for leaf in jax.tree.leaves((specification, times))):
+    if is_traced((specification, times)):
         return _sampled(specification, times, adjoint)
     return _concrete(specification, times)
 

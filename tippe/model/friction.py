@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -59,7 +58,7 @@ class AbstractFriction(Bounded):
     def suspicion(self) -> str | None:
         # The laws of this package oppose every slip. Traced numbers have no values to judge.
         is_own = str(type(self).per_normal_force.__module__).startswith("tippe.")
-        return None if is_own or any(is_traced(leaf) for leaf in jax.tree.leaves(self)) else drive(as_law(self))
+        return None if is_own or is_traced(self) else drive(as_law(self))
 
     @property
     def uses_spin(self) -> bool:

@@ -45,7 +45,7 @@ def of_each_run(function: Callable[[Any], Array]) -> property:
     compiled = eqx.filter_jit(function)
 
     def get(self):
-        if self.t.ndim == 1 and not any(is_traced(leaf) for leaf in jax.tree.leaves((self.t, self.states, self.scene))):
+        if self.t.ndim == 1 and not is_traced((self.t, self.states, self.scene)):
             return jax.device_put(np.asarray(compiled(self.padded()))[: len(self.t)])
         batched = function
         for _ in range(self.t.ndim - 1):

@@ -39,7 +39,7 @@ def simulate_launch(
     if times is not None:
         times = as_number(times)
         require_times(times, t1)
-    if any(is_traced(leaf) for leaf in jax.tree.leaves((model, times, t1, tolerance))):
+    if is_traced((model, times, t1, tolerance)):
         return _traced(model, times, as_number(t1), settings, adjoint)
     if model.smooth:
         path = follow(model.problem(None, None), float(t1), settings)

@@ -235,7 +235,7 @@ def first_or_last_time(model: TopModel, t1: Any, crossing: str, settings: Settin
     """
     explicit_tableau(settings.for_lanes)
     time = time_of_event(model, t1, settings, crossing == "last")
-    if any(is_traced(leaf) for leaf in jax.tree.leaves((model, t1, time, settings))) or not np.isnan(time):
+    if is_traced((model, t1, time, settings)) or not np.isnan(time):
         return time
     # Repeat the run to find the cause.
     t1, form = float(t1), REVERSALS if model.reverses else INVERSIONS
