@@ -35,6 +35,7 @@ from .model import AbstractSceneModel as AbstractSceneModel
 from .model import Names as Names
 from .model import Start as Start
 from .model import model_of as model_of
+from .model import statuses as statuses
 from .samples import Samples as Samples
 from .simulate import evenly_spaced as evenly_spaced
 from .simulate import sampled_if_legal as sampled_if_legal

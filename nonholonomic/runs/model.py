@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..hybrid import AbstractBatchedMode, HybridOutcome
 from ..integration import AbstractProblem, Outcome
 from ..integration.checks import run_bounds
+from ..integration.status import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED, Status
 from ..parameters import numbers, with_numbers
 from ..sweeps import Axis, Quantity, Variable
 from ..validation import require_all, shown
@@ -189,6 +190,16 @@ class AbstractModel(eqx.Module):
     @abc.abstractmethod
     def at_end(self, outcome: Outcome | HybridOutcome, start: Float[Array, "components cells"]) -> dict[str, Array]:
         """The values of `ends`, for the outcome and the initial states of some cells."""
+
+
+def statuses(codes: Int[Array, " cells"], left_domain: Any) -> Int[Array, " cells"]:
+    """How runs have ended, as integers of `Status`, by the codes of the integration. **Arguments:** `left_domain`: the
+    `Status` of a run that left its domain, or that of each run."""
+    status = jnp.full(jnp.shape(codes), int(Status.COMPLETED))
+    ends = {CROSSED: Status.EVENT, LEFT_DOMAIN: left_domain, FAILED: Status.FAILED, UNRESOLVED: Status.UNRESOLVED}
+    for code, ended in ends.items():
+        status = jnp.where(codes == code, jnp.asarray(ended, int), status)
+    return status
 
 
 class AbstractSceneModel(AbstractModel):

@@ -13,10 +13,10 @@ from jaxtyping import Array, Bool, Float, Int
 from ..formulations import AbstractFormulation, AbstractSystem
 from ..hybrid import HybridOutcome
 from ..integration import AbstractProblem, Outcome
-from ..integration.status import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED, Status
+from ..integration.status import Status
 from ..lanes.tracing import dependent_outputs, with_own_numbers
 from ..runs.lyapunov import direction_of_start
-from ..runs.model import AbstractModel, Names, Start, model_of
+from ..runs.model import AbstractModel, Names, Start, model_of, statuses
 from ..runs.parameters import Parameters, check_again, has_checks, require_apart, short_names
 from ..runs.simulate import simulate_model
 from ..runs.trajectory import Trajectory
@@ -26,9 +26,6 @@ from .engine import Cells
 from .form import Form
 from .mode import AbstractMode, Event, Hybrid, require_event
 from .system import MechanicalEvent, MechanicalMode, check_start, formulation_of, is_pair, with_modes_of_systems
-
-#: The statuses, by the code of the integration, of runs that did not reach their horizon.
-STATUSES = {CROSSED: Status.EVENT, LEFT_DOMAIN: Status.STOPPED, FAILED: Status.FAILED, UNRESOLVED: Status.UNRESOLVED}
 
 
 class OwnModel(AbstractModel):
@@ -186,10 +183,7 @@ class OwnModel(AbstractModel):
         return ("event", "completed", "stopped", "failed", "unresolved")
 
     def ended(self, outcome: Outcome | HybridOutcome, tolerance: Any) -> Int[Array, " cells"]:
-        status = jnp.full(jnp.shape(outcome.status), int(Status.COMPLETED))
-        for code, ended in STATUSES.items():
-            status = jnp.where(outcome.status == code, int(ended), status)
-        return status
+        return statuses(outcome.status, Status.STOPPED)
 
     @property
     def ends(self) -> dict[str, Variable]:

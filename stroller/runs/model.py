@@ -13,7 +13,7 @@ from nonholonomic.geometry import Plane
 from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import AbstractProblem, ExtendedProblem, Outcome
 from nonholonomic.integration.checks import run_bounds
-from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, Status
+from nonholonomic.integration.status import Status
 from nonholonomic.lanes.objects import Held
 from nonholonomic.parameters import description, full_name, numbers
 from nonholonomic.runs import (
@@ -25,6 +25,7 @@ from nonholonomic.runs import (
     Names,
     direction_of_start,
     model_of,
+    statuses,
     with_event,
 )
 from nonholonomic.sweeps import Quantity, Variable
@@ -245,10 +246,11 @@ class RideModel(AbstractSceneModel):
         return {name: QUANTITIES[name].of(name, state) for name in names}
 
     def ended(self, outcome: Outcome | HybridOutcome, tolerance: Any) -> Int[Array, " cells"]:
-        lost = self.event is None and jnp.isfinite(outcome.crossing_time)
-        status = jnp.where(lost | (outcome.status == CROSSED), int(Status.EVENT), int(Status.COMPLETED))
-        status = jnp.where(outcome.status == LEFT_DOMAIN, int(Status.RANK_LOST), status)
-        return jnp.where(outcome.status == FAILED, int(Status.FAILED), status)
+        status = statuses(outcome.status, Status.RANK_LOST)
+        if self.event is not None:
+            return status
+        lost = jnp.isfinite(outcome.crossing_time) & (status == int(Status.COMPLETED))
+        return jnp.where(lost, int(Status.EVENT), status)
 
     @property
     def ends(self) -> dict[str, Variable]:

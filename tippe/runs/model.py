@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from nonholonomic.geometry import Plane
 from nonholonomic.hybrid import BETWEEN, HybridOutcome
 from nonholonomic.integration import AbstractProblem, CoreProblem, Outcome
-from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED, Status
+from nonholonomic.integration.status import FAILED, Status
 from nonholonomic.parameters import description, full_name, numbers
 from nonholonomic.runs import (
     AbstractModel,
@@ -22,6 +22,7 @@ from nonholonomic.runs import (
     Start,
     TableForm,
     model_of,
+    statuses,
     with_event,
 )
 from nonholonomic.sweeps import Quantity, Variable
@@ -33,7 +34,6 @@ from ..model.dynamics import NO_COSINE
 from ..model.friction import NoSlip
 from ..model.launch import Launch
 from ..model.scene import Scene
-from ..modes.airborne_ends import loss as flight_loss
 from ..modes.airborne_ends import on_the_ground
 from ..modes.inversion_problem import InversionProblem, StemContact
 from ..modes.sticking import contact_modes
@@ -44,7 +44,7 @@ from .flight_trajectory import HybridTrajectory
 from .launches import NUMBERS_OF_A_LAUNCH, labels, variable_numbers
 from .observables import AbstractTrajectory
 from .quantities import COMPONENTS, DIRECTION, ON_CURVED, PASSIVE, PATH, quantities_of
-from .run_kind import COUNTED, HYBRID, RunKind, flight_modes, has_grown, run_kind_of
+from .run_kind import COUNTED, RunKind, flight_modes, has_grown, run_kind_of
 from .simulate import simulate_launch
 from .trajectory import Trajectory
 
@@ -59,15 +59,6 @@ REVERSALS = TableForm(
     "reversal",
     nan_if_failed=False,
 )
-
-#: The statuses of runs, by the code of the integration; a run that left its domain has one of `LOSSES`.
-STATUSES = {
-    REACHED_END: Status.COMPLETED,
-    CROSSED: Status.EVENT,
-    LEFT_DOMAIN: Status.JAMMED,
-    FAILED: Status.FAILED,
-    UNRESOLVED: Status.UNRESOLVED,
-}
 
 #: A tilt [rad] that no number shows: a plane with a tilt has the equations for any arena.
 NO_TILT = 1e-300
@@ -274,16 +265,9 @@ class TopModel(AbstractSceneModel):
         energy_before = kind.energy_in(scene, start.states, first)[1]
         energy_after = kind.energy_in(scene, state, mode)[0]
         grown = has_grown(scene, energy_before, energy_after, tolerance) & (outcome.status != FAILED)
-        if kind is not HYBRID:
-            # A run with flights over a level plane continues when contact is lost, and its ball fits everywhere.
-            codes = jnp.array([int(status) for status in LOSSES])
-            lost = codes[flight_loss(scene, state) if kind.flight_state else scene.dynamics.loss(state)]
-        else:
-            lost = int(Status.JAMMED)
-        status = jnp.zeros((cells,), int)
-        for code, ended in STATUSES.items():
-            status = jnp.where(outcome.status == code, lost if code == LEFT_DOMAIN else int(ended), status)
-        return jnp.where(grown, int(Status.UNRESOLVED), status)
+        codes = jnp.array([int(status) for status in LOSSES])
+        left_domain = Status.JAMMED if kind.loss is None else codes[kind.loss(scene, state)]
+        return jnp.where(grown, int(Status.UNRESOLVED), statuses(outcome.status, left_domain))
 
     @property
     def ends(self) -> dict[str, Variable]:

@@ -28,12 +28,15 @@ class RunKind(NamedTuple):
 
     `modes` is a function of (scene, problem, tolerance, last) that returns the modes and the index of each cell's first
     mode; `None` for smooth runs. `energy_in` is a function of (scene, state, mode) that returns the least and the
-    greatest energy [J] that the state may have. `flight_state` is true if states in flight have another layout.
+    greatest energy [J] that the state may have. `loss` is a function of (scene, state) that returns how a run left its
+    domain, as a code in `LOSSES`; `None` for runs that can only jam, because they continue when contact is lost, and the
+    ball fits everywhere. `flight_state` is true if states in flight have another layout.
     """
 
     counts: tuple[str, ...]
     modes: Callable[..., tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]] | None
     energy_in: Callable[..., tuple[Float[Array, " cells"], Float[Array, " cells"]]]
+    loss: Callable[..., Int[Array, " cells"]] | None
     flight_state: bool = False
 
     @property
@@ -54,12 +57,17 @@ def energy_of_state(
     return total, total
 
 
-SMOOTH = RunKind((), None, energy_of_state)
-STICK_SLIP = RunKind(("sticks",), sticking.modes, sticking.energy_in)
-HYBRID = RunKind(("hops",), sliding.modes, free_body.energy_in)
-AIRBORNE = RunKind(("hops",), airborne.modes, airborne_ends.energy_in, flight_state=True)
-ON_STEM_TOO = RunKind(("hops",), airborne_stem.modes, airborne_ends.energy_in, flight_state=True)
-STICK_SLIP_FLY = RunKind(("hops", "sticks"), airborne_stick_slip.modes, airborne_ends.energy_in, flight_state=True)
+def loss_of_contact(scene: Scene[Any], state: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+    """How a contact has ended, as a code in `LOSSES`."""
+    return scene.dynamics.loss(state)
+
+
+SMOOTH = RunKind((), None, energy_of_state, loss_of_contact)
+STICK_SLIP = RunKind(("sticks",), sticking.modes, sticking.energy_in, loss_of_contact)
+HYBRID = RunKind(("hops",), sliding.modes, free_body.energy_in, None)
+AIRBORNE = RunKind(("hops",), airborne.modes, airborne_ends.energy_in, airborne_ends.loss, True)
+ON_STEM_TOO = AIRBORNE._replace(modes=airborne_stem.modes)
+STICK_SLIP_FLY = AIRBORNE._replace(counts=("hops", "sticks"), modes=airborne_stick_slip.modes)
 
 
 def run_kind_of(scene: Scene[Any]) -> RunKind:
