@@ -44,6 +44,11 @@ def numbers(root: str, tree: Any, functions: bool = True) -> dict[str, Any]:
     return values
 
 
+def numbers_of(roots: dict[str, Any]) -> dict[str, Any]:
+    """Every parameter of several trees. **Arguments:** `roots`: name -> tree."""
+    return {name: value for root, tree in roots.items() for name, value in numbers(root, tree).items()}
+
+
 def _itself(tree: Any) -> Any:
     """The user's module itself for a module that is evaluated over lanes."""
     return tree.function if isinstance(tree, AbstractHeld) else tree
@@ -70,7 +75,7 @@ def with_numbers(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any
 
     **Raises:** `ValueError` for a name that matches no parameter.
     """
-    values_of_names = {name: number for root, tree in roots.items() for name, number in numbers(root, tree).items()}
+    values_of_names = numbers_of(roots)
     for name in values:
         if name not in values_of_names:
             raise _unknown_axis(

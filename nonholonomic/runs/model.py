@@ -15,7 +15,7 @@ from ..hybrid import AbstractBatchedMode, HybridOutcome
 from ..integration import AbstractProblem, Outcome
 from ..integration.checks import run_bounds
 from ..integration.status import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED, Status
-from ..parameters import numbers, with_numbers
+from ..parameters import full_name, numbers, with_numbers
 from ..sweeps import Axis, Quantity, Variable
 from ..validation import require_all, shown
 
@@ -209,6 +209,14 @@ class AbstractSceneModel(AbstractModel):
     @abc.abstractmethod
     def roots(self) -> dict[str, Any]:
         """The trees whose numbers are parameters, which are fields of the model."""
+
+    @property
+    def known_of_event(self) -> list[str]:
+        """The full names of the parameters of the event."""
+        return [] if self.event is None else self.event.parameters.known
+
+    def full_name(self, argument: str, name: str) -> str:
+        return full_name(argument, name, [*self.known, *self.known_of_event])
 
     def value(self, name: str) -> Any:
         if name.startswith("event.") and self.event is not None:

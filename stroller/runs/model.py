@@ -15,7 +15,7 @@ from nonholonomic.integration import AbstractProblem, ExtendedProblem, Outcome
 from nonholonomic.integration.checks import run_bounds
 from nonholonomic.integration.status import Status
 from nonholonomic.lanes.objects import Held
-from nonholonomic.parameters import description, full_name, numbers
+from nonholonomic.parameters import description, numbers, numbers_of
 from nonholonomic.runs import (
     UNMEASURED,
     AbstractModel,
@@ -137,14 +137,10 @@ class RideModel(AbstractSceneModel):
         module = {} if self.input is None or self.original is not None else {"input": self.input}
         return {"scene": self.scene, "launch": self.launch} | module
 
-    def full_name(self, argument: str, name: str) -> str:
-        return full_name(argument, name, self.known)
-
     @property
     def known(self) -> list[str]:
         """The full names of the parameters that can be varied: single numbers, including omitted ones, which are 0."""
-        values = {name: value for root, tree in self.roots.items() for name, value in numbers(root, tree).items()}
-        level = isinstance(self.scene.surface, Plane)
+        values, level = numbers_of(self.roots), isinstance(self.scene.surface, Plane)
         return [
             name for name, value in values.items() if np.ndim(value) == 0 and (level or name != "scene.body.centre")
         ]
@@ -167,14 +163,12 @@ class RideModel(AbstractSceneModel):
         return labels
 
     def description(self) -> dict[str, Any]:
-        launch = dataclasses.replace(self.launch, place=(0.0, 0.0))
-        request = description("scene", self.scene) | description("launch", launch)
-        request |= {"launch.place": [float(part) for part in self.launch.place]}
-        controls = self.input if self.original is None else self.original.input
+        controls: Any = self.input if self.original is None else self.original.input
         if isinstance(controls, eqx.Module):
-            request |= {"input": description("input", controls)}
+            controls = description("input", controls)
         else:
-            request |= {"input": "none" if controls is None else getattr(controls, "__qualname__", repr(controls))}
+            controls = "none" if controls is None else getattr(controls, "__qualname__", repr(controls))
+        request = description("scene", self.scene) | description("launch", self.launch) | {"input": controls}
         return request if self.event is None else request | {"event": self.event.name}
 
     def check(self) -> None:

@@ -13,7 +13,7 @@ from nonholonomic.geometry import Plane
 from nonholonomic.hybrid import BETWEEN, HybridOutcome
 from nonholonomic.integration import AbstractProblem, CoreProblem, Outcome
 from nonholonomic.integration.status import FAILED, Status
-from nonholonomic.parameters import description, full_name, numbers
+from nonholonomic.parameters import description, full_name, numbers, numbers_of
 from nonholonomic.runs import (
     AbstractModel,
     AbstractSceneModel,
@@ -117,12 +117,11 @@ class TopModel(AbstractSceneModel):
         return {"scene": self.scene, "launch": self.launch}
 
     def full_name(self, argument: str, name: str) -> str:
-        own = [] if self.event is None else self.event.parameters.known
         if argument == "axes":
-            return full_name(argument, name, [*self.known, *own])
-        values = {name: value for root, tree in self.roots.items() for name, value in numbers(root, tree).items()}
+            return super().full_name(argument, name)
+        values = numbers_of(self.roots)
         present = [name for name, value in values.items() if value is not None and np.ndim(value) == 0]
-        return full_name(argument, name, [*present, *own])
+        return full_name(argument, name, [*present, *self.known_of_event])
 
     @property
     def known(self) -> list[str]:

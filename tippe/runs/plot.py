@@ -12,7 +12,7 @@ from jaxtyping import Float
 from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import Settings
 from nonholonomic.integration.status import REACHED_END
-from nonholonomic.parameters import numbers, with_numbers
+from nonholonomic.parameters import numbers_of, with_numbers
 from nonholonomic.runs import Ensemble, at_the_end
 from nonholonomic.sweeps import chunk_for
 
@@ -87,8 +87,7 @@ def theta_over_time(
     **Arguments:** `axes`: full names of the parameters along the axes of that table, such as "launch.theta".
     """
     roots = {"scene": scene, "launch": launch}
-    values = {path: value for root, tree in roots.items() for path, value in numbers(root, tree).items()}
-    size, settings = chunk_for(1), Settings(tolerance)
+    values, size, settings = numbers_of(roots), chunk_for(1), Settings(tolerance)
     cells = with_numbers(roots, {name: np.full(size, float(values[name])) for name in axes})
     model = TopModel.timed(**cells, angle=event_of(scene, None))
     ensemble = Ensemble.of(model, size, settings.tolerance, False)

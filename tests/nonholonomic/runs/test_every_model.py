@@ -1,5 +1,6 @@
 """Every function of `nonholonomic` answers for every kind of model."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +10,7 @@ from models import CASES, NAMES
 
 import nonholonomic
 from nonholonomic.identification import sample
+from nonholonomic.runs import model_of
 
 QUIET = dict(progress=False, tolerance=1e-8)
 
@@ -135,3 +137,18 @@ def test_runs_are_drawn_and_explored(case, tmp_path):
     assert "range" in path.read_text()
     nonholonomic.simulate(case.system, case.start, 0.5, tolerance=1e-7).view(path)
     assert "three" in path.read_text()
+
+
+class EnergyBelow(eqx.Module):
+    level: float
+
+    def __call__(self, t, motion):
+        return motion.energy - self.level
+
+
+@pytest.mark.parametrize("name", ["top", "stroller"])
+def test_the_parameters_of_an_event_have_names(name):
+    model = model_of(CASES[name].system, CASES[name].start, EnergyBelow(0.04))
+    full_name = model.full_name("axes", "event.level")
+    assert model.full_name("sensitivities", "level") == full_name
+    assert float(model.replaced({full_name: 0.05}).value(full_name)) == 0.05
