@@ -79,10 +79,8 @@ def inputs_of(run: Trajectory) -> tuple[np.ndarray, np.ndarray]:
 
 @eqx.filter_jit
 def _inputs(spec: Any, times: Any, states: Any) -> Any:
-    ride = spec.ride
-
     def at(t, state):
-        return ride.input(t, ride.scene.dynamics.geometry(state).motion)
+        return spec.input(t, spec.scene.dynamics.geometry(state).motion)
 
     return jax.vmap(at)(times, states)
 
@@ -135,7 +133,7 @@ def judge(run: Trajectory, problem: Problem) -> Verdict:
 def effort_of(run: Trajectory) -> float:
     """The effort [N^2 s]: the integral over time of F^2 + (torque / l)^2, with the force F and the wheelbase l."""
     force, torque = inputs_of(run)
-    squares = force**2 + (torque / float(run.spec.ride.scene.body.wheelbase)) ** 2
+    squares = force**2 + (torque / float(run.spec.scene.body.wheelbase)) ** 2
     return float(np.trapezoid(squares, np.asarray(run.t)))
 
 

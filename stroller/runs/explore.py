@@ -95,7 +95,7 @@ def outcome(model: RideModel, problem: Any, lane: Any) -> tuple[Int[Array, ""], 
 
 def stage(rides: list[Trajectory]) -> Stage:
     """The stage of the first ride, on a part of the ground that contains all rides."""
-    (first,), scene = rides[0].stages(), rides[0].spec.ride.scene
+    (first,), scene = rides[0].stages(), rides[0].spec.scene
     length = float(scene.body.wheelbase)
     points = np.concatenate([np.asarray(ride.position) for ride in rides])
     # The page would not update the curve of the friction that the tyres need, which `frame` does not compute.

@@ -58,7 +58,7 @@ def table_of(runs: list[Any], names: list[str], request: dict[str, Any], only: S
     - `request`: plain data that describes the computation.
     - `only`: names of quantities, as for `chosen`.
     """
-    flat = {isinstance(run.spec.ride.scene.surface, Plane) for run in runs}
+    flat = {isinstance(run.spec.scene.surface, Plane) for run in runs}
     # On grounds of different kinds, a place has no common unit.
     places, unit = {True: (("x", "y"), "m"), False: (("mu", "eta"), "rad")}[flat.pop()]
     places, unit = (("first", "second"), "m or rad") if flat else (places, unit)
@@ -77,7 +77,7 @@ def table_of_one(run: Any, only: Sequence[str] = ()) -> Table:
     **Raises:** `ValueError` for a batch of runs.
     """
     require_one_run(run, "to_table", "; stroller.sweep makes a table of many")
-    request = description("scene", run.spec.ride.scene) | {"status": run.status}
+    request = description("scene", run.spec.scene) | {"status": run.status}
     return table_of([run], [], request, only)
 
 

@@ -14,7 +14,7 @@ from nonholonomic.integration.checks import require_adaptive, require_adjoint, r
 from nonholonomic.runs import evenly_spaced, sampled_if_legal
 from nonholonomic.validation import as_known, is_traced, nan_unless, require_whole
 
-from .steps import Ride, RideSpec, followed, stats_of
+from .steps import RideSpec, followed, stats_of
 from .trajectory import Trajectory, read_off, read_off_compiled
 
 #: Default limit of the steps of a ride.
@@ -43,17 +43,16 @@ def ride(
         max_steps = grid.size
     settings = Settings(tolerance, solver, max_steps=max_steps)
     # Inside a transformation, this traces all numbers, even if they are known.
-    specification = Ride(model, jnp.add(end, 0.0), settings, grid)
-    if is_traced((specification, times)):
-        return _sampled(specification, times, adjoint)
-    return _concrete(specification, times)
+    spec = RideSpec.of(model, jnp.add(end, 0.0), settings, grid)
+    if is_traced((spec, times)):
+        return _sampled(spec, times, adjoint)
+    return _concrete(spec, times)
 
 
-def _concrete(ride: Ride, times: Float[Array, " times"]) -> Trajectory:
+def _concrete(spec: RideSpec, times: Float[Array, " times"]) -> Trajectory:
     """The run of concrete numbers."""
-    spec = RideSpec.of(ride)
-    if not isinstance(ride.settings.for_steps_alone, diffrax.AbstractERK | ImplicitMidpoint):
-        return _sampled(ride, times, None)
+    if not isinstance(spec.settings.for_steps_alone, diffrax.AbstractERK | ImplicitMidpoint):
+        return _sampled(spec, times, None)
     steps, stats = followed(spec)
     return dataclasses.replace(read_off_compiled(spec, times, steps.at(spec, np.asarray(times)), stats), steps=steps)
 
@@ -61,10 +60,11 @@ def _concrete(ride: Ride, times: Float[Array, " times"]) -> Trajectory:
 # Steps of other implicit solvers cannot be repeated cheaply, so they end on the times.
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
 @eqx.filter_jit
-def _sampled(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None) -> Trajectory:
+def _sampled(spec: RideSpec, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None) -> Trajectory:
     """The run at `times`; NaN and `finished` false if a traced number is out of range."""
-    is_legal, samples, _ = sampled_if_legal(ride.model, times, ride.t1, ride.settings, ride.grid, adjoint)
-    run = read_off(RideSpec.of(ride), times, samples.rows, stats_of(samples.outcome))
+    model, t1, settings, grid = spec.parts
+    is_legal, samples, _ = sampled_if_legal(model, times, t1, settings, grid, adjoint)
+    run = read_off(spec, times, samples.rows, stats_of(samples.outcome))
     stats = run.stats._replace(finished=run.stats.finished & is_legal)
     return eqx.tree_at(lambda trajectory: (trajectory.t, trajectory.stats), nan_unless(is_legal, run), (times, stats))
 

@@ -34,46 +34,46 @@ class Stats(NamedTuple):
     finished: Bool[Array, ""]
 
 
-class Ride(NamedTuple):
-    """A ride and the options of its integration.
-
-    - `model`: the `RideModel` with scene, launch and input; `t1`: end [s].
-    - `grid`: the ends of the steps [s] of a solver without an error estimate.
-    """
-
-    model: Any
-    t1: Float[Array, ""]
-    settings: Settings
-    grid: Float[Array, " steps"] | None
-
-    @property
-    def scene(self) -> Scene:
-        return self.model.scene
-
-    @property
-    def launch(self) -> Launch:
-        return self.model.launch
-
-    @property
-    def input(self) -> Input | None:
-        return self.model.input
-
-
 class RideSpec(eqx.Module):
-    """A `Ride` that can leave a transformation: its numbers are leaves and everything else is static."""
+    """A ride and the options of its integration, in a form that can leave a transformation: its numbers are leaves and
+    everything else is static."""
 
     numbers: Any
     static: Any = eqx.field(static=True)
 
     @classmethod
-    def of(cls, ride: Ride) -> "RideSpec":
-        """The specification of a ride."""
-        return cls(*eqx.partition(ride, eqx.is_array_like))
+    def of(cls, model: Any, t1: Array, settings: Settings, grid: Float[Array, " steps"] | None) -> "RideSpec":
+        """The specification of a ride.
+
+        **Arguments:** `model`: the `RideModel`; `t1`: end [s]; `grid`: the ends of the steps [s] of a solver without an
+        error estimate.
+        """
+        return cls(*eqx.partition((model, t1, settings, grid), eqx.is_array_like))
 
     @property
-    def ride(self) -> Ride:
-        """The ride."""
+    def parts(self) -> tuple[Any, Array, Settings, Array | None]:
+        """The arguments of `of`."""
         return eqx.combine(self.numbers, self.static)
+
+    @property
+    def settings(self) -> Settings:
+        """The settings of the integration."""
+        return self.parts[2]
+
+    @property
+    def scene(self) -> Scene:
+        """The scene of the ride."""
+        return self.parts[0].scene
+
+    @property
+    def launch(self) -> Launch:
+        """The launch of the ride."""
+        return self.parts[0].launch
+
+    @property
+    def input(self) -> Input | None:
+        """The input of the ride."""
+        return self.parts[0].input
 
 
 def stats_of(outcome: HybridOutcome[Array]) -> Stats:
@@ -112,7 +112,7 @@ class Steps(NamedTuple):
         def field(times: Lanes, states: States) -> States:
             return in_blocks(lambda *arguments: _field(spec, *arguments), times, states)
 
-        time, start, solver = self.times[step], self.states[:, step], spec.ride.settings.for_steps_alone
+        time, start, solver = self.times[step], self.states[:, step], spec.settings.for_steps_alone
         rates = [field(time, start)]
         if not isinstance(solver, diffrax.AbstractERK):
             # Use the cubic through states and rates at both ends; repeating an implicit step would be expensive.
@@ -130,8 +130,7 @@ class Steps(NamedTuple):
 
 @eqx.filter_jit
 def _field(spec: RideSpec, times: Float[Array, " lanes"], states: State) -> State:
-    ride = spec.ride
-    return ride.scene.dynamics.field(times, states, ride.input)
+    return spec.scene.dynamics.field(times, states, spec.input)
 
 
 def in_blocks(function: Callable[..., Any], *columns: Any) -> Any:
@@ -146,13 +145,12 @@ def in_blocks(function: Callable[..., Any], *columns: Any) -> Any:
 
 def followed(spec: RideSpec) -> tuple[Steps, Stats]:
     """Run a ride outside of transformations, and keep its steps."""
-    ride = spec.ride
-    problem = _problem(spec)
-    if ride.grid is None:
-        path = follow(problem, float(ride.t1), ride.settings, dense=False)
+    problem, (_, t1, settings, grid) = _problem(spec), spec.parts
+    if grid is None:
+        path = follow(problem, float(t1), settings, dense=False)
         return Steps(path.times, path.states), _counted(path.accepted, path.rejected, not path.failed)
     solution = _on_grid(problem, spec)
-    ends = np.asarray(ride.grid)
+    ends = np.asarray(grid)
     mask = ends <= float(solution.end_time)
     steps = Steps(ends[mask], np.asarray(solution.states)[:, mask])
     return steps, _counted(int(solution.accepted), int(solution.rejected), bool(mask.all()))
@@ -166,15 +164,14 @@ def _counted(accepted: int, rejected: int, finished: bool) -> Stats:
 
 @eqx.filter_jit
 def _problem(spec: RideSpec) -> RideProblem:
-    ride = spec.ride
-    return RideProblem.single(ride.scene, ride.launch, ride.input)
+    return RideProblem.single(spec.scene, spec.launch, spec.input)
 
 
 @compiled_quickly
 def _on_grid(problem: RideProblem, spec: RideSpec) -> Any:
     """A ride with given steps, sampled at their ends."""
-    ride = spec.ride
-    return sample(problem, None, ride.t1, ride.settings, grid=ride.grid)
+    _, t1, settings, grid = spec.parts
+    return sample(problem, None, t1, settings, grid=grid)
 
 
 #: Quantities that can be watched: the normal force [N], the cosine of the steering angle, and the relative reduced
@@ -199,7 +196,7 @@ def watched(spec: RideSpec, states: States, name: str) -> Lanes:
 
 @eqx.filter_jit
 def _watched(spec: RideSpec, states: State) -> Float[Array, "watched lanes"]:
-    dynamics = spec.ride.scene.dynamics
+    dynamics = spec.scene.dynamics
     quantities = (dynamics.contact(states), dynamics.geometry(states).cosine, dynamics.rank(states))
     return jnp.stack(jnp.broadcast_arrays(*quantities))
 

@@ -95,7 +95,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         K is the Gaussian curvature (`stroller.md`, section 9). The model holds if the wheelbase is short compared with
         the radii of curvature.
         """
-        scene = self.spec.ride.scene
+        scene = self.spec.scene
         states = self.state.T
         curvature = scene.surface.gaussian_curvature(scene.dynamics.unpack(states)[0])
         return jnp.abs(spread(curvature, states[0])) * scene.body.wheelbase**2 / 6.0
@@ -107,7 +107,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
     @property
     def loaded_axles(self) -> tuple[str, ...]:
         """The axles that carry a load: only the rear one if the centre of mass is above it (`centre` 0)."""
-        return ("rear",) if self.spec.ride.scene.body.centre is None else ("rear", "front")
+        return ("rear",) if self.spec.scene.body.centre is None else ("rear", "front")
 
     def grip_margin(self, coefficient: Float[Array, ""]) -> Float[Array, "times 2"]:
         """Reserve of side force [N] of each axle before it slips, for a given coefficient of friction [1]."""
@@ -240,7 +240,7 @@ def read_off(
     spec: RideSpec, t: Float[Array, " times"], states: Float[Array, "components times"], stats: Stats
 ) -> Trajectory:
     """The trajectory of the given states at the given times."""
-    state = RideState(spec.ride.scene, spec.ride.input, t, states)
+    state = RideState(spec.scene, spec.input, t, states)
     arrays = {field.name: getattr(state, field.name) for field in dataclasses.fields(Trajectory)[:-3]}
     return Trajectory(**arrays, stats=stats, spec=spec, steps=None)
 

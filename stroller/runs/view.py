@@ -57,7 +57,7 @@ def names_of(runs: list[Any]) -> list[str]:
     """Names of rides, by what differs in their durations, scenes and launches."""
     for run in runs:
         require_one_run(run, "a picture", ", and pass the others as others=")
-    rides = [run.spec.ride for run in runs]
+    rides = [run.spec for run in runs]
     starts = [(f"ride of {float(run.t[-1]):.3g} s",) for run in runs]
     return distinguishing_labels(starts, [ride.scene for ride in rides], [ride.launch for ride in rides])
 
@@ -66,7 +66,7 @@ def grouped(groups: list[list[tuple[int, Any]]], names: list[str]) -> list[Stage
     """A stage for each group of numbered rides on a common ground; `names` are the names of the rides."""
     stages = []
     for group in groups:
-        scene = group[0][1].spec.ride.scene
+        scene = group[0][1].spec.scene
         length = float(scene.body.wheelbase)
         shows = distinguished_by_colour(tuple(show(run, k, names[k]) for k, run in group))
         points = np.concatenate([np.asarray(run.position) for _, run in group])
@@ -130,7 +130,7 @@ class Posture(NamedTuple):
 
 def show(run: Any, number: int, name: str) -> Show:
     """The drawing of one ride, the `number`-th of all."""
-    scene = run.spec.ride.scene
+    scene = run.spec.scene
     length, colour = float(scene.body.wheelbase), COLOURS[number % len(COLOURS)]
     radius, half = RADIUS * length, TRACK * length / 2.0
     times, reader = refined(run, radius)
