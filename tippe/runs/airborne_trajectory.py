@@ -110,11 +110,6 @@ class ArenaTrajectory(HybridTrajectory):
             )
         return "a flight does not end at the arena"
 
-    @classmethod
-    def parts_of(cls, rows: Any, mode: Any, core: int) -> dict[str, Any]:
-        parts = {"states": rows[:14], "cyclic": rows[14:17], "spin_angle": rows[17], "work": rows[18]}
-        return parts | {"distance": rows[19:], "contact": cls.touching(mode)}
-
     @staticmethod
     def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:
         # Also for traced numbers; -1 after the end of a run.
@@ -133,5 +128,7 @@ class StickSlipArenaTrajectory(ArenaTrajectory):
     @staticmethod
     def work_in(piece: Segment) -> float:
         if piece.number == BETWEEN:
-            return float(np.diff(piece.at(np.array([piece.begin, piece.end]))[18])[0])
+            rows = piece.at(np.array([piece.begin, piece.end]))
+            # The last rows are the distance and its rate.
+            return float(np.diff(rows[-3])[0])
         return ArenaTrajectory.work_in(piece)

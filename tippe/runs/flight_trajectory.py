@@ -1,6 +1,5 @@
 """One run through contacts, flights and impacts, with its path."""
 
-import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
@@ -138,13 +137,11 @@ class HybridTrajectory(AbstractTrajectory):
         flight and if both touch."""
         return jnp.stack(approach(self.scene.body, self._ball, self._free).velocity[:2], axis=-1)
 
-    def with_rows(self, times: Float[np.ndarray, " times"], rows: Any, mode: Any) -> "HybridTrajectory":
-        return dataclasses.replace(self, t=times, **self.parts_of(rows, mode, len(self.start)))
-
     @classmethod
     def parts_of(cls, rows: Any, mode: Any, core: int) -> dict[str, Any]:
-        parts = {"states": rows[:8], "cyclic": rows[8:13], "spin_angle": rows[13], "work": rows[14]}
-        return parts | {"distance": rows[15:], "contact": cls.touching(mode)}
+        # The rows end with the distance and its rate.
+        parts = super().parts_of(rows[:-2], mode, core)
+        return parts | {"distance": rows[-2:], "contact": cls.touching(mode)}
 
     @staticmethod
     def work_in(piece: Segment) -> float:

@@ -111,17 +111,17 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         """Kinetic and potential energy [J]."""
 
     @classmethod
-    @abc.abstractmethod
     def parts_of(cls, rows: Float[Any, "rows times"], mode: Any, core: int) -> dict[str, Any]:
         """The fields `by_time` but the times, from output rows.
 
         **Arguments:** `mode`: the indices of the modes at these times, or `None` for a smooth run; `core`: the number of
         components of the state.
         """
+        return {"states": rows[:core], "cyclic": rows[core:-2], "spin_angle": rows[-2], "work": rows[-1]}
 
-    @abc.abstractmethod
     def with_rows(self, times: Float[np.ndarray, " times"], rows: Any, mode: Any) -> Self:
         """The same run at other times, from the output rows there."""
+        return dataclasses.replace(self, t=times, **self.parts_of(rows, mode, len(self.start)))
 
     def resampled(self, times: Float[np.ndarray, " times"]) -> Self:
         """The same run at other times, without checking them."""

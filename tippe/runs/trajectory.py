@@ -101,10 +101,6 @@ class Trajectory(AbstractTrajectory):
         unresolved = isinstance(self.status, str) and self.status == Status.UNRESOLVED.word
         return super().__str__() + (f"\n  unresolved: {why_unbalanced(self)}" if unresolved else "")
 
-    @classmethod
-    def parts_of(cls, rows: Any, mode: Any, core: int) -> dict[str, Any]:
-        return {"states": rows[:core], "cyclic": rows[core:-2], "spin_angle": rows[-2], "work": rows[-1]}
-
     def with_rows(self, times: Float[np.ndarray, " times"], rows: Any, mode: Any) -> "Trajectory":
         parts = {"t": times, **self.parts_of(rows, mode, len(self.start))}
         return dataclasses.replace(self, **dict(zip(parts, on_device(*parts.values()), strict=True)))
