@@ -1,21 +1,26 @@
-"""The parameters of a scene by name, such as `"scene.body.offset"` or `"launch.place[0]"`, and as text with units."""
+"""The parameters of modules by name.
+
+Those of a scene are the numbers in its fields, such as `"scene.body.offset"` or `"launch.place[0]"`; the modules check the
+values that replace them. Those of a user's system are all its numbers, such as `"system.modes[0].drag"`, `"start[1]"`,
+`"start.q[0]"` or `"event.level"`, in a form that can be a constant of a program. `"system.modes[*].drag"` is one number for
+all modes that have it.
+"""
 
 import dataclasses
-import difflib
-import html
-import inspect
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
+from jax.tree_util import DictKey, GetAttrKey, KeyPath, SequenceKey
+from jaxtyping import Array, Float
 
-from .per_run import AbstractHeld, Numbers
+from .per_run import AbstractHeld, Numbers, gathered, spread
+from .text import likely
 
 
 def numbers(root: str, tree: Any, functions: bool = True) -> dict[str, Any]:
@@ -34,12 +39,12 @@ def numbers(root: str, tree: Any, functions: bool = True) -> dict[str, Any]:
     for field in dataclasses.fields(tree):
         name, value = f"{root}.{field.name}", getattr(tree, field.name)
         if isinstance(value, Numbers):
-            values |= dict(zip(_entries(name, value), value.numbers, strict=True))
+            values |= dict(zip(_entries(name, value.shape), value.numbers, strict=True))
         elif isinstance(value, eqx.Module):
             values |= numbers(name, value, functions) if functions or not callable(value) else {}
         elif isinstance(value, tuple):
-            values |= {f"{name}[{k}]": part for k, part in enumerate(value) if _is_number(part)}
-        elif _is_number(value) or (value is None and field.name in getattr(tree, "units", {})):
+            values |= {f"{name}[{k}]": part for k, part in enumerate(value) if is_number(part)}
+        elif is_number(value) or (value is None and field.name in getattr(tree, "units", {})):
             values[name] = value
     return values
 
@@ -54,13 +59,14 @@ def _itself(tree: Any) -> Any:
     return tree.function if isinstance(tree, AbstractHeld) else tree
 
 
-def _entries(name: str, array: Numbers) -> list[str]:
+def _entries(name: str, shape: tuple[int, ...]) -> list[str]:
     """The names of the numbers of an array, such as `knots[2]`."""
-    return [name + "".join(f"[{k}]" for k in index) for index in np.ndindex(array.shape)]
+    return [name + "".join(f"[{k}]" for k in index) for index in np.ndindex(shape)]
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, jax.Array | np.ndarray | float)
+def is_number(leaf: Any) -> bool:
+    """Whether a leaf of a tree is a number or an array of numbers, which may differ from cell to cell."""
+    return eqx.is_array(leaf) or isinstance(leaf, np.ndarray | np.inexact | float)
 
 
 def with_numbers(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
@@ -172,28 +178,6 @@ def _unknown_axis(name: str, known: list[str]) -> ValueError:
     )
 
 
-def likely(name: Any, known: Iterable[str]) -> str:
-    """The known name that resembles an unknown one, as an addition to a message; empty if there is none."""
-    names = list(known)
-    anagrams = [candidate for candidate in names if sorted(candidate) == sorted(str(name))]
-    matches = anagrams or difflib.get_close_matches(str(name), names, 1)
-    return f"; did you mean {matches[0]!r}?" if matches else ""
-
-
-def likely_fix(value: Any, wanted: str = "") -> str:
-    """A hint for a function or a class instead of its result, a body instead of a scene, or a scene instead of a body.
-
-    **Arguments:** `wanted`: name of the class that the value should have.
-    """
-    if inspect.isclass(value):
-        return f"; did you mean {value.__name__}(...)?"
-    if isinstance(value, eqx.Module) and hasattr(value, "body"):
-        return "; the body of this scene is its .body"
-    if wanted == "Scene" and isinstance(value, eqx.Module) and hasattr(value, "mass"):
-        return "; put this body into one, as in Scene(body)"
-    return f"; did you mean {value.__name__}()?" if inspect.isfunction(value) else ""
-
-
 def _replaced(name: str, tree: Any, values: dict[str, Any]) -> Any:
     if isinstance(tree, AbstractHeld):
         return type(tree)(_replaced(name, tree.function, values))
@@ -203,7 +187,7 @@ def _replaced(name: str, tree: Any, values: dict[str, Any]) -> Any:
         if path_of_field in values:
             changes[field.name] = values[path_of_field]
         elif isinstance(value, Numbers):
-            entries = zip(_entries(path_of_field, value), value.numbers, strict=True)
+            entries = zip(_entries(path_of_field, value.shape), value.numbers, strict=True)
             changes[field.name] = Numbers(tuple(values.get(entry, part) for entry, part in entries), value.shape)
         elif isinstance(value, tuple):
             parts = tuple(values.get(f"{path_of_field}[{k}]", part) for k, part in enumerate(value))
@@ -236,169 +220,166 @@ def description(root: str, tree: Any) -> dict[str, Any]:
     return fields
 
 
-#: Value of each unit in the SI unit of the same dimension, which a file may have and a picture may show.
-UNITS = {
-    "s": {"s": 1.0, "ms": 1e-3, "min": 60.0},
-    "rad": {"rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi},
-    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0, "rev/s": 2.0 * math.pi},
-    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
-    "m/s": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1.0 / 3.6},
-    "1": {"1": 1.0, "%": 1e-2},
-}
+@dataclasses.dataclass(frozen=True)
+class TreeForm:
+    """A tree without its numbers, which are listed one by one, in order within each array.
 
-#: How many numbers of an array are shown; longer arrays show the first and the last ones.
-SHOWN = 4
-
-#: A message shows lists of up to this many values in full.
-MOST_PARTS = 8
-
-_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
-def readable_unit(unit: str) -> str:
-    """A unit in common notation, "kg m²/s" for "kg m2 s-1"; an empty string for "1"."""
-    numerator, denominator = [], []
-    for part in unit.split():
-        match = re.fullmatch(r"([A-Za-z]+)(-?\d+)?", part)
-        if match is None and "/" in part:
-            # A unit in common notation.
-            numerator.append(part)
-        elif match is not None:
-            name, power = match[1], int(match[2] or 1)
-            (numerator if power > 0 else denominator).append(name + (str(abs(power)) if abs(power) > 1 else ""))
-    text = " ".join(numerator) or ("1" if denominator else "")
-    if denominator:
-        text += "/" + (denominator[0] if len(denominator) == 1 else f"({' '.join(denominator)})")
-    return re.sub(r"(?<=[A-Za-z])\d+", lambda power: power[0].translate(_SUPERSCRIPTS), text)
-
-
-def in_unit(si: str, unit: str | Sequence[str]) -> tuple[str, float]:
-    """The unit in which to show a number in the SI unit `si`, and the factor that converts the number.
-
-    **Arguments:** `unit`: one of `UNITS`, such as "deg", or several for numbers of different dimensions; "deg", "rev", "cm"
-    and so on also convert rates, to deg/s and so on, unless a unit of the rate is named.
+    - `structure`: structure of the tree of numbers; `kinds`: shape and type of each leaf.
+    - `static_leaves`, `static_structure`: the leaves that are not numbers.
     """
-    readable, names = readable_unit(si), [unit] if isinstance(unit, str) else [*unit]
-    for name in [*names, *(f"{name}/s" for name in names)]:
-        # A number without a unit is no percentage unless its unit says so.
-        if readable and name in UNITS.get(readable, {}):
-            return name, 1.0 / UNITS[readable][name]
-    return si, 1.0
+
+    structure: Any
+    kinds: tuple[tuple[tuple[int, ...], Any], ...]
+    static_leaves: tuple[Hashable, ...]
+    static_structure: Any
+
+    @classmethod
+    def of(cls, tree: Any) -> tuple["TreeForm", tuple[Array, ...]]:
+        """The form of a tree, and its numbers."""
+        numbers, static = eqx.partition(tree, is_number)
+        leaves, structure = jax.tree.flatten(numbers)
+        arrays = [jnp.asarray(leaf) for leaf in leaves]
+        static_leaves, static_structure = jax.tree.flatten(static)
+        kinds = tuple((array.shape, array.dtype) for array in arrays)
+        return cls(structure, kinds, tuple(static_leaves), static_structure), spread(arrays)
+
+    def tree(self, numbers: Sequence[Array]) -> Any:
+        """The tree with the given numbers, each a scalar."""
+        leaves = gathered(numbers, [shape for shape, _ in self.kinds])
+        static = jax.tree.unflatten(self.static_structure, self.static_leaves)
+        return eqx.combine(jax.tree.unflatten(self.structure, leaves), static)
+
+    @property
+    def types(self) -> tuple[jax.ShapeDtypeStruct, ...]:
+        """The types of the numbers."""
+        return tuple(jax.ShapeDtypeStruct((), kind) for shape, kind in self.kinds for _ in range(math.prod(shape)))
 
 
-def require_unit(unit: Any) -> None:
-    """Raise `ValueError` unless this is `None`, a unit that pictures can show, or a list of such units."""
-    known = [name for readable, names in UNITS.items() if readable != "1" for name in names]
-    names = [unit] if isinstance(unit, str) else unit
-    if unit is not None and not (isinstance(names, list | tuple) and all(name in known for name in names)):
-        hint = likely(unit, known) if isinstance(unit, str) else ""
-        raise ValueError(f"unit = {shown(unit)} must be one of {', '.join(known)}, or a list of them{hint}")
+class Parameters(eqx.Module):
+    """The numbers of a tree of a user's modules, one by one, by name.
 
-
-def as_text(value: Any, unit: str | None = "1") -> str:
-    """A value as text: a number to six digits with its unit, or the first and last numbers of an array. Without a unit,
-    the numbers of a module have no units either."""
-    value = value.array if isinstance(value, Numbers) else value
-    if isinstance(value, eqx.Module):
-        return repr(value) if unit is not None else one_line(value, with_units=False)
-    unit = unit or "1"
-    if isinstance(value, Tracer):
-        return f"traced {value.aval.str_short()}"
-    suffix = readable_unit(unit)
-    suffix = f" {suffix}" if suffix else ""
-    if isinstance(value, tuple):
-        return f"({', '.join(as_text(part) for part in value)}){suffix}"
-    if isinstance(value, jax.Array | np.ndarray | float) and np.asarray(value).dtype.kind in "fiu":
-        numbers = np.asarray(value)
-        values = numbers.ravel()
-        if values.size <= SHOWN:
-            text = ", ".join(f"{number:.6g}" for number in values)
-        else:
-            text = f"{values[0]:.6g}, {values[1]:.6g}, ..., {values[-1]:.6g}, {values.size} numbers"
-        return (text if numbers.ndim == 0 else f"[{text}]") + suffix
-    # A function within a function, such as a lambda, goes by its own name.
-    name = getattr(value, "__qualname__", None)
-    return repr(value) if name is None else name.rpartition("<locals>.")[2]
-
-
-def shown(value: Any) -> str:
-    """The value for a message, as a user would write it: plain numbers in place of arrays, also within lists."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{shown(name)}: {shown(part)}" for name, part in value.items()) + "}"
-    if isinstance(value, list) or (isinstance(value, tuple) and not hasattr(value, "_fields")):
-        parts = [shown(part) for part in value]
-        if len(parts) > MOST_PARTS:
-            parts = [*parts[:2], "...", parts[-1], f"{len(parts)} in all"]
-        opening, closing = "[]" if isinstance(value, list) else ("(", ",)" if len(parts) == 1 else ")")
-        return f"{opening}{', '.join(parts)}{closing}"
-    if isinstance(value, jax.Array | np.ndarray | np.generic) and not isinstance(value, Tracer):
-        array = np.asarray(value)
-        return as_text(array) if array.ndim and array.dtype.kind in "fiu" else shown(array.tolist())
-    return as_text(value) if isinstance(value, jax.Array | np.ndarray | eqx.Module) or callable(value) else repr(value)
-
-
-def contents(module: Any, with_units: bool = True) -> list[tuple[str, str]]:
-    """The fields of a module as (name, value as text); omitted fields are left out."""
-    fields = [(field.name, getattr(module, field.name, None)) for field in dataclasses.fields(module)]
-    units = getattr(module, "units", {})
-    fields = [(name, value, units.get(name, "1") if with_units else None) for name, value in fields]
-    return [(name, as_text(value, unit)) for name, value, unit in fields if value is not None]
-
-
-def one_line(module: Any, with_units: bool = True) -> str:
-    """A module in one line: `Plane(tilt=0.05 rad)`."""
-    return f"{type(module).__name__}({', '.join(f'{name}={text}' for name, text in contents(module, with_units))})"
-
-
-def in_lines(title: str, rows: list[tuple[str, str]]) -> str:
-    """A title, followed by one line per row."""
-    width = max((len(name) for name, _ in rows), default=0)
-    return "\n".join([title, *(f"  {name:{width}}  {text}" for name, text in rows)])
-
-
-def distinguishing_labels(starts: list[tuple[str, ...]], *groups: list[Any]) -> list[str]:
-    """Labels that distinguish runs, by what differs between them only.
-
-    **Arguments:** `starts`: for each run, the same number of texts, such as its angle and its spin; `groups`: modules of
-    one role, such as the scenes, one per run.
-
-    **Returns:** the labels. If nothing differs, a label is the whole start; equal labels are numbered.
+    - `values`: the numbers, scalars or arrays with one number per cell; `names`: their names, in the same order.
+    - `form`: the rest of the tree.
     """
-    differing = [k for k, texts in enumerate(zip(*starts, strict=True)) if len(set(texts)) > 1]
-    parts = [[start[k] for k in differing] for start in starts]
-    for group in groups:
-        parts = [part + difference for part, difference in zip(parts, differences(group), strict=True)]
-    names = [", ".join(part or start) for part, start in zip(parts, starts, strict=True)]
-    return [
-        name if names.count(name) == 1 else f"{name} ({names[: k + 1].count(name)})" for k, name in enumerate(names)
-    ]
+
+    values: tuple[Float[Array, "..."], ...]
+    names: tuple[str, ...] = eqx.field(static=True)
+    form: TreeForm = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, tree: dict[str, Any]) -> "Parameters":
+        """The numbers of several named trees."""
+        form, values = TreeForm.of(tree)
+        leaves, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(tree, is_number))
+        names = [entry for path, leaf in leaves for entry in _entries(_name(path), np.shape(leaf))]
+        return cls(values, tuple(names), form)
+
+    @property
+    def tree(self) -> dict[str, Any]:
+        """The trees, for values that are scalars."""
+        return self.form.tree(self.values)
+
+    def replaced(self, changes: dict[str, Any]) -> "Parameters":
+        """The parameters with replacements, by name; a name such as `"system.modes[*].drag"` replaces several."""
+        values = tuple(
+            changes.get(name, changes.get(_of_all_modes(name), value))
+            for name, value in zip(self.names, self.values, strict=True)
+        )
+        return dataclasses.replace(self, values=values)
+
+    def value(self, name: str) -> Array:
+        """The value of a parameter; of the first of several."""
+        return next(
+            value for own, value in zip(self.names, self.values, strict=True) if name in (own, _of_all_modes(own))
+        )
+
+    @property
+    def movable(self) -> list[str]:
+        """The names of the numbers that are floats, which can be varied."""
+        return [name for name, value in zip(self.names, self.values, strict=True) if eqx.is_inexact_array(value)]
+
+    @property
+    def known(self) -> list[str]:
+        """The names of the numbers that can be varied, one by one or in all modes that have them."""
+        merged_names = [_of_all_modes(name) for name in self.movable]
+        return [*self.movable, *dict.fromkeys(name for name in merged_names if merged_names.count(name) > 1)]
+
+    def full_name(self, argument: str, name: str) -> str:
+        """The full name for a name, as in `nonholonomic.parameters.full_name`.
+
+        **Raises:** `ValueError` for an unknown or ambiguous name, with a hint for an attribute that is no float.
+        """
+        try:
+            return full_name(argument, name, self.known)
+        except ValueError as error:
+            raise ValueError(f"{error}{self._undeclared(name)}") from None
+
+    def _undeclared(self, name: str) -> str:
+        """A hint for the name of an attribute that is an integer, or that has no type in its class."""
+        end = name.rsplit(".", 1)[-1]
+        for module in _modules(self.tree):
+            value = getattr(module, end, None)
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                if end in {field.name for field in dataclasses.fields(module)}:
+                    return f"; {end} = {value} is an integer: write {float(value)}" if isinstance(value, int) else ""
+                return f"; declare it with its type in {type(module).__name__}: {end}: float = {float(value)}"
+        return ""
 
 
-def differences(modules: list[Any]) -> list[list[str]]:
-    """What distinguishes each module from the others, as text: its kind, or some of its parameters."""
-    if len({type(module) for module in modules}) > 1:
-        return [[type(module).__name__] for module in modules]
-    labels: list[list[str]] = [[] for _ in modules]
-    for field in dataclasses.fields(modules[0]):
-        values = [getattr(module, field.name) for module in modules]
-        if all(isinstance(value, eqx.Module) for value in values):
-            parts = differences(values)
+def _name(path: KeyPath) -> str:
+    """A path in the user's notation."""
+    parts = []
+    for key in path:
+        if isinstance(key, SequenceKey):
+            parts.append(f"[{key.idx}]")
+        elif isinstance(key, DictKey | GetAttrKey):
+            parts.append(f".{key.key if isinstance(key, DictKey) else key.name}")
         else:
-            unit = getattr(modules[0], "units", {}).get(field.name, "1")
-            texts = [as_text(value, unit) for value in values]
-            parts = [[f"{field.name} {text}"] if len(set(texts)) > 1 else [] for text in texts]
-        labels = [label + part for label, part in zip(labels, parts, strict=True)]
-    return labels
+            parts.append(str(key))
+    return "".join(parts).removeprefix(".")
 
 
-def as_html(title: str, rows: list[tuple[str, ...]]) -> str:
-    """A title and a table of rows, as HTML for a notebook."""
-    style = "text-align: left; vertical-align: top"
-    cells = ("".join(f'<td style="{style}">{html.escape(text)}</td>' for text in row) for row in rows)
-    return f"<div><b>{html.escape(title)}</b><table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table></div>"
+def _of_all_modes(name: str) -> str:
+    """The name of a number for all modes that have it."""
+    return re.sub(r"\bmodes\[\d+\]", "modes[*]", name)
 
 
-def text_as_html(text: str) -> str:
-    """A text whose first line is a title, as HTML for a notebook."""
-    title, _, body = text.partition("\n")
-    return f"<div><b>{html.escape(title)}</b><pre>{html.escape(body)}</pre></div>"
+def require_apart(argument: str, names: Iterable[str]) -> None:
+    """Raise `ValueError` if a number is named both alone and for all modes."""
+    for name in names:
+        if name != _of_all_modes(name) in names:
+            raise ValueError(f"{argument}: {name!r} is named twice, alone and for all modes")
+
+
+def short_names(names: list[str]) -> dict[str, str]:
+    """For each full name, the part after its last dot, in the form `start_0`; if several names end alike, the whole
+    name."""
+    ends = [_plain(name.rsplit(".", 1)[-1]) for name in names]
+    return {name: end if ends.count(end) == 1 else _plain(name) for name, end in zip(names, ends, strict=True)}
+
+
+def _plain(name: str) -> str:
+    return name.replace("[*]", "").replace("[", "_").replace("]", "").replace(".", "_")
+
+
+def has_checks(tree: Any) -> bool:
+    """Whether a user's module checks its numbers, so that every value of an axis must be checked."""
+    kinds = {kind for module in _modules(tree) for kind in type(module).__mro__ if "__check_init__" in vars(kind)}
+    return any(not kind.__module__.startswith("nonholonomic.") for kind in kinds)
+
+
+def check_again(tree: Any) -> None:
+    """Check the numbers of all modules of a tree, as when they are created."""
+    for module in _modules(tree):
+        for kind in type(module).__mro__:
+            if "__check_init__" in vars(kind):
+                vars(kind)["__check_init__"](module)
+
+
+def _modules(tree: Any) -> Iterator[eqx.Module]:
+    inner = jax.tree.leaves(tree, is_leaf=lambda node: isinstance(node, eqx.Module) and node is not tree)
+    if isinstance(tree, eqx.Module):
+        yield tree
+    for node in inner:
+        if isinstance(node, eqx.Module) and node is not tree:
+            yield from _modules(node)

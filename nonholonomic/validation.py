@@ -23,8 +23,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from .parameters import as_html, contents, in_lines, likely_fix, one_line, shown
 from .per_run import is_users
+from .text import as_html, contents, in_lines, likely_fix, one_line, shown
 
 #: Addition to the message about an angle that may be in degrees.
 IN_DEGREES = "; angles are in radians: did you mean np.radians({})?"

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..parameters import UNITS, likely
+from ..text import UNITS, likely
 from ..validation import as_path, require, shown
 from .recording import Quantities
 

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..parameters import numbers, one_line, with_numbers
+from ..parameters import numbers, with_numbers
+from ..text import one_line
 from ..validation import as_number, as_number_or_none, require, shown, warn
 from ..xla_cpu import greatest
 from .likelihood import Measurements

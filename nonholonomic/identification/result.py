@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..parameters import full_name, text_as_html
+from ..parameters import full_name
 from ..progress import status_line
+from ..text import text_as_html
 from ..validation import require_package, shown
 from ..views import draw_fit
 from .curve import fine_predictions

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..parameters import readable_unit
 from ..progress import status_line
+from ..text import readable_unit
 from ..validation import require_flag, require_package, require_whole, shown
 from .exploration import ROWS, Explorer
 from .marginal import draw_errors

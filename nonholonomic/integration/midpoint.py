@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..geometry import inverse
-from ..parameters import one_line
+from ..text import one_line
 from ..validation import as_known, require
 
 #: Number of simplified Newton iterations; each reduces the error by a factor of the order of (step times rate of

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from ..identification import AbstractRecording, Measurements, Quantities, as_quantity, model_times
 from ..integration import Settings
-from ..parameters import likely
+from ..text import likely
 from ..validation import as_number, as_number_or_none, require, shown
 from .event_time import time_of_event
 from .model import AbstractModel, model_of, require_event

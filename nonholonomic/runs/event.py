@@ -20,11 +20,11 @@ from ..integration import AbstractProblem, Lanes, States
 from ..integration.status import CROSSED, RUNNING
 from ..lanes.components import over_lanes
 from ..lanes.tracing import depends_on_first, is_elementary, spelled_out, with_own_numbers
-from ..parameters import likely
+from ..parameters import Parameters
 from ..per_run import gathered
+from ..text import likely
 from ..validation import UNTRACEABLE, shown
 from .model import AbstractModel, Names, Start
-from .parameters import Parameters
 
 
 class Motion:

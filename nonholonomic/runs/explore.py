@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 
 from ..integration import AbstractProblem, Settings
 from ..integration.checks import run_bounds
-from ..parameters import readable_unit
 from ..progress import status_line
+from ..text import readable_unit
 from ..validation import require_all, require_file, shown
 from ..views import Page, Stage
 from ..views.explore import Answer, Frame, HybridSimulator, LiveRun, Simulator, Slider, Summary, live_page

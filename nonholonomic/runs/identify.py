@@ -24,11 +24,11 @@ from ..identification import (
 from ..integration import Settings
 from ..integration.checks import tolerance_bound
 from ..integration.settings import MOST_STEPS
+from ..parameters import require_apart
 from ..progress import status_line
 from ..validation import nan_unless
 from .data import EventTimes, Recording, predicted_columns, predicted_time
 from .model import AbstractModel, check_run
-from .parameters import require_apart
 
 
 class Source(eqx.Module):

@@ -12,8 +12,8 @@ from .. import sweeps
 from ..integration import Settings, explicit_tableau
 from ..integration.checks import require_times
 from ..integration.settings import DEFAULT_MAX_STEPS
-from ..parameters import likely
 from ..sweeps import Axis, Quantity, Table, Variable, axis, cells_to_check, chunk_for, scattered_cells, size_of
+from ..text import likely
 from ..validation import as_number, require_flag, require_outside, require_whole, shown
 from .model import AbstractModel, check_run, model_of, require_event
 from .samples import Samples

@@ -13,8 +13,8 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from ..hybrid import hybrid_resets
 from ..integration import Settings
 from ..integration.status import Status
-from ..parameters import as_text, distinguishing_labels
 from ..sweeps import Table, Tabular
+from ..text import as_text, distinguishing_labels
 from ..validation import is_traced, require, require_increasing
 from ..views import Page, Stage, Viewable, new_figure
 from .explore import explore_model

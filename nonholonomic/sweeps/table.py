@@ -9,7 +9,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from ..parameters import as_html, in_unit, readable_unit, require_unit
+from ..text import as_html, in_unit, readable_unit, require_unit
 from ..validation import as_path, require_package, shown
 from ..views import draw_table
 from ._chunks import unfinished

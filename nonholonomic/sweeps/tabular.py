@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
-from ..parameters import likely, readable_unit, require_unit, shown, text_as_html
 from ..progress import status_line
+from ..text import likely, readable_unit, require_unit, shown, text_as_html
 from ..validation import require_package
 from ..views import draw_portrait, draw_series, require_others
 from ._file import table_path

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..lanes.tracing import depends_on_first, is_elementary, spelled_out
-from ..runs.parameters import TreeForm
+from ..parameters import TreeForm
 from ..validation import UNTRACEABLE, shown
 from .mode import Hybrid, State
 

@@ -15,9 +15,9 @@ from ..hybrid import HybridOutcome
 from ..integration import AbstractProblem, Outcome
 from ..integration.status import Status
 from ..lanes.tracing import dependent_outputs, with_own_numbers
+from ..parameters import Parameters, check_again, has_checks, require_apart, short_names
 from ..runs.lyapunov import direction_of_start
 from ..runs.model import AbstractModel, Names, Start, model_of, statuses
-from ..runs.parameters import Parameters, check_again, has_checks, require_apart, short_names
 from ..runs.simulate import simulate_model
 from ..runs.trajectory import Trajectory
 from ..sweeps import Axis, Quantity, Variable

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..parameters import in_unit
+from ..text import in_unit
 from .arena import FINE
 from .page import ANGLE, centre_and_extent, view_from
 from .plot import new_figure

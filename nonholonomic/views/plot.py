@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..parameters import likely, readable_unit
+from ..text import likely, readable_unit
 from ..validation import require, shown
 
 #: Colours of map cells without a finite value, one for each status.

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from nonholonomic.parameters import readable_unit
+from nonholonomic.text import readable_unit
 
 from ..runs.trajectory import Trajectory
 from ..runs.verbs import simulate

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nonholonomic.parameters import likely
 from nonholonomic.progress import Progress, status_line
+from nonholonomic.text import likely
 from nonholonomic.validation import require, require_flag, require_kind, require_package, require_whole, shown
 
 from ..model.dynamics import Dynamics

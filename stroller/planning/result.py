@@ -5,8 +5,8 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from nonholonomic.parameters import readable_unit
 from nonholonomic.progress import status_line
+from nonholonomic.text import readable_unit
 from nonholonomic.validation import require_file, require_package
 from nonholonomic.views import Page, page
 

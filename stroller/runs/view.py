@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nonholonomic.geometry import AbstractSurface, vector_of
-from nonholonomic.parameters import distinguishing_labels
+from nonholonomic.text import distinguishing_labels
 from nonholonomic.validation import require_one_run
 from nonholonomic.views import (
     COLOURS,

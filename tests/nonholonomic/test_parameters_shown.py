@@ -7,15 +7,7 @@ import pytest
 
 import stroller
 import tippe
-from nonholonomic.parameters import (
-    as_html,
-    as_text,
-    distinguishing_labels,
-    in_lines,
-    in_unit,
-    readable_unit,
-    text_as_html,
-)
+from nonholonomic.text import as_html, as_text, distinguishing_labels, in_lines, in_unit, readable_unit, text_as_html
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.identification import Measurements
-from nonholonomic.parameters import numbers, one_line, with_numbers
+from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.runs import AbstractEventTimes, TableForm
+from nonholonomic.text import one_line
 from nonholonomic.validation import as_number, as_number_or_none, require, require_kind, shown
 
 from ..model.launch import Launch, as_launch

@@ -3,7 +3,7 @@
 from typing import Any
 
 from nonholonomic.geometry import AbstractSurface, Plane
-from nonholonomic.parameters import likely_fix
+from nonholonomic.text import likely_fix
 from nonholonomic.validation import require_kind, shown
 
 from .body import AbstractBody

@@ -11,8 +11,9 @@ from jaxtyping import Array, Float, Int
 
 from nonholonomic.integration import crossing_time
 from nonholonomic.integration.status import CROSSED, Status
-from nonholonomic.parameters import numbers, readable_unit
+from nonholonomic.parameters import numbers
 from nonholonomic.runs import TOLERANCE, live_run, page_of, runs_at_ends, sliders_of
+from nonholonomic.text import readable_unit
 from nonholonomic.views import Stage, arena
 from nonholonomic.views.explore import Frame, LiveRun, Summary, quaternion
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import vector_of
-from nonholonomic.parameters import distinguishing_labels
+from nonholonomic.text import distinguishing_labels
 from nonholonomic.validation import require_one_run
 from nonholonomic.views import (
     COLOURS,

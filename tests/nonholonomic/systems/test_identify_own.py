@@ -7,7 +7,7 @@ from close import assert_close
 from own_modes import Ball, Sleigh, Slip, Stick
 
 from nonholonomic import Hybrid, Recording, identify, simulate
-from nonholonomic.runs.parameters import Parameters
+from nonholonomic.parameters import Parameters
 
 
 @pytest.mark.slow

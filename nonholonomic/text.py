@@ -1,0 +1,210 @@
+"""Values of parameters as text, with units, and hints for messages."""
+
+import dataclasses
+import difflib
+import html
+import inspect
+import math
+import re
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from .per_run import Numbers
+
+
+def likely(name: Any, known: Iterable[str]) -> str:
+    """The known name that resembles an unknown one, as an addition to a message; empty if there is none."""
+    names = list(known)
+    anagrams = [candidate for candidate in names if sorted(candidate) == sorted(str(name))]
+    matches = anagrams or difflib.get_close_matches(str(name), names, 1)
+    return f"; did you mean {matches[0]!r}?" if matches else ""
+
+
+def likely_fix(value: Any, wanted: str = "") -> str:
+    """A hint for a function or a class instead of its result, a body instead of a scene, or a scene instead of a body.
+
+    **Arguments:** `wanted`: name of the class that the value should have.
+    """
+    if inspect.isclass(value):
+        return f"; did you mean {value.__name__}(...)?"
+    if isinstance(value, eqx.Module) and hasattr(value, "body"):
+        return "; the body of this scene is its .body"
+    if wanted == "Scene" and isinstance(value, eqx.Module) and hasattr(value, "mass"):
+        return "; put this body into one, as in Scene(body)"
+    return f"; did you mean {value.__name__}()?" if inspect.isfunction(value) else ""
+
+
+#: Value of each unit in the SI unit of the same dimension, which a file may have and a picture may show.
+UNITS = {
+    "s": {"s": 1.0, "ms": 1e-3, "min": 60.0},
+    "rad": {"rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi},
+    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0, "rev/s": 2.0 * math.pi},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    "m/s": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1.0 / 3.6},
+    "1": {"1": 1.0, "%": 1e-2},
+}
+
+
+#: How many numbers of an array are shown; longer arrays show the first and the last ones.
+SHOWN = 4
+
+
+#: A message shows lists of up to this many values in full.
+MOST_PARTS = 8
+
+
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def readable_unit(unit: str) -> str:
+    """A unit in common notation, "kg m²/s" for "kg m2 s-1"; an empty string for "1"."""
+    numerator, denominator = [], []
+    for part in unit.split():
+        match = re.fullmatch(r"([A-Za-z]+)(-?\d+)?", part)
+        if match is None and "/" in part:
+            # A unit in common notation.
+            numerator.append(part)
+        elif match is not None:
+            name, power = match[1], int(match[2] or 1)
+            (numerator if power > 0 else denominator).append(name + (str(abs(power)) if abs(power) > 1 else ""))
+    text = " ".join(numerator) or ("1" if denominator else "")
+    if denominator:
+        text += "/" + (denominator[0] if len(denominator) == 1 else f"({' '.join(denominator)})")
+    return re.sub(r"(?<=[A-Za-z])\d+", lambda power: power[0].translate(_SUPERSCRIPTS), text)
+
+
+def in_unit(si: str, unit: str | Sequence[str]) -> tuple[str, float]:
+    """The unit in which to show a number in the SI unit `si`, and the factor that converts the number.
+
+    **Arguments:** `unit`: one of `UNITS`, such as "deg", or several for numbers of different dimensions; "deg", "rev", "cm"
+    and so on also convert rates, to deg/s and so on, unless a unit of the rate is named.
+    """
+    readable, names = readable_unit(si), [unit] if isinstance(unit, str) else [*unit]
+    for name in [*names, *(f"{name}/s" for name in names)]:
+        # A number without a unit is no percentage unless its unit says so.
+        if readable and name in UNITS.get(readable, {}):
+            return name, 1.0 / UNITS[readable][name]
+    return si, 1.0
+
+
+def require_unit(unit: Any) -> None:
+    """Raise `ValueError` unless this is `None`, a unit that pictures can show, or a list of such units."""
+    known = [name for readable, names in UNITS.items() if readable != "1" for name in names]
+    names = [unit] if isinstance(unit, str) else unit
+    if unit is not None and not (isinstance(names, list | tuple) and all(name in known for name in names)):
+        hint = likely(unit, known) if isinstance(unit, str) else ""
+        raise ValueError(f"unit = {shown(unit)} must be one of {', '.join(known)}, or a list of them{hint}")
+
+
+def as_text(value: Any, unit: str | None = "1") -> str:
+    """A value as text: a number to six digits with its unit, or the first and last numbers of an array. Without a unit,
+    the numbers of a module have no units either."""
+    value = value.array if isinstance(value, Numbers) else value
+    if isinstance(value, eqx.Module):
+        return repr(value) if unit is not None else one_line(value, with_units=False)
+    unit = unit or "1"
+    if isinstance(value, Tracer):
+        return f"traced {value.aval.str_short()}"
+    suffix = readable_unit(unit)
+    suffix = f" {suffix}" if suffix else ""
+    if isinstance(value, tuple):
+        return f"({', '.join(as_text(part) for part in value)}){suffix}"
+    if isinstance(value, jax.Array | np.ndarray | float) and np.asarray(value).dtype.kind in "fiu":
+        numbers = np.asarray(value)
+        values = numbers.ravel()
+        if values.size <= SHOWN:
+            text = ", ".join(f"{number:.6g}" for number in values)
+        else:
+            text = f"{values[0]:.6g}, {values[1]:.6g}, ..., {values[-1]:.6g}, {values.size} numbers"
+        return (text if numbers.ndim == 0 else f"[{text}]") + suffix
+    # A function within a function, such as a lambda, goes by its own name.
+    name = getattr(value, "__qualname__", None)
+    return repr(value) if name is None else name.rpartition("<locals>.")[2]
+
+
+def shown(value: Any) -> str:
+    """The value for a message, as a user would write it: plain numbers in place of arrays, also within lists."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{shown(name)}: {shown(part)}" for name, part in value.items()) + "}"
+    if isinstance(value, list) or (isinstance(value, tuple) and not hasattr(value, "_fields")):
+        parts = [shown(part) for part in value]
+        if len(parts) > MOST_PARTS:
+            parts = [*parts[:2], "...", parts[-1], f"{len(parts)} in all"]
+        opening, closing = "[]" if isinstance(value, list) else ("(", ",)" if len(parts) == 1 else ")")
+        return f"{opening}{', '.join(parts)}{closing}"
+    if isinstance(value, jax.Array | np.ndarray | np.generic) and not isinstance(value, Tracer):
+        array = np.asarray(value)
+        return as_text(array) if array.ndim and array.dtype.kind in "fiu" else shown(array.tolist())
+    return as_text(value) if isinstance(value, jax.Array | np.ndarray | eqx.Module) or callable(value) else repr(value)
+
+
+def contents(module: Any, with_units: bool = True) -> list[tuple[str, str]]:
+    """The fields of a module as (name, value as text); omitted fields are left out."""
+    fields = [(field.name, getattr(module, field.name, None)) for field in dataclasses.fields(module)]
+    units = getattr(module, "units", {})
+    fields = [(name, value, units.get(name, "1") if with_units else None) for name, value in fields]
+    return [(name, as_text(value, unit)) for name, value, unit in fields if value is not None]
+
+
+def one_line(module: Any, with_units: bool = True) -> str:
+    """A module in one line: `Plane(tilt=0.05 rad)`."""
+    return f"{type(module).__name__}({', '.join(f'{name}={text}' for name, text in contents(module, with_units))})"
+
+
+def in_lines(title: str, rows: list[tuple[str, str]]) -> str:
+    """A title, followed by one line per row."""
+    width = max((len(name) for name, _ in rows), default=0)
+    return "\n".join([title, *(f"  {name:{width}}  {text}" for name, text in rows)])
+
+
+def distinguishing_labels(starts: list[tuple[str, ...]], *groups: list[Any]) -> list[str]:
+    """Labels that distinguish runs, by what differs between them only.
+
+    **Arguments:** `starts`: for each run, the same number of texts, such as its angle and its spin; `groups`: modules of
+    one role, such as the scenes, one per run.
+
+    **Returns:** the labels. If nothing differs, a label is the whole start; equal labels are numbered.
+    """
+    differing = [k for k, texts in enumerate(zip(*starts, strict=True)) if len(set(texts)) > 1]
+    parts = [[start[k] for k in differing] for start in starts]
+    for group in groups:
+        parts = [part + difference for part, difference in zip(parts, differences(group), strict=True)]
+    names = [", ".join(part or start) for part, start in zip(parts, starts, strict=True)]
+    return [
+        name if names.count(name) == 1 else f"{name} ({names[: k + 1].count(name)})" for k, name in enumerate(names)
+    ]
+
+
+def differences(modules: list[Any]) -> list[list[str]]:
+    """What distinguishes each module from the others, as text: its kind, or some of its parameters."""
+    if len({type(module) for module in modules}) > 1:
+        return [[type(module).__name__] for module in modules]
+    labels: list[list[str]] = [[] for _ in modules]
+    for field in dataclasses.fields(modules[0]):
+        values = [getattr(module, field.name) for module in modules]
+        if all(isinstance(value, eqx.Module) for value in values):
+            parts = differences(values)
+        else:
+            unit = getattr(modules[0], "units", {}).get(field.name, "1")
+            texts = [as_text(value, unit) for value in values]
+            parts = [[f"{field.name} {text}"] if len(set(texts)) > 1 else [] for text in texts]
+        labels = [label + part for label, part in zip(labels, parts, strict=True)]
+    return labels
+
+
+def as_html(title: str, rows: list[tuple[str, ...]]) -> str:
+    """A title and a table of rows, as HTML for a notebook."""
+    style = "text-align: left; vertical-align: top"
+    cells = ("".join(f'<td style="{style}">{html.escape(text)}</td>' for text in row) for row in rows)
+    return f"<div><b>{html.escape(title)}</b><table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table></div>"
+
+
+def text_as_html(text: str) -> str:
+    """A text whose first line is a title, as HTML for a notebook."""
+    title, _, body = text.partition("\n")
+    return f"<div><b>{html.escape(title)}</b><pre>{html.escape(body)}</pre></div>"
