@@ -70,6 +70,16 @@ def is_traced(value: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value))
 
 
+def largest(*values: Any) -> float:
+    """The largest magnitude among concrete finite numbers; 0 without any. For `Bounded.suspicion`."""
+    arrays = [
+        np.abs(np.asarray(part))
+        for part in jax.tree.leaves(values)
+        if isinstance(part, jax.Array) and not is_traced(part)
+    ]
+    return max((float(np.max(array)) for array in arrays if array.size and np.isfinite(array).all()), default=0.0)
+
+
 def _first(numbers: np.ndarray, holds: np.ndarray) -> str:
     """The first number for which the condition is false."""
     return shown(numbers[~holds].ravel()[0]) if numbers.ndim else shown(numbers)

@@ -35,6 +35,31 @@ SUSPECTED = {
         lambda: stroller.Launch((0.0, 0.0), 0.0, 1.0, steering=[0.1, -30.0]),
         "steering = 30 rad is large; angles are in radians: did you mean np.radians(30)?",
     ),
+    "the heading of a goal in degrees": (
+        lambda: stroller.Goal((3.0, 2.0), heading=90.0),
+        "heading = 90 rad is large; angles are in radians: did you mean np.radians(90)?",
+    ),
+    "a limit of the steering in degrees": (
+        lambda: stroller.Limits(steering=45.0),
+        "steering = 45 rad is large; angles are in radians: did you mean np.radians(45)?",
+    ),
+    "a wheelbase in mm": (
+        lambda: stroller.Stroller(mass=12.0, wheelbase=700.0, inertia=1e7, steering_inertia=0.05),
+        "wheelbase = 700 m is long: was it in mm? 700 mm are 0.7 m",
+    ),
+    "a mass in g": (
+        lambda: tippe.Top.turned(0.021, mass=20.0, cut=0.0155, stem_radius=0.005, stem_length=0.013),
+        "mass = 20 kg in a sphere of radius 0.021 m is denser than any metal: was it in g? 20 g are 0.02 kg",
+    ),
+    "friction in per cent": (
+        lambda: tippe.Coulomb(27.0, 0.05),
+        "mu = 27 is large for a coefficient of friction: was it in %? 27 % are 0.27",
+    ),
+    "exact friction in per cent": (lambda: tippe.SetValuedCoulomb(27.0), "mu = 27 is large for a coefficient"),
+    "a slip speed in mm/s": (
+        lambda: tippe.Contensou(0.3, 1e-3, 50.0),
+        "slip_speed = 50 m/s is large: was it in mm/s? 50 mm/s are 0.05 m/s",
+    ),
     "a density in g/cm^3": (
         lambda: tippe.Top.turned(0.02, 0.7, cut=0.015, stem_radius=0.005, stem_length=0.012),
         "density = 0.7 kg/m^3 is less than that of balsa wood, 100 kg/m^3: was it in g/cm^3? 0.7 g/cm^3 are 700 kg/m^3",

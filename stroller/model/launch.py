@@ -5,12 +5,10 @@ from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
-import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.parameters import as_one
-from nonholonomic.validation import IN_DEGREES, Bound, Bounded, as_number, is_traced, shown
+from nonholonomic.validation import IN_DEGREES, Bound, Bounded, as_number, largest, shown
 
 
 def as_launch(value: Any) -> Any:
@@ -29,6 +27,14 @@ def as_place(value: Any) -> Any:
     except TypeError:
         return value
     return tuple(as_number(number) for number in numbers)
+
+
+def suspected_degrees(module: Bounded) -> str | None:
+    """The suspicion that an angle of a module, of those that have usual values, is in degrees; `None` if none is."""
+    for name, limit in USUAL.items():
+        if (magnitude := largest(getattr(module, name, None))) > limit:
+            return f"{name} = {magnitude:g} rad is large{IN_DEGREES.format(f'{magnitude:g}')}"
+    return None
 
 
 #: Speeds above this [m/s] suggest kilometres per hour.
@@ -82,18 +88,10 @@ class Launch(Bounded):
             raise ValueError(f"place = {shown(self.place)} must be a pair of numbers, or (x, y, z) [m]")
 
     def suspicion(self) -> str | None:
-        if isinstance(self.speed, jax.Array) and not is_traced(self.speed) and self.speed.size:
-            fastest = float(np.max(np.abs(self.speed)))
-            if fastest > FASTEST:
-                return f"speed = {fastest:g} m/s is fast: was it in km/h? {fastest:g} km/h are {fastest / 3.6:.4g} m/s"
-        for name, limit in USUAL.items():
-            value = getattr(self, name)
-            if is_traced(value) or not isinstance(value, jax.Array) or value.size == 0:
-                continue
-            magnitude = float(np.max(np.abs(value)))
-            if magnitude > limit:
-                return f"{name} = {magnitude:g} rad is large{IN_DEGREES.format(f'{magnitude:g}')}"
-        return None
+        fastest = largest(self.speed)
+        if fastest > FASTEST:
+            return f"speed = {fastest:g} m/s is fast: was it in km/h? {fastest:g} km/h are {fastest / 3.6:.4g} m/s"
+        return suspected_degrees(self)
 
     def bounds(self) -> Iterator[Bound]:
         for k, number in enumerate(self.place):

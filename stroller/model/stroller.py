@@ -7,7 +7,10 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import none_if_zero
-from nonholonomic.validation import Bound, Bounded, as_number
+from nonholonomic.validation import Bound, Bounded, as_number, largest
+
+#: A wheelbase above this [m], more than any vehicle's, suggests millimetres or centimetres.
+LONGEST = 20.0
 
 
 class Stroller(Bounded):
@@ -50,6 +53,13 @@ class Stroller(Bounded):
     steering_inertia: Float[Array, "..."] = eqx.field(converter=as_number)
     steering_spring: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)
     centre: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)
+
+    def suspicion(self) -> str | None:
+        longest = largest(self.wheelbase)
+        if longest <= LONGEST:
+            return None
+        unit, metres = ("mm", longest / 1e3) if longest > 10.0 * LONGEST else ("cm", longest / 1e2)
+        return f"wheelbase = {longest:g} m is long: was it in {unit}? {longest:g} {unit} are {metres:g} m"
 
     def bounds(self) -> Iterator[Bound]:
         for name in ("mass", "wheelbase", "inertia", "steering_inertia"):

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from nonholonomic.validation import Bound, Bounded, as_number, as_number_or_none, shown
 
-from ..model.launch import as_place
+from ..model.launch import as_place, suspected_degrees
 
 #: A bound [any unit] that nothing reaches.
 UNLIMITED = 1e9
@@ -55,6 +55,9 @@ class Goal(Bounded):
     def __check_init__(self):
         if not (isinstance(self.place, tuple) and len(self.place) in (2, 3)):
             raise ValueError(f"place = {shown(self.place)} must be a pair of numbers, or (x, y, z) [m]")
+
+    def suspicion(self) -> str | None:
+        return suspected_degrees(self)
 
     def bounds(self) -> Iterator[Bound]:
         for k, number in enumerate(self.place if isinstance(self.place, tuple) else ()):
@@ -120,6 +123,9 @@ class Limits(Bounded):
             value = getattr(self, name)
             if value is not None and not (isinstance(value, tuple) and len(value) == 2):
                 raise ValueError(f"{name} = {shown(value)} must be a bound, such as 1.0, or a pair (low, high)")
+
+    def suspicion(self) -> str | None:
+        return suspected_degrees(self)
 
     def bounds(self) -> Iterator[Bound]:
         for name in self.units:

@@ -5,13 +5,11 @@ from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.parameters import as_one
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require, shown
+from nonholonomic.validation import Bound, Bounded, as_number, largest, require, shown
 
 
 def as_numbers(value: Any) -> Any:
@@ -126,9 +124,7 @@ class Launch(Bounded):
                 raise ValueError(f"{name} = {shown(value)} must be {words}")
 
     def suspicion(self) -> str | None:
-        if is_traced(self.spin) or not isinstance(self.spin, jax.Array) or self.spin.size == 0:
-            return None
-        fastest = float(np.max(np.abs(self.spin)))
+        fastest = largest(self.spin)
         if fastest <= FASTEST:
             return None
         return (

@@ -20,6 +20,8 @@ INERTIAS = {"kg cm^2": 1e-4, "kg mm^2": 1e-6, "g cm^2": 1e-7, "g mm^2": 1e-9}
 
 #: Least density of the material of a turned top that is not suspicious [kg/m^3].
 LEAST_DENSITY = 50.0
+#: A mean density [kg/m^3] above that of osmium.
+GREATEST_DENSITY = 23_000.0
 #: The radius [m] above which another unit is suspected, and the plausible range of I1 / (m R^2).
 GREATEST_RADIUS = 1.0
 RATIOS = (0.1, 2.0)
@@ -223,6 +225,13 @@ class Top(AbstractBody):
         if max_radius > GREATEST_RADIUS:
             unit = "mm" if max_radius > 10.0 else "cm"
             return f"radius = {max_radius:g} m is large for a top: was it in {unit}?"
+        densest = float(np.max(mass / (4.0 / 3.0 * np.pi * radius**3)))
+        if densest > GREATEST_DENSITY:
+            heaviest = float(np.max(mass))
+            return (
+                f"mass = {heaviest:g} kg in a sphere of radius {float(np.min(radius)):g} m is denser than any metal: was it "
+                f"in g? {heaviest:g} g are {heaviest / 1e3:g} kg"
+            )
         ratios = I1 / (mass * radius**2)
         odd_ratios = np.ravel(ratios[(ratios < RATIOS[0]) | (ratios > RATIOS[1])])
         if odd_ratios.size == 0:

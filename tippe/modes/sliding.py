@@ -170,14 +170,22 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
 
 
 class LeaningProblem(InversionProblem):
-    """Sliding on both spheres until theta reaches an angle or one of the contacts ends."""
+    """Sliding on both spheres until theta reaches an angle or one of the contacts ends.
+
+    The stem carries a part of the top, so its first event has happened; the sphere still touches, so, with `last`, that
+    event has not.
+    """
+
+    last: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def event_function(self, state: Float[Array, "components cells"]) -> Cells:
-        return beyond_on_stem(super().event_function(state), jnp.asarray(True), self.stem_counts)
+        return beyond_on_stem(super().event_function(state), jnp.asarray(not self.last), self.stem_counts)
 
 
 class Lean(AbstractFlyingMode):
-    """Sliding on both spheres; numbered after the modes of the single spheres."""
+    """Sliding on both spheres; numbered after the modes of the single spheres. `last`: as for `Slide`."""
+
+    last: bool = eqx.field(static=True)
 
     @property
     def rare(self) -> bool:
@@ -187,7 +195,7 @@ class Lean(AbstractFlyingMode):
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         dynamics: Any = LeaningDynamics.of(self.scene)
         contact = (dynamics, self.cos_angle, state[:OWN], self.scales[:OWN])
-        problem = LeaningProblem(*contact, stem_counts=self.stem_counts)
+        problem = LeaningProblem(*contact, stem_counts=self.stem_counts, last=self.last)
         return self.extended(problem, Quadratures(self.scene.body.I3, of_mass=True), state)
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
@@ -202,7 +210,10 @@ class Lean(AbstractFlyingMode):
         state = jnp.concatenate([state_at_rest, state[OWN:]])
         zero = jnp.zeros_like(state[0])
         running, zeros = jnp.full(zero.shape, RUNNING), jnp.zeros((1, *zero.shape), int)
-        return Transition(number, state, zero, running, jnp.full_like(zero, jnp.inf), zeros)
+        leaves_sphere = jnp.asarray(self.last) & (number == 1)
+        if self.stem_counts is not None:
+            leaves_sphere &= self.stem_counts > 0.0
+        return Transition(number, state, zero, running, jnp.where(leaves_sphere, 0.0, jnp.inf), zeros)
 
 
 def modes(
@@ -223,7 +234,7 @@ def modes(
     slides = tuple(Slide(*arguments, jnp.asarray(number), last, **event) for number in range(len(spheres)))
     if len(spheres) == 1:
         return slides, jnp.zeros(problem.states.shape[1:], int)
-    return (*slides, Lean(*arguments, **event)), _first_mode(scene.body, problem.states)
+    return (*slides, Lean(*arguments, last, **event)), _first_mode(scene.body, problem.states)
 
 
 @compiled_setup
