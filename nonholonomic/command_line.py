@@ -6,6 +6,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterable
 from typing import Any, NoReturn
 
@@ -46,13 +47,16 @@ def run_and_exit(main: Callable[[], int], program: str) -> NoReturn:
     """Run a command line and end the process.
 
     A command line takes seconds, so it compiles quickly. It also switches off garbage collection, which would take up
-    to a fifth of the time because JAX holds many objects.
+    to a fifth of the time because JAX holds many objects. It shows each warning once, as one line.
 
     **Arguments:** as for `interruptible`.
     """
     # Imported here, because this module must load before JAX does.
     from .xla_cpu import compile_quickly
 
+    # A warning is one line, shown once, without lines of our code.
+    warnings.simplefilter("once")
+    warnings.formatwarning = lambda message, *_: f"python -m {program}: warning: {message}\n"
     gc.disable()
     compile_quickly()
     status = interruptible(main, program)

@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from types import FrameType
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -263,12 +264,21 @@ def require_file(path: Any, name: str, *endings: str) -> Path:
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:
     """Warn at the user's line that led here, so that Python shows the warning once for each such line."""
-    frame = sys._getframe(1)
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in NO_CODE_OF_A_USER:
-        frame = frame.f_back
+    frame, _ = _users_line()
     registry = frame.f_globals.setdefault("__warningregistry__", {})
     place = (frame.f_code.co_filename, frame.f_lineno, frame.f_globals.get("__name__"))
     warnings.warn_explicit(message, category, *place, registry)
+
+
+def _users_line() -> tuple[FrameType, bool]:
+    """The innermost frame of a user, and true; or the outermost frame, and false, in a thread that we have started."""
+    frame: FrameType | None = sys._getframe(2)
+    while frame is not None:
+        outermost = frame
+        if frame.f_globals.get("__name__", "").partition(".")[0] not in NO_CODE_OF_A_USER:
+            return frame, True
+        frame = frame.f_back
+    return outermost, False
 
 
 def require_package(name: str, extra: str, purpose: str) -> None:
@@ -331,7 +341,8 @@ class Bounded(eqx.Module):
     def __check_init__(self):
         self._require_one_shape()
         require_all(self.bounds())
-        if (suspicion := self.suspicion()) is not None:
+        # Copies that our threads make of the user's modules repeat no warning.
+        if (suspicion := self.suspicion()) is not None and _users_line()[1]:
             warn(suspicion)
 
     def _require_one_shape(self) -> None:

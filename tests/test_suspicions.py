@@ -4,6 +4,9 @@ import dataclasses
 import functools
 import importlib
 import re
+import subprocess
+import sys
+import threading
 import warnings
 
 import jax
@@ -176,3 +179,20 @@ def test_a_run_that_lost_contact_says_what_flies_on():
     run = dataclasses.replace(run_of_nothing(), status="contact_lost")
     assert "contact_lost at 0 s" in str(run)
     assert "to continue through the flight, use a Scene with contact='hybrid'" in str(run)
+
+
+def test_copies_in_our_threads_repeat_no_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        thread = threading.Thread(target=tippe.Launch, args=(0.1, 1500.0))
+        thread.start()
+        thread.join()
+
+
+def test_a_command_line_shows_a_warning_once_and_as_one_line():
+    program = (
+        "import warnings; from nonholonomic.command_line import run_and_exit; "
+        "run_and_exit(lambda: [warnings.warn(f'too {k % 2}') for k in range(4)] and 0, 'tippe')"
+    )
+    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert process.stderr == "python -m tippe: warning: too 0\npython -m tippe: warning: too 1\n"

@@ -19,7 +19,7 @@ from nonholonomic.command_line import closing_lines, run_and_exit
 from nonholonomic.compilation_cache import are_kept, enable_compilation_cache, kept_files
 from nonholonomic.geometry import Cylinder, Plane
 from nonholonomic.progress import Progress, status_line
-from nonholonomic.sweeps import Table, saved_cells
+from nonholonomic.sweeps import AnotherRun, Table, saved_cells
 from nonholonomic.validation import require_folder
 from nonholonomic.views import NO_VIEW, Page, can_view, page, picture_as_html, table_as_html
 from nonholonomic.views.explore import live_page
@@ -319,6 +319,10 @@ def main(arguments: list[str] | None = None) -> int:
                 picture(options, samples[0], samples[1], end).savefig(drawing, dpi=130)
                 paths.append(drawing)
             path = write_page(options, arenas, live, drawing)
+    except AnotherRun as error:
+        advice = f"name another folder with --out, or remove {options.out}"
+        print(f"python -m tippe: {options.out} holds another run: {error.difference}; {advice}", file=sys.stderr)
+        return 2
     except (ValueError, OSError) as error:
         print(f"python -m tippe: {error}", file=sys.stderr)
         return 2

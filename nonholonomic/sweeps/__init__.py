@@ -17,6 +17,7 @@ interruption. Any executor can compute the chunks, such as that of `local_proces
  [0.346574 1.151293]]
 """
 
+from ._chunks import AnotherRun as AnotherRun
 from ._chunks import saved_cells as saved_cells
 from .grid import Axis as Axis
 from .grid import Variable as Variable

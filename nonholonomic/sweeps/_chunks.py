@@ -27,6 +27,14 @@ def folder_of(path: Path) -> Path:
     return path.with_name(path.name + ".blocks")
 
 
+class AnotherRun(ValueError):
+    """A table's path holds the result of another run; `difference` says which of its numbers differ."""
+
+    def __init__(self, source: Path, difference: str):
+        super().__init__(f"{source} holds the result of another run: {difference}; give another path or remove it")
+        self.difference = difference
+
+
 class ChunkStore:
     """The finished chunks of a table's file.
 
@@ -125,7 +133,7 @@ class ChunkStore:
             difference = f"it was not written by a sweep in {new_layout.chunks} chunks"
         if difference is not None:
             source = self.path if table.path == self.path else self.folder
-            raise ValueError(f"{source} holds the result of another run: {difference}; give another path or remove it")
+            raise AnotherRun(source, difference)
         changed = [name for name in new if name not in ("nonholonomic", "python") and old.get(name) != new[name]]
         if changed and table.path != self.path:
             versions = ", ".join(f"{name} {old.get(name)}, now {new[name]}" for name in changed)

@@ -79,6 +79,11 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys, monkeypatch, rut
     assert "<td>18 deg</td>" in page
     assert "window.live" not in page
     assert "jupyter-threejs-sage is not installed" in page
+    # Other options in the same folder are refused in the words of the command line.
+    assert main([*arguments, "--rpm", "1500"]) == 2
+    printed = capsys.readouterr().err
+    assert f"{tmp_path} holds another run: " in printed
+    assert printed.rstrip().endswith(f"name another folder with --out, or remove {tmp_path}")
 
 
 @pytest.mark.slow
