@@ -118,10 +118,10 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         """The greatest friction coefficient that each axle needs, and the axle that slips if tyres cannot provide
         it."""
         grip_needed = dict(zip(self.loaded_axles, np.max(np.asarray(self.grip()), axis=0), strict=False))
-        text = ", ".join(f"{name} axle {grip:.3g}" for name, grip in grip_needed.items())
+        text = " and ".join(f"{grip:.3g} under the {name} axle" for name, grip in grip_needed.items())
         slips = " and ".join(name for name, grip in grip_needed.items() if grip > MOST_GRIP)
         remark = f": the {slips} wheels would slip, because tyres provide at most {MOST_GRIP:g}" if slips else ""
-        return f"needed friction up to {text}{remark}"
+        return f"needs a friction coefficient of {text}{remark}"
 
     def at(self, times: Float[ArrayLike, " times"]) -> "Trajectory":
         """The same ride at other times, as accurate as the integration.
