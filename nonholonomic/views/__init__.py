@@ -30,6 +30,7 @@ from .stage import Mesh as Mesh
 from .stage import Show as Show
 from .stage import Stage as Stage
 from .stage import Trace as Trace
+from .stage import css as css
 from .stage import distinguished_by_colour as distinguished_by_colour
 from .stage import turned as turned
 from .viewable import Viewable as Viewable

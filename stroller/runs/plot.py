@@ -5,11 +5,9 @@ from typing import Any
 import numpy as np
 
 from nonholonomic.geometry import AbstractQuadric, AbstractSurface
+from nonholonomic.views import COLOURS, css
 
 from .trajectory import Trajectory
-
-#: One colour for each ride of a ground: without and with friction.
-COLOURS = ("tab:blue", "tab:red")
 
 
 def draw_rides(grounds: dict[str, AbstractSurface], rides: dict[tuple[str, str], Trajectory]) -> Any:
@@ -31,7 +29,7 @@ def draw_rides(grounds: dict[str, AbstractSurface], rides: dict[tuple[str, str],
         space = figure.add_subplot(layout[row, 0], projection="3d")
         _draw_ground(space, ground, on_ground)
         panels = [figure.add_subplot(layout[row, column]) for column in (1, 2, 3)]
-        for colour, (ride, run) in zip(COLOURS, on_ground.items(), strict=False):
+        for colour, (ride, run) in zip(map(css, COLOURS), on_ground.items(), strict=False):
             space.plot(*np.asarray(run.position).T, color=colour, linewidth=1.4, label=ride)
             panels[0].plot(run.t, run.speed, color=colour)
             panels[1].plot(run.t, run.energy, color=colour)

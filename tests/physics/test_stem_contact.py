@@ -49,6 +49,10 @@ def test_the_stem_carries_the_top_from_its_first_contact(run):
     assert run.status == "completed"
     assert_close(run.stem_time, 3.01687, atol=1e-5)
     assert run.inversion_time == run.stem_time
+    assert "turned over: the stem first carries it at 3.01687 s\n" in str(run)
+    falls_back = run.t[(run.t > run.stem_time) & (run.contact == 0)][-1]
+    fallen = run.at([0.0, falls_back])
+    assert "carries it at 3.01687 s, and at the end its sphere touches again\n" in str(fallen)
     assert_close(run.at([run.stem_time]).theta[0], first_contact(run.scene.body), atol=1e-8)
     scan = run.at(np.linspace(run.stem_time - 1e-3, run.stem_time + 1e-3, 2001))
     on_stem = (np.asarray(scan.contact) == 1) & (np.asarray(scan.normal_force) > 0.0)

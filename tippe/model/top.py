@@ -225,19 +225,18 @@ class Top(AbstractBody):
         if max_radius > GREATEST_RADIUS:
             unit = "mm" if max_radius > 10.0 else "cm"
             return f"radius = {max_radius:g} m is large for a top: was it in {unit}?"
-        densest = float(np.max(mass / (4.0 / 3.0 * np.pi * radius**3)))
-        if densest > GREATEST_DENSITY:
-            heaviest = float(np.max(mass))
-            return (
-                f"mass = {heaviest:g} kg in a sphere of radius {float(np.min(radius)):g} m is denser than any metal: was it "
-                f"in g? {heaviest:g} g are {heaviest / 1e3:g} kg"
-            )
         ratios = I1 / (mass * radius**2)
         odd_ratios = np.ravel(ratios[(ratios < RATIOS[0]) | (ratios > RATIOS[1])])
-        if odd_ratios.size == 0:
+        if odd_ratios.size:
+            ratio = float(odd_ratios[0])
+            mistakes = {f"I1 in {unit}": factor for unit, factor in INERTIAS.items()} | {"the mass in g": 1e3}
+            suspects = [mistake for mistake, factor in mistakes.items() if RATIOS[0] <= ratio * factor <= RATIOS[1]]
+            question = f"was {suspects[0]}?" if suspects else "are mass, radius and I1 in kg, m and kg m^2?"
+            return f"I1 = {ratio:.3g} m R^2 is out of the range {RATIOS} of bodies like a top: {question}"
+        if np.all(mass < GREATEST_DENSITY * 4.0 / 3.0 * np.pi * radius**3):
             return None
-        ratio = float(odd_ratios[0])
-        mistakes = {f"I1 in {unit}": factor for unit, factor in INERTIAS.items()} | {"the mass in g": 1e3}
-        suspects = [mistake for mistake, factor in mistakes.items() if RATIOS[0] <= ratio * factor <= RATIOS[1]]
-        question = f"was {suspects[0]}?" if suspects else "are mass, radius and I1 in kg, m and kg m^2?"
-        return f"I1 = {ratio:.3g} m R^2 is out of the range {RATIOS} of bodies like a top: {question}"
+        heaviest, smallest = float(np.max(mass)), float(np.min(radius))
+        return (
+            f"mass = {heaviest:g} kg in a sphere of radius {smallest:g} m is denser than any metal: was it in g? "
+            f"{heaviest:g} g are {heaviest / 1e3:g} kg"
+        )

@@ -154,6 +154,13 @@ class HybridTrajectory(AbstractTrajectory):
         return numbers
 
     @property
+    def _whether_it_turned_over(self) -> str:
+        if not (self.scene.has_stem and np.isfinite(self.stem_time)):
+            return super()._whether_it_turned_over
+        again = ", and at the end its sphere touches again" if np.asarray(self.contact)[-1] in (0, 2) else ""
+        return f"turned over: the stem first carries it at {self.stem_time:.6g} s{again}"
+
+    @property
     def _flights(self) -> int:
         return 0 if self.hops is None else len(self.hops)
 

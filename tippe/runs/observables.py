@@ -308,9 +308,8 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
     def _whether_it_turned_over(self) -> str:
         """Whether and when the top turned over, as text."""
         body, time = self.scene.body, self.inversion_time
-        stem = isinstance(body, Top) and body.stem is not None
         if np.isfinite(time):
-            return f"turned over{' onto its stem' if stem else ''} at {time:.6g} s"
+            return f"turned over at {time:.6g} s"
         reason = ""
         if isinstance(self.scene.friction, Frictionless):
             reason = ": without friction no top turns over"
