@@ -160,7 +160,7 @@ PAGES = {
             "nonholonomic.sweeps",
             *of(
                 "nonholonomic.sweeps",
-                "sweep Axis axis Variable size_of cells_to_check scattered_cells chunk_for saved_cells Quantity chosen "
+                "sweep Axis axis Variable size_of cells_to_check scattered_cells chunk_for saved_cells AnotherRun Quantity chosen "
                 "run_table Tabular",
             ),
             "nonholonomic.identification",

@@ -28,7 +28,10 @@ def folder_of(path: Path) -> Path:
 
 
 class AnotherRun(ValueError):
-    """A table's path holds the result of another run; `difference` says which of its numbers differ."""
+    """A table's path holds the result of another run, which would be overwritten; `difference` says how the runs differ.
+
+    **Example:** `except AnotherRun as error: print(error.difference)`.
+    """
 
     def __init__(self, source: Path, difference: str):
         super().__init__(f"{source} holds the result of another run: {difference}; give another path or remove it")
