@@ -160,8 +160,8 @@ PAGES = {
             "nonholonomic.sweeps",
             *of(
                 "nonholonomic.sweeps",
-                "sweep Axis axis Variable size_of cells_to_check scattered_cells chunk_for saved_cells AnotherRun Quantity chosen "
-                "run_table Tabular",
+                "sweep Axis axis Variable size_of cells_to_check scattered_cells chunk_for saved_cells AnotherRun Quantity "
+                "chosen run_table Tabular",
             ),
             "nonholonomic.identification",
             *of(

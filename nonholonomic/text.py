@@ -162,36 +162,43 @@ def in_lines(title: str, rows: list[tuple[str, str]]) -> str:
     return "\n".join([title, *(f"  {name:{width}}  {text}" for name, text in rows)])
 
 
-def distinguishing_labels(starts: list[tuple[str, ...]], *groups: list[Any]) -> list[str]:
+def distinguishing_labels(
+    starts: list[tuple[str, ...]], *groups: list[Any], unit: str | Sequence[str] = ()
+) -> list[str]:
     """Labels that distinguish runs, by what differs between them only.
 
     **Arguments:** `starts`: for each run, the same number of texts, such as its angle and its spin; `groups`: modules of
-    one role, such as the scenes, one per run.
+    one role, such as the scenes, one per run; `unit`: units for their numbers, as for `in_unit`.
 
     **Returns:** the labels. If nothing differs, a label is the whole start; equal labels are numbered.
     """
     differing = [k for k, texts in enumerate(zip(*starts, strict=True)) if len(set(texts)) > 1]
     parts = [[start[k] for k in differing] for start in starts]
     for group in groups:
-        parts = [part + difference for part, difference in zip(parts, differences(group), strict=True)]
+        parts = [part + difference for part, difference in zip(parts, differences(group, unit), strict=True)]
     names = [", ".join(part or start) for part, start in zip(parts, starts, strict=True)]
     return [
         name if names.count(name) == 1 else f"{name} ({names[: k + 1].count(name)})" for k, name in enumerate(names)
     ]
 
 
-def differences(modules: list[Any]) -> list[list[str]]:
-    """What distinguishes each module from the others, as text: its kind, or some of its parameters."""
+def differences(modules: list[Any], unit: str | Sequence[str] = ()) -> list[list[str]]:
+    """What distinguishes each module from the others, as text: its kind, or some of its parameters.
+
+    **Arguments:** `unit`: units for their numbers, as for `in_unit`.
+    """
     if len({type(module) for module in modules}) > 1:
         return [[type(module).__name__] for module in modules]
     labels: list[list[str]] = [[] for _ in modules]
     for field in dataclasses.fields(modules[0]):
         values = [getattr(module, field.name) for module in modules]
         if all(isinstance(value, eqx.Module) for value in values):
-            parts = differences(values)
+            parts = differences(values, unit)
         else:
-            unit = getattr(modules[0], "units", {}).get(field.name, "1")
-            texts = [as_text(value, unit) for value in values]
+            name, factor = in_unit(getattr(modules[0], "units", {}).get(field.name, "1"), unit)
+            if factor != 1.0:
+                values = [jax.tree.map(lambda number, factor=factor: factor * number, value) for value in values]
+            texts = [as_text(value, name) for value in values]
             parts = [[f"{field.name} {text}"] if len(set(texts)) > 1 else [] for text in texts]
         labels = [label + part for label, part in zip(labels, parts, strict=True)]
     return labels

@@ -184,14 +184,14 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         """A page with sliders that simulates the run in the browser; see `nonholonomic.explore`."""
         return explore_model(self.model, path, sliders, float(self.t1))
 
-    def labels_of(self, runs: list[Any]) -> list[str]:
+    def labels_of(self, runs: list[Any], unit: Any) -> list[str]:
         """Labels that tell runs apart by the numbers of their systems and starts that differ."""
         models = [run.model for run in runs]
         names = models[0].known
         if any(model.known != names for model in models):
-            return Tabular.labels_of(self, runs)
+            return Tabular.labels_of(self, runs, unit)
         numbers = [tuple(f"{name} {as_text(model.value(name))}" for name in names) for model in models]
-        return distinguishing_labels(numbers) if len(set(numbers)) > 1 else Tabular.labels_of(self, runs)
+        return distinguishing_labels(numbers) if len(set(numbers)) > 1 else Tabular.labels_of(self, runs, unit)
 
     def overview(self, runs: list[Any], labels: Sequence[str], unit: Any, ax: Any) -> Any:
         """Draw all components of a run in one picture, or a panel for each component of several runs."""

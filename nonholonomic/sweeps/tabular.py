@@ -161,8 +161,8 @@ class Tabular(abc.ABC):
         """A table over the run's times with at least the named quantities, or with all if one of the names is unknown."""
         return self.to_table()
 
-    def labels_of(self, runs: list[Any]) -> list[str]:
-        """Labels that tell runs of this kind apart; an empty one for a single run."""
+    def labels_of(self, runs: list[Any], unit: str | Sequence[str] | None) -> list[str]:
+        """Labels that tell runs of this kind apart, in units as for `plot`; an empty one for a single run."""
         return [""] if len(runs) == 1 else [f"run {k + 1}" for k in range(len(runs))]
 
     def overview(self, runs: list[Any], labels: Sequence[str], unit: Any, ax: Any) -> Any:
@@ -206,7 +206,7 @@ class Tabular(abc.ABC):
             else:
                 quantities, others = (), first
         runs = [self, *require_others(self, others, "to_table")]
-        labels = self.labels_of(runs) if label is None else [label] if isinstance(label, str) else label
+        labels = self.labels_of(runs, unit) if label is None else [label] if isinstance(label, str) else label
         if not isinstance(labels, list | tuple) or [type(text) for text in labels] != [str] * len(runs):
             raise ValueError(f"label = {shown(label)} must have {len(runs)} texts, one for each run")
         if not quantities:

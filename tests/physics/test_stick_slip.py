@@ -165,6 +165,7 @@ def test_a_table_is_what_its_runs_are():
         assert table.sticks[place] == run.stats["sticks"]
 
 
+@pytest.mark.slow
 def test_a_table_says_that_a_slipping_top_lost_contact():
     """Its state was once read as that of a rolling top, so that its energy seemed to have grown."""
     top, theta, spin = tippe.Top(0.02, 0.02, 0.006, 2.994e-6, 3.2e-6), 1.5169230769230766, 312.3076923076923
@@ -293,6 +294,7 @@ def test_a_launch_beyond_the_angle_from_which_the_top_slips_at_once_is_inverted_
     assert (table.end_time[1], table.end_theta[1], table["sticks"][1]) == (0.0, pytest.approx(3.0, abs=1e-12), 0)
 
 
+@pytest.mark.slow
 def test_a_slip_begins_where_errors_have_taken_the_axis_off_unit_length():
     """A top that the step controller lost at .443 s, after rolling, at |e| - 1 = 3e-7."""
     top = tippe.Top(0.016689, 0.0138854, 0.0009348046138502779, 9.319925953256214e-07, 1.136765490128233e-06)

@@ -1,5 +1,6 @@
 """Scenes and runs show themselves; numbers in another unit are suspected; a run goes to xarray, a file and a picture."""
 
+import dataclasses
 import re
 import warnings
 
@@ -141,6 +142,11 @@ def test_quantities_are_drawn_over_time_by_name_and_in_degrees(run):
     assert portrait.get_ylabel() == "θ' [deg/s]"
     curves = run.plot(unit="deg").axes
     assert curves[0].get_ylabel() == "θ, normal to axis [deg]"
+    slower = run.at([0.5, 1.0])
+    tilted = dataclasses.replace(slower, scene=tippe.Scene(run.scene.body, tippe.Plane(0.1), run.scene.friction))
+    legend = run.plot("theta", others=[tilted], unit=("deg", "rpm")).axes[0].get_legend()
+    theta, spin = np.degrees(slower.theta[0]), float(slower.spin[0]) * 30.0 / np.pi
+    assert legend.get_texts()[1].get_text().startswith(f"θ(0) = {theta:.3g} deg, {spin:.4g} rpm, tilt 5.72958 deg")
 
 
 def test_labels_are_what_differs(run):

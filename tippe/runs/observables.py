@@ -246,8 +246,8 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
     def table_of(self, names: Sequence[str]) -> Table:
         return table_of(self, names)
 
-    def labels_of(self, runs: list[Any]) -> list[str]:
-        return names_of(runs) if len(runs) > 1 else [""]
+    def labels_of(self, runs: list[Any], unit: Any) -> list[str]:
+        return names_of(runs, unit) if len(runs) > 1 else [""]
 
     def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
         return as_stages([self, *others], overlaid)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import vector_of
-from nonholonomic.text import distinguishing_labels
+from nonholonomic.text import distinguishing_labels, in_unit
 from nonholonomic.validation import require_one_run
 from nonholonomic.views import (
     COLOURS,
@@ -97,12 +97,16 @@ def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     return stages([motions_by_name] if overlaid else [[run] for run in motions_by_name])
 
 
-def names_of(runs: list[Any]) -> list[str]:
-    """Names of runs, by what differs in their launches and scenes."""
+def names_of(runs: list[Any], unit: Any = ()) -> list[str]:
+    """Names of runs, by what differs in their launches and scenes. **Arguments:** `unit`: as for `plot`."""
     for run in runs:
         require_one_run(run, "a picture", ", and pass the others as others=")
-    starts = [(f"θ(0) = {float(run.theta[0]):.3g} rad", f"{float(run.spin[0]):.4g} rad/s") for run in runs]
-    return distinguishing_labels(starts, [run.scene for run in runs])
+    (angle, per_angle), (rate, per_rate) = (in_unit(si, unit or ()) for si in ("rad", "rad/s"))
+    starts = [
+        (f"θ(0) = {per_angle * float(run.theta[0]):.3g} {angle}", f"{per_rate * float(run.spin[0]):.4g} {rate}")
+        for run in runs
+    ]
+    return distinguishing_labels(starts, [run.scene for run in runs], unit=unit or ())
 
 
 def motion(run: Any) -> DrawnMotion[np.ndarray]:
