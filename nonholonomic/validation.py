@@ -8,13 +8,10 @@ import contextlib
 import dataclasses
 import functools
 import operator
-import sys
 import tempfile
-import warnings
 from collections.abc import Iterable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
-from types import FrameType
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -26,13 +23,10 @@ from jaxtyping import Array, Bool, Float
 
 from .per_run import is_users
 from .text import as_html, contents, in_lines, likely_fix, one_line, shown
+from .warning import is_called_by_a_user, warn
 
 #: Addition to the message about an angle that may be in degrees.
 IN_DEGREES = "; angles are in radians: did you mean np.radians({})?"
-
-#: Packages whose lines a warning does not point to: ours, and those through which our functions are called.
-NO_CODE_OF_A_USER = ("nonholonomic", "tippe", "stroller", "equinox", "jax", "jaxtyping", "beartype", "typeguard")
-NO_CODE_OF_A_USER += ("contextlib", "dataclasses", "functools", "importlib", "concurrent", "threading")
 
 #: What a message says about a user's function after `jax.errors.JAXTypeError`.
 UNTRACEABLE = (
@@ -262,25 +256,6 @@ def require_file(path: Any, name: str, *endings: str) -> Path:
     return file
 
 
-def warn(message: str, category: type[Warning] = UserWarning) -> None:
-    """Warn at the user's line that led here, so that Python shows the warning once for each such line."""
-    frame, _ = _users_line()
-    registry = frame.f_globals.setdefault("__warningregistry__", {})
-    place = (frame.f_code.co_filename, frame.f_lineno, frame.f_globals.get("__name__"))
-    warnings.warn_explicit(message, category, *place, registry)
-
-
-def _users_line() -> tuple[FrameType, bool]:
-    """The innermost frame of a user, and true; or the outermost frame, and false, in a thread that we have started."""
-    frame: FrameType | None = sys._getframe(2)
-    while frame is not None:
-        outermost = frame
-        if frame.f_globals.get("__name__", "").partition(".")[0] not in NO_CODE_OF_A_USER:
-            return frame, True
-        frame = frame.f_back
-    return outermost, False
-
-
 def require_package(name: str, extra: str, purpose: str) -> None:
     """Raise `ModuleNotFoundError` unless an optional package is installed. Call this before the work begins.
 
@@ -342,7 +317,7 @@ class Bounded(eqx.Module):
         self._require_one_shape()
         require_all(self.bounds())
         # Copies that our threads make of the user's modules repeat no warning.
-        if (suspicion := self.suspicion()) is not None and _users_line()[1]:
+        if (suspicion := self.suspicion()) is not None and is_called_by_a_user():
             warn(suspicion)
 
     def _require_one_shape(self) -> None:

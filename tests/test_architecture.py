@@ -37,7 +37,7 @@ VEHICLE_HEIGHT = {"model": 0, "modes": 1, "steady": 1, "runs": 2, "fit": 3, "pla
 CHECKS = ("witnesses", "papers")
 
 MOST_LINES = 400
-MOST_FILES_OUTSIDE = 10
+MOST_FILES_OUTSIDE = 11
 
 
 class Arrow(NamedTuple):

@@ -20,7 +20,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..geometry import solve
-from ..validation import as_number, is_traced, require, warn
+from ..validation import as_number, is_traced, require
+from ..warning import warn
 from .brackets import Coordinates, lie_brackets
 from .system import AbstractSystem, within_constraints
 

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from ..progress import status_line
-from ..validation import require, require_flag, require_scalars, require_whole, shown, warn
+from ..validation import require, require_flag, require_scalars, require_whole, shown
+from ..warning import warn
 from .exploration import ROWS, Explorer
 from .likelihood import Measurements
 from .posterior import LogDensity

@@ -13,7 +13,8 @@ from jaxtyping import Array, Float
 
 from ..parameters import numbers, with_numbers
 from ..text import one_line
-from ..validation import as_number, as_number_or_none, require, shown, warn
+from ..validation import as_number, as_number_or_none, require, shown
+from ..warning import warn
 from ..xla_cpu import greatest
 from .likelihood import Measurements
 

@@ -16,7 +16,8 @@ from ..integration import Outcome, Settings, explicit_tableau
 from ..integration.checks import legal_run
 from ..integration.status import Status
 from ..progress import status_line
-from ..validation import as_number, is_traced, nan_unless, shown, warn
+from ..validation import as_number, is_traced, nan_unless, shown
+from ..warning import warn
 from .ensemble import Ensemble, status_of
 from .model import AbstractModel, check_run, model_of, require_event
 

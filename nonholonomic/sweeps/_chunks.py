@@ -17,7 +17,7 @@ except ImportError:  # not a POSIX system
 
 import numpy as np
 
-from ..validation import warn
+from ..warning import warn
 from ._file import Stored, replacing, sync_folder, table_path, write_file
 from .layout import Layout, Values
 

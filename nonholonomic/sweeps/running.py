@@ -15,7 +15,8 @@ import numpy as np
 
 from ..compiled_programs import forget_programs_if_many
 from ..progress import Progress
-from ..validation import require_flag, shown, warn
+from ..validation import require_flag, shown
+from ..warning import warn
 from ._chunks import ChunkStore, with_spaces
 from ._file import LONG_NAMES, Stored
 from ._interrupts import no_interrupt_lost

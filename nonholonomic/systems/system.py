@@ -15,7 +15,8 @@ from jaxtyping import Array, Float
 
 from ..formulations import AbstractFormulation, AbstractSystem, Hamel, Lagrange
 from ..formulations.system import within_constraints
-from ..validation import UNTRACEABLE, as_number, is_traced, require, shown, warn
+from ..validation import UNTRACEABLE, as_number, is_traced, require, shown
+from ..warning import warn
 from .form import Form
 from .mode import AbstractMode, Event, Hybrid, State
 

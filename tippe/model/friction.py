@@ -11,26 +11,13 @@ from jaxtyping import Array, Float
 
 from nonholonomic.geometry import sum_vectors
 from nonholonomic.lanes.objects import held, map_methods
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced, largest, require_kind, shown
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require_kind, shown
 
 from .contact_load import ContactLoad, Slip
-from .driving_law import drive
+from .suspicious_law import drive, suspected_unit
 
 #: Addition to the message about an object that is not a friction law.
 A_LAW = " law, such as tippe.Viscous(0.3) or tippe.Coulomb(mu=0.3, slip_speed=0.01)"
-
-
-#: A coefficient of friction, and a slip speed [m/s], above which another unit is suspected.
-GREATEST_MU, GREATEST_SLIP_SPEED = 5.0, 5.0
-
-
-def suspected_unit(mu: Any, slip_speed: Any = 0.0) -> str | None:
-    """The suspicion that numbers of Coulomb's law are in another unit; `None` if they are not."""
-    if (greatest := largest(mu)) > GREATEST_MU:
-        return f"mu = {greatest:g} is large for a coefficient of friction: was it in %? {greatest:g} % are {greatest / 100.0:g}"
-    if (greatest := largest(slip_speed)) > GREATEST_SLIP_SPEED:
-        return f"slip_speed = {greatest:g} m/s is large: was it in mm/s? {greatest:g} mm/s are {greatest / 1e3:g} m/s"
-    return None
 
 
 class AbstractFriction(Bounded):

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Vector
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require, shown, warn
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require, shown
+from nonholonomic.warning import warn
 
 from .body import AbstractBody, Round
 from .turned import Shape

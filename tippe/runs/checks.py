@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.integration.checks import require_run
-from nonholonomic.validation import IN_DEGREES, as_number, is_traced, require, shown, warn
+from nonholonomic.validation import IN_DEGREES, as_number, is_traced, require, shown
+from nonholonomic.warning import warn
 
 from ..model.friction import Frictionless
 from ..model.launch import Launch

@@ -12,7 +12,8 @@ from nonholonomic.integration.settings import DEFAULT_MAX_STEPS
 from nonholonomic.integration.status import Status
 from nonholonomic.runs import Options, TableForm, TableJob, check_cells, compute_table, full_sensitivities, samples_of
 from nonholonomic.sweeps import Table
-from nonholonomic.validation import as_number, require, require_kind, require_outside, shown, warn
+from nonholonomic.validation import as_number, require, require_kind, require_outside, shown
+from nonholonomic.warning import warn
 
 from ..model.scene import Scene
 from ..modes.inversion_problem import StemContact

@@ -11,8 +11,9 @@ from nonholonomic.integration import Settings, explicit_tableau
 from nonholonomic.integration.checks import tolerance_bound
 from nonholonomic.progress import status_line
 from nonholonomic.runs import LyapunovExponent, TableJob, explore_model, exponent_of_model, time_of_event
-from nonholonomic.validation import is_traced, require, require_kind, warn
+from nonholonomic.validation import is_traced, require, require_kind
 from nonholonomic.views import Page
+from nonholonomic.warning import warn
 
 from ..model.launch import Launch
 from ..model.scene import Scene

@@ -1,4 +1,4 @@
-"""The warning about friction laws that drive a top."""
+"""The warnings about friction laws: that they drive a top, or that their numbers are in another unit."""
 
 import math
 from typing import Any
@@ -8,10 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from nonholonomic.geometry import Component
-from nonholonomic.validation import one_line
+from nonholonomic.validation import largest, one_line
 from nonholonomic.xla_cpu import compiled_setup
 
 from .contact_load import Slip
+
+#: A coefficient of friction, and a slip speed [m/s], above which another unit is suspected.
+GREATEST_MU, GREATEST_SLIP_SPEED = 5.0, 5.0
 
 #: Slip speeds [m/s] and turning rates [rad/s] at which a law is tried.
 SPEEDS, TURNINGS = (1e-3, 1e-2, 0.1, 1.0), (0.0, 100.0, -100.0)
@@ -45,3 +48,12 @@ def drive(law: Any) -> str | None:
 @compiled_setup
 def _power(law: Any, slip: Slip) -> Component:
     return law.per_normal_force(slip).power(slip)
+
+
+def suspected_unit(mu: Any, slip_speed: Any = 0.0) -> str | None:
+    """The suspicion that numbers of Coulomb's law are in another unit; `None` if they are not."""
+    if (greatest := largest(mu)) > GREATEST_MU:
+        return f"mu = {greatest:g} is large for a coefficient of friction: was it in %? {greatest:g} % are {greatest / 100.0:g}"
+    if (greatest := largest(slip_speed)) > GREATEST_SLIP_SPEED:
+        return f"slip_speed = {greatest:g} m/s is large: was it in mm/s? {greatest:g} mm/s are {greatest / 1e3:g} m/s"
+    return None
