@@ -12,7 +12,7 @@ from ..integration import AbstractProblem, Settings
 from ..integration.checks import run_bounds
 from ..progress import status_line
 from ..text import readable_unit
-from ..validation import require_all, require_file, shown
+from ..validation import IN_DEGREES, require_all, require_file, shown
 from ..views import Page, Stage
 from ..views.explore import Answer, Frame, HybridSimulator, LiveRun, Simulator, Slider, Summary, live_page
 from .model import AbstractModel, model_of
@@ -149,13 +149,15 @@ def sliders_of(model: AbstractModel, ranges: Any, drawn: tuple[str, ...] = ()) -
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
             raise ValueError(f"sliders[{name!r}] = {shown(ends)} must be two numbers, (low, high), with low < high")
         value = float(model.value(path))
+        short, unit, label = model.label([path])[path]
         if not low <= value <= high:
+            in_degrees = unit == "rad" and low <= math.degrees(value) <= high
             raise ValueError(
                 f"sliders[{name!r}] = {shown(ends)} must contain the parameter's own value, {value:g}: the page starts there"
+                + (IN_DEGREES.format(shown(ends)) if in_degrees else "")
             )
         for end in (low, high):
             model.require_values({path: end})
-        short, unit, label = model.label([path])[path]
         sliders.append(Slider(name, path, (label or short).replace("_", " "), readable_unit(unit), low, high, value))
     return tuple(sliders)
 

@@ -333,6 +333,7 @@ def test_numbers_that_do_not_fit_together_are_refused_in_the_page(browser, rutst
         ({"sliders": {"spinn": (1.0, 2.0)}}, "sliders: 'spinn'"),
         ({"sliders": {"theta": (0.5, 0.2)}}, r"sliders\['theta'\] = \(0.5, 0.2\) must be two numbers"),
         ({"sliders": {"theta": (0.2, 0.5)}}, "must contain the parameter's own value, 0.1"),
+        ({"sliders": {"theta": (5, 20)}}, r"angles are in radians: did you mean np.radians\(\(5, 20\)\)\?"),
         ({"sliders": {"theta": (0.05, 4.0)}}, "theta"),
         ({"sliders": {"radius": (0.01, 0.03)}}, "drawn"),
         ({"sliders": {}}, "must be a dictionary"),
