@@ -30,7 +30,12 @@ def folder_of(path: Path) -> Path:
 class AnotherRun(ValueError):
     """A table's path holds the result of another run, which would be overwritten; `difference` says how the runs differ.
 
-    **Example:** `except AnotherRun as error: print(error.difference)`.
+    **Example:**
+
+    >>> from pathlib import Path
+    >>> from nonholonomic.sweeps import AnotherRun
+    >>> print(AnotherRun(Path("times.h5"), "launch.spin is 155 in the file and 160 here"))
+    times.h5 holds the result of another run: launch.spin is 155 in the file and 160 here; give another path or remove it
     """
 
     def __init__(self, source: Path, difference: str):
