@@ -108,7 +108,8 @@ PAGES = {
         "Estimate parameters from recordings and measured times.",
         [
             *of("nonholonomic", "identify Recording EventTimes log_density"),
-            *of("tippe", "identify Recording read_recording InversionTimes ReversalTimes Free log_density FitWarning"),
+            *of("tippe", "identify Recording read_recording InversionTimes read_inversion_times ReversalTimes Free"),
+            *of("tippe", "log_density FitWarning"),
             *of("stroller", "identify Recording read_recording log_density"),
         ],
     ),
@@ -166,10 +167,9 @@ PAGES = {
             "nonholonomic.identification",
             *of(
                 "nonholonomic.identification",
-                "AbstractRecording Quantities as_quantity read_columns model_times predicted AbstractDataModel scene_unknowns "
-                "free_numbers search_options as_sources fit_data posterior_of_data identify Identification Measurements "
-                "joined of_data "
-                "series_units LogDensity sample Draws",
+                "AbstractRecording Quantities as_quantity read_columns read_launches model_times predicted AbstractDataModel "
+                "scene_unknowns free_numbers search_options as_sources fit_data posterior_of_data identify Identification "
+                "Measurements joined of_data series_units LogDensity sample Draws",
             ),
         ],
     ),

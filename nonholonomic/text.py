@@ -21,7 +21,9 @@ def likely(name: Any, known: Iterable[str]) -> str:
     """The known name that resembles an unknown one, as an addition to a message; empty if there is none."""
     names = list(known)
     anagrams = [candidate for candidate in names if sorted(candidate) == sorted(str(name))]
-    matches = anagrams or difflib.get_close_matches(str(name), names, 1)
+    # By the measure of `difflib`, a name of two letters, such as "mu", resembles no other.
+    short = [other for other in names if len(other) == len(str(name)) == 2 and other[0] == str(name)[0]]
+    matches = anagrams or difflib.get_close_matches(str(name), names, 1) or short
     return f"; did you mean {matches[0]!r}?" if matches else ""
 
 

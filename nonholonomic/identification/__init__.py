@@ -44,6 +44,7 @@ are the quantities that can be recorded.
 """
 
 from .csv import read_columns as read_columns
+from .csv import read_launches as read_launches
 from .data import free_numbers as free_numbers
 from .data import joined as joined
 from .data import of_data as of_data

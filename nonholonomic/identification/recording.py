@@ -36,6 +36,7 @@ class Quantities:
     - `units`: name of a column -> its SI unit.
     - `angles`: columns with a period of a whole turn.
     - `usual`: column of an angle -> a magnitude [rad] that it rarely exceeds.
+    - `launches`: what takes several launches with a measured time each, for messages.
 
     **Example:**
 
@@ -48,6 +49,7 @@ class Quantities:
     units: Mapping[str, str]
     angles: frozenset[str]
     usual: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    launches: str = ""
 
     def of(self, quantity: Any) -> tuple[str, ...]:
         """The columns of a quantity, of a column, or of a tuple of them.
@@ -64,6 +66,12 @@ class Quantities:
         if not columns or len(set(columns)) < len(columns):
             raise ValueError(f"quantity = {shown(quantity)} must name at least one column, and each only once")
         return tuple(columns)
+
+    @property
+    def one_run(self) -> str:
+        """An addition to the message that the times of a recording do not increase."""
+        instead = f"; for launches with a measured time each, use {self.launches}" if self.launches else ""
+        return f": a recording is one run, sampled at increasing times{instead}"
 
     def samples(self, run: Any, column: str) -> Float[Array, " times"]:
         """A column of a trajectory, which has the quantities as properties."""
@@ -125,7 +133,7 @@ class AbstractRecording(eqx.Module):
         require(self.times, "times")
         times = np.asarray(self.times, dtype=float)
         if times.ndim != 1 or not len(times) or np.any(np.diff(times) <= 0.0):
-            raise ValueError(f"times = {shown(self.times)} must be an increasing list")
+            raise ValueError(f"times = {shown(self.times)} must be an increasing list{self.quantities.one_run}")
         require(self.t0, "t0", below=times[-1], why="the last time")
         shape = (len(times), len(self.columns)) if len(self.columns) > 1 else (len(times),)
         if np.shape(self.value) != shape:

@@ -136,6 +136,25 @@ HEADERS = "t,tilt,x\n0.0,5,1\n0.1,6,2\n"
         ),
         ("time,theta [deg]\n0,1\n", None, None, "the header 'time' must have a unit, such as 'time .s.'"),
         ("t,tilt [mm]\n0,1\n", {"theta": "tilt"}, 25.0, "unit of theta = 'mm' must be one of rad"),
+        (
+            HEADERS,
+            {"theta": "Winkel"},
+            25.0,
+            "columns: 'theta' = 'Winkel' must be one of the headers of .*: t, tilt, x",
+        ),
+        (HEADERS, {"time": ("t", "s"), "theta": ("tilt", "rad")}, None, r"theta = 5 at 0 s \(sample 1\) .* in degrees"),
+        (
+            HEADERS.replace("0.1", "0.0"),
+            TIMED,
+            None,
+            "time = 0 s in line 3 .* 0 s in line 2: .* use tippe.InversionTimes",
+        ),
+        (
+            "t [ms],tilt\n1,5\n",
+            TIMED,
+            None,
+            "'time' = .'t', 's'. contradicts the header 't .ms.', whose unit is ms, not s",
+        ),
         (HEADERS, {"theta": ("tlit", "deg")}, 25.0, "'tlit' must be one of the headers of .*; did you mean 'tilt'"),
     ],
 )
@@ -143,6 +162,21 @@ def test_files_that_cannot_be_read_are_refused(tmp_path, text, columns, fps, mes
     (tmp_path / "film.csv").write_text(text)
     with pytest.raises(ValueError, match=message):
         tippe.read_recording(tmp_path / "film.csv", columns, fps, launch=tippe.Launch(0.1, 100.0))
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        ({"theta": 2.0}, r"error: 'theta' = 2.0 must be \(standard error, unit\), such as \(1.0, 'deg'\)"),
+        (2.0, r"error = 2.0 must be {'theta': \(standard error, unit\)}, or None"),
+        ({"theta": ("tilt_", "deg")}, "error: 'theta' = 'tilt_' must be one of the headers .*; did you mean 'tilt'?"),
+        ({"theta": (-1.0, "deg")}, "error of theta = -1.0 must be greater than 0.0"),
+    ],
+)
+def test_errors_of_a_file_are_refused_by_their_own_name(tmp_path, error, message):
+    (tmp_path / "film.csv").write_text(HEADERS)
+    with pytest.raises(ValueError, match=message):
+        tippe.read_recording(tmp_path / "film.csv", TIMED, launch=tippe.Launch(0.1, 100.0), error=error)
 
 
 FILES = {

@@ -60,7 +60,11 @@ class AbstractTimes(AbstractEventTimes):
         require(self.t1, "t1", above=0.0)
         measured = np.asarray(self.time)
         if np.any(np.isnan(measured)):
-            raise ValueError("time must be numbers, infinite where the event did not happen")
+            row = int(np.argmax(np.isnan(measured).reshape(len(measured), -1).any(axis=1)))
+            raise ValueError(
+                f"time[{row}] = {shown(measured[row])} must be a number, infinite where the event did not happen: leave "
+                "out the launch of a measurement that was lost, with its time"
+            )
         if self.until is not None:
             require(self.until, "until", above=0.0, at_most=self.t1, why="t1")
         first, last = self._limits

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.identification import AbstractRecording, Quantities, as_quantity, read_columns
-from nonholonomic.validation import as_number, as_number_or_none, require, require_kind
+from nonholonomic.validation import as_number, as_number_or_none, require_kind
 
 from ..model.launch import Launch
 
@@ -20,6 +20,7 @@ QUANTITIES = Quantities(
     | dict.fromkeys(("axis_x", "axis_y", "axis_z"), "1"),
     angles=frozenset({"azimuth", "eta"}),
     usual={"azimuth": 4.0 * math.pi, "eta": 4.0 * math.pi},
+    launches="tippe.InversionTimes, or tippe.read_inversion_times for a file",
 )
 
 #: Distance [rad] by which a recorded theta may be outside [0, pi] if its errors are smaller or unknown.
@@ -71,8 +72,13 @@ class Recording(AbstractRecording):
         place = self.columns.index("theta")
         theta, reach = value.reshape(reach.shape)[:, place], reach[:, place]
         seen = ~np.isnan(theta)
-        theta, reach = theta[seen], reach[seen]
-        require(theta, "theta", at_least=-reach, at_most=math.pi + reach, why="with room for its errors", unit="rad")
+        is_outside = seen & ((theta < -reach) | (theta > math.pi + reach))
+        for row in np.flatnonzero(is_outside)[:1]:
+            raise ValueError(
+                f"theta = {theta[row]:g} at {float(self.times[row]):.6g} s (sample {row + 1}) must be between 0 and pi rad, "
+                f"with room for its errors: was it recorded in degrees? Pass np.radians({theta[row]:g}), or the unit 'deg' "
+                "when you read a file"
+            )
 
 
 def read_recording(
