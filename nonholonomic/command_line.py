@@ -54,8 +54,8 @@ def run_and_exit(main: Callable[[], int], program: str) -> NoReturn:
     # Imported here, because this module must load before JAX does.
     from .xla_cpu import compile_quickly
 
-    # A warning is one line, shown once, without lines of our code.
-    warnings.simplefilter("once")
+    # After the filters of the user; those of Python hide what concerns developers only.
+    warnings.simplefilter("once", UserWarning, append=True)
     warnings.formatwarning = lambda message, *_: f"python -m {program}: warning: {message}\n"
     gc.disable()
     compile_quickly()

@@ -80,13 +80,13 @@ def readable_unit(unit: str) -> str:
     return re.sub(r"(?<=[A-Za-z])\d+", lambda power: power[0].translate(_SUPERSCRIPTS), text)
 
 
-def in_unit(si: str, unit: str | Sequence[str]) -> tuple[str, float]:
+def in_unit(si: str, unit: str | Sequence[str] | None) -> tuple[str, float]:
     """The unit in which to show a number in the SI unit `si`, and the factor that converts the number.
 
-    **Arguments:** `unit`: one of `UNITS`, such as "deg", or several for numbers of different dimensions; "deg", "rev", "cm"
-    and so on also convert rates, to deg/s and so on, unless a unit of the rate is named.
+    **Arguments:** `unit`: one of `UNITS`, such as "deg", or several for numbers of different dimensions, or `None`
+    for `si`; "deg", "rev", "cm" and so on also convert rates, to deg/s and so on, unless a unit of the rate is named.
     """
-    readable, names = readable_unit(si), [unit] if isinstance(unit, str) else [*unit]
+    readable, names = readable_unit(si), [unit] if isinstance(unit, str) else [*(unit or ())]
     for name in [*names, *(f"{name}/s" for name in names)]:
         # A number without a unit is no percentage unless its unit says so.
         if readable and name in UNITS.get(readable, {}):
@@ -165,7 +165,7 @@ def in_lines(title: str, rows: list[tuple[str, str]]) -> str:
 
 
 def distinguishing_labels(
-    starts: list[tuple[str, ...]], *groups: list[Any], unit: str | Sequence[str] = ()
+    starts: list[tuple[str, ...]], *groups: list[Any], unit: str | Sequence[str] | None = None
 ) -> list[str]:
     """Labels that distinguish runs, by what differs between them only.
 
@@ -184,7 +184,7 @@ def distinguishing_labels(
     ]
 
 
-def differences(modules: list[Any], unit: str | Sequence[str] = ()) -> list[list[str]]:
+def differences(modules: list[Any], unit: str | Sequence[str] | None = None) -> list[list[str]]:
     """What distinguishes each module from the others, as text: its kind, or some of its parameters.
 
     **Arguments:** `unit`: units for their numbers, as for `in_unit`.

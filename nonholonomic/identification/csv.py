@@ -125,7 +125,7 @@ def read_launches(
     >>> print(falls.numbers["height"], falls.time, falls.lines)
     [1.  1.5] [0.45  inf] (2, 4)
     """
-    file, columns = _opened(path, columns, decimal, {"time": "s"} | dict(units))
+    file, columns = _opened(path, columns, decimal, {"time": "s"} | dict(units), {})
     if "time" not in columns:
         raise ValueError(f"columns = {shown(columns)} must have 'time', the measured time of each launch")
     names = [name for name in columns if name != "time"]
@@ -149,7 +149,7 @@ def _opened(
     columns: Any,
     decimal: Any,
     known: Mapping[str, str],
-    several: Mapping[str, tuple[str, ...]] | None = None,
+    several: Mapping[str, tuple[str, ...]],
 ) -> tuple[TextTable, Mapping[str, Any]]:
     """The file and its columns, checked. **Arguments:** `known`: name of a column -> its SI unit; `several`: names that
     stand for several columns."""
@@ -162,8 +162,8 @@ def _opened(
     file = TextTable.read(as_path(path, "path"), decimal)
     columns = file.named(known) if columns is None else columns
     for name in columns:
-        if name in (several or {}):
-            raise ValueError(f"columns: {name!r} must be a single column: {', '.join((several or {})[name])}")
+        if name in several:
+            raise ValueError(f"columns: {name!r} must be a single column: {', '.join(several[name])}")
         if name not in known:
             hint = "; did you mean 'time'?" if name == "t" else likely(name, known)
             raise ValueError(f"columns: {shown(name)} must be one of {', '.join(known)}{hint}")

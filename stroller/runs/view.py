@@ -53,14 +53,14 @@ def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     return grouped([list(enumerate(runs))] if overlaid else [[numbered_run] for numbered_run in enumerate(runs)], names)
 
 
-def names_of(runs: list[Any], unit: Any = ()) -> list[str]:
+def names_of(runs: list[Any], unit: Any = None) -> list[str]:
     """Names of rides, by what differs in their durations, scenes and launches. **Arguments:** `unit`: as for `plot`."""
     for run in runs:
         require_one_run(run, "a picture", ", and pass the others as others=")
     rides = [run.spec for run in runs]
     starts = [(f"ride of {float(run.t[-1]):.3g} s",) for run in runs]
     scenes, launches = ([getattr(ride, name) for ride in rides] for name in ("scene", "launch"))
-    return distinguishing_labels(starts, scenes, launches, unit=unit or ())
+    return distinguishing_labels(starts, scenes, launches, unit=unit)
 
 
 def grouped(groups: list[list[tuple[int, Any]]], names: list[str]) -> list[Stage]:

@@ -167,7 +167,8 @@ def stem_takes_over(
     assert air.falls is not None
     # A sphere that is about to strike without a flight is not the sphere that touched last.
     last_ball = jnp.where(air.falls, 1 - air.ball, air.ball)
-    comes_to_rest_on_stem = ~air_landed.open & ((air_landed.ball == 1) | ((not last) & (air_landed.ball != 0)))
+    # On both spheres, the stem carries a part of the top, but the sphere still touches.
+    comes_to_rest_on_stem = ~air_landed.open & (air_landed.ball == 1 if last else air_landed.ball != 0)
     takes_over = (last_ball == 0) & (strikes | comes_to_rest_on_stem) & (stem_counts > 0.0)
     return air_landed._replace(
         crossing_time=jnp.where(takes_over, air_landed.elapsed, air_landed.crossing_time),

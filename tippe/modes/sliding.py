@@ -210,9 +210,9 @@ class Lean(AbstractFlyingMode):
         state = jnp.concatenate([state_at_rest, state[OWN:]])
         zero = jnp.zeros_like(state[0])
         running, zeros = jnp.full(zero.shape, RUNNING), jnp.zeros((1, *zero.shape), int)
-        leaves_sphere = jnp.asarray(self.last) & (number == 1)
-        if self.stem_counts is not None:
-            leaves_sphere &= self.stem_counts > 0.0
+        leaves_sphere = jnp.zeros(zero.shape, bool)
+        if self.last and self.stem_counts is not None:
+            leaves_sphere = (number == 1) & (self.stem_counts > 0.0)
         return Transition(number, state, zero, running, jnp.where(leaves_sphere, 0.0, jnp.inf), zeros)
 
 

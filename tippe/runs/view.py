@@ -97,16 +97,16 @@ def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     return stages([motions_by_name] if overlaid else [[run] for run in motions_by_name])
 
 
-def names_of(runs: list[Any], unit: Any = ()) -> list[str]:
+def names_of(runs: list[Any], unit: Any = None) -> list[str]:
     """Names of runs, by what differs in their launches and scenes. **Arguments:** `unit`: as for `plot`."""
     for run in runs:
         require_one_run(run, "a picture", ", and pass the others as others=")
-    (angle, per_angle), (rate, per_rate) = (in_unit(si, unit or ()) for si in ("rad", "rad/s"))
+    (angle, per_angle), (rate, per_rate) = (in_unit(si, unit) for si in ("rad", "rad/s"))
     starts = [
         (f"θ(0) = {per_angle * float(run.theta[0]):.3g} {angle}", f"{per_rate * float(run.spin[0]):.4g} {rate}")
         for run in runs
     ]
-    return distinguishing_labels(starts, [run.scene for run in runs], unit=unit or ())
+    return distinguishing_labels(starts, [run.scene for run in runs], unit=unit)
 
 
 def motion(run: Any) -> DrawnMotion[np.ndarray]:
