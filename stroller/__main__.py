@@ -221,15 +221,15 @@ def write_page(
     """Write the page of the main job: the moving plan and rides if three.js is installed, the audit, and the drawings by
     their headings."""
     groups: dict[str, list[tuple[int, Trajectory]]] = {}
-    for (ground, ride), run in rides.items():
-        groups.setdefault(ground, []).append((RIDES.index(ride), run))
+    for number, ((ground, _), run) in enumerate(rides.items()):
+        groups.setdefault(ground, []).append((number, run))
     viewed = []
     if can_view():
         # The title of the stage names the ground of both rides; the name of each ride is beside it.
         viewed = [planned_stage(parking)]
         viewed += [
             stage._replace(title=ground)
-            for ground, stage in zip(groups, grouped(list(groups.values()), list(RIDES)), strict=True)
+            for ground, stage in zip(groups, grouped(list(groups.values()), [ride for _, ride in rides]), strict=True)
         ]
     note = "" if viewed else f'<p class="note">{NO_VIEW}</p>'
     pictures = [f"<h2>{heading}</h2>{picture_as_html(drawing)}" for heading, drawing in drawings.items()]

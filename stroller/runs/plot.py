@@ -24,12 +24,15 @@ def draw_rides(grounds: dict[str, AbstractSurface], rides: dict[tuple[str, str],
 
     figure = Figure(figsize=(18.0, 4.2 * len(grounds)), layout="constrained")
     layout = figure.add_gridspec(len(grounds), 4, width_ratios=(1.5, 1.0, 1.0, 1.0))
+    # As on the page, whose curves are those of all grounds.
+    colours = {name: css(COLOURS[number % len(COLOURS)]) for number, name in enumerate(rides)}
     for row, (name, ground) in enumerate(grounds.items()):
         on_ground = {ride: run for (place_name, ride), run in rides.items() if place_name == name}
         space = figure.add_subplot(layout[row, 0], projection="3d")
         _draw_ground(space, ground, on_ground)
         panels = [figure.add_subplot(layout[row, column]) for column in (1, 2, 3)]
-        for colour, (ride, run) in zip(map(css, COLOURS), on_ground.items(), strict=False):
+        for ride, run in on_ground.items():
+            colour = colours[name, ride]
             space.plot(*np.asarray(run.position).T, color=colour, linewidth=1.4, label=ride)
             panels[0].plot(run.t, run.speed, color=colour)
             panels[1].plot(run.t, run.energy, color=colour)
