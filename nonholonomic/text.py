@@ -199,11 +199,19 @@ def differences(modules: list[Any], unit: str | Sequence[str] | None = None) -> 
         else:
             name, factor = in_unit(getattr(modules[0], "units", {}).get(field.name, "1"), unit)
             if factor != 1.0:
-                values = [jax.tree.map(lambda number, factor=factor: factor * number, value) for value in values]
+                # 0.1 rad is 5.73 deg, not 5.72958.
+                values = [
+                    jax.tree.map(lambda number, factor=factor: _rounded(factor * number), value) for value in values
+                ]
             texts = [as_text(value, name) for value in values]
             parts = [[f"{field.name} {text}"] if len(set(texts)) > 1 else [] for text in texts]
         labels = [label + part for label, part in zip(labels, parts, strict=True)]
     return labels
+
+
+def _rounded(number: Any) -> Any:
+    """A number to four digits."""
+    return np.vectorize(lambda part: float(f"{part:.4g}"))(np.asarray(number, float))
 
 
 def as_html(title: str, rows: list[tuple[str, ...]]) -> str:

@@ -49,6 +49,10 @@ class AbstractDataModel(eqx.Module):
         """The model of other sets of data of the same shapes."""
         return dataclasses.replace(self, data=recorded)
 
+    def unit_of(self, name: str) -> str:
+        """The unit of a parameter, by its name without the prefix `data[k].`; "1" if it is unknown."""
+        return "1"
+
     @abc.abstractmethod
     def together(self, source: Any, values: Values) -> Hashable:
         """A key for a set of data; sets with equal keys can be predicted together."""
@@ -154,5 +158,7 @@ def fit_data(
     0.997
     """
     measurements, labels, seen = joined(data)
-    fit = identify(build(seen), measurements, unknowns, slopes=slopes, labels=labels, **search)
-    return dataclasses.replace(fit, series_units=series_units(data))
+    model = build(seen)
+    fit = identify(model, measurements, unknowns, slopes=slopes, labels=labels, **search)
+    units = {name: model.unit_of(name.split(".", 1)[1] if name.startswith("data[") else name) for name in unknowns}
+    return dataclasses.replace(fit, series_units=series_units(data), units=units)

@@ -201,6 +201,10 @@ class AbstractRecording(eqx.Module):
         all_labels = [f"{column}({time:.4g} s)" for time in np.asarray(self.times) for column in self.columns]
         return tuple(all_labels[i] for i in self.seen)
 
+    def labels_in(self, unit: Any) -> tuple[str, ...]:
+        """Labels for a picture, which has the times below its curves."""
+        return self.labels
+
     @property
     def series_units(self) -> tuple[str, ...]:
         """The unit of each column, which is a series of the measurements."""

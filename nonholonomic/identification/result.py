@@ -1,6 +1,7 @@
 """The result of a fit: estimates, errors, undetermined combinations, and the outcome of every start."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -8,7 +9,7 @@ from jaxtyping import Float
 
 from ..parameters import full_name
 from ..progress import status_line
-from ..text import text_as_html
+from ..text import readable_unit, require_unit, text_as_html
 from ..validation import require_package, shown
 from ..views import draw_fit
 from .curve import fine_predictions
@@ -75,7 +76,7 @@ class Identification:
     - `verdict`: a `Verdict`, whether the fit can be believed.
     - `coordinates`, `coordinate_covariance`: estimates and covariance in the coordinates of the fit.
     - `distribution`: the `Distribution` of the coordinates, with its weighted points.
-    - `series_units`: the unit of each series of the measurements, if known.
+    - `series_units`: the unit of each series of the measurements, if known; `units`: name -> unit of a parameter, if known.
 
     **Example:** the fit of the subpackage's example.
 
@@ -105,6 +106,7 @@ class Identification:
     measurements: Measurements = dataclasses.field(repr=False)
     explorer: Explorer = dataclasses.field(repr=False)
     series_units: tuple[str, ...] = ()
+    units: dict[str, str] = dataclasses.field(default_factory=dict)
 
     def interval(self, name: str, deviations: float = 1.96) -> tuple[float, float]:
         """The central interval of a parameter: the likelihood, times the priors, leaves equal probabilities below and
@@ -178,13 +180,31 @@ class Identification:
         return np.where(np.eye(len(errors), dtype=bool), 1.0, np.where(np.isfinite(shares), shares, 0.0))
 
     @status_line("drawing")
-    def plot(self) -> Any:
-        """Data and model, residuals, the profile likelihood of every parameter, and the correlations (needs matplotlib).
+    def plot(self, unit: str | Sequence[str] | None = None) -> Any:
+        """Data and model, residuals, the profile likelihood of every parameter with its estimate and 95 % interval, and the
+        correlations (needs matplotlib).
+
+        **Arguments:** `unit`: unit to draw in, such as "deg" for all angles, or several, such as ("deg", "rpm").
 
         **Returns:** a matplotlib figure.
+
+        **Raises:** `ValueError` for an unknown unit.
         """
         require_package("matplotlib", "plot", "plot")
-        return draw_fit(self)
+        require_unit(unit)
+        return draw_fit(self, self._labels(unit), unit)
+
+    def _labels(self, unit: Any) -> list[str]:
+        """Short names of the measurements for a picture."""
+        sources = getattr(self.problem.model, "recorded", ())
+        if not sources:
+            return [row.label for row in self.residuals]
+        several = len(sources) > 1
+        return [
+            f"{k}: {label}" if several else label
+            for k, source in enumerate(sources, 1)
+            for label in source.labels_in(unit)
+        ]
 
     def _place(self, name: str) -> int:
         valid = list(self.estimates)
@@ -196,7 +216,6 @@ class Identification:
     def __str__(self) -> str:
         lines = [
             f"Identification of {len(self.estimates)} numbers from {len(self.residuals)} measurements: {self.status}",
-            f"  {self.statuses.count('converged')} of {len(self.statuses)} starts converged, {self.verdict.agree} ended here",
             f"  -2 log likelihood {self.deviance:.4g} at {self.degrees} degrees of freedom",
             "verdict",
             str(self.verdict),
@@ -205,7 +224,9 @@ class Identification:
         width = max(map(len, self.estimates))
         for name, value in self.estimates.items():
             low, high = self.interval(name)
-            lines.append(f"  {name:{width}}  {value:.6g} +- {self.standard_errors[name]:.2g}  ({low:.6g}, {high:.6g})")
+            unit = readable_unit(self.units.get(name, "1"))
+            text = f"{value:.6g} +- {self.standard_errors[name]:.2g}  ({low:.6g}, {high:.6g}) {unit}"
+            lines.append(f"  {name:{width}}  {text}".rstrip())
         lines.append("combinations of parameters and their relative errors")
         for value, words in zip(self.identifiability.singular_values, self.identifiability.words, strict=True):
             mark = "  UNDETERMINED" if words in self.identifiability.unseen else ""

@@ -89,7 +89,9 @@ class Verdict(NamedTuple):
         signs = ", ".join(
             f"{series.runs} runs of {series.count} signs (p = {series.p_value:.2g})" for series in self.series
         )
-        lines = [f"  {scatter}", f"  {signs}" if signs else "", f"  {self.agree} of {self.starts} starts agree"]
+        ended = f"{self.agree} of {self.starts} refined candidates ended at the best minimum"
+        others = ", the others fit worse or were stopped early" if self.agree < self.starts else ""
+        lines = [f"  {scatter}", f"  {signs}" if signs else "", f"  {ended}{others}"]
         lines.append(f"  errors from {self.effective:.0f} effective draws (k-hat {self.k:.2f})")
         lines += [f"  note: {note}" for note in self.notes]
         return "\n".join([*filter(None, lines), *(f"  BUT {concern}" for concern in self.concerns)])

@@ -1,5 +1,6 @@
 """Data of fits of any model: recorded runs, and times of events."""
 
+import abc
 import dataclasses
 import math
 from collections.abc import Callable
@@ -112,6 +113,15 @@ class AbstractEventTimes(eqx.Module):
     """Measured times of an event, in one series with a prediction for each."""
 
     time: eqx.AbstractVar[Float[Array, "n *two"]]
+
+    @property
+    @abc.abstractmethod
+    def labels(self) -> tuple[str, ...]:
+        """A label for each time."""
+
+    def labels_in(self, unit: Any) -> tuple[str, ...]:
+        """Labels for a picture, with numbers in other units."""
+        return self.labels
 
     @property
     def size(self) -> int:

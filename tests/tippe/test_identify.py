@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 
 import equinox as eqx
 import jax
@@ -58,6 +59,7 @@ def test_launches_may_be_a_list_of_launches():
     data = tippe.InversionTimes(launches, TIMES, 0.05, t1=6.0)
     assert eqx.tree_equal(data, tippe.InversionTimes(at_once, TIMES, 0.05, t1=6.0))
     assert data.labels[0] == "theta 0.2, spin 110"
+    assert data.labels_in(("deg", "rpm"))[0] == "theta 11.46 deg, spin 1050 rpm, velocity (0, 0) m/s"
 
 
 def test_states_of_a_list_of_launches(rutstam_scene):
@@ -77,6 +79,8 @@ def test_friction_from_exact_times(exact_fit):
     assert abs(result.residuals[3].residual) < 1e-6
     assert result.residuals[3].prediction > 6.0
     assert "theta 0.3, spin 110" in str(result)
+    assert result.units == {"scene.friction.mu": "s m-1"}
+    assert re.search(r"scene.friction.mu  0\.3.* s/m\n", str(result))
 
 
 def test_another_start_other_bounds_data_and_tolerance_compile_nothing(exact_fit, rutstam_scene, caplog):

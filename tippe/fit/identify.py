@@ -29,7 +29,7 @@ from nonholonomic.validation import as_number, require_kind
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..runs.checks import angle_of, check_run, check_smooth
-from ..runs.launches import variable_numbers
+from ..runs.launches import labels, variable_numbers
 from ..runs.run_kind import run_kind_of
 from ..runs.verbs import simulate
 from .inversion_times import AbstractTimes, InversionTimes, Values
@@ -37,6 +37,11 @@ from .recording import Recording
 
 #: Number of rows that one program simulates together: as many as a fit explores at once, or a few.
 BATCH, FEW = 512, 64
+
+
+def _unit_of(model: Any, name: str) -> str:
+    """The unit of a parameter of a scene, a launch or a clock."""
+    return "s" if name == "t0" else labels(model.scene, model.data[0].launch, [name], ())[name][1]
 
 
 @eqx.filter_jit
@@ -65,6 +70,9 @@ class HybridModel(AbstractDataModel):
 
     #: The model runs mode by mode and cannot be traced.
     on_host: ClassVar[bool] = True
+
+    def unit_of(self, name: str) -> str:
+        return _unit_of(self, name)
 
     def together(self, source: Any, values: Values) -> int:
         """Each set of data is predicted for itself."""
@@ -147,6 +155,9 @@ class SceneModel(AbstractDataModel):
     data: tuple[Any, ...]
     seen: Int[Array | np.ndarray, " n"]
     tolerance: Float[Array, ""] = eqx.field(converter=as_number)
+
+    def unit_of(self, name: str) -> str:
+        return _unit_of(self, name)
 
     def together(self, source: Any, values: Values) -> Hashable:
         if isinstance(source, AbstractTimes):

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from nonholonomic.identification import Measurements
 from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.runs import AbstractEventTimes, TableForm
-from nonholonomic.text import one_line
+from nonholonomic.text import distinguishing_labels, one_line
 from nonholonomic.validation import as_number, as_number_or_none, require, require_kind, shown
 
 from ..model.launch import Launch, as_launch
@@ -106,6 +106,14 @@ class AbstractTimes(AbstractEventTimes):
             np.asarray(self.launch.theta), np.asarray(self.launch.spin), np.asarray(self._limits[0])
         )
         return tuple(f"theta {theta:.4g}, spin {spin:.4g}" for theta, spin in zip(*columns[:2], strict=True))
+
+    def labels_in(self, unit: Any) -> tuple[str, ...]:
+        """What differs between the launches."""
+        launches = [
+            jax.tree.map(lambda leaf, k=k: leaf if jnp.ndim(leaf) == 0 else leaf[k], self.launch)
+            for k in range(self.size)
+        ]
+        return tuple(distinguishing_labels([("launch",)] * self.size, launches, unit=unit))
 
     def check(self, scene: Scene) -> None:
         """Raise `ValueError` unless the scene has such events."""

@@ -1,5 +1,6 @@
 """Verdicts on fits: scatter, runs of signs, agreement of starts, and the plot."""
 
+import dataclasses
 import itertools
 import math
 
@@ -41,7 +42,7 @@ def test_a_good_fit_has_nothing_against_it_and_its_p_value_is_that_of_chi_square
     assert fit.verdict.good
     assert_close(fit.verdict.p_value, scipy.stats.chi2.sf(fit.deviance, 113), rtol=1e-9)
     assert (fit.verdict.agree, fit.verdict.starts) == (3, 3)
-    assert "3 of 3 starts agree" in str(fit)
+    assert "3 of 3 refined candidates ended at the best minimum" in str(fit)
 
 
 def test_the_search_finds_the_minimum_from_a_start_in_another_one():
@@ -106,8 +107,37 @@ def test_the_picture_has_data_residuals_profiles_and_correlation():
     assert_close(data.lines[-1].get_ydata(), [row.prediction for row in fit.residuals])
     assert_close(residuals.lines[0].get_ydata(), [row.residual for row in fit.residuals])
     assert [axes.get_xlabel() for axes in profiles] == ["height", "rate"]
+    low, high = fit.interval("rate")
+    value, error = fit.estimates["rate"], fit.standard_errors["rate"]
+    assert profiles[1].get_title() == f"{value:.3f} ± {error:.3f}\n95 %: {low:.3f} to {high:.3f}"
     assert_close(correlation.images[0].get_array(), fit.correlation)
     assert_close(np.diag(fit.correlation), 1.0)
+
+
+def test_a_picture_has_limits_at_its_edge_and_other_units():
+    """A limit far from the measured values does not squeeze these."""
+    seen = Measurements([0.10, 0.12, 0.11, 7.0, -math.inf], 0.01, upper=[0.10, 0.12, 0.11, math.inf, 9.0])
+    fit = identify(lambda p: p["x"][:, None] * jnp.array([1.0, 1.0, 1.0, 80.0, 80.0]), seen, {"x": 0.11})
+    fit = dataclasses.replace(fit, series_units=("rad",), units={"x": "rad"})
+    data, residuals, profile = fit.plot(unit="deg").axes
+    low, high = data.get_ylim()
+    assert math.degrees(0.05) < low < math.degrees(0.09)
+    assert math.degrees(0.13) < high < math.degrees(0.2)
+    assert [text.get_text() for text in data.texts] == ["> 401.1", "< 515.7"]
+    assert all(low < line.get_ydata()[0] < high for line in data.lines if line.get_marker() in "^v")
+    assert data.get_ylabel() == "measured [deg]"
+    assert profile.get_xlabel() == "x [deg]"
+    assert_close(profile.lines[0].get_xdata()[0], math.degrees(fit.interval("x", 3.0)[0]))
+    assert [tick.get_text() for tick in residuals.get_xticklabels()] == ["#1", "#2", "#3", "#4", "#5"]
+    with pytest.raises(ValueError, match="unit = 'degree' must be one of"):
+        fit.plot(unit="degree")
+
+
+def test_a_picture_says_where_a_profile_found_a_better_fit():
+    fit = identify(oscillation, recorded(), {"height": 0.8, "rate": 5.8})
+    worse = dataclasses.replace(fit, deviance=fit.deviance + 3.0)
+    assert "start there" not in fit.plot().get_suptitle()
+    assert "the fit is better with height = " in worse.plot().get_suptitle()
 
 
 def test_an_angle_is_drawn_on_the_turn_of_its_prediction():
