@@ -18,7 +18,7 @@ __version__ = "0.2.0"
 if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
 
-from .compilation_cache import enable_compilation_cache as enable_compilation_cache
+from .compilation.compilation_cache import enable_compilation_cache as enable_compilation_cache
 from .formulations import AbstractSystem as AbstractSystem
 from .geometry import AbstractSurface as AbstractSurface
 from .geometry import Cylinder as Cylinder

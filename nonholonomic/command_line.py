@@ -52,7 +52,7 @@ def run_and_exit(main: Callable[[], int], program: str) -> NoReturn:
     **Arguments:** as for `interruptible`.
     """
     # Imported here, because this module must load before JAX does.
-    from .xla_cpu import compile_quickly
+    from .compilation.xla_cpu import compile_quickly
 
     # After the filters of the user; those of Python hide what concerns developers only.
     warnings.simplefilter("once", UserWarning, append=True)

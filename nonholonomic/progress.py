@@ -9,8 +9,8 @@ from importlib.util import find_spec
 from types import TracebackType
 from typing import Any
 
-from .compilation_cache import is_off
-from .compiled_programs import forget_programs_if_many
+from .compilation.compilation_cache import is_off
+from .compilation.compiled_programs import forget_programs_if_many
 
 #: How often the line is written [s] (a shorter call shows nothing), how often the thread checks whether the line is due
 #: [s], and how long the thread waits for another call [s]: starting a thread for every call would cost short calls a

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from nonholonomic import __version__
 from nonholonomic.command_line import closing_lines, run_and_exit
-from nonholonomic.compilation_cache import are_kept, enable_compilation_cache, kept_files
+from nonholonomic.compilation.compilation_cache import are_kept, enable_compilation_cache, kept_files
 from nonholonomic.geometry import CLOSED, AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.integration import ImplicitMidpoint
 from nonholonomic.progress import Progress, status_line

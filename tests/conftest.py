@@ -9,14 +9,14 @@ from tops import rutstam_top
 
 import nonholonomic
 import tippe
-from nonholonomic.compiled_programs import (
+from nonholonomic.compilation.compiled_programs import (
     PART_OF_MAPPINGS,
     count_mappings,
     most_mappings,
     release_memory,
     resident_memory,
 )
-from nonholonomic.xla_cpu import compile_quickly
+from nonholonomic.compilation.xla_cpu import compile_quickly
 
 #: The tests that a plain `pytest` chooses (`pyproject.toml`).
 ORDINARY = "not slow"

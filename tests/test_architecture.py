@@ -16,6 +16,7 @@ PACKAGES = ("nonholonomic", "tippe", "stroller")
 
 #: A room of `nonholonomic` imports only from rooms further down; those of one height only if that closes no circle.
 HEIGHT = {
+    "compilation": -1,
     "geometry": 0,
     "integration": 0,
     "formulations": 0,
@@ -37,7 +38,7 @@ VEHICLE_HEIGHT = {"model": 0, "modes": 1, "steady": 1, "runs": 2, "fit": 3, "pla
 CHECKS = ("witnesses", "papers")
 
 MOST_LINES = 400
-MOST_FILES_OUTSIDE = 11
+MOST_FILES_OUTSIDE = 9
 
 
 class Arrow(NamedTuple):
@@ -109,7 +110,8 @@ def allowed(arrow: Arrow) -> bool:
     if package != "nonholonomic":
         return VEHICLE_HEIGHT.get(end_room, -1) < VEHICLE_HEIGHT.get(start_room, len(VEHICLE_HEIGHT))
     if not start_room:
-        return False
+        # The lowest room is as low as the files that stand outside.
+        return HEIGHT[end_room] < 0
     return HEIGHT[end_room] < HEIGHT[start_room] or HEIGHT[end_room] == HEIGHT[start_room] == 0
 
 
@@ -125,7 +127,7 @@ def test_the_reader_of_imports_sees_them():
     rooms = {(room(arrow.file), room(arrow.module)) for arrow in ARROWS}
     assert {("nonholonomic/derivatives", "nonholonomic/integration"), ("tippe", "nonholonomic/geometry")} <= rooms
     # This one stands in a function.
-    assert Arrow("nonholonomic/command_line.py", "nonholonomic.xla_cpu", ("compile_quickly",)) in ARROWS
+    assert Arrow("nonholonomic/command_line.py", "nonholonomic.compilation.xla_cpu", ("compile_quickly",)) in ARROWS
     assert circle({("a", "b"), ("b", "a"), ("b", "c")}) == ["a", "b"]
 
 

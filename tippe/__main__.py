@@ -16,7 +16,7 @@ import numpy as np
 
 from nonholonomic import __version__
 from nonholonomic.command_line import closing_lines, run_and_exit
-from nonholonomic.compilation_cache import are_kept, enable_compilation_cache, kept_files
+from nonholonomic.compilation.compilation_cache import are_kept, enable_compilation_cache, kept_files
 from nonholonomic.geometry import Cylinder, Plane
 from nonholonomic.progress import Progress, status_line
 from nonholonomic.sweeps import AnotherRun, Table, saved_cells

@@ -19,12 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..compilation.xla_cpu import uncounted, written_by_component, written_in_place
 from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, States
 from ..integration.runge_kutta import Stages, moved_state, over_stages
 from ..integration.scheduler import AbstractRecorder, InLanes, LaneScheduler, SchedulerState
 from ..integration.status import RUNNING
 from ..integration.step import length_to_try, try_step
-from ..xla_cpu import uncounted, written_by_component, written_in_place
 from .periods import Checkpoints, LatestSteps, StepRecord, read
 from .variation import VariationalProblem
 

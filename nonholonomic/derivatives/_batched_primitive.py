@@ -19,7 +19,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir, partial_eval
 from jaxtyping import Array, Float
 
-from ..xla_cpu import compiled_alone, compiled_for_one
+from ..compilation.xla_cpu import compiled_alone, compiled_for_one
 
 
 class AbstractLinearSolve(eqx.Module):

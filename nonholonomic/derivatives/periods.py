@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..xla_cpu import written_in_place
+from ..compilation.xla_cpu import written_in_place
 
 #: Number of checkpoints. With more periods, some checkpoints are dropped and computed again from an earlier one. With
 #: the 64 lanes of a CPU the checkpoints take 3 MB, with the 32768 of an accelerator 1.5 GB.

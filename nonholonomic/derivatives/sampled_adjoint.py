@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..compilation.xla_cpu import written_in_place
 from ..integration import AbstractProblem, Lanes, LaneState, Settings, States
 from ..integration.sample_times import SampleTimes, components
 from ..integration.samples import step_towards_sample
 from ..integration.scheduler import InLanes
 from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END
-from ..xla_cpu import written_in_place
 from ._adjoint import StepRecorder, solve_with_adjoint, without_probe
 from .periods import StepRecord
 from .slopes import moving_leaves, shares_of, tangents_of, time_of_zero

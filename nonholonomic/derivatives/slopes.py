@@ -16,11 +16,11 @@ from jax.extend.core import Literal
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
+from ..compilation.xla_cpu import compiled_alone
 from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, States
 from ..integration.ensemble import with_crossing_times
 from ..integration.scheduler import LaneScheduler
 from ..integration.status import CROSSED, REACHED_END
-from ..xla_cpu import compiled_alone
 from ._adjoint import solve_with_adjoint
 from .variation import VariationalProblem, in_groups, slopes_by_variations
 

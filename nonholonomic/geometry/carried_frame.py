@@ -13,8 +13,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from ..compilation.xla_cpu import stored
 from ..validation import Bound, as_number
-from ..xla_cpu import stored
 from .cylinder import Cylinder
 from .frames import (
     AbstractFrame,

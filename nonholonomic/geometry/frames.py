@@ -19,8 +19,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from ..compilation.xla_cpu import least
 from ..validation import as_number
-from ..xla_cpu import least
 from .planar_length import planar_length
 from .vector import Component, Vector, add, cross, dot, multiply, scale, subtract, sum_vectors, tangents
 

@@ -20,10 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..compilation.xla_cpu import compiled_quickly, greatest
 from ..integration import AbstractProblem, Outcome, Settings, solve_ensemble, traced_solve_ensemble
 from ..integration.scheduler import Numbers
 from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
-from ..xla_cpu import compiled_quickly, greatest
 from .mode import AbstractBatchedMode, Transition, mode_of_cells
 
 #: Largest number of rounds, and so of modes in a run; then unfinished cells end as `UNRESOLVED`.

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..compiled_programs import padded
+from ..compilation.compiled_programs import padded
+from ..compilation.xla_cpu import compiled_quickly
 from ..integration import AbstractProblem, DenseSolution, Outcome, Settings, follow
 from ..integration.dense import PIECE_OF_MODE
 from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED
-from ..xla_cpu import compiled_quickly
 from .ensemble import Carry, after_reset, after_solve, at_start, host_rounds
 from .mode import AbstractBatchedMode, Transition
 

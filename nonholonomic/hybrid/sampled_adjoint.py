@@ -19,6 +19,7 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
+from ..compilation.xla_cpu import greatest, uncounted
 from ..derivatives import tangents_of
 from ..derivatives.differentiable import over_cells as with_cells
 from ..derivatives.periods import Checkpoints
@@ -26,7 +27,6 @@ from ..derivatives.sampled_adjoint import SampledCotangents, mixture, samples_pu
 from ..derivatives.variation import where_active
 from ..integration import AbstractProblem, Lanes, Settings, States
 from ..integration.status import LEFT_DOMAIN, REACHED_END, RUNNING
-from ..xla_cpu import greatest, uncounted
 from .ensemble import MOST_ROUNDS, Advance, Carry, HybridOutcome, at_start, chosen, one_round, padded
 from .mode import AbstractBatchedMode, mode_of_cells, over_cells
 from .path import BETWEEN

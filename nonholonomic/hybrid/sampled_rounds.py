@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..compilation.xla_cpu import greatest
 from ..integration import Settings, solve_with_samples
-from ..xla_cpu import greatest
 from .ensemble import Advance, Carry, HybridOutcome, after_reset, after_solve, chosen, padded
 from .mode import AbstractBatchedMode, mode_of_cells, over_cells
 from .path import BETWEEN

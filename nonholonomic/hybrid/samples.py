@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..compilation.xla_cpu import compiled_alone
 from ..derivatives import in_groups, tangents_by
 from ..derivatives.differentiable import by_active, tangent_along
 from ..derivatives.sampling import AbstractSampling, ProblemSpec, solve_for_samples
 from ..integration import Settings
 from ..integration.status import REACHED_END
-from ..xla_cpu import compiled_alone
 from .ensemble import HybridOutcome, at_start, traced_rounds
 from .mode import AbstractBatchedMode, over_cells
 from .saltation import variational_modes, variational_start

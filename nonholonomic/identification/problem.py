@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..compiled_programs import padded
+from ..compilation.compiled_programs import padded
 from ..validation import is_traced, shown
 from .likelihood import Measurements
 from .unknown import Free, Unknown

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..compilation.xla_cpu import greatest
 from ..parameters import numbers, with_numbers
 from ..text import one_line
 from ..validation import as_number, as_number_or_none, require, shown
 from ..warning import warn
-from ..xla_cpu import greatest
 from .likelihood import Measurements
 
 #: Spacing [s] of model times for samples before the launch: so small that nothing moves.

@@ -12,7 +12,7 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Bool, Float, Int
 
-from ..compiled_programs import padded
+from ..compilation.compiled_programs import padded
 from .problem import AbstractProblem, margin_at_start
 from .settings import Settings
 from .zeros import halved

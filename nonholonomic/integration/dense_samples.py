@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Int
 
-from ..xla_cpu import written_in_place
+from ..compilation.xla_cpu import written_in_place
 from .continuous_extension import StatesInside, StepEnd, continuous_extension, second_derivative
 from .runge_kutta import Lanes, States
 from .sample_times import Collected, Rows, SampleTimes

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ..xla_cpu import compiled_alone
+from ..compilation.xla_cpu import compiled_alone
 from .problem import AbstractProblem, crossing_time
 from .scheduler import LaneScheduler, Outcome
 from .settings import Settings

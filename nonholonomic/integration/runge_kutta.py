@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..compilation.xla_cpu import written_by_component, written_in_place
 from ..validation import shown
-from ..xla_cpu import written_by_component, written_in_place
 
 Lanes = Float[Array, " lanes"]
 States = Float[Array, "components lanes"]

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..xla_cpu import written_in_place
+from ..compilation.xla_cpu import written_in_place
 from .dense_samples import DenseSampleRecorder
 from .oscillatory import Oscillatory8
 from .problem import AbstractProblem

@@ -15,7 +15,7 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from ..xla_cpu import in_one_kernel
+from ..compilation.xla_cpu import in_one_kernel
 from .event import Bracket
 from .problem import AbstractProblem, least_margin, margin_at_start
 from .runge_kutta import Lanes, States, explicit_order, explicit_tableau, first_length, memory_for_stages

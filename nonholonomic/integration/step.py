@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from ..xla_cpu import stored
+from ..compilation.xla_cpu import stored
 from .double_roots import missed_double_root, missed_loss
 from .event import Bracket, refine
 from .problem import AbstractProblem, crossing_time, side_of

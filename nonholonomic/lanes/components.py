@@ -20,8 +20,8 @@ import numpy as np
 from jax.extend.core import Jaxpr, Literal
 from jaxtyping import Array
 
+from ..compilation.xla_cpu import stored
 from ..validation import is_traced
-from ..xla_cpu import stored
 from .tracing import spelled_out
 
 #: Operations on numbers, element by element.

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..compilation.xla_cpu import compiled_alone
 from ..hybrid import HybridOutcome, HybridSamples, solve_hybrid_with_samples
 from ..integration import Outcome, Settings, solve_with_samples
 from ..sweeps import Axis, Variable, axis
-from ..xla_cpu import compiled_alone
 from .event import modes_of, problem_of
 from .model import AbstractModel, Names, Start
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..compiled_programs import forget_programs_if_many
+from ..compilation.compiled_programs import forget_programs_if_many
 from ..progress import Progress
 from ..validation import require_flag, shown
 from ..warning import warn

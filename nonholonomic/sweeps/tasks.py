@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import __version__
-from ..compiled_programs import forget_programs_if_many
+from ..compilation.compiled_programs import forget_programs_if_many
 from .grid import Axis, columns, size_of
 from .layout import Values
 

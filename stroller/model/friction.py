@@ -8,10 +8,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from nonholonomic.compilation.xla_cpu import greatest
 from nonholonomic.geometry import Component
 from nonholonomic.lanes.objects import held, map_methods
 from nonholonomic.validation import Bound, Bounded, as_number
-from nonholonomic.xla_cpu import greatest
 
 
 class WheelMotion(NamedTuple):

@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from nonholonomic.compilation.xla_cpu import compiled_quickly
 from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import Settings, explicit_tableau, follow, sample
 from nonholonomic.integration.status import REACHED_END
 from nonholonomic.integration.zeros import few_trials
-from nonholonomic.xla_cpu import compiled_quickly
 
 from ..model.dynamics import State
 from ..model.input import Input

@@ -15,9 +15,9 @@ import jax
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from nonholonomic import compilation_cache as cache
 from nonholonomic import enable_compilation_cache
-from nonholonomic.compilation_cache import LOOKED_AT, are_kept, environment_name, kept_files
+from nonholonomic.compilation import compilation_cache as cache
+from nonholonomic.compilation.compilation_cache import LOOKED_AT, are_kept, environment_name, kept_files
 
 pytestmark = pytest.mark.newest
 

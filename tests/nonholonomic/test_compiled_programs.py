@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from nonholonomic import compiled_programs
-from nonholonomic.compiled_programs import count_mappings, forget_programs_if_many, resident_memory
+from nonholonomic.compilation import compiled_programs
+from nonholonomic.compilation.compiled_programs import count_mappings, forget_programs_if_many, resident_memory
 
 pytestmark = [
     pytest.mark.newest,

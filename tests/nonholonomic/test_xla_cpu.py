@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nonholonomic.xla_cpu import greatest, least
+from nonholonomic.compilation.xla_cpu import greatest, least
 
 
 @pytest.mark.parametrize("function", [least, greatest])

@@ -15,11 +15,11 @@ import numpy as np
 from random_scenes import Batch, batch
 
 import tippe
+from nonholonomic.compilation.xla_cpu import compile_quickly
 from nonholonomic.integration import Settings
 from nonholonomic.parameters import with_numbers
 from nonholonomic.runs import TableJob
 from nonholonomic.runs.errors import errors_of, second_tolerance
-from nonholonomic.xla_cpu import compile_quickly
 from tippe.runs.model import INVERSIONS, TopModel
 
 ANGLE, TOLERANCE = 0.95 * np.pi, 1e-9

@@ -7,9 +7,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from nonholonomic.compilation.xla_cpu import least
 from nonholonomic.geometry import Component, Tangent, multiply, stacked
 from nonholonomic.integration.status import Status
-from nonholonomic.xla_cpu import least
 
 from .contact_load import ContactLoad, Slip
 

@@ -10,6 +10,7 @@ from typing import Self
 
 from jaxtyping import Array, Float
 
+from nonholonomic.compilation.xla_cpu import stored, stored_with_tangents
 from nonholonomic.geometry import (
     AbstractFrame,
     Vector,
@@ -22,7 +23,6 @@ from nonholonomic.geometry import (
     subtract,
     sum_vectors,
 )
-from nonholonomic.xla_cpu import stored, stored_with_tangents
 
 from .body import AbstractBody, AbstractMeridian
 from .contact_dynamics import AbstractContactDynamics, Motion

@@ -21,6 +21,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from nonholonomic.compilation.xla_cpu import stored
 from nonholonomic.geometry import (
     AbstractFrame,
     Component,
@@ -39,7 +40,6 @@ from nonholonomic.geometry import (
     sum_vectors,
     vector_of,
 )
-from nonholonomic.xla_cpu import stored
 
 from .contact_dynamics import AbstractContactDynamics, Motion
 from .contact_load import ContactLoad, Slip

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from nonholonomic.compilation.xla_cpu import stored
 from nonholonomic.geometry import (
     AbstractFrame,
     Component,
@@ -24,7 +25,6 @@ from nonholonomic.geometry import (
     subtract,
     sum_vectors,
 )
-from nonholonomic.xla_cpu import stored
 
 from .contact_dynamics import Motion
 from .contact_load import ContactLoad, Slip

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.polynomial import Polynomial, legendre
 
-from nonholonomic.xla_cpu import greatest
+from nonholonomic.compilation.xla_cpu import greatest
 
 from .contact_load import Slip
 from .dynamics import Dynamics

@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from nonholonomic.compilation.xla_cpu import greatest
 from nonholonomic.geometry import AbstractFrame
-from nonholonomic.xla_cpu import greatest
 
 from .contact_dynamics import FITS, NO_LOAD, AbstractDynamics, Motion, carries_no_load
 from .contact_load import Slip

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.geometry import Component
 from nonholonomic.validation import largest, one_line
-from nonholonomic.xla_cpu import compiled_setup
 
 from .contact_load import Slip
 

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from nonholonomic.compilation.xla_cpu import compiled_setup, greatest
 from nonholonomic.geometry import (
     CarriedFrame,
     Component,
@@ -33,7 +34,6 @@ from nonholonomic.geometry import (
 from nonholonomic.hybrid import Transition
 from nonholonomic.integration import AbstractPassive, AbstractProblem
 from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED
-from nonholonomic.xla_cpu import compiled_setup, greatest
 
 from ..model.dynamics import Dynamics
 from ..model.friction import SetValuedCoulomb

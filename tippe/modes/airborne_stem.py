@@ -14,11 +14,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from nonholonomic.compilation.xla_cpu import compiled_setup, greatest
 from nonholonomic.geometry import scale, sum_vectors, vector_of
 from nonholonomic.hybrid import Transition
 from nonholonomic.integration import AbstractProblem
 from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED
-from nonholonomic.xla_cpu import compiled_setup, greatest
 
 from ..model.scene import Scene
 from ..model.state import COS_THETA

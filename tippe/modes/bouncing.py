@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from nonholonomic.compilation.xla_cpu import greatest
 from nonholonomic.geometry import dot
 from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
-from nonholonomic.xla_cpu import greatest
 
 from ..model.dynamics import Dynamics
 from ..model.scene import Scene

@@ -16,11 +16,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from nonholonomic.compilation.xla_cpu import greatest, least
 from nonholonomic.geometry import Vector, dot, scale, sum_vectors, vector_of
 from nonholonomic.integration import AbstractProblem, Settings, traced_solve_ensemble
 from nonholonomic.integration.settings import MOST_STEPS
 from nonholonomic.integration.status import LEFT_DOMAIN
-from nonholonomic.xla_cpu import greatest, least
 
 from ..model.friction import SetValuedCoulomb, length
 from ..model.top import Top

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
+from nonholonomic.compilation.xla_cpu import greatest
 from nonholonomic.geometry import Vector, cross, dot, scale, subtract, sum_vectors
 from nonholonomic.integration.zeros import halved
-from nonholonomic.xla_cpu import greatest
 
 from ..model.top import Top
 from .free_body import Ball, FreeBody, gap, gap_rate

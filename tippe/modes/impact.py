@@ -24,11 +24,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from nonholonomic.compilation.xla_cpu import greatest, least
 from nonholonomic.geometry import Vector, cross, dot, scale, sum_vectors
 from nonholonomic.integration import AbstractProblem, Settings, traced_solve_ensemble
 from nonholonomic.integration.settings import MOST_STEPS
 from nonholonomic.integration.status import LEFT_DOMAIN
-from nonholonomic.xla_cpu import greatest, least
 
 from ..model.contact_load import ContactLoad, Slip
 from ..model.friction import AbstractFriction

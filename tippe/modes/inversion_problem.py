@@ -6,8 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.integration import AbstractProblem
-from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.dynamics import NO_COSINE, Dynamics
 from ..model.launch import Launch

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from nonholonomic.compilation.xla_cpu import compiled_setup, least
 from nonholonomic.hybrid import AbstractHoppingMode, Transition, TransitionPath
 from nonholonomic.integration import AbstractProblem
 from nonholonomic.integration.status import CROSSED, RUNNING, UNRESOLVED
-from nonholonomic.xla_cpu import compiled_setup, least
 
 from ..model.dynamics import Dynamics
 from ..model.scene import Scene

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.hybrid import AbstractBatchedMode, Transition, TransitionPath
 from nonholonomic.integration import AbstractProblem, ExtendedProblem
 from nonholonomic.integration.status import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING
-from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.dynamics import NO_COSINE
 from ..model.scene import Scene

@@ -6,9 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.geometry import Component, Tangent, Vector, cross, dot, rate_in_frame, scale, stacked, sum_vectors
 from nonholonomic.integration import AbstractPassive, ExtendedProblem
-from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.dynamics import Dynamics
 from ..model.launch import Launch

@@ -19,13 +19,13 @@ import numpy as np
 
 from nonholonomic import __version__
 from nonholonomic.command_line import closing_lines
-from nonholonomic.compilation_cache import enable_compilation_cache
+from nonholonomic.compilation.compilation_cache import enable_compilation_cache
+from nonholonomic.compilation.xla_cpu import compiled_quickly
 from nonholonomic.geometry import AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.progress import Progress, status_line
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import require_folder
 from nonholonomic.views import NO_VIEW, Stage, can_view, page, picture_as_html, table_as_html
-from nonholonomic.xla_cpu import compiled_quickly
 
 from ..model.friction import AbstractFriction, Coulomb, Viscous
 from ..model.launch import Launch

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from nonholonomic.compilation.xla_cpu import greatest, least
 from nonholonomic.derivatives import VariationalProblem, differentiable_solve, in_groups, tangents_by
 from nonholonomic.integration import Lanes, Settings, crossing_time, traced_solve_ensemble
 from nonholonomic.integration.settings import MOST_STEPS
@@ -14,7 +15,6 @@ from nonholonomic.integration.status import CROSSED, FAILED
 from nonholonomic.progress import status_line
 from nonholonomic.runs import EventTime
 from nonholonomic.validation import as_number
-from nonholonomic.xla_cpu import greatest, least
 
 from ..model.launch import Launch
 from ..model.scene import Scene

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.compiled_programs import padded
+from nonholonomic.compilation.compiled_programs import padded
 from nonholonomic.geometry import Component, Vector, dot, rate_in_frame, scale, stacked, sum_vectors
 from nonholonomic.hybrid import HybridPath
 from nonholonomic.integration import DenseSolution

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.hybrid import AbstractBatchedMode
 from nonholonomic.integration.status import Status
 from nonholonomic.runs import Start
-from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.dynamics import NO_COSINE
 from ..model.launch import Launch

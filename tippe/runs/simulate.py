@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from nonholonomic.compilation.xla_cpu import on_device
 from nonholonomic.hybrid import BETWEEN, HybridOutcome, HybridPath, solve_hybrid_dense
 from nonholonomic.integration import DenseSolution, Settings, explicit_tableau, follow
 from nonholonomic.integration.checks import require_adaptive, require_adjoint, require_times
 from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, REACHED_END, Status
 from nonholonomic.runs import sampled_if_legal
 from nonholonomic.validation import as_number, is_traced, nan_unless, shown
-from nonholonomic.xla_cpu import on_device
 
 from ..modes.airborne import FLYING
 from .flight_trajectory import HybridTrajectory

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from nonholonomic.compilation.xla_cpu import on_device
 from nonholonomic.geometry import scale, sum_vectors
 from nonholonomic.integration.status import Status
-from nonholonomic.xla_cpu import on_device
 
 from ..model.friction import length
 from .observables import AbstractTrajectory, of_each_run

@@ -19,7 +19,7 @@ from jax.interpreters import mlir, partial_eval
 from jaxlib.version import __version__ as jaxlib_version
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .warning import warn
+from ..warning import warn
 
 Result = TypeVar("Result")
 

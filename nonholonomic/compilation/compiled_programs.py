@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from .validation import is_traced
+from ..validation import is_traced
 
 #: Memory [bytes] of the process above which programs are cleared, if there are so many mappings that programs are the
 #: cause.
@@ -40,7 +40,7 @@ def padded(values: Float[np.ndarray, "... times"], least: int) -> Float[np.ndarr
     **Example:**
 
     >>> import numpy as np
-    >>> from nonholonomic.compiled_programs import padded
+    >>> from nonholonomic.compilation.compiled_programs import padded
     >>> padded(np.array([1.0, 2.0, 3.0]), least=300).shape
     (512,)
     """

@@ -239,6 +239,6 @@ def _versions() -> list[str]:
 
 def _sources() -> Iterator[Path]:
     """The sources of the packages that were installed with this file."""
-    root = Path(__file__).parent.parent
+    root = Path(__file__).parents[2]
     for package in ("nonholonomic", "tippe", "stroller"):
         yield from (path for kind in ("py", "js", "html") for path in (root / package).rglob(f"*.{kind}"))

@@ -1,0 +1,1 @@
+"""How programs are compiled, kept in memory, and kept on disk."""
