@@ -5,6 +5,7 @@ import re
 import runpy
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import pytest
 
 from tippe import FitWarning
@@ -38,6 +39,17 @@ def test_example_is_short_and_can_be_read(path):
     assert callable(names["draw" if "draw" in names else "main"])
 
 
+@pytest.mark.parametrize(
+    "path", [path for path in EXAMPLES if "def draw()" in path.read_text()], ids=lambda path: path.stem
+)
+def test_a_picture_of_the_gallery_is_drawn(path, tmp_path, monkeypatch):
+    # Some write files.
+    monkeypatch.chdir(tmp_path)
+    picture = runpy.run_path(str(path))["draw"]()
+    plt.close("all")
+    assert picture.axes if hasattr(picture, "axes") else "facts" in picture.html
+
+
 #: What an example is warned of, where that is what it shows.
 WARNED = {"lost_numbers": "the data do not determine"}
 
@@ -48,10 +60,6 @@ def test_example_runs(path, capsys, tmp_path, monkeypatch):
     # Some write files.
     monkeypatch.chdir(tmp_path)
     names = runpy.run_path(str(path))
-    if "draw" in names:
-        # A picture or a page of the manual's gallery.
-        figure = names["draw"]()
-        assert figure.axes if hasattr(figure, "axes") else "facts" in figure.html
     if "main" in names:
         with pytest.warns(FitWarning, match=WARNED[path.stem]) if path.stem in WARNED else contextlib.nullcontext():
             names["main"]()

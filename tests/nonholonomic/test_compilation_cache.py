@@ -19,8 +19,6 @@ from nonholonomic import enable_compilation_cache
 from nonholonomic.compilation import compilation_cache as cache
 from nonholonomic.compilation.compilation_cache import LOOKED_AT, are_kept, environment_name, kept_files
 
-pytestmark = pytest.mark.newest
-
 #: Tells the result of a program, how many programs were asked for, and how many of them were found compiled.
 COUNTED = """
 import collections, json, jax, numpy as np
@@ -53,6 +51,7 @@ def run(program, home, **settings):
     return json.loads(process.stdout), process.stderr
 
 
+@pytest.mark.newest
 def test_a_second_process_compiles_nothing(tmp_path):
     first, _ = run(TABLE, tmp_path)
     assert first["folder"] == str(tmp_path / "nonholonomic" / environment_name())

@@ -9,8 +9,6 @@ from tops import rutstam_top
 
 import tippe
 
-pytestmark = pytest.mark.newest
-
 
 @pytest.mark.parametrize(
     ("I1_factor", "right_angle", "three"),

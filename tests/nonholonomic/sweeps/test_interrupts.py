@@ -15,8 +15,6 @@ from cheap_sweep import cheap_sweep, resumed
 from nonholonomic.command_line import INTERRUPTED, PATIENCE
 from nonholonomic.sweeps._chunks import ChunkStore
 
-pytestmark = pytest.mark.newest
-
 #: How long an answer to Ctrl-C may take [s]: twice as long where other programs keep all cores busy.
 PROMPT = 2.0 if os.getloadavg()[0] <= (os.cpu_count() or 1) else 4.0
 
@@ -199,6 +197,7 @@ def test_a_table_is_heard_while_it_compiles(tmp_path):
     assert duration < PROMPT
 
 
+@pytest.mark.newest
 def test_a_command_line_ends_while_it_compiles(tmp_path):
     process = run(tmp_path, COMMAND)
     assert process.stdout.readline() == "begun\n"
