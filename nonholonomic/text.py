@@ -6,7 +6,7 @@ import html
 import inspect
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -92,6 +92,18 @@ def in_unit(si: str, unit: str | Sequence[str] | None) -> tuple[str, float]:
         if readable and name in UNITS.get(readable, {}):
             return name, 1.0 / UNITS[readable][name]
     return si, 1.0
+
+
+def require_unit_of(unit: str | Sequence[str] | None, units: Mapping[str, str]) -> None:
+    """Raise `ValueError` if none of the drawn numbers can be shown in a unit, as in lengths for an angle.
+
+    **Arguments:** `unit`: as for `in_unit`; `units`: name of a number -> its SI unit.
+    """
+    named = [unit] if isinstance(unit, str) else [*(unit or ())]
+    possible = {name for si in units.values() for name in UNITS.get(readable_unit(si), {})}
+    if named and not possible & {*named, *(f"{name}/s" for name in named)}:
+        listed = ", ".join(f"{name} [{readable_unit(si)}]" if readable_unit(si) else name for name, si in units.items())
+        raise ValueError(f"unit = {shown(unit)} is a unit of nothing that is drawn: {listed}")
 
 
 def require_unit(unit: Any) -> None:
@@ -203,8 +215,10 @@ def differences(modules: list[Any], unit: str | Sequence[str] | None = None) -> 
                 values = [
                     jax.tree.map(lambda number, factor=factor: _rounded(factor * number), value) for value in values
                 ]
-            texts = [as_text(value, name) for value in values]
-            parts = [[f"{field.name} {text}"] if len(set(texts)) > 1 else [] for text in texts]
+            texts = [
+                f"no {field.name}" if value is None else f"{field.name} {as_text(value, name)}" for value in values
+            ]
+            parts = [[text] if len(set(texts)) > 1 else [] for text in texts]
         labels = [label + part for label, part in zip(labels, parts, strict=True)]
     return labels
 

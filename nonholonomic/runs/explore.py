@@ -11,10 +11,11 @@ from jaxtyping import Array, Float
 from ..integration import AbstractProblem, Settings
 from ..integration.checks import run_bounds
 from ..progress import status_line
-from ..text import readable_unit
+from ..text import readable_unit, require_unit
 from ..validation import IN_DEGREES, require_all, require_file, shown
 from ..views import Page, Stage
 from ..views.explore import Answer, Frame, HybridSimulator, LiveRun, Simulator, Slider, Summary, live_page
+from ..views.stage import curves_in
 from .model import AbstractModel, model_of
 
 #: The tolerance in the page, and that of the runs that determine the drawn part of the arena.
@@ -35,6 +36,7 @@ def explore(
     sliders: dict[str, tuple[float, float]] | None = None,
     t1: float = 8.0,
     input: Any = None,
+    unit: Any = None,
 ) -> Page:
     """Make a page with sliders that simulates a run in the browser while you move a slider.
 
@@ -50,6 +52,7 @@ def explore(
     - `sliders`: name of a parameter -> (lowest, highest) value; the end of a name is enough if only one parameter
       matches.
     - `t1`: horizon [s].
+    - `unit`: unit of the curves, such as "deg" for all angles, or several, such as ("deg", "cm").
 
     **Returns:** a `Page`, with its `html`.
 
@@ -79,16 +82,19 @@ def explore(
 
     ```
     """
-    return explore_model(model_of(system, start, None, input), path, sliders, float(t1))
+    return explore_model(model_of(system, start, None, input), path, sliders, float(t1), unit)
 
 
-def explore_model(model: AbstractModel, path: Any, sliders: Any, t1: float) -> Page:
+def explore_model(model: AbstractModel, path: Any, sliders: Any, t1: float, unit: Any) -> Page:
     """The page of a model. **Arguments:** as for `explore`."""
     if path is not None:
         require_file(path, "path", ".html", ".htm")
     require_all(run_bounds(t1, 1e-9))
+    require_unit(unit)
     model.check()
-    html_page = live_page(*page_of(model, sliders, t1))
+    live, stage = page_of(model, sliders, t1)
+    (stage,) = curves_in([stage], unit)
+    html_page = live_page(live, stage)
     if path is not None:
         html_page.save(path)
     return html_page

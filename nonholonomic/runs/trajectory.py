@@ -173,16 +173,18 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         require_increasing(times, "times")
         return self.model.simulate(self.t1, times, self.settings.tolerance, self.settings.solver, None)
 
-    def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
+    def stages(self, others: Sequence[Any] = (), overlaid: bool = False, unit: Any = None) -> list[Stage]:
         return portraits([run._with_resets() for run in (self, *others)], overlaid)
 
     def table_of(self, names: Sequence[str]) -> Table:
         """The table that pictures draw, with the states before and after each reset."""
         return self._with_resets().to_table()
 
-    def explore(self, path: Any = None, sliders: dict[str, tuple[float, float]] | None = None) -> Page:
+    def explore(
+        self, path: Any = None, sliders: dict[str, tuple[float, float]] | None = None, unit: Any = None
+    ) -> Page:
         """A page with sliders that simulates the run in the browser; see `nonholonomic.explore`."""
-        return explore_model(self.model, path, sliders, float(self.t1))
+        return explore_model(self.model, path, sliders, float(self.t1), unit)
 
     def labels_of(self, runs: list[Any], unit: Any) -> list[str]:
         """Labels that tell runs apart by the numbers of their systems and starts that differ."""

@@ -9,7 +9,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from ..text import as_html, in_unit, readable_unit, require_unit
+from ..text import as_html, in_unit, readable_unit, require_unit, require_unit_of
 from ..validation import as_path, require_package, shown
 from ..views import draw_table
 from ._chunks import unfinished
@@ -305,6 +305,8 @@ class Table(eqx.Module):
         chosen = [next(iter(self.variables)) if name is None else str(name).partition(".")[0] for name in names]
         if unit is None or not all(name in self.variables for name in chosen):
             return self
+        drawn = [*dict.fromkeys(chosen), *self.coords]
+        require_unit_of(unit, {name: self.units.get(name, "1") for name in drawn})
         units = {name: in_unit(si, unit) for name, si in self.units.items()}
 
         def converted(values: Mapping[str, Values], names: Sequence[str]) -> dict[str, Values]:

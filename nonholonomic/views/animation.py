@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..text import in_unit
 from .arena import FINE
 from .page import ANGLE, centre_and_extent, view_from
 from .plot import new_figure
-from .stage import Curve, Show, Stage, css, finite, matrices, nearest
+from .stage import Show, Stage, css, finite, matrices, nearest
 
 #: Dots per inch.
 DOTS = 80
@@ -28,15 +27,14 @@ LEAST_RANGE = 1e-3
 Times = Float[np.ndarray, " frames"]
 
 
-def draw_curves(stages: list[Stage], names: Sequence[str] = (), unit: str | Sequence[str] | None = None) -> Any:
+def draw_curves(stages: list[Stage], names: Sequence[str] = ()) -> Any:
     """A panel for each label, with the curves of all runs in it.
 
-    **Arguments:** `names`: names of the runs for the legend, by default those on the page; `unit`: as for `plot`.
+    **Arguments:** `names`: names of the runs for the legend, by default those on the page.
 
     **Returns:** a matplotlib figure.
     """
     shows = [show for stage in stages for show in stage.shows]
-    shows = [show._replace(curves=tuple(_in_unit(curve, unit) for curve in show.curves)) for show in shows]
     labels = _labels(shows)
     figure = new_figure(7.0, 1.3 + 1.5 * len(labels))
     for label, panel in zip(labels, figure.subplots(len(labels), 1, sharex=True, squeeze=False)[:, 0], strict=True):
@@ -55,20 +53,11 @@ def _labels(shows: list[Show]) -> list[str]:
     return list(dict.fromkeys(curve.label for show in shows for curve in show.curves))
 
 
-def _in_unit(curve: Curve, unit: str | Sequence[str] | None) -> Curve:
-    """A curve in another unit, if its label ends in a unit that can be converted."""
-    name, bracket, si = curve.label.removesuffix("]").rpartition(" [")
-    if unit is None or not bracket:
-        return curve
-    text, factor = in_unit(si, unit)
-    return Curve(f"{name} [{text}]", factor * curve.values)
-
-
 def _draw_curve(panel: Any, shows: list[Show], label: str) -> None:
     for show in shows:
         for curve in show.curves:
             if curve.label == label:
-                panel.plot(show.times, curve.values, color=css(show.colour), linewidth=1.0)
+                panel.plot(show.times, curve.drawn, color=css(show.colour), linewidth=1.0)
     panel.margins(x=0.0)
     low, high = panel.get_ylim()
     middle = (low + high) / 2.0

@@ -260,7 +260,9 @@ def _show(show: Show, numbers: _Numbers) -> dict[str, Any]:
             }
             for arrow in show.arrows
         ],
-        "curves": [{"label": curve.label, "values": numbers.add(curve.values)} for curve in show.curves],
+        "curves": [
+            {"label": curve.label, "factor": curve.factor, "values": numbers.add(curve.values)} for curve in show.curves
+        ],
     }
 
 

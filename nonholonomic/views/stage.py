@@ -4,10 +4,13 @@ This module does not depend on tops or strollers. Lengths are in metres in the f
 seconds.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+
+from ..text import in_unit, require_unit_of
 
 Points = Float[np.ndarray, "times 3"]
 
@@ -70,10 +73,27 @@ class Arrow(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """A number over time, with a label that names its unit."""
+    """A number over time, with a label that names its unit.
+
+    `factor` converts the values, in SI units, to the unit of the label.
+    """
 
     label: str
     values: Float[np.ndarray, " times"]
+    factor: float = 1.0
+
+    @property
+    def drawn(self) -> Float[np.ndarray, " times"]:
+        """The values in the unit of the label."""
+        return self.factor * self.values
+
+    def drawn_in(self, unit: str | Sequence[str] | None) -> "Curve":
+        """The curve in another unit, if its label ends in a unit that can be converted. **Arguments:** as for `in_unit`."""
+        name, bracket, si = self.label.removesuffix("]").rpartition(" [")
+        if unit is None or not bracket:
+            return self
+        text, factor = in_unit(si, unit)
+        return self._replace(label=f"{name} [{text}]", factor=factor)
 
 
 class Show(NamedTuple):
@@ -112,6 +132,24 @@ class Stage(NamedTuple):
     shows: tuple[Show, ...]
     follows: bool = False
     rise: float = 0.3
+
+
+def curves_in(stages: list[Stage], unit: str | Sequence[str] | None) -> list[Stage]:
+    """The stages with their curves in other units, as for `in_unit`.
+
+    **Raises:** `ValueError` if no curve can be drawn in the unit.
+    """
+    labels = dict.fromkeys(curve.label for stage in stages for show in stage.shows for curve in show.curves)
+    parts = [label.removesuffix("]").partition(" [") for label in labels]
+    require_unit_of(unit, {name: si or "1" for name, _, si in parts})
+    return [
+        stage._replace(
+            shows=tuple(
+                show._replace(curves=tuple(curve.drawn_in(unit) for curve in show.curves)) for show in stage.shows
+            )
+        )
+        for stage in stages
+    ]
 
 
 #: Colours of a page's runs, for the curves and one half of the body; arrows have other colours.

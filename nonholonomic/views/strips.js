@@ -29,6 +29,10 @@ window.views = window.views || {};
     // `runs()`: returns the runs, with `times`, `colour` and `curves`; `seek(time)`: called when the reader clicks at a time.
     constructor(parent, runs, seek) {
       Object.assign(this, { runs, seek, now: 0, pointed: null });
+      if (runs().length > 1) {
+        const legend = views.element("div", parent, { className: "names" });
+        for (const run of runs()) views.element("span", legend, { textContent: run.name }).style.color = run.colour;
+      }
       const labels = [...new Set(runs().flatMap((run) => run.curves.map((curve) => curve.label)))];
       this.strips = labels.map((label) => {
         const box = views.element("div", parent, { className: "strip" }), head = views.element("div", box, { className: "head" });
@@ -55,7 +59,9 @@ window.views = window.views || {};
       this.duration = Math.max(...runs.map((run) => run.times[run.times.length - 1]));
       for (const strip of this.strips) {
         strip.curves = runs.flatMap((run) => run.curves.filter((curve) => curve.label === strip.label)
-          .map((curve) => ({ times: run.times, values: curve.values, colour: run.colour })));
+          .map((curve) => ({
+            times: run.times, colour: run.colour, values: curve.factor === 1 ? curve.values : curve.values.map((v) => curve.factor * v),
+          })));
         let low = Infinity, high = -Infinity;
         for (const curve of strip.curves) for (const v of curve.values) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); }
         // Draw values that are constant except for round-off as a constant.

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nonholonomic.geometry import AbstractSurface
+from nonholonomic.text import in_unit
 from nonholonomic.views import DARK, Body, Mesh, Stage, arena, bar
 from nonholonomic.views.meshes import of_grid
 from nonholonomic.views.plot import new_figure
@@ -42,8 +43,8 @@ def outline(obstacle: Box | Disc) -> Float[np.ndarray, "corners 2"]:
     return np.array(obstacle.centre, dtype=float) + float(obstacle.radius) * unit
 
 
-def draw_plan(plan: Any) -> Any:
-    """The plan from above, and its speed and steering angle over time, as a matplotlib figure."""
+def draw_plan(plan: Any, unit: Any = None) -> Any:
+    """The plan from above, and its speed and steering angle over time in a unit as for `in_unit`, as a matplotlib figure."""
     figure = new_figure(9.0, 4.5)
     above, curves = figure.subplots(1, 2, width_ratios=(3, 2))
     for obstacle in plan.problem.obstacles:
@@ -65,8 +66,9 @@ def draw_plan(plan: Any) -> Any:
     above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
     above.set_title("reaches the goal" if plan.reached else "; ".join(plan.hindrances), fontsize="small")
     above.legend(fontsize="small")
-    curves.plot(plan.run.t, plan.run.speed, label="speed [m/s]")
-    curves.plot(plan.run.t, plan.run.steering, label="steering angle [rad]")
+    for name, values, si in (("speed", plan.run.speed, "m/s"), ("steering angle", plan.run.steering, "rad")):
+        text, factor = in_unit(si, unit)
+        curves.plot(plan.run.t, factor * values, label=f"{name} [{text}]")
     curves.set_xlabel("time [s]")
     curves.legend(fontsize="small")
     return figure

@@ -1,14 +1,16 @@
 """The result of a plan."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
 from nonholonomic.progress import status_line
-from nonholonomic.text import readable_unit
+from nonholonomic.text import readable_unit, require_unit
 from nonholonomic.validation import require_file, require_package
 from nonholonomic.views import Page, page
+from nonholonomic.views.stage import curves_in
 
 from ..runs.trajectory import Trajectory
 from .check import Verdict
@@ -99,21 +101,26 @@ class Plan(eqx.Module):
     def __repr__(self) -> str:
         return str(self)
 
-    def plot(self) -> Any:
+    def plot(self, unit: str | Sequence[str] | None = None) -> Any:
         """Draw the plan from above, with its obstacles, footprint and candidates, and its speed and steering over time
         (needs matplotlib).
 
+        **Arguments:** `unit`: unit of speed and steering, such as "deg", "km/h", or both.
+
         **Returns:** a matplotlib figure.
+
+        **Raises:** `ValueError` for an unknown unit.
         """
         require_package("matplotlib", "plot", "plot")
-        return draw_plan(self)
+        require_unit(unit)
+        return draw_plan(self, unit)
 
     @status_line("drawing")
-    def view(self, path: Any = None) -> Page:
+    def view(self, path: Any = None, unit: str | Sequence[str] | None = None) -> Page:
         """An animated page of the drive, with its obstacles, the footprint, and the candidates as thin lines (needs
         jupyter-threejs-sage).
 
-        **Arguments:** `path`: file for the page, with a name that ends in .html, or `None`.
+        **Arguments:** `path`: file for the page, with a name that ends in .html, or `None`; `unit`: unit of the curves.
 
         **Returns:** a `Page`, which a notebook shows.
 
@@ -123,7 +130,8 @@ class Plan(eqx.Module):
         require_package("jupyter_threejs_sage", "view", "view")
         if path is not None:
             require_file(path, "path", ".html", ".htm")
-        stage = planned_stage(self)
+        require_unit(unit)
+        (stage,) = curves_in([planned_stage(self)], unit)
         html_page = page([stage], stage.title, speed=1.0)
         if path is not None:
             html_page.save(path)

@@ -197,8 +197,8 @@ class Trajectory(Viewable, Tabular, eqx.Module):
     def labels_of(self, runs: list[Any], unit: Any) -> list[str]:
         return names_of(runs, unit) if len(runs) > 1 else [""]
 
-    def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
-        return as_stages([self, *others], overlaid)
+    def stages(self, others: Sequence[Any] = (), overlaid: bool = False, unit: Any = None) -> list[Stage]:
+        return as_stages([self, *others], overlaid, unit)
 
     @status_line("reading off")
     def __str__(self) -> str:

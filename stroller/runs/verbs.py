@@ -1,5 +1,6 @@
 """The functions of the stroller, on those of `nonholonomic.runs`."""
 
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from typing import Any
 
@@ -162,6 +163,7 @@ def explore(
     sliders: dict[str, tuple[float, float]] | None = None,
     t1: float = 8.0,
     input: Input | None = None,
+    unit: str | Sequence[str] | None = None,
 ) -> Page:
     """Make a page with sliders that simulates the ride in the browser while you move a slider.
 
@@ -179,6 +181,7 @@ def explore(
       matches, such as "launch.speed", "launch.steering" or "inertia". By default speed, steering angle, heading and
       friction.
     - `t1`: horizon [s].
+    - `unit`: unit of the curves, such as "deg" for all angles.
 
     **Returns:** a `Page`, with its `html`.
 
@@ -200,4 +203,4 @@ def explore(
     ```
     """
     check_run(scene, launch, t1, input, TOLERANCE)
-    return explore_model(RideModel.of(scene, launch, input), path, sliders, float(t1))
+    return explore_model(RideModel.of(scene, launch, input), path, sliders, float(t1), unit)

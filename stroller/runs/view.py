@@ -47,9 +47,9 @@ DRAWN_GRIP = 3.0
 GREEN, BLUE, VIOLET, GOLD = 0x1F8A4C, 0x1B6CA8, 0x7B4FA3, 0xE0A100
 
 
-def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
-    """Rides as stages: one stage for each, or a common one for overlaid rides."""
-    names = names_of(runs)
+def as_stages(runs: list[Any], overlaid: bool, unit: Any = None) -> list[Stage]:
+    """Rides as stages: one stage for each, or a common one for overlaid rides. **Arguments:** `unit`: as for `plot`."""
+    names = names_of(runs, unit)
     return grouped([list(enumerate(runs))] if overlaid else [[numbered_run] for numbered_run in enumerate(runs)], names)
 
 

@@ -136,7 +136,11 @@ def test_a_plan_shows_what_it_achieves(parked, tmp_path):
     assert any(line.startswith("  speed      margin 0.") for line in lines)
     figure = plan.plot()
     assert [line.get_label() for line in figure.axes[1].lines] == ["speed [m/s]", "steering angle [rad]"]
-    page = plan.view(tmp_path / "plan.html")
+    speed, steering = plan.plot(unit=("deg", "km/h")).axes[1].lines
+    assert [speed.get_label(), steering.get_label()] == ["speed [km/h]", "steering angle [deg]"]
+    assert_close(steering.get_ydata(), np.degrees(plan.run.steering))
+    page = plan.view(tmp_path / "plan.html", unit="deg")
+    assert "steering angle [deg]" in page.html
     assert (tmp_path / "plan.html").read_text() == page.html
     assert all(f'"{name}"' in page.html for name in ("obstacles", "candidates", "footprint", "goal"))
 

@@ -126,9 +126,8 @@ def test_the_browser_says_when_rattlebacks_reverse(browser):
 def page(browser, rutstam_scene, tmp_path_factory):
     """The page of Rutstam's top, with two sliders, opened from disk."""
     path = tmp_path_factory.mktemp("page") / "top.html"
-    page = tippe.explore(
-        rutstam_scene, tippe.Launch(0.1, 155.0), path, {"theta": (0.05, 0.5), "spin": (60.0, 200.0)}, t1=7.0
-    )
+    sliders = {"theta": (0.05, 0.5), "spin": (60.0, 200.0)}
+    page = tippe.explore(rutstam_scene, tippe.Launch(0.1, 155.0), path, sliders, t1=7.0, unit="deg")
     browser.get_log("browser")
     browser.get_log("performance")
     browser.get(path.as_uri())
@@ -178,6 +177,17 @@ def test_angles_and_spins_have_their_familiar_units(browser, page):
     texts = "return [...document.querySelectorAll('#knobs output')].map((one) => one.textContent)"
     labels = browser.execute_script(texts)
     assert labels == ["0.209 rad = 12.0°", "157 rad/s = 1500 rpm"]
+
+
+def test_its_curves_have_the_unit_that_was_asked_for(browser, page, rutstam_scene):
+    reset(browser)
+    run = tippe.simulate(rutstam_scene, tippe.Launch(0.1, 155.0), 7.0, times=[0.0, 4.0])
+    label, value = browser.execute_script(
+        "player.seek(4); const head = document.querySelector('.strip .head');"
+        "return [head.firstChild.textContent, head.querySelector('.value span').textContent]"
+    )
+    assert label == "θ, normal to axis [deg]"
+    assert float(value) == pytest.approx(float(np.degrees(run.theta[1])), rel=2e-3)
 
 
 def test_a_slider_simulates_anew(browser, page, rutstam_scene):

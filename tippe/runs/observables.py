@@ -249,8 +249,8 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
     def labels_of(self, runs: list[Any], unit: Any) -> list[str]:
         return names_of(runs, unit) if len(runs) > 1 else [""]
 
-    def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
-        return as_stages([self, *others], overlaid)
+    def stages(self, others: Sequence[Any] = (), overlaid: bool = False, unit: Any = None) -> list[Stage]:
+        return as_stages([self, *others], overlaid, unit)
 
     def with_stats(self, path: DenseSolution | HybridPath, **more: Any) -> Self:
         """The same run with its statistics: steps, the greatest drift of |e|, the greatest |E - E(0) - work| [J], and

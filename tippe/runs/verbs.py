@@ -1,5 +1,6 @@
 """The functions for single launches, on those of `nonholonomic.runs`."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import diffrax
@@ -86,6 +87,7 @@ def explore(
     path: Any = None,
     sliders: dict[str, tuple[float, float]] | None = None,
     t1: float = 8.0,
+    unit: str | Sequence[str] | None = None,
 ) -> Page:
     """Make a page with sliders that simulates the top in the browser while you move a slider. The page is one file that
     needs no network; a notebook shows the returned `Page`. The equations of motion, the Runge-Kutta pair, the step-size
@@ -102,6 +104,7 @@ def explore(
       matches, such as "theta", "spin", "mu", "friction.mu" or "offset". By default theta, spin, the coefficient of
       friction and, for a top without a stem, the offset; under `NoSlip` theta and spin in both senses.
     - `t1`: horizon [s].
+    - `unit`: unit of the curves, such as "deg" for all angles.
 
     **Returns:** a `Page`, with its `html`.
 
@@ -122,7 +125,7 @@ def explore(
     ```
     """
     check_run(scene, launch, t1, TOLERANCE)
-    return explore_model(TopModel(scene=scene, launch=launch), path, sliders, float(t1))
+    return explore_model(TopModel(scene=scene, launch=launch), path, sliders, float(t1), unit)
 
 
 @status_line("simulating")

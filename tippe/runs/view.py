@@ -91,9 +91,9 @@ _motion = eqx.filter_jit(DrawnMotion.of)
 _rotation_rate = eqx.filter_jit(lambda run: jnp.linalg.norm(run.angular_velocity, axis=-1))
 
 
-def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
-    """Runs as stages: one stage for each, or a common one for overlaid runs."""
-    motions_by_name = [(name, run.scene, motion(run)) for name, run in zip(names_of(runs), runs, strict=True)]
+def as_stages(runs: list[Any], overlaid: bool, unit: Any = None) -> list[Stage]:
+    """Runs as stages: one stage for each, or a common one for overlaid runs. **Arguments:** `unit`: as for `plot`."""
+    motions_by_name = [(name, run.scene, motion(run)) for name, run in zip(names_of(runs, unit), runs, strict=True)]
     return stages([motions_by_name] if overlaid else [[run] for run in motions_by_name])
 
 

@@ -105,7 +105,7 @@ def test_an_animation_moves(tmp_path):
 class Rolling(Viewable):
     """A run with the stage of `rolling`."""
 
-    def stages(self, others=(), overlaid=False):
+    def stages(self, others=(), overlaid=False, unit=None):
         return [rolling()]
 
 
@@ -157,6 +157,16 @@ def test_curves_are_drawn_and_what_is_constant_is_flat():
     low, high = z.get_ylim()
     assert low < 0.1 < high
     assert high - low > 1e-5
+
+
+def test_a_view_and_an_animation_have_the_unit_that_was_asked_for(tmp_path):
+    run = Rolling()
+    assert '"label": "z [cm]", "factor": 100.0' in run.view(unit="cm").html
+    run.animate(tmp_path / "ball.gif", fps=2.0, unit="mm")
+    with pytest.raises(ValueError, match=r"unit = 'deg' is a unit of nothing that is drawn: x \[m\], z \[m\]"):
+        run.view(unit="deg")
+    with pytest.raises(ValueError, match="unit = 'degree' must be one of"):
+        run.animate(tmp_path / "ball.gif", unit="degree")
 
 
 def test_an_arrow_is_drawn_by_its_scale_up_to_its_limit():

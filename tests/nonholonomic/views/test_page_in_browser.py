@@ -10,6 +10,7 @@ import stroller
 import tippe
 from nonholonomic.views import page
 from nonholonomic.views.page import ANGLE
+from nonholonomic.views.stage import curves_in
 
 pytestmark = needs_browser
 
@@ -35,8 +36,8 @@ def ride():
 
 @pytest.fixture(scope="module")
 def stages(top, ride):
-    """A top in one view, and two rides overlaid in another."""
-    return [*top.stages(), *ride.stages([ride_at(8.0)], overlaid=True)]
+    """A top in one view, and two rides overlaid in another, in other units."""
+    return curves_in([*top.stages(), *ride.stages([ride_at(8.0)], overlaid=True, unit="km/h")], ("deg", "km/h"))
 
 
 @pytest.fixture(scope="module")
@@ -192,6 +193,13 @@ def test_curves_and_arrows_tell_the_same_between_frames(browser, stages):
     assert curve == pytest.approx(expected, rel=5e-4)
 
 
+def test_the_curves_of_several_runs_are_named_in_their_colours(browser, stages):
+    names = "return [...document.querySelectorAll('.names span')].map((one) => [one.textContent, one.style.color])"
+    shows = [show for stage in stages for show in stage.shows]
+    reds = [f"rgb({show.colour >> 16}, {show.colour >> 8 & 255}, {show.colour & 255})" for show in shows]
+    assert browser.execute_script(names) == [[show.name, red] for show, red in zip(shows, reds, strict=True)]
+
+
 def test_keys_move_time_and_a_click_on_a_curve_seeks(browser):
     from selenium.webdriver import ActionChains, Keys
 
@@ -212,7 +220,8 @@ def test_keys_move_time_and_a_click_on_a_curve_seeks(browser):
 def test_round_off_at_the_end_of_a_curve_is_labelled_as_zero(browser):
     """A body at the ground is at 0 m, and not at -1.15e-10 m."""
     script = (
-        "const run = { times: [0, 1, 2], colour: 'red', curves: [{ label: 'height', values: [1, -1.15e-10, 0.5] }] };"
+        "const curve = { label: 'height', factor: 1, values: [1, -1.15e-10, 0.5] };"
+        "const run = { times: [0, 1, 2], colour: 'red', curves: [curve] };"
         "const { low, high } = new views.Strips(document.createElement('div'), () => [run], () => 0).strips[0];"
         "return [low, high]"
     )
