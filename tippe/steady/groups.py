@@ -107,7 +107,9 @@ def jellett_thresholds(scene: Scene[Top]) -> tuple[Float[Array, "..."], Float[Ar
     (alpha, _), body = proportions(scene.body), scene.body
     if body.stem is not None:
         raise ValueError(
-            f"stem = {shown(body.stem)} must be None: a top with a stem does not keep Jellett's constant as it inverts"
+            f"stem = {shown(body.stem)} must be None: a top with a stem does not keep Jellett's constant as it inverts; "
+            "upright_critical_spin and inverted_critical_spin say from which spin it leaves the upright position and stays "
+            "on its stem"
         )
     upright = (1.0 - alpha) * body.radius * body.I3 * upright_critical_spin(scene)
     inverted = (1.0 + alpha) * body.radius * body.I3 * inverted_critical_spin(scene)

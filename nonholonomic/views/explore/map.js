@@ -108,7 +108,7 @@ function makeMap(box, live, integrator, choose) {
     const entries = [];
     if (low <= high) {
       const shades = [0, 0.25, 0.5, 0.75, 1].map(colour).join(",");
-      entries.push(`<span>${answer.label} ${short(low)}<span class="scale" style="background:linear-gradient(90deg,${shades})"></span>${short(high)}\u00a0${answer.unit}</span>`);
+      entries.push(`<span>${answer.label}</span>`, `<span>${short(low)}<span class="scale" style="background:linear-gradient(90deg,${shades})"></span>${short(high)}\u00a0${answer.unit}</span>`);
     }
     for (const status of new Set(known.filter((one) => !Number.isFinite(one[1])).map((one) => one[0]))) {
       const word = words[status] || "illegal";
