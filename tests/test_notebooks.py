@@ -1,11 +1,13 @@
-"""The notebooks for a hosted service are the tutorials: their cells, without what only the manual can do."""
+"""The cells of the manual run; the notebooks for a hosted service are the tutorials, without what only the manual can do."""
 
 import ast
 import importlib.util
 import re
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
+import matplotlib.pyplot as plt
 import nbformat
 import pytest
 
@@ -56,12 +58,35 @@ def test_a_badge_opens_the_notebook_of_the_repository(builder, tmp_path):
     assert address in (tmp_path / "README.md").read_text()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["top", "fit", "stroller"])
-def test_notebooks_run_as_they_are(builder, name, monkeypatch, tmp_path):
-    """All cells in order, but for the one that installs the package."""
-    monkeypatch.chdir(tmp_path)
-    names = {}
-    for cell in builder.notebook(DOCS / builder.PAGES[name]).cells:
-        if cell.cell_type == "code" and not cell.source.startswith("%pip"):
-            exec(cell.source, names)
+def show(source: str, names: dict[str, Any]) -> None:
+    """Run a cell and draw what it ends with, as a notebook does."""
+    tree = ast.parse(source)
+    last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
+    exec(compile(tree, "cell", "exec"), names)
+    if last is not None:
+        value = eval(compile(ast.Expression(last.value), "cell", "eval"), names)
+        for drawn in ("_repr_html_", "_repr_png_"):
+            if hasattr(value, drawn):
+                getattr(value, drawn)()
+
+
+@pytest.mark.parametrize(
+    "page",
+    sorted(path for path in DOCS.rglob("*.md") if "```{code-cell}" in path.read_text()),
+    ids=lambda path: path.stem,
+)
+def test_the_cells_of_a_page_run(builder, page, monkeypatch, tmp_path):
+    """In the process of the tests, whose compiled programs they share; a notebook of its own imports for six seconds."""
+    # What a page may read: its neighbours' sketches, and the examples.
+    folder = tmp_path / "docs" / page.parent.name
+    for path in (folder, tmp_path / "docs" / "concepts"):
+        path.mkdir(parents=True, exist_ok=True)
+    (tmp_path / "docs" / "concepts" / "sketches.py").symlink_to(DOCS / "concepts" / "sketches.py")
+    (tmp_path / "examples").symlink_to(DOCS.parent / "examples")
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(folder)
+    names = {"__name__": "__main__"}
+    _, *cells = [cell.source for cell in builder.notebook(page).cells if cell.cell_type == "code"]
+    for cell in cells:
+        show(cell, names)
+    plt.close("all")
