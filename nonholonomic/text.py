@@ -22,7 +22,11 @@ def likely(name: Any, known: Iterable[str]) -> str:
     names = list(known)
     anagrams = [candidate for candidate in names if sorted(candidate) == sorted(str(name))]
     # By the measure of `difflib`, a name of two letters, such as "mu", resembles no other.
-    short = [other for other in names if len(other) == len(str(name)) == 2 and other[0] == str(name)[0]]
+    short = [
+        other
+        for other in names
+        if len(other) == len(str(name)) == 2 and (other[0] == str(name)[0] or other[1] == str(name)[1])
+    ]
     matches = anagrams or difflib.get_close_matches(str(name), names, 1) or short
     return f"; did you mean {matches[0]!r}?" if matches else ""
 

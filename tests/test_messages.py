@@ -377,9 +377,11 @@ def test_a_page_that_cannot_be_written_is_refused_before_it_is_drawn(monkeypatch
 
 def test_an_unknown_quantity_of_a_run_is_answered_by_a_likely_one():
     with pytest.raises(
-        AttributeError, match=r"the run has no 'thetadot'; did you mean 'theta'\? It has theta, eta, azimuth"
+        AttributeError, match=r"the run has no 'thetadot'; did you mean 'theta'\? It has t, theta, eta, azimuth"
     ):
         _ = run_of_nothing().thetadot
+    with pytest.raises(AttributeError, match="the run has no 'times'; did you mean 't'"):
+        _ = run_of_nothing().times
     assert not hasattr(run_of_nothing(), "_repr_png_")
     with pytest.raises(AttributeError, match=r"did you mean 'theta'\?"):
         _ = run_of_nothing().tetha

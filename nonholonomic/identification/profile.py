@@ -8,6 +8,7 @@ from jaxtyping import Float
 from .exploration import ROWS
 from .levenberg_marquardt import minimise
 from .problem import deviances, linearise, predictions
+from .verdict import SAME
 
 #: Number of batches in which the other parameters are searched, and by how much the search narrows in each.
 BATCHES, NARROWER = 3, 0.4
@@ -26,6 +27,12 @@ class Profile(NamedTuple):
     deviance: Float[np.ndarray, " points"]
     estimates: dict[str, Float[np.ndarray, " points"]]
     converged: np.ndarray
+
+    @property
+    def better(self) -> float | None:
+        """The best value, if the profile falls below the best fit there: the fit missed it."""
+        best = int(np.argmin(self.deviance))
+        return float(self.values[best]) if self.deviance[best] < -SAME else None
 
 
 def profiled(fit: Any, k: int, values: Float[np.ndarray, " points"]) -> Profile:

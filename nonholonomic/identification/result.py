@@ -12,6 +12,7 @@ from ..progress import status_line
 from ..text import readable_unit, require_unit, text_as_html
 from ..validation import require_package, shown
 from ..views import draw_fit
+from ..warning import warn
 from .curve import fine_predictions
 from .distribution import Distribution
 from .exploration import Explorer, Weighted
@@ -22,7 +23,10 @@ from .problem import Problem
 from .profile import Profile, profiled
 from .refinement import Minima
 from .shape import Minimum, minima_of, remarks, unsearched
-from .verdict import CLOSE, SAME, Evidence, Verdict, judge
+from .verdict import CLOSE, SAME, Evidence, FitWarning, Verdict, judge
+
+#: The most likely value is stated where it is farther from the estimate than this part of a standard error.
+NOTICEABLE = 0.1
 
 #: Greatest number of rows of the residual table in a summary.
 MOST_ROWS = 24
@@ -62,7 +66,7 @@ class Identification:
     - `estimates`, `standard_errors`: name -> number. The errors are standard deviations over the likelihood times the
       priors, by importance sampling; they are infinite for a parameter that takes part in an undetermined direction, and
       NaN if the exploration of the likelihood ended early. The estimate is the most likely point; where the likelihood is
-      not that of a linear model, it is a likely point near the mean.
+      not that of a linear model, it is the likely point nearest to the mean.
     - `covariance`: (unknowns, unknowns), in the order of `estimates`. Parameters with infinite error have covariance 0.
     - `most_likely`, `slope_errors`: name -> number, the point of the greatest likelihood, and the errors by the slopes of the
       predictions there (Gauss-Newton). These errors are wrong where predictions are a staircase.
@@ -77,6 +81,7 @@ class Identification:
     - `coordinates`, `coordinate_covariance`: estimates and covariance in the coordinates of the fit.
     - `distribution`: the `Distribution` of the coordinates, with its weighted points.
     - `series_units`: the unit of each series of the measurements, if known; `units`: name -> unit of a parameter, if known.
+    - `profiles`: index of a parameter -> its profile, once it has been computed.
 
     **Example:** the fit of the subpackage's example.
 
@@ -107,6 +112,7 @@ class Identification:
     explorer: Explorer = dataclasses.field(repr=False)
     series_units: tuple[str, ...] = ()
     units: dict[str, str] = dataclasses.field(default_factory=dict)
+    profiles: dict[int, Profile] = dataclasses.field(default_factory=dict, repr=False)
 
     def interval(self, name: str, deviations: float = 1.96) -> tuple[float, float]:
         """The central interval of a parameter: the likelihood, times the priors, leaves equal probabilities below and
@@ -136,13 +142,16 @@ class Identification:
         - `name`: name of the parameter, or the end of its name.
         - `values`: values at which to hold the parameter, by default 13 in its interval of three standard errors (99.7 %).
 
-        **Returns:** a `Profile`.
+        **Returns:** a `Profile`; one that falls below the best fit gives a `FitWarning`.
 
         **Raises:** `ValueError` for a name that was not free, and for a parameter without a finite error if `values` is
         missing.
         """
         k = self._place(name)
         free = self.problem.unknowns[k]
+        if values is None and k in self.profiles:
+            return self.profiles[k]
+        is_default = values is None
         if values is None:
             error = self.standard_errors[self.problem.names[k]]
             if not np.isfinite(error):
@@ -154,7 +163,12 @@ class Identification:
             raise ValueError(
                 f"values = {shown(values)} must lie within the bounds ({free.lower}, {free.upper}) of {name!r}"
             )
-        return profiled(self, k, values)
+        profile = profiled(self, k, values)
+        if is_default:
+            self.profiles[k] = profile
+        if profile.better is not None:
+            warn(f"the fit is better with {name} = {profile.better:.6g}: start there", FitWarning)
+        return profile
 
     @property
     def curves(self) -> tuple[Float[np.ndarray, "slices n"], Float[np.ndarray, "slices n"]]:
@@ -216,7 +230,7 @@ class Identification:
     def __str__(self) -> str:
         lines = [
             f"Identification of {len(self.estimates)} numbers from {len(self.residuals)} measurements: {self.status}",
-            f"  -2 log likelihood {self.deviance:.4g} at {self.degrees} degrees of freedom",
+            f"  -2 log likelihood {self.deviance:.4g} at the most likely values, {self.degrees} degrees of freedom",
             "verdict",
             str(self.verdict),
             "estimates, standard errors and 95 % intervals",
@@ -225,13 +239,16 @@ class Identification:
         for name, value in self.estimates.items():
             low, high = self.interval(name)
             unit = readable_unit(self.units.get(name, "1"))
-            text = f"{value:.6g} +- {self.standard_errors[name]:.2g}  ({low:.6g}, {high:.6g}) {unit}"
-            lines.append(f"  {name:{width}}  {text}".rstrip())
+            error, likely = self.standard_errors[name], self.most_likely[name]
+            text = f"{value:.6g} +- {error:.2g}  ({low:.6g}, {high:.6g}) {unit}".rstrip()
+            # An estimate is a point near the mean where the likelihood is not that of a linear model.
+            differs = abs(value - likely) > NOTICEABLE * error
+            lines.append(f"  {name:{width}}  {text}{f', most likely {likely:.6g}' if differs else ''}")
         lines.append("combinations of parameters and their relative errors")
         for value, words in zip(self.identifiability.singular_values, self.identifiability.words, strict=True):
             mark = "  UNDETERMINED" if words in self.identifiability.unseen else ""
             lines.append(f"  {1.0 / max(value, 1e-300):8.2g}  {words}{mark}")
-        lines.append("measured, predicted, residual in units of the error")
+        lines.append("measured, predicted at the most likely values, residual in standard errors")
         width = max(len(row.label) for row in self.residuals)
         for row in self.residuals[:MOST_ROWS]:
             lines.append(f"  {row.label:{width}}  {row.measured:20}  {row.prediction:.6g}  {row.residual:+.2f}")

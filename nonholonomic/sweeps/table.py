@@ -60,10 +60,11 @@ class Table(eqx.Module):
 
     def __getattr__(self, name: str) -> Values:
         # Python calls this only for names that are not fields.
-        variables = object.__getattribute__(self, "variables")
-        if name in variables:
-            return variables[name]
-        raise AttributeError(f"the table has no variable {name!r}; it has {', '.join(variables)}")
+        variables, coords = (object.__getattribute__(self, part) for part in ("variables", "coords"))
+        for names in (variables, coords):
+            if name in names:
+                return names[name]
+        raise AttributeError(f"the table has no {name!r}; it has {', '.join([*variables, *coords])}")
 
     def __getitem__(self, name: str) -> Values:
         if not isinstance(name, str):
@@ -78,7 +79,7 @@ class Table(eqx.Module):
         return [*self.variables, *self.coords]
 
     def __dir__(self) -> list[str]:
-        return [*super().__dir__(), *self.variables]
+        return [*super().__dir__(), *self.variables, *self.coords]
 
     @property
     def long_names(self) -> dict[str, str]:

@@ -250,8 +250,8 @@ class Tabular(abc.ABC):
         if name.startswith("_") or hasattr(type(self), name) or not self.readable:
             return object.__getattribute__(self, name)
         methods = [method for method in dir(type(self)) if not method.startswith("_")]
-        hint = likely(name, [*self.readable, *methods]) or "."
-        raise AttributeError(f"the run has no {name!r}{hint} It has {', '.join(self.readable)}")
+        hint = "; did you mean 't'?" if name in ("time", "times") else likely(name, [*self.readable, *methods]) or "."
+        raise AttributeError(f"the run has no {name!r}{hint} It has {', '.join(['t', *self.readable])}")
 
     def __repr__(self) -> str:
         return str(self)

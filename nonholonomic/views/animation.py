@@ -116,7 +116,8 @@ def write_animation(stages: list[Stage], path: Any, times: Times | None, speed: 
     for number, label in enumerate(labels):
         panel = figure.add_subplot(grid[1, number * len(stages) : (number + 1) * len(stages)])
         _draw_curve(panel, shows, label)
-        panel.set_title(label, fontsize="small")
+        # At the right, where no power of ten of the axis is.
+        panel.set_title(label, fontsize="small", loc="right")
         panel.tick_params(labelsize="x-small")
         cursors.append(panel.axvline(0.0, color="0.15", linewidth=1.0))
     clock = figure.suptitle("", fontsize="medium")

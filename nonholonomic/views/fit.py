@@ -13,9 +13,6 @@ from .plot import new_figure
 #: Greatest number of drawn profiles, and the rise of -2 log likelihood at the end of a 95 % interval.
 MOST_PROFILES, INTERVAL = 6, 3.84
 
-#: A profile that falls below this -2 log likelihood, relative to the best fit, shows that the fit missed the best one.
-BETTER = -0.5
-
 #: With at most this many measurements without a time, their labels are drawn.
 MOST_LABELS = 12
 
@@ -31,6 +28,9 @@ class Fit(Protocol):
 
     @property
     def standard_errors(self) -> Mapping[str, float]: ...
+
+    @property
+    def most_likely(self) -> Mapping[str, float]: ...
 
     @property
     def units(self) -> Mapping[str, str]: ...
@@ -59,8 +59,8 @@ class Fit(Protocol):
 
 
 def draw_fit(fit: Fit, labels: Sequence[str], unit: Any) -> Any:
-    """Draw a fit: measurements and predictions, residuals in standard errors, profile likelihoods of the determined
-    parameters (with their parabolas dashed, estimates and intervals), and correlations.
+    """Draw a fit: measurements and predictions at the most likely values, residuals in standard errors, profile likelihoods of
+    the determined parameters (with their estimates and intervals, and the parabolas of their errors dashed), and correlations.
 
     **Arguments:** `labels`: (n,), short names of the measurements; `unit`: as for `in_unit`.
 
@@ -82,12 +82,12 @@ def draw_fit(fit: Fit, labels: Sequence[str], unit: Any) -> Any:
     for k, name in enumerate(profiled):
         profile = fit.profile(name)
         _draw_profile(fit, name, profile, figure.add_subplot(grid[2, k]), unit)
-        best = int(np.argmin(profile.deviance))
-        if profile.deviance[best] < BETTER:
-            concerns.append(f"the fit is better with {name} = {profile.values[best]:.6g}: start there")
+        if profile.better is not None:
+            concerns.append(f"the fit is better with {name} = {profile.better:.6g}: start there")
     if correlated:
         _draw_correlation(fit, names, figure.add_subplot(grid[2, lower - 1]))
-    figure.suptitle("; ".join(concerns) or "no concerns about this fit", fontsize=9, wrap=True)
+    remarks = [*(concerns or ["no concerns about this fit"]), *(f"note: {note}" for note in fit.verdict.notes)]
+    figure.suptitle("; ".join(remarks), fontsize=9, wrap=True)
     return figure
 
 
@@ -216,15 +216,24 @@ def _draw_residuals(fit: Fit, axes: Any) -> None:
 def _draw_profile(fit: Fit, name: str, profile: Any, axes: Any, unit: Any) -> None:
     shown, factor = in_unit(fit.units.get(name, "1"), unit)
     estimate, error = fit.estimates[name], fit.standard_errors[name]
-    axes.plot(factor * profile.values, profile.deviance, ".-")
-    axes.plot(factor * profile.values, ((profile.values - estimate) / error) ** 2, "--", color="0.6")
+    likely = fit.most_likely[name]
+    values, deviance = np.append(profile.values, likely), np.append(profile.deviance, 0.0)
+    order = np.argsort(values)
+    axes.plot(factor * values[order], deviance[order], ".-", label="profile")
+    axes.plot(
+        factor * values[order], ((values[order] - estimate) / error) ** 2, "--", color="0.6", label="by its error"
+    )
     axes.axhline(INTERVAL, color="0.6", linewidth=0.8)
+    axes.axvspan(*(factor * end for end in fit.interval(name)), color="0.92", zorder=0, label="95 %")
+    if name == next(iter(fit.estimates)):
+        axes.legend(fontsize=7, loc="upper right")
+    axes.locator_params(axis="x", nbins=4)
     axes.set_ylim(-0.5, 10.0)
     axes.set_xlabel(_with_unit(short_names(list(fit.estimates))[name], shown))
     axes.set_ylabel("-2 log likelihood, profiled")
     digits = max(0, 1 - math.floor(math.log10(factor * error)))
     value, spread, low, high = (f"{factor * part:.{digits}f}" for part in (estimate, error, *fit.interval(name)))
-    axes.set_title(f"{value} ± {spread}\n95 %: {low} to {high}", fontsize=9)
+    axes.set_title(f"{value} ± {spread} {readable_unit(shown)}".rstrip() + f"\n95 %: {low} to {high}", fontsize=9)
 
 
 def _draw_correlation(fit: Fit, names: list[str], axes: Any) -> None:

@@ -109,15 +109,19 @@ def draw_table(
     dims = table.dims(variable)
     if not dims:
         raise ValueError("a table of one cell has nothing to draw")
+    at = {_whole(dims, name): value for name, value in (at or {}).items()}
+    x, y = _whole(dims, x), _whole(dims, y)
     if not isinstance(label, str | None):
         raise ValueError(f"label = {shown(label)} must be a text")
-    names, cut = _drawn(table, variable, at or {}, x, y)
+    names, cut = _drawn(table, variable, at, x, y)
     visible = _slice(np.where(np.isfinite(values), values, np.nan), dims, names, cut)
     figure, drawing = _drawing(ax)
     drawing.set_xlabel(table.label(names[0]))
-    cuts = [_cut_text(table, name, place, (at or {}).get(name)) for name, place in cut.items()]
+    cuts = [_cut_text(table, name, place, at.get(name)) for name, place in cut.items()]
     if len(names) == 1 or (y is None and len(table.coords[names[1]]) <= MOST_LINES):
         _draw_lines(drawing, table, names, visible.reshape(len(visible), -1), label)
+        if not np.any(np.isfinite(visible)):
+            _say_why_it_is_empty(drawing, table, names[0], _words(table, variable, dims, names, cut))
         drawing.set_ylabel(table.label(variable))
         if log:
             drawing.set_yscale("log")
@@ -126,11 +130,27 @@ def draw_table(
         drawing.set_ylabel(table.label(names[1]))
         cuts = [label, *cuts] if label else cuts
         _draw_map(drawing, table, names, visible, table.label(variable), log)
-        if "status" in table.variables and not table.inner.get(variable):
-            words = _slice(table.variables["status"], dims, names, cut)
+        words = _words(table, variable, dims, names, cut)
+        if words is not None:
             _mark_words(drawing, table, names, np.where(np.isnan(visible), words, ""))
     drawing.set_title(", ".join(cuts), fontsize="medium")
     return drawing if figure is None else figure
+
+
+def _words(table: Labelled, variable: str, dims: tuple[str, ...], names: list[str], cut: dict[str, int]) -> Any:
+    """The statuses of the drawn cells, if each has one."""
+    has_status = "status" in table.variables and not table.inner.get(variable)
+    return _slice(table.variables["status"], dims, names, cut) if has_status else None
+
+
+def _say_why_it_is_empty(drawing: Any, table: Labelled, name: str, words: Any) -> None:
+    """Keep the abscissa of lines without any finite value, and count the statuses of their cells."""
+    values = table.coords[name]
+    if values.dtype.kind != "U" and len(values) > 1:
+        drawing.set_xlim(values.min(), values.max())
+    counts = [] if words is None else [f"{np.sum(words == word)} {word.replace('_', ' ')}" for word in np.unique(words)]
+    text = ": ".join(filter(None, ["nothing finite to draw", ", ".join(counts)]))
+    drawing.text(0.5, 0.5, text, transform=drawing.transAxes, ha="center", va="center")
 
 
 def _first_number(table: Labelled) -> str:
@@ -138,6 +158,12 @@ def _first_number(table: Labelled) -> str:
     if not names:
         raise ValueError("the table has no numeric variable to draw")
     return names[0]
+
+
+def _whole(dims: tuple[str, ...], name: Any) -> Any:
+    """The axis that ends with a name, as "launch.spin" does with "spin"; the name itself unless there is one such axis."""
+    ends = [whole for whole in dims if whole.endswith(f".{name}")]
+    return ends[0] if name not in dims and len(ends) == 1 else name
 
 
 def _drawn(

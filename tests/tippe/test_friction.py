@@ -186,6 +186,32 @@ class Sideways(tippe.AbstractFriction):
         return ContactLoad(force, (None, None, self.torque * jnp.tanh(slip.turning[2])))
 
 
+class Pair(tippe.AbstractFriction):
+    """A law that returns no load."""
+
+    def per_normal_force(self, slip):
+        return -slip.x, -slip.y
+
+
+class Branching(tippe.AbstractFriction):
+    """A law that asks for the value of a traced number."""
+
+    def per_normal_force(self, slip):
+        return ContactLoad(force=(-slip.x, -slip.y)) if slip.x > 0.0 else ContactLoad(force=(slip.x, -slip.y))
+
+
+@pytest.mark.parametrize(
+    ("law", "message"),
+    [
+        (Pair, r"friction = Pair\(\): per_normal_force must return a tippe.friction.ContactLoad"),
+        (Branching, r"friction = Branching\(\): per_normal_force cannot be traced by JAX: .* in place of `if`"),
+    ],
+)
+def test_a_law_that_cannot_be_evaluated_is_refused_when_it_is_constructed(law, message):
+    with pytest.raises(ValueError, match=message):
+        law()
+
+
 def test_a_law_that_drives_the_top_is_told_when_it_is_constructed():
     """By its worst slip: in a belt's direction, for a slow slip, 0.3 (v_belt - v) v."""
     slip = (

@@ -119,9 +119,11 @@ def test_a_run_goes_to_pandas(run):
     frame = run.to_dataframe()
     assert_close(frame["position.x"], run.position[:, 0])
     assert frame.attrs["units"]["theta"] == "rad"
-    with pytest.raises(AttributeError, match=re.escape("no 'to_datafrme'; did you mean 'to_dataframe'? It has theta")):
+    with pytest.raises(
+        AttributeError, match=re.escape("no 'to_datafrme'; did you mean 'to_dataframe'? It has t, theta")
+    ):
         _ = run.to_datafrme
-    with pytest.raises(AttributeError, match=re.escape("no 'xqxqx'. It has theta, eta")):
+    with pytest.raises(AttributeError, match=re.escape("no 'xqxqx'. It has t, theta, eta")):
         _ = run.xqxqx
 
 

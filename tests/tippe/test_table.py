@@ -250,7 +250,7 @@ def test_a_table_prints_and_draws(table):
     assert figure.axes[0].get_ylabel() == "inversion time [s]"
     with pytest.raises(ValueError, match="variable = 'status' must be a numeric variable"):
         table.plot("status")
-    with pytest.raises(AttributeError, match="no variable 'tme'; it has time"):
+    with pytest.raises(AttributeError, match="the table has no 'tme'; it has time"):
         _ = table.tme
 
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.geometry import Component
-from nonholonomic.validation import largest, one_line
+from nonholonomic.validation import UNTRACEABLE, largest, one_line
 
-from .contact_load import Slip
+from .contact_load import ContactLoad, Slip
 
 #: A coefficient of friction, and a slip speed [m/s], above which another unit is suspected.
 GREATEST_MU, GREATEST_SLIP_SPEED = 5.0, 5.0
@@ -31,6 +31,13 @@ def drive(law: Any) -> str | None:
     try:
         with jax.ensure_compile_time_eval():
             power = np.asarray(_power(law, Slip(jnp.asarray(x), jnp.asarray(y), (zero, zero, drilling))))
+    except jax.errors.JAXTypeError as error:
+        raise ValueError(f"friction = {one_line(law)}: per_normal_force {UNTRACEABLE}") from error
+    except NoLoad:
+        raise ValueError(
+            f"friction = {one_line(law)}: per_normal_force must return a tippe.friction.ContactLoad, as in "
+            "ContactLoad(force=(x, y))"
+        ) from None
     except Exception:
         # The first run reports what is wrong with such a law.
         return None
@@ -45,9 +52,16 @@ def drive(law: Any) -> str | None:
     )
 
 
+class NoLoad(Exception):
+    """A law that returns something else than a load."""
+
+
 @compiled_setup
 def _power(law: Any, slip: Slip) -> Component:
-    return law.per_normal_force(slip).power(slip)
+    load = law.per_normal_force(slip)
+    if not isinstance(load, ContactLoad):
+        raise NoLoad
+    return load.power(slip)
 
 
 def suspected_unit(mu: Any, slip_speed: Any = 0.0) -> str | None:

@@ -133,11 +133,24 @@ def test_a_picture_has_limits_at_its_edge_and_other_units():
         fit.plot(unit="degree")
 
 
+def test_a_report_and_a_picture_tell_the_estimate_from_the_most_likely_values():
+    fit = identify(oscillation, recorded(), {"height": 0.8, "rate": 5.8})
+    assert "most likely 0" not in str(fit)
+    moved = {name: value + 0.5 * fit.standard_errors[name] for name, value in fit.most_likely.items()}
+    apart = dataclasses.replace(fit, most_likely=moved, verdict=fit.verdict._replace(notes=("a staircase",)))
+    assert f"most likely {moved['height']:.6g}\n" in str(apart)
+    figure = apart.plot()
+    assert figure.get_suptitle() == "no concerns about this fit; note: a staircase"
+    assert moved["height"] in figure.axes[2].lines[0].get_xdata()
+
+
 def test_a_picture_says_where_a_profile_found_a_better_fit():
     fit = identify(oscillation, recorded(), {"height": 0.8, "rate": 5.8})
-    worse = dataclasses.replace(fit, deviance=fit.deviance + 3.0)
+    worse = dataclasses.replace(fit, deviance=fit.deviance + 3.0, profiles={})
     assert "start there" not in fit.plot().get_suptitle()
-    assert "the fit is better with height = " in worse.plot().get_suptitle()
+    with pytest.warns(FitWarning, match="the fit is better with (height|rate) = .*: start there"):
+        assert "the fit is better with height = " in worse.plot().get_suptitle()
+    assert worse.profile("height") is worse.profile("height")
 
 
 def test_an_angle_is_drawn_on_the_turn_of_its_prediction():

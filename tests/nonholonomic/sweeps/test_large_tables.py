@@ -61,7 +61,7 @@ def test_a_table_in_its_file_is_read_piece_by_piece(tmp_path, monkeypatch, in_it
     assert str(table).splitlines()[1:] == [f"  {name}: in {tmp_path / 'table.h5'}" for name in VARIABLES]
     assert "status" in table._repr_html_()
     assert list(table.variables) == ["value", "pair", "status"]
-    with pytest.raises(AttributeError, match="no variable 'tme'; it has value, pair, status"):
+    with pytest.raises(AttributeError, match="the table has no 'tme'; it has value, pair, status"):
         _ = table.tme
     table.save(tmp_path / "copy.h5")
     monkeypatch.undo()

@@ -1,5 +1,6 @@
 """Access to tables: variables by name, plots, xarray, and files without the sweep's internal attributes."""
 
+import dataclasses
 import io
 import json
 
@@ -30,6 +31,7 @@ def table():
 def test_names_are_found_and_completed(table):
     assert table["time"] is table.time
     assert table["spin"] is SPIN
+    assert table.spin is SPIN
     assert {"time", "status", "theta"} <= set(table._ipython_key_completions_())
     assert "time" in dir(table)
     with pytest.raises(KeyError, match="no 'tme'; it has time, status, theta"):
@@ -91,6 +93,21 @@ def test_colours_lie_between_quantiles_and_may_be_logarithmic(table):
     ticks = [tick.get_text() for tick in lines.axes[0].get_yticklabels(which="both")]
     assert any(ticks)
     assert not any("10^" in tick for tick in ticks)
+
+
+def test_lines_without_a_time_say_why_they_are_empty():
+    status = np.array(["not_inverted", "contact_lost", "not_inverted"])
+    none = Table({"spin": SPIN[:3]}, {"time": np.full(3, np.inf), "status": status}, {"spin": "rad s-1"}, {})
+    (axes,) = none.plot().axes
+    assert [text.get_text() for text in axes.texts] == ["nothing finite to draw: 1 contact lost, 2 not inverted"]
+    assert axes.get_xlim() == (SPIN[0], SPIN[2])
+
+
+def test_the_end_of_the_name_of_an_axis_is_enough(table):
+    coords = {"theta": THETA, "mu": MU, "launch.spin": SPIN}
+    renamed = dataclasses.replace(table, coords=coords, units=table.units | {"launch.spin": "rad s-1"})
+    assert renamed.plot(x="spin", at={"mu": MU[0]}).axes[0].get_xlabel() == "launch.spin [rad/s]"
+    assert renamed.plot(x="mu", at={"spin": SPIN[1]}).axes[0].get_title().startswith("launch.spin = ")
 
 
 def test_it_draws_in_given_axes_and_shows_itself(table):
