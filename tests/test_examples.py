@@ -39,8 +39,17 @@ def test_example_is_short_and_can_be_read(path):
     assert callable(names["draw" if "draw" in names else "main"])
 
 
+#: Pictures that take more than ten seconds.
+LONG = ("rattleback", "parking", "planned_top")
+
+
 @pytest.mark.parametrize(
-    "path", [path for path in EXAMPLES if "def draw()" in path.read_text()], ids=lambda path: path.stem
+    "path",
+    [
+        pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in LONG))
+        for path in EXAMPLES
+        if "def draw()" in path.read_text()
+    ],
 )
 def test_a_picture_of_the_gallery_is_drawn(path, tmp_path, monkeypatch):
     # Some write files.

@@ -70,10 +70,17 @@ def show(source: str, names: dict[str, Any]) -> None:
                 getattr(value, drawn)()
 
 
+#: The longest pages; tests of planning, rigid bodies, fits, flights, laws, surfaces and own systems exercise their functions.
+LONG = ("planning", "rattleback", "trust", "hops", "friction", "surface", "own_ball", "own_oscillator")
+
+
 @pytest.mark.parametrize(
     "page",
-    sorted(path for path in DOCS.rglob("*.md") if "```{code-cell}" in path.read_text()),
-    ids=lambda path: path.stem,
+    [
+        pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in LONG))
+        for path in sorted(DOCS.rglob("*.md"))
+        if "```{code-cell}" in path.read_text()
+    ],
 )
 def test_the_cells_of_a_page_run(builder, page, monkeypatch, tmp_path):
     """In the process of the tests, whose compiled programs they share; a notebook of its own imports for six seconds."""

@@ -200,7 +200,12 @@ def _nearest(table: Labelled, dims: tuple[str, ...], name: str, value: Any) -> i
     low, high = float(np.min(coordinate)), float(np.max(coordinate))
     require(value, f"at: {name}")
     if not low - ROUND_OFF * abs(low) <= float(value) <= high + ROUND_OFF * abs(high):
-        raise ValueError(f"at: {name} = {shown(value)} must be between the ends of the axis, {low:.6g} and {high:.6g}")
+        unit = readable_unit(table.units.get(name, "1"))
+        given, ends = (f"{text} {unit}".rstrip() for text in (f"{float(value):.6g}", f"{low:.6g} and {high:.6g}"))
+        raise ValueError(
+            f"at: {name} = {given} must be between the ends of the axis, {ends}; at has the unit of the table, not that of the "
+            "picture"
+        )
     return int(np.argmin(np.abs(coordinate - value)))
 
 

@@ -123,7 +123,10 @@ def test_it_draws_in_given_axes_and_shows_itself(table):
     [
         ({"at": {"colour": 1.0}}, "at: 'colour' must be one of theta, mu, spin"),
         ({"at": {"theta": 0.1, "mu": 0.1, "spin": 60.0}}, "leaves no axis to draw over"),
-        ({"at": {"mu": 0.9}}, "at: mu = 0.9 must be between the ends of the axis, 0.1 and 0.3"),
+        (
+            {"at": {"mu": 0.9}},
+            "at: mu = 0.9 s/m must be between the ends of the axis, 0.1 and 0.3 s/m; at has the unit of the table",
+        ),
         ({"at": {"mu": "x"}}, "at: mu = 'x' is not a number"),
         ({"x": "tehta"}, "x = 'tehta' must be one of theta, mu, spin; did you mean 'theta'"),
         ({"x": "mu", "y": "mu"}, "x = 'mu' must not be named in at, nor be both x and y"),
