@@ -23,8 +23,6 @@ from nonholonomic.integration.status import REACHED_END
 from nonholonomic.progress import Progress, status_line
 from nonholonomic.sweeps import Variable, axis, sweep
 
-pytestmark = pytest.mark.newest
-
 
 class Pipe(Terminal):
     def isatty(self):

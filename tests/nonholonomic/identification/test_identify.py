@@ -17,8 +17,6 @@ from nonholonomic.identification.likelihood import MISSING, one_sided
 from nonholonomic.identification.result import coordinate_covariance
 from nonholonomic.parameters import full_name
 
-pytestmark = pytest.mark.newest
-
 X = np.linspace(0.0, 1.0, 12)
 ERROR = 0.1 + 0.05 * X
 
