@@ -137,7 +137,7 @@ def full_name(argument: str, name: str, known: list[str]) -> str:
 
     **Raises:** `ValueError` for a name that matches no full name or several.
     """
-    matches = _meant(name, known)
+    matches = meant(name, known)
     if len(matches) != 1:
         ends = [candidate.rsplit(".", 1)[-1] for candidate in known]
         hint = likely(str(name).rsplit(".", 1)[-1], ends)
@@ -156,7 +156,7 @@ def full_axes(axes: dict[str, Any], known: list[str]) -> dict[str, Any]:
     """
     by_full_name: dict[str, Any] = {}
     for name, values in axes.items():
-        if not _meant(name, known):
+        if not meant(name, known):
             raise _unknown_axis(name, known)
         full = full_name("axes", name, known)
         if full in by_full_name:
@@ -165,7 +165,7 @@ def full_axes(axes: dict[str, Any], known: list[str]) -> dict[str, Any]:
     return by_full_name
 
 
-def _meant(name: Any, known: list[str]) -> list[str]:
+def meant(name: Any, known: Sequence[str]) -> list[str]:
     """The full names that match a name."""
     return [name] if name in known else [known_name for known_name in known if known_name.endswith("." + str(name))]
 

@@ -90,12 +90,18 @@ def in_unit(si: str, unit: str | Sequence[str] | None) -> tuple[str, float]:
     **Arguments:** `unit`: one of `UNITS`, such as "deg", or several for numbers of different dimensions, or `None`
     for `si`; "deg", "rev", "cm" and so on also convert rates, to deg/s and so on, unless a unit of the rate is named.
     """
-    readable, names = readable_unit(si), [unit] if isinstance(unit, str) else [*(unit or ())]
-    for name in [*names, *(f"{name}/s" for name in names)]:
+    readable = readable_unit(si)
+    for name in _with_rates(unit):
         # A number without a unit is no percentage unless its unit says so.
         if readable and name in UNITS.get(readable, {}):
             return name, 1.0 / UNITS[readable][name]
     return si, 1.0
+
+
+def _with_rates(unit: str | Sequence[str] | None) -> list[str]:
+    """The units that a user names, and then the rates that they imply."""
+    names = [unit] if isinstance(unit, str) else [*(unit or ())]
+    return [*names, *(f"{name}/s" for name in names)]
 
 
 def require_unit_of(unit: str | Sequence[str] | None, units: Mapping[str, str]) -> None:
@@ -103,9 +109,8 @@ def require_unit_of(unit: str | Sequence[str] | None, units: Mapping[str, str]) 
 
     **Arguments:** `unit`: as for `in_unit`; `units`: name of a number -> its SI unit.
     """
-    named = [unit] if isinstance(unit, str) else [*(unit or ())]
     possible = {name for si in units.values() for name in UNITS.get(readable_unit(si), {})}
-    if named and not possible & {*named, *(f"{name}/s" for name in named)}:
+    if unit and possible.isdisjoint(_with_rates(unit)):
         listed = ", ".join(f"{name} [{readable_unit(si)}]" if readable_unit(si) else name for name, si in units.items())
         raise ValueError(f"unit = {shown(unit)} is a unit of nothing that is drawn: {listed}")
 

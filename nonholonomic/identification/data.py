@@ -2,7 +2,7 @@
 set."""
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,12 +30,16 @@ def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], Int[np
     >>> measurements.value.shape, labels[0], seen
     ((3,), 'level(1 s)', array([0, 1, 2]))
     """
-    labels = tuple(
-        f"{i + 1}: {label}" if len(data) > 1 else label for i, source in enumerate(data) for label in source.labels
-    )
+    labels = numbered([source.labels for source in data])
     offsets = np.cumsum([0, *(source.size for source in data)])
     indices = np.concatenate([first + source.seen for first, source in zip(offsets, data, strict=False)])
     return likelihood.joined([source.measurements for source in data]), labels, indices
+
+
+def numbered(labels: Sequence[Sequence[str]]) -> tuple[str, ...]:
+    """The labels of all sets of data, with the number of the set if there are several."""
+    several = len(labels) > 1
+    return tuple(f"{k}: {label}" if several else label for k, part in enumerate(labels, 1) for label in part)
 
 
 def series_units(data: tuple[Any, ...]) -> tuple[str, ...]:
@@ -66,6 +70,11 @@ def of_data(parameters: dict[str, Any], k: int) -> dict[str, Any]:
         name.removeprefix(prefix): value for name, value in parameters.items() if name.startswith(prefix)
     }
     return shared | parameters_of_data
+
+
+def own_name(name: str) -> str:
+    """The name of a parameter without the prefix `data[k].`."""
+    return name.split(".", 1)[1] if name.startswith("data[") else name
 
 
 def scene_unknowns(free: Any, scene: Any, launch: Any, shared: list[str], own: list[list[str]]) -> dict[str, Free]:
@@ -127,14 +136,14 @@ def free_numbers(
                 raise ValueError(f"free: {name!r} is named twice")
             unknowns[name] = unknown
     for name in unknowns:
-        if name.startswith("data[") and name.split(".", 1)[1] in unknowns:
+        if own_name(name) != name and own_name(name) in unknowns:
             raise ValueError(f"free: {name!r} is named twice, alone and for all data")
     for k in range(len(own)):
         check({name: unknown.start for name, unknown in of_data(unknowns, k).items()})
     lower = {}
     for name, unknown in unknowns.items():
         try:
-            check({name.split(".", 1)[1] if name.startswith("data[") else name: -(abs(unknown.start) or 1.0)})
+            check({own_name(name): -(abs(unknown.start) or 1.0)})
         except ValueError:
             lower[name] = 0.0
     return as_free(unknowns, lower)

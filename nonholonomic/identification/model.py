@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from ..parameters import full_name
 from ..validation import shown
-from .data import joined, of_data, series_units
+from .data import joined, of_data, own_name, series_units
 from .identify import check_search, identify
 from .posterior import LogDensity
 from .result import Identification
@@ -50,7 +50,7 @@ class AbstractDataModel(eqx.Module):
         return dataclasses.replace(self, data=recorded)
 
     def unit_of(self, name: str) -> str:
-        """The unit of a parameter, by its name without the prefix `data[k].`; "1" if it is unknown."""
+        """The unit of a parameter other than `t0`, by its name without the prefix `data[k].`; "1" if it is unknown."""
         return "1"
 
     @abc.abstractmethod
@@ -160,5 +160,6 @@ def fit_data(
     measurements, labels, seen = joined(data)
     model = build(seen)
     fit = identify(model, measurements, unknowns, slopes=slopes, labels=labels, **search)
-    units = {name: model.unit_of(name.split(".", 1)[1] if name.startswith("data[") else name) for name in unknowns}
+    own_names = {name: own_name(name) for name in unknowns}
+    units = {name: "s" if own == "t0" else model.unit_of(own) for name, own in own_names.items()}
     return dataclasses.replace(fit, series_units=series_units(data), units=units)

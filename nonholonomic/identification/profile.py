@@ -28,11 +28,13 @@ class Profile(NamedTuple):
     estimates: dict[str, Float[np.ndarray, " points"]]
     converged: np.ndarray
 
-    @property
-    def better(self) -> float | None:
-        """The best value, if the profile falls below the best fit there: the fit missed it."""
+    def concern(self, name: str) -> str:
+        """Where to start again, if the profile falls below the best fit; otherwise empty. **Arguments:** `name`: name of the
+        parameter."""
         best = int(np.argmin(self.deviance))
-        return float(self.values[best]) if self.deviance[best] < -SAME else None
+        if self.deviance[best] >= -SAME:
+            return ""
+        return f"the fit is better with {name} = {self.values[best]:.6g}: start there"
 
 
 def profiled(fit: Any, k: int, values: Float[np.ndarray, " points"]) -> Profile:

@@ -14,6 +14,7 @@ from ..validation import require_package, shown
 from ..views import draw_fit
 from ..warning import warn
 from .curve import fine_predictions
+from .data import numbered
 from .distribution import Distribution
 from .exploration import Explorer, Weighted
 from .identifiability import Identifiability, identifiability
@@ -65,8 +66,8 @@ class Identification:
 
     - `estimates`, `standard_errors`: name -> number. The errors are standard deviations over the likelihood times the
       priors, by importance sampling; they are infinite for a parameter that takes part in an undetermined direction, and
-      NaN if the exploration of the likelihood ended early. The estimate is the most likely point; where the likelihood is
-      not that of a linear model, it is the likely point nearest to the mean.
+      NaN if the exploration of the likelihood ended early. The estimate is the most likely point; if
+      this is more than half a standard error away from the mean, it is a likely point near the mean.
     - `covariance`: (unknowns, unknowns), in the order of `estimates`. Parameters with infinite error have covariance 0.
     - `most_likely`, `slope_errors`: name -> number, the point of the greatest likelihood, and the errors by the slopes of the
       predictions there (Gauss-Newton). These errors are wrong where predictions are a staircase.
@@ -148,26 +149,26 @@ class Identification:
         missing.
         """
         k = self._place(name)
-        free = self.problem.unknowns[k]
-        if values is None and k in self.profiles:
-            return self.profiles[k]
-        is_default = values is None
-        if values is None:
+        if values is not None:
+            return self._profiled(k, name, values)
+        if k not in self.profiles:
             error = self.standard_errors[self.problem.names[k]]
             if not np.isfinite(error):
                 word = "infinite" if np.isinf(error) else "unknown"
                 raise ValueError(f"values must be given for {name!r}, whose standard error is {word}")
-            values = np.linspace(*self.interval(name, 3.0), 13)
-        values = np.atleast_1d(np.asarray(values, float))
+            self.profiles[k] = self._profiled(k, name, np.linspace(*self.interval(name, 3.0), 13))
+        return self.profiles[k]
+
+    def _profiled(self, k: int, name: str, values: Any) -> Profile:
+        """The profile of the parameter with index `k`, which the user calls `name`."""
+        free, values = self.problem.unknowns[k], np.atleast_1d(np.asarray(values, float))
         if not np.all((values > free.lower) & (values < free.upper)):
             raise ValueError(
                 f"values = {shown(values)} must lie within the bounds ({free.lower}, {free.upper}) of {name!r}"
             )
         profile = profiled(self, k, values)
-        if is_default:
-            self.profiles[k] = profile
-        if profile.better is not None:
-            warn(f"the fit is better with {name} = {profile.better:.6g}: start there", FitWarning)
+        if concern := profile.concern(name):
+            warn(concern, FitWarning)
         return profile
 
     @property
@@ -208,17 +209,12 @@ class Identification:
         require_unit(unit)
         return draw_fit(self, self._labels(unit), unit)
 
-    def _labels(self, unit: Any) -> list[str]:
+    def _labels(self, unit: Any) -> tuple[str, ...]:
         """Short names of the measurements for a picture."""
         sources = getattr(self.problem.model, "recorded", ())
         if not sources:
-            return [row.label for row in self.residuals]
-        several = len(sources) > 1
-        return [
-            f"{k}: {label}" if several else label
-            for k, source in enumerate(sources, 1)
-            for label in source.labels_in(unit)
-        ]
+            return tuple(row.label for row in self.residuals)
+        return numbered([source.labels_in(unit) for source in sources])
 
     def _place(self, name: str) -> int:
         valid = list(self.estimates)
@@ -241,7 +237,7 @@ class Identification:
             unit = readable_unit(self.units.get(name, "1"))
             error, likely = self.standard_errors[name], self.most_likely[name]
             text = f"{value:.6g} +- {error:.2g}  ({low:.6g}, {high:.6g}) {unit}".rstrip()
-            # An estimate is a point near the mean where the likelihood is not that of a linear model.
+            # The estimate is another point where the most likely one is far from the mean.
             differs = abs(value - likely) > NOTICEABLE * error
             lines.append(f"  {name:{width}}  {text}{f', most likely {likely:.6g}' if differs else ''}")
         lines.append("combinations of parameters and their relative errors")

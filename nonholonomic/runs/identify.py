@@ -61,7 +61,7 @@ class RunModel(AbstractDataModel):
         return dataclasses.replace(self, data=tuple(Source(data, source.model) for data, source in pairs))
 
     def unit_of(self, name: str) -> str:
-        return "s" if name == "t0" else self.data[0].model.label([name])[name][1]
+        return self.data[0].model.label([name])[name][1]
 
     def together(self, source: Source, values: dict[str, Array]) -> Hashable:
         return source.key, tuple(values)

@@ -82,8 +82,7 @@ def draw_fit(fit: Fit, labels: Sequence[str], unit: Any) -> Any:
     for k, name in enumerate(profiled):
         profile = fit.profile(name)
         _draw_profile(fit, name, profile, figure.add_subplot(grid[2, k]), unit)
-        if profile.better is not None:
-            concerns.append(f"the fit is better with {name} = {profile.better:.6g}: start there")
+        concerns += filter(None, [profile.concern(name)])
     if correlated:
         _draw_correlation(fit, names, figure.add_subplot(grid[2, lower - 1]))
     remarks = [*(concerns or ["no concerns about this fit"]), *(f"note: {note}" for note in fit.verdict.notes)]

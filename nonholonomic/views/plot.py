@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from ..parameters import meant
 from ..text import likely, readable_unit
 from ..validation import require, shown
 
@@ -162,8 +163,8 @@ def _first_number(table: Labelled) -> str:
 
 def _whole(dims: tuple[str, ...], name: Any) -> Any:
     """The axis that ends with a name, as "launch.spin" does with "spin"; the name itself unless there is one such axis."""
-    ends = [whole for whole in dims if whole.endswith(f".{name}")]
-    return ends[0] if name not in dims and len(ends) == 1 else name
+    names = meant(name, dims)
+    return names[0] if len(names) == 1 else name
 
 
 def _drawn(

@@ -86,7 +86,9 @@ def test_a_table_has_the_times_of_its_runs(run, table):
 def test_a_top_that_comes_to_lie_on_stem_and_sphere_has_not_turned_over_for_good():
     """Slower, it falls over, rocks, and comes to rest on both: its stem carries it first, but its sphere still touches."""
     slow = WOODEN | {"spin": 75.0, "t1": 9.0}
-    table = tippe.inversion_table(wooden_scene(0.1), **slow, axes={"restitution": [0.0, 0.5]}, crossing="both")
+    table = tippe.inversion_table(
+        wooden_scene(0.1), **slow, axes={"restitution": [0.0, 0.5]}, crossing="both", errors=True
+    )
     assert_close(table.end_theta, first_contact(tippe.presets.wooden()), atol=1e-8)
     assert (table.first_time < 9.0).all()
     assert np.isinf(table.last_time).all()

@@ -64,6 +64,7 @@ def test_friction_from_a_film(rutstam_scene):
     fit = tippe.identify(rutstam_scene, recording, {"mu": 0.2, "data[0].t0": 0.01}, tolerance=1e-6, progress=False)
     assert fit.status == "converged"
     assert len(fit.residuals) == len(clock) - 1
+    assert fit.units == {"scene.friction.mu": "s m-1", "data[0].t0": "s"}
     for name, exact in {"scene.friction.mu": MU, "data[0].t0": LAUNCHES["t0"][0]}.items():
         assert abs(fit.estimates[name] - exact) < 4.0 * fit.standard_errors[name], name
     assert fit.standard_errors["scene.friction.mu"] < 0.05

@@ -40,8 +40,8 @@ BATCH, FEW = 512, 64
 
 
 def _unit_of(model: Any, name: str) -> str:
-    """The unit of a parameter of a scene, a launch or a clock."""
-    return "s" if name == "t0" else labels(model.scene, model.data[0].launch, [name], ())[name][1]
+    """The unit of a parameter of a scene or a launch."""
+    return labels(model.scene, model.data[0].launch, [name], ())[name][1]
 
 
 @eqx.filter_jit

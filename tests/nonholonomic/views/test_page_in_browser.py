@@ -196,8 +196,8 @@ def test_curves_and_arrows_tell_the_same_between_frames(browser, stages):
 def test_the_curves_of_several_runs_are_named_in_their_colours(browser, stages):
     names = "return [...document.querySelectorAll('.names span')].map((one) => [one.textContent, one.style.color])"
     shows = [show for stage in stages for show in stage.shows]
-    reds = [f"rgb({show.colour >> 16}, {show.colour >> 8 & 255}, {show.colour & 255})" for show in shows]
-    assert browser.execute_script(names) == [[show.name, red] for show, red in zip(shows, reds, strict=True)]
+    colours = [f"rgb({show.colour >> 16}, {show.colour >> 8 & 255}, {show.colour & 255})" for show in shows]
+    assert browser.execute_script(names) == [[show.name, colour] for show, colour in zip(shows, colours, strict=True)]
 
 
 def test_keys_move_time_and_a_click_on_a_curve_seeks(browser):
