@@ -112,7 +112,7 @@ def require_unit_of(unit: str | Sequence[str] | None, units: Mapping[str, str]) 
     possible = {name for si in units.values() for name in UNITS.get(readable_unit(si), {})}
     if unit and possible.isdisjoint(_with_rates(unit)):
         listed = ", ".join(f"{name} [{readable_unit(si)}]" if readable_unit(si) else name for name, si in units.items())
-        raise ValueError(f"unit = {shown(unit)} is a unit of nothing that is drawn: {listed}")
+        raise ValueError(f"unit = {shown(unit)} fits nothing that is drawn: {listed}")
 
 
 def require_unit(unit: Any) -> None:

@@ -220,7 +220,7 @@ def _draw_profile(fit: Fit, name: str, profile: Any, axes: Any, unit: Any) -> No
     order = np.argsort(values)
     axes.plot(factor * values[order], deviance[order], ".-", label="profile")
     axes.plot(
-        factor * values[order], ((values[order] - estimate) / error) ** 2, "--", color="0.6", label="by its error"
+        factor * values[order], ((values[order] - estimate) / error) ** 2, "--", color="0.6", label="standard error"
     )
     axes.axhline(INTERVAL, color="0.6", linewidth=0.8)
     axes.axvspan(*(factor * end for end in fit.interval(name)), color="0.92", zorder=0, label="95 %")

@@ -174,7 +174,7 @@ def test_labels_are_what_differs(run):
 def test_plots_that_cannot_be_drawn_are_refused(run):
     for arguments, options, message in (
         (("tehta",), {}, "quantity = 'tehta' must be one of theta, .*did you mean 'theta'"),
-        (("theta",), {"unit": "mm"}, r"unit = 'mm' is a unit of nothing that is drawn: theta \[rad\], time \[s\]"),
+        (("theta",), {"unit": "mm"}, r"unit = 'mm' fits nothing that is drawn: theta \[rad\], time \[s\]"),
         ((), {"unit": "%"}, "unit = '%' must be one of"),
         (("theta",), {"unit": "degree"}, "unit = 'degree' must be one of s, ms, .*did you mean 'deg'"),
         (("theta", "spin"), {"ax": object()}, "ax takes one quantity, not 2: theta, spin"),

@@ -163,7 +163,7 @@ def test_a_view_and_an_animation_have_the_unit_that_was_asked_for(tmp_path):
     run = Rolling()
     assert '"label": "z [cm]", "factor": 100.0' in run.view(unit="cm").html
     run.animate(tmp_path / "ball.gif", fps=2.0, unit="mm")
-    with pytest.raises(ValueError, match=r"unit = 'deg' is a unit of nothing that is drawn: x \[m\], z \[m\]"):
+    with pytest.raises(ValueError, match=r"unit = 'deg' fits nothing that is drawn: x \[m\], z \[m\]"):
         run.view(unit="deg")
     with pytest.raises(ValueError, match="unit = 'degree' must be one of"):
         run.animate(tmp_path / "ball.gif", unit="degree")
