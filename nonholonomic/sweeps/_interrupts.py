@@ -2,8 +2,10 @@
 
 import contextlib
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
+from typing import Any
 
 
 @contextlib.contextmanager
@@ -12,9 +14,13 @@ def no_interrupt_lost() -> Iterator[Callable[[], None]]:
 
     Python raises `KeyboardInterrupt` wherever the main thread happens to be. In finalizers, in callbacks of weak
     references and during garbage collection, where JAX calls back into Python, exceptions are printed and ignored. Then
-    a sweep would go on, although its processes had ended.
+    a sweep would go on, although its processes had ended. What will be raised again is not printed either.
     """
-    arrived = False
+    arrived, hook = False, sys.unraisablehook
+
+    def print_others(ignored: Any) -> None:
+        if not issubclass(ignored.exc_type, KeyboardInterrupt):
+            hook(ignored)
 
     def record_and_raise(number: int, frame: object) -> None:
         nonlocal arrived
@@ -31,7 +37,10 @@ def no_interrupt_lost() -> Iterator[Callable[[], None]]:
         yield raise_again
         return
     signal.signal(signal.SIGINT, record_and_raise)
+    sys.unraisablehook = print_others
     try:
         yield raise_again
+        raise_again()
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        sys.unraisablehook = hook
