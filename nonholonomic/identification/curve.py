@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 
 from .data import joined
-from .exploration import ROWS
 from .problem import Problem, predictions
 from .recording import AbstractRecording
 
@@ -30,15 +29,13 @@ def fine_predictions(
     if not data or not all(isinstance(source, AbstractRecording) for source in data):
         return np.zeros((0, 0)), np.zeros((0, 0))
     count = int(np.clip(np.ceil(POINTS / max(len(source.times) for source in data)), 1, MOST))
-    batch = np.full((ROWS, len(coordinates)), np.nan)
-    batch[0] = coordinates
     slices = []
     for k in range(count):
         shifted = tuple(_shifted(source, k / count) for source in data)
         moved = eqx.tree_at(lambda problem: problem.model, problem, problem.model.with_recorded(shifted))
         offsets = [float(new.times[0] - old.times[0]) for new, old in zip(shifted, data, strict=True)]
         offset = np.repeat(offsets, [len(source.seen) for source in data])
-        slices.append((np.asarray(joined(shifted)[0].time) + offset, predictions(moved, batch)[0]))
+        slices.append((np.asarray(joined(shifted)[0].time) + offset, predictions(moved, coordinates[None])[0]))
     times, values = zip(*slices, strict=True)
     return np.stack(times), np.stack(values)
 

@@ -175,10 +175,10 @@ class Explorer(NamedTuple):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Predictions, log likelihoods of all measurements, log priors and log densities of at most `ROWS` points."""
         inside = self.region.contains(points)
-        # The program is compiled for `ROWS` rows; rows of NaN take no time.
+        # Rows of NaN take no time. The program of the priors is compiled for `ROWS` rows.
         batch = np.full((ROWS, points.shape[1]), np.nan)
         batch[: len(points)][inside] = points[inside]
-        predictions = self.density.predictions(batch)[: len(points)]
+        predictions = self.density.predictions(batch[: len(points)])
         each, likelihood = log_likelihoods(self.measurements, predictions)
         prior = np.where(inside, self.density.log_priors(batch)[: len(points)], -np.inf)
         return predictions, each, prior, likelihood + prior

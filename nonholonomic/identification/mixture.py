@@ -39,12 +39,9 @@ class Mixture(NamedTuple):
         constant = (
             math.lgamma(0.5 * (FREEDOM + size)) - math.lgamma(0.5 * FREEDOM) - 0.5 * size * math.log(FREEDOM * math.pi)
         )
-        logs = np.empty((len(self.shares), len(points)))
-        for k, (share, centre, root) in enumerate(zip(*self, strict=True)):
-            squares = np.sum(np.linalg.solve(root, (points - centre).T) ** 2, axis=0)
-            volume = np.sum(np.log(np.abs(np.diag(root))))
-            logs[k] = math.log(share) + constant - volume - 0.5 * (FREEDOM + size) * np.log1p(squares / FREEDOM)
-        return logs
+        squares, log_volumes = _squared_distances(points, self.centres, self.roots)
+        constants = np.log(self.shares) + constant - log_volumes
+        return constants[:, None] - 0.5 * (FREEDOM + size) * np.log1p(squares / FREEDOM)
 
     def log_density(self, points: Float[np.ndarray, "n unknowns"]) -> Float[np.ndarray, " n"]:
         """The log density of the mixture."""
@@ -90,12 +87,8 @@ def fitted(
     shares, covariances = np.full(len(centres), 1.0 / len(centres)), np.tile(whole / len(centres), (len(centres), 1, 1))
     effective = 1.0 / np.sum(weights**2)
     for _ in range(ITERATIONS):
-        logs = np.stack(
-            [
-                math.log(share) + _log_normal(points, centre, covariance)
-                for share, centre, covariance in zip(shares, centres, covariances, strict=True)
-            ]
-        )
+        squares, log_volumes = _squared_distances(points, centres, np.linalg.cholesky(covariances))
+        logs = (np.log(shares) - log_volumes)[:, None] - 0.5 * squares
         parts = np.exp(logs - np.logaddexp.reduce(logs, axis=0)) * weights
         shares = np.sum(parts, axis=1)
         # A covariance needs more points than it has dimensions.
@@ -122,7 +115,11 @@ def _spread_centres(
     return points[chosen]
 
 
-def _log_normal(points: np.ndarray, centre: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    root = np.linalg.cholesky(covariance)
-    squares = np.sum(np.linalg.solve(root, (points - centre).T) ** 2, axis=0)
-    return -0.5 * squares - np.sum(np.log(np.diag(root)))
+def _squared_distances(
+    points: Float[np.ndarray, "n unknowns"],
+    centres: Float[np.ndarray, "components unknowns"],
+    roots: Float[np.ndarray, "components unknowns unknowns"],
+) -> tuple[Float[np.ndarray, "components n"], Float[np.ndarray, " components"]]:
+    """Squared distances of points from centres in units of the covariances, and logarithms of the roots' determinants."""
+    off = np.linalg.inv(roots) @ (points.T - centres[:, :, None])
+    return np.sum(off**2, axis=1), np.sum(np.log(np.abs(np.diagonal(roots, axis1=1, axis2=2))), axis=1)

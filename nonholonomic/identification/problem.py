@@ -1,6 +1,7 @@
 """A model with its free parameters, and predictions with slopes, for many sets of parameters at once."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,12 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..compilation.compiled_programs import padded
+from ..sweeps.running import workers
 from ..validation import is_traced, shown
 from .likelihood import Measurements
 from .unknown import Free, Unknown
 
 Rows = Float[np.ndarray, "rows unknowns"]
+
+#: Number of rows in a call of a model without and with slopes; on an accelerator.
+ROWS_OF_CALL, ROWS_WITH_SLOPES, MOST_ROWS = 64, 8, 512
+
+#: Number of predictions that are compared with measurements at once.
+COMPARED = 4096
 
 #: Step of differences in the coordinates: 1 % of a positive parameter. Differences smooth over narrower structure. The
 #: valleys of recordings are narrower, and their predictions are smooth.
@@ -127,10 +134,7 @@ class Linearised(NamedTuple):
 def _differentiated(
     problem: Problem, coordinates: Float[Array | np.ndarray, "rows unknowns"]
 ) -> tuple[Float[Array, "rows n"], Float[Array, "rows n unknowns"]]:
-    """Predictions and their slopes; rows are independent, so a coordinate is moved in all of them at once.
-
-    All evaluations of a model use this function, so that the model is compiled once per number of rows.
-    """
+    """Predictions and their slopes; rows are independent, so a coordinate is moved in all of them at once."""
 
     def along(direction):
         return jax.jvp(problem.predict, (coordinates,), (jnp.broadcast_to(direction, coordinates.shape),))
@@ -146,11 +150,8 @@ def _differences(problem: Problem, step: float, coordinates: Rows) -> tuple[np.n
     """Predictions and central differences; if a side has no prediction, its slope is 0."""
     rows, unknowns = coordinates.shape
     offsets = step * np.concatenate([np.zeros((1, unknowns)), np.eye(unknowns), -np.eye(unknowns)])
-    predict = Problem.predict if problem.on_host else _predicted
-    predictions = np.asarray(predict(problem, jnp.asarray((coordinates[:, None] + offsets).reshape(-1, unknowns))))
-    values, values_above, values_below = np.split(
-        predictions.reshape(rows, len(offsets), -1), [1, 1 + unknowns], axis=1
-    )
+    moved = predictions(problem, (coordinates[:, None] + offsets).reshape(-1, unknowns))
+    values, values_above, values_below = np.split(moved.reshape(rows, len(offsets), -1), [1, 1 + unknowns], axis=1)
     with np.errstate(invalid="ignore"):
         slopes = np.moveaxis(values_above - values_below, 1, -1) / (2.0 * step)
     return values[:, 0], np.where(np.isfinite(slopes), slopes, 0.0)
@@ -166,19 +167,44 @@ def predictions_and_slopes(problem: Problem, coordinates: Rows, mask: Any = None
     """
     coordinates = np.asarray(coordinates, float)
     mask = np.ones(len(coordinates), bool) if mask is None else np.asarray(mask)
-    # The program is compiled for a fixed number of rows. Rows that are not needed get NaN parameters, so their runs end
-    # at once.
     points = np.where(mask[:, None], coordinates, np.nan)
     if problem.step is None:
-        prediction, slopes = _differentiated(problem, points)
-        return np.asarray(prediction), np.asarray(slopes)
+        return _in_parts(lambda part: _differentiated(problem, part), points, ROWS_WITH_SLOPES)
     return _differences(problem, problem.step, points)
+
+
+def compile_slopes(problem: Problem) -> None:
+    """Compile the program of `predictions_and_slopes`, unless it uses that of `predictions`."""
+    if problem.step is None:
+        predictions_and_slopes(problem, np.full((1, len(problem.names)), np.nan))
 
 
 def predictions(problem: Problem, coordinates: Rows) -> np.ndarray:
     """Predictions without slopes, for every row of coordinates; rows of NaN take no time."""
     predict = Problem.predict if problem.on_host else _predicted
-    return np.asarray(predict(problem, jnp.asarray(coordinates)))
+    return _in_parts(lambda part: (predict(problem, jnp.asarray(part)),), coordinates, ROWS_OF_CALL)[0]
+
+
+def _in_parts(
+    function: Callable[[Rows], tuple[Any, ...]], coordinates: Rows, rows_of_part: int
+) -> tuple[np.ndarray, ...]:
+    """The results of a function of some rows for all rows; the cores share its calls, an accelerator has a single one.
+
+    The program is compiled for a fixed number of rows. Runs of rows of NaN end at once.
+    """
+    cores = workers()
+    rows = rows_of_part if jax.default_backend() == "cpu" else MOST_ROWS
+    padding = np.full((-len(coordinates) % rows, coordinates.shape[1]), np.nan)
+    parts = np.concatenate([coordinates, padding]).reshape(-1, rows, coordinates.shape[1])
+    # Before the threads start, so that the program is compiled once.
+    without_runs = [np.asarray(result) for result in function(np.full_like(parts[0], np.nan))]
+
+    def of_part(part: Rows) -> list[np.ndarray]:
+        return [np.asarray(result) for result in function(part)] if np.any(np.isfinite(part)) else without_runs
+
+    with ThreadPoolExecutor(cores) as threads:
+        results = zip(*threads.map(of_part, parts), strict=True)
+        return tuple(np.concatenate(result)[: len(coordinates)] for result in results)
 
 
 def linearise(problem: Problem, coordinates: Any, measurements: Measurements, mask: Any = None) -> Linearised:
@@ -217,15 +243,17 @@ def deviances(
 def compared(measurements: Measurements, prediction: Float[np.ndarray, "rows n"]) -> list[np.ndarray]:
     """Residuals, their slopes with respect to the predictions, and the roots of the expected information.
 
-    All are element by element. One padded list of numbers lets one program serve fits of many sizes.
+    All are element by element. Lists of one length let one program serve all fits.
     """
 
     def listed(values: Any) -> np.ndarray:
         values = np.broadcast_to(np.asarray(values), prediction.shape).ravel()
-        return padded(values, values.size)
+        return np.pad(values, (0, -values.size % COMPARED), mode="edge").reshape(-1, COMPARED)
 
-    results = _residuals(jax.tree.map(listed, measurements), listed(prediction))
-    return [np.asarray(values)[: prediction.size].reshape(prediction.shape) for values in results]
+    lists = jax.tree.map(listed, (measurements, prediction))
+    parts = [_residuals(*jax.tree.map(lambda values, k=k: values[k], lists)) for k in range(len(lists[1]))]
+    results = [np.concatenate(values)[: prediction.size] for values in zip(*parts, strict=True)]
+    return [values.reshape(prediction.shape) for values in results]
 
 
 @eqx.filter_jit

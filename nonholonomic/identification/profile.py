@@ -78,18 +78,11 @@ def _searched(
         noise = NARROWER**batch * random.normal(size=(points, each, size - 1)) @ root.T
         trial[..., others] += noise
         trial[:, 0] = best
-        deviance = _deviances(fit, trial.reshape(-1, size)).reshape(points, each)
+        rows = trial.reshape(-1, size)
+        deviance = deviances(fit.problem, rows, predictions(fit.problem, rows), fit.measurements)
+        deviance = np.where(np.isfinite(deviance), deviance, np.inf).reshape(points, each)
         place = np.argmin(deviance, axis=1)
         improved = deviance[np.arange(points), place]
         best = np.where((improved < least)[:, None], trial[np.arange(points), place], best)
         least = np.minimum(least, improved)
     return best, least
-
-
-def _deviances(fit: Any, coordinates: Float[np.ndarray, "rows unknowns"]) -> Float[np.ndarray, " rows"]:
-    """-2 log likelihood in every row, infinite instead of NaN, in batches of the size of an exploration's."""
-    padding = np.full((-len(coordinates) % ROWS, coordinates.shape[1]), np.nan)
-    batches = np.concatenate([coordinates, padding]).reshape(-1, ROWS, coordinates.shape[1])
-    parts = [deviances(fit.problem, batch, predictions(fit.problem, batch), fit.measurements) for batch in batches]
-    deviance = np.concatenate(parts)[: len(coordinates)]
-    return np.where(np.isfinite(deviance), deviance, np.inf)

@@ -1,11 +1,12 @@
 """The search for all minima of a likelihood, and the exploration of its surroundings."""
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 
 from .exploration import Explorer, Weighted
-from .problem import Problem, deviances
+from .problem import Problem, compile_slopes, deviances
 from .refinement import BETWEEN, Minima, Refinement, refine
 
 #: Greatest number of steps by slopes before an exploration, where predictions may be a staircase.
@@ -35,7 +36,10 @@ def search(problem: Problem, explorer: Explorer, options: Search) -> tuple[Minim
     **Raises:** `ValueError` if no candidate has a finite prediction.
     """
     measurements, (starts, max_steps, seed, progress) = explorer.measurements, options
-    pool = explorer.begin(seed)
+    with ThreadPoolExecutor(1) as thread:
+        # Compile the slopes while this thread compiles and computes the predictions.
+        thread.submit(compile_slopes, problem)
+        pool = explorer.begin(seed)
     if not np.any(np.isfinite(pool.predictions)):
         raise ValueError("model: no start led to finite predictions")
     recorded = bool(np.any(np.asarray(measurements.time) > 0.0))

@@ -35,8 +35,8 @@ from ..runs.verbs import simulate
 from .inversion_times import AbstractTimes, InversionTimes, Values
 from .recording import Recording
 
-#: Number of rows that one program simulates together: as many as a fit explores at once, or a few.
-BATCH, FEW = 512, 64
+#: Number of rows that one program simulates together: as many as a fit asks for at once.
+BATCH = 64
 
 
 def _unit_of(model: Any, name: str) -> str:
@@ -124,20 +124,19 @@ class HybridModel(AbstractDataModel):
         predictions = np.full((count, launches), np.nan)
         if not legal.any():
             return predictions
-        # Two numbers of cells, hence two programs, serve all calls; only the first cells run.
-        size = FEW if legal.sum() <= FEW else BATCH
+        # One number of cells, hence one program, serves all calls; only the first cells run.
         of_launch = {name: value for name, value in numbers("launch", data.launch).items() if value is not None}
         cells = {
-            name: np.tile(np.broadcast_to(np.asarray(value), (launches,)), size) for name, value in of_launch.items()
+            name: np.tile(np.broadcast_to(np.asarray(value), (launches,)), BATCH) for name, value in of_launch.items()
         }
         for name, part in columns.items():
-            filled = np.pad(part[legal], (0, size - legal.sum()), constant_values=part[legal][0])
+            filled = np.pad(part[legal], (0, BATCH - legal.sum()), constant_values=part[legal][0])
             cells[name] = np.repeat(filled, launches)
         job = TableJob(data.timed(self.scene), data.form, float(data.t1), "first", Settings(self.tolerance))
         results = job(cells, launches * int(legal.sum()))
         time = np.asarray(data.of_cells(self.scene, results, cells["launch.theta"]))
         has_failed = np.asarray(results["status"]) == data.form.words.index("failed")
-        predictions[legal] = np.where(has_failed, np.nan, time).reshape(size, launches)[: legal.sum()]
+        predictions[legal] = np.where(has_failed, np.nan, time).reshape(BATCH, launches)[: legal.sum()]
         return predictions
 
     def _allows(self, data: Any, row: dict[str, float]) -> bool:

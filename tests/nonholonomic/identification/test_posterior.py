@@ -223,3 +223,19 @@ def test_numpyro_draws_the_same(draws):
         error = fit.standard_errors[name]
         assert abs(shifted.values[name].mean() - value.mean()) < 5.0 * error / np.sqrt(shifted.ess[name])
         assert_close(shifted.values[name].std(), error, rtol=0.15)
+
+
+def test_one_program_predicts_any_number_of_rows_and_skips_rows_of_nan():
+    traced = []
+
+    def model(parameters):
+        traced.append(parameters["rate"].shape)
+        return parameters["rate"][:, None] * np.array([1.0, 2.0])
+
+    density = LogDensity.of(model, Measurements([1.0, 2.0], 0.1), {"rate": 1.0})
+    for count in (1, 3, 200):
+        rows = np.linspace(0.5, 1.5, count)[:, None]
+        # One of four calls has rows of NaN only.
+        rows[count // 4 : count // 4 + 90] = np.nan
+        np.testing.assert_array_equal(density.predictions(rows), (1.0 + rows) * np.array([1.0, 2.0]))
+    assert len(traced) == 1
