@@ -169,7 +169,8 @@ def predictions_and_slopes(problem: Problem, coordinates: Rows, mask: Any = None
     mask = np.ones(len(coordinates), bool) if mask is None else np.asarray(mask)
     points = np.where(mask[:, None], coordinates, np.nan)
     if problem.step is None:
-        return _in_parts(lambda part: _differentiated(problem, part), points, ROWS_WITH_SLOPES)
+        prediction, slopes = _in_parts(lambda part: _differentiated(problem, part), points, ROWS_WITH_SLOPES)
+        return prediction, slopes
     return _differences(problem, problem.step, points)
 
 
