@@ -90,8 +90,9 @@ def solve_one(request: Request, *leaves: Float[Array, "..."]) -> Any:
 
     **Arguments:** `request`: a request for all parts; `leaves`: numbers of a single cell.
     """
-    # Without weak types, as when the program is traced.
-    typed = (jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+    # Without the weak type of Python's numbers, with which everything would be traced and compiled once more.
+    leaves = tuple(jnp.asarray(leaf, jnp.result_type(leaf)) for leaf in leaves)
+    typed = (jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
     shapes, structure = flat(jax.eval_shape(functools.partial(_compiled_tree, request.solve, request.active), *typed))
     present = [k for k, shape in enumerate(shapes) if shape is not None]
     kinds = tuple(ShapedArray(shapes[k].shape[1:], shapes[k].dtype) for k in present)

@@ -9,6 +9,7 @@ from close import assert_close
 from own_modes import GRAVITY, Ball, Bounces, Sleigh, bounce
 
 from nonholonomic import AbstractMode, Hybrid, event_time, simulate
+from nonholonomic.derivatives._batched_primitive import Request
 
 START = jnp.array([1.0, 0.0, 0.0])
 
@@ -113,6 +114,20 @@ def test_a_smooth_system_has_second_derivatives():
     assert_close(jnp.stack(jax.grad(half_life, (0, 1))(*point)), jnp.stack(jax.grad(exact, (0, 1))(*point)), rtol=1e-10)
     curvature = jax.jvp(jax.grad(half_life), point, (1.0, 0.0))[1]
     assert_close(curvature, jax.grad(jax.grad(exact))(*point), rtol=1e-7)
+
+
+def test_a_python_number_is_traced_once_with_its_derivative(monkeypatch):
+    traced, tree = [], Request.tree
+
+    def counted(request, *arguments):
+        traced.append(request.active)
+        return tree(request, *arguments)
+
+    monkeypatch.setattr(Request, "tree", counted)
+    # A start of its own, so that no other test has traced this program.
+    slope = jax.grad(lambda rate: event_time(Hybrid([Decay(rate)]), [1.0, 2.0, 3.0], 10.0, lambda t, y: y[1] - 1.0))
+    assert_close(slope(0.5), -np.log(2.0) / 0.25, rtol=1e-7)
+    assert len(traced) == len(set(traced))
 
 
 def test_no_event_is_infinite_and_has_no_derivative():
