@@ -271,7 +271,19 @@ def _mark_words(drawing: Any, table: Labelled, names: list[str], words: Any) -> 
         )
         patches.append(Patch(color=grey, label=word.replace("_", " ")))
     if patches:
-        drawing.legend(handles=patches, loc="upper right")
+        x, y = (np.argsort(table.coords[name], kind="stable") for name in names)
+        drawing.legend(handles=patches, loc=_emptiest_corner((words != "")[x][:, y]))
+
+
+def _emptiest_corner(is_empty: np.ndarray) -> str:
+    """The corner of a map with the fewest values, for the legend."""
+    width, height = ((size + 2) // 3 for size in is_empty.shape)
+    shares = {
+        f"{vertical} {horizontal}": np.mean(is_empty[columns, rows])
+        for vertical, rows in (("upper", slice(-height, None)), ("lower", slice(height)))
+        for horizontal, columns in (("right", slice(-width, None)), ("left", slice(width)))
+    }
+    return max(shares, key=lambda corner: shares[corner])
 
 
 def draw_portrait(table: Labelled, x: str, y: str, ax: Any = None) -> Any:

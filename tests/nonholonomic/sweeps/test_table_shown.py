@@ -103,6 +103,20 @@ def test_lines_without_a_time_say_why_they_are_empty():
     assert axes.get_xlim() == (SPIN[0], SPIN[2])
 
 
+@pytest.mark.parametrize(("corner", "sign"), [("lower left", 1.0), ("upper left", -1.0)])
+def test_the_legend_of_a_map_lies_where_times_are_missing(corner, sign):
+    x, y = np.arange(12.0), sign * np.arange(14.0)
+    has_time = (x[:, None] > 5.0) | (abs(y) > 6.0)
+    variables = {"time": np.where(has_time, 1.0, np.inf), "status": np.where(has_time, "inverted", "not_inverted")}
+    table = Table({"x": x, "y": y}, variables, {"time": "s"}, {})
+    legend = table.plot().axes[0].get_legend()
+    legend.figure.draw_without_rendering()
+    axes = legend.axes
+    middle = axes.transAxes.inverted().transform(legend.get_window_extent().get_points().mean(axis=0))
+    place = f"{'lower' if middle[1] < 0.5 else 'upper'} {'left' if middle[0] < 0.5 else 'right'}"
+    assert place == corner
+
+
 def test_the_end_of_the_name_of_an_axis_is_enough(table):
     coords = {"theta": THETA, "mu": MU, "launch.spin": SPIN}
     renamed = dataclasses.replace(table, coords=coords, units=table.units | {"launch.spin": "rad s-1"})
