@@ -1,6 +1,6 @@
 """Cost and error of tables, derivatives and samples on an accelerator, measured in one go, with a page of the results.
 
-    python benchmarks/accelerator.py [--out PAGE] [--seconds 540]
+    python benchmarks/accelerator.py [--out PAGE] [--seconds 540] [--launches 1024 131072]
 
 Without an accelerator the script says so and measures nothing. Rutstam's top on the plane, viscous friction, 100 rad/s,
 theta(0) from 0.05 to 0.15, float64, to theta = 0.95 pi or to 8 s, at two tolerances and for two numbers of launches:
@@ -11,13 +11,13 @@ theta(0) from 0.05 to 0.15, float64, to theta = 0.95 pi or to 8 s, at two tolera
 * a table of tops that may leave the plane, and one with set-valued friction.
 
 Cost is wall time per launch, the less of two runs; the first call, which compiles, has a separate column. Error is the
-greatest difference from the same program at a tolerance of 1e-13, divided by the greatest result. No row begins after
-`--seconds`; the page names the rows that are left out.
+greatest difference from the same program at a tolerance of 1e-13, divided by the greatest result. `--launches` states the
+sizes in the order in which they are measured. No row begins after `--seconds`; the page names the rows that are left out.
 """
 
 import argparse
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -124,9 +124,9 @@ def programs() -> dict[str, Run]:
 
 
 def measured(
-    runs: dict[str, Run], sizes: tuple[int, ...], tolerances: tuple[float, ...], seconds: float
+    runs: dict[str, Run], sizes: Sequence[int], tolerances: tuple[float, ...], seconds: float
 ) -> Iterator[Row | str]:
-    """The rows of all programs, the smaller sizes first, and the names of the rows for which no time is left."""
+    """The rows of all programs, one size after the other, and the names of the rows for which no time is left."""
     deadline = time.monotonic() + seconds
     for launches in sizes:
         for program, run in runs.items():
@@ -166,6 +166,7 @@ def main(arguments: list[str] | None = None) -> None:
     command = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     command.add_argument("--out", type=Path, default=Path("accelerator.txt"), help="the page of results")
     command.add_argument("--seconds", type=float, default=540.0, help="no row begins later")
+    command.add_argument("--launches", type=int, nargs="+", default=LAUNCHES, help="numbers of launches")
     options = command.parse_args(arguments)
     if jax.default_backend() == "cpu":
         print(f"No accelerator: JAX finds {jax.devices()} only. Nothing is measured, and no page is written.")
@@ -173,7 +174,7 @@ def main(arguments: list[str] | None = None) -> None:
     if jnp.result_type(float) != jnp.float64:
         raise SystemExit("JAX_ENABLE_X64 = 0 must be left out: the measurements are of float64")
     rows, omissions = [], []
-    for row in measured(programs(), LAUNCHES, TOLERANCES, options.seconds):
+    for row in measured(programs(), options.launches, TOLERANCES, options.seconds):
         print(row, flush=True)
         (rows if isinstance(row, Row) else omissions).append(row)
         # Written after every row, so that nothing is lost.
