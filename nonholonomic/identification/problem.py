@@ -204,7 +204,8 @@ def _in_parts(
         return [np.asarray(result) for result in function(part)] if np.any(np.isfinite(part)) else without_runs
 
     with ThreadPoolExecutor(cores) as threads:
-        results = zip(*threads.map(of_part, parts), strict=True)
+        # A single core stays in this thread, in which JAX's contexts hold, such as that of `jax.default_device`.
+        results = zip(*(threads.map if cores > 1 else map)(of_part, parts), strict=True)
         return tuple(np.concatenate(result)[: len(coordinates)] for result in results)
 
 
