@@ -18,7 +18,7 @@ from nonholonomic import __version__
 from nonholonomic.command_line import closing_lines, run_and_exit
 from nonholonomic.compilation.compilation_cache import are_kept, enable_compilation_cache, kept_files
 from nonholonomic.geometry import Cylinder, Plane
-from nonholonomic.progress import Progress, status_line
+from nonholonomic.progress import Progress
 from nonholonomic.sweeps import AnotherRun, Table, saved_cells
 from nonholonomic.validation import require_folder
 from nonholonomic.views import NO_VIEW, Page, can_view, page, picture_as_html, table_as_html
@@ -167,9 +167,9 @@ def sliders(options: argparse.Namespace) -> str:
     return live_page(page_of_launch(model, None, t1)._replace(title=TITLE), stage_at_start(model, t1), 0.2, BELOW).html
 
 
-def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str, Table], Any, str]:
-    """The table of each arena, theta(t) of the displayed launch, and the page with sliders. Each table is printed as soon
-    as it is computed, that of the plane first.
+def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str, Table], Path | None, str]:
+    """The table of each arena, the picture of the displayed launch if matplotlib is installed, and the page with sliders.
+    Each table is printed as soon as it is computed, that of the plane first.
 
     They are computed in parallel, because the compiler uses little more than one core. **Arguments:** `cache`: folder for
     results that later commands with the same options read.
@@ -190,12 +190,17 @@ def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str,
         run, axes = (scene(options, "plane"), launch_shown(options)), ("launch.theta", "scene.friction.mu")
         return {"theta": json.dumps(theta_over_time(*run, times, options.tolerance, axes).tolist()).encode()}
 
-    def on_plane() -> tuple[Table, Any]:
+    def on_plane() -> tuple[Table, Path | None]:
         # Compute the table first, because the picture uses its programs.
         plane = table_of("plane")
         if not has_matplotlib():
             return plane, None
-        return plane, json.loads(kept_files(cache, facts(options, "theta"), angles)["theta"])
+        theta = json.loads(kept_files(cache, facts(options, "theta"), angles)["theta"])
+        cell = options.theta.index(middle(options.theta)), options.mu.index(middle(options.mu))
+        path = options.out / "theta.png"
+        # Drawn while other threads compile.
+        picture(options, times, np.array(theta), float(plane.time[cell])).savefig(path, dpi=130)
+        return plane, path
 
     def live() -> str:
         if not can_view():
@@ -214,8 +219,8 @@ def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str,
     finally:
         # After Ctrl-C, the process ends while the compiler is working, which nothing can interrupt.
         threads.shutdown(wait=False, cancel_futures=True)
-    cylinder, (plane, theta), html = (future.result() for future in futures)
-    return {"plane": plane, "cylinder": cylinder}, None if theta is None else (times, np.array(theta)), html
+    cylinder, (plane, drawing), html = (future.result() for future in futures)
+    return {"plane": plane, "cylinder": cylinder}, drawing, html
 
 
 def has_matplotlib() -> bool:
@@ -303,22 +308,14 @@ def main(arguments: list[str] | None = None) -> int:
         print("\n".join(described(options)), flush=True)
         require_folder(options.out, "--out")
         read = all(are_kept(cache, facts(options, arena)) for arena in ARENAS)
-        arenas, samples, live = computed(options, cache)
+        arenas, drawing, live = computed(options, cache)
         print(f"\n{remark(options)}", flush=True)
-        with status_line("drawing") as line:
-            paths, drawing = [options.out / f"{arena}.h5" for arena in arenas], None
-            if samples is None:
-                with line.aside():
-                    print(
-                        "No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr
-                    )
-            else:
-                drawing = options.out / "theta.png"
-                middle_cell = options.theta.index(middle(options.theta)), options.mu.index(middle(options.mu))
-                end = float(arenas["plane"].time[middle_cell])
-                picture(options, samples[0], samples[1], end).savefig(drawing, dpi=130)
-                paths.append(drawing)
-            path = write_page(options, arenas, live, drawing)
+        paths = [options.out / f"{arena}.h5" for arena in arenas]
+        if drawing is None:
+            print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
+        else:
+            paths.append(drawing)
+        path = write_page(options, arenas, live, drawing)
     except AnotherRun as error:
         advice = f"name another folder with --out, or remove {options.out}"
         print(f"python -m tippe: {options.out} holds another run: {error.difference}; {advice}", file=sys.stderr)

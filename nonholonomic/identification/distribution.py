@@ -81,7 +81,9 @@ class Distribution(NamedTuple):
         distribution, and hardly depends on the distance of improbable minima.
         """
         if self.kind == "weights":
-            covariance = weighted_covariance(np.asarray(problem.values(self.points)), self.weights)[1]
+            # Draws without weight may be infinite.
+            used = self.weights > 0.0
+            covariance = weighted_covariance(np.asarray(problem.values(self.points[used])), self.weights[used])[1]
             ends = np.array([self.interval(k, 1.0) for k in range(len(self.estimate))])
             low, high = np.asarray(problem.values(ends.T))
             scale = 0.5 * (high - low) / np.sqrt(np.diag(covariance))

@@ -104,10 +104,12 @@ class Unknown(eqx.Module):
         if self.has_lower and self.has_upper:
             # 1 / (1 + exp(-x)) without an overflow.
             return self.lower + (self.upper - self.lower) * 0.5 * (1.0 + xp.tanh(0.5 * coordinate))
-        if self.has_lower:
-            return self.lower + xp.exp(coordinate)
-        if self.has_upper:
-            return self.upper - xp.exp(-coordinate)
+        # A coordinate that is large enough stands for infinity.
+        with np.errstate(over="ignore"):
+            if self.has_lower:
+                return self.lower + xp.exp(coordinate)
+            if self.has_upper:
+                return self.upper - xp.exp(-coordinate)
         return self.start + self.unit * coordinate
 
     def coordinate(self, value: Any) -> Float[Array, "..."]:

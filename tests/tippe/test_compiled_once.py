@@ -102,7 +102,7 @@ CALLS = {
     ),
     "exponent": lambda scene, mu: tippe.lyapunov_exponent(scene(mu), launch(), T1, tolerance=TOLERANCE),
     "fit": lambda scene, mu: tippe.identify(
-        scene(0.3), tippe.InversionTimes(launch([0.1, 0.2]), [0.1, mu], error=0.1, t1=T1, angle=0.25), {"mu": mu}
+        scene(0.3), tippe.InversionTimes(launch([0.1, 0.2]), [0.1, 0.5 * mu], error=0.1, t1=T1, angle=0.25), {"mu": mu}
     ),
 }
 

@@ -8,6 +8,7 @@ import pytest
 import scipy.stats
 
 from nonholonomic.identification import FitWarning, Free, LogDensity, Measurements, identify, sample
+from nonholonomic.identification.distribution import Distribution
 from nonholonomic.identification.pareto import smoothed_weights
 
 X = np.linspace(0.5, 1.5, 8)
@@ -101,6 +102,15 @@ def test_a_number_that_only_a_limit_bounds_is_told():
     data = Measurements([1.0], 0.1, censored=True)
     with pytest.warns(FitWarning, match="do not (bound|determine) x"):
         identify(lambda p: p["x"][:, None], data, {"x": 2.0})
+
+
+def test_infinite_draws_without_weight_do_not_spoil_the_standard_error():
+    problem = LogDensity.of(lambda p: p["x"][:, None], Measurements([1.0], 0.1), {"x": Free(1.0, 0.0)}).problem
+    points, weights = np.append(np.linspace(-1.0, 1.0, 201), 1000.0)[:, None], np.append(np.full(201, 1.0 / 201.0), 0.0)
+    distribution = Distribution("weights", np.zeros(1), np.eye(1), points, weights)
+    low, high = np.exp(distribution.interval(0, 1.0))
+    variance = distribution.covariance_of_values(problem, np.ones(1))[0, 0]
+    assert variance == pytest.approx((0.5 * (high - low)) ** 2)
 
 
 def test_smoothed_weights_know_a_heavy_tail():
