@@ -8,7 +8,7 @@ part of it.
 import dataclasses
 from typing import Self
 
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from nonholonomic.compilation.xla_cpu import stored, stored_with_tangents
 from nonholonomic.geometry import (
@@ -87,6 +87,12 @@ class Dynamics(AbstractContactDynamics):
         because they no longer add up along a circle.
         """
         return dataclasses.replace(self, turns=turns)
+
+    def unloaded(
+        self, state: Float[Array, "components ..."], scales: Float[Array, "components ..."]
+    ) -> Bool[Array, "..."] | None:
+        """See `AbstractDynamics.unloaded`. On a level plane, N = 0 can last only for an instant."""
+        return None if self.turns is not None else super().unloaded(state, scales)
 
     def motion(self, state: Float[Array, "components ..."]) -> Motion:
         """Evaluate the equations of motion, solving for the normal force with friction included.
