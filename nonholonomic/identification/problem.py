@@ -197,11 +197,9 @@ def _in_parts(
     rows = rows_of_part if jax.default_backend() == "cpu" else MOST_ROWS
     padding = np.full((-len(coordinates) % rows, coordinates.shape[1]), np.nan)
     parts = np.concatenate([coordinates, padding]).reshape(-1, rows, coordinates.shape[1])
-    # Before the threads start, so that the program is compiled once.
-    without_runs = [np.asarray(result) for result in function(np.full_like(parts[0], np.nan))]
 
     def of_part(part: Rows) -> list[np.ndarray]:
-        return [np.asarray(result) for result in function(part)] if np.any(np.isfinite(part)) else without_runs
+        return [np.asarray(result) for result in function(part)]
 
     with ThreadPoolExecutor(cores) as threads:
         # A single core stays in this thread, in which JAX's contexts hold, such as that of `jax.default_device`.

@@ -154,7 +154,7 @@ def test_a_second_call_with_other_numbers_compiles_nothing(kind, call):
 
 
 @pytest.mark.slow
-# Two times of so short runs do not determine the friction.
+# Two times of such short runs do not determine the friction.
 @pytest.mark.filterwarnings("ignore::tippe.FitWarning")
 @pytest.mark.parametrize("kind", SCENES)
 @pytest.mark.parametrize("call", CALLS)
