@@ -55,4 +55,5 @@ from .runge_kutta import explicit_tableau as explicit_tableau
 from .samples import solve_with_samples as solve_with_samples
 from .scheduler import Outcome as Outcome
 from .settings import Settings as Settings
+from .stabilized import Stabilized8 as Stabilized8
 from .step import LaneState as LaneState

@@ -1,7 +1,7 @@
-"""States inside a step: a continuous extension of `Oscillatory8`.
+"""States inside a step: a continuous extension of a pair of orders 8 and 7.
 
 The extension needs no more stages. The stages, together with the second derivatives of the state at both ends of the
-step, determine the state in the middle to seventh order (`oscillatory.MIDDLE`); the extension is the polynomial of
+step, determine the state in the middle to seventh order (`AbstractTunedPair.middle`); the extension is the polynomial of
 degree 7 with the states and rates at both ends and in the middle, and with the second derivatives at the ends. It costs
 one derivative and one evaluation of the field per step, a sixth of a step.
 """
@@ -14,7 +14,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from .oscillatory import MIDDLE
 from .problem import AbstractProblem
 from .runge_kutta import Lanes, States, weighted_sum
 
@@ -52,19 +51,20 @@ def second_derivative(problem: AbstractProblem, length: Lanes, time: Lanes, stat
 
 
 def continuous_extension(
+    middle_weights: Sequence[float],
     problem: AbstractProblem,
     start: StepEnd,
     end: StepEnd,
     length: Lanes,
     rates: Sequence[States],
 ) -> StatesInside:
-    """The states inside a step of `Oscillatory8`.
+    """The states inside a step.
 
-    **Arguments:** `start`, `end`: the ends of the step; `length`: its length [s];
-    `rates`: the field at its stages.
+    **Arguments:** `middle_weights`: those of the pair (`AbstractTunedPair.middle`); `start`, `end`: the ends of the step;
+    `length`: its length [s]; `rates`: the field at its stages.
     """
-    seconds = weighted_sum(MIDDLE[len(rates) :], (start.second, end.second))
-    middle = start.state + length * (weighted_sum(MIDDLE[: len(rates)], rates) + length * seconds)
+    seconds = weighted_sum(middle_weights[len(rates) :], (start.second, end.second))
+    middle = start.state + length * (weighted_sum(middle_weights[: len(rates)], rates) + length * seconds)
     middle = jax.lax.optimization_barrier(middle)
     middle_rate = jax.lax.optimization_barrier(problem.field(start.time + 0.5 * length, middle))
 

@@ -3,6 +3,7 @@
 import functools
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
@@ -37,9 +38,10 @@ class DenseRecord(NamedTuple):
 
 
 class DenseSampleRecorder(AbstractRecorder):
-    """Collects the samples of every cell, which lie inside steps of `Oscillatory8`."""
+    """Collects the samples of every cell, which lie inside steps; `middle_weights`: of the pair, `AbstractTunedPair.middle`."""
 
     times: SampleTimes
+    middle_weights: tuple[float, ...] = eqx.field(static=True)
 
     def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: Collected) -> DenseRecord:
         point = (lane_state.length, lane_state.time, lane_state.state, lane_state.rate)
@@ -67,7 +69,7 @@ class DenseSampleRecorder(AbstractRecorder):
         second = second_derivative(problem, length, end_time, trial.state, trial.rate)
         start = StepEnd(lane_state.time, lane_state.state, lane_state.rate, record.second)
         end = StepEnd(end_time, trial.state, trial.rate, second)
-        states_inside = continuous_extension(problem, start, end, length, trial.rates)
+        states_inside = continuous_extension(self.middle_weights, problem, start, end, length, trial.rates)
         has_moved = new_lanes.time > lane_state.time
         last_time = jnp.where(has_moved, new_lanes.time, -jnp.inf)
         record = self._with_samples(record, new_lanes, last_time, (lane_state.time, length), states_inside)

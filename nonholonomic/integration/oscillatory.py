@@ -1,22 +1,17 @@
 """An explicit Runge-Kutta pair of orders 8 and 7 for motions that oscillate or rotate, the default of ensemble solves.
 
-The pair has the thirteen stages, and all simplifying assumptions, of Prince and Dormand's pair RK8(7)13M (High order
-embedded Runge-Kutta formulae, J. Comput. Appl. Math. 7, 1981), which is Diffrax's `Dopri8`. These assumptions leave ten
-coefficients free. Prince and Dormand chose them for a small error in ninth order, for any field. Here they minimise the
-error of a step along the motions of tops and strollers, for lengths at which the error is about the tolerance, and keep
-the weights small, because large weights magnify round-off; `python benchmarks/tune_pair.py --starts 50 --seed 0`
-computed them. `docs/performance.md` lists the gain. A rotation by 1 rad per step changes the amplitude by 3e-10 and the
-phase by 7e-10; with `Dopri8`, the changes are 1e-8 and 3e-8. A rotation by 3 rad per step, which only the loosest
+Its free weights minimise the error of a step along the motions of tops and strollers, for lengths at which the error is
+about the tolerance, and are small, because large weights magnify round-off; `python benchmarks/tune_pair.py --starts 50
+--seed 0` computed them. `docs/performance.md` lists the gain. A rotation by 1 rad per step changes the amplitude by 3e-10
+and the phase by 7e-10; with `Dopri8`, the changes are 1e-8 and 3e-8. A rotation by 3 rad per step, which only the loosest
 tolerances allow, changes both by 8e-4; `Dopri8` shrinks the amplitude and this pair enlarges it.
-
-A continuous extension of order 7 needs no more stages, only the second derivatives at both ends
-(`continuous_extension.py`).
 """
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import diffrax
-import numpy as np
+
+from .tuned_pair import AbstractTunedPair, tableau_of
 
 #: Weights of the earlier stages in each stage from the second one on.
 STAGES = (
@@ -129,39 +124,29 @@ SEVENTH = (
     0.0,
 )
 
-#: The error of a step is estimated by this factor times the difference between the two orders. With 2, smooth motions
-#: take about as many steps as with Prince and Dormand's pair at the same tolerance, and err less.
-CAUTION = 2.0
-
-#: Weights of the state in the middle of a step: of the stages, the field at the end, and the second derivatives at both
-#: ends (`python benchmarks/tune_middle.py`). They satisfy the order conditions up to order 7.
-MIDDLE = np.array(
-    [
-        0.00947934797670005672,
-        *(0.0, 0.0, 0.0, 0.0),
-        0.230168904967154669,
-        0.30283028385392069,
-        -0.276839618768676743,
-        0.256128116679526452,
-        -0.00501073648702501928,
-        -0.0543396530569756481,
-        0.0295962796869999323,
-        -0.0545129248515897474,
-        0.0624999999999656733,
-        *(-0.00260416666666801223, -0.00260416666666524231),
-    ]
+#: Weights of the state in the middle of a step (`python benchmarks/tune_middle.py`).
+MIDDLE = (
+    0.00947934797670005672,
+    *(0.0, 0.0, 0.0, 0.0),
+    0.230168904967154669,
+    0.30283028385392069,
+    -0.276839618768676743,
+    0.256128116679526452,
+    -0.00501073648702501928,
+    -0.0543396530569756481,
+    0.0295962796869999323,
+    -0.0545129248515897474,
+    0.0624999999999656733,
+    *(-0.00260416666666801223, -0.00260416666666524231),
 )
 
-#: Positions in the step of all stages but the first, and of the end of the step, where the next step begins.
-PLACES = np.array([*(sum(row) for row in STAGES), 1.0])
 
-
-class Oscillatory8(diffrax.AbstractERK):
+class Oscillatory8(AbstractTunedPair):
     """A Runge-Kutta pair of orders 8 and 7 with thirteen stages, for motions that oscillate or turn.
 
-    Its dense output in Diffrax is the cubic through states and rates at both ends, which is far less accurate than its
-    steps. Functions that use Diffrax's dense output, such as `tippe.simulate` for a single run, therefore raise a
-    `ValueError` for this solver. Tables and batches have a continuous extension of their own.
+    Functions that use Diffrax's dense output, such as `tippe.simulate` for a single run, raise a `ValueError` for this
+    solver, because its dense output in Diffrax, the cubic through states and rates at both ends, is far less accurate than
+    its steps. Tables and batches have a continuous extension of their own.
 
     **Example:**
 
@@ -178,13 +163,5 @@ class Oscillatory8(diffrax.AbstractERK):
     ```
     """
 
-    tableau: ClassVar[diffrax.ButcherTableau] = diffrax.ButcherTableau(
-        a_lower=tuple(map(np.array, (*STAGES, EIGHTH))),
-        b_sol=np.array([*EIGHTH, 0.0]),
-        b_error=np.array([*(CAUTION * np.subtract(EIGHTH, SEVENTH)), 0.0]),
-        c=PLACES,
-    )
-    interpolation_cls: ClassVar[Any] = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
-
-    def order(self, terms: Any) -> int:
-        return 8
+    tableau: ClassVar[diffrax.ButcherTableau] = tableau_of(STAGES, EIGHTH, SEVENTH)
+    middle: ClassVar[tuple[float, ...]] = MIDDLE

@@ -13,7 +13,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..compilation.xla_cpu import written_in_place
 from .dense_samples import DenseSampleRecorder
-from .oscillatory import Oscillatory8
 from .problem import AbstractProblem
 from .runge_kutta import Lanes
 from .sample_times import Collected, Read, Rows, SampleTimes, components
@@ -21,6 +20,7 @@ from .scheduler import AbstractRecorder, InLanes, LaneScheduler, Outcome
 from .settings import Settings
 from .status import FAILED, REACHED_END, RUNNING
 from .step import LaneState, length_to_try, try_step
+from .tuned_pair import AbstractTunedPair
 
 #: Largest factor by which a step is stretched to end on a sample: its error stays below the tolerance, because steps
 #: are proposed with a margin of `step.SAFETY`.
@@ -112,8 +112,9 @@ def solve_with_samples(
       reach times after `t1`. Samples are not differentiable with respect to `times`, nor, if `dense`, to `t1`.
     - `read`: function of cells (lanes,) and states (rows, components, lanes) that returns the values to keep, a
       tree of arrays (rows, lanes, ...); by default the states themselves. Keeping less saves time and memory.
-    - `dense`: whether to interpolate the samples inside steps of `Oscillatory8` (`continuous_extension.py`), which takes
-      less time where there are more samples than steps. Otherwise steps end on the samples.
+    - `dense`: whether to interpolate the samples inside steps of `Oscillatory8` or `Stabilized8`
+      (`continuous_extension.py`), which takes less time where there are more samples than steps. Otherwise steps end on
+      the samples.
 
     **Returns:** the `Outcome`, without crossing times; and the kept values at the times, with the first axes (cells,
     times), NaN after the end of a run. By default, these are an array (cells, times, components).
@@ -130,8 +131,9 @@ def solve_with_samples(
     """
     scheduler = LaneScheduler.of(problem, t1, cells, settings, n_blocks=n_blocks, one_kernel=one_kernel)
     sample_times = SampleTimes.of(times, scheduler.capacity, read)
-    interpolates = dense and isinstance(settings.for_lanes, Oscillatory8)
-    recorder = DenseSampleRecorder(sample_times) if interpolates else SampleRecorder(sample_times)
+    solver, recorder = settings.for_lanes, SampleRecorder(sample_times)
+    if dense and isinstance(solver, AbstractTunedPair):
+        recorder = DenseSampleRecorder(sample_times, solver.middle)
     at_start = sample_times.at_start(scheduler.start().lane_state, scheduler.fresh.state)
     outcome, _, collected = scheduler.recorded(recorder, at_start)
     return outcome, collected.samples

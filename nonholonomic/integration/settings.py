@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from ..validation import as_number, shown
 from .oscillatory import Oscillatory8
+from .tuned_pair import AbstractTunedPair
 
 #: The absolute tolerance as a fraction of the relative one, in units of a problem's own magnitudes.
 ABSOLUTE = 0.1
@@ -57,7 +58,7 @@ class Settings(eqx.Module):
 
         **Raises:** `ValueError` for a solver whose dense output is less accurate than its steps.
         """
-        if isinstance(self.solver, Oscillatory8):
+        if isinstance(self.solver, AbstractTunedPair):
             raise ValueError(
                 f"solver = {shown(self.solver)} must have a dense output as accurate as its steps, as Dopri8() has, where "
                 "Diffrax integrates"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from close import assert_close
 
-from nonholonomic.integration import Oscillatory8
+from nonholonomic.integration import Oscillatory8, Stabilized8
 from nonholonomic.integration.runge_kutta import (
     explicit_step,
     explicit_tableau,
@@ -24,7 +24,7 @@ def field(time, state):
 
 @pytest.mark.parametrize(
     "solver",
-    [Oscillatory8(), diffrax.Dopri8(), diffrax.Tsit5(), diffrax.Bosh3(), diffrax.Heun()],
+    [Oscillatory8(), Stabilized8(), diffrax.Dopri8(), diffrax.Tsit5(), diffrax.Bosh3(), diffrax.Heun()],
     ids=lambda value: type(value).__name__,
 )
 def test_a_step_is_that_of_diffrax(solver):
