@@ -190,7 +190,7 @@ def stages_to_look(fractions: Float[np.ndarray, " stages"]) -> list[int]:
     return sorted(stages)
 
 
-def weighted_sum(weights: Float[np.ndarray, " stages"], rates: Sequence[States]) -> States:
+def weighted_sum(weights: Iterable[float], rates: Sequence[States]) -> States:
     """Weighted sum of the rates, without those of weight 0."""
     total = None
     for weight, rate in zip(weights, rates, strict=True):

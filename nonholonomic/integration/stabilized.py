@@ -1,8 +1,8 @@
 """An explicit Runge-Kutta pair of orders 8 and 7 for stiff friction.
 
 Coulomb friction with a small slip speed makes the slip decay fast, and stability then limits the steps of an explicit method:
-of `Oscillatory8` to 5.5 times the time constant of the decay, of this pair to 16.5 times. The limit of any method with
-these stages is 17.2. In smooth motions, its errors are two to thirty times those of `Oscillatory8`.
+of `Oscillatory8` to 5.5 times the time constant of the decay, of this pair to 16.5 times. No polynomial of its
+degree reaches beyond 17.2. In smooth motions, its errors are two to thirty times those of `Oscillatory8`.
 `python benchmarks/tune_stability.py` computed the weights.
 """
 

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import diffrax
-import equinox as eqx
 import numpy as np
 
 #: The error of a step is estimated by this factor times the difference between the two orders. With 2, smooth motions
@@ -28,7 +27,7 @@ class AbstractTunedPair(diffrax.AbstractERK):
     Its dense output in Diffrax is the cubic through states and rates at both ends (`Settings.for_single_runs`).
     """
 
-    middle: eqx.AbstractClassVar[tuple[float, ...]]
+    middle: ClassVar[tuple[float, ...]]
     interpolation_cls: ClassVar[Any] = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
 
     def order(self, terms: Any) -> int:
