@@ -54,9 +54,17 @@ def run_and_exit(main: Callable[[], int], program: str) -> NoReturn:
     # Imported here, because this module must load before JAX does.
     from .compilation.xla_cpu import compile_quickly
 
-    # After the filters of the user; those of Python hide what concerns developers only.
-    warnings.simplefilter("once", UserWarning, append=True)
-    warnings.formatwarning = lambda message, *_: f"python -m {program}: warning: {message}\n"
+    # After the filters of the user; those of Python hide what concerns developers only. Python's filter "once" repeats a
+    # warning for each module and thread that it points to.
+    warnings.simplefilter("always", UserWarning, append=True)
+    shown_texts: set[str] = set()
+
+    def show(message: Warning | str, *_: Any) -> None:
+        if str(message) not in shown_texts:
+            shown_texts.add(str(message))
+            print(f"python -m {program}: warning: {message}", file=sys.stderr)
+
+    warnings.showwarning = show
     gc.disable()
     compile_quickly()
     status = interruptible(main, program)

@@ -190,9 +190,11 @@ def test_copies_in_our_threads_repeat_no_warning():
 
 
 def test_a_command_line_shows_a_warning_once_and_as_one_line():
+    """Also if it comes from several modules, each with a registry of its own."""
     program = (
         "import warnings; from nonholonomic.command_line import run_and_exit; "
-        "run_and_exit(lambda: [warnings.warn(f'too {k % 2}') for k in range(4)] and 0, 'tippe')"
+        "place = (UserWarning, 'module.py', 1, 'module'); "
+        "run_and_exit(lambda: [warnings.warn_explicit(f'too {k % 2}', *place, {}) for k in range(4)] and 0, 'tippe')"
     )
     process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert process.stderr == "python -m tippe: warning: too 0\npython -m tippe: warning: too 1\n"
