@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..progress import status_line
-from ..validation import require, shown
+from ..validation import is_traced, require, shown
 from .likelihood import Measurements
 from .problem import Problem, predictions, step_of
 from .unknown import as_free, as_gaussian
@@ -133,6 +133,9 @@ class LogDensity(eqx.Module):
 
     def predict(self, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
         """The model's predictions for all measurements, at several sets of coordinates."""
+        if self.problem.on_host and not is_traced(coordinates):
+            # By the program of a fit, for whatever number of rows.
+            return jnp.asarray(self.predictions(np.asarray(coordinates)))
         return self.problem.predict(coordinates[:, : len(self.problem.names)])
 
     def predictions(self, coordinates: Float[np.ndarray, "rows unknowns"]) -> Float[np.ndarray, "rows n"]:

@@ -35,9 +35,6 @@ from ..runs.verbs import simulate
 from .inversion_times import AbstractTimes, InversionTimes, Values
 from .recording import Recording
 
-#: Number of rows that one program simulates together: as many as a fit asks for at once.
-BATCH = 64
-
 
 def _unit_of(model: Any, name: str) -> str:
     """The unit of a parameter of a scene or a launch."""
@@ -45,13 +42,14 @@ def _unit_of(model: Any, name: str) -> str:
 
 
 @eqx.filter_jit
-def _samples_of_batch(scene: Scene, data: Recording, tolerance: Any, columns: dict[str, Any]) -> Any:
-    """The samples of a recording in every row of a batch; NaN for illegal parameters, and after the end of a run."""
+def _samples_of_rows(scene: Scene, data: Recording, tolerance: Any, columns: dict[str, Any]) -> Any:
+    """The samples of a recording in every row; NaN for illegal parameters, and after the end of a run."""
 
     def run(scene: Scene, launch: Any, times: Any) -> Any:
         return simulate(scene, launch, times[-1], times, tolerance)
 
-    return predicted(scene, [(data, columns)], BATCH, run)[0]
+    rows = len(next(iter(columns.values())))
+    return predicted(scene, [(data, columns)], rows, run)[0]
 
 
 class HybridModel(AbstractDataModel):
@@ -82,20 +80,16 @@ class HybridModel(AbstractDataModel):
         predictions = []
         for data, values in sources:
             columns = {name: np.asarray(part) for name, part in values.items()}
-            of_batch: Any = self._times
+            of_rows: Any = self._times
             if isinstance(data, Recording):
                 # To compile lanes of runs that stick would take longer than to run them one by one.
-                of_batch = self._samples_one_by_one if self.scene.friction.set_valued else self._samples
-            batches = [slice(first, first + BATCH) for first in range(0, rows, BATCH)]
-            parts = [of_batch(data, {name: part[batch] for name, part in columns.items()}) for batch in batches]
-            predictions.append(np.concatenate(parts))
+                of_rows = self._samples_one_by_one if self.scene.friction.set_valued else self._samples
+            predictions.append(of_rows(data, columns))
         return predictions
 
     def _samples(self, data: Recording, columns: dict[str, np.ndarray]) -> Float[np.ndarray, "rows size"]:
-        """The samples in at most `BATCH` rows, which are filled up to this number, so that one program serves all calls."""
-        count = len(next(iter(columns.values())))
-        filled = {name: np.pad(part, (0, BATCH - count), constant_values=np.nan) for name, part in columns.items()}
-        return np.asarray(_samples_of_batch(self.scene, data, np.asarray(self.tolerance), filled))[:count]
+        """The samples in all rows, by a program for this number of rows."""
+        return np.asarray(_samples_of_rows(self.scene, data, np.asarray(self.tolerance), columns))
 
     def _samples_one_by_one(self, data: Recording, columns: dict[str, np.ndarray]) -> Float[np.ndarray, "rows size"]:
         """The same, run by run. Samples before the launch equal those at the launch; samples after the run's end are NaN."""
@@ -115,7 +109,7 @@ class HybridModel(AbstractDataModel):
         return predictions.reshape(len(rows), -1)
 
     def _times(self, data: AbstractTimes, columns: dict[str, np.ndarray]) -> Float[np.ndarray, "rows launches"]:
-        """The times in at most `BATCH` rows; NaN for illegal parameters."""
+        """The times in all rows; NaN for illegal parameters."""
         count, launches = len(next(iter(columns.values()))), data.size
         columns = {name: part for name, part in columns.items() if name != "t0"}
         legal = np.array(
@@ -124,19 +118,19 @@ class HybridModel(AbstractDataModel):
         predictions = np.full((count, launches), np.nan)
         if not legal.any():
             return predictions
-        # One number of cells, hence one program, serves all calls; only the first cells run.
+        # However many rows are legal, there are as many cells, hence one program; only the first cells run.
         of_launch = {name: value for name, value in numbers("launch", data.launch).items() if value is not None}
         cells = {
-            name: np.tile(np.broadcast_to(np.asarray(value), (launches,)), BATCH) for name, value in of_launch.items()
+            name: np.tile(np.broadcast_to(np.asarray(value), (launches,)), count) for name, value in of_launch.items()
         }
         for name, part in columns.items():
-            filled = np.pad(part[legal], (0, BATCH - legal.sum()), constant_values=part[legal][0])
+            filled = np.pad(part[legal], (0, count - legal.sum()), constant_values=part[legal][0])
             cells[name] = np.repeat(filled, launches)
         job = TableJob(data.timed(self.scene), data.form, float(data.t1), "first", Settings(self.tolerance))
         results = job(cells, launches * int(legal.sum()))
         time = np.asarray(data.of_cells(self.scene, results, cells["launch.theta"]))
         has_failed = np.asarray(results["status"]) == data.form.words.index("failed")
-        predictions[legal] = np.where(has_failed, np.nan, time).reshape(BATCH, launches)[: legal.sum()]
+        predictions[legal] = np.where(has_failed, np.nan, time).reshape(count, launches)[: legal.sum()]
         return predictions
 
     def _allows(self, data: Any, row: dict[str, float]) -> bool:
