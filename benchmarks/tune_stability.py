@@ -7,8 +7,8 @@ eighth, are those of the exponential function. The other four determine how far 
 program computes them for the interval `INTERVAL`, on which |R| <= `DAMPING` where the exponential itself is small.
 
 The script starts from `Oscillatory8`, whose family (`tuning/family.py`) leaves ten weights free, moves these four
-coefficients to their goal in ten stages, and in each stage minimises the errors in ninth order, and the weights, because
-large weights magnify round-off. It prints the interval, the errors and the weights. It takes two minutes.
+coefficients to their goal in ten moves, and after each move minimises the errors in ninth order and the weights, because
+large weights magnify round-off. It prints the interval, the errors and the weights, and takes two minutes.
 """
 
 import math

@@ -52,17 +52,18 @@ class Falls(Growth):
 PAIRS = pytest.mark.parametrize("pair", [Oscillatory8, Stabilized8])
 
 
-@PAIRS
-def test_the_weights_are_computed_from_the_order_conditions(pair):
-    assert_close(pair.middle, middle_weights(pair), atol=1e-9)
+# The conditions determine the weights of `Stabilized8` less well.
+@pytest.mark.parametrize(("pair", "tolerance"), [(Oscillatory8, 1e-11), (Stabilized8, 1e-9)])
+def test_the_weights_are_computed_from_the_order_conditions(pair, tolerance):
+    assert_close(pair.middle, middle_weights(pair), atol=tolerance)
 
 
-@PAIRS
+@pytest.mark.parametrize(("pair", "round_off"), [(Oscillatory8, 1e-15), (Stabilized8, 3e-15)])
 @pytest.mark.parametrize("order", range(1, 9))
-def test_every_condition_of_order_holds(order, pair):
+def test_every_condition_of_order_holds(order, pair, round_off):
     """To round-off up to seventh order; not in eighth."""
     largest = np.max(np.abs(errors(pair, np.array(pair.middle), order)))
-    assert largest < 3e-15 if order < 8 else 1e-7 < largest < 1e-5
+    assert largest < round_off if order < 8 else 1e-7 < largest < 1e-5
 
 
 def test_the_polynomial_has_degree_seven():

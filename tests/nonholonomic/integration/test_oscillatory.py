@@ -26,13 +26,15 @@ def test_there_are_as_many_trees_as_the_literature_counts():
     assert [len(group) for group in trees(9)] == [1, 1, 2, 4, 9, 20, 48, 115, 286]
 
 
-@pytest.mark.parametrize("pair", [PAIR, STABLE_PAIR], ids=["Oscillatory8", "Stabilized8"])
+@pytest.mark.parametrize(
+    ("pair", "round_off"), [(PAIR, 1e-15), (STABLE_PAIR, 2e-15)], ids=["Oscillatory8", "Stabilized8"]
+)
 @pytest.mark.parametrize("order", range(1, 9))
-def test_every_condition_of_order_holds(order, pair):
+def test_every_condition_of_order_holds(order, pair, round_off):
     """To round-off: all of the step up to eighth order, all of its companion up to seventh."""
-    assert jnp.abs(error_coefficients(pair.stages, pair.eighth, order)).max() < 2e-15
+    assert jnp.abs(error_coefficients(pair.stages, pair.eighth, order)).max() < round_off
     seventh = jnp.abs(error_coefficients(pair.stages, pair.seventh, order)).max()
-    assert seventh < 2e-15 if order < 8 else seventh > 1e-7
+    assert seventh < round_off if order < 8 else seventh > 1e-7
 
 
 def test_they_belong_to_the_family_which_leaves_ten_weights_free():
