@@ -168,9 +168,8 @@ PAGES = {
             "nonholonomic.identification",
             *of(
                 "nonholonomic.identification",
-                "AbstractRecording Quantities as_quantity read_columns read_launches model_times predicted AbstractDataModel "
-                "scene_unknowns free_numbers search_options as_sources fit_data posterior_of_data identify Identification "
-                "Measurements joined of_data series_units LogDensity sample Draws",
+                "AbstractRecording Quantities as_quantity read_columns read_launches identify Identification Measurements "
+                "LogDensity sample Draws",
             ),
         ],
     ),
@@ -211,8 +210,8 @@ MEMBERS = {
     "tippe.Status": "word of",
     "tippe.Table": "shape dims long_names load save to_xarray to_dataframe plot digits",
     "tippe.LyapunovExponent": "exponent error status end_time steps times running",
-    "tippe.InversionTimes": "measurements predict",
-    "tippe.ReversalTimes": "measurements predict",
+    "tippe.InversionTimes": "measurements",
+    "tippe.ReversalTimes": "measurements",
     "tippe.Free": "start lower upper prior unit",
     "nonholonomic.AbstractMode": "field margin reset",
     "nonholonomic.AbstractSystem": "dimension metric potential constraints frame force margin reset impact lagrangian "
@@ -229,8 +228,7 @@ MEMBERS = {
     "nonholonomic.derivatives.VariationalProblem": "parts",
     "nonholonomic.sweeps.Quantity": "of",
     "nonholonomic.identification.AbstractRecording": "columns size seen labels series_units measurements",
-    "nonholonomic.identification.Quantities": "of samples",
-    "nonholonomic.identification.AbstractDataModel": "together predict",
+    "nonholonomic.identification.Quantities": "of",
     "nonholonomic.identification.LogDensity": "of names units start values predict replicate",
     "nonholonomic.sweeps.Tabular": "readable portrait_axes to_table to_xarray save portrait",
     "nonholonomic.derivatives.AbstractDifferentiableSolve": "in_blocks movable absent solve value_and_tangents prefers_adjoint "

@@ -29,6 +29,10 @@ REFUSED = {
         lambda: stroller.simulate(PRAM, LAUNCH, 1.0),
         "launch is a tippe.Launch and must be a stroller.Launch",
     ),
+    "the other package's data": (
+        lambda: nonholonomic.identify(TOP, stroller.Recording(RIDE, [1.0], [2.0], 0.1, "speed"), {"mu": 0.3}),
+        "scene is a tippe.Scene and must be a stroller.Scene",
+    ),
     "a number for a law": (
         lambda: tippe.Scene(rutstam_top(), friction=0.3),
         "friction = 0.3 must be a Friction law, such as tippe.Viscous(0.3)",

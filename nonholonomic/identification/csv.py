@@ -51,12 +51,12 @@ def read_columns(
 
     >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
-    >>> from nonholonomic.identification import read_columns
+    >>> from nonholonomic.identification import Quantities, read_columns
     >>> with TemporaryDirectory() as folder:
     ...     path = Path(folder) / "levels.csv"
     ...     length = path.write_text("clock [s];level [%]\\n0,1;90\\n0,2;n/a\\n0,3;80\\n")
     ...     columns = {"time": "clock", "level": "level"}
-    ...     read_columns(path, columns, None, None, Recording.quantities, decimal=",").value
+    ...     read_columns(path, columns, None, None, Quantities({}, {"level": "1"}, frozenset()), decimal=",").value
     array([0.9, 0.8])
     """
     known = {"time": "s", "frame": "1"} | dict(quantities.units)

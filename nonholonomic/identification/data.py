@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from ..parameters import full_name, with_numbers
+from ..parameters import full_name
 from . import likelihood
 from .likelihood import Measurements
 from .unknown import Free, as_free
@@ -22,13 +22,6 @@ def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], Int[np
 
     **Arguments:** `data`: sets of data, each with the attributes `measurements`, `labels`, `seen`, and `size` (the
     number of its predictions).
-
-    **Example:**
-
-    >>> from nonholonomic.identification import joined
-    >>> measurements, labels, seen = joined(data)
-    >>> measurements.value.shape, labels[0], seen
-    ((3,), 'level(1 s)', array([0, 1, 2]))
     """
     labels = numbered([source.labels for source in data])
     offsets = np.cumsum([0, *(source.size for source in data)])
@@ -45,25 +38,12 @@ def numbered(labels: Sequence[Sequence[str]]) -> tuple[str, ...]:
 def series_units(data: tuple[Any, ...]) -> tuple[str, ...]:
     """The unit of each series of the joined measurements. **Arguments:** `data`: sets of data, each with `measurements`
     and `series_units`.
-
-    **Example:**
-
-    >>> from nonholonomic.identification import series_units
-    >>> series_units(data)
-    ('1',)
     """
     return tuple(unit for source in data for unit in source.series_units[: 1 + int(np.max(source.measurements.series))])
 
 
 def of_data(parameters: dict[str, Any], k: int) -> dict[str, Any]:
-    """The parameters of one set of data: the shared parameters, and its own parameters without the prefix `data[k].`.
-
-    **Example:**
-
-    >>> from nonholonomic.identification import of_data
-    >>> of_data({"scene.rate": 1.0, "data[0].t0": 0.1, "data[1].t0": 0.2}, 1)
-    {'scene.rate': 1.0, 't0': 0.2}
-    """
+    """The parameters of one set of data: the shared parameters, and its own parameters without the prefix `data[k].`."""
     prefix = f"data[{k}]."
     shared = {name: value for name, value in parameters.items() if not name.startswith("data[")}
     parameters_of_data = {
@@ -77,32 +57,6 @@ def own_name(name: str) -> str:
     return name.split(".", 1)[1] if name.startswith("data[") else name
 
 
-def scene_unknowns(free: Any, scene: Any, launch: Any, shared: list[str], own: list[list[str]]) -> dict[str, Free]:
-    """The unknowns of a scene, its launches and its data; the scene and the launches check their values.
-
-    **Arguments:**
-
-    - `free`: name, or its unambiguous end, -> a `Free` or a start value. `data[1].launch.azimuth` is a parameter of the
-      second set of data alone, and `data[*].launch.azimuth` stands for one parameter of each set.
-    - `scene`, `launch`: with the parameters that are not free.
-    - `shared`: full names of the parameters of the scene; `own`: names of the parameters of each set of data.
-
-    **Returns:** full name -> `Free`.
-
-    **Example:**
-
-    >>> from nonholonomic.identification import scene_unknowns
-    >>> list(scene_unknowns({"data[*].t0": 0.1}, scene, launch, ["scene.rate"], [["launch.level", "t0"]]))
-    ['data[0].t0']
-    """
-    roots = {"scene": scene, "launch": launch}
-
-    def check(values: dict[str, float]) -> None:
-        with_numbers(roots, {name: value for name, value in values.items() if name != "t0"})
-
-    return free_numbers(free, shared, own, check)
-
-
 def free_numbers(
     free: Any,
     shared: list[str],
@@ -113,7 +67,8 @@ def free_numbers(
 
     **Arguments:**
 
-    - `free`: as for `scene_unknowns`.
+    - `free`: name, or its unambiguous end, -> a `Free` or a start value. `data[1].launch.azimuth` is a parameter of the
+      second set of data alone, and `data[*].launch.azimuth` stands for one parameter of each set.
     - `shared`: full names of the parameters of the model; `own`: names of the parameters of each set of data, without
       the prefix. A name of `own` without a prefix is shared, too.
     - `check`: function of a dictionary (name without prefix -> number) that raises `ValueError` for illegal values.
@@ -121,12 +76,6 @@ def free_numbers(
     **Returns:** full name -> `Free`.
 
     **Raises:** `ValueError` for an unknown name or illegal start values.
-
-    **Example:**
-
-    >>> from nonholonomic.identification import free_numbers
-    >>> list(free_numbers({"rate": 1.5}, ["scene.rate"], [["t0"]], lambda values: None))
-    ['scene.rate']
     """
     candidates = [*shared, *dict.fromkeys(itertools.chain(*own))]
     unknowns: dict[str, Free] = {}

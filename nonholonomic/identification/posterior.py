@@ -14,7 +14,7 @@ from ..progress import status_line
 from ..validation import is_traced, require, shown
 from .likelihood import Measurements
 from .problem import Problem, predictions, step_of
-from .unknown import as_free, as_gaussian
+from .unknown import Unknown, as_free, as_gaussian
 
 #: The log density of a parameter: (mean, standard deviation) of a Gaussian, or a function of the parameter.
 Prior = tuple[float, float] | Callable[[Float[Array, ""]], Float[Array, ""]]
@@ -32,11 +32,10 @@ class LogDensity(eqx.Module):
       start.
     - `units`: name of an unknown -> its unit, if known.
 
-    **Example:**
+    **Example:** that of the subpackage's example.
 
-    >>> from nonholonomic.identification import LogDensity
-    >>> LogDensity.of(Model(scene, data, jnp.arange(3)), data[0].measurements, free)
-    LogDensity of scene.rate, given 3 measurements
+    >>> LogDensity.of(decay, measured, free)
+    LogDensity of rate, given 3 measurements
     """
 
     problem: Problem
@@ -151,7 +150,7 @@ class LogDensity(eqx.Module):
 
     def log_priors(self, coordinates: Float[np.ndarray, "rows unknowns"]) -> Float[np.ndarray, " rows"]:
         """The log density of the priors in the coordinates, in every row."""
-        return np.asarray(_log_priors(self, coordinates))
+        return np.asarray(_log_priors(dict(self.problem.free), self.priors, coordinates))
 
     @status_line("simulating")
     def replicate(self, coordinates: Float[Array, "rows unknowns"], seed: int = 0) -> Float[np.ndarray, "rows n"]:
@@ -171,7 +170,9 @@ class LogDensity(eqx.Module):
 
     def of_prediction(self, coordinates: Float[Array, " unknowns"], prediction: Float[Array, " n"]) -> Float[Array, ""]:
         """The log density at given coordinates, for given predictions of the model."""
-        return self._with_errors(coordinates).log_likelihood(prediction) + self._log_prior(coordinates)
+        return self._with_errors(coordinates).log_likelihood(prediction) + _log_prior(
+            dict(self.problem.free), self.priors, coordinates
+        )
 
     @status_line("simulating")
     def value_and_gradient(
@@ -187,25 +188,26 @@ class LogDensity(eqx.Module):
             errors = jnp.where(mask, errors * jnp.exp(coordinate), errors)
         return self.measurements.with_errors(errors)
 
-    def _log_prior(self, coordinates: Float[Array, " unknowns"]) -> Float[Array, ""]:
-        """The log density of the priors in the coordinates: the density of each parameter, and the Jacobian of its
-        coordinate."""
-        total = jnp.zeros(())
-        for k, (name, unknown) in enumerate(self.problem.free):
-            if (prior := self.priors.get(name)) is not None:
-                value, slope = jax.value_and_grad(unknown.value)(coordinates[k])
-                log_density: Any = prior(value) if callable(prior) else _normal(value, *prior)
-                total += log_density + jnp.log(jnp.abs(slope))
-            elif unknown.has_lower and unknown.has_upper:
-                # Uniform between two bounds; in the coordinate, the prior would have no finite integral.
-                total += jnp.log(jnp.abs(jax.grad(unknown.value)(coordinates[k])))
-        return total
+
+def _log_prior(
+    unknowns: dict[str, Unknown], priors: dict[str, Any], coordinates: Float[Array, " unknowns"]
+) -> Float[Array, ""]:
+    """The log density of the priors in the coordinates: the density of each parameter, and the Jacobian of its
+    coordinate."""
+    total = jnp.zeros(())
+    for coordinate, (name, unknown) in zip(coordinates, unknowns.items(), strict=False):
+        if (prior := priors.get(name)) is not None:
+            value, slope = jax.value_and_grad(unknown.value)(coordinate)
+            log_density: Any = prior(value) if callable(prior) else _normal(value, *prior)
+            total += log_density + jnp.log(jnp.abs(slope))
+        elif unknown.has_lower and unknown.has_upper:
+            # Uniform between two bounds; in the coordinate, the prior would have no finite integral.
+            total += jnp.log(jnp.abs(jax.grad(unknown.value)(coordinate)))
+    return total
 
 
-@eqx.filter_jit
-def _log_priors(density: LogDensity, coordinates: Float[Array | np.ndarray, "rows unknowns"]) -> Float[Array, " rows"]:
-    of_row: Callable[..., Array] = density._log_prior
-    return jax.vmap(of_row)(coordinates)
+# Without the data, so that one program serves all fits of the same unknowns.
+_log_priors = eqx.filter_jit(eqx.filter_vmap(_log_prior, in_axes=(None, None, 0)))
 
 
 @eqx.filter_jit

@@ -2,17 +2,15 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..compilation.xla_cpu import greatest
-from ..parameters import numbers, with_numbers
 from ..text import one_line
 from ..validation import as_number, as_number_or_none, require, shown
 from ..warning import warn
@@ -23,9 +21,6 @@ INSTANT = 1e-9
 
 #: Spacing [s] of times that are added to give recordings the same length.
 AT_ONCE = 1e-6
-
-#: Parameters by name.
-Values = dict[str, Float[Array, "..."]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,12 +68,12 @@ class Quantities:
         instead = f"; for launches with a measured time each, use {self.launches}" if self.launches else ""
         return f": a recording is one run, sampled at increasing times{instead}"
 
-    def samples(self, run: Any, column: str) -> Float[Array, " times"]:
-        """A column of a trajectory, which has the quantities as properties."""
+    def place(self, column: str) -> tuple[str, int | None]:
+        """The quantity to which a column belongs, and the index of the component; `None` for a quantity of one column."""
         for quantity, columns in self.columns.items():
             if column in columns:
-                return getattr(run, quantity)[:, columns.index(column)]
-        return getattr(run, column)
+                return quantity, columns.index(column)
+        return column, None
 
 
 def as_quantity(words: Any) -> Any:
@@ -110,10 +105,17 @@ class AbstractRecording(eqx.Module):
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
 
-    **Example:** the recording of the subpackage's example.
+    **Example:** a class of recordings of a decay.
 
-    >>> data[0].labels
-    ('level(1 s)', 'level(2 s)', 'level(3 s)')
+    >>> import equinox as eqx
+    >>> from nonholonomic.identification import AbstractRecording, Quantities
+    >>> class DecayRecording(AbstractRecording):
+    ...     quantity: str = eqx.field(static=True, default="level")
+    ...     t0: float = 0.0
+    ...     student: None = None
+    ...     quantities = Quantities({}, {"level": "1"}, frozenset())
+    >>> DecayRecording(None, [1.0, 2.0], [0.37, 0.135], 0.005).labels
+    ('level(1 s)', 'level(2 s)')
     """
 
     launch: Any
@@ -177,13 +179,15 @@ class AbstractRecording(eqx.Module):
         """Number of times."""
         return len(self.times)
 
-    def lane(self, size: int) -> dict[str, Array]:
-        """The clock of a run that shares an ensemble with other recordings, of at most `size` times."""
-        return {"times": lengthened(self.times, size), "t0": self.t0}
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The quantities to which the columns belong."""
+        return tuple(dict.fromkeys(self.quantities.place(column)[0] for column in self.columns))
 
-    def part(self, predictions: Float[Array, "rows size columns"]) -> Float[Array, "rows samples"]:
-        """The predicted samples, ordered by time, of the predictions of a lane."""
-        return predictions[:, : self.length].reshape(len(predictions), -1)
+    def columns_of(self, model: Any, values: dict[str, Array]) -> list[Float[Array, " times"]]:
+        """The columns of the recording from the values of quantities. **Arguments:** `model`: that of the run."""
+        places = [self.quantities.place(column) for column in self.columns]
+        return [values[name] if part is None else values[name][:, part] for name, part in places]
 
     @property
     def size(self) -> int:
@@ -250,68 +254,8 @@ def noise(value: Float[np.ndarray, "times columns"]) -> Float[np.ndarray, " colu
 
 
 def model_times(times: Float[Array, " times"], t0: Float[Array, ""]) -> Float[Array, " times"]:
-    """The times of the samples since the launch [s]; 0 for samples before the launch.
-
-    **Example:**
-
-    >>> from nonholonomic.identification import model_times
-    >>> print(model_times(jnp.array([0.5, 1.5]), t0=1.0))
-    [0.  0.5]
-    """
+    """The times of the samples since the launch [s]; 0 for samples before the launch."""
     return greatest(times - t0, INSTANT * jnp.arange(times.shape[0]))
-
-
-def predicted(
-    scene: Any,
-    recordings: Sequence[tuple[AbstractRecording, Values]],
-    rows: int,
-    run: Callable[[Any, Any, Float[Array, " times"]], Any],
-) -> list[Float[Array, "rows samples"]]:
-    """Predictions for several recordings, in every row; all runs are lanes of one ensemble.
-
-    **Arguments:**
-
-    - `scene`: the scene of all runs, before its parameters are replaced.
-    - `recordings`: pairs of a recording and its parameters, name -> (rows,). All recordings must have the same
-      parameter names, and the same kinds of numbers in their launches.
-    - `run`: function of a scene, a launch and times since the launch [s] that returns a trajectory.
-
-    **Returns:** for each recording its samples, ordered by time, including missing ones; NaN after the end of a run.
-
-    **Example:** with another rate.
-
-    >>> print(predicted(scene, [(data[0], {"scene.rate": jnp.array([2.0])})], 1, simulate)[0].round(3))
-    [[0.135 0.018 0.002]]
-    """
-    first, size = recordings[0][0], max(len(recording.times) for recording, _ in recordings)
-    columns = tuple(dict.fromkeys(name for recording, _ in recordings for name in recording.columns))
-
-    def lanes(of_each: list[Array]) -> Array:
-        """The numbers of all runs, one row after the other; each is a scalar or has one number per row."""
-        return jnp.stack([jnp.broadcast_to(number, (rows,)) for number in of_each], axis=1).reshape(-1)
-
-    launches = [numbers("launch", recording.launch) for recording, _ in recordings]
-    names = [name for name, value in launches[0].items() if value is not None]
-    lane_numbers = {name: lanes([launch[name] for launch in launches]) for name in names}
-    lane_numbers |= {"t0": lanes([recording.t0 for recording, _ in recordings])}
-    lane_numbers |= {name: lanes([values[name] for _, values in recordings]) for name in recordings[0][1]}
-    # Shorter recordings are extended by an instant, so that all have the same number of times.
-    clock = jnp.stack([lengthened(recording.times, size) for recording, _ in recordings])
-
-    def samples_of_lane(lane: Values, times: Float[Array, " times"]) -> Float[Array, "times columns"]:
-        values = {name: value for name, value in lane.items() if name != "t0"}
-        roots = with_numbers({"scene": scene, "launch": first.launch}, values)
-        trajectory = run(roots["scene"], roots["launch"], model_times(times, lane["t0"]))
-        return jnp.stack([first.quantities.samples(trajectory, name) for name in columns], axis=-1)
-
-    predictions = jax.vmap(samples_of_lane)(lane_numbers, jnp.tile(clock, (rows, 1))).reshape(
-        rows, len(recordings), size, len(columns)
-    )
-    parts = []
-    for k, (recording, _) in enumerate(recordings):
-        places = np.array([columns.index(name) for name in recording.columns])
-        parts.append(predictions[:, k, : len(recording.times)][..., places].reshape(rows, -1))
-    return parts
 
 
 def lengthened(times: Float[Array, " times"], count: int) -> Float[Array, " count"]:

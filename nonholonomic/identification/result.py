@@ -87,7 +87,7 @@ class Identification:
     **Example:** the fit of the subpackage's example.
 
     >>> fit.status, fit.degrees, list(fit.estimates)
-    ('converged', 2, ['scene.rate'])
+    ('converged', 2, ['rate'])
     """
 
     estimates: dict[str, float]
@@ -174,15 +174,7 @@ class Identification:
     @property
     def curves(self) -> tuple[Float[np.ndarray, "slices n"], Float[np.ndarray, "slices n"]]:
         """Times since the first sample of each recording [s] and predictions, at and between the samples, at the most likely
-        point; empty without recordings.
-
-        **Example:** the decay of the subpackage's example, whose first sample is at 1 s.
-
-        >>> times, values = fit.curves
-        >>> decay = jnp.exp(-fit.most_likely["scene.rate"] * (1.0 + times))
-        >>> values.shape, bool(jnp.allclose(values, decay))
-        ((16, 3), True)
-        """
+        point; empty without recordings."""
         pairs = zip(self.problem.unknowns, self.most_likely.values(), strict=True)
         return fine_predictions(self.problem, np.array([float(unknown.coordinate(value)) for unknown, value in pairs]))
 

@@ -107,10 +107,9 @@ def sample(
 
     **Example:** the rate of the subpackage's example.
 
-    >>> from nonholonomic.identification import LogDensity, sample
-    >>> density = LogDensity.of(Model(scene, data, jnp.arange(3)), data[0].measurements, free)
-    >>> draws = sample(density, draws=200, progress=False)
-    >>> print(f"{draws.values['scene.rate'].mean():.2f}")
+    >>> from nonholonomic.identification import sample
+    >>> draws = sample(LogDensity.of(decay, measured, free), draws=200, progress=False)
+    >>> print(f"{draws.values['rate'].mean():.2f}")
     1.00
     """
     require_package("blackjax", "bayes", "sample")

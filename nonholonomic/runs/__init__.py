@@ -26,6 +26,8 @@ from .identify import fit_runs as fit_runs
 from .identify import identify as identify
 from .identify import log_density as log_density
 from .identify import posterior_of_runs as posterior_of_runs
+from .identify import search_options as search_options
+from .identify import sources_of as sources_of
 from .lyapunov import LyapunovExponent as LyapunovExponent
 from .lyapunov import direction_of_start as direction_of_start
 from .lyapunov import exponent_of_model as exponent_of_model

@@ -11,13 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..identification import AbstractRecording, Measurements, Quantities, as_quantity, model_times
+from ..identification import AbstractRecording, Measurements, Quantities, as_quantity
 from ..integration import Settings
 from ..text import likely
 from ..validation import as_number, as_number_or_none, require, shown
 from .event_time import time_of_event
 from .model import AbstractModel, model_of, require_event
-from .simulate import sampled
 
 #: Quantities with a period of a whole turn.
 ANGLES = frozenset({"azimuth", "eta", "heading", "spin_angle"})
@@ -113,11 +112,33 @@ class AbstractEventTimes(eqx.Module):
     """Measured times of an event, in one series with a prediction for each."""
 
     time: eqx.AbstractVar[Float[Array, "n *two"]]
+    error: eqx.AbstractVar[Float[Array, "..."]]
+    t1: eqx.AbstractVar[Float[Array, ""]]
+
+    #: Whether times through several modes come from the programs of tables, which is faster for flights in closed form.
+    by_tables: ClassVar[bool] = False
 
     @property
     @abc.abstractmethod
     def labels(self) -> tuple[str, ...]:
         """A label for each time."""
+
+    @property
+    @abc.abstractmethod
+    def measurements(self) -> Measurements:
+        """The times as measurements."""
+
+    @abc.abstractmethod
+    def model(self, system: Any) -> AbstractModel:
+        """The model of the timed run, checked. The numbers of its start have a value per run if there are several."""
+
+    @abc.abstractmethod
+    def predicted(self, model: AbstractModel, t1: Any, settings: Settings) -> Float[Array, ""]:
+        """The predicted time of one run."""
+
+    def of_ends(self, model: AbstractModel, t1: Any, time: Any, ends: dict[str, Any]) -> Any:
+        """The predictions from a table: from the times of events, infinite without an event, and the ends of the runs."""
+        return time
 
     def labels_in(self, unit: Any) -> tuple[str, ...]:
         """Labels for a picture, with numbers in other units."""
@@ -183,49 +204,19 @@ class EventTimes(AbstractEventTimes):
             raise ValueError(f"error must be one number or of shape {np.shape(self.time)}, not {np.shape(self.error)}")
 
     @property
-    def length(self) -> int:
-        """Number of times in a lane."""
-        return 1
-
-    @property
     def labels(self) -> tuple[str, ...]:
-        """A label for each time."""
         return tuple(f"time {k + 1}" for k in range(self.size))
 
     @property
     def measurements(self) -> Measurements:
-        """The times as measurements."""
         time = np.asarray(self.time)
         return Measurements(time, np.broadcast_to(self.error, time.shape), student=math.inf)
 
     def model(self, system: Any) -> AbstractModel:
-        """The model of the timed run, checked."""
         model = model_of(system, self.launch, self.event, self.input)
         require_event(model)
         return model
 
-    def lane(self, size: int) -> dict[str, Array]:
-        """The numbers of the run that are not parameters."""
-        return {"t1": self.t1}
-
-    def part(self, predictions: Float[Array, " rows"]) -> Float[Array, "rows n"]:
-        """The predictions for every measurement."""
-        return jnp.broadcast_to(predictions[:, None], (len(predictions), self.size))
-
-
-def predicted_columns(
-    recording: Any, model: AbstractModel, lane: dict[str, Array], settings: Settings
-) -> Float[Array, "times columns"]:
-    """The columns of a recording of one run."""
-    times = model_times(lane["times"], lane["t0"])
-    run = sampled(model, recording.names, times, times[-1], settings)
-    values = model.read(recording.names, times, run.rows, run.mode)
-    return jnp.stack(recording.columns_of(model, values), axis=-1)
-
-
-def predicted_time(
-    times: EventTimes, model: AbstractModel, lane: dict[str, Array], settings: Settings
-) -> Float[Array, ""]:
-    """The time of the event of one run; NaN without an event."""
-    time = time_of_event(model, lane["t1"], settings, False)
-    return jnp.where(jnp.isfinite(time), time, jnp.nan)
+    def predicted(self, model: AbstractModel, t1: Any, settings: Settings) -> Float[Array, ""]:
+        time = time_of_event(model, t1, settings, False)
+        return jnp.where(jnp.isfinite(time), time, jnp.nan)

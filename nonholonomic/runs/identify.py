@@ -1,97 +1,24 @@
 """Estimate parameters of any model from recorded runs and from times of events, and their posterior."""
 
 import dataclasses
-from collections.abc import Callable, Hashable
-from typing import Any
+from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
-
-from ..identification import (
-    AbstractDataModel,
-    AbstractRecording,
-    Free,
-    Identification,
-    LogDensity,
-    as_sources,
-    fit_data,
-    free_numbers,
-    posterior_of_data,
-    search_options,
-)
+from ..identification import AbstractRecording, Free, Identification, LogDensity, Measurements
+from ..identification.data import free_numbers, joined, own_name, series_units
+from ..identification.identify import check_search
+from ..identification.identify import identify as most_likely
 from ..integration import Settings
 from ..integration.checks import tolerance_bound
 from ..integration.settings import MOST_STEPS
-from ..parameters import require_apart
+from ..parameters import full_name, require_apart
 from ..progress import status_line
-from ..validation import nan_unless
-from .data import EventTimes, Recording, predicted_columns, predicted_time
-from .model import AbstractModel, check_run
+from ..validation import shown
+from .data import AbstractEventTimes
+from .model import check_run
+from .predictions import DataModel, Source
 
-
-class Source(eqx.Module):
-    """A set of data and the model of its run."""
-
-    data: Any
-    model: AbstractModel
-
-    @property
-    def key(self) -> Hashable:
-        """Sets of data with equal keys are lanes of one ensemble."""
-        arrays = jax.tree.structure(eqx.filter(self.model, eqx.is_array))
-        columns = getattr(self.data, "columns", None)
-        return type(self.data), arrays, columns, id(getattr(self.data, "event", None))
-
-
-class RunModel(AbstractDataModel):
-    """Predictions of several sets of data of a system."""
-
-    data: tuple[Source, ...]
-    seen: Int[Array, " n"]
-    settings: Settings
-
-    @property
-    def recorded(self) -> tuple[Any, ...]:
-        return tuple(source.data for source in self.data)
-
-    def with_recorded(self, recorded: tuple[Any, ...]) -> "RunModel":
-        pairs = zip(recorded, self.data, strict=True)
-        return dataclasses.replace(self, data=tuple(Source(data, source.model) for data, source in pairs))
-
-    def unit_of(self, name: str) -> str:
-        return self.data[0].model.label([name])[name][1]
-
-    def together(self, source: Source, values: dict[str, Array]) -> Hashable:
-        return source.key, tuple(values)
-
-    def predict(self, sources: list[tuple[Source, dict[str, Array]]], rows: int) -> list[Float[Array, "rows samples"]]:
-        """Every row of every set of data is a lane."""
-        first, count = sources[0][0], len(sources)
-        size = max(source.data.length for source, _ in sources)
-
-        def lanes(of_each: list[Array]) -> Array:
-            """One row after the other; each number is a scalar or has one value per row."""
-            return jnp.stack([jnp.broadcast_to(number, (rows,)) for number in of_each], axis=1).reshape(-1)
-
-        arrays, static = eqx.partition([source.model for source, _ in sources], eqx.is_array)
-        models = jax.tree.map(lambda *leaves: lanes([*leaves]), *arrays)
-        values = {name: lanes([values[name] for _, values in sources]) for name in sources[0][1]}
-        numbers = [source.data.lane(size) for source, _ in sources]
-        inputs = jax.tree.map(lambda *parts: jnp.tile(jnp.stack(parts), (rows,) + (1,) * jnp.ndim(parts[0])), *numbers)
-
-        def of_lane(model: Any, values: dict[str, Array], lane: dict[str, Array]) -> Array:
-            clock = {"t0": values["t0"]} if "t0" in values else {}
-            moved = eqx.combine(model, static[0]).replaced(
-                {name: value for name, value in values.items() if name != "t0"}
-            )
-            predict: Any = predicted_columns if isinstance(first.data, AbstractRecording) else predicted_time
-            return nan_unless(moved.legal(), predict(first.data, moved, lane | clock, self.settings))
-
-        predictions = jax.vmap(of_lane)(models, values, inputs)
-        by_source = predictions.reshape(rows, count, *predictions.shape[1:])
-        return [source.data.part(by_source[:, k]) for k, (source, _) in enumerate(sources)]
+#: The sets of data that can be fitted, and the words for them.
+KINDS = AbstractRecording | AbstractEventTimes, "a nonholonomic.Recording or EventTimes"
 
 
 def identify(
@@ -112,7 +39,8 @@ def identify(
     **Arguments:**
 
     - `system`: a scene, a `Hybrid`, or an `AbstractSystem`, with the values of the parameters that are not free.
-    - `data`: a `Recording` or an `EventTimes`, or a list of several to be fitted together.
+    - `data`: a `Recording` or an `EventTimes`, or a list of several to be fitted together; for scenes, also the data of
+      `tippe.identify` and `stroller.identify`.
     - `free`: full name of a parameter -> a `nonholonomic.Free` or only the start value. Examples of names are
       `"scene.friction.mu"` or `"system.modes[0].drag"`, or `"drag"` if no other name ends so, `"modes[*].drag"` for all
       modes that have a drag, `"launch.theta"`, `"start[0]"`, `"start.q[0]"` and `"t0"`, the reading of a recording's
@@ -144,8 +72,7 @@ def identify(
     ```
     """
     search = search_options(starts, spread, seed, max_steps, progress)
-    data = as_sources(data, Recording | EventTimes, "a nonholonomic.Recording or EventTimes")
-    return fit_runs(system, data, free, tolerance, search)
+    return fit_runs(system, sources_of(data, *KINDS), free, tolerance, search)
 
 
 def log_density(
@@ -177,45 +104,98 @@ def log_density(
 
     ```
     """
-    data = as_sources(data, Recording | EventTimes, "a nonholonomic.Recording or EventTimes")
-    return posterior_of_runs(system, data, free, priors, tolerance)
+    return posterior_of_runs(system, sources_of(data, *KINDS), free, priors, tolerance)
+
+
+def sources_of(data: Any, kinds: Any, expected: str) -> tuple[Any, ...]:
+    """Sets of data as a tuple.
+
+    **Arguments:** `data`: a set or several; `kinds`: a class or several; `expected`: words for the message.
+
+    **Raises:** `ValueError` that names the allowed kinds, unless there is at least one set of data and all sets are of
+    these kinds.
+    """
+    sources = tuple(data) if isinstance(data, list | tuple) else (data,)
+    if not sources or not all(isinstance(source, kinds) for source in sources):
+        raise ValueError(f"data = {shown(data)} must be {expected}, or a list of them")
+    return sources
+
+
+def search_options(starts: Any, spread: Any, seed: Any, max_steps: Any, progress: Any) -> dict[str, Any]:
+    """The options of the search, checked before a model prepares its data."""
+    check_search(starts, spread, seed, max_steps, progress)
+    return {"starts": starts, "spread": spread, "seed": seed, "max_steps": max_steps, "progress": progress}
 
 
 def fit_runs(
-    system: Any, data: tuple[Any, ...], free: dict[str, Any], tolerance: Any, search: dict[str, Any]
+    system: Any,
+    data: tuple[Any, ...],
+    free: dict[str, Any],
+    tolerance: Any,
+    search: dict[str, Any],
+    slopes: str | None = None,
 ) -> Identification:
-    """Fit sets of data of runs. **Arguments:** as for `identify`; `search`: `search_options`."""
+    """Fit sets of data of runs.
+
+    **Arguments:** as for `identify`; `data`: `sources_of`; `search`: `search_options`; `slopes`: "exact" or "differences", by
+    default as the model requires.
+    """
     with status_line("fitting", search["progress"]):
-        return fit_data(*_prepared(system, data, free, tolerance), search)
+        fit = _Fit.of(system, data, free, tolerance)
+        options = {"slopes": slopes or fit.slopes, "labels": fit.labels}
+        found = most_likely(fit.model, fit.measurements, fit.unknowns, **options, **search)
+    label = fit.model.data[0].model.label
+    names = {name: own_name(name) for name in fit.unknowns}
+    units = {name: "s" if own == "t0" else label([own])[own][1] for name, own in names.items()}
+    return dataclasses.replace(found, series_units=series_units(data), units=units)
 
 
 def posterior_of_runs(
     system: Any, data: tuple[Any, ...], free: dict[str, Any], priors: dict[str, Any] | None, tolerance: Any
 ) -> LogDensity:
-    """The posterior, given sets of data of runs. **Arguments:** as for `log_density`."""
-    return posterior_of_data(*_prepared(system, data, free, tolerance), priors)
+    """The posterior, given sets of data of runs. **Arguments:** as for `log_density`; `data`: `sources_of`."""
+    fit = _Fit.of(system, data, free, tolerance)
+    if priors is not None and not isinstance(priors, dict):
+        raise ValueError(
+            f"priors = {shown(priors)} must be a dictionary, name of a number -> (mean, standard deviation)"
+        )
+    by_name = {full_name("priors", name, list(fit.unknowns)): prior for name, prior in (priors or {}).items()}
+    return LogDensity.of(fit.model, fit.measurements, fit.unknowns, by_name, series_units(data), fit.slopes)
 
 
-def _prepared(
-    system: Any, data: tuple[Any, ...], free: dict[str, Any], tolerance: Any
-) -> tuple[Callable[[Any], RunModel], tuple[Any, ...], dict[str, Free]]:
-    """The predictions of the measured indices, the data and the unknowns, all checked."""
-    tolerance_bound(tolerance).require()
-    models = tuple(source.model(system) for source in data)
-    for source, model in zip(data, models, strict=True):
-        check_run(model, source.t1 if isinstance(source, EventTimes) else source.times[-1] - source.t0, tolerance)
-    own = [[name for name in model.known if name.startswith(("start", "launch"))] for model in models]
-    shared = [name for name in models[0].known if name not in own[0]]
-    names_of_data = [
-        [*names, "t0"] if isinstance(source, AbstractRecording) else names
-        for names, source in zip(own, data, strict=True)
-    ]
+class _Fit(NamedTuple):
+    """The predictions of the measurements, the measurements with their labels, and the unknowns, all checked."""
 
-    def check(values: dict[str, float]) -> None:
-        models[0].require_values({name: value for name, value in values.items() if name != "t0"})
+    model: DataModel
+    measurements: Measurements
+    labels: tuple[str, ...]
+    unknowns: dict[str, Free]
 
-    unknowns = free_numbers(free, shared, names_of_data, check)
-    require_apart("free", unknowns)
-    sources = tuple(Source(source, model) for source, model in zip(data, models, strict=True))
-    settings = Settings(tolerance, max_steps=MOST_STEPS)
-    return lambda seen: RunModel(data=sources, seen=jnp.asarray(seen), settings=settings), data, unknowns
+    @property
+    def slopes(self) -> str:
+        """The slopes that guide the fit."""
+        return self.model.data[0].model.fit_slopes
+
+    @classmethod
+    def of(cls, system: Any, data: tuple[Any, ...], free: dict[str, Any], tolerance: Any) -> "_Fit":
+        """**Arguments:** as for `fit_runs`."""
+        tolerance_bound(tolerance).require()
+        models = tuple(source.model(system) for source in data)
+        for source, model in zip(data, models, strict=True):
+            horizon = source.t1 if isinstance(source, AbstractEventTimes) else source.times[-1] - source.t0
+            check_run(model, horizon, tolerance)
+        own = [[name for name in model.known if name.startswith(("start", "launch"))] for model in models]
+        shared = [name for name in models[0].known if name not in own[0]]
+        names_of_data = [
+            [*names, "t0"] if isinstance(source, AbstractRecording) else names
+            for names, source in zip(own, data, strict=True)
+        ]
+
+        def check(values: dict[str, float]) -> None:
+            models[0].require_values({name: value for name, value in values.items() if name != "t0"})
+
+        unknowns = free_numbers(free, shared, names_of_data, check)
+        require_apart("free", unknowns)
+        measurements, labels, seen = joined(data)
+        sources = tuple(Source(source, model) for source, model in zip(data, models, strict=True))
+        return cls(DataModel(sources, seen, Settings(tolerance, max_steps=MOST_STEPS)), measurements, labels, unknowns)

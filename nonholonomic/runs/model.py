@@ -121,6 +121,11 @@ class AbstractModel(eqx.Module):
                 "second derivatives are not available through resets; take differences of a gradient instead"
             )
 
+    @property
+    def fit_slopes(self) -> str:
+        """The slopes that guide a fit: "exact", or "differences" if derivatives do not show the trend of times."""
+        return "exact"
+
     def for_lanes(self) -> "AbstractModel":
         """The model in a form that is fastest where runs in transformations share lanes."""
         return self

@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from nonholonomic.identification import Identification, LogDensity, as_sources, search_options
-from nonholonomic.runs import fit_runs, posterior_of_runs
+from nonholonomic.identification import Identification, LogDensity
+from nonholonomic.runs import fit_runs, posterior_of_runs, search_options, sources_of
 from nonholonomic.validation import require_kind
 
 from ..model.scene import Scene
@@ -56,7 +56,7 @@ def identify(
     """
     search = search_options(starts, spread, seed, max_steps, progress)
     require_kind(scene, "scene", Scene)
-    return fit_runs(scene, as_sources(data, Recording, "a Recording"), free, tolerance, search)
+    return fit_runs(scene, sources_of(data, Recording, "a Recording"), free, tolerance, search)
 
 
 def log_density(
@@ -85,4 +85,4 @@ def log_density(
     ```
     """
     require_kind(scene, "scene", Scene)
-    return posterior_of_runs(scene, as_sources(data, Recording, "a Recording"), free, priors, tolerance)
+    return posterior_of_runs(scene, sources_of(data, Recording, "a Recording"), free, priors, tolerance)

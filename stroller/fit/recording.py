@@ -60,20 +60,11 @@ class Recording(AbstractRecording):
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     quantities: ClassVar[Quantities] = QUANTITIES
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The quantities to which the columns belong."""
-        return tuple(dict.fromkeys("position" if column in "xyz" else column for column in self.columns))
-
     def model(self, scene: Scene) -> AbstractModel:
         """The model of the recorded ride, checked."""
+        require_kind(scene, "scene", Scene)
         scene.check(self.launch)
         return RideModel.of(scene, self.launch, self.input)
-
-    def columns_of(self, model: AbstractModel, values: dict[str, Array]) -> list[Float[Array, " times"]]:
-        """The columns of the recording from the values of quantities."""
-        components = dict(zip("xyz", values["position"].T, strict=True)) if "position" in values else {}
-        return [(values | components)[column] for column in self.columns]
 
     def __check_init__(self):
         require_kind(self.launch, "launch", Launch, several="identify takes a list of recordings")

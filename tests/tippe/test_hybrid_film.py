@@ -5,15 +5,17 @@ from close import assert_close
 from tops import rutstam_top
 
 import tippe
-from tippe.fit.identify import HybridModel
 
 
 def test_rows_of_a_film_are_the_runs_one_by_one_and_illegal_rows_have_no_prediction():
     scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3), contact="hybrid")
     clock = np.linspace(1.0, 6.0, 8)
     film = tippe.Recording(tippe.Launch(0.1, 180.0), clock, np.ones(8), 0.02, "theta", t0=0.05)
-    model = HybridModel(scene, (film,), film.seen, 1e-9)
-    rows = {"scene.friction.mu": [0.3, 0.31, -1.0, np.nan], "launch.spin": [180.0, 185.0, 180.0, 180.0]}
+    model = tippe.log_density(scene, film, {"mu": 0.3, "launch.spin": 180.0}, tolerance=1e-9).problem.model
+    rows = {
+        "scene.friction.mu": np.array([0.3, 0.31, -1.0, np.nan]),
+        "launch.spin": np.array([180.0, 185.0, 180.0, 180.0]),
+    }
     predictions = model(rows)
     assert predictions.shape == (4, 8)
     assert np.all(np.isnan(predictions[2:]))

@@ -16,9 +16,8 @@ from tops import rutstam_top
 import tippe
 from nonholonomic.identification import Free, Measurements
 from nonholonomic.identification.levenberg_marquardt import minimise
-from nonholonomic.identification.problem import Problem, linearise
+from nonholonomic.identification.problem import linearise
 from nonholonomic.identification.result import coordinate_covariance
-from tippe.fit.identify import SceneModel
 
 LAUNCH = tippe.Launch(theta=[0.2, 0.2, 0.3, 0.2], spin=[110.0, 140.0, 110.0, 60.0])
 LAUNCHES = list(zip(np.asarray(LAUNCH.theta).tolist(), np.asarray(LAUNCH.spin).tolist(), strict=True))
@@ -153,8 +152,8 @@ def test_beyond_the_horizon_times_follow_the_rate_of_growth(rutstam_scene):
 def test_slopes_of_the_times_are_those_of_central_differences(rutstam_scene, tables):
     """Along three directions, which are run in groups of two; with many lanes, in one kernel; and beyond the horizon."""
     data = tippe.InversionTimes(LAUNCH, [1.0, 2.0, 3.0, np.inf], 0.05, t1=6.0)
-    free = tuple((name, Free(point, 0.0)) for name, point in (("scene.friction.mu", 0.3), ("scene.body.offset", 0.006)))
-    problem = Problem(SceneModel(rutstam_scene, (data,), data.seen, 1e-11), (*free, ("scene.gravity", Free(9.81, 0.0))))
+    free = {"scene.friction.mu": 0.3, "scene.body.offset": 0.006, "scene.gravity": 9.81}
+    problem = tippe.log_density(rutstam_scene, data, free, tolerance=1e-11).problem
     point = jnp.log(jnp.array([[0.3, 0.006, 9.81]])) + jnp.zeros((tables, 1))
     slopes = linearise(problem, point, Measurements(np.full(4, 2.0), 1.0)).jacobian
     predict = eqx.filter_jit(problem.predict)
@@ -234,8 +233,7 @@ def experiment():
     scene = tippe.Scene(tippe.Top(top.mass, top.radius, 0.0035, top.I1, top.I3), friction=tippe.Viscous(0.3))
     launch = tippe.Launch(np.repeat([0.005, 0.015], 5), np.tile([70.0, 80.0, 100.0, 120.0, 150.0], 2))
     data = tippe.InversionTimes(launch, np.full(10, 5.0), error, t1=60.0, angle=0.5 * np.pi)
-    free = (("scene.friction.mu", Free(0.3, 0.0)), ("scene.body.offset", Free(0.0035, 0.0)))
-    problem = Problem(SceneModel(scene, (data,), data.seen, 1e-8), free)
+    problem = tippe.log_density(scene, data, {"scene.friction.mu": 0.3, "scene.body.offset": 0.0035}).problem
     pairs = zip(np.asarray(launch.theta), np.asarray(launch.spin), strict=True)
     exact = [independent_time(0.0035, a, w, 60.0, 0.5 * np.pi) for a, w in pairs]
     return problem, truth, np.array([exact]), error

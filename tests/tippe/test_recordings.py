@@ -2,6 +2,7 @@
 
 import math
 
+import jax
 import numpy as np
 import pytest
 from tops import rutstam_top
@@ -9,11 +10,10 @@ from viscous_top import Body, azimuth, follow, start, theta
 
 import stroller
 import tippe
-from tippe.fit.identify import prepared
 
 
 def unknowns_of(scene, data, free):
-    return prepared(scene, data, free, 1e-8, None)[2]
+    return dict(tippe.log_density(scene, data, free).problem.free)
 
 
 LAUNCHES = {"theta": (0.4, 0.5), "spin": (100.0, 110.0), "azimuth": (0.7, 3.0), "t0": (0.013, 0.2), "samples": (30, 24)}
@@ -217,7 +217,7 @@ def test_angles_in_degrees_are_suspected():
 def test_a_prior_may_be_a_standard_deviation_about_the_start(rutstam_scene):
     film = tippe.Recording(tippe.Launch(0.1, 9.0), [0.0, 1.0], [0.1, 0.2], 0.1)
     short, full = (unknowns_of(rutstam_scene, (film,), {"mu": tippe.Free(0.3, prior=p)}) for p in (0.1, (0.3, 0.1)))
-    assert short == full
+    assert jax.tree.all(jax.tree.map(np.array_equal, short, full))
     assert tippe.Free(0.0, prior=0.2).unit == 0.2
     densities = [tippe.log_density(rutstam_scene, film, {"mu": 0.3}, {"mu": prior}) for prior in (0.1, (0.3, 0.1))]
     assert [float(np.asarray(part)) for part in densities[0].priors["scene.friction.mu"]] == [0.3, 0.1]
@@ -259,7 +259,7 @@ def test_names_of_one_film_of_each_and_of_all(rutstam_scene):
         rutstam_scene, (film, times, film), {"data[*].t0": 0.0, "mu": 0.3, "data[1].launch.azimuth": 0.1}
     )
     assert list(unknowns) == ["data[0].t0", "data[2].t0", "scene.friction.mu", "data[1].launch.azimuth"]
-    assert unknowns["scene.friction.mu"].lower == 0.0
+    assert bool(unknowns["scene.friction.mu"].has_lower)
     for free, message in (
         ({"data[1].t0": 0.0}, r"'data\[1\].t0' must be one of"),
         ({"data[0].launch.velocity[0]": 0.0}, "must be one of"),

@@ -1,6 +1,5 @@
 """Measured times of launches: of inversion, and of reversal."""
 
-import abc
 import math
 from typing import Any, ClassVar
 
@@ -11,21 +10,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.identification import Measurements
-from nonholonomic.parameters import numbers, with_numbers
-from nonholonomic.runs import AbstractEventTimes, TableForm
+from nonholonomic.integration import Settings
+from nonholonomic.parameters import numbers
+from nonholonomic.runs import AbstractEventTimes, time_of_event
 from nonholonomic.text import distinguishing_labels, one_line
 from nonholonomic.validation import as_number, as_number_or_none, require, require_kind, shown
 
 from ..model.launch import Launch, as_launch
 from ..model.scene import Scene
 from ..runs.checks import angle_of, check_event, check_reversible, event_of, require_rigid
-from ..runs.extended_times import beyond_horizon, extended_inversion_time
-from ..runs.model import INVERSIONS, REVERSALS, TopModel
-from ..runs.verbs import reversal_time
-
-#: Parameters by name, one value per row.
-Values = dict[str, Float[Array, " rows"]]
-
+from ..runs.extended_times import beyond_horizon, time_of_inversion
+from ..runs.model import TopModel
 
 _beyond_horizon = jax.jit(beyond_horizon)
 
@@ -35,17 +30,16 @@ class AbstractTimes(AbstractEventTimes):
 
     - `launch`, `time`, `error`, `t1`, `until`: as for `InversionTimes`.
     - `student`: degrees of freedom of Student's t distribution of the errors, or `None`.
-    - `form`: names in a table of such times.
     """
 
     student: eqx.AbstractVar[Any]
-    form: eqx.AbstractClassVar[TableForm]
 
     launch: Launch = eqx.field(converter=as_launch)
     time: Float[Array, "launches *two"] = eqx.field(converter=as_number)
     error: Float[Array, "..."] = eqx.field(converter=as_number)
     t1: Float[Array, ""] = eqx.field(converter=as_number)
     until: Any = eqx.field(converter=as_number_or_none, default=None)
+    by_tables = True
 
     def __repr__(self) -> str:
         return one_line(self)
@@ -93,7 +87,6 @@ class AbstractTimes(AbstractEventTimes):
 
     @property
     def measurements(self) -> Measurements:
-        """The times as `Measurements`."""
         first, last = self._limits
         is_before = (first == 0.0) & np.isfinite(last)
         student = math.inf if self.student is None else float(self.student)
@@ -114,37 +107,6 @@ class AbstractTimes(AbstractEventTimes):
             for k in range(self.size)
         ]
         return tuple(distinguishing_labels([("launch",)] * self.size, launches, unit=unit))
-
-    def check(self, scene: Scene) -> None:
-        """Raise `ValueError` unless the scene has such events."""
-
-    @abc.abstractmethod
-    def timed(self, scene: Scene) -> TopModel:
-        """The model of the launch whose runs end on the event."""
-
-    @abc.abstractmethod
-    def of_run(self, scene: Scene, launch: Launch, tolerance: Float[Array, ""]) -> Float[Array, ""]:
-        """The predicted time of one launch."""
-
-    @abc.abstractmethod
-    def of_cells(self, scene: Scene, cells: dict[str, Any], theta: Any) -> Any:
-        """The predicted times from the cells of a table, whose launches began at `theta`."""
-
-    def predict(
-        self, scene: Scene, values: Values, rows: int, tolerance: Float[Array, ""]
-    ) -> Float[Array, "rows launches"]:
-        """Times of all launches in every row, computed as lanes of one ensemble."""
-        launches, numbers_of_launch = len(self.time), numbers("launch", self.launch)
-        lists = {name: value for name, value in numbers_of_launch.items() if value is not None and np.ndim(value)}
-        lanes = {name: jnp.tile(value, rows) for name, value in lists.items()}
-        lanes |= {name: jnp.repeat(value, launches) for name, value in values.items() if name != "t0"}
-        first = jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[0], self.launch)
-
-        def time_of_lane(lane: dict[str, Array]) -> Float[Array, ""]:
-            roots = with_numbers({"scene": scene, "launch": first}, lane)
-            return self.of_run(roots["scene"], roots["launch"], tolerance)
-
-        return jax.vmap(time_of_lane)(lanes).reshape(rows, launches)
 
 
 class InversionTimes(AbstractTimes):
@@ -180,21 +142,21 @@ class InversionTimes(AbstractTimes):
     angle: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     units: ClassVar[dict[str, str]] = {"time": "s", "error": "s", "t1": "s", "until": "s", "angle": "rad"}
-    form = INVERSIONS
 
     def __check_init__(self):
         check_event(self.angle, "first")
 
-    def timed(self, scene: Scene) -> TopModel:
-        return TopModel.timed(scene, self.launch, event_of(scene, self.angle))
+    def model(self, system: Any) -> TopModel:
+        require_kind(system, "scene", Scene)
+        return TopModel.timed(system, self.launch, event_of(system, self.angle))
 
-    def of_run(self, scene: Scene, launch: Launch, tolerance: Float[Array, ""]) -> Float[Array, ""]:
-        return extended_inversion_time(scene, launch, self.t1, angle_of(scene, self.angle), tolerance)
+    def predicted(self, model: Any, t1: Any, settings: Settings) -> Float[Array, ""]:
+        return time_of_inversion(model, t1, settings)
 
-    def of_cells(self, scene: Scene, cells: dict[str, Any], theta: Any) -> Any:
-        """Times continued beyond the horizon, as by `extended_inversion_time`."""
-        later = _beyond_horizon(cells["end_theta"], theta, float(angle_of(scene, self.angle)), float(self.t1))
-        return np.where(np.isfinite(cells["time"]), cells["time"], np.asarray(later))
+    def of_ends(self, model: Any, t1: Any, time: Any, ends: dict[str, Any]) -> Any:
+        angle = angle_of(model.scene, self.angle)
+        later = _beyond_horizon(ends["end_theta"], model.launch.theta, angle, t1)
+        return np.where(np.isfinite(time), time, np.asarray(later))
 
 
 class ReversalTimes(AbstractTimes):
@@ -219,17 +181,12 @@ class ReversalTimes(AbstractTimes):
 
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     units: ClassVar[dict[str, str]] = {"time": "s", "error": "s", "t1": "s", "until": "s"}
-    form = REVERSALS
 
-    def check(self, scene: Scene) -> None:
-        require_rigid(scene)
+    def model(self, system: Any) -> TopModel:
+        require_kind(system, "scene", Scene)
+        require_rigid(system)
         check_reversible(self.launch, {})
+        return TopModel.timed(system, self.launch, None)
 
-    def timed(self, scene: Scene) -> TopModel:
-        return TopModel.timed(scene, self.launch, None)
-
-    def of_run(self, scene: Scene, launch: Launch, tolerance: Float[Array, ""]) -> Float[Array, ""]:
-        return reversal_time(scene, launch, self.t1, tolerance)
-
-    def of_cells(self, scene: Scene, cells: dict[str, Any], theta: Any) -> Any:
-        return cells["time"]
+    def predicted(self, model: Any, t1: Any, settings: Settings) -> Float[Array, ""]:
+        return time_of_event(model, t1, settings, False)

@@ -8,9 +8,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.identification import AbstractRecording, Quantities, as_quantity, read_columns
+from nonholonomic.runs import AbstractModel
 from nonholonomic.validation import as_number, as_number_or_none, require_kind
 
 from ..model.launch import Launch
+from ..model.scene import Scene
+from ..runs.model import TopModel
 
 #: The quantities of a top that can be recorded, with the names of a `Trajectory`'s properties.
 QUANTITIES = Quantities(
@@ -60,6 +63,11 @@ class Recording(AbstractRecording):
     t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     quantities: ClassVar[Quantities] = QUANTITIES
+
+    def model(self, scene: Scene) -> AbstractModel:
+        """The model of the recorded run."""
+        require_kind(scene, "scene", Scene)
+        return TopModel.sampled(scene, self.launch)
 
     def __check_init__(self):
         require_kind(self.launch, "launch", Launch, several="identify takes a list of recordings")

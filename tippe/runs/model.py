@@ -95,6 +95,11 @@ class TopModel(AbstractSceneModel):
         event = angle if angle is None or isinstance(angle, StemContact) else jnp.asarray(angle, float)
         return cls(scene=scene, launch=launch, angle=event, reverses=angle is None)
 
+    @classmethod
+    def sampled(cls, scene: Scene, launch: Launch) -> "TopModel":
+        """The model of a launch without an event."""
+        return cls(scene=scene, launch=launch)
+
     def __reduce__(self) -> Any:
         # A traced function cannot be pickled, so each process traces it.
         if self.event is not None:
@@ -102,11 +107,11 @@ class TopModel(AbstractSceneModel):
         return (
             (TopModel.timed, (*self.roots.values(), self.angle))
             if self.has_event
-            else (_sampled, (*self.roots.values(),))
+            else (TopModel.sampled, (*self.roots.values(),))
         )
 
     def without_event(self) -> "TopModel":
-        return TopModel(scene=_integrated(self.scene), launch=self.launch)
+        return TopModel.sampled(_integrated(self.scene), self.launch)
 
     def direction(self, cells: int) -> Float[Array, "components cells"]:
         return generic_direction(self.scene, self.launch, cells)
@@ -156,6 +161,11 @@ class TopModel(AbstractSceneModel):
     @property
     def smooth(self) -> bool:
         return self.kind.smooth
+
+    @property
+    def fit_slopes(self) -> str:
+        # The time jumps with every flight, so its derivative may have the opposite sign of the trend.
+        return "exact" if self.smooth else "differences"
 
     @property
     def has_event(self) -> bool:
@@ -277,11 +287,6 @@ class TopModel(AbstractSceneModel):
         if self.kind.flight_state:
             state = on_the_ground(self.scene, state, outcome.mode)
         return {"end_theta": self.scene.theta(state)}
-
-
-def _sampled(scene: Scene, launch: Launch) -> TopModel:
-    """The model of a launch without an event."""
-    return TopModel(scene=scene, launch=launch)
 
 
 def _integrated(scene: Scene) -> Scene:

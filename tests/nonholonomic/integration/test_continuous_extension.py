@@ -52,8 +52,8 @@ class Falls(Growth):
 PAIRS = pytest.mark.parametrize("pair", [Oscillatory8, Stabilized8])
 
 
-# The conditions determine the weights of `Stabilized8` less well.
-@pytest.mark.parametrize(("pair", "tolerance"), [(Oscillatory8, 1e-11), (Stabilized8, 1e-9)])
+# The conditions magnify round-off, which depends on the processor (1.3e-11 on an AMD EPYC), for `Stabilized8` even more.
+@pytest.mark.parametrize(("pair", "tolerance"), [(Oscillatory8, 3e-11), (Stabilized8, 1e-9)])
 def test_the_weights_are_computed_from_the_order_conditions(pair, tolerance):
     assert_close(pair.middle, middle_weights(pair), atol=tolerance)
 
