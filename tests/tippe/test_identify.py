@@ -13,6 +13,7 @@ import pytest
 from close import assert_close
 from tops import rutstam_top
 
+import nonholonomic
 import tippe
 from nonholonomic.identification import Free, Measurements
 from nonholonomic.identification.levenberg_marquardt import minimise
@@ -80,6 +81,15 @@ def test_friction_from_exact_times(exact_fit):
     assert "theta 0.3, spin 110" in str(result)
     assert result.units == {"scene.friction.mu": "s m-1"}
     assert re.search(r"scene.friction.mu  0\.3.* s/m\n", str(result))
+
+
+def test_the_fit_of_any_system_takes_the_data_of_tops_and_the_fit_of_tops_takes_any_data(exact_fit, rutstam_scene):
+    times, fit = exact_fit
+    data = tippe.InversionTimes(LAUNCH, times, 0.05, t1=6.0)
+    same = nonholonomic.identify(rutstam_scene, data, {"friction.mu": 0.2}, tolerance=1e-6, progress=False)
+    assert same.estimates == fit.estimates
+    fall = nonholonomic.EventTimes(tippe.Launch(0.2, 155.0), [3.0], 0.05, 8.0, lambda t, motion: 1.0 - motion.theta)
+    assert tippe.log_density(rutstam_scene, [fall, data], {"mu": 0.2}).names == ("scene.friction.mu",)
 
 
 def test_another_start_other_bounds_data_and_tolerance_compile_nothing(exact_fit, rutstam_scene, caplog):
