@@ -82,7 +82,8 @@ def log_density(
 
     **Arguments:** `system`, `data`, `free`, `tolerance`: as for `identify`; `priors`: as for `tippe.log_density`.
 
-    **Returns:** a `LogDensity`, for `nonholonomic.identification.sample` and any other sampler.
+    **Returns:** a `LogDensity`, for `nonholonomic.identification.sample` and any other sampler; for tops with several modes it
+    has values only, for `sample`.
 
     **Raises:** `ValueError` for arguments out of range or an unknown name.
 
