@@ -4,7 +4,7 @@
 likelihoods, the combinations that the data do not determine, and a `Verdict`. `Measurements` are the data of a fit.
 Recordings of both vehicles are checked, read from files and converted to `Measurements` here.
 
-**Example:** the rate of a decay from three measurements, as a function of any parameters.
+**Example:** the rate of a decay from three measurements.
 
 >>> import jax.numpy as jnp
 >>> from nonholonomic.identification import LogDensity, Measurements, identify

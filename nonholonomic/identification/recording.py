@@ -175,11 +175,6 @@ class AbstractRecording(eqx.Module):
         return self.quantities.of(self.quantity)
 
     @property
-    def length(self) -> int:
-        """Number of times."""
-        return len(self.times)
-
-    @property
     def names(self) -> tuple[str, ...]:
         """The quantities to which the columns belong."""
         return tuple(dict.fromkeys(self.quantities.place(column)[0] for column in self.columns))

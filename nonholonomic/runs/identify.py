@@ -142,13 +142,13 @@ def fit_runs(
     default as the model requires.
     """
     with status_line("fitting", search["progress"]):
-        fit = _Fit.of(system, data, free, tolerance)
-        options = {"slopes": slopes or fit.slopes, "labels": fit.labels}
-        found = most_likely(fit.model, fit.measurements, fit.unknowns, **options, **search)
-    label = fit.model.data[0].model.label
-    names = {name: own_name(name) for name in fit.unknowns}
+        problem = _Fit.of(system, data, free, tolerance)
+        options = {"slopes": slopes or problem.slopes, "labels": problem.labels}
+        fit = most_likely(problem.model, problem.measurements, problem.unknowns, **options, **search)
+    label = problem.model.data[0].model.label
+    names = {name: own_name(name) for name in problem.unknowns}
     units = {name: "s" if own == "t0" else label([own])[own][1] for name, own in names.items()}
-    return dataclasses.replace(found, series_units=series_units(data), units=units)
+    return dataclasses.replace(fit, series_units=series_units(data), units=units)
 
 
 def posterior_of_runs(

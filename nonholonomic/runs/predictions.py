@@ -79,7 +79,7 @@ class DataModel(eqx.Module):
 
     @property
     def on_host(self) -> bool:
-        """Whether runs go through several modes whose derivatives mislead: such a model is not traced or differentiated."""
+        """Whether derivatives through the modes of the runs mislead; such a model is neither traced nor differentiated."""
         return self.data[0].model.fit_slopes == "differences"
 
     def __call__(self, parameters: Values) -> Float[Array, "rows n"]:

@@ -12,10 +12,7 @@ def test_rows_of_a_film_are_the_runs_one_by_one_and_illegal_rows_have_no_predict
     clock = np.linspace(1.0, 6.0, 8)
     film = tippe.Recording(tippe.Launch(0.1, 180.0), clock, np.ones(8), 0.02, "theta", t0=0.05)
     model = tippe.log_density(scene, film, {"mu": 0.3, "launch.spin": 180.0}, tolerance=1e-9).problem.model
-    rows = {
-        "scene.friction.mu": np.array([0.3, 0.31, -1.0, np.nan]),
-        "launch.spin": np.array([180.0, 185.0, 180.0, 180.0]),
-    }
+    rows = {"scene.friction.mu": [0.3, 0.31, -1.0, np.nan], "launch.spin": [180.0, 185.0, 180.0, 180.0]}
     predictions = model(rows)
     assert predictions.shape == (4, 8)
     assert np.all(np.isnan(predictions[2:]))

@@ -31,7 +31,8 @@ def identify(
     **Arguments:**
 
     - `scene`: a `Scene`, with the values of the parameters that are not free.
-    - `data`: an `InversionTimes`, a `ReversalTimes` or a `Recording`, or a list of several, which are fitted together.
+    - `data`: an `InversionTimes`, a `ReversalTimes` or a `Recording`, or a list of several, which are fitted together;
+      `nonholonomic.EventTimes` and `nonholonomic.Recording`, too.
     - `free`: full name of a parameter -> a `Free` or only the start value: `"scene.friction.mu"`, or `"friction.mu"` if
       no other name ends so. A parameter of the launch, and `"t0"`, the reading of a recording's clock at the launch,
       are the same in all data; `"data[1].launch.azimuth"` belongs to the second set of data, and `"data[*].t0"` is a

@@ -15,6 +15,9 @@ from cheap_sweep import cheap_sweep, resumed
 from nonholonomic.command_line import INTERRUPTED, PATIENCE
 from nonholonomic.sweeps._chunks import ChunkStore
 
+#: How long an answer to Ctrl-C may take [s]: twice as long where other programs keep all cores busy.
+PROMPT = 2.0 if os.getloadavg()[0] <= (os.cpu_count() or 1) else 4.0
+
 #: Keeps a thread in C for some seconds, deaf to signals, as XLA's compiler does; others go on.
 DEAF = "import hashlib\ndef deaf(): hashlib.pbkdf2_hmac('sha256', b'', b'', 30_000_000)\n"
 
@@ -127,11 +130,6 @@ def interrupted(process: subprocess.Popen) -> tuple[int, list[str], list[str], f
     return process.returncode, output.splitlines(), error.splitlines(), time.monotonic() - start_time
 
 
-def prompt() -> float:
-    """How long an answer to Ctrl-C may take [s]: twice as long while other programs keep all cores busy."""
-    return 2.0 if os.getloadavg()[0] <= (os.cpu_count() or 1) else 4.0
-
-
 def wait_for(condition, process: subprocess.Popen) -> None:
     while not condition():
         assert process.poll() is None, process.communicate()[1]
@@ -149,7 +147,7 @@ def test_a_table_says_what_is_saved_and_goes_on_from_there(way, tmp_path):
     wait_for(lambda: len(blocks(path)) >= 2, process)
     status, output, error, duration = interrupted(process)
     assert (status, output) == (-signal.SIGINT, []), error
-    assert duration < prompt()
+    assert duration < PROMPT
     saved_blocks = len(blocks(path))
     assert 2 <= saved_blocks < 7
     assert (
@@ -196,7 +194,7 @@ def test_a_table_is_heard_while_it_compiles(tmp_path):
     time.sleep(0.5)
     status, output, _, duration = interrupted(process)
     assert (status, output) == (7, ["saved 0 of 50 cells to table.h5; run the same call again to resume"])
-    assert duration < prompt()
+    assert duration < PROMPT
 
 
 @pytest.mark.newest
@@ -208,7 +206,7 @@ def test_a_command_line_ends_while_it_compiles(tmp_path):
     status, output, error, duration = interrupted(process)
     assert (status, output) == (INTERRUPTED, [])
     assert error == ["python -m something: interrupted; run the same command again to resume"]
-    assert PATIENCE <= duration < prompt()
+    assert PATIENCE <= duration < PROMPT
 
 
 def test_the_main_job_of_the_top_says_what_is_saved(tmp_path):
@@ -220,7 +218,7 @@ def test_the_main_job_of_the_top_says_what_is_saved(tmp_path):
     status, _, error, duration = interrupted(process)
     assert status == INTERRUPTED
     assert error == ["python -m tippe: saved 0 of 10 cells to out; run the same command again to resume"]
-    assert duration < prompt()
+    assert duration < PROMPT
 
 
 @pytest.mark.parametrize("program", ["tippe", "stroller"])
@@ -238,4 +236,4 @@ def test_the_main_job_of_the_stroller_ends_with_one_line(tmp_path):
     status, _, error, duration = interrupted(process)
     assert status == INTERRUPTED
     assert error == ["python -m stroller: interrupted; run the same command again to resume"]
-    assert duration < prompt()
+    assert duration < PROMPT
