@@ -10,7 +10,6 @@ prints them and the largest errors.
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 from tuning.trees import error_coefficients
@@ -24,13 +23,15 @@ WEIGHTED = np.array([0, *range(5, 14)])
 def stages(pair: Any) -> np.ndarray:
     """The weights of the earlier stages in each stage of a pair; the last stage is the end of the step."""
     rows = pair.tableau.a_lower
-    return np.array([np.zeros(len(rows) + 1), *(np.pad(row, (0, len(rows) + 1 - len(row))) for row in rows)])
+    padded = [np.zeros(len(rows) + 1), *(np.pad(row, (0, len(rows) + 1 - len(row))) for row in rows)]
+    return np.array(padded, dtype=np.longdouble)
 
 
 def errors(pair: Any, weights: np.ndarray, order: int) -> np.ndarray:
     """The error coefficients of the state in the middle, whose exact coefficients are 2^-order times those at the end."""
-    of_stages = np.asarray(error_coefficients(jnp.asarray(stages(pair)), jnp.asarray(weights[:14]), order))
-    of_solution = -np.asarray(error_coefficients(jnp.asarray(stages(pair)), jnp.zeros(14), order))
+    weights = weights.astype(np.longdouble)
+    of_stages = error_coefficients(stages(pair), weights[:14], order)
+    of_solution = -error_coefficients(stages(pair), np.zeros_like(weights[:14]), order)
     second_at_start = 2.0 * weights[14] if order == 2 else 0.0
     second_at_end = order * (order - 1) * weights[15]
     return of_stages + of_solution * (1.0 - 0.5**order + second_at_start + second_at_end)
@@ -50,12 +51,20 @@ def middle_weights(pair: Any) -> np.ndarray:
         return np.stack([of_all(np.eye(16)[k]) - rest for k in used], axis=1), -rest
 
     matrix, right = conditions(range(1, 8))
-    weights = np.linalg.lstsq(matrix, right, rcond=1e-12)[0]
-    free = scipy.linalg.null_space(matrix, rcond=1e-12)
     next_matrix, next_right = conditions(range(8, 9))
-    shift = np.linalg.lstsq(next_matrix @ free, next_right - next_matrix @ weights, rcond=None)[0]
+
+    def solution(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+        return np.linalg.lstsq(matrix.astype(float), right.astype(float), rcond=1e-12)[0]
+
+    # The conditions magnify round-off: in extended precision, each solution is corrected by that for what it leaves.
+    free = scipy.linalg.null_space(matrix.astype(float), rcond=1e-12).astype(np.longdouble)
+    weights = np.zeros(len(used), dtype=np.longdouble)
+    for _ in range(3):
+        free -= solution(matrix, matrix @ free)
+        weights += solution(matrix, right - matrix @ weights)
+        weights += free @ solution(next_matrix @ free, next_right - next_matrix @ weights)
     middle = np.zeros(16)
-    middle[used] = weights + free @ shift
+    middle[used] = weights
     return middle
 
 

@@ -9,7 +9,8 @@ from collections import Counter
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Float
 
 #: The subtrees at the root; a tree of trees, which has no type of its own.
 Tree = tuple[Any, ...]
@@ -53,20 +54,24 @@ def symmetry(tree: Tree) -> int:
 
 
 def error_coefficients(
-    stages: Float[Array, "stages stages"], weights: Float[Array, " stages"], order: int
-) -> Float[Array, " trees"]:
-    """(b . Phi(t) - 1/gamma(t)) / sigma(t) of every tree of an order: all vanish if the method is of that order."""
-    trees_by_order, trees_of_size = trees(order), {}
+    stages: Float[Any, "stages stages"], weights: Float[Any, " stages"], order: int
+) -> Float[Any, " trees"]:
+    """(b . Phi(t) - 1/gamma(t)) / sigma(t) of every tree of an order: all vanish if the method is of that order.
 
-    def phi(tree: Tree) -> Float[Array, " stages"]:
+    Of NumPy's arrays in their own precision, so that extended precision is possible; of others by JAX.
+    """
+    trees_by_order, trees_of_size = trees(order), {}
+    xp = np if isinstance(weights, np.ndarray) else jnp
+
+    def phi(tree: Tree) -> Float[Any, " stages"]:
         """The elementary weights of a tree, one per stage."""
-        value = jnp.ones_like(weights)
+        value = xp.ones_like(weights)
         for branch in tree:
             if branch not in trees_of_size:
                 trees_of_size[branch] = stages @ phi(branch)
             value = value * trees_of_size[branch]
         return value
 
-    return jnp.stack(
+    return xp.stack(
         [(weights @ phi(tree) - 1.0 / density(tree)) / symmetry(tree) for tree in trees_by_order[order - 1]]
     )
