@@ -17,8 +17,8 @@ from .data import AbstractEventTimes
 from .model import check_run
 from .predictions import DataModel, Source
 
-#: The sets of data that can be fitted, and the words for them.
-KINDS = AbstractRecording | AbstractEventTimes, "a nonholonomic.Recording or EventTimes"
+#: The words for data that can be fitted.
+EXPECTED = "a nonholonomic.Recording or EventTimes"
 
 
 def identify(
@@ -72,7 +72,7 @@ def identify(
     ```
     """
     search = search_options(starts, spread, seed, max_steps, progress)
-    return fit_runs(system, sources_of(data, *KINDS), free, tolerance, search)
+    return fit_runs(system, sources_of(data, EXPECTED), free, tolerance, search)
 
 
 def log_density(
@@ -105,19 +105,18 @@ def log_density(
 
     ```
     """
-    return posterior_of_runs(system, sources_of(data, *KINDS), free, priors, tolerance)
+    return posterior_of_runs(system, sources_of(data, EXPECTED), free, priors, tolerance)
 
 
-def sources_of(data: Any, kinds: Any, expected: str) -> tuple[Any, ...]:
+def sources_of(data: Any, expected: str) -> tuple[Any, ...]:
     """Sets of data as a tuple.
 
-    **Arguments:** `data`: a set or several; `kinds`: a class or several; `expected`: words for the message.
+    **Arguments:** `data`: a set or several; `expected`: words for the message.
 
-    **Raises:** `ValueError` that names the allowed kinds, unless there is at least one set of data and all sets are of
-    these kinds.
+    **Raises:** `ValueError` unless there is at least one set of data, and all sets are recordings or times of events.
     """
     sources = tuple(data) if isinstance(data, list | tuple) else (data,)
-    if not sources or not all(isinstance(source, kinds) for source in sources):
+    if not sources or not all(isinstance(source, AbstractRecording | AbstractEventTimes) for source in sources):
         raise ValueError(f"data = {shown(data)} must be {expected}, or a list of them")
     return sources
 

@@ -39,8 +39,8 @@ class LyapunovExponent(NamedTuple):
     >>> import tippe
     >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
     >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
-    >>> found = tippe.lyapunov_exponent(scene, tippe.Launch(1e-3, [155.0, 120.0]), t1=4.0, tolerance=1e-6)
-    >>> print(found.status, found.running.shape)
+    >>> growth = tippe.lyapunov_exponent(scene, tippe.Launch(1e-3, [155.0, 120.0]), t1=4.0, tolerance=1e-6)
+    >>> print(growth.status, growth.running.shape)
     ['completed' 'completed'] (32, 2)
 
     ```

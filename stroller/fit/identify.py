@@ -7,7 +7,9 @@ from nonholonomic.runs import fit_runs, posterior_of_runs, search_options, sourc
 from nonholonomic.validation import require_kind
 
 from ..model.scene import Scene
-from .recording import Recording
+
+#: The words for data that can be fitted.
+EXPECTED = "a Recording or a nonholonomic.EventTimes"
 
 
 def identify(
@@ -22,12 +24,12 @@ def identify(
     max_steps: int = 60,
     progress: bool = True,
 ) -> Identification:
-    """Estimate parameters of a scene and its launch from recorded rides, with errors and undetermined combinations.
+    """Estimate parameters of a scene and its launch from measurements, with errors and undetermined combinations.
 
     **Arguments:**
 
     - `scene`: a `Scene`, with the values of the parameters that are not free.
-    - `data`: a `Recording`, or a list of several, which are fitted together.
+    - `data`: a `Recording`, or a list of several, which are fitted together; `nonholonomic.Recording` and `EventTimes`, too.
     - `free`: full name of a parameter -> a `Free` or only the start value: `"scene.friction.rolling"`, or `"rolling"`
       if no other name ends so; `"launch.place[0]"` and `"launch.place[1]"` are parts of the place. A parameter of the
       launch, and `"t0"`, the reading of a recording's clock at the launch, are the same in all recordings;
@@ -48,15 +50,15 @@ def identify(
     >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
     >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
     >>> data = stroller.Recording(launch, times=[0.5, 1.0], value=[1.765, 1.557], error=0.01, quantity="speed")
-    >>> found = stroller.identify(scene, data, {"rolling": 1.5}, progress=False)
-    >>> print(f"{found.estimates['scene.friction.rolling']:.2f} N s/m, {found.status}")
+    >>> fit = stroller.identify(scene, data, {"rolling": 1.5}, progress=False)
+    >>> print(f"{fit.estimates['scene.friction.rolling']:.2f} N s/m, {fit.status}")
     2.00 N s/m, converged
 
     ```
     """
     search = search_options(starts, spread, seed, max_steps, progress)
     require_kind(scene, "scene", Scene)
-    return fit_runs(scene, sources_of(data, Recording, "a Recording"), free, tolerance, search)
+    return fit_runs(scene, sources_of(data, EXPECTED), free, tolerance, search)
 
 
 def log_density(
@@ -85,4 +87,4 @@ def log_density(
     ```
     """
     require_kind(scene, "scene", Scene)
-    return posterior_of_runs(scene, sources_of(data, Recording, "a Recording"), free, priors, tolerance)
+    return posterior_of_runs(scene, sources_of(data, EXPECTED), free, priors, tolerance)

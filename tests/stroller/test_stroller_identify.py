@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from close import assert_close
 
+import nonholonomic
 import stroller
 
 LAUNCH = stroller.Launch(place=(0.0, 0.0), heading=0.0, speed=1.5, steering=0.3)
@@ -36,6 +37,13 @@ def test_damping_from_recorded_speeds(tmp_path, caplog):
     predicted = posterior.predictions(rows)
     assert_close(predicted[0], speeds, rtol=1e-6)
     assert np.max(np.abs(predicted[1] - speeds)) > 0.01
+
+
+def test_damping_from_the_time_of_an_event():
+    """Half of the speed is lost after log(2) m / c."""
+    data = nonholonomic.EventTimes(LAUNCH, [np.log(2.0) * 12.0 / 2.0], 0.01, 8.0, lambda t, motion: motion.speed - 0.75)
+    fit = stroller.identify(scene(), data, {"rolling": 1.5}, starts=2, progress=False)
+    assert_close(fit.estimates["scene.friction.rolling"], 2.0, rtol=1e-6)
 
 
 @pytest.mark.slow

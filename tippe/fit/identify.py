@@ -2,15 +2,15 @@
 
 from typing import Any
 
-from nonholonomic.identification import AbstractRecording, Identification, LogDensity
-from nonholonomic.runs import AbstractEventTimes, fit_runs, posterior_of_runs, search_options, sources_of
+from nonholonomic.identification import Identification, LogDensity
+from nonholonomic.runs import fit_runs, posterior_of_runs, search_options, sources_of
 from nonholonomic.validation import require_kind
 
 from ..model.scene import Scene
 from ..runs.checks import check_smooth
 
-#: The sets of data that can be fitted, and the words for them.
-KINDS = AbstractEventTimes | AbstractRecording, "an InversionTimes, a ReversalTimes or a Recording"
+#: The words for data that can be fitted.
+EXPECTED = "an InversionTimes, a ReversalTimes or a Recording"
 
 
 def identify(
@@ -57,8 +57,8 @@ def identify(
     >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
     >>> launch = tippe.Launch(theta=[0.2, 0.2, 0.3, 0.2], spin=[155.0, 140.0, 110.0, 60.0])
     >>> data = tippe.InversionTimes(launch, time=[5.60, 5.53, 5.52, float("inf")], error=0.05, t1=8.0)
-    >>> found = tippe.identify(scene, data, {"friction.mu": 0.25}, tolerance=1e-6, progress=False)
-    >>> print(f"{found.estimates['scene.friction.mu']:.3f} s/m, {found.status}")
+    >>> fit = tippe.identify(scene, data, {"friction.mu": 0.25}, tolerance=1e-6, progress=False)
+    >>> print(f"{fit.estimates['scene.friction.mu']:.3f} s/m, {fit.status}")
     0.300 s/m, converged
 
     ```
@@ -67,7 +67,7 @@ def identify(
     require_kind(scene, "scene", Scene)
     if slopes == "exact":
         check_smooth(scene, "identify with slopes = 'exact'")
-    return fit_runs(scene, sources_of(data, *KINDS), free, tolerance, search, slopes)
+    return fit_runs(scene, sources_of(data, EXPECTED), free, tolerance, search, slopes)
 
 
 def log_density(
@@ -103,4 +103,4 @@ def log_density(
     (('scene.friction.mu',), (1,))
     """
     require_kind(scene, "scene", Scene)
-    return posterior_of_runs(scene, sources_of(data, *KINDS), free, priors, tolerance)
+    return posterior_of_runs(scene, sources_of(data, EXPECTED), free, priors, tolerance)
