@@ -33,6 +33,10 @@ def pytest_configure(config: pytest.Config) -> None:
     """
     if config.option.markexpr == ORDINARY:
         compile_quickly()
+    if hasattr(config, "cache"):
+        # Child processes read the bytecode of the first: without it, each parses every module again, for two seconds.
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+        os.environ.setdefault("PYTHONPYCACHEPREFIX", str(config.cache.mkdir("bytecode")))
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ and hasattr(config, "cache"):
         folder = nonholonomic.enable_compilation_cache(config.cache.mkdir("compiled"))
         if folder is not None:

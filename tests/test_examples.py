@@ -39,8 +39,8 @@ def test_example_is_short_and_can_be_read(path):
     assert callable(names["draw" if "draw" in names else "main"])
 
 
-#: Pictures that take more than ten seconds.
-LONG = ("rattleback", "parking", "planned_top")
+#: Pictures that take more than four seconds.
+LONG = ("rattleback", "parking", "planned_top", "onto_its_stem", "flights", "explore_ride", "explore_top", "bowl_rides")
 
 
 @pytest.mark.parametrize(

@@ -70,8 +70,9 @@ def show(source: str, names: dict[str, Any]) -> None:
                 getattr(value, drawn)()
 
 
-#: The longest pages; tests of planning, rigid bodies, fits, flights, laws, surfaces and own systems exercise their functions.
-LONG = ("planning", "rattleback", "trust", "hops", "friction", "surface", "own_ball", "own_oscillator")
+#: The longest pages; tests of planning, bodies, fits, flights, laws, surfaces and own systems exercise their functions.
+LONG = ("planning", "rattleback", "trust", "hops", "friction", "surface", "egg")
+LONG += ("own_ball", "own_oscillator", "own_sleigh", "own_top")
 
 
 @pytest.mark.parametrize(

@@ -153,11 +153,9 @@ class Stabilized8(AbstractTunedPair):
     >>> from nonholonomic.integration import Stabilized8
     >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
     >>> scene = tippe.Scene(top, friction=tippe.Coulomb(mu=0.3, slip_speed=1e-3))
-    >>> options = {"t1": 0.5, "angle": 1.0, "tolerance": 1e-6, "progress": False}
-    >>> for solver in (None, Stabilized8()):
-    ...     table = tippe.inversion_table(scene, theta=[0.2, 0.3], spin=150.0, solver=solver, **options)
-    ...     print(table.end_theta.round(4), table.steps.mean() < 500.0)
-    [0.0709 0.1131] False
+    >>> options = {"t1": 0.5, "angle": 1.0, "tolerance": 1e-6, "solver": Stabilized8(), "progress": False}
+    >>> table = tippe.inversion_table(scene, theta=[0.2, 0.3], spin=150.0, **options)
+    >>> print(table.end_theta.round(4), table.steps.mean() < 500.0)  # Oscillatory8 needs more than 500 steps
     [0.0709 0.1131] True
 
     ```

@@ -39,10 +39,22 @@ def test_damping_from_recorded_speeds(tmp_path, caplog):
     assert np.max(np.abs(predicted[1] - speeds)) > 0.01
 
 
+#: On a straight ride, half of the speed is lost after log(2) m / c.
+HALVED = nonholonomic.EventTimes(
+    stroller.Launch((0.0, 0.0), 0.0, 1.5), [np.log(2.0) * 6.0], 0.01, 9.0, lambda t, motion: motion.speed - 0.75
+)
+
+
+def test_the_time_of_an_event_is_predicted():
+    posterior = stroller.log_density(scene(), HALVED, {"rolling": 1.5})
+    assert_close(
+        posterior.predictions(np.log([[2.0], [1.5]]))[:, 0], np.log(2.0) * 12.0 / np.array([2.0, 1.5]), rtol=1e-7
+    )
+
+
+@pytest.mark.slow
 def test_damping_from_the_time_of_an_event():
-    """Half of the speed is lost after log(2) m / c."""
-    data = nonholonomic.EventTimes(LAUNCH, [np.log(2.0) * 12.0 / 2.0], 0.01, 8.0, lambda t, motion: motion.speed - 0.75)
-    fit = stroller.identify(scene(), data, {"rolling": 1.5}, starts=2, progress=False)
+    fit = stroller.identify(scene(), HALVED, {"rolling": 1.5}, starts=2, progress=False)
     assert_close(fit.estimates["scene.friction.rolling"], 2.0, rtol=1e-6)
 
 

@@ -27,9 +27,14 @@ def hills(x, y):
     return x * x + 0.8 * y * y + 0.1 * jnp.sin(3.0 * x) * y * y
 
 
-#: Scene, launch and horizon [s] of tops that stick, and that fly over an arena.
-STICKING = (tippe.Scene(rutstam_top(), friction=tippe.SetValuedCoulomb(0.3)), tippe.Launch(0.35, 100.0), 2.0)
-ARENA_FLIGHTS = {
+#: Scene, launch and horizon [s] of tops that hop on the plane, that stick, and that fly over an arena.
+IN_MODES = {
+    "hops": (
+        tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3), contact="hybrid", restitution=0.1),
+        tippe.Launch(1.5, 290.0),
+        0.3,
+    ),
+    "sticking": (tippe.Scene(rutstam_top(), friction=tippe.SetValuedCoulomb(0.3)), tippe.Launch(0.35, 100.0), 2.0),
     "cylinder": (tippe.presets.classroom(tippe.Cylinder(0.3)), tippe.Launch(0.1, 199.0, eta=0.1), 3.0),
     "sticking and flying": (
         tippe.Scene(rutstam_top(), friction=tippe.SetValuedCoulomb(0.3), contact="hybrid", restitution=0.4),
@@ -361,6 +366,7 @@ def test_a_page_without_the_shape_of_a_stem_refuses_its_offset():
         tippe.explore(tippe.presets.classroom(), launch, sliders={"body.offset": (0.001, 0.002)})
 
 
+@pytest.mark.slow
 def test_in_the_browser_the_wooden_top_hops_and_climbs_onto_its_stem(browser):
     """As `simulate` has it: through flights, impacts and changes of contact, to the end on its stem."""
     scene, launch = tippe.presets.classroom(), tippe.Launch.degrees(theta=6, rpm=1900)
@@ -392,10 +398,11 @@ def test_in_the_browser_the_wooden_top_hops_and_climbs_onto_its_stem(browser):
     np.testing.assert_allclose(force, samples.normal_force, atol=1e-5 * float(samples.normal_force[0]))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["sticking", *ARENA_FLIGHTS])
-def test_in_the_browser_tops_stick_and_fly_over_arenas_as_runs_do(browser, kind):
-    scene, launch, t1 = {"sticking": STICKING, **ARENA_FLIGHTS}[kind]
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=() if kind == "hops" else pytest.mark.slow) for kind in IN_MODES]
+)
+def test_in_the_browser_tops_hop_stick_and_fly_over_arenas_as_runs_do(browser, kind):
+    scene, launch, t1 = IN_MODES[kind]
     page_run, times = page_of_launch(TopModel(scene=scene, launch=launch), None, t1), np.linspace(0.0, 0.9 * t1, 7)
     run = tippe.simulate(scene, launch, t1, tolerance=1e-9)
     browser.get("about:blank")
