@@ -4,6 +4,7 @@ A program of a hybrid scene takes 60 to 180 MB and 200 to 800 memory mappings. L
 and a compiler that gets no more mappings crashes the process.
 """
 
+import contextlib
 import ctypes
 import gc
 import logging
@@ -17,9 +18,12 @@ from jaxtyping import Float
 
 from ..validation import is_traced
 
-#: Memory [bytes] of the process above which programs are cleared, if there are so many mappings that programs are the
-#: cause.
-MOST_MEMORY, MANY_MAPPINGS = 2_500_000_000, 4_000
+#: Memory [bytes] up to which a process keeps its programs on any machine, and the part of the machine's memory up to which
+#: it keeps them where this is more.
+LEAST_LIMIT, PART_OF_MEMORY = 2_500_000_000, 0.25
+
+#: Mappings from which on programs may be the cause of a process' memory.
+MANY_MAPPINGS = 4_000
 
 #: Fraction of the allowed mappings above which programs are cleared, however little memory they take.
 PART_OF_MAPPINGS = 0.5
@@ -48,17 +52,20 @@ def padded(values: Float[np.ndarray, "... times"], least: int) -> Float[np.ndarr
     return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, padding)], mode="edge")
 
 
-def forget_programs_if_many(most_memory: int = MOST_MEMORY) -> bool:
+def forget_programs_if_many(most_memory: float | None = None) -> bool:
     """Clear all compiled programs if they take too much memory, and log a one-line warning.
 
     The next call of a cleared program compiles it again, or reads it from disk (`enable_compilation_cache`). Nothing is
     cleared inside transformations, outside the main thread, or if the system does not report the memory of a process
     (`/proc`).
 
-    **Arguments:** `most_memory`: memory [bytes] that the process may hold.
+    **Arguments:** `most_memory`: memory [bytes] that the process may hold; by default a quarter of the machine's, but at
+    least 2.5 GB.
 
     **Returns:** whether programs were cleared.
     """
+    if most_memory is None:
+        most_memory = max(LEAST_LIMIT, PART_OF_MEMORY * memory_of_machine())
     memory = resident_memory()
     if memory < min(LITTLE_MEMORY, most_memory) or threading.current_thread() is not threading.main_thread():
         return False
@@ -90,6 +97,16 @@ def resident_memory() -> int:
         return int(Path("/proc/self/statm").read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:
         return 0
+
+
+def memory_of_machine() -> int:
+    """Memory [bytes] of this machine, or of the container if it may have less."""
+    limits = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    # Of version 2 and of version 1 of Linux' control groups; "max" is no limit.
+    for path in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        with contextlib.suppress(OSError, ValueError):
+            limits.append(int(Path(path).read_text()))
+    return min(limits)
 
 
 def count_mappings() -> int:
