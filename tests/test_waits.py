@@ -40,7 +40,7 @@ CALLS = {
     ),
     "simulate": (lambda: tippe.simulate(TOP, LAUNCH, 1.0), "tippe.runs.simulate", "follow"),
     "exponent": (lambda: tippe.lyapunov_exponent(TOP, LAUNCH, 1.0), "tippe.runs.verbs", "exponent_of_model"),
-    "ride": (lambda: stroller.simulate(STROLLER, RIDE, 1.0), "stroller.runs.simulate", "_concrete"),
+    "ride": (lambda: stroller.simulate(STROLLER, RIDE, 1.0), "stroller.runs.simulate", "followed"),
     "identify": (lambda: tippe.identify(TOP, TIMES, {"mu": 0.3}), "nonholonomic.runs.identify", "free_numbers"),
     "stroller identify": (
         lambda: stroller.identify(STROLLER, RECORDING, {"mass": 12.0}),

@@ -6,6 +6,7 @@ and a compiler that gets no more mappings crashes the process.
 
 import contextlib
 import ctypes
+import functools
 import gc
 import logging
 import os
@@ -64,9 +65,9 @@ def forget_programs_if_many(most_memory: float | None = None) -> bool:
 
     **Returns:** whether programs were cleared.
     """
+    memory = resident_memory()
     if most_memory is None:
         most_memory = max(LEAST_LIMIT, PART_OF_MEMORY * memory_of_machine())
-    memory = resident_memory()
     if memory < min(LITTLE_MEMORY, most_memory) or threading.current_thread() is not threading.main_thread():
         return False
     # Putting a number on a device compiles nothing; adding two numbers would.
@@ -99,14 +100,17 @@ def resident_memory() -> int:
         return 0
 
 
-def memory_of_machine() -> int:
-    """Memory [bytes] of this machine, or of the container if it may have less."""
-    limits = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+@functools.cache
+def memory_of_machine() -> float:
+    """Memory [bytes] of this machine, or of the container if it may have less; 0 if the system does not report it."""
+    limits = []
+    with contextlib.suppress(AttributeError, ValueError, OSError):
+        limits.append(float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES"))
     # Of version 2 and of version 1 of Linux' control groups; "max" is no limit.
     for path in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
         with contextlib.suppress(OSError, ValueError):
-            limits.append(int(Path(path).read_text()))
-    return min(limits)
+            limits.append(float(Path(path).read_text()))
+    return min(limits, default=0.0)
 
 
 def count_mappings() -> int:

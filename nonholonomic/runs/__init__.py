@@ -29,7 +29,6 @@ from .identify import posterior_of_runs as posterior_of_runs
 from .identify import search_options as search_options
 from .identify import sources_of as sources_of
 from .lyapunov import LyapunovExponent as LyapunovExponent
-from .lyapunov import direction_of_start as direction_of_start
 from .lyapunov import exponent_of_model as exponent_of_model
 from .lyapunov import lyapunov_exponent as lyapunov_exponent
 from .model import AbstractModel as AbstractModel
@@ -38,7 +37,6 @@ from .model import Names as Names
 from .model import Start as Start
 from .model import model_of as model_of
 from .model import statuses as statuses
-from .samples import Samples as Samples
 from .simulate import evenly_spaced as evenly_spaced
 from .simulate import sampled_if_legal as sampled_if_legal
 from .simulate import simulate as simulate

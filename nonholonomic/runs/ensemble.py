@@ -23,7 +23,10 @@ from ..hybrid import (
 from ..integration import AbstractProblem, Outcome, Settings, solve_ensemble, traced_solve_ensemble
 from ..integration.status import CROSSED, REACHED_END, Status
 from .event import modes_of, problem_of
-from .model import AbstractModel, Names
+from .model import AbstractModel
+
+#: The statuses of runs without a result.
+SILENT = (Status.FAILED, Status.UNRESOLVED)
 
 
 class Ensemble(eqx.Module):
@@ -44,26 +47,23 @@ class Ensemble(eqx.Module):
     continues: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, model: AbstractModel, cells: int, tolerance: Any, continues: bool, names: Names = ()) -> "Ensemble":
+    def of(cls, model: AbstractModel, cells: int, tolerance: Any, continues: bool) -> "Ensemble":
         """The runs of some cells of a model, whose numbers are scalars or arrays with one number per cell."""
         if model.smooth:
-            return cls(problem_of(model, cells, names), None, None, None, 0, continues)
-        return cls(None, *modes_of(model, cells, tolerance, names, continues), len(model.counters), continues)
+            return cls(problem_of(model, cells, ()), None, None, None, 0, continues)
+        return cls(None, *modes_of(model, cells, tolerance, (), continues), len(model.counters), continues)
 
-    def solve(
-        self, t1: Any, cells: Any, settings: Settings, traced: bool = False, one_kernel: bool = True
-    ) -> Outcome | HybridOutcome:
+    def solve(self, t1: Any, cells: Any, settings: Settings, traced: bool = False) -> Outcome | HybridOutcome:
         """The outcome of the runs.
 
         **Arguments:** `t1`: horizon [s]; `cells`: number of cells to run, the rest is padding; `traced`: whether numbers
-        may be traced; `one_kernel`: false for programs that are differentiated again.
+        may be traced.
         """
         if self.problem is not None:
             horizon = (jnp.asarray(t1), jnp.asarray(cells), settings)
-            if not traced:
-                return solve_ensemble(self.problem, *horizon, nonterminal=self.continues)[0]
-            options = {"nonterminal": self.continues, "one_kernel": one_kernel}
-            return traced_solve_ensemble(self.problem, *horizon, **options)[0]
+            if traced:
+                return traced_solve_ensemble(self.problem, *horizon, nonterminal=self.continues, one_kernel=True)[0]
+            return solve_ensemble(self.problem, *horizon, nonterminal=self.continues)[0]
         solve, xp = (traced_solve_hybrid, jnp) if traced else (solve_hybrid, np)
         start, options = self._start(xp), {"counters": self.counters, "nonterminal": self.continues}
         return solve(self.modes, *start, t1, cells, settings, **options)
@@ -79,7 +79,8 @@ class Ensemble(eqx.Module):
     ) -> tuple[Any, Any, Any]:
         """The outcome of the runs, and the derivatives of the times of their events.
 
-        **Arguments:** `tangents`: tangents of the ensemble; the others as for `solve`.
+        **Arguments:** `tangents`: tangents of the ensemble; `one_kernel`: false for programs that are differentiated
+        again; the others as for `solve`.
 
         **Returns:** the outcome; for each tangent the derivative in every cell, 0 if there is no event or the event is
         at the start; and a mask of the cells whose derivative is NaN because an earlier event was grazing.

@@ -18,11 +18,8 @@ from ..integration.status import Status
 from ..progress import status_line
 from ..validation import as_number, is_traced, nan_unless, shown
 from ..warning import warn
-from .ensemble import Ensemble, status_of
+from .ensemble import SILENT, Ensemble, status_of
 from .model import AbstractModel, check_run, model_of, require_event
-
-#: The statuses of runs without a result.
-SILENT = (Status.FAILED, Status.UNRESOLVED)
 
 
 @status_line("simulating")
@@ -174,7 +171,7 @@ class EventTime(AbstractDifferentiableSolve):
 
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         is_legal, t1, settings = self.permitted(leaves)
-        ensemble = self._ensemble(self.model(leaves), cells, settings)
+        ensemble = Ensemble.of(self.model(leaves), cells, settings.tolerance, self.last)
         outcome = ensemble.solve(t1, cells, settings, traced=True)
         return self._times(leaves, is_legal, settings, ensemble, outcome, [])[0]
 
@@ -185,8 +182,8 @@ class EventTime(AbstractDifferentiableSolve):
         model = self.model(leaves)
         model.require_differentiable(nested, self.last)
 
-        def build(floats: tuple[Array, ...], cells: int | None) -> Ensemble:
-            return self._ensemble(self.model((*floats, *leaves[self.movable :])), cells, settings)
+        def build(floats: tuple[Array, ...], cells: Any) -> Ensemble:
+            return Ensemble.of(self.model((*floats, *leaves[self.movable :])), cells, settings.tolerance, self.last)
 
         # Cells are independent, so varying a parameter in all of them at once gives each its own derivative.
         ensemble, tangents, gather = tangents_by(build, active, leaves[: self.movable], cells)
@@ -210,10 +207,6 @@ class EventTime(AbstractDifferentiableSolve):
         if self.unchecked:
             is_legal, t1, tolerance = legal_run(self.model(leaves).legal(), t1, tolerance)
         return is_legal, t1, self.settings.with_tolerance(jnp.min(tolerance))
-
-    def _ensemble(self, model: AbstractModel, cells: int | None, settings: Settings) -> Ensemble:
-        assert cells is not None
-        return Ensemble.of(model, cells, settings.tolerance, self.last)
 
     def _times(
         self,

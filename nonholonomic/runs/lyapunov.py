@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int, Shaped
 from ..derivatives import exponent_of, growth
 from ..derivatives.lyapunov import Growth
 from ..hybrid import AbstractBatchedMode, HybridOutcome, solve_hybrid
+from ..hybrid.ensemble import at_start
 from ..hybrid.saltation import VariationalMode, variational_start
 from ..integration import Outcome, Settings, explicit_tableau
 from ..integration.status import REACHED_END, RUNNING, Status
@@ -141,21 +142,6 @@ def _outcome(growths: Growth) -> Outcome[Array]:
     return Outcome(jnp.asarray(growths.status), none, none, *ending, steps, jnp.zeros_like(steps))
 
 
-def direction_of_start(model: AbstractModel, names: list[str], cells: int) -> Float[Array, "components cells"]:
-    """The change of the initial states when the named parameters move in a generic direction, so that the states stay
-    possible."""
-
-    def states(*moving: Array) -> Array:
-        moved = model.replaced(dict(zip(names, moving, strict=True)))
-        if model.smooth:
-            return moved.problem(cells, model.comparable).start()[0]
-        return moved.modes(cells, jnp.asarray(1e-9), model.comparable, False)[2]
-
-    point = tuple(jnp.asarray(model.value(name), float) for name in names)
-    rates = tuple(jnp.cos(1.0 + k) * jnp.maximum(jnp.abs(value), 1.0) for k, value in enumerate(point))
-    return jax.jvp(states, point, rates)[1]
-
-
 def _through_modes(
     model: AbstractModel, direction: Float[Array, "components cells"], t1: float, cells: int, settings: Settings
 ) -> tuple[Growth, HybridOutcome]:
@@ -169,17 +155,7 @@ def _through_modes(
     state, mode, size = np.asarray(variational_start(states, (tangent,))), np.asarray(first), len(states)
     state = np.asarray(_rescaled(modes, jnp.asarray(mode), jnp.asarray(state), size)[1])
     stretch, count = t1 / STRETCHES, len(model.counters)
-    logarithms, status = [], np.full(cells, RUNNING)
-    ending = HybridOutcome(
-        status=status,
-        crossing_time=np.full(cells, np.inf),
-        end_time=np.zeros(cells),
-        state=state[:size],
-        steps=np.zeros(cells, int),
-        rejected=np.zeros(cells, int),
-        mode=mode,
-        counts=np.zeros((count, cells), int),
-    )
+    logarithms, ending = [], at_start(np, mode, state[:size], cells, count)
     for _ in range(STRETCHES):
         outcome = solve_hybrid(variational, mode, state, stretch, cells, settings, counters=count + 1, n_blocks=2)
         rescaled = _rescaled(modes, jnp.asarray(outcome.mode), jnp.asarray(outcome.state), size)

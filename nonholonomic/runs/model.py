@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -157,9 +158,20 @@ class AbstractModel(eqx.Module):
     def without_event(self) -> "AbstractModel":
         """The same model without an event that ends a run."""
 
-    @abc.abstractmethod
     def direction(self, cells: int) -> Float[Array, "components cells"]:
-        """A generic change of the initial states, tangent to the set of possible states."""
+        """A generic change of the initial states, tangent to the set of possible states: that when the parameters of the
+        start move in a generic direction."""
+        names = [name for name in self.known if name.startswith(("start", "launch"))]
+
+        def states(*moving: Array) -> Array:
+            moved = self.replaced(dict(zip(names, moving, strict=True)))
+            if self.smooth:
+                return moved.problem(cells, self.comparable).start()[0]
+            return moved.modes(cells, jnp.asarray(1e-9), self.comparable, False)[2]
+
+        point = tuple(jnp.asarray(self.value(name), float) for name in names)
+        rates = tuple(jnp.cos(1.0 + k) * jnp.maximum(jnp.abs(value), 1.0) for k, value in enumerate(point))
+        return jax.jvp(states, point, rates)[1]
 
     # What a state means.
 

@@ -16,10 +16,9 @@ from ..identification.recording import lengthened, model_times
 from ..integration import Settings
 from ..integration.status import Status
 from ..validation import nan_unless
-from .ensemble import Ensemble
 from .model import AbstractModel
 from .simulate import sampled
-from .table import at_the_end
+from .table import first_events
 
 #: Parameters of one set of data, name -> (rows,).
 Values = dict[str, Float[Array, " rows"]]
@@ -175,10 +174,7 @@ def _predicted_by_tables(
         order = np.argsort(~is_legal, kind="stable")
         order[count:] = order[0]
         cells, t1 = jax.tree.map(lambda leaf: leaf[order] if eqx.is_array(leaf) else leaf, (lanes.model, lanes.horizon))
-        ensemble = Ensemble.of(cells, size, settings.tolerance, False)
-        outcome = ensemble.solve(np.asarray(t1), count, settings)
-        status, ends = at_the_end(cells, ensemble, outcome, settings.tolerance)
-        time = np.where(np.asarray(status) == Status.EVENT, outcome.crossing_time, np.inf)
+        status, time, ends = first_events(cells, np.asarray(t1), size, count, settings)
         time = np.asarray(sources[0].data.of_ends(cells, t1, time, ends))
-        predictions[order[:count]] = np.where(np.asarray(status) == Status.FAILED, np.nan, time)[:count]
+        predictions[order[:count]] = np.where(status == Status.FAILED, np.nan, time)[:count]
     return jnp.asarray(predictions)

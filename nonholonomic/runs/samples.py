@@ -47,13 +47,16 @@ def solve_samples(
     cells: AbstractModel, samples: Samples, t1: float, size: int, count: int, settings: Settings
 ) -> tuple[Int[Array, " cells"], dict[str, Array]]:
     """The `Status` of all cells, of which only the first `count` are run, and the variables of the table."""
-    times, horizon = jnp.asarray(samples.times, float), jnp.asarray(t1, float)
-    if not cells.smooth:
-        return _through_modes(cells, samples.names, times, horizon, settings, size, count)
-    problem = problem_of(cells, size, samples.names)
-    outcome, status, values = _followed(problem, cells, samples.names, times, horizon, jnp.asarray(count), settings)
-    ending = {"end_time": outcome.end_time, "steps": outcome.steps, "rejected": outcome.rejected}
-    return status, jax.tree.map(np.asarray, values | ending)
+    names, times = samples.names, jnp.asarray(samples.times, float)
+    horizon = (jnp.asarray(t1, float), jnp.asarray(count), settings)
+    if cells.smooth:
+        outcome, status, values = _followed(problem_of(cells, size, names), cells, names, times, *horizon)
+        values |= {"end_time": outcome.end_time, "steps": outcome.steps, "rejected": outcome.rejected}
+    else:
+        start, counters = modes_of(cells, size, settings.tolerance, names), len(cells.counters)
+        run, _ = solve_hybrid_with_samples(*start, times, *horizon, counters=counters)
+        status, values = _read_samples(cells, names, times, run, settings.tolerance)
+    return status, jax.tree.map(np.asarray, values)
 
 
 # Compiled on its own, not inside other transformed functions; otherwise it does not get the compiler's options.
@@ -112,23 +115,6 @@ def outcome_of(samples: HybridSamples) -> HybridOutcome[Array]:
     status, steps, rejected, mode = (code.astype(int) for code in codes)
     ending = (jnp.full_like(samples.end_time, jnp.inf), samples.end_time, samples.end_state.T)
     return HybridOutcome(status, *ending, steps, rejected, mode, samples.counts.astype(int).T)
-
-
-def _through_modes(
-    cells: AbstractModel,
-    names: tuple[str, ...],
-    times: Float[Array, " times"],
-    t1: Float[Array, ""],
-    settings: Settings,
-    size: int,
-    count: int,
-) -> tuple[Int[Array, " cells"], dict[str, Array]]:
-    """The same for runs of several modes."""
-    modes, first, states = modes_of(cells, size, settings.tolerance, names)
-    options = {"counters": len(cells.counters)}
-    samples, _ = solve_hybrid_with_samples(modes, first, states, times, t1, jnp.asarray(count), settings, **options)
-    status, values = _read_samples(cells, names, times, samples, settings.tolerance)
-    return status, jax.tree.map(np.asarray, values)
 
 
 @eqx.filter_jit

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..derivatives import tangent_scale, tangents_of
 from ..hybrid import HybridOutcome
@@ -14,7 +14,7 @@ from ..integration import Outcome, Settings, solve_by_diffrax
 from ..integration.status import Status
 from ..sweeps import Variable
 from ..validation import as_number
-from .ensemble import Ensemble, status_of
+from .ensemble import SILENT, Ensemble, status_of
 from .errors import errors_of, second_tolerance
 from .model import AbstractModel
 from .samples import Samples, solve_samples
@@ -47,10 +47,6 @@ class TableForm(NamedTuple):
         """The integer of a file for each integer of `Status` from 0 on; -1 for statuses without a word."""
         words = [(self.named or {}).get(status.word, status.word) for status in sorted(Status)[1:]]
         return np.array([self.words.index(word) if word in self.words else -1 for word in words], np.int8)
-
-    def code(self, status: Status) -> int:
-        """The integer of a file for a status."""
-        return int(self.codes[int(status)])
 
 
 class TableJob(NamedTuple):
@@ -162,7 +158,7 @@ class TableJob(NamedTuple):
         if self.errors:
             settings = self.settings.with_tolerance(as_number(second_tolerance(float(self.settings.tolerance))))
             second = self._results(cells, columns, size, count, settings, None)
-            silent = tuple(self.form.code(status) for status in (Status.FAILED, Status.UNRESOLVED))
+            silent = tuple(self.form.codes[list(SILENT)])
             variables |= errors_of(variables, second, self.bounded, tuple(self.model.counters), silent)
         names = () if self.samples is None else self.samples.names
         return variables | {name: sampled[name] for name in names}
@@ -204,7 +200,7 @@ class TableJob(NamedTuple):
             time: Any = np.where(has_event, outcome.crossing_time, np.inf)
             if self.continues and self.crossing == "first" and isinstance(outcome, Outcome):
                 time = outcome.first_crossing
-            is_silent = self.form.nan_if_failed & np.isin(status, (Status.FAILED, Status.UNRESOLVED))
+            is_silent = self.form.nan_if_failed & np.isin(status, SILENT)
             variables[self.times[-1]] = np.where(is_silent, np.nan, time)
         variables |= {"status": codes, "end_time": np.asarray(outcome.end_time)}
         if self.samples is None:
@@ -215,27 +211,30 @@ class TableJob(NamedTuple):
         if self.crossing == "both":
             if isinstance(outcome, HybridOutcome):
                 # With several modes, the first event needs a separate solve, which ends there.
-                variables["first_time"] = self._first_event(cells, size, count, settings)
+                variables["first_time"] = first_events(cells, self.t1, size, count, settings)[1]
             else:
                 is_unresolved = np.asarray(status) == Status.UNRESOLVED
                 variables["first_time"] = np.where(is_unresolved, np.inf, np.asarray(outcome.first_crossing))
         for name, (_, other) in cells.further_times.items():
             is_same = jax.tree.structure(other) == jax.tree.structure(cells) and self.crossing != "last"
             first = self.times[0] if is_same else None
-            variables[name] = variables[first] if first else self._first_event(other, size, count, settings)
+            variables[name] = variables[first] if first else first_events(other, self.t1, size, count, settings)[1]
         variables |= {name: np.where(has_event, slope, 0.0) for name, slope in derivatives.items()}
         if slopes and not self.model.smooth:
             variables["grazes"] = (has_event & np.asarray(grazing)).astype(np.int8)
         return variables
 
-    def _first_event(
-        self, cells: AbstractModel, size: int, count: int, settings: Settings
-    ) -> Float[np.ndarray, " cells"]:
-        """The times of the events of runs that end there, infinite in cells that end otherwise."""
-        ensemble = Ensemble.of(cells, size, settings.tolerance, False)
-        outcome = ensemble.solve(self.t1, count, settings)
-        status = np.asarray(at_the_end(cells, ensemble, outcome, settings.tolerance)[0])
-        return np.where(status == Status.EVENT, outcome.crossing_time, np.inf)
+
+def first_events(
+    cells: AbstractModel, t1: Any, size: int, count: int, settings: Settings
+) -> tuple[Int[np.ndarray, " cells"], Float[np.ndarray, " cells"], dict[str, Array]]:
+    """The `Status` of runs that end on their event, the times of the events, infinite in cells that end otherwise, and the
+    variables that describe the ends."""
+    ensemble = Ensemble.of(cells, size, settings.tolerance, False)
+    outcome = ensemble.solve(t1, count, settings)
+    status, ends = at_the_end(cells, ensemble, outcome, settings.tolerance)
+    status = np.asarray(status)
+    return status, np.where(status == Status.EVENT, outcome.crossing_time, np.inf), ends
 
 
 # Compiled once for all chunks.

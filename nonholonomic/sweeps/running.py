@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..compilation.compiled_programs import forget_programs_if_many
+from ..compilation.compiled_programs import forget_programs_if_many, memory_of_machine
 from ..progress import Progress
 from ..validation import require_flag, shown
 from ..warning import warn
@@ -174,8 +174,8 @@ class Held:
 
         **Raises:** `ValueError` if this machine does not have enough memory.
         """
-        required, room = layout.bytes_of_cells(layout.cells), memory()
-        if required > room:
+        required, room = layout.bytes_of_cells(layout.cells), memory_of_machine()
+        if 0.0 < room < required:
             raise ValueError(
                 f"path = None: {layout.cells:.3g} cells take {1e-9 * required:.3g} GB, and this machine has "
                 f"{1e-9 * room:.3g} GB of memory; pass path= to keep them in a file"
@@ -266,14 +266,6 @@ def chunks_together(layout: Layout, chunk: int) -> int:
     """Number of chunks that are dispatched and stored together, a power of two, greater than one for large grids."""
     count = min(layout.cells // (CHUNKS * chunk), MOST_BYTES // layout.bytes_of_cells(chunk))
     return 1 << max(count, 1).bit_length() - 1
-
-
-def memory() -> float:
-    """The memory of this machine [bytes]; infinite if unknown."""
-    try:
-        return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return float("inf")
 
 
 def workers() -> int:

@@ -16,7 +16,6 @@ from ..integration import AbstractProblem, Outcome
 from ..integration.status import Status
 from ..lanes.tracing import dependent_outputs, with_own_numbers
 from ..parameters import Parameters, check_again, has_checks, require_apart, short_names
-from ..runs.lyapunov import direction_of_start
 from ..runs.model import AbstractModel, Names, Start, model_of, statuses
 from ..runs.simulate import simulate_model
 from ..runs.trajectory import Trajectory
@@ -93,7 +92,9 @@ class OwnModel(AbstractModel):
 
     def legal(self) -> Bool[Array, "..."]:
         starts = [
-            value for name, value in zip(self.parameters.names, self.parameters.values, strict=True) if "start" in name
+            value
+            for name, value in zip(self.parameters.names, self.parameters.values, strict=True)
+            if name.startswith("start")
         ]
         return functools.reduce(jnp.logical_and, map(jnp.isfinite, starts))
 
@@ -152,8 +153,7 @@ class OwnModel(AbstractModel):
         return OwnModel.of(tree | {"system": system, "event": None})
 
     def direction(self, cells: int) -> Float[Array, "components cells"]:
-        starts = [name for name in self.known if name.startswith("start")]
-        return self._cells(cells).within_constraints(direction_of_start(self, starts, cells))
+        return self._cells(cells).within_constraints(super().direction(cells))
 
     @property
     def quantities(self) -> dict[str, Quantity]:

@@ -23,7 +23,6 @@ from nonholonomic.runs import (
     Clock,
     EventFunction,
     Names,
-    direction_of_start,
     model_of,
     statuses,
     with_event,
@@ -218,10 +217,6 @@ class RideModel(AbstractSceneModel):
 
     def without_event(self) -> "RideModel":
         return dataclasses.replace(self, event=None)
-
-    def direction(self, cells: int) -> Float[Array, "components cells"]:
-        starts = [name for name in self.known if name.startswith("launch.")]
-        return direction_of_start(self, starts, cells)
 
     @property
     def quantities(self) -> dict[str, Quantity]:

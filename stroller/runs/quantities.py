@@ -34,7 +34,7 @@ QUANTITIES = {
     "steering_power": Quantity("W", "power of the steering", read=lambda run: run.power.steering),
     "friction_power": Quantity("W", "power of friction", read=lambda run: sum(run.power[2:])),
     "side_force": Quantity("N", "side force", "axle"),
-    "grip": Quantity("1", "friction that the tyres need", "axle", read=lambda run: run.grip()),
+    "grip": Quantity("1", "friction that the tyres need", "axle", read=lambda run: grip(run.side_force, run.load)),
     "load": Quantity("N", "load", "axle"),
     "normal_force": Quantity("N", "normal force"),
 }
@@ -167,9 +167,6 @@ class RideState:
     def load(self) -> Float[Array, "... 2"]:
         front_load = self._number(self.geometry.front_load)
         return self._vector((self.normal_force - front_load, front_load))
-
-    def grip(self) -> Float[Array, "... 2"]:
-        return grip(self.side_force, self.load)
 
     @property
     def constraint(self) -> Float[Array, "... 2"]:

@@ -44,20 +44,14 @@ def ride(
     settings = Settings(tolerance, solver, max_steps=max_steps)
     # Inside a transformation, this traces all numbers, even if they are known.
     spec = RideSpec.of(model, jnp.add(end, 0.0), settings, grid)
-    if is_traced((spec, times)):
-        return _sampled(spec, times, adjoint)
-    return _concrete(spec, times)
-
-
-def _concrete(spec: RideSpec, times: Float[Array, " times"]) -> Trajectory:
-    """The run of concrete numbers."""
-    if not isinstance(spec.settings.for_steps_alone, diffrax.AbstractERK | ImplicitMidpoint):
-        return _sampled(spec, times, None)
+    inside = is_traced((spec, times))
+    # Steps of other implicit solvers cannot be repeated cheaply, so they end on the times.
+    if inside or not isinstance(settings.for_steps_alone, diffrax.AbstractERK | ImplicitMidpoint):
+        return _sampled(spec, times, adjoint if inside else None)
     steps, stats = followed(spec)
     return dataclasses.replace(read_off_compiled(spec, times, steps.at(spec, np.asarray(times)), stats), steps=steps)
 
 
-# Steps of other implicit solvers cannot be repeated cheaply, so they end on the times.
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
 @eqx.filter_jit
 def _sampled(spec: RideSpec, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None) -> Trajectory:

@@ -7,6 +7,7 @@ from typing import Any
 import diffrax
 from jaxtyping import Array, ArrayLike, Float
 
+from nonholonomic.integration.checks import require_run
 from nonholonomic.integration.settings import DEFAULT_MAX_STEPS
 from nonholonomic.parameters import full_axes
 from nonholonomic.progress import status_line
@@ -15,10 +16,9 @@ from nonholonomic.sweeps import Table
 from nonholonomic.validation import require_outside, shown
 from nonholonomic.views import Page
 
-from ..model.input import Input
+from ..model.input import Input, check_input
 from ..model.launch import Launch
 from ..model.scene import Scene
-from .checks import check_run
 from .explore import TOLERANCE
 from .model import ENDS, RideModel
 from .simulate import ride
@@ -204,3 +204,12 @@ def explore(
     """
     check_run(scene, launch, t1, input, TOLERANCE)
     return explore_model(RideModel.of(scene, launch, input), path, sliders, float(t1), unit)
+
+
+def check_run(scene: Any, launch: Any, t1: Any, input: Any, tolerance: Any) -> None:
+    """Raise `ValueError` unless scene, launch, horizon, input and tolerance are legal and the scene can start with the
+    launch."""
+    lists = "axes of sweep take lists, and jax.vmap maps over them"
+    require_run(scene, launch, t1, tolerance, (Scene, Launch), lists)
+    scene.check(launch)
+    check_input(input, scene, launch)

@@ -149,6 +149,7 @@ def show(run: Any, number: int, name: str) -> Show:
     loads, forces = reader(run.load), reader(run.side_force)
     scale, width = WEIGHT * length / float(scene.body.mass * scene.gravity), 0.035 * length
     grip = np.asarray(run.grip())[:, : len(run.loaded_axles)]
+    warning = f"needs friction {np.max(grip):.2g}, more than any tyre provides: a real stroller would slip"
     return Show(
         name,
         colour,
@@ -173,17 +174,7 @@ def show(run: Any, number: int, name: str) -> Show:
             Curve("normal force [N]", reader(run.normal_force)),
             Curve("friction that the tyres need [1]", reader(np.minimum(grip, DRAWN_GRIP).max(axis=-1))),
         ),
-        grip_warning(run),
-    )
-
-
-def grip_warning(run: Any) -> str:
-    """A warning for a ride that needs more grip than tyres provide; empty for others."""
-    max_grip = float(np.max(np.asarray(run.grip())[:, : len(run.loaded_axles)]))
-    return (
-        f"needs friction {max_grip:.2g}, more than any tyre provides: a real stroller would slip"
-        if max_grip > MOST_GRIP
-        else ""
+        warning if np.max(grip) > MOST_GRIP else "",
     )
 
 

@@ -66,6 +66,9 @@ def test_a_run_that_does_not_reach_its_stem_has_no_time(run):
     assert early.stem_time == early.inversion_time == np.inf
     with pytest.raises(ValueError, match=r"no dense output: use tippe\.inversion_time"):
         _ = dataclasses.replace(run, dense=None).stem_time
+    # As a run made inside a transformation, which does not know its impacts.
+    assert "impacts" in str(run)
+    assert "impacts" not in str(dataclasses.replace(run, dense=None, stats={}))
 
 
 def test_a_table_has_the_times_of_its_runs(run, table):

@@ -67,7 +67,7 @@ class Recording(AbstractRecording):
     def model(self, scene: Scene) -> AbstractModel:
         """The model of the recorded run."""
         require_kind(scene, "scene", Scene)
-        return TopModel.sampled(scene, self.launch)
+        return TopModel(scene=scene, launch=self.launch)
 
     def __check_init__(self):
         require_kind(self.launch, "launch", Launch, several="identify takes a list of recordings")

@@ -35,9 +35,8 @@ def event_of(scene: Scene[Any], angle: Any) -> Float[Array, "..."] | StemContact
 def angle_of(scene: Scene[Any], angle: Any) -> Float[Array, "..."]:
     """The angle [rad] itself; or, without an angle, the inclination beyond which the top has turned over on a level
     plane."""
-    if angle is None and scene.has_stem:
-        return scene.body.stem_angle
-    return as_number(INVERTED if angle is None else angle)
+    event = event_of(scene, angle)
+    return scene.body.stem_angle if isinstance(event, StemContact) else event
 
 
 #: Advice in messages about lists, where a table is the better choice.

@@ -49,7 +49,9 @@ def page_of_launch(model: TopModel, sliders: dict[str, tuple[float, float]] | No
     """The contents of the page. **Arguments:** `model`: without an event; the others as for `explore`."""
     scene, launch = model.scene, model.launch
     check_run(scene, launch, t1, TOLERANCE)
-    if reverses(scene):
+    # A body that rolls keeps its energy: it does not invert, and the page shows times of reversal.
+    reverses = isinstance(scene.friction, NoSlip)
+    if reverses:
         check_reversible(launch, {})
     # The position of the stem's end is relative to the centre of mass, so another offset would change the shape.
     paths_drawn = ("scene.body.stem.", "scene.body.offset") if scene.has_stem else ()
@@ -65,8 +67,8 @@ def page_of_launch(model: TopModel, sliders: dict[str, tuple[float, float]] | No
         outcome,
         lambda drawn, time, rows, mode: frame(drawn.scene, drawn.moment(rows, mode)),
         title=f"{'Rigid body' if is_rigid else 'Tippe top'} on a {type(scene.surface).__name__.lower()}",
-        answer=("reversal time" if reverses(scene) else answer, "s"),
-        words=REVERSED if reverses(scene) else None,
+        answer=("reversal time" if reverses else answer, "s"),
+        words=REVERSED if reverses else None,
         summaries=tuple(
             Summary(quantities[name].long_name, readable_unit(quantities[name].unit), row)
             for row, name in enumerate(("energy", "normal_spin" if is_rigid else "jellett"), start=1)
@@ -74,15 +76,10 @@ def page_of_launch(model: TopModel, sliders: dict[str, tuple[float, float]] | No
     )
 
 
-def reverses(scene: Scene) -> bool:
-    """Whether the page shows times of reversal: a body that rolls keeps its energy, so it does not invert."""
-    return isinstance(scene.friction, NoSlip)
-
-
 def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float]]:
     """The default sliders: theta, spin, friction, and the offset of a top without a stem, around their own values."""
     theta, spin = float(launch.theta), float(launch.spin)
-    if reverses(scene):
+    if isinstance(scene.friction, NoSlip):
         return {
             "theta": (0.25 * theta, 4.0 * theta) if theta > 0.0 else (0.0, 0.1),
             "spin": (-1.4 * abs(spin), 1.4 * abs(spin)),

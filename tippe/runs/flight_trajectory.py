@@ -179,5 +179,9 @@ class HybridTrajectory(AbstractTrajectory):
         return self.where_the_model_ends
 
     def __str__(self) -> str:
-        text = f"{super().__str__()}\n  {self._flights} flights, {self.stats['impact_loss']:.3g} J lost in impacts"
+        text = super().__str__()
+        # A run made inside a transformation does not know it.
+        if "impact_loss" not in self.stats:
+            return text
+        text = f"{text}\n  {self._flights} flights, {self.stats['impact_loss']:.3g} J lost in impacts"
         return f"{text}\n  unresolved: {self._reason()}" if self.status == Status.UNRESOLVED.word else text

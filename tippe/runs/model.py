@@ -1,6 +1,7 @@
 """The top as a model for the functions of `nonholonomic.runs`."""
 
 import dataclasses
+import functools
 import math
 from typing import Any
 
@@ -44,7 +45,7 @@ from .flight_trajectory import HybridTrajectory
 from .launches import NUMBERS_OF_A_LAUNCH, labels, variable_numbers
 from .observables import AbstractTrajectory
 from .quantities import COMPONENTS, DIRECTION, ON_CURVED, PASSIVE, PATH, quantities_of
-from .run_kind import COUNTED, RunKind, flight_modes, has_grown, run_kind_of
+from .run_kind import COUNTED, RunKind, allowance, flight_modes, run_kind_of
 from .simulate import simulate_launch
 from .trajectory import Trajectory
 
@@ -95,23 +96,15 @@ class TopModel(AbstractSceneModel):
         event = angle if angle is None or isinstance(angle, StemContact) else jnp.asarray(angle, float)
         return cls(scene=scene, launch=launch, angle=event, reverses=angle is None)
 
-    @classmethod
-    def sampled(cls, scene: Scene, launch: Launch) -> "TopModel":
-        """The model of a launch without an event."""
-        return cls(scene=scene, launch=launch)
-
     def __reduce__(self) -> Any:
         # A traced function cannot be pickled, so each process traces it.
-        if self.event is not None:
-            return TopModel.of, (self.scene, self.launch, self.event.function)
-        return (
-            (TopModel.timed, (*self.roots.values(), self.angle))
-            if self.has_event
-            else (TopModel.sampled, (*self.roots.values(),))
-        )
+        if self.event is None:
+            numbers = {"scene": self.scene, "launch": self.launch, "angle": self.angle}
+            return functools.partial(TopModel, **numbers, reverses=self.reverses), ()
+        return TopModel.of, (self.scene, self.launch, self.event.function)
 
     def without_event(self) -> "TopModel":
-        return TopModel.sampled(_integrated(self.scene), self.launch)
+        return TopModel(scene=_integrated(self.scene), launch=self.launch)
 
     def direction(self, cells: int) -> Float[Array, "components cells"]:
         return generic_direction(self.scene, self.launch, cells)
@@ -273,7 +266,8 @@ class TopModel(AbstractSceneModel):
         state = jnp.asarray(outcome.state)[: len(start.states)]
         energy_before = kind.energy_in(scene, start.states, first)[1]
         energy_after = kind.energy_in(scene, state, mode)[0]
-        grown = has_grown(scene, energy_before, energy_after, tolerance) & (outcome.status != FAILED)
+        # Then the arena's heights, the law of friction or the integration is wrong. NaN counts as not grown.
+        grown = (energy_after > energy_before + allowance(scene, energy_before, tolerance)) & (outcome.status != FAILED)
         codes = jnp.array([int(status) for status in LOSSES])
         left_domain = Status.JAMMED if kind.loss is None else codes[kind.loss(scene, state)]
         return jnp.where(grown, int(Status.UNRESOLVED), statuses(outcome.status, left_domain))

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.hybrid import AbstractBatchedMode
@@ -119,15 +119,6 @@ BALANCED = 1e4
 def allowance(scene: Scene[Any], energy: Any, tolerance: Any) -> Any:
     """The allowed error [J] of an energy of the given size [J] at a tolerance."""
     return BALANCED * tolerance * (abs(energy) + scene.body.mass * scene.gravity * scene.body.size)
-
-
-def has_grown(
-    scene: Scene[Any], before: Float[Array, "..."], after: Float[Array, "..."], tolerance: float | Float[Array, "..."]
-) -> Bool[Array, "..."]:
-    """Whether the energy [J] at the end of a run is greater than at its start, by more than the tolerance allows: then the
-    arena's heights, the law of friction or the integration is wrong. NaN counts as not grown.
-    """
-    return jnp.asarray(after > before + allowance(scene, before, tolerance))
 
 
 def if_balanced(run: Any, tolerance: float | Float[Array, ""]) -> Any:

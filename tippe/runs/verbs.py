@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.integration import Settings, explicit_tableau
-from nonholonomic.integration.checks import tolerance_bound
+from nonholonomic.integration.checks import run_bounds
 from nonholonomic.progress import status_line
 from nonholonomic.runs import LyapunovExponent, TableJob, explore_model, exponent_of_model, time_of_event
-from nonholonomic.validation import is_traced, require, require_kind
+from nonholonomic.validation import is_traced, require_all, require_kind
 from nonholonomic.views import Page
 from nonholonomic.warning import warn
 
@@ -290,8 +290,7 @@ def lyapunov_exponent(
     """
     require_kind(scene, "scene", Scene)
     require_kind(launch, "launch", Launch)
-    require(t1, "t1", above=0.0)
-    tolerance_bound(tolerance).require()
+    require_all(run_bounds(t1, tolerance))
     settings = Settings(tolerance, solver)
     explicit_tableau(settings.for_lanes)
     shapes = {np.shape(leaf) for leaf in jax.tree.leaves((scene, launch))} - {()}

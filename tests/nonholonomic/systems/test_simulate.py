@@ -141,6 +141,21 @@ def states_of(height):
     return simulate(Hybrid([Ball()]), jnp.stack([height, 0.0 * height, 0.0 * height]), 1.5, times=TIMES)
 
 
+class Capped(AbstractMode):
+    """A decay, at first at a constant rate if there is a cap."""
+
+    restart: float = jnp.inf
+
+    def field(self, t, y):
+        return -jnp.minimum(y, self.restart)
+
+
+def test_a_number_of_the_system_may_be_infinite_whatever_its_name():
+    """Only the numbers of the start must be finite."""
+    state = jax.jit(lambda y: simulate(Hybrid([Capped()]), [y], 1.0, times=[1.0]).state)(1.0)
+    assert_close(state, np.exp([[-1.0]]), rtol=1e-8)
+
+
 def test_a_misspelt_method_is_reported():
     """Only where the class does not define the method itself, and no other method calls this one."""
     force = broken(Sleigh, forces=lambda self, t, q, rate: -rate)
