@@ -1,6 +1,7 @@
 """The result of a fit: estimates, errors, undetermined combinations, and the outcome of every start."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -24,7 +25,7 @@ from .problem import Problem
 from .profile import Profile, profiled
 from .refinement import Minima
 from .shape import Minimum, minima_of, remarks, unsearched
-from .verdict import CLOSE, SAME, Evidence, FitWarning, Verdict, judge
+from .verdict import CLOSE, SAME, FitWarning, Verdict, judge
 
 #: The most likely value is stated where it is farther from the estimate than this part of a standard error.
 NOTICEABLE = 0.1
@@ -266,29 +267,19 @@ def summarise(
     )
     slopes = problem.slopes(optimum)
     covariance = distribution.covariance_of_values(problem, slopes)
-    numbers = (
-        measurements.value,
-        measurements.error,
-        linearised.prediction[best],
-        linearised.residual[best],
-        measurements.upper,
-    )
+    prediction, residual = linearised.prediction[best], linearised.residual[best]
+    numbers = (measurements.value, measurements.error, prediction, residual, measurements.upper)
     table = zip(labels, *(np.asarray(part).tolist() for part in numbers), strict=True)
     combinations = identifiability(problem, likely, slopes, linearised.information[best])
     priors, limits = linearised.prior.shape[-1], int(np.sum(np.asarray(measurements.censored)))
     degrees = len(labels) + priors - len(names)
     # Where the weights hold, a search by slopes that got stuck on a stair does not matter.
     status = "converged" if distribution.kind == "weights" else statuses[best]
-    evidence = Evidence(
-        status,
-        agreement(ends.coordinates, deviances, by_slopes, best),
-        len(deviances),
-        combinations.unseen,
-        distribution.kind != "none",
-        sample.effective,
-        sample.k,
-        *_shape(explorer, sample, distribution, by_slopes),
-    )
+    agree = agreement(ends.coordinates, deviances, by_slopes, best)
+    minima, concerns, notes = _shape(explorer, sample, distribution, by_slopes)
+    search = (agree, len(deviances), combinations.unseen, concerns, notes, sample.effective, sample.k, minima)
+    explored = Verdict(math.nan, (), *search)
+    trusted = distribution.kind != "none"
     with np.errstate(invalid="ignore"):
         slope_covariance = np.where(by_slopes == 0.0, 0.0, by_slopes * np.outer(slopes, slopes))
 
@@ -310,7 +301,7 @@ def summarise(
         ends=by_name(values.T),
         end_deviances=deviances,
         statuses=statuses,
-        verdict=judge(measurements, linearised.prediction[best], linearised.residual[best], degrees - limits, evidence),
+        verdict=judge(measurements, prediction, residual, degrees - limits, status, trusted, explored),
         coordinates=distribution.estimate,
         coordinate_covariance=distribution.covariance,
         distribution=distribution,

@@ -97,33 +97,14 @@ class Verdict(NamedTuple):
         return "\n".join([*filter(None, lines), *(f"  BUT {concern}" for concern in self.concerns)])
 
 
-class Evidence(NamedTuple):
-    """What the exploration of the likelihood tells about a fit.
-
-    - `status`: status of the fit; `agree`, `starts`: as for `Verdict`; `undetermined`: combinations of parameters, in
-      words.
-    - `trusted`: whether the weights can be trusted; `effective`, `k`, `minima`: as for `Verdict`.
-    - `concerns`, `notes`: remarks on the shape of the likelihood.
-    """
-
-    status: str
-    agree: int
-    starts: int
-    undetermined: tuple[str, ...]
-    trusted: bool
-    effective: float
-    k: float
-    minima: tuple[Any, ...]
-    concerns: tuple[str, ...]
-    notes: tuple[str, ...]
-
-
 def judge(
     measurements: Measurements,
     prediction: Float[np.ndarray, " n"],
     residual: Float[np.ndarray, " n"],
     degrees: int,
-    evidence: Evidence,
+    status: str,
+    trusted: bool,
+    explored: Verdict,
 ) -> Verdict:
     """Judge a fit.
 
@@ -131,7 +112,8 @@ def judge(
 
     - `measurements`, `prediction`, `residual`: (n,).
     - `degrees`: measurements and priors less unknowns, without limits.
-    - `evidence`: an `Evidence`.
+    - `status`: status of the fit; `trusted`: whether the weights can be trusted.
+    - `explored`: the `Verdict` by the exploration alone, whose concerns are about the shape of the likelihood.
 
     **Returns:** a `Verdict`.
     """
@@ -144,7 +126,7 @@ def judge(
     series = tuple(runs for runs in map(runs_of_signs, parts) if runs.count > 1)
     p_values = [runs_of_signs(part).p_value for part in parts if np.any(np.abs(part) > NEGLIGIBLE)]
     limits = np.abs(residual[~exact])
-    concerns = _concerns_of_search(evidence)
+    concerns = _concerns_of_search(status, trusted, explored)
     if not np.all(np.isfinite(prediction[exact])):
         missing = int(np.sum(~np.isfinite(prediction[exact])))
         concerns.append(f"the model has no prediction for {missing} measurements: its run ends earlier, or fails")
@@ -161,33 +143,22 @@ def judge(
             f"the residuals keep their sign for too long (p = {p_trend:.2g}): the model misses a trend, or "
             "errors are correlated"
         )
-    concerns += [*evidence.concerns, *(f"the data do not determine {words}" for words in evidence.undetermined)]
-    return Verdict(
-        p_value,
-        series,
-        evidence.agree,
-        evidence.starts,
-        evidence.undetermined,
-        tuple(concerns),
-        evidence.notes,
-        evidence.effective,
-        evidence.k,
-        evidence.minima,
-    )
+    concerns += [*explored.concerns, *(f"the data do not determine {words}" for words in explored.undetermined)]
+    return explored._replace(p_value=p_value, series=series, concerns=tuple(concerns))
 
 
-def _concerns_of_search(evidence: Evidence) -> list[str]:
+def _concerns_of_search(status: str, trusted: bool, explored: Verdict) -> list[str]:
     """The concerns about the search and the weights."""
     concerns = []
-    if evidence.status != "converged":
+    if status != "converged":
         concerns.append("the fit has not converged: allow more steps (max_steps), or start closer")
-    if not evidence.trusted:
+    if not trusted:
         concerns.append(
-            f"there are no errors and intervals: the exploration ended with {evidence.effective:.0f} effective draws "
-            f"(k-hat {evidence.k:.2f}); start closer, give bounds or priors, or fix numbers"
+            f"there are no errors and intervals: the exploration ended with {explored.effective:.0f} effective draws "
+            f"(k-hat {explored.k:.2f}); start closer, give bounds or priors, or fix numbers"
         )
-    if len(evidence.minima) > 1:
-        concerns.append(f"the data allow {len(evidence.minima)} minima: " + "; ".join(map(str, evidence.minima)))
+    if len(explored.minima) > 1:
+        concerns.append(f"the data allow {len(explored.minima)} minima: " + "; ".join(map(str, explored.minima)))
     return concerns
 
 
