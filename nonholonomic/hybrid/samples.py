@@ -15,11 +15,11 @@ from ..derivatives.differentiable import by_active, tangent_along
 from ..derivatives.sampling import AbstractSampling, ProblemSpec, solve_for_samples
 from ..integration import Settings
 from ..integration.status import REACHED_END
-from .ensemble import HybridOutcome, at_start, traced_rounds
+from .ensemble import at_start, traced_rounds
 from .mode import AbstractBatchedMode, over_cells
 from .saltation import variational_modes, variational_start
 from .sampled_adjoint import hybrid_samples_pulled_back
-from .sampled_rounds import Recorded, output_rows, program_groups, sampled_rounds
+from .sampled_rounds import output_rows, program_groups, sampled_rounds
 from .transition_rows import weighted
 
 #: From some modules (scene, launch, ...), the tolerance and a number of cells to the modes, the index of the first mode
@@ -170,9 +170,8 @@ class HybridSampling(AbstractSampling):
     counters: int = eqx.field(static=True)
 
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> HybridSamples:
-        numbers, horizon, settings, spec = self._parts(leaves)
-        built = spec.built(numbers, settings.tolerance, cells)
-        return _sampled_with_tangents(built, (), horizon, cells, settings, self.counters)[0]
+        build, numbers, horizon, settings = self._builder(leaves)
+        return _sampled_with_tangents(build(numbers, cells), (), horizon, cells, settings, self.counters)[0]
 
     def value_and_tangents(
         self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
@@ -232,19 +231,14 @@ class HybridSampling(AbstractSampling):
 
     def _builder(self, leaves: tuple[Array, ...]) -> tuple[Callable[..., Any], tuple[Array, ...], Any, Settings]:
         """A function (the modules' numbers, cells) -> modes and start; the numbers; times and horizon; the settings."""
-        numbers, horizon, settings, spec = self._parts(leaves)
+        numbers, (times, t1, tolerance), spec = self._sorted(leaves)
+        # One tolerance serves the whole ensemble: the smallest of the batch.
+        settings = spec.settings.with_tolerance(jnp.min(tolerance))
 
         def build(numbers: tuple[Array, ...], cells: int | None) -> Any:
             return spec.built(numbers, settings.tolerance, cells)
 
-        return build, numbers, horizon, settings
-
-    def _parts(self, leaves: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, Array], Settings, ProblemSpec]:
-        """The modules' numbers; times and horizon; the settings; and the spec."""
-        numbers, (times, t1, tolerance), spec = self._sorted(leaves)
-        # One tolerance serves the whole ensemble: the smallest of the batch.
-        settings = spec.settings.with_tolerance(jnp.min(tolerance))
-        return numbers, (times if times.ndim == 1 else times.T, t1), settings, spec
+        return build, numbers, (times if times.ndim == 1 else times.T, t1), settings
 
 
 def _product(slope: HybridSamples, cotangents: HybridSamples) -> Float[Array, " cells"]:
@@ -286,25 +280,13 @@ def _sampled_with_tangents(
 ) -> tuple[HybridSamples, list[HybridSamples]]:
     """The runs, and their derivative along each tangent."""
     (modes, first, state), (times, t1) = built, horizon
-    size = state.shape[1]
-    times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), size))
+    size, runs = state.shape
+    times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), runs))
     variational = variational_modes(modes, tangents, settings.tolerance, False)
     start = at_start(jnp, first, variational_start(state, tangents), cells, counters + 1)
-    rounds = sampled_rounds(variational, start, times, jnp.broadcast_to(t1, (size,)), settings, 1 + len(tangents))
+    rounds = sampled_rounds(variational, start, times, jnp.broadcast_to(t1, (runs,)), settings, 1 + len(tangents))
     ended, output = traced_rounds(*rounds)
     rows, variations = output_rows(variational, output)
-    return _as_samples(ended, output, rows, variations, times, len(state))
-
-
-def _as_samples(
-    ended: HybridOutcome[Array],
-    output: Recorded,
-    rows: Float[Array, "shown times cells"],
-    variations: Float[Array, "tangents shown times cells"],
-    times: Float[Array, "times cells"],
-    size: int,
-) -> tuple[HybridSamples, list[HybridSamples]]:
-    """The samples, and their derivative along each tangent."""
     grazes = ended.counts[-1] > 0
     invalid = jnp.where(times > output.grazing_time, jnp.nan, 0.0)
     counters_and_codes = (ended.mode, ended.status, ended.steps, ended.rejected, ended.counts[:-1])
