@@ -73,11 +73,6 @@ class Pool(NamedTuple):
         """The numbers of the points with the greatest density, the best first."""
         return np.argsort(-self.log_density)[:count]
 
-    @property
-    def deviance(self) -> Float[np.ndarray, " n"]:
-        """-2 log likelihood of every point, with errors as guessed."""
-        return -2.0 * np.sum(self.groups, axis=1)
-
     def log_weights(self, progress: float) -> Float[np.ndarray, " n"]:
         """Log weights of the points. With `progress` from 0 to 1, the powers of the measurements grow from 0 to 1, and the
         region of the search loses its weight; from 1 to 2, guessed errors become unknown errors."""
@@ -142,20 +137,21 @@ class Explorer(NamedTuple):
         """
         with Progress(ROUNDS, "round", shown=progress) as display:
             display.begin()
-            for turn in range(ROUNDS + 1):
-                result = Weighted.of(pool)
-                if turn == ROUNDS or (turn > 0 and result.enough):
-                    return result
-                pool = self.extended(pool, *self._proposed(pool, minima))
+            current = Weighted.of(pool)
+            for _ in range(ROUNDS):
+                pool = self.extended(pool, *self._proposed(current, minima))
                 display.advance(1)
-        raise AssertionError
+                current = Weighted.of(pool)
+                if current.enough:
+                    break
+        return current
 
-    def _proposed(self, pool: Pool, minima: Mixture | None) -> tuple[np.ndarray, Mixture]:
+    def _proposed(self, current: "Weighted", minima: Mixture | None) -> tuple[np.ndarray, Mixture]:
         """The points of the next round, and the mixture they are drawn from."""
+        pool = current.pool
         share = 0.6 if len(pool.proposals) == 1 else KEPT
         mixture = self.proposal(pool, minima, share)
         # The last round draws what is missing, with some to spare.
-        current = Weighted.of(pool)
         rate = current.effective / max(len(current.weights) - pool.proposals[0][0], 1)
         missing = 1.25 * (ENOUGH - current.effective) / max(rate, 1e-3) if len(pool.proposals) > 1 else np.inf
         count = self.rows if current.k >= MOST_K else int(np.clip(missing, self.rows // 8, self.rows))
@@ -213,13 +209,6 @@ class Weighted(NamedTuple):
         return len(self.weights)
 
 
-def normalised(log_weights: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Weights with the sum 1."""
-    logs = np.where(np.isfinite(log_weights), log_weights, -np.inf)
-    weights = np.exp(logs - np.max(logs))
-    return weights / np.sum(weights)
-
-
 def effective_number(weights: Float[np.ndarray, " n"]) -> float:
     """Number of independent draws that are worth as much as weighted ones (Kish)."""
     return float(1.0 / np.sum(weights**2))
@@ -231,7 +220,9 @@ def tempered_weights(pool: Pool, least: float, power: float) -> Float[np.ndarray
     def weights_at(progress: float) -> Float[np.ndarray, " n"]:
         # The density is flatter, the distribution of the points is what it is.
         logs = power * (pool.log_weights(progress) + pool.log_proposal) - pool.log_proposal
-        return normalised(logs)
+        logs = np.where(np.isfinite(logs), logs, -np.inf)
+        weights = np.exp(logs - np.max(logs))
+        return weights / np.sum(weights)
 
     weights, low, high = weights_at(2.0), 0.0, 2.0
     if effective_number(weights) >= least:

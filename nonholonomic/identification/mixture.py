@@ -33,19 +33,16 @@ class Mixture(NamedTuple):
         stretch = np.sqrt(FREEDOM / random.chisquare(FREEDOM, count))
         return self.centres[which] + np.einsum("nij,nj->ni", self.roots[which], normal) * stretch[:, None]
 
-    def log_densities(self, points: Float[np.ndarray, "n unknowns"]) -> Float[np.ndarray, "components n"]:
-        """The log density of each component, times its share."""
+    def log_density(self, points: Float[np.ndarray, "n unknowns"]) -> Float[np.ndarray, " n"]:
+        """The log density of the mixture."""
         size = points.shape[1]
         constant = (
             math.lgamma(0.5 * (FREEDOM + size)) - math.lgamma(0.5 * FREEDOM) - 0.5 * size * math.log(FREEDOM * math.pi)
         )
         squares, log_volumes = _squared_distances(points, self.centres, self.roots)
         constants = np.log(self.shares) + constant - log_volumes
-        return constants[:, None] - 0.5 * (FREEDOM + size) * np.log1p(squares / FREEDOM)
-
-    def log_density(self, points: Float[np.ndarray, "n unknowns"]) -> Float[np.ndarray, " n"]:
-        """The log density of the mixture."""
-        return np.logaddexp.reduce(self.log_densities(points), axis=0)
+        logs = constants[:, None] - 0.5 * (FREEDOM + size) * np.log1p(squares / FREEDOM)
+        return np.logaddexp.reduce(logs, axis=0)
 
     def joined(self, other: "Mixture", share: float) -> "Mixture":
         """This mixture, and another one that gets a share of the draws."""
