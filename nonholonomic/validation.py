@@ -28,6 +28,14 @@ from .warning import is_called_by_a_user, warn
 #: Addition to the message about an angle that may be in degrees.
 IN_DEGREES = "; angles are in radians: did you mean np.radians({})?"
 
+#: How a number is compared with its bounds `above`, `at_least`, `below` and `at_most`, and in words.
+COMPARISONS = (
+    (operator.gt, "greater than"),
+    (operator.ge, "at least"),
+    (operator.lt, "less than"),
+    (operator.le, "at most"),
+)
+
 #: What a message says about a user's function after `jax.errors.JAXTypeError`.
 UNTRACEABLE = (
     "cannot be traced by JAX: write it with jax.numpy in place of numpy and math, and with jnp.where in place of `if`"
@@ -119,13 +127,7 @@ def require(
     finite = np.isfinite(numbers)
     if not np.all(finite):
         raise ValueError(f"{name} = {_first(numbers, finite)} must be finite{remark}")
-    bounds = (
-        (above, np.greater, "greater than"),
-        (at_least, np.greater_equal, "at least"),
-        (below, np.less, "less than"),
-        (at_most, np.less_equal, "at most"),
-    )
-    for bound, holds, words in bounds:
+    for bound, (holds, words) in zip((above, at_least, below, at_most), COMPARISONS, strict=True):
         if bound is None or is_traced(bound):
             continue
         numbers, limits = np.broadcast_arrays(numbers, np.asarray(bound, dtype=float))
@@ -286,13 +288,8 @@ class Bound(NamedTuple):
     def holds(self) -> Bool[Array, "..."]:
         """Whether the number is legal, as an array of the program."""
         conditions = [jnp.isfinite(self.value)]
-        limits = (
-            (operator.gt, self.above),
-            (operator.ge, self.at_least),
-            (operator.lt, self.below),
-            (operator.le, self.at_most),
-        )
-        conditions += [holds(self.value, limit) for holds, limit in limits if limit is not None]
+        limits = zip((self.above, self.at_least, self.below, self.at_most), COMPARISONS, strict=True)
+        conditions += [holds(self.value, limit) for limit, (holds, _) in limits if limit is not None]
         return functools.reduce(jnp.logical_and, conditions)
 
 
