@@ -62,10 +62,7 @@ def solve_hybrid_with_tangents(
     start, n_blocks = np.asarray(variational_start(jnp.asarray(state), tangents)), 1 + len(tangents)
     ended = solve_hybrid(variational, mode, start, t1, cells, settings, counters=counters + 1, n_blocks=n_blocks)
     slopes = [np.asarray(_slopes(varied_mode, jnp.asarray(ended.state))) for varied_mode in variational]
-    event_time = ended.crossing_time if ends_on_event else np.broadcast_to(t1, len(mode))
-    return _without_variations(ended, len(state)), _where_defined(
-        np, ended, _of_mode(np, ended, slopes), event_time, ends_on_event
-    )
+    return _without_variations(ended, len(state)), _where_defined(np, ended, slopes, t1, ends_on_event)
 
 
 def traced_solve_hybrid_with_tangents(
@@ -97,9 +94,8 @@ def traced_solve_hybrid_with_tangents(
         ended = traced_solve_hybrid(
             variational, mode, start, t1, cells, settings, counters=counters + 1, n_blocks=n_blocks
         )
-        slopes = _of_mode(jnp, ended, [varied_mode.slopes(ended.state) for varied_mode in variational])
-        event_time = ended.crossing_time if ends_on_event else jnp.broadcast_to(t1, mode.shape)
-        mask = _where_defined(jnp, ended, slopes, event_time, ends_on_event)
+        slopes = [varied_mode.slopes(ended.state) for varied_mode in variational]
+        mask = _where_defined(jnp, ended, slopes, t1, ends_on_event)
         return (_without_variations(ended, len(state)), mask.grazing), list(mask.slopes)
 
     (outcome, grazing), slopes = in_groups(run, tangents)
@@ -109,26 +105,12 @@ def traced_solve_hybrid_with_tangents(
 def _where_defined(
     xp: Any,
     ended: HybridOutcome[Numbers],
-    slopes: Float[Numbers, "tangents cells"],
-    event_time: Float[Numbers, " cells"],
+    slopes: list[Float[Numbers, "tangents cells"]],
+    t1: Any,
     ends_on_event: bool,
 ) -> Slopes[Numbers]:
-    """The derivatives of the times of events, where these happened and the derivatives have correct digits."""
-    # An event at the start has a fixed time, whatever the tangent.
-    has_event = xp.isfinite(event_time) & (event_time > 0.0)
-    # With its variations a run takes other steps: where it does not reach the event, it has no derivative.
-    arrived = ended.status == (CROSSED if ends_on_event else REACHED_END)
-    grazing = has_event & ((ended.counts[-1] > 0) | ~arrived)
-    return Slopes(xp.where(has_event, xp.where(grazing, xp.nan, slopes), 0.0), grazing)
-
-
-def _without_variations(ended: HybridOutcome[Numbers], size: int) -> HybridOutcome[Numbers]:
-    """A hybrid outcome without its variations."""
-    return ended._replace(state=ended.state[:size], counts=ended.counts[:-1])
-
-
-def _of_mode(xp: Any, ended: HybridOutcome[Numbers], slopes: list[Float[Numbers, "tangents cells"]]) -> Any:
-    """Select, for each cell, the derivatives of its mode.
+    """The derivatives of the times of events, of each cell by its mode, where the events happened and the derivatives have
+    correct digits.
 
     A run that has ended between two modes is in neither. Its event is the end of the previous mode, whose variation is
     the last row.
@@ -136,9 +118,18 @@ def _of_mode(xp: Any, ended: HybridOutcome[Numbers], slopes: list[Float[Numbers,
     of_cells = xp.reshape(ended.state, (1 + len(slopes[0]), -1, len(ended.mode)))[1:, -1]
     for number, of_mode in enumerate(slopes):
         of_cells = xp.where(ended.mode == number, of_mode, of_cells)
-    return of_cells
+    event_time = ended.crossing_time if ends_on_event else xp.broadcast_to(t1, ended.mode.shape)
+    # An event at the start has a fixed time, whatever the tangent.
+    has_event = xp.isfinite(event_time) & (event_time > 0.0)
+    # With its variations a run takes other steps: where it does not reach the event, it has no derivative.
+    arrived = ended.status == (CROSSED if ends_on_event else REACHED_END)
+    grazing = has_event & ((ended.counts[-1] > 0) | ~arrived)
+    return Slopes(xp.where(has_event, xp.where(grazing, xp.nan, of_cells), 0.0), grazing)
 
 
-@eqx.filter_jit
-def _slopes(variational: VariationalMode, state: Float[Array, "components cells"]) -> Float[Array, "tangents cells"]:
-    return variational.slopes(state)
+def _without_variations(ended: HybridOutcome[Numbers], size: int) -> HybridOutcome[Numbers]:
+    """A hybrid outcome without its variations."""
+    return ended._replace(state=ended.state[:size], counts=ended.counts[:-1])
+
+
+_slopes = eqx.filter_jit(VariationalMode.slopes)
