@@ -90,7 +90,7 @@ def page(
     parts = {"TITLE": html.escape(title), "HEIGHT": str(height), "ABOVE": above, "BELOW": below, "VIEW": ""}
     if stages:
         parts["VIEW"] = "\n".join([_view(stages, speed, autoplay), *scripts])
-    page = _template("page.html")
+    page = template("page.html")
     for name, text in parts.items():
         page = page.replace(f"[{name}]", text)
     return Page(page)
@@ -130,7 +130,8 @@ def _safe(text: str) -> str:
     return text.replace("</", "<\\/")
 
 
-def _template(name: str) -> str:
+def template(name: str) -> str:
+    """The text of a file of this folder, such as a part of a page."""
     return files("nonholonomic.views").joinpath(name).read_text(encoding="utf-8")
 
 
@@ -154,7 +155,7 @@ def _view(stages: list[Stage], speed: float, autoplay: bool) -> str:
             json_script("facts", facts),
             data_script("floats", numbers.floats),
             data_script("whole", numbers.whole),
-            *(script(_template(name)) for name in SCRIPTS),
+            *(script(template(name)) for name in SCRIPTS),
         ]
     )
 

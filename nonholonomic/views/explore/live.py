@@ -2,23 +2,20 @@
 
 import json
 from collections.abc import Callable, Mapping
-from importlib.resources import files
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from ...integration.status import Status
-from ..page import Page, page, script
+from ..page import Page, page, script, template
 from ..stage import Stage
 from .frame import Frame
 from .hybrid_simulator import HybridSimulator
 from .javascript import javascript
-from .simulator import Simulator
-
-Numbers = Float[Array, " numbers"]
+from .simulator import Numbers, Simulator
 
 
 class Slider(NamedTuple):
@@ -83,12 +80,12 @@ def live_page(live: LiveRun, stage: Stage, speed: float = 1.0, below: str = "") 
     """
     # The title and the warnings describe one run, but the sliders change the run.
     stage_of_live = stage._replace(title="", shows=tuple(show._replace(note="") for show in stage.shows))
-    scripts = [script(text) for text in (programs(live), _file("map.js"), _file("explore.js"))]
+    scripts = [script(text) for text in (programs(live), template("explore/map.js"), template("explore/explore.js"))]
     return page(
         [stage_of_live],
         live.title,
         speed,
-        _file("explore.html"),
+        template("explore/explore.html"),
         f'<section id="below">{below}</section>',
         scripts=scripts,
     )
@@ -111,13 +108,10 @@ def programs(live: LiveRun) -> str:
         "allowed": javascript("", live.allowed, values),
     }
     return (
-        f"window.live = {{{', '.join(f'{name}: {text}' for name, text in parts.items())}}};\n{_file('integrator.js')}"
+        f"window.live = {{{', '.join(f'{name}: {text}' for name, text in parts.items())}}};\n"
+        f"{template('explore/integrator.js')}"
     )
 
 
 def _layout(motion: Simulator | HybridSimulator, values: Numbers) -> dict[str, Any]:
     return Frame(*eqx.filter_eval_shape(lambda values: motion.read("frame", values), values)).layout()
-
-
-def _file(name: str) -> str:
-    return files("nonholonomic.views.explore").joinpath(name).read_text(encoding="utf-8")
