@@ -122,11 +122,6 @@ def finished(xp: Any, runs: HybridOutcome[Numbers]) -> HybridOutcome[Numbers]:
     return runs._replace(status=xp.where(runs.status == RUNNING, UNRESOLVED, runs.status))
 
 
-def runs_of_cells(runs: HybridOutcome[Numbers], cell: Int[Numbers, " selected"]) -> HybridOutcome[Numbers]:
-    """The runs of the cells with these indices."""
-    return HybridOutcome(*(values[..., cell] for values in runs))
-
-
 def after_solve(
     xp: Any, runs: HybridOutcome[Numbers], outcome: Outcome[Numbers], t1: Float[Numbers, " cells"]
 ) -> HybridOutcome[Numbers]:
@@ -238,7 +233,7 @@ def solve_hybrid(
             return carry
         result = program(modes[numbers[0]], selected.size, *_gathered(runs, selected, t1))
         result = jax.tree.map(lambda values: np.asarray(values)[..., : selected.size], result)
-        new = update(np, runs_of_cells(runs, selected), result, t1[selected])
+        new = update(np, HybridOutcome(*(values[..., selected] for values in runs)), result, t1[selected])
         return (HybridOutcome(*(_with(*values, selected) for values in zip(runs, new, strict=True))),)
 
     if cells == 0:

@@ -108,13 +108,10 @@ def output_rows(
     modes: tuple[VariationalMode, ...], output: Recorded
 ) -> tuple[Float[Array, "shown times cells"], Float[Array, "tangents shown times cells"]]:
     """The output rows, NaN where a sample is missing, and their variations."""
-
-    def of_mode(mode: VariationalMode, states: Float[Array, "components times"]) -> Any:
-        return mode.output_rows(states)
-
-    rows = jax.tree.map(jnp.full_like, jax.eval_shape(over_cells(of_mode, modes[0]), output.state), (jnp.nan, 0.0))
+    shapes = jax.eval_shape(over_cells(VariationalMode.output_rows, modes[0]), output.state)
+    rows = jax.tree.map(jnp.full_like, shapes, (jnp.nan, 0.0))
     for number, mode in enumerate(modes):
-        of_this = over_cells(of_mode, mode)(output.state)
+        of_this = over_cells(VariationalMode.output_rows, mode)(output.state)
         rows = jax.tree.map(functools.partial(jnp.where, output.number == number), of_this, rows)
     if output.between is not None:
         between = (output.between[0], output.between[1:])

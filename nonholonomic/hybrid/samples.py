@@ -259,15 +259,13 @@ def _backward(sampling: HybridSampling, *leaves: Array) -> list[Any]:
     build, numbers, _, _ = sampling._builder(leaves)
     modes, _, state = build(numbers, 1)
 
-    def shown(mode: AbstractBatchedMode, states: Float[Array, "components times"]) -> Float[Array, "shown times"]:
-        return mode.shown(states)
-
     def of_mode(mode: AbstractBatchedMode) -> Any:
         arrays, static = eqx.partition(mode, eqx.is_inexact_array)
 
         def values(arrays: Any, state: Float[Array, "components cells"]) -> Any:
             mode = eqx.combine(arrays, static)
-            return mode.problem(state).field(jnp.zeros_like(state[0]), state), over_cells(shown, mode)(state[:, None])
+            shown = over_cells(lambda mode, states: mode.shown(states), mode)(state[:, None])
+            return mode.problem(state).field(jnp.zeros_like(state[0]), state), shown
 
         results, pull = jax.vjp(values, arrays, state)
         return pull(jax.tree.map(jnp.ones_like, results))
