@@ -106,7 +106,7 @@ def minimise(
             improves = ~done & (gain > 0.0)
             damping = np.where(improves, np.where(gain > GOOD * predicted_gain, EASED, 1.0), HARDENED) * damping
             coordinates[improves] = trial_coordinates[improves]
-            current = _Fit(*(_chosen(improves, new, old) for new, old in zip(trial, current, strict=True)))
+            current = _Fit(*(chosen(improves, new, old) for new, old in zip(trial, current, strict=True)))
             history.append(current.deviance)
             steps[~done] = step
             remaining_gain = _promise(current)
@@ -134,7 +134,7 @@ class _Fit(NamedTuple):
         return cls(deviance, linearised.whole_residual, linearised.whole_jacobian[..., moving])
 
 
-def _chosen(improves: Bool[np.ndarray, " rows"], new: np.ndarray, old: np.ndarray) -> np.ndarray:
+def chosen(improves: Bool[np.ndarray, " rows"], new: np.ndarray, old: np.ndarray) -> np.ndarray:
     """The new rows where they are better, the old ones elsewhere."""
     return np.where(improves.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
 

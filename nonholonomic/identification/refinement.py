@@ -1,5 +1,6 @@
 """Refine candidates to minima by least squares, all together."""
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -7,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .identifiability import coordinate_covariance
-from .levenberg_marquardt import Ends, minimise
+from .levenberg_marquardt import Ends, chosen, minimise
 from .likelihood import Measurements, down_weighted, estimated_errors
 from .mixture import Mixture
 from .problem import Linearised, Problem, linearise
@@ -60,11 +61,11 @@ class Minima(NamedTuple):
         rows = len(self.starts)
         order = np.argsort(np.concatenate([self.deviance, other.deviance]), kind="stable")[:rows]
 
-        def chosen(mine: np.ndarray, others: np.ndarray) -> np.ndarray:
+        def in_order(mine: np.ndarray, others: np.ndarray) -> np.ndarray:
             return np.concatenate([mine, others])[order]
 
         mine, others = ((m.starts, m.coordinates, m.converged, m.linearised) for m in (self, other))
-        starts, coordinates, converged, linearised = jax.tree.map(chosen, mine, others)
+        starts, coordinates, converged, linearised = jax.tree.map(in_order, mine, others)
         return Minima(starts, coordinates, converged, linearised, self.measurements)
 
     def between(self) -> Float[np.ndarray, "rows unknowns"]:
@@ -165,8 +166,5 @@ def _fitted(problem: Problem, starts: Any, measurements: Measurements, options: 
     ends_by_parts = minimise(problem, coordinates, measurements, max_steps=2 * steps, progress=progress)
     by_parts = linearise(problem, ends_by_parts.coordinates, measurements)
     improves = by_parts.deviance < at_ends.deviance
-
-    def chosen(new: Any, old: Any) -> Any:
-        return np.where(improves.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
-
-    return jax.tree.map(chosen, ends_by_parts, ends), jax.tree.map(chosen, by_parts, at_ends)
+    better = functools.partial(chosen, improves)
+    return jax.tree.map(better, ends_by_parts, ends), jax.tree.map(better, by_parts, at_ends)
