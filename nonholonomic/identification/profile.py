@@ -59,10 +59,8 @@ def _searched(
 
     The other coordinates are drawn around their regression on the held one, then around the best of the points so far.
     """
-    estimate, covariance = (
-        fit.coordinates,
-        np.where(np.isfinite(fit.coordinate_covariance), fit.coordinate_covariance, 0.0),
-    )
+    estimate = fit.coordinates
+    covariance = np.where(np.isfinite(fit.coordinate_covariance), fit.coordinate_covariance, 0.0)
     random, size, points = np.random.default_rng(0), len(estimate), len(held)
     others = np.arange(size) != k
     slope = covariance[others, k] / covariance[k, k] if covariance[k, k] > 0.0 else np.zeros(size - 1)

@@ -98,11 +98,12 @@ def write_animation(stages: list[Stage], path: Any, times: Times | None, speed: 
     kind = writers.get(Path(path).suffix)
     if kind is None or not kind.isAvailable():
         raise ValueError(f"path = {str(path)!r} must end in .gif, or in .mp4 where ffmpeg is installed")
-    last = max(float(show.times[-1]) for stage in stages for show in stage.shows)
+    shows = [show for stage in stages for show in stage.shows]
+    last = max(float(show.times[-1]) for show in shows)
     rate = rate_of(Path(path).suffix, fps)
     times = frame_times(last, speed, rate) if times is None else times
     as_text = speed_as_text(times, rate)
-    labels = _labels([show for stage in stages for show in stage.shows])
+    labels = _labels(shows)
     figure = new_figure(max(8.0, 5.0 * len(stages)), 6.0)
     grid = figure.add_gridspec(2, len(stages) * len(labels), height_ratios=(3.2, 1.0))
     spaces = []
@@ -111,7 +112,6 @@ def write_animation(stages: list[Stage], path: Any, times: Times | None, speed: 
         spaces.append(
             _Space(figure.add_subplot(grid[0, columns], projection="3d", computed_zorder=False), stage, times)
         )
-    shows = [show for stage in stages for show in stage.shows]
     cursors = []
     for number, label in enumerate(labels):
         panel = figure.add_subplot(grid[1, number * len(stages) : (number + 1) * len(stages)])
@@ -211,7 +211,8 @@ class _Space:
                 for mesh in body.meshes:
                     corners = (mesh.vertices @ turn.T + body.position[index])[mesh.triangles]
                     triangles.append(corners)
-                    colours.append(_shaded(corners, mesh.colour))
+                    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+                    colours.append(_lit(normals, mesh.colour))
             for trace in filter(lambda trace: trace.shown, show.traces):
                 points = finite(trace.points[: index + 1]) + (0.0 if trace.about is None else trace.about[index])
                 points = np.where(np.linalg.norm(points - middle, axis=-1, keepdims=True) < 1.6 * reach, points, np.nan)
@@ -234,10 +235,6 @@ def _pieces(line: np.ndarray, middle: np.ndarray, reach: float) -> list[np.ndarr
         for part, mask in zip(np.split(line, cuts), np.split(in_view, cuts), strict=True)
         if mask[0] and len(part) > 1
     ]
-
-
-def _shaded(corners: Float[np.ndarray, "triangles 3 3"], colour: int) -> Float[np.ndarray, "triangles 3"]:
-    return _lit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), colour)
 
 
 def _lit(normals: Float[np.ndarray, "faces 3"], colour: int) -> Float[np.ndarray, "faces 3"]:
