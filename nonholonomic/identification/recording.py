@@ -6,21 +6,13 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..compilation.xla_cpu import greatest
 from ..text import one_line
 from ..validation import as_number, as_number_or_none, require, shown
 from ..warning import warn
 from .likelihood import Measurements
-
-#: Spacing [s] of model times for samples before the launch: so small that nothing moves.
-INSTANT = 1e-9
-
-#: Spacing [s] of times that are added to give recordings the same length.
-AT_ONCE = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -246,13 +238,3 @@ def noise(value: Float[np.ndarray, "times columns"]) -> Float[np.ndarray, " colu
         return guess or 0.1 * float(np.ptp(observed)) or 1.0
 
     return np.array([of(column) for column in value.T])
-
-
-def model_times(times: Float[Array, " times"], t0: Float[Array, ""]) -> Float[Array, " times"]:
-    """The times of the samples since the launch [s]; 0 for samples before the launch."""
-    return greatest(times - t0, INSTANT * jnp.arange(times.shape[0]))
-
-
-def lengthened(times: Float[Array, " times"], count: int) -> Float[Array, " count"]:
-    """The times, followed by additional times shortly after the last one."""
-    return jnp.concatenate([times, times[-1] + AT_ONCE * jnp.arange(1, 1 + count - len(times))])

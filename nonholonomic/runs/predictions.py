@@ -10,15 +10,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..compilation.xla_cpu import greatest
 from ..identification import AbstractRecording
 from ..identification.data import of_data
-from ..identification.recording import lengthened, model_times
 from ..integration import Settings
 from ..integration.status import Status
 from ..validation import nan_unless
 from .model import AbstractModel
 from .simulate import sampled
 from .table import first_events
+
+#: Spacing [s] of model times for samples before the launch: so small that nothing moves.
+INSTANT = 1e-9
+
+#: Spacing [s] of times that are added to give recordings the same length.
+AT_ONCE = 1e-6
 
 #: Parameters of one set of data, name -> (rows,).
 Values = dict[str, Float[Array, " rows"]]
@@ -128,7 +134,7 @@ def _lanes(sources: list[Source], values: list[Values], rows: int) -> Lanes:
         horizon: Any = in_lanes([source.data.t1 for source in sources])
     else:
         size = max(len(source.data.times) for source in sources)
-        clocks = jnp.stack([lengthened(source.data.times, size) for source in sources])
+        clocks = jnp.stack([_lengthened(source.data.times, size) for source in sources])
         clock = in_lanes([source.data.t0 for source in sources])
         horizon = (jnp.tile(clocks, (rows, 1)), moved.pop("t0", clock))
     moved.pop("t0", None)
@@ -141,6 +147,16 @@ def _lanes(sources: list[Source], values: list[Values], rows: int) -> Lanes:
     return Lanes(model, is_legal, horizon)
 
 
+def _model_times(times: Float[Array, " times"], t0: Float[Array, ""]) -> Float[Array, " times"]:
+    """The times of the samples since the launch [s]; 0 for samples before the launch."""
+    return greatest(times - t0, INSTANT * jnp.arange(times.shape[0]))
+
+
+def _lengthened(times: Float[Array, " times"], count: int) -> Float[Array, " count"]:
+    """The times, followed by additional times shortly after the last one."""
+    return jnp.concatenate([times, times[-1] + AT_ONCE * jnp.arange(1, 1 + count - len(times))])
+
+
 def _predicted(sources: list[Source], values: list[Values], rows: int, settings: Settings) -> Float[Array, "lanes ..."]:
     """The predictions in all lanes; NaN for illegal parameters, and after the end of a run."""
     data: Any = sources[0].data
@@ -149,7 +165,7 @@ def _predicted(sources: list[Source], values: list[Values], rows: int, settings:
         if not isinstance(data, AbstractRecording):
             return nan_unless(lane.is_legal, data.predicted(lane.model, lane.horizon, settings))
         # An illegal run might never end, so it ends at its start.
-        times = jnp.where(lane.is_legal, model_times(*lane.horizon), 0.0)
+        times = jnp.where(lane.is_legal, _model_times(*lane.horizon), 0.0)
         run = sampled(lane.model, data.names, times, times[-1], settings)
         columns = data.columns_of(lane.model, lane.model.read(data.names, times, run.rows, run.mode))
         return nan_unless(lane.is_legal, jnp.stack(columns, axis=-1))
