@@ -73,22 +73,21 @@ class HybridSimulator(NamedTuple):
         functions: Functions = {"first": (self.first, (values,))}
         functions |= {name: (read, (values, runs)) for name, read in self.readings.items()}
         if self.frame is not None:
-            rows = jax.eval_shape(lambda values: self._mode(values, (0,), 0).shown(self.first(values).state), values)
+            rows = jax.eval_shape(lambda values: self.start(values)[0][0].shown(self.first(values).state), values)
             functions["frame"] = (self.frame, (values, runs.mode, rows, runs.end_time))
         kinds = [self._kind(values, group, modes[group[0]], runs) for group in groups]
         return as_object(facts, functions, kinds=f"[{', '.join(kinds)}]")
-
-    def _mode(self, values: Numbers, group: tuple[int, ...], number: Any) -> Any:
-        """The mode with the given index, from a group of similar modes."""
-        modes: Any = self.start(values)[0]
-        return mode_numbered(modes, group, number)
 
     def _kind(self, values: Numbers, group: tuple[int, ...], mode: AbstractBatchedMode, runs: HybridOutcome) -> str:
         """The modes of one group: how they are integrated, and how they end."""
         t1 = jnp.full(1, self.t1)
 
+        def mode_of(values: Numbers, runs: HybridOutcome) -> Any:
+            modes: Any = self.start(values)[0]
+            return mode_numbered(modes, group, runs.mode)
+
         def begin(values: Numbers, runs: HybridOutcome) -> LaneScheduler:
-            problem = self._mode(values, group, runs.mode).problem(runs.state)
+            problem = mode_of(values, runs).problem(runs.state)
             return LaneScheduler.of(problem, _left(t1, runs), jnp.asarray(1), self.settings)
 
         def ended(constants: Any, lane: Any, runs: HybridOutcome) -> HybridOutcome:
@@ -96,25 +95,25 @@ class HybridSimulator(NamedTuple):
             return after_solve(jnp, runs, outcome, t1)
 
         def reset(values: Numbers, runs: HybridOutcome) -> HybridOutcome:
-            transition = self._mode(values, group, runs.mode).reset_map(runs.state, _left(t1, runs))
+            transition = mode_of(values, runs).reset_map(runs.state, _left(t1, runs))
             return after_reset(jnp, runs, transition, t1)
 
         def lost(values: Numbers, runs: HybridOutcome) -> Any:
-            stretch = self._mode(values, group, runs.mode).lost(runs.state)
+            stretch = mode_of(values, runs).lost(runs.state)
             return stretch.open, stretch.elapsed, stretch
 
         def hop(values: Numbers, runs: HybridOutcome, stretch: Any) -> Any:
-            state_after, following = self._mode(values, group, runs.mode).hop(stretch, _left(t1, runs))
+            state_after, following = mode_of(values, runs).hop(stretch, _left(t1, runs))
             return following.open, state_after.elapsed, following
 
         def closed(values: Numbers, runs: HybridOutcome, stretch: Any) -> HybridOutcome:
-            return after_reset(jnp, runs, self._mode(values, group, runs.mode).closed(stretch), t1)
+            return after_reset(jnp, runs, mode_of(values, runs).closed(stretch), t1)
 
         def output(values: Numbers, runs: HybridOutcome, state: Any) -> Any:
-            return self._mode(values, group, runs.mode).shown(state)
+            return mode_of(values, runs).shown(state)
 
         def between(values: Numbers, runs: HybridOutcome, stretch: Any, elapsed: Any) -> Any:
-            mode = self._mode(values, group, runs.mode)
+            mode = mode_of(values, runs)
             return mode.between(mode.motion_in(stretch), elapsed)
 
         stepper = Stepper.of(begin, (values, runs), self.settings)
