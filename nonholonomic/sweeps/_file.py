@@ -112,7 +112,7 @@ def write_file(
     """Write a table completely or not at all; an existing file is replaced.
 
     **Arguments:** `chunks`: the index of a chunk and its cells by variable, in any order; without chunks, the file only
-    describes the table. `beside`: as for `replacing`.
+    describes the table. `folder`: as for `replacing`.
 
     **Raises:** `OSError` that names the path if it cannot be written.
     """

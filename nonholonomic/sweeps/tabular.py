@@ -10,7 +10,7 @@ from ..progress import status_line
 from ..text import likely, readable_unit, require_unit, shown, text_as_html
 from ..validation import require_package
 from ..views import draw_portrait, draw_series, require_others
-from ._file import table_path
+from ._file import LONG_NAMES, table_path
 from .layout import Values
 from .table import Table
 from .tasks import versions
@@ -92,7 +92,7 @@ def run_table(
         "request": json.dumps(request, default=repr),
         "axes": json.dumps(axes),
         "versions": json.dumps(versions()),
-        "long_names": json.dumps(
+        LONG_NAMES: json.dumps(
             {"time": "time"} | {name: quantity.long_name for name, quantity in quantities.items()}, sort_keys=True
         ),
     }
