@@ -26,13 +26,7 @@ from jaxtyping import Array, Float
 
 from ..derivatives import VariationalProblem, tangents_of
 from ..derivatives.variation import where_active
-from ..integration import (
-    AbstractPassive,
-    AbstractProblem,
-    ExtendedProblem,
-    Lanes,
-    States,
-)
+from ..integration import AbstractPassive, AbstractProblem, ExtendedProblem, Lanes, States
 from .mode import AbstractBatchedMode, Transition
 
 #: An event is grazing if a relative change of the numbers by the tolerance, or an error of the state that the tolerance

@@ -37,22 +37,8 @@ MAX_BYTES_IN_MEMORY = 1 << 27
 
 
 #: Endings of files in other formats, which a table's file must not have.
-OTHER_FORMATS = (
-    ".csv",
-    ".tsv",
-    ".txt",
-    ".dat",
-    ".xls",
-    ".xlsx",
-    ".ods",
-    ".json",
-    ".npy",
-    ".npz",
-    ".mat",
-    ".pkl",
-    ".parquet",
-)
-OTHER_FORMATS += (".html", ".htm", ".png", ".jpg", ".svg", ".pdf", ".gif", ".mp4", ".zip", ".zarr")
+OTHER_FORMATS = (".csv", ".tsv", ".txt", ".dat", ".xls", ".xlsx", ".ods", ".json", ".npy", ".npz", ".mat", ".pkl")
+OTHER_FORMATS += (".parquet", ".html", ".htm", ".png", ".jpg", ".svg", ".pdf", ".gif", ".mp4", ".zip", ".zarr")
 
 
 def table_path(path: Any) -> Path:
