@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from .data import own_name
 from .unknown import Free
 
 #: Half width of the searched range of a number of a launch or a start, as a fraction of its start value: such numbers
@@ -88,7 +89,7 @@ def _ends(name: str, unknown: Free, spread: float, duration: float) -> tuple[flo
     start = float(unknown.coordinate(unknown.start))
     if all(bounded) and unknown.prior is None:
         return -5.0, 5.0
-    kind = name.split("].")[-1] if name.startswith("data[") else name
+    kind = own_name(name)
     if unknown.gaussian is not None:
         middle, reach = unknown.gaussian[0], DEVIATIONS * unknown.gaussian[1]
     elif kind == "t0" and duration > 0.0:

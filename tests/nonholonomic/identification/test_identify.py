@@ -14,6 +14,7 @@ from terminal import Terminal
 
 from nonholonomic.identification import FitWarning, Free, Measurements, identify, levenberg_marquardt
 from nonholonomic.identification.likelihood import MISSING, one_sided
+from nonholonomic.identification.region import region_of
 from nonholonomic.identification.result import coordinate_covariance
 from nonholonomic.parameters import full_name
 
@@ -214,6 +215,12 @@ def test_names_are_paths_or_their_ends():
         full_name("free", "mu", names)
     with pytest.raises(ValueError, match="must be one of"):
         full_name("free", "fset", names)
+
+
+@pytest.mark.parametrize(("name", "half_width"), [("start[0].x", 0.1), ("modes[0].start", 2.0)])
+def test_the_range_of_a_number_is_the_same_for_one_of_several_data(name, half_width):
+    free = {name: Free(2.0), f"data[0].{name}": Free(2.0)}
+    assert_close(region_of(free, 3.0, 0.0).half_width, half_width, rtol=1e-12)
 
 
 def test_the_verdict_tells_that_an_estimate_is_outside_of_the_searched_range():
