@@ -109,8 +109,8 @@ def _where_defined(
     t1: Any,
     ends_on_event: bool,
 ) -> Slopes[Numbers]:
-    """The derivatives of the times of events, of each cell by its mode, where the events happened and the derivatives have
-    correct digits.
+    """The derivatives of the times of events, of each cell by its mode, where the events happened and the derivatives
+    have correct digits.
 
     A run that has ended between two modes is in neither. Its event is the end of the previous mode, whose variation is
     the last row.
