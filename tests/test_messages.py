@@ -31,7 +31,7 @@ REFUSED = {
     ),
     "the other package's data": (
         lambda: nonholonomic.identify(TOP, stroller.Recording(RIDE, [1.0], [2.0], 0.1, "speed"), {"mu": 0.3}),
-        "scene is a tippe.Scene and must be a stroller.Scene",
+        "data: the scene of a stroller.Recording is a tippe.Scene and must be a stroller.Scene",
     ),
     "a number for a law": (
         lambda: tippe.Scene(rutstam_top(), friction=0.3),

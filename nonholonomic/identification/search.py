@@ -41,7 +41,10 @@ def search(problem: Problem, explorer: Explorer, options: Search) -> tuple[Minim
         thread.submit(compile_slopes, problem)
         pool = explorer.begin(seed)
     if not np.any(np.isfinite(pool.predictions)):
-        raise ValueError("model: no start led to finite predictions")
+        raise ValueError(
+            "no start led to finite predictions: simulate a run with the start values of `free`, which may fail, or look "
+            "whether the event happens before t1, where its function falls through zero"
+        )
     recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
     if recorded and problem.step is not None:
         # A step by differences takes as long as a round of the exploration, which also finds the minima.

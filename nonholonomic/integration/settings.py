@@ -60,8 +60,8 @@ class Settings(eqx.Module):
         """
         if isinstance(self.solver, AbstractTunedPair):
             raise ValueError(
-                f"solver = {shown(self.solver)} must have a dense output as accurate as its steps, as Dopri8() has, where "
-                "Diffrax integrates"
+                f"solver = {shown(self.solver)} is for tables and batches, and a single run must have a dense output as "
+                "accurate as its steps: leave solver out, or pass diffrax.Dopri8()"
             )
         return self.for_steps_alone
 

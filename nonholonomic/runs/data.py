@@ -169,7 +169,8 @@ class EventTimes(AbstractEventTimes):
     - `time`: measured times [s], (n,), of runs from the same start.
     - `error`: standard errors [s]: a scalar, or (n,).
     - `t1`: horizon [s] of the runs.
-    - `event`: a function `event(t, motion)`, as for `event_time`; by default the event of the system itself.
+    - `event`: a function `event(t, motion)`, whose fall through zero is the event, as for `event_time`; by default the event of
+      the system itself.
     - `input`: the input of a stroller.
 
     **Raises:** `ValueError` for shapes that do not fit.

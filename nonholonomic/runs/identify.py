@@ -1,6 +1,7 @@
 """Estimate parameters of any model from recorded runs and from times of events, and their posterior."""
 
 import dataclasses
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..identification import AbstractRecording, Free, Identification, LogDensity, Measurements
@@ -117,7 +118,9 @@ def sources_of(data: Any, expected: str) -> tuple[Any, ...]:
     """
     sources = tuple(data) if isinstance(data, list | tuple) else (data,)
     if not sources or not all(isinstance(source, AbstractRecording | AbstractEventTimes) for source in sources):
-        raise ValueError(f"data = {shown(data)} must be {expected}, or a list of them")
+        reader = "; read a file with read_recording" if isinstance(data, str | Path) else ""
+        what = shown(data).partition("\n")[0]
+        raise ValueError(f"data = {what} must be {expected}, or a list of them{reader}")
     return sources
 
 

@@ -17,8 +17,12 @@ from ..hybrid.saltation import VariationalMode, variational_start
 from ..integration import Outcome, Settings, explicit_tableau
 from ..integration.status import REACHED_END, RUNNING, Status
 from ..progress import status_line
+from ..validation import require_outside
 from .event import modes_of
 from .model import AbstractModel, check_run, model_of
+
+#: What to use instead of transformations, in the message.
+INSTEAD = "a Python loop (for tops, tippe.lyapunov_exponent takes lists) in place of vmap"
 
 #: Number of time intervals with recorded growth; half of them give the exponent and its scatter.
 STRETCHES = 32
@@ -80,7 +84,7 @@ def lyapunov_exponent(
 
     **Returns:** a `LyapunovExponent`.
 
-    **Raises:** `ValueError` for arguments outside these ranges.
+    **Raises:** `ValueError` for arguments outside these ranges, and inside transformations.
 
     **Example:** a saddle, with the exponent 2 / s.
 
@@ -98,6 +102,7 @@ def lyapunov_exponent(
 
     ```
     """
+    require_outside((system, start, t1, tolerance), "lyapunov_exponent", INSTEAD)
     model = model_of(system, start, None, input).without_event()
     check_run(model, t1, tolerance)
     settings = Settings(tolerance, solver)

@@ -62,7 +62,7 @@ class Recording(AbstractRecording):
 
     def model(self, scene: Scene) -> AbstractModel:
         """The model of the recorded ride, checked."""
-        require_kind(scene, "scene", Scene)
+        require_kind(scene, "data: the scene of a stroller.Recording", Scene)
         scene.check(self.launch)
         return RideModel.of(scene, self.launch, self.input)
 

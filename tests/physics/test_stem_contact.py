@@ -68,7 +68,9 @@ def test_a_run_that_does_not_reach_its_stem_has_no_time(run):
         _ = dataclasses.replace(run, dense=None).stem_time
     # As a run made inside a transformation, which does not know its impacts.
     assert "impacts" in str(run)
-    assert "impacts" not in str(dataclasses.replace(run, dense=None, stats={}))
+    inside = str(dataclasses.replace(run, dense=None, stats={"hops": 3}))
+    assert inside.endswith("\n  3 flights")
+    assert "impacts" not in inside
 
 
 def test_a_table_has_the_times_of_its_runs(run, table):

@@ -7,6 +7,7 @@ from close import assert_close
 
 import nonholonomic
 import stroller
+import tippe
 
 LAUNCH = stroller.Launch(place=(0.0, 0.0), heading=0.0, speed=1.5, steering=0.3)
 TIMES = np.array([0.5, 1.0, 1.5])
@@ -81,6 +82,11 @@ def test_what_cannot_be_fitted_is_refused():
         stroller.identify(scene(), "no data", {"wheelbase": 1.0}, starts=0)
     with pytest.raises(ValueError, match="must be a Recording"):
         stroller.identify(scene(), 1.0, {"wheelbase": 1.0})
+    with pytest.raises(ValueError, match="or a list of them; read a file with read_recording"):
+        stroller.identify(scene(), "ride.csv", {"wheelbase": 1.0})
+    film = tippe.Recording(tippe.Launch(0.1, 150.0), [0.0, 0.1], [0.1, 0.1], 0.01)
+    with pytest.raises(ValueError, match=r"data: the scene of a tippe\.Recording is a stroller\.Scene and must"):
+        stroller.identify(scene(), film, {"rolling": 1.0})
     with pytest.raises(ValueError, match="quantity = 'theta'"):
         stroller.Recording(LAUNCH, TIMES, np.zeros(3), 0.01, quantity="theta")
     with pytest.raises(ValueError, match="value must be of shape"):

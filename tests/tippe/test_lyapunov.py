@@ -2,11 +2,14 @@
 
 import math
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from close import assert_close
 from tops import rutstam_top
 
+import nonholonomic
 import tippe
 from tippe import steady
 
@@ -118,3 +121,11 @@ def test_bad_arguments_are_named(arguments, message):
         tippe.lyapunov_exponent(
             **({"scene": cylinder_scene(), "launch": tippe.Launch(0.1, 1.0), "t1": 1.0} | arguments)
         )
+
+
+def test_it_is_refused_inside_transformations():
+    scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3))
+    message = "lyapunov_exponent cannot be called inside jit, vmap or grad: use .* in place of vmap there"
+    for exponent in (nonholonomic.lyapunov_exponent, tippe.lyapunov_exponent):
+        with pytest.raises(ValueError, match=message):
+            jax.vmap(lambda spin, of=exponent: of(scene, tippe.Launch(0.1, spin), 1.0).exponent)(jnp.ones(2))

@@ -66,7 +66,7 @@ class Recording(AbstractRecording):
 
     def model(self, scene: Scene) -> AbstractModel:
         """The model of the recorded run."""
-        require_kind(scene, "scene", Scene)
+        require_kind(scene, "data: the scene of a tippe.Recording", Scene)
         return TopModel(scene=scene, launch=self.launch)
 
     def __check_init__(self):

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, Int
 
 from nonholonomic.hybrid import BETWEEN, MOST_ROUNDS, Segment
 from nonholonomic.integration.status import UNRESOLVED, Status
+from nonholonomic.validation import is_traced
 
 from ..modes.bouncing import height
 from ..modes.free_body import Ball, FreeBody, as_free_body, balls, energy, standing_on
@@ -182,6 +183,7 @@ class HybridTrajectory(AbstractTrajectory):
         text = super().__str__()
         # A run made inside a transformation does not know it.
         if "impact_loss" not in self.stats:
-            return text
+            hops = self.stats.get("hops")
+            return text if hops is None or is_traced(hops) or np.ndim(hops) else f"{text}\n  {int(hops)} flights"
         text = f"{text}\n  {self._flights} flights, {self.stats['impact_loss']:.3g} J lost in impacts"
         return f"{text}\n  unresolved: {self._reason()}" if self.status == Status.UNRESOLVED.word else text

@@ -12,7 +12,7 @@ from nonholonomic.integration import Settings, explicit_tableau
 from nonholonomic.integration.checks import run_bounds
 from nonholonomic.progress import status_line
 from nonholonomic.runs import LyapunovExponent, TableJob, explore_model, exponent_of_model, time_of_event
-from nonholonomic.validation import is_traced, require_all, require_kind
+from nonholonomic.validation import is_traced, require_all, require_kind, require_outside
 from nonholonomic.views import Page
 from nonholonomic.warning import warn
 
@@ -290,6 +290,7 @@ def lyapunov_exponent(
     """
     require_kind(scene, "scene", Scene)
     require_kind(launch, "launch", Launch)
+    require_outside((scene, launch, t1, tolerance), "lyapunov_exponent", "lists in the launch in place of vmap")
     require_all(run_bounds(t1, tolerance))
     settings = Settings(tolerance, solver)
     explicit_tableau(settings.for_lanes)

@@ -236,3 +236,8 @@ def test_the_verdict_tells_that_an_estimate_is_outside_of_the_searched_range():
     assert abs(far.estimates["half_life"] - near.estimates["half_life"]) < 0.3 * near.standard_errors["half_life"]
     assert [note for note in far.verdict.notes if note.startswith("half_life: outside of the range")]
     assert not [note for note in near.verdict.notes if "outside" in note]
+
+
+def test_a_model_without_predictions_is_reported():
+    with pytest.raises(ValueError, match=r"no start led to finite predictions: simulate .* falls through zero"):
+        identify(lambda numbers: jnp.nan * line(numbers), Measurements(X, ERROR), {"height": 0.5, "slope": 0.0})
