@@ -424,18 +424,18 @@ def test_in_the_browser_tops_hop_stick_and_fly_over_arenas_as_runs_do(browser, k
 @pytest.mark.parametrize("kind", ["wooden", "bouncing"])
 def test_the_browser_flies_as_the_table_does(browser, kind):
     if kind == "wooden":
-        scene, launch, mu = tippe.presets.classroom(), tippe.Launch(0.1, 199.0), (0.05, 0.8)
+        scene, launch, mu, t1 = tippe.presets.classroom(), tippe.Launch(0.1, 199.0), (0.05, 0.8), 2.5
     else:
         scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3), contact="hybrid", restitution=0.6)
-        launch, mu = tippe.Launch(0.1, 199.0), (0.1, 1.0)
+        launch, mu, t1 = tippe.Launch(0.1, 199.0), (0.1, 1.0), 5.0
     ranges = {"theta": (0.03, 0.6), "spin": (100.0, 280.0), "mu": mu}
     rng, counts = np.random.default_rng(3), {"theta": 5, "spin": 5, "mu": 2}
     grid = {name: np.sort(rng.uniform(*ends, counts[name])) for name, ends in ranges.items()}
-    table = table_of(scene, launch, grid, 5.0)
+    table = table_of(scene, launch, grid, t1)
     theta, mu, spin = (values.ravel() for values in np.meshgrid(grid["theta"], grid["mu"], grid["spin"], indexing="ij"))
     runs = json.dumps(np.stack([theta, spin, mu], axis=-1).tolist())
     browser.get("about:blank")
-    script = f"""{programs(page_of_launch(TopModel(scene=scene, launch=launch), ranges, 5.0))}
+    script = f"""{programs(page_of_launch(TopModel(scene=scene, launch=launch), ranges, t1))}
         const asks = integrator(live.answer), at = live.answer.runs, text = (x) => Number.isFinite(x) ? x : String(x);
         return {runs}.map((values) => {{
           const runs = asks.run(values);
@@ -444,7 +444,7 @@ def test_the_browser_flies_as_the_table_does(browser, kind):
     status, time, end, hops = np.array(browser.execute_script(script), dtype=float).T
     assert [tippe.Status(int(code)).word for code in status] == list(np.ravel(table.status))
     # Through hundreds of bounces even round-off grows: where tables depend on the tolerance as much, no digit is certain.
-    fine_table = tippe.inversion_table(scene, **grid, t1=5.0, tolerance=0.1 * TOLERANCE, progress=False)
+    fine_table = tippe.inversion_table(scene, **grid, t1=t1, tolerance=0.1 * TOLERANCE, progress=False)
     for in_page, *in_tables in ((time, table.time, fine_table.time), (end, table.end_time, fine_table.end_time)):
         finite = np.isfinite(in_page)
         in_page, at_tolerance, with_less = (np.ravel(values)[finite] for values in (in_page, *in_tables))
