@@ -163,7 +163,9 @@ def shown(value: Any) -> str:
     if isinstance(value, jax.Array | np.ndarray | np.generic) and not isinstance(value, Tracer):
         array = np.asarray(value)
         return as_text(array) if array.ndim and array.dtype.kind in "fiu" else shown(array.tolist())
-    return as_text(value) if isinstance(value, jax.Array | np.ndarray | eqx.Module) or callable(value) else repr(value)
+    is_known = isinstance(value, jax.Array | np.ndarray | eqx.Module) or callable(value)
+    # Of a run or a table, the first line says what it is.
+    return (as_text(value) if is_known else repr(value)).partition("\n")[0]
 
 
 def contents(module: Any, with_units: bool = True) -> list[tuple[str, str]]:

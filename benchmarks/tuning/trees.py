@@ -58,7 +58,7 @@ def error_coefficients(
 ) -> Float[Any, " trees"]:
     """(b . Phi(t) - 1/gamma(t)) / sigma(t) of every tree of an order: all vanish if the method is of that order.
 
-    Of NumPy's arrays in their own precision, so that extended precision is possible; of others by JAX.
+    NumPy's arrays keep their precision, which may be extended; for other arrays, JAX computes.
     """
     trees_by_order, trees_of_size = trees(order), {}
     xp = np if isinstance(weights, np.ndarray) else jnp

@@ -19,11 +19,10 @@ from jaxtyping import Float
 
 from ..validation import is_traced
 
-#: Memory [bytes] up to which a process keeps its programs on any machine, and the part of the machine's memory up to which
-#: it keeps them where this is more.
+#: A process keeps its programs up to this memory [bytes] or this part of the machine's memory, whichever is more.
 LEAST_LIMIT, PART_OF_MEMORY = 2_500_000_000, 0.25
 
-#: Mappings from which on programs may be the cause of a process' memory.
+#: Number of mappings from which programs may be the cause of much memory.
 MANY_MAPPINGS = 4_000
 
 #: Fraction of the allowed mappings above which programs are cleared, however little memory they take.

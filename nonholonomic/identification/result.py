@@ -275,10 +275,19 @@ def summarise(
     degrees = len(labels) + priors - len(names)
     # Where the weights hold, a search by slopes that got stuck on a stair does not matter.
     status = "converged" if distribution.kind == "weights" else statuses[best]
-    agree = agreement(ends.coordinates, deviances, by_slopes, best)
     minima, concerns, notes = _shape(explorer, sample, distribution, by_slopes)
-    search = (agree, len(deviances), combinations.unseen, concerns, notes, sample.effective, sample.k, minima)
-    explored = Verdict(math.nan, (), *search)
+    explored = Verdict(
+        p_value=math.nan,
+        series=(),
+        agree=agreement(ends.coordinates, deviances, by_slopes, best),
+        starts=len(deviances),
+        undetermined=combinations.unseen,
+        concerns=concerns,
+        notes=notes,
+        effective=sample.effective,
+        k=sample.k,
+        minima=minima,
+    )
     trusted = distribution.kind != "none"
     with np.errstate(invalid="ignore"):
         slope_covariance = np.where(by_slopes == 0.0, 0.0, by_slopes * np.outer(slopes, slopes))

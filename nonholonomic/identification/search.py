@@ -42,8 +42,8 @@ def search(problem: Problem, explorer: Explorer, options: Search) -> tuple[Minim
         pool = explorer.begin(seed)
     if not np.any(np.isfinite(pool.predictions)):
         raise ValueError(
-            "no start led to finite predictions: simulate a run with the start values of `free`, which may fail, or look "
-            "whether the event happens before t1, where its function falls through zero"
+            "no start led to finite predictions: simulate a run with the start values of `free` to see whether it fails; an "
+            "event must happen before t1, and its function falls through zero"
         )
     recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
     if recorded and problem.step is not None:

@@ -119,8 +119,7 @@ def sources_of(data: Any, expected: str) -> tuple[Any, ...]:
     sources = tuple(data) if isinstance(data, list | tuple) else (data,)
     if not sources or not all(isinstance(source, AbstractRecording | AbstractEventTimes) for source in sources):
         reader = "; read a file with read_recording" if isinstance(data, str | Path) else ""
-        what = shown(data).partition("\n")[0]
-        raise ValueError(f"data = {what} must be {expected}, or a list of them{reader}")
+        raise ValueError(f"data = {shown(data)} must be {expected}, or a list of them{reader}")
     return sources
 
 

@@ -84,6 +84,9 @@ def test_what_cannot_be_fitted_is_refused():
         stroller.identify(scene(), 1.0, {"wheelbase": 1.0})
     with pytest.raises(ValueError, match="or a list of them; read a file with read_recording"):
         stroller.identify(scene(), "ride.csv", {"wheelbase": 1.0})
+    table = nonholonomic.Table({"x": np.arange(2.0)}, {"y": np.ones(2)}, {}, {})
+    with pytest.raises(ValueError, match=r"data = Table over x \(2\).* must be a Recording"):
+        stroller.identify(scene(), table, {"wheelbase": 1.0})
     film = tippe.Recording(tippe.Launch(0.1, 150.0), [0.0, 0.1], [0.1, 0.1], 0.01)
     with pytest.raises(ValueError, match=r"data: the scene of a tippe\.Recording is a stroller\.Scene and must"):
         stroller.identify(scene(), film, {"rolling": 1.0})
