@@ -35,13 +35,6 @@ def numbered(labels: Sequence[Sequence[str]]) -> tuple[str, ...]:
     return tuple(f"{k}: {label}" if several else label for k, part in enumerate(labels, 1) for label in part)
 
 
-def series_units(data: tuple[Any, ...]) -> tuple[str, ...]:
-    """The unit of each series of the joined measurements. **Arguments:** `data`: sets of data, each with `measurements`
-    and `series_units`.
-    """
-    return tuple(unit for source in data for unit in source.series_units[: 1 + int(np.max(source.measurements.series))])
-
-
 def of_data(parameters: dict[str, Any], k: int) -> dict[str, Any]:
     """The parameters of one set of data: the shared parameters, and its own parameters without the prefix `data[k].`."""
     prefix = f"data[{k}]."

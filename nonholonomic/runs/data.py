@@ -7,16 +7,20 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..identification import AbstractRecording, Measurements, Quantities, as_quantity
 from ..integration import Settings
-from ..text import likely
+from ..text import likely, one_line, readable_unit
 from ..validation import as_number, as_number_or_none, require, shown
 from .event_time import time_of_event
 from .model import AbstractModel, model_of, require_event
+
+#: Number of standard errors after `t1` in which an event is still predicted.
+BEYOND = 8.0
 
 #: Quantities with a period of a whole turn.
 ANGLES = frozenset({"azimuth", "eta", "heading", "spin_angle"})
@@ -70,7 +74,12 @@ class Recording(AbstractRecording):
 
     @property
     def series_units(self) -> tuple[str, ...]:
+        # The system knows them; see `units_of`.
         return ("1",) * len(self.columns)
+
+    def units_of(self, model: AbstractModel) -> tuple[str, ...]:
+        """The unit of each column."""
+        return tuple(readable_unit(model.quantities[name.partition(".")[0]].unit) or "1" for name in self.columns)
 
     def model(self, system: Any) -> AbstractModel:
         """The model of the recorded run, checked."""
@@ -109,32 +118,93 @@ def _components(model: AbstractModel) -> list[str]:
 
 
 class AbstractEventTimes(eqx.Module):
-    """Measured times of an event, in one series with a prediction for each."""
+    """Measured times of an event, in one series with a prediction for each.
 
+    - `launch`: the start of the runs.
+    - `time`: (n,) [s], infinite where the event did not happen while you watched; or (n, 2), two times between which the
+      event happened: (0, a) before a, (b, inf) later than b, (a, b) between a and b, (t, t) at t.
+    - `error`: standard errors [s], a scalar or (n,); for a limit, the error of the clock.
+    - `t1`: horizon of the model's runs [s]; `until`: time [s] until which you watched, a scalar or (n,), or `None` for `t1`.
+    - `student`: degrees of freedom of Student's t distribution of the errors, or `None`.
+    """
+
+    launch: eqx.AbstractVar[Any]
     time: eqx.AbstractVar[Float[Array, "n *two"]]
     error: eqx.AbstractVar[Float[Array, "..."]]
     t1: eqx.AbstractVar[Float[Array, ""]]
+    until: eqx.AbstractVar[Any]
+    student: eqx.AbstractVar[Any]
 
     #: Whether times through several modes come from the programs of tables, which is faster for flights in closed form.
     by_tables: ClassVar[bool] = False
+
+    def __repr__(self) -> str:
+        return one_line(self)
+
+    def __check_init__(self):
+        shape = np.shape(self.time)
+        if not isinstance(self.time, jax.Array):
+            raise ValueError(f"time = {shown(self.time)} must be a list of numbers")
+        if len(shape) not in (1, 2) or shape[0] == 0 or shape[1:] not in ((), (2,)):
+            raise ValueError(f"time must be a non-empty list of times or of pairs of them, not of shape {shape}")
+        require(self.t1, "t1", above=0.0)
+        measured = np.asarray(self.time)
+        if np.any(np.isnan(measured)):
+            row = int(np.argmax(np.isnan(measured).reshape(len(measured), -1).any(axis=1)))
+            raise ValueError(
+                f"time[{row}] = {shown(measured[row])} must be a number, infinite where the event did not happen: leave "
+                "out the launch of a measurement that was lost, with its time"
+            )
+        if self.until is not None:
+            require(self.until, "until", above=0.0, at_most=self.t1, why="t1")
+        first, last = self._limits
+        require(first[first == last], "time", above=0.0, below=self.t1, why="t1")
+        require(first, "time", at_least=0.0, at_most=self.t1, why="t1")
+        if np.any(last < first):
+            raise ValueError(f"time = {measured[np.argmax(last < first)]} must be a time, or two in order")
+        require(self.error, "error", above=0.0)
+        if self.student is not None:
+            require(self.student, "student", above=0.0)
+        for name, value in self.of_each_time.items():
+            if value is not None and np.shape(value) not in ((), shape[:1]):
+                raise ValueError(
+                    f"{name} must be one number or one for each of the {shape[0]} times, not of shape {np.shape(value)}"
+                )
+
+    @property
+    def of_each_time(self) -> dict[str, Any]:
+        """The numbers that may differ from time to time, by name."""
+        return {"error": self.error, "until": self.until}
+
+    @property
+    def _limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """The limits between which every event happened."""
+        time = np.asarray(self.time)
+        if time.ndim == 2:
+            return time[:, 0], time[:, 1]
+        until = self.t1 if self.until is None else self.until
+        return np.where(np.isfinite(time), time, np.asarray(until)), time
+
+    @property
+    def measurements(self) -> Measurements:
+        """The times as measurements."""
+        first, last = self._limits
+        is_before = (first == 0.0) & np.isfinite(last)
+        student = math.inf if self.student is None else float(self.student)
+        return Measurements(np.where(is_before, -np.inf, first), self.error, upper=last, student=student)
 
     @property
     @abc.abstractmethod
     def labels(self) -> tuple[str, ...]:
         """A label for each time."""
 
-    @property
-    @abc.abstractmethod
-    def measurements(self) -> Measurements:
-        """The times as measurements."""
-
     @abc.abstractmethod
     def model(self, system: Any) -> AbstractModel:
         """The model of the timed run, checked. The numbers of its start have a value per run if there are several."""
 
-    @abc.abstractmethod
     def predicted(self, model: AbstractModel, t1: Any, settings: Settings) -> Float[Array, ""]:
         """The predicted time of one run."""
+        return time_of_event(model, t1, settings, False)
 
     def of_ends(self, model: AbstractModel, t1: Any, time: Any, ends: dict[str, Any]) -> Any:
         """The predictions from a table: from the times of events, infinite without an event, and the ends of the runs."""
@@ -143,6 +213,11 @@ class AbstractEventTimes(eqx.Module):
     def labels_in(self, unit: Any) -> tuple[str, ...]:
         """Labels for a picture, with numbers in other units."""
         return self.labels
+
+    @property
+    def horizon(self) -> Float[Array, ""]:
+        """The end of the runs [s]: beyond `t1`, so that a time that is a few errors later is still predicted."""
+        return self.t1 + BEYOND * jnp.max(self.error)
 
     @property
     def size(self) -> int:
@@ -166,29 +241,35 @@ class EventTimes(AbstractEventTimes):
     **Arguments:**
 
     - `launch`: the start, as for `simulate`.
-    - `time`: measured times [s], (n,), of runs from the same start.
-    - `error`: standard errors [s]: a scalar, or (n,).
+    - `time`: measured times [s] of runs from the same start: (n,), infinite if the event did not happen while you watched;
+      or (n, 2), two times between which the event happened: (0, a) before a, (b, inf) later than b, (a, b) between a and b.
+    - `error`: standard errors [s]: a scalar, or (n,); for a limit, the error of the clock.
     - `t1`: horizon [s] of the runs.
     - `event`: a function `event(t, motion)`, whose fall through zero is the event, as for `event_time`; by default the event of
       the system itself.
     - `input`: the input of a stroller.
+    - `until`: time [s] until which you watched a run without the event, a scalar or (n,); `t1` by default.
+    - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for outliers; `None`: Gaussian.
 
-    **Raises:** `ValueError` for shapes that do not fit.
+    **Raises:** `ValueError` for numbers out of range or shapes that do not fit.
 
-    **Example:**
+    **Example:** the third run had not ended after 1 s.
 
     >>> import nonholonomic
-    >>> falls = nonholonomic.EventTimes([1.0, 0.0], [0.45, 0.46], 0.005, t1=2.0, event=lambda t, y: y[0])
-    >>> falls.labels
-    ('time 1', 'time 2')
+    >>> times = [0.45, 0.46, float("inf")]
+    >>> falls = nonholonomic.EventTimes([1.0, 0.0], times, 0.005, t1=2.0, event=lambda t, y: y[0], until=1.0)
+    >>> falls.labels, falls.measurements.censored.tolist()
+    (('time 1', 'time 2', 'time 3'), [False, False, True])
     """
 
     launch: Any
-    time: Float[Array, " n"] = eqx.field(converter=as_number)
+    time: Float[Array, "n *two"] = eqx.field(converter=as_number)
     error: Float[Array, "..."] = eqx.field(converter=as_number)
     t1: Float[Array, ""] = eqx.field(converter=as_number)
     event: Callable[..., Any] | None = None
     input: Any = None
+    until: Any = eqx.field(converter=as_number_or_none, default=None)
+    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
 
     def __check_init__(self):
         if isinstance(self.launch, list | tuple) and any(isinstance(part, eqx.Module) for part in self.launch):
@@ -196,28 +277,12 @@ class EventTimes(AbstractEventTimes):
                 f"launch must be one launch, not a list of {len(self.launch)}: make an EventTimes of each, and pass identify a "
                 "list of them"
             )
-        require(self.time, "time", above=0.0)
-        require(self.t1, "t1", above=0.0)
-        require(self.error, "error", above=0.0)
-        if np.ndim(self.time) != 1 or not np.size(self.time):
-            raise ValueError(f"time must be a list of measured times, not of shape {np.shape(self.time)}")
-        if np.shape(self.error) not in ((), np.shape(self.time)):
-            raise ValueError(f"error must be one number or of shape {np.shape(self.time)}, not {np.shape(self.error)}")
 
     @property
     def labels(self) -> tuple[str, ...]:
         return tuple(f"time {k + 1}" for k in range(self.size))
 
-    @property
-    def measurements(self) -> Measurements:
-        time = np.asarray(self.time)
-        return Measurements(time, np.broadcast_to(self.error, time.shape), student=math.inf)
-
     def model(self, system: Any) -> AbstractModel:
         model = model_of(system, self.launch, self.event, self.input)
         require_event(model)
         return model
-
-    def predicted(self, model: AbstractModel, t1: Any, settings: Settings) -> Float[Array, ""]:
-        time = time_of_event(model, t1, settings, False)
-        return jnp.where(jnp.isfinite(time), time, jnp.nan)

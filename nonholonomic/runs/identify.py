@@ -4,8 +4,10 @@ import dataclasses
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from ..identification import AbstractRecording, Free, Identification, LogDensity, Measurements
-from ..identification.data import free_numbers, joined, own_name, series_units
+from ..identification.data import free_numbers, joined, own_name
 from ..identification.identify import check_search
 from ..identification.identify import identify as most_likely
 from ..integration import Settings
@@ -14,7 +16,7 @@ from ..integration.settings import MOST_STEPS
 from ..parameters import full_name, require_apart
 from ..progress import status_line
 from ..validation import shown
-from .data import AbstractEventTimes
+from .data import AbstractEventTimes, Recording
 from .model import check_run
 from .predictions import DataModel, Source
 
@@ -149,7 +151,7 @@ def fit_runs(
     label = problem.model.data[0].model.label
     names = {name: own_name(name) for name in problem.unknowns}
     units = {name: "s" if own == "t0" else label([own])[own][1] for name, own in names.items()}
-    return dataclasses.replace(fit, series_units=series_units(data), units=units)
+    return dataclasses.replace(fit, series_units=problem.series_units, units=units)
 
 
 def posterior_of_runs(
@@ -162,7 +164,7 @@ def posterior_of_runs(
             f"priors = {shown(priors)} must be a dictionary, name of a number -> (mean, standard deviation)"
         )
     by_name = {full_name("priors", name, list(fit.unknowns)): prior for name, prior in (priors or {}).items()}
-    return LogDensity.of(fit.model, fit.measurements, fit.unknowns, by_name, series_units(data), fit.slopes)
+    return LogDensity.of(fit.model, fit.measurements, fit.unknowns, by_name, fit.series_units, fit.slopes)
 
 
 class _Fit(NamedTuple):
@@ -178,13 +180,23 @@ class _Fit(NamedTuple):
         """The slopes that guide the fit."""
         return self.model.data[0].model.fit_slopes
 
+    @property
+    def series_units(self) -> tuple[str, ...]:
+        """The unit of each series of the measurements."""
+        units: list[str] = []
+        for source in self.model.data:
+            data = source.data
+            of_source = data.units_of(source.model) if isinstance(data, Recording) else data.series_units
+            units += of_source[: 1 + int(np.max(data.measurements.series))]
+        return tuple(units)
+
     @classmethod
     def of(cls, system: Any, data: tuple[Any, ...], free: dict[str, Any], tolerance: Any) -> "_Fit":
         """**Arguments:** as for `fit_runs`."""
         tolerance_bound(tolerance).require()
         models = tuple(source.model(system) for source in data)
         for source, model in zip(data, models, strict=True):
-            horizon = source.t1 if isinstance(source, AbstractEventTimes) else source.times[-1] - source.t0
+            horizon = source.horizon if isinstance(source, AbstractEventTimes) else source.times[-1] - source.t0
             check_run(model, horizon, tolerance)
         own = [[name for name in model.known if name.startswith(("start", "launch"))] for model in models]
         shared = [name for name in models[0].known if name not in own[0]]

@@ -131,7 +131,7 @@ def _lanes(sources: list[Source], values: list[Values], rows: int) -> Lanes:
     moved = {name: in_lanes([jnp.asarray(of_source[name])[:, None] for of_source in values]) for name in values[0]}
     first = sources[0].data
     if not isinstance(first, AbstractRecording):
-        horizon: Any = in_lanes([source.data.t1 for source in sources])
+        horizon: Any = in_lanes([source.data.horizon for source in sources])
     else:
         size = max(len(source.data.times) for source in sources)
         clocks = jnp.stack([_lengthened(source.data.times, size) for source in sources])

@@ -1,6 +1,5 @@
 """Measured times of launches: of inversion, and of reversal."""
 
-import math
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -9,12 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.identification import Measurements
 from nonholonomic.integration import Settings
 from nonholonomic.parameters import numbers
-from nonholonomic.runs import AbstractEventTimes, time_of_event
-from nonholonomic.text import distinguishing_labels, one_line
-from nonholonomic.validation import as_number, as_number_or_none, require, require_kind, shown
+from nonholonomic.runs import AbstractEventTimes
+from nonholonomic.text import distinguishing_labels
+from nonholonomic.validation import as_number, as_number_or_none, require_kind
 
 from ..model.launch import Launch, as_launch
 from ..model.scene import Scene
@@ -26,13 +24,7 @@ _beyond_horizon = jax.jit(beyond_horizon)
 
 
 class AbstractTimes(AbstractEventTimes):
-    """Measured times of an event of launches.
-
-    - `launch`, `time`, `error`, `t1`, `until`: as for `InversionTimes`.
-    - `student`: degrees of freedom of Student's t distribution of the errors, or `None`.
-    """
-
-    student: eqx.AbstractVar[Any]
+    """Measured times of an event of launches; see `InversionTimes`."""
 
     launch: Launch = eqx.field(converter=as_launch)
     time: Float[Array, "launches *two"] = eqx.field(converter=as_number)
@@ -41,64 +33,18 @@ class AbstractTimes(AbstractEventTimes):
     until: Any = eqx.field(converter=as_number_or_none, default=None)
     by_tables = True
 
-    def __repr__(self) -> str:
-        return one_line(self)
-
     def __check_init__(self):
         require_kind(self.launch, "launch", Launch, " or a list of launches")
-        shape = np.shape(self.time)
-        if not isinstance(self.time, jax.Array):
-            raise ValueError(f"time = {shown(self.time)} must be a list of numbers")
-        if len(shape) not in (1, 2) or shape[0] == 0 or shape[1:] not in ((), (2,)):
-            raise ValueError(f"time must be a non-empty list of times or of pairs of them, not of shape {shape}")
-        require(self.t1, "t1", above=0.0)
-        measured = np.asarray(self.time)
-        if np.any(np.isnan(measured)):
-            row = int(np.argmax(np.isnan(measured).reshape(len(measured), -1).any(axis=1)))
-            raise ValueError(
-                f"time[{row}] = {shown(measured[row])} must be a number, infinite where the event did not happen: leave "
-                "out the launch of a measurement that was lost, with its time"
-            )
-        if self.until is not None:
-            require(self.until, "until", above=0.0, at_most=self.t1, why="t1")
-        first, last = self._limits
-        require(first[first == last], "time", above=0.0, below=self.t1, why="t1")
-        require(first, "time", at_least=0.0, at_most=self.t1, why="t1")
-        if np.any(last < first):
-            raise ValueError(f"time = {measured[np.argmax(last < first)]} must be a time, or two in order")
-        require(self.error, "error", above=0.0)
-        if self.student is not None:
-            require(self.student, "student", above=0.0)
-        key = numbers("launch", self.launch) | {"error": self.error, "until": self.until}
-        for name, value in key.items():
-            if value is not None and np.shape(value) not in ((), shape[:1]):
-                raise ValueError(
-                    f"{name} must be one number or one for each of the {shape[0]} times, not of shape {np.shape(value)}"
-                )
 
     @property
-    def _limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """The limits between which every launch inverted."""
-        time = np.asarray(self.time)
-        if time.ndim == 2:
-            return time[:, 0], time[:, 1]
-        until = self.t1 if self.until is None else self.until
-        return np.where(np.isfinite(time), time, np.asarray(until)), time
-
-    @property
-    def measurements(self) -> Measurements:
-        first, last = self._limits
-        is_before = (first == 0.0) & np.isfinite(last)
-        student = math.inf if self.student is None else float(self.student)
-        return Measurements(np.where(is_before, -np.inf, first), self.error, upper=last, student=student)
+    def of_each_time(self) -> dict[str, Any]:
+        return numbers("launch", self.launch) | super().of_each_time
 
     @property
     def labels(self) -> tuple[str, ...]:
         """A label for each launch."""
-        columns = np.broadcast_arrays(
-            np.asarray(self.launch.theta), np.asarray(self.launch.spin), np.asarray(self._limits[0])
-        )
-        return tuple(f"theta {theta:.4g}, spin {spin:.4g}" for theta, spin in zip(*columns[:2], strict=True))
+        theta, spin, _ = np.broadcast_arrays(self.launch.theta, self.launch.spin, np.zeros(self.size))
+        return tuple(f"theta {angle:.4g}, spin {rate:.4g}" for angle, rate in zip(theta, spin, strict=True))
 
     def labels_in(self, unit: Any) -> tuple[str, ...]:
         """What differs between the launches."""
@@ -146,6 +92,11 @@ class InversionTimes(AbstractTimes):
     def __check_init__(self):
         check_event(self.angle, "first")
 
+    @property
+    def horizon(self) -> Float[Array, ""]:
+        # Predictions continue smoothly beyond it.
+        return self.t1
+
     def model(self, system: Any) -> TopModel:
         require_kind(system, "scene", Scene)
         return TopModel.timed(system, self.launch, event_of(system, self.angle))
@@ -187,6 +138,3 @@ class ReversalTimes(AbstractTimes):
         require_rigid(system)
         check_reversible(self.launch, {})
         return TopModel.timed(system, self.launch, None)
-
-    def predicted(self, model: Any, t1: Any, settings: Settings) -> Float[Array, ""]:
-        return time_of_event(model, t1, settings, False)
