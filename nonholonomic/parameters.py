@@ -82,11 +82,9 @@ def with_numbers(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any
     **Raises:** `ValueError` for a name that matches no parameter.
     """
     values_of_names = numbers_of(roots)
-    for name in values:
-        if name not in values_of_names:
-            raise _unknown_axis(
-                name, [known_name for known_name, number in values_of_names.items() if number is not None]
-            )
+    unknown = [name for name in values if name not in values_of_names]
+    if unknown:
+        raise _unknown_axis(unknown[0], [name for name, value in values_of_names.items() if value is not None])
     return {root: _replaced(root, tree, values) for root, tree in roots.items()}
 
 
@@ -144,6 +142,23 @@ def full_name(argument: str, name: str, known: list[str]) -> str:
         problem = f"could be {' or '.join(matches)}" if matches else f"must be one of {', '.join(known)}{hint}"
         raise ValueError(f"{argument}: {name!r} {problem}")
     return matches[0]
+
+
+class ByName(dict[str, Any]):
+    """Values by the full names of parameters; to read one, the unambiguous end of its name is enough.
+
+    **Example:**
+
+    >>> from nonholonomic.parameters import ByName
+    >>> ByName({"scene.friction.mu": 0.3, "launch.spin": 150.0})["mu"]
+    0.3
+    """
+
+    def __missing__(self, name: str) -> Any:
+        try:
+            return self[full_name("name", name, list(self))]
+        except ValueError as error:
+            raise KeyError(str(error)) from None
 
 
 def full_axes(axes: dict[str, Any], known: list[str]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import html
 import inspect
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -174,6 +175,27 @@ def contents(module: Any, with_units: bool = True) -> list[tuple[str, str]]:
     units = getattr(module, "units", {})
     fields = [(name, value, units.get(name, "1") if with_units else None) for name, value in fields]
     return [(name, as_text(value, unit)) for name, value, unit in fields if value is not None]
+
+
+def batch_title(shape: tuple[int, ...], words: Iterable[str] = ()) -> str:
+    """A line for a batch of runs, or for a run inside a transformation.
+
+    **Arguments:** `shape`: that of the times, which are the last axis; `words`: how each run ended, if known.
+
+    **Example:**
+
+    >>> from nonholonomic.text import batch_title
+    >>> batch_title((3, 20), ["completed", "completed", "failed"])
+    '3 runs of 20 times: 2 completed, 1 failed'
+    """
+    *batch, times = shape
+    ends = ", ".join(f"{count} {word}" for word, count in Counter(words).items())
+    runs = (
+        f"{math.prod(batch)} runs of {times} times"
+        if batch
+        else f"Trajectory of {times} times, inside a transformation"
+    )
+    return f"{runs}: {ends}" if ends else runs
 
 
 def one_line(module: Any, with_units: bool = True) -> str:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..parameters import full_name
+from ..parameters import ByName, full_name
 from ..progress import status_line
 from ..text import readable_unit, require_unit, text_as_html
 from ..validation import require_package, shown
@@ -65,10 +65,11 @@ class ResidualRow(NamedTuple):
 class Identification:
     """Parameters identified from measurements.
 
-    - `estimates`, `standard_errors`: name -> number. The errors are standard deviations over the likelihood times the
-      priors, by importance sampling; they are infinite for a parameter that takes part in an undetermined direction, and
-      NaN if the exploration of the likelihood ended early. The estimate is the most likely point; if
-      this is more than half a standard error away from the mean, it is a likely point near the mean.
+    - `estimates`, `standard_errors`: name -> number; the end of a name is enough, as in `estimates["mu"]`. The errors are
+      standard deviations over the likelihood times the priors, by importance sampling; they are infinite for a parameter
+      that takes part in an undetermined direction, and NaN if the exploration of the likelihood ended early. The estimate
+      is the most likely point; if this is more than half a standard error away from the mean, it is a likely point near
+      the mean.
     - `covariance`: (unknowns, unknowns), in the order of `estimates`. Parameters with infinite error have covariance 0.
     - `most_likely`, `slope_errors`: name -> number, the point of the greatest likelihood, and the errors by the slopes of the
       predictions there (Gauss-Newton). These errors are wrong where predictions are a staircase.
@@ -293,7 +294,7 @@ def summarise(
         slope_covariance = np.where(by_slopes == 0.0, 0.0, by_slopes * np.outer(slopes, slopes))
 
     def by_name(numbers: np.ndarray) -> dict[str, Any]:
-        return dict(zip(names, numbers.tolist() if numbers.ndim == 1 else numbers, strict=True))
+        return ByName(zip(names, numbers.tolist() if numbers.ndim == 1 else numbers, strict=True))
 
     return Identification(
         estimates=by_name(estimates),

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..parameters import ByName
 from ..progress import status_line
 from ..text import readable_unit
 from ..validation import require_flag, require_package, require_whole, shown
@@ -35,7 +36,7 @@ SPREAD, STARTS, STEPS = 2.0, 16, 60
 class Draws(NamedTuple):
     """Draws from a posterior.
 
-    - `values`: name -> (chains, draws); `coordinates`: (chains, draws, unknowns).
+    - `values`: name -> (chains, draws), where the end of a name is enough; `coordinates`: (chains, draws, unknowns).
     - `r_hat`, `ess`: name -> number: the potential scale reduction, which should be below 1.01, and the effective number of
       independent draws.
     - `units`: name -> unit, of the unknown errors.
@@ -61,10 +62,10 @@ class Draws(NamedTuple):
         cls, density: LogDensity, coordinates: Float[np.ndarray, "chains draws unknowns"], accepted: float, runs: int
     ) -> "Draws":
         """Draws at given coordinates, with diagnostics."""
-        values = {name: np.asarray(value) for name, value in density.values(jnp.asarray(coordinates)).items()}
+        values = ByName((name, np.asarray(value)) for name, value in density.values(jnp.asarray(coordinates)).items())
         draws = map(np.asarray, _diagnosed(coordinates))
         # For a single unknown, these are numbers instead of lists.
-        draws_by_name = (dict(zip(density.names, numbers.reshape(-1).tolist(), strict=True)) for numbers in draws)
+        draws_by_name = (ByName(zip(density.names, numbers.reshape(-1).tolist(), strict=True)) for numbers in draws)
         return cls(values, coordinates, *draws_by_name, accepted=accepted, runs=runs, units=density.units)
 
     def __str__(self) -> str:

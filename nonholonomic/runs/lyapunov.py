@@ -24,6 +24,9 @@ from .model import AbstractModel, check_run, model_of
 #: What to use instead of transformations, in the message.
 INSTEAD = "a Python loop (for tops, tippe.lyapunov_exponent takes lists) in place of vmap"
 
+#: Greatest number of runs in a text.
+MOST_LINES = 24
+
 #: Number of time intervals with recorded growth; half of them give the exponent and its scatter.
 STRETCHES = 32
 
@@ -45,8 +48,12 @@ class LyapunovExponent(NamedTuple):
     >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
     >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
     >>> growth = tippe.lyapunov_exponent(scene, tippe.Launch(1e-3, [155.0, 120.0]), t1=4.0, tolerance=1e-6)
-    >>> print(growth.status, growth.running.shape)
-    ['completed' 'completed'] (32, 2)
+    >>> growth.running.shape
+    (32, 2)
+    >>> print(growth)
+    largest Lyapunov exponents
+      0: 1.199 +- 0.35 1/s, completed at 4 s
+      1: 1.158 +- 0.35 1/s, completed at 4 s
 
     ```
     """
@@ -58,6 +65,22 @@ class LyapunovExponent(NamedTuple):
     steps: Int[np.ndarray, "..."]
     times: Float[np.ndarray, " stretches"]
     running: Float[np.ndarray, "stretches ..."]
+
+    def __str__(self) -> str:
+        columns = map(np.ravel, (self.exponent, self.error, self.status, self.end_time))
+        lines = [
+            f"{value:.4g} +- {error:.2g} 1/s, {word} at {end:.6g} s"
+            for value, error, word, end in zip(*columns, strict=True)
+        ]
+        if np.ndim(self.exponent) == 0:
+            return f"largest Lyapunov exponent {lines[0]}"
+        rest = [f"  and {len(lines) - MOST_LINES} more"] if len(lines) > MOST_LINES else []
+        return "\n".join(
+            ["largest Lyapunov exponents", *(f"  {k}: {line}" for k, line in enumerate(lines[:MOST_LINES])), *rest]
+        )
+
+    def __repr__(self) -> str:
+        return str(self)
 
 
 @status_line("simulating")
@@ -82,7 +105,7 @@ def lyapunov_exponent(
     - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default `nonholonomic.integration.Oscillatory8()`.
 
-    **Returns:** a `LyapunovExponent`.
+    **Returns:** a `LyapunovExponent`: the mean rate of divergence in the second half of the run, and its error.
 
     **Raises:** `ValueError` for arguments outside these ranges, and inside transformations.
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -14,7 +14,7 @@ from ..hybrid import hybrid_resets
 from ..integration import Settings
 from ..integration.status import Status
 from ..sweeps import Table, Tabular
-from ..text import as_text, distinguishing_labels
+from ..text import as_text, batch_title, distinguishing_labels
 from ..validation import is_traced, require, require_increasing
 from ..views import Page, Stage, Viewable, new_figure
 from .explore import explore_model
@@ -154,6 +154,9 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         columns = dict(zip(self.names, np.asarray(self.state).T, strict=True)) | {"mode": np.asarray(self.mode)}
         return Table({"time": np.asarray(self.t)}, columns, {"time": "s"}, {"status": self.status})
 
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
     def __getitem__(self, name: str) -> Float[Array, " times"]:
         if name not in self.names:
             raise KeyError(f"{name!r} must be one of {', '.join(self.names)}")
@@ -210,8 +213,8 @@ class Trajectory(Viewable, Tabular, eqx.Module):
 
     def __str__(self) -> str:
         if is_traced(self.code) or np.ndim(self.t) != 1:
-            shape = "x".join(map(str, jnp.shape(self.state)))
-            return f"Trajectory(status={self.status}, state of shape {shape}, {', '.join(self.names)})"
+            codes = [] if is_traced(self.code) else np.ravel(self.code)
+            return batch_title(jnp.shape(self.state)[:-1], [Status(int(code)).word for code in codes])
         table = str(self.to_table()).splitlines()[1 : 1 + len(self.names)]
         lines = [f"Trajectory of {np.size(self.t)} times, {self.status} at {float(self.end_time):.6g} s", *table]
         lines.append(f"  resets: {int(self.switches)}")

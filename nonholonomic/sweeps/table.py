@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -45,8 +45,8 @@ class Table(eqx.Module):
     >>> print(table)
     Table over speed (3)
       energy [J]: 0.5 to 4.5
-    >>> table["energy"], table.label("speed")
-    (array([0.5, 2. , 4.5]), 'speed [m/s]')
+    >>> table["energy"], table.label("speed"), "mass" in table
+    (array([0.5, 2. , 4.5]), 'speed [m/s]', False)
 
     ```
     """
@@ -68,18 +68,25 @@ class Table(eqx.Module):
 
     def __getitem__(self, name: str) -> Values:
         if not isinstance(name, str):
-            names = ", ".join([*self.variables, *self.coords])
+            names = ", ".join(self)
             raise ValueError(f"table[{name!r}]: {name!r} must be the name of a variable or an axis: {names}")
         for names in (self.variables, self.coords):
             if name in names:
                 return names[name]
-        raise KeyError(f"the table has no {name!r}; it has {', '.join([*self.variables, *self.coords])}")
+        raise KeyError(f"the table has no {name!r}; it has {', '.join(self)}")
+
+    def __iter__(self) -> Iterator[str]:
+        """The names of the variables, and then of the coordinates."""
+        return iter([*self.variables, *self.coords])
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.variables or name in self.coords
 
     def _ipython_key_completions_(self) -> list[str]:
-        return [*self.variables, *self.coords]
+        return list(self)
 
     def __dir__(self) -> list[str]:
-        return [*super().__dir__(), *self.variables, *self.coords]
+        return [*super().__dir__(), *self]
 
     @property
     def long_names(self) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 import abc
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
@@ -243,6 +243,10 @@ class Tabular(abc.ABC):
         if name not in self.quantities:
             raise KeyError(f"{name!r} must be one of {', '.join(self.quantities)}{likely(name, self.quantities)}")
         return self.quantities[name].of(name, self)
+
+    def __iter__(self) -> Iterator[str]:
+        """The names of the quantities."""
+        return iter(self.quantities)
 
     def __getattr__(self, name: str) -> Any:
         # Python calls this for unknown names, and for known names whose property raised an AttributeError, which is

@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.progress import status_line
 from nonholonomic.sweeps import Quantity, Table, Tabular
+from nonholonomic.text import batch_title
 from nonholonomic.validation import is_traced, require, require_increasing, require_one_run, require_outside
 from nonholonomic.views import Stage, Viewable
 
@@ -204,7 +205,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
     def __str__(self) -> str:
         # A batch, or a run inside a transformation, has no single values to show.
         if is_traced(self.t) or self.t.ndim > 1:
-            return f"Trajectory of {self.t.shape} times"
+            return batch_title(self.t.shape)
         self = self.with_steps()
         jackknives = self.jackknifed_at
         lines = [

@@ -3,6 +3,7 @@
 import json
 import re
 
+import diffrax
 import h5py
 import jax
 import jax.numpy as jnp
@@ -83,6 +84,13 @@ def test_a_run_that_needs_more_than_the_most_steps_has_failed(table, scene):
     np.testing.assert_array_equal(short_table.theta[is_reached], table[0].theta[is_reached])
     assert json.loads(short_table.attributes["request"])["max_steps"] == 20
     assert "max_steps" not in json.loads(table[0].attributes["request"])
+
+
+def test_another_solver_has_the_same_samples(table, scene):
+    other = tippe.trajectory_table(scene, theta=THETA, spin=SPIN, mu=MU, times=TIMES, solver=diffrax.Dopri8())
+    assert json.loads(other.attributes["request"])["solver"] == "Dopri8"
+    assert not np.array_equal(other.steps, table[0].steps)
+    assert_close(other.theta, table[0].theta, atol=1e-6)
 
 
 def test_a_batch_by_vmap_is_the_same(table, scene):

@@ -19,6 +19,7 @@ from nonholonomic.integration.status import Status
 from nonholonomic.integration.zeros import few_trials
 from nonholonomic.progress import status_line
 from nonholonomic.sweeps import Quantity, Table, Tabular
+from nonholonomic.text import batch_title
 from nonholonomic.validation import is_traced, require, require_increasing
 from nonholonomic.views import Stage, Viewable
 
@@ -320,7 +321,8 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
     @status_line("reading off")
     def __str__(self) -> str:
         if is_traced(self.t) or self.t.ndim > 1:
-            return f"Trajectory of {self.t.shape} times"
+            codes = [] if is_traced((self.t, self.status)) or self.status is None else np.ravel(self.status)
+            return batch_title(self.t.shape, [Status(int(code)).word for code in codes])
         word = self.status if isinstance(self.status, str) else Status(int(self.status)).word
         lines = [
             f"Trajectory of {len(self.t)} times, {word} at {float(self.end_time):.6g} s",

@@ -279,6 +279,7 @@ def trajectory_table(
     progress: bool = True,
     executor: Executor | None = None,
     max_steps: int = DEFAULT_MAX_STEPS,
+    solver: diffrax.AbstractERK | None = None,
 ) -> Table:
     """Trajectories over a grid of launches and scenes, sampled at given times, in one batched call on all cores.
 
@@ -303,6 +304,7 @@ def trajectory_table(
     - `path`: HDF5 file to write, chunk by chunk. Repeat the same call to resume an interrupted table.
     - `progress`, `executor`: as for `inversion_table`.
     - `max_steps`: a run that needs more steps, including rejected ones, fails; at least 1.
+    - `solver`: as for `inversion_table`.
 
     **Returns:** a `Table` with a variable for each quantity. Its dimensions are the axes and "time"; a vector has one
     more dimension, "component" (x, y, z), or "tangent" (t1, t2) for "slip". Values after the end of a run are NaN. The
@@ -332,7 +334,7 @@ def trajectory_table(
     require_times(as_number(times), None)
     samples = samples_of(quantities_of(scene), times, quantities, None)
     assert samples is not None
-    options = Options(tolerance, max_steps=max_steps, path=path, progress=progress, executor=executor)
+    options = Options(tolerance, solver, max_steps, path=path, progress=progress, executor=executor)
     settings, t1 = options.settings, samples.times[-1]
     require(t1, "times[-1]", above=0.0, why="it is the horizon")
     launch_values = {"theta": theta, "eta": eta, "mu": mu, "spin": spin}

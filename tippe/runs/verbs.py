@@ -272,7 +272,8 @@ def lyapunov_exponent(
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
       `nonholonomic.integration.Oscillatory8()`.
 
-    **Returns:** a `LyapunovExponent`, its arrays of shape () or (n,).
+    **Returns:** a `LyapunovExponent`, its arrays of shape () or (n,): the mean rate of divergence in the second half of each
+    run, and its error.
 
     **Raises:** `ValueError` for arguments outside these ranges.
 

@@ -73,7 +73,10 @@ def test_event_times_with_a_heavy_tail_ignore_an_outlier():
     times = [0.34, 0.35, 0.355, 0.345, 0.42]
     data = nonholonomic.EventTimes([1.0], times, 0.01, t1=3.0, student=1.0)
     fit = nonholonomic.identify(decay(2.0), data, {"rate": 2.0}, starts=2, progress=False)
-    assert_close(fit.estimates["system.modes[0].rate"], np.log(2.0) / 0.3475, rtol=0.03)
+    assert_close(fit.estimates["rate"], np.log(2.0) / 0.3475, rtol=0.03)
+    assert list(fit.estimates) == ["system.modes[0].rate"]
+    with pytest.raises(KeyError, match=r"'rates' must be one of system\.modes\[0\]\.rate"):
+        fit.estimates["rates"]
 
 
 @pytest.mark.parametrize(
@@ -99,6 +102,8 @@ def test_the_picture_of_a_fit_has_the_units_of_the_quantities():
     value = np.stack([run.theta, run.spin, run.position[:, 2]], axis=-1)
     names = ("theta", "spin", "position.z")
     data = nonholonomic.Recording(launch, times, value, [1e-3, 0.1, 1e-5], names)
+    assert "theta" in run
+    assert "tetha" not in run
     fit = nonholonomic.identify(scene, data, {"launch.spin": 155.0}, starts=2, progress=False)
     assert fit.series_units == ("rad", "rad/s", "m")
     figure = fit.plot(unit=("deg", "rpm", "mm"))

@@ -34,6 +34,9 @@ def test_names_are_found_and_completed(table):
     assert table.spin is SPIN
     assert {"time", "status", "theta"} <= set(table._ipython_key_completions_())
     assert "time" in dir(table)
+    assert list(table) == ["time", "status", "theta", "mu", "spin"]
+    assert "spin" in table
+    assert "tme" not in table
     with pytest.raises(KeyError, match="no 'tme'; it has time, status, theta"):
         table["tme"]
 

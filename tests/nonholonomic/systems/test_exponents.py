@@ -28,6 +28,9 @@ def test_nearby_runs_stay_within_the_constraints():
     """The distance of two beads on neighbouring rails is constant; a bead that left its rail would move away."""
     result = lyapunov_exponent(Rail(), ([1.0, 0.3], [0.0, 0.0]), t1=6.0, tolerance=1e-8)
     assert_close(result.exponent, 0.0, atol=1e-6)
+    assert str(result).startswith("largest Lyapunov exponent ")
+    assert str(result).endswith(" 1/s, completed at 6 s")
+    assert repr(result) == str(result)
 
 
 def test_a_change_of_the_start_obeys_the_constraints():

@@ -91,6 +91,15 @@ def test_a_printed_run_states_why_it_ended():
     assert "without end" not in str(simulate(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.0, times=[0.0, 1.0]))
 
 
+def test_a_printed_batch_states_how_its_runs_ended():
+    starts = jnp.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    runs = jax.vmap(lambda start: simulate(Hybrid([Ball()]), start, 1.0, times=[0.0, 1.0]))(starts)
+    assert str(runs) == "3 runs of 2 times: 2 completed, 1 unresolved"
+    texts = []
+    jax.jit(lambda start: texts.append(str(simulate(Hybrid([Ball()]), start, 1.0, times=[0.0, 1.0]))))(starts[0])
+    assert texts == ["Trajectory of 2 times, inside a transformation"]
+
+
 def test_components_are_drawn_over_time():
     run = simulate(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.0, times=[0.0, 1.0])
     (panel,) = run.plot().axes
@@ -105,6 +114,8 @@ def test_components_are_drawn_over_time():
     labels = [text.get_text() for text in run.plot("y0", others=[higher]).axes[0].get_legend().get_texts()]
     assert labels == ["start[0] 1", "start[0] 2"]
     assert run.at(1.0).state.shape == (1, 3)
+    assert list(run) == ["y0", "y1", "y2"]
+    assert "y3" not in run
     assert_close(speeds.get_lines()[0].get_ydata()[[0, -1]], run.state[:, 1])
     assert list(run.to_dataframe().columns) == ["time", "y0", "y1", "y2", "mode"]
 
