@@ -177,6 +177,11 @@ def contents(module: Any, with_units: bool = True) -> list[tuple[str, str]]:
     return [(name, as_text(value, unit)) for name, value, unit in fields if value is not None]
 
 
+def counted(count: int, noun: str) -> str:
+    """A count with its noun, such as "1 number" and "2 numbers"."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def batch_title(shape: tuple[int, ...], words: Iterable[str] = ()) -> str:
     """A line for a batch of runs, or for a run inside a transformation.
 

@@ -120,6 +120,10 @@ REFUSED = {
         lambda: tippe.Recording([LAUNCH], [0.1], [0.1], 0.01),
         "launch must be one Launch, not a list of 1; identify takes a list of recordings",
     ),
+    "a recording of a top without its quantity": (
+        lambda: nonholonomic.identify(TOP, nonholonomic.Recording(LAUNCH, [0.1, 0.2], [0.1, 0.1], 0.01), {"mu": 0.3}),
+        "quantity: 'y0' (the default) must be one of theta, eta",
+    ),
     "a list of launches for event times": (
         lambda: nonholonomic.EventTimes([LAUNCH, LAUNCH], [1.0, 2.0], 0.1, t1=5.0),
         "launch must be one launch, not a list of 2: make an EventTimes of each, and pass identify a list of them",

@@ -50,6 +50,14 @@ SUSPECTED = {
         lambda: stroller.Stroller(mass=12.0, wheelbase=700.0, inertia=1e7, steering_inertia=0.05),
         "wheelbase = 700 m is long: was it in mm? 700 mm are 0.7 m",
     ),
+    "gravity in cm/s^2": (
+        lambda: tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3), gravity=981.0),
+        "gravity = 981 m/s^2 is large: was it in cm/s^2? 981 cm/s^2 are 9.81 m/s^2",
+    ),
+    "gravity of a stroller in cm/s^2": (
+        lambda: stroller.Scene(stroller.Stroller(12.0, 0.7, 1.5, 0.05), gravity=981.0),
+        "gravity = 981 m/s^2 is large: was it in cm/s^2? 981 cm/s^2 are 9.81 m/s^2",
+    ),
     "a mass in g": (
         lambda: tippe.Top.turned(0.021, mass=20.0, cut=0.0155, stem_radius=0.005, stem_length=0.013),
         "mass = 20 kg in a sphere of radius 0.021 m is denser than any metal: was it in g? 20 g are 0.02 kg",

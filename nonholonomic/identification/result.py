@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from ..parameters import ByName, full_name
 from ..progress import status_line
-from ..text import readable_unit, require_unit, text_as_html
+from ..text import counted, readable_unit, require_unit, text_as_html
 from ..validation import require_package, shown
 from ..views import draw_fit
 from ..warning import warn
@@ -219,7 +219,8 @@ class Identification:
 
     def __str__(self) -> str:
         lines = [
-            f"Identification of {len(self.estimates)} numbers from {len(self.residuals)} measurements: {self.status}",
+            f"Identification of {counted(len(self.estimates), 'number')} from "
+            f"{counted(len(self.residuals), 'measurement')}: {self.status}",
             f"  -2 log likelihood {self.deviance:.4g} at the most likely values, {self.degrees} degrees of freedom",
             "verdict",
             str(self.verdict),

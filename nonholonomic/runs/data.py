@@ -87,7 +87,8 @@ class Recording(AbstractRecording):
         known = [*model.quantities, *_components(model)]
         for name in self.columns:
             if name not in known:
-                raise ValueError(f"quantity: {name!r} must be one of {', '.join(known)}{likely(name, known)}")
+                default = " (the default)" if self.quantity == "y0" else ""
+                raise ValueError(f"quantity: {name!r}{default} must be one of {', '.join(known)}{likely(name, known)}")
             if "." not in name and model.quantities[name].components is not None:
                 raise ValueError(f"quantity: {name!r} has several components: name them, such as '{name}.x'")
         return model

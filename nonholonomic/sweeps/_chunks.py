@@ -299,5 +299,6 @@ def same_request(left: str, right: str) -> str | None:
     )
     for name in [*first, *(name for name in second if name not in first)]:
         if first.get(name) != second.get(name):
-            return f"{name} is {first.get(name)!r} in the file and {second.get(name)!r} here"
+            in_file, in_call = (repr(of[name]) if name in of else "absent" for of in (first, second))
+            return f"{name} is {in_file} in the file and {in_call} here"
     return None

@@ -20,6 +20,7 @@ from nonholonomic.validation import (
     require_all,
     require_kind,
     shown,
+    suspected_gravity,
 )
 
 from .dynamics import Dynamics, State
@@ -123,6 +124,9 @@ class Scene(Bounded):
             yield Bound(jnp.maximum(*surface.semi_axes), "greater semi-axis of the surface", at_least=half, why=why)
         elif isinstance(surface, Torus):
             yield Bound(surface.ring + surface.tube, "surface ring + tube", at_least=half, why=why)
+
+    def suspicion(self) -> str | None:
+        return suspected_gravity(self.gravity)
 
     @property
     def dynamics(self) -> Dynamics:
