@@ -23,7 +23,7 @@ def test_the_restitution_of_a_ball_from_its_heights():
 
 def test_a_quantity_that_the_system_does_not_have_is_named():
     data = Recording((np.zeros(3), np.zeros(3)), [1.0], [0.0], 1.0)
-    with pytest.raises(ValueError, match="quantity: 'y0' must be one of q0, q1, q2, rate0"):
+    with pytest.raises(ValueError, match=r"quantity: 'y0' \(the default\) must be one of q0, q1, q2, rate0"):
         identify(Sleigh(), data, {"ahead": 0.3})
 
 
