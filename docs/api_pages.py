@@ -144,7 +144,7 @@ PAGES = {
                 "legal_run run_bounds tolerance_bound require_run require_times require_adaptive require_adjoint",
             ),
             "nonholonomic.integration.zeros",
-            *of("nonholonomic.integration.zeros", "few_trials halved sign_changes"),
+            *of("nonholonomic.integration.zeros", "all_crossings few_trials halved sign_changes"),
             "nonholonomic.hybrid",
             *of(
                 "nonholonomic.hybrid",

@@ -19,6 +19,16 @@ LOCATED = 1e-14
 #: After this number of trials, `few_trials` returns the last trial.
 MOST_TRIALS = 60
 
+#: Number of parts into which `all_crossings` divides a step, to check the sign at their ends, if there may be a crossing.
+PARTS = 8
+
+#: Number of rounds in which checks are added where the quantity is nearest to zero, to detect two crossings close
+#: together.
+CLOSER_LOOKS = 3
+
+#: Checks closer together than this [s] give no new information.
+CLOSEST = 1e-14
+
 
 def halved(
     holds: Callable[[Float[Array, "..."]], Bool[Array, "..."]], low: Float[Array, "..."], high: Float[Array, "..."]
@@ -108,3 +118,70 @@ def few_trials(
         at_low, at_high = np.where(past_root, at_low * fade_low, value), np.where(past_root, value, at_high * fade_high)
         low, high = np.where(past_root, low, guess), np.where(past_root, guess, high)
     return guess
+
+
+def all_crossings(
+    quantity: Callable[[Brackets], Any], time: Float[np.ndarray, " steps"], value: Float[np.ndarray, " steps"]
+) -> Float[np.ndarray, " crossings"]:
+    """The times at which a quantity of a run passes zero, in either direction, in increasing order, with pairs of crossings
+    inside a step.
+
+    **Arguments:** `quantity`: function of times [s] in NumPy, not traced by JAX; NaN counts as beyond zero; `time`, `value`:
+    the ends of the steps [s], and the quantity there.
+
+    **Example:** the tip of a parabola between two steps is below zero.
+
+    >>> import numpy as np
+    >>> from nonholonomic.integration.zeros import all_crossings
+    >>> steps = np.arange(4.0)
+    >>> dip = lambda time: (time - 1.51) ** 2 - 1e-4
+    >>> all_crossings(dip, steps, dip(steps)).round(6)
+    array([1.5 , 1.52])
+    """
+    indices = np.flatnonzero(_may_cross(value))
+    if indices.size == 0:
+        return np.zeros(0)
+
+    def signed(times: Brackets) -> Brackets:
+        values = quantity(times)
+        return np.where(np.isfinite(values), values, -np.inf)
+
+    parts = np.arange(1, PARTS) / PARTS
+    new = (time[indices] + parts[:, None] * (time[indices + 1] - time[indices])).ravel()
+    for _ in range(1 + CLOSER_LOOKS):
+        time, value = np.concatenate([time, new]), np.concatenate([value, signed(new)])
+        order = np.argsort(time, kind="stable")
+        time, value = time[order], value[order]
+        new = _nearest(time, value)
+        if new.size == 0:
+            break
+    changes = np.flatnonzero((value[:-1] > 0.0) != (value[1:] > 0.0))
+    return few_trials(signed, time[changes], time[changes + 1], value[changes], value[changes + 1])
+
+
+def _may_cross(value: Float[np.ndarray, " steps"]) -> Bool[np.ndarray, " gaps"]:
+    """Steps in which a quantity may be zero: its sign changes, or it changes by more than its size, there or in a
+    neighbour."""
+    with np.errstate(invalid="ignore"):
+        change = np.abs(np.diff(value))
+        max_change = np.max([change, np.append(change[1:], 0.0), np.insert(change[:-1], 0, 0.0)], axis=0)
+        is_small = np.minimum(np.abs(value[:-1]), np.abs(value[1:])) < max_change
+    return is_small | ((value[:-1] > 0.0) != (value[1:] > 0.0))
+
+
+def _nearest(time: Float[np.ndarray, " looks"], value: Float[np.ndarray, " looks"]) -> Float[np.ndarray, " new"]:
+    """The times at which a quantity is nearest to zero between checks of equal sign: the vertices of parabolas."""
+    distance = np.abs(value)
+    is_minimum = (distance[1:-1] < distance[:-2]) & (distance[1:-1] <= distance[2:])
+    is_minimum &= (value[1:-1] > 0.0) == (value[:-2] > 0.0)
+    is_minimum &= (value[1:-1] > 0.0) == (value[2:] > 0.0)
+    middle = np.flatnonzero(is_minimum) + 1
+    gap_before, gap_after = time[middle] - time[middle - 1], time[middle + 1] - time[middle]
+    with np.errstate(all="ignore"):
+        fall = (distance[middle - 1] - distance[middle]) / gap_before
+        rise = (distance[middle + 1] - distance[middle]) / gap_after
+        vertex = time[middle] + 0.5 * (fall * gap_after**2 - rise * gap_before**2) / (
+            fall * gap_after + rise * gap_before
+        )
+    is_inside = (vertex > time[middle - 1]) & (vertex < time[middle + 1]) & (np.abs(vertex - time[middle]) > CLOSEST)
+    return vertex[is_inside]

@@ -16,7 +16,7 @@ from nonholonomic.geometry import Component, Vector, dot, rate_in_frame, scale, 
 from nonholonomic.hybrid import HybridPath
 from nonholonomic.integration import DenseSolution
 from nonholonomic.integration.status import Status
-from nonholonomic.integration.zeros import few_trials
+from nonholonomic.integration.zeros import all_crossings
 from nonholonomic.progress import status_line
 from nonholonomic.sweeps import Quantity, Table, Tabular
 from nonholonomic.text import batch_title
@@ -32,9 +32,6 @@ from ..steady import group
 from .checks import INVERTED
 from .quantities import QUANTITIES, table_of
 from .view import as_stages, names_of
-
-#: Distance from the angle [rad] within which a step is checked in parts, and the number of parts.
-NEAR, LOOKS = 0.3, 8
 
 
 def of_each_run(function: Callable[[Any], Array]) -> property:
@@ -152,17 +149,7 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         value = beyond(times)
         if value[0] >= 0.0:
             return 0.0
-        # Within a step, theta may exceed its values at the ends.
-        last = np.argmax(value >= 0.0) if np.any(value >= 0.0) else len(value) - 1
-        suspects = np.flatnonzero(np.maximum(value[:last], value[1 : last + 1]) > -NEAR)
-        check_times = times[suspects] + np.arange(1, LOOKS)[:, None] / LOOKS * (times[suspects + 1] - times[suspects])
-        times = np.unique(np.concatenate([times[: last + 1], check_times.ravel()]))
-        value = beyond(times)
-        crossings = np.flatnonzero(value >= 0.0)
-        if not crossings.size:
-            return np.inf
-        k = crossings[0]
-        return float(few_trials(beyond, times[k - 1 : k], times[k : k + 1], value[k - 1 : k], value[k : k + 1])[0])
+        return float(min(all_crossings(beyond, times, value), default=np.inf))
 
     @of_each_run
     def theta_rate(self) -> Float[Array, " times"]:
