@@ -136,10 +136,7 @@ def unsearched(explorer: Explorer, estimate: Float[np.ndarray, " unknowns"]) -> 
 
 
 def remarks(
-    explorer: Explorer,
-    sample: Weighted,
-    distribution: Distribution,
-    by_slopes: Float[np.ndarray, "unknowns unknowns"],
+    explorer: Explorer, sample: Weighted, distribution: Distribution, by_slopes: Float[np.ndarray, "unknowns unknowns"]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What is special about the shape of a posterior: concerns and notes, in words."""
     problem = explorer.density.problem
