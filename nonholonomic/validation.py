@@ -224,6 +224,15 @@ def require_increasing(values: Any, name: str) -> None:
         )
 
 
+def times_within(times: Any, end: Any, run: str) -> Float[np.ndarray, " times"]:
+    """Convert times of output, or one time, to a list; raise `ValueError` unless they increase and lie within [0, `end`].
+    **Arguments:** `end`: end of the run [s]; `run`: the word for the run in the message."""
+    require(times, "times", at_least=0.0, at_most=end, why=f"the {run} ends there")
+    times = np.atleast_1d(np.asarray(times, dtype=float))
+    require_increasing(times, "times")
+    return times
+
+
 def require_flag(value: Any, name: str) -> None:
     """Raise `ValueError` unless the value is true or false; a word such as "no" would count as true."""
     if not isinstance(value, bool | np.bool_):

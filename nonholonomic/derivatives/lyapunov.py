@@ -92,11 +92,7 @@ class Growth(NamedTuple):
 
 
 def growth(
-    problem: AbstractProblem,
-    tangents: Float[Array, "components cells"],
-    t1: float,
-    stretches: int,
-    settings: Settings,
+    problem: AbstractProblem, tangents: Float[Array, "components cells"], t1: float, stretches: int, settings: Settings
 ) -> Growth:
     """Integrate every cell of a problem together with a tangent.
 

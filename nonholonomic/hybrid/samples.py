@@ -63,12 +63,7 @@ class HybridSamples(NamedTuple):
 
 
 def hybrid_samples(
-    build: Build,
-    modules: Any,
-    times: Float[Array, " times"],
-    t1: Float[Array, ""],
-    settings: Settings,
-    counters: int,
+    build: Build, modules: Any, times: Float[Array, " times"], t1: Float[Array, ""], settings: Settings, counters: int
 ) -> HybridSamples:
     """Run one cell through its modes inside a transformation and sample it, with derivatives that take part in
     step-size control. A batch under `vmap` is solved as one ensemble. The gradient of a function of its samples by many

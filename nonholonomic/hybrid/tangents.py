@@ -103,11 +103,7 @@ def traced_solve_hybrid_with_tangents(
 
 
 def _where_defined(
-    xp: Any,
-    ended: HybridOutcome[Numbers],
-    slopes: list[Float[Numbers, "tangents cells"]],
-    t1: Any,
-    ends_on_event: bool,
+    xp: Any, ended: HybridOutcome[Numbers], slopes: list[Float[Numbers, "tangents cells"]], t1: Any, ends_on_event: bool
 ) -> Slopes[Numbers]:
     """The derivatives of the times of events, of each cell by its mode, where the events happened and the derivatives
     have correct digits.

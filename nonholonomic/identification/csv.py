@@ -145,11 +145,7 @@ def read_launches(
 
 
 def _opened(
-    path: Any,
-    columns: Any,
-    decimal: Any,
-    known: Mapping[str, str],
-    several: Mapping[str, tuple[str, ...]],
+    path: Any, columns: Any, decimal: Any, known: Mapping[str, str], several: Mapping[str, tuple[str, ...]]
 ) -> tuple[TextTable, Mapping[str, Any]]:
     """The file and its columns, checked. **Arguments:** `known`: name of a column -> its SI unit; `several`: names that
     stand for several columns."""

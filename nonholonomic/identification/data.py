@@ -51,10 +51,7 @@ def own_name(name: str) -> str:
 
 
 def free_numbers(
-    free: Any,
-    shared: list[str],
-    own: list[list[str]],
-    check: Callable[[dict[str, float]], Any],
+    free: Any, shared: list[str], own: list[list[str]], check: Callable[[dict[str, float]], Any]
 ) -> dict[str, Free]:
     """The unknowns of a scene and its data: their full names, and a lower bound of 0 for parameters that cannot be negative.
 

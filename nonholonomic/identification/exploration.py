@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..progress import Progress
-from .likelihood import Measurements
 from .marginal import log_likelihoods
 from .mixture import Mixture, fitted
 from .pareto import smoothed_weights
 from .posterior import LogDensity
-from .region import Region
+from .region import Region, region_of
+from .unknown import Free
 
 #: Number of points in a round; all rounds use one program. With a single unknown, half as many are enough. A round of the
 #: search by slopes uses fewer.
@@ -92,19 +92,19 @@ class Explorer(NamedTuple):
     """What is explored, and where: a density, the region of the search, and the group of every measurement."""
 
     density: LogDensity
-    measurements: Measurements
     region: Region
     group: np.ndarray
     random: np.random.Generator
 
     @classmethod
-    def of(cls, density: LogDensity, measurements: Measurements, region: Region, seed: int) -> "Explorer":
-        """An explorer with measurements grouped by their times."""
-        times = np.asarray(measurements.time)
+    def of(cls, density: LogDensity, free: dict[str, Free], spread: float, seed: int) -> "Explorer":
+        """An explorer of the region around start values, as for `region_of`, with measurements grouped by their times."""
+        times = np.asarray(density.measurements.time)
         distinct = np.unique(times)
         count = min(GROUPS, len(distinct))
         group = (np.searchsorted(distinct, times) * count) // len(distinct)
-        return cls(density, measurements, region, group, np.random.default_rng(seed))
+        region = region_of(free, spread, float(np.max(times)))
+        return cls(density, region, group, np.random.default_rng(seed))
 
     @property
     def rows(self) -> int:
@@ -113,7 +113,8 @@ class Explorer(NamedTuple):
 
     def begin(self, seed: int) -> Pool:
         """A pool of quasi-random points in the region."""
-        size, values, groups = len(self.region.middle), self.measurements.value.size, int(np.max(self.group)) + 1
+        values, groups = self.density.measurements.value.size, int(np.max(self.group)) + 1
+        size = len(self.region.middle)
         shapes = ((0, size), (0, values), (0, groups), (0,), (0,), (0,), (0,))
         empty = Pool(*(np.zeros(shape) for shape in shapes), proposals=())
         return self.extended(empty, self.region.points(ROWS if size > 2 else self.rows // 2, seed), self.region)
@@ -175,7 +176,7 @@ class Explorer(NamedTuple):
         batch = np.full((ROWS, points.shape[1]), np.nan)
         batch[: len(points)][inside] = points[inside]
         predictions = self.density.predictions(batch[: len(points)])
-        each, likelihood = log_likelihoods(self.measurements, predictions)
+        each, likelihood = log_likelihoods(self.density.measurements, predictions)
         prior = np.where(inside, self.density.log_priors(batch)[: len(points)], -np.inf)
         return predictions, each, prior, likelihood + prior
 

@@ -3,17 +3,14 @@
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from ..progress import status_line
 from ..validation import require, require_flag, require_scalars, require_whole, shown
 from ..warning import warn
 from .exploration import ROWS, Explorer
 from .likelihood import Measurements
 from .posterior import LogDensity
-from .region import region_of
 from .result import Identification, summarise
-from .search import Search, search
+from .search import search
 from .unknown import as_free
 from .verdict import FitWarning
 
@@ -82,10 +79,9 @@ def identify(
     if len(labels) != count:
         raise ValueError(f"labels must be {count}, one for each measurement, not {len(labels)}")
     with status_line("fitting", progress):
-        region = region_of(unknowns, spread, float(np.max(np.asarray(measurements.time))))
         density = LogDensity.of(model, measurements, unknowns, slopes=slopes)
-        explorer = Explorer.of(density, measurements, region, seed)
-        minima, sample = search(density.problem, explorer, Search(starts, max_steps, seed, progress))
+        explorer = Explorer.of(density, unknowns, spread, seed)
+        minima, sample = search(explorer, starts, max_steps, seed, progress)
         result = summarise(density.problem, labels, minima, explorer, sample)
     if not result.verdict.good:
         warn("; ".join(result.verdict.concerns), FitWarning)

@@ -22,8 +22,7 @@ from .exploration import ROWS, Explorer
 from .marginal import draw_errors
 from .mixture import Mixture
 from .posterior import LogDensity
-from .region import region_of
-from .search import Search, search
+from .search import search
 from .unknown import Free
 
 #: Number of proposals for each draw.
@@ -134,7 +133,7 @@ def drawn(
     """
     chains, discarded, draws = sizes
     explorer, random = explorer_of(density, seed), np.random.default_rng(seed)
-    minima, explored = search(density.problem, explorer, Search(STARTS, STEPS, seed, progress))
+    minima, explored = search(explorer, STARTS, STEPS, seed, progress)
     components = minima.components
     if known is not None:
         components = known if components is None else components.joined(known, 0.5)
@@ -159,8 +158,7 @@ def explorer_of(density: LogDensity, seed: int) -> Explorer:
         gaussian = None if prior is None or callable(prior) else (float(prior[0]), float(prior[1]))
         start, lower, upper = (float(number) for number in (unknown.start, unknown.lower, unknown.upper))
         free[name] = Free(start, lower, upper, gaussian)
-    duration = float(np.max(np.asarray(density.measurements.time)))
-    return Explorer.of(density, density.measurements, region_of(free, SPREAD, duration), seed)
+    return Explorer.of(density, free, SPREAD, seed)
 
 
 def _component(density: LogDensity, centre: Any, covariance: Any) -> Mixture:

@@ -1,7 +1,6 @@
 """The search for all minima of a likelihood, and the exploration of its surroundings."""
 
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,23 +18,13 @@ LAST = 4
 IMPROVED = 0.1
 
 
-class Search(NamedTuple):
-    """How to search: the number of refined candidates, the greatest number of steps of a refinement, the seed, and whether to
-    show progress."""
-
-    starts: int
-    max_steps: int
-    seed: int
-    progress: bool
-
-
-def search(problem: Problem, explorer: Explorer, options: Search) -> tuple[Minima, Weighted]:
+def search(explorer: Explorer, starts: int, max_steps: int, seed: int, progress: bool) -> tuple[Minima, Weighted]:
     """Compare candidates, refine the best, and explore the likelihood around all minima; or explore first, where steps by
-    differences cost more.
+    differences cost more. **Arguments:** as for `identify`.
 
     **Raises:** `ValueError` if no candidate has a finite prediction.
     """
-    measurements, (starts, max_steps, seed, progress) = explorer.measurements, options
+    problem, measurements = explorer.density.problem, explorer.density.measurements
     with ThreadPoolExecutor(1) as thread:
         # Compile the slopes while this thread compiles and computes the predictions.
         thread.submit(compile_slopes, problem)
@@ -61,21 +50,21 @@ def search(problem: Problem, explorer: Explorer, options: Search) -> tuple[Minim
     # Along a direction without any slope, the likelihood has no end that an exploration could find.
     has_end = bool(np.all(np.isfinite(minima.covariance(minima.best))))
     sample = explorer.explore(pool, minima.components, progress) if has_end else Weighted.of(pool)
-    return _improved(problem, minima, sample, options), sample
+    return _improved(problem, minima, sample, max_steps, progress), sample
 
 
-def _improved(problem: Problem, minima: Minima, sample: Weighted, options: Search) -> Minima:
+def _improved(problem: Problem, minima: Minima, sample: Weighted, max_steps: int, progress: bool) -> Minima:
     """The minima, the best of them refined to the end; from the best points of the exploration if these are better."""
-    rows, max_steps = len(minima.starts), options.max_steps
-    pool, order = sample.pool, sample.pool.most_probable(rows)
+    rows, pool = len(minima.starts), sample.pool
+    order = pool.most_probable(rows)
     best = pool.points[order]
     deviance = deviances(problem, best, pool.predictions[order], minima.measurements)
     if np.min(deviance) < np.min(minima.deviance) - IMPROVED:
-        few = Refinement(min(max_steps, FEW_STEPS), options.progress, rows=np.arange(rows) < LAST)
+        few = Refinement(min(max_steps, FEW_STEPS), progress, rows=np.arange(rows) < LAST)
         later = refine(problem, best, minima.measurements, few)
         return later if np.min(later.deviance) < np.min(minima.deviance) else minima
     if minima.converged[minima.best]:
         return minima
     last = np.isin(np.arange(rows), np.argsort(minima.deviance)[:LAST])
-    later = refine(problem, minima.coordinates, minima.measurements, Refinement(max_steps, options.progress, rows=last))
+    later = refine(problem, minima.coordinates, minima.measurements, Refinement(max_steps, progress, rows=last))
     return later._replace(starts=minima.starts, converged=minima.converged | later.converged)

@@ -116,7 +116,7 @@ def roughness(explorer: Explorer, sample: Weighted) -> float:
     columns += [centred[:, i] * centred[:, j] for i in range(size) for j in range(i + 1)]
     terms = np.stack(columns, axis=1)
     predictions = sample.pool.predictions[used]
-    measurements = explorer.measurements
+    measurements = explorer.density.measurements
     predictions = predictions - whole_periods(predictions - predictions[0], np.asarray(measurements.period))
     coefficients, *_ = np.linalg.lstsq(root * terms, root * predictions)
     off = (predictions - terms @ coefficients) / np.asarray(measurements.error)
@@ -136,10 +136,7 @@ def unsearched(explorer: Explorer, estimate: Float[np.ndarray, " unknowns"]) -> 
 
 
 def remarks(
-    explorer: Explorer,
-    sample: Weighted,
-    distribution: Distribution,
-    by_slopes: Float[np.ndarray, "unknowns unknowns"],
+    explorer: Explorer, sample: Weighted, distribution: Distribution, by_slopes: Float[np.ndarray, "unknowns unknowns"]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What is special about the shape of a posterior: concerns and notes, in words."""
     problem = explorer.density.problem

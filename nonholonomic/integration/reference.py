@@ -17,11 +17,7 @@ from .status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END
 
 
 @eqx.filter_jit
-def solve_by_diffrax(
-    problem: AbstractProblem,
-    t1: Float[Array, ""],
-    settings: Settings,
-) -> Outcome:
+def solve_by_diffrax(problem: AbstractProblem, t1: Float[Array, ""], settings: Settings) -> Outcome:
     """Run every cell from t = 0 to its event, to the end of the model's validity, or to `t1`.
 
     The domain margin is checked at the ends of steps, so a short loss can be missed; events are located on Diffrax's

@@ -190,17 +190,16 @@ def _through_modes(
         logarithm, state = map(np.asarray, rescaled)
         alive = (ending.status == RUNNING) | (ending.status == REACHED_END)
         logarithms.append(np.where(alive, logarithm, 0.0))
-        mode = np.minimum(np.asarray(outcome.mode), len(modes) - 1)
-        ending = HybridOutcome(
-            status=np.where(alive, outcome.status, ending.status),
+        mode = np.minimum(outcome.mode, len(modes) - 1)
+        extended = outcome._replace(
             crossing_time=ending.crossing_time,
-            end_time=ending.end_time + np.where(alive, outcome.end_time, 0.0),
-            state=np.where(alive, outcome.state[:size], ending.state),
-            steps=ending.steps + np.where(alive, outcome.steps, 0),
-            rejected=ending.rejected + np.where(alive, outcome.rejected, 0),
-            mode=np.where(alive, outcome.mode, ending.mode),
-            counts=ending.counts + np.where(alive, outcome.counts[:-1], 0),
+            end_time=ending.end_time + outcome.end_time,
+            state=outcome.state[:size],
+            steps=ending.steps + outcome.steps,
+            rejected=ending.rejected + outcome.rejected,
+            counts=ending.counts + outcome.counts[:-1],
         )
+        ending = HybridOutcome(*(np.where(alive, new, old) for new, old in zip(extended, ending, strict=True)))
     growths = Growth(np.stack(logarithms), ending.status, ending.end_time, ending.state, ending.steps)
     return growths, jax.tree.map(jnp.asarray, ending)
 

@@ -15,7 +15,7 @@ from ..integration import Settings
 from ..integration.status import Status
 from ..sweeps import Table, Tabular
 from ..text import as_text, batch_title, distinguishing_labels
-from ..validation import is_traced, require, require_increasing
+from ..validation import is_traced, times_within
 from ..views import Page, Stage, Viewable, new_figure
 from .explore import explore_model
 from .model import AbstractModel
@@ -171,9 +171,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         """
         if not self._is_one_run:
             raise ValueError("at takes one run outside jit, vmap and grad: pass times= to simulate there")
-        require(times, "times", at_least=0.0, at_most=self.end_time, why="the run ends there")
-        times = np.atleast_1d(np.asarray(times, dtype=float))
-        require_increasing(times, "times")
+        times = times_within(times, self.end_time, "run")
         return self.model.simulate(self.t1, times, self.settings.tolerance, self.settings.solver, None)
 
     def stages(self, others: Sequence[Any] = (), overlaid: bool = False, unit: Any = None) -> list[Stage]:

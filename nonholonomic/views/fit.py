@@ -1,14 +1,18 @@
 """The picture of a fit: data and model, residuals, profile likelihoods and correlations (needs matplotlib)."""
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..parameters import short_names
 from ..text import in_unit, readable_unit
 from .plot import new_figure
+
+# Only for type checkers: plots stand below tables and fits, which use them.
+if TYPE_CHECKING:
+    from ..identification import Identification
 
 #: Greatest number of drawn profiles, and the rise of -2 log likelihood at the end of a 95 % interval.
 MOST_PROFILES, INTERVAL = 6, 3.84
@@ -20,45 +24,7 @@ MOST_LABELS = 12
 MARGIN = 0.08
 
 
-class Fit(Protocol):
-    """The parts of an `identification.Identification` that its picture shows."""
-
-    @property
-    def estimates(self) -> Mapping[str, float]: ...
-
-    @property
-    def standard_errors(self) -> Mapping[str, float]: ...
-
-    @property
-    def most_likely(self) -> Mapping[str, float]: ...
-
-    @property
-    def units(self) -> Mapping[str, str]: ...
-
-    @property
-    def measurements(self) -> Any: ...
-
-    @property
-    def residuals(self) -> Sequence[Any]: ...
-
-    @property
-    def correlation(self) -> np.ndarray: ...
-
-    @property
-    def curves(self) -> tuple[np.ndarray, np.ndarray]: ...
-
-    @property
-    def series_units(self) -> tuple[str, ...]: ...
-
-    @property
-    def verdict(self) -> Any: ...
-
-    def interval(self, name: str) -> tuple[float, float]: ...
-
-    def profile(self, name: str) -> Any: ...
-
-
-def draw_fit(fit: Fit, labels: Sequence[str], unit: Any) -> Any:
+def draw_fit(fit: "Identification", labels: Sequence[str], unit: Any) -> Any:
     """Draw a fit: measurements and predictions at the most likely values, residuals in standard errors, profile likelihoods of
     the determined parameters (with their estimates and intervals, and the parabolas of their errors dashed), and correlations.
 
@@ -90,13 +56,13 @@ def draw_fit(fit: Fit, labels: Sequence[str], unit: Any) -> Any:
     return figure
 
 
-def _series(fit: Fit) -> list[np.ndarray]:
+def _series(fit: "Identification") -> list[np.ndarray]:
     """The indices of the measurements of each series."""
     numbers = np.asarray(fit.measurements.series)
     return [np.flatnonzero(numbers == number) for number in np.unique(numbers)]
 
 
-def _named(fit: Fit, unit: Any) -> list[tuple[str, float]]:
+def _named(fit: "Identification", unit: Any) -> list[tuple[str, float]]:
     """The quantity of each series with the unit in which it is drawn, such as "theta [deg]", and the factor that converts
     its values."""
     named = []
@@ -113,17 +79,17 @@ def _with_unit(name: str, unit: str) -> str:
     return f"{name} [{readable_unit(unit)}]" if readable_unit(unit) else name
 
 
-def _has_times(fit: Fit) -> bool:
+def _has_times(fit: "Identification") -> bool:
     return bool(np.any(np.asarray(fit.measurements.time)))
 
 
-def _places(fit: Fit) -> np.ndarray:
+def _places(fit: "Identification") -> np.ndarray:
     """The abscissa of every measurement: its time, if it has one, otherwise its number."""
     times = np.asarray(fit.measurements.time)
     return times if _has_times(fit) else np.arange(len(times))
 
 
-def _label_abscissa(fit: Fit, data: Any, residuals: Any, labels: Sequence[str]) -> None:
+def _label_abscissa(fit: "Identification", data: Any, residuals: Any, labels: Sequence[str]) -> None:
     """Label the common abscissa below the residuals."""
     data.tick_params(labelbottom=False)
     if _has_times(fit):
@@ -134,7 +100,7 @@ def _label_abscissa(fit: Fit, data: Any, residuals: Any, labels: Sequence[str]) 
         residuals.set_xlabel("measurement")
 
 
-def _draw_data(fit: Fit, axes: Any, unit: Any) -> None:
+def _draw_data(fit: "Identification", axes: Any, unit: Any) -> None:
     places, named, (times, curves) = _places(fit), _named(fit, unit), fit.curves
     factors = np.ones(len(places))
     for indices, (_, factor) in zip(_series(fit), named, strict=True):
@@ -203,7 +169,7 @@ def _draw_limits(axes: Any, places: np.ndarray, lower: np.ndarray, upper: np.nda
     axes.set_ylim(low, high)
 
 
-def _draw_residuals(fit: Fit, axes: Any) -> None:
+def _draw_residuals(fit: "Identification", axes: Any) -> None:
     places = _places(fit)
     residual = np.array([row.residual for row in fit.residuals])
     for k, indices in enumerate(_series(fit)):
@@ -212,7 +178,7 @@ def _draw_residuals(fit: Fit, axes: Any) -> None:
     axes.set_ylabel("residual\n[standard errors]")
 
 
-def _draw_profile(fit: Fit, name: str, profile: Any, axes: Any, unit: Any) -> None:
+def _draw_profile(fit: "Identification", name: str, profile: Any, axes: Any, unit: Any) -> None:
     shown, factor = in_unit(fit.units.get(name, "1"), unit)
     estimate, error = fit.estimates[name], fit.standard_errors[name]
     likely = fit.most_likely[name]
@@ -235,7 +201,7 @@ def _draw_profile(fit: Fit, name: str, profile: Any, axes: Any, unit: Any) -> No
     axes.set_title(f"{value} ± {spread} {readable_unit(shown)}".rstrip() + f"\n95 %: {low} to {high}", fontsize=9)
 
 
-def _draw_correlation(fit: Fit, names: list[str], axes: Any) -> None:
+def _draw_correlation(fit: "Identification", names: list[str], axes: Any) -> None:
     image = axes.imshow(fit.correlation, vmin=-1.0, vmax=1.0, cmap="RdBu")
     labels = list(short_names(names).values())
     axes.set_xticks(range(len(names)), labels, rotation=90, fontsize=8)

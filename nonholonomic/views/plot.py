@@ -2,14 +2,17 @@
 
 import functools
 import io
-from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..parameters import meant
 from ..text import likely, readable_unit
 from ..validation import require, shown
+
+# Only for type checkers: plots stand below tables and fits, which use them.
+if TYPE_CHECKING:
+    from ..sweeps import Table
 
 #: Colours of map cells without a finite value, one for each status.
 GREYS = ("0.85", "0.7", "0.55", "0.4", "0.25")
@@ -22,34 +25,6 @@ ROUND_OFF = 1e-9
 
 #: An axis with at most this many values is drawn as one line per value.
 MOST_LINES = 8
-
-
-class Labelled(Protocol):
-    """The parts of a `sweeps.Table` that its plots use."""
-
-    @property
-    def coords(self) -> Mapping[str, np.ndarray]: ...
-
-    @property
-    def variables(self) -> Mapping[str, np.ndarray]: ...
-
-    @property
-    def units(self) -> Mapping[str, str]: ...
-
-    @property
-    def inner(self) -> Mapping[str, tuple[str, ...]]: ...
-
-    @property
-    def long_names(self) -> Mapping[str, str]: ...
-
-    @property
-    def shape(self) -> tuple[int, ...]: ...
-
-    def __getitem__(self, name: str) -> np.ndarray: ...
-
-    def dims(self, variable: str) -> tuple[str, ...]: ...
-
-    def label(self, name: str) -> str: ...
 
 
 @functools.cache
@@ -81,7 +56,7 @@ def _drawing(ax: Any, *size: float) -> tuple[Any, Any]:
 
 
 def draw_table(
-    table: Labelled,
+    table: "Table",
     variable: str | None = None,
     at: dict[str, float] | None = None,
     log: bool = False,
@@ -138,13 +113,13 @@ def draw_table(
     return drawing if figure is None else figure
 
 
-def _words(table: Labelled, variable: str, dims: tuple[str, ...], names: list[str], cut: dict[str, int]) -> Any:
+def _words(table: "Table", variable: str, dims: tuple[str, ...], names: list[str], cut: dict[str, int]) -> Any:
     """The statuses of the drawn cells, if each has one."""
     has_status = "status" in table.variables and not table.inner.get(variable)
     return _slice(table.variables["status"], dims, names, cut) if has_status else None
 
 
-def _say_why_it_is_empty(drawing: Any, table: Labelled, name: str, words: Any) -> None:
+def _say_why_it_is_empty(drawing: Any, table: "Table", name: str, words: Any) -> None:
     """Keep the abscissa of lines without any finite value, and count the statuses of their cells."""
     values = table.coords[name]
     if values.dtype.kind != "U" and len(values) > 1:
@@ -154,7 +129,7 @@ def _say_why_it_is_empty(drawing: Any, table: Labelled, name: str, words: Any) -
     drawing.text(0.5, 0.5, text, transform=drawing.transAxes, ha="center", va="center")
 
 
-def _first_number(table: Labelled) -> str:
+def _first_number(table: "Table") -> str:
     names = [name for name, values in table.variables.items() if values.dtype.kind != "U"]
     if not names:
         raise ValueError("the table has no numeric variable to draw")
@@ -168,7 +143,7 @@ def _whole(dims: tuple[str, ...], name: Any) -> Any:
 
 
 def _drawn(
-    table: Labelled, variable: str, at: dict[str, float], x: str | None, y: str | None
+    table: "Table", variable: str, at: dict[str, float], x: str | None, y: str | None
 ) -> tuple[list[str], dict[str, int]]:
     """The one or two dimensions to draw over, and the indices at which the others are cut."""
     dims = table.dims(variable)
@@ -189,7 +164,7 @@ def _drawn(
     return names, cut | {name: 0 for name in left if name not in names}
 
 
-def _nearest(table: Labelled, dims: tuple[str, ...], name: str, value: Any) -> int:
+def _nearest(table: "Table", dims: tuple[str, ...], name: str, value: Any) -> int:
     """The index of the value of an axis that is nearest to a wanted value within the axis."""
     if name not in dims:
         raise ValueError(f"at: {name!r} must be one of {', '.join(dims)}{likely(name, dims)}")
@@ -216,7 +191,7 @@ def _slice(values: Any, dims: tuple[str, ...], names: list[str], cut: dict[str, 
     return values[tuple(cut.get(name, slice(None)) for name in dims)].transpose([left.index(name) for name in names])
 
 
-def _cut_text(table: Labelled, name: str, place: int, wanted: Any = None) -> str:
+def _cut_text(table: "Table", name: str, place: int, wanted: Any = None) -> str:
     """A coordinate's value as text, "θ(0) = 0.1 rad", with the wanted value where it is another."""
     value = table.coords[name][place]
     text = str(value) if isinstance(value, str) else f"{value:.4g}"
@@ -225,7 +200,7 @@ def _cut_text(table: Labelled, name: str, place: int, wanted: Any = None) -> str
     return text if is_near else f"{text} (nearest to {wanted:.4g})"
 
 
-def _draw_lines(drawing: Any, table: Labelled, names: list[str], lines: Any, label: str | None) -> None:
+def _draw_lines(drawing: Any, table: "Table", names: list[str], lines: Any, label: str | None) -> None:
     marker = "o-" if len(lines) <= 100 else "-"
     for index, line in enumerate(lines.T):
         texts = [label or "", _cut_text(table, names[1], index) if len(names) > 1 else ""]
@@ -235,7 +210,7 @@ def _draw_lines(drawing: Any, table: Labelled, names: list[str], lines: Any, lab
         drawing.legend()
 
 
-def _draw_map(drawing: Any, table: Labelled, names: list[str], visible: Any, label: str, log: bool) -> None:
+def _draw_map(drawing: Any, table: "Table", names: list[str], visible: Any, label: str, log: bool) -> None:
     from matplotlib.colors import LogNorm, Normalize
 
     values = visible[np.isfinite(visible) & (visible > 0.0)] if log else visible[np.isfinite(visible)]
@@ -258,7 +233,7 @@ def _plain_numbers(axis: Any) -> None:
         axis.set_minor_formatter("{x:g}" if high < 10.0 * low else "")
 
 
-def _mark_words(drawing: Any, table: Labelled, names: list[str], words: Any) -> None:
+def _mark_words(drawing: Any, table: "Table", names: list[str], words: Any) -> None:
     """Paint cells without a value in the grey of their status."""
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
@@ -286,7 +261,7 @@ def _emptiest_corner(is_empty: np.ndarray) -> str:
     return max(shares, key=lambda corner: shares[corner])
 
 
-def draw_portrait(table: Labelled, x: str, y: str, ax: Any = None) -> Any:
+def draw_portrait(table: "Table", x: str, y: str, ax: Any = None) -> Any:
     """Draw one variable of a run's table against another, with a dot at the start.
 
     **Arguments:**
@@ -311,7 +286,7 @@ def draw_portrait(table: Labelled, x: str, y: str, ax: Any = None) -> Any:
     return drawing if figure is None else figure
 
 
-def column(table: Labelled, argument: str, name: Any, vectors: bool = False) -> tuple[Any, str]:
+def column(table: "Table", argument: str, name: Any, vectors: bool = False) -> tuple[Any, str]:
     """A variable, or one of its components, with its label.
 
     **Arguments:** `argument`: name of the argument in a message; `vectors`: whether the message lists vectors, too.

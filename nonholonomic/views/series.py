@@ -2,16 +2,20 @@
 
 import itertools
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from .plot import Labelled, column, new_figure
+from .plot import column, new_figure
+
+# Only for type checkers: plots stand below tables and fits, which use them.
+if TYPE_CHECKING:
+    from ..sweeps import Table
 
 #: Styles of the lines of a vector's components, and size of a panel [inches].
 STYLES = ("-", "--", ":", "-.")
 PANEL = (7.0, 2.0)
 
 
-def draw_series(tables: Sequence[Labelled], names: Sequence[str], labels: Sequence[str], ax: Any = None) -> Any:
+def draw_series(tables: Sequence["Table"], names: Sequence[str], labels: Sequence[str], ax: Any = None) -> Any:
     """Draw quantities over time, with a panel for each quantity and a colour for each run.
 
     **Arguments:**
@@ -39,7 +43,7 @@ def draw_series(tables: Sequence[Labelled], names: Sequence[str], labels: Sequen
     return ax if figure is None else figure
 
 
-def _draw_panel(panel: Any, tables: Sequence[Labelled], name: str, labels: Sequence[str]) -> None:
+def _draw_panel(panel: Any, tables: Sequence["Table"], name: str, labels: Sequence[str]) -> None:
     for table, label in zip(tables, labels, strict=True):
         lines, quantity = _lines(table, name)
         colour = None
@@ -54,7 +58,7 @@ def _draw_panel(panel: Any, tables: Sequence[Labelled], name: str, labels: Seque
         panel.legend(fontsize="small")
 
 
-def _lines(table: Labelled, name: str) -> tuple[list[tuple[str, Any]], str]:
+def _lines(table: "Table", name: str) -> tuple[list[tuple[str, Any]], str]:
     """The components of a quantity with their values, and the label of the quantity."""
     dims = table.inner.get(name, ())
     if len(dims) == 1 and table[dims[0]].dtype.kind == "U":

@@ -40,12 +40,7 @@ class Goal(Bounded):
     ```
     """
 
-    units: ClassVar[dict[str, str]] = {
-        "place": "m or rad",
-        "heading": "rad",
-        "speed": "m s-1",
-        "within": "1",
-    }
+    units: ClassVar[dict[str, str]] = {"place": "m or rad", "heading": "rad", "speed": "m s-1", "within": "1"}
 
     place: tuple[Float[Array, ""], ...] = eqx.field(converter=as_place)
     heading: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
@@ -104,13 +99,7 @@ class Limits(Bounded):
     ```
     """
 
-    units: ClassVar[dict[str, str]] = {
-        "steering": "rad",
-        "speed": "m s-1",
-        "force": "N",
-        "torque": "N m",
-        "grip": "1",
-    }
+    units: ClassVar[dict[str, str]] = {"steering": "rad", "speed": "m s-1", "force": "N", "torque": "N m", "grip": "1"}
 
     steering: tuple[Float[Array, ""], ...] | None = eqx.field(converter=as_range, default=None)
     speed: tuple[Float[Array, ""], ...] | None = eqx.field(converter=as_range, default=None)

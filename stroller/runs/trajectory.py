@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 from nonholonomic.progress import status_line
 from nonholonomic.sweeps import Quantity, Table, Tabular
 from nonholonomic.text import batch_title
-from nonholonomic.validation import is_traced, require, require_increasing, require_one_run, require_outside
+from nonholonomic.validation import is_traced, require_one_run, require_outside, times_within
 from nonholonomic.views import Stage, Viewable
 
 from ..model.dynamics import Power
@@ -135,12 +135,9 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         require_one_run(self, "at", "")
         run = self.with_steps()
         assert run.steps is not None
-        require(times, "times", at_least=0.0, at_most=run.steps.times[-1], why="the ride ends there")
-        times = np.atleast_1d(np.asarray(times, dtype=float))
-        require_increasing(times, "times")
-        return dataclasses.replace(
-            read_off_compiled(self.spec, times, run.steps.at(self.spec, times), self.stats), steps=run.steps
-        )
+        times = times_within(times, run.steps.times[-1], "ride")
+        read = read_off_compiled(self.spec, times, run.steps.at(self.spec, times), self.stats)
+        return dataclasses.replace(read, steps=run.steps)
 
     def with_steps(self) -> "Trajectory":
         """The same run with its steps."""

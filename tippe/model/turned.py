@@ -66,12 +66,7 @@ def half_ball(radius: Number, centre: Number) -> Moments:
     """The upper half of a ball about a point on the axis."""
     volume, moment = 2.0 * jnp.pi * radius**3 / 3.0, jnp.pi * radius**4 / 4.0
     second = 2.0 * volume * radius**2 / 5.0
-    return Moments(
-        volume,
-        volume * centre + moment,
-        second,
-        second + 2.0 * moment * centre + volume * centre**2,
-    )
+    return Moments(volume, volume * centre + moment, second, second + 2.0 * moment * centre + volume * centre**2)
 
 
 class Shape(NamedTuple):

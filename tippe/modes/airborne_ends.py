@@ -10,18 +10,7 @@ from ..model.scene import Scene
 from ..model.state import parts
 from ..model.stick_slip import StickSlip
 from ..model.top import Top
-from .airborne import (
-    FLYING,
-    ON_STEM,
-    OWN,
-    SLIDING,
-    as_free_body,
-    below,
-    flight_state,
-    in_contact,
-    lift_off,
-    standing,
-)
+from .airborne import FLYING, ON_STEM, OWN, SLIDING, as_free_body, below, flight_state, in_contact, lift_off, standing
 from .airborne_stick_slip import ROLLING
 from .free_body import balls, gap_rate
 

@@ -166,11 +166,7 @@ def approach(body: Top, ball: Ball, free: FreeBody) -> Approach:
 
     W = 1/m - [r]x J^-1 [r]x, r = a e - R n (`tippe.md`, section 3).
     """
-    arm = (
-        ball.offset * free.axis[0],
-        ball.offset * free.axis[1],
-        ball.offset * free.axis[2] - ball.radius,
-    )
+    arm = (ball.offset * free.axis[0], ball.offset * free.axis[1], ball.offset * free.axis[2] - ball.radius)
     w = angular_velocity(body, free.axis, free.momentum)
     velocity = sum_vectors(free.velocity, cross(w, arm))
     zero, unit = jnp.zeros_like(arm[0]), jnp.ones_like(arm[0])

@@ -38,15 +38,7 @@ from .bouncing import (
 )
 from .flight import cone, flown
 from .flying_mode import AbstractFlyingMode
-from .free_body import (
-    Ball,
-    FreeBody,
-    as_free_body,
-    balls,
-    contact_state,
-    shown,
-    standing_on,
-)
+from .free_body import Ball, FreeBody, as_free_body, balls, contact_state, shown, standing_on
 from .inversion_problem import InversionProblem, beyond_on_stem
 from .leaning import LeaningDynamics, at_rest
 from .trajectory_problem import Quadratures

@@ -44,7 +44,7 @@ class ArenaTrajectory(HybridTrajectory):
     @of_each_run
     def energy(self) -> Float[Array, " times"]:
         """Kinetic energy plus weight times the height of the centre of mass [J]."""
-        return self.scene.energy(self._states) + lifted(self.scene, self._states, *self.above)
+        return self.scene.energy(self.states) + lifted(self.scene, self.states, *self.above)
 
     @of_each_run
     def theta_rate(self) -> Float[Array, " times"]:
@@ -54,13 +54,13 @@ class ArenaTrajectory(HybridTrajectory):
         dynamics = dynamics.slipping if isinstance(dynamics, StickSlip) else dynamics
         # The frame moves with the centre of the top's sphere, also in flight.
         frame = dataclasses.replace(carried_frame(self.scene), distance=self.scene.body.radius + self.above[0])
-        rates = dataclasses.replace(dynamics, frame=frame).field(self._states)
-        return jax.jvp(self.scene.theta, (self._states,), (rates,))[1]
+        rates = dataclasses.replace(dynamics, frame=frame).field(self.states)
+        return jax.jvp(self.scene.theta, (self.states,), (rates,))[1]
 
     @of_each_run
     def normal_force(self) -> Float[Array, " times"]:
         """Normal force [N]; 0 in flight."""
-        force = self.scene.normal_force(self._states)
+        force = self.scene.normal_force(self.states)
         if self.scene.body.stem is not None:
             force = jnp.where(self.contact == 1, self._on_stem.normal_force, force)
         return jnp.where(self.contact < 0, 0.0, force)
@@ -69,7 +69,7 @@ class ArenaTrajectory(HybridTrajectory):
     def slip(self) -> Float[Array, "times 2"]:
         """Velocity along the tangent plane of the point of a sphere that is closest to the arena [m/s]: of the stem's
         sphere while it touches, otherwise of the top's own."""
-        slip = self.scene.slip_velocity(self._states)
+        slip = self.scene.slip_velocity(self.states)
         if self.scene.body.stem is not None:
             of_stem = self._on_stem.slip
             slip = jnp.where(self.contact == 1, jnp.stack([of_stem.x, of_stem.y]), slip)
@@ -83,10 +83,10 @@ class ArenaTrajectory(HybridTrajectory):
     @property
     def _flying(self) -> FlightState:
         """The top as if in flight, also in contact."""
-        scene, place, (distance, rate) = self.scene, parts(self._states).place, self.above
+        scene, place, (distance, rate) = self.scene, parts(self.states).place, self.above
         main = balls(scene.body)[0]
         # The flying top is treated as one whose own sphere is larger by the distance, so that this sphere touches.
-        flying = flight_state(lift_off(scene, self._states, False, Ball(main.offset, main.radius + distance)))
+        flying = flight_state(lift_off(scene, self.states, False, Ball(main.offset, main.radius + distance)))
         normal_velocity = scale(rate, carried_frame(scene).normal(place[:3]))
         return flying._replace(velocity=vector_of(sum_vectors(flying.velocity, normal_velocity)))
 
@@ -96,7 +96,7 @@ class ArenaTrajectory(HybridTrajectory):
         reported one."""
         scene, flying, stem = self.scene, self._flying, balls(self.scene.body)[1]
         ground = below(scene, flying, stem)
-        ground = ground._replace(axes=carried_frame(scene).own_axes((*ground.foot, *parts(self._states).place[3:])))
+        ground = ground._replace(axes=carried_frame(scene).own_axes((*ground.foot, *parts(self.states).place[3:])))
         return standing(scene, stem).motion(in_contact(ground, as_free_body(scene, flying, ground, stem)))
 
     @property

@@ -98,17 +98,13 @@ class HybridTrajectory(AbstractTrajectory):
     def _stem_gap(self) -> Float[Any, " times"]:
         """Distance of the stem from the arena [m]."""
         main, stem = balls(self.scene.body)
-        return self.above[0] + height(main, stem, self._states)
-
-    @property
-    def _states(self) -> Float[Array, "components times"]:
-        return jnp.asarray(self.states)
+        return self.above[0] + height(main, stem, self.states)
 
     @property
     def _free(self) -> FreeBody:
         """The top as a free body, also in contact."""
         body = self.scene.body
-        free = as_free_body(body, balls(body)[0], self._states)
+        free = as_free_body(body, balls(body)[0], self.states)
         (distance, rate), (u1, u2, u3) = self.above, free.velocity
         return FreeBody((u1, u2, u3 + rate), free.height + distance, free.axis, free.momentum)
 
@@ -128,7 +124,7 @@ class HybridTrajectory(AbstractTrajectory):
     @of_each_run
     def normal_force(self) -> Float[Array, " times"]:
         """Normal force [N]; 0 in flight. If both spheres touch, this is the sum of both forces, the weight."""
-        motion = standing_on(self.scene.dynamics, self._ball).motion(self._states)
+        motion = standing_on(self.scene.dynamics, self._ball).motion(self.states)
         total_force = jnp.where(self.contact == BOTH, self.scene.body.mass * self.scene.gravity, motion.normal_force)
         return jnp.where(self.contact < 0, 0.0, total_force)
 

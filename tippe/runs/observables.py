@@ -20,7 +20,7 @@ from nonholonomic.integration.zeros import all_crossings
 from nonholonomic.progress import status_line
 from nonholonomic.sweeps import Quantity, Table, Tabular
 from nonholonomic.text import batch_title
-from nonholonomic.validation import is_traced, require, require_increasing
+from nonholonomic.validation import is_traced, times_within
 from nonholonomic.views import Stage, Viewable
 
 from ..model.body import AbstractBody
@@ -222,10 +222,7 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         """
         if self.dense is None:
             raise ValueError("a run made inside jit, vmap or grad has no dense output: pass `times` to simulate")
-        require(times, "times", at_least=0.0, at_most=self.end_time, why="the run ends there")
-        times = np.atleast_1d(np.asarray(times, dtype=float))
-        require_increasing(times, "times")
-        return self.resampled(times)
+        return self.resampled(times_within(times, self.end_time, "run"))
 
     @status_line("reading off")
     def to_table(self) -> Table:

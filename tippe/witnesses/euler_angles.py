@@ -122,11 +122,7 @@ def contact_motion(
     turning = angle_metric * eta_dot
     s, c, sp, cp = jnp.sin(theta), jnp.cos(theta), jnp.sin(phi), jnp.cos(phi)
     rates = jnp.stack(
-        [
-            -(phi_dot * s + turning * c * sp),
-            theta_dot - turning * cp,
-            psi_dot + phi_dot * c - turning * s * sp,
-        ]
+        [-(phi_dot * s + turning * c * sp), theta_dot - turning * cp, psi_dot + phi_dot * c - turning * s * sp]
     )
     e1, e2, _ = axes(theta, phi)
     velocity = jnp.stack([(metric - angle_metric * gap) * eta_dot, y_dot, gap_dot])
