@@ -177,6 +177,13 @@ def contents(module: Any, with_units: bool = True) -> list[tuple[str, str]]:
     return [(name, as_text(value, unit)) for name, value, unit in fields if value is not None]
 
 
+def suspected_gravity(value: float) -> str | None:
+    """A question for an acceleration of free fall [m/s^2] that is greater than on any planet, for warnings."""
+    if value <= 100.0:
+        return None
+    return f"gravity = {value:g} m/s^2 is large: was it in cm/s^2? {value:g} cm/s^2 are {value / 100.0:g} m/s^2"
+
+
 def counted(count: int, noun: str) -> str:
     """A count with its noun, such as "1 number" and "2 numbers"."""
     return f"{count} {noun}{'' if count == 1 else 's'}"

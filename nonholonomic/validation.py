@@ -83,14 +83,6 @@ def largest(*values: Any) -> float:
     return max((float(np.max(array)) for array in arrays if array.size and np.isfinite(array).all()), default=0.0)
 
 
-def suspected_gravity(gravity: Any) -> str | None:
-    """A question for an acceleration of free fall that is greater than on any planet. For `Bounded.suspicion`."""
-    value = largest(gravity)
-    if value <= 100.0:
-        return None
-    return f"gravity = {value:g} m/s^2 is large: was it in cm/s^2? {value:g} cm/s^2 are {value / 100.0:g} m/s^2"
-
-
 def _first(numbers: np.ndarray, holds: np.ndarray) -> str:
     """The first number for which the condition is false."""
     return shown(numbers[~holds].ravel()[0]) if numbers.ndim else shown(numbers)

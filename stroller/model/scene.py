@@ -10,17 +10,18 @@ from jaxtyping import Array, Bool, Float
 
 from nonholonomic.geometry import AbstractQuadric, AbstractSurface, Plane, Sphere, Torus, stacked
 from nonholonomic.geometry.surface import as_surface
+from nonholonomic.text import suspected_gravity
 from nonholonomic.validation import (
     Bound,
     Bounded,
     all_bounds,
     as_number,
     is_traced,
+    largest,
     legal,
     require_all,
     require_kind,
     shown,
-    suspected_gravity,
 )
 
 from .dynamics import Dynamics, State
@@ -126,7 +127,7 @@ class Scene(Bounded):
             yield Bound(surface.ring + surface.tube, "surface ring + tube", at_least=half, why=why)
 
     def suspicion(self) -> str | None:
-        return suspected_gravity(self.gravity)
+        return suspected_gravity(largest(self.gravity))
 
     @property
     def dynamics(self) -> Dynamics:

@@ -32,7 +32,8 @@ from nonholonomic.geometry import (
 )
 from nonholonomic.geometry.surface import as_surface
 from nonholonomic.parameters import numbers
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require_all, shown, suspected_gravity
+from nonholonomic.text import suspected_gravity
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, largest, require_all, shown
 
 from .body import AbstractBody
 from .dynamics import TURNING, Dynamics
@@ -142,7 +143,7 @@ class Scene(Bounded, Generic[Body]):
                 size = float(np.max(np.asarray(value)))
                 unit = "mm" if size > 10.0 * LARGEST_ARENA else "cm"
                 return f"{name} = {size:g} m is larger than a room: was it in {unit}? There a top moves as on a Plane"
-        return suspected_gravity(self.gravity)
+        return suspected_gravity(largest(self.gravity))
 
     @property
     def frame(self) -> AbstractFrame:
