@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -24,112 +24,154 @@ MOST_LABELS = 12
 MARGIN = 0.08
 
 
+class _Drawn(NamedTuple):
+    """What is drawn of every measurement, in the units of the picture.
+
+    - `series`: the indices of the measurements of each series; `names`: the quantity of each series with its unit, such as
+      "1: theta [deg]", where the number is that of the data.
+    - `value`, `upper`, `errors`, `predicted`: (n,); `is_limit`: (n,); `times`, `curves`: (slices, n), as `fit.curves`.
+    """
+
+    series: list[np.ndarray]
+    names: list[str]
+    value: np.ndarray
+    upper: np.ndarray
+    errors: np.ndarray
+    predicted: np.ndarray
+    is_limit: np.ndarray
+    times: np.ndarray
+    curves: np.ndarray
+
+    @classmethod
+    def of(cls, fit: "Identification", unit: Any) -> "_Drawn":
+        numbers, names = np.asarray(fit.measurements.series), []
+        series, factors = [np.flatnonzero(numbers == number) for number in np.unique(numbers)], np.ones(len(numbers))
+        for k, indices in enumerate(series):
+            label = fit.residuals[indices[0]].label
+            si = fit.series_units[k] if k < len(fit.series_units) else "1"
+            quantity = label.partition("(")[0] if "(" in label else "time" if si == "s" else "measured"
+            shown, factors[indices] = in_unit(si, unit)
+            names.append(_with_unit(quantity, shown))
+        value, upper, errors, predicted = (
+            factors * np.array([getattr(row, name) for row in fit.residuals])
+            for name in ("value", "upper", "error", "prediction")
+        )
+        is_limit = np.array([row.censored for row in fit.residuals])
+        # Draw an angle on the same turn as its prediction.
+        turns = factors * np.asarray(fit.measurements.whole_periods((predicted - value) / factors))
+        times, curves = fit.curves
+        return cls(
+            series,
+            names,
+            np.where(is_limit, value, value + turns),
+            upper,
+            errors,
+            predicted,
+            is_limit,
+            times,
+            factors * curves if len(curves) else curves,
+        )
+
+    def panels(self, chosen: list[int]) -> dict[str, list[int]]:
+        """The series among `chosen` that share a panel, by the quantity, whatever the number of the data."""
+        panels: dict[str, list[int]] = {}
+        for k in chosen:
+            panels.setdefault(self.names[k].rpartition(": ")[2], []).append(k)
+        return panels
+
+
 def draw_fit(fit: "Identification", labels: Sequence[str], unit: Any) -> Any:
-    """Draw a fit: measurements and predictions at the most likely values, residuals in standard errors, profile likelihoods of
-    the determined parameters (with their estimates and intervals, and the parabolas of their errors dashed), and correlations.
+    """Draw a fit: measurements and predictions at the most likely values, with a panel for each quantity; residuals in standard
+    errors; profile likelihoods of the determined parameters (with their estimates and intervals, and the parabolas of their
+    errors dashed); and correlations. Samples over time and other measurements are side by side.
 
     **Arguments:** `labels`: (n,), short names of the measurements; `unit`: as for `in_unit`.
 
     **Returns:** a matplotlib figure.
     """
-    names = list(fit.estimates)
+    names, drawn, times = list(fit.estimates), _Drawn.of(fit, unit), np.asarray(fit.measurements.time)
     profiled = [name for name in names if np.isfinite(fit.standard_errors[name])][:MOST_PROFILES]
     # The correlations of one number say nothing.
     correlated = len(names) > 1
     lower = len(profiled) + correlated or 1
-    figure = new_figure(max(9.0, 2.9 * lower), 8.5)
-    grid = figure.add_gridspec(3, lower, height_ratios=(2.0, 1.0, 1.6))
-    data = figure.add_subplot(grid[0, :])
-    _draw_data(fit, data, unit)
-    residuals = figure.add_subplot(grid[1, :], sharex=data)
-    _draw_residuals(fit, residuals)
-    _label_abscissa(fit, data, residuals, labels)
+    has_time = [bool(np.any(times[indices])) for indices in drawn.series]
+    blocks = [
+        [k for k, timed in enumerate(has_time) if timed == wanted] for wanted in (True, False) if wanted in has_time
+    ]
+    most = max(len(drawn.panels(block)) for block in blocks)
+    figure = new_figure(max(9.0, 2.9 * lower, 6.5 * len(blocks)), 6.5 + 2.0 * most)
+    rows = figure.add_gridspec(2, 1, height_ratios=(1.0 + 2.0 * most, 1.6))
+    columns = rows[0].subgridspec(1, len(blocks))
+    for column, block in enumerate(blocks):
+        _draw_block(fit, drawn, block, has_time[block[0]], labels, columns[column])
+    grid = rows[1].subgridspec(1, lower)
     concerns = [*fit.verdict.concerns]
     for k, name in enumerate(profiled):
         profile = fit.profile(name)
-        _draw_profile(fit, name, profile, figure.add_subplot(grid[2, k]), unit)
+        _draw_profile(fit, name, profile, figure.add_subplot(grid[k]), unit)
         concerns += filter(None, [profile.concern(name)])
     if correlated:
-        _draw_correlation(fit, names, figure.add_subplot(grid[2, lower - 1]))
+        _draw_correlation(fit, names, figure.add_subplot(grid[lower - 1]))
     remarks = [*(concerns or ["no concerns about this fit"]), *(f"note: {note}" for note in fit.verdict.notes)]
     figure.suptitle("; ".join(remarks), fontsize=9, wrap=True)
     return figure
-
-
-def _series(fit: "Identification") -> list[np.ndarray]:
-    """The indices of the measurements of each series."""
-    numbers = np.asarray(fit.measurements.series)
-    return [np.flatnonzero(numbers == number) for number in np.unique(numbers)]
-
-
-def _named(fit: "Identification", unit: Any) -> list[tuple[str, float]]:
-    """The quantity of each series with the unit in which it is drawn, such as "theta [deg]", and the factor that converts
-    its values."""
-    named = []
-    for k, indices in enumerate(_series(fit)):
-        label = fit.residuals[indices[0]].label
-        si = fit.series_units[k] if k < len(fit.series_units) else "1"
-        quantity = label.partition("(")[0] if "(" in label else "time" if si == "s" else "measured"
-        shown, factor = in_unit(si, unit)
-        named.append((_with_unit(quantity, shown), factor))
-    return named
 
 
 def _with_unit(name: str, unit: str) -> str:
     return f"{name} [{readable_unit(unit)}]" if readable_unit(unit) else name
 
 
-def _has_times(fit: "Identification") -> bool:
-    return bool(np.any(np.asarray(fit.measurements.time)))
-
-
-def _places(fit: "Identification") -> np.ndarray:
-    """The abscissa of every measurement: its time, if it has one, otherwise its number."""
-    times = np.asarray(fit.measurements.time)
-    return times if _has_times(fit) else np.arange(len(times))
-
-
-def _label_abscissa(fit: "Identification", data: Any, residuals: Any, labels: Sequence[str]) -> None:
-    """Label the common abscissa below the residuals."""
-    data.tick_params(labelbottom=False)
-    if _has_times(fit):
+def _draw_block(
+    fit: "Identification", drawn: _Drawn, block: list[int], has_time: bool, labels: Sequence[str], place: Any
+) -> None:
+    """Draw series over their times, or over the numbers of their measurements: the data and the residuals."""
+    indices = np.concatenate([drawn.series[k] for k in block])
+    abscissa = np.full(len(drawn.value), np.nan)
+    abscissa[indices] = np.asarray(fit.measurements.time)[indices] if has_time else np.arange(len(indices))
+    panels, figure, first = drawn.panels(block), place.get_gridspec().figure, None
+    grid = place.subgridspec(len(panels) + 1, 1, height_ratios=[2.0] * len(panels) + [1.0])
+    for row, (name, series) in enumerate(panels.items()):
+        axes = figure.add_subplot(grid[row], sharex=first)
+        first = axes if first is None else first
+        axes.tick_params(labelbottom=False)
+        _draw_data(drawn, axes, series, abscissa, has_time)
+        axes.set_ylabel(name)
+    residuals = figure.add_subplot(grid[len(panels)], sharex=first)
+    for k in block:
+        residuals.plot(
+            abscissa[drawn.series[k]], [fit.residuals[i].residual for i in drawn.series[k]], ".", color=f"C{k}"
+        )
+    residuals.axhspan(-1.96, 1.96, color="0.9", zorder=0)
+    residuals.set_ylabel("residual\n[standard errors]")
+    if has_time:
         residuals.set_xlabel("time since the first sample [s]")
-    elif len(labels) <= MOST_LABELS:
-        residuals.set_xticks(_places(fit), labels, rotation=20, ha="right", fontsize=8)
+    elif len(indices) <= MOST_LABELS:
+        residuals.set_xticks(abscissa[indices], [labels[i] for i in indices], rotation=20, ha="right", fontsize=8)
     else:
         residuals.set_xlabel("measurement")
 
 
-def _draw_data(fit: "Identification", axes: Any, unit: Any) -> None:
-    places, named, (times, curves) = _places(fit), _named(fit, unit), fit.curves
-    factors = np.ones(len(places))
-    for indices, (_, factor) in zip(_series(fit), named, strict=True):
-        factors[indices] = factor
-    value, upper, errors, predicted = (
-        factors * np.array([getattr(row, name) for row in fit.residuals])
-        for name in ("value", "upper", "error", "prediction")
-    )
-    is_limit = np.array([row.censored for row in fit.residuals])
-    # Draw an angle on the same turn as its prediction.
-    turns = fit.measurements.whole_periods((predicted - value) / factors)
-    value = np.where(is_limit, value, value + factors * np.asarray(turns))
-    several = len(named) > 1
-    for k, indices in enumerate(_series(fit)):
-        colour, exact = f"C{k}", indices[~is_limit[indices]]
-        text = named[k][0] if several else "measured"
-        axes.errorbar(places[exact], value[exact], errors[exact], fmt=".", color=colour, alpha=0.6, label=text)
-        if len(curves):
-            moments = times[:, indices].T.reshape(-1)
-            drawn = named[k][1] * curves[:, indices].T.reshape(-1)
-            axes.plot(moments, drawn, "-", color=colour, linewidth=1.2, label=None if several else "predicted")
+def _draw_data(drawn: _Drawn, axes: Any, series: list[int], abscissa: np.ndarray, has_time: bool) -> None:
+    """Draw the series of one panel with their predictions, as curves if they have times."""
+    several = len(series) > 1
+    for k in series:
+        colour, indices = f"C{k}", drawn.series[k]
+        exact = indices[~drawn.is_limit[indices]]
+        text = drawn.names[k] if several else "measured"
+        axes.errorbar(
+            abscissa[exact], drawn.value[exact], drawn.errors[exact], fmt=".", color=colour, alpha=0.6, label=text
+        )
+        if has_time and len(drawn.curves):
+            moments, curve = (part[:, indices].T.reshape(-1) for part in (drawn.times, drawn.curves))
+            axes.plot(moments, curve, "-", color=colour, linewidth=1.2, label=None if several else "predicted")
         else:
-            allowed = indices[np.isfinite(predicted[indices]) & ~is_limit[indices]]
-            text = "predicted" if k == 0 else None
-            axes.plot(places[allowed], predicted[allowed], "x", color="0.3", label=text)
-    _keep_range(axes, value[~is_limit], errors[~is_limit], predicted[~is_limit])
-    _draw_limits(axes, places[is_limit], value[is_limit], upper[is_limit])
-    texts = [text for text, _ in named]
-    axes.set_ylabel(texts[0] if len(set(texts)) == 1 else "measured")
+            allowed = exact[np.isfinite(drawn.predicted[exact])]
+            text = "predicted" if k == series[0] else None
+            axes.plot(abscissa[allowed], drawn.predicted[allowed], "x", color="0.3", label=text)
+    indices = np.concatenate([drawn.series[k] for k in series])
+    exact, limits = indices[~drawn.is_limit[indices]], indices[drawn.is_limit[indices]]
+    _keep_range(axes, drawn.value[exact], drawn.errors[exact], drawn.predicted[exact])
+    _draw_limits(axes, abscissa[limits], drawn.value[limits], drawn.upper[limits])
     axes.legend(fontsize=8)
 
 
@@ -160,22 +202,13 @@ def _draw_limits(axes: Any, places: np.ndarray, lower: np.ndarray, upper: np.nda
         axes.annotate(
             f"{'>' if is_lower else '<'} {limit:.4g}",
             (place, drawn),
-            (0, -11),
+            (0, 5 if drawn < low + 0.1 * (high - low) else -11),
             textcoords="offset points",
             ha="center",
             fontsize=8,
         )
         text = None
     axes.set_ylim(low, high)
-
-
-def _draw_residuals(fit: "Identification", axes: Any) -> None:
-    places = _places(fit)
-    residual = np.array([row.residual for row in fit.residuals])
-    for k, indices in enumerate(_series(fit)):
-        axes.plot(places[indices], residual[indices], ".", color=f"C{k}")
-    axes.axhspan(-1.96, 1.96, color="0.9", zorder=0)
-    axes.set_ylabel("residual\n[standard errors]")
 
 
 def _draw_profile(fit: "Identification", name: str, profile: Any, axes: Any, unit: Any) -> None:

@@ -108,6 +108,23 @@ def test_the_picture_of_a_fit_has_the_units_of_the_quantities():
     assert fit.series_units == ("rad", "rad/s", "m")
     figure = fit.plot(unit=("deg", "rpm", "mm"))
     assert isinstance(figure, matplotlib.figure.Figure)
-    texts = [text.get_text() for axes in figure.axes for text in axes.findobj(matplotlib.text.Text)]
-    for label in ("theta [deg]", "spin [rpm]", "position.z [mm]"):
-        assert any(label in text for text in texts), label
+    labels = ["theta [deg]", "spin [rpm]", "position.z [mm]", "residual\n[standard errors]"]
+    assert [axes.get_ylabel() for axes in figure.axes[:4]] == labels
+    (error_bars,) = figure.axes[0].containers
+    assert_close(error_bars.lines[0].get_ydata(), np.degrees(value[:, 0]))
+
+
+def test_samples_over_time_and_times_of_events_are_drawn_side_by_side():
+    times = np.linspace(0.1, 1.0, 10)
+    film = nonholonomic.Recording([1.0], times, np.exp(-2.0 * times), 0.01)
+    ends = nonholonomic.EventTimes([1.0], SEEN, ERROR, t1=3.0)
+    fit = nonholonomic.identify(decay(2.0), [film, ends], {"rate": 2.0}, starts=2, progress=False)
+    level, residuals, time, later_residuals, _ = fit.plot(unit="ms").axes
+    assert [axes.get_ylabel() for axes in (level, time)] == ["y0", "time [ms]"]
+    moments, curve = level.lines[-1].get_data()
+    assert_close(curve, np.exp(-fit.most_likely["rate"] * (moments + 0.1)), rtol=1e-6)
+    assert residuals.lines[0].get_ydata().size == 10
+    (error_bars,) = time.containers
+    assert_close(error_bars.lines[0].get_ydata(), 1e3 * SEEN)
+    assert_close(error_bars.lines[0].get_xdata(), np.arange(3))
+    assert [tick.get_text() for tick in later_residuals.get_xticklabels()] == ["2: time 1", "2: time 2", "2: time 3"]
