@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from ..hybrid import hybrid_resets
 from ..integration import Settings
 from ..integration.status import Status
-from ..sweeps import Table, Tabular
+from ..sweeps import Quantity, Table, Tabular, run_table
 from ..text import as_text, batch_title, distinguishing_labels
 from ..validation import is_traced, times_within
 from ..views import Page, Stage, Viewable, new_figure
@@ -152,7 +152,11 @@ class Trajectory(Viewable, Tabular, eqx.Module):
                 "this is a batch of runs, and to_table takes one run; nonholonomic.sweep makes a table of many"
             )
         columns = dict(zip(self.names, np.asarray(self.state).T, strict=True)) | {"mode": np.asarray(self.mode)}
-        return Table({"time": np.asarray(self.t)}, columns, {"time": "s"}, {"status": self.status})
+        request = self.model.description() | {"status": self.status, "end_time": float(self.end_time)}
+        quantities = self.model.quantities | {"mode": Quantity("1", "mode")}
+        table = run_table(quantities, {"time": np.asarray(self.t)}, columns, ["time"], request)
+        # Earlier versions had only this attribute.
+        return dataclasses.replace(table, attributes=table.attributes | {"status": self.status})
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.names)

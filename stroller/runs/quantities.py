@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_vectors
-from nonholonomic.parameters import description
 from nonholonomic.sweeps import Quantity, Table, chosen, run_table
 from nonholonomic.validation import require_one_run
 
@@ -77,7 +76,7 @@ def table_of_one(run: Any, only: Sequence[str] = ()) -> Table:
     **Raises:** `ValueError` for a batch of runs.
     """
     require_one_run(run, "to_table", "; stroller.sweep makes a table of many")
-    request = description("scene", run.spec.scene) | {"status": run.status}
+    request = run.spec.model.description() | {"status": run.status}
     return table_of([run], [], request, only)
 
 

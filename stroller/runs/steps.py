@@ -56,6 +56,11 @@ class RideSpec(eqx.Module):
         return eqx.combine(self.numbers, self.static)
 
     @property
+    def model(self) -> Any:
+        """The `RideModel`."""
+        return self.parts[0]
+
+    @property
     def settings(self) -> Settings:
         """The settings of the integration."""
         return self.parts[2]
@@ -63,17 +68,17 @@ class RideSpec(eqx.Module):
     @property
     def scene(self) -> Scene:
         """The scene of the ride."""
-        return self.parts[0].scene
+        return self.model.scene
 
     @property
     def launch(self) -> Launch:
         """The launch of the ride."""
-        return self.parts[0].launch
+        return self.model.launch
 
     @property
     def input(self) -> Input | None:
         """The input of the ride."""
-        return self.parts[0].input
+        return self.model.input
 
 
 def stats_of(outcome: HybridOutcome[Array]) -> Stats:

@@ -1,6 +1,7 @@
 """Scenes and runs show themselves; numbers in another unit are suspected; a run goes to xarray, a file and a picture."""
 
 import dataclasses
+import json
 import re
 import warnings
 
@@ -77,6 +78,7 @@ def test_a_run_goes_to_xarray_and_to_a_file(run, tmp_path):
     table = tippe.Table.load(tmp_path / "run.h5")
     np.testing.assert_array_equal(table["work"], run.work)
     assert '"status": "completed"' in table.attributes["request"]
+    assert json.loads(table.attributes["request"])["launch.spin"] == float(run.launch.spin)
 
 
 def test_a_portrait_draws_one_quantity_over_another(run):

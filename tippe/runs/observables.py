@@ -25,6 +25,7 @@ from nonholonomic.views import Stage, Viewable
 
 from ..model.body import AbstractBody
 from ..model.friction import Frictionless
+from ..model.launch import Launch
 from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
 from ..model.top import Top
@@ -75,11 +76,12 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
     end_time: Any = None
     stats: dict[str, Any] = eqx.field(default_factory=dict)
     dense: Any = None
-    # The state at the launch.
+    # The state at the launch, and the launch.
     start: Any = None
+    launch: Launch | None = None
 
     #: The fields that no observable needs.
-    unused: ClassVar[tuple[str, ...]] = ("status", "end_time", "stats", "dense")
+    unused: ClassVar[tuple[str, ...]] = ("status", "end_time", "stats", "dense", "launch")
 
     #: The fields with a value for each time, along the last axis.
     by_time: ClassVar[tuple[str, ...]] = ("t", "states", "cyclic", "spin_angle", "work")

@@ -64,5 +64,6 @@ def table_of(run: Any, names: Sequence[str] = ()) -> Table:
     dims = [quantity.components for quantity in quantities.values() if quantity.components is not None]
     coords = {"time": np.asarray(run.t)} | {dim: np.array(COMPONENTS[dim]) for dim in dict.fromkeys(dims)}
     values = {name: np.asarray(quantity.of(name, run)) for name, quantity in quantities.items()}
-    request = description("scene", run.scene) | {"status": str(run.status), "end_time": float(run.end_time)}
+    request = description("scene", run.scene) | ({} if run.launch is None else description("launch", run.launch))
+    request |= {"status": str(run.status), "end_time": float(run.end_time)}
     return run_table(quantities, coords, values, ["time"], request)

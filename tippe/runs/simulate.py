@@ -85,7 +85,7 @@ def _along(model: Any, path: DenseSolution | HybridPath, tolerance: Any) -> Any:
     mode, counts = (path.numbers(times), path.counts) if isinstance(path, HybridPath) else (None, ())
     end = path.end_time if isinstance(path, HybridPath) and scene.contact == "hybrid" else on_device(times[-1])[0]
     status, start = _status(model, path, tolerance), scene.state(model.launch)
-    run = kind(None, scene, None, None, None, None, status, end, dense=path, start=start)
+    run = kind(None, scene, None, None, None, None, status, end, dense=path, start=start, launch=model.launch)
     # NumPy slices the states, because JAX would compile each slice again for every number of steps.
     run = run.with_rows(times, np.asarray(path.states), mode)
     counted = {name: int(count) for name, count in zip(model.counters, counts, strict=True) if name == "sticks"}
@@ -125,5 +125,14 @@ def _traced(
     parts = kind.parts_of(rows, run.mode, len(start))
     if run.passive is not None:
         parts = {"states": rows, "cyclic": run.passive[:-2], "spin_angle": run.passive[-2], "work": run.passive[-1]}
-    trajectory = kind(times, scene, **parts, status=status, end_time=outcome.end_time[0], stats=stats, start=start)
+    trajectory = kind(
+        times,
+        scene,
+        **parts,
+        status=status,
+        end_time=outcome.end_time[0],
+        stats=stats,
+        start=start,
+        launch=model.launch,
+    )
     return eqx.tree_at(lambda run: (run.t, run.status), nan_unless(is_legal, trajectory), (times, status))

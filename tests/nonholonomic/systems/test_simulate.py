@@ -1,5 +1,6 @@
 """Trajectories of users' own systems against closed forms, with their derivatives through resets."""
 
+import json
 import math
 import warnings
 
@@ -12,6 +13,7 @@ from own_modes import GRAVITY, Ball, Sleigh, Slip, Stick, bounce, final_turn
 
 from nonholonomic import AbstractMode, Hybrid, simulate, sweep
 from nonholonomic.formulations import Hamel, Lagrange, Routhian
+from nonholonomic.sweeps import Table
 from nonholonomic.systems.system import check_start, formulation_of
 
 TIMES = jnp.array([0.3, 0.7, 1.1, 1.5])
@@ -256,6 +258,18 @@ def test_a_trajectory_is_a_table():
     assert_close(table.y0, [0.75, 0.5], rtol=1e-12)
     assert table.attributes["status"] == "completed"
     assert run.to_xarray()["y0"].dims == ("time",)
+    request = json.loads(table.attributes["request"])
+    assert (request["system"], request["start[0]"], request["end_time"]) == ("Hybrid", 1.0, 0.5)
+
+
+def test_the_file_of_a_run_is_not_overwritten_by_a_table(tmp_path):
+    run = simulate(Hybrid([Melting()]), jnp.array([1.0]), 0.5, times=jnp.array([0.25, 0.5]))
+    run.save(tmp_path / "run.h5")
+    assert_close(Table.load(tmp_path / "run.h5").y0, run["y0"])
+    with pytest.raises(
+        ValueError, match=r"run.h5 holds the result of another run: it is a single run, not a table of many"
+    ):
+        sweep(Hybrid([Melting()]), [1.0], 0.5, axes={"start[0]": [1.0, 2.0]}, path=tmp_path / "run.h5", progress=False)
 
 
 def test_a_lagrangian_of_one_s_own_is_run_by_poincare_s_equations():
