@@ -247,8 +247,7 @@ def _nearest(time: Float[np.ndarray, " looks"], value: Float[np.ndarray, " looks
     with np.errstate(all="ignore"):
         fall = (distance[middle - 1] - distance[middle]) / gap_before
         rise = (distance[middle + 1] - distance[middle]) / gap_after
-        vertex = time[middle] + 0.5 * (fall * gap_after**2 - rise * gap_before**2) / (
-            fall * gap_after + rise * gap_before
-        )
+        shift = 0.5 * (fall * gap_after**2 - rise * gap_before**2) / (fall * gap_after + rise * gap_before)
+        vertex = time[middle] + shift
     is_inside = (vertex > time[middle - 1]) & (vertex < time[middle + 1]) & (np.abs(vertex - time[middle]) > CLOSEST)
     return vertex[is_inside]
