@@ -157,14 +157,8 @@ def _draw_limits(axes: Any, places: np.ndarray, lower: np.ndarray, upper: np.nda
         limit = first if is_lower else last
         drawn = min(max(limit, low + 0.03 * (high - low)), high - 0.03 * (high - low))
         axes.plot([place], [drawn], "^" if is_lower else "v", color="C1", label=text)
-        axes.annotate(
-            f"{'>' if is_lower else '<'} {limit:.4g}",
-            (place, drawn),
-            (0, -11),
-            textcoords="offset points",
-            ha="center",
-            fontsize=8,
-        )
+        below: Any = {"xytext": (0, -11), "textcoords": "offset points", "ha": "center", "fontsize": 8}
+        axes.annotate(f"{'>' if is_lower else '<'} {limit:.4g}", (place, drawn), **below)
         text = None
     axes.set_ylim(low, high)
 
