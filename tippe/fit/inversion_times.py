@@ -95,10 +95,8 @@ class AbstractTimes(AbstractEventTimes):
     @property
     def labels(self) -> tuple[str, ...]:
         """A label for each launch."""
-        columns = np.broadcast_arrays(
-            np.asarray(self.launch.theta), np.asarray(self.launch.spin), np.asarray(self._limits[0])
-        )
-        return tuple(f"theta {theta:.4g}, spin {spin:.4g}" for theta, spin in zip(*columns[:2], strict=True))
+        thetas, spins, _ = np.broadcast_arrays(self.launch.theta, self.launch.spin, self._limits[0])
+        return tuple(f"theta {theta:.4g}, spin {spin:.4g}" for theta, spin in zip(thetas, spins, strict=True))
 
     def labels_in(self, unit: Any) -> tuple[str, ...]:
         """What differs between the launches."""
