@@ -75,11 +75,8 @@ def is_traced(value: Any) -> bool:
 
 def largest(*values: Any) -> float:
     """The largest magnitude among concrete finite numbers; 0 without any. For `Bounded.suspicion`."""
-    arrays = [
-        np.abs(np.asarray(part))
-        for part in jax.tree.leaves(values)
-        if isinstance(part, jax.Array) and not is_traced(part)
-    ]
+    leaves = jax.tree.leaves(values)
+    arrays = [np.abs(np.asarray(leaf)) for leaf in leaves if isinstance(leaf, jax.Array) and not is_traced(leaf)]
     return max((float(np.max(array)) for array in arrays if array.size and np.isfinite(array).all()), default=0.0)
 
 

@@ -169,11 +169,8 @@ def moving_leaves(problem: AbstractProblem, direction: Any, functions: Callable[
 
 
 # With its docstring.
-solve_ensemble_with_tangents = compiled_alone(
-    functools.update_wrapper(
-        functools.partial(ensemble_solve_with_tangents, one_kernel=True), ensemble_solve_with_tangents
-    )
-)
+_in_one_kernel = functools.partial(ensemble_solve_with_tangents, one_kernel=True)
+solve_ensemble_with_tangents = compiled_alone(functools.update_wrapper(_in_one_kernel, ensemble_solve_with_tangents))
 
 traced_solve_ensemble_with_tangents = eqx.filter_jit(ensemble_solve_with_tangents)
 

@@ -189,12 +189,10 @@ def solve_hybrid_dense(
             return carry
         (runs, segments), (number,), mode, start_time = carry, numbers, modes[numbers[0]], float(carry[0].end_time[0])
         mode_settings = dataclasses.replace(settings, max_steps=settings.max_steps - int(runs.steps[0]))
-        path = follow(
-            _problem(mode, jnp.asarray(runs.state[:, 0])), t1 - start_time, mode_settings, piece=PIECE_OF_MODE
-        )
-        segment = Segment(
-            start_time, start_time + float(path.times[-1]), number, mode, path, start_time + path.times[1:]
-        )
+        problem = _problem(mode, jnp.asarray(runs.state[:, 0]))
+        path = follow(problem, t1 - start_time, mode_settings, piece=PIECE_OF_MODE)
+        end = start_time + float(path.times[-1])
+        segment = Segment(start_time, end, number, mode, path, start_time + path.times[1:])
         return after_solve(np, runs, _outcome(path), np.full(1, t1)), [*segments, segment]
 
     def reset(numbers: Sequence[int], carry: Carry, lost: Bool[np.ndarray, "1"]) -> Carry:

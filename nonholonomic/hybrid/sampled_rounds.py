@@ -51,15 +51,9 @@ def sampled_rounds(
             # Runs in another mode spend no time in this one.
             left = jnp.where(active, greatest(t1 - runs.end_time, 0.0), 0.0)
             times_in_mode = times - runs.end_time
-            outcome, samples = solve_with_samples(
-                mode.problem(runs.state[:, cell]),
-                times_in_mode,
-                left,
-                jnp.asarray(size),
-                settings,
-                n_blocks=n_blocks,
-                one_kernel=True,
-            )
+            problem, count = mode.problem(runs.state[:, cell]), jnp.asarray(size)
+            options = {"n_blocks": n_blocks, "one_kernel": True}
+            outcome, samples = solve_with_samples(problem, times_in_mode, left, count, settings, **options)
             after = chosen(active, after_solve(jnp, runs, outcome, t1), runs)
             is_new = active & (times_in_mode >= 0.0) & (times <= after.end_time) & jnp.isnan(output.number)
             state = jnp.where(is_new, jnp.moveaxis(samples, -1, 0).swapaxes(1, 2), output.state)

@@ -96,8 +96,5 @@ def _full_names(name_or_suffix: str, candidates: list[str], names_of_data: list[
         all_names = list(dict.fromkeys(name for names in names_of_data for name in names))
         name = full_name("free", name_or_suffix.removeprefix(EACH), all_names)
         return [f"data[{k}].{name}" for k, names in enumerate(names_of_data) if name in names]
-    return [
-        full_name(
-            "free", name_or_suffix, [f"data[{k}].{name}" for k, names in enumerate(names_of_data) for name in names]
-        )
-    ]
+    all_names = [f"data[{k}].{name}" for k, names in enumerate(names_of_data) for name in names]
+    return [full_name("free", name_or_suffix, all_names)]

@@ -147,9 +147,7 @@ class Measurements(eqx.Module):
 
     def whole_periods(self, off: Float[Array | np.ndarray, "... n"]) -> Float[Array, "... n"]:
         """Differences rounded to the nearest whole period; without a slope."""
-        wraps = jnp.isfinite(self.period)
-        period = jnp.where(wraps, self.period, 1.0)
-        return jnp.where(wraps, period * jax.lax.stop_gradient(jnp.round(off / period)), 0.0)
+        return whole_periods(jnp, off, self.period)
 
     def standardised(self, prediction: Float[Array | np.ndarray, "... n"]) -> Float[Array, "... n"]:
         """(prediction - value) / error, with whole periods removed; 0 for limits."""
@@ -192,6 +190,16 @@ def joined(parts: list[Measurements]) -> Measurements:
         renumbered.append(eqx.tree_at(lambda part: part.series, part, part.series + first))
         first += int(np.max(part.series)) + 1
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *renumbered)
+
+
+def whole_periods(xp: Any, off: Any, period: Any) -> Any:
+    """Differences rounded to the nearest whole period; without a slope, as rounding has none.
+
+    **Arguments:** `xp`: `jax.numpy`, or `numpy` for numbers of rows that vary, each of which JAX would compile.
+    """
+    wraps = xp.isfinite(period)
+    period = xp.where(wraps, period, 1.0)
+    return xp.where(wraps, period * xp.round(off / period), 0.0)
 
 
 def one_sided(z: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -4,7 +4,7 @@ logarithms."""
 import numpy as np
 from jaxtyping import Float
 
-from .likelihood import Measurements
+from .likelihood import Measurements, whole_periods
 from .problem import compared
 
 #: Number of values of the logarithm of an error, and their range in units of 1 / sqrt(2 n) for n values.
@@ -26,14 +26,6 @@ def log_likelihoods(
     for scales, logs in _by_error(measurements, prediction, residual, estimated):
         total = total + np.logaddexp.reduce(logs, axis=1) + np.log(scales[:, 1] - scales[:, 0])
     return each, total
-
-
-def whole_periods(off: Float[np.ndarray, "rows n"], period: Float[np.ndarray, " n"]) -> Float[np.ndarray, "rows n"]:
-    """Differences rounded to the nearest whole period, as by `Measurements.whole_periods`, in NumPy: JAX would compile
-    for every number of rows."""
-    wraps = np.isfinite(period)
-    period = np.where(wraps, period, 1.0)
-    return np.where(wraps, period * np.round(off / period), 0.0)
 
 
 def draw_errors(
@@ -59,7 +51,7 @@ def _by_error(measurements: Measurements, prediction: np.ndarray, residual: np.n
     series, freedom = np.asarray(measurements.series), np.asarray(measurements.student)
     difference = np.where(estimated, prediction - np.where(estimated, measurements.value, 0.0), 0.0)
     period = np.asarray(measurements.period)
-    difference = (difference - whole_periods(difference, period)) / np.asarray(measurements.error)
+    difference = (difference - whole_periods(np, difference, period)) / np.asarray(measurements.error)
     for number in np.unique(series[estimated]):
         members = (series == number) & estimated
         z = np.where(np.isfinite(difference[:, members]), difference[:, members], residual[:, members])

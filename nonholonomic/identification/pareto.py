@@ -21,12 +21,8 @@ def smoothed_weights(log_weights: Float[np.ndarray, " n"]) -> tuple[Float[np.nda
     if count >= 5 and excess[0] >= 0.0 and excess[-1] > 1e-9 * weights[order[-1]] and excess[count // 4] > 0.0:
         shape, scale = _generalised_pareto(excess)
         if np.isfinite(shape):
-            quantiles = (np.arange(count) + 0.5) / count
-            smooth = (
-                scale * np.expm1(np.minimum(-shape * np.log1p(-quantiles), 700.0)) / shape
-                if shape
-                else -scale * np.log1p(-quantiles)
-            )
+            logs = np.log1p(-(np.arange(count) + 0.5) / count)
+            smooth = scale * np.expm1(np.minimum(-shape * logs, 700.0)) / shape if shape else -scale * logs
             # No weight is larger than the largest of the weights.
             weights[tail] = np.minimum(cutoff + smooth, 1.0)
     return weights / np.sum(weights), float(shape)

@@ -78,13 +78,9 @@ class LogDensity(eqx.Module):
                 require(prior[1], f"standard deviation of the prior of {name}", above=0.0)
         series, estimated = np.asarray(measurements.series), np.asarray(measurements.estimated)
         leaves = {name: _as_leaves(prior) for name, prior in all_priors.items()}
-        return cls(
-            Problem(model, tuple(unknowns.items()), step_of(slopes, measurements)),
-            measurements,
-            leaves,
-            tuple(np.unique(series[estimated]).tolist()),
-            series_units,
-        )
+        problem = Problem(model, tuple(unknowns.items()), step_of(slopes, measurements))
+        open_series = tuple(np.unique(series[estimated]).tolist())
+        return cls(problem, measurements, leaves, open_series, series_units)
 
     @property
     def names(self) -> tuple[str, ...]:

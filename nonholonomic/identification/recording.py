@@ -205,13 +205,9 @@ class AbstractRecording(eqx.Module):
     def measurements(self) -> Measurements:
         """The samples as `Measurements`, a series for each column; missing samples are omitted."""
         value = np.asarray(self.value).reshape(len(self.times), len(self.columns))
-        if self.error is None:
-            error = np.broadcast_to(noise(value), value.shape)
-        else:
-            error = np.asarray(self.error)
-            error = np.broadcast_to(
-                error.reshape(value.shape) if error.ndim == np.ndim(self.value) else error, value.shape
-            )
+        error = noise(value) if self.error is None else np.asarray(self.error)
+        if error.shape == np.shape(self.value):
+            error = error.reshape(value.shape)
         period = [2.0 * math.pi if name in self.quantities.angles else math.inf for name in self.columns]
 
         def each(numbers_of: Any) -> np.ndarray:

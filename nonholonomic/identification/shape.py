@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 from .distribution import Distribution, quantiles
 from .exploration import Explorer, Weighted
-from .marginal import whole_periods
+from .likelihood import whole_periods
 from .mixture import Mixture, fitted
 from .region import FARTHEST
 from .unknown import Unknown
@@ -117,7 +117,7 @@ def roughness(explorer: Explorer, sample: Weighted) -> float:
     terms = np.stack(columns, axis=1)
     predictions = sample.pool.predictions[used]
     measurements = explorer.density.measurements
-    predictions = predictions - whole_periods(predictions - predictions[0], np.asarray(measurements.period))
+    predictions = predictions - whole_periods(np, predictions - predictions[0], np.asarray(measurements.period))
     coefficients, *_ = np.linalg.lstsq(root * terms, root * predictions)
     off = (predictions - terms @ coefficients) / np.asarray(measurements.error)
     return float(np.sqrt(np.mean(np.sum(root**2 * off**2, axis=0))))

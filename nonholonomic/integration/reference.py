@@ -1,6 +1,7 @@
 """The outcome of every cell by vmapped `diffrax.diffeqsolve`: slow, and independent of the ensemble solver."""
 
 import functools
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -37,15 +38,11 @@ def solve_by_diffrax(problem: AbstractProblem, t1: Float[Array, ""], settings: S
     lane_axes = jax.tree.map(lambda leaf: None if jnp.ndim(leaf) == 0 else -1, problem)
 
     def solve_cell(cell_problem: AbstractProblem, state: Array, scale: Array) -> Outcome:
-        conditions = {
-            CROSSED: None
-            if problem.event_function(states) is None
-            else (lambda t, y, args, **_: args.event_function(y)),
-            LEFT_DOMAIN: None
-            if problem.domain_margin(states[0], states) is None
-            else (lambda t, y, args, **_: args.domain_margin(t, y)),
-        }
-        conditions = {code: condition for code, condition in conditions.items() if condition is not None}
+        conditions: dict[int, Any] = {}
+        if problem.event_function(states) is not None:
+            conditions[CROSSED] = lambda t, y, args, **_: args.event_function(y)
+        if problem.domain_margin(states[0], states) is not None:
+            conditions[LEFT_DOMAIN] = lambda t, y, args, **_: args.domain_margin(t, y)
         # Diffrax detects only changes of a condition's sign, so a cell that starts with a negative condition must end
         # at once.
         at_once = [condition(jnp.zeros(()), state, cell_problem) <= 0.0 for condition in conditions.values()]
@@ -69,15 +66,9 @@ def solve_by_diffrax(problem: AbstractProblem, t1: Float[Array, ""], settings: S
         status = jnp.where(end >= t1, REACHED_END, FAILED)
         for code, occurred, at_start in zip(conditions, solution.event_mask or [], at_once, strict=True):
             status = jnp.where(occurred | at_start, code, status)
-        return Outcome(
-            status,
-            jnp.where(status == CROSSED, end, jnp.inf),
-            jnp.where(status == CROSSED, end, jnp.inf),
-            end,
-            final,
-            solution.stats["num_steps"],
-            solution.stats["num_rejected_steps"],
-        )
+        crossing_time = jnp.where(status == CROSSED, end, jnp.inf)
+        steps, rejected = solution.stats["num_steps"], solution.stats["num_rejected_steps"]
+        return Outcome(status, crossing_time, crossing_time, end, final, steps, rejected)
 
     axes = Outcome._make((0, 0, 0, 0, -1, 0, 0))
     return jax.vmap(solve_cell, in_axes=(lane_axes, -1, -1), out_axes=axes)(problem, states, scales)

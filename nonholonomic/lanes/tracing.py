@@ -78,11 +78,8 @@ def _product(left: Array, right: Array, dimensions: Any) -> Array:
     contracted = [left.shape[k] for k in sums]
     left_factor = left_factor.reshape(*shape[0], *shape[1], *(1 for _ in shape[2]), *contracted)
     right_factor = right_factor.reshape(*shape[0], *(1 for _ in shape[1]), *shape[2], *contracted)
-    return (
-        jnp.sum(left_factor * right_factor, axis=tuple(range(-len(contracted), 0)))
-        if contracted
-        else left_factor * right_factor
-    )
+    products = left_factor * right_factor
+    return jnp.sum(products, axis=tuple(range(-len(contracted), 0))) if contracted else products
 
 
 def is_elementary(function: Callable[..., Any], *args: Any) -> bool:

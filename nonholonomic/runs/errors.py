@@ -76,9 +76,7 @@ def errors_of(
     """
     agree = (first["status"] == second["status"]) & ~np.isin(first["status"], silent)
     differences = {name: np.abs(first[name] - second[name]) for name in counts}
-    is_same = (
-        np.all([difference == 0 for difference in differences.values()], axis=0) if counts else np.ones_like(agree)
-    )
+    is_same = np.all([np.ones_like(agree), *(difference == 0 for difference in differences.values())], axis=0)
     bounds = {name: error_bound(first[name], second[name], agree, is_same) for name in bounded}
     errors = bounds | {"status": (~agree).astype(np.int8)} | differences
     return {f"{name}_error": np.asarray(error) for name, error in errors.items()}

@@ -71,11 +71,8 @@ def _followed(
     settings: Settings,
 ) -> tuple[Outcome, Int[Array, " cells"], dict[str, Float[Array, "cells times ..."]]]:
     """The outcome of the runs, their `Status`, and the named quantities at the samples."""
-    dense = len(times) >= DENSE
-    reader = _reader(cells, names)
-    outcome, samples = solve_with_samples(
-        problem, times, t1, count, settings, one_kernel=True, read=reader, dense=dense
-    )
+    options: Any = {"one_kernel": True, "read": _reader(cells, names), "dense": len(times) >= DENSE}
+    outcome, samples = solve_with_samples(problem, times, t1, count, settings, **options)
     return outcome, cells.ended(outcome, settings.tolerance), samples
 
 

@@ -109,24 +109,17 @@ class TableJob(NamedTuple):
     def _ending(self, ends: dict[str, Variable]) -> dict[str, Variable]:
         """The variables that describe how a run ended."""
         counts = COUNTED | self.model.counters
-        return (
-            {
-                "status": Variable("1", np.int8, self.form.words, long_name=f"how the {self.form.run} ended"),
-                "end_time": Variable("s", np.float64, long_name=f"end of the {self.form.run}"),
-            }
-            | ends
-            | {name: Variable("1", np.int64, long_name=words) for name, words in counts.items()}
-        )
+        of_end = {
+            "status": Variable("1", np.int8, self.form.words, long_name=f"how the {self.form.run} ended"),
+            "end_time": Variable("s", np.float64, long_name=f"end of the {self.form.run}"),
+        }
+        return of_end | ends | {name: Variable("1", np.int64, long_name=words) for name, words in counts.items()}
 
     @property
     def bounded(self) -> tuple[str, ...]:
         """The variables that get error bounds."""
-        return (
-            *self.times,
-            *self.model.further_times,
-            "end_time",
-            *(() if self.samples is not None else self.model.ends),
-        )
+        ends = self.model.ends if self.samples is None else ()
+        return (*self.times, *self.model.further_times, "end_time", *ends)
 
     def _error_variables(self, variables: dict[str, Variable]) -> dict[str, Variable]:
         """The variables that describe the accuracy of others (`errors.py`)."""
@@ -284,6 +277,5 @@ class ScatteredJob(NamedTuple):
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
         """The variables of some cells, of which only the first `count` are run."""
         values_of_columns = {number: values[columns["cell"]] for number, values in self.columns.items()}
-        return self.job(values_of_columns, count) | {
-            self.names[number]: values for number, values in values_of_columns.items()
-        }
+        listed = {self.names[number]: values for number, values in values_of_columns.items()}
+        return self.job(values_of_columns, count) | listed

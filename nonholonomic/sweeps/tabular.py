@@ -56,11 +56,9 @@ def chosen(quantities: dict[str, Quantity], names: Sequence[str]) -> dict[str, Q
     ['speed']
     """
     kept = {name.partition(".")[0] for name in names if isinstance(name, str)}
-    return (
-        {name: quantities[name] for name in quantities if name in kept}
-        if names and kept <= set(quantities)
-        else quantities
-    )
+    if not names or not kept <= set(quantities):
+        return quantities
+    return {name: quantities[name] for name in quantities if name in kept}
 
 
 def run_table(

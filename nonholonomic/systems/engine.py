@@ -103,9 +103,8 @@ class BatchedMode(AbstractBatchedMode):
         the event happens at the reset, and the run ends between two modes.
         """
         axes = tuple(0 if jnp.ndim(number) else None for number in self.numbers)
-        return jax.vmap(self._reset_one, in_axes=(axes, 1, 1), out_axes=_TRANSITION_AXES)(
-            self.numbers, state, self.scales
-        )
+        reset = jax.vmap(self._reset_one, in_axes=(axes, 1, 1), out_axes=_TRANSITION_AXES)
+        return reset(self.numbers, state, self.scales)
 
     def _reset_one(
         self, numbers: Sequence[Array], state: Float[Array, " components"], scales: Float[Array, " components"]

@@ -171,12 +171,8 @@ class _Space:
         self.ground = axes.add_collection3d(
             Line3DCollection([np.zeros((2, 3))], colors="0.75", linewidths=0.6, zorder=1)
         )
-        lines = [
-            (trace.colour, 2 if trace.about is None else 3)
-            for show in stage.shows
-            for trace in show.traces
-            if trace.shown
-        ]
+        traces = [trace for show in stage.shows for trace in show.traces if trace.shown]
+        lines = [(trace.colour, 2 if trace.about is None else 3) for trace in traces]
         self.traces = [axes.plot([], [], [], color=css(c), linewidth=0.9, zorder=z)[0] for c, z in lines]
         arrows = [arrow for show in stage.shows for arrow in show.arrows if arrow.shown]
         # The bodies are at 4.
@@ -230,11 +226,8 @@ def _pieces(line: np.ndarray, middle: np.ndarray, reach: float) -> list[np.ndarr
     """The parts of a line that are in view."""
     in_view = np.linalg.norm(line - middle, axis=-1) < reach
     cuts = np.flatnonzero(np.diff(in_view)) + 1
-    return [
-        part
-        for part, mask in zip(np.split(line, cuts), np.split(in_view, cuts), strict=True)
-        if mask[0] and len(part) > 1
-    ]
+    parts = zip(np.split(line, cuts), np.split(in_view, cuts), strict=True)
+    return [part for part, mask in parts if mask[0] and len(part) > 1]
 
 
 def _lit(normals: Float[np.ndarray, "faces 3"], colour: int) -> Float[np.ndarray, "faces 3"]:

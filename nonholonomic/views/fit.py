@@ -199,14 +199,9 @@ def _draw_limits(axes: Any, places: np.ndarray, lower: np.ndarray, upper: np.nda
         limit = first if is_lower else last
         drawn = min(max(limit, low + 0.03 * (high - low)), high - 0.03 * (high - low))
         axes.plot([place], [drawn], "^" if is_lower else "v", color="C1", label=text)
-        axes.annotate(
-            f"{'>' if is_lower else '<'} {limit:.4g}",
-            (place, drawn),
-            (0, 5 if drawn < low + 0.1 * (high - low) else -11),
-            textcoords="offset points",
-            ha="center",
-            fontsize=8,
-        )
+        shift = 5 if drawn < low + 0.1 * (high - low) else -11
+        apart: Any = {"xytext": (0, shift), "textcoords": "offset points", "ha": "center", "fontsize": 8}
+        axes.annotate(f"{'>' if is_lower else '<'} {limit:.4g}", (place, drawn), **apart)
         text = None
     axes.set_ylim(low, high)
 

@@ -142,14 +142,11 @@ def curves_in(stages: list[Stage], unit: str | Sequence[str] | None) -> list[Sta
     labels = dict.fromkeys(curve.label for stage in stages for show in stage.shows for curve in show.curves)
     parts = [label.removesuffix("]").partition(" [") for label in labels]
     require_unit_of(unit, {name: si or "1" for name, _, si in parts})
-    return [
-        stage._replace(
-            shows=tuple(
-                show._replace(curves=tuple(curve.drawn_in(unit) for curve in show.curves)) for show in stage.shows
-            )
-        )
-        for stage in stages
-    ]
+
+    def in_units(show: Show) -> Show:
+        return show._replace(curves=tuple(curve.drawn_in(unit) for curve in show.curves))
+
+    return [stage._replace(shows=tuple(map(in_units, stage.shows))) for stage in stages]
 
 
 #: Colours of a page's runs, for the curves and one half of the body; arrows have other colours.

@@ -58,12 +58,9 @@ def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float
         "launch.steering": (-max(0.9, steering), max(0.9, steering)),
         "launch.heading": (heading - math.pi, heading + math.pi),
     }
-    friction = {
-        path: float(value) for path, value in numbers("scene.friction", scene.friction).items() if value is not None
-    }
-    return ranges | {
-        path: (0.0, 3.0 * value) for path, value in friction.items() if value > 0.0 and path.endswith("ing")
-    }
+    friction = numbers("scene.friction", scene.friction).items()
+    damping = {path: float(value) for path, value in friction if value is not None and path.endswith("ing")}
+    return ranges | {path: (0.0, 3.0 * value) for path, value in damping.items() if value > 0.0}
 
 
 class WheelAngles(AbstractPassive):

@@ -81,7 +81,7 @@ ENDS = {
     "residual": Variable("J", np.float64, long_name="energy less work"),
 }
 
-#: Names that no axis may have.
+#: The variables of a table in their order, whose names no axis may have.
 TAKEN = (*ENDS, "contact_time", "end_time", "status", "steps", "rejected")
 
 

@@ -20,7 +20,7 @@ from ..model.input import Input, check_input
 from ..model.launch import Launch
 from ..model.scene import Scene
 from .explore import TOLERANCE
-from .model import ENDS, RideModel
+from .model import TAKEN, RideModel
 from .simulate import ride
 from .trajectory import Trajectory
 
@@ -32,7 +32,7 @@ FORM = TableForm(
     nan_if_failed=False,
     time="contact_time",
     run="ride",
-    order=(*ENDS, "contact_time", "end_time", "status", "steps", "rejected"),
+    order=TAKEN,
 )
 
 

@@ -110,20 +110,10 @@ class Chart(AbstractSystem):
         # Long and lat do not depend on the turn of the heading, and only steering changes phi.
         block = inverse(forms[:2, :2])
         level = jnp.concatenate([block, -forms[2:, :2] @ block / forms[2, 2], jnp.zeros((1, 2))])
-        (longitudinal, lateral), yaw, steering = (
-            level.T,
-            jnp.zeros(4).at[2].set(1.0 / forms[2, 2]),
-            jnp.zeros(4).at[3].set(1.0),
-        )
-        return jnp.stack(
-            [
-                cosine * longitudinal + sine / length * yaw,
-                steering,
-                lateral,
-                cosine * yaw - length * sine * longitudinal,
-            ],
-            1,
-        )
+        (longitudinal, lateral), steering = level.T, jnp.zeros(4).at[3].set(1.0)
+        yaw = jnp.zeros(4).at[2].set(1.0 / forms[2, 2])
+        forward, turning = cosine * longitudinal + sine / length * yaw, cosine * yaw - length * sine * longitudinal
+        return jnp.stack([forward, steering, lateral, turning], 1)
 
     def wheel_motion(self, q: Coordinates, rate: Coordinates) -> tuple[Float[Array, "4 4"], WheelMotion]:
         """The one-forms of rear-wheel speed, front-wheel speed, yaw and steering rate, a row each, and their values."""

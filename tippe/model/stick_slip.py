@@ -257,16 +257,7 @@ class ContactMode(AbstractDynamics):
         new_state = jnp.concatenate([stopped_state, quadratures])
         slips = ~(sticks | lost)
         max_duration = jnp.where(slips, left - wait, 0.0)
-        onset = slip_onset(
-            stick_slip.slipping,
-            stick_slip.rolling,
-            stick_slip.mu,
-            slipping,
-            new_state,
-            size,
-            scales,
-            max_duration,
-            self.tolerance,
-        )
+        laws = (stick_slip.slipping, stick_slip.rolling, stick_slip.mu)
+        onset = slip_onset(*laws, slipping, new_state, size, scales, max_duration, self.tolerance)
         state_after = jnp.where(slips, onset.end, jnp.where(lost, state, new_state))
         return Change(state_after, sticks, lost, onset, wait, wait + jnp.where(slips, onset.length, 0.0))

@@ -198,16 +198,11 @@ def resolve_impact(
     contact = approach(body, ball, free)
     impulse_gain = (1.0 + restitution) * greatest(-contact.velocity[2], 0.0)
     problem = Impact(body, friction, contact, ball.radius, impulse_gain)
-    cells = impulse_gain.shape[0]
-    outcome, _ = traced_solve_ensemble(
-        problem,
-        jnp.asarray(LARGEST),
-        jnp.asarray(cells),
-        Settings(TOLERANCE, diffrax.Dopri5(), absolute=1.0, max_steps=MOST_STEPS),
-    )
-    return apply_impulse(
-        body, contact, free, problem.ended(outcome.end_time, outcome.state)
-    ), outcome.status != LEFT_DOMAIN
+    horizon, cells = jnp.asarray(LARGEST), jnp.asarray(impulse_gain.shape[0])
+    settings = Settings(TOLERANCE, diffrax.Dopri5(), absolute=1.0, max_steps=MOST_STEPS)
+    outcome, _ = traced_solve_ensemble(problem, horizon, cells, settings)
+    impulse = problem.ended(outcome.end_time, outcome.state)
+    return apply_impulse(body, contact, free, impulse), outcome.status != LEFT_DOMAIN
 
 
 def apply_impulse(body: Top, contact: Approach, free: FreeBody, impulse: ContactImpulse) -> FreeBody:

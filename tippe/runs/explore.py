@@ -91,11 +91,8 @@ def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float
     for name, (low, high) in parts.items():
         path = next((path for path in values if path.endswith(f".{name}")), None)
         if path is not None and values[path] > 0.0:
-            value = float(values[path])
-            ranges[path] = (
-                low * value,
-                min(high * value, 0.9 * float(scene.body.size)) if name == "offset" else high * value,
-            )
+            value, most = float(values[path]), 0.9 * float(scene.body.size) if name == "offset" else math.inf
+            ranges[path] = (low * value, min(high * value, most))
     return ranges
 
 
@@ -128,9 +125,8 @@ def stage_at_start(model: TopModel, t1: float) -> Stage:
     normal_force, slip, *arrows = initial_show.arrows
     assert slip.limit is not None
     fastest = 0.5 * size * float(np.linalg.norm(start.angular_velocity[0]))
-    initial_show = initial_show._replace(
-        arrows=(normal_force, slip._replace(scale=slip.limit / max(fastest, 1e-12)), *arrows)
-    )
+    slip = slip._replace(scale=slip.limit / max(fastest, 1e-12))
+    initial_show = initial_show._replace(arrows=(normal_force, slip, *arrows))
     reach = REACH * math.sqrt(float(scene.gravity) * size) * t1
     ground = arena(scene.surface, start.contact, start.normal[0], max(reach, 10.0 * size), 2.5 * size)
     return Stage("", ground, (initial_show,), follows=True)
@@ -140,12 +136,8 @@ def stage_at_start(model: TopModel, t1: float) -> Stage:
 def _motion_at_start(model: TopModel) -> DrawnMotion[Array]:
     modes, number, state = model.modes(1, jnp.asarray(TOLERANCE), None, False)
     # The other tops stand on their stem.
-    rows = (
-        dataclasses.replace(modes[0], number=number).shown(state)
-        if isinstance(modes[0], Slide)
-        else modes[0].shown(state)
-    )
-    return DrawnMotion.of(model.moment(rows, number))
+    mode = dataclasses.replace(modes[0], number=number) if isinstance(modes[0], Slide) else modes[0]
+    return DrawnMotion.of(model.moment(mode.shown(state), number))
 
 
 def frame(scene: Scene, run: Any) -> Frame:

@@ -112,9 +112,8 @@ class HybridTrajectory(AbstractTrajectory):
     def _ball(self) -> Ball:
         """The touching sphere; in flight, and if both touch, the top's own."""
         spheres = balls(self.scene.body)
-        return Ball(
-            *(jnp.where(self.contact == 1, stem, main) for main, stem in zip(spheres[0], spheres[-1], strict=True))
-        )
+        pairs = zip(spheres[0], spheres[-1], strict=True)
+        return Ball(*(jnp.where(self.contact == 1, stem, main) for main, stem in pairs))
 
     @of_each_run
     def energy(self) -> Float[Array, " times"]:

@@ -122,10 +122,8 @@ def launches(
     scalars = {number: value for number, value in values.items() if np.ndim(value) == 0}
     launch = _with_room(scene, values)
     names = labels(scene, launch, values, taken)
-    grid = []
-    for number, (name, unit, long_name) in names.items():
-        if number not in scalars:
-            grid.append(axis(name, number, unit, values[number], long_name))
+    listed = [(number, *names[number]) for number in values if number not in scalars]
+    grid = [axis(name, number, unit, values[number], long_name) for number, name, unit, long_name in listed]
     roots = with_numbers({"scene": scene, "launch": launch}, scalars)
     # The numbers of axes are 0 here, which may not be a place on the arena; starts are checked cell by cell.
     require_run(roots["scene"], roots["launch"], t1, tolerance, (Scene, Launch), LISTS)

@@ -186,33 +186,31 @@ class TopModel(AbstractSceneModel):
         on_stem = TopModel.timed(self.scene, self.launch, StemContact())
         return {"stem_time": ("time at which the stem first carries the top", on_stem)}
 
-    def _times_own_event(self, names: Names) -> bool:
-        """Whether runs end on the event of the model itself; runs that are sampled do not."""
-        return self.event is None and self.has_event and names is not None and not names
+    def _is_without_path(self, names: Names) -> bool:
+        """Whether runs need no path: they end on the event of the model itself, or nearby runs are compared."""
+        return (self.event is None and self.has_event and names == ()) or names == self.comparable
+
+    def _problem_without_path(self, cells: int, names: Names) -> InversionProblem:
+        """The motion of such runs; without an event if nearby runs are compared."""
+        problem = InversionProblem.of(self.scene, self.launch, INVERTED if names else self.angle, cells)
+        return dataclasses.replace(problem, cos_angle=jnp.asarray(NO_COSINE)) if names else problem
 
     def problem(self, cells: int | None, names: Names) -> AbstractProblem:
-        scene, launch = self.scene, self.launch
-        if self._times_own_event(names):
+        if self._is_without_path(names):
             assert cells is not None
-            return InversionProblem.of(scene, launch, self.angle, cells)
-        if names == self.comparable:
-            assert cells is not None
+            problem = self._problem_without_path(cells, names)
             # A turning frame turns by a different angle for each launch, and the difference would count as divergence.
-            problem = InversionProblem.of(scene, launch, INVERTED, cells)
-            return dataclasses.replace(problem, dynamics=scene.dynamics, cos_angle=jnp.asarray(NO_COSINE))
-        run = trajectory_problem((scene, launch), cells)
+            return dataclasses.replace(problem, dynamics=self.scene.dynamics) if names else problem
+        run = trajectory_problem((self.scene, self.launch), cells)
         if names is None or any(self.quantities[name].needs >= PASSIVE for name in names):
             return run
-        return with_parts(run, scene, names)
+        return with_parts(run, self.scene, names)
 
     def modes(self, cells: int, tolerance: Any, names: Names, continues: bool) -> Start:
         scene, launch = self.scene, self.launch
-        if self._times_own_event(names) or names == self.comparable:
+        if self._is_without_path(names):
             assert self.kind.modes is not None
-            angle = INVERTED if names else self.angle
-            problem = InversionProblem.of(scene, launch, angle, cells)
-            if names:
-                problem = dataclasses.replace(problem, cos_angle=jnp.asarray(NO_COSINE))
+            problem = self._problem_without_path(cells, names)
             return (*self.kind.modes(scene, problem, tolerance, continues), problem.states)
         if scene.contact == "stop":
             return contact_modes(trajectory_problem((scene, launch), cells), tolerance)

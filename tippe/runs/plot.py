@@ -55,15 +55,8 @@ def draw_launches(panels: list[Panel], angle: float, dots: str) -> Any:
         for theta, start, end, colour in zip(panel.theta, panel.starts, panel.ends, colours, strict=True):
             drawing.plot(panel.times, theta, color=colour, label=f"{start:.4g}", linewidth=1.2)
             if np.isfinite(end):
-                drawing.plot(
-                    end,
-                    np.interp(end, panel.times, theta),
-                    "o",
-                    color=colour,
-                    markersize=9,
-                    markeredgecolor="black",
-                    zorder=3,
-                )
+                dot = {"color": colour, "markersize": 9, "markeredgecolor": "black", "zorder": 3}
+                drawing.plot(end, np.interp(end, panel.times, theta), "o", **dot)
         drawing.axhline(angle, color="0.5", linewidth=0.8, linestyle="--")
         drawing.set_title(panel.title)
         drawing.set_xlabel("time [s]")

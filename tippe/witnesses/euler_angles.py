@@ -234,11 +234,8 @@ def equations(scene: Scene[Top], state: Float[Array, " 8"]) -> tuple[Float[Array
     components = theta_dot * e1 + phi_dot * s * e2
     lean = jnp.stack([cp, sp, zero])
     bend = -(theta_dot**2) * e + 2.0 * c * theta_dot * phi_dot * e2 - phi_dot**2 * s * lean
-    bend = (
-        bend
-        + 2.0 * turning * jnp.stack([-components[2], zero, components[0]])
-        - turning**2 * jnp.stack([e[0], zero, e[2]])
-    )
+    bend += 2.0 * turning * jnp.stack([-components[2], zero, components[0]])
+    bend -= turning**2 * jnp.stack([e[0], zero, e[2]])
     swing = angle_metric * jnp.stack([-e[2], zero, e[0]])
 
     f, torque = friction_per_normal_force(scene, slip_velocity(scene, q, q_dot), angular_velocity(scene, q, q_dot))

@@ -63,12 +63,8 @@ def by_equation_2(scene: Scene[Top], state: Float[Array, " 8"]) -> Accelerations
 
     def routhian(place):
         A, b, axial = parts(place)
-        return (
-            0.5 * velocities @ A @ velocities
-            + beta * (b @ velocities)
-            - 0.5 * beta**2 / axial
-            - potential(scene, place)
-        )
+        kinetic = 0.5 * velocities @ A @ velocities + beta * (b @ velocities) - 0.5 * beta**2 / axial
+        return kinetic - potential(scene, place)
 
     def momenta(place):
         A, b, _ = parts(place)

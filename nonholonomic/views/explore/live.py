@@ -81,14 +81,8 @@ def live_page(live: LiveRun, stage: Stage, speed: float = 1.0, below: str = "") 
     # The title and the warnings describe one run, but the sliders change the run.
     stage_of_live = stage._replace(title="", shows=tuple(show._replace(note="") for show in stage.shows))
     scripts = [script(text) for text in (programs(live), template("explore/map.js"), template("explore/explore.js"))]
-    return page(
-        [stage_of_live],
-        live.title,
-        speed,
-        template("explore/explore.html"),
-        f'<section id="below">{below}</section>',
-        scripts=scripts,
-    )
+    section = f'<section id="below">{below}</section>'
+    return page([stage_of_live], live.title, speed, template("explore/explore.html"), section, scripts=scripts)
 
 
 def programs(live: LiveRun) -> str:
