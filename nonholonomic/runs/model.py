@@ -78,6 +78,11 @@ class AbstractModel(eqx.Module):
     def description(self) -> dict[str, Any]:
         """The model as plain data, for the request of a table."""
 
+    @property
+    @abc.abstractmethod
+    def users(self) -> Any:
+        """The parts of the model that may have a user's code, for `equations.has_users_code`."""
+
     # Whether a run may begin.
 
     @abc.abstractmethod
@@ -226,6 +231,10 @@ class AbstractSceneModel(AbstractModel):
     @abc.abstractmethod
     def roots(self) -> dict[str, Any]:
         """The trees whose numbers are parameters, which are fields of the model."""
+
+    @property
+    def users(self) -> Any:
+        return self.roots, None if self.event is None else self.event.function
 
     @property
     def known_of_event(self) -> list[str]:

@@ -13,8 +13,10 @@ from ..integration import Settings, explicit_tableau
 from ..integration.checks import require_times
 from ..integration.settings import DEFAULT_MAX_STEPS
 from ..sweeps import Axis, Quantity, Table, Variable, axis, cells_to_check, chunk_for, scattered_cells, size_of
+from ..sweeps.layout import EQUATIONS
 from ..text import likely
 from ..validation import as_number, require_flag, require_outside, require_whole, shown
+from .equations import checksum_of, has_users_code
 from .model import AbstractModel, check_run, model_of, require_event
 from .samples import Samples
 from .table import ScatteredJob, TableForm, TableJob
@@ -215,6 +217,8 @@ def compute_table(
     request |= {"max_steps": int(options.max_steps)} if options.max_steps != DEFAULT_MAX_STEPS else {}
     request |= {"errors": True} if options.errors else {}
     request |= {"sensitivities": list(slopes)} if slopes else {}
+    if options.path is not None and has_users_code(job.model.users):
+        request |= {EQUATIONS: checksum_of(job.model)}
     work: Any = job
     if options.scattered:
         columns = scattered_cells(grid)

@@ -9,6 +9,9 @@ from jaxtyping import Shaped
 
 Values = Shaped[np.ndarray, "..."]
 
+#: The name of the checksum of a user's equations in a request.
+EQUATIONS = "equations"
+
 #: Code and word for a cell that has not been computed.
 PENDING, UNREACHED = -1, "pending"
 

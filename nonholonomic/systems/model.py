@@ -78,6 +78,10 @@ class OwnModel(AbstractModel):
         values = zip(self.parameters.names, self.parameters.values, strict=True)
         return {"system": type(system).__name__, "event": name} | {name: float(value) for name, value in values}
 
+    @property
+    def users(self) -> Any:
+        return self.parameters.tree
+
     def check(self) -> None:
         """The start and the system were checked when the model was made."""
 

@@ -137,6 +137,10 @@ class RideModel(AbstractSceneModel):
         return {"scene": self.scene, "launch": self.launch} | module
 
     @property
+    def users(self) -> Any:
+        return super().users, self.input if self.original is None else self.original.input
+
+    @property
     def known(self) -> list[str]:
         """The full names of the parameters that can be varied: single numbers, including omitted ones, which are 0."""
         values, level = numbers_of(self.roots), isinstance(self.scene.surface, Plane)

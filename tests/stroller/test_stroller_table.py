@@ -241,3 +241,14 @@ def test_main_job(tmp_path, capsys, monkeypatch):
 def test_main_job_refuses_bad_input(tmp_path, capsys):
     assert main(["--mass", "-1", "--out", str(tmp_path)]) == 2
     assert "mass = -1.0 must be greater than 0.0" in capsys.readouterr().err
+
+
+def test_a_table_of_another_input_does_not_resume(tmp_path):
+    def ends(force):
+        options = dict(axes={"launch.speed": [1.0, 1.5]}, path=tmp_path / "rides.h5", progress=False)
+        return stroller.sweep(BOWL, LAUNCH, 0.5, input=lambda t, motion: (force * jnp.cos(t), 0.0), **options).end_speed
+
+    speeds = ends(1.0)
+    assert np.array_equal(ends(1.0), speeds)
+    with pytest.raises(ValueError, match="the code of the system, its event or its input has changed"):
+        ends(2.0)

@@ -11,9 +11,12 @@ from close import assert_close
 from own_modes import GRAVITY, Ball, Bounces, Sleigh, Slip, Stick, bounce
 
 import nonholonomic
+import stroller
+import tippe
 from nonholonomic import AbstractMode, Hybrid, sweep
 from nonholonomic.integration import Settings
 from nonholonomic.runs import TableForm, model_of
+from nonholonomic.runs.equations import checksum_of, has_users_code
 from nonholonomic.runs.table import TableJob
 
 HEIGHTS, RESTITUTIONS = np.array([0.5, 1.0, 2.0]), np.array([0.7, 0.8])
@@ -153,3 +156,54 @@ def test_what_a_user_of_own_systems_needs_has_public_names(table):
     assert nonholonomic.Table is type(table)
     assert nonholonomic.Free(0.8, lower=0.0).lower == 0.0
     assert issubclass(nonholonomic.FitWarning, UserWarning)
+
+
+def fall(rate, level):
+    """A decay, and its event, of code with these constants."""
+
+    class Decay(AbstractMode):
+        scale: float = 1.0
+
+        def field(self, t, y):
+            return -rate * self.scale * y
+
+    return Hybrid([Decay()], event=lambda t, y: y[0] - level)
+
+
+def test_a_table_of_changed_code_does_not_resume(tmp_path):
+    def run(rate, level):
+        axes = {"scale": [1.0, 2.0]}
+        return sweep(fall(rate, level), [1.0], 3.0, axes=axes, path=tmp_path / "falls.h5", progress=False).time
+
+    time = run(2.0, 0.5)
+    assert_close(time, np.log(2.0) / np.array([2.0, 4.0]), rtol=1e-6)
+    # The same code, defined again.
+    assert np.array_equal(run(2.0, 0.5), time)
+    for changed in ((2.5, 0.5), (2.0, 0.6)):
+        with pytest.raises(ValueError, match=r"falls\.h5 holds .*: the code of the system, its event or its input has"):
+            run(*changed)
+
+
+def test_constant_arrays_are_part_of_the_code():
+    def checksum(rates):
+        class Decay(AbstractMode):
+            def field(self, t, y):
+                return -rates * y
+
+        return checksum_of(model_of(Hybrid([Decay()]), [1.0, 1.0]))
+
+    assert checksum(np.array([1.0, 2.0])) == checksum(np.array([1.0, 2.0]))
+    assert checksum(np.array([1.0, 2.0])) != checksum(np.array([1.0, 3.0]))
+
+
+@pytest.mark.parametrize(
+    ("parts", "expected"),
+    [
+        ((tippe.Viscous(0.3), stroller.Plane(), [None]), False),
+        ((tippe.Viscous(0.3), {"event": lambda t, motion: motion.theta}), True),
+        (stroller.Graph(lambda x, y: 0.1 * x * y), True),
+    ],
+    ids=["packages", "event", "ground"],
+)
+def test_code_of_users_is_told_from_that_of_the_packages(parts, expected):
+    assert has_users_code(parts) is expected
