@@ -184,7 +184,7 @@ PAGES = {
 }
 
 
-RUN = "to_table to_xarray save view animate plot portrait"
+RUN = "to_table to_xarray save view animate explore plot portrait"
 TOP = (
     "theta theta_rate eta azimuth spin position velocity normal axis angular_velocity angular_momentum slip normal_force "
     "energy jellett jellett_drift inversion_time"
@@ -233,7 +233,7 @@ MEMBERS = {
     "nonholonomic.sweeps.Tabular": "readable portrait_axes to_table to_xarray save portrait",
     "nonholonomic.derivatives.AbstractDifferentiableSolve": "in_blocks movable absent solve value_and_tangents prefers_adjoint "
     "differentiable push_forward pull_back for_parts",
-    "nonholonomic.Trajectory": "status to_table to_xarray save portrait plot",
+    "nonholonomic.Trajectory": "status at resets to_table to_xarray save portrait plot explore",
 }
 
 

@@ -14,7 +14,7 @@ from ..hybrid import hybrid_resets
 from ..integration import Settings
 from ..integration.status import Status
 from ..sweeps import Quantity, Table, Tabular, run_table
-from ..text import as_text, batch_title, distinguishing_labels
+from ..text import as_text, batch_title, distinguishing_labels, likely
 from ..validation import is_traced, times_within
 from ..views import Page, Stage, Viewable, new_figure
 from .explore import explore_model
@@ -39,7 +39,8 @@ class Trajectory(Viewable, Tabular, eqx.Module):
     - `end_time`: time at which the run ended [s]; `switches`: number of resets.
     - `steps`, `rejected`: numbers of all integration steps and of rejected steps.
     - `code`: the status as an integer of `Status`.
-    - `names`: names of the components in tables; `run[name]` is a component at the times.
+    - `names`: names of the components in tables; `run[name]` is a component at the times, and so is `run.height` for a
+      component named "height".
     - `model`, `t1`, `settings`: the model, the horizon and the settings of the integration.
 
     Pictures also show the states before and after each reset, whatever the times.
@@ -103,7 +104,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
             )
         resets = []
         if not self.model.smooth and int(self.switches):
-            modes, first, states = self.model.modes(1, self.settings.tolerance, None, False)
+            modes, first, states = self.model.without_event().modes(1, self.settings.tolerance, None, False)
             start = (modes, int(np.asarray(first)[0]), np.asarray(states)[:, 0])
             changes = hybrid_resets(*start, float(self.t1), self.settings, counters=len(self.model.counters))
             # The end of a mode without a reset is not counted.
@@ -160,6 +161,14 @@ class Trajectory(Viewable, Tabular, eqx.Module):
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.names)
+
+    def __getattr__(self, name: str) -> Float[Array, " times"]:
+        # Python calls this only for names that are not attributes, also while a copy has none yet.
+        names = vars(self).get("names", ())
+        if name not in names:
+            known = ("t", "state", *names)
+            raise AttributeError(f"the run has no {name!r}{likely(name, known)}; it has {', '.join(known)}")
+        return self[name]
 
     def __getitem__(self, name: str) -> Float[Array, " times"]:
         if name not in self.names:

@@ -147,7 +147,9 @@ class OwnModel(AbstractModel):
         return jax.tree.unflatten(jax.tree.structure(single), [a if d else b for a, b, d in leaves])
 
     def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Trajectory:
-        return simulate_model(self.without_event(), t1, times, tolerance, solver)
+        # A run continues through its event, which only its page shows.
+        run = simulate_model(self.without_event(), t1, times, tolerance, solver)
+        return dataclasses.replace(run, model=self)
 
     def without_event(self) -> "OwnModel":
         """The same model without an event."""

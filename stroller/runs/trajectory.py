@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.progress import status_line
+from nonholonomic.runs import explore_model
 from nonholonomic.sweeps import Quantity, Table, Tabular
 from nonholonomic.text import batch_title
 from nonholonomic.validation import is_traced, require_one_run, require_outside, times_within
-from nonholonomic.views import Stage, Viewable
+from nonholonomic.views import Page, Stage, Viewable
 
 from ..model.dynamics import Power
 from ..model.ride import CONTACT_ROUND_OFF, RANK_LOST
@@ -184,6 +185,17 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         if np.isfinite(run.rank_lost_at):
             return "rank_lost"
         return "contact_lost" if np.isfinite(run.contact_lost_at) else "completed"
+
+    def explore(
+        self, path: Any = None, sliders: dict[str, tuple[float, float]] | None = None, unit: Any = None
+    ) -> Page:
+        """A page with sliders that simulates the ride in the browser; see `stroller.explore`.
+
+        **Raises:** as for `stroller.explore`, and `ValueError` for a batch of rides.
+        """
+        require_one_run(self, "explore", "")
+        model, t1, *_ = self.spec.parts
+        return explore_model(model, path, sliders, float(t1), unit)
 
     @status_line("reading off")
     def to_table(self) -> Table:

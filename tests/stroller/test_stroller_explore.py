@@ -80,6 +80,12 @@ def test_ten_rides_end_where_those_of_the_table_end(browser, name):
         np.testing.assert_allclose(distance, np.linalg.norm(position - start, axis=-1), atol=CLOSE)
 
 
+def test_a_ride_has_the_page_of_its_scene():
+    scene, launch = scene_on(stroller.Plane()), stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    ride = stroller.simulate(scene, launch, 2.0)
+    assert ride.explore(sliders=RANGES).html == stroller.explore(scene, launch, sliders=RANGES, t1=2.0).html
+
+
 @pytest.mark.slow
 def test_the_page_opens_and_rides_anew(browser, tmp_path):
     launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)

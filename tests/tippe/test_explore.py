@@ -145,6 +145,14 @@ def reset(browser):
     wait(browser, "return live.values()[0] === 0.1 && live.values()[1] === 155")
 
 
+def test_a_run_has_the_page_of_its_scene(rutstam_scene):
+    launch, sliders = tippe.Launch(0.1, 155.0), {"theta": (0.05, 0.5), "spin": (60.0, 200.0)}
+    run = tippe.simulate(rutstam_scene, launch, 1.0, tolerance=1e-6)
+    assert run.explore(sliders=sliders).html == tippe.explore(rutstam_scene, launch, sliders=sliders, t1=1.0).html
+    with pytest.raises(ValueError, match="'offse' must be one of"):
+        run.explore(sliders={"offse": (0.0, 1.0)})
+
+
 def test_the_page_needs_no_network_and_complains_of_nothing(browser, page):
     assert len(page.html) < 2.5e6
     assert complaints(browser) == []

@@ -18,10 +18,11 @@ from nonholonomic.integration import DenseSolution
 from nonholonomic.integration.status import Status
 from nonholonomic.integration.zeros import all_crossings
 from nonholonomic.progress import status_line
+from nonholonomic.runs import explore
 from nonholonomic.sweeps import Quantity, Table, Tabular
 from nonholonomic.text import batch_title
-from nonholonomic.validation import is_traced, times_within
-from nonholonomic.views import Stage, Viewable
+from nonholonomic.validation import is_traced, require_one_run, times_within
+from nonholonomic.views import Page, Stage, Viewable
 
 from ..model.body import AbstractBody
 from ..model.friction import Frictionless
@@ -225,6 +226,16 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         if self.dense is None:
             raise ValueError("a run made inside jit, vmap or grad has no dense output: pass `times` to simulate")
         return self.resampled(times_within(times, self.end_time, "run"))
+
+    def explore(
+        self, path: Any = None, sliders: dict[str, tuple[float, float]] | None = None, unit: Any = None
+    ) -> Page:
+        """A page with sliders that simulates the run in the browser, until the end of this run; see `tippe.explore`.
+
+        **Raises:** as for `tippe.explore`, and `ValueError` for a batch of runs.
+        """
+        require_one_run(self, "explore", "")
+        return explore(self.scene, self.launch, path, sliders, float(self.end_time), unit=unit)
 
     @status_line("reading off")
     def to_table(self) -> Table:

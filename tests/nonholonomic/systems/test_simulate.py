@@ -1,5 +1,6 @@
 """Trajectories of users' own systems against closed forms, with their derivatives through resets."""
 
+import copy
 import json
 import math
 import warnings
@@ -11,6 +12,7 @@ import pytest
 from close import assert_close
 from own_modes import GRAVITY, Ball, Sleigh, Slip, Stick, bounce, final_turn
 
+import nonholonomic
 from nonholonomic import AbstractMode, Hybrid, simulate, sweep
 from nonholonomic.formulations import Hamel, Lagrange, Routhian
 from nonholonomic.sweeps import Table
@@ -294,6 +296,26 @@ class NamedBall(Ball):
 
 class NamedSleigh(Sleigh):
     names = ("x", "y", "heading")
+
+
+def test_a_component_is_an_attribute():
+    run = simulate(Hybrid([NamedBall()]), [1.0, 0.0, 0.0], 2.0, times=TIMES)
+    np.testing.assert_array_equal(run.velocity, run["velocity"])
+    np.testing.assert_array_equal(copy.deepcopy(run).velocity, run["velocity"])
+    with pytest.raises(AttributeError, match=r"the run has no 'heigth'; did you mean 'height'\?"):
+        _ = run.heigth
+
+
+def test_a_run_knows_its_event_only_for_its_page():
+    ball = Hybrid([NamedBall()], event=lambda t, y: y[1])
+    run = simulate(ball, [1.0, 0.0, 0.0], 1.4, times=[0.5, 1.4])
+    assert run.status == "completed"
+    assert len(run.resets["time"]) == 2
+    assert_close(run.at(1.4).state, run.state[-1:], rtol=1e-12)
+    sliders = {"restitution": (0.7, 0.9)}
+    page = run.explore(sliders=sliders)
+    assert page.html == nonholonomic.explore(ball, [1.0, 0.0, 0.0], sliders=sliders, t1=1.4).html
+    assert "time of the event" in page.html
 
 
 def test_components_have_the_names_of_the_system():
