@@ -134,6 +134,12 @@ def sweep(
     if len(named) < len(axes):
         raise ValueError(f"axes = {', '.join(axes)}: a number is named twice")
     timed = samples is None or event is not None
+    for name, option in {"errors": errors, "sensitivities": list(sensitivities)}.items() if not timed else ():
+        if option:
+            raise ValueError(
+                f"{name} = {shown(option)}: these are {name} of the time of an event, and without event= the runs are only "
+                "sampled; pass event=, or leave out times and quantities"
+            )
     return table_of(model, named, float(t1), crossing, options, TableForm(model.words), samples=samples, timed=timed)
 
 

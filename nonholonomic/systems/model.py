@@ -20,11 +20,15 @@ from ..runs.model import AbstractModel, Names, Start, model_of, statuses
 from ..runs.simulate import simulate_model
 from ..runs.trajectory import Trajectory
 from ..sweeps import Axis, Quantity, Variable
-from ..validation import as_number, shown
+from ..validation import as_number, is_traced, shown
+from ..warning import warn
 from .engine import Cells
 from .form import Form
 from .mode import AbstractMode, Event, Hybrid, require_event
 from .system import MechanicalEvent, MechanicalMode, check_start, formulation_of, is_pair, with_modes_of_systems
+
+#: The margin, in units of the greatest component of the start, below zero by more than which a start is outside its mode.
+OUTSIDE = 1e-9
 
 
 class OwnModel(AbstractModel):
@@ -210,6 +214,21 @@ def assembled(tree: dict[str, Any]) -> tuple[Hybrid, Array, AbstractFormulation 
     return Hybrid([MechanicalMode(formulation)], event), formulation.state(start["q"], start["rate"]), formulation
 
 
+def _at_start(tree: dict[str, Any]) -> OwnModel:
+    """The model of a tree; with a warning if the start is outside its mode."""
+    model = OwnModel.of(tree)
+    hybrid, state, _ = assembled(tree)
+    if model.form.traits.ends[hybrid.first] and not is_traced(tree):
+        margin = float(np.asarray(hybrid.modes[hybrid.first].margin(jnp.zeros(()), state)))
+        # A start on the margin may miss it by round-off.
+        if margin < -OUTSIDE * max(1.0, float(np.max(np.abs(state)))):
+            warn(
+                f"start: the margin of the first mode is {margin:.4g}, below zero: the run begins with the end of this mode; "
+                "start where the margin is positive"
+            )
+    return model
+
+
 @model_of.register(Hybrid)
 def _(system: Hybrid, start: Any, event: Event | None = None, input: Any = None) -> OwnModel:
     check_start(system, start)
@@ -220,7 +239,7 @@ def _(system: Hybrid, start: Any, event: Event | None = None, input: Any = None)
     if event is not None:
         require_event(event)
         system = dataclasses.replace(system, event=with_own_numbers(event, jnp.zeros(()), state))
-    return OwnModel.of({"system": system, "start": state if pair is None else pair, "event": None})
+    return _at_start({"system": system, "start": state if pair is None else pair, "event": None})
 
 
 @model_of.register(AbstractSystem)
@@ -230,7 +249,7 @@ def _(system: AbstractSystem, start: Any, event: Event | None = None, input: Any
     if event is not None:
         require_event(event)
         event = with_own_numbers(event, jnp.zeros(()), jnp.concatenate([q, rate]))
-    return OwnModel.of({"system": system, "start": {"q": q, "rate": rate}, "event": event})
+    return _at_start({"system": system, "start": {"q": q, "rate": rate}, "event": event})
 
 
 @model_of.register(AbstractMode)

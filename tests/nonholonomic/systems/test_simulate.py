@@ -87,7 +87,10 @@ def test_resets_without_end_are_unresolved():
 
 
 def test_a_printed_run_states_why_it_ended():
-    run = simulate(Hybrid([Ball()]), [-1.0, 0.0, 0.0], 1.0, times=[0.0, 1.0])
+    with pytest.warns(
+        UserWarning, match="the margin of the first mode is -1, below zero: the run begins with the end of"
+    ):
+        run = simulate(Hybrid([Ball()]), [-1.0, 0.0, 0.0], 1.0, times=[0.0, 1.0])
     lines = str(run).splitlines()
     assert lines[0] == "Trajectory of 2 times, unresolved at 0 s"
     assert [line.split(":")[0].strip() for line in lines[1:6]] == ["y0", "y1", "y2", "resets", "steps"]

@@ -184,6 +184,22 @@ def test_a_table_of_changed_code_does_not_resume(tmp_path):
             run(*changed)
 
 
+@pytest.mark.parametrize("option", [{"errors": True}, {"sensitivities": ["restitution"]}], ids=["errors", "slopes"])
+def test_options_of_an_event_s_time_are_not_dropped_when_runs_are_sampled(option):
+    (name,) = option
+    with pytest.raises(ValueError, match=f"{name} = .* of the time of an event, and without event= the runs are only"):
+        sweep(
+            BALL,
+            [1.0, 0.0, 0.0],
+            1.0,
+            axes={"restitution": [0.7]},
+            times=[0.5],
+            quantities=["y0"],
+            **option,
+            progress=False,
+        )
+
+
 def test_constant_arrays_are_part_of_the_code():
     def checksum(rates):
         class Decay(AbstractMode):
