@@ -178,7 +178,12 @@ class _Fit(NamedTuple):
     @property
     def slopes(self) -> str:
         """The slopes that guide the fit."""
-        return self.model.data[0].model.fit_slopes
+        models = [source.model for source in self.model.data]
+        # Runs with resets have no derivatives with respect to the times of samples.
+        moves_times = any(name.rpartition(".")[2] == "t0" for name in self.unknowns)
+        if moves_times and not all(model.smooth for model in models):
+            return "differences"
+        return models[0].fit_slopes
 
     @property
     def series_units(self) -> tuple[str, ...]:

@@ -35,3 +35,12 @@ def test_one_number_of_all_modes_is_replaced_in_all():
     data = Recording([0.0, 0.5], [1.0], [0.0], 1.0)
     with pytest.raises(ValueError, match=r"'system.modes\[0\].belt' is named twice, alone and for all modes"):
         identify(Hybrid([Stick(), Slip()]), data, {"modes[*].belt": 0.5, "modes[0].belt": 0.5})
+
+
+def test_the_clock_of_a_recording_is_fitted_through_resets():
+    """Samples between impacts, read off a clock that was 0.02 s ahead."""
+    times = np.array([0.1, 0.2, 0.3, 0.6, 0.75, 0.9, 1.05])
+    heights = simulate(Hybrid([Ball(0.8)]), jnp.array([1.0, 0.0, 0.0]), 1.5, times=times).state[:, 0]
+    data = Recording([1.0, 0.0, 0.0], times + 0.02, heights, 1e-3, "y0")
+    fit = identify(Hybrid([Ball(0.8)]), data, {"t0": 0.0, "restitution": 0.78}, starts=4, progress=False)
+    assert abs(fit.estimates["t0"] - 0.02) < fit.standard_errors["t0"] < 1e-3
