@@ -47,7 +47,7 @@ CALLS = {
         "nonholonomic.runs.identify",
         "free_numbers",
     ),
-    "any fit": (lambda: identify(None, DECAY, {"x": 1.0}), "nonholonomic.identification.identify", "region_of"),
+    "any fit": (lambda: identify(None, DECAY, {"x": 1.0}), "nonholonomic.identification.identify", "search"),
     "its end": (lambda: fitted(), "nonholonomic.identification.identify", "summarise"),
     "density": (lambda: LogDensity.__call__(stub("predict"), np.zeros(1)), None, None),
     "gradient": (
