@@ -12,11 +12,12 @@ from close import assert_close
 from own_modes import GRAVITY, Ball, Sleigh, Slip, Stick, bounce, final_turn
 from PIL import Image
 
-from nonholonomic import AbstractMode, Hybrid, simulate, sweep
+from nonholonomic import AbstractMode, Hybrid, event_time, simulate, sweep
 from nonholonomic.formulations import Hamel, Lagrange, Routhian
 from nonholonomic.sweeps import Table
 from nonholonomic.systems.system import check_start, formulation_of
 
+START = [1.0, 0.0, 0.0]
 TIMES = jnp.array([0.3, 0.7, 1.1, 1.5])
 
 
@@ -255,6 +256,16 @@ def test_a_wrong_function_is_named(name):
     start = np.array([1.0, 0.0, 0.0])
     with pytest.raises(ValueError, match=message):
         simulate(system, start if isinstance(system, Hybrid) else (start, start), 1.0)
+
+
+@pytest.mark.parametrize(("system", "start"), [(Hybrid([Ball()]), START), (Sleigh(), ([0.0] * 3, [0.0] * 3))])
+def test_an_input_of_one_s_own_system_is_refused(system, start):
+    message = (
+        r"input = 2\.0 must be None for your own system: write the input into field\(t, y\) of a mode or into force"
+    )
+    for call in (simulate, event_time):
+        with pytest.raises(ValueError, match=message):
+            call(system, start, 1.0, input=2.0)
 
 
 def test_the_sleigh_turns_to_its_final_heading():
