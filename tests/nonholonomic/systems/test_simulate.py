@@ -124,6 +124,24 @@ def test_components_are_drawn_over_time():
     assert list(run.to_dataframe().columns) == ["time", "y0", "y1", "y2", "mode"]
 
 
+def labels(*runs):
+    return runs[0].labels_of(list(runs), None)
+
+
+def test_labels_name_each_number_once_and_briefly():
+    """A number of all modes is one number, and a name is as short as it is clear."""
+
+    def run(*balls, start=START):
+        return simulate(Hybrid([Ball(*numbers) for numbers in balls]), start, 0.1, times=[0.1])
+
+    both = run((0.8, 9.0), (0.8, 9.0))
+    assert labels(both, run((0.8, 3.0), (0.8, 3.0))) == ["gravity 9", "gravity 3"]
+    assert labels(both, run((0.8, 3.0), (0.8, 9.0))) == ["system.modes[0].gravity 9", "system.modes[0].gravity 3"]
+    different = labels(both, run((0.8, 3.0), (0.8, 2.0), start=[2.0, 0.0, 0.0]))
+    assert different[1] == "start[0] 2, system.modes[0].gravity 3, system.modes[1].gravity 2"
+    assert labels(run((0.8, 9.0)), run((0.8, 3.0))) == ["gravity 9", "gravity 3"]
+
+
 def test_resets_are_listed_and_drawn():
     """A ball strikes the ground at its closed-form times; its lines reach the ground and jump there."""
     run = simulate(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.5, times=[0.0, 1.0, 1.5])
