@@ -297,7 +297,7 @@ class Parameters(eqx.Module):
     def replaced(self, changes: dict[str, Any]) -> "Parameters":
         """The parameters with replacements, by name; a name such as `"system.modes[*].drag"` replaces several."""
         values = tuple(
-            changes.get(name, changes.get(_of_all_modes(name), value))
+            changes.get(name, changes.get(of_all_modes(name), value))
             for name, value in zip(self.names, self.values, strict=True)
         )
         return dataclasses.replace(self, values=values)
@@ -305,7 +305,7 @@ class Parameters(eqx.Module):
     def value(self, name: str) -> Array:
         """The value of a parameter; of the first of several."""
         return next(
-            value for own, value in zip(self.names, self.values, strict=True) if name in (own, _of_all_modes(own))
+            value for own, value in zip(self.names, self.values, strict=True) if name in (own, of_all_modes(own))
         )
 
     @property
@@ -316,7 +316,7 @@ class Parameters(eqx.Module):
     @property
     def known(self) -> list[str]:
         """The names of the numbers that can be varied, one by one or in all modes that have them."""
-        merged_names = [_of_all_modes(name) for name in self.movable]
+        merged_names = [of_all_modes(name) for name in self.movable]
         return [*self.movable, *dict.fromkeys(name for name in merged_names if merged_names.count(name) > 1)]
 
     def full_name(self, argument: str, name: str) -> str:
@@ -354,7 +354,7 @@ def _name(path: KeyPath) -> str:
     return "".join(parts).removeprefix(".")
 
 
-def _of_all_modes(name: str) -> str:
+def of_all_modes(name: str) -> str:
     """The name of a number for all modes that have it."""
     return re.sub(r"\bmodes\[\d+\]", "modes[*]", name)
 
@@ -362,7 +362,7 @@ def _of_all_modes(name: str) -> str:
 def require_apart(argument: str, names: Iterable[str]) -> None:
     """Raise `ValueError` if a number is named both alone and for all modes."""
     for name in names:
-        if name != _of_all_modes(name) in names:
+        if name != of_all_modes(name) in names:
             raise ValueError(f"{argument}: {name!r} is named twice, alone and for all modes")
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from ..hybrid import hybrid_resets
 from ..integration import Settings
 from ..integration.status import Status
+from ..parameters import of_all_modes
 from ..sweeps import Quantity, Table, Tabular, run_table
 from ..text import as_text, batch_title, distinguishing_labels, likely
 from ..validation import is_traced, times_within
@@ -206,7 +207,9 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         names = models[0].known
         if any(model.known != names for model in models):
             return Tabular.labels_of(self, runs, unit)
-        numbers = [tuple(f"{name} {as_text(model.value(name))}" for name in names) for model in models]
+        values = {name: [as_text(model.value(name)) for model in models] for name in names}
+        texts = [[f"{label} {text}" for text in values[name]] for name, label in brief_names(values).items()]
+        numbers = list(zip(*texts, strict=True))
         return distinguishing_labels(numbers) if len(set(numbers)) > 1 else Tabular.labels_of(self, runs, unit)
 
     def overview(self, runs: list[Any], labels: Sequence[str], unit: Any, ax: Any) -> Any:
@@ -233,3 +236,18 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         if self.status in REASONS:
             lines.append(f"  {REASONS[self.status]}")
         return "\n".join(lines)
+
+
+def brief_names(values: dict[str, list[str]]) -> dict[str, str]:
+    """The parameters that a label may name: full name -> its last part, or the full name if several names end alike.
+
+    A parameter with the same value in all modes that have it counts once, under its name for all modes. All other
+    parameters count under their names in each mode.
+
+    **Arguments:** `values`: full name -> the value in each run.
+    """
+    groups = {name: [single for single in values if single != name == of_all_modes(single)] for name in values}
+    shared = {name for name, group in groups.items() if group and all(values[k] == values[name] for k in group)}
+    names = [name for name in values if name in shared or not (groups[name] or of_all_modes(name) in shared)]
+    ends = [name.rsplit(".", 1)[-1] for name in names]
+    return {name: end if ends.count(end) == 1 else name for name, end in zip(names, ends, strict=True)}

@@ -229,8 +229,18 @@ def _at_start(tree: dict[str, Any]) -> OwnModel:
     return model
 
 
+def require_no_input(input: Any) -> None:
+    """Raise `ValueError` unless there is no input, because a user's system has none apart from its own functions."""
+    if input is not None:
+        raise ValueError(
+            f"input = {shown(input)} must be None for your own system: write the input into field(t, y) of a mode or into "
+            "force(t, q, rate) of an AbstractSystem, as numbers or functions of the system"
+        )
+
+
 @model_of.register(Hybrid)
 def _(system: Hybrid, start: Any, event: Event | None = None, input: Any = None) -> OwnModel:
+    require_no_input(input)
     check_start(system, start)
     # With a mechanical system among the modes, a state is (q, rate).
     has_pairs = any(isinstance(mode, AbstractSystem) for mode in system.modes) and is_pair(start)
@@ -244,6 +254,7 @@ def _(system: Hybrid, start: Any, event: Event | None = None, input: Any = None)
 
 @model_of.register(AbstractSystem)
 def _(system: AbstractSystem, start: Any, event: Event | None = None, input: Any = None) -> OwnModel:
+    require_no_input(input)
     check_start(system, start)
     q, rate = (as_number(part) for part in start)
     if event is not None:

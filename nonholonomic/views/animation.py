@@ -10,7 +10,7 @@ from jaxtyping import Float
 from .arena import FINE
 from .page import ANGLE, centre_and_extent, view_from
 from .plot import new_figure
-from .stage import Show, Stage, css, finite, matrices, nearest
+from .stage import Mesh, Show, Stage, css, finite, matrices, nearest
 
 #: Dots per inch.
 DOTS = 80
@@ -160,10 +160,7 @@ class _Space:
         axes.set_title(f"{stage.title} ({stage.arena.spacing})", fontsize="medium")
         self.floor = axes.add_collection3d(Poly3DCollection([np.zeros((3, 3))], linewidths=0.3, zorder=0))
         mesh = stage.arena.mesh
-        # A quarter of the mesh's lines is fine enough.
-        index = np.arange(len(mesh.vertices)).reshape(FINE, FINE)[::4, ::4]
-        self.tiles = mesh.vertices[np.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]], axis=-1)]
-        self.tiles = self.tiles.reshape(-1, 4, 3)
+        self.tiles = _tiles(mesh)
         front = np.cross(*(mesh.vertices[mesh.triangles[0]][[1, 2]] - mesh.vertices[mesh.triangles[0]][0]))
         normals = np.cross(self.tiles[:, 1] - self.tiles[:, 0], self.tiles[:, 2] - self.tiles[:, 0])
         normals *= np.sign(np.sum(normals[0] * front))
@@ -220,6 +217,16 @@ class _Space:
         # Edges of the same colour close the seams between triangles.
         self.solids.set_facecolor(np.concatenate(colours))
         self.solids.set_edgecolor(np.concatenate(colours))
+
+
+def _tiles(mesh: Mesh) -> Float[np.ndarray, "tiles corners 3"]:
+    """The polygons that show an arena: quadrilaterals for the grid of a surface, otherwise the triangles of the mesh."""
+    if len(mesh.vertices) != FINE**2:
+        return mesh.vertices[mesh.triangles]
+    # A quarter of the mesh's lines is fine enough.
+    index = np.arange(FINE**2).reshape(FINE, FINE)[::4, ::4]
+    corners = np.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]], axis=-1)
+    return mesh.vertices[corners.reshape(-1, 4)]
 
 
 def _pieces(line: np.ndarray, middle: np.ndarray, reach: float) -> list[np.ndarray]:

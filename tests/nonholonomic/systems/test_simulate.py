@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 from close import assert_close
 from own_modes import GRAVITY, Ball, Sleigh, Slip, Stick, bounce, final_turn
+from PIL import Image
 
 import nonholonomic
-from nonholonomic import AbstractMode, Hybrid, simulate, sweep
+from nonholonomic import AbstractMode, Hybrid, event_time, simulate, sweep
 from nonholonomic.formulations import Hamel, Lagrange, Routhian
 from nonholonomic.sweeps import Table
 from nonholonomic.systems.system import check_start, formulation_of
 
+START = [1.0, 0.0, 0.0]
 TIMES = jnp.array([0.3, 0.7, 1.1, 1.5])
 
 
@@ -127,6 +129,24 @@ def test_components_are_drawn_over_time():
     assert list(run.to_dataframe().columns) == ["time", "y0", "y1", "y2", "mode"]
 
 
+def labels(*runs):
+    return runs[0].labels_of(list(runs), None)
+
+
+def test_labels_name_each_number_once_and_briefly():
+    """A number of all modes is one number, and a name is as short as it is clear."""
+
+    def run(*balls, start=START):
+        return simulate(Hybrid([Ball(*numbers) for numbers in balls]), start, 0.1, times=[0.1])
+
+    both = run((0.8, 9.0), (0.8, 9.0))
+    assert labels(both, run((0.8, 3.0), (0.8, 3.0))) == ["gravity 9", "gravity 3"]
+    assert labels(both, run((0.8, 3.0), (0.8, 9.0))) == ["system.modes[0].gravity 9", "system.modes[0].gravity 3"]
+    different = labels(both, run((0.8, 3.0), (0.8, 2.0), start=[2.0, 0.0, 0.0]))
+    assert different[1] == "start[0] 2, system.modes[0].gravity 3, system.modes[1].gravity 2"
+    assert labels(run((0.8, 9.0)), run((0.8, 3.0))) == ["gravity 9", "gravity 3"]
+
+
 def test_resets_are_listed_and_drawn():
     """A ball strikes the ground at its closed-form times; its lines reach the ground and jump there."""
     run = simulate(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.5, times=[0.0, 1.0, 1.5])
@@ -147,6 +167,21 @@ def test_resets_are_listed_and_drawn():
         assert len(drawn) == 7
         assert_close(np.sort(drawn)[:4], np.zeros(4), atol=1e-9)
     assert len(run.to_table()["y0"]) == 3
+
+
+def test_an_animation_shows_the_plane_of_the_page(tmp_path):
+    run = simulate(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.0)
+    run.animate(tmp_path / "ball.gif", times=[0.0, 0.4], others=[run.at([0.0, 0.5, 1.0])])
+    with Image.open(tmp_path / "ball.gif") as picture:
+        assert picture.n_frames == 2
+        pictures = []
+        for frame in range(2):
+            picture.seek(frame)
+            pictures.append(np.asarray(picture.convert("RGB"), dtype=float)[50:340])
+    left, right = np.split(np.abs(pictures[1] - pictures[0]).max(axis=-1), 2, axis=1)
+    assert min(np.count_nonzero(left), np.count_nonzero(right)) > 50
+    # The plane has a colour, and the rest of the picture is white.
+    assert 5000 < np.count_nonzero(np.ptp(pictures[0], axis=-1) > 15.0) < 50000
 
 
 def test_resets_need_one_run():
@@ -244,6 +279,16 @@ def test_a_wrong_function_is_named(name):
     start = np.array([1.0, 0.0, 0.0])
     with pytest.raises(ValueError, match=message):
         simulate(system, start if isinstance(system, Hybrid) else (start, start), 1.0)
+
+
+@pytest.mark.parametrize(("system", "start"), [(Hybrid([Ball()]), START), (Sleigh(), ([0.0] * 3, [0.0] * 3))])
+def test_an_input_of_one_s_own_system_is_refused(system, start):
+    message = (
+        r"input = 2\.0 must be None for your own system: write the input into field\(t, y\) of a mode or into force"
+    )
+    for call in (simulate, event_time):
+        with pytest.raises(ValueError, match=message):
+            call(system, start, 1.0, input=2.0)
 
 
 def test_the_sleigh_turns_to_its_final_heading():
