@@ -169,6 +169,14 @@ def shown(value: Any) -> str:
     return (as_text(value) if is_known else repr(value)).partition("\n")[0]
 
 
+def described(result: Any) -> str:
+    """What a traced function returns, for a message, such as "an array of shape (2,)" or "a list of 2 values"."""
+    if hasattr(result, "shape"):
+        return f"an array of shape {result.shape}" if result.shape else f"a number of type {result.dtype}"
+    count = f" of {counted(len(result), 'value')}" if isinstance(result, list | tuple) else ""
+    return "None" if result is None else f"a {type(result).__name__}{count}"
+
+
 def contents(module: Any, with_units: bool = True) -> list[tuple[str, str]]:
     """The fields of a module as (name, value as text); omitted fields are left out."""
     fields = [(field.name, getattr(module, field.name, None)) for field in dataclasses.fields(module)]

@@ -80,7 +80,8 @@ class AbstractSystem(eqx.Module):
 
     def margin(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Float[Array, ""] | None:
         """A smooth function that is positive while the system moves freely and falls through zero where it strikes something,
-        such as the distance from a wall; `None`, the default, for a system that strikes nothing.
+        such as the distance from a wall; `None`, the default, for a system that strikes nothing. An oscillation in time that is
+        faster than the motion can be missed: let `force` contain it.
         """
         return None
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import diffrax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..parameters import numbers
@@ -109,6 +110,10 @@ def require_times(times: Any, t1: Any) -> None:
     Traceback (most recent call last):
     ValueError: times ...
     """
+    if np.ndim(times) == 0:
+        raise ValueError(
+            f"times = {shown(times)} must be an increasing list of times; for evenly spaced ones use np.linspace"
+        )
     require_all(times_bounds(times, t1))
     require_increasing(times, "times")
 

@@ -1,5 +1,6 @@
 """Trace a user's functions to find the arguments on which they depend, and the operations of which they consist."""
 
+import contextlib
 import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -130,11 +131,20 @@ def _reached(jaxpr: Jaxpr, inputs: Sequence[Any]) -> list[bool]:
     return [not isinstance(variable, Literal) and variable in dependents for variable in jaxpr.outvars]
 
 
+@contextlib.contextmanager
+def named_errors(function: str, arguments: str) -> Iterator[None]:
+    """Raise errors in a user's function as `ValueError`s that name the function, such as "field(t, y)", and its arguments."""
+    try:
+        yield
+    except jax.errors.JAXTypeError as error:
+        raise ValueError(f"{function} {UNTRACEABLE}") from error
+    except Exception as error:
+        problem = f"{type(error).__name__}: {str(error).partition(chr(10))[0].rstrip('.')}"
+        raise ValueError(f"{function} raised {problem}; its arguments are {arguments}") from error
+
+
 def with_own_numbers(event: Callable[..., Any], *args: Any) -> Callable[..., Any]:
     """The event itself or, if it closes over traced numbers (such as those of an enclosing `jax.grad`), a module that
     contains these numbers."""
-    try:
-        consts = jax.make_jaxpr(event)(*args).consts
-    except jax.errors.JAXTypeError as error:
-        raise ValueError(f"event(t, y) {UNTRACEABLE}") from error
+    consts = jax.make_jaxpr(event)(*args).consts
     return eqx.filter_closure_convert(event, *args) if any(is_traced(const) for const in consts) else event

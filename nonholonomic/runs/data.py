@@ -159,8 +159,10 @@ class AbstractEventTimes(eqx.Module):
         if self.until is not None:
             require(self.until, "until", above=0.0, at_most=self.t1, why="t1")
         first, last = self._limits
-        require(first[first == last], "time", above=0.0, below=self.t1, why="t1")
-        require(first, "time", at_least=0.0, at_most=self.t1, why="t1")
+        require(first[first == last], "time", above=0.0)
+        require(first[first == last], "time", below=self.t1, why="t1")
+        require(first, "time", at_least=0.0)
+        require(first, "time", at_most=self.t1, why="t1")
         if np.any(last < first):
             raise ValueError(f"time = {measured[np.argmax(last < first)]} must be a time, or two in order")
         require(self.error, "error", above=0.0)

@@ -22,7 +22,7 @@ from ..lanes.components import over_lanes
 from ..lanes.tracing import depends_on_first, is_elementary, spelled_out, with_own_numbers
 from ..parameters import Parameters
 from ..per_run import gathered
-from ..text import likely
+from ..text import described, likely
 from ..validation import UNTRACEABLE, shown
 from .model import AbstractModel, Names, Start
 
@@ -41,7 +41,12 @@ class Motion:
             raise ValueError(f"event: motion.{name} must be one of {known}{likely(name, self._names)}")
         return self._read(name)
 
-    __getitem__ = __getattr__
+    def __getitem__(self, name: str) -> Array:
+        if not isinstance(name, str):
+            raise ValueError(
+                f"event: motion[{shown(name)}]: the quantities of a motion have names, such as motion.{next(iter(self._names))}"
+            )
+        return getattr(self, name)
 
 
 class OfValues(eqx.Module):
@@ -119,7 +124,7 @@ def with_event(model: AbstractModel, event: Any) -> AbstractModel:
     except jax.errors.JAXTypeError as error:
         raise ValueError(f"event(t, motion) {UNTRACEABLE}") from error
     if getattr(result, "shape", None) != () or not jnp.issubdtype(result.dtype, jnp.floating):
-        raise ValueError(f"event(t, motion) must return one float, not {shown(result)}")
+        raise ValueError(f"event(t, motion) must return one float, not {described(result)}")
     names = tuple(used)
     values = jax.eval_shape(lambda t, rows: model.read(names, t, rows, index), t, rows_of(model, names))
     example = (jnp.zeros(()), jax.tree.map(lambda value: jnp.zeros(value.shape, value.dtype), values))

@@ -61,9 +61,9 @@ def event_time(
     - `input`: the input of a stroller.
 
     **Returns:** the time [s]; infinite if there is no event by `t1` or if the run ends before the event; NaN if the
-    integration failed or if resets follow one another without end, with a warning that says so, or if numbers inside a
-    transformation are out of range. If the margin of a mode only touches zero, so that the mode may or may not end
-    within the tolerance, derivatives are NaN.
+    integration failed or if resets follow one another without end (more than 2000), with a warning that says so, or if
+    numbers inside a transformation are out of range. If the margin of a mode only touches zero, so that the mode may or
+    may not end within the tolerance, derivatives are NaN.
 
     **Raises:** `ValueError` for arguments out of range, functions that return a wrong type or shape, and second
     derivatives through resets.

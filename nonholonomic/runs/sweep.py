@@ -93,7 +93,8 @@ def sweep(
       for each core. For other processes, define classes and functions at the top level of a module.
 
     **Returns:** a `Table` with `time` [s] of the event, infinite without one; `status`: "event", "completed" if the run
-    reached `t1`, "stopped" if a mode without a reset ended, "failed", "unresolved", or a word of the system; `end_time`
+    reached `t1`, "stopped" if a mode without a reset ended, "failed", "unresolved" (for example after 2000 resets of your own
+    system), or a word of the system; `end_time`
     [s]; the state at the end, such as `y0`, `q0` and `rate0`, or `end_theta`; `steps` and `rejected`; and for a system
     with resets their number, such as `switches`. With `sensitivities`, the table also contains the derivative of `time`
     with respect to each parameter, such as `time_by_drag` for `"system.modes[0].drag"`, and for a system with resets

@@ -25,7 +25,8 @@ from .portrait import portraits
 #: Why a run ended early, by its word.
 REASONS = {
     "failed": "a function may return NaN or infinity there, or reset the index of no mode",
-    "unresolved": "resets followed one another without end; add a mode for rest, or start where the margin is positive",
+    "unresolved": "resets followed one another without end; add a mode for rest, or start where the margin is positive; or "
+    "the run is too long: it may have at most 2000 resets",
 }
 
 

@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..lanes.tracing import depends_on_first, is_elementary, spelled_out
+from ..lanes.tracing import depends_on_first, is_elementary, named_errors, spelled_out
 from ..parameters import TreeForm
-from ..validation import UNTRACEABLE, shown
+from ..text import described
 from .mode import Hybrid, State
 
 #: A function of the numbers, the time and the state of one run.
@@ -131,12 +131,15 @@ def _name(name: str, mode: int) -> str:
     return f"{name if name == 'event' else f'modes[{mode}].{name}'}(t, y)"
 
 
+def arguments_in_words(size: int) -> str:
+    """The arguments of a function of time and state, for a message."""
+    return f"the time t, a number, and the state y, an array of shape ({size},)"
+
+
 def _result(form: Form, name: str, mode: int) -> Any:
     """The shape and type that a function returns."""
-    try:
+    with named_errors(_name(name, mode), arguments_in_words(form.size)):
         return jax.eval_shape(form.function(name, mode), *form.arguments)
-    except jax.errors.JAXTypeError as error:
-        raise ValueError(f"{_name(name, mode)} {UNTRACEABLE}") from error
 
 
 def _require_shape(form: Form, name: str, mode: int, shape: tuple[int, ...]) -> None:
@@ -144,9 +147,8 @@ def _require_shape(form: Form, name: str, mode: int, shape: tuple[int, ...]) -> 
     function_name, result = _name(name, mode), _result(form, name, mode)
     if not hasattr(result, "shape") or result.shape != shape:
         expected = "one number" if shape == () else f"an array of shape {shape}, like the start"
-        description = f"an array of shape {result.shape}" if hasattr(result, "shape") else repr(result)
         raise ValueError(
-            f"{function_name} must return {expected}, not {description}; jnp.array([...]) makes an array of numbers"
+            f"{function_name} must return {expected}, not {described(result)}; jnp.array([...]) makes an array of numbers"
         )
     if not jnp.issubdtype(result.dtype, jnp.floating):
         raise ValueError(f"{function_name} must return floats, not {result.dtype}: it must be smooth")
@@ -156,9 +158,9 @@ def _require_pair(form: Form, mode: int, result: Any) -> None:
     """Raise `ValueError` unless a reset returns a state and a whole number."""
     expected = f"modes[{mode}].reset(t, y) must return (state, number of the next mode)"
     if not isinstance(result, tuple) or len(result) != 2:
-        raise ValueError(f"{expected}, not {shown(result)}")
+        raise ValueError(f"{expected}, not {described(result)}")
     state, number = (jax.eval_shape(lambda part=part: part) if callable(part) else part for part in result)
     if getattr(state, "shape", None) != (form.size,):
-        raise ValueError(f"{expected}; its state has the shape {getattr(state, 'shape', state)}, not ({form.size},)")
+        raise ValueError(f"{expected}; its state is {described(state)}, not an array of shape ({form.size},)")
     if getattr(number, "shape", None) != () or not jnp.issubdtype(number.dtype, jnp.integer):
-        raise ValueError(f"{expected}; its number is {shown(number)}, not a whole number")
+        raise ValueError(f"{expected}; its number is {described(number)}, not a whole number")

@@ -64,6 +64,9 @@ class AbstractMode(eqx.Module):
     def margin(self, t: Float[Array, ""], y: State) -> Float[Array, ""] | None:
         """A smooth function that is positive while the mode holds and falls through zero where it ends.
 
+        An oscillation in time that is faster than the motion can be missed: let the field contain it, for example with the
+        height above a vibrating table as the state.
+
         **Arguments:** as for `field`.
 
         **Returns:** a number; or `None`, the default, for a mode that never ends.

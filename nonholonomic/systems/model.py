@@ -14,7 +14,7 @@ from ..formulations import AbstractFormulation, AbstractSystem
 from ..hybrid import HybridOutcome
 from ..integration import AbstractProblem, Outcome
 from ..integration.status import Status
-from ..lanes.tracing import dependent_outputs, with_own_numbers
+from ..lanes.tracing import dependent_outputs, named_errors, with_own_numbers
 from ..parameters import Parameters, check_again, has_checks, require_apart, short_names
 from ..runs.model import AbstractModel, Names, Start, model_of, statuses
 from ..runs.simulate import simulate_model
@@ -23,7 +23,7 @@ from ..sweeps import Axis, Quantity, Variable
 from ..validation import as_number, is_traced, shown
 from ..warning import warn
 from .engine import Cells
-from .form import Form
+from .form import Form, arguments_in_words
 from .mode import AbstractMode, Event, Hybrid, require_event
 from .system import MechanicalEvent, MechanicalMode, check_start, formulation_of, is_pair, with_modes_of_systems
 
@@ -229,6 +229,13 @@ def _at_start(tree: dict[str, Any]) -> OwnModel:
     return model
 
 
+def checked_event(event: Any, state: Array) -> Event:
+    """The event with its own numbers; raises `ValueError` unless it is a function that accepts a time and a state."""
+    require_event(event)
+    with named_errors("event(t, y)", arguments_in_words(state.size)):
+        return with_own_numbers(event, jnp.zeros(()), state)
+
+
 def require_no_input(input: Any) -> None:
     """Raise `ValueError` unless there is no input, because a user's system has none apart from its own functions."""
     if input is not None:
@@ -247,8 +254,7 @@ def _(system: Hybrid, start: Any, event: Event | None = None, input: Any = None)
     pair = dict(zip(("q", "rate"), map(as_number, start), strict=True)) if has_pairs else None
     state = as_number(start) if pair is None else jnp.concatenate([*pair.values()])
     if event is not None:
-        require_event(event)
-        system = dataclasses.replace(system, event=with_own_numbers(event, jnp.zeros(()), state))
+        system = dataclasses.replace(system, event=checked_event(event, state))
     return _at_start({"system": system, "start": state if pair is None else pair, "event": None})
 
 
@@ -258,8 +264,7 @@ def _(system: AbstractSystem, start: Any, event: Event | None = None, input: Any
     check_start(system, start)
     q, rate = (as_number(part) for part in start)
     if event is not None:
-        require_event(event)
-        event = with_own_numbers(event, jnp.zeros(()), jnp.concatenate([q, rate]))
+        event = checked_event(event, jnp.concatenate([q, rate]))
     return _at_start({"system": system, "start": {"q": q, "rate": rate}, "event": event})
 
 

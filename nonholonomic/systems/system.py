@@ -15,7 +15,8 @@ from jaxtyping import Array, Float
 
 from ..formulations import AbstractFormulation, AbstractSystem, Hamel, Lagrange
 from ..formulations.system import within_constraints
-from ..validation import UNTRACEABLE, as_number, is_traced, require, shown
+from ..lanes.tracing import named_errors
+from ..validation import as_number, is_traced, require, shown
 from ..warning import warn
 from .form import Form
 from .mode import AbstractMode, Event, Hybrid, State
@@ -123,6 +124,8 @@ def check_start(system: Hybrid | AbstractSystem, start: Any) -> None:
 
 
 def _check_vector(value: Any, name: str, size: int | None) -> None:
+    if isinstance(value, list | tuple) and any(isinstance(part, str) for part in value):
+        raise ValueError(f"{name} = {shown(value)} must be a list of numbers, not of texts")
     value = as_number(value)
     require(value, name)
     shape = f"({'components' if size is None else size},)"
@@ -163,10 +166,9 @@ def _check_functions(form: Form, prefix: str) -> None:
         return getattr(mode.formulation.system, method)(*arguments)
 
     for name, (arguments, expected_shape, fits) in functions.items():
-        try:
+        rest = f"the coordinates q{' and their rates' if 'rate' in name else ''}, of shape ({n},)"
+        with named_errors(f"{prefix}{name}", f"the time t, a number, and {rest}" if "(t" in name else rest):
             result = jax.eval_shape(functools.partial(called, name.partition("(")[0]), numbers, *arguments)
-        except jax.errors.JAXTypeError as error:
-            raise ValueError(f"{prefix}{name} {UNTRACEABLE}") from error
         shape = _shape_of(result)
         if name.startswith("margin") and result is None:
             break  # Nothing calls the reset.

@@ -83,7 +83,8 @@ def test_event_times_with_a_heavy_tail_ignore_an_outlier():
     ("arguments", "message"),
     [
         (dict(time=[1.0, np.nan]), r"time\[1\] = nan must be a number, infinite where the event did not happen"),
-        (dict(time=[5.0]), "time = 5.0 must be less than 3.0"),
+        (dict(time=[5.0]), r"time = 5.0 must be less than 3.0 \(t1\)"),
+        (dict(time=[-1.0]), "time = -1.0 must be greater than 0.0$"),
         (dict(time=1.0), "time must be a non-empty list of times"),
         (dict(time=[np.inf], until=4.0), "until = 4.0 must be at most 3.0"),
         (dict(time=[(2.0, 1.0)]), "a time, or two in order"),

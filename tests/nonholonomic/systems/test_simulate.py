@@ -381,3 +381,88 @@ def test_wrong_names_are_refused(words):
     wrong = type("Wrong", (Ball,), {"names": words})
     with pytest.raises(ValueError, match=r"Wrong\.names = .* must be 3 different words, one for each component"):
         simulate(Hybrid([wrong()]), [1.0, 0.0, 0.0], 2.0)
+
+
+class Swapped(AbstractMode):
+    def field(self, y, t):
+        return jnp.array([y[1], -9.81])
+
+
+class Timeless(AbstractMode):
+    def field(self, y):
+        return y
+
+
+class ListReset(Ball):
+    def reset(self, t, y):
+        return [y[0], y[1], y[2]], 0
+
+
+class StateOnly(Ball):
+    def reset(self, t, y):
+        return y
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: simulate(Hybrid([Swapped()]), [1.0, 0.0], 1.0),
+            r"modes\[0\]\.field\(t, y\) raised IndexError: .*; its arguments are the time t, a number, and the state y, an "
+            r"array of shape \(2,\)",
+        ),
+        (
+            lambda: simulate(Hybrid([Timeless()]), [1.0, 0.0], 1.0),
+            r"modes\[0\]\.field\(t, y\) raised TypeError: .*takes 2",
+        ),
+        (
+            lambda: event_time(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.0, event=lambda t, y: y.height),
+            r"event\(t, y\) raised AttributeError: .*height.*; its arguments are the time t",
+        ),
+        (
+            lambda: simulate(Hybrid([ListReset()]), [1.0, 0.0, 0.0], 1.0),
+            r"its state is a list of 3 values, not an array of shape \(3,\)",
+        ),
+        (
+            lambda: simulate(Hybrid([StateOnly()]), [1.0, 0.0, 0.0], 1.0),
+            r"must return \(state, number of the next mode\), not an array of shape \(3,\)",
+        ),
+        (
+            lambda: simulate(Hybrid([Ball()]), ["1", "0", "0"], 1.0),
+            "start = .* must be a list of numbers, not of texts",
+        ),
+        (
+            lambda: simulate(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.0, times=11),
+            "times = 11 must be an increasing list of times",
+        ),
+    ],
+    ids=["swapped", "timeless", "attribute", "list", "state only", "texts", "times"],
+)
+def test_mistakes_in_functions_are_named_with_their_arguments(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+class AboveTable(AbstractMode):
+    """A ball above a table at A sin(50 t), by its height above the table."""
+
+    amplitude: float = 0.3
+
+    def field(self, t, y):
+        return jnp.array([y[1], -1.0 + 2500.0 * self.amplitude * jnp.sin(50.0 * t)])
+
+    def margin(self, t, y):
+        return y[0]
+
+
+def test_the_first_contact_with_a_vibrating_table():
+    """The manual says how to write such a system; the time is the first zero of 1 - t^2 / 2 - 0.3 sin(50 t)."""
+    run = simulate(Hybrid([AboveTable()]), [1.0, -15.0], 3.0, times=[3.0])
+    assert run.status == "stopped"
+    assert_close(run.end_time, 1.2705959283857677, atol=1e-8)
+
+
+def test_the_reason_of_an_unresolved_run_names_the_limit_of_resets():
+    with pytest.warns(UserWarning, match="the margin of the first mode"):
+        run = simulate(Hybrid([Ball()]), [-1.0, 0.0, 0.0], 1.0, times=[0.0, 1.0])
+    assert "it may have at most 2000 resets" in str(run)
