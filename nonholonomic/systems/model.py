@@ -219,7 +219,8 @@ def _at_start(tree: dict[str, Any]) -> OwnModel:
     model = OwnModel.of(tree)
     hybrid, state, _ = assembled(tree)
     if model.form.traits.ends[hybrid.first] and not is_traced(tree):
-        margin = float(np.asarray(hybrid.modes[hybrid.first].margin(jnp.zeros(()), state)))
+        first: Any = hybrid.modes[hybrid.first]
+        margin = float(np.asarray(first.margin(jnp.zeros(()), state)))
         # A start on the margin may miss it by round-off.
         if margin < -OUTSIDE * max(1.0, float(np.max(np.abs(state)))):
             warn(
