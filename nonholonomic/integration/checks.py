@@ -110,9 +110,9 @@ def require_times(times: Any, t1: Any) -> None:
     Traceback (most recent call last):
     ValueError: times ...
     """
-    if np.ndim(times) == 0:
+    if np.ndim(times) == 0 and not isinstance(times, str) and times is not None:
         raise ValueError(
-            f"times = {shown(times)} must be an increasing list of times; for evenly spaced ones use np.linspace"
+            f"times = {shown(times)} must be a list of at least one number; np.linspace makes evenly spaced ones"
         )
     require_all(times_bounds(times, t1))
     require_increasing(times, "times")

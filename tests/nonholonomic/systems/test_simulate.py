@@ -433,7 +433,7 @@ class StateOnly(Ball):
         ),
         (
             lambda: simulate(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.0, times=11),
-            "times = 11 must be an increasing list of times",
+            "times = 11 must be a list of at least one number; np.linspace",
         ),
     ],
     ids=["swapped", "timeless", "attribute", "list", "state only", "texts", "times"],
