@@ -46,8 +46,10 @@ def as_number(value: Any) -> Float[Array, "..."]:
     """Convert to a floating-point array of the default precision; anything that is not a number stays unchanged, for
     `require` to reject."""
     try:
-        if isinstance(value, str | bytes):
-            raise TypeError
+        # NumPy would read numbers from texts.
+        for leaf in jax.tree.leaves(value):
+            if isinstance(leaf, str | bytes) or (isinstance(leaf, np.ndarray) and leaf.dtype.kind in "SU"):
+                raise TypeError
         return jnp.asarray(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
         # The types exclude what `require` will reject.

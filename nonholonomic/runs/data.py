@@ -157,7 +157,8 @@ class AbstractEventTimes(eqx.Module):
                 "out the launch of a measurement that was lost, with its time"
             )
         if self.until is not None:
-            require(self.until, "until", above=0.0, at_most=self.t1, why="t1")
+            require(self.until, "until", above=0.0)
+            require(self.until, "until", at_most=self.t1, why="t1")
         first, last = self._limits
         require(first[first == last], "time", above=0.0)
         require(first[first == last], "time", below=self.t1, why="t1")

@@ -65,7 +65,7 @@ class AbstractMode(eqx.Module):
         """A smooth function that is positive while the mode holds and falls through zero where it ends.
 
         An oscillation in time that is faster than the motion can be missed: let the field contain it, for example with the
-        height above a vibrating table as the state.
+        sine and cosine of a vibrating table's phase in the state.
 
         **Arguments:** as for `field`.
 

@@ -124,9 +124,9 @@ def check_start(system: Hybrid | AbstractSystem, start: Any) -> None:
 
 
 def _check_vector(value: Any, name: str, size: int | None) -> None:
-    if isinstance(value, list | tuple) and any(isinstance(part, str) for part in value):
-        raise ValueError(f"{name} = {shown(value)} must be a list of numbers, not of texts")
     value = as_number(value)
+    if not isinstance(value, jax.Array):
+        raise ValueError(f"{name} = {shown(value)} is not a list of numbers")
     require(value, name)
     shape = f"({'components' if size is None else size},)"
     if np.ndim(value) != 1 or np.size(value) == 0 or size not in (None, np.size(value)):
@@ -166,8 +166,8 @@ def _check_functions(form: Form, prefix: str) -> None:
         return getattr(mode.formulation.system, method)(*arguments)
 
     for name, (arguments, expected_shape, fits) in functions.items():
-        rest = f"the coordinates q{' and their rates' if 'rate' in name else ''}, of shape ({n},)"
-        with named_errors(f"{prefix}{name}", f"the time t, a number, and {rest}" if "(t" in name else rest):
+        words = f"the coordinates q{' and their rates, each' if 'rate' in name else ','} of shape ({n},)"
+        with named_errors(f"{prefix}{name}", f"the time t, a number, and {words}" if "(t" in name else words):
             result = jax.eval_shape(functools.partial(called, name.partition("(")[0]), numbers, *arguments)
         shape = _shape_of(result)
         if name.startswith("margin") and result is None:

@@ -139,14 +139,6 @@ def test_runs_are_drawn_and_explored(case, tmp_path):
     assert "three" in path.read_text()
 
 
-def test_a_number_in_place_of_a_quantity_s_name_is_refused():
-    case = CASES["stroller"]
-    with pytest.raises(
-        ValueError, match=r"event: motion\[0\]: the quantities of a motion have names, such as motion\."
-    ):
-        nonholonomic.event_time(case.system, case.start, case.t1, event=lambda t, motion: motion[0])
-
-
 class EnergyBelow(eqx.Module):
     level: float
 

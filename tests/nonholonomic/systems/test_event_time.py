@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from close import assert_close
+from never_run import LAUNCH, TOP
 from own_modes import GRAVITY, Ball, Bounces, Sleigh, bounce
 
 from nonholonomic import AbstractMode, Hybrid, event_time, simulate
@@ -214,6 +215,76 @@ def test_wrong_functions_are_refused_before_anything_compiles():
         simulate(Sleigh(), (np.zeros(3), np.array([0.0, 1.0, 0.0])), 1.0)
     with pytest.raises(ValueError, match=r"start: q must be of shape \(3,\)"):
         simulate(Sleigh(), (np.zeros(2), np.zeros(3)), 1.0)
+
+
+def changed(**functions):
+    """A ball of which some functions are replaced."""
+    return Hybrid([type("Changed", (Ball,), functions)()])
+
+
+OF_RUN = r"; its arguments are the time t, a number, and the state y, an array of shape \(3,\)"
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: simulate(changed(field=lambda self, y, t: jnp.stack([y[1], -1.0, 0.0])), START, 1.0),
+            r"modes\[0\]\.field\(t, y\) raised IndexError: Too many indices: .*" + OF_RUN,
+        ),
+        (
+            lambda: simulate(changed(field=lambda self, y: y), START, 1.0),
+            r"modes\[0\]\.field\(t, y\) raised TypeError: .* takes 2 positional arguments but 3 were given" + OF_RUN,
+        ),
+        (
+            lambda: event_time(Hybrid([Ball()]), START, 1.0, event=lambda t, y: y.height),
+            r"event\(t, y\) raised AttributeError: .* no attribute height" + OF_RUN,
+        ),
+        (
+            lambda: event_time(Hybrid([Ball()], event=lambda t, y: y.height), START, 1.0),
+            r"event\(t, y\) raised AttributeError: .* no attribute height" + OF_RUN,
+        ),
+        (
+            lambda: simulate(
+                type("Pushed", (Sleigh,), {"force": lambda self, q, rate: rate})(), (np.zeros(3),) * 2, 1.0
+            ),
+            r"force\(t, q, rate\) raised TypeError: .*; its arguments are the time t, a number, and the coordinates q and "
+            r"their rates, each of shape \(3,\)",
+        ),
+    ],
+)
+def test_an_error_in_a_function_names_the_function_and_its_arguments(call, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        call()
+    assert not isinstance(caught.value.__cause__, ValueError)
+
+
+@pytest.mark.parametrize(
+    ("reset", "message"),
+    [
+        (lambda self, t, y: [y, 0], "not a list of 2 values"),
+        (lambda self, t, y: y, r"not an array of shape \(3,\)"),
+        (lambda self, t, y: (y,), "not a tuple of 1 value$"),
+        (lambda self, t, y: (y[0], 0), r"its state is a number of type float64, not an array of shape \(3,\)"),
+        (lambda self, t, y: ([y[0]], 0), r"its state is a list of 1 value, not an array of shape \(3,\)"),
+        (lambda self, t, y: (y, 0.5), "its number is a number of type float64, not a whole number"),
+    ],
+)
+def test_a_wrong_reset_is_described_in_words(reset, message):
+    with pytest.raises(ValueError, match=r"modes\[0\]\.reset\(t, y\) must return \(state, number .*" + message):
+        simulate(changed(reset=reset), START, 1.0)
+
+
+def test_a_field_that_returns_a_list_is_described_in_words():
+    with pytest.raises(
+        ValueError, match=r"must return an array of shape \(3,\), like the start, not a list of 3 values"
+    ):
+        simulate(changed(field=lambda self, t, y: [y[1], -1.0, 0.0]), START, 1.0)
+
+
+def test_an_event_of_a_scene_reads_quantities_by_name():
+    with pytest.raises(ValueError, match=r"event: motion\[0\]: .* have names, such as motion\.theta"):
+        event_time(TOP, LAUNCH, 1.0, event=lambda t, motion: motion[0])
 
 
 def test_the_last_crossing_may_be_at_a_reset():
