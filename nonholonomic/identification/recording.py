@@ -201,6 +201,10 @@ class AbstractRecording(eqx.Module):
         """The unit of each column, which is a series of the measurements."""
         return tuple(self.quantities.units[name] for name in self.columns)
 
+    def units_of(self, model: Any) -> tuple[str, ...]:
+        """The unit of each series, for the model of the run."""
+        return self.series_units
+
     @property
     def measurements(self) -> Measurements:
         """The samples as `Measurements`, a series for each column; missing samples are omitted."""

@@ -78,7 +78,6 @@ class Recording(AbstractRecording):
         return ("1",) * len(self.columns)
 
     def units_of(self, model: AbstractModel) -> tuple[str, ...]:
-        """The unit of each column."""
         return tuple(readable_unit(model.quantities[name.partition(".")[0]].unit) or "1" for name in self.columns)
 
     def model(self, system: Any) -> AbstractModel:
@@ -160,8 +159,9 @@ class AbstractEventTimes(eqx.Module):
             require(self.until, "until", above=0.0)
             require(self.until, "until", at_most=self.t1, why="t1")
         first, last = self._limits
-        require(first[first == last], "time", above=0.0)
-        require(first[first == last], "time", below=self.t1, why="t1")
+        exact = first[first == last]
+        require(exact, "time", above=0.0)
+        require(exact, "time", below=self.t1, why="t1")
         require(first, "time", at_least=0.0)
         require(first, "time", at_most=self.t1, why="t1")
         if np.any(last < first):
@@ -237,6 +237,10 @@ class AbstractEventTimes(eqx.Module):
     def series_units(self) -> tuple[str, ...]:
         """The unit of the only series of the measurements."""
         return ("s",)
+
+    def units_of(self, model: AbstractModel) -> tuple[str, ...]:
+        """The unit of each series, for the model of the run."""
+        return self.series_units
 
 
 class EventTimes(AbstractEventTimes):

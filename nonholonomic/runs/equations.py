@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import inspect
 import re
 from typing import Any
 
@@ -23,14 +22,15 @@ ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
 
 def has_users_code(part: Any) -> bool:
-    """Whether a tree of modules has a function or an object of a class that is not of these packages."""
+    """Whether a tree of modules has a function, or a module of a class, that is not of these packages."""
     if isinstance(part, eqx.Module):
         if type(part).__module__.partition(".")[0] not in PACKAGES:
             return True
         return any(has_users_code(getattr(part, field.name)) for field in dataclasses.fields(part))
     if isinstance(part, tuple | list | dict):
         return any(map(has_users_code, part.values() if isinstance(part, dict) else part))
-    return inspect.isfunction(part) and part.__module__.partition(".")[0] not in PACKAGES
+    # Functions can also be compiled, methods or partial.
+    return callable(part) and str(getattr(part, "__module__", "")).partition(".")[0] not in PACKAGES
 
 
 def checksum_of(model: AbstractModel) -> str:

@@ -16,7 +16,7 @@ from ..integration.settings import MOST_STEPS
 from ..parameters import full_name, require_apart
 from ..progress import status_line
 from ..validation import shown
-from .data import AbstractEventTimes, Recording
+from .data import AbstractEventTimes
 from .model import check_run
 from .predictions import DataModel, Source
 
@@ -190,9 +190,8 @@ class _Fit(NamedTuple):
         """The unit of each series of the measurements."""
         units: list[str] = []
         for source in self.model.data:
-            data = source.data
-            of_source = data.units_of(source.model) if isinstance(data, Recording) else data.series_units
-            units += of_source[: 1 + int(np.max(data.measurements.series))]
+            last = int(np.max(source.data.measurements.series))
+            units += source.data.units_of(source.model)[: last + 1]
         return tuple(units)
 
     @classmethod

@@ -92,15 +92,15 @@ def sweep(
     - `executor`: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes`; by default a thread
       for each core. For other processes, define classes and functions at the top level of a module.
 
-    **Returns:** a `Table` with `time` [s] of the event, infinite without one; `status`: "event", "completed" if the run
-    reached `t1`, "stopped" if a mode without a reset ended, "failed", "unresolved" (for example after 2000 resets of your own
-    system), or a word of the system; `end_time`
-    [s]; the state at the end, such as `y0`, `q0` and `rate0`, or `end_theta`; `steps` and `rejected`; and for a system
-    with resets their number, such as `switches`. With `sensitivities`, the table also contains the derivative of `time`
-    with respect to each parameter, such as `time_by_drag` for `"system.modes[0].drag"`, and for a system with resets
-    `grazes`: 1 if the derivative is NaN because the margin of a mode only touched zero. With `errors`, `time_error` and
-    so on are bounds: infinite if the two runs disagree on the status. With `times`, the table contains the quantities,
-    NaN after the end of a run, in place of the ends; without an event, runs are only sampled.
+    **Returns:** a `Table` with `time` [s] of the event, infinite without one; `status`: "event", "completed" if the
+    run reached `t1`, "stopped" if a mode without a reset ended, "failed", "unresolved" (for example after 2000 resets
+    of your own system), or a word of the system; `end_time` [s]; the state at the end, such as `y0`, `q0` and
+    `rate0`, or `end_theta`; `steps` and `rejected`; and for a system with resets their number, such as `switches`.
+    With `sensitivities`, the table also contains the derivative of `time` with respect to each parameter, such as
+    `time_by_drag` for `"system.modes[0].drag"`, and for a system with resets `grazes`: 1 if the derivative is NaN
+    because the margin of a mode only touched zero. With `errors`, `time_error` and so on are bounds: infinite if the
+    two runs disagree on the status. With `times`, the table contains the quantities, NaN after the end of a run, in
+    place of the ends; without an event, runs are only sampled.
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
     `RuntimeError` for an executor that breaks down, or a worker with other versions.

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from ..hybrid import hybrid_resets
+from ..hybrid import MOST_ROUNDS, hybrid_resets
 from ..integration import Settings
 from ..integration.status import Status
 from ..parameters import of_all_modes
@@ -26,7 +26,7 @@ from .portrait import portraits
 REASONS = {
     "failed": "a function may return NaN or infinity there, or reset the index of no mode",
     "unresolved": "resets followed one another without end; add a mode for rest, or start where the margin is positive; or "
-    "the run is too long: it may have at most 2000 resets",
+    f"the run is too long: it may have at most {MOST_ROUNDS} resets",
 }
 
 

@@ -217,8 +217,8 @@ def assembled(tree: dict[str, Any]) -> tuple[Hybrid, Array, AbstractFormulation 
 def _at_start(tree: dict[str, Any]) -> OwnModel:
     """The model of a tree; with a warning if the start is outside its mode."""
     model = OwnModel.of(tree)
-    hybrid, state, _ = assembled(tree)
-    if model.form.traits.ends[hybrid.first] and not is_traced(tree):
+    if model.form.traits.ends[model.form.first] and not is_traced(tree):
+        hybrid, state, _ = assembled(tree)
         first: Any = hybrid.modes[hybrid.first]
         margin = float(np.asarray(first.margin(jnp.zeros(()), state)))
         # A start on the margin may miss it by round-off.

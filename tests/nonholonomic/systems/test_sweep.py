@@ -1,5 +1,6 @@
 """Tables of users' own systems against closed forms, with their derivatives, files and other processes."""
 
+import functools
 import pickle
 
 import equinox as eqx
@@ -218,8 +219,10 @@ def test_constant_arrays_are_part_of_the_code():
         ((tippe.Viscous(0.3), stroller.Plane(), [None]), False),
         ((tippe.Viscous(0.3), {"event": lambda t, motion: motion.theta}), True),
         (stroller.Graph(lambda x, y: 0.1 * x * y), True),
+        (jax.jit(lambda t, motion: (jnp.cos(t), 0.0)), True),
+        (functools.partial(pow, 2.0), True),
     ],
-    ids=["packages", "event", "ground"],
+    ids=["packages", "event", "ground", "compiled", "partial"],
 )
 def test_code_of_users_is_told_from_that_of_the_packages(parts, expected):
     assert has_users_code(parts) is expected
