@@ -35,6 +35,10 @@ class VariedProblem(AbstractProblem):
     magnitudes: Float[Array, "components cells"]
     begin: Float[Array, ""] | None = None
 
+    @property
+    def fast(self) -> tuple[bool, bool]:
+        return self.problem.fast
+
     def start(self) -> tuple[Float[Array, "all cells"], Float[Array, "all cells"]]:
         unit_scales = jnp.ones((self.states.shape[0] - len(self.magnitudes), *self.states.shape[1:]))
         return self.states, jnp.concatenate([self.magnitudes, unit_scales])

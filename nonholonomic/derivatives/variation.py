@@ -62,6 +62,10 @@ class VariationalProblem(AbstractProblem):
     def fits_one_kernel(self) -> bool:
         return self.problem.fits_one_kernel
 
+    @property
+    def fast(self) -> tuple[bool, bool]:
+        return self.problem.fast
+
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         states, scales = self.problem.start()
 

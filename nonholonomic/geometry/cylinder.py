@@ -33,6 +33,7 @@ class Cylinder(AbstractSurface):
     """
 
     units: ClassVar[dict[str, str]] = {"radius": "m"}
+    is_wavy: ClassVar[bool] = False
 
     coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("y", "m"), ("eta", "rad"))
 

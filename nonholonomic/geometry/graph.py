@@ -67,6 +67,7 @@ class Paraboloid(AbstractOpen):
     """
 
     units: ClassVar[dict[str, str]] = {"p": "m"}
+    is_wavy: ClassVar[bool] = False
 
     p: Float[Array, "..."] = eqx.field(converter=as_number)
 

@@ -35,6 +35,7 @@ class Plane(AbstractSurface):
     """
 
     units: ClassVar[dict[str, str]] = {"tilt": "rad"}
+    is_wavy: ClassVar[bool] = False
 
     axes: ClassVar[int] = 2
     # "outside" is accepted for the only side of a plane, so that grounds can be compared.

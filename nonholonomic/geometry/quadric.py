@@ -28,6 +28,8 @@ class AbstractQuadric(AbstractSurface):
     A place on it is (mu, eta) [rad], azimuth and reduced latitude: -pi/2 at the lowest point, pi/2 at the highest.
     """
 
+    is_wavy: ClassVar[bool] = False
+
     @property
     @abc.abstractmethod
     def semi_axes(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:

@@ -75,6 +75,9 @@ class AbstractSurface(Bounded):
     #: How many of a position's three components do not vanish identically.
     axes: ClassVar[int] = 3
 
+    #: Whether the surface may rise and fall often along the path of a flight, so that flights look at it more often.
+    is_wavy: ClassVar[bool] = True
+
     #: The words for the side on which a body can be, and the sign of n that points to that side.
     sides: ClassVar[Mapping[str, float]] = CLOSED
 

@@ -35,6 +35,7 @@ class Torus(AbstractSurface):
     """
 
     units: ClassVar[dict[str, str]] = {"ring": "m", "tube": "m"}
+    is_wavy: ClassVar[bool] = False
 
     ring: Float[Array, "..."] = eqx.field(converter=as_number)
     tube: Float[Array, "..."] = eqx.field(converter=as_number)

@@ -2,6 +2,7 @@
 validity."""
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import diffrax
@@ -15,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..compilation.compiled_programs import padded
 from .problem import AbstractProblem, margin_at_start
 from .settings import Settings
+from .watch import Path, watched
 from .zeros import halved
 
 #: Steps that are integrated and stored at once; a longer run consists of several such segments.
@@ -25,8 +27,8 @@ PIECE = 2048
 #: 7 ms and 0.4 MB.
 PIECE_OF_MODE = 128
 
-#: Places in every step at which the domain margin is checked, besides the ends of the step.
-LOOKS = np.arange(1, 8) / 8.0
+#: Number of parts of every step at whose ends the domain margin is checked.
+PARTS = 8
 
 
 class DenseSolution(NamedTuple):
@@ -102,33 +104,55 @@ def _piece(
     scales: Float[Array, " components"],
     settings: Settings,
     dense: bool,
-) -> tuple[diffrax.Solution, Float[Array, " steps"]]:
-    """Integrate as many steps as the settings allow; also return the least domain margin in each step."""
-    watched = problem.domain_margin(t0, state) is not None
+) -> tuple[diffrax.Solution, Float[Array, "steps 2"] | None]:
+    """Integrate as many steps as the settings allow; also bracket the first zero of the domain margin in each step."""
+    is_watched = problem.domain_margin(t0, state) is not None
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
-        settings.for_single_runs if dense or watched else settings.for_steps_alone,
+        settings.for_single_runs if dense or is_watched else settings.for_steps_alone,
         t0,
         t1,
         first,
         state,
         args=problem,
         stepsize_controller=_control(settings, scales),
-        saveat=diffrax.SaveAt(t0=True, steps=True, dense=dense or watched),
+        saveat=diffrax.SaveAt(t0=True, steps=True, dense=dense or is_watched),
         max_steps=settings.max_steps,
-        event=diffrax.Event(lambda t, y, args, **_: args.domain_margin(t, y) < 0.0) if watched else None,
+        event=diffrax.Event(lambda t, y, args, **_: args.domain_margin(t, y) < 0.0) if is_watched else None,
         throw=False,
     )
     ends, _ = saved(solution)
     lengths = jnp.where(jnp.isfinite(ends[1:]), ends[1:] - ends[:-1], 0.0)
     starts = jnp.where(jnp.isfinite(ends[:-1]), ends[:-1], t0)
+    return solution, _first_losses(problem, solution, starts, lengths) if is_watched else None
 
-    def least(begin, length):
-        points = begin + length * jnp.asarray([*LOOKS, 1.0])
-        return jnp.min(jax.vmap(lambda t: _guard(problem, t, solution.evaluate(t)))(points))
 
-    domain_margins = jax.vmap(least)(starts, lengths) if watched else jnp.ones_like(lengths)
-    return solution, domain_margins
+def _first_losses(
+    problem: AbstractProblem,
+    solution: diffrax.Solution,
+    starts: Float[Array, " steps"],
+    lengths: Float[Array, " steps"],
+) -> Float[Array, "steps 2"]:
+    """Brackets [s] of the first zero of the domain margin in every step, infinite where there is none."""
+    # The parts of all steps are the lanes of one problem.
+    length = jnp.repeat(lengths / PARTS, PARTS)
+    time = jnp.repeat(starts, PARTS) + length * jnp.tile(jnp.arange(PARTS), len(starts))
+
+    def states(place: float) -> Float[Array, "components parts"]:
+        return jax.vmap(solution.evaluate)(time + place * length).T
+
+    end = states(1.0)
+    margins = jax.vmap(functools.partial(_guard, problem), (0, 1))(time + length, end)
+    place = jnp.where((margins < 0.0) & (length > 0.0), 1.0, jnp.inf)
+    if problem.fast[0]:
+        start = states(0.0)
+        ends = ((point, problem.field(at, point)) for at, point in ((time, start), (time + length, end)))
+        path, side = Path.of(next(ends), states(0.5), next(ends), length), jnp.ones_like(time)
+        inside, _ = watched(problem, side, path, time, length, length > 0.0, length < 0.0)
+        place = jnp.minimum(place, jnp.where(inside < 1.0, inside, jnp.inf))
+    brackets = jnp.stack([jnp.where(place < jnp.inf, time, jnp.inf), time + place * length], axis=1)
+    first = jnp.argmin(brackets[:, 1].reshape(-1, PARTS), axis=1)
+    return brackets.reshape(-1, PARTS, 2)[jnp.arange(len(starts)), first]
 
 
 def follow(
@@ -176,19 +200,19 @@ def follow(
     if margin is not None and float(margin) <= 0.0:
         return DenseSolution(times[0], states[0], [], True, False, 0, 0)
     while float(time) < t1 and not (lost or failed):
-        solution, domain_margins = _piece(problem, time, end, length, state, scales, piece_settings, dense)
+        solution, brackets = _piece(problem, time, end, length, state, scales, piece_settings, dense)
         steps = int(solution.stats["num_accepted_steps"])
         accepted, rejected = accepted + steps, rejected + int(solution.stats["num_rejected_steps"])
         ts, ys = saved(solution)
         # Cut as NumPy arrays: a slice by JAX would be compiled for every number of steps.
         ts, ys = np.asarray(ts)[1 : steps + 1], np.asarray(ys)[1 : steps + 1].T
         finite = np.isfinite(ts) & np.all(np.isfinite(ys), axis=0)
-        outside = np.flatnonzero(np.asarray(domain_margins)[:steps] < 0.0)
+        brackets = np.full((steps, 2), np.inf) if brackets is None else np.asarray(brackets)[:steps]
+        outside = np.flatnonzero(brackets[:, 1] < np.inf)
         if outside.size:
             lost, steps = True, int(outside[0]) + 1
-            begin = float(ts[outside[0] - 1]) if outside[0] else float(time)
             ts, ys, finite = ts[:steps].copy(), ys[:, :steps].copy(), finite[:steps]
-            ts[-1] = float(_loss(problem, solution, jnp.asarray(begin), jnp.asarray(ts[-1])))
+            ts[-1] = float(_loss(problem, solution, *map(jnp.asarray, brackets[outside[0]])))
             ys[:, -1] = np.asarray(_evaluate(solution, ts[-1:]))[0]
         failed = steps == 0 or not finite.all()
         valid_steps = int(finite.sum()) if finite.all() else int(np.argmin(finite))
@@ -209,14 +233,8 @@ def follow(
 def _loss(
     problem: AbstractProblem, solution: diffrax.Solution, begin: Float[Array, ""], end: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """The last time in a step before the domain margin becomes negative, on the dense output."""
-
-    def holds(time):
-        return ~(_guard(problem, time, solution.evaluate(time)) < 0.0)
-
-    looks = begin + (end - begin) * jnp.asarray([0.0, *LOOKS, 1.0])
-    first = jnp.argmin(jax.vmap(holds)(looks[1:]))
-    return halved(holds, looks[first], looks[first + 1])[0]
+    """The last time in a bracket before the domain margin becomes negative, on the dense output."""
+    return halved(lambda time: ~(_guard(problem, time, solution.evaluate(time)) < 0.0), begin, end)[0]
 
 
 class _GivenSteps(diffrax.StepTo):
@@ -272,12 +290,12 @@ def sample(
     """
     state, scales = problem.start()
     margin = margin_at_start(problem, jnp.zeros_like(t1), state)
-    watched = margin is not None
+    is_watched = margin is not None
     # Diffrax detects only changes of the margin's sign, so a run that starts outside the domain must end at once.
     at_once = jnp.zeros((), bool) if margin is None else margin <= 0.0
     t1 = jnp.where(at_once, 0.0, t1)
     event = diffrax.Event(
-        lambda t, y, args, **_: args.domain_margin(t, y), optimistix.Newton(1e-13, 1e-13) if watched else None
+        lambda t, y, args, **_: args.domain_margin(t, y), optimistix.Newton(1e-13, 1e-13) if is_watched else None
     )
     if times is None:
         assert grid is not None
@@ -290,7 +308,7 @@ def sample(
         controller = _GivenSteps(grid)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
-        settings.for_single_runs if watched else settings.for_steps_alone,
+        settings.for_single_runs if is_watched else settings.for_steps_alone,
         jnp.zeros_like(t1),
         t1,
         None,
@@ -299,7 +317,7 @@ def sample(
         stepsize_controller=controller,
         saveat=diffrax.SaveAt(subs=[save_at, diffrax.SubSaveAt(t1=True)]),
         max_steps=max_points,
-        event=event if watched else None,
+        event=event if is_watched else None,
         adjoint=diffrax.ForwardMode() if adjoint is None else adjoint,
         throw=False,
     )

@@ -71,6 +71,10 @@ class ExtendedProblem(AbstractProblem, Generic[Core]):
     def fits_one_kernel(self) -> bool:
         return self.problem.fits_one_kernel
 
+    @property
+    def fast(self) -> tuple[bool, bool]:
+        return self.problem.fast
+
     def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
         states, scales = self.problem.start()
         return jnp.concatenate([states, self.values]), jnp.concatenate([scales, self.scales])

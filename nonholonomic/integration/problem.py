@@ -45,6 +45,13 @@ class AbstractProblem(eqx.Module):
         """Whether XLA can compile a loop over the field into a single kernel on a CPU (`xla_cpu.in_one_kernel`)."""
         return True
 
+    @property
+    def fast(self) -> tuple[bool, bool]:
+        """Whether the margins, and whether the event function, may change faster than the state, as a user's functions may:
+        steps then resolve them where they are near zero (`watch.py`).
+        """
+        return False, False
+
     @abc.abstractmethod
     def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
         """The initial state of every cell, and the magnitudes that scale its absolute errors."""
@@ -104,6 +111,10 @@ class CoreProblem(AbstractProblem):
     @property
     def fits_one_kernel(self) -> bool:
         return self.whole.fits_one_kernel
+
+    @property
+    def fast(self) -> tuple[bool, bool]:
+        return self.whole.fast
 
     def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
         state, scales = self.whole.start()

@@ -27,7 +27,7 @@ class Step(NamedTuple):
     - `first_negative`: time of the first stage at which a margin or the event function was negative, as a fraction of
       the step; 2 if there was none.
     - `margins`: all margins at `watched_places` of the step; `None` if there are none.
-    - `rates`: the field at all stages.
+    - `rates`: the field at all stages; `middle`: the state in the middle of the step, to fifth order.
     - `stages`: the field at the inner stages (`inner_stages`) in one array, whose memory the next step reuses.
     """
 
@@ -38,6 +38,7 @@ class Step(NamedTuple):
     first_negative: Lanes
     margins: Float[Array, "places margins lanes"] | None
     rates: Sequence[States]
+    middle: States
     stages: Stages | None
 
 
@@ -83,6 +84,7 @@ def explicit_step(
     length: Lanes,
     margins_before: Float[Array, "margins lanes"] | None,
     stages: Stages,
+    looks: Sequence[int],
 ) -> Step:
     """Try one step in every lane.
 
@@ -95,8 +97,8 @@ def explicit_step(
     - `field`: (time [s], state) -> rate of the state.
     - `margins`, `crossing`: a function of (time, state) that returns the margins, and a function of (state, rate) that
       returns the event function; either may be `None`. Their values, one per lane, should stay positive. Both are
-      evaluated at the end of the step and at three stages. The margins, which may need the whole state, are evaluated
-      during these stages. The event function, which may need few components, is evaluated after all stages.
+      evaluated at the end of the step and at the stages `looks`. The margins, which may need the whole state, are
+      evaluated during these stages. The event function, which may need few components, is evaluated after all stages.
     - `time`, `state`, `rate`: time and state at the start of the step, and the field there.
     - `length`: length of the step [s], one per lane.
     - `margins_before`: the margins at the start; `None` if there are none.
@@ -106,7 +108,6 @@ def explicit_step(
     **Returns:** a `Step`.
     """
     inner = inner_stages(tableau)
-    looks = stages_to_look(tableau.c)
     places, is_look = jnp.asarray(tableau.c[:inner]), jnp.asarray(np.isin(np.arange(inner), looks))
     rows = jnp.asarray(np.searchsorted(looks, np.arange(inner)) + 1)
 
@@ -143,9 +144,10 @@ def explicit_step(
         margin = lesser(_least(None if history is None else history[row]), crossing(trial, rates[stage + 1]), length)
         negative = jnp.where(margin < 0.0, tableau.c[stage], 2.0)
         first_negative = jnp.minimum(first_negative, negative)
+    middle = state + length * weighted_sum(middle_weights(tableau), [*rates, last_rate])
     rates += [last_rate] if tableau.fsal else []
     error = length * weighted_sum(tableau.b_error, rates)
-    return Step(end, last_rate, error, margin_at_end, first_negative, history, rates, stages)
+    return Step(end, last_rate, error, margin_at_end, first_negative, history, rates, middle, stages)
 
 
 def inner_stages(tableau: diffrax.ButcherTableau) -> int:
@@ -153,14 +155,45 @@ def inner_stages(tableau: diffrax.ButcherTableau) -> int:
     return len(tableau.c) - 1 if tableau.fsal else len(tableau.c)
 
 
+def middle_weights(tableau: diffrax.ButcherTableau) -> tuple[float, ...]:
+    """Weights of the rates at the stages and at the end of a step in the state in its middle: the smallest that meet the
+    order conditions (Hairer, Norsett and Wanner, Solving ODEs I, section II.2) to the fifth order, or to the highest that
+    the stages allow.
+    """
+    inner = inner_stages(tableau)
+    rows = [*tableau.a_lower[:inner], np.asarray(tableau.b_sol[: 1 + inner])]
+    return _middle_weights(tuple(tuple(row.tolist()) for row in rows))
+
+
+@functools.cache
+def _middle_weights(rows: tuple[tuple[float, ...], ...]) -> tuple[float, ...]:
+    a = np.zeros((1 + len(rows), 1 + len(rows)))
+    for k, row in enumerate(rows, start=1):
+        a[k, : len(row)] = row
+    one = np.ones(len(a))
+    c = a @ one
+    # The elementary weights of the rooted trees, with the order and the density of each.
+    trees = [(one, 1, 1), (c, 2, 2), (c**2, 3, 3), (a @ c, 3, 6), (c**3, 4, 4), (c * (a @ c), 4, 8), (a @ c**2, 4, 12)]
+    trees += [(a @ a @ c, 4, 24), (c**4, 5, 5), (c**2 * (a @ c), 5, 10), ((a @ c) ** 2, 5, 20), (c * (a @ c**2), 5, 15)]
+    trees += [(c * (a @ a @ c), 5, 30), (a @ c**3, 5, 20), (a @ (c * (a @ c)), 5, 40), (a @ a @ c**2, 5, 60)]
+    trees += [(a @ a @ a @ c, 5, 120)]
+    for highest in (5, 4, 3, 2):
+        conditions = np.array([tree for tree, order, _ in trees if order <= highest])
+        values = np.array([0.5**order / density for _, order, density in trees if order <= highest])
+        weights = np.linalg.lstsq(conditions, values, rcond=1e-12)[0]
+        if np.abs(conditions @ weights - values).max() < 1e-12:
+            break
+    return tuple(np.where(np.abs(weights) < 1e-14, 0.0, weights).tolist())
+
+
 def memory_for_stages(tableau: diffrax.ButcherTableau, state: States) -> Stages:
     """Memory in which `explicit_step` stores the field at the inner stages."""
     return jnp.zeros((inner_stages(tableau), *state.shape), state.dtype)
 
 
-def watched_places(tableau: diffrax.ButcherTableau) -> Float[np.ndarray, " places"]:
-    """The fractions of a step at which its margins are known: its start, some stages between, and its end."""
-    return np.array([0.0, *(tableau.c[stage] for stage in stages_to_look(tableau.c)), 1.0])
+def watched_places(tableau: diffrax.ButcherTableau, looks: Sequence[int]) -> Float[np.ndarray, " places"]:
+    """The fractions of a step at which its margins are known: its start, the stages `looks`, and its end."""
+    return np.array([0.0, *(tableau.c[stage] for stage in looks), 1.0])
 
 
 def lesser(margin: Lanes | None, crossing: Lanes | None, like: Lanes) -> Lanes:

@@ -24,9 +24,14 @@ from .runge_kutta import (
     inverse_root,
     memory_for_stages,
     scaled_error,
+    stages_to_look,
     watched_places,
 )
 from .status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING
+from .watch import Path, watched
+
+#: Steps are not cut below this fraction of the horizon because of a fast function, whose minimum may be zero.
+SHORTEST_CUT = 1e-9
 
 #: Step-size control as in Diffrax's I controller with its defaults.
 SAFETY, SHRINK, GROW = 0.9, 0.2, 10.0
@@ -118,7 +123,14 @@ def trial_step(problem: AbstractProblem, control: Control, lane_state: LaneState
     crossing = side_of(problem, lane_state.side)
     start = (lane_state.time, lane_state.state, lane_state.rate, tried_length, lane_state.margins)
     stages = memory_for_stages(control.tableau, lane_state.state) if lane_state.stages is None else lane_state.stages
-    return tried_length, explicit_step(control.tableau, problem.field, problem.margins, crossing, *start, stages)
+    looks = looks_of(problem, control.tableau, lane_state)
+    return tried_length, explicit_step(control.tableau, problem.field, problem.margins, crossing, *start, stages, looks)
+
+
+def looks_of(problem: AbstractProblem, tableau: diffrax.ButcherTableau, lane_state: LaneState) -> list[int]:
+    """The stages at which slow margins and a slow event function are evaluated; `watched` looks at the fast ones."""
+    fast_margins, fast_event = problem.fast
+    return [] if fast_event and (fast_margins or lane_state.margins is None) else stages_to_look(tableau.c)
 
 
 def after_step(
@@ -143,11 +155,23 @@ def after_step(
     error = jnp.where(jnp.isfinite(error) & ~jnp.isnan(margin), error, jnp.inf)
     accurate = error <= 1.0
     # Negative inside the step: end the step there and check again, so that the first of several events is located.
-    event = missed_double_root(
-        problem.event_function, lane_state.side, (lane_state.state, lane_state.rate), trial, tried_length
-    )
-    loss = missed_loss(watched_places(control.tableau), stop_gradient(trial.margins), free & accurate)
-    negative = jnp.minimum(trial.first_negative, stop_gradient(jnp.minimum(event, loss)))
+    fast_margins, fast_event = problem.fast
+    start = (lane_state.time, lane_state.state, lane_state.rate)
+    negative = trial.first_negative
+    if not fast_event:
+        event = missed_double_root(problem.event_function, lane_state.side, start[1:], trial, tried_length)
+        negative = jnp.minimum(negative, stop_gradient(event))
+    if not fast_margins:
+        places = watched_places(control.tableau, looks_of(problem, control.tableau, lane_state))
+        negative = jnp.minimum(negative, missed_loss(places, stop_gradient(trial.margins), free & accurate))
+    longest = None
+    if fast_margins or fast_event:
+        path = Path.of(start[1:], trial.middle, (trial.state, trial.rate), tried_length)
+        checked = free & accurate
+        may_cut = checked & (tried_length > SHORTEST_CUT * control.t1)
+        step = (path, lane_state.time, tried_length)
+        place, longest = watched(problem, lane_state.side, *step, checked, may_cut)
+        negative = jnp.minimum(negative, place)
     crosses_inside = accurate & (negative < 1.0)
     is_beyond = accurate & ~crosses_inside & (margin <= 0.0)
     forward = free & accurate & ~crosses_inside & ~is_beyond
@@ -165,6 +189,7 @@ def after_step(
     time = jnp.where(moved, lane_state.time + tried_length, lane_state.time)
 
     length = tried_length * _factor(error, accurate, control.order)
+    length = length if longest is None else jnp.where(accurate, jnp.minimum(length, longest), length)
     length = jnp.where(crosses_inside, tried_length * negative, length)
     length = jnp.where(bracketing, guess, jnp.where(hit, bracket.stride, length))
     status, side, first, latest_crossing = _classify(problem, control, lane_state, trial, time, hit)

@@ -167,6 +167,10 @@ class EventProblem(AbstractProblem):
     def fits_one_kernel(self) -> bool:
         return self.motion.fits_one_kernel and self.model.event.elementary
 
+    @property
+    def fast(self) -> tuple[bool, bool]:
+        return self.motion.fast[0], True
+
     def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
         states, scales = self.motion.start()
         return jnp.concatenate([states, self.clock]), jnp.concatenate([scales, jnp.full_like(self.clock, UNMEASURED)])

@@ -48,6 +48,10 @@ class ModeProblem(AbstractProblem):
     def fits_one_kernel(self) -> bool:
         return self.form.traits.elementary
 
+    @property
+    def fast(self) -> tuple[bool, bool]:
+        return True, True
+
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales
 

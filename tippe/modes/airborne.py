@@ -200,6 +200,11 @@ class FlightProblem(AbstractProblem):
     # As for `InversionProblem`.
     stem_counts: Any = None
 
+    @property
+    def fast(self) -> tuple[bool, bool]:
+        # A flight is smoother than the ground below, which may have waves.
+        return self.scene.surface.is_wavy, False
+
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales
 

@@ -12,8 +12,9 @@ function integrator(model) {
     const rates = Array.from({ length: stages + 2 }, () => new Float64Array(n));
     const [there, time, length, number] = [new Float64Array(n), new Float64Array(1), new Float64Array(1), [1]];
     // Like `Step` in Python: state, rate, error, the least of margins and event function at the end, the first place at which one of
-    // them was negative, and the margins at the start, at the checked stages and at the end.
-    const m = model.margins_count, rows = model.looks.length + 2, tried = new Float64Array(3 * n + 2 + rows * m);
+    // them was negative, the margins at the start, at the checked stages and at the end, and the state in the middle.
+    const m = model.margins_count, rows = model.looks.length + 2, tried = new Float64Array(4 * n + 2 + rows * m);
+    const middle = tried.subarray(3 * n + 2 + rows * m);
     const [end, last, error] = [0, 1, 2].map((k) => tried.subarray(k * n, (k + 1) * n));
     const margins = Array.from({ length: rows }, (_, k) => tried.subarray(3 * n + 2 + k * m, 3 * n + 2 + (k + 1) * m));
 
@@ -51,6 +52,7 @@ function integrator(model) {
       model.field(constants, time, end, last);
       rates[stages + 1].set(last);
       move(error, none, length, model.error);
+      move(middle, state, length, model.middle);
       const margin = least(rows - 1, time, end, last, side);
       tried[3 * n] = margin === Infinity ? 1 : margin;
       tried[3 * n + 1] = negative;

@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...integration import AbstractProblem, LaneState, Settings, explicit_tableau
-from ...integration.runge_kutta import Step, inner_stages, stages_to_look, watched_places
+from ...integration.runge_kutta import Step, inner_stages, middle_weights, watched_places
 from ...integration.scheduler import LaneScheduler
 from ...integration.status import RUNNING
-from ...integration.step import Control, after_step, length_to_try
+from ...integration.step import Control, after_step, length_to_try, looks_of
 from .javascript import javascript
 
 Numbers = Float[Array, " numbers"]
@@ -96,9 +96,9 @@ class Stepper(NamedTuple):
         """The functions that `integrator.js` calls."""
         constants, lane, run = self.constants, self.lane, self.run
         time, state = lane.time, lane.state
-        places = len(watched_places(explicit_tableau(self.settings.for_lanes)))
+        places = len(watched_places(explicit_tableau(self.settings.for_lanes), self.looks))
         margins = jax.tree.map(lambda least: jax.ShapeDtypeStruct((places, *least.shape), least.dtype), lane.margins)
-        trial = Step(state, state, state, time, time, margins, (), None)
+        trial = Step(state, state, state, time, time, margins, (), state, None)
 
         def after(constants: Any, lane: LaneState, length: Any, trial: Step) -> LaneState:
             problem, control, atols = run(constants)
@@ -131,11 +131,17 @@ class Stepper(NamedTuple):
             "running": RUNNING,
             "stages": [row.tolist() for row in tableau.a_lower[:inner]],
             "places": np.asarray(tableau.c[:inner]).tolist(),
-            "looks": stages_to_look(tableau.c),
+            "looks": self.looks,
             "margins_count": 0 if self.lane.margins is None else len(self.lane.margins),
             "step": np.asarray(tableau.b_sol[: 1 + inner]).tolist(),
             "error": np.asarray(tableau.b_error).tolist(),
+            "middle": middle_weights(tableau),
         }
+
+    @property
+    def looks(self) -> list[int]:
+        """The stages at which margins and event function are evaluated, too."""
+        return looks_of(self.run(self.constants)[0], explicit_tableau(self.settings.for_lanes), self.lane)
 
 
 def _started(begin: Callable[..., LaneScheduler], *inputs: Any) -> tuple[Any, LaneState]:

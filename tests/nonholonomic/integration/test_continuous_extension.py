@@ -84,7 +84,7 @@ def worst_inside(pair, length):
     state = jnp.exp(jnp.sin(time))[None]
     rate = problem.field(time, state)
     start = (time, state, rate, size, None, memory_for_stages(pair.tableau, state))
-    step = explicit_step(pair.tableau, problem.field, lambda *_: (), lambda *_: None, *start)
+    step = explicit_step(pair.tableau, problem.field, lambda *_: (), lambda *_: None, *start, [])
     start = StepEnd(time, state, rate, second_derivative(problem, size, time, state, rate))
     end_time = time + size
     end = StepEnd(end_time, step.state, step.rate, second_derivative(problem, size, end_time, step.state, step.rate))
