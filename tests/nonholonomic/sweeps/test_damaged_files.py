@@ -325,3 +325,10 @@ def test_what_is_not_a_path_is_refused(path):
     for read in (Table.load, lambda path: cheap_sweep(path, pytest.fail), cheap_sweep(None).save):
         with pytest.raises(ValueError, match=r"path = .* must be the path of a file"):
             read(path)
+
+
+def test_a_number_that_is_missing_in_a_request_is_the_same_again():
+    assert same_request('{"data": [NaN, 1.0]}', '{"data": [NaN, 1.0]}') is None
+    assert "data is [nan, 1.0] in the file and [nan, 2.0]" in same_request(
+        '{"data": [NaN, 1.0]}', '{"data": [NaN, 2.0]}'
+    )

@@ -20,7 +20,6 @@ from nonholonomic.integration import Settings
 from nonholonomic.runs import TableForm, model_of
 from nonholonomic.runs.equations import checksum_of, has_users_code
 from nonholonomic.runs.table import TableJob
-from nonholonomic.sweeps._chunks import same_request
 
 HEIGHTS, RESTITUTIONS = np.array([0.5, 1.0, 2.0]), np.array([0.7, 0.8])
 BALL = Hybrid([Ball()], event=Bounces(3.0))
@@ -299,10 +298,3 @@ def test_a_table_of_compiled_code_with_other_data_does_not_resume(compiled, tmp_
     assert np.array_equal(run(np.array([2.0, 1.0])), time)
     with pytest.raises(ValueError, match="the code of the system, its event or its input has changed"):
         run(np.array([2.5, 1.0]))
-
-
-def test_a_number_that_is_missing_in_a_request_is_the_same_again():
-    assert same_request('{"data": [NaN, 1.0]}', '{"data": [NaN, 1.0]}') is None
-    assert "data is [nan, 1.0] in the file and [nan, 2.0]" in same_request(
-        '{"data": [NaN, 1.0]}', '{"data": [NaN, 2.0]}'
-    )
