@@ -20,7 +20,7 @@ from jax.tree_util import DictKey, GetAttrKey, KeyPath, SequenceKey
 from jaxtyping import Array, Float
 
 from .per_run import AbstractHeld, Numbers, gathered, spread
-from .text import likely
+from .text import likely, name_of
 
 
 def numbers(root: str, tree: Any, functions: bool = True) -> dict[str, Any]:
@@ -216,23 +216,33 @@ def _replaced(name: str, tree: Any, values: dict[str, Any]) -> Any:
 def description(root: str, tree: Any) -> dict[str, Any]:
     """A tree of modules as plain data: the kind of every module and the value of every number.
 
-    A function is described by its name alone.
+    A function is described by its name alone. Nothing in the data is different in another process.
     """
     tree = _itself(tree)
     fields: dict[str, Any] = {root: type(tree).__name__}
     for field in dataclasses.fields(tree):
         name, value = f"{root}.{field.name}", getattr(tree, field.name)
-        if isinstance(value, Numbers):
-            fields[name] = np.asarray(value).tolist()
-        elif isinstance(value, eqx.Module):
-            fields |= description(name, value)
-        elif isinstance(value, tuple):
-            fields[name] = [np.asarray(part).tolist() for part in value]
-        else:
-            fields[name] = np.asarray(value).tolist() if isinstance(value, jax.Array | np.ndarray) else value
-            if callable(value):
-                fields[name] = getattr(value, "__qualname__", repr(value))
+        fields |= description(name, value) if _is_described(value) else {name: _plain_data(value)}
     return fields
+
+
+def _is_described(value: Any) -> bool:
+    return isinstance(value, eqx.Module) and not isinstance(value, Numbers)
+
+
+def _plain_data(value: Any) -> Any:
+    """A value as JSON can store it; other objects are described by their kind, because their text can be an address."""
+    if isinstance(value, tuple | list):
+        return [_plain_data(part) for part in value]
+    if isinstance(value, dict):
+        return {str(name): _plain_data(part) for name, part in value.items()}
+    if _is_described(value):
+        return description("self", value)
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    if isinstance(value, jax.Array | np.ndarray | np.generic | Numbers):
+        return np.asarray(value).tolist()
+    return name_of(value)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -151,6 +151,19 @@ def as_text(value: Any, unit: str | None = "1") -> str:
     return repr(value) if name is None else name.rpartition("<locals>.")[2]
 
 
+def name_of(value: Any) -> str:
+    """The name of a function, or the kind of another object; unlike its text, it holds no address.
+
+    **Example:**
+
+    >>> import functools
+    >>> from nonholonomic.text import name_of
+    >>> name_of(max), name_of(functools.partial(max, 1))
+    ('max', 'partial')
+    """
+    return getattr(value, "__qualname__", type(value).__name__)
+
+
 def shown(value: Any) -> str:
     """The value for a message, as a user would write it: plain numbers in place of arrays, also within lists."""
     if isinstance(value, dict):

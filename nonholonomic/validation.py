@@ -8,7 +8,9 @@ import contextlib
 import dataclasses
 import functools
 import operator
+import os
 import tempfile
+import uuid
 from collections.abc import Iterable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -242,10 +244,10 @@ def require_folder(path: Path, name: str) -> None:
 
 def as_path(path: Any, name: str) -> Path:
     """Convert to a path; raise `ValueError` for a value that is not a path."""
-    try:
-        return Path(path)
-    except TypeError:
-        raise ValueError(f"{name} = {shown(path)} must be the path of a file") from None
+    if isinstance(path, str | os.PathLike) and path != "" and "\0" not in str(path):
+        with contextlib.suppress(TypeError):
+            return Path(path)
+    raise ValueError(f"{name} = {shown(path)} must be the path of a file")
 
 
 def require_file(path: Any, name: str, *endings: str) -> Path:
@@ -264,6 +266,51 @@ def require_file(path: Any, name: str, *endings: str) -> Path:
     except OSError as error:
         raise OSError(f"{name} = {file}: nothing can be written there: {error.strerror}") from None
     return file
+
+
+@contextlib.contextmanager
+def replacing(path: Path, folder: Path | None = None) -> Iterator[Path]:
+    """A new file that replaces `path` at the end of the context, completely or not at all. If `path` is a symbolic link,
+    the new file replaces the file to which it points.
+
+    **Arguments:** `folder`: the folder of the new file until then, by default that of `path`.
+
+    **Raises:** `OSError` that names the path if it cannot be written.
+    """
+    target = real_path(path)
+    # The ending tells the kind of a file to its writer.
+    scratch = (folder or target.parent) / f"{path.name}.{uuid.uuid4().hex}.part{path.suffix}"
+    try:
+        if target.is_dir():
+            raise OSError(0, "it is a folder")
+        scratch.touch(exist_ok=False)
+        yield scratch
+        with scratch.open("r+b") as stream:
+            os.fsync(stream.fileno())
+        os.replace(scratch, target)
+        sync_folder(target.parent)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            scratch.unlink()
+        # Errors that were raised while reading the chunks keep their own message.
+        if isinstance(error, OSError) and error.strerror:
+            raise OSError(f"cannot write {path}: {error.strerror}") from None
+        raise
+
+
+def real_path(path: Path) -> Path:
+    """The file to which a symbolic link points; any other path itself."""
+    return Path(os.path.realpath(path)) if path.is_symlink() else path
+
+
+def sync_folder(folder: Path) -> None:
+    """Flush a folder's entries to disk, on systems that let a folder be opened."""
+    if os.name == "posix":
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
 
 
 def require_package(name: str, extra: str, purpose: str) -> None:

@@ -22,7 +22,7 @@ from nonholonomic.geometry import CLOSED, AbstractSurface, Cylinder, Paraboloid,
 from nonholonomic.integration import ImplicitMidpoint
 from nonholonomic.progress import Progress, status_line
 from nonholonomic.sweeps import Table
-from nonholonomic.validation import as_number, require, require_folder
+from nonholonomic.validation import as_number, replacing, require, require_folder
 from nonholonomic.views import NO_VIEW, can_view, page, picture_as_html
 
 from .model.friction import Damping
@@ -317,7 +317,8 @@ def main(arguments: list[str] | None = None) -> int:
         if read:
             print(files[AUDIT].decode())
             for name in files.keys() - {AUDIT}:
-                (options.out / name).write_bytes(files[name])
+                with replacing(options.out / name) as scratch:
+                    scratch.write_bytes(files[name])
     except (ValueError, OSError) as error:
         print(f"python -m stroller: {error}", file=sys.stderr)
         return 2

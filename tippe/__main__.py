@@ -20,7 +20,7 @@ from nonholonomic.compilation.compilation_cache import are_kept, enable_compilat
 from nonholonomic.geometry import Cylinder, Plane
 from nonholonomic.progress import Progress
 from nonholonomic.sweeps import AnotherRun, Table, saved_cells
-from nonholonomic.validation import require_folder
+from nonholonomic.validation import replacing, require_folder
 from nonholonomic.views import NO_VIEW, Page, can_view, page, picture_as_html, table_as_html
 from nonholonomic.views.explore import live_page
 
@@ -149,9 +149,8 @@ def table(options: argparse.Namespace, arena: str, cache: Path | None) -> Table:
     if saved_cells(path) == 0:
         contents = kept_files(cache, facts(options, arena), computed)[path.name]
         if not path.exists():
-            scratch = path.with_suffix(".part")
-            scratch.write_bytes(contents)
-            scratch.replace(path)
+            with replacing(path) as scratch:
+                scratch.write_bytes(contents)
     return compute()
 
 

@@ -23,6 +23,8 @@ from typing import Any
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
+from ..validation import replacing
+
 #: The file that lists the entries that passed the check, one per line.
 LOOKED_AT = ".looked_at"
 
@@ -200,15 +202,16 @@ def kept_files(folder: Path | None, facts: Any, compute: Callable[[], dict[str, 
     try:
         with zipfile.ZipFile(path) as stored:
             return {name: stored.read(name) for name in stored.namelist()}
-    except (OSError, zipfile.BadZipFile, zlib.error):
+    except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error):
         files = compute()
     # Write the archive as a whole, because another process may read it. A full disk must not stop the program.
-    with contextlib.suppress(OSError):
-        scratch = path.with_name(f".{uuid.uuid4().hex}")
-        with zipfile.ZipFile(scratch, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-            for name, contents in files.items():
-                archive.writestr(name, contents)
-        os.replace(scratch, path)
+    with (
+        contextlib.suppress(OSError),
+        replacing(path) as scratch,
+        zipfile.ZipFile(scratch, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+    ):
+        for name, contents in files.items():
+            archive.writestr(name, contents)
     return files
 
 

@@ -72,7 +72,10 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module
         arrays = results[0].shape == () and len(shapes) > 1 and not isinstance(value, Held)
         return Held(parted(value)) if arrays else value
     closes_over = any(is_traced(constant) for constant in traced.consts)
-    return Closure(spread(traced.consts), traced.jaxpr) if closes_over else Plain(value)
+    if closes_over:
+        return Closure(spread(traced.consts), traced.jaxpr)
+    # Equinox warns of the arrays of a tree, such as JAX's partial functions, but not of those of its method.
+    return Plain(value if jax.tree_util.all_leaves([value]) else value.__call__)
 
 
 def partials(function: Callable[..., Any], at: tuple[Any, ...]) -> tuple[Float[Array, "..."], ...]:

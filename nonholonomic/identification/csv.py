@@ -185,7 +185,11 @@ def _times_of_launches(
     is_limit = np.array([cell.startswith(">") for cell in cells])
     plain = ["inf" if cell in words else cell.removeprefix(">").strip() for cell in cells]
     time = file._replace(cells={**file.cells, header: plain}).numbers(
-        "time", header_and_unit, "s", remark=": if it stands for an event that did not happen, pass it as never"
+        "time",
+        header_and_unit,
+        "s",
+        remark=": if it stands for an event that did not happen, pass it as never",
+        infinite=True,
     )
     for line, cell, value in zip(file.lines, cells, time, strict=True):
         if value <= 0.0:

@@ -24,12 +24,14 @@ SYNONYMS |= {"sec": "s", "second": "s", "seconds": "s", "1/min": "rpm", "rev/min
 
 
 class TextTable(NamedTuple):
-    """The cells of a file as text: header -> cells; the number of each row's line in the file; and the decimal mark."""
+    """The cells of a file as text: header -> cells; the number of each row's line in the file; the decimal mark; and the
+    headers that the file has more than once."""
 
     path: Path
     cells: dict[str, list[str]]
     lines: list[int]
     decimal: str
+    repeated: tuple[str, ...] = ()
 
     @classmethod
     def read(cls, path: Path, decimal: str) -> "TextTable":
@@ -46,7 +48,10 @@ class TextTable(NamedTuple):
             )
         # Blanks also stand between a name and its unit, as in "theta [deg]".
         part = re.compile(r"\S+(?:\s+[\[(][^\])]*[\])])?")
-        rows = [next(csv.reader([line], delimiter=mark)) if mark else part.findall(line) for _, line in text]
+        try:
+            rows = [next(csv.reader([line], delimiter=mark)) if mark else part.findall(line) for _, line in text]
+        except csv.Error as error:
+            raise ValueError(f"path = {str(path)!r} is not a text file of columns: {error}") from None
         headers = [header.strip() for header in rows[0]]
         for (number, _), row in zip(text, rows, strict=True):
             if len(row) != len(headers):
@@ -56,7 +61,8 @@ class TextTable(NamedTuple):
                 )
                 raise ValueError(f"path = {str(path)!r}: line {number} has {len(row)} cells, not {len(headers)}{hint}")
         cells = {header: [row[k].strip() for row in rows[1:]] for k, header in enumerate(headers)}
-        return cls(path, cells, [number for number, _ in text[1:]], decimal)
+        repeated = tuple(header for header in cells if headers.count(header) > 1)
+        return cls(path, cells, [number for number, _ in text[1:]], decimal, repeated)
 
     def named(self, known: Mapping[str, str]) -> dict[str, Any]:
         """The columns whose headers are names of the model's columns, with their headers."""
@@ -64,6 +70,8 @@ class TextTable(NamedTuple):
         for header in self.cells:
             name, unit = _split(header)
             if name.lower() in known:
+                if name.lower() in columns:
+                    raise self._ambiguous("columns", name.lower(), [columns[name.lower()], header])
                 columns[name.lower()] = header if unit else (header, _unit_of(name.lower(), known))
         if not columns.keys() - {"time", "frame"}:
             raise ValueError(
@@ -73,13 +81,19 @@ class TextTable(NamedTuple):
         return columns
 
     def numbers(
-        self, name: str, header_and_unit: Any, si: str, argument: str = "columns", remark: str = ""
+        self,
+        name: str,
+        header_and_unit: Any,
+        si: str,
+        argument: str = "columns",
+        remark: str = "",
+        infinite: bool = False,
     ) -> np.ndarray:
         """A column in SI units, NaN where it is missing. **Arguments:** `argument`: as for `parts`; `remark`: an addition to
-        the message about a cell that is not a number."""
+        the message about a cell that is not a number; `infinite`: whether numbers may be infinite."""
         header, size = self.parts(name, header_and_unit, si, argument)
         numbers = zip(self.lines, self.cells[header], strict=True)
-        return size * np.array([self._number(header, line, cell, remark) for line, cell in numbers])
+        return size * np.array([self._number(header, line, cell, remark, infinite) for line, cell in numbers])
 
     def errors(self, name: str, header_and_unit: Any, si: str) -> np.ndarray:
         """The standard errors of a column in SI units, from a column of their own or the same in all lines."""
@@ -89,16 +103,24 @@ class TextTable(NamedTuple):
         require(header, f"error of {name}", above=0.0)
         return np.full(len(self.lines), size * float(header))
 
-    def _number(self, header: str, line: int, cell: str, remark: str) -> float:
+    def _number(self, header: str, line: int, cell: str, remark: str, infinite: bool) -> float:
         if cell.lower() in MISSING:
             return math.nan
+        place = f"{header} = {cell!r} in line {line} of {str(self.path)!r}"
+        if self.decimal == "," and "." in cell:
+            raise ValueError(
+                f"{place} has a decimal point, or a mark of thousands, although decimal = ',': remove marks of thousands from "
+                "the file; if its numbers have decimal points, leave out decimal"
+            )
         try:
-            return float(cell.replace(",", ".") if self.decimal == "," else cell)
+            # Python also reads 1_000.
+            number = float("_" if "_" in cell else cell.replace(",", ".") if self.decimal == "," else cell)
         except ValueError:
             hint = ": pass decimal=',' if it has a decimal comma" if "," in cell and self.decimal == "." else remark
-            raise ValueError(
-                f"{header} = {cell!r} in line {line} of {str(self.path)!r} is not a number{hint}"
-            ) from None
+            raise ValueError(f"{place} is not a number{hint}") from None
+        if math.isinf(number) and not infinite:
+            raise ValueError(f"{place} must be finite: write n/a, or nothing, for a missing sample")
+        return number
 
     def parts(self, name: str, header_and_unit: Any, si: str, argument: str) -> tuple[Any, float]:
         """The header of a column (or, for an error, possibly a number), and the factor that converts the file's numbers to
@@ -135,13 +157,23 @@ class TextTable(NamedTuple):
 
     def _header(self, argument: str, name: str, header: str) -> str:
         """The full header for a header, with or without its unit."""
-        full = {_split(full)[0]: full for full in self.cells}.get(header, header)
-        if full not in self.cells:
+        matches = [header] if header in self.cells else [full for full in self.cells if _split(full)[0] == header]
+        if len(matches) > 1 or not set(self.repeated).isdisjoint(matches):
+            raise self._ambiguous(argument, name, matches)
+        if not matches:
             raise ValueError(
                 f"{argument}: {name!r} = {shown(header)} must be one of the headers of {str(self.path)!r}: "
                 f"{', '.join(self.cells)}{likely(header, [*self.cells, *(_split(full)[0] for full in self.cells)])}"
             )
-        return full
+        return matches[0]
+
+    def _ambiguous(self, argument: str, name: str, headers: list[Any]) -> ValueError:
+        """The error for a column that the file has more than once."""
+        listed = " or ".join(shown(header) for header in (headers if len(headers) > 1 else 2 * headers))
+        return ValueError(
+            f"{argument}: {name!r} could be {listed}, columns of {str(self.path)!r}: rename one of them in the file, or pass "
+            "the whole header if it differs from the other"
+        )
 
     def _expected(self, argument: str, si: str, header: Any) -> str:
         """What describes a column or its errors, for messages."""
@@ -161,7 +193,7 @@ def _text(path: Path) -> str:
     """The text of a file in UTF-8, or as spreadsheets write it: in UTF-16 with a mark, or in Windows' encoding."""
     raw = path.read_bytes()
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return raw.decode("utf-16")
+        return raw.decode("utf-16", errors="replace")
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:

@@ -3,12 +3,14 @@
 import dataclasses
 import hashlib
 import re
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Literal
 from jaxtyping import Array
 
 from .ensemble import Ensemble
@@ -29,8 +31,9 @@ def has_users_code(part: Any) -> bool:
         return any(has_users_code(getattr(part, field.name)) for field in dataclasses.fields(part))
     if isinstance(part, tuple | list | dict):
         return any(map(has_users_code, part.values() if isinstance(part, dict) else part))
-    # Functions can also be compiled, methods or partial.
-    return callable(part) and str(getattr(part, "__module__", "")).partition(".")[0] not in PACKAGES
+    # Functions can also be compiled or methods. An object that can be called, such as a partial function, has data.
+    is_own = str(getattr(part, "__module__", "")).partition(".")[0] in PACKAGES
+    return callable(part) and not (is_own and hasattr(part, "__qualname__"))
 
 
 def checksum_of(model: AbstractModel) -> str:
@@ -50,7 +53,28 @@ def checksum_of(model: AbstractModel) -> str:
         return [*parts, *(mode.reset_map(state, jnp.ones(1)) for mode in modes)]
 
     program = jax.make_jaxpr(equations)(arrays)
-    checksum = hashlib.sha256(ADDRESS.sub("", str(program.jaxpr)).encode())
-    for constant in program.consts:
-        checksum.update(np.asarray(constant).tobytes() if isinstance(constant, Array | np.ndarray) else b"")
+    checksum = hashlib.sha256(ADDRESS.sub("", str(program)).encode())
+    for array in _constants(program, set()):
+        checksum.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
     return checksum.hexdigest()[:16]
+
+
+def _constants(program: Any, visited: set[int]) -> Iterator[np.ndarray]:
+    """The constants of a program, whose text does not show all their digits, and of the programs within it, such as those
+    of compiled functions."""
+    if id(program) in visited:
+        return
+    visited.add(id(program))
+    parts = [*getattr(program, "consts", ())]
+    for equation in program.eqns:
+        parts += [operand.val for operand in equation.invars if isinstance(operand, Literal)]
+        parts += jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program)
+    for part in parts:
+        if _is_program(part):
+            yield from _constants(part, visited)
+        elif isinstance(part, Array | np.ndarray | np.generic):
+            yield np.asarray(part)
+
+
+def _is_program(part: Any) -> bool:
+    return hasattr(part, "eqns")

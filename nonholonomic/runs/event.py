@@ -22,7 +22,7 @@ from ..lanes.components import over_lanes
 from ..lanes.tracing import depends_on_first, is_elementary, spelled_out, with_own_numbers
 from ..parameters import Parameters
 from ..per_run import gathered
-from ..text import described, likely
+from ..text import described, likely, name_of
 from ..validation import UNTRACEABLE, shown
 from .model import AbstractModel, Names, Start
 
@@ -81,7 +81,7 @@ class EventFunction(eqx.Module):
     @property
     def name(self) -> str:
         """The name of the function, for the request of a table."""
-        return getattr(self.function, "__qualname__", type(self.function).__name__)
+        return name_of(self.function)
 
     def replaced(self, values: dict[str, Any]) -> "EventFunction":
         """The event with other values of its numbers."""

@@ -4,8 +4,9 @@ can resume."""
 import contextlib
 import json
 import os
+import platform
+import re
 import shutil
-import zipfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,14 +18,33 @@ except ImportError:  # not a POSIX system
 
 import numpy as np
 
+from ..validation import real_path, replacing, sync_folder
 from ..warning import warn
-from ._file import Stored, replacing, sync_folder, table_path, write_file
+from ._file import Stored, table_path, write_file
 from .layout import EQUATIONS, Layout, Values
+
+#: The files of the folder of a table's chunks, besides those of the chunks: a table without numbers, and the lock.
+HEADER, LOCK = "table.h5", "nonholonomic.lock"
+
+#: The name of a file in the folder that was not finished, as `replacing` names it.
+PART = re.compile(r".+\.[0-9a-f]{32}\.part(\.[^.]*)?")
 
 
 def folder_of(path: Path) -> Path:
-    """The folder of a table's chunks while it is computed."""
+    """The folder of a table's chunks while it is computed, beside the file itself, not beside a link to it."""
+    path = real_path(path)
     return path.with_name(path.name + ".blocks")
+
+
+def chunks_in(folder: Path, layout: Layout) -> set[int]:
+    """The chunks of a table whose files are in its folder."""
+    chunks = {int(file.stem) for file in folder.glob("*.npz") if file.stem.isdecimal()}
+    return {chunk for chunk in chunks if chunk < layout.chunks}
+
+
+def chunk_file(folder: Path, chunk: int) -> Path:
+    """The file of a chunk."""
+    return folder / f"{chunk}.npz"
 
 
 class AnotherRun(ValueError):
@@ -59,17 +79,19 @@ class ChunkStore:
         difference if it holds the result of another request or of another version of this package.
         """
         self.path = table_path(path)
-        self.folder, self.layout = folder_of(self.path), layout
-        self._lock = self._locked()
+        self.folder, self.layout, self._lock = folder_of(self.path), layout, None
         try:
+            self._lock = self._locked()
             self._find()
         except BaseException:
             self.close()
             raise
 
     def _find(self) -> None:
+        for part in filter(is_part, self.folder.iterdir()):
+            part.unlink()
         stored = Stored(self.path) if self.path.exists() else None
-        header = self.folder / "table.h5"
+        header = self.folder / HEADER
         table = stored or (Stored(header) if header.exists() else None)
         if table is not None:
             self._check(table)
@@ -82,7 +104,7 @@ class ChunkStore:
             return
         if not header.exists():
             self._begin(header)
-        chunks_on_disk = {int(file.stem) for file in self.folder.glob("*.npz")}
+        chunks_on_disk = chunks_in(self.folder, self.layout)
         damaged = {chunk for chunk in chunks_on_disk if read_chunk(self.folder, self.layout, chunk) is None}
         self.finished = chunks_on_disk - damaged
         if stored is not None:
@@ -92,8 +114,6 @@ class ChunkStore:
                 assert values is not None
                 self.write(chunk, values)
             self.finished |= valid
-        for part in self.folder.glob("*.part"):
-            part.unlink()
         if damaged:
             warn(
                 f"{self.path} is damaged: {len(damaged)} finished chunks do not match their checksums and are computed again",
@@ -101,25 +121,26 @@ class ChunkStore:
             )
 
     def _begin(self, header: Path) -> None:
-        """Create the folder, with a note about its purpose."""
+        """Write a note about the folder's purpose, unless the folder is somebody else's."""
+        foreign = [file.name for file in self.folder.iterdir() if file.name != LOCK]
+        if foreign:
+            raise OSError(
+                f"cannot write {self.path}: the folder of its chunks, {self.folder}, holds other files, such as {foreign[0]}; "
+                "give another path, or move them"
+            )
         # The chunks remain until the table's file exists.
         bytes_needed = 2 * self.layout.bytes_of_cells(self.layout.cells)
         try:
-            room = shutil.disk_usage(self.path.parent).free
+            room = shutil.disk_usage(self.folder).free
             if room < bytes_needed:
                 raise OSError(
                     0,
                     f"{1e-9 * room:.3g} GB are free, and the table needs {1e-9 * bytes_needed:.3g} GB while it is computed",
                 )
-            self.folder.mkdir(exist_ok=True)
-            sync_folder(self.path.parent)
+            sync_folder(self.folder.parent)
         except OSError as error:
             raise OSError(f"cannot write {self.path}: {error.strerror}") from None
-        try:
-            write_file(header, self.layout, ())
-        except OSError:
-            self.folder.rmdir()
-            raise
+        write_file(header, self.layout, ())
 
     def _check(self, table: Stored) -> None:
         new_layout, old_layout = self.layout, table.layout
@@ -160,7 +181,9 @@ class ChunkStore:
         """
         if not self._whole:
             write_file(self.path, self.layout, self._all(computed), self.folder)
-        shutil.rmtree(self.folder, ignore_errors=True)
+        for chunk in chunks_in(self.folder, self.layout):
+            chunk_file(self.folder, chunk).unlink(missing_ok=True)
+        (self.folder / HEADER).unlink(missing_ok=True)
         return Stored(self.path)
 
     def _all(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> Iterator[tuple[int, dict[str, Values]]]:
@@ -179,43 +202,64 @@ class ChunkStore:
         **Raises:** `OSError` that names the path if that fails; earlier chunks remain finished.
         """
         kinds = self.layout.kinds
-        with replacing(self.folder / f"{chunk}.npz") as scratch, scratch.open("wb") as stream:
+        with replacing(chunk_file(self.folder, chunk)) as scratch, scratch.open("wb") as stream:
             arrays: dict[str, Any] = {name: np.asarray(cells, kinds[name]) for name, cells in values.items()}
             np.savez(stream, **arrays)
 
     def interrupted(self) -> str:
         """Message after Ctrl-C: what is saved, and how to resume."""
-        numbers = {int(file.stem) for file in self.folder.glob("*.npz")} | self.finished
+        numbers = chunks_in(self.folder, self.layout) | self.finished
         cells = self.layout.cells if self._whole else sum(map(self.layout.size, numbers))
         total = with_spaces(self.layout.cells)
         return f"saved {with_spaces(cells)} of {total} cells to {self.path}; run the same call again to resume"
 
     def _locked(self) -> Any:
-        """Keep other processes from computing the same file; the system releases the lock when this process ends."""
-        if fcntl is None:
-            return None
-        lock_path = self.path.with_name(self.path.name + ".lock")
+        """Create the folder, and keep others from computing the same file; the system releases the lock when this process
+        ends."""
         while True:
             try:
-                lock = lock_path.open("w")
+                self.folder.mkdir(exist_ok=True)
+            except OSError as error:
+                where = f"; {self.folder} must be a folder or absent" if self.folder.exists() else ""
+                raise OSError(f"cannot write {self.path}: {error.strerror}{where}") from None
+            if fcntl is None:
+                return None
+            try:
+                lock = (self.folder / LOCK).open("a+b", buffering=0)
+            except FileNotFoundError:
+                # A process that has just closed the file has removed the folder.
+                continue
             except OSError as error:
                 raise OSError(f"cannot write {self.path}: {error.strerror}") from None
+            holder = f"process {os.getpid()} on {platform.node()}".encode()
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
+            except BlockingIOError:
+                lock.seek(0)
+                other = {holder: "another thread", b"": "another thread or process"}.get(lock.read(), "another process")
                 lock.close()
-                raise OSError(f"cannot write {self.path}: another process is writing it") from None
+                raise OSError(f"cannot write {self.path}: {other} is writing it") from None
             # A process that has just closed the file has removed its lock, possibly after we opened it.
             with contextlib.suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(lock.fileno()), lock_path.stat()):
+                if os.path.samestat(os.fstat(lock.fileno()), (self.folder / LOCK).stat()):
+                    with contextlib.suppress(OSError):
+                        lock.truncate(0)
+                        lock.write(holder)
                     return lock
             lock.close()
 
     def close(self) -> None:
-        """Release the file for other processes."""
+        """Release the file for others, and remove the folder unless it holds files."""
         if self._lock is not None:
-            self.path.with_name(self.path.name + ".lock").unlink(missing_ok=True)
+            (self.folder / LOCK).unlink(missing_ok=True)
             self._lock.close()
+        with contextlib.suppress(OSError):
+            self.folder.rmdir()
+
+
+def is_part(file: Path) -> bool:
+    """Whether a file in the folder of the chunks was not finished."""
+    return PART.fullmatch(file.name) is not None
 
 
 def layout_words(
@@ -247,10 +291,10 @@ def saved_cells(path: Path) -> int:
     folder = folder_of(path)
     if path.exists():
         return Stored(path).layout.cells
-    if not (folder / "table.h5").exists():
+    if not (folder / HEADER).exists():
         return 0
-    layout = Stored(folder / "table.h5").layout
-    return sum(layout.size(int(file.stem)) for file in folder.glob("*.npz"))
+    layout = Stored(folder / HEADER).layout
+    return sum(map(layout.size, chunks_in(folder, layout)))
 
 
 def unfinished(path: Path) -> tuple[Layout, dict[str, Values]] | None:
@@ -261,13 +305,13 @@ def unfinished(path: Path) -> tuple[Layout, dict[str, Values]] | None:
     **Raises:** `OSError` that names the path if a chunk is damaged.
     """
     folder = folder_of(path)
-    if path.exists() or not (folder / "table.h5").exists():
+    if path.exists() or not (folder / HEADER).exists():
         return None
-    layout = Stored(folder / "table.h5").layout
+    layout = Stored(folder / HEADER).layout
     variables, damaged = layout.empty(layout.cells), 0
-    for file in folder.glob("*.npz"):
-        first, end = layout.ends(int(file.stem))
-        values = read_chunk(folder, layout, int(file.stem))
+    for chunk in chunks_in(folder, layout):
+        first, end = layout.ends(chunk)
+        values = read_chunk(folder, layout, chunk)
         damaged += values is None
         for name, cells in (values or {}).items():
             variables[name][first:end] = cells
@@ -284,9 +328,10 @@ def read_chunk(folder: Path, layout: Layout, chunk: int) -> dict[str, Values] | 
     """The variables of a chunk; `None` if they do not match the checksums of the archive."""
     try:
         # NumPy does not close a file that it cannot read.
-        with (folder / f"{chunk}.npz").open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        with chunk_file(folder, chunk).open("rb") as file, np.load(file, allow_pickle=False) as archive:
             variables = {name: archive[name] for name in layout.kinds}
-    except (OSError, ValueError, KeyError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile):
+    # What a damaged file makes NumPy raise can be of any kind.
+    except Exception:
         return None
     first, end = layout.ends(chunk)
     right = {name: (kind, (end - first, *layout.inner_shape(name))) for name, kind in layout.kinds.items()}
@@ -309,7 +354,8 @@ def same_request(left: str, right: str, ignored: tuple[str, ...] = ()) -> str | 
             # Earlier versions wrote no checksum.
             if name in first and name in second and first[name] != second[name]:
                 return "the code of the system, its event or its input has changed"
-        elif first.get(name) != second.get(name):
+        # As texts, in which a missing number, NaN, equals itself.
+        elif len({json.dumps(of.get(name), sort_keys=True) for of in (first, second)}) > 1:
             in_file, in_call = (repr(of[name]) if name in of else "absent" for of in (first, second))
             return f"{name} is {in_file} in the file and {in_call} here"
     return None

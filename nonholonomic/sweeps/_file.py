@@ -7,8 +7,6 @@ which xarray does not show, has one for each chunk of each variable. A file appe
 
 import contextlib
 import json
-import os
-import uuid
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -17,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..integration.status import FORMER_WORDS
-from ..validation import as_path
+from ..validation import as_path, replacing
 from .layout import PENDING, UNREACHED, Layout, Values, boxes
 
 if TYPE_CHECKING:
@@ -34,6 +32,9 @@ INNER = "inner"
 
 #: Variables of tables larger than this [bytes] are read only when needed.
 MAX_BYTES_IN_MEMORY = 1 << 27
+
+#: No compression of HDF5 makes numbers smaller by a greater factor.
+MAX_COMPRESSION = 2000
 
 
 #: Endings of files in other formats, which a table's file must not have.
@@ -53,43 +54,6 @@ def table_path(path: Any) -> Path:
             ".to_excel"
         )
     return file
-
-
-@contextlib.contextmanager
-def replacing(path: Path, folder: Path | None = None) -> Iterator[Path]:
-    """A new file that replaces `path` at the end of the context, completely or not at all.
-
-    **Arguments:** `folder`: the folder of the new file until then, by default that of `path`.
-
-    **Raises:** `OSError` that names the path if it cannot be written.
-    """
-    scratch = (folder or path.parent) / f"{path.name}.{uuid.uuid4().hex}.part"
-    try:
-        if path.is_dir():
-            raise OSError(0, "it is a folder")
-        scratch.touch(exist_ok=False)
-        yield scratch
-        with scratch.open("r+b") as stream:
-            os.fsync(stream.fileno())
-        os.replace(scratch, path)
-        sync_folder(path.parent)
-    except BaseException as error:
-        with contextlib.suppress(OSError):
-            scratch.unlink()
-        # Errors that were raised while reading the chunks keep their own message.
-        if isinstance(error, OSError) and error.strerror:
-            raise OSError(f"cannot write {path}: {error.strerror}") from None
-        raise
-
-
-def sync_folder(folder: Path) -> None:
-    """Flush a folder's entries to disk, on systems that let a folder be opened."""
-    if os.name == "posix":
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
 
 
 def write_file(
@@ -226,10 +190,29 @@ def _dataset(group: "h5py.Group", name: str) -> "h5py.Dataset":
     return array
 
 
+def _values(group: "h5py.Group", name: str, box: Any = ()) -> Values:
+    """The numbers of a variable, or those within a box.
+
+    **Raises:** `ValueError` if there cannot be as many numbers in the file: reading them could take all memory.
+    """
+    array = _dataset(group, name)
+    if array.nbytes > MAX_COMPRESSION * group.file.id.get_filesize():
+        raise ValueError(f"{name} has {array.size} numbers, more than fit into the file")
+    return np.asarray(array[box])
+
+
 def _attribute(node: Any, name: str) -> Any:
     """An attribute, a number or a string."""
     value = node.attrs[name]
     return value.decode() if isinstance(value, bytes) else value
+
+
+def _text(node: Any, name: str) -> str:
+    """An attribute that is a string."""
+    value = _attribute(node, name)
+    if not isinstance(value, str):
+        raise ValueError(f"the attribute {name} is not a text")
+    return value
 
 
 class Stored:
@@ -257,7 +240,9 @@ class Stored:
         **Raises:** `OSError` that names the path if numbers do not match their checksums.
         """
         with self._opened() as file:
-            values, sums = np.asarray(_dataset(file, name)[()]), self._sums[name]
+            values, sums = _values(file, name), self._sums[name]
+            if name in self.layout.words and np.any((values < PENDING) | (values >= len(self.layout.words[name]))):
+                raise ValueError(f"{name} has codes without a word")
         values = values.reshape(-1, *self.layout.inner_shape(name))
         damaged = 0
         for chunk in range(self.layout.chunks):
@@ -276,7 +261,7 @@ class Stored:
         variables = {}
         with self._opened() as file:
             for name in self.layout.kinds:
-                parts = [np.asarray(_dataset(file, name)[box]) for box in boxes(self.layout.shape, first, end)]
+                parts = [_values(file, name, box) for box in boxes(self.layout.shape, first, end)]
                 shape = self.layout.inner_shape(name)
                 variables[name] = np.concatenate([part.reshape(-1, *shape) for part in parts])
                 if zlib.crc32(variables[name].data) != self._sums[name][chunk]:
@@ -291,8 +276,9 @@ class Stored:
         try:
             with h5py.File(self.path, "r") as file:
                 yield file
-        except (OSError, KeyError, IndexError, ValueError, TypeError, AttributeError, RuntimeError) as error:
-            reason = f"it is not a table of nonholonomic, or it is damaged ({error})"
+        # What a damaged file makes HDF5 and NumPy raise can be of any kind.
+        except Exception as error:
+            reason = f"it is not a table of nonholonomic, or it is damaged ({error or type(error).__name__})"
             raise OSError(f"cannot read {self.path}: {reason}") from None
 
 
@@ -301,7 +287,10 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
     coords, kinds, units, words, shapes, long_names = {}, {}, {}, {}, {}, {}
     if "request" not in file.attrs:
         raise ValueError("it names no request")
-    attributes = {name: _attribute(file, name) for name in file.attrs if name != "Conventions"}
+    attributes = {name: _attribute(file, name) for name in file.attrs if name not in ("Conventions", LONG_NAMES)}
+    for name in ("request", "versions"):
+        if not isinstance(json.loads(attributes.get(name, "{}")), dict):
+            raise ValueError(f"the attribute {name} is not a dictionary")
     inner = {name: tuple(dims) for name, dims in json.loads(attributes.pop(INNER, "{}")).items()}
     dims = [*json.loads(attributes["axes"]), *(dim for dims in inner.values() for dim in dims)]
     # Only files need it.
@@ -310,21 +299,23 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
     checksums = file[CHECKSUMS]
     if not isinstance(checksums, h5py.Group):
         raise ValueError(f"{CHECKSUMS} is not a group")
-    sums = {name: _dataset(checksums, name)[()] for name in map(str, checksums)}
+    sums = {name: _values(checksums, name) for name in map(str, checksums)}
     for name in (*dict.fromkeys(dims), *(name for name in map(str, file) if name not in (*dims, CHECKSUMS))):
         array = _dataset(file, name)
         if LONG_NAME in array.attrs:
-            long_names[name] = _attribute(array, LONG_NAME)
+            long_names[name] = _text(array, LONG_NAME)
         if "flag_meanings" in array.attrs:
-            meanings = _attribute(array, "flag_meanings").split()
+            meanings = _text(array, "flag_meanings").split()
             # Words of earlier versions are converted to current ones.
             words[name] = (
                 tuple(FORMER_WORDS.get(word, word) for word in meanings) if name == "status" else tuple(meanings)
             )
         else:
-            units[name] = _attribute(array, "units")
+            units[name] = _text(array, "units")
         if name in dims:
-            coords[name] = array[()]
+            coords[name] = _values(file, name)
+            if coords[name].ndim != 1:
+                raise ValueError(f"{name} is not a list of numbers")
             if [zlib.crc32(coords[name])] != sums[name].tolist():
                 raise ValueError(f"{name} does not match its checksum")
         else:
@@ -333,6 +324,8 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
         attributes[LONG_NAMES] = json.dumps(long_names, sort_keys=True)
     coords = {name: np.array(words.pop(name))[values] if name in words else values for name, values in coords.items()}
     layout = Layout(coords, kinds, units, attributes, words, inner, int(_attribute(checksums, "block")))
+    if layout.chunk < 1:
+        raise ValueError(f"its chunks have {layout.chunk} cells")
     for name, shape in shapes.items():
         if shape != layout.shape + layout.inner_shape(name) or len(sums[name]) != layout.chunks:
             raise ValueError(f"{name} has the wrong shape")

@@ -91,21 +91,35 @@ class LocalProcesses(Executor):
 _starting = threading.Lock()
 
 
+#: A process that is killed while it starts, by the system if memory is short, is started again, this many times in all.
+MAX_STARTS = 3
+
+
 def _started(place: int, threads: int) -> ProcessPoolExecutor:
     """A process that has its cores and its settings before its first line runs."""
-    pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin)
-    with _starting, _environment(_settings()), _cores(place, threads), _without_interrupts():
-        # The process starts with the first call.
-        first_call = pool.submit(int)
-    try:
-        first_call.result()
-    except BrokenProcessPool as error:
-        # It would die again.
-        raise RuntimeError(
-            "a process ended before it computed anything; a script that starts processes must have its own calls under "
-            "`if __name__ == '__main__':`"
-        ) from error
-    return pool
+    for _ in range(MAX_STARTS):
+        pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin)
+        with _starting, _environment(_settings()), _cores(place, threads), _without_interrupts():
+            others = multiprocessing.active_children()
+            # The process starts with the first call.
+            first_call = pool.submit(int)
+            started = [process for process in multiprocessing.active_children() if process not in others]
+        try:
+            first_call.result()
+            return pool
+        except BrokenProcessPool as error:
+            pool.shutdown()
+            # The exit status of a process that a signal has ended is negative.
+            if not any((process.exitcode or 0) < 0 for process in started):
+                # It would end again.
+                raise RuntimeError(
+                    "a process ended before it computed anything; a script that starts processes must have its own calls under "
+                    "`if __name__ == '__main__':`"
+                ) from error
+    raise RuntimeError(
+        f"{MAX_STARTS} processes were killed while they started; if the machine has too little memory, start fewer: "
+        "local_processes(n=...)"
+    )
 
 
 def _settings() -> dict[str, str]:

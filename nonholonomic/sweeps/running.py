@@ -6,7 +6,7 @@ import json
 import os
 import uuid
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -83,6 +83,12 @@ def sweep(
     require_flag(progress, "progress")
     if executor is not None and not isinstance(executor, Executor):
         raise ValueError(f"executor = {shown(executor)} must be a concurrent.futures.Executor, or None")
+    context: Any = getattr(executor, "_mp_context", None)
+    if isinstance(executor, ProcessPoolExecutor) and context.get_start_method() == "fork":
+        raise ValueError(
+            "executor = ProcessPoolExecutor(...) starts its processes by fork, in which JAX makes no progress: pass the "
+            "processes of nonholonomic.local_processes, or ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn'))"
+        )
     cells = size_of(axes)
     chunk_size = chunk_for(cells) if chunk is None else chunk
     chunk_size = chunk_size if most is None else min(chunk_size, most)

@@ -10,10 +10,10 @@ import equinox as eqx
 import numpy as np
 
 from ..text import as_html, in_unit, readable_unit, require_unit, require_unit_of
-from ..validation import as_path, require_package, shown
+from ..validation import as_path, replacing, require_package, shown
 from ..views import draw_table
 from ._chunks import unfinished
-from ._file import LONG_NAMES, MAX_BYTES_IN_MEMORY, Stored, StoredVariables, coded, replacing, table_path, write_file
+from ._file import LONG_NAMES, MAX_BYTES_IN_MEMORY, Stored, StoredVariables, coded, table_path, write_file
 from .digits import concise_strings
 from .layout import UNREACHED, Layout, Values, axes_of
 

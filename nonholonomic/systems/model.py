@@ -20,6 +20,7 @@ from ..runs.model import AbstractModel, Names, Start, model_of, statuses
 from ..runs.simulate import simulate_model
 from ..runs.trajectory import Trajectory
 from ..sweeps import Axis, Quantity, Variable
+from ..text import name_of
 from ..validation import as_number, is_traced, shown
 from ..warning import warn
 from .engine import Cells
@@ -78,7 +79,7 @@ class OwnModel(AbstractModel):
         tree = self.parameters.tree
         system, event = tree["system"], tree["event"]
         event = system.event if isinstance(system, Hybrid) else event
-        name = None if event is None else getattr(event, "__qualname__", type(event).__name__)
+        name = None if event is None else name_of(event)
         values = zip(self.parameters.names, self.parameters.values, strict=True)
         return {"system": type(system).__name__, "event": name} | {name: float(value) for name, value in values}
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from ..validation import replacing
 from .arena import FINE
 from .page import ANGLE, centre_and_extent, view_from
 from .plot import new_figure
@@ -135,7 +136,8 @@ def write_animation(stages: list[Stage], path: Any, times: Times | None, speed: 
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     # Matplotlib truncates the duration of a frame to milliseconds.
-    FuncAnimation(figure, update, frames=len(times)).save(path, writer=kind(fps=rate * (1.0 - 1e-9)), dpi=DOTS)
+    with replacing(Path(path)) as scratch:
+        FuncAnimation(figure, update, frames=len(times)).save(scratch, writer=kind(fps=rate * (1.0 - 1e-9)), dpi=DOTS)
 
 
 class _Space:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..validation import require_file
+from ..validation import replacing, require_file
 from .stage import Mesh, Show, Stage, css, finite
 
 #: Selectable speeds of time.
@@ -45,11 +45,12 @@ class Page(NamedTuple):
     html: str
 
     def save(self, path: Any) -> None:
-        """Write the page to a file.
+        """Write the page to a file, completely or not at all.
 
         **Raises:** `OSError` if it cannot be written; `ValueError` unless the name ends in .html.
         """
-        require_file(path, "path", ".html", ".htm").write_text(self.html, encoding="utf-8")
+        with replacing(require_file(path, "path", ".html", ".htm")) as scratch:
+            scratch.write_text(self.html, encoding="utf-8")
 
     def _repr_html_(self) -> str:
         style = "width:100%;height:820px;border:0"

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Vector
+from nonholonomic.text import name_of
 from nonholonomic.validation import Bound, Bounded, as_number, is_traced, shown
 
 
@@ -110,7 +111,7 @@ def check_input(controls: Any, scene: Any, launch: Any) -> None:
     if not callable(controls):
         raise ValueError(f"input = {shown(controls)} must be {WANTED}, or None")
     t, motion = at_start(scene, launch)
-    name = f"input = {getattr(controls, '__qualname__', None) or repr(controls)}"
+    name = f"input = {name_of(controls)}"
     try:
         inspect.signature(controls).bind(t, motion)
     except TypeError as error:

@@ -28,6 +28,7 @@ from nonholonomic.runs import (
     with_event,
 )
 from nonholonomic.sweeps import Quantity, Variable
+from nonholonomic.text import name_of
 from nonholonomic.validation import require_all, require_kind, require_scalars
 
 from ..model.friction import Damping, RollingResistance
@@ -170,7 +171,7 @@ class RideModel(AbstractSceneModel):
         if isinstance(controls, eqx.Module):
             controls = description("input", controls)
         else:
-            controls = "none" if controls is None else getattr(controls, "__qualname__", repr(controls))
+            controls = "none" if controls is None else name_of(controls)
         request = description("scene", self.scene) | description("launch", self.launch) | {"input": controls}
         return request if self.event is None else request | {"event": self.event.name}
 

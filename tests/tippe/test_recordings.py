@@ -157,12 +157,51 @@ HEADERS = "t,tilt,x\n0.0,5,1\n0.1,6,2\n"
             "'time' = .'t', 's'. contradicts the header 't .ms.', whose unit is ms, not s",
         ),
         (HEADERS, {"theta": ("tlit", "deg")}, 25.0, "'tlit' must be one of the headers of .*; did you mean 'tilt'"),
+        (HEADERS.replace("x", "tilt"), TIMED, None, "'theta' could be 'tilt' or 'tilt', columns of .*: rename one"),
+        (
+            "t,tilt [deg],tilt [rad]\n0,5,0.1\n1,6,0.2\n",
+            TIMED,
+            None,
+            r"'theta' could be 'tilt \[deg\]' or 'tilt \[rad\]', columns of",
+        ),
+        (
+            "time [s],theta [deg],Theta [rad]\n0,5,0.1\n1,6,0.2\n",
+            None,
+            None,
+            r"'theta' could be 'theta \[deg\]' or 'Theta \[rad\]'",
+        ),
+        (
+            HEADERS.replace("6", "inf"),
+            TIMED,
+            None,
+            "tilt = 'inf' in line 3 of .* must be finite: write n/a, or nothing",
+        ),
+        (HEADERS.replace("0.1", "1e999"), TIMED, None, "t = '1e999' in line 3 of .* must be finite"),
+        (HEADERS.replace("6", "1_0"), TIMED, None, "tilt = '1_0' in line 3 of .* is not a number"),
+        (
+            HEADERS.replace("6", "6" * 200_000),
+            TIMED,
+            None,
+            r"path = .*film\.csv' is not a text file of columns: field larger",
+        ),
     ],
 )
 def test_files_that_cannot_be_read_are_refused(tmp_path, text, columns, fps, message):
     (tmp_path / "film.csv").write_text(text)
     with pytest.raises(ValueError, match=message):
         tippe.read_recording(tmp_path / "film.csv", columns, fps, launch=tippe.Launch(0.1, 100.0))
+
+
+def test_marks_of_thousands_are_not_read_as_decimal_points(tmp_path):
+    """With decimal commas, 1.100 rpm are eleven hundred; columns that are not read may have anything twice."""
+    (tmp_path / "film.csv").write_text("time [s];spin [rpm];note;note\n0,1;1.100;a;b\n0,2;1.200;a;b\n")
+    with pytest.raises(
+        ValueError, match=r"spin .rpm. = '1\.100' in line 2 .* mark of thousands, although decimal = ','"
+    ):
+        tippe.read_recording(tmp_path / "film.csv", launch=tippe.Launch(0.1, 100.0), decimal=",")
+    (tmp_path / "film.csv").write_text("time [s];spin [rpm];note;note\n0,1;1100;a;b\n0,2;1200,5;a;b\n")
+    film = tippe.read_recording(tmp_path / "film.csv", launch=tippe.Launch(0.1, 100.0), decimal=",")
+    np.testing.assert_allclose(film.value, np.array([1100.0, 1200.5]) * math.pi / 30.0)
 
 
 @pytest.mark.parametrize(

@@ -1,16 +1,19 @@
 """Files that are cut, changed or foreign: no wrong number read, none of another's bytes changed."""
 
+import resource
 import shutil
+import zlib
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from cheap_sweep import BLOCK, cheap_sweep, resumed
+from cheap_sweep import BLOCK, cheap_sweep, finished_blocks, resumed
 from disk_faults import half_finished
 
 from nonholonomic.sweeps import Table
 from nonholonomic.sweeps._chunks import same_request
+from nonholonomic.views import Page
 
 pytestmark = pytest.mark.newest
 
@@ -193,3 +196,139 @@ def test_a_file_of_an_earlier_version_names_options_that_were_not_set():
     """It can be resumed: an empty list is the same as no entry."""
     assert same_request('{"t1": 1.0, "sensitivities": []}', '{"t1": 1.0}') is None
     assert "sensitivities is ['mu']" in str(same_request('{"sensitivities": ["mu"]}', "{}"))
+
+
+def test_a_user_s_own_files_beside_a_table_stay(tmp_path):
+    """A lock, and a folder that has the name of the folder of the chunks: it is refused, or kept with what is in it."""
+    path, lock, folder = tmp_path / "table.h5", tmp_path / "table.h5.lock", tmp_path / "table.h5.blocks"
+    lock.write_text("mine")
+    folder.mkdir()
+    for name in ("0.npz", "notes.txt"):
+        note = folder / name
+        note.write_text("mine")
+        with pytest.raises(
+            OSError, match=rf"cannot write {path}: the folder .*table\.h5\.blocks, holds .*{name}; give"
+        ):
+            cheap_sweep(path, pytest.fail)
+        assert [file.name for file in folder.iterdir()] == [name]
+        note.unlink()
+    half_finished(path)
+    for name in ("notes.txt", "first.npz", "99.npz"):
+        (folder / name).write_text("mine")
+    assert len(finished_blocks(Table.load(path))) == 3
+    assert len(resumed(path)) == 4
+    assert resumed(path) == set()
+    assert sorted(file.name for file in folder.iterdir()) == ["99.npz", "first.npz", "notes.txt"]
+    assert lock.read_text() == "mine"
+    shutil.rmtree(folder)
+    folder.write_text("mine")
+    path.unlink()
+    with pytest.raises(
+        OSError, match=rf"cannot write {path}: File exists; .*table\.h5\.blocks must be a folder or absent"
+    ):
+        cheap_sweep(path, pytest.fail)
+    assert folder.read_text() == "mine"
+
+
+def test_a_symbolic_link_stays_one(tmp_path):
+    """Everything that is written through a link: a sweep, also one that is resumed, a saved table, and a page."""
+    (tmp_path / "far").mkdir()
+    for name, write in {
+        "sweep.h5": lambda path: (half_finished(path), resumed(path)),
+        "saved.h5": lambda path: cheap_sweep(None).save(path),
+        "page.html": Page("<html>").save,
+    }.items():
+        link, target = tmp_path / name, tmp_path / "far" / f"real_{name}"
+        link.symlink_to(target)
+        write(link)
+        write(link) if name == "page.html" else None
+        assert link.is_symlink()
+        assert sorted(file.name for file in target.parent.iterdir() if name in file.name) == [target.name]
+        assert target.stat().st_size > 5
+    assert finished_blocks(Table.load(tmp_path / "sweep.h5")) == set(range(7))
+    assert not [file for file in tmp_path.iterdir() if not file.is_symlink() and file.is_file()]
+
+
+def test_a_full_disk_leaves_no_half_file(tmp_path):
+    """A page and a table that do not fit: the old file stays as it was, and no other file remains."""
+    table, page = cheap_sweep(None), Page("x" * 100_000)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for name, save in {"page.html": page.save, "table.h5": table.save}.items():
+        path = tmp_path / name
+        save(path)
+        content_before = path.read_bytes()
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+        try:
+            with pytest.raises(OSError, match=f"cannot write {path}: File too large"):
+                save(path)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert path.read_bytes() == content_before
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["page.html", "table.h5"]
+
+
+def hostile_files():
+    """Changes of a file with right checksums, each of which another program could have written."""
+
+    def no_cells_in_a_chunk(file):
+        file["checksums"].attrs["block"] = 0
+
+    def more_numbers_than_fit(file):
+        del file["value"]
+        file.create_dataset("value", shape=(10**13,), dtype=float, chunks=(10**4,))
+        del file["x"]
+        file.create_dataset("x", shape=(10**13,), dtype=float, chunks=(10**4,))
+
+    def a_code_without_a_word(file):
+        codes = file["status"][()]
+        codes[0] = 100
+        file["status"][...] = codes
+        file["checksums"]["status"][0] = zlib.crc32(codes[:BLOCK].data)
+
+    def words_of_another_kind(file):
+        file["status"].attrs["flag_meanings"] = np.arange(3)
+
+    def a_request_of_another_kind(file):
+        file.attrs["request"] = "[1, 2]"
+
+    def a_grid_in_place_of_an_axis(file):
+        del file["x"]
+        file["x"] = np.zeros((5, 10))
+        file["checksums"]["x"][0] = zlib.crc32(np.zeros((5, 10)))
+
+    def too_deep(file):
+        file.attrs["axes"] = "[" * 30_000
+
+    def a_unit_of_another_kind(file):
+        file["value"].attrs["units"] = 3.0
+
+    def a_loop(file):
+        del file["value"]
+        file["value"] = h5py.SoftLink("/value")
+
+    return [value for name, value in locals().items() if callable(value)]
+
+
+@pytest.mark.parametrize("change", hostile_files(), ids=lambda change: change.__name__)
+def test_a_hostile_file_is_refused_by_name(change, images, tmp_path):
+    path = tmp_path / "hostile.h5"
+    path.write_bytes(images["whole"])
+    with h5py.File(path, "r+") as file:
+        change(file)
+    assert contents(path) is None
+    with pytest.raises(OSError, match=f"cannot read {path}"):
+        cheap_sweep(path, pytest.fail)
+
+
+@pytest.mark.parametrize("path", ["", "a\0b", 3])
+def test_what_is_not_a_path_is_refused(path):
+    for read in (Table.load, lambda path: cheap_sweep(path, pytest.fail), cheap_sweep(None).save):
+        with pytest.raises(ValueError, match=r"path = .* must be the path of a file"):
+            read(path)
+
+
+def test_a_number_that_is_missing_in_a_request_is_the_same_again():
+    assert same_request('{"data": [NaN, 1.0]}', '{"data": [NaN, 1.0]}') is None
+    assert "data is [nan, 1.0] in the file and [nan, 2.0]" in same_request(
+        '{"data": [NaN, 1.0]}', '{"data": [NaN, 2.0]}'
+    )

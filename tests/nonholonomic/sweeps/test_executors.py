@@ -304,6 +304,41 @@ def test_a_script_without_a_guard_is_told_so(tmp_path):
     )
 
 
+@pytest.mark.parametrize("kills", [1, 99])
+def test_a_process_that_is_killed_while_it_starts_is_started_again(kills):
+    """It is killed as soon as it exists; a process that dies again and again is given up with a reason."""
+    others, done = set(multiprocessing.active_children()), threading.Event()
+
+    def kill_the_first():
+        killed = set()
+        while len(killed) < kills and not done.is_set():
+            for process in set(multiprocessing.active_children()) - others - killed:
+                process.kill()
+                killed.add(process)
+            time.sleep(0.001)
+
+    killer = threading.Thread(target=kill_the_first)
+    killer.start()
+    try:
+        with nonholonomic.local_processes(1) as executor:
+            call = executor.submit(sum, [1.0, 2.0])
+            if kills == 1:
+                assert call.result(60.0) == 3.0
+            else:
+                with pytest.raises(RuntimeError, match=r"3 processes were killed while they started; .* start fewer"):
+                    call.result(60.0)
+    finally:
+        done.set()
+        killer.join()
+
+
+def test_a_pool_by_fork_is_refused_at_once(tmp_path):
+    fork = ProcessPoolExecutor(1, multiprocessing.get_context("fork"))
+    with fork as pool, pytest.raises(ValueError, match=r"by fork, .* nonholonomic\.local_processes, or .*'spawn'"):
+        cheap_sweep(tmp_path / "table.h5", job=CheapJob(tmp_path), executor=pool)
+    assert not list(tmp_path.iterdir())
+
+
 class Hands(Executor):
     """An executor whose futures the test ends."""
 

@@ -1,6 +1,7 @@
 """Tables of users' own systems against closed forms, with their derivatives, files and other processes."""
 
 import functools
+import json
 import pickle
 
 import equinox as eqx
@@ -221,8 +222,79 @@ def test_constant_arrays_are_part_of_the_code():
         (stroller.Graph(lambda x, y: 0.1 * x * y), True),
         (jax.jit(lambda t, motion: (jnp.cos(t), 0.0)), True),
         (functools.partial(pow, 2.0), True),
+        (jax.tree_util.Partial(jnp.interp, xp=jnp.arange(3.0), fp=jnp.ones(3)), True),
+        (jnp.sin, False),
     ],
-    ids=["packages", "event", "ground", "compiled", "partial"],
+    ids=["packages", "event", "ground", "compiled", "partial", "partial of JAX", "function of JAX"],
 )
 def test_code_of_users_is_told_from_that_of_the_packages(parts, expected):
     assert has_users_code(parts) is expected
+
+
+def waves(x, y, heights):
+    """A ground with waves of the given heights."""
+    modes = jnp.sin(jnp.asarray(x)[..., None] * jnp.arange(1.0, len(heights) + 1.0))
+    return jnp.sum(jnp.asarray(heights) * modes, axis=-1) + 0.0 * y
+
+
+class Waves:
+    """The same as an object that can be called."""
+
+    def __init__(self, heights):
+        self.heights = heights
+
+    def __call__(self, x, y):
+        return waves(x, y, self.heights)
+
+
+GROUNDS = {
+    "closure": lambda heights: lambda x, y: waves(x, y, heights),
+    "compiled": lambda heights: jax.jit(lambda x, y: waves(x, y, heights)),
+    "compiled within": lambda heights: lambda x, y: 2.0 * jax.jit(lambda x, y: waves(x, y, heights))(x, y),
+    "compiled by equinox": lambda heights: eqx.filter_jit(lambda x, y: waves(x, y, heights)),
+    "partial": lambda heights: functools.partial(waves, heights=heights),
+    "partial of JAX": lambda heights: jax.tree_util.Partial(waves, heights=heights),
+    "object": Waves,
+    "method": lambda heights: Waves(heights).__call__,
+}
+
+
+@pytest.mark.parametrize("kind", GROUNDS)
+def test_a_request_is_that_of_the_code_and_its_data(kind):
+    """It has no address, which is another in every process, and the data of the code are part of its checksum."""
+
+    def request(heights):
+        scene = stroller.Scene(
+            stroller.presets.light(), stroller.Graph(GROUNDS[kind](heights)), stroller.Damping(2.0, 1.0, 0.2, 0.05)
+        )
+        model = model_of(scene, stroller.Launch((0.0, -0.8), 0.3, 2.0))
+        assert has_users_code(model.users)
+        description = json.dumps(model.description())
+        assert " at 0x" not in description
+        return description, checksum_of(model)
+
+    first, again, changed = (request(scale * np.arange(20.0)) for scale in (1e-3, 1e-3, 1.0001e-3))
+    assert first == again
+    assert first[1] != changed[1]
+
+
+@pytest.mark.parametrize("compiled", [jax.jit, eqx.filter_jit, lambda function: jax.tree_util.Partial(function)])
+def test_a_table_of_compiled_code_with_other_data_does_not_resume(compiled, tmp_path):
+    def run(rates):
+        decay = compiled(lambda y: -jnp.asarray(rates) * y)
+
+        class Decay(AbstractMode):
+            scale: float = 1.0
+
+            def field(self, t, y):
+                return self.scale * decay(y)
+
+        falls = Hybrid([Decay()], event=lambda t, y: y[0] - 0.5)
+        axes, path = {"scale": [1.0, 2.0]}, tmp_path / "falls.h5"
+        return sweep(falls, [1.0, 1.0], 3.0, axes=axes, path=path, progress=False).time
+
+    time = run(np.array([2.0, 1.0]))
+    assert_close(time, np.log(2.0) / np.array([2.0, 4.0]), rtol=1e-6)
+    assert np.array_equal(run(np.array([2.0, 1.0])), time)
+    with pytest.raises(ValueError, match="the code of the system, its event or its input has changed"):
+        run(np.array([2.5, 1.0]))
