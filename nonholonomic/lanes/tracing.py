@@ -1,14 +1,16 @@
 """Trace a user's functions to find the arguments on which they depend, and the operations of which they consist."""
 
 import contextlib
+import functools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.extend.core import Jaxpr, Literal
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from jaxtyping import Array
 
 from ..validation import UNTRACEABLE, is_traced
@@ -145,6 +147,100 @@ def named_errors(function: str, arguments: str) -> Iterator[None]:
 
 def with_own_numbers(event: Callable[..., Any], *args: Any) -> Callable[..., Any]:
     """The event itself or, if it closes over traced numbers (such as those of an enclosing `jax.grad`), a module that
-    contains these numbers."""
-    consts = jax.make_jaxpr(event)(*args).consts
-    return eqx.filter_closure_convert(event, *args) if any(is_traced(const) for const in consts) else event
+    contains these numbers. An event without numbers of its own has `TracedFunction`s in place of its functions."""
+    closed, shape = jax.make_jaxpr(event, return_shape=True)(*args)
+    if any(is_traced(const) for const in closed.consts):
+        # The constants become the first arguments.
+        inputs = [*closed.jaxpr.constvars, *closed.jaxpr.invars]
+        program = ClosedJaxpr(closed.jaxpr.replace(constvars=[], invars=inputs), ())
+
+        def evaluated(*args: Any) -> Any:
+            results = jaxpr_as_fun(program)(*jax.tree.leaves(args))
+            return jax.tree.unflatten(jax.tree.structure(shape), results)
+
+        return _WithConstants(list(closed.consts), TracedFunction(evaluated, program))
+    if not all(callable(leaf) for leaf in jax.tree.leaves(event)):
+        return event
+    return jax.tree.map(lambda function: TracedFunction(function, closed), event)
+
+
+class _WithConstants(eqx.Module):
+    """A traced function with its constants as numbers."""
+
+    consts: list[Array]
+    function: "TracedFunction"
+
+    def __call__(self, *args: Any) -> Any:
+        return self.function(self.consts, *args)
+
+
+class TracedFunction:
+    """A function that equals every function that JAX traces to the same operations with the same constants.
+
+    A program that is compiled for one of them serves all, such as for a lambda that is written anew for every call.
+
+    **Arguments:** `program`: the traced function, or what calls it.
+    """
+
+    def __init__(self, function: Callable[..., Any], program: Any):
+        functools.update_wrapper(self, function, updated=())
+        self.function = function
+        # Objects without a value of their own are compared by their address, so they must stay in memory.
+        self.program = program
+        self.key = _comparable(program)
+
+    def __call__(self, *args: Any) -> Any:
+        return self.function(*args)
+
+    def __eq__(self, other: Any) -> bool:
+        return isinstance(other, TracedFunction) and self.key == other.key
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __reduce__(self) -> Any:
+        # A program cannot be pickled, but the function may be.
+        return _itself, (self.function,)
+
+
+def _itself(function: Callable[..., Any]) -> Callable[..., Any]:
+    return function
+
+
+def _comparable(value: Any) -> Hashable:
+    """A part of a program in a form that is equal for programs with the same operations and constants."""
+    if isinstance(value, ClosedJaxpr) and value.jaxpr is not value:
+        return _comparable(value.jaxpr), _comparable(value.consts)
+    if isinstance(value, Jaxpr):
+        numbers: dict[Any, int] = {}
+
+        def named(variables: Sequence[Any]) -> tuple[Hashable, ...]:
+            return tuple(
+                (str(variable.aval), _comparable(np.asarray(variable.val)))
+                if isinstance(variable, Literal)
+                else (str(variable.aval), numbers.setdefault(variable, len(numbers)))
+                for variable in variables
+            )
+
+        inputs = named((*value.constvars, *value.invars))
+        equations = tuple(
+            (equation.primitive, named(equation.invars), named(equation.outvars), _comparable(equation.params))
+            for equation in value.eqns
+        )
+        return inputs, equations, named(value.outvars), _comparable(getattr(value, "consts", ()))
+    if isinstance(value, dict):
+        return tuple((name, _comparable(value[name])) for name in sorted(value))
+    if isinstance(value, tuple | list):
+        return tuple(map(_comparable, value))
+    if isinstance(value, jax.Array | np.ndarray | np.generic):
+        return np.shape(value), str(value.dtype), np.asarray(value).tobytes()
+    # Numbers by their bytes: 0.0 equals -0.0, and True equals 1.
+    return (type(value), repr(value)) if isinstance(value, int | float) else value if _hashable(value) else id(value)
+
+
+def _hashable(value: Any) -> bool:
+    try:
+        hash(value)
+    except TypeError:
+        return False
+    return True

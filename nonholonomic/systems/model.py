@@ -255,6 +255,7 @@ def _(system: Hybrid, start: Any, event: Event | None = None, input: Any = None)
     has_pairs = any(isinstance(mode, AbstractSystem) for mode in system.modes) and is_pair(start)
     pair = dict(zip(("q", "rate"), map(as_number, start), strict=True)) if has_pairs else None
     state = as_number(start) if pair is None else jnp.concatenate([*pair.values()])
+    event = system.event if event is None else event
     if event is not None:
         system = dataclasses.replace(system, event=checked_event(event, state))
     return _at_start({"system": system, "start": state if pair is None else pair, "event": None})

@@ -1,11 +1,10 @@
 """A program is compiled once for each kind of scene: a second call with other numbers compiles nothing."""
 
-import collections
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compilations import compilations
 from tops import rutstam_top
 
 import tippe
@@ -108,23 +107,6 @@ CALLS = {
 
 #: What has no meaning through modes, and is refused there.
 SMOOTH_ONLY = ("time, hessian", "extended", "table of paths", "exponent")
-
-COMPILED = "/jax/core/compile/backend_compile_duration"
-
-
-def compilations(function, *arguments):
-    """How many programs a call compiles, those that are found on the disk included."""
-    counts = collections.Counter()
-
-    def heard(event, duration, **_):
-        counts[event] += 1
-
-    jax.monitoring.register_event_duration_secs_listener(heard)
-    try:
-        jax.block_until_ready(jax.tree.leaves(function(*arguments)))
-    finally:
-        jax.monitoring.unregister_event_duration_listener(heard)
-    return counts[COMPILED]
 
 
 def is_refused(kind, call):

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from close import assert_close
+from compilations import compilations
 from never_run import LAUNCH, TOP
 from own_modes import GRAVITY, Ball, Bounces, Sleigh, bounce
 
@@ -79,6 +80,8 @@ def test_an_event_may_close_over_what_is_differentiated():
     expected, expected_slope = jax.value_and_grad(exact)(0.1)
     assert_close(value, expected, rtol=1e-12)
     assert_close(slope, expected_slope, rtol=1e-12)
+    # A new lambda for another level.
+    assert compilations(jax.value_and_grad(time), 0.12) == 0
 
 
 class Decay(AbstractMode):
@@ -101,6 +104,19 @@ class Level(eqx.Module):
 
 def half_life(rate, level):
     return event_time(Hybrid([Decay(rate)], event=Level(level)), jnp.ones(1), 9.0)
+
+
+def test_a_new_but_equal_event_compiles_nothing_again():
+    """An array in a compiled part of the event is a constant like any other: another one is another event."""
+
+    def time(part):
+        parts = np.array([0.0, part])
+        event = jax.jit(lambda y: y[0] - parts[1] * jnp.asarray(parts)[1])
+        return event_time(Hybrid([Decay(jnp.asarray(2.0))]), jnp.ones(1), 9.0, event=lambda t, y: event(y))
+
+    assert_close(time(0.5), jnp.log(2.0), rtol=1e-12)
+    assert compilations(time, 0.5) == 0
+    assert_close(time(0.25), jnp.log(4.0), rtol=1e-10)
 
 
 def test_a_smooth_system_has_second_derivatives():
