@@ -1,5 +1,6 @@
 """Posteriors whose mean and covariance are known: the density, its gradient, and draws."""
 
+import itertools
 import sys
 from pathlib import Path
 
@@ -46,6 +47,45 @@ def test_the_density_is_that_of_bayes_in_the_coordinates():
     assert_close(density.values(jnp.asarray(point))["height"], 1.8)
     gradients = density.value_and_gradient(np.stack([point, point]))[1]
     assert_close(gradients, [gradient, gradient], rtol=1e-12)
+
+
+#: Unknowns with a prior, with two bounds, and with a function as prior.
+KINDS = {
+    "rate": Free(0.3, 0.0, prior=(0.3, 0.1)),
+    "b": Free(0.5, 0.2, 0.9),
+    "offset": Free(0.006, 0.0),
+}
+
+
+def expected_log_prior(name, coordinate):
+    """The log density of a coordinate by SciPy, from that of the parameter."""
+    if name == "rate":
+        return scipy.stats.norm.logpdf(np.exp(coordinate), 0.3, 0.1) + coordinate
+    if name == "b":
+        return np.log(0.7) + scipy.stats.logistic.logpdf(coordinate)
+    return scipy.stats.expon.logpdf(np.exp(coordinate), scale=0.01) + coordinate
+
+
+@pytest.mark.parametrize("names", list(itertools.permutations(KINDS)), ids="-".join)
+def test_priors_and_bounds_stay_with_their_unknowns(names):
+    """In rows and at single points, for every order of the names, and as SciPy has them."""
+    data = Measurements([1.0, 2.0, 3.0], 0.1, estimated=True)
+
+    def model(p):
+        assert tuple(p) == names
+        return jnp.stack([p["rate"], p["b"], p["offset"]], axis=1)
+
+    function = {"offset": lambda offset: jnp.log(100.0) - 100.0 * offset}
+    density = LogDensity.of(model, data, {name: KINDS[name] for name in names}, function)
+    points = np.asarray(density.start) + 0.3 * np.random.default_rng(0).normal(size=(4, 4))
+    expected = sum(expected_log_prior(name, points[:, k]) for k, name in enumerate(names))
+    assert_close(density.log_priors(points), expected, rtol=1e-10)
+
+    def single(point, prediction):
+        """The density less the likelihood with the errors of the point."""
+        return density.of_prediction(point, prediction) - density._with_errors(point).log_likelihood(prediction)
+
+    assert_close(jax.jit(jax.vmap(single))(points, density.predict(points)), expected, rtol=1e-9)
 
 
 def test_densities_that_differ_in_numbers_share_a_program(caplog):
