@@ -11,7 +11,7 @@ import pytest
 import scipy.stats
 from close import assert_close
 
-from nonholonomic.identification import Free, LogDensity, Measurements, identify, sample
+from nonholonomic.identification import Draws, FitWarning, Free, LogDensity, Measurements, identify, sample
 
 sys.path.insert(0, str(Path(__file__).parents[3] / "benchmarks"))
 from plain_nuts import plain
@@ -172,6 +172,32 @@ def test_draws_that_could_not_be_judged_are_refused_at_once(change, message):
     density = LogDensity.of(line, measured(), {"height": 0.5, "slope": -2.0})
     with pytest.raises(ValueError, match=message):
         sample(**({"density": density, "centre": np.zeros(2), "covariance": np.eye(2)} | change))
+
+
+def test_draws_that_are_no_posterior_say_so():
+    """Too few draws, chains that stay where they are, and a start in a pit that the search cannot find."""
+    data = Measurements([0.0], 0.05)
+
+    def pit(p):
+        return jnp.where(jnp.abs(p["x"] - 1.0) < 1e-6, 0.0, 1.0)[:, None]
+
+    density = LogDensity.of(pit, data, {"x": Free(1.0, prior=(1.5, 0.3))})
+    with pytest.warns(
+        FitWarning, match="no draws from the posterior: the ESS of x is .*the start is more probable"
+    ) as record:
+        draws = sample(density, chains=2, draws=20, progress=False)
+    assert "exp(19" in str(record[0].message) or "exp(20" in str(record[0].message)
+    assert not draws.good
+    assert draws.values["x"].shape == (2, 20)
+    assert "x  no interval  R-hat" in str(draws)
+    assert "NO POSTERIOR: the ESS" in str(draws)
+    with pytest.warns(FitWarning, match="^the start is more probable"):
+        assert sample(density, chains=2, draws=200, progress=False).good
+    stuck = Draws.of(density, np.zeros((2, 200, 1)), 0.001, 400)
+    assert [flaw.split(":")[0] for flaw in stuck.flaws] == [
+        "only 0.1 % of the proposals were accepted",
+        f"the ESS of x is {stuck.ess['x']:.0f}, below 50 for each of 2 chains",
+    ]
 
 
 def test_chains_visit_all_minima_without_a_fit():
