@@ -33,7 +33,7 @@ def identify(
     The search has three steps, all in batches. It compares hundreds of quasi-random candidates in a region around the start
     values (`region.py`), refines the best by Levenberg-Marquardt (`refinement.py`), and explores the likelihood around all
     minima by adaptive importance sampling (`exploration.py`), until errors and intervals rest on at least 400 effective
-    draws. Slopes make the search fast; they do not enter errors and intervals unless the likelihood is that of a linear
+    draws; 100 evenly spread draws are enough for a single unknown of runs with several modes. Slopes make the search fast; they do not enter errors and intervals unless the likelihood is that of a linear
     model.
 
     **Arguments:**
@@ -81,8 +81,8 @@ def identify(
     with status_line("fitting", progress):
         density = LogDensity.of(model, measurements, unknowns, slopes=slopes)
         explorer = Explorer.of(density, unknowns, spread, seed)
-        minima, sample = search(explorer, starts, max_steps, seed, progress)
-        result = summarise(density.problem, labels, minima, explorer, sample)
+        explorer, minima, sample = search(explorer, starts, max_steps, seed, progress)
+        result = summarise(explorer.density.problem, labels, minima, explorer, sample)
     if not result.verdict.good:
         warn("; ".join(result.verdict.concerns), FitWarning)
     return result

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..progress import status_line
 from ..validation import is_traced, require, shown
@@ -97,6 +97,12 @@ class LogDensity(eqx.Module):
     def _priors_in_order(self) -> tuple[Any, ...]:
         """The prior of every unknown or `None`, in the order of the coordinates; JAX would sort a dictionary by its keys."""
         return tuple(self.priors.get(name) for name in self.problem.names)
+
+    @property
+    def proper(self) -> Bool[np.ndarray, " unknowns"]:
+        """Which unknowns have a prior, or lie between two bounds: the data need not determine them."""
+        pairs = zip(self.problem.unknowns, self._priors_in_order, strict=True)
+        return np.array([prior is not None or (u.has_lower and u.has_upper) for u, prior in pairs])
 
     @property
     def _first_errors(self) -> Float[Array, " errors"]:

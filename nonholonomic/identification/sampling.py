@@ -190,7 +190,7 @@ def drawn(
     """
     chains, discarded, draws = sizes
     explorer, random = explorer_of(density, seed), np.random.default_rng(seed)
-    minima, explored = search(explorer, STARTS, STEPS, seed, progress)
+    explorer, minima, explored = search(explorer, STARTS, STEPS, seed, progress)
     components = minima.components
     if known is not None:
         components = known if components is None else components.joined(known, 0.5)
