@@ -28,14 +28,8 @@ ROWS = 512
 #: `ROUNDS` rounds.
 ENOUGH, MOST_K, ROUNDS = 400.0, 0.7, 40
 
-#: A single unknown of runs with several modes, which are slow: rows of a round, and effective draws, which are spread evenly.
-FEW_ROWS, FEW_ENOUGH = 64, 100.0
-
 #: Effective number of points to which the likelihood is tempered, for each unknown, and at least.
 TEMPERED, LEAST_TEMPERED = 20.0, 80.0
-
-#: The same as a part of the points, where these are few.
-PART_TEMPERED = 0.4
 
 #: Number of groups of measurements, in the order of their times, and the number of groups whose powers grow together.
 GROUPS, FRONT = 32, 8
@@ -116,20 +110,8 @@ class Explorer(NamedTuple):
         return cls(density, region, group, np.random.default_rng(seed))
 
     @property
-    def is_slow(self) -> bool:
-        """Whether there is a single unknown, and runs through several modes, so that few runs must do."""
-        return len(self.region.middle) == 1 and self.density.problem.on_host
-
-    @property
-    def enough(self) -> float:
-        """The least effective number of draws."""
-        return FEW_ENOUGH if self.is_slow else ENOUGH
-
-    @property
     def rows(self) -> int:
         """Number of points in a round."""
-        if self.is_slow:
-            return FEW_ROWS
         return ROWS if len(self.region.middle) > 1 else ROWS // 2
 
     def begin(self, seed: int) -> Pool:
@@ -138,9 +120,7 @@ class Explorer(NamedTuple):
         size = len(self.region.middle)
         shapes = ((0, size), (0, values), (0, groups), (0,), (0,), (0,), (0,))
         empty = Pool(*(np.zeros(shape) for shape in shapes), proposals=())
-        return self.extended(
-            empty, self.region.points(ROWS if size > 2 else max(self.rows // 2, FEW_ROWS), seed), self.region
-        )
+        return self.extended(empty, self.region.points(ROWS if size > 2 else self.rows // 2, seed), self.region)
 
     def acting(self, pool: Pool) -> Bool[np.ndarray, " unknowns"]:
         """Which unknowns act: moved from one of the two best points to the farther end of its range, such an unknown changes a
@@ -176,11 +156,11 @@ class Explorer(NamedTuple):
         """
         with Progress(ROUNDS, "round", shown=progress) as display:
             display.begin()
-            current = Weighted.of(pool, self.enough)
+            current = Weighted.of(pool)
             for _ in range(ROUNDS):
                 pool = self.extended(pool, *self._proposed(current, minima))
                 display.advance(1)
-                current = Weighted.of(pool, self.enough)
+                current = Weighted.of(pool)
                 if current.enough:
                     break
         return current
@@ -192,15 +172,13 @@ class Explorer(NamedTuple):
         mixture = self.proposal(pool, minima, share)
         # The last round draws what is missing, with some to spare.
         rate = current.effective / max(len(current.weights) - pool.proposals[0][0], 1)
-        missing = 1.25 * (self.enough - current.effective) / max(rate, 1e-3) if len(pool.proposals) > 1 else np.inf
+        missing = 1.25 * (ENOUGH - current.effective) / max(rate, 1e-3) if len(pool.proposals) > 1 else np.inf
         count = self.rows if current.k >= MOST_K else int(np.clip(missing, self.rows // 8, self.rows))
         return mixture.draw(count, self.random), mixture
 
     def proposal(self, pool: Pool, minima: Mixture | None, share: float = KEPT) -> Mixture:
         """The mixture that fits the points so far best; the components around known minima get a share of it."""
         least = max(LEAST_TEMPERED, TEMPERED * pool.points.shape[1])
-        if self.is_slow:
-            least = min(least, PART_TEMPERED * len(pool.points))
         halves = [
             fitted(pool.points, tempered_weights(pool, least, power), COMPONENTS, self.random) for power in POWERS
         ]
@@ -225,25 +203,24 @@ class Weighted(NamedTuple):
     """A weighted sample of a posterior.
 
     - `pool`: the points; `weights`: (n,), Pareto-smoothed, with the sum 1.
-    - `k`: shape of the weights' tail; `effective`: the effective number of draws; `least`: how many are enough.
+    - `k`: shape of the weights' tail; `effective`: the effective number of draws.
     """
 
     pool: Pool
     weights: Float[np.ndarray, " n"]
     k: float
     effective: float
-    least: float
 
     @classmethod
-    def of(cls, pool: Pool, least: float = ENOUGH) -> "Weighted":
+    def of(cls, pool: Pool) -> "Weighted":
         logs = pool.log_weights(2.0)
         weights, k = smoothed_weights(np.where(np.isfinite(logs), logs, -np.inf))
-        return cls(pool, weights, k, effective_number(weights), least)
+        return cls(pool, weights, k, effective_number(weights))
 
     @property
     def enough(self) -> bool:
         """Whether means and quantiles over the weights can be trusted."""
-        return self.effective >= self.least and self.k < MOST_K
+        return self.effective >= ENOUGH and self.k < MOST_K
 
     @property
     def runs(self) -> int:

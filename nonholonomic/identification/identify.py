@@ -33,8 +33,8 @@ def identify(
     The search has three steps, all in batches. It compares hundreds of quasi-random candidates in a region around the start
     values (`region.py`), refines the best by Levenberg-Marquardt (`refinement.py`), and explores the likelihood around all
     minima by adaptive importance sampling (`exploration.py`), until errors and intervals rest on at least 400 effective
-    draws; 100 evenly spread draws are enough for a single unknown of runs with several modes. Slopes make the search fast;
-    they do not enter errors and intervals unless the likelihood is that of a linear model.
+    draws. Slopes make the search fast; they do not enter errors and intervals unless the likelihood is that of a linear
+    model.
 
     **Arguments:**
 

@@ -26,28 +26,12 @@ class Mixture(NamedTuple):
     roots: Float[np.ndarray, "components unknowns unknowns"]
 
     def draw(self, count: int, random: np.random.Generator) -> Float[np.ndarray, "count unknowns"]:
-        """Independent draws; each component gets its share of them, rounded at random. Draws of a single unknown are spread
-        evenly: one in each of `count` intervals of equal probability."""
-        if self.centres.shape[1] == 1:
-            return self._spread(count, random)
+        """Independent draws; each component gets its share of them, rounded at random."""
         steps = (np.arange(count) + random.uniform()) / count
         which = np.minimum(np.searchsorted(np.cumsum(self.shares), steps), len(self.shares) - 1)
         normal = random.normal(size=(count, self.centres.shape[1]))
         stretch = np.sqrt(FREEDOM / random.chisquare(FREEDOM, count))
         return self.centres[which] + np.einsum("nij,nj->ni", self.roots[which], normal) * stretch[:, None]
-
-    def _spread(self, count: int, random: np.random.Generator) -> Float[np.ndarray, "count 1"]:
-        """Draws of a single unknown, by the distribution function of the mixture."""
-        from scipy.stats import t
-
-        scales = np.abs(self.roots[:, 0, 0])
-        shares = (np.arange(count) + random.uniform(size=count)) / count
-        reach = t.isf(1e-9, FREEDOM)
-        grid = np.sort(
-            (self.centres[:, :1] + scales[:, None] * np.sinh(np.linspace(-1, 1, 401) * np.arcsinh(reach))).ravel()
-        )
-        below = self.shares @ t.cdf((grid - self.centres[:, :1]) / scales[:, None], FREEDOM)
-        return random.permutation(np.interp(shares, below, grid))[:, None]
 
     def log_density(self, points: Float[np.ndarray, "n unknowns"]) -> Float[np.ndarray, " n"]:
         """The log density of the mixture."""

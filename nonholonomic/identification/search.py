@@ -42,13 +42,12 @@ def search(
     problem = eqx.tree_at(lambda problem: problem.acts, problem, explorer.acting(pool))
     explorer = explorer._replace(density=eqx.tree_at(lambda density: density.problem, explorer.density, problem))
     recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
-    if (recorded and problem.step is not None) or (explorer.is_slow and np.all(problem.acts)):
+    if recorded and problem.step is not None:
         # A step by differences takes as long as a round of the exploration, which also finds the minima.
         sample = explorer.explore(pool, None, progress)
         best = sample.pool.points[sample.pool.most_probable(starts)]
-        steps = max_steps if recorded else min(max_steps, FEW_STEPS)
-        last = Refinement(steps, progress, rows=np.arange(starts) < LAST)
-        return explorer, refine(problem, best, measurements, last), sample
+        last = np.arange(starts) < LAST
+        return explorer, refine(problem, best, measurements, Refinement(max_steps, progress, rows=last)), sample
     steps = max_steps if recorded else min(max_steps, FEW_STEPS)
     minima = refine(problem, pool.candidates(starts), measurements, Refinement(steps, progress, in_parts=recorded))
     if recorded:
