@@ -1,11 +1,12 @@
 """How often intervals of fits contain the truth, and estimates lie within one standard error of it, with default options.
 
-    nice python benchmarks/coverage.py [times late ... own] [--drawn] [--repeats 200] [--rows coverage.jsonl] [--report]
+    nice python benchmarks/coverage.py [times late ... own] [--drawn] [--orders 1] [--repeats 200] [--rows coverage.jsonl]
 
 The truth is the same in all repeats, and starts are drawn within a factor of 1.5 of the friction, 12 % of the offset and
 5 % of the spin; numbers of other models within a factor of 1.5. With `--drawn`, fits start from the same values, and the
 truth is drawn from Gaussian priors, which the fits are given: intervals of the right posterior then contain the truth as often
-as they say, also where the data say little. The settings:
+as they say, also where the data say little; a truth between two bounds without a prior is uniform. With `--orders 3`, the names
+of the unknowns are given in so many orders, which must make no difference. The settings:
 
 - `times`, `late`: eight inversion times at 0.7 pi and at 0.95 pi;
 - `outliers`: the late times with outliers and `student=4`; `censored`: the latest two are only known to be later;
@@ -13,7 +14,8 @@ as they say, also where the data say little. The settings:
 - `reversal`: four reversal times of a rattleback;
 - `film`: theta of a top, with unknown friction, spin and clock; `wooden`: theta of a wooden top that hops;
 - `ride`: the speed of a stroller, with unknown rolling friction and launch speed;
-- `own`: the heights of a bouncing ball of one's own, with unknown restitution and height at the start.
+- `own`: the heights of a bouncing ball of one's own, with unknown restitution and height at the start;
+- `decay`: a sum of two decays, a function, with a prior, two bounds, and a prior within a bound: cheap.
 
 Every fit is appended to the file of rows at once; a second call continues where the first ended. `--report` prints the
 table of the rows with the binomial errors of the fractions.
@@ -34,6 +36,7 @@ import numpy as np
 import nonholonomic
 import stroller
 import tippe
+from nonholonomic.identification import Measurements, identify
 
 warnings.simplefilter("ignore", tippe.FitWarning)
 MU, OFFSET, SPIN = 0.3, 0.006, 150.0
@@ -44,12 +47,14 @@ XY = -2e-5
 
 
 class Number(NamedTuple):
-    """An unknown: its value; the greatest factor or difference of a start; and bounds, if they are given to the fit."""
+    """An unknown: its value; the greatest factor or difference of a start; bounds, if they are given to the fit; and whether
+    it has no prior but these."""
 
     value: float
     factor: float = 1.5
     difference: float = 0.0
     bounds: tuple[float, float] = (-np.inf, np.inf)
+    uniform: bool = False
 
     def start(self, random: np.random.Generator) -> tippe.Free:
         """A start near the value."""
@@ -58,12 +63,16 @@ class Number(NamedTuple):
         return tippe.Free(min(start, 0.95 * self.bounds[1]), *self.bounds)
 
     def prior(self) -> tippe.Free:
-        """A prior with a standard deviation of half the reach of the starts."""
+        """A prior with a standard deviation of half the reach of the starts; none between bounds that are the prior."""
+        if self.uniform:
+            return tippe.Free(self.value, *self.bounds)
         deviation = 0.5 * (self.difference or abs(self.value) * np.log(self.factor))
         return tippe.Free(self.value, *self.bounds, prior=(self.value, deviation))
 
     def draw(self, random: np.random.Generator) -> float:
         """A value from the prior, with the sign of the mean."""
+        if self.uniform:
+            return random.uniform(*self.bounds)
         mean, deviation = self.prior().prior
         while not (self.bounds[0] < (drawn := random.normal(mean, deviation)) < self.bounds[1] and drawn * mean >= 0.0):
             pass
@@ -258,6 +267,28 @@ def own() -> Setting:
     return Setting({"restitution": Number(0.8, bounds=(0.0, 1.0)), "start[0]": Number(1.0, 1.05)}, exact, data, fit)
 
 
+def decay() -> Setting:
+    """A height, a rate and a second height from 12 values of a sum of decays."""
+    at = np.linspace(0.0, 3.0, 12)
+
+    def model(p: dict[str, Any]) -> Any:
+        height, rate, background = (p[name][:, None] for name in ("height", "rate", "background"))
+        return height * jnp.exp(-rate * at) + background * jnp.exp(-0.1 * at)
+
+    def exact(**values: float) -> np.ndarray:
+        return np.asarray(model({name: jnp.array([value]) for name, value in values.items()}))[0]
+
+    def data(exact: np.ndarray, random: np.random.Generator) -> Any:
+        return Measurements(exact + 0.2 * random.normal(size=12), 0.2)
+
+    def fit(data: Any, free: dict[str, tippe.Free]) -> Any:
+        return identify(model, data, free, progress=False)
+
+    rate = Number(1.0, bounds=(0.3, 1.7), uniform=True)
+    unknowns = {"rate": rate, "background": Number(0.4, bounds=(0.0, np.inf)), "height": Number(2.0)}
+    return Setting(unknowns, exact, data, fit)
+
+
 SETTINGS: dict[str, Callable[[], Setting]] = {
     "times": lambda: times((0.03, 0.08), 0.7 * np.pi, 0.02),
     "late": lambda: times((0.1, 0.3), 0.95 * np.pi, 0.05),
@@ -270,14 +301,16 @@ SETTINGS: dict[str, Callable[[], Setting]] = {
     "wooden": wooden,
     "ride": ride,
     "own": own,
+    "decay": decay,
 }
 
 
-def row_of(setting: Setting, random: np.random.Generator, drawn: bool = False) -> dict[str, Any]:
-    """A fit as a row of the file."""
+def row_of(setting: Setting, random: np.random.Generator, drawn: bool = False, order: int = 0) -> dict[str, Any]:
+    """A fit as a row of the file, with the names of the unknowns turned by `order` places."""
     values = {name: number.draw(random) if drawn else number.value for name, number in setting.unknowns.items()}
     data = setting.data(setting.exact(**values), random)
     free = {name: number.prior() if drawn else number.start(random) for name, number in setting.unknowns.items()}
+    free = {name: free[name] for name in (*list(free)[order:], *list(free)[:order])}
     begin = time.process_time()
     fit = setting.fit(data, free)
     row: dict[str, Any] = {
@@ -298,20 +331,20 @@ def row_of(setting: Setting, random: np.random.Generator, drawn: bool = False) -
     return row
 
 
-def measure(name: str, repeats: int, path: Path, drawn: bool) -> None:
+def measure(name: str, repeats: int, path: Path, drawn: bool, order: int) -> None:
     """Fit until the file has `repeats` rows of a setting; the truth, noise and start of a row depend only on its number."""
-    done = {row["number"] for row in rows_of(path, label(name, drawn))}
+    done = {row["number"] for row in rows_of(path, label(name, drawn, order))}
     setting = SETTINGS[name]() if len(done) < repeats else None
     for number in range(repeats):
         if setting is not None and number not in done:
-            row = row_of(setting, np.random.default_rng(number), drawn)
+            row = row_of(setting, np.random.default_rng(number), drawn, order)
             with path.open("a") as file:
-                file.write(json.dumps({"setting": label(name, drawn), "number": number} | row) + "\n")
+                file.write(json.dumps({"setting": label(name, drawn, order), "number": number} | row) + "\n")
 
 
-def label(name: str, drawn: bool) -> str:
+def label(name: str, drawn: bool, order: int) -> str:
     """The name of a setting in the rows."""
-    return f"{name}, drawn" if drawn else name
+    return name + ", drawn" * drawn + f", order {order + 1}" * (order > 0)
 
 
 def rows_of(path: Path, name: str) -> list[dict[str, Any]]:
@@ -343,13 +376,14 @@ def main() -> None:
     parser.add_argument("settings", nargs="*", default=list(SETTINGS))
     parser.add_argument("--repeats", type=int, default=200)
     parser.add_argument("--drawn", action="store_true", help="draw the truth from priors instead of the starts")
+    parser.add_argument("--orders", type=int, default=1, help="number of orders of the names of the unknowns")
     parser.add_argument("--rows", type=Path, default=Path("coverage.jsonl"))
     parser.add_argument("--report", action="store_true", help="only print the table of the rows")
     options = parser.parse_args()
     for name in options.settings:
-        if not options.report:
-            measure(name, options.repeats, options.rows, options.drawn)
-        for named in (name, label(name, True)):
+        for order in range(options.orders if not options.report else 0):
+            measure(name, options.repeats, options.rows, options.drawn, order)
+        for named in (label(name, drawn, order) for drawn in (False, True) for order in range(options.orders)):
             if rows := rows_of(options.rows, named):
                 report(named, rows)
 

@@ -25,7 +25,7 @@ FINDS = {
     "next_launch": r"fix mu to 2\d %, offset to 2\d %\nnext: theta 0\.005, spin 70 rad/s: then mu to 0\.9\d? %",
     "parking": r"Plan of 15 s: reaches the goal(?s:.*)clearance  0\.0\d+ m from 4 obstacles",
     "planned_top": r"\d\d of 64 launches turn over(?s:.*)level at 5\.00000 s, \[0\.3 0\.2\] m",
-    "posterior": r"4 chains of 500 draws, [78]\d % accepted(?s:.*)100 % of the times lie",
+    "posterior": r"4 chains of 500 draws, [3-9]\d % accepted(?s:.*)mu  0\.(2[6-9]|3[0-3])\d+ (?s:.*)100 % of the times lie",
     "cohens_figure": r"(?s)slip_speed = 0\.11\d,.*mu = 0\.3\d\d,.*known to 0\.\d+ %: .*known to \d+ %: ",
     "printed_numbers": r"(?s)top: 77\.18 27\.41\n.*known to 3\.9 %.*mu \+1 %: not at all.*top: 2\.077 55\.78 -11\.16",
     "lost_numbers": r"(?s)likelihood 29\.59 at 11 degrees.*\n\[29\.592\d* 31\.242\d* 31\.238\d* 32\.285\d*\]",

@@ -10,7 +10,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..progress import Progress
 from .marginal import log_likelihoods
@@ -36,6 +36,9 @@ GROUPS, FRONT = 32, 8
 
 #: Components of the proposals, and the share of the draws that the ends of the search by slopes keep.
 COMPONENTS, KEPT = 16, 0.15
+
+#: An unknown does not act if it changes predictions by less than this part of their errors.
+NO_CHANGE = 1e-3
 
 #: Powers of the density to which the two halves of the proposals are fitted. The flatter half reaches beyond the posterior, to
 #: other minima and into the tails.
@@ -118,6 +121,21 @@ class Explorer(NamedTuple):
         shapes = ((0, size), (0, values), (0, groups), (0,), (0,), (0,), (0,))
         empty = Pool(*(np.zeros(shape) for shape in shapes), proposals=())
         return self.extended(empty, self.region.points(ROWS if size > 2 else self.rows // 2, seed), self.region)
+
+    def acting(self, pool: Pool) -> Bool[np.ndarray, " unknowns"]:
+        """Which unknowns act: moved from one of the two best points to the farther end of its range, such an unknown changes a
+        prediction. Unknowns with a prior or between two bounds need not act: their posterior has an end."""
+        middle, half_width = self.region.middle, self.region.half_width
+        points = pool.points[pool.most_probable(2)]
+        moved = np.repeat(points[:, None], len(middle), axis=1)
+        ends = middle + np.where(points > middle, -half_width, half_width)
+        np.einsum("bkk->bk", moved)[:] = ends
+        predictions = self.density.predictions(np.concatenate([points, moved.reshape(-1, len(middle))]))
+        base, others = predictions[: len(points), None], predictions[len(points) :].reshape(*ends.shape, -1)
+        with np.errstate(invalid="ignore"):
+            change = np.abs(others - base) / np.asarray(self.density.measurements.error)
+        is_same = np.all((others == base) | (change < NO_CHANGE), axis=(0, 2))
+        return ~is_same | self.density.proper
 
     def extended(self, pool: Pool, points: Float[np.ndarray, "rows unknowns"], proposal: Any) -> Pool:
         """The pool with points that were drawn from a proposal."""

@@ -81,8 +81,8 @@ def identify(
     with status_line("fitting", progress):
         density = LogDensity.of(model, measurements, unknowns, slopes=slopes)
         explorer = Explorer.of(density, unknowns, spread, seed)
-        minima, sample = search(explorer, starts, max_steps, seed, progress)
-        result = summarise(density.problem, labels, minima, explorer, sample)
+        explorer, minima, sample = search(explorer, starts, max_steps, seed, progress)
+        result = summarise(explorer.density.problem, labels, minima, explorer, sample)
     if not result.verdict.good:
         warn("; ".join(result.verdict.concerns), FitWarning)
     return result

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..progress import status_line
 from ..validation import is_traced, require, shown
@@ -94,6 +94,17 @@ class LogDensity(eqx.Module):
         return {f"error[{k}]": unit for k, unit in units.items()}
 
     @property
+    def _priors_in_order(self) -> tuple[Any, ...]:
+        """The prior of every unknown or `None`, in the order of the coordinates; JAX would sort a dictionary by its keys."""
+        return tuple(self.priors.get(name) for name in self.problem.names)
+
+    @property
+    def proper(self) -> Bool[np.ndarray, " unknowns"]:
+        """Which unknowns have a prior, or lie between two bounds: the data need not determine them."""
+        pairs = zip(self.problem.unknowns, self._priors_in_order, strict=True)
+        return np.array([prior is not None or (u.has_lower and u.has_upper) for u, prior in pairs])
+
+    @property
     def _first_errors(self) -> Float[Array, " errors"]:
         """The first guesses of the unknown errors, one for each series."""
         mask = [self.measurements.estimated & (self.measurements.series == k) for k in self.open_series]
@@ -146,7 +157,7 @@ class LogDensity(eqx.Module):
 
     def log_priors(self, coordinates: Float[np.ndarray, "rows unknowns"]) -> Float[np.ndarray, " rows"]:
         """The log density of the priors in the coordinates, in every row."""
-        return np.asarray(_log_priors(dict(self.problem.free), self.priors, coordinates))
+        return np.asarray(_log_priors(self.problem.unknowns, self._priors_in_order, coordinates))
 
     @status_line("simulating")
     def replicate(self, coordinates: Float[Array, "rows unknowns"], seed: int = 0) -> Float[np.ndarray, "rows n"]:
@@ -167,7 +178,7 @@ class LogDensity(eqx.Module):
     def of_prediction(self, coordinates: Float[Array, " unknowns"], prediction: Float[Array, " n"]) -> Float[Array, ""]:
         """The log density at given coordinates, for given predictions of the model."""
         return self._with_errors(coordinates).log_likelihood(prediction) + _log_prior(
-            dict(self.problem.free), self.priors, coordinates
+            self.problem.unknowns, self._priors_in_order, coordinates
         )
 
     @status_line("simulating")
@@ -186,13 +197,13 @@ class LogDensity(eqx.Module):
 
 
 def _log_prior(
-    unknowns: dict[str, Unknown], priors: dict[str, Any], coordinates: Float[Array, " unknowns"]
+    unknowns: tuple[Unknown, ...], priors: tuple[Any, ...], coordinates: Float[Array, " unknowns"]
 ) -> Float[Array, ""]:
     """The log density of the priors in the coordinates: the density of each parameter, and the Jacobian of its
-    coordinate."""
+    coordinate. The coordinates of unknown errors, which come last, have a flat prior."""
     total = jnp.zeros(())
-    for coordinate, (name, unknown) in zip(coordinates, unknowns.items(), strict=False):
-        if (prior := priors.get(name)) is not None:
+    for unknown, prior, coordinate in zip(unknowns, priors, coordinates[: len(unknowns)], strict=True):
+        if prior is not None:
             value, slope = jax.value_and_grad(unknown.value)(coordinate)
             log_density: Any = prior(value) if callable(prior) else _normal(value, *prior)
             total += log_density + jnp.log(jnp.abs(slope))

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..sweeps.running import workers
 from ..validation import is_traced, shown
@@ -47,17 +47,20 @@ class Problem(eqx.Module):
     - `names`, `unknowns`: the names of the free parameters, and the parameters; `free` combines both.
     - `step`: `None` for automatic differentiation in forward mode; otherwise the step of central differences in the
       coordinates. The model then need not be differentiable, nor traceable if it has `on_host = True`.
+    - `acts`: which unknowns act on a prediction; the slopes of the others are round-off, and set to zero.
     """
 
     model: Callable[[dict[str, Float[Array, " rows"]]], Float[Array, "rows n"]]
     names: tuple[str, ...] = eqx.field(static=True)
     unknowns: tuple[Unknown, ...]
     step: float | None = eqx.field(static=True)
+    acts: Bool[np.ndarray, " unknowns"]
 
     def __init__(self, model: Callable[..., Any], free: tuple[tuple[str, Free], ...], step: float | None = None):
         self.model, self.step = model, step
         self.names = tuple(name for name, _ in free)
         self.unknowns = tuple(Unknown.of(unknown) for _, unknown in free)
+        self.acts = np.ones(len(free), bool)
 
     @property
     def free(self) -> tuple[tuple[str, Unknown], ...]:
@@ -170,8 +173,9 @@ def predictions_and_slopes(problem: Problem, coordinates: Rows, mask: Any = None
     points = np.where(mask[:, None], coordinates, np.nan)
     if problem.step is None:
         prediction, slopes = _in_parts(lambda part: _differentiated(problem, part), points, ROWS_WITH_SLOPES)
-        return prediction, slopes
-    return _differences(problem, problem.step, points)
+    else:
+        prediction, slopes = _differences(problem, problem.step, points)
+    return prediction, np.where(problem.acts, slopes, 0.0)
 
 
 def compile_slopes(problem: Problem) -> None:

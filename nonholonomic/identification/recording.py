@@ -80,6 +80,10 @@ def as_quantity(words: Any) -> Any:
     return tuple(words) if isinstance(words, list) else words
 
 
+#: Samples of a top or a stroller are usually closer together [s]; others may have times in milliseconds.
+FAR_APART = 5.0
+
+
 class AbstractRecording(eqx.Module):
     """A recorded run: quantities sampled at the times of a clock.
 
@@ -142,14 +146,16 @@ class AbstractRecording(eqx.Module):
             if np.shape(self.error) not in ((), shape[1:], shape):
                 raise ValueError(f"error must be one number, one for each column, or of shape {shape}")
             require(np.broadcast_to(self.error, shape)[seen], "error", above=0.0)
-        self._suspect_degrees()
+        self._suspect_units()
         if self.student is not None:
             require(self.student, "student", above=0.0)
             if np.ndim(self.student) != 0:
                 raise ValueError(f"student must be one number, not of shape {np.shape(self.student)}")
 
-    def _suspect_degrees(self) -> None:
-        """Warn of angles that are unusually large for radians."""
+    def _suspect_units(self) -> None:
+        """Warn of angles that are unusually large for radians, and of samples too far apart for seconds."""
+        if self.quantities.usual and len(self.times) > 2 and (apart := np.median(np.diff(self.times))) > FAR_APART:
+            warn(f"times: samples are {apart:g} s apart; times are in seconds: did you mean 1e-3 * times?")
         samples = np.abs(np.asarray(self.value)).reshape(len(self.times), -1)
         for name, limit in self.quantities.usual.items():
             if name not in self.columns:

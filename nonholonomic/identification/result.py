@@ -24,7 +24,7 @@ from .likelihood import Measurements
 from .problem import Problem
 from .profile import Profile, profiled
 from .refinement import Minima
-from .shape import Minimum, minima_of, remarks, unsearched
+from .shape import Minimum, minima_of, remarks, unsearched, without_prediction
 from .verdict import CLOSE, SAME, FitWarning, Verdict, judge
 
 #: The most likely value is stated where it is farther from the estimate than this part of a standard error.
@@ -326,11 +326,12 @@ def _shape(
     explorer: Explorer, sample: Weighted, distribution: Distribution, by_slopes: np.ndarray
 ) -> tuple[tuple[Minimum, ...], tuple[str, ...], tuple[str, ...]]:
     """The minima that the data allow, and concerns and notes about the shape of the likelihood."""
-    notes = unsearched(explorer, distribution.estimate)
+    concerns, notes = without_prediction(explorer, sample, distribution)
+    notes = (*unsearched(explorer, distribution.estimate), *notes)
     if distribution.kind != "weights":
-        return (), (), notes
-    concerns, others = remarks(explorer, sample, distribution, by_slopes)
-    return minima_of(explorer, sample), concerns, (*notes, *others)
+        return (), concerns, notes
+    further, others = remarks(explorer, sample, distribution, by_slopes)
+    return minima_of(explorer, sample), (*concerns, *further), (*notes, *others)
 
 
 def agreement(

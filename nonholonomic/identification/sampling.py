@@ -18,18 +18,28 @@ from ..parameters import ByName
 from ..progress import status_line
 from ..text import readable_unit
 from ..validation import require_flag, require_package, require_whole, shown
+from ..warning import warn
 from .exploration import ROWS, Explorer
 from .marginal import draw_errors
 from .mixture import Mixture
 from .posterior import LogDensity
 from .search import search
 from .unknown import Free
+from .verdict import FitWarning
 
 #: Number of proposals for each draw.
 MOVES = 2
 
 #: Options of the search: range, refined candidates, and their steps.
 SPREAD, STARTS, STEPS = 2.0, 16, 60
+
+#: Draws are from a posterior only if at least this fraction of the proposals is accepted, and if every unknown has at least
+#: this many effective draws for each chain.
+LEAST_ACCEPTED, LEAST_ESS = 0.02, 50.0
+
+#: Draws are far less probable than the start if its log density exceeds their median by more than this and 1 for each unknown;
+#: the most probable point exceeds the median of a normal distribution by about 0.5 for each unknown.
+FAR_BELOW = 10.0
 
 
 class Draws(NamedTuple):
@@ -40,6 +50,8 @@ class Draws(NamedTuple):
       independent draws.
     - `units`: name -> unit, of the unknown errors.
     - `accepted`: fraction of accepted proposals; `runs`: number of parameter sets for which the model ran.
+    - `flaws`: why the draws are not from the posterior, in words; empty if they are, as `good` says. `concerns`: what else to
+      check.
 
     **Example:** as for `sample`.
 
@@ -55,17 +67,37 @@ class Draws(NamedTuple):
     accepted: float
     runs: int
     units: dict[str, str]
+    flaws: tuple[str, ...] = ()
+    concerns: tuple[str, ...] = ()
+
+    @property
+    def good(self) -> bool:
+        """Whether the draws can be used as those of a posterior."""
+        return not self.flaws
 
     @classmethod
     def of(
-        cls, density: LogDensity, coordinates: Float[np.ndarray, "chains draws unknowns"], accepted: float, runs: int
+        cls,
+        density: LogDensity,
+        coordinates: Float[np.ndarray, "chains draws unknowns"],
+        accepted: float,
+        runs: int,
+        excess: float = 0.0,
     ) -> "Draws":
-        """Draws at given coordinates, with diagnostics."""
+        """Draws at given coordinates, with diagnostics. **Arguments:** `excess`: of the log density at the start over the
+        median of the draws."""
         values = ByName((name, np.asarray(value)) for name, value in density.values(jnp.asarray(coordinates)).items())
         draws = map(np.asarray, _diagnosed(coordinates))
         # For a single unknown, these are numbers instead of lists.
         draws_by_name = (ByName(zip(density.names, numbers.reshape(-1).tolist(), strict=True)) for numbers in draws)
-        return cls(values, coordinates, *draws_by_name, accepted=accepted, runs=runs, units=density.units)
+        r_hat, ess = draws_by_name
+        flaws, concerns = _judged(ess, len(coordinates), accepted), ()
+        if excess > FAR_BELOW + len(ess):
+            concerns = (
+                f"the start is more probable than the draws, by a factor of exp({excess:.4g}): the search missed its "
+                "surroundings; start closer, state priors or bounds, or pass the coordinates of a fit",
+            )
+        return cls(values, coordinates, r_hat, ess, accepted, runs, density.units, flaws, concerns)
 
     def __str__(self) -> str:
         width = max(map(len, self.values))
@@ -73,9 +105,11 @@ class Draws(NamedTuple):
         lines = [f"{chains} chains of {draws} draws, {100.0 * self.accepted:.0f} % accepted, {self.runs} runs"]
         for name, value in self.values.items():
             low, middle, high = np.quantile(value, (0.025, 0.5, 0.975))
+            interval = f"{middle:.6g}  ({low:.6g}, {high:.6g})" if self.good else "no interval"
             quality = f"R-hat {self.r_hat[name]:.4f}, ESS {self.ess[name]:.0f}"
             unit = f" {readable_unit(self.units[name])}" if name in self.units else ""
-            lines.append(f"  {name:{width}}  {middle:.6g}  ({low:.6g}, {high:.6g}){unit}  {quality}")
+            lines.append(f"  {name:{width}}  {interval}{unit}  {quality}")
+        lines += [f"  NO POSTERIOR: {flaw}" for flaw in self.flaws] + [f"  BUT {concern}" for concern in self.concerns]
         return "\n".join(lines)
 
 
@@ -101,7 +135,9 @@ def sample(
       chain that are discarded and kept; `seed`.
     - `progress`: whether to show progress, on a terminal or in a notebook.
 
-    **Returns:** `Draws`.
+    **Returns:** `Draws`. If hardly a proposal was accepted, or if an unknown has an ESS below 50 for each chain, these are not
+    draws from the posterior: `draws.good` is false, `draws.flaws` says why, and a `FitWarning` is given, also for draws that
+    are far less probable than the start.
 
     **Raises:** `ValueError` for arguments out of range, and `ModuleNotFoundError` without BlackJAX, whose diagnostics it uses.
 
@@ -118,36 +154,59 @@ def sample(
     require_flag(progress, "progress")
     known = None if centre is None else _component(density, centre, covariance)
     with status_line("sampling", progress):
-        coordinates, accepted, runs = drawn(density, known, (chains, MOVES * warmup, draws), seed, progress)
+        coordinates, *counts = drawn(density, known, (chains, MOVES * warmup, draws), seed, progress)
     with status_line("diagnosing the draws", progress):
-        return Draws.of(density, coordinates, accepted, runs)
+        posterior = Draws.of(density, coordinates, *counts)
+    if words := (*(f"these are no draws from the posterior: {flaw}" for flaw in posterior.flaws), *posterior.concerns):
+        warn("; ".join(words), FitWarning)
+    return posterior
+
+
+def _judged(ess: dict[str, float], chains: int, accepted: float) -> tuple[str, ...]:
+    """Why draws are not from a posterior, in words."""
+    name, least = min(ess.items(), key=lambda item: item[1] if item[1] > 0.0 else 0.0)
+    flaws = []
+    if accepted < LEAST_ACCEPTED:
+        flaws.append(
+            f"only {100.0 * accepted:.2g} % of the proposals were accepted: start closer, or state priors or bounds that "
+            "contain the truth"
+        )
+    # The ESS of chains that never move is not a number.
+    if not least >= LEAST_ESS * chains:
+        flaws.append(
+            f"the ESS of {name} is {least:.0f}, below {LEAST_ESS:.0f} for each of {chains} chains: ask for more draws"
+        )
+    return tuple(flaws)
 
 
 def drawn(
     density: LogDensity, known: Mixture | None, sizes: tuple[int, int, int], seed: int, progress: bool
-) -> tuple[Float[np.ndarray, "chains draws unknowns"], float, int]:
-    """Coordinates of draws, the fraction of accepted proposals, and the number of runs.
+) -> tuple[Float[np.ndarray, "chains draws unknowns"], float, int, float]:
+    """Coordinates of draws, the fraction of accepted proposals, the number of runs, and the excess of the log density at the
+    start over the median of the draws.
 
     **Arguments:** `known`: a component around a fit, or `None`; `sizes`: numbers of chains, of steps before the first
     draw, and of draws; the others as for `sample`.
     """
     chains, discarded, draws = sizes
     explorer, random = explorer_of(density, seed), np.random.default_rng(seed)
-    minima, explored = search(explorer, STARTS, STEPS, seed, progress)
+    explorer, minima, explored = search(explorer, STARTS, STEPS, seed, progress)
     components = minima.components
     if known is not None:
         components = known if components is None else components.joined(known, 0.5)
     proposal = explorer.proposal(explored.pool, components)
     steps = discarded + MOVES * draws
     first = explored.pool.points[random.choice(explored.runs, chains, p=explored.weights)]
+    start = np.asarray(density.start)[None, : len(density.problem.names)]
     points = np.concatenate([first, proposal.draw(chains * steps, random)])
-    predictions, log_density = _runs(explorer, points)
+    predictions, log_density = _runs(explorer, np.concatenate([points, start]))
     order = random.permutation(np.arange(chains, len(points))).reshape(steps, chains)
-    path, accepted = _chains(order, log_density - proposal.log_density(points), chains, random)
+    path, accepted = _chains(order, log_density[:-1] - proposal.log_density(points), chains, random)
     kept = path[discarded + MOVES - 1 :: MOVES].T.reshape(-1)
     errors = draw_errors(density.measurements, predictions[kept], random)
     coordinates = np.concatenate([points[kept], errors], axis=1).reshape(chains, draws, -1)
-    return coordinates, accepted, explored.runs + len(points)
+    excess = float(log_density[-1] - np.median(log_density[kept]))
+    return coordinates, accepted, explored.runs + len(points), excess
 
 
 def explorer_of(density: LogDensity, seed: int) -> Explorer:

@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 
+import equinox as eqx
 import numpy as np
 
 from .exploration import Explorer, Weighted
@@ -18,9 +19,13 @@ LAST = 4
 IMPROVED = 0.1
 
 
-def search(explorer: Explorer, starts: int, max_steps: int, seed: int, progress: bool) -> tuple[Minima, Weighted]:
+def search(
+    explorer: Explorer, starts: int, max_steps: int, seed: int, progress: bool
+) -> tuple[Explorer, Minima, Weighted]:
     """Compare candidates, refine the best, and explore the likelihood around all minima; or explore first, where steps by
     differences cost more. **Arguments:** as for `identify`.
+
+    **Returns:** the explorer, which knows the unknowns that do not act; the minima; and the explored sample.
 
     **Raises:** `ValueError` if no candidate has a finite prediction.
     """
@@ -34,13 +39,15 @@ def search(explorer: Explorer, starts: int, max_steps: int, seed: int, progress:
             "no start led to finite predictions: simulate a run with the start values of `free` to see whether it fails; an "
             "event must happen before t1, and its function falls through zero"
         )
+    problem = eqx.tree_at(lambda problem: problem.acts, problem, explorer.acting(pool))
+    explorer = explorer._replace(density=eqx.tree_at(lambda density: density.problem, explorer.density, problem))
     recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
     if recorded and problem.step is not None:
         # A step by differences takes as long as a round of the exploration, which also finds the minima.
         sample = explorer.explore(pool, None, progress)
         best = sample.pool.points[sample.pool.most_probable(starts)]
         last = np.arange(starts) < LAST
-        return refine(problem, best, measurements, Refinement(max_steps, progress, rows=last)), sample
+        return explorer, refine(problem, best, measurements, Refinement(max_steps, progress, rows=last)), sample
     steps = max_steps if recorded else min(max_steps, FEW_STEPS)
     minima = refine(problem, pool.candidates(starts), measurements, Refinement(steps, progress, in_parts=recorded))
     if recorded:
@@ -50,7 +57,7 @@ def search(explorer: Explorer, starts: int, max_steps: int, seed: int, progress:
     # Along a direction without any slope, the likelihood has no end that an exploration could find.
     has_end = bool(np.all(np.isfinite(minima.covariance(minima.best))))
     sample = explorer.explore(pool, minima.components, progress) if has_end else Weighted.of(pool)
-    return _improved(problem, minima, sample, max_steps, progress), sample
+    return explorer, _improved(problem, minima, sample, max_steps, progress), sample
 
 
 def _improved(problem: Problem, minima: Minima, sample: Weighted, max_steps: int, progress: bool) -> Minima:

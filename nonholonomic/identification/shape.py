@@ -33,6 +33,9 @@ SKEWED = 1.4
 #: the interval or the region.
 CUT, NEAR = 0.02, 0.05
 
+#: Candidates within this many standard errors of the estimate are beside it.
+BESIDE = 3.0
+
 
 class Minimum(NamedTuple):
     """A minimum that the data allow.
@@ -133,6 +136,33 @@ def unsearched(explorer: Explorer, estimate: Float[np.ndarray, " unknowns"]) -> 
         f"{', '.join(names)}: outside of the range in which minima were searched, so better ones may be missing; start "
         "closer, or state a prior",
     )
+
+
+def without_prediction(
+    explorer: Explorer, sample: Weighted, distribution: Distribution
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """A concern or a note of candidates whose runs have no prediction, if there are any: a concern if they lie where the
+    posterior does."""
+    problem, points = explorer.density.problem, sample.pool.points
+    evaluated = explorer.region.contains(points)
+    points, failed = points[evaluated], np.any(np.isnan(sample.pool.predictions[evaluated]), axis=1)
+    if not np.any(failed):
+        return (), ()
+    off = points - distribution.estimate
+    values = np.asarray(problem.values(points[failed]))
+    ends = zip(problem.names, np.min(values, axis=0), np.max(values, axis=0), strict=True)
+    places = ", ".join(f"{name} {low:.4g}" + (f" to {high:.4g}" if high > low else "") for name, low, high in ends)
+    words = (
+        f"{np.sum(failed)} of {len(failed)} candidates count as impossible, because a run failed, was unresolved, ended too "
+        f"early or was illegal: at {places}"
+    )
+    if not np.all(np.isfinite(distribution.covariance)):
+        return (), (words,)
+    near = np.sum(np.linalg.solve(np.linalg.cholesky(distribution.covariance), off.T) ** 2, axis=0) < BESIDE**2
+    share = np.mean(failed[near]) if np.any(near) else 0.0
+    if share > CUT:
+        return (f"{words}; of those beside the estimate, {100.0 * share:.0f} %: simulate a run there to see why",), ()
+    return (), (words,)
 
 
 def remarks(

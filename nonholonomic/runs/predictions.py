@@ -14,8 +14,8 @@ from ..compilation.xla_cpu import greatest
 from ..identification import AbstractRecording
 from ..identification.data import of_data
 from ..integration import Settings
-from ..integration.status import Status
 from ..validation import nan_unless
+from .ensemble import SILENT
 from .model import AbstractModel
 from .simulate import sampled
 from .table import first_events
@@ -180,7 +180,8 @@ _compiled_lanes = eqx.filter_jit(_lanes)
 def _predicted_by_tables(
     sources: list[Source], values: list[Values], rows: int, settings: Settings
 ) -> Float[Array, " lanes"]:
-    """The times of events in all lanes, by the programs of tables; NaN for illegal parameters and failed runs."""
+    """The times of events in all lanes, by the programs of tables; NaN for illegal parameters and for runs that failed or are
+    unresolved."""
     lanes = _compiled_lanes(sources, values, rows)
     is_legal = np.asarray(lanes.is_legal)
     size, count = len(is_legal), int(is_legal.sum())
@@ -192,5 +193,5 @@ def _predicted_by_tables(
         cells, t1 = jax.tree.map(lambda leaf: leaf[order] if eqx.is_array(leaf) else leaf, (lanes.model, lanes.horizon))
         status, time, ends = first_events(cells, np.asarray(t1), size, count, settings)
         time = np.asarray(sources[0].data.of_ends(cells, t1, time, ends))
-        predictions[order[:count]] = np.where(status == Status.FAILED, np.nan, time)[:count]
+        predictions[order[:count]] = np.where(np.isin(status, SILENT), np.nan, time)[:count]
     return jnp.asarray(predictions)

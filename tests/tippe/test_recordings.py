@@ -253,6 +253,13 @@ def test_angles_in_degrees_are_suspected():
         stroller.Recording(ride, times, [np.nan, 25.0], 0.01, "steering")
 
 
+def test_times_in_milliseconds_are_suspected():
+    with pytest.warns(UserWarning, match=r"samples are 33 s apart; times are in seconds: did you mean 1e-3 \* times"):
+        tippe.Recording(tippe.Launch(0.1, 150.0), 33.0 * np.arange(1, 5), np.full(4, 0.3), 0.01)
+    with pytest.warns(UserWarning, match=r"time = 5970 s is long for a top; .*did you mean 1e-3 \* time"):
+        tippe.InversionTimes(tippe.Launch(0.1, 150.0), [5970.0], 10.0, t1=20000.0)
+
+
 def test_a_prior_may_be_a_standard_deviation_about_the_start(rutstam_scene):
     film = tippe.Recording(tippe.Launch(0.1, 9.0), [0.0, 1.0], [0.1, 0.2], 0.1)
     short, full = (unknowns_of(rutstam_scene, (film,), {"mu": tippe.Free(0.3, prior=p)}) for p in (0.1, (0.3, 0.1)))

@@ -13,12 +13,16 @@ from nonholonomic.parameters import numbers
 from nonholonomic.runs import AbstractEventTimes
 from nonholonomic.text import distinguishing_labels
 from nonholonomic.validation import as_number, as_number_or_none, require_kind
+from nonholonomic.warning import warn
 
 from ..model.launch import Launch, as_launch
 from ..model.scene import Scene
 from ..runs.checks import angle_of, check_event, check_reversible, event_of, require_rigid
 from ..runs.extended_times import beyond_horizon, time_of_inversion
 from ..runs.model import TopModel
+
+#: Measured times are usually shorter [s]; longer ones may be in milliseconds.
+LONG = 500.0
 
 _beyond_horizon = jax.jit(beyond_horizon)
 
@@ -35,6 +39,9 @@ class AbstractTimes(AbstractEventTimes):
 
     def __check_init__(self):
         require_kind(self.launch, "launch", Launch, " or a list of launches")
+        seconds = np.asarray(self.time)
+        if np.any(np.isfinite(seconds)) and (middle := np.median(seconds[np.isfinite(seconds)])) > LONG:
+            warn(f"time = {middle:g} s is long for a top; times are in seconds: did you mean 1e-3 * time?")
 
     @property
     def of_each_time(self) -> dict[str, Any]:

@@ -56,6 +56,7 @@ def test_intervals_cover_the_truth_on_a_staircase(slopes):
     assert all(fit.verdict.effective >= 400.0 and fit.verdict.k < 0.7 for _, fit in results)
 
 
+@pytest.mark.filterwarnings("ignore:these are no draws.*ESS:nonholonomic.identification.FitWarning")
 def test_the_rank_of_the_truth_among_draws_is_uniform():
     """Simulation-based calibration of `sample` on the staircase. Of 16 ranks, more than 3 are in the outer 5 % with a
     probability of 0.007; of draws around a fit by its slopes, 6 are."""

@@ -1,5 +1,6 @@
 """Posteriors whose mean and covariance are known: the density, its gradient, and draws."""
 
+import itertools
 import sys
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 import scipy.stats
 from close import assert_close
 
-from nonholonomic.identification import Free, LogDensity, Measurements, identify, sample
+from nonholonomic.identification import Draws, FitWarning, Free, LogDensity, Measurements, identify, sample
 
 sys.path.insert(0, str(Path(__file__).parents[3] / "benchmarks"))
 from plain_nuts import plain
@@ -46,6 +47,45 @@ def test_the_density_is_that_of_bayes_in_the_coordinates():
     assert_close(density.values(jnp.asarray(point))["height"], 1.8)
     gradients = density.value_and_gradient(np.stack([point, point]))[1]
     assert_close(gradients, [gradient, gradient], rtol=1e-12)
+
+
+#: Unknowns with a prior, with two bounds, and with a function as prior.
+KINDS = {
+    "rate": Free(0.3, 0.0, prior=(0.3, 0.1)),
+    "b": Free(0.5, 0.2, 0.9),
+    "offset": Free(0.006, 0.0),
+}
+
+
+def expected_log_prior(name, coordinate):
+    """The log density of a coordinate by SciPy, from that of the parameter."""
+    if name == "rate":
+        return scipy.stats.norm.logpdf(np.exp(coordinate), 0.3, 0.1) + coordinate
+    if name == "b":
+        return np.log(0.7) + scipy.stats.logistic.logpdf(coordinate)
+    return scipy.stats.expon.logpdf(np.exp(coordinate), scale=0.01) + coordinate
+
+
+@pytest.mark.parametrize("names", list(itertools.permutations(KINDS)), ids="-".join)
+def test_priors_and_bounds_stay_with_their_unknowns(names):
+    """In rows and at single points, for every order of the names, and as SciPy has them."""
+    data = Measurements([1.0, 2.0, 3.0], 0.1, estimated=True)
+
+    def model(p):
+        assert tuple(p) == names
+        return jnp.stack([p["rate"], p["b"], p["offset"]], axis=1)
+
+    function = {"offset": lambda offset: jnp.log(100.0) - 100.0 * offset}
+    density = LogDensity.of(model, data, {name: KINDS[name] for name in names}, function)
+    points = np.asarray(density.start) + 0.3 * np.random.default_rng(0).normal(size=(4, 4))
+    expected = sum(expected_log_prior(name, points[:, k]) for k, name in enumerate(names))
+    assert_close(density.log_priors(points), expected, rtol=1e-10)
+
+    def single(point, prediction):
+        """The density less the likelihood with the errors of the point."""
+        return density.of_prediction(point, prediction) - density._with_errors(point).log_likelihood(prediction)
+
+    assert_close(jax.jit(jax.vmap(single))(points, density.predict(points)), expected, rtol=1e-9)
 
 
 def test_densities_that_differ_in_numbers_share_a_program(caplog):
@@ -132,6 +172,32 @@ def test_draws_that_could_not_be_judged_are_refused_at_once(change, message):
     density = LogDensity.of(line, measured(), {"height": 0.5, "slope": -2.0})
     with pytest.raises(ValueError, match=message):
         sample(**({"density": density, "centre": np.zeros(2), "covariance": np.eye(2)} | change))
+
+
+def test_draws_that_are_no_posterior_say_so():
+    """Too few draws, chains that stay where they are, and a start in a pit that the search cannot find."""
+    data = Measurements([0.0], 0.05)
+
+    def pit(p):
+        return jnp.where(jnp.abs(p["x"] - 1.0) < 1e-6, 0.0, 1.0)[:, None]
+
+    density = LogDensity.of(pit, data, {"x": Free(1.0, prior=(1.5, 0.3))})
+    with pytest.warns(
+        FitWarning, match="no draws from the posterior: the ESS of x is .*the start is more probable"
+    ) as record:
+        draws = sample(density, chains=2, draws=20, progress=False)
+    assert "exp(19" in str(record[0].message) or "exp(20" in str(record[0].message)
+    assert not draws.good
+    assert draws.values["x"].shape == (2, 20)
+    assert "x  no interval  R-hat" in str(draws)
+    assert "NO POSTERIOR: the ESS" in str(draws)
+    with pytest.warns(FitWarning, match="^the start is more probable"):
+        assert sample(density, chains=2, draws=200, progress=False).good
+    stuck = Draws.of(density, np.zeros((2, 200, 1)), 0.001, 400)
+    assert [flaw.split(":")[0] for flaw in stuck.flaws] == [
+        "only 0.1 % of the proposals were accepted",
+        f"the ESS of x is {stuck.ess['x']:.0f}, below 50 for each of 2 chains",
+    ]
 
 
 def test_chains_visit_all_minima_without_a_fit():

@@ -3,7 +3,9 @@
 import dataclasses
 import itertools
 import math
+import re
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -58,6 +60,45 @@ def test_a_wrong_model_is_told_although_the_fit_converged():
     assert fit.deviance / fit.degrees > 1.4
     assert fit.verdict.p_value < 0.01
     assert not fit.verdict.good
+
+
+class Stopping(eqx.Module):
+    """Lines whose run fails where the rate exceeds a limit; a level with a tiny effect changes them by round-off."""
+
+    limit: jnp.ndarray
+    effect: jnp.ndarray
+
+    def __call__(self, p):
+        predicted = p["rate"][:, None] * T[:8] + self.effect * p["level"][:, None]
+        return jnp.where(p["rate"][:, None] < self.limit, predicted, jnp.nan)
+
+
+def fitted_with_limit(limit, effect):
+    data = Measurements(2.0 * T[:8] + 0.02 * np.random.default_rng(0).normal(size=8), 0.02)
+    model = Stopping(jnp.asarray(limit), jnp.asarray(effect))
+    return identify(model, data, {"rate": Free(2.0, 0.0), "level": 0.1}, progress=False)
+
+
+def test_candidates_whose_runs_fail_are_counted_and_placed():
+    """Beside the estimate they cut its interval; far from it, they are a note."""
+    with pytest.warns(FitWarning, match="candidates count as impossible.* at rate 2.0.*of those beside the estimate"):
+        fit = fitted_with_limit(2.03, 1.0)
+    assert fit.interval("rate")[1] < 2.03
+    fit = fitted_with_limit(3.5, 1.0)
+    assert fit.verdict.good
+    count, of_all = (int(re.search(r"(\d+) of (\d+) candidates", str(fit)).group(k)) for k in (1, 2))
+    points = fit.distribution.points
+    assert of_all == len(points)
+    assert count == np.sum(np.exp(points[:, 0]) >= 3.5) > 0
+
+
+def test_a_number_that_does_not_act_is_seen_at_once():
+    """It would otherwise be explored to the end of the region: 20 000 runs."""
+    with pytest.warns(FitWarning, match="the data do not determine level"):
+        fit = fitted_with_limit(100.0, 1e-13)
+    assert len(fit.distribution.points) == 256
+    assert np.isinf(fit.standard_errors["level"])
+    assert_close(fit.standard_errors["rate"], 0.02 / np.sqrt(np.sum(T[:8] ** 2)), rtol=1e-3)
 
 
 def test_a_trend_that_the_model_misses_shows_in_the_runs_where_the_errors_are_too_large():
