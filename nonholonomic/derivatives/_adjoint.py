@@ -386,7 +386,9 @@ def step_taken_back(
 
     zero_state, ends = jnp.zeros_like(state), written_in_place(memory.adjoints, adjoint.state, at=start)
     adjoints, total = over_stages(stages, stage_taken_back, (ends, adjoint))
-    return jump_taken_back(problem, moving, time, state, total), StageMemory(stage_states, rates, adjoints)
+    # A step that was rejected begins on the same far side as the one that follows.
+    begin = jnp.where(length > 0.0, time, jnp.nan)
+    return jump_taken_back(problem, moving, begin, state, total), StageMemory(stage_states, rates, adjoints)
 
 
 def jump_taken_back(
@@ -394,7 +396,7 @@ def jump_taken_back(
 ) -> Derivatives:
     """Carry derivatives from the far side of a jump to its near side, in the lanes whose step begins on a far side.
 
-    **Arguments:** as for `step_taken_back`; time and state are those of the far side.
+    **Arguments:** as for `step_taken_back`; `time`, `state`: those of the far side; the time is NaN if no step was made.
     """
     jumps = problem.jumps(time, state)
     if jumps is None:

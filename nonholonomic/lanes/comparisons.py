@@ -179,8 +179,10 @@ def _affine(name: str, equation: Any, inputs: Sequence[Any]) -> Affine | None:
         shape = equation.invars[0].aval.shape
         if not isinstance(inputs[0], Affine):
             return None
-        parts = [bind(jnp.broadcast_to(jnp.asarray(part, float), shape), **parameters) for part in inputs[0][:2]]
-        return Affine(*parts, inputs[0].bent)
+        slope, offset = (
+            bind(jnp.broadcast_to(jnp.asarray(part, float), shape), **parameters) for part in inputs[0][:2]
+        )
+        return Affine(slope, offset, inputs[0].bent)
     if name == "convert_element_type":
         is_real = jnp.issubdtype(equation.params["new_dtype"], jnp.inexact)
         return inputs[0] if is_real and isinstance(inputs[0], Affine) else None

@@ -63,8 +63,8 @@ class RideProblem(AbstractProblem):
         times = None
         if controls is not None and (jumps or is_searched(controls)):
             t, motion = eqx.filter_eval_shape(at_start, scene, launch)
-            of_one_ride = jax.tree.map(lambda part: jnp.zeros((), part.dtype), (t, motion))
-            times = jump_times(controls, jumps, *of_one_ride, cells)
+            t, motion = jax.tree.map(lambda part: jnp.zeros((), part.dtype), (t, motion))
+            times = jump_times(controls, jumps, t, motion, cells)
         return cls(scene.dynamics, controls, *start, press, False, False, times)
 
     @classmethod

@@ -42,7 +42,7 @@ def ride(
         jumps = model.problem(None, ()).jump_times
         known = jumps is not None and not is_traced((jumps, times, end))
         inside = [time for time in np.asarray(jumps) if 0.0 < time < end] if known else []
-        grid = even_steps(np.union1d(times, inside) if inside else times, end, solver.step_length)
+        grid = even_steps(jnp.asarray(np.union1d(times, inside)) if inside else times, end, solver.step_length)
         max_steps = grid.size
     settings = Settings(tolerance, solver, max_steps=max_steps)
     # Inside a transformation, this traces all numbers, even if they are known.
