@@ -1,13 +1,18 @@
 """Own systems whose functions compare the time, against closed forms."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from browser import needs_browser, open_browser
 from close import assert_close
 
 import nonholonomic
 from nonholonomic import AbstractMode, Hybrid, event_time, simulate, sweep
+from nonholonomic.runs import model_of, page_of
+from nonholonomic.views.explore import programs
 
 
 class Pulse(AbstractMode):
@@ -145,3 +150,17 @@ def test_an_event_that_jumps_through_zero():
 
     assert_close(time(0.7), 0.7, atol=1e-12)
     assert_close(jax.grad(time)(0.7), 1.0, atol=1e-12)
+
+
+@needs_browser
+def test_a_page_does_not_miss_a_pulse():
+    model = model_of(Hybrid([Pulse(0.5, 0.01, 100.0)]), [0.0, 0.0])
+    live, _ = page_of(model, {"system.modes[0].start": (0.3, 1.2), "width": (1e-3, 0.1)}, 2.0)
+    runs = [[0.5, 0.01], [1.1, 0.001], [0.3, 0.1]]
+    script = f"""{programs(live)}
+        const asks = integrator(live.answer);
+        return {json.dumps(runs)}.map((values) => (asks.run(values), asks.read("outcome", values)[1]))"""
+    with open_browser("300,200") as browser:
+        browser.get("about:blank")
+        places = browser.execute_script(script)
+    assert_close(places, [place(*run, 100.0) for run in runs], atol=1e-9)
