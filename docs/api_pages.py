@@ -134,7 +134,7 @@ PAGES = {
                 "nonholonomic.integration",
                 "AbstractProblem CoreProblem AbstractPassive ExtendedProblem Settings "
                 "solve_ensemble traced_solve_ensemble solve_with_samples Outcome "
-                "crossing_time LaneState solve_by_diffrax follow DenseSolution sample explicit_tableau Oscillatory8 "
+                "crossing_time LaneState Jumps solve_by_diffrax follow DenseSolution sample explicit_tableau Oscillatory8 "
                 "Stabilized8",
             ),
             "nonholonomic.integration.status",

@@ -24,7 +24,7 @@ from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, 
 from ..integration.runge_kutta import Stages, moved_state, over_stages
 from ..integration.scheduler import AbstractRecorder, InLanes, LaneScheduler, SchedulerState
 from ..integration.status import RUNNING
-from ..integration.step import length_to_try, try_step
+from ..integration.step import length_to_try, try_step, until_jump
 from .periods import Checkpoints, LatestSteps, StepRecord, read
 from .variation import VariationalProblem
 
@@ -51,7 +51,8 @@ class StepRecorder(AbstractRecorder):
         self, in_lanes: InLanes, lane_state: LaneState, record: StepRecord, iteration: Int[Array, ""]
     ) -> tuple[LaneState, StepRecord]:
         next_state = try_step(*in_lanes, lane_state)
-        length = jnp.where(next_state.time > lane_state.time, length_to_try(in_lanes[1], lane_state), 0.0)
+        tried_length = length_to_try(until_jump(*in_lanes[:2], lane_state), lane_state)
+        length = jnp.where(next_state.time > lane_state.time, tried_length, 0.0)
         entry = StepRecord(lane_state.time, without_probe(lane_state).state, length)
         return next_state, jax.tree.map(functools.partial(written_in_place, at=iteration), record, entry)
 
@@ -385,4 +386,35 @@ def step_taken_back(
 
     zero_state, ends = jnp.zeros_like(state), written_in_place(memory.adjoints, adjoint.state, at=start)
     adjoints, total = over_stages(stages, stage_taken_back, (ends, adjoint))
-    return total, StageMemory(stage_states, rates, adjoints)
+    # A step that was rejected begins on the same far side as the one that follows.
+    begin = jnp.where(length > 0.0, time, jnp.nan)
+    return jump_taken_back(problem, moving, begin, state, total), StageMemory(stage_states, rates, adjoints)
+
+
+def jump_taken_back(
+    problem: AbstractProblem, moving: Any, time: Lanes, state: States, adjoint: Derivatives
+) -> Derivatives:
+    """Carry derivatives from the far side of a jump to its near side, in the lanes whose step begins on a far side.
+
+    **Arguments:** as for `step_taken_back`; `time`, `state`: those of the far side; the time is NaN if no step was made.
+    """
+    jumps = problem.jumps(time, state)
+    if jumps is None:
+        return adjoint
+    numbers, static = eqx.partition(problem, moving)
+    near = jumps.before(time)
+    is_jump = jnp.isfinite(near)
+    near = jnp.where(is_jump, near, time)
+
+    def taken_back() -> Derivatives:
+        def across(numbers: Any, state: States) -> States:
+            return eqx.combine(numbers, static).across_jump(near, state)
+
+        # Round-off apart, the states of both sides differ only in their clocks.
+        near_state = state + (near - time) * problem.field(time, state)
+        by_number, by_state = jax.vjp(across, numbers, near_state)[1](adjoint.state)
+        by_number = jax.tree.map(lambda term: jnp.where(is_jump, term, 0.0), by_number)
+        state_before = jnp.where(is_jump, by_state, adjoint.state)
+        return Derivatives(state_before, jax.tree.map(jnp.add, adjoint.numbers, by_number))
+
+    return jax.lax.cond(jnp.any(is_jump), taken_back, lambda: adjoint)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..integration import AbstractProblem, Settings, solve_ensemble
+from ..integration import AbstractProblem, Jumps, Settings, solve_ensemble
 from ..integration.status import REACHED_END, RUNNING
 from ..progress import Progress
 
@@ -66,6 +66,11 @@ class VariedProblem(AbstractProblem):
     ) -> tuple[Float[Array, " lanes"], ...]:
         time = time if self.begin is None else time + self.begin
         return self.problem.margins(time, state[: len(self.magnitudes)])
+
+    def jumps(self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]) -> Jumps | None:
+        begin = 0.0 if self.begin is None else self.begin
+        jumps = self.problem.jumps(time + begin, state[: len(self.magnitudes)])
+        return None if jumps is None else jumps._replace(times=jumps.times - begin)
 
 
 def probed(problem: AbstractProblem) -> VariedProblem:

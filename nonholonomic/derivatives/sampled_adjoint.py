@@ -169,7 +169,7 @@ def mixture(point: tuple[Float[Array, "... cells"], ...]) -> list[Float[Array, "
 
 def _field_and_margin(problem: AbstractProblem, states: States) -> Any:
     time = jnp.zeros_like(states[0])
-    return problem.field(time, states), problem.domain_margin(time, states)
+    return problem.field(time, states), problem.domain_margin(time, states), problem.jumps(time, states)
 
 
 def _end(variational: VariationalProblem, lane_state: LaneState) -> tuple[Lanes, States]:

@@ -360,4 +360,17 @@ def _follow(
     times, t1, tolerance = arguments
     path = sample(variational, times, t1, spec.settings.with_tolerance(tolerance), grid=spec.grid)
     ends = (path.end_time, path.end_state, _status(path, t1))
-    return _found(variational, path.states.T, ends, (path.accepted, path.rejected))
+    samples, slopes = _found(variational, path.states.T, ends, (path.accepted, path.rejected))
+    problem = variational.problem
+
+    def jump_times(problem: AbstractProblem) -> Array | None:
+        jumps = problem.jumps(jnp.zeros_like(t1), problem.start()[0])
+        return None if jumps is None else jumps.times
+
+    for number, direction in enumerate(variational.tangents if jump_times(problem) is not None else ()):
+        # Diffrax's steps do not move with a jump.
+        moved = eqx.filter_jvp(jump_times, (problem,), (direction,))[1]
+        if moved is not None:
+            missing = jnp.where(jnp.any(moved != 0.0), jnp.nan, 0.0)
+            slopes[number] = jax.tree.map(lambda part, missing=missing: part + missing, slopes[number])
+    return samples, slopes

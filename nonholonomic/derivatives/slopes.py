@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int
 from ..compilation.xla_cpu import compiled_alone
 from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, States
 from ..integration.ensemble import with_crossing_times
+from ..integration.problem import time_at_jump
 from ..integration.scheduler import LaneScheduler
 from ..integration.status import CROSSED, REACHED_END
 from ._adjoint import solve_with_adjoint
@@ -106,7 +107,8 @@ def _slopes_by_adjoint(
         start = eqx.filter_jvp(lambda problem: problem.start()[0], (problem,), (direction,))[1]
         rates = eqx.filter(direction, moving)
         shares = [
-            gradient * rate for gradient, rate in zip(jax.tree.leaves(by_number), jax.tree.leaves(rates), strict=True)
+            jnp.sum((gradient * rate).reshape(-1, by_start.shape[1]), axis=0)
+            for gradient, rate in zip(jax.tree.leaves(by_number), jax.tree.leaves(rates), strict=True)
         ]
         return sum(shares, jnp.zeros(by_start.shape[1]) if start is None else jnp.sum(by_start * start, axis=0))
 
@@ -138,11 +140,12 @@ def time_of_zero(problem: AbstractProblem, function: Callable[[Any], Any], time:
     First order, unlike `event_time`: the event is located to 1e-10 of a step, and its time is not differentiated again.
     """
     fall = stop_gradient(jax.jvp(function, (stop_gradient(state),), (problem.field(time, state),))[1])
-    return time - function(state) / jnp.where(fall == 0.0, 1.0, fall)
+    return time_at_jump(problem, time, state, time - function(state) / jnp.where(fall == 0.0, 1.0, fall))
 
 
 def _field_and_event(problem: AbstractProblem, states: States) -> Any:
-    return problem.field(jnp.zeros_like(states[0]), states), problem.event_function(states)
+    zero = jnp.zeros_like(states[0])
+    return problem.field(zero, states), problem.event_function(states), problem.jumps(zero, states)
 
 
 def moving_leaves(problem: AbstractProblem, direction: Any, functions: Callable[[AbstractProblem, States], Any]) -> Any:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..integration import AbstractProblem, Outcome, crossing_time
+from ..integration import AbstractProblem, Jumps, Outcome, crossing_time
 from ..integration.scheduler import LaneScheduler
 
 #: Number of tangents that are integrated together. Two together take 0.6 to 1.0 times as long as two in turn, and an
@@ -80,15 +80,20 @@ class VariationalProblem(AbstractProblem):
         point, *variations = self.parts(state)
         if not variations:
             return self.problem.field(time, point)
-        moving = where_active(self.problem, self.tangents[0])
+        return self._varied(lambda problem, point: problem.field(time, point), point, variations)
 
-        def rate(moving: Any, point: Float[Array, "components lanes"]) -> Float[Array, "components lanes"]:
-            return eqx.combine(moving, self.problem).field(time, point)
+    def _varied(
+        self, function: Callable[[AbstractProblem, Array], Array], point: Array, variations: list[Array]
+    ) -> Array:
+        """The value of a function of problem and state, and its change along every tangent."""
 
-        # Linearised once: the rate is computed once, and the tangents share common subexpressions.
-        rates, change = jax.linearize(rate, moving, point)
+        def value(moving: Any, point: Float[Array, "components lanes"]) -> Float[Array, "components lanes"]:
+            return function(eqx.combine(moving, self.problem), point)
+
+        # Linearised once: the value is computed once, and the tangents share common subexpressions.
+        values, change = jax.linearize(value, where_active(self.problem, self.tangents[0]), point)
         return jnp.concatenate(
-            [rates, *(change(*direction) for direction in zip(self.tangents, variations, strict=True))]
+            [values, *(change(*direction) for direction in zip(self.tangents, variations, strict=True))]
         )
 
     def event_function(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"] | None:
@@ -102,6 +107,15 @@ class VariationalProblem(AbstractProblem):
 
     def margins(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
         return self.problem.margins(time, self.parts(state)[0])
+
+    def jumps(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Jumps | None:
+        return self.problem.jumps(time, self.parts(state)[0])
+
+    def across_jump(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        point, *variations = self.parts(state)
+        if not variations:
+            return self.problem.across_jump(time, point)
+        return self._varied(lambda problem, point: problem.across_jump(time, point), point, variations)
 
     def parts(self, state: Float[Array, "components ..."]) -> list[Float[Array, "components ..."]]:
         """The state and its variations."""

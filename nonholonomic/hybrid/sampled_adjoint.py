@@ -25,7 +25,7 @@ from ..derivatives.differentiable import over_cells as with_cells
 from ..derivatives.periods import Checkpoints
 from ..derivatives.sampled_adjoint import SampledCotangents, mixture, samples_pulled_back
 from ..derivatives.variation import where_active
-from ..integration import AbstractProblem, Lanes, Settings, States
+from ..integration import AbstractProblem, Jumps, Lanes, Settings, States
 from ..integration.status import LEFT_DOMAIN, REACHED_END, RUNNING
 from .ensemble import MOST_ROUNDS, Advance, Carry, HybridOutcome, at_start, chosen, one_round, padded
 from .mode import AbstractBatchedMode, mode_of_cells, over_cells
@@ -58,6 +58,9 @@ class EndlessProblem(AbstractProblem):
 
     def domain_margin(self, time: Lanes, state: States) -> None:
         return None
+
+    def jumps(self, time: Lanes, state: States) -> Jumps | None:
+        return self.whole.jumps(time, state)
 
 
 class Costate(NamedTuple):

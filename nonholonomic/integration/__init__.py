@@ -43,6 +43,7 @@ from .ensemble import solve_ensemble as solve_ensemble
 from .ensemble import traced_solve_ensemble as traced_solve_ensemble
 from .extended import AbstractPassive as AbstractPassive
 from .extended import ExtendedProblem as ExtendedProblem
+from .jumps import Jumps as Jumps
 from .midpoint import ImplicitMidpoint as ImplicitMidpoint
 from .oscillatory import Oscillatory8 as Oscillatory8
 from .problem import AbstractProblem as AbstractProblem

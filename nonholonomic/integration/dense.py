@@ -94,6 +94,19 @@ def _control(settings: Settings, scales: Float[Array, " components"]) -> diffrax
     return diffrax.PIDController(settings.tolerance, atol, norm=optimistix.max_norm)
 
 
+def _clipped(
+    problem: AbstractProblem, controller: Any, state: Float[Array, " components"], times: Float[Array, " times"] | None
+) -> Any:
+    """A controller whose steps end on given times and on both sides of each jump."""
+    jumps = problem.jumps(jnp.zeros_like(state[0]), state)
+    ends = [] if times is None else [times]
+    ends += [] if jumps is None else [jumps.ahead, jumps.past]
+    if not ends:
+        return controller
+    ends = jnp.concatenate(ends)
+    return diffrax.ClipStepSizeController(controller, step_ts=jnp.where(jnp.isnan(ends), jnp.inf, ends))
+
+
 @eqx.filter_jit
 def _piece(
     problem: AbstractProblem,
@@ -115,7 +128,7 @@ def _piece(
         first,
         state,
         args=problem,
-        stepsize_controller=_control(settings, scales),
+        stepsize_controller=_clipped(problem, _control(settings, scales), state, None),
         saveat=diffrax.SaveAt(t0=True, steps=True, dense=dense or is_watched),
         max_steps=settings.max_steps,
         event=diffrax.Event(lambda t, y, args, **_: args.domain_margin(t, y) < 0.0) if is_watched else None,
@@ -249,6 +262,19 @@ class _GivenSteps(diffrax.StepTo):
         return self.ts[1], 2
 
 
+@eqx.filter_custom_jvp
+def _with_fixed_jumps(state: Float[Array, " components"], times: Float[Array, " jumps"]) -> Float[Array, " components"]:
+    """The state, whose derivative is NaN if the times of jumps vary: Diffrax's steps do not move with them."""
+    return state
+
+
+@_with_fixed_jumps.def_jvp
+def _nan_if_moved(primals: Any, tangents: Any) -> Any:
+    (state, _), (rates, time_rates) = primals, tangents
+    rates = jnp.zeros_like(state) if rates is None else rates
+    return state, rates if time_rates is None else rates + jnp.nan * jnp.sum(time_rates)
+
+
 class SampledSolution(NamedTuple):
     """A run at given times: its states, NaN after its end; when and where it ended, and whether it left the model's
     domain.
@@ -289,6 +315,8 @@ def sample(
     [[0.367879 0.135335]]
     """
     state, scales = problem.start()
+    if (jumps := problem.jumps(jnp.zeros_like(t1), state)) is not None:
+        state = _with_fixed_jumps(state, jumps.times)
     margin = margin_at_start(problem, jnp.zeros_like(t1), state)
     is_watched = margin is not None
     # Diffrax detects only changes of the margin's sign, so a run that starts outside the domain must end at once.
@@ -303,7 +331,7 @@ def sample(
     else:
         save_at, max_points = diffrax.SubSaveAt(ts=jnp.minimum(times, t1)), settings.max_steps
     if grid is None:
-        controller = diffrax.ClipStepSizeController(_control(settings, scales), step_ts=jnp.minimum(times, t1))
+        controller = _clipped(problem, _control(settings, scales), state, jnp.minimum(times, t1))
     else:
         controller = _GivenSteps(grid)
     solution = diffrax.diffeqsolve(

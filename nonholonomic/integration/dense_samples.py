@@ -14,7 +14,7 @@ from .continuous_extension import StatesInside, StepEnd, continuous_extension, s
 from .runge_kutta import Lanes, States
 from .sample_times import Collected, Rows, SampleTimes
 from .scheduler import AbstractRecorder, InLanes
-from .step import LaneState, after_step, trial_step
+from .step import LaneState, after_step, past_jump, trial_step, until_jump
 
 #: Rows of a record, and the number of filled rows at which a period ends. The record fits the caches.
 ROWS, ROWS_OF_PERIOD = 128, 112
@@ -62,8 +62,10 @@ class DenseSampleRecorder(AbstractRecorder):
         problem, control, atol = in_lanes
         furthest_time = self.times.time_of(record.sample + MAX_SAMPLES_IN_STEP - 1, lane_state)
         lane_state = lane_state._replace(length=jnp.minimum(lane_state.length, furthest_time - lane_state.time))
-        length, trial = trial_step(problem, control, lane_state)
-        new_lanes = after_step(problem, control, atol, lane_state, length, trial)
+        near = until_jump(problem, control, lane_state)
+        length, trial = trial_step(problem, near, lane_state)
+        near_lanes = after_step(problem, near, atol, lane_state, length, trial)
+        new_lanes = past_jump(problem, control, near, lane_state, near_lanes)
         length = stop_gradient(length)
         end_time = lane_state.time + length
         second = second_derivative(problem, length, end_time, trial.state, trial.rate)
@@ -73,6 +75,10 @@ class DenseSampleRecorder(AbstractRecorder):
         has_moved = new_lanes.time > lane_state.time
         last_time = jnp.where(has_moved, new_lanes.time, -jnp.inf)
         record = self._with_samples(record, new_lanes, last_time, (lane_state.time, length), states_inside)
+        if new_lanes is not near_lanes:
+            has_jumped = new_lanes.time > near_lanes.time
+            of_far_side = second_derivative(problem, length, new_lanes.time, new_lanes.state, new_lanes.rate)
+            second = jnp.where(has_jumped, of_far_side, second)
         return new_lanes, record._replace(second=jnp.where(has_moved, second, record.second))
 
     def _with_samples(

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .jumps import Jumps
 from .problem import AbstractProblem
 from .runge_kutta import Lanes, States
 
@@ -93,3 +94,6 @@ class ExtendedProblem(AbstractProblem, Generic[Core]):
 
     def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
         return self.problem.margins(time, state[: self.leading])
+
+    def jumps(self, time: Lanes, state: States) -> Jumps | None:
+        return self.problem.jumps(time, state[: self.leading])

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .jumps import Jumps, moved_across
 from .runge_kutta import Lanes, States, lesser
 
 
@@ -85,6 +86,16 @@ class AbstractProblem(eqx.Module):
         domain_margin = self.domain_margin(time, state)
         return () if domain_margin is None else (domain_margin,)
 
+    def jumps(self, time: Lanes, state: States) -> Jumps | None:
+        """The times at which the field or a margin may jump, for a run that is in this state now; `None` if there are none.
+        Steps end on them."""
+        return None
+
+    def across_jump(self, time: Lanes, state: States) -> States:
+        """The state just after the jump whose near side is this time (`jumps.py`)."""
+        jumps = self.jumps(time, state)
+        return state if jumps is None else moved_across(jumps, self.field, time, state)[1]
+
 
 class CoreProblem(AbstractProblem):
     """The core state of a problem: the leading components, on which the others do not act.
@@ -135,6 +146,9 @@ class CoreProblem(AbstractProblem):
 
     def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
         return self.whole.margins(time, self._longer(state))
+
+    def jumps(self, time: Lanes, state: States) -> Jumps | None:
+        return self.whole.jumps(time, self._longer(state))
 
     def _longer(self, state: States) -> States:
         state = jnp.stack(state) if isinstance(state, tuple) else state
@@ -200,4 +214,15 @@ def event_time(problem: AbstractProblem, function: Callable[[States], Any], time
     first, second = jax.jvp(slope, (state,), (problem.field(time, state),))
     first = jnp.where(first == 0.0, 1.0, first)
     shift = function(state) / first
-    return time - shift - 0.5 * second / first * shift * shift
+    return time_at_jump(problem, time, state, time - shift - 0.5 * second / first * shift * shift)
+
+
+def time_at_jump(problem: AbstractProblem, time: Lanes, state: States, otherwise: Lanes) -> Lanes:
+    """The time of the jump whose far side is this time, which is that of an event whose function jumps through zero; elsewhere
+    the other time."""
+    jumps = problem.jumps(time, state)
+    if jumps is None:
+        return otherwise
+    near = jumps.before(time)
+    is_jump, _, jump, _ = jumps.sides(jnp.where(jnp.isfinite(near), near, time))
+    return jnp.where(is_jump, jump, otherwise)

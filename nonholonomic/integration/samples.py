@@ -19,7 +19,7 @@ from .sample_times import Collected, Read, Rows, SampleTimes, components
 from .scheduler import AbstractRecorder, InLanes, LaneScheduler, Outcome
 from .settings import Settings
 from .status import FAILED, REACHED_END, RUNNING
-from .step import LaneState, length_to_try, try_step
+from .step import LaneState, length_to_try, try_step, until_jump
 from .tuned_pair import AbstractTunedPair
 
 #: Largest factor by which a step is stretched to end on a sample: its error stays below the tolerance, because steps
@@ -79,17 +79,20 @@ def step_towards_sample(
     """
     problem, control, atol = in_lanes
     next_time = times.time_of(sample, lane_state)
-    target = jnp.minimum(next_time, control.t1)
+    control_to_target = control._replace(t1=jnp.minimum(next_time, control.t1))
+    # Even lengths up to the sample or, if it comes first, to the jump.
+    target = until_jump(problem, control_to_target, lane_state).t1
     even_length = _even(lane_state.length, target - lane_state.time, lane_state.bracketing)
     # The step after a rejected step is shorter on purpose, because it may have to end on a minimum of a margin.
     length = jnp.where(accepted, even_length, jnp.minimum(even_length, lane_state.length))
-    lane_state, control_to_target = lane_state._replace(length=length), control._replace(t1=target)
+    lane_state = lane_state._replace(length=length)
     new_lanes = try_step(problem, control_to_target, atol, lane_state)
     at_target = (lane_state.status == RUNNING) & (new_lanes.status == REACHED_END)
     goes_on = at_target & (new_lanes.time < control.t1)
     status = jnp.where(new_lanes.steps < control.max_steps, RUNNING, FAILED)
     new_lanes = new_lanes._replace(status=jnp.where(goes_on, status, new_lanes.status))
-    return new_lanes, length_to_try(control_to_target, lane_state), at_target & (new_lanes.time >= next_time)
+    tried_length = length_to_try(until_jump(problem, control_to_target, lane_state), lane_state)
+    return new_lanes, tried_length, at_target & (new_lanes.time >= next_time)
 
 
 def solve_with_samples(

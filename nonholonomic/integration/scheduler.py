@@ -148,10 +148,15 @@ class LaneScheduler(eqx.Module):
             explicit_tableau(solver), explicit_order(solver), rtol, t1, settings.max_steps, nonterminal, n_blocks
         )
         states, scales = problem.start()
-        zero = jnp.zeros_like(states[0])
-        rates, atols = problem.field(zero, states), settings.absolute * rtol * scales
-        lengths = first_length(problem.field, zero, states, rates, control.order, rtol, atols, n_blocks)
+        begin = jnp.zeros_like(states[0])
+        if (jumps := problem.jumps(begin, states)) is not None:
+            # Beyond a jump at the start, also by a clock in the state.
+            states = states + jumps.begin(begin) * problem.field(begin, states)
+            begin = jumps.begin(begin)
+        rates, atols = problem.field(begin, states), settings.absolute * rtol * scales
+        lengths = first_length(problem.field, begin, states, rates, control.order, rtol, atols, n_blocks)
         fresh = _fresh_lanes(problem, control, states, rates, jnp.minimum(stop_gradient(lengths), t1))
+        fresh = fresh._replace(time=begin)
         return cls(problem, control, atols, fresh, cells, settings.lanes_of(states.shape[1]), one_kernel)
 
     @property
@@ -253,7 +258,9 @@ class LaneScheduler(eqx.Module):
 
     def store(self, outcome: Outcome, lane_state: LaneState) -> Outcome:
         """Store the cells whose lanes have ended in the outcome."""
-        in_lanes = outcome_of(lane_state)
+        # A run that ends on a jump may be on its far side.
+        time = jnp.minimum(lane_state.time, self.pick(self.control.t1, lane_state.cell))
+        in_lanes = outcome_of(lane_state._replace(time=time))
         targets = jnp.where(
             (lane_state.status != RUNNING) & (lane_state.cell < self.cells), lane_state.cell, self.capacity
         )

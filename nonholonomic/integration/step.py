@@ -7,6 +7,7 @@ lengths, until the step ends on the event. The time of the event therefore has t
 from typing import NamedTuple
 
 import diffrax
+import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
@@ -14,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..compilation.xla_cpu import stored
 from .double_roots import missed_double_root, missed_loss
 from .event import Bracket, refine
-from .problem import AbstractProblem, crossing_time, side_of
+from .problem import AbstractProblem, crossing_time, least_margin, side_of
 from .runge_kutta import (
     Lanes,
     Stages,
@@ -114,7 +115,54 @@ def try_step(problem: AbstractProblem, control: Control, atol: States, lane_stat
 
     **Returns:** the lanes after the step.
     """
-    return after_step(problem, control, atol, lane_state, *trial_step(problem, control, lane_state))
+    near = until_jump(problem, control, lane_state)
+    new_lanes = after_step(problem, near, atol, lane_state, *trial_step(problem, near, lane_state))
+    return past_jump(problem, control, near, lane_state, new_lanes)
+
+
+def until_jump(problem: AbstractProblem, control: Control, lane_state: LaneState) -> Control:
+    """The control with the near side of the next jump as the horizon of each lane, if the jump comes first."""
+    jumps = problem.jumps(lane_state.time, lane_state.state)
+    return control if jumps is None else control._replace(t1=jnp.minimum(control.t1, jumps.next(lane_state.time)))
+
+
+def past_jump(
+    problem: AbstractProblem, control: Control, near: Control, lane_state: LaneState, new_lanes: LaneState
+) -> LaneState:
+    """Move the lanes whose step ended on the near side of a jump to the far side, where margins or the event function
+    may be negative. **Arguments:** `near`: as from `until_jump`; `lane_state`, `new_lanes`: before and after the step."""
+    jumps = problem.jumps(new_lanes.time, new_lanes.state)
+    if jumps is None:
+        return new_lanes
+    is_jump, _, _, far = jumps.sides(new_lanes.time)
+    landed = is_jump & (lane_state.status == RUNNING) & (new_lanes.status == REACHED_END) & (near.t1 <= new_lanes.time)
+
+    def moved() -> tuple[States, States, Lanes, Float[Array, "margins lanes"] | None]:
+        state = problem.across_jump(new_lanes.time, new_lanes.state)
+        rate, margins = problem.field(far, state), problem.margins(far, state)
+        margin = stop_gradient(least_margin(problem, new_lanes.side, far, state, rate))
+        of_far_side = (state, rate, margin, stop_gradient(jnp.stack(margins)) if margins else None)
+        return jax.tree.map(lambda new, old: jnp.where(landed, new, old), of_far_side, of_near_side)
+
+    of_near_side = (new_lanes.state, new_lanes.rate, new_lanes.margin, new_lanes.margins)
+    state, rate, margin, margins = jax.lax.cond(jnp.any(landed), moved, lambda: of_near_side)
+    time, hit = jnp.where(landed, far, new_lanes.time), landed & (margin <= 0.0)
+    far_end = Step(state, rate, rate, margin, margin, None if margins is None else margins[None], (), None)
+    lanes = new_lanes._replace(status=jnp.where(landed, RUNNING, new_lanes.status))
+    status, side, first, latest_crossing = _classify(problem, control, lanes, far_end, time, hit)
+    failed = landed & ~hit & (new_lanes.steps >= control.max_steps)
+    status = jnp.where(landed & ~hit & (time >= control.t1), REACHED_END, jnp.where(failed, FAILED, status))
+    return new_lanes._replace(
+        status=status,
+        time=time,
+        state=state,
+        rate=rate,
+        side=side,
+        margin=jnp.where(hit, jnp.abs(margin), margin),
+        margins=margins,
+        first_crossing=first,
+        crossing_time=latest_crossing,
+    )
 
 
 def trial_step(problem: AbstractProblem, control: Control, lane_state: LaneState) -> tuple[Lanes, Step]:

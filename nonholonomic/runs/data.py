@@ -54,7 +54,7 @@ class Recording(AbstractRecording):
     - `t0`: the clock's reading at the start.
     - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for outliers; `None`:
       Gaussian.
-    - `input`: the input of a stroller.
+    - `input`: the input of a stroller; `jumps`: times [s] at which it jumps, as for `stroller.simulate`.
 
     **Raises:** `ValueError` for shapes that do not fit.
 
@@ -70,6 +70,7 @@ class Recording(AbstractRecording):
     t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     input: Any = None
+    jumps: Any = None
     quantities: ClassVar[Quantities] = AnyQuantities({}, {}, ANGLES)
 
     @property
@@ -82,7 +83,7 @@ class Recording(AbstractRecording):
 
     def model(self, system: Any) -> AbstractModel:
         """The model of the recorded run, checked."""
-        model = model_of(system, self.launch, None, self.input).without_event()
+        model = model_of(system, self.launch, None, self.input, self.jumps).without_event()
         known = [*model.quantities, *_components(model)]
         for name in self.columns:
             if name not in known:
@@ -255,7 +256,7 @@ class EventTimes(AbstractEventTimes):
     - `t1`: horizon [s] of the runs.
     - `event`: a function `event(t, motion)`, whose fall through zero is the event, as for `event_time`; by default the event of
       the system itself.
-    - `input`: the input of a stroller.
+    - `input`: the input of a stroller; `jumps`: times [s] at which it jumps, as for `stroller.simulate`.
     - `until`: time [s] until which you watched a run without the event, a scalar or (n,); `t1` by default.
     - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for outliers; `None`: Gaussian.
 
@@ -278,6 +279,7 @@ class EventTimes(AbstractEventTimes):
     input: Any = None
     until: Any = eqx.field(converter=as_number_or_none, default=None)
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
+    jumps: Any = None
 
     def __check_init__(self):
         if isinstance(self.launch, list | tuple) and any(isinstance(part, eqx.Module) for part in self.launch):
@@ -291,6 +293,6 @@ class EventTimes(AbstractEventTimes):
         return tuple(f"time {k + 1}" for k in range(self.size))
 
     def model(self, system: Any) -> AbstractModel:
-        model = model_of(system, self.launch, self.event, self.input)
+        model = model_of(system, self.launch, self.event, self.input, self.jumps)
         require_event(model)
         return model

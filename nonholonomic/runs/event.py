@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..hybrid import AbstractBatchedMode, Transition
 from ..hybrid.saltation import UNMEASURED
-from ..integration import AbstractProblem, Lanes, States
+from ..integration import AbstractProblem, Jumps, Lanes, States
 from ..integration.status import CROSSED, RUNNING
 from ..lanes.components import over_lanes
 from ..lanes.tracing import depends_on_first, is_elementary, spelled_out, with_own_numbers
@@ -191,6 +191,9 @@ class EventProblem(AbstractProblem):
 
     def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
         return self.motion.margins(time, self._core(state))
+
+    def jumps(self, time: Lanes, state: States) -> Jumps | None:
+        return self.motion.jumps(time, self._core(state))
 
     def _core(self, state: Any) -> Any:
         return state[:-1] if len(self.clock) else state

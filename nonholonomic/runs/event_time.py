@@ -33,6 +33,7 @@ def event_time(
     *,
     crossing: str = "first",
     input: Any = None,
+    jumps: Any = None,
 ) -> Float[Array, ""]:
     """Time of the event of a run; works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and their compositions.
 
@@ -58,7 +59,7 @@ def event_time(
       units of the magnitudes of the system.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default `nonholonomic.integration.Oscillatory8()`.
     - `crossing`: "first", or "last" for the last fall through zero after which the function stays below zero until `t1`.
-    - `input`: the input of a stroller.
+    - `input`: the input of a stroller; `jumps`: times [s] at which the input jumps, as for `stroller.simulate`.
 
     **Returns:** the time [s]; infinite if there is no event by `t1` or if the run ends before the event; NaN if the
     integration failed or if resets follow one another without end (more than 2000), with a warning that says so, or if
@@ -97,7 +98,7 @@ def event_time(
     """
     if crossing not in ("first", "last"):
         raise ValueError(f"crossing = {shown(crossing)} must be 'first' or 'last'")
-    model = model_of(system, start, event, input)
+    model = model_of(system, start, event, input, jumps)
     check_run(model, t1, tolerance)
     require_event(model)
     settings = Settings(tolerance, solver)

@@ -37,6 +37,7 @@ def explore(
     t1: float = 8.0,
     input: Any = None,
     unit: Any = None,
+    jumps: Any = None,
 ) -> Page:
     """Make a page with sliders that simulates a run in the browser while you move a slider.
 
@@ -47,7 +48,7 @@ def explore(
 
     **Arguments:**
 
-    - `system`, `start`, `input`: as for `event_time`; the run that the page shows first.
+    - `system`, `start`, `input`, `jumps`: as for `event_time`; the run that the page shows first.
     - `path`: file to write the page to, or `None`.
     - `sliders`: name of a parameter -> (lowest, highest) value; the end of a name is enough if only one parameter
       matches.
@@ -82,7 +83,7 @@ def explore(
 
     ```
     """
-    return explore_model(model_of(system, start, None, input), path, sliders, float(t1), unit)
+    return explore_model(model_of(system, start, None, input, jumps), path, sliders, float(t1), unit)
 
 
 def explore_model(model: AbstractModel, path: Any, sliders: Any, t1: float, unit: Any) -> Page:

@@ -91,6 +91,7 @@ def lyapunov_exponent(
     tolerance: float = 1e-9,
     solver: diffrax.AbstractERK | None = None,
     input: Any = None,
+    jumps: Any = None,
 ) -> LyapunovExponent:
     """The largest Lyapunov exponent of a run, by the variational equation, through resets by the saltation matrix.
 
@@ -100,7 +101,7 @@ def lyapunov_exponent(
 
     **Arguments:**
 
-    - `system`, `start`, `input`: as for `event_time`.
+    - `system`, `start`, `input`, `jumps`: as for `event_time`.
     - `t1`: time [s] to follow the motion, positive.
     - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default `nonholonomic.integration.Oscillatory8()`.
@@ -126,7 +127,7 @@ def lyapunov_exponent(
     ```
     """
     require_outside((system, start, t1, tolerance), "lyapunov_exponent", INSTEAD)
-    model = model_of(system, start, None, input).without_event()
+    model = model_of(system, start, None, input, jumps).without_event()
     check_run(model, t1, tolerance)
     settings = Settings(tolerance, solver)
     explicit_tableau(settings.for_lanes)

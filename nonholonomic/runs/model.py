@@ -258,7 +258,7 @@ class AbstractSceneModel(AbstractModel):
 
 
 @functools.singledispatch
-def model_of(system: Any, start: Any, event: Any = None, input: Any = None) -> AbstractModel:
+def model_of(system: Any, start: Any, event: Any = None, input: Any = None, jumps: Any = None) -> AbstractModel:
     """The model of a system, for the functions of this room.
 
     Each kind of system registers its own function.
@@ -267,7 +267,7 @@ def model_of(system: Any, start: Any, event: Any = None, input: Any = None) -> A
 
     - `system`, `start`: a scene and a launch, or your own system and its initial state.
     - `event`: a function of time and motion, or `None` for the event of the system itself.
-    - `input`: the input of a driven system, or `None`.
+    - `input`: the input of a driven system, or `None`; `jumps`: times at which it jumps, or `None`.
 
     **Raises:** `ValueError` for another kind of system, or an illegal start.
 

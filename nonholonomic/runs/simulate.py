@@ -35,6 +35,7 @@ def simulate(
     solver: diffrax.AbstractSolver | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     input: Any = None,
+    jumps: Any = None,
 ) -> Any:
     """Simulate one run of a system to `t1`; works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and their compositions.
 
@@ -42,7 +43,7 @@ def simulate(
 
     **Arguments:**
 
-    - `system`, `start`, `tolerance`, `input`: as for `event_time`.
+    - `system`, `start`, `tolerance`, `input`, `jumps`: as for `event_time`.
     - `t1`: end of the run [s], positive.
     - `times`: times [s] to report, increasing, within [0, t1]; by default those of `tippe.simulate` for a top, and
       otherwise 201 equally spaced ones.
@@ -78,7 +79,7 @@ def simulate(
     ```
     """
     require_scalars({"t1": t1, "tolerance": tolerance}, "jax.vmap or sweep runs many")
-    model = model_of(system, start, None, input)
+    model = model_of(system, start, None, input, jumps)
     return model.simulate(t1, times, tolerance, solver, adjoint)
 
 

@@ -67,12 +67,14 @@ def sweep(
     progress: bool = True,
     executor: Executor | None = None,
     input: Any = None,
+    jumps: Any = None,
 ) -> Table:
     """Event times, ends and samples of all runs over a grid of parameters, in one batched call on all cores.
 
     **Arguments:**
 
-    - `system`, `start`, `event`, `tolerance`, `solver`, `input`: as for `event_time`. Without an event, runs end at `t1`.
+    - `system`, `start`, `event`, `tolerance`, `solver`, `input`, `jumps`: as for `event_time`. Without an event, runs end at
+      `t1`.
     - `t1`: horizon [s].
     - `axes`: full name of a parameter -> values, such as `{"scene.friction.mu": [0.1, 0.2]}` or
       `{"system.modes[0].drag": [0.1, 0.2], "start[1]": [0.0, 1.0]}`; the end of a name is enough if it is unique. The
@@ -127,7 +129,7 @@ def sweep(
         raise ValueError(f"axes = {shown(axes)} must be a dictionary, name of a number -> values")
     if crossing not in ("first", "last", "both"):
         raise ValueError(f"crossing = {shown(crossing)} must be 'first', 'last' or 'both'")
-    model = model_of(system, start, event, input)
+    model = model_of(system, start, event, input, jumps)
     check_run(model, t1, tolerance)
     samples = samples_of(model.quantities, times, quantities, t1)
     options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)

@@ -5,6 +5,7 @@ layout as equations written for the engine: components along the first axis, lan
 time is an additional component of the state.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,7 +16,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from ..hybrid import AbstractBatchedMode, Transition
-from ..integration import AbstractProblem, Lanes, States
+from ..integration import AbstractProblem, Jumps, Lanes, States
 from ..integration.status import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
 from ..lanes.components import over_lanes
 from ..runs import UNMEASURED
@@ -31,7 +32,8 @@ AT_END, ROUND_OFF = 1e-6, 1e-14
 class ModeProblem(AbstractProblem):
     """The motion in one mode, up to the event or the end of the mode.
 
-    `numbers`: the system's numbers; `states`, `scales`: as `start` returns them.
+    `numbers`: the system's numbers; `states`, `scales`: as `start` returns them; `jump_times`: the readings of the clock in
+    the state at which a function of the mode may jump.
     """
 
     numbers: tuple[Float[Array, "..."], ...]
@@ -39,6 +41,22 @@ class ModeProblem(AbstractProblem):
     scales: Float[Array, "components cells"]
     form: Form = eqx.field(static=True)
     mode: int = eqx.field(static=True)
+    jump_times: Float[Array, "jumps *cells"] | None = None
+
+    @classmethod
+    def of(
+        cls, numbers: tuple[Float[Array, "..."], ...], states: States, scales: States, form: Form, mode: int
+    ) -> "ModeProblem":
+        """The problem of a mode, with the jumps of its functions."""
+        times = None
+        if form.traits.depends_on_time:
+            axes = tuple(0 if jnp.ndim(number) else None for number in numbers)
+            found = functools.partial(form.jump_times, mode)
+            is_single = all(axis is None for axis in axes)
+            times = found(numbers) if is_single else jax.vmap(found, in_axes=(axes,), out_axes=-1)(numbers)
+            times = times if times.ndim == states.ndim else times.reshape(len(times), *[1] * (states.ndim - 1))
+            times = jnp.broadcast_to(times, (len(times), *states.shape[1:])) if len(times) else None
+        return cls(numbers, states, scales, form, mode, times)
 
     @property
     def direction_decides(self) -> bool:
@@ -69,6 +87,9 @@ class ModeProblem(AbstractProblem):
         # If some modes have a domain margin, all modes need one.
         return None if self.form.traits.smooth else jnp.ones_like(state[0])
 
+    def jumps(self, time: Lanes, state: States) -> Jumps | None:
+        return None if self.jump_times is None else Jumps.at(self.jump_times, state[-1] - time)
+
     def _over_lanes(self, function: OfRun, state: States) -> Any:
         """A user's function, evaluated in every lane."""
 
@@ -98,7 +119,7 @@ class BatchedMode(AbstractBatchedMode):
     continues: bool = eqx.field(static=True, default=False)
 
     def problem(self, state: Float[Array, "components cells"]) -> ModeProblem:
-        return ModeProblem(self.numbers, state, self.scales, self.form, self.mode)
+        return ModeProblem.of(self.numbers, state, self.scales, self.form, self.mode)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """The reset, or the end of the run if the mode has no reset.
@@ -230,7 +251,7 @@ class Cells(eqx.Module):
 
     def problem(self, cells: int | None) -> ModeProblem:
         """The problem of a system whose runs are smooth."""
-        return ModeProblem(self.numbers, *self.states(cells), self.form, self.form.first)
+        return ModeProblem.of(self.numbers, *self.states(cells), self.form, self.form.first)
 
     def modes(
         self, cells: int, continues: bool = False

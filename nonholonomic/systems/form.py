@@ -3,6 +3,7 @@ tracing."""
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..lanes.comparisons import jumps_of, warn_of_unclear
 from ..lanes.tracing import depends_on_first, is_elementary, named_errors, spelled_out
 from ..parameters import TreeForm
 from ..text import described
@@ -55,6 +57,13 @@ class Form:
             return function(t, y)
 
         return called
+
+    def jump_times(self, mode: int, numbers: Sequence[Array]) -> Array:
+        """The times at which the functions of a mode that are evaluated within steps may jump, (jumps,)."""
+        _, t, y = self.arguments
+        names = ["field", *(["margin"] if self.traits.ends[mode] else []), *(["event"] if self.has_event else [])]
+        functions = [functools.partial(self.function(name, mode), numbers) for name in names]
+        return jnp.concatenate([jumps_of(function, t, y)[0] for function in functions])
 
     @property
     def arguments(self) -> tuple[Any, ...]:
@@ -116,8 +125,16 @@ def _traits(form: Form) -> Traits:
         return lambda t, y, *numbers: [function(numbers, t, y) for function in functions]
 
     numbers, t, y = form.arguments
+
+    def warned(numbers: Sequence[Array]) -> None:
+        for k, own in itertools.product(range(form.modes), ("field", "margin")):
+            if own == "field" or ends[k]:
+                warn_of_unclear(_name(own, k), functools.partial(form.function(own, k), numbers), y)
+
     modes = form.system([jnp.zeros((), kind.dtype) for kind in numbers]).modes
     depends_on_time = depends_on_first(combined([*step_functions, *reset_functions]), t, y, *numbers)
+    if depends_on_time:
+        jax.eval_shape(warned, numbers)
     return Traits(
         depends_on_time,
         is_elementary(spelled_out(combined(step_functions)), t, y, *numbers),

@@ -238,18 +238,23 @@ def checked_event(event: Any, state: Array) -> Event:
         return with_own_numbers(event, jnp.zeros(()), state)
 
 
-def require_no_input(input: Any) -> None:
+def require_no_input(input: Any, jumps: Any) -> None:
     """Raise `ValueError` unless there is no input, because a user's system has none apart from its own functions."""
     if input is not None:
         raise ValueError(
             f"input = {shown(input)} must be None for your own system: write the input into field(t, y) of a mode or into "
             "force(t, q, rate) of an AbstractSystem, as numbers or functions of the system"
         )
+    if jumps is not None:
+        raise ValueError(
+            f"jumps = {shown(jumps)} must be None for your own system: compare t itself with numbers in its functions, such as "
+            "t > self.switch, and the times are found"
+        )
 
 
 @model_of.register(Hybrid)
-def _(system: Hybrid, start: Any, event: Event | None = None, input: Any = None) -> OwnModel:
-    require_no_input(input)
+def _(system: Hybrid, start: Any, event: Event | None = None, input: Any = None, jumps: Any = None) -> OwnModel:
+    require_no_input(input, jumps)
     check_start(system, start)
     # With a mechanical system among the modes, a state is (q, rate).
     has_pairs = any(isinstance(mode, AbstractSystem) for mode in system.modes) and is_pair(start)
@@ -262,8 +267,8 @@ def _(system: Hybrid, start: Any, event: Event | None = None, input: Any = None)
 
 
 @model_of.register(AbstractSystem)
-def _(system: AbstractSystem, start: Any, event: Event | None = None, input: Any = None) -> OwnModel:
-    require_no_input(input)
+def _(system: AbstractSystem, start: Any, event: Event | None = None, input: Any = None, jumps: Any = None) -> OwnModel:
+    require_no_input(input, jumps)
     check_start(system, start)
     q, rate = (as_number(part) for part in start)
     if event is not None:
@@ -272,7 +277,7 @@ def _(system: AbstractSystem, start: Any, event: Event | None = None, input: Any
 
 
 @model_of.register(AbstractMode)
-def _(system: AbstractMode, start: Any, event: Event | None = None, input: Any = None) -> OwnModel:
+def _(system: AbstractMode, start: Any, event: Event | None = None, input: Any = None, jumps: Any = None) -> OwnModel:
     raise ValueError(
         f"system = {shown(system)} must be a Hybrid or an AbstractSystem; wrap modes in nonholonomic.Hybrid([...])"
     )

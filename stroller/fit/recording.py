@@ -37,7 +37,7 @@ class Recording(AbstractRecording):
     - `quantity`: "position" ("x", "y", "z") [m] of the rear axle in the fixed frame, "heading", "steering" [rad],
       "speed" [m/s], "yaw_rate" or "steering_rate" [rad/s], all as in `Trajectory`; or a tuple of some of these words. A
       heading may differ by whole turns.
-    - `input`: the input of the ride, as for `simulate`.
+    - `input`, `jumps`: the input of the ride and the times at which it jumps, as for `simulate`.
     - `t0`: the clock's reading [s] at the launch. Before this time, the stroller is at its launch position.
     - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for data with outliers;
       `None` for Gaussian errors.
@@ -58,13 +58,14 @@ class Recording(AbstractRecording):
     input: Input | None = None
     t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
+    jumps: Any = None
     quantities: ClassVar[Quantities] = QUANTITIES
 
     def model(self, scene: Scene) -> AbstractModel:
         """The model of the recorded ride, checked."""
         require_kind(scene, "data: the scene of a stroller.Recording", Scene)
         scene.check(self.launch)
-        return RideModel.of(scene, self.launch, self.input)
+        return RideModel.of(scene, self.launch, self.input, None, self.jumps)
 
     def __check_init__(self):
         require_kind(self.launch, "launch", Launch, several="identify takes a list of recordings")
@@ -81,6 +82,7 @@ def read_recording(
     t0: float = 0.0,
     student: float | None = None,
     decimal: str = ".",
+    jumps: Any = None,
 ) -> Recording:
     """A recording of a ride from a text file of columns with a header line (CSV).
 
@@ -94,7 +96,7 @@ def read_recording(
       such as metres per pixel. If the header has the unit, as "speed [km/h]", the header is enough. By default, the
       columns whose headers are quantities with units, such as "time [s]" and "speed [km/h]".
     - `fps`: frames per second, if there is no `"time"`. If there is no `"frame"` either, every line is a frame.
-    - `launch`: a `Launch`, with guesses for unknown numbers; `input`, `t0`, `student`: as for `Recording`.
+    - `launch`: a `Launch`, with guesses for unknown numbers; `input`, `jumps`, `t0`, `student`: as for `Recording`.
     - `error`: quantity -> (standard error or the header of its column, unit); with `None`, errors are estimated from
       the residuals.
     - `decimal`: "," if the file has decimal commas.
@@ -114,4 +116,4 @@ def read_recording(
     [0. 1. 2.] [1.5  1.39 1.31]
     """
     table = read_columns(path, columns, fps, error, QUANTITIES, decimal)
-    return Recording(launch, *table, input=input, t0=t0, student=student)
+    return Recording(launch, *table, input=input, t0=t0, student=student, jumps=jumps)

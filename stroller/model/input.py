@@ -16,6 +16,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Vector
+from nonholonomic.lanes.comparisons import jumps_of, warn_of_unclear
+from nonholonomic.per_run import is_users
 from nonholonomic.text import name_of
 from nonholonomic.validation import Bound, Bounded, as_number, is_traced, shown
 
@@ -98,15 +100,20 @@ def at_start(scene: Any, launch: Any) -> tuple[Float[Array, ""], Motion]:
     return jnp.zeros(()), scene.dynamics.geometry(state).motion
 
 
-def check_input(controls: Any, scene: Any, launch: Any) -> None:
-    """Raise `ValueError` unless an input can be called, traced by JAX, and is finite at the start of a run.
+def check_input(controls: Any, scene: Any, launch: Any, jumps: Any = None) -> None:
+    """Raise `ValueError` unless an input can be called, traced by JAX, and is finite at the start of a run; warn of
+    comparisons of the time whose jumps are unknown.
 
     **Arguments:**
 
     - `controls`: an input, or `None`.
     - `scene`, `launch`: scene and launch of the ride, with concrete or traced numbers.
+    - `jumps`: times at which the input jumps, or `None`.
     """
+    as_jumps(jumps)
     if controls is None:
+        if jumps is not None:
+            raise ValueError(f"jumps = {shown(jumps)} must be None without an input: the input is what jumps")
         return
     if not callable(controls):
         raise ValueError(f"input = {shown(controls)} must be {WANTED}, or None")
@@ -132,10 +139,56 @@ def check_input(controls: Any, scene: Any, launch: Any) -> None:
     if not any(is_traced(part) for part in values) and not np.all(np.isfinite([float(part) for part in values])):
         numbers = ", ".join(f"{float(part):g}" for part in values)
         raise ValueError(f"{name} must be finite: at the start it gives ({numbers})")
+    if jumps is None and is_searched(controls):
+        remedy = ", or pass the times of the jumps as jumps=[...], which is [] if there are none"
+        warn_of_unclear("input(t, motion)", controls, motion, remedy=remedy)
 
 
 def _first_line(error: Exception) -> str:
     return str(error).strip().splitlines()[0]
+
+
+def as_jumps(jumps: Any) -> tuple[Array, ...]:
+    """The times at which an input jumps, as a tuple of numbers; raises `ValueError` unless they are a list of times."""
+    times = () if jumps is None else jumps
+    if not isinstance(times, list | tuple) and getattr(times, "ndim", None) != 1:
+        raise ValueError(f"jumps = {shown(jumps)} must be a list of times [s] at which the input jumps, or None")
+    return tuple(map(as_number, times))
+
+
+def is_searched(controls: Any) -> bool:
+    """Whether an input is a user's, so that its comparisons of the time are searched for jumps; those of plans are smooth."""
+    if is_users(type(controls)):
+        return True
+    # A module that evaluates another one ride by ride.
+    inner = getattr(controls, "input", getattr(controls, "function", None))
+    return getattr(controls, "searched", False) if inner is None else is_searched(inner)
+
+
+def jump_times(
+    controls: Any, jumps: tuple[Array, ...], t: Any, motion: Any, cells: int | None
+) -> Float[Array, "jumps *cells"] | None:
+    """The times at which an input may jump: those given, and those of its comparisons of the time; `None` if there are none.
+
+    **Arguments:** `controls`: an input as a module, with the cells in the last axis of its arrays if there are cells; `jumps`:
+    given times, scalars or (cells,); `t`, `motion`: the types of its arguments, scalars.
+    """
+    arrays, static = eqx.partition(controls, eqx.is_inexact_array)
+
+    def found(arrays: Any) -> Float[Array, " jumps"]:
+        return jumps_of(eqx.combine(arrays, static), t, motion)[0]
+
+    if not is_searched(controls):
+        times = jnp.zeros(0)
+    elif cells is None:
+        times = found(arrays)
+    else:
+        axes = jax.tree.map(lambda leaf: -1 if leaf.ndim else None, arrays)
+        is_single = all(leaf.ndim == 0 for leaf in jax.tree.leaves(arrays))
+        times = found(arrays) if is_single else jax.vmap(found, in_axes=(axes,), out_axes=-1)(arrays)
+    shape = () if cells is None else (cells,)
+    rows = [jnp.broadcast_to(time, shape) for time in (*times, *jumps)]
+    return jnp.stack(rows) if rows else None
 
 
 class Program:
@@ -161,12 +214,13 @@ class Formula(eqx.Module):
 
     held: tuple[Array, ...]
     program: Program = eqx.field(static=True)
+    searched: bool = eqx.field(static=True, default=True)
 
     @classmethod
     def of(cls, controls: Input, t: Any, motion: Any) -> "Formula":
         """The formula of a function that takes scalars of these types; their values do not matter."""
         closed = jax.make_jaxpr(lambda *arguments: tuple(map(as_number, controls(*arguments))))(t, motion)
-        return cls(tuple(closed.consts), Program(closed.jaxpr))
+        return cls(tuple(closed.consts), Program(closed.jaxpr), is_searched(controls))
 
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         leaves = jnp.broadcast_arrays(*jax.tree.leaves((t, motion)))

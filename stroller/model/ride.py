@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Plane
-from nonholonomic.integration import AbstractProblem
+from nonholonomic.integration import AbstractProblem, Jumps
 from nonholonomic.lanes.objects import Held
 from nonholonomic.per_run import is_array, is_users, parted
 
 from .dynamics import Dynamics, State
 from .heading import Projected
-from .input import Formula, Input, at_start
+from .input import Formula, Input, at_start, is_searched, jump_times
 from .launch import Launch
 from .per_ride import MOST_ELEMENTS, PerRide
 from .scene import Scene
@@ -40,21 +40,43 @@ class RideProblem(AbstractProblem):
     press: Float[Array, "..."]
     watched: bool = eqx.field(static=True)
     guarded: bool = eqx.field(static=True)
+    jump_times: Float[Array, "jumps *cells"] | None = None
 
     @property
     def fits_one_kernel(self) -> bool:
         return not isinstance(self.input, PerRide) or self.input.by_elements
 
     @classmethod
-    def single(cls, scene: Scene, launch: Launch, controls: Input | None) -> "RideProblem":
-        """The problem of one ride, which continues if contact or rank is lost."""
+    def single(
+        cls,
+        scene: Scene,
+        launch: Launch,
+        controls: Input | None,
+        jumps: tuple[Array, ...] = (),
+        cells: int | None = None,
+    ) -> "RideProblem":
+        """The problem of one ride, which continues if contact or rank is lost. **Arguments:** `jumps`: times at which the
+        input jumps, apart from those that its comparisons of the time show."""
         driven = controls is not None
         press = scene.body.mass * (scene.gravity + launch.speed**2 / scene.body.wheelbase + 1e-3)
         start = (scene.state(launch, driven), scene.scales(launch, driven))
-        return cls(scene.dynamics, controls, *start, press, False, False)
+        times = None
+        if controls is not None and (jumps or is_searched(controls)):
+            t, motion = eqx.filter_eval_shape(at_start, scene, launch)
+            t, motion = jax.tree.map(lambda part: jnp.zeros((), part.dtype), (t, motion))
+            times = jump_times(controls, jumps, t, motion, cells)
+        return cls(scene.dynamics, controls, *start, press, False, False, times)
 
     @classmethod
-    def of(cls, scene: Scene, launch: Launch, controls: Input | None, cells: int, watched: bool) -> "RideProblem":
+    def of(
+        cls,
+        scene: Scene,
+        launch: Launch,
+        controls: Input | None,
+        cells: int,
+        watched: bool,
+        jumps: tuple[Array, ...] = (),
+    ) -> "RideProblem":
         """The problem of the given number of cells; every number is a scalar or one per cell."""
 
         def spread(states):
@@ -64,7 +86,7 @@ class RideProblem(AbstractProblem):
             t, motion = eqx.filter_eval_shape(at_start, scene, launch)
             of_one_ride = jax.tree.map(lambda part: jax.ShapeDtypeStruct((), part.dtype), (t, motion))
             controls = PerRide.of(controls, *of_one_ride).of_cells(cells)
-        ride = cls.single(scene, launch, controls)
+        ride = cls.single(scene, launch, controls, jumps, cells)
         guarded, watched = (
             isinstance(ride.dynamics.heading, Projected),
             watched and not isinstance(scene.surface, Plane),
@@ -86,6 +108,9 @@ class RideProblem(AbstractProblem):
 
     def domain_margin(self, time: Float[Array, "..."], state: State) -> Any:
         return self.dynamics.rank(state) / RANK_LOST - 1.0 if self.guarded else None
+
+    def jumps(self, time: Float[Array, "..."], state: State) -> Jumps | None:
+        return None if self.jump_times is None else Jumps.at(self.jump_times)
 
 
 def as_module(controls: Input | None, scene: Scene, launch: Launch) -> Any:

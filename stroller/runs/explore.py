@@ -77,7 +77,7 @@ class WheelAngles(AbstractPassive):
 
 def rolling_ride(model: RideModel) -> ExtendedProblem[RideProblem]:
     """A ride of one cell with the rolling angles of its wheels."""
-    ride = RideProblem.of(model.scene, model.launch, model.input, 1, False)
+    ride = RideProblem.of(model.scene, model.launch, model.input, 1, False, model.jumps)
     return ExtendedProblem(ride, WheelAngles(), jnp.zeros((3, 1)), jnp.ones((3, 1)))
 
 

@@ -32,7 +32,7 @@ from nonholonomic.text import name_of
 from nonholonomic.validation import require_all, require_kind, require_scalars
 
 from ..model.friction import Damping, RollingResistance
-from ..model.input import Formula, Input, Steady, at_start, check_input
+from ..model.input import Formula, Input, Steady, as_jumps, at_start, check_input
 from ..model.launch import Launch
 from ..model.per_ride import PerRide
 from ..model.ride import RideProblem, as_module, has_arrays
@@ -104,7 +104,7 @@ class RideModel(AbstractSceneModel):
     """A ride, or the rides of many cells: scene, launch and input, and the event. Without another event, the event is
     that the ground would have to pull; a ride continues through this event.
 
-    `original`: the user's input, if it was traced.
+    `original`: the user's input, if it was traced; `jumps`: times at which it jumps, apart from those found in it.
     """
 
     scene: Scene
@@ -112,24 +112,25 @@ class RideModel(AbstractSceneModel):
     input: Any
     event: EventFunction | None = None
     original: "Original | None" = eqx.field(static=True, default=None)
+    jumps: tuple[Array, ...] = ()
 
     continues = True
     # Nothing is watched.
     comparable = ("speed",)
 
     @classmethod
-    def of(cls, scene: Scene, launch: Launch, controls: Any, event: Any = None) -> AbstractModel:
+    def of(cls, scene: Scene, launch: Launch, controls: Any, event: Any = None, jumps: Any = None) -> AbstractModel:
         """The model of a ride, with a user's event if there is one."""
         module = as_module(controls, scene, launch)
         original = None if isinstance(module, Held) or module is controls else Original(controls)
-        ride = cls(scene=scene, launch=launch, input=module, original=original)
+        ride = cls(scene=scene, launch=launch, input=module, original=original, jumps=as_jumps(jumps))
         return with_event(ride, event)
 
     def __reduce__(self) -> Any:
         # A traced function cannot be pickled, so each process traces it.
         controls = self.input if self.original is None else self.original.input
         event = None if self.event is None else self.event.function
-        return RideModel.of, (self.scene, self.launch, controls, event)
+        return RideModel.of, (self.scene, self.launch, controls, event, self.jumps)
 
     @property
     def roots(self) -> dict[str, Any]:
@@ -173,6 +174,7 @@ class RideModel(AbstractSceneModel):
         else:
             controls = "none" if controls is None else name_of(controls)
         request = description("scene", self.scene) | description("launch", self.launch) | {"input": controls}
+        request |= {"jumps": [float(time) for time in self.jumps]} if self.jumps else {}
         return request if self.event is None else request | {"event": self.event.name}
 
     def check(self) -> None:
@@ -206,10 +208,10 @@ class RideModel(AbstractSceneModel):
 
     def problem(self, cells: int | None, names: Names) -> AbstractProblem:
         if cells is None:
-            ride = RideProblem.single(self.scene, self.launch, self.input)
+            ride = RideProblem.single(self.scene, self.launch, self.input, self.jumps)
         else:
             watched = self.event is None and names is not None and not names
-            ride = RideProblem.of(self.scene, self.launch, self.input, cells, watched)
+            ride = RideProblem.of(self.scene, self.launch, self.input, cells, watched, self.jumps)
         # The state ends with the time if a quantity depends on the input.
         if self.input is None or names is None or TIMED.isdisjoint(names):
             return ride
@@ -268,10 +270,10 @@ class RideModel(AbstractSceneModel):
 
 
 @model_of.register(Scene)
-def _(system: Scene, start: Any, event: Any = None, input: Input | None = None) -> AbstractModel:
+def _(system: Scene, start: Any, event: Any = None, input: Input | None = None, jumps: Any = None) -> AbstractModel:
     require_kind(start, "start", Launch)
     lists = "axes of sweep take lists, and jax.vmap maps over them"
     require_scalars(numbers("scene", system, functions=False) | numbers("launch", start), lists)
     system.check(start)
-    check_input(input, system, start)
-    return RideModel.of(system, start, input, event)
+    check_input(input, system, start, jumps)
+    return RideModel.of(system, start, input, event, jumps)

@@ -39,7 +39,10 @@ def ride(
     times = evenly_spaced(end) if times is None else as_known(times)
     require_times(times, t1)
     if isinstance(solver, ImplicitMidpoint):
-        grid = even_steps(times, end, solver.step_length)
+        jumps = model.problem(None, ()).jump_times
+        known = jumps is not None and not is_traced((jumps, times, end))
+        inside = [time for time in np.asarray(jumps) if 0.0 < time < end] if known else []
+        grid = even_steps(jnp.asarray(np.union1d(times, inside)) if inside else times, end, solver.step_length)
         max_steps = grid.size
     settings = Settings(tolerance, solver, max_steps=max_steps)
     # Inside a transformation, this traces all numbers, even if they are known.

@@ -169,7 +169,7 @@ def _counted(accepted: int, rejected: int, finished: bool) -> Stats:
 
 @eqx.filter_jit
 def _problem(spec: RideSpec) -> RideProblem:
-    return RideProblem.single(spec.scene, spec.launch, spec.input)
+    return RideProblem.single(spec.scene, spec.launch, spec.input, spec.model.jumps)
 
 
 @compiled_quickly

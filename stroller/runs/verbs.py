@@ -47,6 +47,7 @@ def simulate(
     solver: diffrax.AbstractSolver | None = None,
     max_steps: int = 65536,
     adjoint: diffrax.AbstractAdjoint | None = None,
+    jumps: Sequence[Any] | Array | None = None,
 ) -> Trajectory:
     """Simulate a ride from a launch until `t1`.
 
@@ -66,6 +67,8 @@ def simulate(
     - `adjoint`: an adjoint method of Diffrax, such as `RecursiveCheckpointAdjoint()`, with which Diffrax
       differentiates. By default, this package computes forward and reverse derivatives; the gradient of a loss function
       costs about five runs, whatever the number of parameters, which may be arrays, such as the weights of an input.
+    - `jumps`: times [s] at which the input jumps or has a kink, so that steps end there. The times of comparisons of the time
+      with numbers, such as `t > 1.0`, and the knots of `jnp.interp` are found without being named here.
 
     **Returns:** a `Trajectory`; its `status` states how the run ended.
 
@@ -86,8 +89,8 @@ def simulate(
 
     ```
     """
-    check_run(scene, launch, t1, input, tolerance)
-    return ride(RideModel.of(scene, launch, input), t1, times, tolerance, solver, max_steps, adjoint)
+    check_run(scene, launch, t1, input, tolerance, jumps)
+    return ride(RideModel.of(scene, launch, input, None, jumps), t1, times, tolerance, solver, max_steps, adjoint)
 
 
 def sweep(
@@ -103,6 +106,7 @@ def sweep(
     progress: bool = True,
     executor: Executor | None = None,
     max_steps: int = DEFAULT_MAX_STEPS,
+    jumps: Sequence[Any] | Array | None = None,
 ) -> Table:
     """The ends of all rides over a grid of parameters, in one batched call on all cores.
 
@@ -122,6 +126,7 @@ def sweep(
     - `executor`: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a Dask client;
       by default, a thread for each core. On the same kind of processor, all executors give bitwise equal results.
     - `max_steps`: a ride that needs more steps, including rejected ones, fails; at least 1.
+    - `jumps`: times [s] at which the input jumps, as for `simulate`.
 
     **Returns:** a `Table` of the rides' ends: position `x`, `y`, `z` [m] in the fixed frame, `heading`, `end_steering`
     [rad], `end_speed` [m/s], `energy` [J], `residual` [J] of energy against work, `contact_time` [s] at which the
@@ -146,11 +151,11 @@ def sweep(
 
     ```
     """
-    require_outside((scene, launch, t1, axes, input), "sweep", "simulate")
-    check_run(scene, launch, t1, input, tolerance)
+    require_outside((scene, launch, t1, axes, input, jumps), "sweep", "simulate")
+    check_run(scene, launch, t1, input, tolerance, jumps)
     if not isinstance(axes, dict) or not all(isinstance(number, str) for number in axes):
         raise ValueError(f"axes = {shown(axes)} must be a dictionary, full name of a parameter -> values")
-    model = RideModel.of(scene, launch, input)
+    model = RideModel.of(scene, launch, input, None, jumps)
     options = Options(tolerance, solver, max_steps, path=path, progress=progress, executor=executor)
     return table_of(model, full_axes(axes, model.known), float(t1), "first", options, FORM)
 
@@ -164,6 +169,7 @@ def explore(
     t1: float = 8.0,
     input: Input | None = None,
     unit: str | Sequence[str] | None = None,
+    jumps: Sequence[Any] | Array | None = None,
 ) -> Page:
     """Make a page with sliders that simulates the ride in the browser while you move a slider.
 
@@ -182,6 +188,7 @@ def explore(
       friction.
     - `t1`: horizon [s].
     - `unit`: unit of the curves, such as "deg" for all angles.
+    - `jumps`: times [s] at which the input jumps, as for `simulate`.
 
     **Returns:** a `Page`, with its `html`.
 
@@ -202,14 +209,14 @@ def explore(
 
     ```
     """
-    check_run(scene, launch, t1, input, TOLERANCE)
-    return explore_model(RideModel.of(scene, launch, input), path, sliders, float(t1), unit)
+    check_run(scene, launch, t1, input, TOLERANCE, jumps)
+    return explore_model(RideModel.of(scene, launch, input, None, jumps), path, sliders, float(t1), unit)
 
 
-def check_run(scene: Any, launch: Any, t1: Any, input: Any, tolerance: Any) -> None:
+def check_run(scene: Any, launch: Any, t1: Any, input: Any, tolerance: Any, jumps: Any = None) -> None:
     """Raise `ValueError` unless scene, launch, horizon, input and tolerance are legal and the scene can start with the
     launch."""
     lists = "axes of sweep take lists, and jax.vmap maps over them"
     require_run(scene, launch, t1, tolerance, (Scene, Launch), lists)
     scene.check(launch)
-    check_input(input, scene, launch)
+    check_input(input, scene, launch, jumps)

@@ -305,10 +305,11 @@ def with_parts(run: TrajectoryProblem, scene: Scene, names: tuple[str, ...]) -> 
 
 
 @model_of.register(Scene)
-def _(system: Scene, start: Any, event: Any = None, input: Any = None) -> AbstractModel:
+def _(system: Scene, start: Any, event: Any = None, input: Any = None, jumps: Any = None) -> AbstractModel:
     require_kind(start, "start", Launch)
-    if input is not None:
-        raise ValueError("input must be None for a tippe.Scene: nothing drives a top")
+    if input is not None or jumps is not None:
+        name = "jumps" if input is None else "input"
+        raise ValueError(f"{name} must be None for a tippe.Scene: nothing drives a top")
     lists = "axes of sweep take lists, and jax.vmap maps over them"
     require_scalars(numbers("scene", system, functions=False) | numbers("launch", start), lists)
     system.check_start(start)

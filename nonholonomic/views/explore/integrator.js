@@ -68,17 +68,17 @@ function integrator(model) {
       while (lane[at.status] === model.running) {
         model.length(constants, lane, length);
         margins[0].set(lane.subarray(at.margins, at.margins + m));
-        const from = lane[at.time], before = record && { time: from, state: state.slice(), rate: rate.slice(), constants: held };
+        const from = lane[at.time], before = record && { time: from, state: state.slice(), rate: rate.slice(), length: length[0], constants: held };
         step(from, state, rate, lane[at.side], length[0]);
         model.after(constants, lane, length, tried, lane);
         if (record && lane[at.time] > from) record(before);
       }
     }
 
-    // The state at a time within a recorded step, by a shorter step from the same start.
+    // The state at a time within a recorded step, by a shorter step from the same start, which does not pass a jump.
     function within(one, wanted) {
       constants.set(one.constants);
-      step(one.time, one.state, one.rate, 1, wanted - one.time, false);
+      step(one.time, one.state, one.rate, 1, Math.min(wanted - one.time, one.length), false);
       return end;
     }
     return { run, within, constants, lane };

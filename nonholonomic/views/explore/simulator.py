@@ -19,7 +19,7 @@ from ...integration import AbstractProblem, LaneState, Settings, explicit_tablea
 from ...integration.runge_kutta import Step, inner_stages, middle_weights, watched_places
 from ...integration.scheduler import LaneScheduler
 from ...integration.status import RUNNING
-from ...integration.step import Control, after_step, length_to_try, looks_of
+from ...integration.step import Control, after_step, length_to_try, looks_of, past_jump, until_jump
 from .javascript import javascript
 
 Numbers = Float[Array, " numbers"]
@@ -102,11 +102,16 @@ class Stepper(NamedTuple):
 
         def after(constants: Any, lane: LaneState, length: Any, trial: Step) -> LaneState:
             problem, control, atols = run(constants)
-            return after_step(problem, control, atols, lane, length, trial)
+            near = until_jump(problem, control, lane)
+            new_lane = after_step(problem, near, atols, lane, length, trial)
+            return past_jump(problem, control, near, lane, new_lane)
+
+        def length(constants: Any, lane: LaneState) -> Any:
+            return length_to_try(until_jump(*run(constants)[:2], lane), lane)
 
         return {
             "begin": (lambda *inputs: eqx.filter(_started(self.begin, *inputs), eqx.is_array), self.examples),
-            "length": (lambda constants, lane: length_to_try(run(constants)[1], lane), (constants, lane)),
+            "length": (length, (constants, lane)),
             "field": (lambda constants, time, state: run(constants)[0].field(time, state), (constants, time, state)),
             "margins": (
                 lambda constants, time, state: run(constants)[0].margins(time, state),

@@ -1,0 +1,220 @@
+"""Find the times at which a user's function of time jumps or has a kink, by reading its jaxpr.
+
+A value is known, affine in the time, piecewise constant in the time, or something else. A comparison of two affine or known
+values holds up to a time that follows from them, whatever operations they consist of; so do `sign`, `abs`, `max`, `min` and
+`clip`, and the search among known numbers in `jnp.interp`. A comparison of something else that depends on the time cannot be
+solved, and is reported.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Jaxpr, Literal
+from jaxtyping import Array, Float
+
+from ..warning import warn
+
+
+class Known(NamedTuple):
+    """A value that does not depend on the arguments."""
+
+    value: Any
+
+
+class Affine(NamedTuple):
+    """A value `slope * t + offset`; if `bent`, the value is a constant in some intervals that end at known times."""
+
+    slope: Any
+    offset: Any
+    bent: bool = False
+
+
+class Other(NamedTuple):
+    """Any other value: whether it depends on the time other than by jumps that were found."""
+
+    depends_on_time: bool
+
+
+#: Operations that move elements or change nothing: applied to slope and offset alike.
+LINEAR = ["broadcast_in_dim", "reshape", "squeeze", "expand_dims", "slice", "transpose", "rev", "reduce_sum", "neg"]
+LINEAR += ["copy", "copy_p", "stop_gradient", "optimization_barrier"]
+COMPARISONS = ["gt", "ge", "lt", "le", "eq", "ne", "lt_to", "le_to"]
+KINKS = ["max", "min", "abs", "sign", "clamp"]
+STAIRS = ["floor", "ceil", "round"]
+
+#: Functions of JAX that are smooth, whatever their operations.
+SMOOTH = ["sinc"]
+
+
+def jumps_of(function: Callable[..., Any], t: Any, *others: Any) -> tuple[Float[Array, " jumps"], tuple[str, ...]]:
+    """The times at which a function of time and of other arguments may jump or have a kink.
+
+    **Arguments:** the function, and examples of its arguments; the numbers that it closes over may be traced.
+
+    **Returns:** the times, differentiable with respect to these numbers; not finite where there is no such time; and the
+    names of the comparisons whose times cannot be found.
+
+    **Example:**
+
+    >>> from nonholonomic.lanes.comparisons import jumps_of
+    >>> times, unclear = jumps_of(lambda t: jnp.where((t > 1.0) & (2.0 * t < 3.0), jnp.clip(t, 0.0, 5.0), 0.0), 0.0)
+    >>> print(times, unclear)
+    [1.  1.5 0.  5. ] ()
+    """
+    closed = jax.make_jaxpr(function)(t, *others)
+    reader = _Reader([], {})
+    rest = [Other(False)] * (len(closed.jaxpr.invars) - 1)
+    reader.read(closed.jaxpr, [Known(const) for const in closed.consts], [Affine(1.0, 0.0), *rest])
+    times = [jnp.ravel(jnp.asarray(time, float)) for time in reader.times]
+    return jnp.concatenate([jnp.zeros(0), *times]), tuple(reader.unclear)
+
+
+def warn_of_unclear(name: str, function: Callable[..., Any], *others: Any, remedy: str = "") -> None:
+    """Warn if a function of time compares something whose times are unknown. **Arguments:** `name`: the function, such as
+    "input(t, motion)"; `others`: examples of its arguments after the time; `remedy`: what else the user can do."""
+    unclear: list[str] = []
+
+    def times(*others: Any) -> Array:
+        times, names = jumps_of(function, jnp.zeros(()), *others)
+        unclear.extend(names)
+        return times
+
+    jax.eval_shape(times, *others)
+    if unclear:
+        warn(
+            f"{name} compares ({', '.join(unclear)}) a quantity that depends on the time, and may jump at times that are "
+            f"unknown: a short pulse can be missed. Compare t itself with numbers, such as t > 1.0, which are found{remedy}"
+        )
+
+
+class _Reader(NamedTuple):
+    """The times found so far, and the comparisons whose times cannot be found, as the keys of a dictionary."""
+
+    times: list[Any]
+    unclear: dict[str, None]
+
+    def read(self, jaxpr: Jaxpr, consts: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
+        """The kinds of the results of a jaxpr."""
+        kinds = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *inputs), strict=True))
+
+        def kind(atom: Any) -> Any:
+            return Known(atom.val) if isinstance(atom, Literal) else kinds[atom]
+
+        for equation in jaxpr.eqns:
+            results = self.apply(equation, [kind(atom) for atom in equation.invars])
+            kinds |= dict(zip(equation.outvars, results, strict=True))
+        return [kind(atom) for atom in jaxpr.outvars]
+
+    def apply(self, equation: Any, inputs: list[Any]) -> list[Any]:
+        """The kinds of the results of an equation."""
+        name, parameters, count = equation.primitive.name, equation.params, len(equation.outvars)
+        inner = [parameters[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in parameters]
+        if all(isinstance(kind, Known) for kind in inputs):
+            values = equation.primitive.bind(
+                *(kind.value for kind in inputs), **equation.primitive.get_bind_params(parameters)
+            )
+            return [Known(value) for value in (values if equation.primitive.multiple_results else [values])]
+        depends = any(map(_depends, inputs))
+        if parameters.get("name") in SMOOTH:
+            return [Other(depends)] * count
+        if parameters.get("name") == "searchsorted" and isinstance(inputs[0], Known):
+            return [self.compared(name, [Known(jnp.ravel(inputs[0].value)), inputs[1]])]
+        if name == "cond":
+            branches = [
+                self.read(one.jaxpr, list(map(Known, one.consts)), inputs[1:]) for one in parameters["branches"]
+            ]
+            return [Other(any(map(_depends, (inputs[0], *kinds)))) for kinds in zip(*branches, strict=True)]
+        if name in ("while", "scan"):
+            if depends and any(_compares(part) for part in parameters.values()):
+                self.unclear[name] = None
+            return [Other(depends)] * count
+        if inner:
+            jaxpr = getattr(inner[0], "jaxpr", inner[0])
+            return self.read(jaxpr, list(map(Known, getattr(inner[0], "consts", ()))), inputs)
+        if not depends:
+            return [Other(False)] * count
+        is_real = jnp.issubdtype(equation.invars[0].aval.dtype, jnp.inexact)
+        if name in COMPARISONS or (name == "sign" and is_real):
+            return [self.compared(name, inputs) if is_real else Other(False)]
+        is_index = name == "convert_element_type" and not jnp.issubdtype(parameters["new_dtype"], jnp.inexact)
+        if (name in STAIRS or is_index) and is_real:
+            # Its steps are known, but not how many there are.
+            self.unclear["int" if is_index else name] = None
+            return [Other(False)]
+        if name in KINKS and is_real:
+            pairs = [inputs[:2], inputs[1:]] if name == "clamp" else [inputs]
+            for pair in pairs:
+                self.solve(pair)
+            moving = [kind for kind in inputs if not isinstance(kind, Known)]
+            is_bent = name != "abs" and len(moving) == 1 and isinstance(moving[0], Affine)
+            return [moving[0]._replace(bent=True) if is_bent else Other(True)]
+        return [_affine(name, equation, inputs) or Other(True)] * count
+
+    def compared(self, name: str, inputs: Sequence[Any]) -> Other:
+        """A comparison, which is constant between its jumps."""
+        # Where two values are equal at an instant only, nothing jumps.
+        if not self.solve(inputs) and name not in ("eq", "ne"):
+            self.unclear[name] = None
+        return Other(False)
+
+    def solve(self, inputs: Sequence[Any]) -> bool:
+        """Whether the time at which two values are equal, or one is 0, can be found; the time is added to the others."""
+        left, right = [*inputs, Known(0.0)][:2]
+        if any(isinstance(kind, Other) for kind in (left, right)):
+            return not (_depends(left) or _depends(right))
+        if all(isinstance(kind, Affine) for kind in (left, right)) and (left.bent or right.bent):
+            return False
+        (a, b), (c, d) = map(_parts, (left, right))
+        slope, is_moving = jnp.subtract(a, c), jnp.subtract(a, c) != 0.0
+        self.times.append(jnp.where(is_moving, jnp.subtract(d, b) / jnp.where(is_moving, slope, 1.0), jnp.inf))
+        return True
+
+
+def _affine(name: str, equation: Any, inputs: Sequence[Any]) -> Affine | None:
+    """The result of an operation that keeps values affine."""
+    if name in LINEAR and len(inputs) == 1:
+        bind, parameters = equation.primitive.bind, equation.params
+        shape = equation.invars[0].aval.shape
+        if not isinstance(inputs[0], Affine):
+            return None
+        slope, offset = (
+            bind(jnp.broadcast_to(jnp.asarray(part, float), shape), **parameters) for part in inputs[0][:2]
+        )
+        return Affine(slope, offset, inputs[0].bent)
+    if name == "convert_element_type":
+        is_real = jnp.issubdtype(equation.params["new_dtype"], jnp.inexact)
+        return inputs[0] if is_real and isinstance(inputs[0], Affine) else None
+    if name not in ("add", "add_any", "sub", "mul", "div") or any(isinstance(kind, Other) for kind in inputs):
+        return None
+    (a, b), (c, d) = map(_parts, inputs)
+    is_first, is_second = (isinstance(kind, Affine) for kind in inputs)
+    bent = any(isinstance(kind, Affine) and kind.bent for kind in inputs)
+    if (is_second and (is_first or name == "div")) and (bent or name in ("mul", "div")):
+        return None
+    if name == "mul":
+        return Affine(a * d, b * d, bent) if is_first else Affine(b * c, b * d, bent)
+    if name == "div":
+        return Affine(a / d, b / d, bent)
+    return Affine(a - c, b - d, bent) if name == "sub" else Affine(a + c, b + d, bent)
+
+
+def _parts(kind: Known | Affine) -> tuple[Any, Any]:
+    """Slope and offset of a known or affine value."""
+    return kind[:2] if isinstance(kind, Affine) else (0.0, kind.value)
+
+
+def _depends(kind: Any) -> bool:
+    """Whether a value depends on the time other than by jumps that were found."""
+    return isinstance(kind, Affine) or (isinstance(kind, Other) and kind.depends_on_time)
+
+
+def _compares(part: Any) -> bool:
+    """Whether a jaxpr compares real numbers."""
+    jaxpr = getattr(part, "jaxpr", part)
+    return hasattr(jaxpr, "eqns") and any(
+        (equation.primitive.name in COMPARISONS and jnp.issubdtype(equation.invars[0].aval.dtype, jnp.inexact))
+        or any(_compares(inner) for inner in equation.params.values())
+        for equation in jaxpr.eqns
+    )
