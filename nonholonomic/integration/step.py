@@ -147,7 +147,7 @@ def past_jump(
     of_near_side = (new_lanes.state, new_lanes.rate, new_lanes.margin, new_lanes.margins)
     state, rate, margin, margins = jax.lax.cond(jnp.any(landed), moved, lambda: of_near_side)
     time, hit = jnp.where(landed, far, new_lanes.time), landed & (margin <= 0.0)
-    far_end = Step(state, rate, rate, margin, margin, None if margins is None else margins[None], (), None)
+    far_end = Step(state, rate, rate, margin, margin, None if margins is None else margins[None], (), state, None)
     lanes = new_lanes._replace(status=jnp.where(landed, RUNNING, new_lanes.status))
     status, side, first, latest_crossing = _classify(problem, control, lanes, far_end, time, hit)
     failed = landed & ~hit & (new_lanes.steps >= control.max_steps)
