@@ -2,6 +2,7 @@
 
     pip install casadi ompl
     python benchmarks/planning.py [--problems 200] [--ipopt 40] [--ompl 12] [--curved 100] [--learn 600]
+    python benchmarks/planning.py --empty 200
 
 Problems on the plane have 3 to 8 boxes in a square of 6 m and a vehicle of 0.5 m by 0.25 m, with a steering angle of at most
 60 degrees and a speed between -0.5 and 0.8 m/s; the drive takes 25 s. Those on curved ground have no obstacles. Every
@@ -14,6 +15,10 @@ Time is CPU time of a problem, without compilation, which the wall time of a fir
 collocation of the same dynamics from the straight line, and from the path that our search finds, whose time is included.
 OMPL's planner decides the duration itself. Effort is that of the run, relative to the effort of `stroller.plan` for the same
 problem (median). Ctrl-C ends a group of problems early, with a table of those that are solved.
+
+With `--empty`, the time is minimised on the empty plane, from rest to rest, to random goals in a square of 10 m, with a least
+turning radius of 1 m, a speed of at most 1 m/s, wheelbases of 0.25 to 1 m, and 1.2 to 4 times the time of the shortest path as
+the longest duration. The excess is that over the shortest path of a point that needs no time to turn its wheel or to brake.
 """
 
 import argparse
@@ -27,6 +32,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from measure import machine, table, write_csv
+from shortest_paths import dubins, reeds_shepp
 
 import stroller
 from stroller.planning.candidates import Outline, prices
@@ -206,6 +212,39 @@ def compared(
     return [row_of(name, planner, solved, ours, first[planner]) for planner, solved in outcomes.items() if solved]
 
 
+def on_empty_plane(count: int, seed: int) -> list[dict[str, str]]:
+    """Rows for the least time without obstacles, forwards only and with reverse."""
+    rows = []
+    for name, shortest, slowest in (("Dubins", dubins, 0.0), ("Reeds and Shepp", reeds_shepp, -1.0)):
+        random, excess, cpu = np.random.default_rng(seed), [], []
+        for number in range(count):
+            wheelbase, longest = float(random.choice([0.25, 0.5, 1.0])), random.uniform(1.2, 4.0)
+            (x, y), heading = pose(random, (-5.0, -5.0), (5.0, 5.0))
+            way = shortest(x, y, heading)
+            body = stroller.Stroller(mass=5.0, wheelbase=wheelbase, inertia=0.1, steering_inertia=0.005)
+            limits = stroller.Limits(steering=np.arctan(wheelbase), speed=(slowest, 1.0))
+            start, goal = stroller.Launch((0.0, 0.0), 0.0, 0.0), stroller.Goal((x, y), heading)
+            scene, options = (
+                stroller.Scene(body, friction=FRICTION),
+                {"limits": limits, "minimise": "time", "progress": False},
+            )
+            plan, seconds, _ = measured(partial(stroller.plan, scene, start, goal, longest * way, **options))
+            excess.append(plan.t1 / way - 1.0 if plan.reached else np.nan)
+            cpu.append(seconds)
+            print(name, number, f"{way:.2f} m, excess {excess[-1]:.3f}, {seconds:.1f} s", flush=True)
+        rows.append(
+            {
+                "goals": f"{count}",
+                "shortest paths of": name,
+                "reached": f"{np.isfinite(excess).sum()}",
+                "excess: median": f"{100.0 * np.nanmedian(excess):.1f} %",
+                "greatest": f"{100.0 * np.nanmax(excess):.1f} %",
+                "CPU s: median": f"{np.median(cpu):.1f}",
+            }
+        )
+    return rows
+
+
 def main() -> None:
     """Measure, print and write."""
     command = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -213,6 +252,7 @@ def main() -> None:
     command.add_argument("--ipopt", type=int, default=40, help="problems that CasADi with IPOPT solves")
     command.add_argument("--ompl", type=int, default=12, help="problems that OMPL solves")
     command.add_argument("--curved", type=int, default=100)
+    command.add_argument("--empty", type=int, default=0, help="goals on the empty plane, instead of all others")
     command.add_argument("--learn", type=float, default=600.0, help="time for which a planner learns [s]; 0 for none")
     command.add_argument(
         "--seconds", type=float, default=20.0, help="most CPU time of another planner for a problem [s]"
@@ -221,8 +261,8 @@ def main() -> None:
     command.add_argument("--out", type=Path, default=Path("planning.csv"))
     options = command.parse_args()
     print(machine())
-    rows: list[dict[str, str]] = []
-    counts = {"plane": options.problems} | dict.fromkeys(GROUNDS, options.curved)
+    rows = on_empty_plane(options.empty, options.seed) if options.empty else []
+    counts = {} if options.empty else {"plane": options.problems} | dict.fromkeys(GROUNDS, options.curved)
     for name, count in counts.items():
         if not count:
             continue

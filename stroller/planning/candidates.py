@@ -12,7 +12,7 @@ from .goal import Limits
 from .guess import smoothed, timed
 from .obstacles import Obstacles
 from .problem import Problem
-from .search import Costs, Ground, Path, Steps, search
+from .search import MOST_NODES, Costs, Ground, Path, Steps, search
 from .spline import ORDER
 from .transcription import Scales, Task
 
@@ -23,8 +23,12 @@ INTERVALS = 64
 #: range to keep in reserve: the check examines the ride between the points at which the optimiser looks.
 RESERVE, LIMIT_RESERVE = 0.04, 0.01
 
-#: Curvature of the arcs of a search in units of the greatest one, because the fork takes time to turn.
-SEARCH_CURVATURE = 0.85
+#: Curvature of the arcs of the searches for neighbouring lanes, in units of the greatest one: less, because the fork takes time
+#: to turn, and nearly all, because a somewhat wider turn may need a detour.
+SEARCH_CURVATURES = (0.98, 0.85)
+
+#: First duration of a drive in the least time, in units of the least one that its path and the limits allow.
+UNHURRIED = 1.5
 
 #: Length of the shortest drive that is expected, in units of the path of a search, which consists of arcs.
 OPTIMISTIC = 0.8
@@ -87,14 +91,22 @@ class Outline(NamedTuple):
         """A path for each of several prices, straight to the goal where the search finds none; and a reason, in words, why
         none can be driven within `t1`, if there is one."""
         start, goal = self.chart.point(self.start), self.chart.point(self.goal)
-        ground = Ground.of(np.stack([start, goal]), self.obstacles, self.problem.footprint)
-        steps = steps_of(self.problem)
+        radius = 1.0 / steps_of(self.problem, min(SEARCH_CURVATURES)).sharpest
+        ground = Ground.of(np.stack([start, goal]), self.obstacles, self.problem.footprint, radius)
         has_heading = self.problem.goal.heading is not None
-        results = [search(ground, start, goal, has_heading, steps, prices) for prices in costs]
-        paths = [path for path, _ in results if path is not None]
+        results = [
+            search(ground, start, goal, has_heading, steps_of(self.problem, SEARCH_CURVATURES[lane % 2]), prices)
+            for lane, prices in enumerate(costs)
+        ]
+        paths = [path for path, _, _ in results if path is not None]
         if not paths:
-            nearest = min(distance for _, distance in results)
-            reason = f"no path around the obstacles was found; the nearest ended {nearest:.2g} m from the goal"
+            nearest, was_all = min(result[1] for result in results), all(result[2] for result in results)
+            what = (
+                "no path to the goal was found"
+                if was_all
+                else f"the search ended after {MOST_NODES} poses without a path"
+            )
+            reason = f"{what}; the nearest ended {nearest:.2g} m from the goal"
             return [straight(start, goal)] * len(costs), reason
         low, high = self.problem.limits.ranges().get("speed", (-np.inf, np.inf))
         way, fastest = min(float(path.length.sum()) for path in paths), max(-low, high)
@@ -103,7 +115,17 @@ class Outline(NamedTuple):
             reason = (
                 f"the shortest path that was found, {way:.3g} m, takes {way / fastest:.3g} s at the limit of the speed"
             )
-        return [path or paths[0] for path, _ in results], reason
+        return [path or paths[0] for path, _, _ in results], reason
+
+    def soonest(self, path: Path) -> float:
+        """A time [s] that a path takes at least, by the limits of speed, force, grip and torque."""
+        scene, body = self.problem.scene, self.problem.scene.body
+        way = max(float(path.length.sum()), float(body.wheelbase))
+        most = {name: max(-low, high) for name, (low, high) in self.problem.limits.ranges().items()}
+        # The way from rest to rest with the greatest acceleration, and a turn of the wheel by 1 rad in the same manner.
+        accelerations = [most.get("force", np.inf) / body.mass, most.get("grip", np.inf) * scene.gravity]
+        slowest = [way / accelerations[0], way / accelerations[1], body.steering_inertia / most.get("torque", np.inf)]
+        return max(way / most.get("speed", np.inf), 2.0 * float(np.sqrt(max(slowest))))
 
     def unknowns(self, path: Path, t1: float) -> Float[np.ndarray, "rows unknowns"]:
         """A path, driven within `t1`, as unknowns of the optimiser (see `transcription.py`)."""
@@ -123,13 +145,13 @@ class Outline(NamedTuple):
         return np.stack([np.asarray(part) for part in surface.in_fixed_frame(padded(components))], axis=-1)
 
 
-def steps_of(problem: Problem) -> Steps:
-    """What the limits of steering angle and speed allow a search."""
+def steps_of(problem: Problem, share: float) -> Steps:
+    """What the limits of speed and steering angle, of whose curvature only a share is used, allow a search."""
     angles = Limits(steering=problem.limits.steering).arrays(LIMIT_RESERVE)
     low, high = (float(np.tan(angle[0])) / float(problem.scene.body.wheelbase) for angle in angles)
     slowest, fastest = problem.limits.ranges().get("speed", (-np.inf, np.inf))
     directions = tuple(sign for sign, speed in ((1.0, fastest), (-1.0, -slowest)) if speed > 0.0)
-    return Steps(max(low, SEARCH_CURVATURE * low), min(high, SEARCH_CURVATURE * high), directions)
+    return Steps(max(low, share * low), min(high, share * high), directions)
 
 
 def straight(start: Any, goal: Any) -> Path:
@@ -140,11 +162,14 @@ def straight(start: Any, goal: Any) -> Path:
     return Path(poses, np.ones(1), np.zeros(1), np.array([max(float(np.hypot(*away)), 1e-3)]))
 
 
-def prices(outline: Outline, count: int, batch: int, rng: np.random.Generator) -> list[Costs]:
-    """What the searches of a batch minimise: ordinary prices first, then random ones."""
+def prices(outline: Outline, count: int, batch: int, rng: np.random.Generator, in_haste: bool = False) -> list[Costs]:
+    """What the searches of a batch minimise: ordinary prices first, or mostly the length where haste is wanted, then random
+    ones."""
     length, keep = float(outline.problem.footprint.length), outline.clearance
     if batch == 0:
         usual = [Costs(1.5 * length, 0.1, 1.0, 0.9 * keep), Costs(0.5 * length, 0.3, 1.5, 1.8 * keep)]
+        if in_haste:
+            usual = [Costs(0.1 * length, 0.0, 1.0, 0.9 * keep), Costs(0.5 * length, 0.1, 1.0, 1.8 * keep)]
         return [usual[k % 2] for k in range(count)]
     spread = np.exp(rng.normal(size=(count, 4)) * np.array([1.0, 0.7, 0.5, 0.5]))
     middle = np.array([length, 0.2, 1.2, 0.7 * keep])

@@ -124,7 +124,10 @@ def judge(run: Trajectory, problem: Problem) -> Verdict:
         excess = -margins[name] / (high - low) - ALLOWED
         wrong.append((excess, f"the {name} exceeds its limit by {-margins[name]:.3g} {units[name]}".rstrip()))
     if run.status != "completed":
-        wrong.append((1.0, f"the run ends with the status {run.status!r}"))
+        # Where the run has no end, what is unknown there is no reason.
+        last = np.asarray(run.t)[np.isfinite(run.speed)].max(initial=0.0)
+        ended = f"the run ends with the status {run.status!r}, after {last:.4g} s of {float(run.t[-1]):.4g} s"
+        wrong = [(1.0, ended), *(pair for pair in wrong if not np.isnan(pair[0]))]
     hindrances = tuple(words for excess, words in wrong if not excess <= 0.0)
     total = sum(max(excess, 0.0) for excess, _ in wrong)
     return Verdict(errors, clearance, margins, effort_of(run), float(np.nan_to_num(total, nan=np.inf)), hindrances)

@@ -17,7 +17,7 @@ from .polygons import disc_distance, separation, signed_distance
 PADDING = 8
 
 #: Distance [m] of the obstacles that pad a list.
-FAR = 1e5
+FAR = 1e9
 
 #: Length, width and rear overhang of the drawn vehicle, in units of the wheelbase.
 DRAWN = (1.4, 0.87, 0.2)

@@ -89,12 +89,14 @@ def constraints(candidates: Candidates, task: Task) -> Residuals:
 
 
 def _step(band: np.ndarray, gradient: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Damped Gauss-Newton steps of all lanes, solved as one banded system."""
+    """Damped Gauss-Newton steps of all lanes, solved as one banded system; none in a lane that is not finite."""
     lanes, width, count = band.shape
-    matrix = band.copy()
-    matrix[:, 0] += damping[:, None] * (1.0 + 0.0 * band[:, 0]) + 1e-12
-    joined = matrix.transpose(1, 0, 2).reshape(width, lanes * count)
-    return -scipy.linalg.solveh_banded(joined, gradient.reshape(-1), lower=True).reshape(lanes, count)
+    usable = np.isfinite(band).all((1, 2), keepdims=True)
+    matrix = np.where(usable, band, 0.0)
+    # Rounding must not make the matrix indefinite where an unknown far from the others has a very steep residual.
+    matrix[:, 0] += damping[:, None] + 1e-12 + 1e-13 * matrix[:, 0].max(axis=1, keepdims=True)
+    joined, slopes = matrix.transpose(1, 0, 2).reshape(width, lanes * count), np.where(usable[..., 0], gradient, 0.0)
+    return -scipy.linalg.solveh_banded(joined, slopes.reshape(-1), lower=True).reshape(lanes, count)
 
 
 def _minimise(
@@ -114,7 +116,7 @@ def _minimise(
         promised = np.sum(step * (damping[:, None] * step - gradient), axis=1)
         trial = candidates._replace(unknowns=unknowns + step.reshape(unknowns.shape))
         new = tuple(map(np.asarray, _normal_equations(trial, task, multipliers, weight)))
-        gain = np.where(np.isfinite(new[2]).all((1, 2)), (merit - new[0]) / promised, -1.0)
+        gain = np.where(np.isfinite(new[2]).all((1, 2)), (merit - new[0]) / promised, -1.0).clip(-1.0, 2.0)
         better = gain > 0.0
         for old, part in zip((merit, gradient, band, unknowns), (*new, trial.unknowns), strict=True):
             old[better] = part[better]

@@ -13,7 +13,7 @@ from nonholonomic.validation import require_flag, require_kind, require_whole, s
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..runs.trajectory import Trajectory
-from .candidates import Outline, prices
+from .candidates import UNHURRIED, Outline, prices
 from .check import COMPARED, CONFIRMED, Verdict, checked_run
 from .drive import Drive, drive_along
 from .goal import Goal, Limits
@@ -38,9 +38,9 @@ MORE_CLEARANCE = 2
 #: Batches without a path that can be driven in time after which the search goes on; one more ends it.
 PATIENCE = 1
 
-#: The most rounds in which the duration is shortened, the share of the duration to which the first one shortens it, and the
-#: difference of the share from 1 at which they end.
-ROUNDS, SHORTER, CLOSE = 16, 0.5, 0.02
+#: The most rounds in which the duration is shortened, the share of the duration to which the first one shortens it, its
+#: exponent after a success, and the difference of the share from 1 at which they end.
+ROUNDS, SHORTER, LONGER_STEP, CLOSE = 16, 0.7, 1.5, 0.02
 
 MINIMISED = ("effort", "time")
 
@@ -140,13 +140,14 @@ def plan(
     with status_line("planning", progress):
         outline = Outline.of(problem)
         attempts, log = [], Log([], [])
-        guesses = _guesses(outline, duration, starts, planner, np.random.default_rng(seed), log)
-        for attempt in _attempts(outline, guesses, duration, tolerance, log):
+        in_haste = minimise == "time"
+        guesses = _guesses(outline, duration, in_haste, starts, planner, seed, log)
+        for attempt in _attempts(outline, guesses, tolerance, log):
             attempts.append(attempt)
             if not attempt.verdict.hindrances:
                 break
         best = min(attempts, key=lambda attempt: attempt.rank)
-        if minimise == "time" and not best.verdict.hindrances:
+        if in_haste and not best.verdict.hindrances:
             best = _shortened(outline, best, tolerance)
         run, verdict = best.run, best.verdict
         if verdict.hindrances:
@@ -157,10 +158,11 @@ def plan(
 
 
 def _guesses(
-    outline: Outline, t1: float, starts: int, planner: Planner | None, rng: np.random.Generator, log: Log
+    outline: Outline, t1: float, in_haste: bool, starts: int, planner: Planner | None, seed: int, log: Log
 ) -> Iterator[tuple[float, Candidates]]:
     """Batches of candidates, each with the length [m] of its shortest way: the proposal of a planner, then what searches
-    find."""
+    find. Candidates that are in haste begin with the duration that their path allows, whatever the longest one `t1` is."""
+    rng = np.random.default_rng(seed)
     if planner is not None:
         task = outline.task(outline.distance, t1, outline.clearance)
         if (misfit := planner.misfit(task)) is not None:
@@ -170,29 +172,32 @@ def _guesses(
             yield outline.distance, Candidates(proposal[None], np.full(1, t1))
             starts -= 1
     for batch in range(-(-starts // LANES)):
-        paths, reason = outline.paths(prices(outline, LANES, batch, rng), t1)
+        paths, reason = outline.paths(prices(outline, LANES, batch, rng, in_haste), t1)
         log.reasons.extend([reason] if reason else [])
         if len(log.reasons) > PATIENCE:
             return
         way = min(float(path.length.sum()) for path in paths)
-        yield way, Candidates(np.stack([outline.unknowns(path, t1) for path in paths]), np.full(LANES, t1))
+        longest = [UNHURRIED * 2.0**batch * outline.soonest(path) if in_haste else t1 for path in paths]
+        durations = np.minimum(t1, longest)
+        yield way, Candidates(np.stack(list(map(outline.unknowns, paths, durations))), durations)
 
 
 def _attempts(
-    outline: Outline, guesses: Iterator[tuple[float, Candidates]], t1: float, tolerance: float, log: Log
+    outline: Outline, guesses: Iterator[tuple[float, Candidates]], tolerance: float, log: Log
 ) -> Iterator[Attempt]:
     """Attempts at a problem, best first in each batch of candidates."""
     for way, candidates in guesses:
         clearance = outline.clearance
         for _ in range(MORE_CLEARANCE + 1):
-            candidates, violation, objective = optimise(candidates, outline.task(way, t1, clearance))
+            task = outline.task(way, candidates.durations.mean(), clearance)
+            candidates, violation, objective = optimise(candidates, task)
             log.tried.append(candidates.unknowns)
-            order = np.lexsort((objective, violation > HOPELESS))
+            order = np.lexsort((objective, candidates.durations, violation > HOPELESS))
             attempts = []
             for lane in order:
                 if attempts and violation[lane] > HOPELESS:
                     break
-                attempts.append(_driven(outline, candidates.unknowns[lane], t1, tolerance))
+                attempts.append(_driven(outline, candidates, lane, tolerance))
                 yield attempts[-1]
             overlap = -max(attempt.verdict.clearance for attempt in attempts)
             if overlap <= 0.0 or violation.min() > HOPELESS:
@@ -200,9 +205,13 @@ def _attempts(
             clearance += overlap + 0.5 * outline.clearance
 
 
-def _driven(outline: Outline, unknowns: Any, t1: float, tolerance: float) -> Attempt:
+def _driven(outline: Outline, candidates: Candidates, lane: int, tolerance: float) -> Attempt:
     """An optimised candidate, driven; a solution is driven again at a tight tolerance, and this run counts."""
-    dynamics = outline.problem.scene.dynamics
+    dynamics, unknowns, t1 = (
+        outline.problem.scene.dynamics,
+        candidates.unknowns[lane],
+        float(candidates.durations[lane]),
+    )
     drive = drive_along(dynamics, outline.start, unknowns[:, -2], unknowns[:, -1], t1)
     run, verdict = checked_run(outline.problem, drive, t1, tolerance, COMPARED)
     if not verdict.hindrances:
@@ -214,7 +223,7 @@ def _shortened(outline: Outline, best: Attempt, tolerance: float) -> Attempt:
     """A solution in less time: the same drive, faster, optimised again for several durations in turn.
 
     Every duration is a share of that of the best solution yet, and this solution is the first guess. The share is closer to 1
-    after a round without a solution.
+    after a round without a solution, and further from 1 after one with a solution.
     """
     share = SHORTER
     for _ in range(ROUNDS):
@@ -224,14 +233,10 @@ def _shortened(outline: Outline, best: Attempt, tolerance: float) -> Attempt:
         way = float(np.trapezoid(np.abs(best.run.speed), best.run.t))
         task = outline.task(way, float(durations.mean()), outline.clearance)
         candidates, violation, _ = optimise(Candidates(faster, durations), task)
-        attempts = (
-            _driven(outline, candidates.unknowns[lane], float(durations[lane]), tolerance)
-            for lane in np.flatnonzero(violation < HOPELESS)
-        )
+        attempts = (_driven(outline, candidates, lane, tolerance) for lane in np.flatnonzero(violation < HOPELESS))
         shorter = next((attempt for attempt in attempts if not attempt.verdict.hindrances), None)
         best = best if shorter is None else shorter
-        if shorter is None:
-            share **= 0.5 / LANES
+        share **= 0.5 / LANES if shorter is None else LONGER_STEP
         if share > 1.0 - CLOSE:
             break
     return best

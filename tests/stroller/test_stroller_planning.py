@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from close import assert_close
+from shortest_paths import dubins, reeds_shepp
 
 import stroller
 from stroller.planning import learn
@@ -20,10 +21,11 @@ from stroller.planning.check import inputs_of
 from stroller.planning.drawing import planned_stage
 from stroller.planning.drive import drive_along
 from stroller.planning.inverse import Rates, actuation
+from stroller.planning.obstacles import Obstacles
 from stroller.planning.planner import proposed
 from stroller.planning.polygons import disc_distance, separation, signed_distance
 from stroller.planning.problem import checked_problem
-from stroller.planning.search import arcs
+from stroller.planning.search import Costs, Ground, Steps, arcs, search
 from stroller.planning.spline import evaluate, interpolate
 
 BODY = stroller.Stroller(mass=5.0, wheelbase=0.25, inertia=0.1, steering_inertia=0.005)
@@ -222,7 +224,7 @@ def test_a_search_keeps_to_what_the_limits_allow(steering, speed, bends, directi
     """And the optimiser may use the values of launch and goal, which are 0."""
     limits = stroller.Limits(steering=steering, speed=speed)
     problem = checked_problem(SCENE, START, GOAL, 12.0, GAP, limits, FOOTPRINT, 1e-6)
-    task, steps = Outline.of(problem).task(1.0, 12.0, 0.0), steps_of(problem)
+    task, steps = Outline.of(problem).task(1.0, 12.0, 0.0), steps_of(problem, 0.85)
     assert all(low <= 0.0 <= high for low, high in zip(task.low[:2], task.high[:2], strict=True))
     moves = arcs(SimpleNamespace(cell=0.1), steps)
     assert_close(np.unique(moves[:, 1]) / steps.sharpest, bends, atol=0.02)
@@ -256,6 +258,57 @@ def test_what_is_out_of_reach_is_said():
     assert all(f"  hindrance  {words}" in str(plan) for words in plan.hindrances)
 
 
+def test_the_search_finds_the_shortest_path_on_the_empty_plane():
+    """Forwards only by Dubins' lengths, and with reverse by Reeds and Shepp's, for short and long vehicles."""
+    random, prices = np.random.default_rng(0), Costs(0.0, 0.0, 1.0, 0.0)
+    for number in range(24):
+        (x, y), (heading, wheelbase) = (
+            random.uniform(-5.0, 5.0, 2),
+            (random.uniform(-np.pi, np.pi), 0.25 * 4.0 ** random.random()),
+        )
+        shortest, directions = ((dubins, (1.0,)), (reeds_shepp, (1.0, -1.0)))[number % 2]
+        start, goal = np.zeros(3), np.array([x, y, heading])
+        footprint = stroller.Footprint(1.4 * wheelbase, 0.87 * wheelbase, 0.2 * wheelbase)
+        ground = Ground.of(np.stack([start, goal]), Obstacles.of(()), footprint, 1.0)
+        path, _, _ = search(ground, start, goal, True, Steps(-1.0, 1.0, directions), prices)
+        assert 1.0 - 1e-9 < path.length.sum() / shortest(*path.poses[-1]) < 1.1
+        assert np.hypot(*(path.poses[-1] - goal)[:2]) < ground.cell
+
+
+def test_a_search_that_is_cut_short_says_so(monkeypatch):
+    """The U-turn between two walls needs more poses than it may look at; and a goal that is walled in needs none."""
+    launch, goal = stroller.Launch((0.0, 0.0), 0.0, 0.0), stroller.Goal((0.0, 0.0), np.pi)
+    outline = Outline.of(
+        checked_problem(SCENE, launch, goal, 12.0, room(-1.5, 1.5, -0.3, 0.3), LIMITS, FOOTPRINT, 1e-6)
+    )
+    monkeypatch.setattr("stroller.planning.search.MOST_NODES", 50)
+    _, reason = outline.paths(prices(outline, 1, 0, np.random.default_rng(0)), 12.0)
+    assert re.match(r"the search ended after \d+ poses without a path; the nearest", reason)
+
+
+@pytest.mark.parametrize(
+    ("heading", "goal", "longest", "shortest"),
+    [(0.0, (0.0, 2.0, np.pi), 20.0, np.pi), (np.pi / 2.0, (4.0, 4.0, 0.0), 17.4, 5.81)],
+)
+def test_a_wide_turn_is_found_however_long_it_may_take(heading, goal, longest, shortest, monkeypatch):
+    """A least turning radius of 1 m, four wheelbases, and forwards only."""
+    monkeypatch.setattr(importlib.import_module("stroller.planning.plan"), "ROUNDS", 3)
+    limits = stroller.Limits(steering=np.arctan(0.25), speed=(0.0, 1.0))
+    launch, away = stroller.Launch((0.0, 0.0), heading, 0.0), [stroller.Box((-9.0, 0.0), (0.5, 0.5))]
+    options = {"obstacles": away, "limits": limits, "minimise": "time", "progress": False}
+    plan = stroller.plan(SCENE, launch, stroller.Goal(goal[:2], goal[2]), longest, **options)
+    assert plan.reached, str(plan)
+    assert shortest - 0.1 < plan.t1 < 1.3 * shortest
+
+
+def test_a_goal_very_far_away_gets_a_reason():
+    """A million metres in 20 s."""
+    _, plan = freely(stroller.Goal((1e6, 1e6)), 20.0, LIMITS)
+    assert not plan.reached
+    assert "nan" not in str(plan)
+    assert "takes 1.77e+06 s at the limit of the speed" in plan.hindrances[-1]
+
+
 WALLED_IN = (stroller.Launch((-2.0, 0.5), 0.0, 0.0), stroller.Goal((0.5, 0.5), 0.0), room(0.0, 1.2, 0.0, 1.0))
 
 
@@ -263,7 +316,7 @@ def test_the_search_says_that_a_goal_is_walled_in():
     launch, goal, walls = WALLED_IN
     outline = Outline.of(checked_problem(SCENE, launch, goal, 12.0, walls, LIMITS, FOOTPRINT, 1e-6))
     _, reason = outline.paths(prices(outline, 1, 0, np.random.default_rng(0)), 12.0)
-    assert re.match(r"no path around the obstacles was found; the nearest ended \S+ m from the goal", reason)
+    assert re.match(r"no path to the goal was found; the nearest ended \S+ m from the goal", reason)
 
 
 @pytest.mark.slow
@@ -271,7 +324,7 @@ def test_a_goal_that_is_walled_in_is_not_reached():
     launch, goal, walls = WALLED_IN
     plan = stroller.plan(SCENE, launch, goal, 12.0, obstacles=walls, **OPTIONS)
     assert not plan.reached
-    assert "no path around the obstacles was found; the nearest ended" in plan.hindrances[-1]
+    assert "no path to the goal was found; the nearest ended" in plan.hindrances[-1]
 
 
 @pytest.mark.parametrize("rounds", [1, pytest.param(16, marks=pytest.mark.slow)])
