@@ -12,7 +12,7 @@ from disk_faults import half_finished
 from nonholonomic.sweeps import Table
 from nonholonomic.sweeps._chunks import same_request
 
-pytestmark = pytest.mark.newest
+pytestmark = pytest.mark.oldest
 
 
 @pytest.fixture(scope="module")
