@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.stats
-from coverage import OFFSET, SPIN, scene_of
+from interval_coverage import OFFSET, SPIN, scene_of
 
 import tippe
 from nonholonomic.identification import LogDensity, sample

@@ -1,6 +1,7 @@
 """The rooms: which way their imports point, and what stays inside them."""
 
 import ast
+import importlib.metadata
 import io
 import re
 import sys
@@ -251,3 +252,12 @@ def test_every_file_that_the_walk_names_exists():
     )
     assert names
     assert [name for name in names if not (ROOT / name).exists()] == []
+
+
+def test_no_module_beside_the_packages_has_the_name_of_an_installed_package():
+    """Python finds a module in these folders before the package, which another package may import: numba imports `coverage`."""
+    folders = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]["pythonpath"]
+    modules = {path.stem for folder in folders for path in (ROOT / folder).glob("[!_.]*") if path.suffix in ("", ".py")}
+    installed = importlib.metadata.packages_distributions().keys() | sys.stdlib_module_names | {"coverage", "numba"}
+    assert {"interval_coverage", "browser"} <= modules
+    assert not modules & installed

@@ -17,7 +17,7 @@ from nonholonomic.parameters import numbers
 from tippe.runs.launches import launches
 from tippe.runs.model import TopModel
 
-pytestmark = pytest.mark.newest
+pytestmark = pytest.mark.oldest
 
 
 class Hill(eqx.Module):

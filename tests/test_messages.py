@@ -18,7 +18,7 @@ from nonholonomic.identification.unknown import as_free
 from nonholonomic.validation import shown
 from nonholonomic.views import Page
 
-pytestmark = pytest.mark.newest
+pytestmark = pytest.mark.oldest
 
 REFUSED = {
     "the other package's scene": (

@@ -10,7 +10,7 @@ from never_run import density_of_a_film, run_of_nothing, small_table
 import nonholonomic
 from nonholonomic.identification import sample
 
-pytestmark = pytest.mark.newest
+pytestmark = pytest.mark.oldest
 
 
 OPTIONAL = {

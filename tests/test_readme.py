@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.newest
+pytestmark = pytest.mark.oldest
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
 

@@ -21,7 +21,7 @@ import tippe
 from nonholonomic.integration import Settings
 from tippe.runs.table import warn_of_long_runs
 
-pytestmark = pytest.mark.newest
+pytestmark = pytest.mark.oldest
 
 SUSPECTED = {
     "rpm": (lambda: tippe.Launch(0.1, 1500.0), "was it in rpm? 1500 rpm are 157.1 rad/s"),

@@ -16,7 +16,7 @@ from nonholonomic.sweeps import Tabular
 from nonholonomic.views import Viewable
 from tippe.runs.observables import AbstractTrajectory
 
-pytestmark = pytest.mark.newest
+pytestmark = pytest.mark.oldest
 
 TOP = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3))
 LAUNCH = tippe.Launch(0.1, 155.0)

@@ -6,7 +6,7 @@ and `benchmarks/work_precision.py` measure all of them together.
 
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -183,6 +183,20 @@ def on_device(*arrays: Float[ArrayLike, "..."]) -> tuple[Float[Array, "..."], ..
     return tuple(jax.device_put(np.asarray(array, dtype=float)) for array in arrays)
 
 
+def traced(function: Callable[..., Any], *arguments: Any) -> tuple[ClosedJaxpr, Any]:
+    """Trace a function, for those who read its operations.
+
+    **Returns:** the program, and the tree of the shapes of its results.
+
+    Since JAX 0.12, `jnp.searchsorted`, `jnp.interp` and `jnp.einsum` are traced as primitives of another kind, which JAX
+    expands only when it compiles. Here they are expanded.
+    """
+    program, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    if getattr(program, "is_high", False):
+        program = partial_eval.lower_jaxpr2(program)  # pyright: ignore[reportAttributeAccessIssue]
+    return program, shape
+
+
 def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """A function of a tree of arrays that XLA compiles, on a CPU, into a single kernel.
 
@@ -190,6 +204,8 @@ def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     caches, calling costs as much as computing. XLA does this by itself only for loops over very small arrays. A single
     kernel is 2.5 times as fast with jaxlib 0.10.2, and 1.3 times as fast with 0.12. It can be removed when XLA's
     threshold can be set for one program.
+
+    XLA cannot put some operations into a kernel, such as sorts and calls of LAPACK: a function that has them is unchanged.
 
     JAX chooses the platform when it lowers a program; on platforms other than CPUs this function has no effect
     (`jax.export` lowers for platforms that this machine does not have).
@@ -202,7 +218,9 @@ def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
         # The attributes also prevent XLA from fusing small functions inside, such as `where`, into everything that uses
         # them.
         with set_xla_metadata(**_ATTRIBUTES):
-            closed, shape = jax.make_jaxpr(function, return_shape=True)(argument)
+            closed, shape = traced(function, argument)
+        if not set(OUTSIDE_KERNELS.split()).isdisjoint(operations(closed.jaxpr)):
+            return function(argument)
         # The values that the function closes over become its first arguments.
         inputs = [*closed.jaxpr.constvars, *closed.jaxpr.invars]
         program = closed.jaxpr.replace(constvars=[], invars=inputs)
@@ -211,6 +229,25 @@ def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
     return called
 
+
+def operations(program: Jaxpr) -> Iterator[str]:
+    """The names of the operations of a program and of the programs inside it."""
+    for equation in program.eqns:
+        yield equation.primitive.name
+        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program):
+            if _is_program(inner):
+                yield from operations(getattr(inner, "jaxpr", inner))
+
+
+def _is_program(value: Any) -> bool:
+    return hasattr(getattr(value, "jaxpr", value), "eqns")
+
+
+#: Operations for which XLA calls a library, which the code of a single kernel cannot do.
+OUTSIDE_KERNELS = """
+    approx_top_k cholesky debug_callback eig eigh fft ffi_call geqp3 geqrf hessenberg householder_product io_callback lu
+    pure_callback qr schur sort svd top_k triangular_solve tridiagonal tridiagonal_solve
+"""
 
 _ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
 

@@ -21,9 +21,8 @@ class Plain(eqx.Module):
     function: Callable[..., Any] = eqx.field(static=True)
 
     def __call__(self, *at: Float[Array, "..."]) -> Float[Array, "..."]:
-        value, shape = jnp.asarray(self.function(*at)), jnp.broadcast_shapes(*map(jnp.shape, at))
-        # A constant is the same in every lane.
-        return value if value.shape == shape else jnp.broadcast_to(value, shape)
+        # Users may compare, sort and look up numbers, or join them, which would mix lanes.
+        return jnp.vectorize(lambda *numbers: jnp.asarray(self.function(*numbers)))(*at)
 
 
 class Closure(eqx.Module):
@@ -54,14 +53,14 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module
         value = jax.tree.map(lambda leaf: as_number(leaf) if isinstance(leaf, float | np.ndarray) else leaf, value)
     zeros = (jnp.zeros(()),) * len(arguments)
     try:
-        traced = jax.make_jaxpr(value)(*zeros)
+        program = jax.make_jaxpr(value)(*zeros)
     except jax.errors.JAXTypeError as error:
         raise ValueError(f"{name} = {shown(value)} {UNTRACEABLE}") from error
     except TypeError as error:
         raise ValueError(f"{name} = {shown(value)} must be a function of ({', '.join(arguments)}): {error}") from error
     # The parameters of a module may have one value per lane.
     shapes = {(), *(leaf.shape for leaf in jax.tree.leaves(value) if eqx.is_array(leaf))}
-    results = traced.out_avals
+    results = program.out_avals
     if len(results) != 1 or results[0].shape not in shapes or not jnp.issubdtype(results[0].dtype, jnp.floating):
         names_of_results = ", ".join(map(str, results))
         raise ValueError(
@@ -69,13 +68,22 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module
         )
     if isinstance(value, eqx.Module):
         # If the parameters have one number per lane, so have the results.
-        arrays = results[0].shape == () and len(shapes) > 1 and not isinstance(value, Held)
-        return Held(parted(value)) if arrays else value
-    closes_over = any(is_traced(constant) for constant in traced.consts)
-    if closes_over:
-        return Closure(spread(traced.consts), traced.jaxpr)
+        of_one_run = results[0].shape == () and (len(shapes) > 1 or not _takes_lanes(value, len(arguments)))
+        return Held(parted(value)) if of_one_run and not isinstance(value, Held) else value
+    if any(is_traced(constant) for constant in program.consts):
+        return Closure(spread(program.consts), program.jaxpr)
     # Equinox warns of the arrays of a tree, such as JAX's partial functions, but not of those of its method.
     return Plain(value if jax.tree_util.all_leaves([value]) else value.__call__)
+
+
+def _takes_lanes(function: Any, count: int) -> bool:
+    """Whether a function of numbers, whose parameters are single numbers, takes one number per lane, too."""
+    lanes = jax.ShapeDtypeStruct((2,), float)
+    try:
+        return jax.eval_shape(function, *(lanes,) * count).shape == lanes.shape
+    except Exception:
+        # Any error: the function is a user's.
+        return False
 
 
 def partials(function: Callable[..., Any], at: tuple[Any, ...]) -> tuple[Float[Array, "..."], ...]:

@@ -141,9 +141,9 @@ class Graph(AbstractOpen, AbstractLevel):
 
     **Arguments:**
 
-    - `height`: returns z [m] for x and y [m]. It is called with arrays of any shape, one number per lane, so write it
-      with `jax.numpy` and without `if`. If it is an `equinox.Module`, its numbers are parameters of the scene, which
-      you can sweep and differentiate.
+    - `height`: returns z [m] for x and y [m], numbers. Write it with `jax.numpy` and without `if`. It may look up measured
+      heights, as `jax.numpy.interp` and `jax.scipy.interpolate.RegularGridInterpolator` do. If it is an
+      `equinox.Module`, its numbers are parameters of the scene, which you can sweep and differentiate.
 
     **Raises:** `ValueError` if `height` is not a function of x and y.
 

@@ -29,9 +29,9 @@ class Implicit(AbstractLevel):
 
     **Arguments:**
 
-    - `function`: a smooth function of x, y and z [m] whose gradient does not vanish on the surface. It is called with
-      arrays of any shape, one number per lane, so write it with `jax.numpy` and without `if`. If it is an
-      `equinox.Module`, its numbers are parameters of the scene, which you can sweep and differentiate.
+    - `function`: a smooth function of the numbers x, y and z [m] whose gradient does not vanish on the surface. Write it
+      with `jax.numpy` and without `if`. If it is an `equinox.Module`, its numbers are parameters of the scene, which you
+      can sweep and differentiate.
 
     **Raises:** `ValueError` if `function` is not a function of x, y and z.
 

@@ -20,30 +20,33 @@ import numpy as np
 from jax.extend.core import Jaxpr, Literal
 from jaxtyping import Array
 
-from ..compilation.xla_cpu import stored
+from ..compilation.xla_cpu import stored, traced
 from ..validation import is_traced
 from .tracing import spelled_out
 
 #: Operations on numbers, element by element.
 BY_ELEMENT = """
     abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy copy_p cos cosh
-    digamma div eq erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow is_finite le lgamma log log1p logistic lt max min
-    mul ne neg nextafter not or pow rem round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor
+    digamma div eq erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow is_finite le lgamma log log1p log2 logistic lt max
+    min mul ne neg nextafter not one_minus_square or polynomial pow rem round rsqrt select_n sign sin sinh sqrt square
+    stop_gradient sub tan tanh xor
 """
 
 #: Operations that are expensive enough to be computed once only; XLA would compute them again for each result.
 COSTLY = """
-    acos acosh asin asinh atan atan2 atanh cbrt cos cosh erf exp exp2 expm1 log log1p logistic pow sin sinh tan tanh
+    acos acosh asin asinh atan atan2 atanh cbrt cos cosh erf exp exp2 expm1 log log1p log2 logistic pow sin sinh tan tanh
 """
 
 #: Operations whose result may not be finite although their operands are, apart from overflow in sums and products.
 RISKY = """
-    acos acosh asin atanh cosh digamma div erf_inv exp exp2 expm1 integer_pow lgamma log log1p pow rem rsqrt sinh sqrt
+    acos acosh asin atanh cosh digamma div erf_inv exp exp2 expm1 integer_pow lgamma log log1p log2 pow rem rsqrt sinh
+    sqrt
 """
 
 #: Operations whose result is not finite if an operand is not; for a quotient, if the dividend is not.
 TRANSPARENT = """
-    abs add add_any cbrt convert_element_type copy copy_p cos div log log1p mul neg sin sinh sqrt square stop_gradient sub tan
+    abs add add_any cbrt convert_element_type copy copy_p cos div log log1p log2 mul neg one_minus_square sin sinh sqrt square
+    stop_gradient sub tan
 """
 
 #: A function with more scalar operations than this is left in arrays: it would take long to compile.
@@ -70,7 +73,7 @@ def by_components(function: Callable[..., Any], *shapes: Any) -> Callable[..., A
     """
 
     def evaluated(*args: Any) -> Any:
-        closed, shape = jax.make_jaxpr(function, return_shape=True)(*shapes)
+        closed, shape = traced(function, *shapes)
         leaves, evaluation = [_elements(leaf) for leaf in jax.tree.leaves(args)], Evaluation()
         results = evaluation.of(closed.jaxpr, [_constants(const) for const in closed.consts], leaves)
         numbers = evaluation.with_hidden([result.item() for result in results])

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax.extend.core import Jaxpr, Literal
 from jaxtyping import Array
 
+from ..compilation.xla_cpu import traced
 from .components import BY_ELEMENT, TooLarge
 
 #: Reductions, which name the axes that they remove.
@@ -32,7 +33,7 @@ def over_last_axis(function: Callable[..., Any], *shapes: Any) -> Callable[..., 
     """
 
     def mapped(*arguments: Any) -> Any:
-        closed, shape = jax.make_jaxpr(function, return_shape=True)(*shapes)
+        closed, shape = traced(function, *shapes)
         leaves, expected = jax.tree.leaves(arguments), jax.tree.leaves(shapes)
         size = next(leaf.shape[-1] for leaf, own in zip(leaves, expected, strict=True) if leaf.ndim > own.ndim)
         results = _evaluated(closed.jaxpr, closed.consts, leaves, size)

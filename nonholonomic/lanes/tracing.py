@@ -13,6 +13,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from jaxtyping import Array
 
+from ..compilation.xla_cpu import operations, traced
 from ..validation import UNTRACEABLE, is_traced
 
 #: Operations that XLA compiles into a single kernel on a CPU, forwards and backwards. A function with other operations,
@@ -20,10 +21,10 @@ from ..validation import UNTRACEABLE, is_traced
 ELEMENTARY = """
     abs acos acosh add add_any and asin asinh atan atan2 atanh bessel_i0e bessel_i1e broadcast_in_dim cbrt ceil clamp
     concatenate convert_element_type copy copy_p cos cosh custom_jvp_call custom_vjp_call digamma div eq erf erf_inv erfc exp
-    exp2 expand_dims expm1 floor full ge gt integer_pow iota is_finite jit le lgamma log log1p logistic lt max min mul ne neg
-    nextafter not optimization_barrier or pad pjit pow reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum rem
-    reshape rev round rsqrt select_and_n select_n sign sin sinh slice split sqrt square squeeze stack stop_gradient sub tan
-    tanh transpose unstack xor zeros_like
+    exp2 expand_dims expm1 floor full ge gt integer_pow iota is_finite jit le lgamma log log1p log2 logistic lt max min mul ne
+    neg nextafter not one_minus_square optimization_barrier or pad pjit polynomial pow reduce_and reduce_max reduce_min
+    reduce_or reduce_prod reduce_sum rem reshape rev round rsqrt select_and_n select_n sign sin sinh slice split sqrt square
+    squeeze stack stop_gradient sub tan tanh transpose unstack xor zeros_like
 """
 
 #: Products with at most this many terms are written as sums of products, which all of XLA's compilers accept.
@@ -93,23 +94,11 @@ def is_elementary(function: Callable[..., Any], *args: Any) -> bool:
         return pull(jax.tree.map(jnp.ones_like, values))
 
     try:
-        closed = jax.make_jaxpr(pulled_back)(*args)
+        program, _ = traced(pulled_back, *args)
     except ValueError:
         # A loop without a fixed number of iterations has no backward pass.
         return False
-    return set(_operations(closed.jaxpr)) <= set(ELEMENTARY.split())
-
-
-def _operations(jaxpr: Jaxpr) -> Iterator[str]:
-    for equation in jaxpr.eqns:
-        yield equation.primitive.name
-        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_jaxpr):
-            if _is_jaxpr(inner):
-                yield from _operations(getattr(inner, "jaxpr", inner))
-
-
-def _is_jaxpr(value: Any) -> bool:
-    return hasattr(getattr(value, "jaxpr", value), "eqns")
+    return set(operations(program.jaxpr)) <= set(ELEMENTARY.split())
 
 
 def depends_on_first(function: Callable[..., Any], first: Any, *args: Any) -> bool:

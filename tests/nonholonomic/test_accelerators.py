@@ -91,7 +91,7 @@ def foreign(text):
     return set(re.findall(r"custom_call @(\w+)|(xla_cpu_\w+|frontend_attributes)", text))
 
 
-@pytest.mark.newest
+@pytest.mark.oldest
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_programs_lower_for_accelerators(name):
     text = lowered(*(PROGRAMS | LONGER)[name], "cuda", "tpu")

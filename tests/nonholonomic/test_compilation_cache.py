@@ -51,7 +51,7 @@ def run(program, home, **settings):
     return json.loads(process.stdout), process.stderr
 
 
-@pytest.mark.newest
+@pytest.mark.oldest
 def test_a_second_process_compiles_nothing(tmp_path):
     first, _ = run(TABLE, tmp_path)
     assert first["folder"] == str(tmp_path / "nonholonomic" / environment_name())

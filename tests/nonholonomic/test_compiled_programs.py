@@ -15,7 +15,7 @@ from nonholonomic.compilation.compiled_programs import (
 )
 
 pytestmark = [
-    pytest.mark.newest,
+    pytest.mark.oldest,
     pytest.mark.skipif(count_mappings() == 0, reason="this system does not report mappings"),
 ]
 

@@ -13,7 +13,7 @@ from stroller.runs.verbs import FORM
 from tippe.runs.model import INVERSIONS, REVERSALS
 from tippe.runs.table import TRAJECTORIES as OF_TRAJECTORIES
 
-pytestmark = pytest.mark.newest
+pytestmark = pytest.mark.oldest
 
 Status = nonholonomic.Status
 

@@ -1,11 +1,11 @@
-"""The least and the greatest of some numbers, and their derivatives."""
+"""The least and the greatest of some numbers, and their derivatives; loops in one kernel."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nonholonomic.compilation.xla_cpu import greatest, least
+from nonholonomic.compilation.xla_cpu import greatest, in_one_kernel, least
 
 
 @pytest.mark.parametrize("function", [least, greatest])
@@ -35,3 +35,24 @@ def test_of_several_numbers():
     numbers = jnp.array([[3.0, 1.0], [2.0, 5.0], [4.0, 0.0]])
     np.testing.assert_array_equal(least(*numbers), [2.0, 0.0])
     np.testing.assert_array_equal(greatest(*numbers), [4.0, 5.0])
+
+
+#: What loops of users' functions may do.
+STEPS = {
+    "interp": lambda x: jnp.interp(x, jnp.linspace(0.0, 1.0, 5), jnp.linspace(0.0, 1.0, 5) ** 2),
+    "einsum": lambda x: jnp.einsum("ij,j->i", jnp.outer(x, x), x),
+    "polynomial": lambda x: jnp.polyval(jnp.ones(12) / 12.0, x),
+    "sort": lambda x: jnp.sort(1.0 - x),
+    "solve": lambda x: jnp.linalg.solve(jnp.eye(4) + jnp.outer(x, x), x),
+    "qr": lambda x: jnp.linalg.qr(jnp.eye(4) + jnp.outer(x, x))[1][0],
+    "fft": lambda x: jnp.fft.fft(x).imag,
+}
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_a_loop_in_one_kernel_computes_the_same_whatever_it_does(name):
+    def loop(x):
+        return jax.lax.fori_loop(0, 2, lambda _, x: 0.5 * STEPS[name](x), x)
+
+    x = np.linspace(0.1, 0.9, 4)
+    np.testing.assert_allclose(jax.jit(in_one_kernel(loop))(x), loop(x), rtol=1e-12, atol=1e-15)

@@ -65,7 +65,7 @@ def begun(scene, launch, start):
     return coarse_onset, *slips
 
 
-@pytest.mark.newest
+@pytest.mark.oldest
 def test_a_slip_begins_at_every_tolerance():
     """The direction of the force turns by 0.14 rad in the first trial; the state later is that of a shorter step."""
     scene = tippe.Scene(rutstam_top(), tippe.Sphere(0.3), tippe.SetValuedCoulomb(0.2))

@@ -38,7 +38,7 @@ def bowl(tmp_path_factory):
     return stroller.sweep(BOWL, LAUNCH, 3.0, input=Steady(), axes=AXES, path=path), path
 
 
-@pytest.mark.newest
+@pytest.mark.oldest
 @pytest.mark.parametrize("cell", [(0, 0, 0, 0, 0, 0), (1, 0, 1, 1, 1, 1), (1, 1, 0, 1, 0, 1)])
 def test_cells_are_the_single_rides(bowl, cell):
     """Every cell of the table is what `simulate` gives for its numbers."""
@@ -61,7 +61,7 @@ def test_cells_are_the_single_rides(bowl, cell):
     np.testing.assert_allclose(table.energy[cell], run.energy[0], atol=1e-8)
 
 
-@pytest.mark.newest
+@pytest.mark.oldest
 def test_table_is_labelled_and_its_file_opens_in_xarray(bowl):
     table, path = bowl
     assert list(table.coords) == ["speed", "steering", "wheelbase", "rolling", "polar", "force"]
@@ -129,7 +129,7 @@ def test_a_sweep_without_axes_is_a_single_ride():
     np.testing.assert_allclose([table.x, table.y, table.end_speed], [1.0, 0.0, 2.0], atol=1e-12)
 
 
-@pytest.mark.newest
+@pytest.mark.oldest
 def test_a_ride_that_needs_more_than_the_most_steps_has_failed(bowl):
     """The file of the default limit says nothing of it, so that older files can be resumed."""
     table = stroller.sweep(Scene(BODY), LAUNCH, 3.0, axes={}, max_steps=3)

@@ -12,7 +12,7 @@ from tops import random_states, rutstam_top
 import tippe
 from nonholonomic.validation import all_bounds, legal
 
-pytestmark = pytest.mark.newest
+pytestmark = pytest.mark.oldest
 
 GOOD = {"mass": 0.02, "radius": 0.02, "offset": 0.006, "I1": 3e-6, "I3": 3.2e-6}
 EGG = {"mass": 0.05, "equatorial": 0.02, "polar": 0.028, "I1": 1.184e-5, "I3": 8e-6}

@@ -189,7 +189,7 @@ QUICK = ((0, 2), (17, 0))
 @pytest.mark.parametrize(
     ("arena", "law", "asked"),
     [
-        pytest.param(*pair, asked, marks=[pytest.mark.newest if (place, kind) in QUICK else pytest.mark.slow])
+        pytest.param(*pair, asked, marks=[pytest.mark.oldest if (place, kind) in QUICK else pytest.mark.slow])
         for place, pair in enumerate(SCENES)
         for kind, asked in enumerate(ASKED)
     ],

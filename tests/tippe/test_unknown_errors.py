@@ -8,7 +8,7 @@ from never_run import LAUNCH, density_of_a_film
 import tippe
 from nonholonomic.identification import Draws
 
-pytestmark = pytest.mark.newest
+pytestmark = pytest.mark.oldest
 
 FILM = {"launch": LAUNCH, "times": [0.0, 0.1, 0.2]}
 

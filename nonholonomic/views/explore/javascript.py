@@ -17,6 +17,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
+from ...compilation.xla_cpu import traced
 from ...lanes.components import MOVES
 
 #: A number: a Python number if known, otherwise its name or text in JavaScript. A value is an array of numbers.
@@ -25,13 +26,21 @@ Value = np.ndarray
 Values = list[Value]
 
 #: JavaScript for elementwise operations.
-_MATH = "abs sqrt cbrt sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp expm1 log log1p sign floor ceil"
+_MATH = (
+    "abs sqrt cbrt sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp expm1 log log1p log2 sign floor ceil"
+)
 _PAIRS = {"add": "+", "add_any": "+", "sub": "-", "mul": "*", "div": "/", "rem": "%", "eq": "==", "ne": "!=", "lt": "<"}
 _PAIRS |= {"le": "<=", "gt": ">", "ge": ">=", "and": "&", "or": "|", "xor": "^"}
 ELEMENTWISE = {name: f"Math.{name}({{}})" for name in _MATH.split()}
 ELEMENTWISE |= {name: f"{{}} {sign} {{}}" for name, sign in _PAIRS.items()}
 ELEMENTWISE |= {name: f"Math.{name}({{}}, {{}})" for name in ("max", "min", "pow", "atan2")}
-ELEMENTWISE |= {"neg": "-{}", "square": "{0} * {0}", "rsqrt": "1 / Math.sqrt({})", "exp2": "Math.pow(2, {})"}
+ELEMENTWISE |= {
+    "neg": "-{}",
+    "square": "{0} * {0}",
+    "one_minus_square": "(1 + {0}) * (1 - {0})",
+    "rsqrt": "1 / Math.sqrt({})",
+    "exp2": "Math.pow(2, {})",
+}
 ELEMENTWISE |= {"clamp": "Math.min(Math.max({1}, {0}), {2})", "logistic": "1 / (1 + Math.exp(-{}))"}
 ELEMENTWISE |= {"is_finite": "Number.isFinite({})"}
 # The order in which `jnp.searchsorted` and `jnp.interp` sort: NaN comes last.
@@ -100,7 +109,7 @@ def javascript(name: str, function: Callable[..., Any], *arguments: Any) -> str:
         names = (f"a{number}[{place}]" for place in itertools.count())
         shapes = [np.zeros(leaf.shape) for leaf in jax.tree.leaves(argument)]
         values += [_map(lambda _, names=names: block.name(next(names)), shape) for shape in shapes]
-    results = _flat(block.call(jax.make_jaxpr(function)(*arguments), values))
+    results = _flat(block.call(traced(function, *arguments)[0], values))
     statements = [f"out[{k}] = {_text(number)};" for k, number in enumerate(results)]
     heads = ", ".join([*(f"a{number}" for number in range(len(arguments))), "out"])
     body = _indented([*block.leading_to(results)[0], *statements, "return out;"])
@@ -201,6 +210,10 @@ class _Block:
         if name == "integer_pow":
             power = " * ".join(["{0}"] * abs(parameters["y"])) or "1"
             return power if parameters["y"] >= 0 else f"1 / ({power})"
+        if name == "polynomial":
+            return functools.reduce(
+                lambda terms, k: f"({terms}) * {{0}} + {{{k}}}", range(len(types) - 2, 0, -1), f"{{{len(types) - 1}}}"
+            )
         if name == "select_n":
             chain = (f"{{0}} == {k - 1} ? {{{k}}} : " for k in range(1, len(types)))
             return CHOICE if types[0] == np.bool_ else "".join(chain) + "NaN"

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from close import assert_close
+from jax.scipy.interpolate import RegularGridInterpolator
 
 import tippe
 from nonholonomic import Graph
@@ -65,6 +66,45 @@ def test_the_numbers_in_an_array_have_their_derivatives(held):
 
     squares = np.array([np.sum(x * x), np.sum(y * y)])
     assert_close(jax.jit(jax.grad(total))(jnp.asarray(BENDS)), np.array([squares, squares]), rtol=1e-14)
+
+
+class Ridge(eqx.Module):
+    """A ground whose function branches, with a number."""
+
+    height: float
+
+    def __call__(self, x, y):
+        return jax.lax.cond(x > 0.15, lambda: self.height * x * y, lambda: self.height * x)
+
+
+PLACES = np.linspace(-1.0, 1.0, 5)
+TERRAIN = RegularGridInterpolator((PLACES, PLACES), 0.2 * PLACES[:, None] + 0.1 * PLACES)
+
+#: Grounds that join, sort, look up or compare their numbers, and the same in NumPy for numbers.
+OF_NUMBERS = {
+    "interp": (lambda x, y: jnp.interp(x, PLACES, PLACES**2) + 0.0 * y, lambda x, y: np.interp(x, PLACES, PLACES**2)),
+    "searchsorted": (lambda x, y: x * jnp.searchsorted(PLACES, y), lambda x, y: x * np.searchsorted(PLACES, y)),
+    "grid": (lambda x, y: TERRAIN(jnp.array([x, y]))[0], lambda x, y: 0.2 * x + 0.1 * y),
+    "sort": (lambda x, y: jnp.sort(jnp.stack([x, y]))[0], min),
+    "einsum": (lambda x, y: jnp.einsum("i,i->", jnp.array([x, y]), jnp.array([x, x])), lambda x, y: x * x + x * y),
+    "norm": (lambda x, y: jnp.linalg.norm(jnp.stack([x, y])), np.hypot),
+    "cond": (lambda x, y: jax.lax.cond(x > y, jnp.sin, jnp.cos, x), lambda x, y: np.sin(x) if x > y else np.cos(x)),
+    "constant": (lambda x, y: 0.3, lambda x, y: 0.3),
+    "module": (Ridge(2.0), lambda x, y: 2.0 * x * (y if x > 0.15 else 1.0)),
+}
+
+
+@pytest.mark.parametrize("name", OF_NUMBERS)
+def test_a_height_is_a_function_of_numbers_in_every_lane(name):
+    """In lanes and for a single place; derivatives are those of differences."""
+    height, expected = OF_NUMBERS[name]
+    ground, x, y = Graph(height), jnp.array([0.1, 0.2, 0.3]), jnp.array([0.35, -0.2, 0.1])
+    heights = np.array([expected(*place) for place in zip(x.tolist(), y.tolist(), strict=True)])
+    assert_close(ground.ground(x, y), heights, rtol=1e-14)
+    assert_close(ground.ground(x[0], y[0]), heights[0], rtol=1e-14)
+    slope = ground.gradient((x, y, 0.0 * x))[0]
+    nearby = [expected(*place) for place in zip((x + 1e-7).tolist(), y.tolist(), strict=True)]
+    assert_close(-slope, (np.array(nearby) - heights) / 1e-7, atol=1e-5)
 
 
 @pytest.mark.slow

@@ -26,7 +26,7 @@ from nonholonomic.integration.scheduler import AbstractRecorder, LaneScheduler
 from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END
 from nonholonomic.integration.step import try_step
 
-pytestmark = pytest.mark.newest
+pytestmark = pytest.mark.oldest
 
 
 class Oscillators(AbstractProblem):

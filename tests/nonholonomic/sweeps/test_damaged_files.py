@@ -15,7 +15,7 @@ from nonholonomic.sweeps import Table
 from nonholonomic.sweeps._chunks import same_request
 from nonholonomic.views import Page
 
-pytestmark = pytest.mark.newest
+pytestmark = pytest.mark.oldest
 
 
 @pytest.fixture(scope="module")

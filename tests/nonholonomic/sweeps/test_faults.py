@@ -22,7 +22,7 @@ from nonholonomic.sweeps import Table, running
 from nonholonomic.sweeps._chunks import ChunkStore
 from nonholonomic.sweeps.layout import Layout
 
-pytestmark = pytest.mark.newest
+pytestmark = pytest.mark.oldest
 
 KILLER = Path(__file__).with_name("kill_sweeps.py")
 

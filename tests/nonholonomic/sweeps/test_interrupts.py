@@ -197,7 +197,7 @@ def test_a_table_is_heard_while_it_compiles(tmp_path):
     assert duration < PROMPT
 
 
-@pytest.mark.newest
+@pytest.mark.oldest
 def test_a_command_line_ends_while_it_compiles(tmp_path):
     process = run(tmp_path, COMMAND)
     assert process.stdout.readline() == "begun\n"

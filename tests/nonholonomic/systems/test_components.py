@@ -66,6 +66,20 @@ def test_a_number_that_is_not_finite_does_not_disappear_with_the_zeros_of_a_matr
     assert [equation.primitive.name for equation in jaxpr.eqns].count("mul") == 3
 
 
+def test_what_newer_versions_of_jax_trace_as_one_operation_is_evaluated_number_by_number():
+    """Products by `einsum`, binary logarithms, and the derivatives of inverse functions."""
+
+    def function(*parts):
+        vector = jnp.stack(parts[:2])
+        slope = jax.grad(lambda x: jnp.arctan(x) + jnp.tanh(x) + jnp.log2(x))
+        return jnp.einsum("i,ij,j->", vector, jnp.array([[1.0, 2.0], [2.0, 5.0]]), vector), slope(parts[2])
+
+    a, b, c = (np.asarray(part) for part in LANES[:3])
+    product, slope = by_components(function, *SCALARS)(*LANES)
+    assert_close(product, a * a + 4.0 * a * b + 5.0 * b * b, rtol=1e-14)
+    assert_close(slope, 1.0 / (1.0 + c * c) + 1.0 - np.tanh(c) ** 2 + 1.0 / (c * np.log(2.0)), rtol=1e-14)
+
+
 def test_large_functions_and_loops_are_left_in_arrays():
     def large(*parts):
         matrix = jnp.sin(jnp.outer(jnp.arange(20.0), jnp.stack(parts)))

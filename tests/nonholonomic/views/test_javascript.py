@@ -82,6 +82,9 @@ def array_work(x):
         jnp.all(x > 2.0),
         x[::-1],
         jnp.linalg.norm(x),
+        jnp.einsum("ij,j->i", matrix, x),
+        jnp.polyval(jnp.array([0.5, -1.0, 2.0, 3.0]), x),
+        jnp.log2(jnp.abs(x) + 1.0),
         jnp.hypot(x[0], x[1]),
     )
 
@@ -94,7 +97,9 @@ def looked_up(x):
 
 def slopes(x):
     """The derivative of a function by automatic differentiation."""
-    return jax.grad(lambda y: jnp.sin(y[0]) * y[1] ** 3 / jnp.sqrt(1.0 + y[2] ** 2))(x)
+    b = jnp.tanh(x)
+    of_inverses = jax.vmap(jax.grad(lambda b: jnp.arcsin(b) + jnp.arctanh(b) ** 2 + jnp.tanh(b)))(b)
+    return jax.grad(lambda y: jnp.sin(y[0]) * y[1] ** 3 / jnp.sqrt(1.0 + y[2] ** 2))(x), of_inverses
 
 
 FUNCTIONS = [loop, until, newton, of_two, of_three, everything, array_work, looked_up, slopes]

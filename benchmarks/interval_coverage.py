@@ -1,6 +1,6 @@
 """How often intervals of fits contain the truth, and estimates lie within one standard error of it, with default options.
 
-    nice python benchmarks/coverage.py [times late ... own] [--drawn] [--orders 1] [--repeats 200] [--rows coverage.jsonl]
+    nice python benchmarks/interval_coverage.py [times ... own] [--drawn] [--orders 1] [--repeats 200] [--rows coverage.jsonl]
 
 The truth is the same in all repeats, and starts are drawn within a factor of 1.5 of the friction, 12 % of the offset and
 5 % of the spin; numbers of other models within a factor of 1.5. With `--drawn`, fits start from the same values, and the
