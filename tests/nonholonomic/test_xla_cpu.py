@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nonholonomic.compilation.xla_cpu import greatest, least
+from nonholonomic.compilation.xla_cpu import greatest, in_one_kernel, least
 
 
 @pytest.mark.parametrize("function", [least, greatest])
@@ -35,3 +35,8 @@ def test_of_several_numbers():
     numbers = jnp.array([[3.0, 1.0], [2.0, 5.0], [4.0, 0.0]])
     np.testing.assert_array_equal(least(*numbers), [2.0, 0.0])
     np.testing.assert_array_equal(greatest(*numbers), [4.0, 5.0])
+
+
+def test_a_kernel_is_compiled_even_where_compilation_is_disabled():
+    with jax.disable_jit():
+        assert in_one_kernel(lambda x: x + 1.0)(jnp.ones(2)).tolist() == [2.0, 2.0]
