@@ -71,13 +71,15 @@ def _rooms_of_rates(parts: Arrays, xp: Any, round_off: float, exact: float) -> A
     G, W, n = parts["metric"], parts["constraints"], parts["metric"].shape[-1]
     left = {"finite": 0.0 * (xp.sum(G, axis=(-1, -2)) + xp.sum(W, axis=(-1, -2)))}
     # In units in which each coordinate with a mass has a mass of 1, the rules do not depend on the user's units.
-    unit = xp.sqrt(xp.abs(xp.diagonal(G, axis1=-2, axis2=-1)))
+    # Pages and components know no primitive for a diagonal.
+    identity = xp.eye(n, dtype=G.dtype)
+    unit = xp.sqrt(xp.abs(xp.sum(G * identity, axis=-1)))
     unit = xp.where(unit > 0.0, unit, 1.0)
     scaled = G / (unit[..., :, None] * unit[..., None, :])
     left["symmetry"] = exact - _greatest(xp, scaled - scaled.swapaxes(-1, -2), 2)
     # Projectors on the allowed directions and on the others, by orthonormal rows: batches of LAPACK inside a compiled program
     # can deadlock.
-    allowed, others = xp.broadcast_to(xp.eye(n, dtype=G.dtype), G.shape), xp.zeros_like(G)
+    allowed, others = xp.broadcast_to(identity, G.shape), xp.zeros_like(G)
     independent = xp.ones_like(left["finite"])
     for k in range(W.shape[-2]):
         row = _unit(xp, W[..., k, :] / unit)

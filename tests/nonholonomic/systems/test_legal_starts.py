@@ -7,7 +7,7 @@ import pytest
 from close import assert_close
 from own_modes import Ball, Sleigh
 
-from nonholonomic import AbstractSystem, Hybrid, event_time, simulate, sweep
+from nonholonomic import AbstractSystem, Hybrid, event_time, explore, simulate, sweep
 from nonholonomic.runs import model_of
 
 HEADING, TURN, TIME = 0.3, 1.1, 2.0
@@ -139,3 +139,8 @@ def test_a_table_computes_its_legal_cells_and_warns_once_of_the_others():
             assert np.array_equal(np.isfinite(table[name]), is_legal), name
     for row, inertia in ((0, 0.0), (2, 0.2)):
         assert_close(table["time"][row, 0], np.arccosh(TURN / 0.5) / pace(inertia), 1e-7)
+
+
+def test_a_page_may_have_sliders_whose_ends_are_illegal():
+    """Its rules are JavaScript; it draws only the legal runs."""
+    assert "Skate" in explore(Skate(inertia=0.2), START, None, {"mass": (-1.0, 3.0)}, 0.5).html
