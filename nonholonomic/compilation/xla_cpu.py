@@ -254,7 +254,15 @@ _ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
 #: A program with the attributes in all of its equations; `context` is the context of an equation without them.
 _kernel = Primitive("in_one_kernel")
 _kernel.multiple_results = True
-_kernel.def_impl(lambda *arguments, **parameters: jax.jit(functools.partial(_kernel.bind, **parameters))(*arguments))
+
+
+@_kernel.def_impl
+def _compiled_kernel(*arguments: Array, **parameters: Any) -> list[Array]:
+    # Without compilation, the kernel would call itself without end.
+    with jax.disable_jit(False):
+        return jax.jit(functools.partial(_kernel.bind, **parameters))(*arguments)
+
+
 _kernel.def_abstract_eval(lambda *arguments, program, context: [variable.aval for variable in program.outvars])
 
 

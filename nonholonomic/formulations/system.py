@@ -139,7 +139,8 @@ class AbstractSystem(eqx.Module):
         ```
         """
         gradient = jax.grad(lambda q: self.margin(t, q, rate))(q)
-        push = within_constraints(self, q, solve(self.metric(q), gradient, positive=True))
+        metric = with_constraints(self.metric(q), self.constraints(q))
+        push = within_constraints(self, q, solve(metric, gradient, positive=True))
         return rate - (1.0 + restitution) * (gradient @ rate) / (gradient @ push) * push
 
     def lagrangian(self, q: Coordinates, rate: Coordinates) -> Float[Array, ""]:
@@ -156,8 +157,24 @@ def within_constraints(system: AbstractSystem, q: Coordinates, rate: Coordinates
     W = system.constraints(q)
     if not W.shape[0]:
         return rate
-    per_impulse = solve(system.metric(q), W.T, positive=True)
+    per_impulse = solve(with_constraints(system.metric(q), W), W.T, positive=True)
     return rate - per_impulse @ solve(W @ per_impulse, W @ rate, positive=True)
+
+
+def with_constraints(metric: Float[Array, "n n"], W: Float[Array, "k n"]) -> Float[Array, "n n"]:
+    """The metric plus a mass for each forbidden direction, G + W^T S W.
+
+    Allowed motions do not feel these masses: they only change the multipliers. If parts have no mass, G is singular, and this
+    sum is positive definite where G is positive for the allowed rates. The masses have the size of those of the coordinates
+    that a constraint combines, so that they hide no small mass.
+    """
+    if not W.shape[0]:
+        return metric
+    lengths = jnp.sum(W * W, axis=1)
+    diagonal = jnp.sum(metric * np.eye(len(metric)), axis=1)
+    mean = W * W @ diagonal / lengths
+    masses = jnp.where(mean > 0.0, mean, jnp.sum(diagonal)) / lengths
+    return metric + W.T @ (jax.lax.stop_gradient(masses)[:, None] * W)
 
 
 class Routhian(AbstractSystem):

@@ -1,13 +1,15 @@
 """Settings of the integration; `DEFAULT_MAX_STEPS` limits the steps of a run, and `MOST_STEPS` those of a short run."""
 
-from typing import Self
+from typing import Any, Self
 
 import diffrax
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..validation import as_number, shown
+from ..validation import as_number, is_traced, shown
+from ..warning import warn
 from .oscillatory import Oscillatory8
 from .tuned_pair import AbstractTunedPair
 
@@ -22,12 +24,30 @@ DEFAULT_MAX_STEPS = 2_000_000
 MOST_STEPS = 100_000
 
 
+#: Least tolerance in single precision: below it, round-off would control the steps, and derivatives are often NaN.
+TIGHTEST_IN_SINGLE = 1e-5
+
+
+def as_tolerance(value: Any) -> Float[Array, ""]:
+    """Convert a tolerance to a number; in single precision to one of at least `TIGHTEST_IN_SINGLE`, with a warning."""
+    tolerance = as_number(value)
+    if not isinstance(tolerance, jax.Array) or tolerance.dtype != jnp.float32:
+        return tolerance
+    is_finer = (tolerance > 0.0) & (tolerance < 0.99 * TIGHTEST_IN_SINGLE)
+    if not is_traced(is_finer) and is_finer.any():
+        warn(
+            f"tolerance = {float(jnp.min(tolerance)):.3g} is finer than single precision resolves, and "
+            f"{TIGHTEST_IN_SINGLE:g} takes its place; leave out JAX_ENABLE_X64=0 for double precision"
+        )
+    return jnp.where(is_finer, TIGHTEST_IN_SINGLE, tolerance)
+
+
 class Settings(eqx.Module):
     """Settings of the integration, for every kind of result.
 
     **Arguments:**
 
-    - `tolerance`: relative tolerance.
+    - `tolerance`: relative tolerance; in single precision at least 1e-5.
     - `solver`: a solver of Diffrax, which must be an explicit Runge-Kutta solver for ensembles; `None` for
       `Oscillatory8` in ensembles and `Dopri8` in single runs, which need its dense output.
     - `absolute`: absolute tolerance as a fraction of the relative one, in units of the problem's magnitudes.
@@ -41,7 +61,7 @@ class Settings(eqx.Module):
     ('Oscillatory8', 'Dopri8')
     """
 
-    tolerance: Float[Array, ""] = eqx.field(converter=as_number)
+    tolerance: Float[Array, ""] = eqx.field(converter=as_tolerance)
     solver: diffrax.AbstractSolver | None = None
     absolute: float = eqx.field(static=True, default=ABSOLUTE)
     max_steps: int = eqx.field(static=True, default=DEFAULT_MAX_STEPS)

@@ -1,9 +1,11 @@
 """Error bounds for a table, from a second run of each cell at another tolerance."""
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
 from ..integration.checks import TIGHTEST
+from ..integration.settings import TIGHTEST_IN_SINGLE
 
 #: Ratio of the tolerance of the first run to that of the second. With a pair of eighth order, the second run costs 1.8
 #: times as much as the first. The error of the second run is a hundredth of that of the first, so the difference of the
@@ -27,8 +29,9 @@ def second_tolerance(tolerance: float) -> float:
     """Tolerance of the second run: a hundredth of that of the first run. If the integration allows no smaller
     tolerance, it is a hundred times that of the first run, and the bound is up to a hundred times wider."""
     fine_tolerance = tolerance / FINER
+    tightest = TIGHTEST if jnp.result_type(float) == jnp.float64 else TIGHTEST_IN_SINGLE
     # Because of rounding, the quotient of 1e-12 may be below the least tolerance.
-    return max(fine_tolerance, TIGHTEST) if fine_tolerance > 0.99 * TIGHTEST else tolerance * FINER
+    return max(fine_tolerance, tightest) if fine_tolerance > 0.99 * tightest else tolerance * FINER
 
 
 def error_bound(

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..integration import AbstractProblem, Settings
@@ -172,7 +173,8 @@ def sliders_of(model: AbstractModel, ranges: Any, drawn: tuple[str, ...] = ()) -
 def runs_at_ends(model: AbstractModel, sliders: tuple[Slider, ...], t1: float) -> list[Any]:
     """The run of a model, and those at both ends of every slider, which determine what part of the arena is drawn."""
     ends = [{slider.path: end} for slider in sliders for end in (slider.low, slider.high)]
-    return [changed.simulate(t1, None, DRAWN, None, None) for changed in (model, *map(model.replaced, ends))]
+    others = [changed for changed in map(model.replaced, ends) if np.all(changed.legal())]
+    return [changed.simulate(t1, None, DRAWN, None, None) for changed in (model, *others)]
 
 
 def live_run(

@@ -102,6 +102,10 @@ class AbstractModel(eqx.Module):
     def legal(self) -> Bool[Array, "..."]:
         """Whether the numbers, which may be traced, allow a run."""
 
+    def legal_cells(self, columns: dict[str, Any]) -> Any:
+        """Whether each cell of a table is legal, `None` if `check_axes` has raised an error for those that are not."""
+        return None
+
     # The motion.
 
     @property
@@ -286,6 +290,11 @@ def model_of(system: Any, start: Any, event: Any = None, input: Any = None, jump
 def check_run(model: AbstractModel, t1: Any, tolerance: Any) -> None:
     """Raise `ValueError` unless the model may run, and horizon and tolerance are single legal numbers."""
     model.check()
+    check_horizon(t1, tolerance)
+
+
+def check_horizon(t1: Any, tolerance: Any) -> None:
+    """Raise `ValueError` unless horizon and tolerance are single legal numbers."""
     require_all(run_bounds(t1, tolerance))
     for name, number in {"t1": t1, "tolerance": tolerance}.items():
         if np.ndim(number) != 0:

@@ -1,5 +1,6 @@
 """Simulate one run of any model."""
 
+import dataclasses
 from typing import Any
 
 import diffrax
@@ -92,7 +93,8 @@ def simulate_model(
     require_times(times, t1)
     settings = Settings(tolerance, solver)
     explicit_tableau(settings.for_lanes)
-    return _sampled(model, as_number(times), as_number(t1), settings)
+    unchecked = is_traced((model, times, t1, tolerance))
+    return _sampled(model, as_number(times), as_number(t1), settings, unchecked)
 
 
 def evenly_spaced(t1: Any) -> Float[Array, " times"]:
@@ -169,7 +171,12 @@ def sampled_if_legal(
         # An illegal run has zero length, but Diffrax would differentiate it.
         model = nan_unless(is_legal, model)
     settings = settings.with_tolerance(tolerance)
-    return is_legal, sampled(model, None, times, t1, settings, grid, adjoint), settings
+    run = sampled(model, None, times, t1, settings, grid, adjoint)
+    # The derivatives of a run of zero length are 0: those of an illegal run are made NaN here.
+    numbers = [leaf for leaf in jax.tree.leaves(model) if eqx.is_inexact_array(leaf)]
+    changes = [jnp.where(jnp.isfinite(leaf), leaf - jax.lax.stop_gradient(leaf), 0.0) for leaf in numbers]
+    change = jnp.where(is_legal, 0.0, jnp.nan) * sum(map(jnp.sum, changes))
+    return is_legal, dataclasses.replace(run, rows=run.rows + change), settings
 
 
 def problem_of_run(modules: tuple[AbstractModel, Names], cells: int | None) -> AbstractProblem:
@@ -180,16 +187,20 @@ def problem_of_run(modules: tuple[AbstractModel, Names], cells: int | None) -> A
 
 @eqx.filter_jit
 def _sampled(
-    model: AbstractModel, times: Float[Array, " times"], t1: Float[Array, ""], settings: Settings
+    model: AbstractModel, times: Float[Array, " times"], t1: Float[Array, ""], settings: Settings, unchecked: bool
 ) -> Trajectory:
-    """The run, or NaN and "failed" if a traced number is out of range."""
-    is_legal, samples, legal_settings = sampled_if_legal(model, times, t1, settings)
+    """The run, or NaN and "illegal" if a traced number is out of range. **Arguments:** `unchecked`: whether one is traced."""
+    if unchecked:
+        is_legal, samples, legal_settings = sampled_if_legal(model, times, t1, settings)
+    else:
+        # Already checked, so the program need not contain the rules.
+        is_legal, samples, legal_settings = jnp.asarray(True), sampled(model, None, times, t1, settings), settings
     outcome = samples.outcome
     names = tuple(model.quantities)
     values = model.read(names, times, nan_unless(is_legal, samples.rows), samples.mode)
     status = model.ended(outcome, legal_settings.tolerance)[0]
-    is_reached = jnp.all(jnp.isfinite(samples.rows), axis=0)
-    mode = jnp.where(is_reached, 0, -1) if samples.mode is None else samples.mode
+    is_reached = is_legal & jnp.all(jnp.isfinite(samples.rows), axis=0)
+    mode = jnp.where(is_reached, 0 if samples.mode is None else samples.mode, -1)
     return Trajectory(
         t=times,
         state=jnp.stack([values[name] for name in names], axis=-1),
@@ -198,7 +209,7 @@ def _sampled(
         switches=sum((count[0] for count in outcome.counts), jnp.zeros((), int)),
         steps=outcome.steps[0],
         rejected=outcome.rejected[0],
-        code=jnp.where(is_legal, status, int(Status.FAILED)),
+        code=jnp.where(is_legal, status, int(Status.ILLEGAL)),
         model=model,
         t1=t1,
         settings=settings,

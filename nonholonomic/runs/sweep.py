@@ -12,12 +12,16 @@ from .. import sweeps
 from ..integration import Settings, explicit_tableau
 from ..integration.checks import require_times
 from ..integration.settings import DEFAULT_MAX_STEPS
+from ..integration.status import Status
 from ..sweeps import Axis, Quantity, Table, Variable, axis, cells_to_check, chunk_for, scattered_cells, size_of
+from ..sweeps.grid import columns
 from ..sweeps.layout import EQUATIONS
+from ..sweeps.table import cells_with
 from ..text import likely
 from ..validation import as_number, require_flag, require_outside, require_whole, shown
+from ..warning import warn
 from .equations import checksum_of, has_users_code
-from .model import AbstractModel, check_run, model_of, require_event
+from .model import AbstractModel, check_horizon, model_of, require_event
 from .samples import Samples
 from .table import ScatteredJob, TableForm, TableJob
 
@@ -130,7 +134,7 @@ def sweep(
     if crossing not in ("first", "last", "both"):
         raise ValueError(f"crossing = {shown(crossing)} must be 'first', 'last' or 'both'")
     model = model_of(system, start, event, input, jumps)
-    check_run(model, t1, tolerance)
+    check_horizon(t1, tolerance)
     samples = samples_of(model.quantities, times, quantities, t1)
     options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
     named = {model.full_name("axes", name): values for name, values in axes.items()}
@@ -229,11 +233,12 @@ def compute_table(
     if options.path is not None and has_users_code(job.model.users):
         request |= {EQUATIONS: checksum_of(job.model)}
     work: Any = job
+    listed: dict[str, Any] | None = None
     if options.scattered:
-        columns = scattered_cells(grid)
-        request |= {"cells": digest(columns)}
+        listed = scattered_cells(grid)
+        request |= {"cells": digest(listed)}
         variables = {axis.name: Variable(axis.unit, np.float64, long_name=axis.long_name) for axis in grid} | variables
-        work = ScatteredJob(job, columns, {axis.number: axis.name for axis in grid})
+        work = ScatteredJob(job, listed, {axis.number: axis.name for axis in grid})
         grid = [Axis("cell", "cell", "1", np.arange(len(grid[0].values)), "cell")]
     cells, least = size_of(grid), job.model.least_chunk
     chunk = max(least, chunk_for(cells)) if least is not None and cells > 4 * least else None
@@ -244,7 +249,24 @@ def compute_table(
         # A run has about a dozen components.
         most = max(16, 1 << (MOST_SAMPLED // (12 * len(job.samples.times))).bit_length() - 1)
     running = {"path": options.path, "progress": options.progress, "executor": options.executor}
-    return sweeps.sweep(work, grid, variables, request, chunk=chunk, most=most, inner=inner, **running)
+    table = sweeps.sweep(work, grid, variables, request, chunk=chunk, most=most, inner=inner, **running)
+    illegal = cells_with(table, "status", Status.ILLEGAL.word)
+    if len(illegal):
+        first, of_all = (illegal[0], listed) if listed is not None else (0, columns(grid, int(illegal[0]), 1))
+        values = {name: float(values[first]) for name, values in of_all.items()}
+        _warn_of_illegal_cells(job.model, values, len(illegal), cells)
+    return table
+
+
+def _warn_of_illegal_cells(model: AbstractModel, first: dict[str, float], count: int, cells: int) -> None:
+    """Warn of the cells of a table that may not run. **Arguments:** `first`: the parameters of the first of them."""
+    reason = ""
+    try:
+        model.replaced(first).check()
+    except ValueError as error:
+        named = ", ".join(f"{name} = {value:.6g}" for name, value in first.items())
+        reason = f"; {'the first is at ' * bool(named)}{named}: {error}"
+    warn(f"{count} of {cells} cells are illegal: their results are NaN, and their status is 'illegal'{reason}")
 
 
 def digest(columns: dict[str, Any]) -> str:

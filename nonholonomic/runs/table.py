@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..derivatives import tangent_scale, tangents_of
 from ..hybrid import HybridOutcome
@@ -139,6 +139,27 @@ class TableJob(NamedTuple):
         if self.by_diffrax and count == 0:
             # Diffrax always computes a whole chunk, so a call only to compile would compute the first chunk twice.
             return {}
+        legal = self.model.legal_cells(columns)
+        # Without columns, there is one cell.
+        legal = None if legal is None else np.atleast_1d(legal)
+        if legal is None or legal[:count].all():
+            return self._of_legal(columns, count)
+        # The legal cells come first, and only they run: with the same program as any others.
+        order = np.argsort(~legal | (np.arange(len(legal)) >= count), kind="stable")
+        ordered = {name: values[order] for name, values in columns.items()}
+        variables = self._of_legal(ordered, int(legal[:count].sum()))
+        back = np.argsort(order)
+        return {name: self._unless_illegal(name, legal, np.asarray(values)[back]) for name, values in variables.items()}
+
+    def _unless_illegal(self, name: str, legal: Bool[np.ndarray, " cells"], values: np.ndarray) -> np.ndarray:
+        """A variable of which the illegal cells are NaN, or 0 for integers, with the status "illegal"."""
+        nothing: Any = np.nan if np.issubdtype(values.dtype, np.floating) else 0
+        if name == "status":
+            nothing = self.form.codes[Status.ILLEGAL]
+        return np.where(legal.reshape(-1, *(1,) * (values.ndim - 1)), values, nothing).astype(values.dtype)
+
+    def _of_legal(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+        """The variables of some cells, of which only the first `count` are run, which are legal."""
         size = next((len(values) for values in columns.values()), 1)
         cells = self.model.replaced(columns)
         sampled: dict[str, Any] = {}

@@ -79,8 +79,9 @@ class Trajectory(Viewable, Tabular, eqx.Module):
 
     @property
     def status(self) -> Any:
-        """How the run ended: "completed" at `t1`; "stopped" if a mode without a reset ended; "failed"; or "unresolved"
-        if resets followed one another without end.
+        """How the run ended: "completed" at `t1`; "stopped" if a mode without a reset ended; "failed"; "unresolved"
+        if resets followed one another without end; or, inside a transformation, "illegal" for a start that raises an error
+        elsewhere.
 
         For a batch of runs, an array of words; inside a transformation, the integer.
         """

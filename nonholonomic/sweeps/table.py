@@ -8,6 +8,7 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
+from jaxtyping import Int
 
 from ..text import as_html, in_unit, readable_unit, require_unit, require_unit_of
 from ..validation import as_path, replacing, require_package, shown
@@ -371,3 +372,14 @@ def _summary(values: Values) -> str:
         return "none finite"
     missing = values.size - finite.size
     return f"{finite.min():.6g} to {finite.max():.6g}" + (f", {missing} not finite" if missing else "")
+
+
+def cells_with(table: Table, name: str, word: str) -> Int[np.ndarray, " cells"]:
+    """The indices of the cells in which a variable of words has this word. A table in a file is read as codes, which need
+    a byte for each cell."""
+    words, variables = table.words.get(name, ()), table.variables
+    if word not in words:
+        return np.zeros(0, int)
+    if isinstance(variables, StoredVariables):
+        return np.flatnonzero(variables.stored.whole(name) == words.index(word))
+    return np.flatnonzero(np.ravel(variables[name]) == word)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import operator
 from typing import Any
 
 import equinox as eqx
@@ -22,14 +23,11 @@ from ..runs.trajectory import Trajectory
 from ..sweeps import Axis, Quantity, Variable
 from ..text import name_of
 from ..validation import as_number, is_traced, shown
-from ..warning import warn
 from .engine import Cells
 from .form import Form, arguments_in_words
+from .legality import RULES, parts_of_start, problem_of_start, rooms
 from .mode import AbstractMode, Event, Hybrid, require_event
 from .system import MechanicalEvent, MechanicalMode, check_start, formulation_of, is_pair, with_modes_of_systems
-
-#: The margin, in units of the greatest component of the start, below zero by more than which a start is outside its mode.
-OUTSIDE = 1e-9
 
 
 class OwnModel(AbstractModel):
@@ -88,7 +86,16 @@ class OwnModel(AbstractModel):
         return self.parameters.tree
 
     def check(self) -> None:
-        """The start and the system were checked when the model was made."""
+        if is_traced(self):
+            return
+        parts = jax.tree.map(np.asarray, _compiled_parts(self))
+        with np.errstate(all="ignore"):
+            left = rooms(parts, np)
+        system = self.parameters.tree["system"]
+        for rule in RULES:
+            if rule in left and not left[rule] >= 0.0:
+                mode = f"modes[{system.first}]." if isinstance(system, Hybrid) else ""
+                raise ValueError(problem_of_start(parts, rule, mode))
 
     def require_values(self, values: dict[str, Any]) -> None:
         check_again(self.replaced(values).parameters.tree)
@@ -100,12 +107,12 @@ class OwnModel(AbstractModel):
                 self.require_values({axis.number: value})
 
     def legal(self) -> Bool[Array, "..."]:
-        starts = [
-            value
-            for name, value in zip(self.parameters.names, self.parameters.values, strict=True)
-            if name.startswith("start")
-        ]
-        return functools.reduce(jnp.logical_and, map(jnp.isfinite, starts))
+        return _all_left(rooms(_parts_of_cells(self), jnp))
+
+    def legal_cells(self, columns: dict[str, Any]) -> Any:
+        parts = jax.tree.map(np.asarray, _compiled_parts(self.replaced(columns)))
+        with np.errstate(all="ignore"):
+            return _all_left(rooms(parts, np))
 
     @property
     def smooth(self) -> bool:
@@ -191,7 +198,7 @@ class OwnModel(AbstractModel):
 
     @property
     def words(self) -> tuple[str, ...]:
-        return ("event", "completed", "stopped", "failed", "unresolved")
+        return ("event", "completed", "stopped", "failed", "unresolved", "illegal")
 
     def ended(self, outcome: Outcome | HybridOutcome, tolerance: Any) -> Int[Array, " cells"]:
         return statuses(outcome.status, Status.STOPPED)
@@ -215,20 +222,24 @@ def assembled(tree: dict[str, Any]) -> tuple[Hybrid, Array, AbstractFormulation 
     return Hybrid([MechanicalMode(formulation)], event), formulation.state(start["q"], start["rate"]), formulation
 
 
-def _at_start(tree: dict[str, Any]) -> OwnModel:
-    """The model of a tree; with a warning if the start is outside its mode."""
-    model = OwnModel.of(tree)
-    if model.form.traits.ends[model.form.first] and not is_traced(tree):
-        hybrid, state, _ = assembled(tree)
-        first: Any = hybrid.modes[hybrid.first]
-        margin = float(np.asarray(first.margin(jnp.zeros(()), state)))
-        # A start on the margin may miss it by round-off.
-        if margin < -OUTSIDE * max(1.0, float(np.max(np.abs(state)))):
-            warn(
-                f"start: the margin of the first mode is {margin:.4g}, below zero: the run begins with the end of this mode; "
-                "start where the margin is positive"
-            )
-    return model
+def _all_left(left: dict[str, Any]) -> Any:
+    """Whether no rule of a start is broken."""
+    return functools.reduce(operator.and_, (room >= 0.0 for room in left.values()))
+
+
+def _parts_of_cells(model: OwnModel) -> dict[str, Array]:
+    """What the rules of a start compare (`legality.parts_of_start`), for all cells."""
+
+    def of_one(*numbers: Array) -> dict[str, Array]:
+        tree = model.parameters.form.tree(numbers)
+        return parts_of_start(tree["system"], tree["start"])
+
+    values = jax.lax.stop_gradient(model.parameters.values)
+    axes = tuple(0 if jnp.ndim(value) else None for value in values)
+    return of_one(*values) if set(axes) == {None} else jax.vmap(of_one, in_axes=axes)(*values)
+
+
+_compiled_parts = eqx.filter_jit(_parts_of_cells)
 
 
 def checked_event(event: Any, state: Array) -> Event:
@@ -263,7 +274,7 @@ def _(system: Hybrid, start: Any, event: Event | None = None, input: Any = None,
     event = system.event if event is None else event
     if event is not None:
         system = dataclasses.replace(system, event=checked_event(event, state))
-    return _at_start({"system": system, "start": state if pair is None else pair, "event": None})
+    return OwnModel.of({"system": system, "start": state if pair is None else pair, "event": None})
 
 
 @model_of.register(AbstractSystem)
@@ -273,7 +284,7 @@ def _(system: AbstractSystem, start: Any, event: Event | None = None, input: Any
     q, rate = (as_number(part) for part in start)
     if event is not None:
         event = checked_event(event, jnp.concatenate([q, rate]))
-    return _at_start({"system": system, "start": {"q": q, "rate": rate}, "event": event})
+    return OwnModel.of({"system": system, "start": {"q": q, "rate": rate}, "event": event})
 
 
 @model_of.register(AbstractMode)

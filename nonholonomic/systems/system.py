@@ -16,13 +16,10 @@ from jaxtyping import Array, Float
 from ..formulations import AbstractFormulation, AbstractSystem, Hamel, Lagrange
 from ..formulations.system import within_constraints
 from ..lanes.tracing import named_errors
-from ..validation import as_number, is_traced, require, shown
+from ..validation import as_number, require, shown
 from ..warning import warn
 from .form import Form
 from .mode import AbstractMode, Event, Hybrid, State
-
-#: Largest relative violation of the constraints by a start's velocity.
-VIOLATION = 1e-9
 
 
 class MechanicalMode(AbstractMode):
@@ -118,9 +115,6 @@ def check_start(system: Hybrid | AbstractSystem, start: Any) -> None:
             )
         form = Form.of(Hybrid([MechanicalMode(Lagrange(mode))]), 2 * mode.dimension)[0]
         _check_functions(form, prefix)
-    first = modes[0] if isinstance(system, AbstractSystem) else system.modes[system.first]
-    if isinstance(first, AbstractSystem):
-        _check_constraints(first, *(start if is_pair(start) else jnp.split(as_number(start), 2)))
 
 
 def _check_vector(value: Any, name: str, size: int | None) -> None:
@@ -181,28 +175,6 @@ def _shape_of(result: Any) -> Any:
     if isinstance(result, tuple):
         return tuple(map(_shape_of, result))
     return None if result is None else getattr(result, "shape", "")
-
-
-def _check_constraints(system: AbstractSystem, q: Any, rate: Any) -> None:
-    """Raise `ValueError` if the rates of a start violate the constraints, or if the frame does not fit them."""
-    q, rate = as_number(q), as_number(rate)
-    constraints = system.constraints(q)
-    if not constraints.size:
-        return
-    violation, frame = constraints @ rate, constraints @ system.frame(q)[:, : system.freedom]
-    if is_traced(violation) or is_traced(frame):
-        return
-    error = float(jnp.max(jnp.abs(violation)))
-    if error > VIOLATION * float(jnp.max(jnp.abs(constraints)) * jnp.max(jnp.abs(rate))):
-        raise ValueError(
-            f"start: rate = {np.asarray(rate)} violates the constraints by {error:.3g}; constraints(q) @ rate must be 0"
-        )
-    component = float(jnp.max(jnp.abs(frame)))
-    if isinstance(formulation_of(system), Hamel) and component > VIOLATION * float(jnp.max(jnp.abs(constraints))):
-        raise ValueError(
-            f"frame(q): the constraints must annihilate its first {system.freedom} columns, and do so only up to "
-            f"{component:.3g}; leave it out to run with Lagrange multipliers"
-        )
 
 
 #: Least similarity of a name to a known one, as `difflib` measures it: "forces" and "force" have 0.91.

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -174,13 +175,19 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         return float(min(crossings(self.spec, self.steps, name, level), default=np.inf))
 
     @property
-    def status(self) -> str:
-        """How the run ended: the first of the words `failed`, `rank_lost`, `contact_lost` and `completed` that applies.
+    def status(self) -> Any:
+        """How the run ended: the first of the words `illegal`, `failed`, `rank_lost`, `contact_lost` and `completed` that
+        applies; for a batch of runs, an array of words.
 
-        After `contact_lost`, the run continues as if the ground could pull.
+        After `contact_lost`, the run continues as if the ground could pull. A run from inside a transformation is `illegal`
+        if its numbers raise an error elsewhere.
         """
+        if self.t.ndim > 1:
+            count = self.t.shape[0]
+            return np.array([jax.tree.map(lambda leaf, k=k: leaf[k], self).status for k in range(count)])
         if not (bool(self.stats.finished) and np.all(np.isfinite(self.state))):
-            return "failed"
+            is_legal = self.spec.parts[0].legal()
+            return "failed" if np.all(is_legal) else "illegal"
         run = self.with_steps()
         if np.isfinite(run.rank_lost_at):
             return "rank_lost"

@@ -56,3 +56,8 @@ def test_a_loop_in_one_kernel_computes_the_same_whatever_it_does(name):
 
     x = np.linspace(0.1, 0.9, 4)
     np.testing.assert_allclose(jax.jit(in_one_kernel(loop))(x), loop(x), rtol=1e-12, atol=1e-15)
+
+
+def test_a_kernel_is_compiled_even_where_compilation_is_disabled():
+    with jax.disable_jit():
+        assert in_one_kernel(lambda x: x + 1.0)(jnp.ones(2)).tolist() == [2.0, 2.0]

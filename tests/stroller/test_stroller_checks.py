@@ -21,7 +21,7 @@ def push(t, motion):
 
 
 def test_illegal_numbers_in_a_batch_of_rides_give_nothing_that_looks_right():
-    """Constructors do not see these numbers: the ride has failed, and all its quantities are NaN."""
+    """Constructors do not see these numbers: the ride is illegal, and all its quantities are NaN."""
 
     def ride(mass, steering, latitude, damping, tolerance):
         scene = Scene(Stroller(mass, 0.7, 0.4, 0.05), Sphere(2.0), Damping(damping), side="inside")
@@ -36,6 +36,7 @@ def test_illegal_numbers_in_a_batch_of_rides_give_nothing_that_looks_right():
         ]
     rides = jax.jit(jax.vmap(ride))(*jnp.array(columns).T)
     assert rides.stats.finished.tolist() == [True] + 7 * [False]
+    assert rides.status.tolist() == ["completed"] + 7 * ["illegal"]
     assert jax.vmap(ride)(*jnp.array(columns).T[:, :0]).speed.shape == (0, 2)
     for quantity in (rides.position, rides.steering, rides.energy, rides.work, rides.normal_force, rides.load):
         assert np.all(np.isfinite(quantity[0]))

@@ -89,12 +89,9 @@ def test_resets_without_end_are_unresolved():
 
 
 def test_a_printed_run_states_why_it_ended():
-    with pytest.warns(
-        UserWarning, match="the margin of the first mode is -1, below zero: the run begins with the end of"
-    ):
-        run = simulate(Hybrid([Ball()]), [-1.0, 0.0, 0.0], 1.0, times=[0.0, 1.0])
+    run = simulate(Hybrid([Ball(0.2)]), jnp.array([1.0, 0.0, 0.0]), 5.0, times=jnp.array([0.2, 4.0]))
     lines = str(run).splitlines()
-    assert lines[0] == "Trajectory of 2 times, unresolved at 0 s"
+    assert lines[0].startswith("Trajectory of 2 times, unresolved at 0.67")
     assert [line.split(":")[0].strip() for line in lines[1:6]] == ["y0", "y1", "y2", "resets", "steps"]
     assert lines[6].strip().startswith("resets followed one another without end; add a mode for rest")
     assert "without end" not in str(simulate(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.0, times=[0.0, 1.0]))
@@ -103,7 +100,7 @@ def test_a_printed_run_states_why_it_ended():
 def test_a_printed_batch_states_how_its_runs_ended():
     starts = jnp.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
     runs = jax.vmap(lambda start: simulate(Hybrid([Ball()]), start, 1.0, times=[0.0, 1.0]))(starts)
-    assert str(runs) == "3 runs of 2 times: 2 completed, 1 unresolved"
+    assert str(runs) == "3 runs of 2 times: 2 completed, 1 illegal"
     texts = []
     jax.jit(lambda start: texts.append(str(simulate(Hybrid([Ball()]), start, 1.0, times=[0.0, 1.0]))))(starts[0])
     assert texts == ["Trajectory of 2 times, inside a transformation"]
@@ -431,6 +428,5 @@ def test_the_first_contact_with_a_vibrating_table(mode, start, atol):
 
 
 def test_the_reason_of_an_unresolved_run_names_the_limit_of_resets():
-    with pytest.warns(UserWarning, match="the margin of the first mode"):
-        run = simulate(Hybrid([Ball()]), [-1.0, 0.0, 0.0], 1.0, times=[0.0, 1.0])
+    run = simulate(Hybrid([Ball(0.2)]), [1.0, 0.0, 0.0], 5.0, times=[0.2, 4.0])
     assert "it may have at most 2000 resets" in str(run)
