@@ -55,6 +55,7 @@ class Recording(AbstractRecording):
     - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for outliers; `None`:
       Gaussian.
     - `input`: the input of a stroller.
+    - `side`: "before" or "after": the state that a sample at the time of a reset is; a level after a dose is "after".
 
     **Raises:** `ValueError` for shapes that do not fit.
 
@@ -70,6 +71,7 @@ class Recording(AbstractRecording):
     t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     input: Any = None
+    side: str = eqx.field(static=True, default="before")
     quantities: ClassVar[Quantities] = AnyQuantities({}, {}, ANGLES)
 
     @property
