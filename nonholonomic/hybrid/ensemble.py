@@ -141,6 +141,12 @@ def after_solve(
     )
 
 
+def resolution(start: Float[Numbers, "*runs"], end: Float[Numbers, "*runs"]) -> Float[Numbers, "*runs"]:
+    """How accurately the end of a mode is known [s], which lasts from `start` to `end` [s]: events are located to 1e-10 of a
+    step, and times are rounded."""
+    return 1e-10 * (end - start) + 16.0 * np.finfo(float).eps * end
+
+
 def after_reset(
     xp: Any, runs: HybridOutcome[Numbers], transition: Transition[Numbers], t1: Float[Numbers, " cells"]
 ) -> HybridOutcome[Numbers]:

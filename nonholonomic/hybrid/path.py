@@ -15,7 +15,7 @@ from ..compilation.xla_cpu import compiled_quickly
 from ..integration import AbstractProblem, DenseSolution, Outcome, Settings, follow
 from ..integration.dense import PIECE_OF_MODE
 from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED
-from .ensemble import Carry, after_reset, after_solve, at_start, host_rounds
+from .ensemble import Carry, after_reset, after_solve, at_start, host_rounds, resolution
 from .mode import AbstractBatchedMode, Transition
 
 #: The number of a segment between two modes.
@@ -119,7 +119,8 @@ class HybridPath(NamedTuple):
         return output
 
     def _where(self, times: Float[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
-        ends = np.array([segment.end for segment in self.segments])
+        begins, ends = np.array([(segment.begin, segment.end) for segment in self.segments]).T
+        ends = np.maximum.accumulate(ends + resolution(begins, ends))
         return np.minimum(np.searchsorted(ends, times), len(ends) - 1)
 
 

@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float
 
 from ..compilation.xla_cpu import greatest
 from ..integration import Settings, solve_with_samples
-from .ensemble import Advance, Carry, HybridOutcome, after_reset, after_solve, chosen, padded
+from ..integration.status import LEFT_DOMAIN
+from .ensemble import Advance, Carry, HybridOutcome, after_reset, after_solve, chosen, padded, resolution
 from .mode import AbstractBatchedMode, mode_of_cells, over_cells
 from .path import BETWEEN
 from .saltation import VariationalMode
@@ -55,8 +56,14 @@ def sampled_rounds(
             options = {"n_blocks": n_blocks, "one_kernel": True}
             outcome, samples = solve_with_samples(problem, times_in_mode, left, count, settings, **options)
             after = chosen(active, after_solve(jnp, runs, outcome, t1), runs)
-            is_new = active & (times_in_mode >= 0.0) & (times <= after.end_time) & jnp.isnan(output.number)
-            state = jnp.where(is_new, jnp.moveaxis(samples, -1, 0).swapaxes(1, 2), output.state)
+            # A sample at the time of a reset is the state before it.
+            is_last = abs(times - after.end_time) <= resolution(runs.end_time, after.end_time)
+            is_last &= outcome.status == LEFT_DOMAIN
+            samples = jnp.moveaxis(samples, -1, 0).swapaxes(1, 2)
+            samples = jnp.where(is_last, outcome.state[:, None], samples)
+            is_within = (times_in_mode >= 0.0) & (times <= after.end_time)
+            is_new = active & (is_within | is_last) & jnp.isnan(output.number)
+            state = jnp.where(is_new, samples, output.state)
             return after, output._replace(state=state, number=jnp.where(is_new, runs.mode, output.number))
 
         return jax.lax.cond(jnp.any(active), solved, lambda: carry)

@@ -97,7 +97,8 @@ class AbstractRecording(eqx.Module):
     - `quantity`: what was recorded: a quantity, a column, or a tuple of them.
     - `t0`: the clock's reading [s] at the launch.
     - `student`: degrees of freedom of Student's t distribution of the errors; `None` for Gaussian errors. The attribute
-      `quantities` of a subclass lists what can be recorded.
+      `quantities` of a subclass lists what can be recorded. Its field `side`, where it has one, says which state a sample
+      at the time of a reset is: the one "before" or "after" it.
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
 
@@ -123,11 +124,15 @@ class AbstractRecording(eqx.Module):
     student: eqx.AbstractVar[Float[Array, ""] | None]
     quantities: eqx.AbstractClassVar[Quantities]
     units: ClassVar[dict[str, str]] = {"times": "s", "t0": "s"}
+    # Without an annotation: a subclass may have a field of this name.
+    side = "before"
 
     def __repr__(self) -> str:
         return one_line(self)
 
     def __check_init__(self):
+        if self.side not in ("before", "after"):
+            raise ValueError(f'side = {shown(self.side)} must be "before" or "after": samples at the time of a reset')
         require(self.times, "times")
         times = np.asarray(self.times, dtype=float)
         if times.ndim != 1 or not len(times) or np.any(np.diff(times) <= 0.0):

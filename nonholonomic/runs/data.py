@@ -55,6 +55,7 @@ class Recording(AbstractRecording):
     - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for outliers; `None`:
       Gaussian.
     - `input`: the input of a stroller; `jumps`: times [s] at which it jumps, as for `stroller.simulate`.
+    - `side`: "before" or "after": the state that a sample at the time of a reset is; a level after a dose is "after".
 
     **Raises:** `ValueError` for shapes that do not fit.
 
@@ -71,6 +72,7 @@ class Recording(AbstractRecording):
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     input: Any = None
     jumps: Any = None
+    side: str = eqx.field(static=True, default="before")
     quantities: ClassVar[Quantities] = AnyQuantities({}, {}, ANGLES)
 
     @property

@@ -47,7 +47,7 @@ class Source(eqx.Module):
         """Sets of data with equal keys are lanes of one batch."""
         arrays = jax.tree.structure(eqx.filter(self.model, eqx.is_array))
         columns = getattr(self.data, "columns", None)
-        return type(self.data), arrays, columns, id(getattr(self.data, "event", None))
+        return type(self.data), arrays, columns, getattr(self.data, "side", None), id(getattr(self.data, "event", None))
 
 
 class Lanes(eqx.Module):
@@ -166,6 +166,8 @@ def _predicted(sources: list[Source], values: list[Values], rows: int, settings:
             return nan_unless(lane.is_legal, data.predicted(lane.model, lane.horizon, settings))
         # An illegal run might never end, so it ends at its start.
         times = jnp.where(lane.is_legal, _model_times(*lane.horizon), 0.0)
+        # A sample at the time of a reset, as accurately as it is known, is the state before it.
+        times = times * (1.0 + INSTANT) if data.side == "after" else times
         run = sampled(lane.model, data.names, times, times[-1], settings)
         columns = data.columns_of(lane.model, lane.model.read(data.names, times, run.rows, run.mode))
         return nan_unless(lane.is_legal, jnp.stack(columns, axis=-1))

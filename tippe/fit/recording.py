@@ -46,6 +46,7 @@ class Recording(AbstractRecording):
     - `t0`: the clock's reading [s] at the launch. Before this time, the top is at its launch position.
     - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for data with outliers;
       `None` for Gaussian errors.
+    - `side`: "before" or "after": the state that a sample at the time of an impact is.
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
 
@@ -62,6 +63,7 @@ class Recording(AbstractRecording):
     quantity: str | tuple[str, ...] = eqx.field(static=True, default="theta", converter=as_quantity)
     t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
+    side: str = eqx.field(static=True, default="before")
     quantities: ClassVar[Quantities] = QUANTITIES
 
     def model(self, scene: Scene) -> AbstractModel:

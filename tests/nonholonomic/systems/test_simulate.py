@@ -430,3 +430,70 @@ def test_the_first_contact_with_a_vibrating_table(mode, start, atol):
 def test_the_reason_of_an_unresolved_run_names_the_limit_of_resets():
     run = simulate(Hybrid([Ball(0.2)]), [1.0, 0.0, 0.0], 5.0, times=[0.2, 4.0])
     assert "it may have at most 2000 resets" in str(run)
+
+
+class Doses(AbstractMode):
+    """A level that decays, at the sum of some rates, and a clock that adds a dose after each second."""
+
+    decay: tuple = (0.7,)
+
+    def field(self, t, y):
+        return jnp.stack([-sum(self.decay) * y[0], jnp.ones_like(t)])
+
+    def margin(self, t, y):
+        return 1.0 - y[1]
+
+    def reset(self, t, y):
+        return jnp.stack([y[0] + 1.0, 0.0 * y[1]]), 0
+
+
+def level(times, decay, after=False):
+    """The sum of the doses that have been given, each decayed; one at the time of a sample counts if `after`."""
+    doses = np.arange(1.0, 21.0)[:, None]
+    given = (times >= doses) if after else (times > doses)
+    return np.exp(-decay * times) + np.sum(np.where(given, np.exp(-decay * (times - doses)), 0.0), axis=0)
+
+
+DOSE_TIMES = np.linspace(0.0, 20.0, 201).round(12)
+
+
+def levels(decay):
+    return simulate(Hybrid([Doses(tuple(decay))]), [1.0, 0.0], 20.0, times=DOSE_TIMES).state[:, 0]
+
+
+def test_a_sample_at_a_reset_is_the_state_before_it():
+    """Also where the times of the resets are rounded: in runs, tables and derivatives, forwards and backwards."""
+    expected = level(DOSE_TIMES, 0.7)
+    slope = (level(DOSE_TIMES, 0.7001) - level(DOSE_TIMES, 0.6999)) / 2e-4
+    run = simulate(Hybrid([Doses()]), [1.0, 0.0], 20.0)
+    assert_close(run.state[:, 0], expected, rtol=1e-9)
+    assert_close(jax.jit(jax.jacfwd(levels))(jnp.array([0.7]))[:, 0], slope, atol=1e-6)
+    decays = jnp.tile(jnp.array([[0.1], [0.15]]), 7)
+    gradient = jax.jit(jax.grad(lambda decays: jnp.sum(jax.vmap(levels)(decays) * DOSE_TIMES)))(decays)
+    assert_close(gradient[0], np.full(7, slope @ DOSE_TIMES), rtol=1e-6)
+    axes = {"modes[0].decay[0]": [0.7, 0.8]}
+    table = sweep(Hybrid([Doses()]), [1.0, 0.0], 20.0, axes=axes, times=DOSE_TIMES, quantities=["y0"], progress=False)
+    assert_close(table["y0"][0], expected, rtol=1e-9)
+
+
+def test_samples_at_the_times_of_all_resets():
+    """A dropped ball hits the ground with the speed v, e v, e^2 v, ..."""
+    ball = Hybrid([Ball(0.8)])
+    for tolerance in (1e-6, 1e-9):
+        impacts = simulate(ball, START, 3.0, tolerance=tolerance).resets["time"]
+        run = simulate(ball, START, 3.0, times=impacts, tolerance=tolerance)
+        speeds = np.sqrt(2.0 * GRAVITY) * 0.8 ** np.arange(len(impacts))
+        assert_close(run.state[:, :2], np.stack([0.0 * speeds, -speeds], axis=-1), atol=1e-5)
+        assert np.all(np.asarray(run.mode) == 0)
+
+
+@pytest.mark.parametrize("side", ["before", "after"])
+def test_a_recording_says_on_which_side_of_a_reset_its_samples_are(side):
+    """The levels of 1 s, 2 s, ... just before or just after the doses, fitted from another start."""
+    times = np.arange(1.0, 8.0)
+    values = level(times, 0.7, side == "after")
+    recording = nonholonomic.Recording([1.0, 0.0], times, values, 0.001, "y0", side=side)
+    fit = nonholonomic.identify(Hybrid([Doses()]), recording, {"decay[0]": 0.6}, progress=False)
+    assert_close(fit.estimates["system.modes[0].decay[0]"], 0.7, atol=1e-5)
+    with pytest.raises(ValueError, match=r"side = 'below' must be \"before\" or \"after\""):
+        nonholonomic.Recording([1.0, 0.0], times, values, 0.001, "y0", side="below")
