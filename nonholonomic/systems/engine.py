@@ -114,7 +114,7 @@ class ModeProblem(AbstractProblem):
 
     def _margins(self, state: States) -> tuple[Lanes, ...]:
         """The margins without allowances."""
-        return (self._over_lanes(self.form.function("margin", self.mode), state),)
+        return self._over_lanes(self.form.function("margins", self.mode), state)
 
     def _at_start(self) -> tuple[Array, ...]:
         """The margins at the start; their slopes along the motion; the errors of both if the error of every component is the
@@ -197,17 +197,32 @@ class BatchedMode(AbstractBatchedMode):
         the event happens at the reset, and the run ends between two modes.
         """
         axes = tuple(0 if jnp.ndim(number) else None for number in self.numbers)
-        reset = jax.vmap(self._reset_one, in_axes=(axes, 1, 1), out_axes=_TRANSITION_AXES)
-        return reset(self.numbers, state, self.scales)
+        reset = jax.vmap(self._reset_one, in_axes=(axes, 1, 1, 0), out_axes=_TRANSITION_AXES)
+        return reset(self.numbers, state, self.scales, self._exit(stop_gradient(state)))
+
+    def _exit(self, state: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+        """The index of the margin that ended the mode: the first of those that are least up to round-off and fall."""
+        if self.form.traits.ends[self.mode] < 2:
+            return jnp.zeros(state.shape[1], int)
+        problem = ModeProblem(self.numbers, state, self.scales, self.tolerance, self.form, self.mode)
+        value, slope, error, slope_error, _ = jax.tree.map(stop_gradient, problem)._at_start()
+        is_least = value <= jnp.min(value, axis=0) + ROUND_OFF / self.tolerance * error
+        falls = is_least & (slope < -ACCUMULATED * slope_error)
+        steepest = jnp.argmin(jnp.where(is_least, slope, jnp.inf), axis=0)
+        return jnp.where(jnp.any(falls, axis=0), jnp.argmax(falls, axis=0), steepest)
 
     def _reset_one(
-        self, numbers: Sequence[Array], state: Float[Array, " components"], scales: Float[Array, " components"]
+        self,
+        numbers: Sequence[Array],
+        state: Float[Array, " components"],
+        scales: Float[Array, " components"],
+        exit: Int[Array, ""],
     ) -> Transition:
         form, zero, now, never = self.form, jnp.zeros((), int), jnp.zeros(()), jnp.asarray(jnp.inf)
         if not form.traits.resets[self.mode]:
             return Transition(zero + self.mode, state, now, zero + LEFT_DOMAIN, never, zero[None])
         t, y = time_and_state(form, tuple(state))
-        state_after, number = form.function("reset", self.mode)(numbers, t, y)
+        state_after, number = form.function("reset", self.mode)(numbers, t, y, exit)
         number = jnp.asarray(number).astype(int)
         for mode, is_projected in enumerate(form.traits.projected):
             if is_projected:

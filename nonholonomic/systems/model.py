@@ -24,7 +24,7 @@ from ..validation import as_number, is_traced, shown
 from ..warning import warn
 from .engine import Cells
 from .form import Form, arguments_in_words
-from .mode import AbstractMode, Event, Hybrid, require_event
+from .mode import AbstractMode, Event, Hybrid, require_event, values_of_margin
 from .system import MechanicalEvent, MechanicalMode, check_start, formulation_of, is_pair, with_modes_of_systems
 
 #: The margin, in units of the greatest component of the start, below zero by more than which a start is outside its mode.
@@ -220,7 +220,7 @@ def _at_start(tree: dict[str, Any]) -> OwnModel:
     if model.form.traits.ends[model.form.first] and not is_traced(tree):
         hybrid, state, _ = assembled(tree)
         first: Any = hybrid.modes[hybrid.first]
-        margin = float(np.asarray(first.margin(jnp.zeros(()), state)))
+        margin = float(np.min(np.asarray(values_of_margin(first.margin(jnp.zeros(()), state)))))
         # A start on the margin may miss it by round-off.
         if margin < -OUTSIDE * max(1.0, float(np.max(np.abs(state)))):
             warn(
