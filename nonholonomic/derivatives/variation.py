@@ -105,6 +105,9 @@ class VariationalProblem(AbstractProblem):
     def lost_at_start(self, state: Float[Array, "components lanes"]) -> Any:
         return self.problem.lost_at_start(self.parts(state)[0])
 
+    def exact_margin(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        return self.problem.exact_margin(time, self.parts(state)[0])
+
     def margins(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
         return self.problem.margins(time, self.parts(state)[0])
 

@@ -78,16 +78,21 @@ class AbstractSystem(eqx.Module):
         """Generalised force f(t, q, q') in addition to that of the potential; zero by default."""
         return jnp.zeros_like(q)
 
-    def margin(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Float[Array, ""] | None:
+    def margin(
+        self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates
+    ) -> Float[Array, "..."] | dict[str, Float[Array, ""]] | None:
         """A smooth function that is positive while the system moves freely and falls through zero where it strikes something,
-        such as the distance from a wall; `None`, the default, for a system that strikes nothing. An oscillation in time that is
+        such as the distance from a wall; several in an array, (k,), or in a dict by name, of which the first to fall counts;
+        `None`, the default, for a system that strikes nothing. An oscillation in time that is
         faster than the motion can be missed: let `force` contain it.
         """
         return None
 
     def reset(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> tuple[Any, ...] | None:
         """The coordinates and rates that follow when the margin has fallen to zero, `(q, rate)`, such as those after an
-        `impact`; `None`, the default, if the run ends here.
+        `impact`; `None`, the default, if the run ends here. If there are several margins, write
+        `reset(self, t, q, rate, exit)`: `exit` is the index of the margin that fell, or for a dict a dict that is true for its
+        name and false for the others.
 
         The constraints hold after the reset, too: rates that violate them are projected onto them, orthogonally in the
         kinetic metric. The change is the impulse of the constraints, as if the reset happened without constraints and
@@ -97,7 +102,12 @@ class AbstractSystem(eqx.Module):
         return None
 
     def impact(
-        self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates, restitution: Float[ArrayLike, ""] = 1.0
+        self,
+        t: Float[ArrayLike, ""],
+        q: Coordinates,
+        rate: Coordinates,
+        restitution: Float[ArrayLike, ""] = 1.0,
+        exit: Any = None,
     ) -> Coordinates:
         """The rates after an impact without friction on the surface where the margin is zero.
 
@@ -105,7 +115,8 @@ class AbstractSystem(eqx.Module):
         time, so that the rates obey them before and after. The rate of the margin changes its sign and is multiplied by
         the restitution (Newton's law of impact). With a restitution of 1, the energy is conserved.
 
-        **Arguments:** `t`, `q`, `rate`: at the impact; `restitution`: usually in [0, 1].
+        **Arguments:** `t`, `q`, `rate`: at the impact; `restitution`: usually in [0, 1]; `exit`: as for `reset`, for a system
+        with several margins.
 
         **Returns:** the rates, for use in `reset`; NaN if the constraints hold the system against the impulse.
 
@@ -138,7 +149,14 @@ class AbstractSystem(eqx.Module):
 
         ```
         """
-        gradient = jax.grad(lambda q: self.margin(t, q, rate))(q)
+
+        def margin(q: Coordinates) -> Float[Array, ""]:
+            margin: Any = self.margin(t, q, rate)
+            if isinstance(margin, dict):
+                return sum((jnp.where(exit[name], value, 0.0) for name, value in margin.items()), jnp.zeros(()))
+            return margin if exit is None else margin[exit]
+
+        gradient = jax.grad(margin)(q)
         metric = with_constraints(self.metric(q), self.constraints(q))
         push = within_constraints(self, q, solve(metric, gradient, positive=True))
         return rate - (1.0 + restitution) * (gradient @ rate) / (gradient @ push) * push
@@ -221,11 +239,12 @@ class Routhian(AbstractSystem):
     def force(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
         return jnp.delete(self.full.force(t, *self.complete(q, rate)), self.cyclic)
 
-    def margin(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Float[Array, ""] | None:
+    def margin(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Any:
         return self.full.margin(t, *self.complete(q, rate))
 
-    def reset(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> tuple[Any, ...] | None:
-        following = self.full.reset(t, *self.complete(q, rate))
+    def reset(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates, *exit: Any) -> tuple[Any, ...] | None:
+        full: Any = self.full
+        following = full.reset(t, *self.complete(q, rate), *exit)
         if following is None:
             return None
         q, rate, *number = following

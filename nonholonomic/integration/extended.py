@@ -92,6 +92,9 @@ class ExtendedProblem(AbstractProblem, Generic[Core]):
     def lost_at_start(self, state: States) -> Bool[Array, "..."] | None:
         return self.problem.lost_at_start(state[: self.leading])
 
+    def exact_margin(self, time: Lanes, state: States) -> Lanes | None:
+        return self.problem.exact_margin(time, state[: self.leading])
+
     def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
         return self.problem.margins(time, state[: self.leading])
 

@@ -81,6 +81,12 @@ class AbstractProblem(eqx.Module):
         """
         return None
 
+    def exact_margin(self, time: Lanes, state: States) -> Lanes | None:
+        """The domain margin without allowances. Runs that leave the domain go back to its zero; `None`, the default, if they
+        end where the zero of the domain margin was located, up to a fraction of a step.
+        """
+        return None
+
     def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
         """The smooth functions of which `domain_margin` is the least; a step searches each of them for a missed double root."""
         domain_margin = self.domain_margin(time, state)
@@ -143,6 +149,9 @@ class CoreProblem(AbstractProblem):
 
     def lost_at_start(self, state: States) -> Bool[Array, "..."] | None:
         return self.whole.lost_at_start(self._longer(state))
+
+    def exact_margin(self, time: Lanes, state: States) -> Lanes | None:
+        return self.whole.exact_margin(time, self._longer(state))
 
     def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
         return self.whole.margins(time, self._longer(state))

@@ -197,7 +197,8 @@ class LaneScheduler(eqx.Module):
 
         carry = (self.start(), self.empty(), collected)
         progress, outcome, collected = jax.lax.while_loop(lambda carry: self.unfinished(carry[0]), period, carry)
-        return self.store(outcome, progress.lane_state), progress.iterations, collected
+        outcome = back_to_margin(self.problem, self.store(outcome, progress.lane_state))
+        return outcome, progress.iterations, collected
 
     def start(self) -> SchedulerState:
         """The first cells, one in each lane."""
@@ -278,6 +279,25 @@ def outcome_of(lane_state: LaneState) -> Outcome:
     return Outcome(lane_state.status, *times, lane_state.state, lane_state.steps, lane_state.rejected)
 
 
+def back_to_margin(problem: AbstractProblem, outcome: Outcome) -> Outcome:
+    """The outcome in which the cells that left the domain have gone back to the zero of the exact margin, but not to before
+    their start. The end was located to a fraction of a step, and where an allowance was used up."""
+    time, state = outcome.end_time, outcome.state
+    margin = problem.exact_margin(time, state)
+    if margin is None:
+        return outcome
+    rates = problem.field(time, state)
+    slope = jax.jvp(lambda point: problem.exact_margin(time, point), (state,), (rates,))[1]
+    beyond = (outcome.status == LEFT_DOMAIN) & (margin < 0.0) & (slope < 0.0)
+    shift = jnp.where(beyond, jnp.maximum(-margin / jnp.where(beyond, slope, 1.0), -time), 0.0)
+    new_state = state + shift * problem.field(time + 0.5 * shift, state + 0.5 * shift * rates)
+    # Where the slope is an error, its tangent leads elsewhere.
+    new_margin = problem.exact_margin(time + shift, new_state)
+    assert new_margin is not None
+    nearer = beyond & (jnp.abs(new_margin) <= 0.5 * jnp.abs(margin))
+    return outcome._replace(end_time=jnp.where(nearer, time + shift, time), state=jnp.where(nearer, new_state, state))
+
+
 def _fresh_lanes(
     problem: AbstractProblem,
     control: Control,
@@ -290,11 +310,13 @@ def _fresh_lanes(
     false = jnp.zeros(lengths.shape, bool)
     if problem.direction_decides:
         before_event = _holds(problem, problem.event_function, states, rates, lengths)
-        valid = _holds(problem, lambda point: problem.domain_margin(zero, point), states, rates, lengths)
+        lost, margin = problem.lost_at_start(states), problem.domain_margin(zero, states)
+        if lost is None or margin is None:
+            valid = _holds(problem, lambda point: problem.domain_margin(zero, point), states, rates, lengths)
+        else:
+            valid = ~lost & (margin > 0.0)
         side = jnp.ones_like(zero) if before_event is None else jnp.where(before_event, 1.0, -1.0).astype(zero.dtype)
         status = jnp.full(zero.shape, RUNNING) if valid is None else jnp.where(valid, RUNNING, LEFT_DOMAIN)
-        lost = problem.lost_at_start(states)
-        status = status if lost is None else jnp.where(lost, LEFT_DOMAIN, status)
         return _lanes_at_start(problem, states, rates, lengths, side, status, jnp.full_like(zero, jnp.inf))
     crossing, domain_margin = problem.event_function(states), margin_at_start(problem, zero, states)
     is_beyond = false

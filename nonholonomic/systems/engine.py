@@ -5,6 +5,7 @@ layout as equations written for the engine: components along the first axis, lan
 time is an additional component of the state.
 """
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any
@@ -12,9 +13,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
+from ..compilation.xla_cpu import least
 from ..hybrid import AbstractBatchedMode, Transition
 from ..integration import AbstractProblem, Jumps, Lanes, States
 from ..integration.status import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
@@ -23,31 +26,47 @@ from ..runs import UNMEASURED
 from .form import Form, OfRun
 from .mode import State
 
-#: A function counts as zero if changing every component of the state by this fraction of its size could make it zero.
-#: The first fraction is for the end of a mode, which is located only to 1e-10 of a step, so that a long step leaves an
-#: error; the second is for round-off.
-AT_END, ROUND_OFF = 1e-6, 1e-14
+#: A function counts as zero if changing every component of the state by this fraction of its size could make it zero:
+#: round-off.
+ROUND_OFF = 1e-14
+
+#: A state at the start of a mode may be wrong by this many times the tolerance, because the mode before ended with an
+#: error. Slower changes of a margin than such errors allow say nothing of its direction.
+ACCUMULATED = 100.0
+
+#: When a margin whose slope at the start of the mode is an error is looked at for its direction, increasing, in units of the
+#: time in which an error of its slope becomes one of its value.
+SOON = 4.0 ** -np.arange(10.0, 0.0, -1.0)
 
 
 class ModeProblem(AbstractProblem):
     """The motion in one mode, up to the event or the end of the mode.
 
-    `numbers`: the system's numbers; `states`, `scales`: as `start` returns them; `jump_times`: the readings of the clock in
-    the state at which a function of the mode may jump.
+    `numbers`: the system's numbers; `states`, `scales`: as `start` returns them; `tolerance`: of the modes before;
+    `jump_times`: the readings of the clock in the state at which a function of the mode may jump; `allowances`: for each
+    margin an allowance for errors of the start, zero where the mode does not begin on the margin.
     """
 
     numbers: tuple[Float[Array, "..."], ...]
-    states: Float[Array, "components cells"]
-    scales: Float[Array, "components cells"]
+    states: Float[Array, "components *cells"]
+    scales: Float[Array, "components *cells"]
+    tolerance: Float[Array, ""]
     form: Form = eqx.field(static=True)
     mode: int = eqx.field(static=True)
     jump_times: Float[Array, "jumps *cells"] | None = None
+    allowances: Float[Array, "margins *cells"] | None = None
 
     @classmethod
     def of(
-        cls, numbers: tuple[Float[Array, "..."], ...], states: States, scales: States, form: Form, mode: int
+        cls,
+        numbers: tuple[Float[Array, "..."], ...],
+        states: States,
+        scales: States,
+        tolerance: Float[Array, ""],
+        form: Form,
+        mode: int,
     ) -> "ModeProblem":
-        """The problem of a mode, with the jumps of its functions."""
+        """The problem of a mode, with the jumps of its functions and its allowances."""
         times = None
         if form.traits.depends_on_time:
             axes = tuple(0 if jnp.ndim(number) else None for number in numbers)
@@ -56,7 +75,16 @@ class ModeProblem(AbstractProblem):
             times = found(numbers) if is_single else jax.vmap(found, in_axes=(axes,), out_axes=-1)(numbers)
             times = times if times.ndim == states.ndim else times.reshape(len(times), *[1] * (states.ndim - 1))
             times = jnp.broadcast_to(times, (len(times), *states.shape[1:])) if len(times) else None
-        return cls(numbers, states, scales, form, mode, times)
+        problem = cls(numbers, states, scales, tolerance, form, mode, times)
+        if not form.traits.ends[mode]:
+            return problem
+        value, _, error, _, is_tangential = jax.tree.map(stop_gradient, problem)._at_start()
+        # Where the margin rises with slope 0, errors of the start may let it fall at first.
+        dip = jnp.where(is_tangential, error, ROUND_OFF / tolerance * error)
+        allowances = jnp.where(
+            jnp.abs(value) <= ACCUMULATED * error, dip + 2.0 * jnp.maximum(-value, 0.0) + 1e-200, 0.0
+        )
+        return dataclasses.replace(problem, allowances=stop_gradient(allowances))
 
     @property
     def direction_decides(self) -> bool:
@@ -82,10 +110,76 @@ class ModeProblem(AbstractProblem):
         return self._over_lanes(self.form.function("event"), state) if self.form.has_event else None
 
     def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
-        if self.form.traits.ends[self.mode]:
-            return self._over_lanes(self.form.function("margin", self.mode), state)
-        # If some modes have a domain margin, all modes need one.
-        return None if self.form.traits.smooth else jnp.ones_like(state[0])
+        margins = self.margins(time, state)
+        return least(*margins) if margins else None
+
+    def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
+        if self.allowances is None:
+            # If some modes have a domain margin, all modes need one.
+            return () if self.form.traits.smooth else (jnp.ones_like(state[0]),)
+        return tuple(margin + extra for margin, extra in zip(self._margins(state), self.allowances, strict=True))
+
+    def exact_margin(self, time: Lanes, state: States) -> Lanes | None:
+        return least(*self._margins(state)) if self.form.traits.ends[self.mode] else None
+
+    def lost_at_start(self, state: States) -> Bool[Array, "..."] | None:
+        if self.allowances is None:
+            return None
+        value, slope, error, slope_error, is_tangential = self._at_start()
+        falls = jax.lax.cond(
+            jnp.any(is_tangential),
+            lambda: self._falls_soon(value, error + 2.0 * jnp.abs(value), error / slope_error),
+            lambda: jnp.zeros(value.shape, bool),
+        )
+        is_near = jnp.abs(value) <= ACCUMULATED * error
+        falls = jnp.where(is_tangential, falls, slope < 0.0) & (value <= ROUND_OFF / self.tolerance * error)
+        return jnp.any(jnp.where(is_near, falls, value <= 0.0), axis=0)
+
+    def _margins(self, state: States) -> tuple[Lanes, ...]:
+        """The margins without allowances."""
+        return self._over_lanes(self.form.function("margins", self.mode), state)
+
+    def _at_start(self) -> tuple[Array, ...]:
+        """The margins at the start; their slopes along the motion; the errors of both if the error of every component is the
+        tolerance, and whether value and slope are such errors."""
+
+        def value_and_slope(state: States) -> tuple[Array, Array]:
+            rates = self.field(jnp.zeros_like(state[0]), state)
+            return jax.jvp(lambda point: jnp.stack(self._margins(point)), (state,), (rates,))
+
+        state = self.states
+        # The states at the samples of one cell have the scales of the cell.
+        scales = self.scales.reshape(*self.scales.shape, *[1] * (state.ndim - self.scales.ndim))
+        sizes = jnp.abs(state) + jnp.where(scales < UNMEASURED, 0.1 * scales, 0.0)
+        directions = jnp.eye(len(state)).reshape(*2 * state.shape[:1], *[1] * (state.ndim - 1)) * sizes
+        (value, slope), pushed = jax.linearize(value_and_slope, state)
+        error, slope_error = (self.tolerance * jnp.sum(jnp.abs(part), axis=0) for part in jax.vmap(pushed)(directions))
+        is_near = jnp.abs(value) <= ACCUMULATED * error
+        return value, slope, error, slope_error, is_near & (jnp.abs(slope) <= ACCUMULATED * slope_error)
+
+    def _falls_soon(
+        self, value: Float[Array, "margins *cells"], error: Float[Array, "margins *cells"], unit: Array
+    ) -> Bool[Array, "margins *cells"]:
+        """Whether each margin falls where it first changes by more than an error: the sign of its first derivative along the
+        motion that is not zero. **Arguments:** `unit`: that of `SOON` [s]."""
+        state, zero = self.states, jnp.zeros_like(self.states[0])
+        rates, length = self.field(zero, state), jnp.min(jnp.where(jnp.isfinite(unit), unit, 1.0), axis=0)
+
+        def change(share: Float[Array, ""]) -> Float[Array, "margins *cells"]:
+            def stage(carry: Any, weights: tuple[Array, Array]) -> Any:
+                rate, total = carry
+                rate = self.field(zero, state + share * length * weights[0] * rate)
+                return (rate, total + weights[1] * rate), None
+
+            # The classical method of Runge and Kutta.
+            weights = (jnp.array([0.0, 0.5, 0.5, 1.0]), jnp.array([1.0, 2.0, 2.0, 1.0]) / 6.0)
+            (_, mean), _ = jax.lax.scan(stage, (rates, jnp.zeros_like(rates)), weights)
+            return jnp.stack(self._margins(state + share * length * mean)) - value
+
+        changes = jax.vmap(change)(jnp.asarray(SOON))
+        first = jnp.argmax(jnp.abs(changes) > error, axis=0)
+        chosen = jnp.take_along_axis(changes, first[None], axis=0)[0]
+        return chosen < -error
 
     def jumps(self, time: Lanes, state: States) -> Jumps | None:
         return None if self.jump_times is None else Jumps.at(self.jump_times, state[-1] - time)
@@ -109,17 +203,18 @@ def time_and_state(form: Form, parts: tuple[Array, ...]) -> tuple[Array, State]:
 class BatchedMode(AbstractBatchedMode):
     """A user's mode as a mode of the engine, for cells with `numbers` and `scales` as in `ModeProblem`.
 
-    `continues`: whether a run continues through its event.
+    `tolerance`: of the integration; `continues`: whether a run continues through its event.
     """
 
     numbers: tuple[Float[Array, "..."], ...]
     scales: Float[Array, "components cells"]
+    tolerance: Float[Array, ""]
     form: Form = eqx.field(static=True)
     mode: int = eqx.field(static=True)
     continues: bool = eqx.field(static=True, default=False)
 
     def problem(self, state: Float[Array, "components cells"]) -> ModeProblem:
-        return ModeProblem.of(self.numbers, state, self.scales, self.form, self.mode)
+        return ModeProblem.of(self.numbers, state, self.scales, self.tolerance, self.form, self.mode)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """The reset, or the end of the run if the mode has no reset.
@@ -128,30 +223,32 @@ class BatchedMode(AbstractBatchedMode):
         the event happens at the reset, and the run ends between two modes.
         """
         axes = tuple(0 if jnp.ndim(number) else None for number in self.numbers)
-        reset = jax.vmap(self._reset_one, in_axes=(axes, 1, 1), out_axes=_TRANSITION_AXES)
-        return reset(self.numbers, state, self.scales)
+        reset = jax.vmap(self._reset_one, in_axes=(axes, 1, 1, 0), out_axes=_TRANSITION_AXES)
+        return reset(self.numbers, state, self.scales, self._exit(stop_gradient(state)))
+
+    def _exit(self, state: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+        """The index of the margin that ended the mode: the first of those that are least up to round-off and fall."""
+        if self.form.traits.ends[self.mode] < 2:
+            return jnp.zeros(state.shape[1], int)
+        problem = ModeProblem(self.numbers, state, self.scales, self.tolerance, self.form, self.mode)
+        value, slope, error, slope_error, _ = jax.tree.map(stop_gradient, problem)._at_start()
+        is_least = value <= jnp.min(value, axis=0) + ROUND_OFF / self.tolerance * error
+        falls = is_least & (slope < -ACCUMULATED * slope_error)
+        steepest = jnp.argmin(jnp.where(is_least, slope, jnp.inf), axis=0)
+        return jnp.where(jnp.any(falls, axis=0), jnp.argmax(falls, axis=0), steepest)
 
     def _reset_one(
-        self, numbers: Sequence[Array], state: Float[Array, " components"], scales: Float[Array, " components"]
+        self,
+        numbers: Sequence[Array],
+        state: Float[Array, " components"],
+        scales: Float[Array, " components"],
+        exit: Int[Array, ""],
     ) -> Transition:
-        form = self.form
-        function = (
-            form.function("margin", self.mode)
-            if form.traits.ends[self.mode]
-            else lambda numbers, t, y: 1.0 + 0.0 * y[0]
-        )
-        margin = _Watched(form, self.mode, function, numbers, scales)
-        value, slope = margin.along(state)
-        # The end was located to a fraction of a step and may lie after the zero; the way back is known.
-        close = margin.is_near_zero(state, AT_END) & (slope < 0.0) & (value < 0.0)
-        delay = jnp.where(close, -value / jnp.where(close, slope, 1.0), 0.0)
-        state = state + delay * margin.rate(state)
-        zero = jnp.zeros((), int)
+        form, zero, now, never = self.form, jnp.zeros((), int), jnp.zeros(()), jnp.asarray(jnp.inf)
         if not form.traits.resets[self.mode]:
-            no_time = jnp.full_like(delay, jnp.inf)
-            return Transition(zero + self.mode, state, delay, zero + LEFT_DOMAIN, no_time, zero[None])
+            return Transition(zero + self.mode, state, now, zero + LEFT_DOMAIN, never, zero[None])
         t, y = time_and_state(form, tuple(state))
-        state_after, number = form.function("reset", self.mode)(numbers, t, y)
+        state_after, number = form.function("reset", self.mode)(numbers, t, y, exit)
         number = jnp.asarray(number).astype(int)
         for mode, is_projected in enumerate(form.traits.projected):
             if is_projected:
@@ -160,21 +257,19 @@ class BatchedMode(AbstractBatchedMode):
         state_after = jnp.concatenate([state_after, state[form.size :]])
         status = jnp.where((number >= 0) & (number < form.modes), RUNNING, FAILED)
         if not form.has_event:
-            return Transition(number, state_after, delay, status, jnp.full_like(delay, jnp.inf), zero[None] + 1)
-        event = _Watched(form, self.mode, form.function("event"), numbers, scales)
-        value_before, slope_before = event.along(state)
-        ends = event.is_near_zero(state, ROUND_OFF) & (slope_before < 0.0)
-        jumps = ~ends & (value_before > 0.0) & (event.value(state_after) <= 0.0)
+            return Transition(number, state_after, now, status, never, zero[None] + 1)
+        event = _Watched(form, self.mode, numbers, scales)
+        ends = event.is_zero(state) & (event.slope(state) < 0.0)
+        jumps = ~ends & (event.value(state) > 0.0) & (event.value(state_after) <= 0.0)
         crossed = ends | jumps
         if self.continues:
-            crossing_time = jnp.where(crossed, delay, jnp.inf)
-            return Transition(number, state_after, delay, status, crossing_time, zero[None] + 1)
+            return Transition(number, state_after, now, status, jnp.where(crossed, now, never), zero[None] + 1)
         return Transition(
             mode=jnp.where(ends, self.mode, jnp.where(jumps, form.modes, number)),
             state=jnp.where(ends, state, state_after),
-            elapsed=delay,
+            elapsed=now,
             status=jnp.where(crossed, CROSSED, status),
-            crossing_time=jnp.where(crossed, delay, jnp.inf),
+            crossing_time=jnp.where(crossed, now, never),
             counts=jnp.where(ends, 0, 1)[None],
         )
 
@@ -185,31 +280,27 @@ _TRANSITION_AXES = Transition(*_AXES)
 
 
 class _Watched(eqx.Module):
-    """A function that ends a mode or defines the event, for a single run: its value for a state with its time."""
+    """The event, for a single run: its function for a state with its time."""
 
     form: Form = eqx.field(static=True)
     mode: int = eqx.field(static=True)
-    function: OfRun = eqx.field(static=True)
     numbers: Sequence[Array]
     scales: Float[Array, " components"]
 
     def value(self, state: Float[Array, " components"]) -> Float[Array, ""]:
-        return self.function(self.numbers, *time_and_state(self.form, tuple(state)))
+        return self.form.function("event")(self.numbers, *time_and_state(self.form, tuple(state)))
 
-    def rate(self, state: Float[Array, " components"]) -> Float[Array, " components"]:
-        """Rate of the state in the mode."""
+    def slope(self, state: Float[Array, " components"]) -> Float[Array, ""]:
+        """The rate of the value along the motion in the mode."""
         rate = self.form.function("field", self.mode)(self.numbers, *time_and_state(self.form, tuple(state)))
-        return jnp.concatenate([rate, jnp.ones(len(state) - self.form.size)])
+        rate = jnp.concatenate([rate, jnp.ones(len(state) - self.form.size)])
+        return jax.jvp(self.value, (state,), (rate,))[1]
 
-    def along(self, state: Float[Array, " components"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """The value and its rate along the motion."""
-        return jax.jvp(self.value, (state,), (self.rate(state),))
-
-    def is_near_zero(self, state: Float[Array, " components"], fraction: float) -> Bool[Array, ""]:
-        """Whether changing each component by a fraction of its size could make the function zero."""
+    def is_zero(self, state: Float[Array, " components"]) -> Bool[Array, ""]:
+        """Whether the function is zero up to round-off."""
         slopes = jax.jacfwd(self.value)(state)
         sizes = jnp.abs(state) + jnp.where(self.scales < UNMEASURED, self.scales, 0.0)
-        return jnp.abs(self.value(state)) <= fraction * jnp.sum(jnp.abs(slopes) * sizes)
+        return jnp.abs(self.value(state)) <= ROUND_OFF * jnp.sum(jnp.abs(slopes) * sizes)
 
 
 class Cells(eqx.Module):
@@ -250,13 +341,14 @@ class Cells(eqx.Module):
         return jax.vmap(of_one, in_axes=(axes, 1, 1), out_axes=1)(self.numbers, states, changes)
 
     def problem(self, cells: int | None) -> ModeProblem:
-        """The problem of a system whose runs are smooth."""
-        return ModeProblem.of(self.numbers, *self.states(cells), self.form, self.form.first)
+        """The problem of a system whose runs are smooth, which starts without an error."""
+        return ModeProblem.of(self.numbers, *self.states(cells), jnp.asarray(ROUND_OFF), self.form, self.form.first)
 
     def modes(
-        self, cells: int, continues: bool = False
+        self, cells: int, tolerance: Any, continues: bool = False
     ) -> tuple[tuple[BatchedMode, ...], Int[Array, " cells"], Float[Array, "components cells"]]:
         """The modes of a system with resets, the index of the first mode, and the initial states in it."""
         states, scales = self.states(cells)
-        phases = tuple(BatchedMode(self.numbers, scales, self.form, mode, continues) for mode in range(self.form.modes))
+        shared = (self.numbers, scales, stop_gradient(jnp.asarray(tolerance, float)), self.form)
+        phases = tuple(BatchedMode(*shared, mode, continues) for mode in range(self.form.modes))
         return phases, jnp.full(cells, self.form.first), states

@@ -15,10 +15,13 @@ from ..lanes.comparisons import jumps_of, warn_of_unclear
 from ..lanes.tracing import depends_on_first, is_elementary, named_errors, spelled_out
 from ..parameters import TreeForm
 from ..text import described
-from .mode import Hybrid, State
+from .mode import Hybrid, State, exit_of, values_of_margin
+
+#: The last argument of a reset, in words for a message.
+EXIT = "; and exit, which of them fell, if the mode has several margins"
 
 #: A function of the numbers, the time and the state of one run.
-OfRun = Callable[[Sequence[Array], Array, State], Any]
+OfRun = Callable[..., Any]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,21 +50,26 @@ class Form:
         return self.tree.tree(numbers)
 
     def function(self, name: str, mode: int = 0) -> OfRun:
-        """One of the user's functions: "field", "margin" or "reset" of a mode, or "event"; or "entered", which projects the
-        state after a reset to a mode onto its constraints."""
+        """One of the user's functions: "field", "margin" or "reset" of a mode, or "event"; "margins", the values of the margin
+        as a tuple; or "entered", which projects the state after a reset to a mode onto its constraints. A reset also receives
+        the index of the margin that fell."""
 
-        def called(numbers: Sequence[Array], t: Array, y: State) -> Any:
+        def called(numbers: Sequence[Array], t: Array, y: State, exit: Any = 0) -> Any:
             system = self.system(numbers)
-            function = system.event if name == "event" else getattr(system.modes[mode], name)
-            assert function is not None
-            return function(t, y)
+            if name == "event":
+                assert system.event is not None
+                return system.event(t, y)
+            part: Any = system.modes[mode]
+            if name == "margins":
+                return values_of_margin(part.margin(t, y))
+            return getattr(part, name)(t, y, *(exit_of(part.margin(t, y), exit) if name == "reset" else ()))
 
         return called
 
     def jump_times(self, mode: int, numbers: Sequence[Array]) -> Array:
         """The times at which the functions of a mode that are evaluated within steps may jump, (jumps,)."""
         _, t, y = self.arguments
-        names = ["field", *(["margin"] if self.traits.ends[mode] else []), *(["event"] if self.has_event else [])]
+        names = ["field", *(["margins"] if self.traits.ends[mode] else []), *(["event"] if self.has_event else [])]
         functions = [functools.partial(self.function(name, mode), numbers) for name in names]
         return jnp.concatenate([jumps_of(function, t, y)[0] for function in functions])
 
@@ -82,13 +90,13 @@ class Traits(NamedTuple):
 
     - `depends_on_time`: whether a function depends on time, which is then an additional component of the state.
     - `elementary`: whether all functions that are evaluated within steps fit a single kernel.
-    - `ends`, `resets`: for each mode, whether it has a margin, and whether it also has a reset.
+    - `ends`, `resets`: for each mode, the number of its margins, and whether it also has a reset.
     - `projected`: for each mode, whether it has constraints that a state may violate.
     """
 
     depends_on_time: bool
     elementary: bool
-    ends: tuple[bool, ...]
+    ends: tuple[int, ...]
     resets: tuple[bool, ...]
     projected: tuple[bool, ...]
 
@@ -107,13 +115,12 @@ def _traits(form: Form) -> Traits:
     ends, resets, step_functions, reset_functions = [], [], [], []
     for k in range(form.modes):
         _require_shape(form, "field", k, (form.size,))
-        ends.append(_result(form, "margin", k) is not None)
+        ends.append(_margin_count(form, k))
         reset = _result(form, "reset", k) if ends[k] else None
         resets.append(reset is not None)
         step_functions.append(form.function("field", k))
         if ends[k]:
-            _require_shape(form, "margin", k, ())
-            step_functions.append(form.function("margin", k))
+            step_functions.append(form.function("margins", k))
         if reset is not None:
             _require_pair(form, k, reset)
             reset_functions.append(form.function("reset", k))
@@ -127,9 +134,9 @@ def _traits(form: Form) -> Traits:
     numbers, t, y = form.arguments
 
     def warned(numbers: Sequence[Array]) -> None:
-        for k, own in itertools.product(range(form.modes), ("field", "margin")):
+        for k, own in itertools.product(range(form.modes), ("field", "margins")):
             if own == "field" or ends[k]:
-                warn_of_unclear(_name(own, k), functools.partial(form.function(own, k), numbers), y)
+                warn_of_unclear(_name(own.rstrip("s"), k), functools.partial(form.function(own, k), numbers), y)
 
     modes = form.system([jnp.zeros((), kind.dtype) for kind in numbers]).modes
     depends_on_time = depends_on_first(combined([*step_functions, *reset_functions]), t, y, *numbers)
@@ -155,8 +162,27 @@ def arguments_in_words(size: int) -> str:
 
 def _result(form: Form, name: str, mode: int) -> Any:
     """The shape and type that a function returns."""
-    with named_errors(_name(name, mode), arguments_in_words(form.size)):
+    words = arguments_in_words(form.size) + (EXIT if name == "reset" else "")
+    with named_errors(_name(name, mode), words):
         return jax.eval_shape(form.function(name, mode), *form.arguments)
+
+
+def _margin_count(form: Form, mode: int) -> int:
+    """The number of margins of a mode. **Raises:** `ValueError` unless they are floats, in an array or a dict if several."""
+    result = _result(form, "margin", mode)
+    if result is None:
+        return 0
+    parts = list(result.values()) if isinstance(result, dict) else [result]
+    most = 0 if isinstance(result, dict) else 1
+    if not parts or not all(hasattr(part, "shape") and part.ndim <= most and part.size for part in parts):
+        raise ValueError(
+            f"{_name('margin', mode)} must return one number, an array of shape (k,), a dict of numbers by name, or None, not "
+            f"{described(result)}"
+        )
+    wrong = [part.dtype for part in parts if not jnp.issubdtype(part.dtype, jnp.floating)]
+    if wrong:
+        raise ValueError(f"{_name('margin', mode)} must return floats, not {wrong[0]}: it must be smooth")
+    return sum(part.size for part in parts)
 
 
 def _require_shape(form: Form, name: str, mode: int, shape: tuple[int, ...]) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..formulations import AbstractSystem
@@ -14,6 +15,21 @@ State = Float[Array, " components"]
 
 #: The event function, of time [s] and state; the event happens when it falls through zero.
 Event = Callable[[Float[Array, ""], State], Float[Array, ""]]
+
+
+def values_of_margin(margin: Any) -> tuple[Array, ...]:
+    """The values of a margin, one or several, in order."""
+    if isinstance(margin, dict):
+        return tuple(map(jnp.asarray, margin.values()))
+    return (margin,) if jnp.ndim(margin) == 0 else tuple(margin[k] for k in range(margin.shape[0]))
+
+
+def exit_of(margin: Any, number: Any) -> tuple[Any, ...]:
+    """The further argument of a reset after the margin of this index has fallen, if there are several: the index, or for a
+    dict whether it is the margin of each name."""
+    if isinstance(margin, dict):
+        return ({name: jnp.asarray(number) == k for k, name in enumerate(margin)},)
+    return () if jnp.ndim(margin) == 0 else (jnp.asarray(number),)
 
 
 class AbstractMode(eqx.Module):
@@ -61,15 +77,17 @@ class AbstractMode(eqx.Module):
         **Returns:** the rate, (components,).
         """
 
-    def margin(self, t: Float[Array, ""], y: State) -> Float[Array, ""] | None:
-        """A smooth function that is positive while the mode holds and falls through zero where it ends.
+    def margin(self, t: Float[Array, ""], y: State) -> Float[Array, "..."] | dict[str, Float[Array, ""]] | None:
+        """A smooth function that is positive while the mode holds and falls through zero where it ends; or several such
+        functions, of which the first to fall ends the mode.
 
         An oscillation in time that is faster than the motion can be missed: let the field contain it, for example with the
         sine and cosine of a vibrating table's phase in the state.
 
         **Arguments:** as for `field`.
 
-        **Returns:** a number; or `None`, the default, for a mode that never ends.
+        **Returns:** a number; several in an array, (k,), or in a dict by name; or `None`, the default, for a mode that never
+        ends.
         """
         return None
 
@@ -78,7 +96,10 @@ class AbstractMode(eqx.Module):
 
         The margin of the next state may be zero if it then rises, as for a ball that has just bounced.
 
-        **Arguments:** as for `field`, at the end of the mode.
+        **Arguments:** as for `field`, at the end of the mode. If there are several margins, write `reset(self, t, y, exit)`:
+        `exit` is the index of the margin that fell in the array, a traced whole number, or for a dict a dict that is true for
+        the name of the margin that fell and false for the others. Of margins that fall at the same time, the first one counts,
+        and the others follow at once.
 
         **Returns:** the next state, (components,), and the index of the next mode in `Hybrid.modes`, a whole number
         that may depend on the state; or `None`, the default, if the run ends here.

@@ -130,7 +130,7 @@ class OwnModel(AbstractModel):
         return self._cells(cells).problem(cells)
 
     def modes(self, cells: int, tolerance: Any, names: Names, continues: bool) -> Start:
-        return self._cells(cells).modes(cells, continues)
+        return self._cells(cells).modes(cells, tolerance, continues)
 
     def _cells(self, size: int | None) -> Cells:
         """The runs in the form for the engine, with an axis of cells for the numbers that differ."""

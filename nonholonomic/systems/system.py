@@ -18,8 +18,8 @@ from ..formulations.system import within_constraints
 from ..lanes.tracing import named_errors
 from ..validation import as_number, require, shown
 from ..warning import warn
-from .form import Form
-from .mode import AbstractMode, Event, Hybrid, State
+from .form import EXIT, Form
+from .mode import AbstractMode, Event, Hybrid, State, exit_of
 
 
 class MechanicalMode(AbstractMode):
@@ -31,11 +31,12 @@ class MechanicalMode(AbstractMode):
     def field(self, t: Float[Array, ""], y: State) -> State:
         return self.formulation.field(t, y)
 
-    def margin(self, t: Float[Array, ""], y: State) -> Float[Array, ""] | None:
+    def margin(self, t: Float[Array, ""], y: State) -> Any:
         return self.formulation.system.margin(t, *self.formulation.split(y))
 
-    def reset(self, t: Float[Array, ""], y: State) -> tuple[State, Any] | None:
-        following = self.formulation.system.reset(t, *self.formulation.split(y))
+    def reset(self, t: Float[Array, ""], y: State, *exit: Any) -> tuple[State, Any] | None:
+        system: Any = self.formulation.system
+        following = system.reset(t, *self.formulation.split(y), *exit)
         if following is None:
             return None
         q, rate, *number = following
@@ -147,7 +148,11 @@ def _check_functions(form: Form, prefix: str) -> None:
         ),
         "frame(q)": ((q,), f"of shape ({n}, {n})", lambda shape: shape == (n, n)),
         "force(t, q, rate)": ((t, q, q), f"of shape ({n},)", lambda shape: shape in ((), (1,), (n,))),
-        "margin(t, q, rate)": ((t, q, q), "one number or None", lambda shape: shape in ((), None)),
+        "margin(t, q, rate)": (
+            (t, q, q),
+            "one number, an array of shape (k,), a dict of numbers by name, or None",
+            lambda shape: shape is None or (shape != "" and (set(shape) == {()} or len(shape) < 2)),
+        ),
         "reset(t, q, rate)": (
             (t, q, q),
             f"(q, rate), both of shape ({n},), or None; as a mode of a Hybrid also (q, rate, number of the next mode)",
@@ -157,11 +162,14 @@ def _check_functions(form: Form, prefix: str) -> None:
 
     def called(method: str, numbers: Any, *arguments: Any) -> Any:
         mode: Any = form.system(numbers).modes[0]
-        return getattr(mode.formulation.system, method)(*arguments)
+        system = mode.formulation.system
+        exit = exit_of(system.margin(*arguments), 0) if method == "reset" else ()
+        return getattr(system, method)(*arguments, *exit)
 
     for name, (arguments, expected_shape, fits) in functions.items():
         words = f"the coordinates q{' and their rates, each' if 'rate' in name else ','} of shape ({n},)"
-        with named_errors(f"{prefix}{name}", f"the time t, a number, and {words}" if "(t" in name else words):
+        words = (f"the time t, a number, and {words}" if "(t" in name else words) + EXIT * name.startswith("reset")
+        with named_errors(f"{prefix}{name}", words):
             result = jax.eval_shape(functools.partial(called, name.partition("(")[0]), numbers, *arguments)
         shape = _shape_of(result)
         if name.startswith("margin") and result is None:
@@ -172,6 +180,7 @@ def _check_functions(form: Form, prefix: str) -> None:
 
 def _shape_of(result: Any) -> Any:
     """The shape of an array, a tuple of those of several arrays, `None` for `None`, and "" for anything else."""
+    result = tuple(result.values()) if isinstance(result, dict) else result
     if isinstance(result, tuple):
         return tuple(map(_shape_of, result))
     return None if result is None else getattr(result, "shape", "")

@@ -17,7 +17,7 @@ from ...hybrid.ensemble import after_reset, after_solve, at_start
 from ...hybrid.sampled_rounds import mode_numbered, program_groups
 from ...integration import Settings
 from ...integration.ensemble import with_crossing_times
-from ...integration.scheduler import LaneScheduler, outcome_of
+from ...integration.scheduler import LaneScheduler, back_to_margin, outcome_of
 from ...integration.status import LEFT_DOMAIN, RUNNING, UNRESOLVED
 from .simulator import Functions, Numbers, Stepper, as_object, offsets_of, size_of
 
@@ -91,7 +91,8 @@ class HybridSimulator(NamedTuple):
             return LaneScheduler.of(problem, _left(t1, runs), jnp.asarray(1), self.settings)
 
         def ended(constants: Any, lane: Any, runs: HybridOutcome) -> HybridOutcome:
-            outcome = with_crossing_times(stepper.run(constants)[0], outcome_of(lane))
+            problem = stepper.run(constants)[0]
+            outcome = with_crossing_times(problem, back_to_margin(problem, outcome_of(lane)))
             return after_solve(jnp, runs, outcome, t1)
 
         def reset(values: Numbers, runs: HybridOutcome) -> HybridOutcome:

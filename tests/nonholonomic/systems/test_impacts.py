@@ -164,9 +164,13 @@ def broken(kind, **functions):
 
 
 WRONG = {
-    "a margin that is a vector": (
-        lambda: broken(Bumper, margin=lambda self, t, q, rate: q),
-        r"margin\(t, q, rate\) must be one number or None, not \(3,\)",
+    "a margin that is a matrix": (
+        lambda: broken(Bumper, margin=lambda self, t, q, rate: jnp.outer(q, q)),
+        r"margin\(t, q, rate\) must be one number, an array of shape \(k,\), a dict of numbers by name, or None, not \(3, 3\)",
+    ),
+    "a reset that does not expect several margins": (
+        lambda: broken(Bumper, margin=lambda self, t, q, rate: 1.0 - q),
+        r"reset\(t, q, rate\) raised TypeError.*and exit, which of them fell, if the mode has several margins",
     ),
     "a reset without rates": (
         lambda: broken(Bumper, reset=lambda self, t, q, rate: q),
