@@ -20,7 +20,7 @@ from scipy.optimize import differential_evolution
 
 import tippe
 from nonholonomic.identification import Measurements
-from tippe.papers import paper
+from tippe import paper
 
 HORIZON, ANGLE = 30.0, 0.95 * np.pi
 ROWS = [(table, row) for table in (paper.TABLE_2, paper.TABLE_3) for row in table.rows]

@@ -18,7 +18,7 @@ from ompl import base, control, util
 import stroller
 from stroller.planning.candidates import LIMIT_RESERVE, SMOOTHING
 from stroller.planning.guess import smoothed, timed
-from stroller.planning.polygons import separation
+from stroller.planning.obstacles import separation
 from stroller.planning.problem import Problem
 from stroller.planning.search import Path
 

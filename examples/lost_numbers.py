@@ -10,7 +10,7 @@ import numpy as np
 
 import tippe
 from nonholonomic.identification import Free, Measurements, identify
-from tippe.papers import paper
+from tippe import paper
 
 HORIZON = 30.0
 ROWS = [(table, row) for table in (paper.TABLE_2, paper.TABLE_3) for row in table.rows]

@@ -36,10 +36,6 @@ HEIGHT = {
 #: The same for the rooms of a vehicle.
 VEHICLE_HEIGHT = {"model": 0, "modes": 1, "steady": 1, "runs": 2, "fit": 3, "planning": 3}
 
-#: Rooms that check what the others compute; papers may use witnesses, and command lines, which show the papers' tables
-#: beside their own, may use papers.
-CHECKS = ("witnesses", "papers")
-
 #: Lines of code, without blank lines, comments and docstrings, of the longest file.
 MOST_LINES = 450
 MOST_FILES_OUTSIDE = 9
@@ -161,18 +157,14 @@ def test_modules_close_no_circle(package):
     assert circle(edges) == []
 
 
-def test_witnesses_and_papers_are_not_needed_to_compute_anything():
-    violations = []
-    for arrow in ARROWS:
-        file_room, module_room = room(arrow.file).rpartition("/")[2], room(arrow.module).rpartition("/")[2]
-        by_right = (
-            file_room == module_room
-            or (file_room, module_room) == ("papers", "witnesses")
-            or arrow.file.endswith("/__main__.py")
-        )
-        if module_room in CHECKS and not by_right:
-            violations.append(str(arrow))
-    assert violations == []
+def test_only_the_command_line_uses_the_tables_of_the_paper():
+    assert {arrow.file for arrow in ARROWS if arrow.module == "tippe.paper"} == {"tippe/__main__.py"}
+
+
+def test_the_packages_do_not_use_the_modules_of_tests_and_benchmarks():
+    """These modules are not installed."""
+    assert {"euler_angles", "papers"} <= modules_beside_the_packages()
+    assert not imported_from_outside(functions=True) & modules_beside_the_packages()
 
 
 def test_private_modules_and_names_stay_in_their_rooms():
@@ -202,19 +194,25 @@ def test_the_vehicles_and_own_systems_use_only_the_public_engine():
     assert is_private("nonholonomic.integration.scheduler.LaneScheduler")
 
 
+def imported_from_outside(functions: bool) -> set[str]:
+    """Top-level names of the absolute imports of the packages, at once and, on request, inside functions."""
+    imported = set()
+    for file in files(*PACKAGES):
+        for node, asked in statements(ast.parse((ROOT / file).read_text())):
+            if isinstance(node, ast.Import) and asked <= functions:
+                imported |= {name.name.split(".")[0] for name in node.names}
+            elif isinstance(node, ast.ImportFrom) and asked <= functions and not node.level:
+                imported.add(node.module.split(".")[0])
+    return imported
+
+
 def test_what_is_imported_at_once_is_required():
     """Extras may be imported inside functions only: without them the packages must load."""
     required = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
     packages = {re.split(r"[^\w-]", requirement)[0] for requirement in required}
     # JAX brings jaxlib along.
     packages |= {"jaxlib", *sys.stdlib_module_names, *PACKAGES}
-    imported = set()
-    for file in files(*PACKAGES):
-        for node, asked in statements(ast.parse((ROOT / file).read_text())):
-            if not asked and isinstance(node, ast.Import):
-                imported |= {name.name.split(".")[0] for name in node.names}
-            elif not asked and not node.level:
-                imported.add(node.module.split(".")[0])
+    imported = imported_from_outside(functions=False)
     assert {"jax", "numpy"} <= imported
     assert imported - packages == set()
 
@@ -254,10 +252,15 @@ def test_every_file_that_the_walk_names_exists():
     assert [name for name in names if not (ROOT / name).exists()] == []
 
 
+def modules_beside_the_packages() -> set[str]:
+    """Top-level modules of the tests, benchmarks, reference scenes and documents."""
+    folders = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]["pythonpath"]
+    return {path.stem for folder in folders for path in (ROOT / folder).glob("[!_.]*") if path.suffix in ("", ".py")}
+
+
 def test_no_module_beside_the_packages_has_the_name_of_an_installed_package():
     """Python finds a module in these folders before the package, which another package may import: numba imports `coverage`."""
-    folders = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]["pythonpath"]
-    modules = {path.stem for folder in folders for path in (ROOT / folder).glob("[!_.]*") if path.suffix in ("", ".py")}
+    modules = modules_beside_the_packages()
     installed = importlib.metadata.packages_distributions().keys() | sys.stdlib_module_names | {"coverage", "numba"}
     assert {"interval_coverage", "browser"} <= modules
     assert not modules & installed

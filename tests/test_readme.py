@@ -59,7 +59,7 @@ roots = {"nonholonomic": nonholonomic, "stroller": stroller, "tippe": tippe}
 for name in sys.argv[1:]:
     root, *rest = name.split(".")
     functools.reduce(getattr, rest, roots[root])
-slow = ("matplotlib", "scipy.integrate", "tippe.papers.paper", "stroller.papers.paper")
+slow = ("matplotlib", "scipy.integrate", "tippe.paper")
 print(json.dumps([name for name in slow if name in sys.modules]))
 """
 

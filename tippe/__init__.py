@@ -23,7 +23,7 @@ from .fit.identify import identify as identify
 from .fit.identify import log_density as log_density
 from .fit.inversion_times import InversionTimes as InversionTimes
 from .fit.inversion_times import ReversalTimes as ReversalTimes
-from .fit.read_inversion_times import read_inversion_times as read_inversion_times
+from .fit.inversion_times import read_inversion_times as read_inversion_times
 from .fit.recording import Recording as Recording
 from .fit.recording import read_recording as read_recording
 from .model.convex import ConvexBody as ConvexBody

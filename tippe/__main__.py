@@ -24,11 +24,10 @@ from nonholonomic.validation import replacing, require_folder
 from nonholonomic.views import NO_VIEW, Page, can_view, page, picture_as_html, table_as_html
 from nonholonomic.views.explore import live_page
 
-from . import presets, steady
+from . import paper, presets, steady
 from .model.friction import Coulomb
 from .model.launch import Launch
 from .model.scene import Scene
-from .papers import tables as paper_tables
 from .runs.checks import INVERTED
 from .runs.explore import page_of_launch, stage_at_start
 from .runs.model import TopModel
@@ -299,7 +298,7 @@ def main(arguments: list[str] | None = None) -> int:
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if "--paper" in arguments:
-        return paper_tables.main([word for word in arguments if word != "--paper"])
+        return paper.main([word for word in arguments if word != "--paper"])
     options = parser().parse_args(arguments)
     cache = enable_compilation_cache()
     start_time = time.perf_counter()

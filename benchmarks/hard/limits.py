@@ -1,7 +1,9 @@
 """Poles and limits of the top: launches and scenes at the ends of their legal range."""
 
 import math
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -12,7 +14,9 @@ import tippe
 from hard.lagrange import theta_by_lagrange
 from hard.row import Row, of_runs, of_table
 from tippe.steady import growth_rate, standing_matrix, tumbling_angles
-from tippe.witnesses.quadrature import FrictionlessNutation, swing
+
+sys.path.append(str(Path(__file__).parents[2] / "tests" / "witnesses"))
+from quadrature import FrictionlessNutation, swing
 
 VISCOUS = tippe.Viscous(0.3)
 

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..geometry import solve
-from ..validation import as_number, require
-from .brackets import Coordinates
+
+Coordinates = Float[Array, " n"]
 
 
 class AbstractSystem(eqx.Module):
@@ -193,59 +193,3 @@ def with_constraints(metric: Float[Array, "n n"], W: Float[Array, "k n"]) -> Flo
     mean = W * W @ diagonal / lengths
     masses = jnp.where(mean > 0.0, mean, jnp.sum(diagonal)) / lengths
     return metric + W.T @ (jax.lax.stop_gradient(masses)[:, None] * W)
-
-
-class Routhian(AbstractSystem):
-    """A system with one cyclic coordinate eliminated, at a given momentum, R = L - beta psi'.
-
-    The coordinate is cyclic if neither metric, potential, force, margin nor reset depends on it, and neither force nor
-    impulse has a component along it. The reduced Lagrangian has terms linear in the velocity, which `Hamel` accepts.
-
-    **Arguments:**
-
-    - `full`: the unconstrained system to reduce.
-    - `cyclic`: index of the cyclic coordinate.
-    - `momentum`: its constant momentum beta.
-    """
-
-    full: AbstractSystem
-    cyclic: int = eqx.field(static=True)
-    momentum: Float[Array, ""] = eqx.field(converter=as_number)
-
-    def __check_init__(self):
-        require(self.momentum, "momentum")
-
-    @property
-    def dimension(self) -> int:
-        return self.full.dimension - 1
-
-    def complete(self, q: Coordinates, rate: Coordinates) -> tuple[Coordinates, Coordinates]:
-        """All coordinates and velocities, with the cyclic coordinate at 0 and its velocity from the momentum."""
-        q = jnp.insert(q, self.cyclic, 0.0)
-        rate = jnp.insert(rate, self.cyclic, 0.0)
-        row = self.full.metric(q)[self.cyclic]
-        return q, rate.at[self.cyclic].set((self.momentum - row @ rate) / row[self.cyclic])
-
-    def metric(self, q: Coordinates) -> Float[Array, "m m"]:
-        full_metric = self.full.metric(jnp.insert(q, self.cyclic, 0.0))
-        free = np.delete(np.arange(len(full_metric)), self.cyclic)
-        column = full_metric[free, self.cyclic]
-        return full_metric[np.ix_(free, free)] - jnp.outer(column, column) / full_metric[self.cyclic, self.cyclic]
-
-    def lagrangian(self, q: Coordinates, rate: Coordinates) -> Float[Array, ""]:
-        q, rate = self.complete(q, rate)
-        return self.full.lagrangian(q, rate) - self.momentum * rate[self.cyclic]
-
-    def force(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
-        return jnp.delete(self.full.force(t, *self.complete(q, rate)), self.cyclic)
-
-    def margin(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Any:
-        return self.full.margin(t, *self.complete(q, rate))
-
-    def reset(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates, *exit: Any) -> tuple[Any, ...] | None:
-        full: Any = self.full
-        following = full.reset(t, *self.complete(q, rate), *exit)
-        if following is None:
-            return None
-        q, rate, *number = following
-        return jnp.delete(q, self.cyclic), jnp.delete(rate, self.cyclic), *number

@@ -13,7 +13,7 @@ from rigid_reference import Rattleback
 from scipy.linalg import expm
 
 import tippe
-from tippe.model.directions import generic_direction
+from tippe.model.scene import generic_direction
 
 THEORY = Oscillations.of_ellipsoid(1.0, SHAPE, 0.01, INERTIA)
 

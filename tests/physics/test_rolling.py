@@ -1,20 +1,22 @@
 """The rolling top: other formulations, constants of motion, closed forms, and the limit of ever greater friction."""
 
+import euler_angles
 import jax
 import jax.numpy as jnp
 import numpy as np
+import poincare
 import pytest
+import quadrature
 from close import assert_close
+from other_formulations import Multipliers
 from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 from tops import homogeneous_ball, random_states, rutstam_top
 
 import tippe
-from nonholonomic.formulations import Multipliers
 from tippe.model.contact_load import ContactLoad, Slip
 from tippe.model.friction import AbstractFriction
 from tippe.model.rolling import RollingDynamics
-from tippe.witnesses import euler_angles, poincare, quadrature
 
 ARENAS = [tippe.Plane(), tippe.Cylinder(0.1), tippe.Sphere(0.1)]
 

@@ -4,13 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from other_formulations import Multipliers
 from scipy.integrate import quad
 from scipy.optimize import brentq
+from stroller_chart import Chart
 
 import stroller
-from nonholonomic.formulations import Multipliers
 from stroller import Launch, Scene, Sphere, Spheroid, Stroller
-from stroller.witnesses.charts import Chart
 
 BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05)
 M, L, J = 1.7, 0.7, 0.4

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from geographiclib.geodesic import Geodesic
 from scipy.special import ellipk
+from stroller_chart import Chart
 
 import stroller
 from nonholonomic.formulations import Hamel
 from stroller import Damping, Launch, Scene, Sphere, Spheroid, Steady, Stroller
-from stroller.witnesses.charts import Chart
 
 BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05)
 M, L, J = 1.7, 0.7, 0.4

@@ -3,15 +3,19 @@
 import itertools
 
 import equinox as eqx
+import euler_angles
 import jax
 import jax.numpy as jnp
 import numpy as np
+import other_formulations
+import poincare
 import pytest
+import quadrature
+import reduced_tops
 from scipy.integrate import solve_ivp
 
 import tippe
-from nonholonomic import formulations
-from tippe.witnesses import euler_angles, poincare, quadrature, reduced
+from nonholonomic.formulations import Hamel
 
 STATES = 1000
 ARENAS = ["plane", "cylinder"]
@@ -112,12 +116,12 @@ def test_rutstam_and_the_jellett_reduction_give_the_accelerations_of_the_vector_
     def errors(scene, state):
         rate = scene.field(state)
         scales = jnp.array([1.0, 1.0, 1.0, 1.0, scene.body.radius, scene.body.radius])
-        chart, expected = jax.jvp(lambda s: reduced.rutstam_state(scene, s), (state,), (rate,))
-        rutstam = (reduced.rutstam_rate(scene, chart) - expected) / scales
+        chart, expected = jax.jvp(lambda s: reduced_tops.rutstam_state(scene, s), (state,), (rate,))
+        rutstam = (reduced_tops.rutstam_rate(scene, chart) - expected) / scales
 
-        chart, expected = jax.jvp(lambda s: reduced.jellett_state(scene, s), (state,), (rate,))
-        jellett_rate = reduced.jellett_rate(scene, chart, scene.jellett(state))
-        scales = reduced.JellettState(1.0, 1.0, scene.body.I3, scene.body.radius, scene.body.radius)
+        chart, expected = jax.jvp(lambda s: reduced_tops.jellett_state(scene, s), (state,), (rate,))
+        jellett_rate = reduced_tops.jellett_rate(scene, chart, scene.jellett(state))
+        scales = reduced_tops.JellettState(1.0, 1.0, scene.body.I3, scene.body.radius, scene.body.radius)
         jellett = jnp.stack(jax.tree.map(lambda a, b, unit: (a - b) / unit, jellett_rate, expected, scales))
         # Rates in 1/s^2, as a share of the squared angular velocity and of g / R together.
         w = jnp.linalg.norm(state[5:8]) / scene.body.I1
@@ -136,10 +140,10 @@ def test_the_general_formulations_give_the_accelerations_of_the_frictionless_top
     scenes, states = legal_cases(arena, "frictionless")
     chart, expected, _, lengths = from_vector_form(scenes, states)
     for kind in (
-        formulations.Multipliers,
-        formulations.Hamel,
-        formulations.ConstrainedConnection,
-        formulations.ReducedBracket,
+        other_formulations.Multipliers,
+        Hamel,
+        other_formulations.ConstrainedConnection,
+        other_formulations.ReducedBracket,
     ):
 
         @eqx.filter_jit
@@ -161,8 +165,8 @@ def test_the_general_reduction_by_a_cyclic_angle_gives_the_accelerations_of_the_
     def accelerations(scene, angles):
         q, rate = poincare.from_angles(angles)
         system = poincare.TopSystem(scene)
-        reduced_system = formulations.Routhian(system, poincare.PSI, system.metric(q)[poincare.PSI] @ rate)
-        return formulations.Hamel(reduced_system).acceleration(0.0, q[: poincare.PSI], rate[: poincare.PSI])
+        reduced_system = other_formulations.Routhian(system, poincare.PSI, system.metric(q)[poincare.PSI] @ rate)
+        return Hamel(reduced_system).acceleration(0.0, q[: poincare.PSI], rate[: poincare.PSI])
 
     acceleration = accelerations(scenes, chart)
     # psi'' is not among the equations; it follows from the momentum.
@@ -191,7 +195,7 @@ def test_the_nonholonomic_formulations_give_the_accelerations_of_the_rolling_top
 
     angles, rates = chart(scenes, rolling)
     lengths = jnp.stack([jnp.ones(STATES), jnp.ones(STATES), scenes.body.radius], axis=1)
-    for kind in (formulations.Multipliers, formulations.Hamel, formulations.ConstrainedConnection):
+    for kind in (other_formulations.Multipliers, Hamel, other_formulations.ConstrainedConnection):
 
         @eqx.filter_jit
         @eqx.filter_vmap
@@ -252,7 +256,7 @@ def test_trajectories_of_all_formulations_on_the_plane_agree_for_five_seconds(fr
     angles = euler_angles.from_vector_state(scene, start)
 
     def jellett(y):
-        return jnp.stack(reduced.jellett_rate(scene, reduced.JellettState(*y), constant))
+        return jnp.stack(reduced_tops.jellett_rate(scene, reduced_tops.JellettState(*y), constant))
 
     def euler(form):
         return lambda y: euler_angles.state_rate(form(scene, y), y)
@@ -260,8 +264,8 @@ def test_trajectories_of_all_formulations_on_the_plane_agree_for_five_seconds(fr
     vector, rutstam, routh, lagrange, second = run(
         [
             (scene.field, start, scene.scales(launch)),
-            (lambda y: reduced.rutstam_rate(scene, y), reduced.rutstam_state(scene, start), 1.0),
-            (jellett, jnp.stack(reduced.jellett_state(scene, start)), np.array([1.0, 10.0, 1e-4, 0.1, 0.1])),
+            (lambda y: reduced_tops.rutstam_rate(scene, y), reduced_tops.rutstam_state(scene, start), 1.0),
+            (jellett, jnp.stack(reduced_tops.jellett_state(scene, start)), np.array([1.0, 10.0, 1e-4, 0.1, 0.1])),
             (euler(euler_angles.by_lagrange), angles, ANGLES),
             (euler(poincare.by_equation_2), angles, ANGLES),
         ],

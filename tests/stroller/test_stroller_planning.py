@@ -21,9 +21,8 @@ from stroller.planning.check import inputs_of
 from stroller.planning.drawing import planned_stage
 from stroller.planning.drive import drive_along
 from stroller.planning.inverse import Rates, actuation
-from stroller.planning.obstacles import Obstacles
+from stroller.planning.obstacles import Obstacles, disc_distance, separation, signed_distance
 from stroller.planning.planner import proposed
-from stroller.planning.polygons import disc_distance, separation, signed_distance
 from stroller.planning.problem import checked_problem
 from stroller.planning.search import Costs, Ground, Steps, arcs, search
 from stroller.planning.spline import evaluate, interpolate

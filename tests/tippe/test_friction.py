@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import lagrange_top
 import numpy as np
 import pytest
+import reduced_tops
 from close import assert_close
 from hard.friction import hertz_disc
 from tops import random_states, rutstam_top
 
 import tippe
 from tippe.model.contact_load import ContactLoad, Slip
-from tippe.witnesses import reduced
 
 ARENAS = {"plane": tippe.Plane(), "cylinder": tippe.Cylinder(0.3), "sphere": tippe.Sphere(0.3)}
 BOTH = tippe.Rolling(2e-3, 3.0, tippe.Contensou(0.4, 4e-3, 0.1))
@@ -108,7 +108,7 @@ def test_the_reduced_forms_refuse_a_torque():
     scene = tippe.Scene(rutstam_top(), tippe.Plane(), BOTH)
     state = scene.state(tippe.Launch(0.3, 100.0))
     with pytest.raises(ValueError, match="must act at a point, without a torque"):
-        reduced.rutstam_rate(scene, reduced.rutstam_state(scene, state))
+        reduced_tops.rutstam_rate(scene, reduced_tops.rutstam_state(scene, state))
 
 
 def test_a_law_of_ones_own_flies_on():

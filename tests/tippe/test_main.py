@@ -13,7 +13,7 @@ import tippe
 from nonholonomic.views import NO_VIEW
 from tippe import __main__ as job
 from tippe.__main__ import main
-from tippe.papers.tables import drawn, parser
+from tippe.paper import drawn, parser
 from tippe.runs.observables import INVERTED
 from tippe.runs.plot import theta_over_time
 

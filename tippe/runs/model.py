@@ -30,11 +30,10 @@ from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.validation import Bound, all_bounds, legal, require_kind, require_scalars
 
 from ..model.contact_dynamics import LOSSES
-from ..model.directions import generic_direction
 from ..model.dynamics import NO_COSINE
 from ..model.friction import NoSlip
 from ..model.launch import Launch
-from ..model.scene import Scene
+from ..model.scene import Scene, generic_direction
 from ..modes.airborne_ends import on_the_ground
 from ..modes.inversion_problem import InversionProblem, StemContact
 from ..modes.sticking import contact_modes

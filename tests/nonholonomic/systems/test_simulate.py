@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from close import assert_close
+from other_formulations import Routhian
 from own_modes import GRAVITY, Ball, Sleigh, Slip, Stick, bounce, final_turn
 from PIL import Image
 
 import nonholonomic
 from nonholonomic import AbstractMode, Hybrid, event_time, simulate, sweep
-from nonholonomic.formulations import Hamel, Lagrange, Routhian
+from nonholonomic.formulations import Hamel, Lagrange
 from nonholonomic.sweeps import Table
 from nonholonomic.systems.system import check_start, formulation_of
 

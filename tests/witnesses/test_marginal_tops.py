@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import marginal_tops
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -9,7 +10,6 @@ from scipy.integrate import solve_ivp
 import tippe
 from nonholonomic.integration.zeros import sign_changes
 from tippe import steady
-from tippe.witnesses import marginal
 
 SCENE = tippe.Scene(tippe.Top(0.02, 0.02, 0.006, 0.94 * 3.2e-6, 3.2e-6), friction=tippe.Viscous(0.3))
 GRID = jnp.linspace(15.0, 75.0, 301)
@@ -34,7 +34,7 @@ def critical_spins():
 
 @pytest.fixture(scope="module")
 def curves():
-    return {inverted: marginal.marginal_curve(SCENE, inverted) for inverted in (False, True)}
+    return {inverted: marginal_tops.marginal_curve(SCENE, inverted) for inverted in (False, True)}
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_the_marginal_curve_meets_the_critical_spins_found_by_scanning(curves, c
 
 def test_an_inverted_top_in_a_narrow_cylinder_has_a_band_of_unstable_spins_that_begins_at_a_fold():
     """The two further critical spins at rc / R = 5 lie on one curve, which turns round at rc = 5.10 R."""
-    curve = marginal.marginal_curve(SCENE, True, start=(0.2, 39.49), largest_ratio=0.21, backwards=True, step=0.02)
+    curve = marginal_tops.marginal_curve(SCENE, True, start=(0.2, 39.49), largest_ratio=0.21, backwards=True, step=0.02)
     np.testing.assert_allclose(np.min(curve.ratio), 0.19596, rtol=3e-4)
     turn = np.argmin(curve.ratio)
     assert 0 < turn < len(curve.ratio) - 1
@@ -104,4 +104,4 @@ def test_a_top_without_a_critical_spin_has_no_marginal_curve_from_the_plane():
     """Group III never stands inverted."""
     scene = tippe.Scene(tippe.Top(0.02, 0.02, 0.006, 1.35 * 3.2e-6, 3.2e-6), friction=tippe.Viscous(0.3))
     with pytest.raises(ValueError, match="no critical spin"):
-        marginal.marginal_curve(scene, inverted=True)
+        marginal_tops.marginal_curve(scene, inverted=True)

@@ -6,12 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from other_formulations import ConstrainedConnection, Multipliers, ReducedBracket
+from stroller_chart import Chart, coordinates, coordinates_and_rates
 
 import stroller
-from nonholonomic.formulations import ConstrainedConnection, Hamel, Multipliers, ReducedBracket
+from nonholonomic.formulations import Hamel
 from stroller import Damping, Frictionless, Launch, Plane, RollingResistance, Scene, Spheroid, Stroller
 from stroller.runs.quantities import side_force
-from stroller.witnesses.charts import Chart, coordinates, coordinates_and_rates
 
 FORMULATIONS = (Multipliers, Hamel, ConstrainedConnection, ReducedBracket)
 BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05, steering_spring=0.3)

@@ -12,11 +12,10 @@ from jaxtyping import Array, Float
 
 from nonholonomic.formulations import AbstractSystem, Coordinates
 from nonholonomic.geometry import AbstractQuadric, Plane, add, inverse, multiply, subtract
-
-from ..model.dynamics import State
-from ..model.friction import WheelMotion
-from ..model.input import Input, Motion
-from ..model.scene import FORKS, Scene
+from stroller.model.dynamics import State
+from stroller.model.friction import WheelMotion
+from stroller.model.input import Input, Motion
+from stroller.model.scene import FORKS, Scene
 
 
 class Chart(AbstractSystem):

@@ -1,10 +1,10 @@
 """The chart of Euler angles: what it reads off a launch, and where it does not apply."""
 
+import euler_angles
 import numpy as np
 import pytest
 
 import tippe
-from tippe.witnesses import euler_angles
 
 TOP = tippe.Top(0.02, 0.02, 0.006, 131 / 350 * 8e-6, 3.2e-6)
 

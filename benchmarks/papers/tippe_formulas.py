@@ -1,55 +1,18 @@
-"""The paper on the top in the cylinder, as data: its units, tables, rotation generators and misprinted formulas.
+"""The misprinted formulas of the paper on the top in the cylinder, as printed; `tippe_audit.py` has the verdict on each.
 
-"Modeling of Dynamics Object with Non-Holonomic Constraints Based on Maple in Cylinder Coordinate R x S^1 x SO(3)". Its
-numbers are in g, cm and s and are converted here only. `audit.py` has the verdict on each equation.
+"Modeling of Dynamics Object with Non-Holonomic Constraints Based on Maple in Cylinder Coordinate R x S^1 x SO(3)"; the module
+`tippe/paper.py` has the numbers of this paper.
 """
 
-from typing import NamedTuple
-
 import jax.numpy as jnp
+from euler_angles import across
 from jaxtyping import Array, Float
 
-from ..model.launch import Launch
-from ..model.scene import Scene
-from ..model.top import Top
-from ..witnesses.euler_angles import across
+from tippe import Launch, Scene, Top
+from tippe.paper import BETA1, GRAM, PrintedTable, Row
 
-#: The paper's units in SI.
-GRAM, CENTIMETRE = 1e-3, 1e-2
-
-#: beta1 of Tables 2 and 3 [kg m^2/s], its "2,500 g m^2 rad/s" read as 2500 g cm^2/s.
-BETA1 = 2500.0 * GRAM * CENTIMETRE**2
-#: The same with the unit of the table's header [kg m^2/s].
+#: beta1 of Tables 2 and 3 with the unit of the table's header [kg m^2/s].
 BETA1_AS_PRINTED = 2500.0 * GRAM
-
-
-class Row(NamedTuple):
-    """One row of Table 2 or 3.
-
-    - `theta`: inclination at the start [rad].
-    - `time`: time at which the top is reversed [s]; None for "Not reversed".
-    """
-
-    theta: float
-    time: float | None
-
-
-class PrintedTable(NamedTuple):
-    """Table 2 or 3, whose rows differ only in the inclination.
-
-    - `eta`: place at the start [rad].
-    - `mu`: coefficient of friction, of a law that the paper does not state.
-    - `rows`: the nine rows.
-    """
-
-    eta: float
-    mu: float
-    rows: tuple[Row, ...]
-
-
-THETAS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, float(jnp.pi) / 2.0)
-TABLE_2 = PrintedTable(0.0, 0.3, tuple(map(Row, THETAS, (25.0, 22.0, *(None,) * 7))))
-TABLE_3 = PrintedTable(float(jnp.pi) / 2.0, 0.3, tuple(map(Row, THETAS, (23.0, 19.0, 20.0, 22.0, *(None,) * 5))))
 
 
 def launch(table: PrintedTable, row: Row, body: Top) -> Launch:
@@ -100,7 +63,7 @@ def printed_normal_force(scene: Scene[Top], state: Float[Array, " 8"], theta_2: 
 
     **Arguments:**
 
-    - `state`: (8,) as in `witnesses/euler_angles.py`; r is taken as rho, the better of its two readings.
+    - `state`: (8,) as in `tests/witnesses/euler_angles.py`; r is taken as rho, the better of its two readings.
     - `theta_2`: theta'' [rad/s^2].
     """
     metric, turns = across(scene)

@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from quadrature import FrictionlessNutation, RollingNutation, rolling_rate, swing
 from scipy.integrate import solve_ivp
 
 import tippe
-from tippe.witnesses.quadrature import FrictionlessNutation, RollingNutation, rolling_rate, swing
 
 SCENE = tippe.Scene(tippe.Top(0.02, 0.02, 0.006, 131 / 350 * 8e-6, 3.2e-6))
 

@@ -320,7 +320,7 @@ def render() -> str:
         "",
         "This page states which equations of *Vector Fields of the Dynamics of Non-Holonomic Constraint System With",
         "Elliptical Configuration Space* hold, and corrects the others. D stands for sinh²ξ + sin²η. The tests, listed in",
-        "`stroller/papers/paper.py`, derive each corrected form from the position on the spheroid.",
+        "`benchmarks/papers/stroller_paper.py`, derive each corrected form from the position on the spheroid.",
         "",
         'The paper constrains the horizontal projections of the wheels\' velocities: `heading="projected"`. On a slope, such a',
         'vehicle does not have a rigid frame, so `heading="intrinsic"` is the default.',

@@ -9,13 +9,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from euler_angles import Accelerations, metric, per_normal_force, potential, slip_velocity, spread
 from jaxtyping import Array, Float
+from other_formulations import structure_constants
 
-from nonholonomic.formulations import AbstractSystem, structure_constants
-
-from ..model.scene import Scene
-from ..model.top import Top
-from .euler_angles import Accelerations, metric, per_normal_force, potential, slip_velocity, spread
+from nonholonomic.formulations import AbstractSystem
+from tippe.model.scene import Scene
+from tippe.model.top import Top
 
 #: Index of the cyclic angle psi among (eta, y, theta, phi, psi, gap).
 PSI = 4
@@ -94,7 +94,7 @@ def by_equation_2(scene: Scene[Top], state: Float[Array, " 8"]) -> Accelerations
 
 
 class TopSystem(AbstractSystem):
-    """The top in contact, as data for `nonholonomic.formulations.formulation`: coordinates (eta, y, theta, phi, psi).
+    """The top in contact, as data for the general formulations: coordinates (eta, y, theta, phi, psi).
 
     **Arguments:**
 

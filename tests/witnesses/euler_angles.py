@@ -18,11 +18,10 @@ from jaxtyping import Array, Float
 
 from nonholonomic.geometry import rate_in_frame
 from nonholonomic.validation import shown
-
-from ..model.contact_load import Slip
-from ..model.scene import Scene
-from ..model.state import AXIS, MOMENTUM, PLACE, VELOCITY
-from ..model.top import Top
+from tippe.model.contact_load import Slip
+from tippe.model.scene import Scene
+from tippe.model.state import AXIS, MOMENTUM, PLACE, VELOCITY
+from tippe.model.top import Top
 
 
 def across(scene: Scene[Top]) -> tuple[Float[Array, ""] | float, float]:

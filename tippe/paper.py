@@ -1,4 +1,7 @@
-"""The papers' two inversion tables beside computed times: `python -m tippe --paper`.
+"""The two inversion tables of a paper, as printed and computed: `python -m tippe --paper`.
+
+The paper: "Modeling of Dynamics Object with Non-Holonomic Constraints Based on Maple in Cylinder Coordinate R x S^1 x SO(3)".
+Its numbers are in g, cm and s and are converted here only.
 
 The printed and the computed times have different trends: the numbers of the paper's top are lost, and its equations of
 motion are not those of a top (`docs/development/tippe_paper.md`). The same launches also run on the plane.
@@ -12,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from html import escape
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -27,15 +30,49 @@ from nonholonomic.sweeps import Table
 from nonholonomic.validation import require_folder
 from nonholonomic.views import NO_VIEW, Stage, can_view, page, picture_as_html, table_as_html
 
-from ..model.friction import AbstractFriction, Coulomb, Viscous
-from ..model.launch import Launch
-from ..model.scene import Scene
-from ..model.top import Top
-from ..runs.plot import Panel, draw_launches
-from ..runs.table import inversion_table
-from ..runs.verbs import simulate
-from ..runs.view import DrawnMotion, stages
-from . import paper
+from .model.friction import AbstractFriction, Coulomb, Viscous
+from .model.launch import Launch
+from .model.scene import Scene
+from .model.top import Top
+from .runs.plot import Panel, draw_launches
+from .runs.table import inversion_table
+from .runs.verbs import simulate
+from .runs.view import DrawnMotion, stages
+
+#: The paper's units in SI.
+GRAM, CENTIMETRE = 1e-3, 1e-2
+
+#: beta1 of Tables 2 and 3 [kg m^2/s], its "2,500 g m^2 rad/s" read as 2500 g cm^2/s.
+BETA1 = 2500.0 * GRAM * CENTIMETRE**2
+
+
+class Row(NamedTuple):
+    """One row of Table 2 or 3.
+
+    - `theta`: inclination at the start [rad].
+    - `time`: time at which the top is reversed [s]; None for "Not reversed".
+    """
+
+    theta: float
+    time: float | None
+
+
+class PrintedTable(NamedTuple):
+    """Table 2 or 3, whose rows differ only in the inclination.
+
+    - `eta`: place at the start [rad].
+    - `mu`: coefficient of friction, of a law that the paper does not state.
+    - `rows`: the nine rows.
+    """
+
+    eta: float
+    mu: float
+    rows: tuple[Row, ...]
+
+
+THETAS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, math.pi / 2.0)
+TABLE_2 = PrintedTable(0.0, 0.3, tuple(map(Row, THETAS, (25.0, 22.0, *(None,) * 7))))
+TABLE_3 = PrintedTable(math.pi / 2.0, 0.3, tuple(map(Row, THETAS, (23.0, 19.0, 20.0, 22.0, *(None,) * 5))))
 
 #: The arenas by name, and their numbers.
 SURFACES = {
@@ -86,11 +123,9 @@ def parser() -> argparse.ArgumentParser:
     )
     scene.add_argument("--gravity", type=float, default=9.81, help="acceleration of free fall [m/s^2]")
     launch = command.add_argument_group("the launches")
-    launch.add_argument(
-        "--theta", type=float, nargs="+", default=list(paper.THETAS), help="inclinations theta(0) [rad]"
-    )
+    launch.add_argument("--theta", type=float, nargs="+", default=list(THETAS), help="inclinations theta(0) [rad]")
     launch.add_argument("--eta", type=float, nargs="+", default=[0.0, math.pi / 2.0], help="places eta(0) [rad]")
-    launch.add_argument("--beta1", type=float, default=paper.BETA1, help="I3 w3 at the start [kg m^2/s]")
+    launch.add_argument("--beta1", type=float, default=BETA1, help="I3 w3 at the start [kg m^2/s]")
     launch.add_argument(
         "--spin", type=float, help="spin w3 at the start [rad/s] instead of --beta1; --spin=-100 if negative"
     )
@@ -174,7 +209,7 @@ def tables(options: argparse.Namespace) -> dict[str, Table]:
 
 def printed_times(options: argparse.Namespace, eta: float) -> list[str] | None:
     """The paper's times for a place, if the launches are those of the paper."""
-    for table in (paper.TABLE_2, paper.TABLE_3):
+    for table in (TABLE_2, TABLE_3):
         if list(options.theta) == [row.theta for row in table.rows] and math.isclose(eta, table.eta):
             return ["-" if row.time is None else f"{row.time:g}" for row in table.rows]
     return None

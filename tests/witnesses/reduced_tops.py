@@ -10,15 +10,14 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from euler_angles import from_vector_state
 from jaxtyping import Array, Float
 
 from nonholonomic.validation import shown
-
-from ..model.contact_load import Slip
-from ..model.scene import Scene
-from ..model.state import AXIS, VELOCITY
-from ..model.top import Top
-from .euler_angles import from_vector_state
+from tippe.model.contact_load import Slip
+from tippe.model.scene import Scene
+from tippe.model.state import AXIS, VELOCITY
+from tippe.model.top import Top
 
 
 def nodal(state: Float[Array, " 8"], vector: Float[Array, " 2"]) -> Float[Array, " 2"]:

@@ -21,10 +21,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.integration.zeros import halved
-
-from ..model.scene import Scene
-from ..model.state import AXIS, MOMENTUM, VELOCITY
-from ..model.top import Top
+from tippe.model.scene import Scene
+from tippe.model.state import AXIS, MOMENTUM, VELOCITY
+from tippe.model.top import Top
 
 #: Gauss points for the divided difference along each direction, and cosines for the time as a function of chi.
 POINTS, COSINES = 24, 96

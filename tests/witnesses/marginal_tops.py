@@ -20,10 +20,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Cylinder
-
-from ..model.scene import Scene
-from ..model.top import Top
-from ..steady import inverted_critical_spin, standing_matrix, upright_critical_spin
+from tippe.model.scene import Scene
+from tippe.model.top import Top
+from tippe.steady import inverted_critical_spin, standing_matrix, upright_critical_spin
 
 #: Curvature ratio at the start of the curve: so close to the plane that the plane's critical spin is the first guess.
 ALMOST_FLAT = 1e-9

@@ -1,8 +1,8 @@
 r"""Audit of the paper: each numbered equation as printed, the verdict, the correct form, and the tests for both.
 
-`python -m tippe.papers.audit` prints the page `docs/development/tippe_paper.md`. In its formulas eta is the angle of the
-position from the lowest line, r the arena's radius, rho = r - R the radius of the centre's path, and phi the direction of the
-axis from that of increasing eta.
+`python benchmarks/papers/tippe_audit.py` prints the page `docs/development/tippe_paper.md`. In its formulas eta is the angle of
+the position from the lowest line, r the arena's radius, rho = r - R the radius of the centre's path, and phi the direction of
+the axis from that of increasing eta.
 """
 
 import textwrap
@@ -32,7 +32,9 @@ class Equation(NamedTuple):
     tests: tuple[str, ...]
 
 
-WITNESSES, PAPER = "tests/physics/test_witnesses.py::", "tests/tippe/papers/test_paper.py::"
+WITNESSES, PAPER = "tests/physics/test_witnesses.py::", "tests/papers/test_tippe_paper.py::"
+REDUCED, ANGLES = "tests/witnesses/reduced_tops.py::", "tests/witnesses/euler_angles.py::"
+FORMULAS = "benchmarks/papers/tippe_formulas.py::"
 
 AUDIT = (
     Equation(
@@ -47,7 +49,7 @@ AUDIT = (
             r"J = R\left[I_1(\dot\phi\sin^2\theta + \dot\eta\sin\theta\cos\theta\sin\phi) "
             r"+ I_3\omega_3\cos\theta\right] - aI_3\omega_3",
         ),
-        code=("tippe.witnesses.reduced.jellett_constant", "tippe.Scene.jellett"),
+        code=(REDUCED + "jellett_constant", "tippe.Scene.jellett"),
         tests=(PAPER + "test_equation_1_is_jelletts_constant_only_when_corrected",),
     ),
     Equation(
@@ -78,7 +80,7 @@ AUDIT = (
             r"- c^\lambda_{\mu\rho}v^\mu\frac{\partial R}{\partial v^\lambda} "
             r"- c^1_{\mu\rho}v^\mu\beta_1 - X_\rho R = Q_\rho,\qquad \dot\beta_1 = Q_1,\qquad R = L - \beta_1v^1",
         ),
-        code=("tippe.witnesses.poincare.by_equation_2",),
+        code=("tests/witnesses/poincare.py::by_equation_2",),
         tests=(
             WITNESSES + "test_lagrange_poincare_and_the_corrected_paper_give_the_accelerations_of_the_vector_form",
             PAPER + "test_the_frame_of_equation_2_has_the_structure_that_the_reduction_needs",
@@ -94,7 +96,7 @@ AUDIT = (
         reason="The formulas hold for x = r sin(eta) and z = r cos(eta), with eta = 0 at the top. The first line of (5) "
         "contains phi and theta instead of eta and y. Only the second field is tangent to the cylinder.",
         correct=(r"[R_x, R_y] = -R_z,\qquad [R_y, R_z] = -R_x,\qquad [R_z, R_x] = -R_y",),
-        code=("tippe.papers.paper.rotation_generators",),
+        code=(FORMULAS + "rotation_generators",),
         tests=(
             PAPER + "test_the_printed_generators_are_the_rotations_and_close_as_so3",
             PAPER + "test_only_the_second_generator_is_tangent_to_the_cylinder",
@@ -114,9 +116,9 @@ AUDIT = (
             r"+ \tfrac12I_3\omega_3^2 - mgz",
         ),
         code=(
-            "tippe.witnesses.reduced.lagrangian",
-            "tippe.witnesses.euler_angles.metric",
-            "tippe.witnesses.euler_angles.potential",
+            REDUCED + "lagrangian",
+            ANGLES + "metric",
+            ANGLES + "potential",
         ),
         tests=(PAPER + "test_equation_6_lacks_the_vertical_motion_of_the_centre_of_mass",),
     ),
@@ -130,9 +132,9 @@ AUDIT = (
         "adds a term.",
         correct=(r"\dot\psi = \frac{\beta_1}{I_3} - \dot\phi\cos\theta + \dot\eta\sin\theta\sin\phi",),
         code=(
-            "tippe.witnesses.reduced.spin_rate_from_jellett",
-            "tippe.witnesses.reduced.spin_momentum_from_jellett",
-            "tippe.witnesses.reduced.spin_rate",
+            REDUCED + "spin_rate_from_jellett",
+            REDUCED + "spin_momentum_from_jellett",
+            REDUCED + "spin_rate",
         ),
         tests=(PAPER + "test_equations_7_8_and_10_hold_on_the_plane",),
     ),
@@ -158,7 +160,7 @@ AUDIT = (
             r"+ I\sin^2\theta\,\dot\phi^2\right) + \beta_1\dot\phi\cos\theta - \frac{\beta_1^2}{2I_3} "
             r"- mg(R-a\cos\theta)",
         ),
-        code=("tippe.witnesses.reduced.routhian", "tippe.witnesses.reduced.jellett_rate"),
+        code=(REDUCED + "routhian", REDUCED + "jellett_rate"),
         tests=(
             PAPER + "test_equation_9_is_an_energy_but_no_routhian",
             WITNESSES + "test_rutstam_and_the_jellett_reduction_give_the_accelerations_of_the_vector_form",
@@ -179,7 +181,7 @@ AUDIT = (
             r"p = -(\dot\phi\sin\theta + \dot\eta\cos\theta\sin\phi),\quad q = \dot\theta - \dot\eta\cos\phi,\quad "
             r"s = \dot\phi\cos\theta - \dot\eta\sin\theta\sin\phi,\quad \omega_3 = \dot\psi + s",
         ),
-        code=("tippe.witnesses.euler_angles.equations", "tippe.witnesses.euler_angles.by_equation_11"),
+        code=(ANGLES + "equations", ANGLES + "by_equation_11"),
         tests=(
             WITNESSES + "test_lagrange_poincare_and_the_corrected_paper_give_the_accelerations_of_the_vector_form",
             WITNESSES + "test_trajectories_of_all_formulations_in_the_cylinder_agree_for_five_seconds",
@@ -196,7 +198,7 @@ AUDIT = (
             r"\frac Nm = g\cos\eta + \rho\dot\eta^2 + a(\ddot\theta\sin\theta + \dot\theta^2\cos\theta) "
             r"+ a\dot\eta^2\cos\theta - a\ddot\eta\,e_t - 2a\dot\eta\,\dot e_t,\qquad e_t = \sin\theta\cos\phi",
         ),
-        code=("tippe.witnesses.euler_angles.normal_force",),
+        code=(ANGLES + "normal_force",),
         tests=(PAPER + "test_equation_12_needs_three_more_terms_in_the_cylinder_and_none_on_the_plane",),
     ),
     Equation(
@@ -222,7 +224,7 @@ AUDIT = (
         "beta1: such a top never rises. We use 2500 g cm^2/s, which gives the initial spin. The paper does not state the "
         "friction law for mu = 0.3.",
         correct=(r"\omega_3(0) = \beta_1/I_3,\qquad \beta_1 = 2.5\cdot10^{-4}\ \mathrm{kg\,m^2/s}",),
-        code=("tippe.papers.paper.launch",),
+        code=(FORMULAS + "launch",),
         tests=(
             PAPER + "test_the_unit_of_beta1_as_printed_is_impossible",
             PAPER + "test_a_top_launched_with_all_rates_zero_never_rises",
