@@ -90,12 +90,13 @@ def test_only_what_can_be_varied_is_suggested():
 
 
 def test_the_axes_of_rides_may_be_named_by_their_ends_too(monkeypatch):
-    monkeypatch.setattr(nonholonomic.sweeps, "sweep", lambda job, grid, *_, **__: [axis.number for axis in grid])
-    assert stroller.sweep(PRAM, RIDE, 1.0, axes={"speed": [1.0, 2.0], "place[1]": [0.0, 1.0], "wheelbase": [0.6]}) == [
-        "launch.speed",
-        "launch.place[1]",
-        "scene.body.wheelbase",
-    ]
+    def only_axes(job, grid, *_, **__):
+        raise KeyError(*(axis.number for axis in grid))
+
+    monkeypatch.setattr(nonholonomic.sweeps, "sweep", only_axes)
+    with pytest.raises(KeyError) as axes:
+        stroller.sweep(PRAM, RIDE, 1.0, axes={"speed": [1.0, 2.0], "place[1]": [0.0, 1.0], "wheelbase": [0.6]})
+    assert axes.value.args == ("launch.speed", "launch.place[1]", "scene.body.wheelbase")
     sprung = dataclasses.replace(PRAM, friction=stroller.Damping(1.0))
     with pytest.raises(ValueError, match=r"axes: 'steering' could be scene\.friction\.steering or launch\.steering"):
         stroller.sweep(sprung, RIDE, 1.0, axes={"steering": [0.1]})

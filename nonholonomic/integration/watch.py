@@ -155,7 +155,7 @@ def _bounded(
         # Too short to bound: the function may be zero, which counts as its sign at the end.
         positive = (values.low > 0.0) | (value - steepest - doubt > 0.0) | (rises.low > 0.0)
         positive |= ((rises.high < 0.0) | is_short) & (at_end > 0.0)
-        falls = ((rises.high < 0.0) | is_short) & (at_end <= 0.0)
+        falls = ((rises.high < 0.0) | is_short) & ~(at_end > 0.0)
         clear, decided = jnp.all(positive, axis=0), jnp.all(positive | falls, axis=0)
         # The state's error, not the length of the part, may hide a zero.
         hides = jnp.any(~positive & ~falls & (steepest <= doubt), axis=0) & may_cut

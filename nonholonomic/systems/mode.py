@@ -81,8 +81,8 @@ class AbstractMode(eqx.Module):
         """A smooth function that is positive while the mode holds and falls through zero where it ends; or several such
         functions, of which the first to fall ends the mode.
 
-        An oscillation in time that is faster than the motion can be missed: let the field contain it, for example with the
-        sine and cosine of a vibrating table's phase in the state.
+        The function may change faster than the motion, as the height above a vibrating table or above waves: no zero is
+        missed, unless the function contains an operation without bounds, such as a loop.
 
         **Arguments:** as for `field`.
 

@@ -15,7 +15,7 @@ from nonholonomic.integration import Settings
 from nonholonomic.parameters import numbers
 from nonholonomic.runs import AbstractEventTimes
 from nonholonomic.text import distinguishing_labels
-from nonholonomic.validation import as_number, as_number_or_none, require_kind, require_scalars
+from nonholonomic.validation import as_number, as_number_or_none, is_traced, require_kind, require_scalars
 from nonholonomic.warning import warn
 
 from ..model.launch import Launch, as_launch
@@ -48,7 +48,8 @@ class AbstractTimes(AbstractEventTimes):
 
     def __check_init__(self):
         require_kind(self.launch, "launch", Launch, " or a list of launches")
-        seconds = np.asarray(self.time)
+        # What is no number is refused later.
+        seconds = np.asarray(self.time) if isinstance(self.time, jax.Array) and not is_traced(self.time) else np.zeros(0)
         if np.any(np.isfinite(seconds)) and (middle := np.median(seconds[np.isfinite(seconds)])) > LONG:
             warn(f"time = {middle:g} s is long for a top; times are in seconds: did you mean 1e-3 * time?")
 
