@@ -49,7 +49,9 @@ class AbstractTimes(AbstractEventTimes):
     def __check_init__(self):
         require_kind(self.launch, "launch", Launch, " or a list of launches")
         # What is no number is refused later.
-        seconds = np.asarray(self.time) if isinstance(self.time, jax.Array) and not is_traced(self.time) else np.zeros(0)
+        seconds = (
+            np.asarray(self.time) if isinstance(self.time, jax.Array) and not is_traced(self.time) else np.zeros(0)
+        )
         if np.any(np.isfinite(seconds)) and (middle := np.median(seconds[np.isfinite(seconds)])) > LONG:
             warn(f"time = {middle:g} s is long for a top; times are in seconds: did you mean 1e-3 * time?")
 
