@@ -33,7 +33,7 @@ class Jumps(NamedTuple):
     ...     def field(self, time, state):
     ...         return super().field(time, state) * jnp.where(time < 0.5, 1.0, 0.5)
     ...     def jumps(self, time, state):
-    ...         return Jumps.at(jnp.full((1, 3), 0.5))
+    ...         return Jumps.at(jnp.full((1, *self.rate.shape), 0.5))
     >>> halved, _ = solve_ensemble(Halved(problem.rate), jnp.asarray(1.0), jnp.asarray(3), settings)
     >>> print(halved.crossing_time.round(6))  # (ln(2) / rate - 0.5) / 0.5 + 0.5, and before the jump ln(2) / rate
     [0.886294 0.346574 0.173287]

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Vector
 from nonholonomic.lanes.comparisons import jumps_of, warn_of_unclear
-from nonholonomic.per_run import is_users
+from nonholonomic.per_run import AbstractHeld, is_users
 from nonholonomic.text import name_of
 from nonholonomic.validation import Bound, Bounded, as_number, is_traced, shown
 
@@ -161,6 +161,8 @@ def is_searched(controls: Any) -> bool:
     if is_users(type(controls)):
         return True
     # A module that evaluates another one ride by ride.
+    if isinstance(controls, AbstractHeld):
+        return is_searched(controls.function)
     inner = getattr(controls, "input", getattr(controls, "function", None))
     return getattr(controls, "searched", False) if inner is None else is_searched(inner)
 
