@@ -137,7 +137,8 @@ def wait_for(condition, process: subprocess.Popen) -> None:
 
 
 def blocks(path: Path) -> list[Path]:
-    return list(path.with_name(f"{path.name}.blocks").glob("*.npz"))
+    """The finished blocks: a file that is being written has `.part` in its name."""
+    return [file for file in path.with_name(f"{path.name}.blocks").glob("*.npz") if ".part" not in file.name]
 
 
 @pytest.mark.parametrize("way", ["threads", pytest.param("processes", marks=pytest.mark.slow)])
