@@ -154,9 +154,10 @@ def sample(
     require_flag(progress, "progress")
     known = None if centre is None else _component(density, centre, covariance)
     with status_line("sampling", progress):
-        coordinates, *counts = drawn(density, known, (chains, MOVES * warmup, draws), seed, progress)
+        sizes = (chains, MOVES * warmup, draws)
+        coordinates, accepted, runs, excess = drawn(density, known, sizes, seed, progress)
     with status_line("diagnosing the draws", progress):
-        posterior = Draws.of(density, coordinates, *counts)
+        posterior = Draws.of(density, coordinates, accepted, runs, excess)
     if words := (*(f"these are no draws from the posterior: {flaw}" for flaw in posterior.flaws), *posterior.concerns):
         warn("; ".join(words), FitWarning)
     return posterior

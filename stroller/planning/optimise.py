@@ -91,7 +91,7 @@ def constraints(candidates: Candidates, task: Task) -> Residuals:
 def _step(band: np.ndarray, gradient: np.ndarray, damping: np.ndarray) -> np.ndarray:
     """Damped Gauss-Newton steps of all lanes, solved as one banded system; none in a lane that is not finite."""
     lanes, width, count = band.shape
-    usable = np.isfinite(band).all((1, 2), keepdims=True)
+    usable = np.all(np.isfinite(band), axis=(1, 2), keepdims=True)
     matrix = np.where(usable, band, 0.0)
     # Rounding must not make the matrix indefinite where an unknown far from the others has a very steep residual.
     matrix[:, 0] += damping[:, None] + 1e-12 + 1e-13 * matrix[:, 0].max(axis=1, keepdims=True)

@@ -233,7 +233,8 @@ def _shortened(outline: Outline, best: Attempt, tolerance: float) -> Attempt:
         way = float(np.trapezoid(np.abs(best.run.speed), best.run.t))
         task = outline.task(way, float(durations.mean()), outline.clearance)
         candidates, violation, _ = optimise(Candidates(faster, durations), task)
-        attempts = (_driven(outline, candidates, lane, tolerance) for lane in np.flatnonzero(violation < HOPELESS))
+        hopeful = np.flatnonzero(violation < HOPELESS).tolist()
+        attempts = (_driven(outline, candidates, lane, tolerance) for lane in hopeful)
         shorter = next((attempt for attempt in attempts if not attempt.verdict.hindrances), None)
         best = best if shorter is None else shorter
         share **= 0.5 / LANES if shorter is None else LONGER_STEP

@@ -263,7 +263,7 @@ def shortcuts(
 
     def piece(sign: float, radius: float, turn: Any, straight: Any) -> list[np.ndarray]:
         arc = (np.mod(sign * np.sign(radius) * turn + TIE, 2.0 * np.pi) - TIE).clip(0.0)
-        return np.broadcast_arrays(sign, 1.0 / radius if radius else 0.0, abs(radius) * arc + straight + 0.0 * x)
+        return list(np.broadcast_arrays(sign, 1.0 / radius if radius else 0.0, abs(radius) * arc + straight + 0.0 * x))
 
     pieces = [
         list(map(piece, signs, of_pieces, turns, (0.0, straight, 0.0)))
