@@ -33,7 +33,7 @@ AT_ZERO = 1e-9
 SHORTEST_FIRST, SHORTEST = 2.0**-12, 2.0**-30
 
 #: Number of intervals between looks at a function without bounds, and of the intervals on either side whose mismatch counts.
-INTERVALS, NEIGHBOURS = 16, 3
+INTERVALS, NEIGHBOURS = 32, 7
 
 #: The error of a cubic between neighbouring looks, as a fraction of the mismatch of the cubic twice as long, which is 16
 #: times as large where the function is smooth; and the mismatch up to which the first intervals are resolved, as a fraction

@@ -176,7 +176,8 @@ def sampled_if_legal(
     numbers = [leaf for leaf in jax.tree.leaves(model) if eqx.is_inexact_array(leaf)]
     changes = [jnp.where(jnp.isfinite(leaf), leaf - jax.lax.stop_gradient(leaf), 0.0) for leaf in numbers]
     change = jnp.where(is_legal, 0.0, jnp.nan) * sum(map(jnp.sum, changes))
-    return is_legal, dataclasses.replace(run, rows=run.rows + change), settings
+    # Selected, so that what is not a number in the cotangents of a legal run does not reach the sum.
+    return is_legal, dataclasses.replace(run, rows=jnp.where(is_legal, run.rows, run.rows + change)), settings
 
 
 def problem_of_run(modules: tuple[AbstractModel, Names], cells: int | None) -> AbstractProblem:

@@ -198,7 +198,7 @@ def test_a_file_has_one_writer(rutstam_scene_module, tmp_path):
     original = sweeping.ChunkStore.write
 
     def and_try_again(self, block, values):
-        with pytest.raises(OSError, match="another process is writing it"):
+        with pytest.raises(OSError, match="another thread is writing it"):
             tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
         original(self, block, values)
 
