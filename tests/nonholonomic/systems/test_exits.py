@@ -133,6 +133,7 @@ def test_wrong_margins_are_described(margin, message):
         event_time(Hybrid([type("Wrong", (Room,), {"margin": margin})()], lambda t, y: y[0]), STARTS[0], 1.0)
 
 
+@pytest.mark.slow
 @needs_browser
 def test_the_browser_knows_the_wall():
     live = page_of(model_of(Hybrid([Room()]), list(STARTS[0])), {"start[0]": (-0.5, 0.5)}, 7.0)[0]
