@@ -16,8 +16,7 @@ import numpy as np
 from ompl import base, control, util
 
 import stroller
-from stroller.planning.candidates import LIMIT_RESERVE, SMOOTHING
-from stroller.planning.guess import smoothed, timed
+from stroller.planning.candidates import LIMIT_RESERVE, SMOOTHING, smoothed, timed
 from stroller.planning.obstacles import separation
 from stroller.planning.problem import Problem
 from stroller.planning.search import Path

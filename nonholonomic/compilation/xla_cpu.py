@@ -6,7 +6,7 @@ and `benchmarks/work_precision.py` measure all of them together.
 
 import functools
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -20,6 +20,7 @@ from jaxlib.version import __version__ as jaxlib_version
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..warning import warn
+from .programs import operations, traced
 
 Result = TypeVar("Result")
 
@@ -183,20 +184,6 @@ def on_device(*arrays: Float[ArrayLike, "..."]) -> tuple[Float[Array, "..."], ..
     return tuple(jax.device_put(np.asarray(array, dtype=float)) for array in arrays)
 
 
-def traced(function: Callable[..., Any], *arguments: Any) -> tuple[ClosedJaxpr, Any]:
-    """Trace a function, for those who read its operations.
-
-    **Returns:** the program, and the tree of the shapes of its results.
-
-    Since JAX 0.12, `jnp.searchsorted`, `jnp.interp` and `jnp.einsum` are traced as primitives of another kind, which JAX
-    expands only when it compiles. Here they are expanded.
-    """
-    program, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
-    if getattr(program, "is_high", False):
-        program = partial_eval.lower_jaxpr2(program)  # pyright: ignore[reportAttributeAccessIssue]
-    return program, shape
-
-
 def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """A function of a tree of arrays that XLA compiles, on a CPU, into a single kernel.
 
@@ -219,7 +206,7 @@ def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
         # them.
         with set_xla_metadata(**_ATTRIBUTES):
             closed, shape = traced(function, argument)
-        if not set(OUTSIDE_KERNELS.split()).isdisjoint(operations(closed.jaxpr)):
+        if not operations(closed).isdisjoint(OUTSIDE_KERNELS.split()):
             return function(argument)
         # The values that the function closes over become its first arguments.
         inputs = [*closed.jaxpr.constvars, *closed.jaxpr.invars]
@@ -228,19 +215,6 @@ def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
         return jax.tree.unflatten(jax.tree.structure(shape), results)
 
     return called
-
-
-def operations(program: Jaxpr) -> Iterator[str]:
-    """The names of the operations of a program and of the programs inside it."""
-    for equation in program.eqns:
-        yield equation.primitive.name
-        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program):
-            if _is_program(inner):
-                yield from operations(getattr(inner, "jaxpr", inner))
-
-
-def _is_program(value: Any) -> bool:
-    return hasattr(getattr(value, "jaxpr", value), "eqns")
 
 
 #: Operations for which XLA calls a library, which the code of a single kernel cannot do.

@@ -183,13 +183,15 @@ def with_constraints(metric: Float[Array, "n n"], W: Float[Array, "k n"]) -> Flo
     """The metric plus a mass for each forbidden direction, G + W^T S W.
 
     Allowed motions do not feel these masses: they only change the multipliers. If parts have no mass, G is singular, and this
-    sum is positive definite where G is positive for the allowed rates. The masses have the size of those of the coordinates
-    that a constraint combines, so that they hide no small mass.
+    sum is positive definite where G is positive for the allowed rates. A constraint adds to each coordinate at most the mass
+    that it has, so that none is lost beside a large one, like a ball's beside that of the turntable it rolls on.
     """
     if not W.shape[0]:
         return metric
-    lengths = jnp.sum(W * W, axis=1)
     diagonal = jnp.sum(metric * np.eye(len(metric)), axis=1)
-    mean = W * W @ diagonal / lengths
-    masses = jnp.where(mean > 0.0, mean, jnp.sum(diagonal)) / lengths
+    squares = W * W
+    has_mass = (squares > 0.0) & (diagonal > 0.0)
+    least = jnp.min(jnp.where(has_mass, diagonal / jnp.where(has_mass, squares, 1.0), jnp.inf), axis=1)
+    # None of the coordinates in the constraint has a mass: any will do.
+    masses = jnp.where(least < jnp.inf, least, jnp.sum(diagonal) / jnp.sum(squares, axis=1))
     return metric + W.T @ (jax.lax.stop_gradient(masses)[:, None] * W)

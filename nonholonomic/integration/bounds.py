@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import Jaxpr, Literal
 from jaxtyping import Array
+
+from ..compilation.programs import bound, called_program, read_program, traced
 
 
 class Bounds(NamedTuple):
@@ -29,8 +30,8 @@ class UnboundedError(Exception):
 #: Operations that grow with every operand, and those that only move numbers.
 GROWING = """
     add add_any and asinh atan broadcast_in_dim cbrt ceil clamp concatenate convert_element_type copy copy_p cumsum erf exp exp2
-    expand_dims expm1 floor full iota log log1p logistic max min optimization_barrier or pad reduce_and reduce_max reduce_min
-    reduce_or reduce_sum reshape rev round sign sinh slice split squeeze stack stop_gradient tanh transpose unstack
+    expand_dims expm1 floor full iota log log1p log2 logistic max min optimization_barrier or pad reduce_and reduce_max
+    reduce_min reduce_or reduce_sum reshape rev round sign sinh slice split squeeze stack stop_gradient tanh transpose unstack
 """
 
 #: Operations that call another traced function.
@@ -42,9 +43,8 @@ def enclosing(function: Callable[..., Any], *shapes: Any) -> Callable[..., Any]:
 
     **Arguments:** `function`: a function of arrays; `shapes`: their shapes and types, as for `jax.eval_shape`.
 
-    **Returns:** a function of `Bounds`, one for each array, that returns `Bounds` in place of the results.
-
-    **Raises:** `UnboundedError` for a function with an operation that has no rule.
+    **Returns:** a function of `Bounds`, one for each array, that returns `Bounds` in place of the results. It raises
+    `UnboundedError` if the function has an operation that has no rule.
 
     **Example:**
 
@@ -53,44 +53,31 @@ def enclosing(function: Callable[..., Any], *shapes: Any) -> Callable[..., Any]:
     >>> print(*square(Bounds(jnp.asarray(-1.0), jnp.asarray(2.0))))
     -0.41614683654714235 5.0
     """
-    closed, shape = jax.make_jaxpr(function, return_shape=True)(*shapes)
-    constants = [Bounds(constant, constant) for constant in closed.consts]
-
-    def bounds(*boxes: Bounds) -> Any:
-        return jax.tree.unflatten(jax.tree.structure(shape), _evaluated(closed.jaxpr, constants, boxes))
-
-    # What has no rule shows when the rules are applied.
-    jax.eval_shape(bounds, *(Bounds(box, box) for box in shapes))
-    return bounds
+    program, shape = traced(function, *shapes)
+    return lambda *boxes: jax.tree.unflatten(jax.tree.structure(shape), _enclosed(program, boxes))
 
 
-def _evaluated(jaxpr: Jaxpr, constants: Sequence[Bounds], boxes: Sequence[Bounds]) -> list[Bounds]:
-    values: dict[Any, Bounds] = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*constants, *boxes), strict=True))
+def _enclosed(program: Any, boxes: Sequence[Bounds]) -> list[Bounds]:
+    return read_program(program, boxes, _applied, known=lambda constant: Bounds(constant, constant))
 
-    def read(variable: Any) -> Bounds:
-        return Bounds(variable.val, variable.val) if isinstance(variable, Literal) else values[variable]
 
-    for equation in jaxpr.eqns:
-        name, inputs = equation.primitive.name, [read(variable) for variable in equation.invars]
-        bind = functools.partial(equation.primitive.bind, **equation.params)
-        if name in CALLS.split():
-            inner = next(equation.params[key] for key in ("jaxpr", "call_jaxpr") if key in equation.params)
-            outer = [Bounds(constant, constant) for constant in getattr(inner, "consts", ())]
-            results = _evaluated(getattr(inner, "jaxpr", inner), outer, inputs)
-        elif name in GROWING.split():
-            lows, highs = bind(*(box.low for box in inputs)), bind(*(box.high for box in inputs))
-            several = equation.primitive.multiple_results
-            results = [Bounds(*pair) for pair in zip(lows, highs, strict=True)] if several else [Bounds(lows, highs)]
-        elif name == "mul" and equation.invars[0] is equation.invars[1]:
-            results = [_even(inputs[0], jnp.square)]
-        elif name == "integer_pow":
-            results = [_integer_power(equation.params["y"], *inputs)]
-        elif name in RULES:
-            results = [RULES[name](*inputs)]
-        else:
-            raise UnboundedError(name)
-        values |= dict(zip(equation.outvars, results, strict=True))
-    return [read(variable) for variable in jaxpr.outvars]
+def _applied(equation: Any, boxes: list[Bounds]) -> list[Bounds]:
+    """The bounds of the results of an operation."""
+    name = equation.primitive.name
+    if name in CALLS.split():
+        return _enclosed(called_program(equation), boxes)
+    if name in GROWING.split():
+        lows, highs = (
+            (bound(equation, ends) for ends in zip(*boxes, strict=True)) if boxes else 2 * [bound(equation, [])]
+        )
+        return list(map(Bounds, lows, highs))
+    if name == "mul" and equation.invars[0] is equation.invars[1]:
+        return [_even(boxes[0], jnp.square)]
+    if name == "integer_pow":
+        return [_integer_power(equation.params["y"], *boxes)]
+    if name not in RULES:
+        raise UnboundedError(name)
+    return [RULES[name](*boxes)]
 
 
 def _hull(*corners: Array) -> Bounds:
@@ -197,6 +184,7 @@ RULES: dict[str, Callable[..., Bounds]] = {
     "ne": lambda a, b: _opposite(_equal(a, b)),
     "neg": lambda box: Bounds(-box.high, -box.low),
     "not": _opposite,
+    "one_minus_square": lambda box: RULES["sub"](Bounds(1.0, 1.0), _even(box, jnp.square)),
     "pow": _power,
     "rsqrt": lambda box: _everything_where(~(box.low > 0.0), Bounds(jax.lax.rsqrt(box.high), jax.lax.rsqrt(box.low))),
     "select_n": _selected,

@@ -158,9 +158,9 @@ def _first_losses(
     margins = jax.vmap(functools.partial(_guard, problem), (0, 1))(time + length, end)
     place = jnp.where((margins < 0.0) & (length > 0.0), 1.0, jnp.inf)
     if problem.fast[0]:
-        start = states(0.0)
-        ends = ((point, problem.field(at, point)) for at, point in ((time, start), (time + length, end)))
-        path, side = Path.of(next(ends), states(0.5), next(ends), length), jnp.ones_like(time)
+        start, side = states(0.0), jnp.ones_like(time)
+        rate, end_rate = problem.field(time, start), problem.field(time + length, end)
+        path = Path.of((start, rate), states(0.5), (end, end_rate), length)
         inside, _ = watched(problem, side, path, time, length, length > 0.0, length < 0.0)
         place = jnp.minimum(place, jnp.where(inside < 1.0, inside, jnp.inf))
     brackets = jnp.stack([jnp.where(place < jnp.inf, time, jnp.inf), time + place * length], axis=1)

@@ -51,7 +51,7 @@ def missed_double_root(
     low, fall = jax.jvp(function, (state,), (rate,))
     high, rise = jax.jvp(function, (trial.state,), (trial.rate,))
     low, high = side * low, side * high
-    place, minimum = _minimum(low, side * fall * length, high, side * rise * length)
+    place, minimum = cubic_minimum(low, side * fall * length, high, side * rise * length)
     dips = (minimum < DIP * jnp.minimum(low, high)) & (place > 0.02) & (place < 0.98)
     return jnp.where(dips, place, 2.0)
 
@@ -93,7 +93,7 @@ def missed_loss(
     return jax.lax.cond(jnp.any(suspect), first_minimum, lambda: jnp.full(free.shape, 2.0))
 
 
-def _minimum(
+def cubic_minimum(
     low: Float[Array, "..."], fall: Float[Array, "..."], high: Float[Array, "..."], rise: Float[Array, "..."]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Position between 0 and 1 of the minimum of the cubic with given values and derivatives at both ends, and its

@@ -170,10 +170,10 @@ def _middle_weights(rows: tuple[tuple[float, ...], ...]) -> tuple[float, ...]:
     a = np.zeros((1 + len(rows), 1 + len(rows)))
     for k, row in enumerate(rows, start=1):
         a[k, : len(row)] = row
-    one = np.ones(len(a))
-    c = a @ one
+    ones = np.ones(len(a))
+    c = a @ ones
     # The elementary weights of the rooted trees, with the order and the density of each.
-    trees = [(one, 1, 1), (c, 2, 2), (c**2, 3, 3), (a @ c, 3, 6), (c**3, 4, 4), (c * (a @ c), 4, 8), (a @ c**2, 4, 12)]
+    trees = [(ones, 1, 1), (c, 2, 2), (c**2, 3, 3), (a @ c, 3, 6), (c**3, 4, 4), (c * (a @ c), 4, 8), (a @ c**2, 4, 12)]
     trees += [(a @ a @ c, 4, 24), (c**4, 5, 5), (c**2 * (a @ c), 5, 10), ((a @ c) ** 2, 5, 20), (c * (a @ c**2), 5, 15)]
     trees += [(c * (a @ a @ c), 5, 30), (a @ c**3, 5, 20), (a @ (c * (a @ c)), 5, 40), (a @ a @ c**2, 5, 60)]
     trees += [(a @ a @ a @ c, 5, 120)]

@@ -116,7 +116,7 @@ def solve_with_samples(
     - `read`: function of cells (lanes,) and states (rows, components, lanes) that returns the values to keep, a
       tree of arrays (rows, lanes, ...); by default the states themselves. Keeping less saves time and memory.
     - `dense`: whether to interpolate the samples inside steps of `Oscillatory8` or `Stabilized8`
-      (`continuous_extension.py`), which takes less time where there are more samples than steps. Otherwise steps end on
+      (`dense_samples.py`), which takes less time where there are more samples than steps. Otherwise steps end on
       the samples.
 
     **Returns:** the `Outcome`, without crossing times; and the kept values at the times, with the first axes (cells,

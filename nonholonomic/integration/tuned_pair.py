@@ -6,7 +6,7 @@ coefficients free. Prince and Dormand chose them for a small error in ninth orde
 `Stabilized8` choose them for other purposes.
 
 A continuous extension of order 7 needs no more stages, only the second derivatives at both ends
-(`continuous_extension.py`).
+(`dense_samples.py`).
 """
 
 from collections.abc import Sequence

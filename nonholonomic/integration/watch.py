@@ -17,6 +17,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from .bounds import Bounds, UnboundedError, enclosing
+from .double_roots import cubic_minimum
 from .problem import AbstractProblem
 from .runge_kutta import Lanes, States, inverse_root
 
@@ -61,6 +62,10 @@ class Path(NamedTuple):
         step, slope, end_slope = end_state - state, length * rate, length * end_rate
         square, cube = 3.0 * step - 2.0 * slope - end_slope, slope + end_slope - 2.0 * step
         return cls(state, slope, square, cube, middle - 0.5 * (state + end_state) - 0.125 * (slope - end_slope))
+
+    def error(self, place: Any) -> Lanes:
+        """How many times the bulge the error of the state at a place is."""
+        return STATE_SHARE * 16.0 * (place * (1.0 - place)) ** 2
 
     def derivatives(self, place: Any) -> list[States]:
         """The state at a place, and its four derivatives by the place, each divided by the factorial of its order."""
@@ -113,18 +118,15 @@ def watched(
 
     if not len(jax.eval_shape(functions, time, path.start)):
         return jnp.full_like(length, 2.0), any_length
-    point = (time, path.start)
     try:
-        enclosed = enclosing(lambda *point: jax.jvp(functions, point[:2], point[2:]), *point, *point)
+        return _bounded(functions, path, time, length, free, may_cut), any_length
     except UnboundedError:
         place, room = _looked(functions, path, time, length, may_cut)
         return jnp.where(free, place, 2.0), length * 0.9 * inverse_root(1.0 / jnp.clip(room, 1.0, 1e5), 4)
-    return _bounded(functions, enclosed, path, time, length, free, may_cut), any_length
 
 
 def _bounded(
     functions: Callable[[Lanes, States], Functions],
-    enclosed: Callable[..., tuple[Bounds, Bounds]],
     path: Path,
     time: Lanes,
     length: Lanes,
@@ -132,6 +134,8 @@ def _bounded(
     may_cut: Bool[Array, " lanes"],
 ) -> Lanes:
     """The place as in `watched`, by bounds of the functions and their slopes along parts of the step."""
+    point = (time, path.start)
+    enclosed = enclosing(lambda *point: jax.jvp(functions, point[:2], point[2:]), *point, *point)
 
     def part(carry: tuple[Lanes, Lanes, Lanes]) -> tuple[Lanes, Lanes, Lanes]:
         # All before `begin` is known to be positive.
@@ -148,7 +152,7 @@ def _bounded(
         times = Bounds(time + begin * length, time + end * length)
         values, rises = enclosed(times, states, Bounds(length, length), slopes)
         value, along = jax.linearize(functions, time + middle * length, state)
-        doubt = STATE_SHARE * jnp.abs(along(jnp.zeros_like(time), path.bulge)) * 16.0 * (middle * (1.0 - middle)) ** 2
+        doubt = path.error(middle) * jnp.abs(along(jnp.zeros_like(time), path.bulge))
         steepest = jnp.maximum(jnp.abs(rises.low), jnp.abs(rises.high)) * half
         at_end = functions(time + end * length, path.derivatives(end)[0])
         is_short = end - begin <= jnp.where(begin > 0.0, SHORTEST, SHORTEST_FIRST)
@@ -189,8 +193,7 @@ def _looked(
     def look(place: Any) -> Look:
         state, slope, *_ = path.derivatives(place)
         value, along = jax.linearize(functions, time + place * length, state)
-        error = 16.0 * (place * (1.0 - place)) ** 2 * jnp.abs(along(jnp.zeros_like(time), path.bulge))
-        return Look(value, along(length, slope), STATE_SHARE * error)
+        return Look(value, along(length, slope), path.error(place) * jnp.abs(along(jnp.zeros_like(time), path.bulge)))
 
     places, width = jnp.linspace(0.0, 1.0, 1 + INTERVALS), 1.0 / INTERVALS
     value, slope, error = jax.lax.map(look, places)
@@ -206,7 +209,8 @@ def _looked(
     window = jnp.pad(mismatch, ((NEIGHBOURS, NEIGHBOURS + 1), (0, 0), (0, 0)))
     near = [window[k : k + INTERVALS] for k in range(2 * NEIGHBOURS + 1)]
     total = jnp.max(jnp.stack(near), axis=0) + jnp.maximum(error[1:], error[:-1])
-    inner, least = _least(value[:-1], slope[:-1], value[1:], slope[1:])
+    inner, least = cubic_minimum(value[:-1], slope[:-1], value[1:], slope[1:])
+    least = jnp.where(inner <= 1.0, least, jnp.minimum(value[:-1], value[1:]))
     falls = (value[1:] <= 0.0) | (least < -total) & (least < -AT_ZERO * jnp.maximum(value[1:], value[:-1]))
     hides = jnp.where(begins, unresolved, least < total) & ~falls & may_cut
     begin, end = places[:-1, None, None], places[1:, None, None]
@@ -217,14 +221,3 @@ def _looked(
     place = jnp.where(jnp.any(problems, axis=0), jnp.take_along_axis(place, first[None], axis=0)[0], 2.0)
     room = jnp.where(begins | falls | hides, jnp.inf, least / jnp.maximum(total, 1e-300))
     return place, jnp.min(room, axis=(0, 1))
-
-
-def _least(value: Array, fall: Array, end_value: Array, rise: Array) -> tuple[Array, Array]:
-    """Place and value of the least of the cubics with given values and slopes at 0 and 1."""
-    climb = end_value - value
-    cubic, square = 3.0 * (fall + rise - 2.0 * climb), 3.0 * climb - 2.0 * fall - rise
-    root = square + jnp.sqrt(jnp.maximum(square * square - cubic * fall, 0.0))
-    place = jnp.clip(-fall / jnp.where(root == 0.0, 1.0, root), 0.0, 1.0)
-    least = value + place * (fall + place * (square + place * cubic / 3.0))
-    is_inside, at_end = (fall < 0.0) & (rise > 0.0), jnp.where(value < end_value, 0.0, 1.0)
-    return jnp.where(is_inside, place, at_end), jnp.where(is_inside, least, jnp.minimum(value, end_value))

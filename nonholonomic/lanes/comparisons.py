@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import Jaxpr, Literal
 from jaxtyping import Array, Float
 
+from ..compilation.programs import bound, called_program, read_program
 from ..warning import warn
 
 
@@ -66,9 +66,24 @@ def jumps_of(function: Callable[..., Any], t: Any, *others: Any) -> tuple[Float[
     closed = jax.make_jaxpr(function)(t, *others)
     reader = _Reader([], {})
     rest = [Other(False)] * (len(closed.jaxpr.invars) - 1)
-    reader.read(closed.jaxpr, [Known(const) for const in closed.consts], [Affine(1.0, 0.0), *rest])
+    reader.read(closed, [Affine(1.0, 0.0), *rest])
     times = [jnp.ravel(jnp.asarray(time, float)) for time in reader.times]
     return jnp.concatenate([jnp.zeros(0), *times]), tuple(reader.unclear)
+
+
+def in_cells(
+    times_of: Callable[[Any], Float[Array, " jumps"]], numbers: Any, shape: tuple[int, ...]
+) -> Float[Array, "jumps *cells"] | None:
+    """Times that follow from the numbers of a run, for all cells; `None` if there are no times.
+
+    **Arguments:** `numbers`: a tree of arrays, each with the cells in its last axis, or scalars for all cells; `shape`: that
+    of the cells, () for a single run.
+    """
+    axes = jax.tree.map(lambda leaf: -1 if jnp.ndim(leaf) else None, numbers)
+    is_mapped = shape != () and any(jnp.ndim(leaf) for leaf in jax.tree.leaves(numbers))
+    times = jax.vmap(times_of, in_axes=(axes,), out_axes=-1)(numbers) if is_mapped else times_of(numbers)
+    rows = [jnp.broadcast_to(time, shape) for time in times]
+    return jnp.stack(rows) if rows else None
 
 
 def warn_of_unclear(name: str, function: Callable[..., Any], *others: Any, remedy: str = "") -> None:
@@ -95,44 +110,29 @@ class _Reader(NamedTuple):
     times: list[Any]
     unclear: dict[str, None]
 
-    def read(self, jaxpr: Jaxpr, consts: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
-        """The kinds of the results of a jaxpr."""
-        kinds = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *inputs), strict=True))
-
-        def kind(atom: Any) -> Any:
-            return Known(atom.val) if isinstance(atom, Literal) else kinds[atom]
-
-        for equation in jaxpr.eqns:
-            results = self.apply(equation, [kind(atom) for atom in equation.invars])
-            kinds |= dict(zip(equation.outvars, results, strict=True))
-        return [kind(atom) for atom in jaxpr.outvars]
+    def read(self, program: Any, inputs: Sequence[Any]) -> list[Any]:
+        """The kinds of the results of a program."""
+        return read_program(program, inputs, self.apply, Known)
 
     def apply(self, equation: Any, inputs: list[Any]) -> list[Any]:
         """The kinds of the results of an equation."""
         name, parameters, count = equation.primitive.name, equation.params, len(equation.outvars)
-        inner = [parameters[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in parameters]
         if all(isinstance(kind, Known) for kind in inputs):
-            values = equation.primitive.bind(
-                *(kind.value for kind in inputs), **equation.primitive.get_bind_params(parameters)
-            )
-            return [Known(value) for value in (values if equation.primitive.multiple_results else [values])]
+            return list(map(Known, bound(equation, [kind.value for kind in inputs])))
         depends = any(map(_depends, inputs))
         if parameters.get("name") in SMOOTH:
             return [Other(depends)] * count
         if parameters.get("name") == "searchsorted" and isinstance(inputs[0], Known):
             return [self.compared(name, [Known(jnp.ravel(inputs[0].value)), inputs[1]])]
         if name == "cond":
-            branches = [
-                self.read(one.jaxpr, list(map(Known, one.consts)), inputs[1:]) for one in parameters["branches"]
-            ]
+            branches = [self.read(branch, inputs[1:]) for branch in parameters["branches"]]
             return [Other(any(map(_depends, (inputs[0], *kinds)))) for kinds in zip(*branches, strict=True)]
         if name in ("while", "scan"):
             if depends and any(_compares(part) for part in parameters.values()):
                 self.unclear[name] = None
             return [Other(depends)] * count
-        if inner:
-            jaxpr = getattr(inner[0], "jaxpr", inner[0])
-            return self.read(jaxpr, list(map(Known, getattr(inner[0], "consts", ()))), inputs)
+        if (inner := called_program(equation)) is not None:
+            return self.read(inner, inputs)
         if not depends:
             return [Other(False)] * count
         is_real = jnp.issubdtype(equation.invars[0].aval.dtype, jnp.inexact)

@@ -17,10 +17,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Jaxpr, Literal
 from jaxtyping import Array
 
-from ..compilation.xla_cpu import stored, traced
+from ..compilation.programs import read_program, traced
+from ..compilation.xla_cpu import stored
 from ..validation import is_traced
 from .tracing import spelled_out
 
@@ -75,7 +75,7 @@ def by_components(function: Callable[..., Any], *shapes: Any) -> Callable[..., A
     def evaluated(*args: Any) -> Any:
         closed, shape = traced(function, *shapes)
         leaves, evaluation = [_elements(leaf) for leaf in jax.tree.leaves(args)], Evaluation()
-        results = evaluation.of(closed.jaxpr, [_constants(const) for const in closed.consts], leaves)
+        results = read_program(closed, leaves, evaluation.apply, _constants)
         numbers = evaluation.with_hidden([result.item() for result in results])
         return jax.tree.unflatten(jax.tree.structure(shape), [jnp.asarray(number) for number in numbers])
 
@@ -128,23 +128,11 @@ class Evaluation:
         self.sources: dict[int, list[Any]] = {}
         self.dropped: list[Any] = []
 
-    def of(self, jaxpr: Jaxpr, consts: Sequence[Elements], args: Sequence[Elements]) -> list[Elements]:
-        """The results of a traced function."""
-        values: dict[Any, Elements] = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *args), strict=True))
-
-        def read(variable: Any) -> Elements:
-            return _constants(np.asarray(variable.val)) if isinstance(variable, Literal) else values[variable]
-
-        for equation in jaxpr.eqns:
-            results = self._equation(equation, [read(variable) for variable in equation.invars])
-            values |= dict(zip(equation.outvars, results, strict=True))
-        return [read(variable) for variable in jaxpr.outvars]
-
-    def _equation(self, equation: Any, inputs: list[Elements]) -> list[Elements]:
+    def apply(self, equation: Any, inputs: list[Elements]) -> list[Elements]:
+        """The results of an equation."""
         name, params = equation.primitive.name, equation.params
         if name in ("jit", "pjit"):
-            inner = params["jaxpr"]
-            return self.of(inner.jaxpr, [_constants(const) for const in inner.consts], inputs)
+            return read_program(params["jaxpr"], inputs, self.apply, _constants)
         if name in BY_ELEMENT.split():
             return [self._by_element(equation, inputs)]
         if name == "optimization_barrier":

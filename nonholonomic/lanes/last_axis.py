@@ -5,15 +5,15 @@ compilers vectorise only along the last axis, so this costs up to ten times as m
 a network of a thousand weights.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import Jaxpr, Literal
 from jaxtyping import Array
 
-from ..compilation.xla_cpu import traced
+from ..compilation.programs import bound, read_program, traced
 from .components import BY_ELEMENT, TooLarge
 
 #: Reductions, which name the axes that they remove.
@@ -36,7 +36,7 @@ def over_last_axis(function: Callable[..., Any], *shapes: Any) -> Callable[..., 
         closed, shape = traced(function, *shapes)
         leaves, expected = jax.tree.leaves(arguments), jax.tree.leaves(shapes)
         size = next(leaf.shape[-1] for leaf, own in zip(leaves, expected, strict=True) if leaf.ndim > own.ndim)
-        results = _evaluated(closed.jaxpr, closed.consts, leaves, size)
+        results = read_program(closed, leaves, functools.partial(_applied, size=size))
         outputs = [_with_axis(result, aval.ndim, size) for result, aval in zip(results, closed.out_avals, strict=True)]
         return jax.tree.unflatten(jax.tree.structure(shape), outputs)
 
@@ -49,27 +49,16 @@ def _with_axis(value: Any, ndim: int, size: int) -> Array:
     return value if value.ndim > ndim else jnp.broadcast_to(value[..., None], (*value.shape, size))
 
 
-def _evaluated(jaxpr: Jaxpr, consts: Sequence[Any], arguments: Sequence[Any], size: int) -> list[Any]:
-    values: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True)) | dict(
-        zip(jaxpr.invars, arguments, strict=True)
-    )
-
-    def read(variable: Any) -> Any:
-        return variable.val if isinstance(variable, Literal) else values[variable]
-
-    equations: list[Any] = jaxpr.eqns
-    for equation in equations:
-        operands, inner = [read(variable) for variable in equation.invars], equation.params.get("jaxpr")
-        own = [variable.aval.ndim for variable in equation.invars]
-        if equation.primitive.name in ("jit", "pjit") and inner is not None:
-            results = _evaluated(inner.jaxpr, inner.consts, operands, size)
-        elif not any(jnp.ndim(operand) > ndim for operand, ndim in zip(operands, own, strict=True)):
-            results = equation.primitive.bind(*operands, **equation.primitive.get_bind_params(equation.params))
-        else:
-            wide = [_with_axis(operand, ndim, size) for operand, ndim in zip(operands, own, strict=True)]
-            results = _mapped(equation, wide, own, size)
-        values |= dict(zip(equation.outvars, results if isinstance(results, list | tuple) else [results], strict=True))
-    return [read(variable) for variable in jaxpr.outvars]
+def _applied(equation: Any, operands: list[Any], size: int) -> Sequence[Any]:
+    """The results of an equation, with one more axis where an operand has one more."""
+    own = [atom.aval.ndim for atom in equation.invars]
+    if equation.primitive.name in ("jit", "pjit"):
+        return read_program(equation.params["jaxpr"], operands, functools.partial(_applied, size=size))
+    if not any(jnp.ndim(operand) > ndim for operand, ndim in zip(operands, own, strict=True)):
+        return bound(equation, operands)
+    wide = [_with_axis(operand, ndim, size) for operand, ndim in zip(operands, own, strict=True)]
+    results = _mapped(equation, wide, own, size)
+    return results if isinstance(results, list | tuple) else [results]
 
 
 def _mapped(equation: Any, operands: list[Array], own: list[int], size: int) -> Any:

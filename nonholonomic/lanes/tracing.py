@@ -13,7 +13,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from jaxtyping import Array
 
-from ..compilation.xla_cpu import operations, traced
+from ..compilation.programs import bound, operations, read_program, traced
 from ..validation import UNTRACEABLE, is_traced
 
 #: Operations that XLA compiles into a single kernel on a CPU, forwards and backwards. A function with other operations,
@@ -39,33 +39,16 @@ def spelled_out(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def evaluated(*args: Any) -> Any:
         closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
-        results = _evaluated(closed.jaxpr, closed.consts, jax.tree.leaves(args))
-        return jax.tree.unflatten(jax.tree.structure(shape), results)
+        return jax.tree.unflatten(jax.tree.structure(shape), read_program(closed, jax.tree.leaves(args), _spelled_out))
 
     return evaluated
 
 
-def _evaluated(jaxpr: Jaxpr, consts: Any, args: list[Any]) -> list[Any]:
-    values: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True)) | dict(
-        zip(jaxpr.invars, args, strict=True)
-    )
-
-    def read(variable: Any) -> Any:
-        return variable.val if isinstance(variable, Literal) else values[variable]
-
-    for equation in jaxpr.eqns:
-        inputs, primitive = [read(variable) for variable in equation.invars], equation.primitive
-        if primitive.name == "dot_general":
-            left, right = inputs
-            results = [_product(left, right, equation.params["dimension_numbers"])]
-        elif primitive.name in ("jit", "pjit"):
-            inner = equation.params["jaxpr"]
-            results = _evaluated(inner.jaxpr, inner.consts, inputs)
-        else:
-            results = primitive.bind(*inputs, **primitive.get_bind_params(equation.params))
-            results = results if primitive.multiple_results else [results]
-        values |= dict(zip(equation.outvars, results, strict=True))
-    return [read(variable) for variable in jaxpr.outvars]
+def _spelled_out(equation: Any, inputs: list[Any]) -> Sequence[Any]:
+    name, params = equation.primitive.name, equation.params
+    if name == "dot_general":
+        return [_product(*inputs, params["dimension_numbers"])]
+    return read_program(params["jaxpr"], inputs, _spelled_out) if name in ("jit", "pjit") else bound(equation, inputs)
 
 
 def _product(left: Array, right: Array, dimensions: Any) -> Array:
@@ -98,28 +81,28 @@ def is_elementary(function: Callable[..., Any], *args: Any) -> bool:
     except ValueError:
         # A loop without a fixed number of iterations has no backward pass.
         return False
-    return set(operations(program.jaxpr)) <= set(ELEMENTARY.split())
+    return operations(program) <= set(ELEMENTARY.split())
 
 
 def depends_on_first(function: Callable[..., Any], first: Any, *args: Any) -> bool:
     """Whether a function's results depend on its first argument, a number."""
     closed = jax.make_jaxpr(function)(first, *args)
-    return any(_reached(closed.jaxpr, closed.jaxpr.invars[:1]))
+    return any(_reached(closed, [k == 0 for k in range(len(closed.in_avals))]))
 
 
 def dependent_outputs(function: Callable[..., Any], *args: Any) -> list[bool]:
     """A mask of the function's results that depend on its arguments."""
     closed = jax.make_jaxpr(function)(*args)
-    return _reached(closed.jaxpr, closed.jaxpr.invars)
+    return _reached(closed, [True] * len(closed.in_avals))
 
 
-def _reached(jaxpr: Jaxpr, inputs: Sequence[Any]) -> list[bool]:
-    """Which outputs depend on some of the inputs."""
-    dependents = set(inputs)
-    for equation in jaxpr.eqns:
-        if any(not isinstance(variable, Literal) and variable in dependents for variable in equation.invars):
-            dependents |= set(equation.outvars)
-    return [not isinstance(variable, Literal) and variable in dependents for variable in jaxpr.outvars]
+def _reached(program: Any, inputs: Sequence[bool]) -> list[bool]:
+    """Which results depend on the inputs that are true in a mask."""
+
+    def is_reached(equation: Any, operands: list[bool]) -> list[bool]:
+        return [any(operands)] * len(equation.outvars)
+
+    return read_program(program, inputs, is_reached, known=lambda _: False)
 
 
 @contextlib.contextmanager

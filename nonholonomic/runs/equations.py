@@ -3,7 +3,6 @@
 import dataclasses
 import hashlib
 import re
-from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
@@ -13,6 +12,7 @@ import numpy as np
 from jax.extend.core import Literal
 from jaxtyping import Array
 
+from ..compilation.programs import opened, programs_in
 from .ensemble import Ensemble
 from .model import AbstractModel
 
@@ -54,27 +54,12 @@ def checksum_of(model: AbstractModel) -> str:
 
     program = jax.make_jaxpr(equations)(arrays)
     checksum = hashlib.sha256(ADDRESS.sub("", str(program)).encode())
-    for array in _constants(program, set()):
-        checksum.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
+    # The text of a program does not show all digits of the constants.
+    for inner in programs_in(program):
+        jaxpr, parts = opened(inner)
+        for equation in jaxpr.eqns:
+            literals = [operand.val for operand in equation.invars if isinstance(operand, Literal)]
+            parts = [*parts, *literals, *jax.tree.leaves(list(equation.params.values()))]
+        for array in (np.asarray(part) for part in parts if isinstance(part, Array | np.ndarray | np.generic)):
+            checksum.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
     return checksum.hexdigest()[:16]
-
-
-def _constants(program: Any, visited: set[int]) -> Iterator[np.ndarray]:
-    """The constants of a program, whose text does not show all their digits, and of the programs within it, such as those
-    of compiled functions."""
-    if id(program) in visited:
-        return
-    visited.add(id(program))
-    parts = [*getattr(program, "consts", ())]
-    for equation in program.eqns:
-        parts += [operand.val for operand in equation.invars if isinstance(operand, Literal)]
-        parts += jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program)
-    for part in parts:
-        if _is_program(part):
-            yield from _constants(part, visited)
-        elif isinstance(part, Array | np.ndarray | np.generic):
-            yield np.asarray(part)
-
-
-def _is_program(part: Any) -> bool:
-    return hasattr(part, "eqns")

@@ -109,8 +109,8 @@ def _started(place: int, threads: int) -> ProcessPoolExecutor:
             return pool
         except BrokenProcessPool as error:
             pool.shutdown()
-            # The exit status of a process that a signal has ended is negative.
-            if not any((process.exitcode or 0) < 0 for process in started):
+            # The exit status of a process that a signal has ended is negative; one that is no longer listed was ended at once.
+            if started and not any((process.exitcode or 0) < 0 for process in started):
                 # It would end again.
                 raise RuntimeError(
                     "a process ended before it computed anything; a script that starts processes must have its own calls under "

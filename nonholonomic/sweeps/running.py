@@ -4,6 +4,9 @@ import contextlib
 import functools
 import json
 import os
+import signal
+import sys
+import threading
 import uuid
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
@@ -19,7 +22,6 @@ from ..validation import require_flag, shown
 from ..warning import warn
 from ._chunks import ChunkStore, with_spaces
 from ._file import LONG_NAMES, Stored
-from ._interrupts import no_interrupt_lost
 from .dispatch import MAX_CRASHES, ExecutorBroken, handed_out
 from .grid import Axis, Variable, columns, size_of
 from .layout import Layout, Values
@@ -279,3 +281,44 @@ def workers() -> int:
     if jax.default_backend() != "cpu":
         return 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+# Ctrl-C where Python ignores exceptions.
+
+
+@contextlib.contextmanager
+def no_interrupt_lost() -> Iterator[Callable[[], None]]:
+    """A function, as a context, that raises `KeyboardInterrupt` again if Ctrl-C arrived within the context.
+
+    Python raises `KeyboardInterrupt` wherever the main thread happens to be. In finalizers, in callbacks of weak
+    references and during garbage collection, where JAX calls back into Python, exceptions are printed and ignored. Then
+    a sweep would go on, although its processes had ended. What will be raised again is not printed either.
+    """
+    arrived, hook = False, sys.unraisablehook
+
+    def print_others(ignored: Any) -> None:
+        if not issubclass(ignored.exc_type, KeyboardInterrupt):
+            hook(ignored)
+
+    def record_and_raise(number: int, frame: object) -> None:
+        nonlocal arrived
+        arrived = True
+        raise KeyboardInterrupt
+
+    def raise_again() -> None:
+        if arrived:
+            raise KeyboardInterrupt
+
+    # Only the main thread may set handlers; another handler is somebody else's decision.
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield raise_again
+        return
+    signal.signal(signal.SIGINT, record_and_raise)
+    sys.unraisablehook = print_others
+    try:
+        yield raise_again
+        raise_again()
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        sys.unraisablehook = hook

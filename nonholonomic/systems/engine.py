@@ -21,6 +21,7 @@ from ..compilation.xla_cpu import least
 from ..hybrid import AbstractBatchedMode, Transition
 from ..integration import AbstractProblem, Jumps, Lanes, States
 from ..integration.status import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
+from ..lanes.comparisons import in_cells
 from ..lanes.components import over_lanes
 from ..runs import UNMEASURED
 from .form import Form, OfRun
@@ -67,14 +68,8 @@ class ModeProblem(AbstractProblem):
         mode: int,
     ) -> "ModeProblem":
         """The problem of a mode, with the jumps of its functions and its allowances."""
-        times = None
-        if form.traits.depends_on_time:
-            axes = tuple(0 if jnp.ndim(number) else None for number in numbers)
-            found = functools.partial(form.jump_times, mode)
-            is_single = all(axis is None for axis in axes)
-            times = found(numbers) if is_single else jax.vmap(found, in_axes=(axes,), out_axes=-1)(numbers)
-            times = times if times.ndim == states.ndim else times.reshape(len(times), *[1] * (states.ndim - 1))
-            times = jnp.broadcast_to(times, (len(times), *states.shape[1:])) if len(times) else None
+        times_of, depends = functools.partial(form.jump_times, mode), form.traits.depends_on_time
+        times = in_cells(times_of, numbers, states.shape[1:]) if depends else None
         problem = cls(numbers, states, scales, tolerance, form, mode, times)
         if not form.traits.ends[mode]:
             return problem

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Vector
-from nonholonomic.lanes.comparisons import jumps_of, warn_of_unclear
+from nonholonomic.lanes.comparisons import in_cells, jumps_of, warn_of_unclear
 from nonholonomic.per_run import AbstractHeld, is_users
 from nonholonomic.text import name_of
 from nonholonomic.validation import Bound, Bounded, as_number, is_traced, shown
@@ -177,19 +177,12 @@ def jump_times(
     """
     arrays, static = eqx.partition(controls, eqx.is_inexact_array)
 
-    def found(arrays: Any) -> Float[Array, " jumps"]:
+    def times_of(arrays: Any) -> Float[Array, " jumps"]:
         return jumps_of(eqx.combine(arrays, static), t, motion)[0]
 
-    if not is_searched(controls):
-        times = jnp.zeros(0)
-    elif cells is None:
-        times = found(arrays)
-    else:
-        axes = jax.tree.map(lambda leaf: -1 if leaf.ndim else None, arrays)
-        is_single = all(leaf.ndim == 0 for leaf in jax.tree.leaves(arrays))
-        times = found(arrays) if is_single else jax.vmap(found, in_axes=(axes,), out_axes=-1)(arrays)
     shape = () if cells is None else (cells,)
-    rows = [jnp.broadcast_to(time, shape) for time in (*times, *jumps)]
+    times = in_cells(times_of, arrays, shape) if is_searched(controls) else None
+    rows = [*(() if times is None else times), *(jnp.broadcast_to(time, shape) for time in jumps)]
     return jnp.stack(rows) if rows else None
 
 

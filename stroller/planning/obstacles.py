@@ -268,8 +268,8 @@ def separation(first: Any, second: Any) -> Any:
     This is the exact depth of penetration (negative) of polygons that overlap (the separating-axis theorem; Ericson,
     Real-Time Collision Detection (2005), section 5.2), and a lower bound of the distance of others.
     """
-    one, other = (-_least(-_least(_face_gaps(*pair), -1), -1) for pair in ((first, second), (second, first)))
-    return one + (other - one).clip(0.0)
+    gap, gap_back = (-_least(-_least(_face_gaps(*pair), -1), -1) for pair in ((first, second), (second, first)))
+    return gap + (gap_back - gap).clip(0.0)
 
 
 def _edge_distance(polygon: Any, points: Any) -> Any:

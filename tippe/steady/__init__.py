@@ -26,20 +26,20 @@ an inverted top is stable above 41.31 rad/s
 ```
 """
 
-from .groups import folds as folds
-from .groups import group as group
-from .groups import inverted_critical_spin as inverted_critical_spin
-from .groups import jellett_thresholds as jellett_thresholds
-from .groups import proportions as proportions
-from .groups import upright_critical_spin as upright_critical_spin
 from .stability import growth_rate as growth_rate
 from .stability import standing_matrix as standing_matrix
 from .stability import standing_state as standing_state
 from .stability import tumbling_matrix as tumbling_matrix
 from .tumbling_tops import Tumbling as Tumbling
 from .tumbling_tops import effective_energy as effective_energy
+from .tumbling_tops import folds as folds
+from .tumbling_tops import group as group
+from .tumbling_tops import inverted_critical_spin as inverted_critical_spin
+from .tumbling_tops import jellett_thresholds as jellett_thresholds
+from .tumbling_tops import proportions as proportions
 from .tumbling_tops import quarter_turn as quarter_turn
 from .tumbling_tops import tumbling as tumbling
 from .tumbling_tops import tumbling_angles as tumbling_angles
 from .tumbling_tops import tumbling_is_stable as tumbling_is_stable
 from .tumbling_tops import tumbling_state as tumbling_state
+from .tumbling_tops import upright_critical_spin as upright_critical_spin

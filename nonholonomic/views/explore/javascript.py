@@ -15,9 +15,8 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal
 
-from ...compilation.xla_cpu import traced
+from ...compilation.programs import called_program, opened, programs_of, read_program, traced
 from ...lanes.components import MOVES
 
 #: A number: a Python number if known, otherwise its name or text in JavaScript. A value is an array of numbers.
@@ -162,17 +161,7 @@ class _Block:
 
     def call(self, closed: Any, arguments: Sequence[Value]) -> Values:
         """The results of a jaxpr."""
-        jaxpr, constants = _opened(closed)
-        values = dict(zip(jaxpr.constvars, map(_value, constants), strict=True))
-        values |= dict(zip(jaxpr.invars, arguments, strict=True))
-
-        def read(atom: Any) -> Value:
-            return _value(atom.val) if isinstance(atom, Literal) else values[atom]
-
-        for equation in jaxpr.eqns:
-            results = self.apply(equation, [read(atom) for atom in equation.invars])
-            values |= dict(zip(equation.outvars, results, strict=True))
-        return [read(atom) for atom in jaxpr.outvars]
+        return read_program(closed, arguments, self.apply, _value)
 
     def apply(self, equation: Any, inputs: Values) -> Values:
         """The results of one equation."""
@@ -181,8 +170,8 @@ class _Block:
             return inputs
         if name in ("while", "cond", "scan"):
             return getattr(self, f"{name}_")(inputs, **parameters)
-        if inner := [parameters[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in parameters]:
-            return self.call(inner[0], inputs)
+        if (inner := called_program(equation)) is not None:
+            return self.call(inner, inputs)
         if name in MOVED:
             return [np.asarray(MOVES[name](equation, *inputs), object)]
         if name == "unstack":
@@ -333,7 +322,7 @@ class _Block:
             first, count, _ = map(len, counts["ft_in"].unpack())
         constants, carry, rows = inputs[:first], inputs[first : first + count], inputs[first + count :]
         unrolled = length <= WRITTEN_OUT and length * _statements(jaxpr) <= MOST_STATEMENTS
-        if not rows and len(_opened(jaxpr)[0].outvars) == count and not unrolled:
+        if not rows and len(opened(jaxpr)[0].outvars) == count and not unrolled:
             head = f"for (let k = 0; k < {length}; k++)"
             return self.loop(head, carry, lambda block, carry: block.call(jaxpr, [*constants, *carry]))
         rows_of_steps: list[Any] = [None] * length
@@ -368,23 +357,14 @@ def _flat(values: Sequence[Value]) -> list[Number]:
     return [number for value in values for number in value.ravel()]
 
 
-def _opened(jaxpr: Any) -> tuple[Any, Sequence[Any]]:
-    """A jaxpr without its constants, and the constants."""
-    return (jaxpr.jaxpr, jaxpr.consts) if isinstance(jaxpr, ClosedJaxpr) else (jaxpr, ())
-
-
 def _statements(jaxpr: Any) -> int:
     """About how many statements a jaxpr takes: one for each number that it computes."""
     total = 0
-    for equation in _opened(jaxpr)[0].eqns:
-        inner = [leaf for leaf in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_jaxpr) if _is_jaxpr(leaf)]
+    for equation in opened(jaxpr)[0].eqns:
+        inner = programs_of(equation)
         numbers = sum(math.prod(atom.aval.shape) for atom in equation.outvars)
         total += sum(map(_statements, inner)) * equation.params.get("length", 1) if inner else numbers
     return total
-
-
-def _is_jaxpr(value: Any) -> bool:
-    return hasattr(value, "eqns") or isinstance(value, ClosedJaxpr)
 
 
 def _indented(lines: list[str]) -> list[str]:

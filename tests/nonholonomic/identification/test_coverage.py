@@ -9,7 +9,7 @@ import scipy.stats
 
 from nonholonomic.identification import FitWarning, Free, LogDensity, Measurements, identify, sample
 from nonholonomic.identification.distribution import Distribution
-from nonholonomic.identification.pareto import smoothed_weights
+from nonholonomic.identification.exploration import smoothed_weights
 
 X = np.linspace(0.5, 1.5, 8)
 TRUTH, ERROR, TOOTH = 2.0, 0.05, 0.1

@@ -10,7 +10,7 @@ from close import assert_close
 from tune_middle import errors, middle_weights
 
 from nonholonomic.integration import AbstractProblem, Oscillatory8, Settings, Stabilized8, solve_with_samples
-from nonholonomic.integration.continuous_extension import (
+from nonholonomic.integration.dense_samples import (
     StepEnd,
     continuous_extension,
     hermite_factors,

@@ -7,7 +7,7 @@ import pytest
 from close import assert_close
 
 from nonholonomic.integration import Settings
-from nonholonomic.runs.errors import second_tolerance
+from nonholonomic.runs.table import second_tolerance
 
 
 def test_a_tolerance_is_bounded_by_the_precision_with_a_warning():

@@ -68,8 +68,8 @@ class Beads(AbstractMode):
         return {"wall": s[0], "beads": s[1] - s[0], "end": 1.0 - s[1]}
 
     def reset(self, t, s, exit):
-        one, other = s[2], s[3]
-        struck = jnp.array([-0.5 * one + 1.5 * other, 0.5 * one + 0.5 * other])
+        left, right = s[2], s[3]
+        struck = jnp.array([-0.5 * left + 1.5 * right, 0.5 * left + 0.5 * right])
         walls = jnp.array([jnp.where(exit["wall"], -one, one), jnp.where(exit["end"], -other, other)])
         return jnp.concatenate([s[:2], jnp.where(exit["beads"], struck, walls)]), 0
 

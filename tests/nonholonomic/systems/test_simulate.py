@@ -451,8 +451,8 @@ class Doses(AbstractMode):
 def level(times, decay, after=False):
     """The sum of the doses that have been given, each decayed; one at the time of a sample counts if `after`."""
     doses = np.arange(1.0, 21.0)[:, None]
-    given = (times >= doses) if after else (times > doses)
-    return np.exp(-decay * times) + np.sum(np.where(given, np.exp(-decay * (times - doses)), 0.0), axis=0)
+    has_acted = (times >= doses) if after else (times > doses)
+    return np.exp(-decay * times) + np.sum(np.where(has_acted, np.exp(-decay * (times - doses)), 0.0), axis=0)
 
 
 DOSE_TIMES = np.linspace(0.0, 20.0, 201).round(12)
