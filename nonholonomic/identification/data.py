@@ -9,15 +9,14 @@ import numpy as np
 from jaxtyping import Int
 
 from ..parameters import full_name
-from . import likelihood
-from .likelihood import Measurements
+from .likelihood import Measurements, joined_measurements
 from .unknown import Free, as_free
 
 #: Stands for every set of data that has the parameter.
 EACH = "data[*]."
 
 
-def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], Int[np.ndarray, " n"]]:
+def joined_data(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], Int[np.ndarray, " n"]]:
     """The joined measurements of several sets of data, their labels, and the indices of the predictions that were measured.
 
     **Arguments:** `data`: sets of data, each with the attributes `measurements`, `labels`, `seen`, and `size` (the
@@ -26,7 +25,7 @@ def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], Int[np
     labels = numbered([source.labels for source in data])
     offsets = np.cumsum([0, *(source.size for source in data)])
     indices = np.concatenate([first + source.seen for first, source in zip(offsets, data, strict=False)])
-    return likelihood.joined([source.measurements for source in data]), labels, indices
+    return joined_measurements([source.measurements for source in data]), labels, indices
 
 
 def numbered(labels: Sequence[Sequence[str]]) -> tuple[str, ...]:

@@ -183,7 +183,7 @@ class Measurements(eqx.Module):
         return eqx.tree_at(lambda measurements: measurements.error, self, jnp.broadcast_to(error, self.error.shape))
 
 
-def joined(parts: list[Measurements]) -> Measurements:
+def joined_measurements(parts: list[Measurements]) -> Measurements:
     """The measurements of several sets, one after the other; their series are renumbered consecutively."""
     first, renumbered = 0, []
     for part in parts:

@@ -15,7 +15,7 @@ from ..text import counted, readable_unit, require_unit, text_as_html
 from ..validation import require_package, shown
 from ..views import draw_fit
 from ..warning import warn
-from .data import joined, numbered
+from .data import joined_data, numbered
 from .distribution import Distribution
 from .exploration import Explorer, Weighted
 from .identifiability import Identifiability, identifiability
@@ -382,7 +382,7 @@ def fine_predictions(
             for new, old in zip(shifted, data, strict=True)
         ]
         offset = np.repeat(offsets, [len(source.seen) for source in data])
-        slices.append((np.asarray(joined(shifted)[0].time) + offset, predictions(moved, coordinates[None])[0]))
+        slices.append((np.asarray(joined_data(shifted)[0].time) + offset, predictions(moved, coordinates[None])[0]))
     times, values = zip(*slices, strict=True)
     return np.stack(times), np.stack(values)
 

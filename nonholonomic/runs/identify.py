@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..identification import AbstractRecording, Free, Identification, LogDensity, Measurements
-from ..identification.data import free_numbers, joined, own_name
+from ..identification.data import free_numbers, joined_data, own_name
 from ..identification.identify import check_search
 from ..identification.identify import identify as most_likely
 from ..integration import Settings
@@ -214,6 +214,6 @@ class _Fit(NamedTuple):
 
         unknowns = free_numbers(free, shared, names_of_data, check)
         require_apart("free", unknowns)
-        measurements, labels, seen = joined(data)
+        measurements, labels, seen = joined_data(data)
         sources = tuple(Source(source, model) for source, model in zip(data, models, strict=True))
         return cls(DataModel(sources, seen, Settings(tolerance, max_steps=MOST_STEPS)), measurements, labels, unknowns)

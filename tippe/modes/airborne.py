@@ -144,7 +144,7 @@ def from_frame(vector: Vector, axes: tuple[Vector, Vector, Vector]) -> Vector:
     return vector_of(sum_vectors(*(scale(part, axis) for part, axis in zip(vector, axes, strict=True))))
 
 
-def as_free_body(scene: Scene[Top], flying: FlightState, ground: Below, ball: Ball | None = None) -> FreeBody:
+def flying_body(scene: Scene[Top], flying: FlightState, ground: Below, ball: Ball | None = None) -> FreeBody:
     """A flying top as a free body above the tangent plane below one of its spheres, by default its own."""
     velocity, axis, momentum = (to_frame(part, ground.axes) for part in flying[1:])
     ball = balls(scene.body)[0] if ball is None else ball
@@ -178,7 +178,7 @@ def gap_margin(scene: Scene[Top], flying: FlightState, ball: Ball, rounding: flo
     **Arguments:** `rounding`: an additional allowance.
     """
     body, ground = scene.body, landing_site(scene, flying, ball)
-    rate = gap_rate(body, ball, as_free_body(scene, flying, ground, ball))
+    rate = gap_rate(body, ball, flying_body(scene, flying, ground, ball))
     distance = add(*(jnp.abs(part) for part in flying.place))
     rounding = rounding + 4.0 * jnp.finfo(distance.dtype).eps * distance / body.radius
     return ground.gap / body.radius + still_parting(rate, scene.gravity, body.radius, rounding)
@@ -306,7 +306,7 @@ class Fly(AbstractFlyingMode):
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         flying = flight_state(state)
         ground = below(self.scene, flying)
-        free = as_free_body(self.scene, flying, ground)
+        free = flying_body(self.scene, flying, ground)
         c_vector = to_frame(vector_of(state[OWN + k] for k in range(3)), ground.axes)
         rate = gap_rate(self.scene.body, balls(self.scene.body)[0], free)
         rows = [jnp.stack(c_vector), state[OWN + 3 :], jnp.stack([ground.gap, rate])]
@@ -316,7 +316,7 @@ class Fly(AbstractFlyingMode):
         """Strike the arena; rebound, or slide if the rebound would be slow. Counts the flights that begin."""
         scene, flying, ball = self.scene, flight_state(state), balls(self.scene.body)[0]
         ground = landing_site(scene, flying, ball)
-        free, zero = as_free_body(scene, flying, ground), jnp.zeros_like(state[0])
+        free, zero = flying_body(scene, flying, ground), jnp.zeros_like(state[0])
         speed = greatest(-gap_rate(scene.body, ball, free), 0.0)
         bounce = zero if scene.restitution is None else scene.restitution + zero
         rebounds = bounce * speed > CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
@@ -360,7 +360,7 @@ class Fly(AbstractFlyingMode):
         return jnp.concatenate([state_after, c_vector, jnp.stack([spin_angle, work + energy_change])])
 
 
-def modes(
+def airborne_modes(
     scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `sliding.modes`."""

@@ -10,7 +10,7 @@ from ..model.scene import Scene
 from ..model.state import parts
 from ..model.stick_slip import StickSlip
 from ..model.top import Top
-from .airborne import FLYING, ON_STEM, OWN, SLIDING, as_free_body, below, flight_state, in_contact, lift_off, standing
+from .airborne import FLYING, ON_STEM, OWN, SLIDING, flying_body, below, flight_state, in_contact, lift_off, standing
 from .airborne_stick_slip import ROLLING
 from .free_body import balls, gap_rate
 
@@ -24,7 +24,7 @@ def on_the_ground(
     return _above_the_ground(scene, state, mode)[0]
 
 
-def energy_in(
+def airborne_energy(
     scene: Scene[Top], state: Float[Array, "components cells"], mode: Int[Array, " cells"]
 ) -> tuple[Float[Array, " cells"], Float[Array, " cells"]]:
     """The least and the greatest energy [J] that a state in a mode may have; here these are the same."""
@@ -58,7 +58,7 @@ def _above_the_ground(
         )
     flying = flight_state(flight)
     ground = below(scene, flying)
-    free = as_free_body(scene, flying, ground)
+    free = flying_body(scene, flying, ground)
     rate = gap_rate(scene.body, balls(scene.body)[0], free)
     contact = jnp.where(flies, in_contact(ground, free), state[:OWN])
     return contact, jnp.where(flies, ground.gap, 0.0), jnp.where(flies, rate, 0.0)

@@ -34,7 +34,7 @@ from .airborne import (
     FlightState,
     Fly,
     QuadraturesInFlight,
-    as_free_body,
+    flying_body,
     cosine,
     flight_state,
     from_frame,
@@ -176,7 +176,7 @@ class FlyBoth(Fly):
         # If the landing was located slightly below the arena, the next mode would end where it begins.
         flying = flying._replace(place=vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2]))))
         ground = ground._replace(gap=zero)
-        free = as_free_body(scene, flying, ground, contact_ball)
+        free = flying_body(scene, flying, ground, contact_ball)
         impact = resolve_arena_impact(scene, flying, ground, free, contact_ball, other_ball)
         flies = impact.rebounds | impact.throws
         slides = jnp.where(number == 0, SLIDING, ON_STEM)
@@ -228,7 +228,7 @@ def resolve_arena_impact(
     )
     site = landing_site(scene, flying, other_ball)
     rate_before, rate_after = (
-        gap_rate(body, other_ball, as_free_body(scene, motion, site, other_ball)) for motion in (flying, flying_after)
+        gap_rate(body, other_ball, flying_body(scene, motion, site, other_ball)) for motion in (flying, flying_after)
     )
     touches = site.gap < TOUCHING * body.radius
     rests = touches & ~rebounds & (speed <= closing) & (jnp.abs(rate_before) <= closing)
@@ -242,7 +242,7 @@ def own_and_other(scene: Scene[Top], number: Int[Array, "..."]) -> tuple[Ball, B
     return contact_ball, Ball(*(jnp.where(number == 0, b, a) for a, b in zip(main, stem, strict=True)))
 
 
-def modes(
+def modes_with_stem(
     scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `sliding.modes`.

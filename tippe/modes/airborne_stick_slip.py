@@ -17,7 +17,8 @@ from nonholonomic.integration.status import LEFT_DOMAIN, RUNNING
 from ..model.scene import Scene
 from ..model.stick_slip import AT_REST, ContactMode, StickSlip
 from ..model.top import Top
-from . import sticking
+from .sticking import ROLLING as STICKS
+from .sticking import StickSlipMode
 from .airborne import FLYING, OWN, SLIDING, Fly, lift_off
 from .flying_mode import AbstractFlyingMode
 from .inversion_problem import InversionProblem
@@ -34,10 +35,10 @@ class Touch(AbstractFlyingMode):
     last: bool = eqx.field(static=True)
 
     @property
-    def contact_state(self) -> sticking.StickSlipMode:
+    def contact_state(self) -> StickSlipMode:
         """The mode of runs that end where the contact is lost."""
         passive, size = (Quadratures(self.scene.body.I3), OWN) if self.with_quadratures else (None, None)
-        return sticking.StickSlipMode(self.kind, self.cos_angle, self.scales, self.last, passive, size)
+        return StickSlipMode(self.kind, self.cos_angle, self.scales, self.last, passive, size)
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         return self.contact_state.problem(state)
@@ -57,7 +58,7 @@ class Touch(AbstractFlyingMode):
                 [self.kind.stick_slip.rolling.carried_along(state_after[:OWN]), state_after[OWN:]]
             )
         flies = (transition.status == LEFT_DOMAIN) & (self.kind.loss(state_after[:OWN]) == 0)
-        mode = jnp.where(transition.mode == sticking.ROLLING, ROLLING, SLIPPING)
+        mode = jnp.where(transition.mode == STICKS, ROLLING, SLIPPING)
         return transition._replace(
             mode=jnp.where(flies, FLYING, mode),
             state=jnp.where(flies, lift_off(self.scene, state_after, self.with_quadratures), transition.state),
@@ -79,7 +80,7 @@ class Land(Fly):
         return transition._replace(mode=jnp.where(transition.mode == FLYING, FLYING, mode), counts=counts)
 
 
-def modes(
+def airborne_stick_slip_modes(
     scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `sliding.modes`."""

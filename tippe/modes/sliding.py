@@ -208,7 +208,7 @@ class Lean(AbstractFlyingMode):
         return Transition(number, state, zero, running, jnp.where(leaves_sphere, 0.0, jnp.inf), zeros)
 
 
-def modes(
+def hopping_modes(
     scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The modes of runs, sliding on each sphere and on both if there are two; and the index of the mode in which each

@@ -25,7 +25,7 @@ from .trajectory_problem import Quadratures, TrajectoryProblem
 SLIPPING, ROLLING = range(2)
 
 
-def energy_in(
+def contact_energy(
     scene: Scene[Top], state: Float[Array, "components cells"], number: Int[Array, " cells"]
 ) -> tuple[Float[Array, " cells"], Float[Array, " cells"]]:
     """The least and the greatest energy [J] that a state in a mode may have; here these are the same."""
@@ -124,7 +124,7 @@ def _recorded(change: Change) -> TransitionPath:
     return TransitionPath(ends[None], motions, jnp.ones((1, len(ends)), int))
 
 
-def modes(
+def stick_slip_modes(
     scene: Scene[Top] | None,
     problem: InversionProblem,
     tolerance: float,
@@ -165,4 +165,4 @@ def contact_modes(
     state, scales = (values if values.ndim == 2 else values[:, None] for values in run.start())
     problem = InversionProblem(run.problem.dynamics, jnp.asarray(NO_COSINE), state[: run.leading], scales)
     assert isinstance(run.passive, Quadratures)
-    return (*modes(None, problem, tolerance, False, run.passive, run.leading), state)
+    return (*stick_slip_modes(None, problem, tolerance, False, run.passive, run.leading), state)

@@ -19,7 +19,7 @@ from ..modes.airborne import (
     ON_STEM,
     STRIKING,
     FlightState,
-    as_free_body,
+    flying_body,
     below,
     carried_frame,
     flight_state,
@@ -97,7 +97,7 @@ class ArenaTrajectory(HybridTrajectory):
         scene, flying, stem = self.scene, self._flying, balls(self.scene.body)[1]
         ground = below(scene, flying, stem)
         ground = ground._replace(axes=carried_frame(scene).own_axes((*ground.foot, *parts(self.states).place[3:])))
-        return standing(scene, stem).motion(in_contact(ground, as_free_body(scene, flying, ground, stem)))
+        return standing(scene, stem).motion(in_contact(ground, flying_body(scene, flying, ground, stem)))
 
     @property
     def where_the_model_ends(self) -> str:

@@ -18,7 +18,13 @@ from ..model.dynamics import NO_COSINE
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.top import Top
-from ..modes import airborne, airborne_ends, airborne_stem, airborne_stick_slip, free_body, sliding, sticking
+from ..modes.airborne import airborne_modes
+from ..modes.airborne_ends import airborne_energy, loss
+from ..modes.airborne_stem import modes_with_stem
+from ..modes.airborne_stick_slip import airborne_stick_slip_modes
+from ..modes.free_body import energy_in
+from ..modes.sliding import hopping_modes
+from ..modes.sticking import contact_energy, stick_slip_modes
 from ..modes.inversion_problem import InversionProblem
 from ..modes.trajectory_problem import trajectory_problem
 
@@ -63,11 +69,11 @@ def loss_of_contact(scene: Scene[Any], state: Float[Array, "components cells"]) 
 
 
 SMOOTH = RunKind((), None, energy_of_state, loss_of_contact)
-STICK_SLIP = RunKind(("sticks",), sticking.modes, sticking.energy_in, loss_of_contact)
-HYBRID = RunKind(("hops",), sliding.modes, free_body.energy_in, None)
-AIRBORNE = RunKind(("hops",), airborne.modes, airborne_ends.energy_in, airborne_ends.loss, True)
-ON_STEM_TOO = AIRBORNE._replace(modes=airborne_stem.modes)
-STICK_SLIP_FLY = AIRBORNE._replace(counts=("hops", "sticks"), modes=airborne_stick_slip.modes)
+STICK_SLIP = RunKind(("sticks",), stick_slip_modes, contact_energy, loss_of_contact)
+HYBRID = RunKind(("hops",), hopping_modes, energy_in, None)
+AIRBORNE = RunKind(("hops",), airborne_modes, airborne_energy, loss, True)
+ON_STEM_TOO = AIRBORNE._replace(modes=modes_with_stem)
+STICK_SLIP_FLY = AIRBORNE._replace(counts=("hops", "sticks"), modes=airborne_stick_slip_modes)
 
 
 def run_kind_of(scene: Scene[Any]) -> RunKind:
