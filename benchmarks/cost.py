@@ -26,9 +26,9 @@ from nonholonomic.derivatives import VariationalProblem, tangents_of
 from nonholonomic.geometry import AbstractSurface
 from nonholonomic.integration import AbstractProblem, Oscillatory8, Settings, solve_ensemble
 from nonholonomic.parameters import with_numbers
-from stroller.model.ride import RideProblem
-from tippe.modes.inversion_problem import InversionProblem
-from tippe.runs.run_kind import run_kind_of
+from stroller.model.scene import RideProblem
+from tippe.modes.problems import InversionProblem
+from tippe.runs.launches import run_kind_of
 
 RECORD = Path(__file__).with_name("cost.json")
 

@@ -10,7 +10,7 @@ import time
 os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
 
 import tippe
-from nonholonomic.compilation.compiled_programs import count_mappings, resident_memory
+from nonholonomic.compilation.cache import count_mappings, resident_memory
 
 
 def main(scenes: int) -> None:

@@ -22,9 +22,9 @@ import numpy as np
 
 import tippe
 from nonholonomic.integration import Settings, solve_ensemble
-from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN
+from nonholonomic.integration.problem import CROSSED, FAILED, LEFT_DOMAIN
 from tippe import paper
-from tippe.modes.inversion_problem import InversionProblem
+from tippe.modes.problems import InversionProblem
 
 ANGLE, BLOCK = 0.95 * np.pi, 4096
 NAMES = ("mass [g]", "R [mm]", "alpha", "I1/I3", "I3/mR^2", "rc/R", "azimuth", "slip speed [m/s]")

@@ -36,10 +36,8 @@ from shortest_paths import dubins, reeds_shepp
 
 import stroller
 from stroller.planning.candidates import Outline, prices
-from stroller.planning.check import CONFIRMED, checked_run
-from stroller.planning.drive import drive_along
-from stroller.planning.problem import Problem
-from stroller.planning.spline import interpolate
+from stroller.planning.problem import CONFIRMED, Problem, checked_run
+from stroller.planning.transcription import drive_along, interpolate
 
 BODY = stroller.Stroller(mass=5.0, wheelbase=0.25, inertia=0.1, steering_inertia=0.005)
 FRICTION = stroller.Damping(2.0, 0.5, 0.1, 0.05)

@@ -31,9 +31,9 @@ from scenes import TOP
 
 import tippe
 from nonholonomic.integration import Settings, solve_ensemble
-from nonholonomic.integration.settings import lanes_for
+from nonholonomic.integration.problem import lanes_for
 from nonholonomic.sweeps import running
-from tippe.modes.inversion_problem import InversionProblem
+from tippe.modes.problems import InversionProblem
 
 ON_CPU = jax.default_backend() == "cpu"
 DOUBLE = jnp.result_type(float) == jnp.float64

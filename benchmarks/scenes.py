@@ -12,8 +12,8 @@ from peers import NUMPY, Task
 import stroller
 import tippe
 from nonholonomic.integration import AbstractProblem
-from stroller.model.ride import RideProblem
-from tippe.modes.inversion_problem import InversionProblem
+from stroller.model.scene import RideProblem
+from tippe.modes.problems import InversionProblem
 
 ANGLE = 0.95 * math.pi
 

@@ -30,7 +30,7 @@ from measure import machine, one_core, table, timed
 
 import tippe
 from nonholonomic.compilation.xla_cpu import compiled_alone
-from nonholonomic.integration.settings import ABSOLUTE
+from nonholonomic.integration.problem import ABSOLUTE
 
 HORIZON, TOLERANCE, TIGHT, SPIN, MU = 10.0, 1e-9, 1e-13, 100.0, 0.3
 

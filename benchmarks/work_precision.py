@@ -23,7 +23,7 @@ from peers import PEERS, Ends, Task, available, heyoka_scalar, scipy_with
 from scenes import Case, misprint, scenes
 
 from nonholonomic.integration import Oscillatory8, Settings, Stabilized8, solve_ensemble
-from nonholonomic.integration.status import CROSSED
+from nonholonomic.integration.problem import CROSSED
 
 TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
 

@@ -34,9 +34,9 @@ ENGINE_ROOMS = tuple(
 #: The public numbers and types of the engine; the docstrings of the rooms say what they mean.
 CONSTANTS = [
     *of("nonholonomic.integration", "Lanes States"),
-    *of("nonholonomic.integration.status", "RUNNING REACHED_END CROSSED LEFT_DOMAIN FAILED UNRESOLVED"),
-    *of("nonholonomic.integration.settings", "DEFAULT_MAX_STEPS MOST_STEPS"),
-    "nonholonomic.integration.checks.TIGHTEST",
+    *of("nonholonomic.integration.problem", "RUNNING REACHED_END CROSSED LEFT_DOMAIN FAILED UNRESOLVED"),
+    *of("nonholonomic.integration.problem", "DEFAULT_MAX_STEPS MOST_STEPS"),
+    "nonholonomic.integration.problem.TIGHTEST",
     *of("nonholonomic.hybrid", "MOST_ROUNDS BETWEEN"),
 ]
 
@@ -137,14 +137,14 @@ PAGES = {
                 "crossing_time LaneState Jumps solve_by_diffrax follow DenseSolution sample explicit_tableau Oscillatory8 "
                 "Stabilized8",
             ),
-            "nonholonomic.integration.status",
-            "nonholonomic.integration.checks",
+            "nonholonomic.integration.problem",
+            "nonholonomic.integration.problem",
             *of(
-                "nonholonomic.integration.checks",
+                "nonholonomic.integration.problem",
                 "legal_run run_bounds tolerance_bound require_run require_times require_adaptive require_adjoint",
             ),
-            "nonholonomic.integration.zeros",
-            *of("nonholonomic.integration.zeros", "all_crossings few_trials halved sign_changes"),
+            "nonholonomic.integration.dense",
+            *of("nonholonomic.integration.dense", "all_crossings few_trials halved sign_changes"),
             "nonholonomic.hybrid",
             *of(
                 "nonholonomic.hybrid",

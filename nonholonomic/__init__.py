@@ -3,7 +3,7 @@
 import os
 import sys
 
-from .command_line import import_quietly as _import_quietly
+from .terminal import import_quietly as _import_quietly
 
 # While `python -m` looks for the module to run, `sys.argv[0]` is "-m".
 if sys.argv[:1] == ["-m"]:
@@ -18,7 +18,7 @@ __version__ = "0.2.0"
 if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
 
-from .compilation.compilation_cache import enable_compilation_cache as enable_compilation_cache
+from .compilation.cache import enable_compilation_cache as enable_compilation_cache
 from .formulations import AbstractSystem as AbstractSystem
 from .geometry import AbstractSurface as AbstractSurface
 from .geometry import Cylinder as Cylinder
@@ -31,7 +31,7 @@ from .geometry import Spheroid as Spheroid
 from .geometry import Torus as Torus
 from .identification import FitWarning as FitWarning
 from .identification import Free as Free
-from .integration.status import Status as Status
+from .integration.problem import Status as Status
 from .runs import EventTimes as EventTimes
 from .runs import Recording as Recording
 from .runs import Trajectory as Trajectory

@@ -19,8 +19,7 @@ import numpy as np
 from jax.tree_util import DictKey, GetAttrKey, KeyPath, SequenceKey
 from jaxtyping import Array, Float
 
-from .per_run import AbstractHeld, Numbers, gathered, spread
-from .text import likely, name_of
+from .text import AbstractHeld, Numbers, gathered, likely, name_of, spread
 
 
 def numbers(root: str, tree: Any, functions: bool = True) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Check arguments on concrete numbers, before anything compiles.
+"""Checks of arguments, whose messages name the argument, its value and what is allowed; and warnings.
 
 Traced numbers pass these checks. A module states the ranges of its numbers once, in `bounds`: concrete numbers out of
 range raise an error; traced numbers out of range make `legal` false and the results NaN.
@@ -9,11 +9,14 @@ import dataclasses
 import functools
 import operator
 import os
+import sys
 import tempfile
 import uuid
+import warnings
 from collections.abc import Iterable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from types import FrameType
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -23,9 +26,40 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from .per_run import is_users
-from .text import as_html, contents, in_lines, likely_fix, one_line, shown
-from .warning import is_called_by_a_user, warn
+from .text import as_html, contents, in_lines, is_users, likely_fix, one_line, shown
+
+# Warnings, which point to the user's line.
+
+#: Packages whose lines a warning does not point to: ours, and those through which our functions are called.
+NO_CODE_OF_A_USER = ("nonholonomic", "tippe", "stroller", "equinox", "jax", "jaxtyping", "beartype", "typeguard")
+NO_CODE_OF_A_USER += ("contextlib", "dataclasses", "functools", "importlib", "concurrent", "threading")
+
+
+def warn(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn at the user's line that led here, so that Python shows the warning once for each such line."""
+    frame = _users_frame()
+    if frame is None:
+        # In a thread that we have started: its first line.
+        frame = sys._getframe(1)
+        while frame.f_back is not None:
+            frame = frame.f_back
+    registry = frame.f_globals.setdefault("__warningregistry__", {})
+    place = (frame.f_code.co_filename, frame.f_lineno, frame.f_globals.get("__name__"))
+    warnings.warn_explicit(message, category, *place, registry)
+
+
+def is_called_by_a_user() -> bool:
+    """Whether a user's line led here; in a thread that we have started, none does."""
+    return _users_frame() is not None
+
+
+def _users_frame() -> FrameType | None:
+    """The innermost frame of a user's code."""
+    frame: FrameType | None = sys._getframe(2)
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in NO_CODE_OF_A_USER:
+        frame = frame.f_back
+    return frame
+
 
 #: Addition to the message about an angle that may be in degrees.
 IN_DEGREES = "; angles are in radians: did you mean np.radians({})?"

@@ -16,29 +16,23 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from nonholonomic import __version__
-from nonholonomic.command_line import closing_lines, run_and_exit
-from nonholonomic.compilation.compilation_cache import are_kept, enable_compilation_cache, kept_files
+from nonholonomic.compilation.cache import are_kept, enable_compilation_cache, kept_files
 from nonholonomic.geometry import CLOSED, AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.integration import ImplicitMidpoint
-from nonholonomic.progress import Progress, status_line
 from nonholonomic.sweeps import Table
+from nonholonomic.terminal import Progress, closing_lines, run_and_exit, status_line
 from nonholonomic.validation import as_number, replacing, require, require_folder
 from nonholonomic.views import NO_VIEW, can_view, page, picture_as_html
 
-from .model.friction import Damping
-from .model.launch import Launch
 from .model.scene import FORKS, Scene
-from .model.stroller import Stroller
-from .planning.drawing import draw_plan, planned_stage
-from .planning.goal import Goal, Limits
+from .model.vehicle import Damping, Launch, Stroller
 from .planning.obstacles import Box
 from .planning.plan import plan
-from .planning.result import Plan
-from .runs.plot import draw_rides
-from .runs.quantities import table_of
+from .planning.problem import Goal, Limits
+from .planning.result import Plan, draw_plan, planned_stage
 from .runs.trajectory import Trajectory
-from .runs.verbs import simulate
-from .runs.view import grouped
+from .runs.verbs import draw_rides, simulate
+from .runs.view import grouped, table_of
 
 RIDES = ("without friction", "with friction")
 

@@ -18,9 +18,8 @@ The papers on the stroller state no numbers. We chose ordinary values; no stroll
 
 from nonholonomic.geometry import Plane, Spheroid
 
-from .model.friction import Damping
 from .model.scene import Scene
-from .model.stroller import Stroller
+from .model.vehicle import Damping, Stroller
 
 
 def light() -> Stroller:

@@ -9,7 +9,7 @@ from tops import rutstam_top
 
 import nonholonomic
 import tippe
-from nonholonomic.compilation.compiled_programs import (
+from nonholonomic.compilation.cache import (
     PART_OF_MAPPINGS,
     count_mappings,
     most_mappings,

@@ -22,8 +22,6 @@ HEIGHT = {
     "compilation": -1,
     "geometry": 0,
     "integration": 0,
-    "formulations": 0,
-    "lanes": 0,
     "derivatives": 1,
     "hybrid": 2,
     "views": 3,
@@ -34,7 +32,7 @@ HEIGHT = {
 }
 
 #: The same for the rooms of a vehicle.
-VEHICLE_HEIGHT = {"model": 0, "modes": 1, "steady": 1, "runs": 2, "fit": 3, "planning": 3}
+VEHICLE_HEIGHT = {"model": 0, "modes": 1, "runs": 2, "planning": 3}
 
 #: Lines of code, without blank lines, comments and docstrings, of the longest file.
 MOST_LINES = 450
@@ -110,8 +108,8 @@ def allowed(arrow: Arrow) -> bool:
     if package != "nonholonomic":
         return VEHICLE_HEIGHT.get(end_room, -1) < VEHICLE_HEIGHT.get(start_room, len(VEHICLE_HEIGHT))
     if not start_room:
-        # The lowest room is as low as the files that stand outside.
-        return HEIGHT[end_room] < 0
+        # The lowest room is as low as the files that stand outside, except for the equations of motion.
+        return HEIGHT[end_room] < 0 or (arrow.file == "nonholonomic/formulations.py" and end_room == "geometry")
     return HEIGHT[end_room] < HEIGHT[start_room] or HEIGHT[end_room] == HEIGHT[start_room] == 0
 
 
@@ -127,7 +125,7 @@ def test_the_reader_of_imports_sees_them():
     rooms = {(room(arrow.file), room(arrow.module)) for arrow in ARROWS}
     assert {("nonholonomic/derivatives", "nonholonomic/integration"), ("tippe", "nonholonomic/geometry")} <= rooms
     # This one stands in a function.
-    assert Arrow("nonholonomic/command_line.py", "nonholonomic.compilation.xla_cpu", ("compile_quickly",)) in ARROWS
+    assert Arrow("nonholonomic/terminal.py", "nonholonomic.compilation.xla_cpu", ("compile_quickly",)) in ARROWS
     assert circle({("a", "b"), ("b", "a"), ("b", "c")}) == ["a", "b"]
 
 

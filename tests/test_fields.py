@@ -14,14 +14,11 @@ from tops import rutstam_top
 
 import stroller
 import tippe
-from stroller.model.ride import RideProblem
-from tippe.modes.coulomb_impact import Skid
-from tippe.modes.free_body import FreeBody, balls
-from tippe.modes.impact import Impact, approach
-from tippe.modes.inversion_problem import InversionProblem
+from stroller.model.scene import RideProblem
+from tippe.modes.impact import FreeBody, Impact, Skid, approach, balls
+from tippe.modes.problems import InversionProblem, trajectory_problem
 from tippe.modes.sticking import contact_modes
-from tippe.modes.trajectory_problem import trajectory_problem
-from tippe.runs.run_kind import flight_modes, run_kind_of
+from tippe.runs.launches import flight_modes, run_kind_of
 
 #: 16 to 44 ns for each number on a CPU, where a product takes one.
 SLOW = {"sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "exp2", "expm1"}

@@ -13,9 +13,9 @@ from tops import rutstam_top
 import nonholonomic
 import stroller
 import tippe
-from nonholonomic.identification.identify import check_search
-from nonholonomic.identification.unknown import as_free
-from nonholonomic.validation import shown
+from nonholonomic.identification.likelihood import as_free
+from nonholonomic.identification.result import check_search
+from nonholonomic.text import shown
 from nonholonomic.views import Page
 
 pytestmark = pytest.mark.oldest

@@ -17,10 +17,10 @@ from jaxtyping import Array, Float
 import nonholonomic
 import stroller
 import tippe
-from nonholonomic.sweeps.tasks import versions
+from nonholonomic.sweeps.grid import versions
 from nonholonomic.validation import Bound, as_number
 from tippe.model.body import AbstractBody, AbstractMeridian, ContactGeometry
-from tippe.model.contact_load import Slip
+from tippe.model.friction import Slip
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

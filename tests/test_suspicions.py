@@ -19,7 +19,7 @@ from tops import rutstam_top
 import stroller
 import tippe
 from nonholonomic.integration import Settings
-from tippe.runs.table import warn_of_long_runs
+from tippe.runs.verbs import warn_of_long_runs
 
 pytestmark = pytest.mark.oldest
 
@@ -116,7 +116,7 @@ def nothing_runs(monkeypatch):
     """What would run says that it was asked to."""
     monkeypatch.setattr(importlib.import_module("tippe.runs.verbs"), "time_of_event", lambda *_: jnp.inf)
     monkeypatch.setattr(
-        importlib.import_module("tippe.runs.table"), "compute_table", lambda *_, **__: table_of_times([5.0], [9])
+        importlib.import_module("tippe.runs.verbs"), "compute_table", lambda *_, **__: table_of_times([5.0], [9])
     )
 
 
@@ -200,7 +200,7 @@ def test_copies_in_our_threads_repeat_no_warning():
 def test_a_command_line_shows_a_warning_once_and_as_one_line():
     """Also if it comes from several modules, each with a registry of its own."""
     program = (
-        "import warnings; from nonholonomic.command_line import run_and_exit; "
+        "import warnings; from nonholonomic.terminal import run_and_exit; "
         "place = (UserWarning, 'module.py', 1, 'module'); "
         "run_and_exit(lambda: [warnings.warn_explicit(f'too {k % 2}', *place, {}) for k in range(4)] and 0, 'tippe')"
     )

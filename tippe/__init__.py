@@ -13,21 +13,23 @@ from nonholonomic.geometry import Spheroid as Spheroid
 from nonholonomic.geometry import Torus as Torus
 from nonholonomic.identification import FitWarning as FitWarning
 from nonholonomic.identification import Free as Free
-from nonholonomic.integration.status import Status as Status
+from nonholonomic.integration.problem import Status as Status
 from nonholonomic.runs import LyapunovExponent as LyapunovExponent
 from nonholonomic.sweeps import Table as Table
 
 from . import presets as presets
 from . import steady as steady
-from .fit.identify import identify as identify
-from .fit.identify import log_density as log_density
-from .fit.inversion_times import InversionTimes as InversionTimes
-from .fit.inversion_times import ReversalTimes as ReversalTimes
-from .fit.inversion_times import read_inversion_times as read_inversion_times
-from .fit.recording import Recording as Recording
-from .fit.recording import read_recording as read_recording
-from .model.convex import ConvexBody as ConvexBody
-from .model.convex import SpheroidBody as SpheroidBody
+from .fit import InversionTimes as InversionTimes
+from .fit import Recording as Recording
+from .fit import ReversalTimes as ReversalTimes
+from .fit import identify as identify
+from .fit import log_density as log_density
+from .fit import read_inversion_times as read_inversion_times
+from .fit import read_recording as read_recording
+from .model.body import ConvexBody as ConvexBody
+from .model.body import SpheroidBody as SpheroidBody
+from .model.body import Stem as Stem
+from .model.body import Top as Top
 from .model.friction import AbstractFriction as AbstractFriction
 from .model.friction import Contensou as Contensou
 from .model.friction import Coulomb as Coulomb
@@ -40,19 +42,17 @@ from .model.launch import Launch as Launch
 from .model.rigid_body import Ellipsoid as Ellipsoid
 from .model.rigid_body import RigidBody as RigidBody
 from .model.scene import Scene as Scene
-from .model.top import Stem as Stem
-from .model.top import Top as Top
-from .runs.extended_times import extended_inversion_time as extended_inversion_time
-from .runs.flight_trajectory import HybridTrajectory as HybridTrajectory
-from .runs.table import inversion_table as inversion_table
-from .runs.table import reversal_table as reversal_table
-from .runs.table import trajectory_table as trajectory_table
+from .runs.trajectory import HybridTrajectory as HybridTrajectory
 from .runs.trajectory import Trajectory as Trajectory
 from .runs.verbs import explore as explore
+from .runs.verbs import extended_inversion_time as extended_inversion_time
+from .runs.verbs import inversion_table as inversion_table
 from .runs.verbs import inversion_time as inversion_time
 from .runs.verbs import lyapunov_exponent as lyapunov_exponent
+from .runs.verbs import reversal_table as reversal_table
 from .runs.verbs import reversal_time as reversal_time
 from .runs.verbs import simulate as simulate
+from .runs.verbs import trajectory_table as trajectory_table
 
 # `import *` exports the names above, and not the subpackages.
 __all__ = [

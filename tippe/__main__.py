@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 
 from nonholonomic import __version__
-from nonholonomic.command_line import closing_lines, run_and_exit
-from nonholonomic.compilation.compilation_cache import are_kept, enable_compilation_cache, kept_files
+from nonholonomic.compilation.cache import are_kept, enable_compilation_cache, kept_files
 from nonholonomic.geometry import Cylinder, Plane
-from nonholonomic.progress import Progress
 from nonholonomic.sweeps import AnotherRun, Table, saved_cells
+from nonholonomic.terminal import Progress, closing_lines, run_and_exit
 from nonholonomic.validation import replacing, require_folder
 from nonholonomic.views import NO_VIEW, Page, can_view, page, picture_as_html, table_as_html
 from nonholonomic.views.explore import live_page
@@ -28,11 +27,10 @@ from . import paper, presets, steady
 from .model.friction import Coulomb
 from .model.launch import Launch
 from .model.scene import Scene
-from .runs.checks import INVERTED
-from .runs.explore import page_of_launch, stage_at_start
+from .runs.explore import Panel, draw_launches, page_of_launch, stage_at_start, theta_over_time
+from .runs.launches import INVERTED
 from .runs.model import TopModel
-from .runs.plot import Panel, draw_launches, theta_over_time
-from .runs.table import inversion_table
+from .runs.verbs import inversion_table
 
 TOPS = {top.__name__: top for top in (presets.wooden, presets.rutstam, presets.cohen, presets.leine_glocker)}
 

@@ -21,22 +21,20 @@ import jax
 import numpy as np
 
 from nonholonomic import __version__
-from nonholonomic.command_line import closing_lines
-from nonholonomic.compilation.compilation_cache import enable_compilation_cache
+from nonholonomic.compilation.cache import enable_compilation_cache
 from nonholonomic.compilation.xla_cpu import compiled_quickly
 from nonholonomic.geometry import AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
-from nonholonomic.progress import Progress, status_line
 from nonholonomic.sweeps import Table
+from nonholonomic.terminal import Progress, closing_lines, status_line
 from nonholonomic.validation import require_folder
 from nonholonomic.views import NO_VIEW, Stage, can_view, page, picture_as_html, table_as_html
 
+from .model.body import Top
 from .model.friction import AbstractFriction, Coulomb, Viscous
 from .model.launch import Launch
 from .model.scene import Scene
-from .model.top import Top
-from .runs.plot import Panel, draw_launches
-from .runs.table import inversion_table
-from .runs.verbs import simulate
+from .runs.explore import Panel, draw_launches
+from .runs.verbs import inversion_table, simulate
 from .runs.view import DrawnMotion, stages
 
 #: The paper's units in SI.

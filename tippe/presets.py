@@ -19,9 +19,9 @@ Coulomb(mu=0.3, slip_speed=0.05 m/s) hybrid
 
 from nonholonomic.geometry import AbstractSurface, Plane
 
+from .model.body import Stem, Top
 from .model.friction import Coulomb
 from .model.scene import Scene
-from .model.top import Stem, Top
 
 
 def wooden() -> Top:

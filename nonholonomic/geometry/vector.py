@@ -1,4 +1,4 @@
-"""Component vectors in which an exact zero costs nothing.
+"""Vectors in which an exact zero costs nothing, lengths in a plane, and small linear systems.
 
 A vector is a tuple of components, each an array over the lanes, or `None` where the model says that the component
 vanishes identically (no curvature on a plane, no force without friction). Sums skip `None` and products with `None` are
@@ -8,8 +8,12 @@ vanishes identically (no curvature on a plane, no force without friction). Sums 
 from collections.abc import Iterable
 from typing import Any, TypeAlias
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
 
 from ..validation import as_number, is_traced
@@ -109,3 +113,94 @@ def _projected(vector: Vector, component: Component) -> Vector:
     """The vector at unit length; where it is not used, a finite vector with finite derivatives."""
     square = jnp.where(component, dot(vector, vector), 1.0)
     return scale(1.0 / jnp.sqrt(square), vector)
+
+
+# Small linear systems in plain JAX operations.
+#
+# LAPACK, which `jnp.linalg.solve` calls on a CPU, costs more than the elimination itself for a few unknowns, and large
+# batches of it inside one compiled program can deadlock on a machine with few cores.
+
+
+def solve(matrix: Float[Array, "n n"], right: Float[Array, "n ..."], positive: bool = False) -> Float[Array, "n ..."]:
+    """Solution X of A X = B by Gauss-Jordan elimination, unrolled.
+
+    **Arguments:**
+
+    - `matrix`: A, of a few rows.
+    - `right`: B, a vector or the columns of a matrix.
+    - `positive`: whether A is symmetric and positive definite, so that no pivoting is needed.
+    """
+    size = matrix.shape[0]
+    if size == 0:
+        return right
+    rows = jnp.concatenate([matrix, right.reshape(size, -1)], axis=1)
+    for k in range(size):
+        if not positive and k < size - 1:
+            pivot = k + jnp.argmax(jnp.abs(rows[k:, k]))
+            rows = rows.at[jnp.stack([jnp.asarray(k), pivot])].set(rows[jnp.stack([pivot, jnp.asarray(k)])])
+        row = rows[k] / rows[k, k]
+        rows = jnp.where(jnp.arange(size)[:, None] == k, row, rows - jnp.outer(rows[:, k], row))
+    return rows[:, size:].reshape(right.shape)
+
+
+def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Inverse of a small matrix."""
+    return solve(matrix, jnp.eye(matrix.shape[0], dtype=matrix.dtype))
+
+
+# The length of a vector in a plane, such as the sine of an angle from a pole, with its derivative where the length is 0.
+#
+# At length 0 there is no gradient, only one-sided derivatives: the length grows in every direction. The forward
+# derivative is that of a step in the direction of the tangent, |tangent|. The reverse derivative is NaN, but 0 with
+# respect to numbers that do not move the vector.
+
+
+@jax.custom_jvp
+def planar_length(x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
+    """sqrt(x^2 + y^2), without overflow.
+
+    **Arguments:** `x`, `y`: of the same shape.
+
+    **Example:** along t at the origin, and away from it.
+
+    >>> import jax
+    >>> from nonholonomic.geometry import planar_length
+    >>> print(jax.jacfwd(lambda t: planar_length(3.0 * t, 4.0 * t))(0.0))
+    5.0
+    >>> print(jax.grad(planar_length)(0.0, 0.0), jax.grad(planar_length)(3.0, 4.0))
+    nan 0.6
+    """
+    return jnp.hypot(x, y)
+
+
+@planar_length.defjvp
+def _change(primals: Any, tangents: Any) -> Any:
+    length = planar_length(*primals)
+    (x, y), (dx, dy) = jnp.broadcast_arrays(*primals), jnp.broadcast_arrays(*tangents)
+    at_pole = length == 0.0
+    divisor = jnp.where(at_pole, 1.0, length)
+    return length, jnp.where(at_pole, _departure.bind(dx, dy), (x * dx + y * dy) / divisor)
+
+
+#: The length of a tangent at the pole. This function is not linear, so it has no true transpose: reverse mode gives NaN
+#: for every cotangent but 0.
+_departure = Primitive("departure_from_pole")
+_departure.def_impl(lambda dx, dy: jnp.hypot(dx, dy))
+_departure.def_abstract_eval(lambda dx, dy: ShapedArray(dx.shape, dx.dtype))
+mlir.register_lowering(_departure, mlir.lower_fun(lambda dx, dy: jnp.hypot(dx, dy), multiple_results=False))
+
+
+def _second_change(primals: Any, tangents: Any) -> Any:
+    return jax.jvp(planar_length, primals, tuple(ad.instantiate_zeros(tangent) for tangent in tangents))
+
+
+def _taken_back(cotangent: Any, dx: Any, dy: Any) -> Any:
+    if isinstance(cotangent, ad.Zero):
+        return None, None
+    doubt = jnp.where(cotangent == 0.0, 0.0, jnp.nan)
+    return tuple(doubt if ad.is_undefined_primal(part) else None for part in (dx, dy))
+
+
+ad.primitive_jvps[_departure] = _second_change
+ad.primitive_transposes[_departure] = _taken_back
+batching.defbroadcasting(_departure)

@@ -15,7 +15,7 @@ is the number of the segment of a `HybridPath` between two modes.
 >>> import numpy as np
 >>> from nonholonomic.hybrid import AbstractBatchedMode, Transition, solve_hybrid
 >>> from nonholonomic.integration import AbstractProblem, Settings
->>> from nonholonomic.integration.status import RUNNING
+>>> from nonholonomic.integration.problem import RUNNING
 >>> class Fall(AbstractProblem):
 ...     state: jax.Array  # height and velocity, (2, cells), or (2,) for a single run
 ...     direction_decides = True  # a ball that starts on the ground and rises has not left the mode
@@ -42,21 +42,21 @@ is the number of the segment of a `HybridPath` between two modes.
 [0.722438 0.812743] [[1 1]]
 """
 
+from .ensemble import BETWEEN as BETWEEN
 from .ensemble import MOST_ROUNDS as MOST_ROUNDS
 from .ensemble import HybridOutcome as HybridOutcome
+from .ensemble import HybridPath as HybridPath
+from .ensemble import Segment as Segment
+from .ensemble import hybrid_resets as hybrid_resets
 from .ensemble import solve_hybrid as solve_hybrid
+from .ensemble import solve_hybrid_dense as solve_hybrid_dense
 from .ensemble import traced_solve_hybrid as traced_solve_hybrid
 from .mode import AbstractBatchedMode as AbstractBatchedMode
 from .mode import AbstractHoppingMode as AbstractHoppingMode
 from .mode import Transition as Transition
 from .mode import TransitionPath as TransitionPath
-from .path import BETWEEN as BETWEEN
-from .path import HybridPath as HybridPath
-from .path import Segment as Segment
-from .path import solve_hybrid_dense as solve_hybrid_dense
-from .resets import hybrid_resets as hybrid_resets
+from .saltation import solve_hybrid_with_tangents as solve_hybrid_with_tangents
+from .saltation import traced_solve_hybrid_with_tangents as traced_solve_hybrid_with_tangents
 from .samples import HybridSamples as HybridSamples
 from .samples import hybrid_samples as hybrid_samples
 from .samples import solve_hybrid_with_samples as solve_hybrid_with_samples
-from .tangents import solve_hybrid_with_tangents as solve_hybrid_with_tangents
-from .tangents import traced_solve_hybrid_with_tangents as traced_solve_hybrid_with_tangents

@@ -11,16 +11,13 @@ from jaxtyping import Array, Float
 
 from ..compilation.xla_cpu import compiled_alone
 from ..derivatives import in_groups, tangents_by
-from ..derivatives.differentiable import by_active, tangent_along
-from ..derivatives.sampling import AbstractSampling, ProblemSpec, solve_for_samples
+from ..derivatives.differentiable import AbstractSampling, ProblemSpec, by_active, solve_for_samples, tangent_along
 from ..integration import Settings
-from ..integration.status import REACHED_END
+from ..integration.problem import REACHED_END
 from .ensemble import at_start, traced_rounds
-from .mode import AbstractBatchedMode, over_cells
+from .mode import AbstractBatchedMode, over_cells, weighted
 from .saltation import variational_modes, variational_start
-from .sampled_adjoint import hybrid_samples_pulled_back
-from .sampled_rounds import output_rows, program_groups, sampled_rounds
-from .transition_rows import weighted
+from .sampled_adjoint import hybrid_samples_pulled_back, output_rows, program_groups, sampled_rounds
 
 #: From some modules (scene, launch, ...), the tolerance and a number of cells to the modes, the index of the first mode
 #: of every cell, and the initial states.

@@ -12,12 +12,293 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..progress import Progress
-from .marginal import log_likelihoods
-from .mixture import Mixture, fitted
-from .posterior import LogDensity
-from .region import Region, region_of
-from .unknown import Free
+from ..terminal import Progress
+from .likelihood import Free, Measurements, own_name, whole_periods
+from .posterior import LogDensity, compared
+
+# The likelihood of measurements whose errors are unknown: the mean over the errors, with a flat prior of their
+# logarithms.
+
+#: Number of values of the logarithm of an error, and their range in units of 1 / sqrt(2 n) for n values.
+GRID, RANGE = 33, 6.0
+
+
+def log_likelihoods(
+    measurements: Measurements, prediction: Float[np.ndarray, "rows n"]
+) -> tuple[Float[np.ndarray, "rows n"], Float[np.ndarray, " rows"]]:
+    """Two log likelihoods of every row, up to constants.
+
+    **Returns:** the contribution of every measurement with its stated or guessed error; and the log likelihood of all
+    measurements, averaged over the errors that are unknown.
+    """
+    residual = compared(measurements, prediction)[0]
+    each = -0.5 * residual**2
+    estimated = np.asarray(measurements.estimated) & ~np.asarray(measurements.censored)
+    total = np.sum(each[:, ~estimated], axis=1)
+    for scales, logs in _by_error(measurements, prediction, residual, estimated):
+        total = total + np.logaddexp.reduce(logs, axis=1) + np.log(scales[:, 1] - scales[:, 0])
+    return each, total
+
+
+def draw_errors(
+    measurements: Measurements, prediction: Float[np.ndarray, "rows n"], random: np.random.Generator
+) -> Float[np.ndarray, "rows series"]:
+    """Logarithms of the unknown errors in units of their guesses, drawn from their distribution for given predictions."""
+    residual = compared(measurements, prediction)[0]
+    estimated = np.asarray(measurements.estimated) & ~np.asarray(measurements.censored)
+    columns = [np.zeros((len(prediction), 0))]
+    for scales, logs in _by_error(measurements, prediction, residual, estimated):
+        cumulative = np.cumsum(np.exp(logs - np.max(logs, axis=1, keepdims=True)), axis=1)
+        share = random.uniform(size=len(scales)) * cumulative[:, -1]
+        column = [np.interp(s, c, scale) for s, c, scale in zip(share, cumulative, scales, strict=True)]
+        columns.append(np.array(column)[:, None])
+    return np.concatenate(columns, axis=1)
+
+
+def _by_error(measurements: Measurements, prediction: np.ndarray, residual: np.ndarray, estimated: np.ndarray):
+    """For each series of unknown error: logarithms of the error in units of its guess (rows, grid), and the log likelihood
+    there."""
+    if not np.any(estimated):
+        return
+    series, freedom = np.asarray(measurements.series), np.asarray(measurements.student)
+    difference = np.where(estimated, prediction - np.where(estimated, measurements.value, 0.0), 0.0)
+    period = np.asarray(measurements.period)
+    difference = (difference - whole_periods(np, difference, period)) / np.asarray(measurements.error)
+    for number in np.unique(series[estimated]):
+        members = (series == number) & estimated
+        z = np.where(np.isfinite(difference[:, members]), difference[:, members], residual[:, members])
+        count, nu = z.shape[1], freedom[members][0]
+        scale = np.sqrt(np.mean(z**2, axis=1)) + 1e-150
+        if np.isfinite(nu):
+            for _ in range(20):
+                weight = (nu + 1.0) / (nu + (z / scale[:, None]) ** 2)
+                scale = np.sqrt(np.mean(weight * z**2, axis=1)) + 1e-150
+        reach = RANGE / np.sqrt(2.0 * count)
+        scales = np.log(scale)[:, None] + np.linspace(-reach, 2.0 * reach, GRID)
+        logs = np.empty(scales.shape)
+        for k in range(GRID):
+            squares = (z / np.exp(scales[:, k : k + 1])) ** 2
+            terms = (nu + 1.0) * np.log1p(squares / nu) if np.isfinite(nu) else squares
+            logs[:, k] = -0.5 * np.sum(terms, axis=1) - count * scales[:, k]
+        yield scales, logs
+
+
+# Mixtures of multivariate Student's t distributions: heavy-tailed proposals for importance sampling.
+
+#: Degrees of freedom of the components: tails heavier than those of a posterior, and a finite covariance.
+FREEDOM = 5.0
+
+#: Iterations of expectation maximisation, and the fraction of the whole covariance that is added to each component's.
+ITERATIONS, SHRINKAGE = 15, 1e-3
+
+
+class Mixture(NamedTuple):
+    """A mixture of multivariate t distributions.
+
+    - `shares`: (components,), positive, with the sum 1.
+    - `centres`: (components, unknowns).
+    - `roots`: (components, unknowns, unknowns), Cholesky factors of the scale matrices.
+    """
+
+    shares: Float[np.ndarray, " components"]
+    centres: Float[np.ndarray, "components unknowns"]
+    roots: Float[np.ndarray, "components unknowns unknowns"]
+
+    def draw(self, count: int, random: np.random.Generator) -> Float[np.ndarray, "count unknowns"]:
+        """Independent draws; each component gets its share of them, rounded at random."""
+        steps = (np.arange(count) + random.uniform()) / count
+        which = np.minimum(np.searchsorted(np.cumsum(self.shares), steps), len(self.shares) - 1)
+        normal = random.normal(size=(count, self.centres.shape[1]))
+        stretch = np.sqrt(FREEDOM / random.chisquare(FREEDOM, count))
+        return self.centres[which] + np.einsum("nij,nj->ni", self.roots[which], normal) * stretch[:, None]
+
+    def log_density(self, points: Float[np.ndarray, "n unknowns"]) -> Float[np.ndarray, " n"]:
+        """The log density of the mixture."""
+        size = points.shape[1]
+        constant = (
+            math.lgamma(0.5 * (FREEDOM + size)) - math.lgamma(0.5 * FREEDOM) - 0.5 * size * math.log(FREEDOM * math.pi)
+        )
+        squares, log_volumes = _squared_distances(points, self.centres, self.roots)
+        constants = np.log(self.shares) + constant - log_volumes
+        logs = constants[:, None] - 0.5 * (FREEDOM + size) * np.log1p(squares / FREEDOM)
+        return np.logaddexp.reduce(logs, axis=0)
+
+    def joined(self, other: "Mixture", share: float) -> "Mixture":
+        """This mixture, and another one that gets a share of the draws."""
+        shares = np.concatenate([(1.0 - share) * self.shares, share * other.shares])
+        return Mixture(shares, np.concatenate([self.centres, other.centres]), np.concatenate([self.roots, other.roots]))
+
+
+def weighted_covariance(
+    points: Float[np.ndarray, "n unknowns"], weights: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " unknowns"], Float[np.ndarray, "unknowns unknowns"]]:
+    """The mean and the covariance of weighted points."""
+    mean = weights @ points
+    off = points - mean
+    return mean, (off * weights[:, None]).T @ off
+
+
+def fitted(
+    points: Float[np.ndarray, "n unknowns"],
+    weights: Float[np.ndarray, " n"],
+    components: int,
+    random: np.random.Generator,
+) -> Mixture:
+    """The mixture that best fits weighted points: expectation maximisation of a Gaussian mixture, whose covariances
+    become scale matrices.
+
+    Components with too few points for a covariance are dropped.
+
+    Source: Cappe, Douc, Guillin, Marin and Robert, "Adaptive importance sampling in general mixture classes", Stat.
+    Comput. 18 (2008) 447.
+    """
+    used = weights > 1e-6 * np.max(weights)
+    points, weights = points[used], weights[used] / np.sum(weights[used])
+    size = points.shape[1]
+    mean, whole = weighted_covariance(points, weights)
+    spread = np.sqrt(np.diag(whole)) + 1e-12 * (1.0 + np.abs(mean))
+    points = (points - mean) / spread
+    whole = whole / np.outer(spread, spread) + 1e-9 * np.eye(size)
+    centres = _spread_centres(points, weights, components, random)
+    shares, covariances = np.full(len(centres), 1.0 / len(centres)), np.tile(whole / len(centres), (len(centres), 1, 1))
+    effective = 1.0 / np.sum(weights**2)
+    for _ in range(ITERATIONS):
+        squares, log_volumes = _squared_distances(points, centres, np.linalg.cholesky(covariances))
+        logs = (np.log(shares) - log_volumes)[:, None] - 0.5 * squares
+        parts = np.exp(logs - np.logaddexp.reduce(logs, axis=0)) * weights
+        shares = np.sum(parts, axis=1)
+        # A covariance needs more points than it has dimensions.
+        kept = shares * effective > size + 2.0
+        kept[np.argmax(shares)] = True
+        parts, shares = parts[kept], shares[kept] / np.sum(shares[kept])
+        moments = [weighted_covariance(points, part / np.sum(part)) for part in parts]
+        centres = np.stack([moment[0] for moment in moments])
+        covariances = np.stack([moment[1] + SHRINKAGE * whole for moment in moments])
+    roots = np.linalg.cholesky(covariances)
+    return Mixture(shares, mean + spread * centres, spread[:, None] * roots)
+
+
+def _spread_centres(
+    points: np.ndarray, weights: np.ndarray, count: int, random: np.random.Generator
+) -> Float[np.ndarray, "components unknowns"]:
+    """First centres, drawn far from each other (k-means++)."""
+    chosen = [int(random.choice(len(points), p=weights))]
+    for _ in range(min(count, len(points)) - 1):
+        squares = np.min([np.sum((points - points[k]) ** 2, axis=1) for k in chosen], axis=0) * weights
+        if not np.sum(squares) > 0.0:
+            break
+        chosen.append(int(random.choice(len(points), p=squares / np.sum(squares))))
+    return points[chosen]
+
+
+def _squared_distances(
+    points: Float[np.ndarray, "n unknowns"],
+    centres: Float[np.ndarray, "components unknowns"],
+    roots: Float[np.ndarray, "components unknowns unknowns"],
+) -> tuple[Float[np.ndarray, "components n"], Float[np.ndarray, " components"]]:
+    """Squared distances of points from centres in units of the covariances, and logarithms of the roots' determinants."""
+    off = np.linalg.inv(roots) @ (points.T - centres[:, :, None])
+    return np.sum(off**2, axis=1), np.sum(np.log(np.abs(np.diagonal(roots, axis1=1, axis2=2))), axis=1)
+
+
+# The region in which a fit looks for minima: a box in the coordinates of the unknowns.
+
+#: Half width of the searched range of a number of a launch or a start, as a fraction of its start value: such numbers
+#: were measured or set.
+OF_LAUNCH = 0.1
+
+#: Half width of the searched range of `t0`, as a fraction of the duration of the recordings.
+OF_DURATION = 0.02
+
+#: A prior is searched to this many standard deviations.
+DEVIATIONS = 3.0
+
+#: Width of the soft edge of the box, in half widths.
+EDGE = 0.25
+
+#: Weights are 0 farther from the start than this many half widths: a factor of 2^10 for a positive number.
+FARTHEST = 10.0
+
+
+class Region(NamedTuple):
+    """A box in the coordinates: the middle and the half widths of the search, each (unknowns,)."""
+
+    middle: Float[np.ndarray, " unknowns"]
+    half_width: Float[np.ndarray, " unknowns"]
+
+    def points(self, count: int, seed: int) -> Float[np.ndarray, "count unknowns"]:
+        """Quasi-random points that fill the box, `count` a power of two; the first is the middle."""
+        from scipy.stats import qmc
+
+        # SciPy 1.15 renamed the argument, and accepts both names.
+        options: dict[str, Any] = {"seed": seed}
+        unit = qmc.Sobol(len(self.middle), **options).random(count)
+        unit[0] = 0.5
+        return self.middle + (2.0 * unit - 1.0) * self.half_width
+
+    def log_density(self, points: Float[np.ndarray, "n unknowns"]) -> Float[np.ndarray, " n"]:
+        """The log density of points that are uniform in the box."""
+        inside = np.all(np.abs(points - self.middle) <= self.half_width, axis=1)
+        return np.where(inside, -np.sum(np.log(2.0 * self.half_width)), -np.inf)
+
+    def log_weight(self, points: Float[np.ndarray, "n unknowns"]) -> Float[np.ndarray, " n"]:
+        """0 in the box; outside, less with the square of the distance."""
+        beyond = (np.abs(points - self.middle) / self.half_width - 1.0).clip(0.0)
+        return -0.5 * np.sum((beyond / EDGE) ** 2, axis=1)
+
+    def searched(self, points: Float[np.ndarray, "*n unknowns"]) -> Bool[np.ndarray, "*n unknowns"]:
+        """Which coordinates are within the box."""
+        return np.abs(points - self.middle) <= self.half_width
+
+    def contains(self, points: Float[np.ndarray, "n unknowns"]) -> np.ndarray:
+        """Which points are near enough for a weight."""
+        return np.all(np.abs(points - self.middle) <= FARTHEST * self.half_width, axis=1)
+
+
+def region_of(free: dict[str, Free], spread: float, duration: float) -> Region:
+    """The region of the search.
+
+    The range of an unknown is, by the first of these rules that applies:
+
+    - between two bounds: the whole range;
+    - with a prior: `DEVIATIONS` standard deviations around its mean, within the bounds;
+    - `t0`: `OF_DURATION` of the longest recording around the start value, in both directions;
+    - a number of a launch or a start: `OF_LAUNCH` of the start value (0.1 where it is 0) in both directions, within the
+      bounds;
+    - with one bound: a factor `spread` of the distance from the bound in both directions;
+    - any other number: `spread` - 1 times the start value (or 1 where it is 0) in both directions.
+
+    **Arguments:** `free`: name -> a `Free`; `spread`: greater than 1; `duration`: of the longest recording [s], 0 if there is
+    none.
+
+    **Returns:** a `Region`, centred on the start values except for the first two rules.
+    """
+    ends = np.array([_ends(name, unknown, spread, duration) for name, unknown in free.items()])
+    return Region(np.mean(ends, axis=1), 0.5 * np.ptp(ends, axis=1))
+
+
+def _ends(name: str, unknown: Free, spread: float, duration: float) -> tuple[float, float]:
+    """The ends of the range of one coordinate."""
+    bounded = math.isfinite(unknown.lower), math.isfinite(unknown.upper)
+    start = float(unknown.coordinate(unknown.start))
+    if all(bounded) and unknown.prior is None:
+        return -5.0, 5.0
+    kind = own_name(name)
+    if unknown.gaussian is not None:
+        middle, reach = unknown.gaussian[0], DEVIATIONS * unknown.gaussian[1]
+    elif kind == "t0" and duration > 0.0:
+        middle, reach = unknown.start, OF_DURATION * duration
+    elif kind.startswith(("launch", "start")):
+        middle, reach = unknown.start, OF_LAUNCH * (abs(unknown.start) or 1.0)
+    elif any(bounded):
+        return start - math.log(spread), start + math.log(spread)
+    else:
+        return start - (spread - 1.0), start + (spread - 1.0)
+    # Stay away from the bounds, where coordinates are infinite.
+    margin = 0.05 * reach
+    low, high = max(middle - reach, unknown.lower + margin), min(middle + reach, unknown.upper - margin)
+    return float(unknown.coordinate(low)), float(unknown.coordinate(max(high, low + margin)))
+
 
 #: Number of points in a round; all rounds use one program. With a single unknown, half as many are enough. A round of the
 #: search by slopes uses fewer.

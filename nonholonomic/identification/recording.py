@@ -1,18 +1,22 @@
-"""Recorded runs: quantities sampled at the times of a clock, converted to measurements."""
+"""Recorded runs: quantities sampled at the times of a clock, from arrays and from files of columns."""
 
+import csv
 import dataclasses
 import math
+import re
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..text import one_line
-from ..validation import as_number, as_number_or_none, require, shown
-from ..warning import warn
+from ..text import UNITS, likely, one_line, shown
+from ..validation import as_number, as_number_or_none, as_path, require, warn
 from .likelihood import Measurements
+
+# Recorded runs: quantities sampled at the times of a clock, converted to measurements.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -249,3 +253,442 @@ def noise(value: Float[np.ndarray, "times columns"]) -> Float[np.ndarray, " colu
         return guess or 0.1 * float(np.ptp(observed)) or 1.0
 
     return np.array([of(column) for column in value.T])
+
+
+# A text file of columns with a header line, read in the units of the file.
+
+#: Hyphens and dashes in place of a number.
+DASHES = ("-", "--", "\u2013", "\u2014")
+
+#: Cells, in lower case, that stand for a missing sample.
+MISSING = ("", "nan", "n/a", "#n/a", "na", "null", "none", *DASHES)
+
+#: Other words for units in headers.
+SYNONYMS = {"°": "deg", "degree": "deg", "degrees": "deg", "°/s": "deg/s", "radian": "rad", "radians": "rad"}
+SYNONYMS |= {"sec": "s", "second": "s", "seconds": "s", "1/min": "rpm", "rev/min": "rpm", "U/min": "rpm"}
+
+
+class TextTable(NamedTuple):
+    """The cells of a file as text: header -> cells; the number of each row's line in the file; the decimal mark; and the
+    headers that the file has more than once."""
+
+    path: Path
+    cells: dict[str, list[str]]
+    lines: list[int]
+    decimal: str
+    repeated: tuple[str, ...] = ()
+
+    @classmethod
+    def read(cls, path: Path, decimal: str) -> "TextTable":
+        """Read a file of columns."""
+        text = [(number, line) for number, line in enumerate(_text(path).splitlines(), start=1) if _has_cells(line)]
+        if len(text) < 2:
+            raise ValueError(f"path = {str(path)!r} must have a header line and at least one line of numbers")
+        marks = ("\t", ";") if decimal == "," else ("\t", ";", ",")
+        mark = next((mark for mark in marks if mark in text[0][1]), None)
+        if mark is None and decimal == "," and "," in text[0][1]:
+            raise ValueError(
+                f"path = {str(path)!r}: the header separates columns by commas, so decimal must be '.': separate the columns "
+                "by semicolons"
+            )
+        # Blanks also stand between a name and its unit, as in "theta [deg]".
+        part = re.compile(r"\S+(?:\s+[\[(][^\])]*[\])])?")
+        try:
+            rows = [next(csv.reader([line], delimiter=mark)) if mark else part.findall(line) for _, line in text]
+        except csv.Error as error:
+            raise ValueError(f"path = {str(path)!r} is not a text file of columns: {error}") from None
+        headers = [header.strip() for header in rows[0]]
+        for (number, _), row in zip(text, rows, strict=True):
+            if len(row) != len(headers):
+                comma = mark == "," and len(row) > len(headers)
+                hint = (
+                    "; to read decimal commas, separate the columns by semicolons and pass decimal=','" if comma else ""
+                )
+                raise ValueError(f"path = {str(path)!r}: line {number} has {len(row)} cells, not {len(headers)}{hint}")
+        cells = {header: [row[k].strip() for row in rows[1:]] for k, header in enumerate(headers)}
+        repeated = tuple(header for header in cells if headers.count(header) > 1)
+        return cls(path, cells, [number for number, _ in text[1:]], decimal, repeated)
+
+    def named(self, known: Mapping[str, str]) -> dict[str, Any]:
+        """The columns whose headers are names of the model's columns, with their headers."""
+        columns = {}
+        for header in self.cells:
+            name, unit = _split(header)
+            if name.lower() in known:
+                if name.lower() in columns:
+                    raise self._ambiguous("columns", name.lower(), [columns[name.lower()], header])
+                columns[name.lower()] = header if unit else (header, _unit_of(name.lower(), known))
+        if not columns.keys() - {"time", "frame"}:
+            raise ValueError(
+                f"path = {str(self.path)!r}: no header is the name of a quantity with its unit, such as 'theta [deg]': pass "
+                f"columns, a dictionary; the headers are {', '.join(self.cells)}"
+            )
+        return columns
+
+    def numbers(
+        self,
+        name: str,
+        header_and_unit: Any,
+        si: str,
+        argument: str = "columns",
+        remark: str = "",
+        infinite: bool = False,
+    ) -> np.ndarray:
+        """A column in SI units, NaN where it is missing. **Arguments:** `argument`: as for `parts`; `remark`: an addition to
+        the message about a cell that is not a number; `infinite`: whether numbers may be infinite."""
+        header, size = self.parts(name, header_and_unit, si, argument)
+        numbers = zip(self.lines, self.cells[header], strict=True)
+        return size * np.array([self._number(header, line, cell, remark, infinite) for line, cell in numbers])
+
+    def errors(self, name: str, header_and_unit: Any, si: str) -> np.ndarray:
+        """The standard errors of a column in SI units, from a column of their own or the same in all lines."""
+        header, size = self.parts(name, header_and_unit, si, "error")
+        if isinstance(header, str):
+            return self.numbers(name, header_and_unit, si, "error")
+        require(header, f"error of {name}", above=0.0)
+        return np.full(len(self.lines), size * float(header))
+
+    def _number(self, header: str, line: int, cell: str, remark: str, infinite: bool) -> float:
+        if cell.lower() in MISSING:
+            return math.nan
+        place = f"{header} = {cell!r} in line {line} of {str(self.path)!r}"
+        if self.decimal == "," and "." in cell:
+            raise ValueError(
+                f"{place} has a decimal point, or a mark of thousands, although decimal = ',': remove marks of thousands from "
+                "the file; if its numbers have decimal points, leave out decimal"
+            )
+        try:
+            # Python also reads 1_000.
+            number = float("_" if "_" in cell else cell.replace(",", ".") if self.decimal == "," else cell)
+        except ValueError:
+            hint = ": pass decimal=',' if it has a decimal comma" if "," in cell and self.decimal == "." else remark
+            raise ValueError(f"{place} is not a number{hint}") from None
+        if math.isinf(number) and not infinite:
+            raise ValueError(f"{place} must be finite: write n/a, or nothing, for a missing sample")
+        return number
+
+    def parts(self, name: str, header_and_unit: Any, si: str, argument: str) -> tuple[Any, float]:
+        """The header of a column (or, for an error, possibly a number), and the factor that converts the file's numbers to
+        SI units.
+
+        **Arguments:** `name`: name of the column of the model; `header_and_unit`: (header, unit), or a header with its
+        unit; `si`: the SI unit; `argument`: "columns" or "error", for messages.
+        """
+        first, unit = header_and_unit if _is_pair(header_and_unit) else (header_and_unit, None)
+        of_header = None
+        if isinstance(first, str):
+            first = self._header(argument, name, first)
+            of_header = _split(first)[1] or None
+        elif argument == "columns" or unit is None:
+            first = unit = None
+        unit = of_header if unit is None else unit
+        if unit is None:
+            raise ValueError(
+                f"{argument}: {name!r} = {shown(header_and_unit)} must be {self._expected(argument, si, first)}"
+            )
+        if not isinstance(unit, str):
+            require(unit, f"unit of {name}")
+            return first, float(unit)
+        factors, plain = UNITS[si], SYNONYMS.get(unit, unit)
+        if plain not in factors:
+            raise ValueError(f"unit of {name} = {shown(unit)} must be one of {', '.join(factors)}, or a number of {si}")
+        if of_header is not None and SYNONYMS.get(of_header, of_header) != plain:
+            raise ValueError(
+                f"{argument}: {name!r} = {shown(header_and_unit)} contradicts the header {first!r}, whose unit is {of_header}, "
+                f"not {unit}: pass the header alone, {name!r}: {first!r}; if the header is wrong, correct it or pass a "
+                f"factor, the number of {si} in {unit}"
+            )
+        return first, factors[plain]
+
+    def _header(self, argument: str, name: str, header: str) -> str:
+        """The full header for a header, with or without its unit."""
+        matches = [header] if header in self.cells else [full for full in self.cells if _split(full)[0] == header]
+        if len(matches) > 1 or not set(self.repeated).isdisjoint(matches):
+            raise self._ambiguous(argument, name, matches)
+        if not matches:
+            raise ValueError(
+                f"{argument}: {name!r} = {shown(header)} must be one of the headers of {str(self.path)!r}: "
+                f"{', '.join(self.cells)}{likely(header, [*self.cells, *(_split(full)[0] for full in self.cells)])}"
+            )
+        return matches[0]
+
+    def _ambiguous(self, argument: str, name: str, headers: list[Any]) -> ValueError:
+        """The error for a column that the file has more than once."""
+        listed = " or ".join(shown(header) for header in (headers if len(headers) > 1 else 2 * headers))
+        return ValueError(
+            f"{argument}: {name!r} could be {listed}, columns of {str(self.path)!r}: rename one of them in the file, or pass "
+            "the whole header if it differs from the other"
+        )
+
+    def _expected(self, argument: str, si: str, header: Any) -> str:
+        """What describes a column or its errors, for messages."""
+        unit = "deg" if si == "rad" else next(iter(UNITS[si]))
+        if header is not None:
+            return f"(header, unit), such as ({header!r}, {unit!r}), because the header has no unit that is known"
+        if argument == "error":
+            return f"(standard error, unit), such as (1.0, {unit!r}), or (header of a column of standard errors, unit)"
+        return f"(header, unit), such as ('tilt', {unit!r}), or a header with its unit, such as 'tilt [{unit}]'"
+
+
+def _is_pair(value: Any) -> bool:
+    return isinstance(value, tuple | list) and len(value) == 2
+
+
+def _text(path: Path) -> str:
+    """The text of a file in UTF-8, or as spreadsheets write it: in UTF-16 with a mark, or in Windows' encoding."""
+    raw = path.read_bytes()
+    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return raw.decode("utf-16", errors="replace")
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return raw.decode("cp1252", errors="replace")
+
+
+def _has_cells(line: str) -> bool:
+    return bool(line.strip()) and not line.lstrip().startswith("#")
+
+
+def _split(header: str) -> tuple[str, str]:
+    """The name and the unit of a header, such as "tilt [deg]", "tilt (deg)" or "tilt / deg"; no unit if there is none."""
+    match = re.fullmatch(r"(.+?)\s*(?:\[([^\]]+)\]|\(([^)]+)\)|\s/\s*(\S+))", header.strip())
+    if match is None:
+        return header.strip(), ""
+    unit = next(part for part in match.groups()[1:] if part).strip()
+    known = unit in SYNONYMS or any(unit in units for units in UNITS.values())
+    return (match[1].strip(), unit) if known else (header.strip(), "")
+
+
+def _unit_of(name: str, known: Mapping[str, str]) -> str:
+    """The unit of a column whose header has none: only a number without a unit needs none."""
+    if known[name] != "1":
+        raise ValueError(
+            f"columns: the header {name!r} must have a unit, such as '{name} [{known[name]}]'; or pass columns, a dictionary"
+        )
+    return "1"
+
+
+# Read recordings, and launches with measured times, from a file of columns, in the units of the file.
+
+
+class Read(NamedTuple):
+    """The contents of a file: times [s]; samples in SI units, NaN where missing; their errors or `None`; and the
+    quantity.
+
+    A single column is given by its name, and its samples are (times,).
+    """
+
+    times: Float[np.ndarray, " times"]
+    value: Float[np.ndarray, "times *columns"]
+    error: Float[np.ndarray, "times *columns"] | None
+    quantity: str | tuple[str, ...]
+
+
+def read_columns(
+    path: Any, columns: Any, fps: float | None, error: Any, quantities: Quantities, decimal: str = "."
+) -> Read:
+    """Read samples from a text file with a header line and columns separated by commas, semicolons, tabs or blanks.
+
+    **Arguments:**
+
+    - `path`: path of the file. Lines that begin with # are ignored; empty cells and the words in `MISSING`, such as `nan`
+      and `n/a`, are missing samples.
+    - `columns`: name of a column of the model -> (header, unit); the unit is one of `UNITS`, or a factor that converts
+      the file's numbers to SI units. `"time"` is the clock; `"frame"` is the number of the frame and needs `fps`. A
+      header with its unit, such as "tilt [deg]", needs no other unit. With `None`, all headers that are names of columns
+      of the model with their units, such as "theta [deg]".
+    - `fps`: frames per second. Without a column for the frame, each line is a frame.
+    - `error`: name of a column -> (standard error or header of its column, unit), for some or all columns; or `None`.
+    - `quantities`: the quantities that can be recorded.
+    - `decimal`: "," for a file with decimal commas, whose columns are not separated by commas.
+
+    **Returns:** times, values, errors and quantity.
+
+    **Raises:** `ValueError` that names the file, the column and the problem.
+
+    **Example:**
+
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> from nonholonomic.identification import Quantities, read_columns
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "levels.csv"
+    ...     length = path.write_text("clock [s];level [%]\\n0,1;90\\n0,2;n/a\\n0,3;80\\n")
+    ...     columns = {"time": "clock", "level": "level"}
+    ...     read_columns(path, columns, None, None, Quantities({}, {"level": "1"}, frozenset()), decimal=",").value
+    array([0.9, 0.8])
+    """
+    known = {"time": "s", "frame": "1"} | dict(quantities.units)
+    file, columns = _opened(path, columns, decimal, known, quantities.columns)
+    names = quantities.of(tuple(name for name in columns if name not in ("time", "frame")))
+    times = _times(file, columns, fps)
+    value = np.stack([file.numbers(name, columns[name], known[name]) for name in names], axis=1)
+    mask = np.isfinite(times) & np.any(np.isfinite(value), axis=1)
+    _require_increasing(file, times, mask, quantities)
+    errors = None
+    if error is not None:
+        if not isinstance(error, Mapping) or set(error) != set(names):
+            form = ", ".join(f"{name!r}: (standard error, unit)" for name in names)
+            raise ValueError(f"error = {shown(error)} must be {{{form}}}, or None")
+        errors = np.stack([file.errors(name, error[name], known[name]) for name in names], axis=1)[mask]
+    if len(names) == 1:
+        return Read(times[mask], value[mask, 0], None if errors is None else errors[:, 0], names[0])
+    return Read(times[mask], value[mask], errors, names)
+
+
+class ReadLaunches(NamedTuple):
+    """The launches of a file and their times, in SI units.
+
+    - `numbers`: name of a number of the launch -> (launches,).
+    - `time`: (launches,), infinite where the event did not happen; `until`: (launches,), the time until which it did
+      not happen, NaN where the file does not state one.
+    - `error`: a standard error for all, or (launches,).
+    - `lines`: the number of each launch's line in the file.
+    """
+
+    numbers: dict[str, Float[np.ndarray, " launches"]]
+    time: Float[np.ndarray, " launches"]
+    until: Float[np.ndarray, " launches"]
+    error: Float[np.ndarray, "*launches"]
+    lines: tuple[int, ...]
+
+
+def read_launches(
+    path: Any, columns: Any, error: Any, units: Mapping[str, str], decimal: str = ".", never: Any = ()
+) -> ReadLaunches:
+    """Read launches and the measured time of an event of each from a text file with a header line, a launch per line.
+
+    Lines with a missing cell are lost measurements, which are left out. A time such as ">30" is a lower limit.
+
+    **Arguments:**
+
+    - `path`, `decimal`: as for `read_columns`.
+    - `columns`: `"time"`, or a name of `units` -> (header, unit) or a header with its unit, as for `read_columns`.
+    - `error`: standard error of the times [s]; or `{"time": (standard error or header of its column, unit)}`.
+    - `units`: name of a number of the launch -> its SI unit.
+    - `never`: a cell, or several, that stand for an event that did not happen, such as "-".
+
+    **Returns:** a `ReadLaunches`.
+
+    **Raises:** `ValueError` that names the file, the line or column, and the problem.
+
+    **Example:** the second measurement was lost, and the third launch did not fall within the time of observation.
+
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> from nonholonomic.identification import read_launches
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "falls.csv"
+    ...     length = path.write_text("height [cm];time [s]\\n100;0,45\\n120;n/a\\n150;-\\n")
+    ...     falls = read_launches(path, None, 0.01, {"height": "m"}, decimal=",", never="-")
+    >>> print(falls.numbers["height"], falls.time, falls.lines)
+    [1.  1.5] [0.45  inf] (2, 4)
+    """
+    file, columns = _opened(path, columns, decimal, {"time": "s"} | dict(units), {})
+    if "time" not in columns:
+        raise ValueError(f"columns = {shown(columns)} must have 'time', the measured time of each launch")
+    names = [name for name in columns if name != "time"]
+    time, until = _times_of_launches(file, columns["time"], never)
+    numbers = {name: file.numbers(name, columns[name], units[name]) for name in names}
+    errors = _errors_of_times(file, error)
+    mask = ~np.any(np.isnan([time, *numbers.values(), np.broadcast_to(errors, time.shape)]), axis=0)
+    if not np.any(mask):
+        raise ValueError(f"path = {str(file.path)!r} must have at least one line with {', '.join(columns)}")
+    return ReadLaunches(
+        {name: value[mask] for name, value in numbers.items()},
+        time[mask],
+        until[mask],
+        errors[mask] if errors.ndim else errors,
+        tuple(line for line, is_whole in zip(file.lines, mask, strict=True) if is_whole),
+    )
+
+
+def _opened(
+    path: Any, columns: Any, decimal: Any, known: Mapping[str, str], several: Mapping[str, tuple[str, ...]]
+) -> tuple[TextTable, Mapping[str, Any]]:
+    """The file and its columns, checked. **Arguments:** `known`: name of a column -> its SI unit; `several`: names that
+    stand for several columns."""
+    if decimal not in (".", ","):
+        raise ValueError(f"decimal = {shown(decimal)} must be '.' or ','")
+    if columns is not None and (not isinstance(columns, Mapping) or not columns):
+        raise ValueError(
+            f"columns = {shown(columns)} must be a dictionary, such as {{'theta': ('tilt', 'deg')}}, or None"
+        )
+    file = TextTable.read(as_path(path, "path"), decimal)
+    columns = file.named(known) if columns is None else columns
+    for name in columns:
+        if name in several:
+            raise ValueError(f"columns: {name!r} must be a single column: {', '.join(several[name])}")
+        if name not in known:
+            hint = "; did you mean 'time'?" if name == "t" else likely(name, known)
+            raise ValueError(f"columns: {shown(name)} must be one of {', '.join(known)}{hint}")
+    return file, columns
+
+
+def _times_of_launches(
+    file: TextTable, header_and_unit: Any, never: Any
+) -> tuple[Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]:
+    """The times of all lines, infinite where the event did not happen, and the limits that the file states."""
+    words = (never,) if isinstance(never, str) else never
+    if not isinstance(words, tuple | list) or not all(isinstance(word, str) for word in words):
+        raise ValueError(f"never = {shown(never)} must be a text, such as '-', or a list of them")
+    header, _ = file.parts("time", header_and_unit, "s", "columns")
+    cells = file.cells[header]
+    for line, cell in zip(file.lines, cells, strict=True):
+        # People write a dash for a lost measurement and for an event that did not happen.
+        if cell in DASHES and cell not in words:
+            raise ValueError(
+                f"{header} = {cell!r} in line {line} of {str(file.path)!r} can be a lost measurement or an event that did not "
+                f"happen: pass never={cell!r} if it did not happen; write n/a for a lost measurement"
+            )
+    is_limit = np.array([cell.startswith(">") for cell in cells])
+    plain = ["inf" if cell in words else cell.removeprefix(">").strip() for cell in cells]
+    time = file._replace(cells={**file.cells, header: plain}).numbers(
+        "time",
+        header_and_unit,
+        "s",
+        remark=": if it stands for an event that did not happen, pass it as never",
+        infinite=True,
+    )
+    for line, cell, value in zip(file.lines, cells, time, strict=True):
+        if value <= 0.0:
+            raise ValueError(f"{header} = {cell!r} in line {line} of {str(file.path)!r} must be greater than 0")
+    return np.where(is_limit, np.inf, time), np.where(is_limit, time, np.nan)
+
+
+def _errors_of_times(file: TextTable, error: Any) -> Float[np.ndarray, "*lines"]:
+    """The standard errors of the times [s]."""
+    if isinstance(error, Mapping):
+        if set(error) != {"time"}:
+            raise ValueError(
+                f"error = {shown(error)} must be {{'time': (standard error, unit)}} or a number of seconds"
+            )
+        return file.errors("time", error["time"], "s")
+    require(error, "error", above=0.0)
+    if np.ndim(error) != 0:
+        raise ValueError("error must be one number [s], or {'time': (header of a column of standard errors, unit)}")
+    return np.asarray(error, float)
+
+
+def _require_increasing(file: TextTable, times: np.ndarray, mask: np.ndarray, quantities: Quantities) -> None:
+    """Raise `ValueError` unless the times of the samples increase."""
+    lines, seen = np.asarray(file.lines)[mask], times[mask]
+    for k in np.flatnonzero(np.diff(seen) <= 0.0)[:1]:
+        raise ValueError(
+            f"time = {seen[k + 1]:.6g} s in line {lines[k + 1]} of {str(file.path)!r} must be later than "
+            f"{seen[k]:.6g} s in line {lines[k]}{quantities.one_run}"
+        )
+
+
+def _times(file: TextTable, columns: Mapping[str, Any], fps: Any) -> np.ndarray:
+    """The clock's readings in all lines [s]."""
+    if fps is not None:
+        require(fps, "fps", above=0.0)
+        if "time" in columns:
+            raise ValueError(f"fps = {shown(fps)} must be omitted because 'time' is among the columns")
+        if "frame" not in columns:
+            return np.arange(len(file.lines)) / float(fps)
+        return file.numbers("frame", columns["frame"], "1") / float(fps)
+    if "time" not in columns or "frame" in columns:
+        raise ValueError("fps must be given, or the columns must have 'time'")
+    return file.numbers("time", columns["time"], "s")

@@ -37,24 +37,24 @@ per cell, and `States` the type of the states of all cells.
 """
 
 from .dense import DenseSolution as DenseSolution
+from .dense import ImplicitMidpoint as ImplicitMidpoint
 from .dense import follow as follow
 from .dense import sample as sample
-from .ensemble import solve_ensemble as solve_ensemble
-from .ensemble import traced_solve_ensemble as traced_solve_ensemble
-from .extended import AbstractPassive as AbstractPassive
-from .extended import ExtendedProblem as ExtendedProblem
-from .jumps import Jumps as Jumps
-from .midpoint import ImplicitMidpoint as ImplicitMidpoint
-from .oscillatory import Oscillatory8 as Oscillatory8
+from .pairs import Oscillatory8 as Oscillatory8
+from .pairs import Stabilized8 as Stabilized8
+from .problem import AbstractPassive as AbstractPassive
 from .problem import AbstractProblem as AbstractProblem
 from .problem import CoreProblem as CoreProblem
+from .problem import ExtendedProblem as ExtendedProblem
+from .problem import Jumps as Jumps
+from .problem import Settings as Settings
 from .problem import crossing_time as crossing_time
-from .reference import solve_by_diffrax as solve_by_diffrax
 from .runge_kutta import Lanes as Lanes
 from .runge_kutta import States as States
 from .runge_kutta import explicit_tableau as explicit_tableau
 from .samples import solve_with_samples as solve_with_samples
 from .scheduler import Outcome as Outcome
-from .settings import Settings as Settings
-from .stabilized import Stabilized8 as Stabilized8
+from .scheduler import solve_by_diffrax as solve_by_diffrax
+from .scheduler import solve_ensemble as solve_ensemble
+from .scheduler import traced_solve_ensemble as traced_solve_ensemble
 from .step import LaneState as LaneState

@@ -3,7 +3,8 @@ validity."""
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -13,11 +14,193 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Bool, Float, Int
 
-from ..compilation.compiled_programs import padded
-from .problem import AbstractProblem, margin_at_start
-from .settings import Settings
-from .watch import Path, watched
-from .zeros import halved
+from ..compilation.cache import padded
+from ..geometry import inverse
+from ..text import one_line
+from ..validation import as_known, require
+from .events import Path, watched
+from .problem import AbstractProblem, Settings, margin_at_start
+
+# Find many zeros of functions of one variable at once. (Events within a step are located in `events.py`.)
+
+Brackets = Float[np.ndarray, " zeros"]
+
+#: Halvings that reduce any bracket to round-off.
+HALVINGS = 60
+
+#: `few_trials` stops once a bracket, or the change from one trial to the next, is shorter than this fraction of the value.
+LOCATED = 1e-14
+
+#: After this number of trials, `few_trials` returns the last trial.
+MOST_TRIALS = 60
+
+#: Number of parts into which `all_crossings` divides a step, to check the sign at their ends, if there may be a crossing.
+PARTS_OF_STEP = 8
+
+#: Number of rounds in which checks are added where the quantity is nearest to zero, to detect two crossings close
+#: together.
+CLOSER_LOOKS = 3
+
+#: Checks closer together than this [s] give no new information.
+CLOSEST = 1e-14
+
+
+def halved(
+    holds: Callable[[Float[Array, "..."]], Bool[Array, "..."]], low: Float[Array, "..."], high: Float[Array, "..."]
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Find where a condition ceases to hold, by halving brackets; also inside transformations.
+
+    **Arguments:**
+
+    - `holds`: the condition, true at `low` and false at `high`.
+    - `low`, `high`: the brackets, of any shape.
+
+    **Returns:** the last value at which the condition holds, and the next value, at which it does not.
+
+    **Example:**
+
+    >>> from nonholonomic.integration.dense import halved
+    >>> low, high = halved(lambda x: x**2 < 2.0, jnp.asarray(1.0), jnp.asarray(2.0))
+    >>> print(f"{low:.6f}")
+    1.414214
+    """
+
+    def halve(_, bracket):
+        low, high = bracket
+        middle = 0.5 * (low + high)
+        is_inside = holds(middle)
+        return jnp.where(is_inside, middle, low), jnp.where(is_inside, high, middle)
+
+    return jax.lax.fori_loop(0, HALVINGS, halve, (low, high))
+
+
+def sign_changes(
+    function: Callable[[Float[Array, " n"]], Float[Array, " n"]], grid: Float[Array, " n"]
+) -> Float[Array, " zeros"]:
+    """Zeros of a function between neighbours of a grid at which it has different signs, to round-off.
+
+    **Arguments:** `function`: function of an array, element by element; `grid`: increasing numbers.
+
+    **Example:**
+
+    >>> from nonholonomic.integration.dense import sign_changes
+    >>> print(sign_changes(jnp.cos, jnp.arange(0.5, 7.0)).round(6))
+    [1.570796 4.712389]
+    """
+    values = function(grid)
+    changes = np.flatnonzero(np.sign(values[:-1]) != np.sign(values[1:]))
+    if changes.size == 0:
+        return jnp.zeros(0)
+    sign = jnp.sign(values[changes])
+    low, high = halved(lambda middle: jnp.sign(function(middle)) == sign, grid[changes], grid[changes + 1])
+    return 0.5 * (low + high)
+
+
+def few_trials(
+    function: Callable[[Brackets], Any], low: Brackets, high: Brackets, at_low: Brackets, at_high: Brackets
+) -> Brackets:
+    """Zeros of a function that is expensive to evaluate, one in each bracket (Anderson and Bjorck, BIT 13 (1973) 253).
+
+    **Arguments:**
+
+    - `function`: function of NumPy arrays, element by element; JAX does not trace it.
+    - `low`, `high`: the brackets; `at_low`, `at_high`: the function there, of opposite signs.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from nonholonomic.integration.dense import few_trials
+    >>> low, high = np.array([1.0]), np.array([2.0])
+    >>> few_trials(lambda x: x**2 - 2.0, low, high, low**2 - 2.0, high**2 - 2.0).round(6)
+    array([1.414214])
+    """
+    guess = low
+    for trial in range(MOST_TRIALS if low.size else 0):
+        last, rise = guess, at_high - at_low
+        with np.errstate(all="ignore"):
+            guess = low - at_low * (high - low) / rise
+        # Where the function is NaN, and in every fourth trial as a safeguard, the bracket is halved.
+        halve = ~np.isfinite(guess) | (trial % 4 == 3)
+        guess = np.where(halve, 0.5 * (low + high), np.clip(guess, low, high))
+        if np.all(np.minimum(high - low, np.abs(guess - last)) <= LOCATED * np.maximum(high, 1.0)):
+            break
+        value = function(guess)
+        past_root = (value > 0.0) != (at_low > 0.0)
+        with np.errstate(all="ignore"):
+            fade_low, fade_high = 1.0 - value / at_high, 1.0 - value / at_low
+        fade_low, fade_high = (np.where(fade > 0.0, fade, 0.5) for fade in (fade_low, fade_high))
+        # The retained end is given less weight, so that it moves too in the next trial.
+        at_low, at_high = np.where(past_root, at_low * fade_low, value), np.where(past_root, value, at_high * fade_high)
+        low, high = np.where(past_root, low, guess), np.where(past_root, guess, high)
+    return guess
+
+
+def all_crossings(
+    quantity: Callable[[Brackets], Any], time: Float[np.ndarray, " steps"], value: Float[np.ndarray, " steps"]
+) -> Float[np.ndarray, " crossings"]:
+    """The times at which a quantity of a run passes zero, in either direction, in increasing order, with pairs of crossings
+    inside a step.
+
+    **Arguments:** `quantity`: function of times [s] in NumPy, not traced by JAX; NaN counts as beyond zero; `time`, `value`:
+    the ends of the steps [s], and the quantity there.
+
+    **Example:** the tip of a parabola between two steps is below zero.
+
+    >>> import numpy as np
+    >>> from nonholonomic.integration.dense import all_crossings
+    >>> steps = np.arange(4.0)
+    >>> dip = lambda time: (time - 1.51) ** 2 - 1e-4
+    >>> all_crossings(dip, steps, dip(steps)).round(6)
+    array([1.5 , 1.52])
+    """
+    indices = np.flatnonzero(_may_cross(value))
+    if indices.size == 0:
+        return np.zeros(0)
+
+    def signed(times: Brackets) -> Brackets:
+        values = quantity(times)
+        return np.where(np.isfinite(values), values, -np.inf)
+
+    parts = np.arange(1, PARTS_OF_STEP) / PARTS_OF_STEP
+    new = (time[indices] + parts[:, None] * (time[indices + 1] - time[indices])).ravel()
+    for _ in range(1 + CLOSER_LOOKS):
+        time, value = np.concatenate([time, new]), np.concatenate([value, signed(new)])
+        order = np.argsort(time, kind="stable")
+        time, value = time[order], value[order]
+        new = _nearest(time, value)
+        if new.size == 0:
+            break
+    changes = np.flatnonzero((value[:-1] > 0.0) != (value[1:] > 0.0))
+    return few_trials(signed, time[changes], time[changes + 1], value[changes], value[changes + 1])
+
+
+def _may_cross(value: Float[np.ndarray, " steps"]) -> Bool[np.ndarray, " gaps"]:
+    """Steps in which a quantity may be zero: its sign changes, or it changes by more than its size, there or in a
+    neighbour."""
+    with np.errstate(invalid="ignore"):
+        change = np.abs(np.diff(value))
+        max_change = np.max([change, np.append(change[1:], 0.0), np.insert(change[:-1], 0, 0.0)], axis=0)
+        is_small = np.minimum(np.abs(value[:-1]), np.abs(value[1:])) < max_change
+    return is_small | ((value[:-1] > 0.0) != (value[1:] > 0.0))
+
+
+def _nearest(time: Float[np.ndarray, " looks"], value: Float[np.ndarray, " looks"]) -> Float[np.ndarray, " new"]:
+    """The times at which a quantity is nearest to zero between checks of equal sign: the vertices of parabolas."""
+    distance = np.abs(value)
+    is_minimum = (distance[1:-1] < distance[:-2]) & (distance[1:-1] <= distance[2:])
+    is_minimum &= (value[1:-1] > 0.0) == (value[:-2] > 0.0)
+    is_minimum &= (value[1:-1] > 0.0) == (value[2:] > 0.0)
+    middle = np.flatnonzero(is_minimum) + 1
+    gap_before, gap_after = time[middle] - time[middle - 1], time[middle + 1] - time[middle]
+    with np.errstate(all="ignore"):
+        fall = (distance[middle - 1] - distance[middle]) / gap_before
+        rise = (distance[middle + 1] - distance[middle]) / gap_after
+        vertex = time[middle] + 0.5 * (fall * gap_after**2 - rise * gap_before**2) / (
+            fall * gap_after + rise * gap_before
+        )
+    is_inside = (vertex > time[middle - 1]) & (vertex < time[middle + 1]) & (np.abs(vertex - time[middle]) > CLOSEST)
+    return vertex[is_inside]
+
 
 #: Steps that are integrated and stored at once; a longer run consists of several such segments.
 PIECE = 2048
@@ -356,3 +539,80 @@ def sample(
     states = jnp.where(times <= end, states.T, jnp.nan)
     counts = solution.stats
     return SampledSolution(states, end, ends_at[0], lost, counts["num_accepted_steps"], counts["num_rejected_steps"])
+
+
+# The implicit midpoint rule, whose energy balance closes to round-off on the P-form.
+
+#: Number of simplified Newton iterations; each reduces the error by a factor of the order of (step times rate of
+#: change)^2.
+ITERATIONS = 8
+
+
+class ImplicitMidpoint(diffrax.AbstractSolver):
+    """The implicit midpoint rule y1 = y0 + h f((y0 + y1) / 2), second order, with a fixed step.
+
+    It conserves every linear and quadratic invariant, and on the P-form the balance of energy and work, up to rounding
+    errors (`stroller.md`, section 5).
+
+    **Arguments:**
+
+    - `step_length`: longest step [s], positive. The steps between two output times are equal, and steps end on the
+      output times.
+
+    **Raises:** `ValueError` if the step is not positive.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    >>> run = stroller.simulate(scene, launch, 1.0, solver=stroller.ImplicitMidpoint(0.02), times=[0.5, 1.0])
+    >>> bool(abs(run.energy_residual[-1]) < 1e-12)
+    True
+
+    ```
+    """
+
+    step_length: Float[Array, ""] = eqx.field(converter=as_known)
+
+    units: ClassVar[dict[str, str]] = {"step_length": "s"}
+    term_structure: ClassVar = diffrax.AbstractTerm
+    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
+
+    def __repr__(self) -> str:
+        return one_line(self)
+
+    def __check_init__(self):
+        require(self.step_length, "step_length", above=0.0)
+
+    def order(self, terms):
+        return 2
+
+    def init(self, terms, t0, t1, y0, args):
+        return None
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        control = terms.contr(t0, t1)
+        middle = t0 + 0.5 * (t1 - t0)
+
+        def increment(z: Float[Array, " state"]) -> Float[Array, " state"]:
+            return terms.vf_prod(middle, y0 + 0.5 * z, args, control)
+
+        guess = increment(jnp.zeros_like(y0))
+        newton = inverse(jnp.eye(y0.size, dtype=y0.dtype) - jax.jacfwd(increment)(guess))
+
+        def improve(z, _):
+            correction = newton @ (increment(z) - z)
+            return z + correction, jnp.max(jnp.abs(correction) / (jnp.abs(y0) + jnp.abs(z) + 1.0))
+
+        z, corrections = jax.lax.scan(improve, guess, length=ITERATIONS)
+        converged = corrections[-1] < 1e3 * jnp.finfo(y0.dtype).eps
+        diverged: Any = diffrax.RESULTS.nonlinear_divergence
+        result = diffrax.RESULTS.where(converged, diffrax.RESULTS.successful, diverged)
+        y1 = y0 + z
+        return y1, None, dict(y0=y0, y1=y1), None, result
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..compilation.xla_cpu import written_by_component, written_in_place
-from ..validation import shown
+from ..text import shown
 
 Lanes = Float[Array, " lanes"]
 States = Float[Array, "components lanes"]

@@ -5,22 +5,36 @@ waiting for one another. All ensemble solves share this loop; a recorder stores 
 """
 
 import abc
+import functools
 from collections.abc import Callable
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from ..compilation.xla_cpu import in_one_kernel
-from .event import Bracket
-from .problem import AbstractProblem, least_margin, margin_at_start
+from ..compilation.xla_cpu import compiled_alone, in_one_kernel
+from .dense import saved
+from .events import Bracket
+from .problem import (
+    CROSSED,
+    FAILED,
+    LEFT_DOMAIN,
+    MOST_STEPS,
+    REACHED_END,
+    RUNNING,
+    AbstractProblem,
+    Settings,
+    crossing_time,
+    least_margin,
+    margin_at_start,
+)
 from .runge_kutta import Lanes, States, explicit_order, explicit_tableau, first_length, memory_for_stages
-from .settings import Settings
-from .status import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING
 from .step import Control, LaneState, try_step
 
 #: JAX's arrays, or NumPy's on the host.
@@ -38,13 +52,13 @@ SOON, AT_ZERO = 1e-2, 1e-6
 class Outcome(NamedTuple, Generic[Numbers]):
     """How every cell ended.
 
-    `status` is one of the codes of `status.py`; `first_crossing` and `crossing_time` [s] are the times of the first and
+    `status` is one of the codes of `problem.py`; `first_crossing` and `crossing_time` [s] are the times of the first and
     the last event, which are equal if runs end on the event, and infinite if there was none; `end_time` [s] and `state`
     are time and state at the end of the run; `steps` counts accepted and rejected steps, `rejected` only rejected ones.
 
     **Example:** the outcome of the subpackage's example, whose runs end on the event.
 
-    >>> from nonholonomic.integration.status import CROSSED
+    >>> from nonholonomic.integration.problem import CROSSED
     >>> print(outcome.status == CROSSED, outcome.state.shape)
     [ True  True  True] (1, 3)
     """
@@ -382,3 +396,134 @@ def _holds(
     lead = SOON * lengths
     change = lead * (first + 0.5 * lead * second)
     return jnp.where(jnp.abs(value) <= AT_ZERO * jnp.abs(change), change > 0.0, value > 0.0)
+
+
+# Solve an ensemble in lanes: event times and end states of a whole grid.
+#
+# All lanes step together, every lane with its own step length; cells wait in a queue for a lane. The
+# state is one array (components, lanes); the parameters of the problem are scalars or one per cell.
+#
+# Forward-mode derivatives flow through the states alone; step lengths are held fixed. `derivatives/adjoint.py` computes
+# first derivatives faster.
+
+
+def ensemble_solve(
+    problem: AbstractProblem,
+    t1: Float[Array, "..."],
+    cells: Int[Array, ""],
+    settings: Settings,
+    *,
+    nonterminal: bool = False,
+    one_kernel: bool = False,
+    n_blocks: int = 1,
+) -> tuple[Outcome, Int[Array, ""]]:
+    """Run every cell of a problem from t = 0 to its event, to the end of the model's validity, or to `t1`.
+
+    `solve_ensemble` is compiled on its own, for use outside of other transformed functions; `traced_solve_ensemble` is for
+    use inside them.
+
+    **Arguments:**
+
+    - `problem`: the problem; the last axis of its `start()` counts the cells.
+    - `t1`: horizon [s], one number for all cells or one per cell.
+    - `cells`: number of cells to run; the other cells of the problem are padding, so that one compiled program serves
+      grids of different sizes.
+    - `settings`: settings with an explicit Runge-Kutta solver of Diffrax.
+    - `nonterminal`: whether the event is nonterminal: a run continues through it, in either direction.
+    - `one_kernel`: whether to compile the loop into a single kernel on a CPU, which halves its cost; not for programs
+      that are differentiated again.
+    - `n_blocks`: number of equal blocks of the state, as for `LaneScheduler.of`.
+
+    **Returns:** the `Outcome`, and the number of iterations, each of which advanced all lanes.
+
+    **Example:** inside `jit`, with `traced_solve_ensemble`. With `nonterminal`, the runs continue to `t1`.
+
+    >>> from nonholonomic.integration import traced_solve_ensemble
+    >>> def solve(problem, t1):
+    ...     return traced_solve_ensemble(problem, t1, jnp.asarray(3), settings, nonterminal=True)[0]
+    >>> continued = jax.jit(solve)(problem, jnp.asarray(2.0))
+    >>> print(continued.crossing_time.round(6), continued.end_time)
+    [0.693147 0.346574 0.173287] [2. 2. 2.]
+    """
+    options = {"nonterminal": nonterminal, "one_kernel": one_kernel, "n_blocks": n_blocks}
+    outcome, iterations = LaneScheduler.of(problem, t1, cells, settings, **options).outcome()
+    return (outcome if nonterminal else with_crossing_times(problem, outcome)), iterations
+
+
+def with_crossing_times(problem: AbstractProblem, outcome: Outcome) -> Outcome:
+    """The outcome with the event time of the cells that ended on the event, and infinite times for the others."""
+    if problem.event_function(outcome.state) is None:
+        return outcome
+    time = crossing_time(problem, outcome.end_time, outcome.state)
+    # A cell that starts beyond the event has its event at 0.
+    time = jnp.where(outcome.end_time > 0.0, time, 0.0)
+    time = jnp.where(outcome.status == CROSSED, time, jnp.inf)
+    return outcome._replace(first_crossing=time, crossing_time=time)
+
+
+# With its docstring.
+solve_ensemble = compiled_alone(
+    functools.update_wrapper(functools.partial(ensemble_solve, one_kernel=True), ensemble_solve)
+)
+
+traced_solve_ensemble = eqx.filter_jit(ensemble_solve)
+
+
+# The outcome of every cell by vmapped `diffrax.diffeqsolve`: slow, and independent of the ensemble solver.
+
+
+@eqx.filter_jit
+def solve_by_diffrax(problem: AbstractProblem, t1: Float[Array, ""], settings: Settings) -> Outcome:
+    """Run every cell from t = 0 to its event, to the end of the model's validity, or to `t1`.
+
+    The domain margin is checked at the ends of steps, so a short loss can be missed; events are located on Diffrax's
+    dense output.
+
+    **Arguments:** as for `solve_ensemble`, but any solver of Diffrax works.
+
+    **Returns:** the `Outcome`.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import solve_by_diffrax
+    >>> print(solve_by_diffrax(problem, jnp.asarray(5.0), settings).crossing_time.round(6))
+    [0.693147 0.346574 0.173287]
+    """
+    (states, scales), rtol = problem.start(), settings.tolerance
+    lane_axes = jax.tree.map(lambda leaf: None if jnp.ndim(leaf) == 0 else -1, problem)
+
+    def solve_cell(cell_problem: AbstractProblem, state: Array, scale: Array) -> Outcome:
+        conditions: dict[int, Any] = {}
+        if problem.event_function(states) is not None:
+            conditions[CROSSED] = lambda t, y, args, **_: args.event_function(y)
+        if problem.domain_margin(states[0], states) is not None:
+            conditions[LEFT_DOMAIN] = lambda t, y, args, **_: args.domain_margin(t, y)
+        # Diffrax detects only changes of a condition's sign, so a cell that starts with a negative condition must end
+        # at once.
+        at_once = [condition(jnp.zeros(()), state, cell_problem) <= 0.0 for condition in conditions.values()]
+        ends_at_once = functools.reduce(jnp.logical_or, at_once, jnp.asarray(False))
+        event = diffrax.Event(list(conditions.values()), root_finder=optimistix.Newton(1e-13, 1e-13))
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
+            settings.for_single_runs,
+            0.0,
+            jnp.where(ends_at_once, 0.0, t1),
+            None,
+            state,
+            args=cell_problem,
+            stepsize_controller=diffrax.PIDController(rtol, settings.absolute * rtol * scale),
+            max_steps=min(settings.max_steps, MOST_STEPS),
+            event=event if conditions else None,
+            throw=False,
+        )
+        ends, finals = saved(solution)
+        end, final = ends[0], finals[0]
+        status = jnp.where(end >= t1, REACHED_END, FAILED)
+        for code, occurred, at_start in zip(conditions, solution.event_mask or [], at_once, strict=True):
+            status = jnp.where(occurred | at_start, code, status)
+        crossing_time = jnp.where(status == CROSSED, end, jnp.inf)
+        steps, rejected = solution.stats["num_steps"], solution.stats["num_rejected_steps"]
+        return Outcome(status, crossing_time, crossing_time, end, final, steps, rejected)
+
+    axes = Outcome._make((0, 0, 0, 0, -1, 0, 0))
+    return jax.vmap(solve_cell, in_axes=(lane_axes, -1, -1), out_axes=axes)(problem, states, scales)

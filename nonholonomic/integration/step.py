@@ -13,9 +13,18 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from ..compilation.xla_cpu import stored
-from .double_roots import missed_double_root, missed_loss
-from .event import Bracket, refine
-from .problem import AbstractProblem, crossing_time, least_margin, side_of
+from .events import Bracket, Path, missed_double_root, missed_loss, refine, watched
+from .problem import (
+    CROSSED,
+    FAILED,
+    LEFT_DOMAIN,
+    REACHED_END,
+    RUNNING,
+    AbstractProblem,
+    crossing_time,
+    least_margin,
+    side_of,
+)
 from .runge_kutta import (
     Lanes,
     Stages,
@@ -28,8 +37,6 @@ from .runge_kutta import (
     stages_to_look,
     watched_places,
 )
-from .status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING
-from .watch import Path, watched
 
 #: Steps are not cut below this fraction of the horizon because of a fast function, whose minimum may be zero.
 SHORTEST_CUT = 1e-9
@@ -59,7 +66,7 @@ class Control(NamedTuple):
 class LaneState(NamedTuple):
     """The state of the lanes.
 
-    - `cell`: which cell of the problem a lane runs; `status`: a code of `status.py`.
+    - `cell`: which cell of the problem a lane runs; `status`: a code of `problem.py`.
     - `time` [s], `state`, `rate`: where the lane is, and the field there.
     - `length`: length of the next step [s], unless the horizon is nearer.
     - `side`: 1 before the event, -1 beyond it; `margin`: the least of the margins and of `side` times the event

@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
 
 from ..derivatives import exponent_of, growth
-from ..derivatives.lyapunov import Growth
+from ..derivatives.variation import Growth
 from ..hybrid import AbstractBatchedMode, HybridOutcome, solve_hybrid
 from ..hybrid.ensemble import at_start
 from ..hybrid.saltation import VariationalMode, variational_start
 from ..integration import Outcome, Settings, explicit_tableau
-from ..integration.status import REACHED_END, RUNNING, Status
-from ..progress import status_line
+from ..integration.problem import REACHED_END, RUNNING, Status
+from ..terminal import status_line
 from ..validation import require_outside
 from .event import modes_of
 from .model import AbstractModel, check_run, model_of
@@ -96,8 +96,8 @@ def lyapunov_exponent(
     """The largest Lyapunov exponent of a run, by the variational equation, through resets by the saltation matrix.
 
     The exponent is positive if nearby runs diverge exponentially. In chaotic motion, the exponent stays positive as `t1`
-    grows. Source: Benettin et al., Meccanica 15 (1980) 9; see `nonholonomic/derivatives/lyapunov.py`. In a run with resets, the
-    tangent is rescaled at the ends of 32 intervals of time.
+    grows. Source: Benettin et al., Meccanica 15 (1980) 9; see `nonholonomic/derivatives/variation.py`. In a run with
+    resets, the tangent is rescaled at the ends of 32 intervals of time.
 
     **Arguments:**
 

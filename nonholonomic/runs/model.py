@@ -14,11 +14,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..hybrid import AbstractBatchedMode, HybridOutcome
 from ..integration import AbstractProblem, Outcome
-from ..integration.checks import run_bounds
-from ..integration.status import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED, Status
+from ..integration.problem import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED, Status, run_bounds
 from ..parameters import full_name, numbers, with_numbers
 from ..sweeps import Axis, Quantity, Variable
-from ..validation import require_all, shown
+from ..text import shown
+from ..validation import require_all
 
 #: The names of the quantities that will be read, which choose the layout of the state; `None` for all quantities, with
 #: the path of the run.

@@ -1,29 +1,84 @@
 """Tables of many runs of any model, over a grid of its parameters and starts."""
 
+import dataclasses
 import hashlib
+import re
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Literal
+from jaxtyping import Array
 
 from .. import sweeps
+from ..compilation.xla_cpu import opened, programs_in
 from ..integration import Settings, explicit_tableau
-from ..integration.checks import require_times
-from ..integration.settings import DEFAULT_MAX_STEPS
-from ..integration.status import Status
+from ..integration.problem import DEFAULT_MAX_STEPS, Status, require_times
 from ..sweeps import Axis, Quantity, Table, Variable, axis, cells_to_check, chunk_for, scattered_cells, size_of
-from ..sweeps.grid import columns
-from ..sweeps.layout import EQUATIONS
+from ..sweeps.grid import EQUATIONS, columns
 from ..sweeps.table import cells_with
-from ..text import likely
-from ..validation import as_number, require_flag, require_outside, require_whole, shown
-from ..warning import warn
-from .equations import checksum_of, has_users_code
+from ..text import likely, shown
+from ..validation import as_number, require_flag, require_outside, require_whole, warn
+from .event import Ensemble
 from .model import AbstractModel, check_horizon, model_of, require_event
-from .samples import Samples
+from .simulate import Samples
 from .table import ScatteredJob, TableForm, TableJob
+
+# A checksum of the equations of a model, so that a table does not resume with the cells of other equations.
+
+#: The packages whose code changes only with the version, which tables compare too.
+PACKAGES = ("nonholonomic", "tippe", "stroller", "jax", "equinox")
+
+#: The address of an object in the text of a program.
+ADDRESS = re.compile(r" at 0x[0-9a-f]+")
+
+
+def has_users_code(part: Any) -> bool:
+    """Whether a tree of modules has a function, or a module of a class, that is not of these packages."""
+    if isinstance(part, eqx.Module):
+        if type(part).__module__.partition(".")[0] not in PACKAGES:
+            return True
+        return any(has_users_code(getattr(part, field.name)) for field in dataclasses.fields(part))
+    if isinstance(part, tuple | list | dict):
+        return any(map(has_users_code, part.values() if isinstance(part, dict) else part))
+    # Functions can also be compiled or methods. An object that can be called, such as a partial function, has data.
+    is_own = str(getattr(part, "__module__", "")).partition(".")[0] in PACKAGES
+    return callable(part) and not (is_own and hasattr(part, "__qualname__"))
+
+
+def checksum_of(model: AbstractModel) -> str:
+    """A checksum of the operations that compute the rates, the events and the resets of a model, and of the constants in them,
+    but not of its parameters."""
+    arrays, static = eqx.partition(model, eqx.is_array)
+
+    def equations(arrays: Any) -> list[Any]:
+        ensemble = Ensemble.of(eqx.combine(arrays, static), 1, jnp.asarray(1e-9), False)
+        state, time = ensemble.starts, jnp.zeros(1)
+        modes = ensemble.modes or ()
+        problems = [ensemble.problem] if ensemble.problem is not None else [mode.problem(state) for mode in modes]
+        parts: list[Any] = [
+            (problem.field(time, state), problem.event_function(state), problem.domain_margin(time, state))
+            for problem in problems
+        ]
+        return [*parts, *(mode.reset_map(state, jnp.ones(1)) for mode in modes)]
+
+    program = jax.make_jaxpr(equations)(arrays)
+    checksum = hashlib.sha256(ADDRESS.sub("", str(program)).encode())
+    # The text of a program does not show all digits of the constants.
+    for inner in programs_in(program):
+        jaxpr, parts = opened(inner)
+        for equation in jaxpr.eqns:
+            literals = [operand.val for operand in equation.invars if isinstance(operand, Literal)]
+            parts = [*parts, *literals, *jax.tree.leaves(list(equation.params.values()))]
+        for array in (np.asarray(part) for part in parts if isinstance(part, Array | np.ndarray | np.generic)):
+            checksum.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
+    return checksum.hexdigest()[:16]
+
 
 #: Greatest number of values in the samples of a chunk: 256 MB.
 MOST_SAMPLED = 1 << 25

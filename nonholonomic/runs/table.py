@@ -11,14 +11,12 @@ from jaxtyping import Array, Bool, Float, Int, Num
 from ..derivatives import tangent_scale, tangents_of
 from ..hybrid import HybridOutcome
 from ..integration import Outcome, Settings, solve_by_diffrax
-from ..integration.checks import TIGHTEST
-from ..integration.settings import TIGHTEST_IN_SINGLE
-from ..integration.status import Status
+from ..integration.problem import TIGHTEST, TIGHTEST_IN_SINGLE, Status
 from ..sweeps import Variable
 from ..validation import as_number
-from .ensemble import SILENT, Ensemble, status_of
+from .event import SILENT, Ensemble, status_of
 from .model import AbstractModel
-from .samples import Samples, solve_samples
+from .simulate import Samples, solve_samples
 
 #: Descriptions of the counters of every run.
 COUNTED = {"steps": "steps", "rejected": "rejected steps"}
@@ -123,7 +121,7 @@ class TableJob(NamedTuple):
         return (*self.times, *self.model.further_times, "end_time", *ends)
 
     def _error_variables(self, variables: dict[str, Variable]) -> dict[str, Variable]:
-        """The variables that describe the accuracy of others (`errors.py`)."""
+        """The variables that describe the accuracy of others."""
         errors = {
             name: Variable(variables[name].unit, np.float64, long_name=f"error of the {variables[name].long_name}")
             for name in self.bounded

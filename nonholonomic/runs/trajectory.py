@@ -1,8 +1,9 @@
-"""One run of a user's system at given times."""
+"""One run of any model: its quantities, its plots and its page."""
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -11,16 +12,320 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from ..hybrid import MOST_ROUNDS, hybrid_resets
-from ..integration import Settings
-from ..integration.status import Status
+from ..integration import AbstractProblem, Settings
+from ..integration.problem import Status, run_bounds
 from ..parameters import of_all_modes
 from ..sweeps import Quantity, Table, Tabular, run_table
-from ..text import as_text, batch_title, distinguishing_labels, likely
-from ..validation import is_traced, times_within
-from ..views import Page, Stage, Viewable, new_figure
-from .explore import explore_model
-from .model import AbstractModel
-from .portrait import portraits
+from ..terminal import status_line
+from ..text import as_text, batch_title, distinguishing_labels, likely, readable_unit, require_unit, shown
+from ..validation import IN_DEGREES, is_traced, require_all, require_file, require_one_run, times_within
+from ..views import COLOURS, PALE, Arena, Body, Curve, Mesh, Page, Show, Stage, Trace, Viewable, new_figure
+from ..views.explore import Answer, Frame, HybridSimulator, LiveRun, Simulator, Slider, Summary, live_page
+from ..views.stage import curves_in
+from .model import AbstractModel, model_of
+
+# A page with sliders that simulates any model in the browser.
+
+#: The tolerance in the page, and that of the runs that determine the drawn part of the arena.
+TOLERANCE, DRAWN = 1e-7, 1e-5
+
+#: Greatest number of steps of a run in the page; they take some hundred milliseconds.
+MOST_STEPS_OF_A_PAGE = 50_000
+
+#: Parameters that change the drawn meshes.
+OF_MESHES = ("scene.surface.", "scene.body.radius", "scene.body.equatorial", "scene.body.polar", "scene.body.wheelbase")
+
+
+@status_line("writing a page")
+def explore(
+    system: Any,
+    start: Any,
+    path: Any = None,
+    sliders: dict[str, tuple[float, float]] | None = None,
+    t1: float = 8.0,
+    input: Any = None,
+    unit: Any = None,
+    jumps: Any = None,
+) -> Page:
+    """Make a page with sliders that simulates a run in the browser while you move a slider.
+
+    The page is one file that needs no network; a notebook shows the returned `Page`. The equations of motion, the
+    Runge-Kutta pair and the step-size control are generated from those of tables, at a tolerance of 1e-7. A scene shows
+    its body; your own system shows the first and the last component of its state as a point in a plane, and the curves of
+    all components.
+
+    **Arguments:**
+
+    - `system`, `start`, `input`, `jumps`: as for `event_time`; the run that the page shows first.
+    - `path`: file to write the page to, or `None`.
+    - `sliders`: name of a parameter -> (lowest, highest) value; the end of a name is enough if only one parameter
+      matches.
+    - `t1`: horizon [s].
+    - `unit`: unit of the curves, such as "deg" for all angles, or several, such as ("deg", "cm").
+
+    **Returns:** a `Page`, with its `html`.
+
+    **Raises:** `ValueError` for arguments out of range, an unknown slider, or equations with an operation of JAX that cannot
+    be written in JavaScript; `ModuleNotFoundError` if the library for views is not installed; `OSError` if the file cannot be
+    written.
+
+    **Example:** a page with a slider for the drag of a ball.
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> class Ball(nonholonomic.AbstractMode):
+    ...     drag: float = 0.1
+    ...
+    ...     def field(self, t, y):
+    ...         return jnp.array([y[1], -9.81 - self.drag * y[1]])
+    ...
+    ...     def margin(self, t, y):
+    ...         return y[0]
+    ...
+    ...     def reset(self, t, y):
+    ...         return jnp.array([0.0, -0.8 * y[1]]), 0
+    >>> page = nonholonomic.explore(nonholonomic.Hybrid([Ball()]), [1.0, 0.0], sliders={"drag": (0.0, 0.3)}, t1=2.0)
+    >>> "range" in page.html
+    True
+
+    ```
+    """
+    return explore_model(model_of(system, start, None, input, jumps), path, sliders, float(t1), unit)
+
+
+def explore_model(model: AbstractModel, path: Any, sliders: Any, t1: float, unit: Any) -> Page:
+    """The page of a model. **Arguments:** as for `explore`."""
+    if path is not None:
+        require_file(path, "path", ".html", ".htm")
+    require_all(run_bounds(t1, 1e-9))
+    require_unit(unit)
+    model.check()
+    live, stage = page_of(model, sliders, t1)
+    (stage,) = curves_in([stage], unit)
+    html_page = live_page(live, stage)
+    if path is not None:
+        html_page.save(path)
+    return html_page
+
+
+@functools.singledispatch
+def page_of(model: AbstractModel, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
+    """The contents of the page of a model, and the stage on which the page draws the run.
+
+    Each kind of model registers its own function.
+
+    **Arguments:** as for `explore`.
+
+    **Raises:** `ValueError` for an unknown slider, and for numbers that are out of range.
+
+    **Example:**
+
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> from nonholonomic.runs import model_of, page_of
+    >>> class Decay(nonholonomic.AbstractMode):
+    ...     rate: float = 2.0
+    ...
+    ...     def field(self, t, y):
+    ...         return -self.rate * y
+    >>> live, stage = page_of(model_of(nonholonomic.Hybrid([Decay()]), [1.0]), {"rate": (1.0, 3.0)}, 1.0)
+    >>> [slider.label for slider in live.sliders]
+    ['rate']
+    """
+    raise NotImplementedError(f"{type(model).__name__} has no page")
+
+
+def sliders_of(model: AbstractModel, ranges: Any, drawn: tuple[str, ...] = ()) -> tuple[Slider, ...]:
+    """The sliders for the ranges that a user passes.
+
+    **Arguments:** `ranges`: name of a parameter -> (lowest, highest) value; `drawn`: parameters, in addition to
+    `OF_MESHES`, that change the drawn meshes.
+
+    **Raises:** `ValueError` for an unknown name, an illegal range, and numbers that the modules do not allow.
+    """
+    if not (isinstance(ranges, dict) and ranges and all(isinstance(name, str) for name in ranges)):
+        raise ValueError(
+            f"sliders = {shown(ranges)} must be a dictionary, name of a parameter -> (low, high), such as "
+            '{"theta": (0.05, 0.5)}'
+        )
+    sliders = []
+    for name, ends in ranges.items():
+        path = model.full_name("sliders", name)
+        if path.startswith((*OF_MESHES, *drawn)):
+            raise ValueError(
+                f"sliders[{name!r}]: {path} changes the drawn arena or body, which a page cannot change; "
+                "write a page for each value"
+            )
+        try:
+            low, high = (float(end) for end in ends)
+        except (TypeError, ValueError):
+            low, high = math.nan, math.nan
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            raise ValueError(f"sliders[{name!r}] = {shown(ends)} must be two numbers, (low, high), with low < high")
+        value = float(model.value(path))
+        short, unit, label = model.label([path])[path]
+        if not low <= value <= high:
+            in_degrees = unit == "rad" and low <= math.degrees(value) <= high
+            raise ValueError(
+                f"sliders[{name!r}] = {shown(ends)} must contain the parameter's own value, {value:g}: the page starts there"
+                + (IN_DEGREES.format(shown(ends)) if in_degrees else "")
+            )
+        for end in (low, high):
+            model.require_values({path: end})
+        sliders.append(Slider(name, path, (label or short).replace("_", " "), readable_unit(unit), low, high, value))
+    return tuple(sliders)
+
+
+def runs_at_ends(model: AbstractModel, sliders: tuple[Slider, ...], t1: float) -> list[Any]:
+    """The run of a model, and those at both ends of every slider, which determine what part of the arena is drawn."""
+    ends = [{slider.path: end} for slider in sliders for end in (slider.low, slider.high)]
+    others = [changed for changed in map(model.replaced, ends) if np.all(changed.legal())]
+    return [changed.simulate(t1, None, DRAWN, None, None) for changed in (model, *others)]
+
+
+def live_run(
+    model: AbstractModel,
+    drawn: AbstractModel,
+    sliders: tuple[Slider, ...],
+    t1: float,
+    outcome: Callable[[Any, Any, Any], tuple[Array, Array]],
+    frame: Callable[[Any, Any, Any, Any], Frame],
+    *,
+    title: str,
+    answer: tuple[str, str],
+    words: Mapping[int, str] | None = None,
+    summaries: tuple[Summary, ...],
+    motion: Callable[[Any], AbstractProblem] | None = None,
+) -> LiveRun:
+    """The contents of a page of any model.
+
+    **Arguments:**
+
+    - `model`, `drawn`: the model that answers, with its event, and that of the drawn run, for the same `sliders`.
+    - `outcome`: function that returns the `Status` and the result of a run, or infinity; its arguments are the model, its
+      problem and the `LaneState` at the end of a smooth run, or the model, `None` and a `HybridOutcome`.
+    - `frame`: function that returns a frame; its arguments are the drawn model, the time, the rows of the state, and the
+      index of the mode, `None` for a smooth run.
+    - `answer`: label and unit of the result; the others as for `LiveRun` and `Answer`.
+    - `motion`: function that returns the problem of a smooth drawn run; by default that of the model.
+    """
+    settings = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE)
+
+    def at(model: Any, values: Float[Array, " numbers"]) -> Any:
+        return model.replaced({slider.path: value for slider, value in zip(sliders, values, strict=True)})
+
+    if model.smooth:
+        problem = motion or (lambda drawn: drawn.problem(1, None))
+        answering: Any = Simulator(
+            lambda values: at(model, values).problem(1, ()),
+            t1,
+            settings,
+            {"outcome": lambda values, problem, lane: outcome(at(model, values), problem, lane)},
+            model.continues and model.has_event,
+        )
+        moving: Any = Simulator(
+            lambda values: problem(at(drawn, values)),
+            t1,
+            settings,
+            {"frame": lambda values, problem, lane: frame(at(drawn, values), lane.time, lane.state, None)},
+        )
+    else:
+        counters = len(model.counters)
+        answering = HybridSimulator(
+            lambda values: at(model, values).modes(1, settings.tolerance, (), False),
+            t1,
+            settings,
+            counters,
+            {"outcome": lambda values, runs: outcome(at(model, values), None, runs)},
+        )
+        moving = HybridSimulator(
+            lambda values: at(drawn, values).modes(1, settings.tolerance, None, False),
+            t1,
+            settings,
+            counters,
+            {},
+            lambda values, mode, rows, time: frame(at(drawn, values), time, rows, mode),
+        )
+    result = Answer(*answer, answering, words or {})
+    return LiveRun(title, sliders, lambda values: jnp.all(at(model, values).legal()), result, moving, summaries)
+
+
+# Pictures of a user's system: the first and the last component of its state as a point in a plane, and curves of all.
+
+#: Half the side of the drawn plane [m], and the radius of the point and the width of its trace, in the same unit.
+HALF, RADIUS, WIDTH = 1.0, 0.03, 0.012
+
+#: Number of lines of the plane's grid in each direction.
+LINES = 9
+
+
+def portraits(runs: list[Any], overlaid: bool, drawn: tuple[np.ndarray, np.ndarray] | None = None) -> list[Stage]:
+    """Runs as stages: one stage for each, or a common one for overlaid runs.
+
+    **Arguments:** `drawn`: middle and scales of the drawn part of the plane, by default that of the runs.
+    """
+    for run in runs:
+        require_one_run(run, "a picture", ", and pass the others as others=")
+    groups = [list(enumerate(runs))] if overlaid else [[numbered] for numbered in enumerate(runs)]
+    stages = []
+    for group in groups:
+        points = np.concatenate([plane_points(run) for _, run in group])
+        centre, scale = frame_of(points) if drawn is None else drawn
+        shows = tuple(show(run, number, centre, scale) for number, run in group)
+        names = group[0][1].portrait_axes
+        stages.append(Stage(f"{names[1]} over {names[0]}", plane(scale), shows))
+    return stages
+
+
+def plane_points(run: Any) -> Float[np.ndarray, "times 2"]:
+    """The drawn components of a run."""
+    return np.stack([np.asarray(run[name], float) for name in run.portrait_axes], axis=-1)
+
+
+def frame_of(points: Float[np.ndarray, "points 2"]) -> tuple[np.ndarray, np.ndarray]:
+    """The middle of some points, and the factors that scale them to the drawn plane."""
+    points = points[np.all(np.isfinite(points), axis=-1)]
+    low, high = points.min(axis=0), points.max(axis=0)
+    span = np.where(high > low, high - low, 1.0)
+    return 0.5 * (low + high), 1.8 * HALF / span
+
+
+def show(run: Any, number: int, centre: np.ndarray, scale: np.ndarray) -> Show:
+    """The drawing of one run, the `number`-th of all."""
+    colour = COLOURS[number % len(COLOURS)]
+    is_reached = np.all(np.isfinite(np.asarray(run.state)), axis=-1)
+    points = ((plane_points(run) - centre) * scale)[is_reached]
+    position = np.concatenate([points, np.full((len(points), 1), RADIUS)], axis=-1)
+    upright, ball = np.tile([0.0, 0.0, 0.0, 1.0], (len(points), 1)), octahedron(colour)
+    curves = tuple(Curve(name, np.asarray(run[name])[is_reached]) for name in run.names)
+    trace = Trace(" over ".join(run.portrait_axes[::-1]), position, colour, WIDTH)
+    normal = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    body = Body("state", position, upright, (ball,))
+    return Show(f"run {number + 1}", colour, np.asarray(run.t)[is_reached], normal, HALF, (body,), (trace,), (), curves)
+
+
+def octahedron(colour: int) -> Mesh:
+    """The drawn point."""
+    vertices = RADIUS * np.concatenate([np.eye(3), -np.eye(3)])
+    corners = [(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)]
+    return Mesh(vertices, np.array(corners), colour)
+
+
+def plane(scale: np.ndarray) -> Arena:
+    """The drawn part of the plane, with lines at a spacing that is named."""
+    corners = HALF * np.array([(-1.0, -1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 1.0, 0.0), (-1.0, 1.0, 0.0)])
+    places = HALF * np.linspace(-1.0, 1.0, LINES)
+    ends = HALF * np.array([-1.0, 1.0])
+    lines = [np.stack([np.full(2, place), ends, np.zeros(2)], axis=-1) for place in places]
+    lines += [np.stack([ends, np.full(2, place), np.zeros(2)], axis=-1) for place in places]
+    spacing = 2.0 * HALF / (LINES - 1) / scale
+    text = f"{spacing[0]:.3g} by {spacing[1]:.3g}"
+    mesh = Mesh(corners, np.array([(0, 1, 2), (0, 2, 3)]), PALE)
+    return Arena(mesh, tuple(lines), text, np.array([0.0, 0.0, 1.0]))
+
+
+# One run of a user's system at given times.
 
 #: Why a run ended early, by its word.
 REASONS = {

@@ -28,8 +28,8 @@ from .grid import size_of as size_of
 from .processes import local_processes as local_processes
 from .running import chunk_for as chunk_for
 from .running import sweep as sweep
+from .table import Quantity as Quantity
 from .table import Table as Table
-from .tabular import Quantity as Quantity
-from .tabular import Tabular as Tabular
-from .tabular import chosen as chosen
-from .tabular import run_table as run_table
+from .table import Tabular as Tabular
+from .table import chosen as chosen
+from .table import run_table as run_table

@@ -18,10 +18,9 @@ except ImportError:  # not a POSIX system
 
 import numpy as np
 
-from ..validation import real_path, replacing, sync_folder
-from ..warning import warn
+from ..validation import real_path, replacing, sync_folder, warn
 from ._file import Stored, table_path, write_file
-from .layout import EQUATIONS, Layout, Values
+from .grid import EQUATIONS, Layout, Values
 
 #: The files of the folder of a table's chunks, besides those of the chunks: a table without numbers, and the lock.
 HEADER, LOCK = "table.h5", "nonholonomic.lock"

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..integration.status import FORMER_WORDS
+from ..integration.problem import FORMER_WORDS
 from ..validation import as_path, replacing
-from .layout import PENDING, UNREACHED, Layout, Values, boxes
+from .grid import PENDING, UNREACHED, Layout, Values, boxes
 
 if TYPE_CHECKING:
     import h5py

@@ -1,13 +1,127 @@
-"""A grid of named axes: its cells, and the parameters of each cell."""
+"""The grid of a sweep: its axes, the layout of its results, and its tasks."""
 
+import functools
 import itertools
-from collections.abc import Iterator
+import math
+import os
+import pickle
+import platform
+import threading
+from collections.abc import Callable, Iterator
+from importlib.metadata import version
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Shaped
 
+from .. import __version__
+from ..compilation.cache import forget_programs_if_many
 from ..validation import require
-from .layout import Values
+
+# The layout of a table: everything except its numbers, and the division of its cells into chunks.
+
+Values = Shaped[np.ndarray, "..."]
+
+#: The name of the checksum of a user's equations in a request.
+EQUATIONS = "equations"
+
+#: Code and word for a cell that has not been computed.
+PENDING, UNREACHED = -1, "pending"
+
+
+class Layout(NamedTuple):
+    """A table without its numbers.
+
+    `kinds`: variable -> dtype; `chunk`: number of cells in every chunk but the last; the other fields are as in
+    `Table`.
+    """
+
+    coords: dict[str, Values]
+    kinds: dict[str, np.dtype]
+    units: dict[str, str]
+    attributes: dict[str, Any]
+    words: dict[str, tuple[str, ...]]
+    inner: dict[str, tuple[str, ...]]
+    chunk: int
+
+    @property
+    def axes(self) -> list[str]:
+        """The coordinates that are axes of the grid."""
+        return axes_of(self.coords, self.inner)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the grid."""
+        return tuple(len(self.coords[name]) for name in self.axes)
+
+    @property
+    def cells(self) -> int:
+        """Number of cells of the grid."""
+        return math.prod(self.shape)
+
+    @property
+    def chunks(self) -> int:
+        """Number of chunks."""
+        return -(-self.cells // self.chunk)
+
+    def ends(self, chunk: int) -> tuple[int, int]:
+        """The index of the first cell of a chunk, and of the cell after its last."""
+        return chunk * self.chunk, min((chunk + 1) * self.chunk, self.cells)
+
+    def size(self, chunk: int) -> int:
+        """Number of cells in a chunk."""
+        first, end = self.ends(chunk)
+        return end - first
+
+    def inner_shape(self, name: str) -> tuple[int, ...]:
+        """Shape of a variable's value for one cell."""
+        return tuple(len(self.coords[dim]) for dim in self.inner.get(name, ()))
+
+    def empty(self, cells: int, status: int = PENDING) -> dict[str, Values]:
+        """Variables without results, with cells along the first axis; variables of words are filled with `status`."""
+        variables = {}
+        for name, kind in self.kinds.items():
+            value = status if name in self.words else np.nan if kind.kind == "f" else PENDING
+            variables[name] = np.full((cells, *self.inner_shape(name)), value, kind)
+        return variables
+
+    def shaped(self, name: str, values: Values) -> Values:
+        """A variable in the shape of the grid, with words instead of codes."""
+        values = values.reshape((*self.shape, *self.inner_shape(name)))
+        return np.array([*self.words[name], UNREACHED])[values] if name in self.words else values
+
+    def bytes_of_cells(self, cells: int) -> int:
+        """Memory for the numbers of some cells [bytes]."""
+        return cells * sum(kind.itemsize * math.prod(self.inner_shape(name)) for name, kind in self.kinds.items())
+
+
+def axes_of(coords: dict[str, Values], inner: dict[str, tuple[str, ...]]) -> list[str]:
+    """The coordinates that are axes of the grid, without those of the variables' additional dimensions."""
+    inner_dims = {dim for dims in inner.values() for dim in dims}
+    return [name for name in coords if name not in inner_dims]
+
+
+def boxes(shape: tuple[int, ...], first: int, end: int) -> Iterator[tuple[slice, ...]]:
+    """Slices of an array that contain its elements with the flat indices from `first` to `end` - 1, in order."""
+    if not shape:
+        yield ()
+        return
+    row = math.prod(shape[1:])
+    while first < end:
+        start, offset = divmod(first, row)
+        rows = (end - first) // row
+        if offset == 0 and rows:
+            yield (slice(start, start + rows), *(slice(0, size) for size in shape[1:]))
+            first += rows * row
+        else:
+            stop = min(end, (start + 1) * row)
+            for box in boxes(shape[1:], offset, offset + stop - first):
+                yield (slice(start, start + 1), *box)
+            first = stop
+
+
+# A grid of named axes: its cells, and the parameters of each cell.
 
 #: Grids with at most this many cells are checked cell by cell before anything runs.
 CHECKED_WHOLE = 1 << 20
@@ -141,3 +255,100 @@ def scattered_cells(axes: list[Axis]) -> dict[str, Values]:
             f"scattered = True takes lists of one length, not {lengths_text}; the other numbers are scalars"
         )
     return {axis.number: axis.values for axis in axes}
+
+
+# The computation of several cells of a grid, in this process or in another process that has only the data that it
+# received.
+
+#: A function from (full name of a parameter -> values of some cells, number of cells to compute) to (name -> results).
+Job = Callable[[dict[str, Values], int], dict[str, Values]]
+
+#: Packages and settings that must agree wherever a part of a table is computed.
+MUST_AGREE = ("nonholonomic", "jax", "jaxlib", "diffrax", "float")
+
+
+class ChunkTask(NamedTuple):
+    """A job and its grid; `chunk`: number of cells in each call of the job, always the same, so that it is compiled
+    once."""
+
+    job: Job
+    axes: list[Axis]
+    chunk: int
+
+    def compile(self) -> None:
+        """Call the job with padding alone, to compile it."""
+        self.job(columns(self.axes, 0, self.chunk), 0)
+
+    def results(self, first: int, count: int) -> dict[str, Values]:
+        """The results of `count` cells, starting with cell `first`."""
+        end = min(first + count, size_of(self.axes))
+        parts = []
+        for start in range(first, end, self.chunk):
+            count_of_part = min(self.chunk, end - start)
+            variables = self.job(columns(self.axes, start, self.chunk), count_of_part)
+            parts.append({name: np.asarray(values)[:count_of_part] for name, values in variables.items()})
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def packed(work: ChunkTask) -> bytes:
+    """The task in a form that can be sent to another process.
+
+    **Raises:** `ValueError` that names the object that cannot be sent.
+    """
+    try:
+        return pickle.dumps(work)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise ValueError(
+            f"executor: the work cannot be sent to another process ({error}); a function in it must be defined at the top of a "
+            "module, not inside another function and not as a lambda"
+        ) from None
+
+
+def remote_results(payload: bytes, needed: dict[str, str], first: int, count: int, mark: str) -> dict[str, Values]:
+    """Compute the results of several cells in a worker process.
+
+    **Arguments:** `payload`: the result of `packed`; `needed`: the `stamp` of the sender; `first`, `count`: as for
+    `ChunkTask.results`; `mark`: different in every call, because Dask merges calls with equal arguments.
+
+    **Raises:** `RuntimeError` that names the worker if a package there has another version, which may give other
+    results.
+    """
+    local = stamp()
+    for name in MUST_AGREE:
+        if local[name] != needed[name]:
+            raise RuntimeError(
+                f"the worker {platform.node()}, process {os.getpid()}, has {name} {local[name]}, and {needed[name]} is needed: "
+                "all workers of a table need the same versions"
+            )
+    # Otherwise, threads of one worker would compile the same program twice.
+    with _unpacking:
+        work = _unpacked(payload)
+    return work.results(first, count)
+
+
+_unpacking = threading.Lock()
+
+
+@functools.lru_cache(maxsize=4)
+def _unpacked(payload: bytes) -> ChunkTask:
+    """The work, compiled once per process, however many parts of it arrive."""
+    forget_programs_if_many()
+    work = pickle.loads(payload)
+    work.compile()
+    return work
+
+
+@functools.cache
+def versions() -> dict[str, str]:
+    """The versions that a result depends on."""
+    packages = ("jax", "jaxlib", "diffrax", "numpy")
+    return {"python": platform.python_version(), "nonholonomic": __version__} | {
+        name: version(name) for name in packages
+    }
+
+
+def stamp() -> dict[str, str]:
+    """The versions in this process of the packages in `MUST_AGREE`."""
+    # Float64 may have been switched off by hand.
+    local = versions() | {"float": str(np.dtype(jnp.result_type(float)))}
+    return {name: local[name] for name in MUST_AGREE}

@@ -13,7 +13,8 @@ from typing import Any
 
 import jax
 
-from ..validation import require, shown
+from ..text import shown
+from ..validation import require
 
 
 @contextlib.contextmanager

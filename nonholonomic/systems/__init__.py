@@ -4,7 +4,7 @@ A hybrid system is a `Hybrid` of modes, each an `AbstractMode`; a mechanical sys
 potential, constraints and forces the equations of motion follow.
 """
 
-from .mode import AbstractMode as AbstractMode
-from .mode import Hybrid as Hybrid
+from .form import AbstractMode as AbstractMode
+from .form import Hybrid as Hybrid
 from .model import OwnModel as OwnModel
-from .page import page_of_system as page_of_system
+from .model import page_of_system as page_of_system

@@ -17,15 +17,14 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
+from ..compilation.components import over_lanes
+from ..compilation.tracing import in_cells
 from ..compilation.xla_cpu import least
 from ..hybrid import AbstractBatchedMode, Transition
 from ..integration import AbstractProblem, Jumps, Lanes, States
-from ..integration.status import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
-from ..lanes.comparisons import in_cells
-from ..lanes.components import over_lanes
+from ..integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
 from ..runs import UNMEASURED
-from .form import Form, OfRun
-from .mode import State
+from .form import Form, OfRun, State
 
 #: A function counts as zero if changing every component of the state by this fraction of its size could make it zero:
 #: round-off.

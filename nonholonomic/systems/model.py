@@ -1,4 +1,4 @@
-"""A user's own system as a model: its numbers by name, its modes, and its components."""
+"""A user's hybrid system as a model for the functions of `nonholonomic.runs`, and its page."""
 
 import dataclasses
 import functools
@@ -11,23 +11,47 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..compilation.tracing import dependent_outputs, named_errors, with_own_numbers
 from ..formulations import AbstractFormulation, AbstractSystem
 from ..hybrid import HybridOutcome
 from ..integration import AbstractProblem, Outcome
-from ..integration.status import Status
-from ..lanes.tracing import dependent_outputs, named_errors, with_own_numbers
+from ..integration.problem import CROSSED, FAILED, UNRESOLVED, Status
 from ..parameters import Parameters, check_again, has_checks, require_apart, short_names
 from ..runs.model import AbstractModel, Names, Start, model_of, statuses
 from ..runs.simulate import simulate_model
-from ..runs.trajectory import Trajectory
+from ..runs.trajectory import (
+    RADIUS,
+    TOLERANCE,
+    Trajectory,
+    frame_of,
+    live_run,
+    page_of,
+    plane_points,
+    portraits,
+    runs_at_ends,
+    sliders_of,
+)
 from ..sweeps import Axis, Quantity, Variable
-from ..text import name_of
-from ..validation import as_number, is_traced, shown
+from ..text import name_of, shown
+from ..validation import as_number, is_traced
+from ..views import Stage
+from ..views.explore import Frame, LiveRun, Summary
 from .engine import Cells
-from .form import Form, arguments_in_words
-from .legality import RULES, parts_of_start, problem_of_start, rooms
-from .mode import AbstractMode, Event, Hybrid, require_event
-from .system import MechanicalEvent, MechanicalMode, check_start, formulation_of, is_pair, with_modes_of_systems
+from .form import AbstractMode, Event, Form, Hybrid, arguments_in_words, require_event
+from .system import (
+    RULES,
+    MechanicalEvent,
+    MechanicalMode,
+    check_start,
+    formulation_of,
+    is_pair,
+    parts_of_start,
+    problem_of_start,
+    rooms,
+    with_modes_of_systems,
+)
+
+# A user's own system as a model: its numbers by name, its modes, and its components.
 
 
 class OwnModel(AbstractModel):
@@ -321,3 +345,56 @@ def names_of(system: Any, size: int) -> tuple[str, ...]:
             f"{', '.join(TAKEN)}"
         )
     return (*names, *(f"{name}_rate" for name in names)) if has_rates else tuple(names)
+
+
+# The page of a user's own system: the equations for the browser, and the point that shows the state.
+
+#: Number of parameters with a slider by default, and rotations of the drawn point per run, which set the number of frames.
+DEFAULT_SLIDERS, TURNS = 3, 40.0
+
+
+def default_ranges(model: OwnModel) -> dict[str, Any]:
+    """The default sliders: the first parameters that are not zero, from half to twice their values."""
+    names = [name for name in model.known if "[*]" not in name and float(model.value(name))]
+    names.sort(key=lambda name: name.startswith("start"))
+    values = {name: float(model.value(name)) for name in names[:DEFAULT_SLIDERS]}
+    return {name: tuple(sorted((0.5 * value, 2.0 * value))) for name, value in values.items()}
+
+
+@page_of.register(OwnModel)
+def page_of_system(model: OwnModel, ranges: Any, t1: float) -> tuple[LiveRun, Stage]:
+    """The page of a model: its run, and the plane on which it is drawn."""
+    sliders = sliders_of(model, default_ranges(model) if ranges is None else ranges)
+    runs, names = runs_at_ends(model, sliders, t1), model.names
+    centre, scale = frame_of(np.concatenate([plane_points(run) for run in runs]))
+    (stage,) = portraits(runs[:1], False, (centre, scale))
+
+    def outcome(model: OwnModel, problem: Any, ended: Any) -> tuple[Array, Array]:
+        if model.has_event:
+            time = ended.crossing_time if problem is None else ended.time
+            result = jnp.where(ended.status == CROSSED, time, jnp.inf)
+        else:
+            failed = (ended.status == FAILED) | (ended.status == UNRESOLVED)
+            result = jnp.where(failed, jnp.inf, model.components_of(ended.state[:, 0])[0])
+        return model.ended(ended, TOLERANCE)[0], result[0]
+
+    def frame(model: OwnModel, time: Any, rows: Array, mode: Any) -> Frame:
+        components = model.components_of(rows[:, 0])
+        point = (components[jnp.array([0, len(names) - 1])] - centre) * scale
+        position = jnp.concatenate([point, jnp.full(1, RADIUS)])
+        upright, normal = jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([0.0, 0.0, 1.0])
+        rate = jnp.asarray(2.0 * np.pi * TURNS / t1) + 0.0 * point[0]
+        return Frame(normal, ((position, upright),), ((position, None),), (), tuple(components), rate)
+
+    live = live_run(
+        model,
+        model.without_event(),
+        sliders,
+        t1,
+        outcome,
+        frame,
+        title=type(model.parameters.tree["system"]).__name__,
+        answer=("time of the event", "s") if model.has_event else (f"{names[0]} at the end", ""),
+        summaries=tuple(Summary(name, "", k) for k, name in enumerate(names[:2])),
+    )
+    return live, stage

@@ -1,14 +1,9 @@
 """Pictures, animations and pages of results. The subpackages above compute the results, and use these functions to draw
 them."""
 
-from .arena import arena as arena
+from .animation import Viewable as Viewable
+from .animation import require_others as require_others
 from .fit import draw_fit as draw_fit
-from .meshes import ball as ball
-from .meshes import bar as bar
-from .meshes import box as box
-from .meshes import rod as rod
-from .meshes import striped as striped
-from .meshes import wheel as wheel
 from .page import NO_VIEW as NO_VIEW
 from .page import Page as Page
 from .page import can_view as can_view
@@ -16,9 +11,9 @@ from .page import page as page
 from .page import picture_as_html as picture_as_html
 from .page import table_as_html as table_as_html
 from .plot import draw_portrait as draw_portrait
+from .plot import draw_series as draw_series
 from .plot import draw_table as draw_table
 from .plot import new_figure as new_figure
-from .series import draw_series as draw_series
 from .stage import COLOURS as COLOURS
 from .stage import DARK as DARK
 from .stage import PALE as PALE
@@ -30,8 +25,13 @@ from .stage import Mesh as Mesh
 from .stage import Show as Show
 from .stage import Stage as Stage
 from .stage import Trace as Trace
+from .stage import arena as arena
+from .stage import ball as ball
+from .stage import bar as bar
+from .stage import box as box
 from .stage import css as css
 from .stage import distinguished_by_colour as distinguished_by_colour
+from .stage import rod as rod
+from .stage import striped as striped
 from .stage import turned as turned
-from .viewable import Viewable as Viewable
-from .viewable import require_others as require_others
+from .stage import wheel as wheel

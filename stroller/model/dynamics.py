@@ -35,10 +35,8 @@ from nonholonomic.geometry import (
     sum_vectors,
 )
 
-from .friction import AbstractFriction, Drag, WheelMotion
-from .heading import AbstractHeading
 from .input import Input, Motion
-from .stroller import Stroller
+from .vehicle import AbstractFriction, AbstractHeading, Drag, Stroller, WheelMotion
 
 State = Float[Array, "components ..."]
 

@@ -7,13 +7,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ..model.dynamics import padded
-from .chart import Chart
-from .goal import Limits
 from .obstacles import Obstacles
-from .problem import Problem
+from .problem import Chart, Limits, Problem
 from .search import MOST_NODES, Costs, Ground, Path, Steps, driven, search
-from .spline import ORDER
-from .transcription import Scales, Task
+from .transcription import ORDER, Scales, Task
 
 #: Number of intervals of a plan.
 INTERVALS = 64

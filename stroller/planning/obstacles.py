@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.validation import Bound, Bounded, as_number, require_kind, shown
+from nonholonomic.text import shown
+from nonholonomic.validation import Bound, Bounded, as_number, require_kind
 
-from ..model.stroller import Stroller
+from ..model.vehicle import Stroller
 
 #: The numbers of boxes and of discs are padded to a multiple of this, so that other problems use the same programs.
 PADDING = 8

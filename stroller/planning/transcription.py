@@ -1,4 +1,4 @@
-"""The planning problem as residuals of neighbouring knots, for a Gauss-Newton method with a banded matrix.
+"""The planning problem as residuals of neighbouring knots, and its optimisation.
 
 The unknowns of a knot are the pose (position and heading, in the ground's axes) and a coefficient of the B-splines of
 the steering angle and of the front wheel's speed. An interval between two knots depends on four neighbouring rows of
@@ -7,19 +7,154 @@ each to the next (multiple shooting; Bock and Plitt, IFAC Proceedings 17 (1984) 
 that no motion connects yet.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import cross, scale
+from nonholonomic.geometry import Vector, add, cross, dot, multiply, scale, stacked, subtract, vector_of
 
 from ..model.dynamics import Dynamics, padded
-from .inverse import Rates, actuation, pose_rate
+from ..model.input import Motion
 from .obstacles import Footprint, Obstacles
-from .spline import ORDER, basis, weighted
+
+# Inverse dynamics: the force and the torque that move the stroller with a given speed and steering angle.
+#
+# Position and heading follow from the speed of the front wheel and the steering angle alone, on every ground; force and
+# torque enter the rates of the momentum P and of the fork linearly (`model/dynamics.py`), which determines them.
+
+Pose = Float[Array, "components ..."]
+
+
+class Rates(NamedTuple):
+    """Steering angle phi [rad], its two derivatives, and speed of the front wheel [m/s] and its derivative."""
+
+    steering: Any
+    steering_rate: Any
+    steering_acceleration: Any
+    front_speed: Any
+    front_acceleration: Any
+
+
+class Actuation(NamedTuple):
+    """What a motion needs: force [N], torque [N m], speed of the rear axle [m/s], normal force [N] and, if asked for,
+    the coefficient of friction of each loaded axle."""
+
+    force: Any
+    torque: Any
+    speed: Any
+    normal_force: Any
+    grip: Any
+
+
+def state_of(dynamics: Dynamics, pose: Pose, steering: Any, steering_rate: Any, front_speed: Any) -> Any:
+    """The state (see `model/dynamics.py`) of a stroller without work components; the heading is intrinsic."""
+    axes = dynamics.surface.axes
+    heading = padded(pose[axes:])
+    sine, cosine = jnp.sin(steering), jnp.cos(steering)
+    momentum = front_speed * jnp.sqrt(dynamics.inertia(heading, 1.0, sine, cosine))
+    fork_rate = steering_rate
+    if dynamics.absolute is not None:
+        fork_rate = fork_rate + front_speed * sine / dynamics.body.wheelbase
+    return stacked((*pose, steering, momentum, fork_rate, sine, cosine), pose)
+
+
+def no_input(t: Any, motion: Any) -> tuple[Any, Any]:
+    """An input without force and torque."""
+    return 0.0, 0.0
+
+
+def pose_rate(dynamics: Dynamics, pose: Pose, steering: Any, front_speed: Any) -> Pose:
+    """Rate of the position and the heading."""
+    state = state_of(dynamics, pose, steering, 0.0, front_speed)
+    return dynamics.field(jnp.zeros(()), state, no_input)[: len(pose)]
+
+
+def actuation(dynamics: Dynamics, pose: Pose, rates: Rates, with_grip: bool) -> Actuation:
+    """Force, torque and contact forces of a motion."""
+    components = len(pose)
+    state, body = state_of(dynamics, pose, *rates[:2], rates.front_speed), dynamics.body
+    geometry = dynamics.geometry(state)
+    coasting = dynamics.field(jnp.zeros(()), state, no_input)
+
+    def momenta(pose, steering, steering_rate, front_speed):
+        state = state_of(dynamics, pose, steering, steering_rate, front_speed)
+        return state[components + 1], state[components + 2]
+
+    changes = (coasting[:components], rates.steering_rate, rates.steering_acceleration, rates.front_acceleration)
+    values = (pose, rates.steering, rates.steering_rate, rates.front_speed)
+    _, (momentum_rate, fork_acceleration) = jax.jvp(momenta, values, changes)
+    torque = body.steering_inertia * (fork_acceleration - coasting[components + 2])
+    momentum_change = momentum_rate - coasting[components + 1]
+    if dynamics.absolute is not None:
+        momentum_change = momentum_change + geometry.gauge * geometry.sine / body.wheelbase * torque
+    force = momentum_change / (geometry.gauge * geometry.cosine)
+    grip = jnp.zeros(0)
+    if with_grip:
+        # `side_force` expects the work components.
+        whole = jnp.concatenate([state, jnp.zeros(2 + dynamics.friction.dissipates)])
+        sides = dynamics.side_force(jnp.zeros(()), whole, lambda t, motion: (force, torque))
+        load = (geometry.normal_force, geometry.front_load)
+        rear_load = load[0] if load[1] is None else load[0] - load[1]
+        loads = [rear_load] if load[1] is None else [rear_load, load[1]]
+        grip = jnp.stack([jnp.abs(side) / part for side, part in zip(sides, loads, strict=False)])
+    normal_force = jnp.broadcast_to(multiply(1.0, geometry.normal_force), jnp.shape(rates.steering))
+    return Actuation(force, torque, geometry.motion.speed, normal_force, grip)
+
+
+# Uniform cubic B-splines: a function of time with two continuous derivatives, from a row of coefficients.
+#
+# A spline with n coefficients has n - 3 intervals; between two knots it depends on four coefficients (de Boor, A Practical
+# Guide to Splines (2001), chapter X).
+
+#: Number of coefficients on which an interval depends.
+ORDER = 4
+
+
+def basis(u: Any) -> tuple[Any, Any, Any]:
+    """The weights of an interval's four coefficients at a part `u` of it, in [0, 1], and their first and second
+    derivatives: each a list of four."""
+    v = 1.0 - u
+    value = [v**3 / 6.0, (3.0 * u**3 - 6.0 * u**2 + 4.0) / 6.0, (3.0 * v**3 - 6.0 * v**2 + 4.0) / 6.0, u**3 / 6.0]
+    slope = [-(v**2) / 2.0, (3.0 * u**2 - 4.0 * u) / 2.0, -(3.0 * v**2 - 4.0 * v) / 2.0, u**2 / 2.0]
+    bend = [v, 3.0 * u - 2.0, 3.0 * v - 2.0, u]
+    return value, slope, bend
+
+
+def weighted(weights: list[Any], coefficients: Any) -> Any:
+    """The sum of four coefficients, along axis 0, with weights."""
+    return sum(weight * coefficients[k] for k, weight in enumerate(weights))
+
+
+# Every run of a plan traces its input several times; `jit` keeps the trace.
+@partial(jax.jit, static_argnames="derivative", inline=True)
+def evaluate(coefficients: Any, part: Any, derivative: int = 0) -> Any:
+    """The value of a spline, or of its derivative, at parts of its whole length, held constant beyond its ends.
+
+    Derivatives are with respect to the number of intervals passed.
+    """
+    intervals = len(coefficients) - ORDER + 1
+    position = jnp.clip(part, 0.0, 1.0) * intervals
+    first = jnp.clip(jnp.floor(position), 0, intervals - 1).astype(int)
+    return weighted(basis(position - first)[derivative], [coefficients[first + k] for k in range(ORDER)])
+
+
+def interpolate(values: np.ndarray) -> np.ndarray:
+    """Coefficients of the spline through values (knots, ...) at its knots, without curvature at the ends."""
+    count = len(values) + 2
+    # The diagonals of the matrix, from the second above to the second below.
+    diagonals = np.zeros((5, count))
+    diagonals[1:4, :] = np.array([[1.0], [4.0], [1.0]]) / 6.0
+    diagonals[2, 0], diagonals[1, 1], diagonals[0, 2] = 1.0, -2.0, 1.0
+    diagonals[2, -1], diagonals[3, -2], diagonals[4, -3] = 1.0, -2.0, 1.0
+    ends = np.zeros_like(values[:1])
+    return scipy.linalg.solve_banded((2, 2), diagonals, np.concatenate([ends, values, ends]))
+
 
 #: Number of steps of the Runge-Kutta method in an interval; constraints hold at the start of each step, and at the end of the
 #: drive.
@@ -166,3 +301,263 @@ def residuals(unknowns: Any, task: Task, t1: Any) -> Residuals:
         return interval_residuals(window, task, index, intervals, t1 / intervals)
 
     return jax.vmap(of_one)(windows(unknowns), jnp.arange(intervals))
+
+
+# Optimisation of all candidates together: an augmented Lagrangian, minimised by damped Gauss-Newton steps.
+#
+# Method: Nocedal and Wright, Numerical Optimization (2006), chapters 10 and 17. JAX evaluates the residuals and their
+# slopes in lanes; SciPy solves the banded equations of all lanes as one system.
+
+#: Penalties of the constraints, in turn, and the number of Gauss-Newton steps with each.
+PENALTIES = (100.0, 300.0, *(1e3,) * 6)
+STEPS_EACH = 8
+
+#: Violation of the constraints of a solution, and relative change of the objective at which the optimiser stops.
+FEASIBLE, SETTLED = 2e-4, 0.02
+
+#: The damping: least, first and greatest value.
+LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-6, 1.0, 1e6
+
+
+class Candidates(NamedTuple):
+    """Candidates in lanes: unknowns (lanes, rows, unknowns) and durations (lanes,) [s]."""
+
+    unknowns: Any
+    durations: Any
+
+
+class Multipliers(NamedTuple):
+    """Multipliers in units of the penalty, shaped as the constraints."""
+
+    equalities: Any
+    inequalities: Any
+
+
+def _penalised(evaluation: Residuals, multipliers: Multipliers, penalty: Any) -> Any:
+    """The residuals of the augmented Lagrangian, as one list per interval."""
+    root = jnp.sqrt(penalty)
+    shifted = evaluation.inequalities + multipliers.inequalities
+    broken = jnp.where(shifted < 0.0, shifted, 0.0)
+    return jnp.concatenate(
+        [root * (evaluation.equalities + multipliers.equalities), root * broken, evaluation.objective], -1
+    )
+
+
+@eqx.filter_jit
+def _normal_equations(candidates: Candidates, task: Task, multipliers: Multipliers, penalty: Any) -> Any:
+    """Merit (lanes,), gradient (lanes, rows, unknowns), and lower band of the Gauss-Newton matrix of every lane."""
+
+    def of_lane(unknowns, t1, multipliers):
+        rows, width = unknowns.shape
+        intervals = rows - ORDER + 1
+
+        # The poses of the third and the fourth row of a window have no influence.
+        used = np.array([k for k in range(ORDER * width) if k < 2 * width or k % width >= width - 2])
+
+        def of_interval(window, multipliers, index):
+            def terms(numbers):
+                changed = window.ravel().at[used].set(numbers).reshape(window.shape)
+                evaluation = interval_residuals(changed, task, index, intervals, t1 / intervals)
+                value = _penalised(evaluation, multipliers, penalty)
+                return value, value
+
+            slope, value = jax.jacfwd(terms, has_aux=True)(window.ravel()[used])
+            return value @ value, slope.T @ value, slope.T @ slope
+
+        merit, gradient, matrix = jax.vmap(of_interval)(windows(unknowns), multipliers, jnp.arange(intervals))
+        number = np.arange(intervals)[:, None] * width + used
+        total = jnp.zeros(rows * width).at[number].add(gradient)
+        row, column = np.tril_indices(len(used))
+        band = jnp.zeros((ORDER * width, rows * width))
+        band = band.at[(used[row] - used[column])[None], number[:, column]].add(matrix[:, row, column])
+        return merit.sum(), total, band
+
+    return jax.vmap(of_lane)(*candidates, multipliers)
+
+
+@eqx.filter_jit
+def constraints(candidates: Candidates, task: Task) -> Residuals:
+    """The residuals of every lane."""
+    return jax.vmap(lambda unknowns, t1: residuals(unknowns, task, t1))(*candidates)
+
+
+def _step(band: np.ndarray, gradient: np.ndarray, damping: np.ndarray) -> np.ndarray:
+    """Damped Gauss-Newton steps of all lanes, solved as one banded system; none in a lane that is not finite."""
+    lanes, width, count = band.shape
+    usable = np.all(np.isfinite(band), axis=(1, 2), keepdims=True)
+    matrix = np.where(usable, band, 0.0)
+    # Rounding must not make the matrix indefinite where an unknown far from the others has a very steep residual.
+    matrix[:, 0] += damping[:, None] + 1e-12 + 1e-13 * matrix[:, 0].max(axis=1, keepdims=True)
+    joined, slopes = matrix.transpose(1, 0, 2).reshape(width, lanes * count), np.where(usable[..., 0], gradient, 0.0)
+    return -scipy.linalg.solveh_banded(joined, slopes.reshape(-1), lower=True).reshape(lanes, count)
+
+
+def _minimise(
+    candidates: Candidates, task: Task, multipliers: Multipliers, penalty: float, damping: np.ndarray
+) -> tuple[Candidates, np.ndarray]:
+    """Gauss-Newton steps for a given penalty, and the damping after them.
+
+    The damping follows the ratio of the gain to the one that the linear model promised (Nielsen, "Damping parameter in
+    Marquardt's method", Technical University of Denmark, 1999); a step that does not lower the merit is repeated.
+    """
+    # A Python number would be a constant of the program.
+    weight = jnp.asarray(penalty)
+    merit, gradient, band = (np.array(part) for part in _normal_equations(candidates, task, multipliers, weight))
+    unknowns, growth = np.array(candidates.unknowns), np.full(len(merit), 2.0)
+    for _ in range(STEPS_EACH):
+        step = _step(band, gradient, damping)
+        promised = np.sum(step * (damping[:, None] * step - gradient), axis=1)
+        trial = candidates._replace(unknowns=unknowns + step.reshape(unknowns.shape))
+        new = tuple(map(np.asarray, _normal_equations(trial, task, multipliers, weight)))
+        gain = np.where(np.isfinite(new[2]).all((1, 2)), (merit - new[0]) / promised, -1.0).clip(-1.0, 2.0)
+        better = gain > 0.0
+        for old, part in zip((merit, gradient, band, unknowns), (*new, trial.unknowns), strict=True):
+            old[better] = part[better]
+        damping = damping * np.where(better, np.maximum(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), growth)
+        damping = np.clip(damping, LEAST_DAMPING, MOST_DAMPING)
+        growth = np.where(better, 2.0, 2.0 * growth)
+    return candidates._replace(unknowns=unknowns), damping
+
+
+def violation(evaluation: Residuals) -> np.ndarray:
+    """The greatest violation of a constraint in every lane, in the units of the residuals."""
+    equalities, inequalities = np.asarray(evaluation.equalities), np.asarray(evaluation.inequalities)
+    return np.maximum(np.abs(equalities).max((1, 2)), -inequalities.min((1, 2)).clip(max=0.0))
+
+
+def objective(evaluation: Residuals) -> np.ndarray:
+    """The objective of every lane."""
+    return np.sum(np.asarray(evaluation.objective) ** 2, axis=(1, 2))
+
+
+def optimise(candidates: Candidates, task: Task) -> tuple[Candidates, np.ndarray, np.ndarray]:
+    """Minimise the effort of all candidates under the constraints, until that of a feasible one changes by less than
+    2 %, or the penalties are used up.
+
+    **Returns:** the candidates, and the violation and the objective of each.
+    """
+    # Where the weight makes the effort large, the penalties would be too weak beside it.
+    least = float(objective(constraints(candidates, task)).min())
+    task = eqx.tree_at(lambda task: task.scales.force, task, task.scales.force * np.sqrt(max(1.0, least)))
+    evaluation = constraints(candidates, task)
+    multipliers = Multipliers(jnp.zeros_like(evaluation.equalities), jnp.zeros_like(evaluation.inequalities))
+    values = np.full(len(candidates.durations), np.inf)
+    damping = np.full(len(candidates.durations), FIRST_DAMPING)
+    for last, penalty in zip((PENALTIES[0], *PENALTIES), PENALTIES, strict=False):
+        multipliers = Multipliers(*(part * (last / penalty) for part in multipliers))
+        candidates, damping = _minimise(candidates, task, multipliers, penalty, damping)
+        evaluation, before = constraints(candidates, task), values
+        values = objective(evaluation)
+        if np.any((violation(evaluation) < FEASIBLE) & (np.abs(values - before) < SETTLED * values)):
+            break
+        multipliers = Multipliers(
+            multipliers.equalities + evaluation.equalities,
+            jnp.minimum(multipliers.inequalities + evaluation.inequalities, 0.0),
+        )
+    return candidates, violation(evaluation), values
+
+
+# The input of a plan: a force and a torque over time, and feedback that holds the planned speed and steering angle.
+
+#: How fast feedback removes an error of the steering angle and of the speed [1/s].
+STEERING_RATE, SPEED_RATE = 8.0, 4.0
+
+#: Values of force and torque in an interval of the plan, and Runge-Kutta steps between them.
+FINE, FINE_STEPS = 4, 2
+
+
+class Drive(eqx.Module):
+    """An input that follows a planned speed of the front wheel and a planned steering angle.
+
+    Each is a uniform cubic B-spline over `duration` [s]. `force` [N], together with the part of the `weight` [N] (a vector in
+    the ground's axes) that acts against the actual heading, and `torque` [N m] move the planned stroller exactly. Without
+    that part, an error of the heading on a slope would change the speed, and grow. The gains pull speed [N s/m], angle
+    [N m/rad] and rate [N m s/rad] back where rounding or a disturbance changes them, because a fork in reverse is unstable
+    by itself. Nothing corrects the place: see `track`.
+    """
+
+    duration: Float[Array, ""]
+    steering: Float[Array, " coefficients"]
+    front_speed: Float[Array, " coefficients"]
+    force: Float[Array, " fine"]
+    torque: Float[Array, " fine"]
+    weight: Vector
+    speed_gain: Float[Array, ""]
+    angle_gain: Float[Array, ""]
+    rate_gain: Float[Array, ""]
+
+    def reference(self, t: Float[Array, "..."]) -> tuple[Any, Any, Any, Any, Any]:
+        """Planned steering angle [rad], its rate [rad/s], speed of the front wheel [m/s], force [N] without the weight's
+        part, and torque [N m]."""
+        part = jnp.asarray(t) / self.duration
+        per_second = (len(self.steering) - ORDER + 1) / self.duration
+        return (
+            evaluate(self.steering, part),
+            evaluate(self.steering, part, 1) * per_second,
+            evaluate(self.front_speed, part),
+            evaluate(self.force, part),
+            evaluate(self.torque, part),
+        )
+
+    def climbing(self, motion: Motion) -> Any:
+        """The force [N] that holds the stroller against its weight; `None` where the ground is level."""
+        return dot(self.weight, motion.heading)
+
+    def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        angle, rate, speed, force, torque = self.reference(t)
+        force = add(self.climbing(motion), force + self.speed_gain * (speed - motion.front_speed))
+        torque = torque + self.angle_gain * (angle - motion.steering) + self.rate_gain * (rate - motion.steering_rate)
+        return force, torque
+
+
+@eqx.filter_jit
+def _needed(dynamics: Dynamics, pose: Any, steering: Any, front_speed: Any, t1: Any) -> tuple[Any, Any, Any]:
+    """Force, torque and pose of a drive from a pose, `FINE` times in every interval and at the end."""
+    intervals = len(steering) - ORDER + 1
+    duration, width = t1 / intervals, 1.0 / FINE
+
+    def forces(pose, window, part):
+        needed = actuation(dynamics, pose, motion_at(window, part, duration), False)
+        return needed.force, needed.torque, pose
+
+    def over_interval(pose, window):
+        def over_part(pose, k):
+            end = pose
+            for step in range(FINE_STEPS):
+                first = (k + step / FINE_STEPS) * width
+                end = drive_from(dynamics, end, window, first, width / FINE_STEPS, duration)
+            return end, forces(pose, window, k * width)
+
+        return jax.lax.scan(over_part, pose, jnp.arange(FINE))
+
+    rows = (windows(steering[:, None])[..., 0], windows(front_speed[:, None])[..., 0])
+    end, values = jax.lax.scan(over_interval, pose, rows)
+    last = forces(end, (rows[0][-1], rows[1][-1]), 1.0)
+    return tuple(  # pyright: ignore[reportReturnType]
+        jnp.concatenate([value.reshape(-1, *value.shape[2:]), final[None]])
+        for value, final in zip(values, last, strict=True)
+    )
+
+
+def poses_along(dynamics: Dynamics, pose: Any, steering: np.ndarray, front_speed: np.ndarray, t1: float) -> np.ndarray:
+    """The poses at the knots of a drive from a pose, (knots, components)."""
+    return np.asarray(_needed(dynamics, pose, steering, front_speed, jnp.asarray(t1, dtype=float))[2])[::FINE]
+
+
+def drive_along(dynamics: Dynamics, pose: Any, steering: np.ndarray, front_speed: np.ndarray, t1: float) -> Drive:
+    """The input that gives a stroller, from a pose, the steering angle and the speed of two splines."""
+    force, torque, poses = _needed(dynamics, pose, steering, front_speed, jnp.asarray(t1, dtype=float))
+    body = dynamics.body
+    weight = vector_of(scale(body.mass * dynamics.gravity, dynamics.up))
+    force = subtract(force, dot(weight, padded(poses[:, dynamics.surface.axes :].T)))
+    return Drive(
+        duration=jnp.asarray(t1, dtype=float),
+        steering=jnp.asarray(steering),
+        front_speed=jnp.asarray(front_speed),
+        force=jnp.asarray(interpolate(np.asarray(force))),
+        torque=jnp.asarray(interpolate(np.asarray(torque))),
+        weight=weight,
+        speed_gain=SPEED_RATE * body.mass,
+        angle_gain=STEERING_RATE**2 * body.steering_inertia,
+        rate_gain=2.0 * STEERING_RATE * body.steering_inertia,
+    )

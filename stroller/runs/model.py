@@ -9,12 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from nonholonomic.compilation.components import Held
 from nonholonomic.geometry import Plane
 from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import AbstractProblem, ExtendedProblem, Outcome
-from nonholonomic.integration.checks import run_bounds
-from nonholonomic.integration.status import Status
-from nonholonomic.lanes.objects import Held
+from nonholonomic.integration.problem import Status, run_bounds
 from nonholonomic.parameters import description, numbers, numbers_of
 from nonholonomic.runs import (
     UNMEASURED,
@@ -31,16 +30,11 @@ from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.text import name_of
 from nonholonomic.validation import require_all, require_kind, require_scalars
 
-from ..model.friction import Damping, RollingResistance
-from ..model.input import Formula, Input, Steady, as_jumps, at_start, check_input
-from ..model.launch import Launch
-from ..model.per_ride import PerRide
-from ..model.ride import RideProblem, as_module, has_arrays
-from ..model.scene import Scene
-from ..model.stroller import Stroller
-from .quantities import QUANTITIES, TIMED, VECTORS, RideState
-from .simulate import DEFAULT_STEPS, ride
-from .trajectory import Trajectory
+from ..model.input import Formula, Input, PerRide, Steady, as_jumps, at_start, check_input
+from ..model.scene import RideProblem, Scene, as_module, has_arrays
+from ..model.vehicle import Damping, Launch, RollingResistance, Stroller
+from .trajectory import DEFAULT_STEPS, Trajectory, ride
+from .view import QUANTITIES, TIMED, VECTORS, RideState
 
 #: Names of the coordinates of a place in the fixed frame.
 FIXED = (("x", "m"), ("y", "m"), ("z", "m"))

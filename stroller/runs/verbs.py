@@ -1,28 +1,60 @@
-"""The functions of the stroller, on those of `nonholonomic.runs`."""
+"""The functions of the stroller: rides, tables, crossings, fits, plots and pages."""
 
+import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
-from jaxtyping import Array, ArrayLike, Float
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int
 
-from nonholonomic.integration.checks import require_run
-from nonholonomic.integration.settings import DEFAULT_MAX_STEPS
-from nonholonomic.parameters import full_axes
-from nonholonomic.progress import status_line
-from nonholonomic.runs import Options, TableForm, explore_model, table_of
+from nonholonomic.geometry import AbstractQuadric, AbstractSurface
+from nonholonomic.identification import (
+    AbstractRecording,
+    Identification,
+    LogDensity,
+    Quantities,
+    as_quantity,
+    read_columns,
+)
+from nonholonomic.integration import AbstractPassive, ExtendedProblem
+from nonholonomic.integration.problem import DEFAULT_MAX_STEPS, Status, require_run
+from nonholonomic.parameters import full_axes, numbers
+from nonholonomic.runs import (
+    AbstractModel,
+    Options,
+    TableForm,
+    explore_model,
+    fit_runs,
+    live_run,
+    page_of,
+    posterior_of_runs,
+    runs_at_ends,
+    search_options,
+    sliders_of,
+    sources_of,
+    table_of,
+)
+from nonholonomic.runs.trajectory import TOLERANCE
 from nonholonomic.sweeps import Table
-from nonholonomic.validation import require_outside, shown
-from nonholonomic.views import Page
+from nonholonomic.terminal import status_line
+from nonholonomic.text import shown
+from nonholonomic.validation import as_number, as_number_or_none, require_kind, require_outside
+from nonholonomic.views import COLOURS, Page, Stage, arena, css
+from nonholonomic.views.explore import Frame, LiveRun, Summary, quaternion
 
+from ..model.dynamics import State
 from ..model.input import Input, check_input
-from ..model.launch import Launch
-from ..model.scene import Scene
-from .explore import TOLERANCE
+from ..model.scene import RideProblem, Scene
+from ..model.vehicle import USUAL, Launch
 from .model import TAKEN, RideModel
-from .simulate import ride
-from .trajectory import Trajectory
+from .trajectory import Trajectory, ride
+from .view import RADIUS, TRACK, Posture, RideState, normals
+
+# The functions of the stroller, on those of `nonholonomic.runs`.
 
 #: The names in a table of rides. A ride continues if contact is lost, as if the ground could pull.
 FORM = TableForm(
@@ -220,3 +252,370 @@ def check_run(scene: Any, launch: Any, t1: Any, input: Any, tolerance: Any, jump
     require_run(scene, launch, t1, tolerance, (Scene, Launch), lists)
     scene.check(launch)
     check_input(input, scene, launch, jumps)
+
+
+# A page with sliders that simulates a ride in the browser.
+
+#: Number of curves of `view.show` that the page computes.
+CURVES = 4
+
+#: The quantities of a ride that the page draws.
+SHOWN = ("position", "direction", "steering", "speed", "front_speed", "energy", "normal_force", "load", "side_force")
+
+
+@page_of.register(RideModel)
+def page_of_ride(model: RideModel, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
+    """The contents of the page, and the stage."""
+    knobs = sliders_of(model, default_ranges(model.scene, model.launch) if sliders is None else sliders)
+    live = live_run(
+        model,
+        model,
+        knobs,
+        t1,
+        outcome,
+        lambda drawn, time, rows, mode: frame(drawn.scene, drawn.input, time, rows),
+        title=f"Stroller on a {type(model.scene.surface).__name__.lower()}",
+        answer=("distance from the start", "m"),
+        summaries=(Summary("speed", "m/s", 0), Summary("energy", "J", 2)),
+        motion=rolling_ride,
+    )
+    return live, stage(runs_at_ends(model, knobs, t1))
+
+
+def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float]]:
+    """The default sliders: speed, steering angle, heading, and the parameters of friction."""
+    speed, steering, heading = float(launch.speed), abs(float(launch.steering)), float(launch.heading)
+    ranges = {
+        "launch.speed": (min(0.0, 2.0 * speed), max(3.0, 2.0 * speed)),
+        "launch.steering": (-max(0.9, steering), max(0.9, steering)),
+        "launch.heading": (heading - math.pi, heading + math.pi),
+    }
+    friction = numbers("scene.friction", scene.friction).items()
+    damping = {path: float(value) for path, value in friction if value is not None and path.endswith("ing")}
+    return ranges | {path: (0.0, 3.0 * value) for path, value in damping.items() if value > 0.0}
+
+
+class WheelAngles(AbstractPassive):
+    """The rolling angles of the left, the right and the front wheel of a ride."""
+
+    def rates(self, problem: Any, time: Float[Array, "..."], state: State, passive: State) -> State:
+        """Each rear wheel, half a track from the middle, rolls as fast as the ground passes below it."""
+        length = problem.dynamics.body.wheelbase
+        motion = problem.dynamics.geometry(state).motion
+        side_offset = 0.5 * TRACK * length * motion.yaw_rate
+        speeds = jnp.stack([motion.speed - side_offset, motion.speed + side_offset, motion.front_speed])
+        return jnp.concatenate([problem.field(time, state), speeds / (RADIUS * length)])
+
+
+def rolling_ride(model: RideModel) -> ExtendedProblem[RideProblem]:
+    """A ride of one cell with the rolling angles of its wheels."""
+    ride = RideProblem.of(model.scene, model.launch, model.input, 1, False, model.jumps)
+    return ExtendedProblem(ride, WheelAngles(), jnp.zeros((3, 1)), jnp.ones((3, 1)))
+
+
+def outcome(model: RideModel, problem: Any, lane: Any) -> tuple[Int[Array, ""], Float[Array, ""]]:
+    """The `Status` of a ride and the distance of its end from its start [m], infinite if the ride is not completed."""
+    first, last = problem.dynamics.unpack(problem.states)[0], problem.dynamics.unpack(lane.state)[0]
+    squares = [(a - b) ** 2 for a, b in zip(first, last, strict=True) if a is not None and b is not None]
+    status = model.ended(lane._replace(crossing_time=lane.first_crossing), TOLERANCE)[0]
+    status = jnp.where(status == int(Status.EVENT), int(Status.CONTACT_LOST), status)
+    return status, jnp.where(status == int(Status.COMPLETED), jnp.sqrt(sum(squares))[0], jnp.inf)
+
+
+def stage(rides: list[Trajectory]) -> Stage:
+    """The stage of the first ride, on a part of the ground that contains all rides."""
+    (first,), scene = rides[0].stages(), rides[0].spec.scene
+    length = float(scene.body.wheelbase)
+    points = np.concatenate([np.asarray(ride.position) for ride in rides])
+    # The page would not update the curve of the friction that the tyres need, which `frame` does not compute.
+    shows = tuple(show._replace(curves=show.curves[:CURVES]) for show in first.shows)
+    ground = arena(scene.surface, points, first.arena.normal, 3.0 * length, length)
+    return first._replace(shows=shows, arena=ground)
+
+
+def frame(scene: Scene, controls: Input | None, time: Any, rows: Float[Array, "rows 1"]) -> Frame:
+    """The drawn quantities of a stroller at one time, in the order of `view.show`. The rows end with the rolling angles of
+    the wheels."""
+    state = RideState(scene, controls, time, rows[:-3])
+    outputs = {name: getattr(state, name)[0] for name in SHOWN}
+    length, position = scene.body.wheelbase, outputs["position"]
+    normal = normals(jnp, scene.surface, scene.side, position)
+    posture = Posture.of(jnp, length, position, outputs["direction"], normal, outputs["steering"], rows[-3:, 0])
+    rotations = [quaternion(rotation) for rotation in posture.rotations]
+    (rear, front), load, side_force = posture.contacts, outputs["load"], outputs["side_force"]
+    return Frame(
+        normal=normal,
+        bodies=tuple(zip(posture.places, rotations, strict=True)),
+        traces=((rear, None), (front, None)),
+        arrows=(
+            (rear, load[0] * posture.up),
+            (front, load[1] * posture.up),
+            (rear, side_force[0] * posture.left[0]),
+            (front, side_force[1] * posture.left[1]),
+        ),
+        curves=(outputs["speed"], outputs["steering"], outputs["energy"], outputs["normal_force"]),
+        turning_rate=jnp.maximum(jnp.abs(outputs["speed"]), jnp.abs(outputs["front_speed"])) / (RADIUS * length),
+    )
+
+
+# The plot of the main job (needs matplotlib): paths on the ground, speed, energy and side forces.
+
+
+def draw_rides(grounds: dict[str, AbstractSurface], rides: dict[tuple[str, str], Trajectory]) -> Any:
+    """Draw rides, one row of plots per ground.
+
+    **Arguments:**
+
+    - `grounds`: name of a ground -> the ground.
+    - `rides`: (name of a ground, name of a ride) -> its trajectory.
+
+    **Returns:** a matplotlib figure.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(18.0, 4.2 * len(grounds)), layout="constrained")
+    layout = figure.add_gridspec(len(grounds), 4, width_ratios=(1.5, 1.0, 1.0, 1.0))
+    # As on the page, whose curves are those of all grounds.
+    colours = {name: css(COLOURS[number % len(COLOURS)]) for number, name in enumerate(rides)}
+    for row, (name, ground) in enumerate(grounds.items()):
+        on_ground = {ride: run for (place_name, ride), run in rides.items() if place_name == name}
+        space = figure.add_subplot(layout[row, 0], projection="3d")
+        _draw_ground(space, ground, on_ground)
+        panels = [figure.add_subplot(layout[row, column]) for column in (1, 2, 3)]
+        for name_of_ride, run in on_ground.items():
+            colour = colours[name, name_of_ride]
+            space.plot(*np.asarray(run.position).T, color=colour, linewidth=1.4, label=name_of_ride)
+            panels[0].plot(run.t, run.speed, color=colour)
+            panels[1].plot(run.t, run.energy, color=colour)
+            panels[1].plot(run.t, run.energy[0] + run.work, color="black", linewidth=0.8, linestyle=":")
+            panels[2].plot(run.t, run.side_force[:, 0], color=colour)
+            panels[2].plot(run.t, run.side_force[:, 1], color=colour, linestyle="--")
+        space.set_title(name)
+        space.legend(fontsize="small")
+        for panel, label in zip(panels, ("speed [m/s]", "energy [J]", "side force [N]"), strict=True):
+            panel.set_xlabel("time [s]")
+            panel.set_ylabel(label)
+        # The legend beside the path explains the colours; this one explains the line styles, above, where it hides
+        # nothing.
+        panels[1].set_title("dotted: start plus work", fontsize="small")
+        panels[2].set_title("full: rear axle, dashed: front wheel", fontsize="small")
+    return figure
+
+
+def _draw_ground(space: Any, ground: AbstractSurface, rides: dict[str, Trajectory]) -> None:
+    """A wire frame of the ground as far as the rides go."""
+    from matplotlib.ticker import MaxNLocator
+
+    places = np.concatenate([np.asarray(run.place) for run in rides.values()])
+    first, second = (
+        np.linspace(part.min() - 0.3, part.max() + 0.3, 13) if unit == "m" else np.linspace(-np.pi, np.pi, 49)
+        for part, (_, unit) in zip(places.T, ground.coordinates, strict=True)
+    )
+    if isinstance(ground, AbstractQuadric):
+        second = np.linspace(-np.pi / 2, min(places[:, 1].max() + 0.1, np.pi / 2), 13)
+    grid = tuple(np.meshgrid(first, second, indexing="ij"))
+    x, y, z = (np.asarray(part) for part in ground.in_fixed_frame(ground.chart(grid)[0]))
+    space.plot_wireframe(x, y, z, color="0.75", linewidth=0.4)
+    space.set_xlabel("x [m]", labelpad=8)
+    space.set_ylabel("y [m]", labelpad=8)
+    space.set_zlabel("z [m]")
+    # As many ticks along each axis as there is room for.
+    spans = [np.ptp(part) for part in (x, y, z)]
+    for axis, span in zip((space.xaxis, space.yaxis, space.zaxis), spans, strict=True):
+        axis.set_major_locator(MaxNLocator(max(round(4.0 * span / max(spans)), 1)))
+    # A plane has nearly no height to show.
+    if spans[2] < 0.1 * max(spans):
+        space.set_zticks([])
+        space.set_zlabel("")
+    space.set_aspect("equal")
+
+
+# Estimate parameters of a stroller, its ground and its launch from recorded rides, and their posterior.
+
+#: The words for data that can be fitted.
+EXPECTED = "a Recording or a nonholonomic.EventTimes"
+
+
+def identify(
+    scene: Scene,
+    data: Any,
+    free: dict[str, Any],
+    *,
+    starts: int = 16,
+    spread: float = 2.0,
+    seed: int = 0,
+    tolerance: float = 1e-8,
+    max_steps: int = 60,
+    progress: bool = True,
+) -> Identification:
+    """Estimate parameters of a scene and its launch from measurements, with errors and undetermined combinations.
+
+    **Arguments:**
+
+    - `scene`: a `Scene`, with the values of the parameters that are not free.
+    - `data`: a `Recording`, or a list of several, which are fitted together; `nonholonomic.Recording` and `EventTimes`, too.
+    - `free`: full name of a parameter -> a `Free` or only the start value: `"scene.friction.rolling"`, or `"rolling"`
+      if no other name ends so; `"launch.place[0]"` and `"launch.place[1]"` are parts of the place. A parameter of the
+      launch, and `"t0"`, the reading of a recording's clock at the launch, are the same in all recordings;
+      `"data[1].launch.heading"` belongs to the second recording, and `"data[*].t0"` is a separate parameter for each.
+      Parameters that cannot be negative are fitted by their logarithms.
+    - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.result`.
+    - `tolerance`: relative tolerance of the integration.
+
+    **Returns:** an `Identification` with its `verdict`; a doubtful fit gives a `FitWarning`.
+
+    **Raises:** `ValueError` for arguments out of range or an unknown name.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    >>> data = stroller.Recording(launch, times=[0.5, 1.0], value=[1.765, 1.557], error=0.01, quantity="speed")
+    >>> fit = stroller.identify(scene, data, {"rolling": 1.5}, progress=False)
+    >>> print(f"{fit.estimates['scene.friction.rolling']:.2f} N s/m, {fit.status}")
+    2.00 N s/m, converged
+
+    ```
+    """
+    search = search_options(starts, spread, seed, max_steps, progress)
+    require_kind(scene, "scene", Scene)
+    return fit_runs(scene, sources_of(data, EXPECTED), free, tolerance, search)
+
+
+def log_density(
+    scene: Scene, data: Any, free: dict[str, Any], priors: dict[str, Any] | None = None, *, tolerance: float = 1e-8
+) -> LogDensity:
+    """The log of the posterior density of the parameters of a scene and its launch, as a function of unbounded coordinates.
+
+    **Arguments:** `scene`, `data`, `free`, `tolerance`: as for `identify`; `priors`: as for `tippe.log_density`.
+
+    **Returns:** a `LogDensity`, for `nonholonomic.identification.sample` and any other sampler.
+
+    **Raises:** `ValueError` for arguments out of range or an unknown name.
+
+    **Example:** rolling friction from two speeds, with a prior of 10 %.
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    >>> data = stroller.Recording(launch, times=[0.5, 1.0], value=[1.765, 1.557], error=0.01, quantity="speed")
+    >>> density = stroller.log_density(scene, data, {"rolling": 2.0}, priors={"rolling": (2.0, 0.2)})
+    >>> density.names, density.start.shape
+    (('scene.friction.rolling',), (1,))
+
+    ```
+    """
+    require_kind(scene, "scene", Scene)
+    return posterior_of_runs(scene, sources_of(data, EXPECTED), free, priors, tolerance)
+
+
+# Recorded rides of strollers, from arrays and from files.
+
+#: The quantities of a ride that can be recorded, with the names of a `Trajectory`'s properties.
+QUANTITIES = Quantities(
+    columns={"position": ("x", "y", "z")},
+    units=dict.fromkeys(("x", "y", "z"), "m")
+    | {"heading": "rad", "steering": "rad", "speed": "m/s", "yaw_rate": "rad/s", "steering_rate": "rad/s"},
+    angles=frozenset({"heading"}),
+    usual=USUAL,
+)
+
+
+class Recording(AbstractRecording):
+    """A recorded ride: quantities sampled at the times of a clock.
+
+    **Arguments:**
+
+    - `launch`: a `Launch`; all its numbers must be scalars.
+    - `times`: (times,) [s], increasing.
+    - `value`: (times,) for a single column, (times, columns) for several; NaN where a sample is missing.
+    - `error`: standard errors: a scalar, (columns,), or of the shape of `value`; with `None`, they are estimated for
+      each column from the residuals.
+    - `quantity`: "position" ("x", "y", "z") [m] of the rear axle in the fixed frame, "heading", "steering" [rad],
+      "speed" [m/s], "yaw_rate" or "steering_rate" [rad/s], all as in `Trajectory`; or a tuple of some of these words. A
+      heading may differ by whole turns.
+    - `input`, `jumps`: the input of the ride and the times at which it jumps, as for `simulate`.
+    - `t0`: the clock's reading [s] at the launch. Before this time, the stroller is at its launch position.
+    - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for data with outliers;
+      `None` for Gaussian errors.
+
+    **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
+
+    **Example:** two positions in the plane, seen from above.
+
+    >>> import stroller
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.0, speed=1.0)
+    >>> track = stroller.Recording(launch, [0.5, 1.0], [[0.5, 0.0], [1.0, 0.02]], 0.01, ("x", "y"))
+    >>> track.labels
+    ('x(0.5 s)', 'y(0.5 s)', 'x(1 s)', 'y(1 s)')
+    """
+
+    launch: Launch
+    quantity: str | tuple[str, ...] = eqx.field(static=True, default="position", converter=as_quantity)
+    input: Input | None = None
+    t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
+    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
+    jumps: Any = None
+    quantities: ClassVar[Quantities] = QUANTITIES
+
+    def model(self, scene: Scene) -> AbstractModel:
+        """The model of the recorded ride, checked."""
+        require_kind(scene, "data: the scene of a stroller.Recording", Scene)
+        scene.check(self.launch)
+        return RideModel.of(scene, self.launch, self.input, None, self.jumps)
+
+    def __check_init__(self):
+        require_kind(self.launch, "launch", Launch, several="identify takes a list of recordings")
+
+
+def read_recording(
+    path: Any,
+    columns: Any = None,
+    fps: float | None = None,
+    *,
+    launch: Launch,
+    error: Any = None,
+    input: Input | None = None,
+    t0: float = 0.0,
+    student: float | None = None,
+    decimal: str = ".",
+    jumps: Any = None,
+) -> Recording:
+    """A recording of a ride from a text file of columns with a header line (CSV).
+
+    **Arguments:**
+
+    - `path`: path of the file. Columns are separated by commas, semicolons, tabs or blanks; empty cells, `nan`, `n/a` and
+      `-` are missing samples; lines that begin with # are ignored.
+    - `columns`: quantity -> (header of its column, unit): `"time"`, or `"frame"`, and any of `"x"`, `"y"`, `"z"`,
+      `"heading"`, `"steering"`, `"speed"`, `"yaw_rate"`, `"steering_rate"`. Units are s, ms, min; rad, deg, rev; rad/s,
+      deg/s, rpm, rev/s; m, cm, mm; m/s, cm/s, mm/s, km/h; or a factor that converts the file's numbers to SI units,
+      such as metres per pixel. If the header has the unit, as "speed [km/h]", the header is enough. By default, the
+      columns whose headers are quantities with units, such as "time [s]" and "speed [km/h]".
+    - `fps`: frames per second, if there is no `"time"`. If there is no `"frame"` either, every line is a frame.
+    - `launch`: a `Launch`, with guesses for unknown numbers; `input`, `jumps`, `t0`, `student`: as for `Recording`.
+    - `error`: quantity -> (standard error or the header of its column, unit); with `None`, errors are estimated from
+      the residuals.
+    - `decimal`: "," if the file has decimal commas.
+
+    **Returns:** a `Recording`.
+
+    **Raises:** `ValueError` that names the column and the problem.
+
+    **Example:** a speedometer, read every second.
+
+    >>> import pathlib, tempfile, stroller
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "ride.csv"
+    >>> _ = path.write_text("speed\\n5.4\\n5.0\\n4.7\\n")
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.0, speed=1.5)
+    >>> ride = stroller.read_recording(path, {"speed": ("speed", "km/h")}, fps=1, launch=launch)
+    >>> print(ride.times, ride.value.round(2))
+    [0. 1. 2.] [1.5  1.39 1.31]
+    """
+    table = read_columns(path, columns, fps, error, QUANTITIES, decimal)
+    return Recording(launch, *table, input=input, t0=t0, student=student, jumps=jumps)

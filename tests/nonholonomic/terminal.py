@@ -4,7 +4,7 @@ import io
 import sys
 import time
 
-from nonholonomic import progress
+from nonholonomic import terminal
 
 
 class Terminal(io.StringIO):
@@ -26,11 +26,11 @@ class Terminal(io.StringIO):
 def watched(monkeypatch):
     """Standard error as a terminal, on which everything happens ten times as fast."""
     # Importing tqdm takes longer than the fast calls here.
-    progress.bar_class()
+    terminal.bar_class()
     stream = Terminal()
     monkeypatch.setattr(sys, "stderr", stream)
-    monkeypatch.setattr(progress, "INTERVAL", 0.05)
-    monkeypatch.setattr(progress, "TICK", 0.01)
+    monkeypatch.setattr(terminal, "INTERVAL", 0.05)
+    monkeypatch.setattr(terminal, "TICK", 0.01)
     return stream
 
 

@@ -16,8 +16,8 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from nonholonomic import enable_compilation_cache
-from nonholonomic.compilation import compilation_cache as cache
-from nonholonomic.compilation.compilation_cache import LOOKED_AT, are_kept, environment_name, kept_files
+from nonholonomic.compilation import cache
+from nonholonomic.compilation.cache import LOOKED_AT, are_kept, environment_name, kept_files
 
 #: Tells the result of a program, how many programs were asked for, and how many of them were found compiled.
 COUNTED = """

@@ -6,13 +6,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from nonholonomic.compilation import compiled_programs
-from nonholonomic.compilation.compiled_programs import (
-    count_mappings,
-    forget_programs_if_many,
-    memory_of_machine,
-    resident_memory,
-)
+from nonholonomic.compilation import cache
+from nonholonomic.compilation.cache import count_mappings, forget_programs_if_many, memory_of_machine, resident_memory
 
 pytestmark = [
     pytest.mark.oldest,
@@ -36,7 +31,7 @@ def program():
 
 def test_what_a_process_uses_is_known():
     assert 1e8 < resident_memory() < memory_of_machine() < 1e15
-    assert 100 < count_mappings() < compiled_programs.most_mappings()
+    assert 100 < count_mappings() < cache.most_mappings()
 
 
 def test_little_memory_forgets_nothing(program, caplog):
@@ -50,10 +45,10 @@ def test_little_memory_forgets_nothing(program, caplog):
 @pytest.mark.parametrize("why", ["memory", "mappings"])
 def test_much_memory_or_many_mappings_forget_all_programs_with_one_line(why, program, caplog, monkeypatch):
     double, traced = program
-    monkeypatch.setattr(compiled_programs, "MANY_MAPPINGS", 10)
-    monkeypatch.setattr(compiled_programs, "LITTLE_MEMORY", 1000)
+    monkeypatch.setattr(cache, "MANY_MAPPINGS", 10)
+    monkeypatch.setattr(cache, "LITTLE_MEMORY", 1000)
     if why == "mappings":
-        monkeypatch.setattr(compiled_programs, "most_mappings", lambda: 10)
+        monkeypatch.setattr(cache, "most_mappings", lambda: 10)
     with caplog.at_level(logging.WARNING):
         assert forget_programs_if_many(1000 if why == "memory" else 10**12)
     assert double(3.0) == 6.0
@@ -65,7 +60,7 @@ def test_much_memory_or_many_mappings_forget_all_programs_with_one_line(why, pro
 
 def test_memory_that_programs_do_not_take_forgets_nothing(program, monkeypatch):
     """Such as a large table: forgetting programs would not help, in any call."""
-    monkeypatch.setattr(compiled_programs, "MANY_MAPPINGS", 10**9)
+    monkeypatch.setattr(cache, "MANY_MAPPINGS", 10**9)
     double, traced = program
     array = jnp.zeros(1_000_000)
     assert not forget_programs_if_many(1000)
@@ -75,7 +70,7 @@ def test_memory_that_programs_do_not_take_forgets_nothing(program, monkeypatch):
 
 
 def test_looking_at_the_memory_compiles_nothing(program, monkeypatch):
-    monkeypatch.setattr(compiled_programs, "MANY_MAPPINGS", 10**9)
+    monkeypatch.setattr(cache, "MANY_MAPPINGS", 10**9)
     compiled = []
     jax.clear_caches()
 
@@ -91,7 +86,7 @@ def test_looking_at_the_memory_compiles_nothing(program, monkeypatch):
 
 
 def test_nothing_is_forgotten_while_a_program_is_traced(monkeypatch):
-    monkeypatch.setattr(compiled_programs, "MANY_MAPPINGS", 10)
+    monkeypatch.setattr(cache, "MANY_MAPPINGS", 10)
     calls = []
 
     @jax.jit

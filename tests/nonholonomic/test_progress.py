@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 from terminal import Terminal, left, watched, words
 
-from nonholonomic import progress
+from nonholonomic import terminal as progress_module
 from nonholonomic.derivatives import growth
 from nonholonomic.integration import Settings
-from nonholonomic.integration.status import REACHED_END
-from nonholonomic.progress import Progress, status_line
+from nonholonomic.integration.problem import REACHED_END
 from nonholonomic.sweeps import Variable, axis, sweep
+from nonholonomic.terminal import Progress, status_line
 
 
 class Pipe(Terminal):
@@ -178,7 +178,7 @@ def test_an_exponent_says_how_many_stretches_are_done(monkeypatch):
         ends = {"state": jnp.ones((5, 3)), "end_time": jnp.ones(3), "steps": jnp.ones(3, int)}
         return types.SimpleNamespace(**ends, status=jnp.full(3, REACHED_END)), None
 
-    monkeypatch.setattr(sys.modules["nonholonomic.derivatives.lyapunov"], "solve_ensemble", ensemble_solve)
+    monkeypatch.setattr(sys.modules["nonholonomic.derivatives.variation"], "solve_ensemble", ensemble_solve)
     growth(Still(), jnp.ones((2, 3)), 1.0, 8, Settings(1e-6))
     assert words(terminal)[0] == "compiling"
     assert any("3/8" in text and "stretch/s" in text for _, text in terminal.lines)
@@ -190,16 +190,16 @@ def test_nobody_watches_a_stream_that_is_closed(closed, monkeypatch):
     stream = io.TextIOWrapper(io.BytesIO())
     stream.close()
     monkeypatch.setattr(sys, "stderr", stream if closed else None)
-    assert not progress.is_watched()
+    assert not progress_module.is_watched()
 
 
 @pytest.mark.parametrize("widgets", [True, False])
 def test_a_notebook_without_widgets_has_a_line_of_text_and_no_warning(widgets, monkeypatch):
-    monkeypatch.setattr(progress, "is_notebook", lambda: True)
-    monkeypatch.setattr(progress, "find_spec", lambda name: ModuleSpec(name, None) if widgets else None)
+    monkeypatch.setattr(progress_module, "is_notebook", lambda: True)
+    monkeypatch.setattr(progress_module, "find_spec", lambda name: ModuleSpec(name, None) if widgets else None)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        bar = progress.bar_class()
+        bar = progress_module.bar_class()
     assert bar.__module__ == ("tqdm.notebook" if widgets else "tqdm.std")
 
 

@@ -11,7 +11,7 @@ import tippe
 from nonholonomic.sweeps import Table, Variable, axis, sweep
 from stroller.runs.verbs import FORM
 from tippe.runs.model import INVERSIONS, REVERSALS
-from tippe.runs.table import TRAJECTORIES as OF_TRAJECTORIES
+from tippe.runs.verbs import TRAJECTORIES as OF_TRAJECTORIES
 
 pytestmark = pytest.mark.oldest
 

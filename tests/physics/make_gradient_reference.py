@@ -19,9 +19,9 @@ import numpy as np
 
 import tippe
 from nonholonomic.integration import Settings, solve_ensemble
-from nonholonomic.integration.status import CROSSED
+from nonholonomic.integration.problem import CROSSED
 from nonholonomic.parameters import with_numbers
-from tippe.modes.inversion_problem import InversionProblem
+from tippe.modes.problems import InversionProblem
 
 HERE = Path(__file__).parent
 ANGLE, TOLERANCE, STEP, RATIO, STEPS = 0.95 * math.pi, 1e-13, 1e-3, 1.6, 16

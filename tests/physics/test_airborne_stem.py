@@ -16,10 +16,9 @@ from hop_reference import CASES as ON_THE_PLANE
 from test_leaning import REFERENCE as FOUND_ON_THE_PLANE
 
 import tippe
-from nonholonomic.hybrid.sampled_rounds import program_groups
-from tippe.modes.airborne import ON_STEM, STRIKING
-from tippe.modes.airborne_stem import FlyBoth
-from tippe.runs.run_kind import flight_modes
+from nonholonomic.hybrid.sampled_adjoint import program_groups
+from tippe.modes.airborne import ON_STEM, STRIKING, FlyBoth
+from tippe.runs.launches import flight_modes
 
 REFERENCE = recorded()
 STEM = tippe.Stem(radius=5e-3, offset=0.016)

@@ -13,7 +13,7 @@ from tops import homogeneous_ball, rutstam_top
 import nonholonomic
 import tippe
 from nonholonomic.integration import Settings, follow
-from tippe.modes.trajectory_problem import trajectory_problem
+from tippe.modes.problems import trajectory_problem
 
 GRAVITY = 9.81
 

@@ -108,7 +108,7 @@ def test_position_is_the_integral_of_velocity(rutstam_scene):
 def test_a_frictionless_run_goes_back_to_its_start():
     """Reversing velocity and angular momentum retraces the way (time reversal)."""
     from nonholonomic.integration import follow
-    from tippe.modes.trajectory_problem import trajectory_problem
+    from tippe.modes.problems import trajectory_problem
 
     scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Frictionless())
     run = trajectory_problem((scene, tippe.Launch(0.3, 60.0, eta=0.5)))

@@ -20,12 +20,10 @@ from test_strong_friction import random_falls
 from tops import homogeneous_ball
 
 import tippe
-from tippe.model.state import angular_velocity
+from tippe.model.launch import angular_velocity
 from tippe.modes.airborne import FLYING
-from tippe.modes.airborne_stick_slip import ROLLING, SLIPPING
-from tippe.modes.coulomb_impact import resolve_coulomb_impact
-from tippe.modes.free_body import balls, energy, gap_rate
-from tippe.modes.impact import approach
+from tippe.modes.impact import approach, balls, energy, gap_rate, resolve_coulomb_impact
+from tippe.modes.sticking import TOUCH_ROLLING, TOUCH_SLIPPING
 
 NUMBERS, MU, THETA, SPIN, T1 = (0.02, 0.02, 0.016, 1.6e-6, 1.9e-6), 0.5, 1.5, 350.0, 0.276
 
@@ -115,13 +113,13 @@ def check_against_reference(run: tippe.HybridTrajectory, arena: float | None) ->
     body = Body(*NUMBERS, float(scene.friction.mu), 9.81, arena, curved)
     restitution = 0.0 if scene.restitution is None else float(scene.restitution)
     expected = follow(body, start(body, THETA, SPIN), T1, restitution)
-    kinds = {"slipping": SLIPPING, "rolling": ROLLING, "flying": FLYING}
+    kinds = {"slipping": TOUCH_SLIPPING, "rolling": TOUCH_ROLLING, "flying": FLYING}
     # The reference follows the beginning of a slip by another method, and has no bounces that are too short to see.
     events = [event for k, event in enumerate(expected[1:]) if event.kind != expected[k].kind]
     mode_segments = run.dense.mode_segments
     numbers = [piece.number for piece in mode_segments]
     assert numbers == [kinds[event.kind] for event in (expected[0], *events)]
-    start_times = {piece.begin if piece.number != SLIPPING else None for piece in mode_segments[1:]} - {None}
+    start_times = {piece.begin if piece.number != TOUCH_SLIPPING else None for piece in mode_segments[1:]} - {None}
     for previous, event in zip(expected, expected[1:], strict=False):
         if event.kind not in ("slipping", previous.kind):
             # A slip is stopped where the way that is left is within the tolerance, earlier by its speed over its deceleration.
@@ -139,8 +137,8 @@ def test_a_top_that_slips_flies_sticks_and_rolls(arena):
     run = tippe.simulate(scene_of(arena), tippe.Launch(THETA, SPIN), T1, tolerance=1e-9, solver=diffrax.Tsit5())
     assert run.status == "completed"
     numbers = check_against_reference(run, arena)
-    assert numbers[:4] == [SLIPPING, FLYING, SLIPPING, FLYING]
-    assert numbers[-2:] == [ROLLING, SLIPPING] if arena else [SLIPPING, ROLLING]
+    assert numbers[:4] == [TOUCH_SLIPPING, FLYING, TOUCH_SLIPPING, FLYING]
+    assert numbers[-2:] == [TOUCH_ROLLING, TOUCH_SLIPPING] if arena else [TOUCH_SLIPPING, TOUCH_ROLLING]
     assert len(run.hops) == 2
     # A stop takes what is left of a slip, within the tolerance.
     assert np.max(np.diff(run.energy)) < 1e-10 * run.energy[0]

@@ -12,10 +12,9 @@ from test_hops import scene_of
 from tops import rutstam_top
 
 import tippe
-from tippe.model.state import angular_velocity
+from tippe.model.launch import angular_velocity
 from tippe.modes.flight import Descent, angle_reached, cone, flown, landing
-from tippe.modes.free_body import FreeBody, balls, energy, gap_rate, jellett
-from tippe.modes.impact import resolve_impact
+from tippe.modes.impact import FreeBody, balls, energy, gap_rate, jellett, resolve_impact
 
 search = eqx.filter_jit(landing)
 

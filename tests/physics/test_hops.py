@@ -17,7 +17,7 @@ from tops import rutstam_top
 
 import tippe
 from tippe import steady
-from tippe.modes.free_body import balls, jellett, standing_on
+from tippe.modes.impact import balls, jellett, standing_on
 
 REFERENCE = list(csv.DictReader(Path(__file__).with_name("hop_reference.csv").read_text().splitlines()))
 

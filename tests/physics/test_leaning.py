@@ -14,10 +14,9 @@ from stems import first_contact
 from test_hops import scene_of
 
 import tippe
-from tippe.model.state import angular_velocity
-from tippe.modes.free_body import FreeBody, as_free_body, balls, gap_rate, jellett
-from tippe.modes.free_body import energy as energy_of
-from tippe.modes.leaning import BOTH, LeaningDynamics, at_rest
+from tippe.model.launch import angular_velocity
+from tippe.modes.impact import BOTH, FreeBody, LeaningDynamics, as_free_body, at_rest, balls, gap_rate, jellett
+from tippe.modes.impact import energy as energy_of
 
 REFERENCE = list(csv.DictReader(Path(__file__).with_name("hop_reference.csv").read_text().splitlines()))
 

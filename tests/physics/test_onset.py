@@ -8,7 +8,7 @@ from close import assert_close
 from tops import rutstam_top
 
 import tippe
-from tippe.model.slip_onset import slip_onset
+from tippe.model.stick_slip import slip_onset
 
 #: A top that rolls in a sphere, its grip just gone: velocity, axis, angular momentum, the vertical in its frame.
 ROLLING = np.array(

@@ -14,9 +14,8 @@ from scipy.special import ellipk
 from tops import homogeneous_ball, random_states, rutstam_top
 
 import tippe
-from tippe.model.contact_load import ContactLoad, Slip
-from tippe.model.friction import AbstractFriction
-from tippe.model.rolling import RollingDynamics
+from tippe.model.dynamics import RollingDynamics
+from tippe.model.friction import AbstractFriction, ContactLoad, Slip
 
 ARENAS = [tippe.Plane(), tippe.Cylinder(0.1), tippe.Sphere(0.1)]
 

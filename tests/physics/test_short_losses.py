@@ -13,7 +13,7 @@ from viscous_top import Body, normal_force, rate, start
 
 import tippe
 from nonholonomic.integration.runge_kutta import weighted_sum
-from tippe.modes.inversion_problem import InversionProblem
+from tippe.modes.problems import InversionProblem
 
 SCENE = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3))
 

@@ -12,8 +12,8 @@ from tops import homogeneous_ball, rutstam_top
 import tippe
 from nonholonomic.hybrid import HybridPath, solve_hybrid_dense
 from nonholonomic.integration import Settings
+from tippe.modes.problems import trajectory_problem
 from tippe.modes.sticking import ROLLING, contact_modes
-from tippe.modes.trajectory_problem import trajectory_problem
 
 
 def cohen_top() -> tippe.Top:

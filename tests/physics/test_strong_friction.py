@@ -12,10 +12,9 @@ from impact_reference import resolve_impact as reference_impact
 from scipy.integrate import solve_ivp
 
 import tippe
-from tippe.model.contact_dynamics import JAMMED
-from tippe.model.state import angular_velocity
-from tippe.modes.free_body import FreeBody, balls, energy, gap_rate, jellett
-from tippe.modes.impact import resolve_impact
+from tippe.model.dynamics import JAMMED
+from tippe.model.launch import angular_velocity
+from tippe.modes.impact import FreeBody, balls, energy, gap_rate, jellett, resolve_impact
 
 # Impacts
 

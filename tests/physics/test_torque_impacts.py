@@ -13,8 +13,8 @@ from test_hops import scene_of
 from test_strong_friction import COUNT, Falls, impact_of, random_falls
 
 import tippe
-from tippe.model.state import angular_velocity
-from tippe.modes.free_body import balls, energy, gap_rate
+from tippe.model.launch import angular_velocity
+from tippe.modes.impact import balls, energy, gap_rate
 
 
 def with_torques(impacts: Falls) -> Falls:

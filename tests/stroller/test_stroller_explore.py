@@ -10,8 +10,8 @@ from browser import complaints, needs_browser, open_browser, wait
 import stroller
 from nonholonomic.runs import TOLERANCE
 from nonholonomic.views.explore import programs
-from stroller.runs.explore import page_of_ride
 from stroller.runs.model import RideModel
+from stroller.runs.verbs import page_of_ride
 
 pytestmark = needs_browser
 

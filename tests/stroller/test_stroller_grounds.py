@@ -25,7 +25,7 @@ from stroller import (
     Torus,
 )
 from stroller.__main__ import GROUNDS, main, parser, scenes
-from stroller.model.ride import RideProblem
+from stroller.model.scene import RideProblem
 from stroller.runs.model import RideModel
 
 BODY = Stroller(1.7, 0.3, 0.4, 0.05)

@@ -15,17 +15,14 @@ from close import assert_close
 from shortest_paths import dubins, reeds_shepp
 
 import stroller
-from stroller.planning import learn
+from stroller.planning import planner as planner_module
 from stroller.planning.candidates import Outline, prices, steps_of
-from stroller.planning.check import inputs_of
-from stroller.planning.drawing import planned_stage
-from stroller.planning.drive import drive_along
-from stroller.planning.inverse import Rates, actuation
 from stroller.planning.obstacles import Obstacles, disc_distance, separation, signed_distance
 from stroller.planning.planner import proposed
-from stroller.planning.problem import checked_problem
+from stroller.planning.problem import checked_problem, inputs_of
+from stroller.planning.result import planned_stage
 from stroller.planning.search import Costs, Ground, Steps, arcs, search
-from stroller.planning.spline import evaluate, interpolate
+from stroller.planning.transcription import Rates, actuation, drive_along, evaluate, interpolate
 
 BODY = stroller.Stroller(mass=5.0, wheelbase=0.25, inertia=0.1, steering_inertia=0.005)
 SCENE = stroller.Scene(BODY, friction=stroller.Damping(2.0, 0.5, 0.1, 0.05))
@@ -383,13 +380,13 @@ def gripping(random, limits):
 @pytest.mark.parametrize("more", [{}, pytest.param({"grip": (0.0, 5.0)}, marks=pytest.mark.slow)])
 def test_a_planner_learns_and_a_plan_begins_with_its_proposal(more, monkeypatch):
     """By a clock of its own, which allows eighty steps; in the slow run, every second problem limits the grip."""
-    monkeypatch.setattr(learn, "time", SimpleNamespace(perf_counter=count().__next__))
-    monkeypatch.setattr(learn, "BATCH", 8)
+    monkeypatch.setattr(planner_module, "time", SimpleNamespace(perf_counter=count().__next__))
+    monkeypatch.setattr(planner_module, "BATCH", 8)
     others = dataclasses.replace(LIMITS, **more)
     planner = stroller.learn_planner(SCENE, lambda random: drawn(random) | gripping(random, others), seconds=100.0)
     untrained = stroller.learn_planner(SCENE, drawn, seconds=0)
     random = np.random.default_rng(5)
-    tasks = [learn.drawn_task(SCENE, drawn, random, k) for k in range(6)]
+    tasks = [planner_module.drawn_task(SCENE, drawn, random, k) for k in range(6)]
 
     def missed(planner):
         ends = [proposed(planner, task, t1)[-1, :4] - np.asarray(task.goal[0]) for task, t1 in tasks]

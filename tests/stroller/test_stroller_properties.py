@@ -16,9 +16,9 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from nonholonomic.integration import Settings, solve_ensemble
-from nonholonomic.integration.status import LEFT_DOMAIN, REACHED_END
+from nonholonomic.integration.problem import LEFT_DOMAIN, REACHED_END
 from stroller import Damping, Launch, Plane, RollingResistance, Scene, Sphere, Spheroid, Stroller
-from stroller.model.ride import RideProblem
+from stroller.model.scene import RideProblem
 
 HORIZON = 0.25
 

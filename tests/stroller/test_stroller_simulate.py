@@ -23,7 +23,7 @@ from stroller import (
     Spheroid,
     Stroller,
 )
-from stroller.model.ride import RideProblem
+from stroller.model.scene import RideProblem
 
 BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05)
 FULL = Scene(BODY, Spheroid(2.0, 1.1), Damping(0.3, 0.2, 0.1, 0.15), side="inside", fork="absolute")

@@ -16,9 +16,8 @@ from tops import rutstam_top
 import nonholonomic
 import tippe
 from nonholonomic.identification import Free, Measurements
-from nonholonomic.identification.levenberg_marquardt import minimise
-from nonholonomic.identification.problem import linearise
-from nonholonomic.identification.result import coordinate_covariance
+from nonholonomic.identification.least_squares import coordinate_covariance, minimise
+from nonholonomic.identification.posterior import linearise
 
 LAUNCH = tippe.Launch(theta=[0.2, 0.2, 0.3, 0.2], spin=[110.0, 140.0, 110.0, 60.0])
 LAUNCHES = list(zip(np.asarray(LAUNCH.theta).tolist(), np.asarray(LAUNCH.spin).tolist(), strict=True))

@@ -14,8 +14,8 @@ from tops import rutstam_top
 
 import tippe
 from nonholonomic.integration import Settings, solve_ensemble
-from nonholonomic.integration.status import CROSSED
-from tippe.modes.inversion_problem import InversionProblem
+from nonholonomic.integration.problem import CROSSED
+from tippe.modes.problems import InversionProblem
 
 
 def time_of(mu=0.3, theta=0.1, spin=155.0, offset=0.006, tolerance=1e-11, crossing="first", t1=20.0):

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 import tippe
 from nonholonomic.integration import Settings, solve_ensemble
-from nonholonomic.integration.status import FAILED, LEFT_DOMAIN, REACHED_END
-from tippe.modes.inversion_problem import InversionProblem
+from nonholonomic.integration.problem import FAILED, LEFT_DOMAIN, REACHED_END
+from tippe.modes.problems import InversionProblem
 
 # Scenes are scaled beyond the size of any top.
 pytestmark = pytest.mark.filterwarnings("ignore:radius = .* is large for a top:UserWarning")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import tippe
-from nonholonomic.integration.zeros import sign_changes
+from nonholonomic.integration.dense import sign_changes
 from tippe import steady
 
 RNG = np.random.default_rng(7)

@@ -14,7 +14,7 @@ from tops import rutstam_top
 import tippe
 from nonholonomic.integration import Settings, follow
 from nonholonomic.integration.dense import PIECE
-from tippe.modes.trajectory_problem import trajectory_problem
+from tippe.modes.problems import trajectory_problem
 
 LAUNCH = tippe.Launch(0.1, 155.0)
 

@@ -250,7 +250,7 @@ def test_it_is_drawn_over_time(table):
     ids=str,
 )
 def test_what_is_refused_before_anything_compiles(scene, change, told, monkeypatch):
-    monkeypatch.setattr("tippe.runs.table.compute_table", lambda *_: pytest.fail("it was run"))
+    monkeypatch.setattr("tippe.runs.verbs.compute_table", lambda *_: pytest.fail("it was run"))
     arguments = {"scene": scene, "theta": 0.1, "spin": 100.0, "times": TIMES} | change
     with pytest.raises(ValueError, match=re.escape(told)):
         tippe.trajectory_table(arguments.pop("scene"), **arguments)

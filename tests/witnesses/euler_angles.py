@@ -17,11 +17,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import rate_in_frame
-from nonholonomic.validation import shown
-from tippe.model.contact_load import Slip
+from nonholonomic.text import shown
+from tippe.model.body import Top
+from tippe.model.friction import Slip
+from tippe.model.launch import AXIS, MOMENTUM, PLACE, VELOCITY
 from tippe.model.scene import Scene
-from tippe.model.state import AXIS, MOMENTUM, PLACE, VELOCITY
-from tippe.model.top import Top
 
 
 def across(scene: Scene[Top]) -> tuple[Float[Array, ""] | float, float]:
@@ -46,7 +46,7 @@ def from_vector_state(scene: Scene[Top], state: Float[Array, " components"]) -> 
     **Arguments:**
 
     - `scene`: a `Scene` on a `Plane` or a `Cylinder`.
-    - `state`: (8 or 10,) as in `tippe/model/state.py`.
+    - `state`: (8 or 10,) as in `tippe/model/launch.py`.
 
     **Returns:** (eta or x, theta, phi, and the rates of eta or x, y, theta, phi, psi), an array (8,) in rad, m and s; x
     is 0.

@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Cylinder
+from tippe.model.body import Top
 from tippe.model.scene import Scene
-from tippe.model.top import Top
 from tippe.steady import inverted_critical_spin, standing_matrix, upright_critical_spin
 
 #: Curvature ratio at the start of the curve: so close to the plane that the plane's critical spin is the first guess.

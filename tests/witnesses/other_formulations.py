@@ -1,4 +1,4 @@
-"""Further formulations of a constrained mechanical system, beside those of `nonholonomic/formulations/formulation.py`.
+"""Further formulations of a constrained mechanical system, beside those of `nonholonomic/formulations.py`.
 
 - `Multipliers`: Hamilton's equations with Lagrange multipliers, the constrained port-Hamiltonian form;
 - `ConstrainedConnection`: geodesics, with forces, of the constrained Levi-Civita connection;
@@ -25,8 +25,7 @@ from nonholonomic.formulations import (
     lie_brackets,
 )
 from nonholonomic.geometry import solve
-from nonholonomic.validation import as_number, is_traced, require
-from nonholonomic.warning import warn
+from nonholonomic.validation import as_number, is_traced, require, warn
 
 Frame = Callable[[Coordinates], Float[Array, "n n"]]
 

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 from other_formulations import structure_constants
 
 from nonholonomic.formulations import AbstractSystem
+from tippe.model.body import Top
 from tippe.model.scene import Scene
-from tippe.model.top import Top
 
 #: Index of the cyclic angle psi among (eta, y, theta, phi, psi, gap).
 PSI = 4

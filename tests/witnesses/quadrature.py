@@ -20,10 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.integration.zeros import halved
+from nonholonomic.integration.dense import halved
+from tippe.model.body import Top
+from tippe.model.launch import AXIS, MOMENTUM, VELOCITY
 from tippe.model.scene import Scene
-from tippe.model.state import AXIS, MOMENTUM, VELOCITY
-from tippe.model.top import Top
 
 #: Gauss points for the divided difference along each direction, and cosines for the time as a function of chi.
 POINTS, COSINES = 24, 96

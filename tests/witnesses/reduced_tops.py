@@ -13,11 +13,11 @@ import jax.numpy as jnp
 from euler_angles import from_vector_state
 from jaxtyping import Array, Float
 
-from nonholonomic.validation import shown
-from tippe.model.contact_load import Slip
+from nonholonomic.text import shown
+from tippe.model.body import Top
+from tippe.model.friction import Slip
+from tippe.model.launch import AXIS, VELOCITY
 from tippe.model.scene import Scene
-from tippe.model.state import AXIS, VELOCITY
-from tippe.model.top import Top
 
 
 def nodal(state: Float[Array, " 8"], vector: Float[Array, " 2"]) -> Float[Array, " 2"]:

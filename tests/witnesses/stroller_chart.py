@@ -1,4 +1,4 @@
-"""The stroller in coordinates, as data for the formulations of `nonholonomic/formulations/formulation.py`.
+"""The stroller in coordinates, as data for the formulations of `nonholonomic/formulations.py`.
 
 The coordinates are q = (x, y, theta, phi) on a plane and (eta, mu, psi, phi), reduced latitude first as in the paper,
 on a sphere or spheroid, where psi is the paper's theta if the heading is projected. Unlike the P-form, these equations
@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 from nonholonomic.formulations import AbstractSystem, Coordinates
 from nonholonomic.geometry import AbstractQuadric, Plane, add, inverse, multiply, subtract
 from stroller.model.dynamics import State
-from stroller.model.friction import WheelMotion
 from stroller.model.input import Input, Motion
 from stroller.model.scene import FORKS, Scene
+from stroller.model.vehicle import WheelMotion
 
 
 class Chart(AbstractSystem):

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import tippe
-from nonholonomic.integration.zeros import sign_changes
+from nonholonomic.integration.dense import sign_changes
 from tippe import steady
 
 SCENE = tippe.Scene(tippe.Top(0.02, 0.02, 0.006, 0.94 * 3.2e-6, 3.2e-6), friction=tippe.Viscous(0.3))

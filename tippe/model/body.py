@@ -1,4 +1,4 @@
-"""The interface of bodies of revolution: inertia, and the contact point on the arena.
+"""Bodies of revolution: the eccentric sphere, its mass and inertia when turned from one material, and convex bodies.
 
 A convex body touches the arena at the point that is farthest down along the arena's normal n. The height of the centre
 of mass above the arena is a function H of c = cos(theta) = e.n alone, the support function, and the contact point is at
@@ -11,13 +11,17 @@ c.
 
 import abc
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import Component, Vector
-from nonholonomic.validation import Bound, Bounded
+from nonholonomic.geometry import Component, Vector, as_function
+from nonholonomic.text import shown
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require, warn
 
 
 class ContactGeometry(NamedTuple):
@@ -102,3 +106,517 @@ class AbstractBody(Bounded):
         yield Bound(self.I1, "I1", above=0.0)
         yield Bound(self.I3, "I3", above=0.0)
         yield Bound(self.I3, "I3", at_most=2.0 * self.I1, why="I3 <= 2 I1 for every rigid body")
+
+
+# Mass, centre of mass and moments of inertia of a top turned from one material, in closed form.
+#
+# Every part is a homogeneous solid of revolution about the z axis with density 1. A slice of radius r and thickness dz at
+# height z contributes pi r^2 to the volume, pi r^2 z to the first moment, pi r^4 / 2 to the moment of inertia about the
+# axis, and pi r^4 / 4 + pi r^2 z^2 to that about a transverse axis through the origin (the moment of inertia of a thin
+# disc and the
+# parallel-axis theorem; Landau and Lifshitz, Mechanics, section 32). The integrals over z are below; volume and first moment of
+# the truncated ball are those of a spherical segment (Harris and Stocker, Handbook of Mathematics and Computational Science,
+# 1998, section 4.8.4).
+
+Number = Float[Array, ""]
+
+
+class Moments(NamedTuple):
+    """Volume [m^3], first moment along the axis [m^4], axial and transverse second moments about the origin [m^5]."""
+
+    volume: Number
+    first: Number
+    axial: Number
+    transverse: Number
+
+    def plus(self, other: "Moments", sign: float = 1.0) -> "Moments":
+        """Both solids together, or, with `sign` -1, this solid without the other."""
+        return Moments(*(a + sign * b for a, b in zip(self, other, strict=True)))
+
+
+def truncated_ball(radius: Number, cut: Number) -> Moments:
+    """A ball about the origin without the part above z = `cut`: r^2 = radius^2 - z^2 from -radius to `cut`."""
+
+    def axial(z):
+        return radius**4 * z - 2.0 * radius**2 * z**3 / 3.0 + z**5 / 5.0
+
+    def vertical(z):
+        return radius**2 * z**3 / 3.0 - z**5 / 5.0
+
+    transverse = jnp.pi / 2.0 * (axial(cut) - axial(-radius))
+    return Moments(
+        jnp.pi * (2.0 * radius**3 / 3.0 + radius**2 * cut - cut**3 / 3.0),
+        -jnp.pi / 4.0 * (radius**2 - cut**2) ** 2,
+        transverse,
+        transverse / 2.0 + jnp.pi * (vertical(cut) - vertical(-radius)),
+    )
+
+
+def cylinder(radius: Number, low: Number, high: Number) -> Moments:
+    """A cylinder between two heights."""
+    section = jnp.pi * radius**2
+    transverse = section * (high - low) * radius**2 / 2.0
+    return Moments(
+        section * (high - low),
+        section * (high**2 - low**2) / 2.0,
+        transverse,
+        transverse / 2.0 + section * (high**3 - low**3) / 3.0,
+    )
+
+
+def half_ball(radius: Number, centre: Number) -> Moments:
+    """The upper half of a ball about a point on the axis."""
+    volume, moment = 2.0 * jnp.pi * radius**3 / 3.0, jnp.pi * radius**4 / 4.0
+    second = 2.0 * volume * radius**2 / 5.0
+    return Moments(volume, volume * centre + moment, second, second + 2.0 * moment * centre + volume * centre**2)
+
+
+class Shape(NamedTuple):
+    """The shape of a turned top: lengths [m], with heights above the centre of its sphere along the stem."""
+
+    radius: Number
+    cut: Number
+    stem_radius: Number
+    stem_length: Number
+    hole_radius: Number
+    hole_depth: Number
+
+    @classmethod
+    def checked(cls, lengths: dict[str, Any]) -> "Shape":
+        """A shape with checked numbers.
+
+        **Raises:** `ValueError` for numbers that are impossible for such a top.
+        """
+        for name, length in lengths.items():
+            if name.startswith("hole"):
+                require(length, name, at_least=0.0)
+            else:
+                require(length, name, above=0.0)
+        shape = cls(**{name: as_number(length) for name, length in lengths.items()})
+        radius, cut, stem = shape.radius, shape.cut, shape.stem_radius
+        require(cut, "cut", below=radius, why="the radius of the sphere")
+        rim = jnp.sqrt(radius**2 - cut**2)
+        require(stem, "stem_radius", below=rim, why="the radius of the flat that the cut leaves")
+        require(shape.stem_length, "stem_length", above=stem, why="the stem ends in a half ball")
+        if lengths["hole_radius"] or lengths["hole_depth"]:
+            require(shape.hole_radius, "hole_radius", above=stem, why="the hole is drilled around the stem")
+            require(shape.hole_radius, "hole_radius", below=rim, why="the radius of the flat that the cut leaves")
+            wall = cut + jnp.sqrt(radius**2 - shape.hole_radius**2)
+            require(shape.hole_depth, "hole_depth", above=0.0, below=wall, why="the hole must not pierce the sphere")
+        # On the level plane, sphere and stem touch together where cos(theta) is (stem - radius) / tip; the rim touches
+        # where it is -cut / radius.
+        reason = "else the rim of the cut touches the table before the stem; lengthen the stem, or cut less off"
+        require(shape.tip, "cut + stem_length - stem_radius", above=radius * (radius - stem) / cut, why=reason)
+        return shape
+
+    @property
+    def tip(self) -> Number:
+        """Height of the centre of the stem's end [m]."""
+        return self.cut + self.stem_length - self.stem_radius
+
+    @property
+    def moments(self) -> Moments:
+        """Moments of the whole top with density 1, about the centre of the sphere."""
+        bottom = self.cut - self.hole_depth
+        return (
+            truncated_ball(self.radius, self.cut)
+            .plus(cylinder(self.hole_radius, bottom, self.cut), -1.0)
+            .plus(cylinder(self.stem_radius, bottom, self.tip))
+            .plus(half_ball(self.stem_radius, self.tip))
+        )
+
+
+# The body: an eccentric sphere whose mass is symmetric about the axis through its two centres.
+
+#: Units that are often used for moments of inertia by mistake, in kg m^2.
+INERTIAS = {"kg cm^2": 1e-4, "kg mm^2": 1e-6, "g cm^2": 1e-7, "g mm^2": 1e-9}
+
+#: Least density of the material of a turned top that is not suspicious [kg/m^3].
+LEAST_DENSITY = 50.0
+#: A mean density [kg/m^3] above that of osmium.
+GREATEST_DENSITY = 23_000.0
+#: The radius [m] above which another unit is suspected, and the plausible range of I1 / (m R^2).
+GREATEST_RADIUS = 1.0
+RATIOS = (0.1, 2.0)
+
+
+class Stem(Bounded):
+    """The rounded end of a stem: a second sphere on which a top can touch the plane (`tippe.md`, section 4).
+
+    **Arguments:**
+
+    - `radius`: radius of the sphere [m], positive.
+    - `offset`: distance of its centre from the centre of mass, along e [m], positive.
+
+    **Raises:** `ValueError` for numbers outside these ranges.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> stem = tippe.Stem(radius=0.005, offset=0.016)
+    >>> top = tippe.Top(mass=0.006, radius=0.015, offset=0.003, I1=8e-7, I3=7e-7, stem=stem)
+    >>> top.stem
+    Stem(radius=0.005 m, offset=0.016 m)
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"radius": "m", "offset": "m"}
+
+    radius: Float[Array, "..."] = eqx.field(converter=as_number)
+    offset: Float[Array, "..."] = eqx.field(converter=as_number)
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.radius, "stem radius", above=0.0)
+        yield Bound(self.offset, "stem offset", above=0.0)
+
+
+class Top(AbstractBody):
+    """A tippe top: a sphere with its centre of mass off its centre, symmetric about the axis e, with or without a stem.
+
+    The centre of mass lies at -`offset` e from the sphere's centre, where e is the direction of the stem.
+
+    **Arguments:**
+
+    - `mass`: mass [kg], positive.
+    - `radius`: radius of the sphere [m], positive.
+    - `offset`: distance of the centre of mass from the sphere's centre [m], at least 0 and less than `radius`.
+    - `I1`: transverse moment of inertia about the centre of mass [kg m^2], positive.
+    - `I3`: axial moment of inertia [kg m^2], positive and at most 2 `I1`, as for every rigid body.
+    - `stem`: a `Stem`, or `None`. Its centre must be farther along e than the sphere's centre, and neither sphere may
+      contain the other.
+
+    **Raises:** `ValueError` for numbers outside these ranges.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> top
+    Top(mass=0.02 kg, radius=0.02 m, offset=0.006 m, I1=2.994e-06 kg m², I3=3.2e-06 kg m²)
+    >>> float(top.offset / top.radius)
+    0.3
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"mass": "kg", "radius": "m", "offset": "m", "I1": "kg m2", "I3": "kg m2"}
+
+    mass: Float[Array, "..."] = eqx.field(converter=as_number)
+    radius: Float[Array, "..."] = eqx.field(converter=as_number)
+    offset: Float[Array, "..."] = eqx.field(converter=as_number)
+    I1: Float[Array, "..."] = eqx.field(converter=as_number)
+    I3: Float[Array, "..."] = eqx.field(converter=as_number)
+    stem: Stem | None = None
+
+    @classmethod
+    def turned(
+        cls,
+        radius: Any,
+        density: Any = None,
+        *,
+        mass: Any = None,
+        cut: Any,
+        stem_radius: Any,
+        stem_length: Any,
+        hole_radius: Any = 0.0,
+        hole_depth: Any = 0.0,
+    ) -> "Top":
+        """A top turned from one material: a sphere with its cap cut off, a cylindrical stem, and optionally a hole
+        around the stem.
+
+        Mass, offset, I1, I3 and the stem follow from the shape in closed form, and you can differentiate them. The top
+        touches with its sphere or with the half ball at the stem's end. `tippe.steady.group` returns whether the top
+        turns over.
+
+        **Arguments:** (lengths in metres)
+
+        - `radius`: radius of the sphere.
+        - `density`: density of the material [kg/m^3]: beech 700, acrylic 1180, aluminium 2700; or, instead, `mass`: mass
+          of the whole top [kg].
+        - `cut`: height of the flat above the centre of the sphere, less than `radius`; the sphere is cut off above the
+          flat.
+        - `stem_radius`: radius of the stem, which is a cylinder that ends in a half ball.
+        - `stem_length`: length of the stem above the flat.
+        - `hole_radius`, `hole_depth`: a hole drilled from the flat around the stem; the stem stands on the bottom of
+          the hole.
+
+        **Returns:** a `Top`.
+
+        **Raises:** `ValueError` for a shape that cannot be turned, whose centre of mass lies above the centre of the
+        sphere, or whose rim would touch the table before its stem; and unless there is one of `density` and `mass`.
+
+        The formulas are the integrals over thin discs (Landau and Lifshitz, Mechanics, section 32), in `tippe/model/body.py`.
+
+        **Example:** a beech ball 4 cm across, drilled around a stem 1 cm thick.
+
+        ```
+        >>> import tippe
+        >>> shape = {"cut": 0.015, "stem_radius": 0.005, "stem_length": 0.012, "hole_radius": 0.012, "hole_depth": 0.020}
+        >>> top = tippe.Top.turned(0.020, 700.0, **shape)
+        >>> print(f"{1e3 * top.mass:.1f} g, centre of mass {1e3 * top.offset:.2f} mm below the centre")
+        17.8 g, centre of mass 1.77 mm below the centre
+        >>> tippe.steady.group(top)
+        'II'
+
+        ```
+        """
+        if (density is None) == (mass is None):
+            wrong = "neither" if density is None else "both"
+            raise ValueError(f"Top.turned takes density [kg/m^3] or mass [kg], not {wrong}")
+        require(density if mass is None else mass, "density" if mass is None else "mass", above=0.0)
+        if density is not None and not is_traced(density) and np.any(np.asarray(density) < LEAST_DENSITY):
+            min_density = float(np.min(density))
+            warn(
+                f"density = {min_density:g} kg/m^3 is less than that of balsa wood, 100 kg/m^3: was it in g/cm^3? "
+                f"{min_density:g} g/cm^3 are {1e3 * min_density:g} kg/m^3"
+            )
+        lengths = {"radius": radius, "cut": cut, "stem_radius": stem_radius, "stem_length": stem_length}
+        shape = Shape.checked(lengths | {"hole_radius": hole_radius, "hole_depth": hole_depth})
+        moments = shape.moments
+        offset = -moments.first / moments.volume
+        reason = "the centre of mass lies above the centre of the sphere: shorten the stem, or drill a hole around it"
+        require(offset, "offset", at_least=0.0, why=reason)
+        transverse = moments.transverse - moments.volume * offset**2
+        stem = Stem(shape.stem_radius, shape.tip + offset)
+        density = as_number(density) if mass is None else as_number(mass) / moments.volume
+        return cls(density * moments.volume, shape.radius, offset, density * transverse, density * moments.axial, stem)
+
+    def __check_init__(self):
+        if self.stem is not None and not isinstance(self.stem, Stem):
+            raise ValueError(f"stem = {shown(self.stem)} must be a Stem")
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.mass, "mass", above=0.0)
+        yield Bound(self.radius, "radius", above=0.0)
+        yield Bound(self.offset, "offset", at_least=0.0)
+        yield Bound(self.offset, "offset", below=self.radius, why="the centre of mass lies inside the sphere")
+        yield from self.inertia_bounds()
+        if self.stem is not None:
+            reach = self.offset + jnp.abs(self.radius - self.stem.radius)
+            yield Bound(self.stem.offset, "stem offset", above=reach, why="neither sphere lies within the other")
+
+    @property
+    def meridian(self) -> Round:
+        return Round(self.offset, self.radius, self.mass * self.offset / self.I1)
+
+    @property
+    def size(self) -> Float[Array, "..."]:
+        return self.radius
+
+    @property
+    def stem_angle(self) -> Float[Array, "..."]:
+        """The inclination theta [rad] at which sphere and stem touch a level plane together; the stem alone carries the
+        top at larger angles. NaN without a stem.
+
+        The centre of mass is at the heights R - a cos(theta) and R_s - a_s cos(theta) above the plane when the sphere or
+        the stem touches, so cos(theta) = (R_s - R) / (a_s - a).
+        """
+        if self.stem is None:
+            return jnp.full(jnp.shape(self.radius), jnp.nan)
+        return jnp.arccos((self.stem.radius - self.radius) / (self.stem.offset - self.offset))
+
+    @property
+    def offset_of_path(self) -> Float[Array, "..."]:
+        return self.offset
+
+    def mass_from_frame(self, axis: Vector) -> Vector:
+        return (-self.offset * axis[0], -self.offset * axis[1], -self.offset * axis[2])
+
+    def path_from_frame(self, axis: Vector) -> Vector:
+        # The frame moves with the centre of the sphere, whose path is also reported.
+        return (None, None, None)
+
+    def suspicion(self) -> str | None:
+        numbers = (self.mass, self.radius, self.I1)
+        if any(is_traced(number) or not isinstance(number, jax.Array) for number in numbers):
+            return None
+        mass, radius, I1 = (np.asarray(number, dtype=float) for number in numbers)
+        max_radius = float(np.max(radius))
+        if max_radius > GREATEST_RADIUS:
+            unit = "mm" if max_radius > 10.0 else "cm"
+            return f"radius = {max_radius:g} m is large for a top: was it in {unit}?"
+        ratios = I1 / (mass * radius**2)
+        odd_ratios = np.ravel(ratios[(ratios < RATIOS[0]) | (ratios > RATIOS[1])])
+        if odd_ratios.size:
+            ratio = float(odd_ratios[0])
+            mistakes = {f"I1 in {unit}": factor for unit, factor in INERTIAS.items()} | {"the mass in g": 1e3}
+            suspects = [mistake for mistake, factor in mistakes.items() if RATIOS[0] <= ratio * factor <= RATIOS[1]]
+            question = f"was {suspects[0]}?" if suspects else "are mass, radius and I1 in kg, m and kg m^2?"
+            return f"I1 = {ratio:.3g} m R^2 is out of the range {RATIOS} of bodies like a top: {question}"
+        if np.all(mass < GREATEST_DENSITY * 4.0 / 3.0 * np.pi * radius**3):
+            return None
+        heaviest, smallest = float(np.max(mass)), float(np.min(radius))
+        return (
+            f"mass = {heaviest:g} kg in a sphere of radius {smallest:g} m is denser than any metal: was it in g? "
+            f"{heaviest:g} g are {heaviest / 1e3:g} kg"
+        )
+
+
+# Bodies of revolution other than spheres: the spheroid, and any convex body that a support function describes.
+#
+# Source of the support function: Bonnesen and Fenchel, Theorie der konvexen Koerper (1934), section 15; of the motion on a
+# plane: Moffatt and Shimomura, Nature 416 (2002) 385, and Moffatt, Shimomura and Branicki, Proc. R. Soc. A 460 (2004) 3643.
+
+#: Number of inclinations at which a support function is checked for convexity.
+SAMPLES = 65
+
+
+class SpheroidBody(AbstractBody):
+    """A spheroid: prolate like an egg if `polar` exceeds `equatorial`, otherwise oblate like a pebble. At theta = pi/2
+    the spheroid lies on its equator; at 0 and pi it stands on a pole. The scene must have a level or tilted plane, and
+    a friction law other than `SetValuedCoulomb`.
+
+    **Arguments:**
+
+    - `mass`: mass [kg], positive.
+    - `equatorial`, `polar`: half axes [m], across the axis e and along it, positive.
+    - `I1`, `I3`: moments of inertia about the centre of mass [kg m^2], across the axis and along it, positive, I3 <= 2
+      I1. For a homogeneous spheroid they are m (equatorial^2 + polar^2) / 5 and 2/5 m equatorial^2.
+    - `offset`: distance of the centre of mass from the centre, against e [m], at least 0 and less than `polar`.
+
+    **Raises:** `ValueError` for numbers outside these ranges.
+
+    **Example:** an egg that stands up.
+
+    ```
+    >>> import math, tippe
+    >>> egg = tippe.SpheroidBody(mass=0.05, equatorial=0.02, polar=0.028, I1=1.184e-5, I3=8e-6)
+    >>> egg
+    SpheroidBody(mass=0.05 kg, equatorial=0.02 m, polar=0.028 m, I1=1.184e-05 kg m², I3=8e-06 kg m², offset=0 m)
+    >>> launch = tippe.Launch(theta=math.pi / 2 + 0.05, spin=0.0, angular_velocity=(0.0, 0.0, 200.0))
+    >>> time = tippe.inversion_time(tippe.Scene(egg, friction=tippe.Viscous(0.3)), launch, t1=5.0, tolerance=1e-6)
+    >>> print(f"it stands within 0.05 pi after {time:.1f} s")
+    it stands within 0.05 pi after 2.4 s
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"mass": "kg", "equatorial": "m", "polar": "m", "I1": "kg m2", "I3": "kg m2"}
+    units |= {"offset": "m"}
+
+    mass: Float[Array, "..."] = eqx.field(converter=as_number)
+    equatorial: Float[Array, "..."] = eqx.field(converter=as_number)
+    polar: Float[Array, "..."] = eqx.field(converter=as_number)
+    I1: Float[Array, "..."] = eqx.field(converter=as_number)
+    I3: Float[Array, "..."] = eqx.field(converter=as_number)
+    offset: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.mass, "mass", above=0.0)
+        yield Bound(self.equatorial, "equatorial", above=0.0)
+        yield Bound(self.polar, "polar", above=0.0)
+        yield Bound(self.offset, "offset", at_least=0.0)
+        yield Bound(self.offset, "offset", below=self.polar, why="the centre of mass lies inside the spheroid")
+        yield from self.inertia_bounds()
+
+    @property
+    def meridian(self) -> "SpheroidMeridian":
+        square = self.equatorial * self.equatorial
+        excess = self.polar * self.polar - square
+        return SpheroidMeridian(square, excess, self.offset, self.mass / self.I1)
+
+    @property
+    def size(self) -> Float[Array, "..."]:
+        return jnp.maximum(self.equatorial, self.polar)
+
+
+class SpheroidMeridian(AbstractMeridian):
+    """H = q - a c with q^2 = b^2 + (p^2 - b^2) c^2, b and p the half axes.
+
+    `square`: b^2; `excess`: p^2 - b^2 [m^2]; `offset`: a [m]; `per_inertia`: m / I1 [1/m^2].
+    """
+
+    square: Float[Array, "..."]
+    excess: Float[Array, "..."]
+    offset: Float[Array, "..."]
+    per_inertia: Float[Array, "..."]
+
+    def at(self, cosine: Float[Array, "..."]) -> ContactGeometry:
+        squared = self.square + self.excess * cosine * cosine
+        per_height = 1.0 / jnp.sqrt(squared)
+        offset = self.offset - self.excess * cosine * per_height
+        radius = self.square * per_height
+        growth = -self.excess * radius / squared
+        return ContactGeometry(offset, radius, self.per_inertia * offset, growth)
+
+
+class ConvexBody(AbstractBody):
+    """A convex body of revolution, given by its support function, for the same scenes as a `SpheroidBody`.
+
+    **Arguments:**
+
+    - `mass`: mass [kg], positive.
+    - `support`: function of c = cos(theta), the height [m] of the centre of mass above a plane that the body touches
+      while its axis is inclined by theta: R - a c for a sphere, sqrt(b^2 + (p^2 - b^2) c^2) for a spheroid. Write it
+      with `jax.numpy`, twice differentiable, positive, and convex: both radii of curvature, H - c H' and H - c H' + (1
+      - c^2) H'', must be positive, which is checked at 65 inclinations. If it is an `equinox.Module`, its numbers are
+      parameters of the scene.
+    - `I1`, `I3`: moments of inertia about the centre of mass [kg m^2], across the axis and along it, positive, I3 <= 2 I1.
+
+    **Raises:** `ValueError` for numbers outside these ranges, or an illegal support function.
+
+    **Example:** an egg whose blunt end points down at theta = 0.
+
+    ```
+    >>> import jax.numpy as jnp, tippe
+    >>> def support(c):
+    ...     return jnp.sqrt(4e-4 + 3.84e-4 * c * c) - 1e-3 * c * (1.0 + c * c)
+    >>> egg = tippe.ConvexBody(mass=0.05, support=support, I1=1.2e-5, I3=8e-6)
+    >>> print(f"{egg.meridian.at(0.0).radius:.3f} m")
+    0.020 m
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"mass": "kg", "I1": "kg m2", "I3": "kg m2"}
+
+    mass: Float[Array, "..."] = eqx.field(converter=as_number)
+    support: Any = eqx.field(converter=lambda value: as_function(value, "support", ("c",)))
+    I1: Float[Array, "..."] = eqx.field(converter=as_number)
+    I3: Float[Array, "..."] = eqx.field(converter=as_number)
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.mass, "mass", above=0.0)
+        yield from self.inertia_bounds()
+        height, radius, meridian = (jnp.min(part, axis=0) for part in self._samples())
+        yield Bound(height, "least support", above=0.0, why="the centre of mass lies inside the body")
+        for radius_part in (radius, meridian):
+            yield Bound(radius_part, "least radius of curvature by support", above=0.0, why="the body is convex")
+
+    def _samples(self) -> tuple[Float[Array, "samples ..."], ...]:
+        """Height and the two radii of curvature at the checked inclinations [m]."""
+
+        def sample(cosine: Float[Array, ""]) -> tuple[Float[Array, "..."], ...]:
+            lever = self.meridian.at(cosine)
+            return self.support(cosine), lever.radius, lever.radius - (1.0 - cosine * cosine) * lever.growth
+
+        return jax.vmap(sample)(jnp.cos(jnp.linspace(0.0, jnp.pi, SAMPLES)))
+
+    @property
+    def meridian(self) -> "SupportMeridian":
+        return SupportMeridian(self.support, self.mass / self.I1)
+
+    @property
+    def size(self) -> Float[Array, "..."]:
+        return jnp.max(self._samples()[0], axis=0)
+
+
+class SupportMeridian(AbstractMeridian):
+    """The contact geometry by differentiation of the support function; `per_inertia`: m / I1 [1/m^2]."""
+
+    support: Any
+    per_inertia: Float[Array, "..."]
+
+    def at(self, cosine: Float[Array, "..."]) -> ContactGeometry:
+        cosine = as_number(cosine)
+        unit = jnp.ones_like(cosine)
+
+        def slope(c: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+            height, along = jax.jvp(self.support, (c,), (unit,))
+            return along, height
+
+        rise, bend, height = jax.jvp(slope, (cosine,), (unit,), has_aux=True)
+        return ContactGeometry(-rise, height - cosine * rise, -self.per_inertia * rise, -bend)

@@ -3,7 +3,7 @@
 import abc
 import math
 from collections.abc import Iterator
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,22 +11,46 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from nonholonomic.compilation.components import held, map_methods
 from nonholonomic.compilation.xla_cpu import compiled_setup
-from nonholonomic.geometry import Component, sum_vectors
-from nonholonomic.lanes.objects import held, map_methods
-from nonholonomic.validation import (
-    UNTRACEABLE,
-    Bound,
-    Bounded,
-    as_number,
-    is_traced,
-    largest,
-    one_line,
-    require_kind,
-    shown,
-)
+from nonholonomic.geometry import Component, Vector, add, dot, sum_vectors
+from nonholonomic.text import one_line, shown
+from nonholonomic.validation import UNTRACEABLE, Bound, Bounded, as_number, is_traced, largest, require_kind
 
-from .contact_load import ContactLoad, Slip
+# Argument and result of a friction law: the motion at the contact, and force and torque per unit normal force.
+
+
+class Slip(NamedTuple):
+    """The motion of the body at the contact, in the moving frame (t1, t2, n).
+
+    - `x`, `y`: velocity of the material contact point along the arena [m/s].
+    - `turning`: angular velocity of the body [rad/s]; its component along n, the drilling, is `None` unless the law
+      `uses_spin`.
+    """
+
+    x: Float[Array, "..."]
+    y: Float[Array, "..."]
+    turning: Vector = (None, None, None)
+
+
+class ContactLoad(NamedTuple):
+    """The effect of friction at the contact per unit normal force, in the moving frame.
+
+    - `force`: the tangential force [1].
+    - `torque`: the torque about the contact point [m].
+
+    A component is `None` where it vanishes identically.
+    """
+
+    force: tuple[Component, Component]
+    torque: Vector = (None, None, None)
+
+    def power(self, slip: Slip) -> Component:
+        """Power per unit normal force, f.v_s + tau.w [m/s] (`tippe.md`, section 2)."""
+        return add(dot(self.force, (slip.x, slip.y)), dot(self.torque, slip.turning))
+
+
+# Friction at the contact, per unit normal force. Each law is a class.
 
 #: Addition to the message about an object that is not a friction law.
 A_LAW = " law, such as tippe.Viscous(0.3) or tippe.Coulomb(mu=0.3, slip_speed=0.01)"
@@ -366,9 +390,9 @@ class SetValuedCoulomb(AbstractFriction):
     the arena up to mu N while it sticks (`tippe.md`, section 3).
 
     A run consists of modes. During a slip, the force is mu N. When the slip stops, the top rolls, with the
-    equations of `tippe/model/rolling.py`, if the required force is within the friction cone, and slips again when the
+    equations of `tippe/model/dynamics.py`, if the required force is within the friction cone, and slips again when the
     required force leaves the cone. Rolling conserves the energy. With `contact="hybrid"`, a top without a stem
-    flies when contact is lost, and slips, rolls or rebounds after an impact (`tippe/modes/airborne_stick_slip.py`).
+    flies when contact is lost, and slips, rolls or rebounds after an impact (`tippe/modes/sticking.py`).
 
     **Arguments:**
 

@@ -1,7 +1,7 @@
 """The equations of motion of a body of any shape and inertia on an arena, free of trigonometry and of coordinate
 singularities.
 
-The state is that of a top (`state.py`) with an additional vector: in the arena's frame (t1, t2, n) the velocity (u1,
+The state is that of a top (`launch.py`) with an additional vector: in the arena's frame (t1, t2, n) the velocity (u1,
 u2) of the centre of mass along the arena, the body's z axis e, the angular momentum L about the centre of mass, the
 arena's place, and the body's x axis c. With d = e x c, the components of n in the body's axes are (c.n, d.n, e.n),
 which determine the contact (`rigid_body.py`).
@@ -41,13 +41,10 @@ from nonholonomic.geometry import (
     vector_of,
 )
 
-from .contact_dynamics import AbstractContactDynamics, Motion
-from .contact_load import ContactLoad, Slip
-from .friction import AbstractFriction, NoSlip, length
-from .inertia import SymmetricMatrix
-from .launch import Launch
-from .rigid_body import AbstractRigidBody
-from .state import AXIS, joined, parts
+from .dynamics import AbstractContactDynamics, Motion
+from .friction import AbstractFriction, ContactLoad, NoSlip, Slip, length
+from .launch import AXIS, Launch, joined, parts
+from .rigid_body import AbstractRigidBody, SymmetricMatrix
 
 
 class Attitude(NamedTuple):

@@ -32,18 +32,16 @@ from nonholonomic.geometry import (
 )
 from nonholonomic.geometry.surface import as_surface
 from nonholonomic.parameters import numbers
-from nonholonomic.text import likely_fix, suspected_gravity
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced, largest, require_all, require_kind, shown
+from nonholonomic.text import likely_fix, shown, suspected_gravity
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, largest, require_all, require_kind
 
-from .body import AbstractBody
+from .body import AbstractBody, Top
 from .dynamics import TURNING, Dynamics
 from .friction import A_LAW, AbstractFriction, Frictionless, NoSlip, as_law
-from .launch import Launch, as_launch
+from .launch import Launch, angular_velocity, as_launch, inclination, joined, parts
 from .rigid_body import AbstractRigidBody
 from .rigid_dynamics import AbstractRigidDynamics, rigid_dynamics
-from .state import angular_velocity, inclination, joined, parts
 from .stick_slip import StickSlip
-from .top import Top
 
 #: The body's class: code that needs a sphere takes a `Scene[Top]`.
 Body = TypeVar("Body", bound=AbstractBody | AbstractRigidBody)
@@ -240,7 +238,7 @@ class Scene(Bounded, Generic[Body]):
         return self.frame.at_foot(self.surface.chart(place_named(self.surface, launch.place))[0])
 
     def state(self, launch: Launch) -> Float[Array, "components ..."]:
-        """The state at the start of a run (see `state.py` for its components).
+        """The state at the start of a run (see `launch.py` for its components).
 
         **Arguments:**
 

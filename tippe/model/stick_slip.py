@@ -4,7 +4,7 @@ Within the friction cone, rolling is the only motion near zero slip, and a slip 
 direction of the slip has no limit, and steps shrink with the slip speed. Therefore an impulse stops the slip when the
 remaining sliding distance, v^2 / (2 |v'|), is `LEFT` times the tolerance in units of R. Friction would have given the
 same impulse in the remaining time, so the error of the state is of the order of this distance, and proportional to the
-tolerance. Rolling ends where mu N = |F_t|; there a separate step begins the slip (`slip_onset.py`), with an estimated
+tolerance. Rolling ends where mu N = |F_t|; there a separate step begins the slip, with an estimated
 error within the tolerance (`tests/physics/test_stick_slip.py`).
 """
 
@@ -15,20 +15,287 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from numpy.polynomial import Polynomial, legendre
 
 from nonholonomic.compilation.xla_cpu import greatest
 from nonholonomic.geometry import AbstractFrame
 
-from .contact_dynamics import FITS, NO_LOAD, AbstractDynamics, Motion, carries_no_load
-from .contact_load import Slip
-from .dynamics import Dynamics
-from .friction import AbstractFriction, Frictionless, SetValuedCoulomb, length
+from .body import Top
+from .dynamics import FITS, NO_LOAD, AbstractDynamics, Dynamics, Motion, RollingDynamics, carries_no_load
+from .friction import AbstractFriction, Frictionless, SetValuedCoulomb, Slip, length
 from .rigid_body import AbstractRigidBody
 from .rigid_dynamics import RigidRolling, RigidSlipping
-from .rolling import RollingDynamics
-from .slip_onset import Onset, slip_onset
-from .top import Top
+
+# The onset of a slip: an implicit step from a contact at rest to a slipping contact, of the length that the tolerance
+# allows.
+#
+# Let G be the force that rolling requires beyond the friction cone. The slip velocity v changes as v' = M G, where M is
+# the contact's inverse mass along the arena. Where rolling leaves the cone, G = 0, and so is the slip's acceleration;
+# both grow in proportion to the time t since then. Of all solutions that begin there, only one is smooth: v = c t^2 d +
+# O(t^3), with d against the force of rolling and
+#
+# c = -m' / (2 (d . P_t + mu P_n)),   m = mu N - |F_t| of rolling, P the impulse that gives the contact the velocity d.
+#
+# A deviation of the slip's direction decays as exp(k / t), faster than any power, so an explicit method cannot begin
+# there. A collocation method can: it needs only the state at t = 0, and the polynomial of the smooth solution satisfies
+# the equations at all nodes. This module takes one step of Radau IIA (Hairer and Wanner, Solving ODEs II, section IV.5).
+# It solves the equations by Newton's method in the slip velocity, which alone is stiff, and by iteration in the other
+# components. If the force of rolling is beyond the cone from the start, the slip begins as v = b t d + O(t^2), where d is
+# the direction in which the slip grows against friction, nearly opposite to the force of rolling. The same step applies.
+
+#: Stages of the step. In powers of the step's length, the error of the step is of order `STAGES` + 1, and the estimate
+#: of the error of order `STAGES`.
+STAGES = 6
+
+#: Length of the first trial over tolerance^(1 / STAGES), in units of the shorter of sqrt(R / g) and the time for a
+#: radian. It does not affect the error: a step with too large an estimate is repeated with a shorter length.
+FIRST = 5.0
+
+#: Estimates below this are round-off: where a slip of 1e-7 m/s begins, its direction has only nine correct digits.
+#: Below it, the step's length still follows the tolerance; steps with an estimate of 1e-11 had errors of 1e-13.
+LEAST_ERROR = 1e-10
+
+#: Trials of the length, and iterations for each; if they are not enough, the run fails (none of 256 tops that slip and
+#: stick for 4 s in a sphere).
+TRIALS, ITERATIONS = 10, 10
+
+
+def _radau() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The nodes in (0, 1], the coefficients of the integrals up to `x` (coefficients of x, stage), and the row of the
+    highest Legendre coefficient."""
+    # The roots are real, but since NumPy 2.5 their type is complex.
+    nodes = (np.sort(legendre.legroots([0.0] * (STAGES - 1) + [-1.0, 1.0]).real) + 1.0) / 2.0
+    nodes[-1] = 1.0
+    integrals = []
+    for k in range(STAGES):
+        other_nodes = np.delete(nodes, k)
+        basis = Polynomial.fromroots(other_nodes) / np.prod(nodes[k] - other_nodes)
+        integrals.append(basis.integ().coef)
+    highest = np.linalg.inv(legendre.legvander(2.0 * nodes - 1.0, STAGES - 1))[-1]
+    return nodes, np.stack(integrals, axis=1), highest
+
+
+NODES, INTEGRALS, HIGHEST = _radau()
+WEIGHTS = np.vander(NODES, STAGES + 1, increasing=True) @ INTEGRALS
+
+
+class Onset(eqx.Module):
+    """The beginning of a slip.
+
+    - `start`: the state at the onset, (components, ...); `length`: its duration [s].
+    - `rates`: rates of the state at the step's stages, (components, stages, ...).
+    - `converged`: whether the step reached the tolerance.
+    """
+
+    start: Float[Array, "components ..."]
+    length: Float[Array, "..."]
+    rates: Float[Array, "components stages ..."]
+    converged: Bool[Array, "..."]
+
+    def at(self, fraction: Float[Array, "..."]) -> Float[Array, "components ..."]:
+        """The state after a fraction of the step."""
+        powers = jnp.stack([fraction**k for k in range(STAGES + 1)])
+        return self.start + self.length * jnp.einsum("ps,p...,cs...->c...", INTEGRALS, powers, self.rates)
+
+    def of_components(self, components: slice) -> "Onset":
+        """The same step of some components alone."""
+        return Onset(self.start[components], self.length, self.rates[components], self.converged)
+
+    def falls_to_zero(
+        self, event: Callable[[Float[Array, "components ..."]], Float[Array, "..."]], first: Float[Array, "..."]
+    ) -> Float[Array, "..."]:
+        """The fraction of the step, after `first`, at which a function of the state falls to zero; 1 if it does not fall
+        so far."""
+
+        def halved(_, bracket):
+            low, high = bracket
+            middle = 0.5 * (low + high)
+            is_positive = event(self.at(middle)) > 0.0
+            return jnp.where(is_positive, middle, low), jnp.where(is_positive, high, middle)
+
+        fraction = jax.lax.stop_gradient(jax.lax.fori_loop(0, 52, halved, (first, jnp.ones_like(first)))[1])
+        # Bisection has no derivative, so the implicit function theorem supplies it.
+        missing, rise = jax.jvp(lambda part: event(self.at(part)), (fraction,), (jnp.ones_like(fraction),))
+        is_inside = (fraction < 1.0) & (rise != 0.0)
+        shift = (missing - jax.lax.stop_gradient(missing)) / jax.lax.stop_gradient(jnp.where(is_inside, rise, 1.0))
+        return fraction - jnp.where(is_inside, shift, 0.0)
+
+    @property
+    def end(self) -> Float[Array, "components ..."]:
+        """The state at the end of the step, NaN if the step did not converge."""
+        state = self.start + self.length * jnp.einsum("s,cs...->c...", WEIGHTS[-1], self.rates)
+        return jnp.where(self.converged, state, jnp.nan)
+
+
+def slip_onset(
+    slipping: Dynamics | RigidSlipping,
+    rolling: RollingDynamics | RigidRolling,
+    mu: Float[Array, "..."],
+    field: Callable[[Float[Array, "components ..."]], Float[Array, "components ..."]],
+    state: Float[Array, "components ..."],
+    size: int,
+    scales: Float[Array, "components ..."],
+    max_duration: Float[Array, "..."],
+    tolerance: Float[Array, ""],
+) -> Onset:
+    """Compute the beginning of a slip from a contact at rest.
+
+    **Arguments:**
+
+    - `slipping`, `rolling`: the equations with slip and without; `mu`: coefficient of friction [1].
+    - `field`: rate of the slipping state, including other integrated components.
+    - `state`: a state at rest, (components, ...); the equations use the first `size` components; `scales`: their
+      magnitudes.
+    - `max_duration`: longest duration [s]; `tolerance`: tolerance for the estimated error, relative to the magnitudes.
+
+    **Returns:** an `Onset`.
+    """
+    core_state = state[:size]
+    rolling_rate = rolling.field(core_state)
+    contact = _Contact.of(rolling, mu, core_state, rolling_rate)
+    rolling_rate = jnp.concatenate([rolling_rate, jnp.zeros_like(state[size:])])
+    scales = scales.reshape(scales.shape[:1] + (1,) * (state.ndim - scales.ndim) + scales.shape[1:])
+
+    def iterated(duration, times):
+        """Slip velocities and rates at the stages, in one loop, so that the equations are compiled once."""
+
+        def newton(_, carry):
+            v, states, _, _ = carry
+            slipping_state = rolling.with_slip(states[:size], Slip(v[0], v[1]))
+            rates = field(jnp.concatenate([slipping_state, states[size:]]))
+            states = state[:, None] + duration * jnp.einsum("js,cs...->cj...", WEIGHTS, rates)
+            slip = slipping.motion(states[:size]).slip
+            change = contact.correction(duration, v, jnp.stack([slip.x, slip.y]) - v)
+            return v + change, states, change, rates
+
+        # The force of rolling must have changed accordingly, or Newton's first correction would stop the slip.
+        rolling_states = state[:, None] + times * rolling_rate[:, None]
+        v = contact.first_guess(times)
+        return jax.lax.fori_loop(0, ITERATIONS, newton, (v, rolling_states, v, jnp.zeros_like(rolling_states)))
+
+    def shorten(carry):
+        trial, duration, converged, _ = carry
+        times = duration * NODES.reshape((-1,) + (1,) * (state.ndim - 1))
+        _, states, change, rates = iterated(duration, times)
+        residual = jnp.max(length(*change), axis=0) / contact.speed
+        highest = duration * jnp.abs(jnp.einsum("s,cs...->c...", HIGHEST, rates))
+        # The scales of a launch that is upright up to round-off are nearly zero.
+        sizes = jnp.maximum(scales, jnp.max(jnp.abs(states), axis=1))
+        error = jnp.maximum(jnp.max((highest / sizes)[:size], axis=0), residual)
+        # The contact must persist, or this step would miss a loss of contact.
+        lost = jnp.min(slipping.contact_margin(states[:size]), axis=0) <= 0.0
+        error = jnp.where(jnp.isfinite(error) & ~lost, error, jnp.inf)
+        converged = error <= jnp.maximum(tolerance, LEAST_ERROR)
+        factor = jnp.clip(0.8 * (tolerance / error) ** (1.0 / STAGES), 0.4, 0.8)
+        return trial + 1, jnp.where(converged, duration, factor * duration), converged, rates
+
+    def goes_on(carry):
+        trial, _, converged, _ = carry
+        return (trial < TRIALS) & ~jnp.all(converged)
+
+    duration = jnp.minimum(FIRST * tolerance ** (1.0 / STAGES) * contact.unit, max_duration)
+    rates = jnp.zeros((*state.shape[:1], STAGES, *state.shape[1:]))
+    _, duration, converged, rates = jax.lax.while_loop(
+        goes_on, shorten, (0, duration, jnp.zeros(duration.shape, bool), rates)
+    )
+    return Onset(state, duration, rates, converged)
+
+
+class _Contact(eqx.Module):
+    """The quantities that decide how a contact at rest begins to slip.
+
+    - `direction`: against the force of rolling; `rise`: the slip's acceleration [m/s^2] and half its rate [m/s^3] at
+      the start.
+    - `inverse_mass`: M [1/kg] as (M11, M12, M22); `load_change`: n, the change of N by the force along the arena.
+    - `mu`; `free_load`: N without a force along the arena [N]; `speed`: sqrt(g R) [m/s]; `unit`: unit of time [s].
+    """
+
+    direction: Float[Array, "2 ..."]
+    rise: tuple[Float[Array, "..."], Float[Array, "..."]]
+    inverse_mass: tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]
+    load_change: Float[Array, "2 ..."]
+    mu: Float[Array, "..."]
+    free_load: Float[Array, "..."]
+    speed: Float[Array, "..."]
+    unit: Float[Array, "..."]
+
+    @classmethod
+    def of(
+        cls,
+        rolling: RollingDynamics | RigidRolling,
+        mu: Float[Array, "..."],
+        state: Float[Array, "components ..."],
+        rate: Float[Array, "components ..."],
+    ) -> "_Contact":
+        weight = rolling.mass * rolling.gravity
+        grip, grip_rate = jax.jvp(lambda point: rolling.grip(point, mu), (state,), (rate,))
+        F1, F2, N = rolling.reaction(state)
+        force = length(F1, F2)
+        force = jnp.where(force > 0.0, force, 1.0)
+        d = jnp.stack([-F1 / force, -F2 / force])
+
+        # The impulses that give the contact unit velocities: P_t = M^-1 v and P_n = -n . P_t.
+        (a, b, f), (_, c, h) = rolling.unit_impulse(state, 0), rolling.unit_impulse(state, 1)
+        determinant = a * c - b * b
+        load_change = jnp.stack([b * h - c * f, b * f - a * h]) / determinant
+        yields = d[0] * (a * d[0] + b * d[1] + mu * f) + d[1] * (b * d[0] + c * d[1] + mu * h)
+        rise = (greatest(-grip, 0.0) * weight / yields, greatest(-grip_rate, 0.0) * weight / (2.0 * yields))
+        speed = jnp.sqrt(rolling.gravity * rolling.size)
+        spin = jnp.sqrt(sum(x * x for x in rolling.angular_velocity(state)))
+        unit = 1.0 / jnp.maximum(spin, speed / rolling.size)
+        inverse_mass = (c / determinant, -b / determinant, a / determinant)
+        return cls(d, rise, inverse_mass, load_change, mu, N + load_change[0] * F1 + load_change[1] * F2, speed, unit)
+
+    def first_guess(self, times: Float[Array, "stages ..."]) -> Float[Array, "2 stages ..."]:
+        """The slip velocity in the limit of small times [m/s]."""
+        return self.direction[:, None] * (self.rise[0] + self.rise[1] * times) * times
+
+    def correction(
+        self, duration: Float[Array, "..."], v: Float[Array, "2 stages ..."], missing: Float[Array, "2 stages ..."]
+    ) -> Float[Array, "2 stages ..."]:
+        """Newton's correction of the slip velocities; only the slip's direction makes the equations stiff.
+
+        With F = -mu N d along the arena and N = N0 - n . F, so that N = N0 / (1 - mu n . d), a turn of d by eta changes
+        the acceleration by -eta mu N M (1 - mu d n^T)^-1 d', with d' across d. Beyond the cone, this N is not that of
+        rolling.
+        """
+        size = length(v[0], v[1])
+        size = jnp.where(size > 0.0, size, 1.0)
+        unit = v / size
+        normal = jnp.stack([-unit[1], unit[0]])
+        n, (M11, M12, M22) = self.load_change, self.inverse_mass
+        painleve_factor = 1.0 - self.mu * (n[0] * unit[0] + n[1] * unit[1])
+        share = self.mu * (n[0] * normal[0] + n[1] * normal[1]) / painleve_factor
+        x, y = self.mu * self.free_load / painleve_factor * (normal + share * unit)
+        pull = jnp.stack([M11 * x + M12 * y, M12 * x + M22 * y])
+        # For each pair of stages: normal_j . pull_k, times the weight of stage k in stage j.
+        matrix = duration * jnp.einsum("jk,ij...,ik...->jk...", WEIGHTS, normal, pull)
+        matrix = matrix + jnp.eye(STAGES).reshape((STAGES, STAGES) + (1,) * (size.ndim - 1)) * size
+        turn = _solved(matrix, normal[0] * missing[0] + normal[1] * missing[1])
+        change = missing - duration * jnp.einsum("js,is...->ij...", WEIGHTS, pull * turn)
+        # The force depends only on the slip's direction, and where a slip begins, v is much smaller than the change of
+        # v by a small turn of the force. So the new direction is the turned direction, not the direction of the
+        # corrected v, and v is never reversed.
+        new_direction = unit + turn * normal
+        new_size = greatest(size + change[0] * unit[0] + change[1] * unit[1], 0.2 * size)
+        return new_size / length(new_direction[0], new_direction[1]) * new_direction - v
+
+
+def _solved(matrix: Float[Array, "n n ..."], right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+    """Solution of a few linear equations, lane by lane, by elimination. The matrices here need no pivots."""
+    rows = jnp.arange(len(right)).reshape((-1,) + (1,) * (right.ndim - 1))
+
+    def eliminated(k, system):
+        matrix, right = system
+        row, of_row = matrix[k] / matrix[k, k], right[k] / matrix[k, k]
+        column = jnp.where(rows == k, 0.0, matrix[:, k])
+        matrix = jnp.where(rows[:, None] == k, row, matrix - column[:, None] * row)
+        return matrix, jnp.where(rows == k, of_row, right - column * of_row)
+
+    return jax.lax.fori_loop(0, len(right), eliminated, (matrix, right))[1]
+
 
 #: The remaining sliding distance at which a slip is stopped, over the tolerance and the radius. The error of the state
 #: is at most a tenth of the tolerance. The impulse comes too early by the speed over the deceleration: 8e-8 s at a

@@ -1,5 +1,4 @@
-"""Impact of a sphere of the top on the plane, with the scene's own friction, torque included (Routh's incremental
-method).
+"""Impacts of the top as a free body, with any friction, and the motion that slides on both spheres at once.
 
 During an impact, the configuration is fixed and the contact load acts as in contact, where f and tau are the scene's
 friction force and torque per unit normal force. With the normal impulse p in place of time, d(tangential impulse)/dp =
@@ -17,24 +16,165 @@ holds with a torque, which also only dissipates energy: velocity and angular vel
 and torque by a positive definite matrix.
 """
 
-from typing import NamedTuple
+import dataclasses
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from nonholonomic.compilation.xla_cpu import greatest, least
-from nonholonomic.geometry import Vector, cross, dot, scale, sum_vectors
+from nonholonomic.geometry import Component, Vector, add, cross, dot, multiply, scale, subtract, sum_vectors, vector_of
 from nonholonomic.integration import AbstractProblem, Settings, traced_solve_ensemble
-from nonholonomic.integration.settings import MOST_STEPS
-from nonholonomic.integration.status import LEFT_DOMAIN
+from nonholonomic.integration.problem import LEFT_DOMAIN, MOST_STEPS
 
-from ..model.contact_load import ContactLoad, Slip
-from ..model.friction import AbstractFriction
-from ..model.state import angular_velocity
-from ..model.top import Top
-from .free_body import Ball, FreeBody
+from ..model.body import Round, Top
+from ..model.dynamics import AbstractDynamics, Dynamics
+from ..model.friction import AbstractFriction, ContactLoad, SetValuedCoulomb, Slip, length
+from ..model.launch import angular_velocity, joined, parts
+from ..model.scene import Scene
+from ..model.stick_slip import StickSlip
+
+# The top as a free body, and the spheres with which it can touch the plane.
+#
+# In contact the velocity and the height of the centre of mass follow from the axis; for a free body they are part of the
+# state.
+
+#: Round-off allowed for a sphere that has just left the arena, as a fraction of R. A sphere that returns gets no
+#: allowance, so ten times or a tenth of this value changes no landing.
+ROUNDING = 1e-12
+
+#: A sphere counts as returning if it sinks faster than this fraction of sqrt(g R). Before it reaches this speed, it
+#: sinks by half the square of this fraction, in units of R.
+COMES_BACK = 1e-8
+
+
+class Ball(NamedTuple):
+    """A sphere of the body: the distance of its centre from the centre of mass along e [m], and its radius [m]."""
+
+    offset: Float[Array, "..."]
+    radius: Float[Array, "..."]
+
+
+class FreeBody(NamedTuple):
+    """A top that touches nothing: velocity [m/s] and height [m] of its centre of mass, its axis, and its angular
+    momentum about the centre of mass.
+
+    Vectors are tuples of components along x, y and the plane's normal z.
+    """
+
+    velocity: Vector
+    height: Float[Array, "..."]
+    axis: Vector
+    momentum: Vector
+
+
+def balls(body: Top) -> tuple[Ball, ...]:
+    """The spheres of a top with which it can touch the plane: its own, and that of its stem if it has one."""
+    main = Ball(body.offset, body.radius)
+    return (main,) if body.stem is None else (main, Ball(body.stem.offset, body.stem.radius))
+
+
+def standing_on(dynamics: Dynamics | StickSlip, ball: Ball) -> Dynamics:
+    """The equations of motion of a top that stands on another of its spheres: the same equations with the parameters of
+    this sphere.
+    """
+    assert isinstance(dynamics, Dynamics)
+    coupling = dynamics.mass * ball.offset * dynamics.per_transverse
+    return dataclasses.replace(dynamics, meridian=Round(ball.offset, ball.radius, coupling))
+
+
+def as_free_body(body: Top, ball: Ball, state: Float[Array, "components ..."]) -> FreeBody:
+    """A top that stands on a sphere, as a free body: the sphere's centre is at rest along the normal.
+
+    **Arguments:** `state`: (8, ...), as in `tippe/model/launch.py`.
+    """
+    velocity, axis, momentum, _ = parts(state)
+    height = ball.radius - ball.offset * axis[2]
+    return FreeBody((*velocity, -ball.offset * axis_rate(body, axis, momentum)[2]), height, axis, momentum)
+
+
+def contact_state(free: FreeBody) -> Float[Array, "components ..."]:
+    """The state (8, ...) of a top in contact; the omitted components follow from the contact."""
+    return joined(free.velocity[:2], free.axis, free.momentum)
+
+
+def shown(body: Top, free: FreeBody, quadratures: Float[Array, "7 ..."]) -> Float[Array, "17 ..."]:
+    """The output rows of a body that may fly.
+
+    **Arguments:** `quadratures`: position (x, y) of the centre of mass [m], the vector c of `problems.py`, spin
+    angle [rad], work [J].
+
+    **Returns:** the state as in contact; position (x, y) of the sphere's centre, c, spin angle, work; and the distance
+    of the top's own sphere from the plane [m] with its rate [m/s].
+    """
+    main = balls(body)[0]
+    place = [x + main.offset * e for x, e in zip(quadratures[:2], free.axis[:2], strict=True)]
+    distance = (gap(main, free), gap_rate(body, main, free))
+    rows = (*free.velocity[:2], *free.axis, *free.momentum, *place, *quadratures[2:], *distance)
+    return jnp.stack(jnp.broadcast_arrays(*rows))
+
+
+def axis_rate(body: Top, axis: Vector, momentum: Vector) -> Vector:
+    """Rate of the axis e' = L x e / I1 [1/s]."""
+    return scale(1.0 / body.I1, cross(momentum, axis))
+
+
+def gap(ball: Ball, free: FreeBody) -> Float[Array, "..."]:
+    """Distance [m] of a sphere from the plane."""
+    return free.height + ball.offset * free.axis[2] - ball.radius
+
+
+def gap_rate(body: Top, ball: Ball, free: FreeBody) -> Float[Array, "..."]:
+    """Rate of that distance [m/s]."""
+    return free.velocity[2] + ball.offset * axis_rate(body, free.axis, free.momentum)[2]
+
+
+def still_parting(
+    rate: Float[Array, "..."], gravity: Float[Array, "..."], radius: Float[Array, "..."], rounding: Any = 0.0
+) -> Float[Array, "..."]:
+    """The round-off allowed for the distance of a sphere, as a fraction of R.
+
+    The full allowance holds while the sphere lifts off. There is none when the sphere returns, because it would delay
+    the landing.
+
+    **Arguments:** `rate`: rate of the distance [m/s]; `rounding`: an allowance in addition to `ROUNDING`.
+    """
+    return (ROUNDING + rounding) * jnp.clip(1.0 + rate / (COMES_BACK * jnp.sqrt(gravity * radius)), 0.0, 1.0)
+
+
+def energy(body: Top, gravity: Float[ArrayLike, "..."], free: FreeBody) -> Float[Array, "..."]:
+    """Kinetic energy plus weight times height above the plane [J]."""
+    axial = dot(free.momentum, free.axis)
+    transverse_square = dot(free.momentum, free.momentum) - axial**2
+    rotation = transverse_square / (2.0 * body.I1) + axial**2 / (2.0 * body.I3)
+    return body.mass * (0.5 * dot(free.velocity, free.velocity) + gravity * free.height) + rotation
+
+
+def energy_in(
+    scene: Scene[Top], state: Float[Array, "components ..."], number: Int[Array, "..."]
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """The least and the greatest energy [J] that a state at the end of a mode, or of a flight from there, may have.
+
+    In flight, the state does not contain the speed of the sphere along the normal.
+
+    **Arguments:** `number`: index of the mode in `sliding.py`; where both spheres touch, either determines the height.
+    """
+    main, stem = balls(scene.body)[0], balls(scene.body)[-1]
+    contact_ball = Ball(
+        *(jnp.where(number == 1, of_stem, of_main) for of_stem, of_main in zip(stem, main, strict=True))
+    )
+    free = as_free_body(scene.body, contact_ball, state)
+    total = energy(scene.body, scene.gravity, free)
+    return total - 0.5 * scene.body.mass * free.velocity[2] ** 2, total
+
+
+def jellett(ball: Ball, free: FreeBody) -> Float[Array, "..."]:
+    """Jellett's quantity L.(R n - a e) [kg m^3/s] for one of the spheres: constant while no force acts on the other
+    sphere."""
+    return ball.radius * free.momentum[2] - ball.offset * dot(free.axis, free.momentum)
+
 
 Cells = Float[Array, " cells"]
 
@@ -212,3 +352,336 @@ def apply_impulse(body: Top, contact: Approach, free: FreeBody, impulse: Contact
     if impulse.torque is not None:
         momentum = sum_vectors(momentum, impulse.torque)
     return FreeBody(velocity, free.height, free.axis, momentum)
+
+
+# Impact under set-valued Coulomb friction: the slip may stop, and the contact then sticks or slips again.
+#
+# As above, the normal impulse p replaces time, and the contact's velocity changes by the constant matrix W. While
+# the contact slips, the tangential impulse grows by -mu v / |v|, whose direction has no limit where a slip stops. With
+# the slip distance s as the independent variable, ds = dp / |v|, nothing is singular: v' = |v| W_n - mu W_t v, and a slip
+# that stops decays exponentially in s.
+#
+# After a stop, the tangential impulse per unit of p is the f with |f| <= mu that minimises f.W_tt f / 2 + f.W_tn: v then
+# grows along -f if |f| = mu, and stays zero if |f| < mu. Because W_tt is positive definite, there is one such f, (W_tt +
+# k) f = -W_tn with k >= 0: the solution after the stop is unique and straight, and lasts to the end of the impact. The
+# normal velocity grows during this motion.
+
+#: A slip has stopped when its speed is this fraction of the sphere's speed of arrival. The error of the impulse is at
+#: most this fraction. Integration errors, a tenth of the tolerance, must be smaller.
+STOPS = 1e-11
+
+#: Newton iterations for the force after a stop. They converge from one side, in about six iterations.
+ITERATIONS = 30
+
+
+class Skid(AbstractProblem):
+    """The slipping part of impacts: tangential and normal impulse as the state, the slip distance as the time.
+
+    - `impact`: the impacts, which define the units of the impulses; `pace`: the speed of arrival of the sphere [m/s].
+    """
+
+    impact: Impact
+    mu: Float[Array, "..."]
+    pace: Cells
+
+    def velocity(self, state: Float[Array, "3 cells"]) -> Vector:
+        """Velocity of the contact point [m/s]."""
+        contact, impulse = self.impact.approach, self.impact.impulse(state[2], state[:2])
+        changes = tuple(dot(column, impulse.force) for column in contact.response)
+        return sum_vectors(contact.velocity, changes)
+
+    def start(self) -> tuple[Float[Array, "3 cells"], Float[Array, "3 cells"]]:
+        zeros = jnp.zeros((3, *self.pace.shape))
+        return zeros, jnp.ones_like(zeros)
+
+    def field(self, time: Cells, state: Float[Array, "3 cells"]) -> Float[Array, "3 cells"]:
+        v1, v2, _ = self.velocity(state)
+        return jnp.stack([-self.mu * v1, -self.mu * v2, length(v1, v2)]) / self.pace
+
+    def event_function(self, state: Float[Array, "3 cells"]) -> None:
+        return None
+
+    def domain_margin(self, time: Cells, state: Float[Array, "3 cells"]) -> Cells:
+        return least(self.impact.domain_margin(state[2], state[:2]), self.slip_left(state))
+
+    def slip_left(self, state: Float[Array, "3 cells"]) -> Cells:
+        """Slip speed above the threshold at which a slip has stopped, as a fraction of the speed of arrival."""
+        return length(*self.velocity(state)[:2]) / self.pace - STOPS
+
+
+def resolve_coulomb_impact(
+    body: Top, friction: SetValuedCoulomb, ball: Ball, free: FreeBody, restitution: Cells
+) -> tuple[FreeBody, Bool[Array, " cells"]]:
+    """The body after one of its spheres has struck the plane; if the contact sticks, its slip is zero up to round-off.
+
+    **Arguments, returns:** as for `resolve_impact`; this is its limit for a slip speed of 0.
+    """
+    contact = approach(body, ball, free)
+    impact = Impact(body, friction, contact, ball.radius, (1.0 + restitution) * greatest(-contact.velocity[2], 0.0))
+    pace = greatest(length(*contact.velocity[:2]), impact.speed)
+    skid = Skid(impact, friction.mu, pace)
+    settings = Settings(TOLERANCE, diffrax.Dopri5(), absolute=0.1, max_steps=MOST_STEPS)
+    outcome, _ = traced_solve_ensemble(skid, jnp.asarray(LARGEST), jnp.asarray(pace.shape[0]), settings)
+    stops = skid.slip_left(outcome.state) <= STOPS
+    rates = skid.field(outcome.end_time, outcome.state)
+    # An impact that ends while it slips is corrected by one step of Newton's method, as in `Impact.ended`.
+    left, slope = jax.jvp(lambda point: impact.domain_margin(point[2], point[:2]), (outcome.state,), (rates,))
+    step = -left / jnp.where(slope == 0.0, 1.0, slope)
+    step = jnp.where(jnp.abs(step) < 1e-6, step, 0.0)
+    state = jnp.where(stops, outcome.state, outcome.state + step * rates)
+    impulse = impact.impulse(state[2], state[:2])
+    remaining_impulse = _remaining_impulse(impact, friction.mu, impulse.force)
+    force = vector_of(jnp.where(stops, a + b, a) for a, b in zip(impulse.force, remaining_impulse, strict=True))
+    return apply_impulse(body, contact, free, ContactImpulse(force, None)), outcome.status != LEFT_DOMAIN
+
+
+def _remaining_impulse(impact: Impact, mu: Float[Array, "..."], impulse: Vector) -> Vector:
+    """The impulse [N s] from the stop of the slip to the end of the impact."""
+    contact = impact.approach
+    W = contact.response
+    a, b, c = W[0][0], W[0][1], W[1][1]
+    f1, f2 = sticking_force((a, b, c), (W[0][2], W[1][2]), mu)
+
+    def change(force: Vector) -> Vector:
+        return tuple(dot(column, force) for column in W)
+
+    # Where the contact sticks, the impulse first removes the remaining slip.
+    v1, v2, _ = sum_vectors(contact.velocity, change(impulse))
+    sticks, determinant = f1 * f1 + f2 * f2 < mu * mu, a * c - b * b
+    stopping_impulse = (
+        jnp.where(sticks, (b * v2 - c * v1) / determinant, 0.0),
+        jnp.where(sticks, (b * v1 - a * v2) / determinant, 0.0),
+    )
+    impulse = sum_vectors(impulse, (*stopping_impulse, None))
+    velocity, impulse_direction = sum_vectors(contact.velocity, change(impulse)), (f1, f2, jnp.ones_like(f1))
+    # The impact ends as in `Impact.domain_margin`: the normal velocity is linear in the impulse, and the energy is
+    # quadratic.
+    gains = change(impulse_direction)
+    normal_impulse = greatest((contact.velocity[2] + impact.gained - velocity[2]) / gains[2], 0.0)
+    compressed = greatest(-velocity[2], 0.0) / gains[2]
+    power, stiff = dot(impulse_direction, velocity), dot(impulse_direction, gains)
+    gain = least(dot(impulse, contact.velocity) + 0.5 * dot(impulse, change(impulse)), 0.0)
+    restored = (-power + jnp.sqrt(power * power - 2.0 * gain * stiff)) / stiff
+    return sum_vectors(
+        scale(least(normal_impulse, greatest(compressed, restored)), impulse_direction), (*stopping_impulse, None)
+    )
+
+
+def sticking_force(
+    matrix: tuple[Cells, Cells, Cells], coupling: tuple[Cells, Cells], mu: Float[Array, "..."]
+) -> tuple[Cells, Cells]:
+    """The f with |f| <= mu that minimises f.A f / 2 + f.b, for A = (A11, A12, A22) positive definite.
+
+    (A + k) f = -b, and 1 / |f| grows with k and is concave, so Newton's method finds |f| = mu from k = 0 on.
+    """
+    a, b, c = matrix
+
+    def solved(k: Cells, right: tuple[Cells, Cells]) -> tuple[Cells, Cells]:
+        determinant = (a + k) * (c + k) - b * b
+        x, y = right
+        return ((c + k) * x - b * y) / determinant, ((a + k) * y - b * x) / determinant
+
+    def force(k: Cells) -> tuple[Cells, Cells]:
+        return solved(k, (-coupling[0], -coupling[1]))
+
+    free = length(*force(jnp.zeros_like(a)))
+    is_beyond = (free > mu) & (mu > 0.0)
+    normal_impulse = jnp.where(is_beyond, mu, 1.0)
+
+    def newton(_: int, k: Cells) -> Cells:
+        f1, f2 = force(k)
+        size = jnp.where(is_beyond, length(f1, f2), 1.0)
+        g1, g2 = solved(k, (f1, f2))
+        slope = jnp.where(is_beyond, (f1 * g1 + f2 * g2) / size**3, 1.0)
+        return k + jnp.where(is_beyond, (1.0 / normal_impulse - 1.0 / size) / slope, 0.0)
+
+    f1, f2 = force(jax.lax.fori_loop(0, ITERATIONS, newton, jnp.zeros_like(a)))
+    return jnp.where(mu > 0.0, f1, 0.0), jnp.where(mu > 0.0, f2, 0.0)
+
+
+# Leaning: the top slides on its sphere and on its stem at once.
+#
+# Both spheres touch the plane at one angle theta only, so the axis turns about the normal at some rate W, e' = W n x e,
+# and the centre of mass stays at its height h = R_j - a_j c, c = cos theta. With L = A e + I1 W n and the momenta p = L.n
+# and b = L.e,
+#
+#     A = (b - c p) / (1 - c^2),   I1 W = p - c A,   w = s e + W n,   s = A / I1 + (1 / I3 - 1 / I1) b,
+#
+# and the slip of sphere j is v_j = u + (s R_j + W a_j) n x e. With the friction f_j per unit normal force, each from its
+# own slip, the vertical force on the centre of mass and the torque that raises the axis vanish if
+#
+#     N_0 + N_1 = m g,   N_0 m_0 + N_1 m_1 = -A W (1 - c^2),   m_j = a_j (1 - c^2) + h f_j.e - tau_j.(n x e),
+#
+# with tau_j the torque per unit normal force of a law that has one. Then m u' = N_0 f_0 + N_1 f_1, and with
+# t_j = f_j.(n x e) the momenta change by p' = sum N_j (a_j t_j + tau_j.n) and b' = sum N_j (R_j t_j + tau_j.e).
+#
+# The slips differ only across the direction of leaning. So m_1 - m_0 is (a_1 - a_0) (1 - c^2) without friction and with
+# viscous friction; Coulomb's law can make it vanish if mu h is more than (a_1 - a_0) sin theta. One of the two normal
+# forces vanishes before that.
+
+#: The number of this contact mode, next to those of the spheres, 0 and 1.
+BOTH = 2
+
+#: A contact ends when its normal force is below minus this fraction of the weight. A top that begins to roll on its
+#: sphere presses its stem less and less, but never lifts it; without this margin, errors of a nearly zero force would
+#: determine the step lengths. Ending the contact late changes velocities by the square of this value: ten times or a
+#: tenth of it changes an inversion time by 4e-16.
+HOLDS = 1e-8
+
+#: Where m_1 - m_0 is less than this fraction of its value without friction, rigid-body mechanics does not determine the
+#: motion. Used for a status only.
+INDEFINITE = 1e-6
+
+
+class LeaningMotion(NamedTuple):
+    """The equations of motion evaluated at one state: the rate of the state of `tippe/model/dynamics.py`, and both
+    normal forces [N].
+
+    `friction_power` [W] is that of both contacts, `None` without friction; `definiteness` is m_1 - m_0 as a fraction of
+    its value without friction.
+    """
+
+    rate: tuple[Component, ...]
+    normal_forces: tuple[Float[Array, "..."], Float[Array, "..."]]
+    friction_power: Component
+    spin_momentum: Float[Array, "..."]
+    definiteness: Float[Array, "..."]
+
+
+class LeaningDynamics(AbstractDynamics):
+    """The equations of motion of a top with a stem while both of its spheres touch the plane.
+
+    The state has the layout of `tippe/model/dynamics.py`. Its cos theta is constant to the bit; the part of L along
+    n x e, which would change theta and is round-off, is integrated but not used.
+    """
+
+    body: Top
+    friction: AbstractFriction
+    gravity: Float[Array, "..."]
+
+    @classmethod
+    def of(cls, scene: Scene[Top]) -> "LeaningDynamics":
+        """The equations for the top of a scene."""
+        return cls(scene.body, scene.friction, scene.gravity)
+
+    def motion(self, state: Float[Array, "components ..."]) -> LeaningMotion:
+        """Evaluate the equations of motion.
+
+        **Arguments:**
+
+        - `state`: (8, ...), with the axis at the angle at which both spheres touch.
+
+        **Returns:** a `LeaningMotion`; `rate` is (m/s^2, 1/s, N m).
+        """
+        spheres, m, I1, I3 = balls(self.body), self.body.mass, self.body.I1, self.body.I3
+        u, e, L, _ = parts(state)
+        c, p, b = e[2], L[2], dot(e, L)
+        perpendicular = (-e[1], e[0])
+        sine2 = dot(perpendicular, perpendicular)
+        axial_rate = (b - c * p) / sine2
+        precession = (p - c * axial_rate) / I1
+        rolling = axial_rate / I1 + (1.0 / I3 - 1.0 / I1) * b
+
+        w = (rolling * e[0], rolling * e[1], rolling * c + precession if self.friction.uses_spin else None)
+        velocities = [sum_vectors(u, scale(rolling * R + precession * a, perpendicular)) for a, R in spheres]
+        slips = [Slip(x, y, w) for x, y in velocities]
+        loads = [self.friction.per_normal_force(slip) for slip in slips]
+        height = spheres[0].radius - spheres[0].offset * c
+        m_0, m_1 = (
+            subtract(
+                add(ball.offset * sine2, multiply(height, dot(load.force, e[:2]))), dot(perpendicular, load.torque[:2])
+            )
+            for ball, load in zip(spheres, loads, strict=True)
+        )
+        weight = m * self.gravity
+        N_1 = -(axial_rate * precession * sine2 + weight * m_0) / (m_1 - m_0)
+        normal = (weight - N_1, N_1)
+
+        u_dot = scale(1.0 / m, sum_vectors(*(scale(N, load.force) for N, load in zip(normal, loads, strict=True))))
+        pulls = [dot(perpendicular, load.force) for load in loads]
+        triples = list(zip(spheres, pulls, loads, strict=True))
+        p_dot = dot(normal, tuple(add(multiply(ball.offset, t), load.torque[2]) for ball, t, load in triples))
+        b_dot = dot(normal, tuple(add(multiply(ball.radius, t), dot(load.torque, e)) for ball, t, load in triples))
+        # L turns with the axis, including its part across; so b changes by its own rate alone.
+        growth = multiply(1.0 / sine2, subtract(b_dot, multiply(c, p_dot)))
+        L_dot = sum_vectors(scale(growth, e[:2]), (-precession * L[1], precession * L[0]))
+        rate = (*u_dot, *scale(precession, perpendicular), None, *L_dot, p_dot)
+        power = dot(normal, tuple(load.power(slip) for load, slip in zip(loads, slips, strict=True)))
+        stiff = (m_1 - m_0) / ((spheres[1].offset - spheres[0].offset) * sine2)
+        return LeaningMotion(rate, normal, power, b, stiff)
+
+    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
+        """Both normal forces as fractions of the weight, plus `HOLDS`."""
+        weight = self.body.mass * self.gravity
+        return tuple(force / weight + HOLDS for force in self.motion(state).normal_forces)
+
+    def heavier(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+        """The number of the sphere with the greater normal force: contact remains there when the other force vanishes."""
+        N_0, N_1 = self.motion(state).normal_forces
+        return (N_1 > N_0).astype(int)
+
+    def stopped(self, free: FreeBody) -> tuple[FreeBody, Bool[Array, "..."]]:
+        """The end of rocking: the total effect of all remaining impacts on a top whose spheres are both at the plane.
+
+        The top rocks from sphere to sphere with decreasing amplitude, and infinitely many impacts take a finite time T.
+        In addition to the impulses of leaning for T, sphere j gets the impulse P_j (f_j, 1), and P_j tau_j if the law
+        has a torque. Together, these stop both speeds along the normal, g + G P = 0. During T, both slips change only
+        by the order of the speeds g, so the error is of the order of their square.
+
+        **Returns:** the body after these impulses, before `at_rest`; and whether their friction dissipates energy. One
+        P_j is negative: during T, the load of this sphere is reduced. If the friction of this sphere adds energy now,
+        it dissipates energy after the impact of the other sphere (det G > 0).
+        """
+        spheres, zero = balls(self.body), jnp.zeros_like(free.height)
+        w1, w2, w3 = angular_velocity(self.body, free.axis, free.momentum)
+        forces, torques, gains = [], [], []
+        for ball in spheres:
+            contact = approach(self.body, ball, free)
+            slip = Slip(*contact.velocity[:2], (w1, w2, w3 if self.friction.uses_spin else None))
+            load = self.friction.per_normal_force(slip)
+            forces.append(tuple(zero if part is None else part for part in (*load.force, 1.0 + zero)))
+            torques.append(sum_vectors(cross(contact.arm, forces[-1]), load.torque))
+            gains.append(zero if (power := load.power(slip)) is None else power)
+        speeds = [gap_rate(self.body, ball, free) for ball in spheres]
+        rates = [axis_rate(self.body, free.axis, turn)[2] for turn in torques]
+        (G_00, G_01), (G_10, G_11) = ([1.0 / self.body.mass + ball.offset * rate for rate in rates] for ball in spheres)
+        determinant = G_00 * G_11 - G_01 * G_10
+        per = 1.0 / jnp.where(determinant == 0.0, 1.0, determinant)
+        impulses = (per * (G_01 * speeds[1] - G_11 * speeds[0]), per * (G_10 * speeds[0] - G_00 * speeds[1]))
+        total = sum_vectors(*(scale(P, force) for P, force in zip(impulses, forces, strict=True)))
+        velocity = sum_vectors(free.velocity, scale(1.0 / self.body.mass, total))
+        momentum = sum_vectors(free.momentum, *(scale(P, turn) for P, turn in zip(impulses, torques, strict=True)))
+        return FreeBody(velocity, free.height, free.axis, momentum), dot(impulses, tuple(gains)) <= 0.0
+
+    def settled(self, free: FreeBody) -> tuple[FreeBody, Int[Array, "..."], Bool[Array, "..."]]:
+        """The contacts of a top whose spheres are both at rest at the plane. The normal forces must not be negative,
+        and the force on a sphere that leaves the plane is zero. If m_1 - m_0 is positive, there is a single solution:
+        the top stands on both spheres if this takes two positive forces, otherwise on the sphere with the positive
+        force.
+
+        **Returns:** the body, exactly at rest along the normal (`at_rest`); `BOTH`, or the number of the sphere on
+        which it stands; and whether this is the only solution.
+        """
+        free = at_rest(self.body, free)
+        state = contact_state(free)
+        number = jnp.where(self.contact_margin(state) > 0.0, BOTH, self.heavier(state))
+        return free, number, self.motion(state).definiteness > INDEFINITE
+
+
+def at_rest(body: Top, free: FreeBody) -> FreeBody:
+    """A body whose spheres are both at the plane, with its remaining speeds along the normal removed.
+
+    theta becomes the angle at which both spheres touch. L loses its component along n x e, the only one that changes
+    theta; impulses along the normal at both spheres would have this effect. L.n, L.e, Jellett's quantity of either
+    sphere and the slip do not change; the energy decreases by the energy of the removed motion.
+    """
+    main, stem = balls(body)
+    e, L = free.axis, free.momentum
+    c = jnp.broadcast_to((stem.radius - main.radius) / (stem.offset - main.offset), e[2].shape)
+    square = e[0] ** 2 + e[1] ** 2
+    # The length of e is unchanged.
+    factor = jnp.sqrt((square + e[2] ** 2 - c**2) / square)
+    perpendicular = (-e[1], e[0])
+    L = (*sum_vectors(L[:2], scale(-dot(perpendicular, L[:2]) / square, perpendicular)), L[2])
+    velocity = (free.velocity[0], free.velocity[1], jnp.zeros_like(c))
+    return FreeBody(velocity, main.radius - main.offset * c, (*scale(factor, e[:2]), c), L)

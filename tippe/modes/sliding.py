@@ -2,7 +2,7 @@
 to the end.
 
 A single run whose path is kept has seven passive quadratures after its state: the position (x, y) of the centre of
-mass [m], the vector c of `trajectory_problem.py`, the rotation angle of the top about its axis [rad], and the work of
+mass [m], the vector c of `problems.py`, the rotation angle of the top about its axis [rad], and the work of
 friction and impacts [J].
 """
 
@@ -16,17 +16,19 @@ from jaxtyping import Array, Bool, Float, Int
 from nonholonomic.compilation.xla_cpu import compiled_setup, least
 from nonholonomic.hybrid import AbstractHoppingMode, Transition, TransitionPath
 from nonholonomic.integration import AbstractProblem
-from nonholonomic.integration.status import CROSSED, RUNNING, UNRESOLVED
+from nonholonomic.integration.problem import CROSSED, RUNNING, UNRESOLVED
 
+from ..model.body import Top
 from ..model.dynamics import Dynamics
+from ..model.launch import COS_THETA
 from ..model.scene import Scene
-from ..model.state import COS_THETA
-from ..model.top import Top
-from .bouncing import (
+from .flight import (
     OWN,
     Air,
     Cells,
     clearance,
+    cone,
+    flown,
     height,
     land,
     lost_contact,
@@ -36,12 +38,8 @@ from .bouncing import (
     stem_takes_over,
     take_flight,
 )
-from .flight import cone, flown
-from .flying_mode import AbstractFlyingMode
-from .free_body import Ball, FreeBody, as_free_body, balls, contact_state, shown, standing_on
-from .inversion_problem import InversionProblem, beyond_on_stem
-from .leaning import LeaningDynamics, at_rest
-from .trajectory_problem import Quadratures
+from .impact import Ball, FreeBody, LeaningDynamics, as_free_body, at_rest, balls, contact_state, shown, standing_on
+from .problems import AbstractFlyingMode, InversionProblem, Quadratures, beyond_on_stem
 
 #: Most consecutive bounces before a run fails.
 MOST_BOUNCES = 10_000

@@ -1,4 +1,4 @@
-"""Runs with stick and slip: the cells of a table, and a single run with its path."""
+"""Stick and slip under set-valued Coulomb friction, with and without flights."""
 
 from typing import Any
 
@@ -10,16 +10,30 @@ from jaxtyping import Array, Float, Int
 from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.hybrid import AbstractBatchedMode, Transition, TransitionPath
 from nonholonomic.integration import AbstractProblem, ExtendedProblem
-from nonholonomic.integration.status import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING
+from nonholonomic.integration.problem import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING
 
+from ..model.body import Top
 from ..model.dynamics import NO_COSINE
+from ..model.launch import COS_THETA, parts
 from ..model.scene import Scene
-from ..model.slip_onset import Onset
-from ..model.state import COS_THETA
-from ..model.stick_slip import AT_REST, Change, ContactMode, StickSlip
-from ..model.top import Top
-from .inversion_problem import InversionProblem
-from .trajectory_problem import Quadratures, TrajectoryProblem
+from ..model.stick_slip import AT_REST, Change, ContactMode, Onset, StickSlip
+from .airborne import (
+    FLYING,
+    ON_STEM,
+    OWN,
+    SLIDING,
+    Fly,
+    below,
+    flight_state,
+    flying_body,
+    in_contact,
+    lift_off,
+    standing,
+)
+from .impact import balls, gap_rate
+from .problems import AbstractFlyingMode, InversionProblem, Quadratures, TrajectoryProblem
+
+# Runs with stick and slip: the cells of a table, and a single run with its path.
 
 #: The numbers of the two modes.
 SLIPPING, ROLLING = range(2)
@@ -166,3 +180,147 @@ def contact_modes(
     problem = InversionProblem(run.problem.dynamics, jnp.asarray(NO_COSINE), state[: run.leading], scales)
     assert isinstance(run.passive, Quadratures)
     return (*stick_slip_modes(None, problem, tolerance, False, run.passive, run.leading), state)
+
+
+# Slipping, rolling and flying over any arena, the level plane included, under set-valued Coulomb friction.
+#
+# With flights: slipping and rolling are as above, flight as in `airborne.py`, with the states and passive quadratures of
+# `airborne.py`.
+
+#: The numbers of the modes; flying has the same number as in `airborne.py`.
+TOUCH_SLIPPING, TOUCH_ROLLING = SLIDING, 2
+
+
+class Touch(AbstractFlyingMode):
+    """Slipping or rolling on the arena; `last` is whether the last crossing of the angle counts."""
+
+    kind: ContactMode
+    last: bool = eqx.field(static=True)
+
+    @property
+    def contact_state(self) -> StickSlipMode:
+        """The mode of runs that end where the contact is lost."""
+        passive, size = (Quadratures(self.scene.body.I3), OWN) if self.with_quadratures else (None, None)
+        return StickSlipMode(self.kind, self.cos_angle, self.scales, self.last, passive, size)
+
+    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+        return self.contact_state.problem(state)
+
+    def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
+        return _at_no_distance(self.contact_state.shown(state))
+
+    def between(self, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "21 times"]:
+        return _at_no_distance(self.contact_state.between(motion, passed))
+
+    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
+        """Stick, slip, or fly where the contact is lost. Counts flights, and changes from slip to rolling."""
+        transition = self.contact_state.reset_map(state, left)
+        state_after = transition.state
+        if self.kind.rolls:
+            state_after = jnp.concatenate(
+                [self.kind.stick_slip.rolling.carried_along(state_after[:OWN]), state_after[OWN:]]
+            )
+        flies = (transition.status == LEFT_DOMAIN) & (self.kind.loss(state_after[:OWN]) == 0)
+        mode = jnp.where(transition.mode == ROLLING, TOUCH_ROLLING, TOUCH_SLIPPING)
+        return transition._replace(
+            mode=jnp.where(flies, FLYING, mode),
+            state=jnp.where(flies, lift_off(self.scene, state_after, self.with_quadratures), transition.state),
+            status=jnp.where(flies, RUNNING, transition.status),
+            counts=jnp.concatenate([flies.astype(int)[None], transition.counts]),
+        )
+
+
+class Land(Fly):
+    """Flying over the arena, to a contact that slips or rolls."""
+
+    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
+        """Strike the arena; then rebound, or continue to slip or roll."""
+        transition, stick_slip = super().reset_map(state, left), self.scene.dynamics
+        assert isinstance(stick_slip, StickSlip)
+        rests = stick_slip.slip_speed(transition.state[:OWN]) <= AT_REST * stick_slip.speed
+        mode = jnp.where(rests, TOUCH_ROLLING, TOUCH_SLIPPING)
+        counts = jnp.concatenate([transition.counts, jnp.zeros_like(transition.counts)])
+        return transition._replace(mode=jnp.where(transition.mode == FLYING, FLYING, mode), counts=counts)
+
+
+def airborne_stick_slip_modes(
+    scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
+) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
+    """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `sliding.modes`."""
+    stick_slip, arguments = problem.dynamics, (scene, problem.scales, problem.cos_angle, with_quadratures)
+    assert isinstance(stick_slip, StickSlip)
+    slips, rolls = (
+        Touch(*arguments, ContactMode(stick_slip, jnp.asarray(tolerance, float), rolls_first), last)
+        for rolls_first in (False, True)
+    )
+    rests = stick_slip.slip_speed(problem.states[:OWN]) <= AT_REST * stick_slip.speed
+    return (slips, Land(*arguments), rolls), jnp.where(rests, TOUCH_ROLLING, TOUCH_SLIPPING)
+
+
+def _at_no_distance(rows: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
+    """The output rows of states in contact."""
+    return jnp.concatenate([rows, jnp.zeros_like(rows[:2])])
+
+
+# Convert the final states of runs over any arena to states in contact, and compute their energy and why a contact
+# ended.
+
+
+def on_the_ground(
+    scene: Scene[Top], state: Float[Array, "components cells"], mode: Int[Array, " cells"]
+) -> Float[Array, "14 cells"]:
+    """States of runs, in the layout for sliding on the top's own sphere. States of other modes refer to the foot below
+    that sphere.
+    """
+    return _above_the_ground(scene, state, mode)[0]
+
+
+def airborne_energy(
+    scene: Scene[Top], state: Float[Array, "components cells"], mode: Int[Array, " cells"]
+) -> tuple[Float[Array, " cells"], Float[Array, " cells"]]:
+    """The least and the greatest energy [J] that a state in a mode may have; here these are the same."""
+    state, distance, rate = _above_the_ground(scene, state, mode)
+    if isinstance(scene.dynamics, StickSlip):
+        state = jnp.where(mode == TOUCH_ROLLING, scene.dynamics.rolling.carried_along(state), state)
+    total = scene.energy(state) + lifted(scene, state, distance, rate)
+    return total, total
+
+
+def lifted(scene: Scene[Top], state: Float[Array, "14 ..."], distance: Any, rate: Any) -> Float[Array, "..."]:
+    """Difference [J] between the energy of a flying top and that of the same state in contact; `distance` [m] is that
+    of its sphere from the ground, and `rate` [m/s] the rate of this distance."""
+    _, e, L, place = parts(state)
+    # In contact the velocity along n is that of the centre of mass about the sphere's centre.
+    moment = -scene.body.offset * (L[0] * e[1] - L[1] * e[0]) / scene.body.I1
+    potential = scene.gravity * distance * scene.frame.vertical(place)[2]
+    return scene.body.mass * (potential + 0.5 * ((moment + rate) ** 2 - moment**2))
+
+
+def _above_the_ground(
+    scene: Scene[Top], state: Float[Array, "components cells"], mode: Int[Array, " cells"]
+) -> tuple[Float[Array, "14 cells"], Float[Array, " cells"], Float[Array, " cells"]]:
+    """States as `on_the_ground` has them, and the distance [m] of the top's own sphere with its rate [m/s]."""
+    flies, flight = mode == FLYING, state[:OWN]
+    if scene.body.stem is not None:
+        on_stem = mode == ON_STEM
+        flies, flight = (
+            mode != SLIDING,
+            jnp.where(on_stem, lift_off(scene, flight, False, balls(scene.body)[1]), flight),
+        )
+    flying = flight_state(flight)
+    ground = below(scene, flying)
+    free = flying_body(scene, flying, ground)
+    rate = gap_rate(scene.body, balls(scene.body)[0], free)
+    contact = jnp.where(flies, in_contact(ground, free), state[:OWN])
+    return contact, jnp.where(flies, ground.gap, 0.0), jnp.where(flies, rate, 0.0)
+
+
+def loss(scene: Scene[Top], state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+    """Why a contact ended, if it was not merely lost: a code in `LOSSES` (`tippe/model/dynamics.py`)."""
+    dynamics, state = scene.dynamics, state[:OWN]
+    if scene.body.stem is None:
+        return dynamics.loss(state)
+    # The domain margin of the touching sphere has vanished.
+    stem = standing(scene, balls(scene.body)[1])
+    on_stem = jnp.abs(stem.contact_margin(state)) < jnp.abs(dynamics.contact_margin(state))
+    return jnp.where(on_stem, stem.loss(state), dynamics.loss(state))

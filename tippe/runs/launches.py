@@ -1,20 +1,144 @@
-"""Build and check the grid of launches and scenes of a table."""
+"""Launches of a table and their checks, the events of a top, and the kinds of its runs."""
 
+import dataclasses
+import math
 from collections import Counter
-from collections.abc import Collection, Iterable
-from typing import Any
+from collections.abc import Callable, Collection, Iterable
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 
-from nonholonomic.integration.checks import require_run
+from nonholonomic.compilation.xla_cpu import compiled_setup
+from nonholonomic.hybrid import AbstractBatchedMode
+from nonholonomic.integration.problem import Status, require_run
 from nonholonomic.parameters import full_axes, numbers, with_numbers
+from nonholonomic.runs import Start
 from nonholonomic.sweeps import Axis, axis
-from nonholonomic.validation import require_kind, shown
+from nonholonomic.text import shown
+from nonholonomic.validation import IN_DEGREES, as_number, is_traced, require, require_kind, warn
 
+from ..model.body import Top
+from ..model.dynamics import NO_COSINE
+from ..model.friction import Frictionless
 from ..model.launch import Launch
+from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
-from ..model.top import Top
-from .checks import LISTS
+from ..modes.airborne import airborne_modes, modes_with_stem
+from ..modes.impact import energy_in
+from ..modes.problems import InversionProblem, StemContact, trajectory_problem
+from ..modes.sliding import hopping_modes
+from ..modes.sticking import airborne_energy, airborne_stick_slip_modes, contact_energy, loss, stick_slip_modes
+
+# The events of a top, and checks of the arguments of a run, before anything compiles and inside a program.
+
+#: The inclination [rad] at which a body without a stem counts as turned over.
+INVERTED = 0.95 * math.pi
+
+
+def event_of(scene: Scene[Any], angle: Any) -> Float[Array, "..."] | StemContact:
+    """The event of a run: theta reaches the angle [rad]; or, without an angle, the top has turned over.
+
+    A top with a stem has turned over when its stem first carries it: when the stem bears a force or, as it lands, an
+    impulse. In flight nothing carries the top, whatever theta. No angle defines this event, because after a hop the stem
+    lands at a larger theta, and in a curved arena `Top.stem_angle` is not exactly the angle of the contact.
+    """
+    if angle is None and scene.has_stem:
+        return StemContact()
+    return as_number(INVERTED if angle is None else angle)
+
+
+def angle_of(scene: Scene[Any], angle: Any) -> Float[Array, "..."]:
+    """The angle [rad] itself; or, without an angle, the inclination beyond which the top has turned over on a level
+    plane."""
+    event = event_of(scene, angle)
+    return scene.body.stem_angle if isinstance(event, StemContact) else event
+
+
+#: Advice in messages about lists, where a table is the better choice.
+LISTS = "inversion_table takes lists, and jax.vmap maps over them"
+
+
+def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str = LISTS) -> None:
+    """Raise `ValueError` unless the arguments are a scene, a launch that the scene allows, a positive horizon and a
+    legal tolerance.
+
+    **Arguments:** as for `require_run`.
+    """
+    require_run(scene, launch, t1, tolerance, (Scene, Launch), lists)
+    scene.check_start(launch)
+
+
+def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, angle: Any) -> None:
+    """Warn if the scene has no friction, or if the top stands exactly upright on a level plane or is inverted already.
+
+    **Arguments:** `launch`: its theta is ignored; `theta`: one angle or several [rad]; `angle`: the angle to be
+    reached, or `None` (see `event_of`).
+    """
+    if isinstance(scene.friction, Frictionless):
+        warn(
+            "friction = Frictionless(): without friction no top turns over; give the scene a law, such as "
+            "tippe.Scene(top, friction=tippe.Viscous(0.3))"
+        )
+    limit = angle_of(scene, angle)
+    if isinstance(scene.body, AbstractRigidBody) or is_traced(theta) or is_traced(limit):
+        return
+    if np.any(np.asarray(theta) >= np.min(limit)):
+        start = np.max(np.asarray(theta))
+        on_stem = angle is None and scene.has_stem
+        reached = "the angle at which the stem touches a level plane" if on_stem else "the angle to be reached"
+        warn(
+            f"theta = {start:g} rad is not below {reached}, {float(np.min(limit)):.4g} rad: the top "
+            f"{'stands on its stem' if on_stem else 'is inverted'} from the start{IN_DEGREES.format(f'{start:g}')}"
+        )
+    at_rest = launch.velocity is None and launch.angular_velocity is None
+    if scene.level and at_rest and np.any(np.asarray(theta) == 0.0):
+        warn("theta = 0.0 is exactly upright, where a top stays forever: launch it at a small angle, such as 0.01 rad")
+
+
+def check_smooth(scene: Scene, caller: str) -> None:
+    """Raise `ValueError` for a scene with hybrid runs, which do not support derivatives here."""
+    if scene.contact == "hybrid":
+        raise ValueError(f"contact = 'hybrid' must be 'stop' for {caller}; inversion_table supports flights")
+    if scene.friction.set_valued:
+        kind = type(scene.friction).__name__
+        raise ValueError(
+            f"friction = {kind} must be a law with a single mode for {caller}; inversion_table supports others"
+        )
+
+
+def check_reversible(launch: Launch, values: dict[str, Any]) -> None:
+    """Raise `ValueError` for a launch without spin, because there is no spin to reverse.
+
+    **Arguments:** `values`: full name of a number -> values in place of the launch's own.
+    """
+    spin = values.get("launch.spin", launch.spin)
+    if launch.angular_velocity is None and not is_traced(spin) and np.any(np.asarray(spin) == 0.0):
+        raise ValueError("spin = 0.0 must not be zero: a spin of zero cannot reverse")
+
+
+def check_event(angle: Any, crossing: Any, known: tuple[str, ...] = ("first", "last")) -> None:
+    """Raise `ValueError` unless the angle is `None` or in (0, pi], and the crossing is a known word."""
+    if angle is not None:
+        require(angle, "angle", above=0.0, at_most=math.pi, unit="rad")
+    if angle is not None and np.ndim(angle) != 0:
+        raise ValueError(f"angle must be one number, not of shape {np.shape(angle)}")
+    if crossing not in known:
+        raise ValueError(f"crossing = {shown(crossing)} must be {' or '.join(map(repr, known))}")
+
+
+def require_rigid(scene: Scene) -> None:
+    """Raise `ValueError` unless the body can reverse its spin."""
+    if not isinstance(scene.body, AbstractRigidBody):
+        kind = type(scene.body).__name__
+        raise ValueError(
+            f"body = {kind} must be an Ellipsoid or a RigidBody for times of reversal: a body of revolution keeps its "
+            "sense of rotation"
+        )
+
+
+# Build and check the grid of launches and scenes of a table.
 
 UNITS = Top.units | Scene.units | Launch.units
 
@@ -138,3 +262,124 @@ def _with_room(scene: Scene, values: Collection[str]) -> Launch:
         name: (0.0,) * size for name, size in sizes.items() if any(f"launch.{name}[{k}]" in values for k in range(size))
     }
     return Launch(theta=0.0, spin=0.0, **parts)
+
+
+# The kinds of runs, one smooth motion or several modes of contact and flight, and the check of their energy: without a
+# drive, energy never grows, and it decreases by the work of friction.
+
+
+class RunKind(NamedTuple):
+    """How to run a kind of scene: its counters besides steps, and its modes.
+
+    `modes` is a function of (scene, problem, tolerance, last) that returns the modes and the index of each cell's first
+    mode; `None` for smooth runs. `energy_in` is a function of (scene, state, mode) that returns the least and the
+    greatest energy [J] that the state may have. `loss` is a function of (scene, state) that returns how a run left its
+    domain, as a code in `LOSSES`; `None` for runs that can only jam, because they continue when contact is lost, and the
+    ball fits everywhere. `flight_state` is true if states in flight have another layout.
+    """
+
+    counts: tuple[str, ...]
+    modes: Callable[..., tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]] | None
+    energy_in: Callable[..., tuple[Float[Array, " cells"], Float[Array, " cells"]]]
+    loss: Callable[..., Int[Array, " cells"]] | None
+    flight_state: bool = False
+
+    @property
+    def smooth(self) -> bool:
+        """Whether a run is one smooth motion."""
+        return self.modes is None
+
+
+#: Descriptions of the counters of a run.
+COUNTED = {"hops": "flights", "sticks": "changes from slip to rolling"}
+
+
+def energy_of_state(
+    scene: Scene[Any], state: Float[Array, "components cells"], mode: Any
+) -> tuple[Float[Array, " cells"], Float[Array, " cells"]]:
+    """The least and the greatest energy [J] of a state of one smooth motion, which are the same."""
+    total = scene.energy(state)
+    return total, total
+
+
+def loss_of_contact(scene: Scene[Any], state: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+    """How a contact has ended, as a code in `LOSSES`."""
+    return scene.dynamics.loss(state)
+
+
+SMOOTH = RunKind((), None, energy_of_state, loss_of_contact)
+STICK_SLIP = RunKind(("sticks",), stick_slip_modes, contact_energy, loss_of_contact)
+HYBRID = RunKind(("hops",), hopping_modes, energy_in, None)
+AIRBORNE = RunKind(("hops",), airborne_modes, airborne_energy, loss, True)
+ON_STEM_TOO = AIRBORNE._replace(modes=modes_with_stem)
+STICK_SLIP_FLY = AIRBORNE._replace(counts=("hops", "sticks"), modes=airborne_stick_slip_modes)
+
+
+def run_kind_of(scene: Scene[Any]) -> RunKind:
+    """The run kind of a scene."""
+    hybrid = scene.contact == "hybrid"
+    if scene.friction.set_valued:
+        return STICK_SLIP_FLY if hybrid else STICK_SLIP
+    if not hybrid:
+        return SMOOTH
+    if scene.flies_in_closed_form:
+        return HYBRID
+    return AIRBORNE if scene.body.stem is None else ON_STEM_TOO
+
+
+def flight_modes(scene: Scene[Top], launch: Launch, tolerance: Any, cells: int = 1) -> Start:
+    """The modes of launches of a hybrid scene, with their path, rotation and work; the index of each first mode; and the
+    initial states."""
+    problem, modes = _start_of_flights(scene, launch, cells), run_kind_of(scene).modes
+    assert modes is not None
+    return (*modes(scene, problem, tolerance, last=False, with_quadratures=True), problem.states)
+
+
+@compiled_setup
+def _start_of_flights(scene: Scene[Top], launch: Launch, cells: int) -> InversionProblem:
+    """The launches, with the passive quadratures."""
+    state, scales = trajectory_problem((scene, launch), cells).start()
+    if scene.flies_in_closed_form:
+        # The path is that of the centre of mass.
+        place = state[8:10] - scene.body.offset * state[2:4]
+        state = jnp.concatenate([state[:8], place, state[10:]])
+    return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state, scales)
+
+
+def why_unresolved(kind: RunKind) -> str:
+    """The reasons why a run of this kind may be unresolved."""
+    grown = (
+        "its energy has grown by more than the tolerance allows, although nothing drives the top: the law of friction pushes "
+        "it, or the arena's heights do not fit its normals"
+    )
+    reasons = "the model does not determine the motion from there on, or the mode changed too often, or"
+    return grown if kind.smooth else f"{reasons} {grown}; tippe.simulate states which"
+
+
+#: Largest allowed error of the energy, relative to its size, divided by the tolerance. Flights over ripples and in a
+#: spheroid stay below 1e-4 of this value; a faulty landing away from the arena once left 8e4 times this value.
+BALANCED = 1e4
+
+
+def allowance(scene: Scene[Any], energy: Any, tolerance: Any) -> Any:
+    """The allowed error [J] of an energy of the given size [J] at a tolerance."""
+    return BALANCED * tolerance * (abs(energy) + scene.body.mass * scene.gravity * scene.body.size)
+
+
+def if_balanced(run: Any, tolerance: float | Float[Array, ""]) -> Any:
+    """A single run, with the status "unresolved" if its energy has grown or does not balance the work of friction and
+    impacts."""
+    energy = np.asarray(run.energy)
+    limit = float(allowance(run.scene, np.max(np.abs(energy)), tolerance))
+    balanced = run.stats["energy_residual"] <= limit and energy[-1] <= energy[0] + limit
+    if balanced or run.status == Status.FAILED.word:
+        return run
+    return dataclasses.replace(run, status=Status.UNRESOLVED.word)
+
+
+def why_unbalanced(run: Any) -> str:
+    """The reason why such a run is "unresolved"."""
+    energy = np.asarray(run.energy)
+    if (gain := energy[-1] - energy[0]) > run.stats["energy_residual"]:
+        return f"the energy has grown by {gain:.1e} J, although nothing drives the top"
+    return f"the energy residual of {run.stats['energy_residual']:.1e} J is beyond what the tolerance allows"

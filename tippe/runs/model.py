@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from nonholonomic.geometry import Plane
 from nonholonomic.hybrid import BETWEEN, HybridOutcome
 from nonholonomic.integration import AbstractProblem, CoreProblem, Outcome
-from nonholonomic.integration.status import FAILED, Status
+from nonholonomic.integration.problem import FAILED, Status
 from nonholonomic.parameters import description, full_name, numbers, numbers_of
 from nonholonomic.runs import (
     AbstractModel,
@@ -29,24 +29,27 @@ from nonholonomic.runs import (
 from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.validation import Bound, all_bounds, legal, require_kind, require_scalars
 
-from ..model.contact_dynamics import LOSSES
-from ..model.dynamics import NO_COSINE
+from ..model.dynamics import LOSSES, NO_COSINE
 from ..model.friction import NoSlip
 from ..model.launch import Launch
 from ..model.scene import Scene, generic_direction
-from ..modes.airborne_ends import on_the_ground
-from ..modes.inversion_problem import InversionProblem, StemContact
-from ..modes.sticking import contact_modes
-from ..modes.trajectory_problem import BEHIND_PATH, TrajectoryProblem, trajectory_problem
-from .airborne_trajectory import ArenaTrajectory, StickSlipArenaTrajectory
-from .checks import INVERTED, event_of
-from .flight_trajectory import HybridTrajectory
-from .launches import NUMBERS_OF_A_LAUNCH, labels, variable_numbers
+from ..modes.problems import BEHIND_PATH, InversionProblem, StemContact, TrajectoryProblem, trajectory_problem
+from ..modes.sticking import contact_modes, on_the_ground
+from .launches import (
+    COUNTED,
+    INVERTED,
+    NUMBERS_OF_A_LAUNCH,
+    RunKind,
+    allowance,
+    event_of,
+    flight_modes,
+    labels,
+    run_kind_of,
+    variable_numbers,
+)
 from .observables import AbstractTrajectory
-from .quantities import COMPONENTS, DIRECTION, ON_CURVED, PASSIVE, PATH, quantities_of
-from .run_kind import COUNTED, RunKind, allowance, flight_modes, run_kind_of
-from .simulate import simulate_launch
-from .trajectory import Trajectory
+from .trajectory import ArenaTrajectory, HybridTrajectory, StickSlipArenaTrajectory, Trajectory, simulate_launch
+from .view import COMPONENTS, DIRECTION, ON_CURVED, PASSIVE, PATH, quantities_of
 
 #: The words of tables, in the order of the integers in their files, which is older than `Status`.
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit", "unresolved")

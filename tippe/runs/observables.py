@@ -11,29 +11,27 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.compilation.compiled_programs import padded
+from nonholonomic.compilation.cache import padded
 from nonholonomic.geometry import Component, Vector, dot, rate_in_frame, scale, stacked, sum_vectors
 from nonholonomic.hybrid import HybridPath
 from nonholonomic.integration import DenseSolution
-from nonholonomic.integration.status import Status
-from nonholonomic.integration.zeros import all_crossings
-from nonholonomic.progress import status_line
+from nonholonomic.integration.dense import all_crossings
+from nonholonomic.integration.problem import Status
 from nonholonomic.runs import explore
 from nonholonomic.sweeps import Quantity, Table, Tabular
+from nonholonomic.terminal import status_line
 from nonholonomic.text import batch_title
 from nonholonomic.validation import is_traced, require_one_run, times_within
 from nonholonomic.views import Page, Stage, Viewable
 
-from ..model.body import AbstractBody
+from ..model.body import AbstractBody, Top
 from ..model.friction import Frictionless
 from ..model.launch import Launch
 from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
-from ..model.top import Top
 from ..steady import group
-from .checks import INVERTED
-from .quantities import QUANTITIES, table_of
-from .view import as_stages, names_of
+from .launches import INVERTED
+from .view import QUANTITIES, as_stages, names_of, table_of
 
 
 def of_each_run(function: Callable[[Any], Array]) -> property:
@@ -290,7 +288,7 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
 
     @property
     def _path(self) -> tuple[Array, ...]:
-        """The cyclic coordinates of the arena's frame, followed by the vector c of `trajectory_problem.py`."""
+        """The cyclic coordinates of the arena's frame, followed by the vector c of `modes/problems.py`."""
         return tuple(self.cyclic[:-3])
 
     @property

@@ -1,19 +1,58 @@
-"""One run of a tippe top, with its path."""
+"""One run of a tippe top, with its path, in contact or through flights."""
 
 import dataclasses
 from typing import Any
 
+import diffrax
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from nonholonomic.compilation.xla_cpu import on_device
-from nonholonomic.geometry import scale, sum_vectors
-from nonholonomic.integration.status import Status
+from nonholonomic.geometry import scale, sum_vectors, vector_of
+from nonholonomic.hybrid import BETWEEN, MOST_ROUNDS, HybridOutcome, HybridPath, Segment, solve_hybrid_dense
+from nonholonomic.integration import DenseSolution, Settings, explicit_tableau, follow
+from nonholonomic.integration.problem import (
+    FAILED,
+    LEFT_DOMAIN,
+    REACHED_END,
+    UNRESOLVED,
+    Status,
+    require_adaptive,
+    require_adjoint,
+    require_times,
+)
+from nonholonomic.runs import sampled_if_legal
+from nonholonomic.text import shown
+from nonholonomic.validation import as_number, is_traced, nan_unless
 
+from ..model.dynamics import Motion
 from ..model.friction import length
+from ..model.launch import parts
+from ..model.stick_slip import StickSlip
+from ..modes.airborne import (
+    FLYING,
+    ON_STEM,
+    STRIKING,
+    FlightState,
+    below,
+    carried_frame,
+    flight_state,
+    flying_body,
+    in_contact,
+    lift_off,
+    standing,
+)
+from ..modes.flight import height
+from ..modes.impact import BOTH, TOUCHING, Ball, FreeBody, approach, as_free_body, balls, energy, standing_on
+from ..modes.sliding import MOST_BOUNCES
+from ..modes.sticking import lifted
+from .launches import if_balanced, why_unbalanced
 from .observables import AbstractTrajectory, of_each_run
-from .run_kind import why_unbalanced
+
+# One run of a tippe top, with its path.
 
 
 class Trajectory(AbstractTrajectory):
@@ -104,3 +143,392 @@ class Trajectory(AbstractTrajectory):
     def with_rows(self, times: Float[np.ndarray, " times"], rows: Any, mode: Any) -> "Trajectory":
         parts = {"t": times, **self.parts_of(rows, mode, len(self.start))}
         return dataclasses.replace(self, **dict(zip(parts, on_device(*parts.values()), strict=True)))
+
+
+# One run through contacts, flights and impacts, with its path.
+
+
+class HybridTrajectory(AbstractTrajectory):
+    """A run through contacts, flights and impacts; vectors are arrays (times, 3) in the fixed frame (x, y, z).
+
+    - `status`: "completed", "jammed" (as in `Trajectory`), "failed" or "unresolved"; the run ends at `end_time`.
+      `print(run)` states why a run is unresolved: more than 10 000 flights in a row or 2000 contacts; a flight that does
+      not end at the arena; an energy that grows or does not balance, by more than 1e4 times the tolerance, relative to
+      the energy; or, for a top with a stem, contact of sphere and stem at once, on the level plane with so much friction
+      that the forces are not determined, or at rest on any other arena.
+    - `contact`: the sphere that touches at each time: 0 for the top's sphere, 1 for the stem's, 2 for both, -1 for none.
+      At the time of an impact, values are those before the impact.
+    - `distance`: distance of the top's own sphere from the plane [m], and its rate [m/s].
+    - `hops`: start and end [s] of each flight until `end_time`, one row per flight; a table counts only the flights
+      before the inversion. When the speed of bounces has decreased to 1e-5 sqrt(g R), the top counts as in contact,
+      although the remaining bounces would take e / (1 - e) times as long as the last one (restitution e).
+    - `stem_time`: when the stem of a top first carries it [s].
+    - `work`: work of friction and of the impacts [J].
+    - `stats`: accepted and rejected steps, the greatest drift of |e|, the greatest energy residual |E - E(0) - work| and
+      the energy lost in impacts [J].
+    - `rotation`, `angular_velocity`: as in `Trajectory`.
+
+    Inside a transformation, `status` is the integer of the `Status`, `hops` is `None`, and `stats["hops"]` is the number
+    of flights. First derivatives with respect to the scene and the launch pass through flights and impacts. They are
+    NaN after a grazing event, because within the tolerance such an event may not happen.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3), contact="hybrid")
+    >>> run = tippe.simulate(scene, tippe.Launch(0.1, 155.0), t1=0.1, tolerance=1e-6)
+    >>> int(run.contact[0]), len(run.hops)
+    (0, 0)
+
+    ```
+    """
+
+    distance: Any = None
+    contact: Any = None
+    hops: Float[np.ndarray, "hops 2"] | None = None
+
+    unused = (*AbstractTrajectory.unused, "hops")
+    by_time = (*AbstractTrajectory.by_time, "distance", "contact")
+
+    @property
+    def above(self) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, " times"]]:
+        """Distance of the top's own sphere from the plane [m] and its rate [m/s]."""
+        return self.distance[0], self.distance[1]
+
+    @property
+    def inversion_time(self) -> float:
+        return self.stem_time if self.scene.has_stem else super().inversion_time
+
+    @property
+    def stem_time(self) -> float:
+        """Time [s] at which the stem first carries the top, as it bears a force or, in a bounce, an impulse; infinite if
+        the stem does not touch by the end, or if there is no stem.
+
+        **Raises:** as for `inversion_time`.
+        """
+        if self.dense is None:
+            raise ValueError("a run made inside jit, vmap or grad has no dense output: use tippe.inversion_time there")
+        if not self.scene.has_stem:
+            return np.inf
+        segments = self.dense.segments
+        on_stem = [segment.begin for segment in segments if self.touching(np.asarray(segment.number)) >= 1]
+        # The stem may bounce before it slides. Values at the end of a flight are those before the impact.
+        ends = np.unique([segment.end for segment in segments])
+        first = min([*on_stem, np.inf])
+        ends = ends[ends < min(first, self.end_time)]
+        if not ends.size:
+            return float(first)
+        strokes = ends[np.asarray(self.resampled(ends)._stem_gap) < TOUCHING * float(self.scene.body.radius)]
+        return float(min([*strokes, first]))
+
+    @of_each_run
+    def _stem_gap(self) -> Float[Any, " times"]:
+        """Distance of the stem from the arena [m]."""
+        main, stem = balls(self.scene.body)
+        return self.above[0] + height(main, stem, self.states)
+
+    @property
+    def _free(self) -> FreeBody:
+        """The top as a free body, also in contact."""
+        body = self.scene.body
+        free = as_free_body(body, balls(body)[0], self.states)
+        (distance, rate), (u1, u2, u3) = self.above, free.velocity
+        return FreeBody((u1, u2, u3 + rate), free.height + distance, free.axis, free.momentum)
+
+    @property
+    def _ball(self) -> Ball:
+        """The touching sphere; in flight, and if both touch, the top's own."""
+        spheres = balls(self.scene.body)
+        pairs = zip(spheres[0], spheres[-1], strict=True)
+        return Ball(*(jnp.where(self.contact == 1, stem, main) for main, stem in pairs))
+
+    @of_each_run
+    def energy(self) -> Float[Array, " times"]:
+        """Kinetic energy plus weight times the height of the centre of mass [J]."""
+        return energy(self.scene.body, self.scene.gravity, self._free)
+
+    @of_each_run
+    def normal_force(self) -> Float[Array, " times"]:
+        """Normal force [N]; 0 in flight. If both spheres touch, this is the sum of both forces, the weight."""
+        motion = standing_on(self.scene.dynamics, self._ball).motion(self.states)
+        total_force = jnp.where(self.contact == BOTH, self.scene.body.mass * self.scene.gravity, motion.normal_force)
+        return jnp.where(self.contact < 0, 0.0, total_force)
+
+    @of_each_run
+    def slip(self) -> Float[Array, "times 2"]:
+        """Velocity along the plane of the lowest point of the sphere that touches [m/s]; of the top's own sphere in
+        flight and if both touch."""
+        return jnp.stack(approach(self.scene.body, self._ball, self._free).velocity[:2], axis=-1)
+
+    @classmethod
+    def parts_of(cls, rows: Any, mode: Any, core: int) -> dict[str, Any]:
+        # The rows end with the distance and its rate.
+        parts = super().parts_of(rows[:-2], mode, core)
+        return parts | {"distance": rows[-2:], "contact": cls.touching(mode)}
+
+    @staticmethod
+    def work_in(piece: Segment) -> float:
+        """The work [J] of friction in a segment of the path, without the work of impacts."""
+        return 0.0 if piece.number == BETWEEN else piece.motion.states[-1, -1] - piece.motion.states[-1, 0]
+
+    @staticmethod
+    def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:
+        """The sphere that touches, for each mode index."""
+        return numbers
+
+    @property
+    def _whether_it_turned_over(self) -> str:
+        if not (self.scene.has_stem and np.isfinite(self.stem_time)):
+            return super()._whether_it_turned_over
+        again = ", and at the end its sphere touches again" if np.asarray(self.contact)[-1] in (0, 2) else ""
+        return f"turned over: the stem first carries it at {self.stem_time:.6g} s{again}"
+
+    @property
+    def _flights(self) -> int:
+        return 0 if self.hops is None else len(self.hops)
+
+    @property
+    def where_the_model_ends(self) -> str:
+        """The reason why the motion is undetermined after the end of the run."""
+        return "sphere and stem touch the plane together, and friction is so strong that the forces are not determined"
+
+    def _reason(self) -> str:
+        """The reason for the status "unresolved"."""
+        contacts = sum(segment.number != BETWEEN for segment in self.dense.segments)
+        if self.dense.status != UNRESOLVED:
+            return why_unbalanced(self)
+        if self._flights >= MOST_BOUNCES or contacts >= MOST_ROUNDS:
+            return "there were too many flights or changes of contact"
+        return self.where_the_model_ends
+
+    def __str__(self) -> str:
+        text = super().__str__()
+        # A run made inside a transformation does not know it.
+        if "impact_loss" not in self.stats:
+            hops = self.stats.get("hops")
+            return text if hops is None or is_traced(hops) or np.ndim(hops) else f"{text}\n  {int(hops)} flights"
+        text = f"{text}\n  {self._flights} flights, {self.stats['impact_loss']:.3g} J lost in impacts"
+        return f"{text}\n  unresolved: {self._reason()}" if self.status == Status.UNRESOLVED.word else text
+
+
+# One run through contacts, flights and impacts, with its path, in scenes whose flights are integrated numerically.
+
+#: A sphere is at the arena if its distance is below this fraction of its radius, at the end of a run.
+NEAR = 1e-6
+
+
+class ArenaTrajectory(HybridTrajectory):
+    """A `HybridTrajectory` over any arena: `theta` and `azimuth` refer to the frame at the foot, the point of the arena
+    nearest to the centre of the top's own sphere, and `distance` is the distance of this sphere from the arena and its
+    rate. `slip` refers to the frame at the foot of the touching sphere."""
+
+    @of_each_run
+    def energy(self) -> Float[Array, " times"]:
+        """Kinetic energy plus weight times the height of the centre of mass [J]."""
+        return self.scene.energy(self.states) + lifted(self.scene, self.states, *self.above)
+
+    @of_each_run
+    def theta_rate(self) -> Float[Array, " times"]:
+        """Rate of change of theta [rad/s]."""
+        dynamics = self.scene.dynamics
+        # theta changes with velocities only, so rolling and slipping do not differ.
+        dynamics = dynamics.slipping if isinstance(dynamics, StickSlip) else dynamics
+        # The frame moves with the centre of the top's sphere, also in flight.
+        frame = dataclasses.replace(carried_frame(self.scene), distance=self.scene.body.radius + self.above[0])
+        rates = dataclasses.replace(dynamics, frame=frame).field(self.states)
+        return jax.jvp(self.scene.theta, (self.states,), (rates,))[1]
+
+    @of_each_run
+    def normal_force(self) -> Float[Array, " times"]:
+        """Normal force [N]; 0 in flight."""
+        force = self.scene.normal_force(self.states)
+        if self.scene.body.stem is not None:
+            force = jnp.where(self.contact == 1, self._on_stem.normal_force, force)
+        return jnp.where(self.contact < 0, 0.0, force)
+
+    @of_each_run
+    def slip(self) -> Float[Array, "times 2"]:
+        """Velocity along the tangent plane of the point of a sphere that is closest to the arena [m/s]: of the stem's
+        sphere while it touches, otherwise of the top's own."""
+        slip = self.scene.slip_velocity(self.states)
+        if self.scene.body.stem is not None:
+            of_stem = self._on_stem.slip
+            slip = jnp.where(self.contact == 1, jnp.stack([of_stem.x, of_stem.y]), slip)
+        return slip.T
+
+    @of_each_run
+    def _stem_gap(self) -> Float[Array, " times"]:
+        """Distance of the stem from the arena [m]."""
+        return below(self.scene, self._flying, balls(self.scene.body)[1]).gap
+
+    @property
+    def _flying(self) -> FlightState:
+        """The top as if in flight, also in contact."""
+        scene, place, (distance, rate) = self.scene, parts(self.states).place, self.above
+        main = balls(scene.body)[0]
+        # The flying top is treated as one whose own sphere is larger by the distance, so that this sphere touches.
+        flying = flight_state(lift_off(scene, self.states, False, Ball(main.offset, main.radius + distance)))
+        normal_velocity = scale(rate, carried_frame(scene).normal(place[:3]))
+        return flying._replace(velocity=vector_of(sum_vectors(flying.velocity, normal_velocity)))
+
+    @property
+    def _on_stem(self) -> Motion:
+        """The motion on the stem, at times at which the stem touches; the first tangent is the projection of the
+        reported one."""
+        scene, flying, stem = self.scene, self._flying, balls(self.scene.body)[1]
+        ground = below(scene, flying, stem)
+        ground = ground._replace(axes=carried_frame(scene).own_axes((*ground.foot, *parts(self.states).place[3:])))
+        return standing(scene, stem).motion(in_contact(ground, flying_body(scene, flying, ground, stem)))
+
+    @property
+    def where_the_model_ends(self) -> str:
+        body = self.scene.body
+        height = self.resampled(np.array([self.end_time])).distance[0, 0]
+        if body.stem is not None and abs(height) < NEAR * body.radius:
+            return (
+                "sphere and stem came to rest on the arena together; sliding on both at once is implemented only for the level "
+                "plane, Plane() without tilt"
+            )
+        return "a flight does not end at the arena"
+
+    @staticmethod
+    def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:
+        # Also for traced numbers; -1 after the end of a run.
+        return (numbers == ON_STEM) - 1 * ((numbers == FLYING) | (numbers == STRIKING) | (numbers < 0))
+
+
+class StickSlipArenaTrajectory(ArenaTrajectory):
+    """An `ArenaTrajectory` under exact Coulomb friction; `stats` also holds `sticks`, the number of changes from slip
+    to rolling."""
+
+    @staticmethod
+    def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:
+        # Between two modes, a slip begins.
+        return -1 * (numbers == FLYING)
+
+    @staticmethod
+    def work_in(piece: Segment) -> float:
+        if piece.number == BETWEEN:
+            rows = piece.at(np.array([piece.begin, piece.end]))
+            # The last rows are the distance and its rate.
+            return float(np.diff(rows[-3])[0])
+        return ArenaTrajectory.work_in(piece)
+
+
+# Simulate one launch of a top: a single run with its path, or a run inside a transformation.
+
+
+def simulate_launch(
+    model: Any,
+    t1: Any,
+    times: Any,
+    tolerance: Any,
+    solver: diffrax.AbstractSolver | None,
+    adjoint: diffrax.AbstractAdjoint | None,
+) -> Trajectory | HybridTrajectory:
+    """The run of a `TopModel`. **Arguments:** as for `tippe.simulate`."""
+    require_adaptive(solver)
+    require_adjoint(adjoint)
+    settings = Settings(tolerance, solver)
+    if times is not None:
+        times = as_number(times)
+        require_times(times, t1)
+    if is_traced((model, times, t1, tolerance)):
+        return _traced(model, times, as_number(t1), settings, adjoint)
+    if model.smooth:
+        path = follow(model.problem(None, None), float(t1), settings)
+    else:
+        modes, first, state = model.modes(1, settings.tolerance, None, False)
+        start = int(np.asarray(first)[0]), np.asarray(state)[:, 0]
+        path = solve_hybrid_dense(modes, *start, float(t1), settings, counters=len(model.counters))
+    run = _along(model, path, settings.tolerance)
+    if times is None:
+        return run
+    times_reached = np.asarray(times)[np.asarray(times) <= float(run.end_time)]
+    if not times_reached.size:
+        raise ValueError(
+            f"times = {shown(times)} are all after the end of the run at {float(run.end_time):.6g} s "
+            f"({run.status}): pass earlier times, or omit `times` to get those of the steps"
+        )
+    return run.resampled(times_reached)
+
+
+@eqx.filter_jit
+def _ended(model: Any, outcome: HybridOutcome[Array], tolerance: Float[Array, ""]) -> Array:
+    return model.ended(outcome, tolerance)[0]
+
+
+def _status(model: Any, path: DenseSolution | HybridPath, tolerance: Any) -> str:
+    """The word for how a single run has ended."""
+    if isinstance(path, HybridPath):
+        code, state, mode = path.status, path.state, path.mode
+    else:
+        code = FAILED if path.failed else LEFT_DOMAIN if path.left_domain else REACHED_END
+        state, mode = np.asarray(path.states)[:, -1], 0
+    one, none = np.ones(1), np.zeros(1, int)
+    state, inf = np.asarray(state)[:, None], np.inf * one
+    outcome = HybridOutcome(none + code, inf, one, state, none, none, none + mode, none[None])
+    outcome = jax.tree.map(jnp.asarray, outcome)
+    return Status(int(_ended(model, outcome, jnp.asarray(tolerance)))).word
+
+
+def _along(model: Any, path: DenseSolution | HybridPath, tolerance: Any) -> Any:
+    """The run along its path, at the times of its steps. A run whose energy does not balance the work of friction and
+    impacts ends as "unresolved"."""
+    scene, kind, times = model.scene, model.trajectories, path.times
+    mode, counts = (path.numbers(times), path.counts) if isinstance(path, HybridPath) else (None, ())
+    end = path.end_time if isinstance(path, HybridPath) and scene.contact == "hybrid" else on_device(times[-1])[0]
+    status, start = _status(model, path, tolerance), scene.state(model.launch)
+    run = kind(None, scene, None, None, None, None, status, end, dense=path, start=start, launch=model.launch)
+    # NumPy slices the states, because JAX would compile each slice again for every number of steps.
+    run = run.with_rows(times, np.asarray(path.states), mode)
+    counted = {name: int(count) for name, count in zip(model.counters, counts, strict=True) if name == "sticks"}
+    if scene.contact == "hybrid":
+        assert isinstance(path, HybridPath)
+        in_flight = BETWEEN if scene.flies_in_closed_form else FLYING
+        segments = [segment for segment in path.segments if segment.number == in_flight and segment.end > segment.begin]
+        hops = np.array([(segment.begin, segment.end) for segment in segments]).reshape(-1, 2)
+        run = dataclasses.replace(run, hops=hops)
+        # The remaining work is that of the impacts.
+        in_contact = sum(kind.work_in(segment) for segment in path.segments)
+        counted = {"impact_loss": float(in_contact - path.state[-1]), **counted}
+    return if_balanced(run.with_stats(path, **counted), tolerance)
+
+
+# Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
+@eqx.filter_jit
+def _traced(
+    model: Any, times: Any, t1: Any, settings: Settings, adjoint: diffrax.AbstractAdjoint | None
+) -> Trajectory | HybridTrajectory:
+    """The run inside a transformation; NaN and the status "illegal" if a traced number is out of range."""
+    if times is None:
+        raise ValueError("times must be given inside jit, vmap and grad, where the number of steps is not known")
+    scene = model.scene
+    if not model.smooth:
+        if adjoint is not None:
+            name = "contact = 'hybrid'" if scene.contact == "hybrid" else "SetValuedCoulomb"
+            raise ValueError(f"adjoint = {adjoint!r} must be omitted for {name}")
+        explicit_tableau(settings.for_lanes)
+    is_legal, run, settings = sampled_if_legal(model, times, t1, settings, adjoint=adjoint)
+    outcome = run.outcome
+    status = jnp.where(is_legal, model.ended(outcome, settings.tolerance)[0], int(Status.ILLEGAL))
+    rejected, start = outcome.rejected[0], scene.state(model.launch)
+    stats = {"accepted": outcome.steps[0] - rejected, "rejected": rejected}
+    stats |= {name: count[0] for name, count in zip(model.counters, outcome.counts, strict=True)}
+    kind, rows = model.trajectories, run.rows
+    parts = kind.parts_of(rows, run.mode, len(start))
+    if run.passive is not None:
+        parts = {"states": rows, "cyclic": run.passive[:-2], "spin_angle": run.passive[-2], "work": run.passive[-1]}
+    trajectory = kind(
+        times,
+        scene,
+        **parts,
+        status=status,
+        end_time=outcome.end_time[0],
+        stats=stats,
+        start=start,
+        launch=model.launch,
+    )
+    return eqx.tree_at(lambda run: (run.t, run.status), nan_unless(is_legal, trajectory), (times, status))

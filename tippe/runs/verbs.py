@@ -1,30 +1,394 @@
-"""The functions for single launches, on those of `nonholonomic.runs`."""
+"""The functions for launches of a top: single runs, inversion times, tables."""
 
+import math
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
-from nonholonomic.integration import Settings, explicit_tableau
-from nonholonomic.integration.checks import run_bounds
-from nonholonomic.progress import status_line
-from nonholonomic.runs import LyapunovExponent, TableJob, explore_model, exponent_of_model, time_of_event
-from nonholonomic.validation import is_traced, require_all, require_kind, require_outside
+from nonholonomic.compilation.xla_cpu import greatest, least
+from nonholonomic.derivatives import VariationalProblem, differentiable_solve, in_groups, tangents_by
+from nonholonomic.integration import Lanes, Settings, crossing_time, explicit_tableau, traced_solve_ensemble
+from nonholonomic.integration.problem import (
+    CROSSED,
+    DEFAULT_MAX_STEPS,
+    FAILED,
+    MOST_STEPS,
+    Status,
+    require_times,
+    run_bounds,
+)
+from nonholonomic.runs import (
+    EventTime,
+    LyapunovExponent,
+    Options,
+    TableForm,
+    TableJob,
+    check_cells,
+    compute_table,
+    explore_model,
+    exponent_of_model,
+    full_sensitivities,
+    samples_of,
+    time_of_event,
+)
+from nonholonomic.runs.trajectory import TOLERANCE
+from nonholonomic.sweeps import Table
+from nonholonomic.terminal import status_line
+from nonholonomic.text import shown
+from nonholonomic.validation import as_number, is_traced, require, require_all, require_kind, require_outside, warn
 from nonholonomic.views import Page
-from nonholonomic.warning import warn
 
-from ..model.launch import Launch
+from ..model.launch import Launch, inclination, parts
 from ..model.scene import Scene
-from .checks import check_event, check_reversible, check_run, event_of, require_rigid, warn_if_it_cannot_invert
-from .explore import TOLERANCE
-from .flight_trajectory import HybridTrajectory
+from ..modes.problems import InversionProblem, StemContact
+from .launches import (
+    check_event,
+    check_reversible,
+    check_run,
+    check_smooth,
+    event_of,
+    labels,
+    launches,
+    require_rigid,
+    warn_if_it_cannot_invert,
+    why_unresolved,
+)
 from .model import INVERSIONS, REVERSALS, TopModel
-from .run_kind import why_unresolved
-from .table import too_many_steps
-from .trajectory import Trajectory
+from .trajectory import HybridTrajectory, Trajectory
+from .view import QUANTITIES, quantities_of
+
+# Tables of many launches: inversion times, reversal times, and trajectories.
+
+#: The words for how the run of a trajectory ends, in the order of `Status`.
+TRAJECTORIES = TableForm(tuple(Status(code).word for code in range(Status.UNRESOLVED + 1)))
+
+
+def too_many_steps(t1: float, max_steps: int, end: float) -> str:
+    """Message for a run that needs more than the allowed steps."""
+    return (
+        f"t1 = {t1:g} s is too long: the run needs more than {max_steps:_} steps, which reached only {end:.4g} s; "
+        "take a shorter t1 or a larger tolerance"
+    ).replace("_", " ")
+
+
+def inversion_table(
+    scene: Scene,
+    *,
+    theta: Any,
+    spin: Any,
+    eta: Any = 0.0,
+    mu: Any = None,
+    t1: float,
+    angle: float | None = None,
+    tolerance: float = 1e-9,
+    crossing: str = "first",
+    path: Any = None,
+    azimuth: Any = 0.0,
+    axes: dict[str, Any] | None = None,
+    solver: diffrax.AbstractERK | None = None,
+    method: str = "ensemble",
+    scattered: bool = False,
+    errors: bool = False,
+    sensitivities: Sequence[str] = (),
+    progress: bool = True,
+    executor: Executor | None = None,
+    max_steps: int = DEFAULT_MAX_STEPS,
+) -> Table:
+    """Inversion times over a grid of launches and scenes, in one batched call on all cores.
+
+    **Arguments:**
+
+    - `scene`: the scene; all its numbers must be scalars.
+    - `theta`, `spin`, `eta`, `azimuth`: parameters of the launch, as for `Launch`; `mu`: coefficient of the scene's
+      friction law, by default that of the scene. Each list or array becomes an axis of the table, in the order (theta,
+      eta, mu, spin, azimuth).
+    - `t1`: horizon [s].
+    - `angle`: angle [rad] that counts as inverted. By default, a top with a stem counts as inverted when the stem first
+      carries it, and any other body when theta reaches 0.95 pi.
+    - `tolerance`: relative tolerance of the integration.
+    - `crossing`: "first" for the first time theta reaches the angle; "last" for the crossing after which theta stays
+      above the angle until `t1` (if theta oscillates, first crossings are ill-conditioned), or, for the contact of a
+      stem, the time after which the sphere does not touch until `t1`; "both" for both times from one run: the variables
+      `first_time` and `last_time` replace `time`, and the status is that of the last crossing.
+    - `path`: HDF5 file to write, chunk by chunk. Repeat the same call to resume an interrupted table.
+    - `axes`: additional axes, name of a parameter -> values. The end of a full name is enough if it is unique, such as
+      `{"offset": [0.005, 0.006]}` for `"scene.body.offset"`.
+    - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
+      `nonholonomic.integration.Oscillatory8()`, or `Dopri8()` for method "diffrax".
+    - `method`: "ensemble" (fast); or "diffrax" for vmapped `diffeqsolve`, a slow reference that supports only first
+      crossings and can miss a loss of contact shorter than a step.
+    - `scattered`: whether the lists are columns of equal length instead of axes of a grid: the k-th cell has the k-th
+      number of each list. The only axis of the table is then "cell", and the columns are variables.
+    - `errors`: whether to run every cell again at a hundredth of the tolerance, for error bounds; this costs 2.8 times
+      as much as a table without errors. Below a tolerance of 1e-12, the second run has a hundred times the tolerance
+      instead of a hundredth, and the bounds are wider.
+    - `sensitivities`: names of the parameters with respect to which the times are differentiated, such as
+      `["scene.friction.mu", "launch.theta"]`; the end of a name is enough if only one parameter matches.
+    - `progress`: whether to show progress, on a terminal or in a notebook; `NONHOLONOMIC_PROGRESS=0` hides it
+      everywhere.
+    - `executor`: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a Dask client;
+      by default, a thread for each core. On the same kind of processor, all executors give bitwise equal results.
+    - `max_steps`: a run that needs more steps, including rejected ones, fails; at least 1. In a hybrid run, the limit
+      applies to each time in a mode; `method="diffrax"` allows 100 000 steps at most.
+
+    **Returns:** a `Table` with the variables
+
+    - `time` [s]: the inversion time, infinite if the top did not invert.
+    - `stem_time` [s], for a top with a stem: when the stem first carries it, infinite if it does not by `t1`, whatever the
+      angle. In a flight the stem carries nothing until it lands.
+    - `status`: "inverted", "not_inverted" by `t1`, "contact_lost", "failed", "jammed", or "unresolved" (the energy grows;
+      with `contact="hybrid"`, also 10 000 flights in a row, or sphere and stem on the plane together with so much
+      friction that the forces are undetermined; with `SetValuedCoulomb`, also too many changes between slip and rolling).
+    - `end_time` [s], `end_theta` [rad]: when and at which inclination the run ended, also if contact was lost or jammed.
+    - `steps`, `rejected`: numbers of integration steps.
+    - `hops`, with `contact="hybrid"`: number of flights until the run ended. The run continues through flights, and may
+      reach the angle in flight.
+    - `sticks`, with `SetValuedCoulomb`: number of changes from slip to rolling outside impacts.
+    - `time_error` [s], with `errors`: a bound that is infinite if the two runs disagree on the status or failed, and 0 if
+      both find no time. `end_time_error` and `end_theta_error` are such bounds, too; `hops_error` and `sticks_error` are
+      the differences of the two runs; `status_error` is 1 if the runs disagree on the status or failed.
+      `Table.digits("time")` shows the correct digits.
+    - `time_by_mu` and so on, with `sensitivities`: the derivative of `time` with respect to each parameter; 0 if the top
+      did not invert. Derivatives pass through flights, impacts, stick and slip.
+    - `grazes`, with `sensitivities`: 1 if an earlier event, such as a landing, was grazing, so that within the tolerance
+      it may not happen; the derivative is then NaN.
+
+    **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
+    `RuntimeError` for an executor that breaks down, or a worker with other versions.
+
+    **Example:**
+
+    ```
+    >>> import numpy as np
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> table = tippe.inversion_table(scene, theta=[0.1, 0.2], spin=[100.0, 155.0], t1=8.0, tolerance=1e-6)
+    >>> print(table.time.round(2))
+    [[6.36 5.97]
+     [5.86 5.59]]
+    >>> print(table.status)
+    [['inverted' 'inverted']
+     ['inverted' 'inverted']]
+
+    ```
+    """
+    require_outside((scene, theta, spin, eta, mu, azimuth, axes, t1, angle), "inversion_table", "inversion_time")
+    check_event(angle, crossing, ("first", "last", "both"))
+    if method not in ("ensemble", "diffrax"):
+        raise ValueError(f"method = {shown(method)} must be 'ensemble' or 'diffrax'")
+    if method == "diffrax" and sensitivities:
+        raise ValueError("method = 'diffrax' must be 'ensemble' for sensitivities")
+    if method == "diffrax" and crossing != "first":
+        raise ValueError(f"crossing = {shown(crossing)} must be 'first' for method = 'diffrax'")
+    launch_values = {"theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
+    options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
+    return event_table(scene, launch_values, axes, t1, event_of(scene, angle), options, crossing, method)
+
+
+def reversal_table(
+    scene: Scene,
+    *,
+    theta: Any,
+    spin: Any,
+    azimuth: Any = 0.0,
+    mu: Any = None,
+    t1: float,
+    tolerance: float = 1e-9,
+    path: Any = None,
+    axes: dict[str, Any] | None = None,
+    solver: diffrax.AbstractERK | None = None,
+    scattered: bool = False,
+    errors: bool = False,
+    sensitivities: Sequence[str] = (),
+    progress: bool = True,
+    executor: Executor | None = None,
+    max_steps: int = DEFAULT_MAX_STEPS,
+) -> Table:
+    """Times of the first reversal of spin over a grid of launches and scenes, in one batched call on all cores.
+
+    **Arguments:** as for `inversion_table`; the body of the scene is an `Ellipsoid` or a `RigidBody`, and the spin is not zero.
+    Axes have names such as `"scene.body.inertia.xy"` and `"scene.body.semi_axes[0]"`.
+
+    **Returns:** a `Table` like that of `inversion_table`, with the time [s] at which the spin about the arena's normal
+    first vanishes, infinite if it does not, and `status`: "reversed", "not_reversed" by `t1`, "contact_lost", "failed",
+    "jammed".
+
+    **Raises:** as for `inversion_table`, and `ValueError` for another body and a launch without spin.
+
+    **Example:** a rattleback reverses sooner in one sense than in the other.
+
+    ```
+    >>> import tippe
+    >>> inertia = [[2e-4, -2e-5, 0.0], [-2e-5, 1.6e-3, 0.0], [0.0, 0.0, 1.7e-3]]
+    >>> body = tippe.Ellipsoid(1.0, (0.2, 0.03, 0.02), (0.0, 0.0, -0.01), inertia)
+    >>> scene = tippe.Scene(body, friction=tippe.NoSlip())
+    >>> table = tippe.reversal_table(scene, theta=0.02, spin=[-5.0, 5.0], t1=9.0, tolerance=1e-6)
+    >>> print(table.time.round(2), table.status)
+    [2.61 8.17] ['reversed' 'reversed']
+
+    ```
+    """
+    require_outside((scene, theta, spin, azimuth, mu, axes, t1), "reversal_table", "reversal_time")
+    require_kind(scene, "scene", Scene)
+    require_rigid(scene)
+    launch_values = {"theta": theta, "mu": mu, "spin": spin, "azimuth": azimuth}
+    options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
+    return event_table(scene, launch_values, axes, t1, None, options)
+
+
+def event_table(
+    scene: Scene,
+    launch_values: dict[str, Any],
+    axes: dict[str, Any] | None,
+    t1: float,
+    angle: Any,
+    options: Options,
+    crossing: str = "first",
+    method: str = "ensemble",
+) -> Table:
+    """The table of the times at which theta reaches an angle, at which the stem carries the top, or, without an angle,
+    at which the spin about the normal reverses.
+
+    **Arguments:** as for `inversion_table`; `launch_values`: name of a launch's parameter, or "mu" -> a number or a
+    list.
+    """
+    roots, grid = launches(scene, launch_values, axes, t1, options.tolerance)
+    settings, form = options.settings, REVERSALS if angle is None else INVERSIONS
+    model = TopModel.timed(**roots, angle=angle)
+    names = full_sensitivities(model, options.sensitivities, crossing)
+    if not model.smooth and method == "diffrax":
+        raise ValueError(
+            "method = 'diffrax' does not support runs of several modes: contact = 'hybrid' or SetValuedCoulomb"
+        )
+    check_cells(model, grid, options)
+    axis_values = {axis.number: axis.values for axis in grid}
+    if angle is None:
+        check_reversible(roots["launch"], axis_values)
+        request: dict[str, Any] = {"event": "reversal"}
+    else:
+        on_stem = isinstance(angle, StemContact)
+        theta = axis_values.get("launch.theta", roots["launch"].theta)
+        warn_if_it_cannot_invert(scene, roots["launch"], theta, None if on_stem else float(angle))
+        request = {"event": "contact of the stem"} if on_stem else {"angle": float(angle)}
+    request |= {"t1": float(t1), "crossing": crossing, "method": method}
+    shorts = [name.rsplit(".", 1)[-1] for name in names]
+    slopes = {
+        name: "time_by_" + (short if shorts.count(short) == 1 else name.replace(".", "_"))
+        for name, short in zip(names, shorts, strict=True)
+    }
+    units = {name: unit for name, (_, unit, _) in labels(scene, roots["launch"], names, ()).items()}
+    by_diffrax = method == "diffrax"
+    job = TableJob(model, form, float(t1), crossing, settings, slopes, options.errors, by_diffrax=by_diffrax)
+    table = compute_table(job, grid, units, request, options)
+    warn_of_long_runs(table, float(t1), options.max_steps)
+    # Tables whose variables stay in the file are not checked.
+    if model.smooth and isinstance(table.variables, dict):
+        unresolved = np.asarray(table.variables["status"] == "unresolved")
+        if unresolved.any():
+            warn(f"{unresolved.sum()} of {unresolved.size} runs are unresolved: {why_unresolved(model.kind)}")
+    return table
+
+
+def warn_of_long_runs(table: Table, t1: float, max_steps: int) -> None:
+    """Warn of runs that needed more than the allowed steps. Tables whose variables stay in the file are not checked."""
+    if not isinstance(table.variables, dict):
+        return
+    is_long = (table.variables["status"] == "failed") & (table.variables["steps"] >= max_steps)
+    if is_long.any():
+        end = float(np.min(table.variables["end_time"][is_long]))
+        warn(f"{is_long.sum()} of {is_long.size} runs have failed: {too_many_steps(t1, max_steps, end)}")
+
+
+def trajectory_table(
+    scene: Scene,
+    *,
+    theta: Any,
+    spin: Any,
+    eta: Any = 0.0,
+    mu: Any = None,
+    times: Any,
+    axes: dict[str, Any] | None = None,
+    quantities: Sequence[str] = ("theta", "eta"),
+    tolerance: float = 1e-9,
+    path: Any = None,
+    progress: bool = True,
+    executor: Executor | None = None,
+    max_steps: int = DEFAULT_MAX_STEPS,
+    solver: diffrax.AbstractERK | None = None,
+) -> Table:
+    """Trajectories over a grid of launches and scenes, sampled at given times, in one batched call on all cores.
+
+    The samples are as accurate as the steps. Up to 999 samples, a step ends on each of them; from 1000 on, they are
+    interpolated inside steps. With 1001 samples over 10 s, this table costs 1.6 times as much as a table of inversion times
+    to the same horizon.
+
+    **Arguments:**
+
+    - `scene`: the scene; all its numbers must be scalars.
+    - `theta`, `spin`, `eta`: parameters of the launch, as for `Launch`; `mu`: coefficient of the scene's friction law,
+      by default that of the scene. Each list or array becomes an axis of the table, in the order (theta, eta, mu,
+      spin). The axes of the launch are called "launch.theta", "launch.eta" and "launch.spin", because `theta` is the
+      sampled quantity.
+    - `times`: times of the samples [s], increasing, at least 0; the last time is the horizon.
+    - `axes`: additional axes, as for `inversion_table`, such as `{"azimuth": [0.0, 1.0]}`.
+    - `quantities`: what to sample: any of "theta", "eta", "azimuth" [rad], "theta_rate", "spin" [rad/s], "energy" [J],
+      "jellett" [kg m^3/s], "normal_force" [N], and the vectors "axis" [1], "position" [m], "velocity" [m/s], "angular_momentum"
+      [kg m^2/s] and "slip" [m/s]; "spin_angle" [rad] and "work" [J]; and of an `Ellipsoid` or a `RigidBody` "normal_spin"
+      [rad/s], "grip" [1] and "reaction" [N]; all as in `Trajectory` and `HybridTrajectory`.
+    - `tolerance`: relative tolerance of the integration.
+    - `path`: HDF5 file to write, chunk by chunk. Repeat the same call to resume an interrupted table.
+    - `progress`, `executor`: as for `inversion_table`.
+    - `max_steps`: a run that needs more steps, including rejected ones, fails; at least 1.
+    - `solver`: as for `inversion_table`.
+
+    **Returns:** a `Table` with a variable for each quantity. Its dimensions are the axes and "time"; a vector has one
+    more dimension, "component" (x, y, z), or "tangent" (t1, t2) for "slip". Values after the end of a run are NaN. The
+    table also contains, over the axes: `status` (the word of a `Status`, "completed" at the last of the times),
+    `end_time` [s], `steps` and `rejected`; with `contact="hybrid"`, also `hops`, and with `SetValuedCoulomb` `sticks`.
+
+    **Raises:** `ValueError` for arguments out of range, and for an unknown axis or quantity; `OSError` for a path that
+    cannot be used; `RuntimeError` for an executor that breaks down, or a worker with other versions.
+
+    **Example:**
+
+    ```
+    >>> import numpy as np
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> table = tippe.trajectory_table(scene, theta=[0.1, 0.2], spin=155.0, times=np.linspace(0.0, 1.0, 11))
+    >>> table.dims("theta"), table.theta.shape
+    (('launch.theta', 'time'), (2, 11))
+    >>> print(table.theta[:, -1].round(3), table.status)
+    [0.025 0.076] ['completed' 'completed']
+
+    ```
+    """
+    require_outside((scene, theta, spin, eta, mu, times, axes), "trajectory_table", "simulate with times=")
+    require_kind(scene, "scene", Scene)
+    require_times(as_number(times), None)
+    samples = samples_of(quantities_of(scene), times, quantities, None)
+    assert samples is not None
+    options = Options(tolerance, solver, max_steps, path=path, progress=progress, executor=executor)
+    settings, t1 = options.settings, samples.times[-1]
+    require(t1, "times[-1]", above=0.0, why="it is the horizon")
+    launch_values = {"theta": theta, "eta": eta, "mu": mu, "spin": spin}
+    roots, grid = launches(scene, launch_values, axes, t1, tolerance, taken=QUANTITIES)
+    model = TopModel(scene=roots["scene"], launch=roots["launch"])
+    check_cells(model, grid, options)
+    job = TableJob(model, TRAJECTORIES, float(t1), "first", settings, samples=samples, timed=False)
+    return compute_table(job, grid, {}, {}, options)
+
+
+# The functions for single launches, on those of `nonholonomic.runs`.
 
 
 @status_line("simulating")
@@ -142,7 +506,7 @@ def inversion_time(
 
     The derivative comes from the implicit function theorem at the event; it is 0 if the result is infinite. Together
     with derivatives, a time costs two to three times as much for one parameter, four times for two, and six to eight
-    times for more (`nonholonomic/derivatives/slopes.py`). Second derivatives use forward mode.
+    times for more (`nonholonomic/derivatives/adjoint.py`). Second derivatives use forward mode.
 
     **Arguments:**
 
@@ -261,7 +625,7 @@ def lyapunov_exponent(
 
     The exponent is positive if nearby launches diverge exponentially. While a top rises, the exponent is the rate of
     the rise; in chaotic motion, the exponent stays positive as `t1` grows. Source: Benettin et al., Meccanica 15 (1980)
-    9; see `nonholonomic/derivatives/lyapunov.py`. Tangents pass
+    9; see `nonholonomic/derivatives/variation.py`. Tangents pass
     through flights, impacts, stick and slip by the saltation matrix.
 
     **Arguments:**
@@ -300,3 +664,116 @@ def lyapunov_exponent(
         raise ValueError(f"scene and launch must hold scalars or one number per launch, not arrays of shapes {shapes}")
     model = TopModel(scene=scene, launch=launch).without_event()
     return exponent_of_model(model, float(t1), settings, shapes.pop() if shapes else ())
+
+
+# Inversion time extended smoothly past the horizon, for use in a loss function.
+
+#: The least angle [rad] distinguished from 0 in the penalty for a top that does not invert.
+LEAST_ANGLE = 1e-6
+
+
+@status_line("simulating")
+def extended_inversion_time(
+    scene: Scene,
+    launch: Launch,
+    t1: float | Float[Array, ""],
+    angle: Float[ArrayLike, ""] = 0.95 * math.pi,
+    tolerance: float | Float[Array, ""] = 1e-8,
+) -> Float[Array, ""]:
+    """Inversion time, continued beyond the horizon, for loss functions: the result is finite everywhere, and its slope
+    leads back to inversion.
+
+    If a top has not inverted, and is at theta at `t1` or when it loses contact, the result is
+    t1 (1 + log(angle / theta) / C) with C = log(angle / theta at the launch), at least 1. This is a penalty, not a
+    prediction. Where theta grows as exp(s t), as it does from small angles, the penalty is linear in the rate s. It then
+    continues the time C / s with the same value and slope at `t1`.
+
+    The function works under `jit`, `vmap`, `grad`, `jvp` and their compositions. The derivatives of the time (implicit
+    function theorem) and of the penalty are with respect to every number except `t1` and `tolerance`.
+
+    **Arguments:**
+
+    - `scene`, `launch`, `t1`, `angle`: as for `inversion_time`; all numbers must be scalars.
+    - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
+
+    **Returns:** the time [s]; NaN where the integration failed or numbers inside a transformation are out of range.
+
+    **Raises:** `ValueError` for arguments out of range, and for a scene with `contact="hybrid"` or `SetValuedCoulomb`.
+
+    **Example:** this top does not invert by 3 s, so the result is a later time.
+
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=3.0e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> print(3.0 < tippe.extended_inversion_time(scene, tippe.Launch(0.2, 60.0), t1=3.0) < 10.0)
+    True
+    """
+    check_run(scene, launch, t1, tolerance)
+    check_event(angle, "first")
+    check_smooth(scene, "extended_inversion_time")
+    # A fit may try parameters that are far off.
+    settings = Settings(as_number(tolerance), max_steps=MOST_STEPS)
+    return time_of_inversion(TopModel.timed(scene, launch, as_number(angle)), t1, settings)
+
+
+def time_of_inversion(model: TopModel, t1: Any, settings: Settings) -> Float[Array, ""]:
+    """The extended time of a smooth model until its angle, for checked arguments."""
+    return differentiable_solve(*ExtendedTime.of(model, t1, settings, False))
+
+
+class ExtendedTime(EventTime):
+    """Extended inversion times of cells."""
+
+    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
+        # Every run has a time. A select on NaN would make the derivative of a failed run zero.
+        return jnp.zeros(jnp.shape(value), bool)
+
+    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
+        return self._extended((), self.model(leaves).problem(cells, ()), leaves, cells)[0]
+
+    def value_and_tangents(
+        self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
+    ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
+        def build(floats: tuple[Array, ...], cells: int | None) -> Any:
+            return self.model((*floats, *leaves[self.movable :])).problem(cells, ())
+
+        problem, tangents, gather = tangents_by(build, active, leaves[: self.movable], cells)
+        times, slopes = in_groups(lambda group: self._extended(group, problem, leaves, cells, nested), tangents)
+        return times, gather(slopes)
+
+    def _extended(
+        self, tangents: tuple[Any, ...], problem: Any, leaves: tuple[Array, ...], cells: int, nested: bool = False
+    ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
+        """The extended times of every cell, and their derivatives along tangents (as of `VariationalProblem`)."""
+        is_legal, t1, settings = self.permitted(leaves)
+        variational = VariationalProblem(problem, tangents, True)
+        outcome, _ = traced_solve_ensemble(
+            variational, t1, jnp.asarray(cells), settings, one_kernel=not nested, n_blocks=1 + len(tangents)
+        )
+        state, *variations = variational.parts(outcome.state)
+        has_crossed = outcome.status == CROSSED
+
+        def extended(problem: InversionProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+            # A cell that starts beyond the angle has reached it at time 0.
+            time = jnp.where(outcome.end_time > 0.0, crossing_time(problem, outcome.end_time, state), 0.0)
+            end, start = (inclination(parts(states).axis) for states in (state, problem.states))
+            return jnp.where(has_crossed, time, beyond_horizon(end, start, jnp.arccos(problem.cos_angle), t1))
+
+        is_good = is_legal & (outcome.status != FAILED)
+        times = jnp.where(is_good, extended(problem, state), jnp.nan)
+        slopes = [
+            jnp.where(is_good, eqx.filter_jvp(extended, (problem, state), direction)[1], jnp.nan)
+            for direction in zip(tangents, variations, strict=True)
+        ]
+        return times, slopes
+
+
+def beyond_horizon(end: Lanes, start: Lanes, angle: Any, t1: Any) -> Lanes:
+    """The time [s] of a top that has not inverted by `t1`, with theta at the end and at the start of the run [rad]; see
+    `extended_inversion_time`."""
+
+    def e_folds(theta: Lanes) -> Lanes:
+        """Number of e-folds by which theta must still grow to reach the angle."""
+        return jnp.log(angle / least(greatest(theta, LEAST_ANGLE), angle))
+
+    return t1 * (1.0 + e_folds(end) / greatest(e_folds(start), 1.0))

@@ -16,8 +16,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from ...compilation.programs import called_program, opened, programs_of, read_program, traced
-from ...lanes.components import MOVES
+from ...compilation.components import MOVES
+from ...compilation.xla_cpu import called_program, opened, programs_of, read_program, traced
 
 #: A number: a Python number if known, otherwise its name or text in JavaScript. A value is an array of numbers.
 Number = str | float

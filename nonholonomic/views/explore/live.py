@@ -1,21 +1,360 @@
-"""A page with sliders: its contents, and how they are combined into one file."""
+"""A page with sliders: its contents, and its problem for integration in the browser."""
 
+import functools
 import json
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
-from ...integration.status import Status
+from ...hybrid import MOST_ROUNDS, AbstractBatchedMode, AbstractHoppingMode, HybridOutcome
+from ...hybrid.ensemble import after_reset, after_solve, at_start
+from ...hybrid.sampled_adjoint import mode_numbered, program_groups
+from ...integration import AbstractProblem, LaneState, Settings, explicit_tableau
+from ...integration.problem import LEFT_DOMAIN, RUNNING, UNRESOLVED, Status
+from ...integration.runge_kutta import Step, inner_stages, middle_weights, watched_places
+from ...integration.scheduler import LaneScheduler, back_to_margin, outcome_of, with_crossing_times
+from ...integration.step import Control, after_step, length_to_try, looks_of, past_jump, until_jump
 from ..page import Page, page, script, template
 from ..stage import Stage
-from .frame import Frame
-from .hybrid_simulator import HybridSimulator
 from .javascript import javascript
-from .simulator import Numbers, Simulator
+
+# The contents of a page at one time of a run, in the form for the player (`player.js`).
+
+Three = Float[Array, "3"]
+
+
+class Frame(NamedTuple):
+    """One moment of a run, with bodies, traces, arrows and curves in the order of the `Show` of the page.
+
+    - `normal`: normal of the arena, towards the body; `bodies`: position [m] and quaternion (x, y, z, w) of each body.
+    - `traces`: the point of each trace [m], and the point to which it is relative, or `None`.
+    - `arrows`: start [m] and vector of each arrow, in its unit; `curves`: a number for each curve.
+    - `turning_rate`: greatest rotation rate of all parts [rad/s], which determines the number of frames.
+    """
+
+    normal: Three
+    bodies: tuple[tuple[Three, Float[Array, "4"]], ...]
+    traces: tuple[tuple[Three, Three | None], ...]
+    arrows: tuple[tuple[Three, Three], ...]
+    curves: tuple[Float[Array, ""], ...]
+    turning_rate: Float[Array, ""]
+
+    def layout(self) -> dict[str, Any]:
+        """The number of items of each kind, for readers of the flat list of numbers."""
+        return {
+            "bodies": len(self.bodies),
+            "traces": [about is not None for _, about in self.traces],
+            "arrows": len(self.arrows),
+            "curves": len(self.curves),
+        }
+
+
+def quaternion(rotation: Float[Array, "3 3"]) -> Float[Array, "4"]:
+    """The quaternion (x, y, z, w) of a rotation matrix, from its largest component (Shepperd 1978)."""
+    m, trace = rotation, rotation[0, 0] + rotation[1, 1] + rotation[2, 2]
+    # Four times the products of the quaternion's components, one row each.
+    skew = (m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1])
+    symmetric = (m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1])
+    squares = [1.0 - trace + 2.0 * m[k, k] for k in range(3)]
+    rows = jnp.stack(
+        [
+            jnp.stack([squares[0], symmetric[0], symmetric[1], skew[0]]),
+            jnp.stack([symmetric[0], squares[1], symmetric[2], skew[1]]),
+            jnp.stack([symmetric[1], symmetric[2], squares[2], skew[2]]),
+            jnp.stack([*skew, 1.0 + trace]),
+        ]
+    )
+    row = rows[0]
+    for k in range(1, 4):
+        # `row` is the largest of the first k compared rows.
+        row = jnp.where(rows[k, k] > jnp.max(jnp.stack([rows[j, j] for j in range(k)])), rows[k], row)
+    return row / jnp.sqrt(jnp.sum(row * row))
+
+
+# A problem for integration in the browser: its functions and its method, in JavaScript.
+#
+# Everything is generated from the objects that make tables (`nonholonomic.integration`), so both take the same steps. Only the
+# loops over steps and stages are written by hand, in `integrator.js`.
+
+Numbers = Float[Array, " numbers"]
+
+#: Functions of a page by name, with examples of their arguments.
+Functions = dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]
+
+
+class Simulator(NamedTuple):
+    """A problem that is integrated in the browser.
+
+    - `problem`: function of the numbers of the sliders that returns the problem of one cell.
+    - `t1`: horizon [s]; `settings`: settings with an explicit Runge-Kutta solver of Diffrax.
+    - `readings`: results of a run, name -> function of (the sliders' numbers, the problem, a `LaneState` of one lane).
+    - `passes`: whether a run continues through its event.
+    """
+
+    problem: Callable[[Numbers], AbstractProblem]
+    t1: float
+    settings: Settings
+    readings: dict[str, Callable[[Numbers, Any, LaneState], Any]]
+    passes: bool = False
+
+    def begin(self, values: Numbers) -> LaneScheduler:
+        """The run for the sliders' numbers, at its start."""
+        t1, cells = jnp.asarray(self.t1), jnp.asarray(1)
+        return LaneScheduler.of(self.problem(values), t1, cells, self.settings, nonterminal=self.passes)
+
+    def read(self, name: str, values: Numbers) -> Any:
+        """A reading at the start of a run."""
+        scheduler = self.begin(values)
+        return self.readings[name](values, scheduler.problem, scheduler.fresh)
+
+    def javascript(self, values: Numbers) -> str:
+        """The simulator as an object of JavaScript.
+
+        **Arguments:** `values`: numbers of the sliders; only their count matters.
+        """
+        stepper = Stepper.of(self.begin, (values,), self.settings)
+        functions = stepper.functions
+        for name, read in self.readings.items():
+            functions[name] = (
+                lambda values, constants, lane, read=read: read(values, stepper.run(constants)[0], lane),
+                (values, stepper.constants, stepper.lane),
+            )
+        return as_object(stepper.facts, functions)
+
+
+class Stepper(NamedTuple):
+    """The steps of a motion in JavaScript.
+
+    - `begin`: function that returns the scheduler of one cell; `examples`: example arguments of this function;
+      `settings`: settings of the steps.
+    - `constants`, `lane`: the shapes of the constants of a run, and of the lane; `run` computes problem, control and
+      absolute tolerances from the constants.
+    """
+
+    begin: Callable[..., LaneScheduler]
+    examples: tuple[Any, ...]
+    settings: Settings
+    constants: Any
+    lane: LaneState
+    run: Callable[[Any], tuple[Any, Control, Any]]
+
+    @classmethod
+    def of(cls, begin: Callable[..., LaneScheduler], examples: tuple[Any, ...], settings: Settings) -> "Stepper":
+        """The steps of the motion that a function begins."""
+        shapes = eqx.filter_eval_shape(functools.partial(_started, begin), *examples)
+        (constants, lane), static = eqx.partition(shapes, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
+        return cls(begin, examples, settings, constants, lane, functools.partial(eqx.combine, static[0]))
+
+    @property
+    def functions(self) -> Functions:
+        """The functions that `integrator.js` calls."""
+        constants, lane, run = self.constants, self.lane, self.run
+        time, state = lane.time, lane.state
+        places = len(watched_places(explicit_tableau(self.settings.for_lanes), self.looks))
+        margins = jax.tree.map(lambda least: jax.ShapeDtypeStruct((places, *least.shape), least.dtype), lane.margins)
+        trial = Step(state, state, state, time, time, margins, (), state, None)
+
+        def after(constants: Any, lane: LaneState, length: Any, trial: Step) -> LaneState:
+            problem, control, atols = run(constants)
+            near = until_jump(problem, control, lane)
+            new_lane = after_step(problem, near, atols, lane, length, trial)
+            return past_jump(problem, control, near, lane, new_lane)
+
+        def length(constants: Any, lane: LaneState) -> Any:
+            return length_to_try(until_jump(*run(constants)[:2], lane), lane)
+
+        return {
+            "begin": (lambda *inputs: eqx.filter(_started(self.begin, *inputs), eqx.is_array), self.examples),
+            "length": (length, (constants, lane)),
+            "field": (lambda constants, time, state: run(constants)[0].field(time, state), (constants, time, state)),
+            "margins": (
+                lambda constants, time, state: run(constants)[0].margins(time, state),
+                (constants, time, state),
+            ),
+            "crossing": (
+                lambda constants, state, rate: run(constants)[0].crossing_along(state, rate),
+                (constants, state, state),
+            ),
+            "after": (after, (constants, lane, time, trial)),
+        }
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """The sizes and the coefficients that `integrator.js` reads."""
+        tableau = explicit_tableau(self.settings.for_lanes)
+        inner = inner_stages(tableau)
+        return {
+            "constants": size_of(self.constants),
+            "components": self.lane.state.shape[0],
+            "lane": offsets_of(self.lane),
+            "running": RUNNING,
+            "stages": [row.tolist() for row in tableau.a_lower[:inner]],
+            "places": np.asarray(tableau.c[:inner]).tolist(),
+            "looks": self.looks,
+            "margins_count": 0 if self.lane.margins is None else len(self.lane.margins),
+            "step": np.asarray(tableau.b_sol[: 1 + inner]).tolist(),
+            "error": np.asarray(tableau.b_error).tolist(),
+            "middle": middle_weights(tableau),
+        }
+
+    @property
+    def looks(self) -> list[int]:
+        """The stages at which margins and event function are evaluated, too."""
+        return looks_of(self.run(self.constants)[0], explicit_tableau(self.settings.for_lanes), self.lane)
+
+
+def _started(begin: Callable[..., LaneScheduler], *inputs: Any) -> tuple[Any, LaneState]:
+    scheduler = begin(*inputs)
+    return (scheduler.problem, scheduler.control, scheduler.atols), scheduler.fresh
+
+
+def as_object(facts: dict[str, Any], functions: Functions, **more: str) -> str:
+    """A JavaScript object with facts and functions; `more`: text of further entries."""
+    lines = [f"{name}: {javascript('', function, *examples)}" for name, (function, examples) in functions.items()]
+    lines += [f"{name}: {text}" for name, text in more.items()]
+    return "{\n" + ",\n".join([*(f"{name}: {json.dumps(fact)}" for name, fact in facts.items()), *lines]) + "}"
+
+
+def size_of(tree: Any) -> int:
+    """Number of numbers in a tree of arrays."""
+    return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
+
+
+def offsets_of(parts: Any) -> dict[str, int]:
+    """The offset of each part of a named tuple in its flat list of numbers, and under `size` the length of the list."""
+    return dict(zip((*parts._fields, "size"), np.cumsum([0, *map(size_of, parts)]).tolist(), strict=True))
+
+
+# A hybrid system for integration in the browser: its modes and transitions, in JavaScript.
+#
+# Everything is generated from the modes that make tables (`nonholonomic.hybrid`). Only the loops over rounds and over the
+# stretches of a transition are written by hand, in `integrator.js`.
+
+Start = tuple[tuple[AbstractBatchedMode, ...], Int[Array, "1"], Float[Array, "components 1"]]
+
+
+class HybridSimulator(NamedTuple):
+    """A hybrid system that is integrated in the browser.
+
+    - `start`: function of the numbers of the sliders that returns the modes, the index of the first mode, and the
+      initial state, for one cell.
+    - `t1`: horizon [s]; `settings`: settings with an explicit Runge-Kutta solver of Diffrax; `counters`: rows of
+      `Transition.counts`.
+    - `readings`: results at the end of a run, name -> function of (the sliders' numbers, a `HybridOutcome`).
+    - `frame`: function that returns the frame at any time; its arguments are the sliders' numbers, the index of the
+      mode or -1 between modes, the output rows of the modes, and the time [s]. `None` if no path is needed.
+    """
+
+    start: Callable[[Numbers], Start]
+    t1: float
+    settings: Settings
+    counters: int
+    readings: dict[str, Callable[[Numbers, HybridOutcome], Any]]
+    frame: Callable[[Numbers, Any, Any, Any], Any] | None = None
+
+    def first(self, values: Numbers) -> HybridOutcome[Array]:
+        """The run for the sliders' numbers, at its start."""
+        _, mode, state = self.start(values)
+        return at_start(jnp, mode, state, 1, self.counters)
+
+    def read(self, name: str, values: Numbers) -> Any:
+        """A reading at the start of a run."""
+        assert self.frame is not None, name
+        modes, number, state = self.start(values)
+        return self.frame(values, number, modes[0].shown(state), jnp.zeros(1))
+
+    def javascript(self, values: Numbers) -> str:
+        """The simulator as an object of JavaScript.
+
+        **Arguments:** `values`: numbers of the sliders; only their count matters.
+        """
+        modes = eqx.filter_eval_shape(self.start, values)[0]
+        runs = jax.eval_shape(self.first, values)
+        groups = program_groups(modes)
+        facts = {
+            "runs": offsets_of(runs),
+            "modes": [next(k for k, group in enumerate(groups) if number in group) for number in range(len(modes))],
+            "rounds": MOST_ROUNDS,
+            "running": RUNNING,
+            "left": LEFT_DOMAIN,
+            "unresolved": UNRESOLVED,
+        }
+        functions: Functions = {"first": (self.first, (values,))}
+        functions |= {name: (read, (values, runs)) for name, read in self.readings.items()}
+        if self.frame is not None:
+            rows = jax.eval_shape(lambda values: self.start(values)[0][0].shown(self.first(values).state), values)
+            functions["frame"] = (self.frame, (values, runs.mode, rows, runs.end_time))
+        kinds = [self._kind(values, group, modes[group[0]], runs) for group in groups]
+        return as_object(facts, functions, kinds=f"[{', '.join(kinds)}]")
+
+    def _kind(self, values: Numbers, group: tuple[int, ...], mode: AbstractBatchedMode, runs: HybridOutcome) -> str:
+        """The modes of one group: how they are integrated, and how they end."""
+        t1 = jnp.full(1, self.t1)
+
+        def mode_of(values: Numbers, runs: HybridOutcome) -> Any:
+            modes: Any = self.start(values)[0]
+            return mode_numbered(modes, group, runs.mode)
+
+        def begin(values: Numbers, runs: HybridOutcome) -> LaneScheduler:
+            problem = mode_of(values, runs).problem(runs.state)
+            return LaneScheduler.of(problem, _left(t1, runs), jnp.asarray(1), self.settings)
+
+        def ended(constants: Any, lane: Any, runs: HybridOutcome) -> HybridOutcome:
+            problem = stepper.run(constants)[0]
+            outcome = with_crossing_times(problem, back_to_margin(problem, outcome_of(lane)))
+            return after_solve(jnp, runs, outcome, t1)
+
+        def reset(values: Numbers, runs: HybridOutcome) -> HybridOutcome:
+            transition = mode_of(values, runs).reset_map(runs.state, _left(t1, runs))
+            return after_reset(jnp, runs, transition, t1)
+
+        def lost(values: Numbers, runs: HybridOutcome) -> Any:
+            stretch = mode_of(values, runs).lost(runs.state)
+            return stretch.open, stretch.elapsed, stretch
+
+        def hop(values: Numbers, runs: HybridOutcome, stretch: Any) -> Any:
+            state_after, following = mode_of(values, runs).hop(stretch, _left(t1, runs))
+            return following.open, state_after.elapsed, following
+
+        def closed(values: Numbers, runs: HybridOutcome, stretch: Any) -> HybridOutcome:
+            return after_reset(jnp, runs, mode_of(values, runs).closed(stretch), t1)
+
+        def output(values: Numbers, runs: HybridOutcome, state: Any) -> Any:
+            return mode_of(values, runs).shown(state)
+
+        def between(values: Numbers, runs: HybridOutcome, stretch: Any, elapsed: Any) -> Any:
+            mode = mode_of(values, runs)
+            return mode.between(mode.motion_in(stretch), elapsed)
+
+        stepper = Stepper.of(begin, (values, runs), self.settings)
+        functions, facts = stepper.functions, stepper.facts
+        functions["ended"] = (ended, (stepper.constants, stepper.lane, runs))
+        if not isinstance(mode, AbstractHoppingMode):
+            functions["reset"] = (reset, (values, runs))
+        else:
+            stretch = eqx.filter_eval_shape(lost, values, runs)[2]
+            facts |= {"stretch": size_of(stretch), "most_hops": mode.most_hops}
+            functions |= {"lost": (lost, (values, runs)), "hop": (hop, (values, runs, stretch))}
+            functions["closed"] = (closed, (values, runs, stretch))
+            if self.frame is not None:
+                functions["between"] = (between, (values, runs, stretch, runs.end_time))
+        if self.frame is not None:
+            functions["shown"] = (output, (values, runs, runs.state))
+        return as_object(facts, functions)
+
+
+def _left(t1: Float[Array, "1"], runs: HybridOutcome) -> Float[Array, "1"]:
+    """Time to the horizon [s]."""
+    return jnp.maximum(t1 - runs.end_time, 0.0)
+
+
+# A page with sliders: its contents, and how they are combined into one file.
 
 
 class Slider(NamedTuple):

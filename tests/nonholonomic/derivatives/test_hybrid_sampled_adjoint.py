@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from close import assert_close
 
-import nonholonomic.derivatives.periods as periods
+import nonholonomic.derivatives.adjoint as periods
 import nonholonomic.hybrid.samples as samples
 from nonholonomic.hybrid import AbstractBatchedMode, Transition, hybrid_samples
 from nonholonomic.integration import AbstractProblem, Settings
-from nonholonomic.integration.status import LEFT_DOMAIN, RUNNING
+from nonholonomic.integration.problem import LEFT_DOMAIN, RUNNING
 
 TIMES = jnp.linspace(0.0, 1.0, 11)
 #: Restitution, gravity, drag, height and speed of four balls; the ceiling stops the last one.

@@ -7,7 +7,7 @@ from close import assert_close
 
 from nonholonomic.derivatives import exponent_of, growth
 from nonholonomic.integration import AbstractProblem, Settings
-from nonholonomic.integration.status import LEFT_DOMAIN, REACHED_END
+from nonholonomic.integration.problem import LEFT_DOMAIN, REACHED_END
 
 
 class Shears(AbstractProblem):

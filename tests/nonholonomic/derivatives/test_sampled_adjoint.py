@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from close import assert_close
 
-import nonholonomic.derivatives._adjoint as adjoint
-import nonholonomic.derivatives.periods as periods
+import nonholonomic.derivatives.adjoint as adjoint
+import nonholonomic.derivatives.adjoint as periods
 from nonholonomic.derivatives import sampled_run
 from nonholonomic.integration import AbstractProblem, Settings
 

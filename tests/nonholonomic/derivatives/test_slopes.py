@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from close import assert_close
 
-import nonholonomic.derivatives._adjoint as adjoint
-import nonholonomic.derivatives.periods as periods
-import nonholonomic.derivatives.slopes as slopes
+import nonholonomic.derivatives.adjoint as adjoint
+import nonholonomic.derivatives.adjoint as periods
+import nonholonomic.derivatives.adjoint as slopes
 from nonholonomic.derivatives import tangents_of
 from nonholonomic.integration import AbstractProblem, Settings
-from nonholonomic.integration.status import CROSSED, LEFT_DOMAIN
+from nonholonomic.integration.problem import CROSSED, LEFT_DOMAIN
 
 MOVED = ("rate", "height", "growth")
 #: So many that the runs are differentiated backward.

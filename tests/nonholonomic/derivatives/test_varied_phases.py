@@ -16,7 +16,7 @@ from nonholonomic.hybrid import (
     traced_solve_hybrid_with_tangents,
 )
 from nonholonomic.integration import AbstractProblem, Settings
-from nonholonomic.integration.status import CROSSED, REACHED_END, RUNNING
+from nonholonomic.integration.problem import CROSSED, REACHED_END, RUNNING
 
 CELLS = 8
 

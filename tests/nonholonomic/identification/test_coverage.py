@@ -8,7 +8,7 @@ import pytest
 import scipy.stats
 
 from nonholonomic.identification import FitWarning, Free, LogDensity, Measurements, identify, sample
-from nonholonomic.identification.distribution import Distribution
+from nonholonomic.identification.conclusions import Distribution
 from nonholonomic.identification.exploration import smoothed_weights
 
 X = np.linspace(0.5, 1.5, 8)

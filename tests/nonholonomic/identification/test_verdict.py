@@ -14,7 +14,7 @@ from close import assert_close
 from matplotlib.figure import Figure
 
 from nonholonomic.identification import FitWarning, Free, Measurements, identify
-from nonholonomic.identification.verdict import normal_scores, runs_of_signs
+from nonholonomic.identification.conclusions import normal_scores, runs_of_signs
 
 T = np.linspace(0.0, 4.0, 115)
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nonholonomic.integration.bounds import RULES, Bounds, UnboundedError, enclosing
+from nonholonomic.integration.events import RULES, Bounds, UnboundedError, enclosing
 
 FUNCTIONS = {
     "abs": jnp.abs,

@@ -10,13 +10,8 @@ from close import assert_close
 from tune_middle import errors, middle_weights
 
 from nonholonomic.integration import AbstractProblem, Oscillatory8, Settings, Stabilized8, solve_with_samples
-from nonholonomic.integration.dense_samples import (
-    StepEnd,
-    continuous_extension,
-    hermite_factors,
-    second_derivative,
-)
 from nonholonomic.integration.runge_kutta import explicit_step, memory_for_stages
+from nonholonomic.integration.samples import StepEnd, continuous_extension, hermite_factors, second_derivative
 
 
 class Growth(AbstractProblem):

@@ -5,7 +5,7 @@ import numpy as np
 from close import assert_close
 
 from nonholonomic.integration import Oscillatory8, explicit_tableau
-from nonholonomic.integration.double_roots import missed_loss
+from nonholonomic.integration.events import missed_loss
 from nonholonomic.integration.runge_kutta import stages_to_look, watched_places
 
 PLACES = watched_places(explicit_tableau(Oscillatory8()), stages_to_look(Oscillatory8.tableau.c))

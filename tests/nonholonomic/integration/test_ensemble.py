@@ -21,9 +21,8 @@ from nonholonomic.integration import (
     solve_by_diffrax,
     solve_ensemble,
 )
-from nonholonomic.integration.ensemble import ensemble_solve
-from nonholonomic.integration.scheduler import AbstractRecorder, LaneScheduler
-from nonholonomic.integration.status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END
+from nonholonomic.integration.problem import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END
+from nonholonomic.integration.scheduler import AbstractRecorder, LaneScheduler, ensemble_solve
 from nonholonomic.integration.step import try_step
 
 pytestmark = pytest.mark.oldest

@@ -18,7 +18,7 @@ from nonholonomic.hybrid import (
     solve_hybrid_with_samples,
 )
 from nonholonomic.integration import AbstractProblem, Settings
-from nonholonomic.integration.status import CROSSED, REACHED_END, RUNNING, UNRESOLVED
+from nonholonomic.integration.problem import CROSSED, REACHED_END, RUNNING, UNRESOLVED
 
 GRAVITY, CLOSING = 9.81, 1e-3
 

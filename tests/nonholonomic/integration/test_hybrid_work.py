@@ -9,7 +9,7 @@ from close import assert_close
 
 from nonholonomic.hybrid import AbstractBatchedMode, Transition, hybrid_samples, solve_hybrid_dense
 from nonholonomic.integration import AbstractProblem, Settings
-from nonholonomic.integration.status import REACHED_END, RUNNING
+from nonholonomic.integration.problem import REACHED_END, RUNNING
 
 #: Turning rate [rad/s], how long a clock runs [s], and how long the other clock would run.
 RATE, OWN, OTHER = 100.0, 0.05, 10.0

@@ -12,8 +12,8 @@ from tuning.trees import error_coefficients, trees
 
 import tippe
 from nonholonomic.integration import Oscillatory8, Settings, Stabilized8, solve_ensemble
-from nonholonomic.integration.tuned_pair import CAUTION
-from tippe.modes.inversion_problem import InversionProblem
+from nonholonomic.integration.pairs import CAUTION
+from tippe.modes.problems import InversionProblem
 
 OWN = unknowns_of(Oscillatory8().tableau, CAUTION)
 STABLE = unknowns_of(Stabilized8().tableau, CAUTION)

@@ -7,7 +7,7 @@ import pytest
 from close import assert_close
 
 from nonholonomic.integration import AbstractProblem, Settings, solve_with_samples
-from nonholonomic.integration.status import LEFT_DOMAIN, REACHED_END
+from nonholonomic.integration.problem import LEFT_DOMAIN, REACHED_END
 
 CELLS = 40
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nonholonomic.lanes.comparisons import jumps_of
+from nonholonomic.compilation.tracing import jumps_of
 
 KNOTS = jnp.array([0.0, 0.3, 1.0])
 

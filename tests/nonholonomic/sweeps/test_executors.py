@@ -24,7 +24,7 @@ import stroller
 import tippe
 from nonholonomic.runs.table import TableJob
 from nonholonomic.sweeps import Table, running
-from nonholonomic.sweeps.dispatch import ExecutorBroken, handed_out
+from nonholonomic.sweeps.running import ExecutorBroken, handed_out
 
 HERE = Path(__file__).parent
 

@@ -20,7 +20,7 @@ from disk_faults import FOR_A_BLOCK, FOR_THE_FILE, FOR_THE_FOLDER, Killed, fail_
 
 from nonholonomic.sweeps import Table, running
 from nonholonomic.sweeps._chunks import ChunkStore
-from nonholonomic.sweeps.layout import Layout
+from nonholonomic.sweeps.grid import Layout
 
 pytestmark = pytest.mark.oldest
 

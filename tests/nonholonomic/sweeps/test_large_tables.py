@@ -12,8 +12,7 @@ from tops import rutstam_top
 
 import tippe
 from nonholonomic.sweeps import Table, Variable, axis, running, sweep
-from nonholonomic.sweeps.grid import cells_to_check, columns, size_of
-from nonholonomic.sweeps.layout import Layout, boxes
+from nonholonomic.sweeps.grid import Layout, boxes, cells_to_check, columns, size_of
 
 X, Y = axis("x", "x", "s", np.linspace(0.0, 1.0, 1000)), axis("y", "y", "m", np.arange(500.0))
 VARIABLES = {
@@ -120,7 +119,7 @@ def test_a_small_grid_is_checked_whole_and_a_large_one_at_its_edges_and_corners(
 
 def test_a_billion_cells_are_refused_at_once(monkeypatch):
     """Values that are illegal only in combination, in one corner of the grid."""
-    monkeypatch.setattr("tippe.runs.table.compute_table", lambda *_, **__: pytest.fail("it was run"))
+    monkeypatch.setattr("tippe.runs.verbs.compute_table", lambda *_, **__: pytest.fail("it was run"))
     scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3))
     axes = {"scene.body.radius": np.linspace(0.02, 0.01, 100), "scene.body.offset": np.linspace(0.001, 0.011, 100)}
     start_time = time.process_time()

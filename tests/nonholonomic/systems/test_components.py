@@ -7,8 +7,8 @@ import pytest
 from close import assert_close
 from own_modes import Sleigh
 
+from nonholonomic.compilation.components import TooLarge, by_components
 from nonholonomic.formulations import Lagrange
-from nonholonomic.lanes.components import TooLarge, by_components
 
 LANES = tuple(jnp.linspace(0.1, 1.0, 8) * scale for scale in (1.0, -2.0, 0.7, 1.3, 0.4, 3.0))
 SCALARS = tuple(jax.ShapeDtypeStruct((), jnp.float64) for _ in LANES)

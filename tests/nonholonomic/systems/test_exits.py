@@ -8,8 +8,8 @@ from browser import needs_browser, open_browser
 from close import assert_close
 
 from nonholonomic import AbstractMode, AbstractSystem, Hybrid, event_time, simulate, sweep
-from nonholonomic.runs.explore import page_of
 from nonholonomic.runs.model import model_of
+from nonholonomic.runs.trajectory import page_of
 from nonholonomic.views.explore import programs
 
 
@@ -70,7 +70,7 @@ class Beads(AbstractMode):
     def reset(self, t, s, exit):
         left, right = s[2], s[3]
         struck = jnp.array([-0.5 * left + 1.5 * right, 0.5 * left + 0.5 * right])
-        walls = jnp.array([jnp.where(exit["wall"], -one, one), jnp.where(exit["end"], -other, other)])
+        walls = jnp.array([jnp.where(exit["wall"], -left, left), jnp.where(exit["end"], -right, right)])
         return jnp.concatenate([s[:2], jnp.where(exit["beads"], struck, walls)]), 0
 
 

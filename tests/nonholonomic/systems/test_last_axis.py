@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from close import assert_close
 
-from nonholonomic.lanes.components import TooLarge
-from nonholonomic.lanes.last_axis import over_last_axis
+from nonholonomic.compilation.components import TooLarge, over_last_axis
 
 RANDOM = np.random.default_rng(0)
 WEIGHTS, INPUTS = jnp.asarray(RANDOM.normal(size=(4, 3, 5))), jnp.asarray(RANDOM.normal(size=(3, 5)))

@@ -10,8 +10,8 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from nonholonomic import AbstractMode, Hybrid, event_time, simulate, sweep
-from nonholonomic.runs.explore import page_of
 from nonholonomic.runs.model import model_of
+from nonholonomic.runs.trajectory import page_of
 from nonholonomic.views.explore import programs
 
 G = 9.8

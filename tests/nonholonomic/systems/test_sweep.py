@@ -18,7 +18,7 @@ import tippe
 from nonholonomic import AbstractMode, Hybrid, sweep
 from nonholonomic.integration import Settings
 from nonholonomic.runs import TableForm, model_of
-from nonholonomic.runs.equations import checksum_of, has_users_code
+from nonholonomic.runs.sweep import checksum_of, has_users_code
 from nonholonomic.runs.table import TableJob
 
 HEIGHTS, RESTITUTIONS = np.array([0.5, 1.0, 2.0]), np.array([0.7, 0.8])

@@ -24,9 +24,8 @@ from nonholonomic.views import (
     page,
     turned,
 )
-from nonholonomic.views.animation import draw_curves, frame_times, rate_of, speed_as_text, write_animation
+from nonholonomic.views.animation import Viewable, draw_curves, frame_times, rate_of, speed_as_text, write_animation
 from nonholonomic.views.stage import matrices
-from nonholonomic.views.viewable import Viewable
 
 SURFACES = (
     (Plane(), (0.3, 0.1)),

@@ -1,0 +1,730 @@
+"""First derivatives of event times with respect to any number of parameters: the discrete adjoint of an ensemble solve.
+
+A run is cut into periods, and the steps of each period are recorded. After the last period, a backward pass carries the
+derivatives of the event times with respect to the states from the last period to the first. The records of the latest
+periods are kept; a period whose record is gone is computed again from the latest checkpoint before it. The cost does not
+depend on the number of parameters, and the memory does not depend on the length of the runs. Step lengths are held
+fixed, as in `variation.py`.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Literal
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float, Int
+
+from ..compilation.xla_cpu import compiled_alone, uncounted, written_by_component, written_in_place
+from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, States
+from ..integration.problem import CROSSED, REACHED_END, RUNNING, time_at_jump
+from ..integration.runge_kutta import Stages, moved_state, over_stages
+from ..integration.scheduler import AbstractRecorder, InLanes, LaneScheduler, SchedulerState, with_crossing_times
+from ..integration.step import length_to_try, try_step, until_jump
+from .variation import VariationalProblem, in_groups, slopes_by_variations
+
+# The periods of an ensemble solve that are kept for its adjoint: where some of them begin and end, and the steps of the
+# latest ones.
+
+#: Number of checkpoints. With more periods, some checkpoints are dropped and computed again from an earlier one. With
+#: the 64 lanes of a CPU the checkpoints take 3 MB, with the 32768 of an accelerator 1.5 GB.
+SLOTS = 64
+
+#: Number of steps that are kept for each cell, on average, and the memory [bytes] that all of them may take.
+STEPS_KEPT, MAX_BYTES = 1024, {"cpu": 1 << 26}
+
+
+class StepRecord(NamedTuple):
+    """The steps of a period: where each step began, and its length, 0 for a lane that did not move.
+
+    For runs with samples, `sample` is the index of the sample on which the step ended, the number of samples if there is
+    none; and `fixed` are the components that the tangent does not move there.
+    """
+
+    time: Float[Array, "iterations lanes"]
+    state: Float[Array, "iterations components lanes"]
+    length: Float[Array, "iterations lanes"]
+    sample: Int[Array, "iterations lanes"] | None = None
+    fixed: Bool[Array, "iterations components lanes"] | None = None
+
+
+#: A period without its steps, as a tree of arrays: the lanes before it, and after it but before their refill; or other states
+#: of a run.
+Period = Any
+
+
+class Checkpoints(NamedTuple):
+    """Some of the periods, the earliest first.
+
+    There are `depth` of them; `index` holds their numbers, `slot` their places in `periods`.
+    """
+
+    depth: Int[Array, ""]
+    index: Int[Array, " slots"]
+    slot: Int[Array, " slots"]
+    periods: Period
+
+    @classmethod
+    def none(cls, example: Period) -> "Checkpoints":
+        """No periods. **Arguments:** `example`: a period, for the shapes."""
+        room = jax.tree.map(lambda leaf: jnp.zeros((SLOTS, *leaf.shape), leaf.dtype), example)
+        return cls(jnp.zeros((), int), jnp.zeros(SLOTS, int), jnp.arange(SLOTS), room)
+
+    def latest(self) -> tuple[Int[Array, ""], Period]:
+        """The latest period, and its number."""
+        last = self.depth - 1
+        return self.index[last], jax.tree.map(functools.partial(read, index=self.slot[last]), self.periods)
+
+    def without_latest(self) -> "Checkpoints":
+        """All but the latest period."""
+        return self._replace(depth=self.depth - 1)
+
+    def added(self, index: Int[Array, ""], period: Period) -> "Checkpoints":
+        """Add a period; if all slots are full, drop the period whose neighbours are closest."""
+        position = jnp.arange(SLOTS)
+        is_full = self.depth == SLOTS
+        following = jnp.where(position == SLOTS - 1, index, jnp.roll(self.index, -1))
+        gap = jnp.where(position == 0, jnp.iinfo(self.index.dtype).max, following - jnp.roll(self.index, 1))
+        victim = jnp.where(is_full, jnp.argmin(gap), self.depth)
+        free = self.slot[victim]
+        shifts = is_full & (position >= victim)
+        end = jnp.minimum(self.depth, SLOTS - 1)
+        indices = jnp.where(shifts, jnp.roll(self.index, -1), self.index).at[end].set(index)
+        slots = jnp.where(shifts, jnp.roll(self.slot, -1), self.slot).at[end].set(free)
+        room = jax.tree.map(functools.partial(written_in_place, at=free), self.periods, period)
+        return Checkpoints(jnp.minimum(self.depth + 1, SLOTS), indices, slots, room)
+
+
+class LatestSteps(NamedTuple):
+    """The steps of all iterations from number `first` on, in a ring with room for a period beyond its end."""
+
+    first: Int[Array, ""]
+    ring: StepRecord
+
+    @classmethod
+    def none(cls, example: StepRecord, cells: int) -> "LatestSteps":
+        """No steps. **Arguments:** `example`: the steps of a period, for the shapes; `cells`: number of cells."""
+        period, lanes = example.length.shape
+        bytes_of_step = sum(leaf.dtype.itemsize * leaf.size for leaf in jax.tree.leaves(example)) // period
+        max_steps = MAX_BYTES.get(jax.default_backend(), 1 << 31) // bytes_of_step
+        size = period + max(period, min(max_steps, STEPS_KEPT * -(-cells // lanes)))
+        room = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape[1:]), leaf.dtype), example)
+        return cls(jnp.zeros((), int), room)
+
+    def added(self, first: Int[Array, ""], steps: StepRecord) -> "LatestSteps":
+        """Add the steps of a period that begins with iteration number `first`."""
+        period = len(steps.length)
+        size = len(self.ring.length) - period
+
+        def written(stack: Array, rows: Array) -> Array:
+            return jax.lax.dynamic_update_slice_in_dim(stack, rows, first % size, 0)
+
+        oldest = jnp.maximum(self.first, first + period - size)
+        return LatestSteps(oldest, jax.tree.map(written, self.ring, steps))
+
+    def of_period(self, first: Int[Array, ""], period: int) -> StepRecord:
+        """The steps of a period that begins with iteration number `first`."""
+        start = first % (len(self.ring.length) - period)
+        return jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, period), self.ring)
+
+
+def read(stack: Array, index: Int[Array, ""]) -> Array:
+    """One of the arrays stacked in another."""
+    return jax.lax.dynamic_index_in_dim(stack, index, 0, keepdims=False)
+
+
+#: The quantities measured at the end of a run: (problem, lane state) -> a tree of arrays with the lanes last,
+#: differentiable with respect to the problem's parameters and the lanes' states.
+Measured = Callable[[Any, LaneState], Any]
+
+
+class StepRecorder(AbstractRecorder):
+    """Records where each step began, and its length; the derivatives begin at the ends of the runs."""
+
+    # As many iterations as fit in the caches with their record; a period ends with a refill.
+    period: ClassVar[int] = 128
+    refill_cost = 2.0
+
+    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: None) -> StepRecord:
+        leaves = (lane_state.time, without_probe(lane_state).state, lane_state.length)
+        return StepRecord(*(jnp.zeros((self.period, *leaf.shape), leaf.dtype) for leaf in leaves))
+
+    def has_room(self, record: StepRecord, iteration: Int[Array, ""]) -> Bool[Array, ""]:
+        return iteration < self.period
+
+    def step(
+        self, in_lanes: InLanes, lane_state: LaneState, record: StepRecord, iteration: Int[Array, ""]
+    ) -> tuple[LaneState, StepRecord]:
+        next_state = try_step(*in_lanes, lane_state)
+        tried_length = length_to_try(until_jump(*in_lanes[:2], lane_state), lane_state)
+        length = jnp.where(next_state.time > lane_state.time, tried_length, 0.0)
+        entry = StepRecord(lane_state.time, without_probe(lane_state).state, length)
+        return next_state, jax.tree.map(functools.partial(written_in_place, at=iteration), record, entry)
+
+    def steps(self, record: Any) -> StepRecord:
+        """The steps in the record of a period."""
+        return record
+
+    def arriving(self, lane_state: LaneState, steps: StepRecord) -> Float[Array, "iterations components lanes"] | None:
+        """The derivatives of the measured quantity with respect to the states at the ends of the steps, apart from those
+        through later states; `None` if the quantity depends only on the ends of the runs."""
+        return None
+
+    def share_of_end(self, lane_state: LaneState) -> Any:
+        """The factors of the measured quantities at the end of the runs in the lanes."""
+        return jnp.ones_like(lane_state.time)
+
+
+class Derivatives(NamedTuple):
+    """Derivatives of the measured quantity with respect to the state and to the parameters, a tree of arrays."""
+
+    state: Float[Array, "components lanes"]
+    numbers: Any
+
+
+class Backward(NamedTuple):
+    """State of the forward pass and of the backward pass.
+
+    `frontier` holds the lanes at the start of the next period to compute, and `number` its number. The backward pass takes
+    the period before number `limit` next. `adjoint` holds the derivatives for the cell in each lane, `gradient` those of
+    every cell with respect to its initial state.
+    """
+
+    frontier: SchedulerState
+    number: Int[Array, ""]
+    limit: Int[Array, ""]
+    checkpoints: Checkpoints
+    latest_steps: LatestSteps
+    outcome: Outcome
+    adjoint: Derivatives
+    gradient: Derivatives
+
+
+def solve_with_adjoint(
+    problem: VariationalProblem,
+    moving: Any,
+    probe: Any,
+    t1: Float[Array, "..."],
+    cells: Int[Array, ""],
+    settings: Settings,
+    *,
+    measured: Measured,
+    recorder: StepRecorder | None = None,
+    one_kernel: bool = False,
+) -> tuple[Outcome, Float[Array, "components cells"], Any]:
+    """Run every cell to its end, and differentiate a quantity at the end with respect to the problem's parameters.
+
+    **Arguments:** as for `ensemble_solve`, except `nonterminal`, and
+
+    - `problem`: without tangents.
+    - `moving`: a tree of booleans like the problem: the leaves with respect to which to differentiate, scalars or
+      (..., cells).
+    - `probe`: a tangent of the inner problem. Its variation is also integrated and takes part in step-size control, so
+      that the steps suit tangents even where the state is at rest.
+    - `measured`: the quantity to differentiate.
+    - `recorder`: the recorder of the steps, which may add derivatives at the ends of the steps.
+
+    **Returns:** the `Outcome`, without crossing times; the derivatives of every cell with respect to its initial state;
+    and those with respect to the parameters, one per cell, in a tree like the problem with `None` for the other leaves.
+    """
+    components, size = problem.start()[0].shape
+    numbers, problem_with_probe = _with_probe(problem, moving, probe, size)
+    scheduler = LaneScheduler.of(problem_with_probe, t1, cells, settings, one_kernel=one_kernel, n_blocks=2)
+    passes = Passes(scheduler, moving, measured, StepRecorder() if recorder is None else recorder)
+    run = passes.start(numbers)
+    run = jax.lax.while_loop(lambda run: uncounted(run.limit > 0, run.outcome.steps[0]), passes.there_and_back, run)
+    return run.outcome._replace(state=run.outcome.state[:components]), run.gradient.state, run.gradient.numbers
+
+
+def _with_probe(problem: VariationalProblem, moving: Any, probe: Any, size: int) -> tuple[Any, VariationalProblem]:
+    """The chosen parameters with one value per cell, and the problem with them and the probe.
+
+    **Arguments:** as for `solve_with_adjoint`; `size`: number of cells, padding included.
+    """
+    numbers, static = eqx.partition(problem, moving)
+    numbers = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*jnp.shape(leaf)[:-1], size)), numbers)
+    problem = eqx.combine(numbers, static)
+    # The chosen parameters now have one value per cell, so their rates must, too.
+    probe = jax.tree.map(
+        lambda rate, number: None if rate is None else jnp.broadcast_to(rate, jnp.shape(number)),
+        probe,
+        problem.problem,
+        is_leaf=lambda rate: rate is None,
+    )
+    return numbers, dataclasses.replace(problem, tangents=(probe,))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Passes:
+    """The forward pass, which computes periods, and the backward pass, which carries derivatives through them.
+
+    `moving`, `measured`, `recorder`: as for `solve_with_adjoint`.
+    """
+
+    scheduler: LaneScheduler
+    moving: Any
+    measured: Measured
+    recorder: StepRecorder
+
+    def start(self, numbers: Any) -> Backward:
+        """Both passes before the first period. **Arguments:** `numbers`: the parameters, with one value per cell."""
+        scheduler, start = self.scheduler, self.scheduler.start()
+        in_lanes = scheduler.in_lanes(start.lane_state)
+        state, states = (without_probe(lanes).state for lanes in (start.lane_state, scheduler.fresh))
+        record = jax.eval_shape(lambda: self.recorder.steps(self.recorder.begin(in_lanes, start.lane_state, None)))
+        return Backward(
+            frontier=start,
+            number=jnp.zeros((), int),
+            limit=jnp.asarray(jnp.iinfo(jnp.arange(0).dtype).max),
+            checkpoints=Checkpoints.none((start, start)),
+            latest_steps=LatestSteps.none(record, scheduler.capacity),
+            outcome=scheduler.empty(),
+            adjoint=jax.tree.map(jnp.zeros_like, Derivatives(state, scheduler.pick(numbers, start.lane_state.cell))),
+            gradient=jax.tree.map(jnp.zeros_like, Derivatives(states, numbers)),
+        )
+
+    def there_and_back(self, run: Backward) -> Backward:
+        """Compute all periods up to the one that the backward pass needs, and take back those whose steps are kept."""
+        run = jax.lax.while_loop(self.is_ahead, self.forward, run)
+        run = run._replace(limit=jnp.minimum(run.limit, run.number))
+        run = jax.lax.while_loop(self.is_recorded, self.backward, run)
+        # The steps before are gone: continue from the latest checkpoint.
+        number, (lanes_before, _) = run.checkpoints.latest()
+        return run._replace(
+            frontier=lanes_before,
+            number=number,
+            checkpoints=run.checkpoints.without_latest(),
+            latest_steps=run.latest_steps._replace(first=lanes_before.iterations),
+        )
+
+    def is_ahead(self, run: Backward) -> Bool[Array, ""]:
+        """Whether a period that the backward pass needs has not been computed."""
+        return uncounted(self.scheduler.unfinished(run.frontier) & (run.number < run.limit), run.number)
+
+    def forward(self, run: Backward) -> Backward:
+        """Compute the next period, and record its steps."""
+        lanes_after, record = self.scheduler.run(run.frontier, self.recorder)
+        return run._replace(
+            frontier=self.scheduler.refill(lanes_after),
+            number=run.number + 1,
+            checkpoints=run.checkpoints.added(run.number, (run.frontier, lanes_after)),
+            latest_steps=run.latest_steps.added(run.frontier.iterations, self.recorder.steps(record)),
+            outcome=self.scheduler.store(run.outcome, lanes_after.lane_state),
+        )
+
+    def is_recorded(self, run: Backward) -> Bool[Array, ""]:
+        """Whether the steps of the period that the backward pass takes next are kept."""
+        number, (lanes_before, _) = run.checkpoints.latest()
+        recorded = (number == run.limit - 1) & (lanes_before.iterations >= run.latest_steps.first)
+        return uncounted((run.checkpoints.depth > 0) & recorded, run.number)
+
+    def backward(self, run: Backward) -> Backward:
+        """Carry the derivatives through the latest period."""
+        scheduler, (number, (lanes_before, lanes_after)) = self.scheduler, run.checkpoints.latest()
+        steps = run.latest_steps.of_period(lanes_before.iterations, self.recorder.period)
+        count = lanes_after.iterations - lanes_before.iterations
+        adjoint = self.taken_back(lanes_after.lane_state, steps, count, run.adjoint)
+        # A cell that had made no step was at its start.
+        at_its_start = (lanes_before.lane_state.steps == 0) & (lanes_before.lane_state.cell < scheduler.cells)
+        cell = jnp.where(at_its_start, lanes_before.lane_state.cell, scheduler.capacity)
+        gradient = jax.tree.map(
+            lambda of_cells, of_lanes: of_cells.at[..., cell].set(of_lanes, mode="drop"), run.gradient, adjoint
+        )
+        checkpoints = run.checkpoints.without_latest()
+        return run._replace(limit=number, checkpoints=checkpoints, adjoint=adjoint, gradient=gradient)
+
+    def taken_back(
+        self, lane_state: LaneState, steps: StepRecord, count: Int[Array, ""], adjoint: Derivatives
+    ) -> Derivatives:
+        """Carry the derivatives from the end of a period to its start; in lanes that have ended, the derivatives begin
+        there.
+        """
+        weights, lane_state = Weights.of(self.scheduler.control.tableau), without_probe(lane_state)
+        # Selected here: XLA 0.10.2 aborts on a kernel that takes the initial states of all cells if they are constants.
+        problem = dataclasses.replace(self.scheduler.in_lanes(lane_state)[0], tangents=())
+        arriving, share = self.recorder.arriving(lane_state, steps), self.recorder.share_of_end(lane_state)
+        record = (steps.time, steps.state, steps.length, arriving)
+
+        def loop(carry: Any) -> Any:
+            lane_state, share, record, count, adjoint = carry
+            ended = lane_state.status != RUNNING
+            at_end = _at_the_end(problem, self.moving, self.measured, lane_state, share)
+            adjoint = jax.tree.map(functools.partial(jnp.where, ended), at_end, adjoint)
+
+            def step(carry: Any) -> Any:
+                index, adjoint, memory = carry
+                time, state, length, at_end = jax.tree.map(functools.partial(read, index=index - 1), record)
+                if at_end is not None:
+                    adjoint = adjoint._replace(state=adjoint.state + at_end)
+                point = (time, state, length)
+                return index - 1, *step_taken_back(weights, problem, self.moving, *point, adjoint, memory)
+
+            memory = StageMemory.of(len(weights.fractions), lane_state.state)
+            return jax.lax.while_loop(lambda carry: carry[0] > 0, step, (count, adjoint, memory))[1]
+
+        return self.scheduler.in_kernel(loop)((lane_state, share, record, count, adjoint))
+
+
+def without_probe(lane_state: LaneState) -> LaneState:
+    """The lanes with the states alone, without the variations."""
+    return lane_state._replace(state=lane_state.state[: lane_state.state.shape[0] // 2])
+
+
+def _at_the_end(
+    problem: AbstractProblem, moving: Any, measured: Measured, lane_state: LaneState, share: Any
+) -> Derivatives:
+    """The derivatives with respect to the final state and the parameters. **Arguments:** `share`: as `share_of_end`."""
+    numbers, static = eqx.partition(problem, moving)
+
+    def value(numbers: Any, state: States) -> Any:
+        return measured(eqx.combine(numbers, static), lane_state._replace(state=state))
+
+    by_number, by_state = jax.vjp(value, numbers, lane_state.state)[1](share)
+    return Derivatives(by_state, by_number)
+
+
+class Weights(NamedTuple):
+    """The coefficients of a Runge-Kutta method that its adjoint needs.
+
+    `fractions`: the position of each stage in the step; `rows`: the weights of each stage but the first; `shares`: for
+    each stage, the share of its rate in the end of the step and in the later stages.
+    """
+
+    fractions: Float[np.ndarray, " stages"]
+    rows: tuple[Float[np.ndarray, " before"], ...]
+    shares: Float[np.ndarray, "stages 1+stages"]
+
+    @classmethod
+    def of(cls, tableau: diffrax.ButcherTableau) -> "Weights":
+        """The weights of a method, without a last stage that only serves the next step."""
+        weights, fractions, rows = tableau.b_sol, np.array([0.0, *tableau.c]), tableau.a_lower
+        if tableau.fsal:
+            weights, fractions, rows = rows[-1], fractions[:-1], rows[:-1]
+        stages = len(fractions)
+        shares = np.zeros((stages, 1 + stages))
+        shares[:, 0] = weights
+        for stage, row in enumerate(rows, start=1):
+            shares[: len(row), 1 + stage] = row
+        return cls(fractions, tuple(rows), shares)
+
+
+class StageMemory(NamedTuple):
+    """Memory for the stages of a step, which all steps share; what it holds before a step does not matter.
+
+    `states`, `rates`: the states and the field at the stages; `adjoints`: the derivatives with respect to the end of
+    the step and to the stages.
+    """
+
+    states: Stages
+    rates: Stages
+    adjoints: Stages
+
+    @classmethod
+    def of(cls, stages: int, state: States) -> "StageMemory":
+        """Memory for a number of stages."""
+        return cls(*(jnp.zeros((count, *state.shape), state.dtype) for count in (stages, stages - 1, stages + 1)))
+
+
+def step_taken_back(
+    weights: Weights,
+    problem: AbstractProblem,
+    moving: Any,
+    time: Lanes,
+    state: States,
+    length: Lanes,
+    adjoint: Derivatives,
+    memory: StageMemory,
+) -> tuple[Derivatives, StageMemory]:
+    """Carry derivatives from the end of a Runge-Kutta step to its start (Hager, Numer. Math. 87 (2000) 247).
+
+    The stages are computed in loops, as in `explicit_step`.
+
+    **Arguments:**
+
+    - `weights`: the method.
+    - `problem`, `moving`: the problem, with leaves that are scalars or have one number per lane; the leaves with
+      respect to which to differentiate.
+    - `time`, `state`, `length`: where the step starts, and its length; 0 if no step was made.
+    - `adjoint`: derivatives at the end of the step.
+    - `memory`: memory for the stages.
+
+    **Returns:** the derivatives at the start, and the memory for reuse.
+    """
+    numbers, static = eqx.partition(problem, moving)
+    stages = len(weights.fractions)
+    fractions = jnp.asarray(weights.fractions)
+
+    def stage_made(stage: Int[Array, ""], carry: tuple[Stages, Stages]) -> tuple[Stages, Stages]:
+        stage_states, rates = carry
+        rate = problem.field(time + fractions[stage] * length, read(stage_states, index=stage))
+        rates = written_by_component(rates, rate, at=stage)
+        return written_in_place(
+            stage_states, moved_state(stage, weights.rows, state, length, rates), at=stage + 1
+        ), rates
+
+    start = jnp.zeros((), int)
+    initial_stages = written_in_place(memory.states, state, at=start), memory.rates
+    stage_states, rates = over_stages(stages - 1, stage_made, initial_stages)
+
+    def pull(stage_time: Lanes, numbers: Any, parts: tuple[Lanes, ...], by_rate: tuple[Lanes, ...]) -> Any:
+        def field(numbers: Any, parts: tuple[Lanes, ...]) -> States:
+            return eqx.combine(numbers, static).field(stage_time, parts)
+
+        by_number, by_part = jax.vjp(field, numbers, parts)[1](jnp.stack(by_rate))
+        return jnp.stack(by_part), by_number
+
+    def stage_taken_back(count: Int[Array, ""], carry: Any) -> Any:
+        stage, (by_stage, total) = stages - 1 - count, carry
+        by_rate = jax.lax.optimization_barrier(moved_state(stage, weights.shares, zero_state, length, by_stage))
+        stage_time = time + fractions[stage] * length
+        by_state, by_number = pull(
+            stage_time, numbers, tuple(jnp.unstack(read(stage_states, index=stage))), tuple(jnp.unstack(by_rate))
+        )
+        # If no step was made, values may not be finite.
+        by_state = jax.lax.optimization_barrier(jnp.where(length > 0.0, by_state, 0.0))
+        total = jax.tree.map(
+            lambda sum_so_far, term: sum_so_far + jnp.where(length > 0.0, term, 0.0),
+            total,
+            Derivatives(by_state, by_number),
+        )
+        return written_in_place(by_stage, by_state, at=stage + 1), total
+
+    zero_state, ends = jnp.zeros_like(state), written_in_place(memory.adjoints, adjoint.state, at=start)
+    adjoints, total = over_stages(stages, stage_taken_back, (ends, adjoint))
+    # A step that was rejected begins on the same far side as the one that follows.
+    begin = jnp.where(length > 0.0, time, jnp.nan)
+    return jump_taken_back(problem, moving, begin, state, total), StageMemory(stage_states, rates, adjoints)
+
+
+def jump_taken_back(
+    problem: AbstractProblem, moving: Any, time: Lanes, state: States, adjoint: Derivatives
+) -> Derivatives:
+    """Carry derivatives from the far side of a jump to its near side, in the lanes whose step begins on a far side.
+
+    **Arguments:** as for `step_taken_back`; `time`, `state`: those of the far side; the time is NaN if no step was made.
+    """
+    jumps = problem.jumps(time, state)
+    if jumps is None:
+        return adjoint
+    numbers, static = eqx.partition(problem, moving)
+    near = jumps.before(time)
+    is_jump = jnp.isfinite(near)
+    near = jnp.where(is_jump, near, time)
+
+    def taken_back() -> Derivatives:
+        def across(numbers: Any, state: States) -> States:
+            return eqx.combine(numbers, static).across_jump(near, state)
+
+        # Round-off apart, the states of both sides differ only in their clocks.
+        near_state = state + (near - time) * problem.field(time, state)
+        by_number, by_state = jax.vjp(across, numbers, near_state)[1](adjoint.state)
+        by_number = jax.tree.map(lambda term: jnp.where(is_jump, term, 0.0), by_number)
+        state_before = jnp.where(is_jump, by_state, adjoint.state)
+        return Derivatives(state_before, jax.tree.map(jnp.add, adjoint.numbers, by_number))
+
+    return jax.lax.cond(jnp.any(is_jump), taken_back, lambda: adjoint)
+
+
+# Derivatives of the event times of many cells along tangents of a problem.
+#
+# Up to `MOST_FORWARD` tangents are integrated forward, as variations beside the run (`variation.py`); for more tangents,
+# each run takes one backward pass.
+
+#: Up to this many tangents are integrated forward, in pairs. The cost relative to a table without derivatives, at a
+#: tolerance of 1e-8, for 2, 3, 4 and 6 parameters, is on the plane 3.4, 6.4, 6.3, 9.6 forward and 5.0, 5.7, 5.6, 5.5
+#: backward, in a cylinder 3.6, 7.6, 7.6, 11 forward and 5.6, 6.8, 6.8, 7.6 backward (jax 0.10).
+MOST_FORWARD = 2
+
+
+def ensemble_solve_with_tangents(
+    problem: AbstractProblem,
+    tangents: tuple[Any, ...],
+    t1: Float[Array, "..."],
+    cells: Int[Array, ""],
+    settings: Settings,
+    *,
+    nonterminal: bool = False,
+    one_kernel: bool = False,
+) -> tuple[Outcome, list[Float[Array, " cells"]]]:
+    """Run every cell, and differentiate the time of its event along tangents.
+
+    `solve_ensemble_with_tangents` is compiled on its own, for use outside of other transformed functions;
+    `traced_solve_ensemble_with_tangents` is for use inside them.
+
+    **Arguments:** as for `solve_ensemble`, and
+
+    - `tangents`: tangents of the problem, as for `VariationalProblem`. Their variations, or a mixture of the
+      variations, take part in step-size control.
+    - `one_kernel`: as for `solve_ensemble`. If it is false, all tangents are integrated forward, whatever their number,
+      so that the result can be differentiated again.
+
+    **Returns:** the `Outcome`, and for each tangent the derivative of `crossing_time`, 0 where that is infinite.
+    Source: implicit function theorem at the event; step lengths are held fixed.
+
+    **Example:** half-lives, and their derivatives with respect to the rates.
+
+    >>> from nonholonomic.derivatives import solve_ensemble_with_tangents
+    >>> problem, tangents = Decays(jnp.array([1.0, 2.0])), (Decays(jnp.ones(2)),)
+    >>> outcome, slopes = solve_ensemble_with_tangents(problem, tangents, t1, jnp.asarray(2), settings)
+    >>> print(outcome.crossing_time.round(6), slopes[0].round(6))
+    [0.693147 0.346574] [-0.693147 -0.173287]
+    """
+    horizon = t1
+    if nonterminal:
+        scheduler = LaneScheduler.of(problem, t1, cells, settings, nonterminal=True, one_kernel=one_kernel)
+        outcome = scheduler.outcome()[0]
+        # The derivatives need the run only up to the event, whose time is now known.
+        horizon = jnp.where(jnp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
+    options = (not nonterminal, horizon, cells, settings)
+
+    def with_group(group: tuple[Any, ...]) -> tuple[Outcome, list[Float[Array, " cells"]]]:
+        return slopes_by_variations(problem, group, *options, one_kernel=one_kernel)
+
+    if one_kernel and problem.fits_one_kernel and len(tangents) > MOST_FORWARD:
+        ended, slopes = _slopes_by_adjoint(problem, tangents, *options)
+    else:
+        ended, slopes = in_groups(with_group, tangents)
+    if not nonterminal:
+        outcome = with_crossing_times(problem, ended)
+    # An event at the start has a fixed time, whatever the tangent.
+    has_delay = jnp.isfinite(outcome.crossing_time) & (ended.end_time > 0.0)
+    # With its variations a run takes other steps: where it does not reach the event, it has no derivative.
+    arrived = ended.status == (REACHED_END if nonterminal else CROSSED)
+    return outcome, [jnp.where(has_delay, jnp.where(arrived, slope, jnp.nan), 0.0) for slope in slopes]
+
+
+def _slopes_by_adjoint(
+    problem: AbstractProblem, tangents: tuple[Any, ...], ends_on_event: bool, *options: Any
+) -> tuple[Outcome, list[Float[Array, " cells"]]]:
+    """The result of `slopes_by_variations`, at a cost that does not depend on the number of tangents."""
+    moving = moving_leaves(problem, tangents[0], _field_and_event)
+    # Without tangents, a `VariationalProblem` is the problem itself, with the option not to end on its event.
+    ended, by_start, by_number = solve_with_adjoint(
+        VariationalProblem(problem, (), ends_on_event),
+        VariationalProblem(moving, (), ends_on_event),
+        _mixed(tangents),
+        *options,
+        measured=_event_time,
+        one_kernel=True,
+    )
+
+    def slope(direction: Any) -> Float[Array, " cells"]:
+        start = eqx.filter_jvp(lambda problem: problem.start()[0], (problem,), (direction,))[1]
+        rates = eqx.filter(direction, moving)
+        shares = [
+            jnp.sum((gradient * rate).reshape(-1, by_start.shape[1]), axis=0)
+            for gradient, rate in zip(jax.tree.leaves(by_number), jax.tree.leaves(rates), strict=True)
+        ]
+        return sum(shares, jnp.zeros(by_start.shape[1]) if start is None else jnp.sum(by_start * start, axis=0))
+
+    return ended, [slope(direction) for direction in tangents]
+
+
+def _mixed(tangents: tuple[Any, ...]) -> Any:
+    """A mixture of some tangents."""
+    shares = shares_of(len(tangents)).tolist()
+    return jax.tree.map(lambda *rates: sum(c * rate for c, rate in zip(shares, rates, strict=True)), *tangents)
+
+
+def shares_of(count: int) -> Float[np.ndarray, " count"]:
+    """Shares for a mixture of some tangents that are unlikely to cancel. The mixture is about as large as each tangent, so
+    that steps are as short as for one tangent.
+    """
+    return (0.5 + np.modf(0.618 * np.arange(count))[0]) / count
+
+
+def _event_time(variational: VariationalProblem, lane_state: LaneState) -> Float[Array, " lanes"]:
+    """Zero of the event function for lanes that have ended on the event."""
+    problem = variational.problem
+    return time_of_zero(problem, problem.event_function, lane_state.time, lane_state.state)
+
+
+def time_of_zero(problem: AbstractProblem, function: Callable[[Any], Any], time: Lanes, state: States) -> Lanes:
+    """The time at which a function of the state vanishes, for a state at the zero (implicit function theorem).
+
+    First order, unlike `event_time`: the event is located to 1e-10 of a step, and its time is not differentiated again.
+    """
+    fall = stop_gradient(jax.jvp(function, (stop_gradient(state),), (problem.field(time, state),))[1])
+    return time_at_jump(problem, time, state, time - function(state) / jnp.where(fall == 0.0, 1.0, fall))
+
+
+def _field_and_event(problem: AbstractProblem, states: States) -> Any:
+    zero = jnp.zeros_like(states[0])
+    return problem.field(zero, states), problem.event_function(states), problem.jumps(zero, states)
+
+
+def moving_leaves(problem: AbstractProblem, direction: Any, functions: Callable[[AbstractProblem, States], Any]) -> Any:
+    """The leaves that a tangent moves, as far as some functions of problem and states depend on them, as a tree of
+    booleans."""
+    arrays, static = eqx.partition(problem, eqx.is_array)
+    leaves, structure = jax.tree.flatten(arrays)
+
+    def values(*leaves: Any) -> Any:
+        return functions(eqx.combine(jax.tree.unflatten(structure, leaves), static), problem.start()[0])
+
+    closed = jax.make_jaxpr(values)(*leaves)
+    dependencies = set(closed.jaxpr.outvars)
+    for equation in reversed(closed.jaxpr.eqns):
+        if not dependencies.isdisjoint(equation.outvars):
+            dependencies |= {variable for variable in equation.invars if not isinstance(variable, Literal)}
+    is_dependency = jax.tree.unflatten(structure, [variable in dependencies for variable in closed.jaxpr.invars])
+    return jax.tree.map(
+        lambda rate, is_used: bool(is_used) and rate is not None,
+        direction,
+        is_dependency,
+        is_leaf=lambda rate: rate is None,
+    )
+
+
+# With its docstring.
+_in_one_kernel = functools.partial(ensemble_solve_with_tangents, one_kernel=True)
+solve_ensemble_with_tangents = compiled_alone(functools.update_wrapper(_in_one_kernel, ensemble_solve_with_tangents))
+
+traced_solve_ensemble_with_tangents = eqx.filter_jit(ensemble_solve_with_tangents)
+
+
+def tangents_of(
+    build: Callable[..., Any], numbers: tuple[Any, ...], tangents: list[tuple[Any, ...]]
+) -> tuple[Any, ...]:
+    """The tangents of a problem that is built from numbers.
+
+    **Arguments:**
+
+    - `build`: numbers -> problem.
+    - `numbers`: the arguments of `build`, arrays.
+    - `tangents`: each with the rates at which the numbers move.
+
+    **Returns:** for each tangent the tangent of the problem, `None` for leaves that depend on no number.
+
+    **Example:**
+
+    >>> from nonholonomic.derivatives import tangents_of
+    >>> tangents = tangents_of(Decays, (jnp.ones(2),), [(jnp.array([1.0, 0.0]),)])
+    >>> print(tangents[0].rate)
+    [1. 0.]
+    """
+
+    def built(*numbers: Any) -> Any:
+        # A problem may also hold functions.
+        return eqx.filter(build(*numbers), eqx.is_inexact_array)
+
+    dependents = _reached(jax.make_jaxpr(built)(*numbers))
+    structure = jax.tree.structure(jax.eval_shape(built, *numbers))
+    moving = jax.tree.unflatten(structure, dependents)
+    changes = [jax.jvp(built, numbers, tangent)[1] for tangent in tangents]
+    return tuple(eqx.filter(change, moving) for change in changes)
+
+
+def _reached(closed: Any) -> list[bool]:
+    """Which outputs of a traced function depend on an input."""
+    depends = set(closed.jaxpr.invars)
+    for equation in closed.jaxpr.eqns:
+        if any(not isinstance(variable, Literal) and variable in depends for variable in equation.invars):
+            depends |= set(equation.outvars)
+    return [not isinstance(variable, Literal) and variable in depends for variable in closed.jaxpr.outvars]

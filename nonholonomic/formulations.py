@@ -1,0 +1,345 @@
+"""Equations of motion of a constrained mechanical system, derived from its data alone; JAX computes every derivative.
+
+The data of a system are its metric G(q), potential V(q), constraint one-forms W(q) with W q' = 0, frame E(q), and the
+generalised force f(t, q, q') of drives and friction. From them follow
+
+- `Lagrange`: Lagrange's equations with multipliers, in coordinates and velocities;
+- `Hamel`: Poincare's equations in the quasi-velocities of the frame; with constraints, Hamel's equations.
+
+Each formulation takes a single state (n,); use `jax.vmap` for many. The models of the vehicles are faster and do not use the
+formulations. `tests/witnesses/other_formulations.py` has further formulations, with which the tests compare these.
+"""
+
+import abc
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from .geometry import solve
+
+# A mechanical system as data: its metric, potential, constraints and forces, and how it strikes its surroundings.
+
+Coordinates = Float[Array, " n"]
+
+
+class AbstractSystem(eqx.Module):
+    """A mechanical system with n coordinates and k linear constraints on its velocity.
+
+    Subclass it, declare the numbers of your model as fields, set `dimension` to the number of coordinates, and write functions
+    of one set of coordinates: the `metric`, and as needed `potential`, `constraints`, `force` and `frame`. The equations of
+    motion follow; `nonholonomic.simulate`, `event_time`, `sweep` and `identify` run them. For a system that strikes something,
+    write `margin` and `reset` as well.
+
+    **Example:** a bead on a parabolic wire z = x^2 / 2, which oscillates in about 2 pi / sqrt(g).
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> class Bead(nonholonomic.AbstractSystem):
+    ...     gravity: float = 9.81
+    ...     dimension = 1
+    ...
+    ...     def metric(self, q):
+    ...         return (1.0 + q[0] ** 2)[None, None]
+    ...
+    ...     def potential(self, q):
+    ...         return 0.5 * self.gravity * q[0] ** 2
+    >>> quarter = nonholonomic.event_time(Bead(), ([0.01], [0.0]), t1=5.0, event=lambda t, y: y[0])
+    >>> print(f"{4.0 * quarter:.4f} s, small oscillations: {2.0 * jnp.pi / jnp.sqrt(9.81):.4f} s")
+    2.0061 s, small oscillations: 2.0061 s
+
+    ```
+    """
+
+    #: Names of the coordinates, such as ("x", "angle"), in tables and pictures, where their rates are "x_rate" and so on; by
+    #: default "q0" and "rate0" and so on.
+    names: ClassVar[tuple[str, ...] | None] = None
+
+    @property
+    @abc.abstractmethod
+    def dimension(self) -> int:
+        """Number n of coordinates."""
+
+    @property
+    def freedom(self) -> int:
+        """Number n - k of independent velocities."""
+        q = jax.ShapeDtypeStruct((self.dimension,), jnp.result_type(float))
+        return self.dimension - jax.eval_shape(self.constraints, q).shape[0]
+
+    @abc.abstractmethod
+    def metric(self, q: Coordinates) -> Float[Array, "n n"]:
+        """Kinetic metric G(q): the kinetic energy is q'.G q' / 2."""
+
+    def potential(self, q: Coordinates) -> Float[Array, ""]:
+        """Potential energy V(q); zero by default."""
+        return jnp.zeros((), q.dtype)
+
+    def constraints(self, q: Coordinates) -> Float[Array, "k n"]:
+        """One-forms W(q), one per row, that vanish on every allowed velocity; none by default."""
+        return jnp.zeros((0, q.size), q.dtype)
+
+    def frame(self, q: Coordinates) -> Float[Array, "n n"]:
+        """Frame fields E(q), one per column; W annihilates the first n - k. By default, the coordinate fields."""
+        return jnp.eye(q.size, dtype=q.dtype)
+
+    def force(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
+        """Generalised force f(t, q, q') in addition to that of the potential; zero by default."""
+        return jnp.zeros_like(q)
+
+    def margin(
+        self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates
+    ) -> Float[Array, "..."] | dict[str, Float[Array, ""]] | None:
+        """A smooth function that is positive while the system moves freely and falls through zero where it strikes something,
+        such as the distance from a wall; several in an array, (k,), or in a dict by name, of which the first to fall counts;
+        `None`, the default, for a system that strikes nothing. An oscillation in time that is
+        faster than the motion can be missed: let `force` contain it.
+        """
+        return None
+
+    def reset(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> tuple[Any, ...] | None:
+        """The coordinates and rates that follow when the margin has fallen to zero, `(q, rate)`, such as those after an
+        `impact`; `None`, the default, if the run ends here. If there are several margins, write
+        `reset(self, t, q, rate, exit)`: `exit` is the index of the margin that fell, or for a dict a dict that is true for its
+        name and false for the others.
+
+        The constraints hold after the reset, too: rates that violate them are projected onto them, orthogonally in the
+        kinetic metric. The change is the impulse of the constraints, as if the reset happened without constraints and
+        their impulse followed. For a mode of a `Hybrid`, `(q, rate, number)` also names the next mode by its index, and
+        the constraints are those of the next mode.
+        """
+        return None
+
+    def impact(
+        self,
+        t: Float[ArrayLike, ""],
+        q: Coordinates,
+        rate: Coordinates,
+        restitution: Float[ArrayLike, ""] = 1.0,
+        exit: Any = None,
+    ) -> Coordinates:
+        """The rates after an impact without friction on the surface where the margin is zero.
+
+        The impulse acts along the gradient of the margin with respect to the coordinates; the constraints act at the same
+        time, so that the rates obey them before and after. The rate of the margin changes its sign and is multiplied by
+        the restitution (Newton's law of impact). With a restitution of 1, the energy is conserved.
+
+        **Arguments:** `t`, `q`, `rate`: at the impact; `restitution`: usually in [0, 1]; `exit`: as for `reset`, for a system
+        with several margins.
+
+        **Returns:** the rates, for use in `reset`; NaN if the constraints hold the system against the impulse.
+
+        **Example:** a bead on a wire that strikes a wall at x = 0 once per half-period, sqrt(m / k) pi.
+
+        ```
+        >>> import jax.numpy as jnp
+        >>> import nonholonomic
+        >>> class Bead(nonholonomic.AbstractSystem):
+        ...     stiffness: float = 4.0
+        ...     restitution: float = 0.5
+        ...     dimension = 1
+        ...
+        ...     def metric(self, q):
+        ...         return jnp.eye(1)
+        ...
+        ...     def potential(self, q):
+        ...         return 0.5 * self.stiffness * q[0] ** 2
+        ...
+        ...     def margin(self, t, q, rate):
+        ...         return q[0]
+        ...
+        ...     def reset(self, t, q, rate):
+        ...         return q, self.impact(t, q, rate, self.restitution)
+        >>> run = nonholonomic.simulate(Bead(), ([0.0], [1.0]), t1=4.0)
+        >>> for time, rate in zip(run.resets["time"], run.resets["rate0_after"]):
+        ...     print(f"{time:.6f} s: {rate:.6f}")
+        1.570796 s: 0.500000
+        3.141593 s: 0.250000
+
+        ```
+        """
+
+        def margin(q: Coordinates) -> Float[Array, ""]:
+            margin: Any = self.margin(t, q, rate)
+            if isinstance(margin, dict):
+                return sum((jnp.where(exit[name], value, 0.0) for name, value in margin.items()), jnp.zeros(()))
+            return margin if exit is None else margin[exit]
+
+        gradient = jax.grad(margin)(q)
+        metric = with_constraints(self.metric(q), self.constraints(q))
+        push = within_constraints(self, q, solve(metric, gradient, positive=True))
+        return rate - (1.0 + restitution) * (gradient @ rate) / (gradient @ push) * push
+
+    def lagrangian(self, q: Coordinates, rate: Coordinates) -> Float[Array, ""]:
+        """The Lagrangian L(q, q') = q'.G q' / 2 - V."""
+        return 0.5 * rate @ self.metric(q) @ rate - self.potential(q)
+
+    def energy(self, q: Coordinates, rate: Coordinates) -> Float[Array, ""]:
+        """Energy q'.dL/dq' - L; for a Lagrangian quadratic in q', kinetic plus potential energy."""
+        return jax.grad(self.lagrangian, argnums=1)(q, rate) @ rate - self.lagrangian(q, rate)
+
+
+def within_constraints(system: AbstractSystem, q: Coordinates, rate: Coordinates) -> Coordinates:
+    """The rates closest to some rates, in the kinetic metric, that the constraints allow."""
+    W = system.constraints(q)
+    if not W.shape[0]:
+        return rate
+    per_impulse = solve(with_constraints(system.metric(q), W), W.T, positive=True)
+    return rate - per_impulse @ solve(W @ per_impulse, W @ rate, positive=True)
+
+
+def with_constraints(metric: Float[Array, "n n"], W: Float[Array, "k n"]) -> Float[Array, "n n"]:
+    """The metric plus a mass for each forbidden direction, G + W^T S W.
+
+    Allowed motions do not feel these masses: they only change the multipliers. If parts have no mass, G is singular, and this
+    sum is positive definite where G is positive for the allowed rates. A constraint adds to each coordinate at most the mass
+    that it has, so that none is lost beside a large one, like a ball's beside that of the turntable it rolls on.
+    """
+    if not W.shape[0]:
+        return metric
+    diagonal = jnp.sum(metric * np.eye(len(metric)), axis=1)
+    squares = W * W
+    has_mass = (squares > 0.0) & (diagonal > 0.0)
+    least = jnp.min(jnp.where(has_mass, diagonal / jnp.where(has_mass, squares, 1.0), jnp.inf), axis=1)
+    # None of the coordinates in the constraint has a mass: any will do.
+    masses = jnp.where(least < jnp.inf, least, jnp.sum(diagonal) / jnp.sum(squares, axis=1))
+    return metric + W.T @ (jax.lax.stop_gradient(masses)[:, None] * W)
+
+
+def lie_brackets(fields: Callable[[Coordinates], Float[Array, "n m"]], q: Coordinates) -> Float[Array, "n m m"]:
+    """Lie brackets of vector fields: component i of [X_a, X_b] = (X_a.d) X_b - (X_b.d) X_a at [i, a, b].
+
+    **Arguments:**
+
+    - `fields`: function of the coordinates (n,) that returns m fields as the columns of an (n, m) array.
+    - `q`: coordinates at which to evaluate, (n,).
+    """
+    derivatives = jnp.einsum("ibk,ka->iab", jax.jacfwd(fields)(q), fields(q))
+    return derivatives - jnp.swapaxes(derivatives, 1, 2)
+
+
+class AbstractFormulation(eqx.Module):
+    """Equations of motion of a system, as a first-order field of their own state.
+
+    **Arguments:**
+
+    - `system`: the data, an `AbstractSystem`.
+    """
+
+    system: eqx.AbstractVar[AbstractSystem]
+
+    @abc.abstractmethod
+    def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
+        """The state for coordinates and velocity, each (n,); the velocity must obey the constraints."""
+
+    @abc.abstractmethod
+    def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
+        """Coordinates and velocity, each (n,), of a state."""
+
+    @abc.abstractmethod
+    def field(self, t: Float[ArrayLike, ""], state: Float[Array, " state"], args=None) -> Float[Array, " state"]:
+        """Rate of change of the state, with the signature of a Diffrax vector field."""
+
+    def acceleration(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
+        """Second derivative of the coordinates, by the chain rule through this formulation's state."""
+        state = self.state(q, rate)
+        _, (_, acceleration) = jax.jvp(self.split, (state,), (self.field(t, state),))
+        return acceleration
+
+    def energy(self, state: Float[Array, " state"]) -> Float[Array, ""]:
+        """Energy at a state."""
+        return self.system.energy(*self.split(state))
+
+
+class Hamel(AbstractFormulation):
+    """Poincare's equations in quasi-velocities u, q' = E u (`stroller.md`, section 6, F2).
+
+    With l(q, u) = L(q, E u) and p = dl/du, p_i' = E_i(l) + c^k_ji u^j p_k + E_i.f. Constraints remove the equations and
+    the quasi-velocities of the frame's last fields, but not their momenta, which carry the nonholonomic terms (Hamel).
+    The Lagrangian may have terms linear in the velocity, as that of a Routhian has. The state is (q, u).
+
+    **Arguments:**
+
+    - `system`: the data, an `AbstractSystem`.
+    """
+
+    system: AbstractSystem
+
+    def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
+        rate = within_constraints(self.system, q, rate)
+        return jnp.concatenate([q, solve(self.system.frame(q), rate)[: self.system.freedom]])
+
+    def quasi_velocity(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
+        """Coordinates and all n quasi-velocities; those that the constraints forbid are 0."""
+        n = self.system.dimension
+        return state[:n], jnp.concatenate([state[n:], jnp.zeros(n - self.system.freedom, state.dtype)])
+
+    def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
+        q, u = self.quasi_velocity(state)
+        return q, self.system.frame(q) @ u
+
+    def field(self, t: Float[ArrayLike, ""], state: Float[Array, " state"], args=None) -> Float[Array, " state"]:
+        system, free = self.system, self.system.freedom
+        q, u = self.quasi_velocity(state)
+        E = system.frame(q)
+        rate = E @ u
+
+        def lagrangian(q, u):
+            return system.lagrangian(q, system.frame(q) @ u)
+
+        momentum = jax.grad(lagrangian, argnums=1)
+        swell = jax.jvp(lambda q: momentum(q, u), (q,), (rate,))[1]
+        inertia = jax.jacfwd(momentum, argnums=1)(q, u)[:free, :free]
+        # c^k_ji p_k is the bracket [E_j, E_i] paired with dL/dq', of which p_k is the part along E_k.
+        gradient = jax.grad(system.lagrangian, argnums=1)(q, rate)
+        gyroscopic = jnp.einsum("kji,j,k->i", lie_brackets(system.frame, q), u, gradient)
+        forces = E.T @ (jax.grad(lagrangian)(q, u) + system.force(t, q, rate)) + gyroscopic - swell
+        return jnp.concatenate([rate, solve(inertia, forces[:free], positive=True)])
+
+
+class AbstractVelocityFormulation(AbstractFormulation):
+    """Equations of motion whose state is (q, q')."""
+
+    def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
+        return jnp.concatenate([q, rate])
+
+    def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
+        q, rate = jnp.split(state, 2)
+        return q, rate
+
+
+class Lagrange(AbstractVelocityFormulation):
+    """Lagrange's equations with multipliers, G q'' + G' q' = dL/dq + f + W^T lambda, with W q'' + W' q' = 0.
+
+    The state is (q, q'), so one linear system with the metric is solved
+    for the force and the rows of W together. The metric may be singular if it is positive for the allowed rates, as with
+    parts without mass. The Lagrangian must be kinetic minus potential energy. Source:
+    `stroller.md`, section 6, F1.
+
+    **Arguments:**
+
+    - `system`: the data, an `AbstractSystem`.
+    """
+
+    system: AbstractSystem
+
+    def field(self, t: Float[ArrayLike, ""], state: Float[Array, " state"], args=None) -> Float[Array, " state"]:
+        q, rate = self.split(state)
+        return jnp.concatenate([rate, self.acceleration(t, q, rate)])
+
+    def acceleration(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
+        system = self.system
+
+        def seen(q: Coordinates) -> tuple[Array, Array]:
+            return system.constraints(q), system.metric(q)
+
+        (W, G), (bend, swell) = jax.jvp(seen, (q,), (rate,))
+        free = jax.grad(system.lagrangian)(q, rate) + system.force(t, q, rate) - swell @ rate
+        per_mass = solve(with_constraints(G, W), jnp.column_stack([W.T, free]), positive=True)
+        by_constraints, unconstrained = per_mass[:, :-1], per_mass[:, -1]
+        multipliers = solve(W @ by_constraints, bend @ rate + W @ unconstrained, positive=True)
+        return unconstrained - by_constraints @ multipliers

@@ -1,0 +1,468 @@
+"""Surfaces on which a function vanishes: the paraboloid, the graph of a function, and any zero set.
+
+Both searches here are minimisations. The nearest point minimises the distance over the surface, which may have many
+local minima for positions farther than the surface's least radius of curvature. The region that can contain the nearest
+point is therefore divided into sectors, and a descent starts at the best of several points in each sector. The gap
+below a ball needs no nearest point: the ball touches where the function is least over the ball, so the search never
+leaves the ball, however far the surface is. The gap is negative only if a point of the ball is in the arena.
+
+Each descent is Newton's method with the curvature kept positive and steps cut to a trust region (Nocedal and Wright, Numerical
+Optimization, chapter 4). A last Newton step carries the derivatives (implicit function theorem).
+"""
+
+import abc
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..validation import Bound, as_number
+from .surface import DIVIDED, OPEN, AbstractSurface, BallGap, Place, as_function, partials, second_derivative
+from .vector import Component, Vector, dot, scale, subtract, sum_vectors, tangents, vector_of
+
+#: Most iterations of a search. Most searches take three to six; ten times as many would not move any point.
+MOST_ITERATIONS = 40
+
+#: Smaller curvatures of the minimised function are raised to this value, relative to the curvature above a flat
+#: surface.
+LEAST_CURVATURE = 0.05
+
+#: A search ends when a step is shorter than this fraction of the distance; the last step squares this error.
+SETTLED = 1e-8
+
+#: Steps shorter than this fraction are accepted without comparing values: the gain is below round-off.
+UNSEEN = 1e-4
+
+
+def newton_step(a: Component, b: Component, c: Component, x: Component, y: Component) -> tuple[Component, Component]:
+    """Solution s of ((a, b), (b, c)) s = (x, y), with smaller eigenvalues raised to `LEAST_CURVATURE`."""
+    least_eigenvalue = 0.5 * (a + c) - jnp.sqrt((0.5 * (a - c)) ** 2 + b**2)
+    lift = jnp.maximum(LEAST_CURVATURE - jax.lax.stop_gradient(least_eigenvalue), 0.0)
+    a, c = a + lift, c + lift
+    per_determinant = 1.0 / (a * c - b * b)
+    return (c * x - b * y) * per_determinant, (a * y - b * x) * per_determinant
+
+
+class Descent(NamedTuple):
+    """The state of a search: a vector, its value, the longest step allowed next, and whether the search has ended."""
+
+    point: Float[Array, "3 ..."]
+    value: Float[Array, "..."]
+    reach: Float[Array, "..."]
+    ended: Bool[Array, "..."]
+
+
+def descended(
+    step: Callable[[Vector], tuple[Component, Component, Vector, Vector]],
+    onto: Callable[[Vector], Vector],
+    value: Callable[[Vector], Component],
+    start: Vector,
+    size: Component,
+    reach: Component,
+) -> Vector:
+    """A local minimum of a function of a vector that stays on a surface.
+
+    **Arguments:**
+
+    - `step`: Newton's step, as two components, and the unit tangents for these components.
+    - `onto`: brings a vector back to the surface; `value`: the function to minimise.
+    - `start`: a vector on the surface; `size`: unit for steps; `reach`: the longest first step.
+    """
+
+    def going_on(carry: tuple[Descent, Any]) -> Bool[Array, ""]:
+        descent, count = carry
+        return ~jnp.all(descent.ended) & (count < MOST_ITERATIONS)
+
+    def descend(carry: tuple[Descent, Any]) -> tuple[Descent, Any]:
+        descent, count = carry
+        point = vector_of(descent.point)
+        s1, s2, t1, t2 = step(point)
+        length = jnp.sqrt(s1 * s1 + s2 * s2)
+        cut = jnp.minimum(1.0, descent.reach / jnp.where(length > 0.0, length, 1.0))
+        trial = onto(vector_of(sum_vectors(point, scale(cut * s1, t1), scale(cut * s2, t2))))
+        trial_value = value(trial)
+        improves = (trial_value <= descent.value) | (length <= UNSEEN * size)
+        accepted = improves & ~descent.ended
+        # NaN ends the search, too.
+        ended = descent.ended | ~(length > SETTLED * size)
+        new = Descent(
+            point=jnp.where(accepted, _stacked(trial), descent.point),
+            value=jnp.where(accepted, trial_value, descent.value),
+            reach=jnp.where(improves, 2.0, 0.25) * descent.reach,
+            ended=ended,
+        )
+        return new, count + 1
+
+    first = _stacked(start)
+    zero = jnp.zeros_like(first[0])
+    initial = Descent(first, value(start) + zero, reach + zero, zero > 0.0)
+    minimum, _ = jax.lax.while_loop(going_on, descend, (initial, jnp.zeros((), int)))
+    return vector_of(minimum.point)
+
+
+class AbstractLevel(AbstractSurface):
+    """A surface on which a function is zero; bodies are where the function is positive."""
+
+    #: Start points for the search for the nearest point, about a position; its distance is less than 1 in their unit.
+    starts: ClassVar[Float[np.ndarray, "sectors starts 3"]]
+
+    @abc.abstractmethod
+    def level(self, position: Vector) -> Component:
+        """The function at a position [m]."""
+
+    @abc.abstractmethod
+    def gradient(self, position: Vector) -> Vector:
+        """Gradient of the function at a position [m], along the normal."""
+
+    @abc.abstractmethod
+    def second_derivative(self, position: Vector, a: Vector, b: Vector) -> Component:
+        """Second derivative of the function at a position [m], along two vectors."""
+
+    def offset(self, position: Vector) -> Component:
+        gradient = self.gradient(position)
+        return self.level(position) / jnp.sqrt(dot(gradient, gradient))
+
+    def normal(self, position: Vector) -> Vector:
+        gradient = self.gradient(position)
+        return scale(1.0 / jnp.sqrt(dot(gradient, gradient)), gradient)
+
+    def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
+        numbers = jnp.broadcast_arrays(*position, *velocity)
+        return jax.jvp(self.normal, (vector_of(numbers[:3]),), (vector_of(numbers[3:]),))[1]
+
+    def bending(self, position: Vector, a: Vector, b: Vector) -> tuple[Component, Component, Component]:
+        # The gradient's size changes the normal only along n, which is perpendicular to a and b.
+        gradient = self.gradient(position)
+        per_size = 1.0 / jnp.sqrt(dot(gradient, gradient))
+        aa, ab, bb = (self.second_derivative(position, *pair) for pair in ((a, a), (a, b), (b, b)))
+        return per_size * aa, per_size * ab, per_size * bb
+
+    def gaussian_curvature(self, position: Vector) -> Component:
+        aa, ab, bb = self.bending(position, *tangents(self.normal(position)))
+        return aa * bb - ab * ab
+
+    def onto(self, position: Vector) -> Vector:
+        for _ in range(2):
+            difference = scale(self.offset(position), self.normal(position))
+            position = vector_of(subtract(a, b) for a, b in zip(position, difference, strict=True))
+        return position
+
+    def nearest(self, position: Vector) -> Vector:
+        surface, place = _held(self), jax.lax.stop_gradient(position)
+        # A start that is off the surface, on the position's side, could be nearer than every point of the surface.
+        first = surface.onto(surface.onto(place))
+        distance = jnp.sqrt(_square(place, first))
+        starts = jnp.asarray(self.starts)
+
+        def step(foot: Vector) -> tuple[Component, Component, Vector, Vector]:
+            return surface._step_on_surface(place, foot)
+
+        def in_sector(k: Any, nearest: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
+            def start(i: Any, nearest: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
+                start_point = vector_of(x + distance * starts[k, i, axis] for axis, x in enumerate(place))
+                return nearer(nearest, surface.onto(start_point))
+
+            initial = vector_of(jax.lax.fori_loop(0, self.starts.shape[1], start, _stacked(first)))
+            initial = surface.onto(surface.onto(initial))
+            searched = (step, surface.onto, lambda foot: _square(place, foot), initial, distance, 0.25 * distance)
+            return nearer(nearest, descended(*searched))
+
+        def nearer(old: Float[Array, "3 ..."], new: Vector) -> Float[Array, "3 ..."]:
+            return jnp.where(_square(place, new) < _square(place, vector_of(old)), _stacked(new), old)
+
+        foot = vector_of(jax.lax.fori_loop(0, len(self.starts), in_sector, _stacked(first)))
+        s1, s2, t1, t2 = self._step_on_surface(position, foot)
+        return self.onto(vector_of(sum_vectors(foot, scale(s1, t1), scale(s2, t2))))
+
+    def ball_gap(self, centre: Vector, radius: Component, side: float) -> BallGap:
+        surface, place, size = _held(self), jax.lax.stop_gradient(centre), jax.lax.stop_gradient(radius)
+
+        def step(normal: Vector) -> tuple[Component, Component, Vector, Vector]:
+            return surface._step_on_ball(place, size, normal)
+
+        def value(normal: Vector) -> Component:
+            return surface.level(_lowered(place, size, normal))
+
+        normal = descended(step, _unit, value, surface.normal(place), 1.0, 0.5)
+        s1, s2, t1, t2 = self._step_on_ball(centre, radius, normal)
+        normal = _unit(vector_of(sum_vectors(normal, scale(s1, t1), scale(s2, t2))))
+        minimum = _lowered(centre, radius, normal)
+        gap = self.offset(minimum)
+        return BallGap(_lowered(minimum, gap, normal), normal, gap)
+
+    def _step_on_surface(self, position: Vector, foot: Vector) -> tuple[Component, Component, Vector, Vector]:
+        """Newton's step from a foot towards the least squared distance to a position, and the two tangents at the foot
+        for its components."""
+        n = self.normal(foot)
+        difference = vector_of(subtract(a, b) for a, b in zip(position, foot, strict=True))
+        d, (t1, t2) = dot(difference, n), tangents(n)
+        aa, ab, bb = self.bending(foot, t1, t2)
+        return *newton_step(1.0 + d * aa, d * ab, 1.0 + d * bb, dot(difference, t1), dot(difference, t2)), t1, t2
+
+    def _step_on_ball(
+        self, centre: Vector, radius: Component, normal: Vector
+    ) -> tuple[Component, Component, Vector, Vector]:
+        """Newton's step from the point of a ball opposite to a normal towards the least value of the function, per unit
+        gradient and radius, and the two tangents there for its components."""
+        minimum, (t1, t2) = _lowered(centre, radius, normal), tangents(normal)
+        m = self.normal(minimum)
+        aa, ab, bb = self.bending(minimum, t1, t2)
+        cosine = dot(m, normal)
+        return *newton_step(cosine + radius * aa, radius * ab, cosine + radius * bb, dot(m, t1), dot(m, t2)), t1, t2
+
+
+def _held(surface: AbstractLevel) -> AbstractLevel:
+    """A surface whose parameters are constants in derivatives."""
+    return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, surface)
+
+
+def _stacked(vector: Vector) -> Float[Array, "3 ..."]:
+    return jnp.stack(jnp.broadcast_arrays(*vector))
+
+
+def _square(a: Vector, b: Vector) -> Component:
+    difference = vector_of(subtract(x, y) for x, y in zip(a, b, strict=True))
+    return dot(difference, difference)
+
+
+def _unit(vector: Vector) -> Vector:
+    return vector_of(scale(1.0 / jnp.sqrt(dot(vector, vector)), vector))
+
+
+def _lowered(position: Vector, distance: Component, normal: Vector) -> Vector:
+    return vector_of(subtract(x, distance * n) for x, n in zip(position, normal, strict=True))
+
+
+# Open surfaces: the paraboloid and the graph of any smooth function.
+
+#: Newton steps to the nearest point of a paraboloid, from above: enough for the worst positions.
+NEWTON_STEPS = 12
+
+#: A negligible distance [m], to avoid division by zero.
+TINY = 1e-100
+
+
+class AbstractOpen(AbstractSurface):
+    """A surface above the whole x-y plane.
+
+    A place on it is (x, y) [m]; east is the projection of x onto the surface, and north is to its left.
+    """
+
+    sides: ClassVar[Mapping[str, float]] = OPEN
+    coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("x", "m"), ("y", "m"))
+
+    def place_at(self, position: Vector) -> Place:
+        return position[:2]
+
+    def elevation(self, position: Vector) -> Component:
+        return position[2]
+
+    def charted(self, place: Place) -> tuple[Vector, Vector, Vector]:
+        x, y = jnp.broadcast_arrays(*place)
+        position = (x, y, self.ground(x, y))
+        return position, *tangents(self.normal(position))
+
+    @abc.abstractmethod
+    def ground(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Height z [m] of the surface at (x, y) [m]."""
+
+
+class Paraboloid(AbstractOpen):
+    """The bowl z = (x^2 + y^2) / (2 p).
+
+    **Arguments:**
+
+    - `p`: radius of curvature [m] at the lowest point, positive.
+
+    **Example:**
+
+    ```
+    >>> import nonholonomic
+    >>> bowl = nonholonomic.Paraboloid(p=0.5)
+    >>> print(bowl.elevation((0.5, 0.0, 0.25)))
+    0.25
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"p": "m"}
+    is_wavy: ClassVar[bool] = False
+
+    p: Float[Array, "..."] = eqx.field(converter=as_number)
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.p, "p", above=0.0)
+
+    def ground(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
+        return (x * x + y * y) / (2.0 * self.p)
+
+    def normal(self, position: Vector) -> Vector:
+        x, y, _ = position
+        per_length = 1.0 / jnp.sqrt(x * x + y * y + self.p * self.p)
+        return (-x * per_length, -y * per_length, self.p * per_length)
+
+    def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
+        x, y, _ = position
+        per_length, normal = 1.0 / jnp.sqrt(x * x + y * y + self.p * self.p), self.normal(position)
+        gradient_rate = (-velocity[0], -velocity[1], None)
+        correction = scale(subtract(None, dot(normal, gradient_rate)), normal)
+        rate = scale(per_length, sum_vectors(gradient_rate, correction))
+        return (rate[0], rate[1], rate[2])
+
+    def gaussian_curvature(self, position: Vector) -> Component:
+        x, y, _ = position
+        return (self.p / (x * x + y * y + self.p * self.p)) ** 2
+
+    def offset(self, position: Vector) -> Component:
+        return (position[2] - self.ground(position[0], position[1])) * self.normal(position)[2]
+
+    def nearest(self, position: Vector) -> Vector:
+        # At a distance s from the axis, s^3 / (2 p^2) + (1 - z / p) s = r; the greatest root is the nearest point.
+        # Above this root the cubic is convex, so Newton's method converges from above.
+        x, y, z = position
+        square = x * x + y * y
+        r = jnp.sqrt(jnp.maximum(square, TINY * TINY))
+        rise, bend = 1.0 - z / self.p, 1.0 / (2.0 * self.p * self.p)
+
+        def fallen(s: Component, r: Component, rise: Component, bend: Component) -> Component:
+            return s - ((bend * s * s + rise) * s - r) / (3.0 * bend * s * s + rise)
+
+        constants = jax.lax.stop_gradient((r, rise, bend))
+        s = jax.lax.fori_loop(0, NEWTON_STEPS, lambda _, s: fallen(s, *constants), _above_the_root(*constants))
+        s = fallen(s, r, rise, bend)
+        # On the axis, above the centre of curvature, all directions are equally near.
+        part, x = s / r, x + jnp.where(square == 0.0, TINY, 0.0)
+        return (part * x, part * y, s * s / (2.0 * self.p))
+
+
+def _above_the_root(r: Component, rise: Component, bend: Component) -> Component:
+    """An upper bound of the greatest root s of bend s^3 + rise s = r, for r and bend above 0."""
+    cube = r / bend
+    fourth_root = jnp.sqrt(jnp.sqrt(cube))
+    # A cube root is expensive. By the inequality of means, (2 c + cube / c^2) / 3 is not below the cube root for any c;
+    # this c is close to the root.
+    c = fourth_root * jnp.sqrt(jnp.sqrt(fourth_root))
+    bound = jnp.sqrt(jnp.maximum(-rise / bend, 0.0)) + (2.0 * c + cube / (c * c)) / 3.0
+    return jnp.where(rise > 0.0, jnp.minimum(bound, r / jnp.where(rise > 0.0, rise, 1.0)), bound)
+
+
+def _disc(sectors: int, starts: int) -> Float[np.ndarray, "sectors starts 3"]:
+    """Points spread evenly over sectors of the unit disc of x and y."""
+    distance = np.sqrt((np.arange(starts) + 0.5) / starts)
+    # The golden ratio prevents neighbouring radii from having similar angles.
+    part = (np.arange(starts) * 0.5 * (np.sqrt(5.0) - 1.0)) % 1.0
+    angle = 2.0 * np.pi * (np.arange(sectors)[:, None] + part) / sectors
+    return np.stack([distance * np.cos(angle), distance * np.sin(angle), 0.0 * angle], axis=2)
+
+
+class Graph(AbstractOpen, AbstractLevel):
+    """The surface z = height(x, y) of any smooth function.
+
+    **Arguments:**
+
+    - `height`: returns z [m] for x and y [m], numbers. Write it with `jax.numpy` and without `if`. It may look up measured
+      heights, as `jax.numpy.interp` and `jax.scipy.interpolate.RegularGridInterpolator` do. If it is an
+      `equinox.Module`, its numbers are parameters of the scene, which you can sweep and differentiate.
+
+    **Raises:** `ValueError` if `height` is not a function of x and y.
+
+    **Example:**
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> hills = nonholonomic.Graph(lambda x, y: 0.1 * jnp.cos(x) * jnp.cos(y))
+    >>> print(hills.elevation((0.0, 0.0, 0.1)))
+    0.1
+
+    ```
+    """
+
+    starts: ClassVar[Float[np.ndarray, "sectors starts 3"]] = _disc(5, 12)
+
+    height: Any = eqx.field(converter=lambda height: as_function(height, "height", ("x", "y")))
+
+    def ground(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
+        return self.height(x, y)
+
+    def level(self, position: Vector) -> Component:
+        return position[2] - self.height(position[0], position[1])
+
+    def onto(self, position: Vector) -> Vector:
+        x, y, z = jnp.broadcast_arrays(*position)
+        return (x, y, self.height(x, y) + 0.0 * z)
+
+    def gradient(self, position: Vector) -> Vector:
+        slope = partials(self.height, position[:2])
+        return (-slope[0], -slope[1], jnp.ones_like(slope[0]))
+
+    def second_derivative(self, position: Vector, a: Vector, b: Vector) -> Component:
+        return -second_derivative(self.height, position[:2], a[:2], b[:2])
+
+
+# The zero set of any smooth function of three coordinates.
+
+
+def _sphere() -> Float[np.ndarray, "6 9 3"]:
+    """Points spread over the unit sphere: a square grid on each face of a cube, projected from its centre."""
+    a, b = np.meshgrid(*[np.tan(np.pi / 4.0 * np.array([-2.0, 0.0, 2.0]) / 3.0)] * 2)
+    sides = [np.stack([a, b, side + 0.0 * a], axis=-1).reshape(-1, 3) for side in (-1.0, 1.0)]
+    points = np.stack([np.roll(side, axis, axis=1) for axis in range(3) for side in sides])
+    return points / np.linalg.norm(points, axis=-1, keepdims=True)
+
+
+class Implicit(AbstractLevel):
+    """The surface function(x, y, z) = 0 in the fixed frame; bodies are where the function is positive.
+
+    A place on it is (x, y, z) [m]; east is the projection of x onto the surface, or of y where the normal is along x,
+    and north is to its left.
+
+    **Arguments:**
+
+    - `function`: a smooth function of the numbers x, y and z [m] whose gradient does not vanish on the surface. Write it
+      with `jax.numpy` and without `if`. If it is an `equinox.Module`, its numbers are parameters of the scene, which you
+      can sweep and differentiate.
+
+    **Raises:** `ValueError` if `function` is not a function of x, y and z.
+
+    **Example:**
+
+    ```
+    >>> import nonholonomic
+    >>> egg = nonholonomic.Implicit(lambda x, y, z: 1.0 - x * x - y * y - 0.5 * z * z)
+    >>> float(egg.normal((1.0, 0.0, 0.0))[0])
+    -1.0
+
+    ```
+    """
+
+    sides: ClassVar[Mapping[str, float]] = DIVIDED
+    coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("x", "m"), ("y", "m"), ("z", "m"))
+
+    starts: ClassVar[Float[np.ndarray, "sectors starts 3"]] = _sphere()
+
+    function: Any = eqx.field(converter=lambda function: as_function(function, "function", ("x", "y", "z")))
+
+    def gradient(self, position: Vector) -> Vector:
+        slope = partials(self.function, position)
+        return (slope[0], slope[1], slope[2])
+
+    def second_derivative(self, position: Vector, a: Vector, b: Vector) -> Component:
+        return second_derivative(self.function, position, a, b)
+
+    def level(self, position: Vector) -> Component:
+        return self.function(*position)
+
+    def elevation(self, position: Vector) -> Component:
+        return position[2]
+
+    def place_at(self, position: Vector) -> Place:
+        return (position[0], position[1], position[2])
+
+    def charted(self, place: Place) -> tuple[Vector, Vector, Vector]:
+        position = self.nearest((place[0], place[1], place[2]))
+        return position, *tangents(self.normal(position))

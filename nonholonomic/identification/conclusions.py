@@ -1,0 +1,583 @@
+"""What a fit concludes: a verdict, intervals, profile likelihoods, and the shape of the posterior in words."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from .exploration import FARTHEST, ROWS, Explorer, Mixture, Weighted, fitted, weighted_covariance
+from .least_squares import minimise
+from .likelihood import Measurements, Unknown, whole_periods
+from .posterior import Problem, deviances, linearise, predictions
+
+# Judge a fit: the size and order of its residuals, the minima that the data allow, and the undetermined combinations.
+
+#: A p-value below this is a poor fit.
+POOR = 0.01
+
+#: A measurement with a larger residual cannot be explained.
+FAR = 4.0
+
+#: Residuals that are all smaller than this are not noise but round-off and integration errors, which may keep their
+#: sign.
+NEGLIGIBLE = 1e-3
+
+#: Ends whose -2 log likelihoods differ by less than this are the same minimum.
+SAME = 0.1
+
+#: Ends agree on a minimum if all their parameters agree to this many standard errors.
+CLOSE = 0.5
+
+
+class FitWarning(UserWarning):
+    """A fit that should not be believed without further checks.
+
+    **Example:** make doubtful fits fail.
+
+    ```
+    >>> import warnings
+    >>> import tippe
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("error", tippe.FitWarning)
+
+    ```
+    """
+
+
+class Series(NamedTuple):
+    """The order of the residuals of one series: the number of residuals, the number of runs of one sign, and the
+    probability of at most so many runs if the signs were random."""
+
+    count: int
+    runs: int
+    p_value: float
+
+
+class Verdict(NamedTuple):
+    """Whether a fit can be believed.
+
+    - `p_value`: probability of residuals this large or larger if the model and the errors are right (chi squared of the
+      measurements that are not limits); NaN if errors were estimated or no degree of freedom is left.
+    - `series`: a `Series` for each series of measurements.
+    - `agree`, `starts`: number of refined candidates that reached the best minimum, and number of all.
+    - `undetermined`: the parameters that the data do not determine, in words.
+    - `concerns`: the concerns, in words; empty for a flawless fit.
+    - `notes`: what is special about the likelihood, in words; errors and intervals take account of it.
+    - `effective`, `k`: effective number of draws behind errors and intervals, and the shape of the tail of their weights
+      (Pareto k-hat): below 0.7, they can be trusted.
+    - `minima`: the minima that the data allow, as `Minimum`, the most probable first.
+    """
+
+    p_value: float
+    series: tuple[Series, ...]
+    agree: int
+    starts: int
+    undetermined: tuple[str, ...]
+    concerns: tuple[str, ...]
+    notes: tuple[str, ...]
+    effective: float
+    k: float
+    minima: tuple[Any, ...]
+
+    @property
+    def good(self) -> bool:
+        """Whether there are no concerns about the fit."""
+        return not self.concerns
+
+    def __str__(self) -> str:
+        scatter = (
+            "the size of the residuals cannot test the fit: the errors were estimated from it, or no degree of freedom is left"
+            if math.isnan(self.p_value)
+            else f"residuals this large have a probability of {self.p_value:.2g}"
+        )
+        signs = ", ".join(
+            f"{series.runs} runs of {series.count} signs (p = {series.p_value:.2g})" for series in self.series
+        )
+        ended = f"{self.agree} of {self.starts} refined candidates ended at the best minimum"
+        others = ", the others fit worse or were stopped early" if self.agree < self.starts else ""
+        lines = [f"  {scatter}", f"  {signs}" if signs else "", f"  {ended}{others}"]
+        lines.append(f"  errors from {self.effective:.0f} effective draws (k-hat {self.k:.2f})")
+        lines += [f"  note: {note}" for note in self.notes]
+        return "\n".join([*filter(None, lines), *(f"  BUT {concern}" for concern in self.concerns)])
+
+
+def judge(
+    measurements: Measurements,
+    prediction: Float[np.ndarray, " n"],
+    residual: Float[np.ndarray, " n"],
+    degrees: int,
+    status: str,
+    trusted: bool,
+    explored: Verdict,
+) -> Verdict:
+    """Judge a fit.
+
+    **Arguments:**
+
+    - `measurements`, `prediction`, `residual`: (n,).
+    - `degrees`: measurements and priors less unknowns, without limits.
+    - `status`: status of the fit; `trusted`: whether the weights can be trusted.
+    - `explored`: the `Verdict` by the exploration alone, whose concerns are about the shape of the likelihood.
+
+    **Returns:** a `Verdict`.
+    """
+    scores = normal_scores(measurements, prediction)
+    exact = ~np.asarray(measurements.censored)
+    estimated = bool(np.any(np.asarray(measurements.estimated)))
+    p_value = math.nan if estimated or degrees < 1 else chi_squared_tail(float(np.sum(scores[exact] ** 2)), degrees)
+    numbers = np.asarray(measurements.series)
+    parts = [scores[exact & (numbers == number)] for number in np.unique(numbers)]
+    series = tuple(runs for runs in map(runs_of_signs, parts) if runs.count > 1)
+    p_values = [runs_of_signs(part).p_value for part in parts if np.any(np.abs(part) > NEGLIGIBLE)]
+    limits = np.abs(residual[~exact])
+    concerns = _concerns_of_search(status, trusted, explored)
+    if not np.all(np.isfinite(prediction[exact])):
+        missing = int(np.sum(~np.isfinite(prediction[exact])))
+        concerns.append(f"the model has no prediction for {missing} measurements: its run ends earlier, or fails")
+    if p_value < POOR:
+        concerns.append(
+            f"the residuals are too large (p = {p_value:.2g}): the model is wrong, the errors are too small, "
+            "or this is not the best minimum"
+        )
+    if np.any(limits > FAR):
+        concerns.append(f"{int(np.sum(limits > FAR))} limits are violated by more than {FAR:.0f} errors")
+    p_trend = min(p_values, default=1.0) * max(len(p_values), 1)
+    if p_trend < POOR:
+        concerns.append(
+            f"the residuals keep their sign for too long (p = {p_trend:.2g}): the model misses a trend, or "
+            "errors are correlated"
+        )
+    concerns += [*explored.concerns, *(f"the data do not determine {words}" for words in explored.undetermined)]
+    return explored._replace(p_value=p_value, series=series, concerns=tuple(concerns))
+
+
+def _concerns_of_search(status: str, trusted: bool, explored: Verdict) -> list[str]:
+    """The concerns about the search and the weights."""
+    concerns = []
+    if status != "converged":
+        concerns.append("the fit has not converged: allow more steps (max_steps), or start closer")
+    if not trusted:
+        concerns.append(
+            f"there are no errors and intervals: the exploration ended with {explored.effective:.0f} effective draws "
+            f"(k-hat {explored.k:.2f}); start closer, give bounds or priors, or fix numbers"
+        )
+    if len(explored.minima) > 1:
+        concerns.append(f"the data allow {len(explored.minima)} minima: " + "; ".join(map(str, explored.minima)))
+    return concerns
+
+
+def normal_scores(measurements: Measurements, prediction: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Residuals converted to numbers that are normal if the stated errors are right; 0 for limits."""
+    from scipy.stats import norm, t
+
+    z = np.asarray(measurements.standardised(np.asarray(prediction)))
+    freedom = np.asarray(measurements.student)
+    heavy = np.isfinite(freedom)
+    return np.where(heavy, np.sign(z) * norm.isf(t.sf(np.abs(z), np.where(heavy, freedom, 1.0))), z)
+
+
+def chi_squared_tail(value: float, degrees: int) -> float:
+    """The probability that chi squared exceeds a value."""
+    from scipy.stats import chi2
+
+    return float(chi2.sf(value, degrees)) if math.isfinite(value) else 0.0
+
+
+def runs_of_signs(values: Float[np.ndarray, " n"]) -> Series:
+    """The number of runs of one sign in a series, and the probability of at most so many runs (Wald and Wolfowitz, Ann.
+    Math. Stat. 11 (1940) 147).
+
+    If the numbers of positive and negative values are given, the number of runs of one sign has a hypergeometric
+    distribution; the probability is summed exactly.
+    """
+    from scipy.special import gammaln
+
+    signs = np.sign(values[np.isfinite(values) & (values != 0.0)])
+    positive, negative = int(np.sum(signs > 0.0)), int(np.sum(signs < 0.0))
+    runs = 1 + int(np.sum(signs[1:] != signs[:-1])) if len(signs) else 0
+    if not positive or not negative:
+        # All of one sign: as improbable as a coin that always shows the same side.
+        return Series(len(signs), runs, min(1.0, 2.0 ** (1 - len(signs))) if len(signs) else 1.0)
+
+    def log_choose(n: int, k: np.ndarray) -> np.ndarray:
+        is_valid = (k >= 0) & (k <= n)
+        k_valid = np.where(is_valid, k, 0)
+        return np.where(is_valid, gammaln(n + 1.0) - gammaln(k_valid + 1.0) - gammaln(n - k_valid + 1.0), -np.inf)
+
+    # For r runs, the positive signs are cut into r // 2 runs and the negative ones into r - r // 2, or the other way
+    # round.
+    counts = np.arange(2, runs + 1)
+    few_cuts, many_cuts = counts // 2 - 1, counts - counts // 2 - 1
+    total = log_choose(positive + negative, np.array(positive))
+    ways = [
+        log_choose(a - 1, few_cuts) + log_choose(b - 1, many_cuts)
+        for a, b in ((positive, negative), (negative, positive))
+    ]
+    return Series(len(signs), runs, min(1.0, float(np.sum(np.exp(np.array(ways) - total)))))
+
+
+# Profile likelihoods, by batches of runs and by least squares.
+
+#: Number of batches in which the other parameters are searched, and by how much the search narrows in each.
+BATCHES, NARROWER = 3, 0.4
+
+
+class Profile(NamedTuple):
+    """The profile likelihood of one parameter.
+
+    - `values`: (points,), the values at which the parameter was held.
+    - `deviance`: (points,), -2 log likelihood above its minimum, with all other parameters fitted again.
+    - `estimates`: name -> (points,), estimates of the other parameters.
+    - `converged`: (points,), whether these fits converged.
+    """
+
+    values: Float[np.ndarray, " points"]
+    deviance: Float[np.ndarray, " points"]
+    estimates: dict[str, Float[np.ndarray, " points"]]
+    converged: np.ndarray
+
+    def concern(self, name: str) -> str:
+        """Where to start again, if the profile falls below the best fit; otherwise empty. **Arguments:** `name`: name of the
+        parameter."""
+        best = int(np.argmin(self.deviance))
+        if self.deviance[best] >= -SAME:
+            return ""
+        return f"the fit is better with {name} = {self.values[best]:.6g}: start there"
+
+
+def profiled(fit: Any, k: int, values: Float[np.ndarray, " points"]) -> Profile:
+    """The profile likelihood of the unknown with index `k`."""
+    problem = fit.problem
+    held = np.asarray(problem.unknowns[k].coordinate(values))
+    coordinates, deviance = _searched(fit, k, held)
+    ends = minimise(problem, coordinates, fit.measurements, fixed=k)
+    at_ends = linearise(problem, ends.coordinates, fit.measurements).deviance
+    improves = np.isfinite(at_ends) & (at_ends <= deviance)
+    coordinates = np.where(improves[:, None], ends.coordinates, coordinates)
+    deviance = np.where(improves, at_ends, deviance)
+    optima = problem.values(coordinates)
+    others = {other: optima[:, i] for i, other in enumerate(problem.names) if i != k}
+    return Profile(values, deviance - fit.deviance, others, ends.converged)
+
+
+def _searched(
+    fit: Any, k: int, held: Float[np.ndarray, " points"]
+) -> tuple[Float[np.ndarray, "points unknowns"], Float[np.ndarray, " points"]]:
+    """The best coordinates for every held value, and -2 log likelihood there, by batches of runs without slopes.
+
+    The other coordinates are drawn around their regression on the held one, then around the best of the points so far.
+    """
+    estimate = fit.coordinates
+    covariance = np.where(np.isfinite(fit.coordinate_covariance), fit.coordinate_covariance, 0.0)
+    random, size, points = np.random.default_rng(0), len(estimate), len(held)
+    others = np.arange(size) != k
+    slope = covariance[others, k] / covariance[k, k] if covariance[k, k] > 0.0 else np.zeros(size - 1)
+    conditional = covariance[np.ix_(others, others)] - np.outer(slope, covariance[k, others])
+    values, vectors = np.linalg.eigh(conditional) if size > 1 else (np.zeros(0), np.zeros((0, 0)))
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    best = np.tile(estimate, (points, 1))
+    best[:, k] = held
+    best[:, others] += (held - estimate[k])[:, None] * slope
+    least, each = np.full(points, np.inf), max(ROWS // points, 1)
+    for batch in range(BATCHES):
+        trial = np.repeat(best[:, None], each, axis=1)
+        noise = NARROWER**batch * random.normal(size=(points, each, size - 1)) @ root.T
+        trial[..., others] += noise
+        trial[:, 0] = best
+        rows = trial.reshape(-1, size)
+        deviance = deviances(fit.problem, rows, predictions(fit.problem, rows), fit.measurements)
+        deviance = np.where(np.isfinite(deviance), deviance, np.inf).reshape(points, each)
+        place = np.argmin(deviance, axis=1)
+        improved = deviance[np.arange(points), place]
+        best = np.where((improved < least)[:, None], trial[np.arange(points), place], best)
+        least = np.minimum(least, improved)
+    return best, least
+
+
+# What a fit concludes about its parameters: estimate, errors and intervals, from the likelihood itself.
+
+#: A likelihood counts as that of a linear model if its logarithm differs from it by less than this standard deviation over
+#: the posterior; the errors by slopes then hold.
+LINEAR = 0.1
+
+#: The most likely point is the estimate if it lies within this many standard errors of the mean. A staircase has many
+#: points of nearly the same likelihood; then the estimate is a likely point near the mean, with this weight of the distance.
+AT_MEAN, CENTRAL = 0.5, 4.0
+
+
+class Distribution(NamedTuple):
+    """The distribution of the coordinates.
+
+    - `kind`: "linear" if the likelihood is that of a linear model, whose errors are exact; "weights" if errors come from the
+      weights; "slopes" if the slopes leave a direction undetermined, so that there are no weights; "none" if the weights
+      cannot be trusted.
+    - `estimate`: (unknowns,); `covariance`: (unknowns, unknowns), NaN for the kind "none".
+    - `points`, `weights`: (n, unknowns), (n,), the weighted sample.
+    """
+
+    kind: str
+    estimate: Float[np.ndarray, " unknowns"]
+    covariance: Float[np.ndarray, "unknowns unknowns"]
+    points: Float[np.ndarray, "n unknowns"]
+    weights: Float[np.ndarray, " n"]
+
+    @classmethod
+    def of(
+        cls, best: Float[np.ndarray, " unknowns"], by_slopes: Float[np.ndarray, "unknowns unknowns"], sample: Weighted
+    ) -> "Distribution":
+        """The distribution for the most likely coordinates, their covariance by slopes, and a weighted sample."""
+        points, weights = sample.pool.points, sample.weights
+        if not np.all(np.isfinite(by_slopes)):
+            return cls("slopes", best, by_slopes, points, weights)
+        if not sample.enough:
+            return cls("none", best, np.full_like(by_slopes, np.nan), points, weights)
+        squares = np.sum(np.linalg.solve(np.linalg.cholesky(by_slopes), (points - best).T) ** 2, axis=0)
+        used = weights > 0.0
+        excess = sample.pool.log_density[used] + 0.5 * squares[used]
+        mean_excess = weights[used] @ excess
+        if math.sqrt(weights[used] @ (excess - mean_excess) ** 2) < LINEAR:
+            return cls("linear", best, by_slopes, points, weights)
+        mean, covariance = weighted_covariance(points, weights)
+        root = np.linalg.cholesky(covariance)
+
+        def squares_from_mean(coordinates: Float[np.ndarray, "n unknowns"]) -> Float[np.ndarray, " n"]:
+            return np.sum(np.linalg.solve(root, (coordinates - mean).T) ** 2, axis=0)
+
+        if squares_from_mean(best[None])[0] > AT_MEAN**2:
+            scores = -2.0 * sample.pool.log_density[used] + CENTRAL * squares_from_mean(points[used])
+            best = points[used][np.argmin(scores)]
+        return cls("weights", best, covariance, points, weights)
+
+    def interval(self, k: int, deviations: float) -> tuple[float, float]:
+        """The interval of a coordinate with the probability of so many deviations of a normal distribution, and equal
+        probabilities below and above."""
+        if self.kind != "weights":
+            reach = deviations * math.sqrt(self.covariance[k, k])
+            return float(self.estimate[k] - reach), float(self.estimate[k] + reach)
+        outside = math.erfc(deviations / math.sqrt(2.0))
+        low, high = quantiles(self.points[:, k], self.weights, np.array([0.5 * outside, 1.0 - 0.5 * outside]))
+        return float(low), float(high)
+
+    def covariance_of_values(
+        self, problem: Problem, slopes: Float[np.ndarray, " unknowns"]
+    ) -> Float[np.ndarray, "unknowns unknowns"]:
+        """The covariance of the parameters themselves, whose slopes with respect to the coordinates are given.
+
+        The standard error of a parameter is half the width of its 68 % interval, which is the standard deviation of a normal
+        distribution, and hardly depends on the distance of improbable minima.
+        """
+        if self.kind == "weights":
+            # Draws without weight may be infinite.
+            used = self.weights > 0.0
+            covariance = weighted_covariance(np.asarray(problem.values(self.points[used])), self.weights[used])[1]
+            ends = np.array([self.interval(k, 1.0) for k in range(len(self.estimate))])
+            low, high = np.asarray(problem.values(ends.T))
+            scale = 0.5 * (high - low) / np.sqrt(np.diag(covariance))
+            return covariance * np.outer(scale, scale)
+        with np.errstate(invalid="ignore"):
+            return np.where(self.covariance == 0.0, 0.0, self.covariance * np.outer(slopes, slopes))
+
+
+def quantiles(
+    values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], shares: Float[np.ndarray, " shares"]
+) -> Float[np.ndarray, " shares"]:
+    """Quantiles of weighted values."""
+    order = np.argsort(values)
+    cumulative = np.cumsum(weights[order])
+    return np.interp(shares, cumulative - 0.5 * weights[order], values[order])
+
+
+# The shape of a posterior in words: several minima, staircases, bounds that cut, directions without information.
+
+#: Two components of the posterior are one minimum if the density on the ridge between them stays above this fraction of the
+#: lower peak; and the least weight of a minimum that is named.
+SADDLE, LEAST_WEIGHT = 0.1, 0.03
+
+#: The number of components into which a posterior is divided to find its minima.
+COMPONENTS = 6
+
+#: Slopes that are wrong by less than this factor go without a remark.
+FACTOR = 1.3
+
+#: Predictions that scatter about a smooth trend by more than this fraction of their errors are a staircase.
+ROUGH = 0.25
+
+#: A profile is no parabola if the two sides of a 95 % interval differ by more than this factor.
+SKEWED = 1.4
+
+#: Weight near a bound, or near the edge of the searched region, that is worth a warning; and how near, as a fraction of
+#: the interval or the region.
+CUT, NEAR = 0.02, 0.05
+
+#: Candidates within this many standard errors of the estimate are beside it.
+BESIDE = 3.0
+
+
+class Minimum(NamedTuple):
+    """A minimum that the data allow.
+
+    - `estimates`: name -> value at its most likely point; `weight`: its probability; `deviance`: -2 log likelihood.
+    """
+
+    estimates: dict[str, float]
+    weight: float
+    deviance: float
+
+    def __str__(self) -> str:
+        values = ", ".join(f"{name} {value:.4g}" for name, value in self.estimates.items())
+        return f"{values} (weight {self.weight:.2f})"
+
+
+def divided(
+    points: Float[np.ndarray, "n unknowns"], weights: Float[np.ndarray, " n"], random: np.random.Generator
+) -> Int[np.ndarray, " n"]:
+    """The index of the minimum to which each point belongs.
+
+    Components of a mixture are merged where the ridge between them has no deep saddle (Ray and Lindsay, Ann. Stat. 33
+    (2005) 2042).
+    """
+    mixture = fitted(points, weights, COMPONENTS, random)
+    parent = list(range(len(mixture.shares)))
+    for a in range(len(parent)):
+        for b in range(a):
+            ridge = _ridge(mixture, a, b)
+            density = np.logaddexp.reduce(_log_normals(mixture, ridge), axis=0)
+            if np.min(density) > min(density[0], density[-1]) + math.log(SADDLE):
+                parent = [parent[b] if group == parent[a] else group for group in parent]
+    return np.array(parent)[np.argmax(_log_normals(mixture, points), axis=0)]
+
+
+def _ridge(mixture: Mixture, a: int, b: int) -> Float[np.ndarray, "points unknowns"]:
+    """The curve on which the density of two components has its ridge."""
+    inverse = [np.linalg.inv(mixture.roots[k] @ mixture.roots[k].T) for k in (a, b)]
+    curve = []
+    for share in np.linspace(0.0, 1.0, 33):
+        sides = ((1.0 - share) * inverse[0], share * inverse[1])
+        curve.append(
+            np.linalg.solve(sides[0] + sides[1], sides[0] @ mixture.centres[a] + sides[1] @ mixture.centres[b])
+        )
+    return np.stack(curve)
+
+
+def _log_normals(mixture: Mixture, points: np.ndarray) -> np.ndarray:
+    logs = []
+    for share, centre, root in zip(*mixture, strict=True):
+        squares = np.sum(np.linalg.solve(root, (points - centre).T) ** 2, axis=0)
+        logs.append(math.log(share) - 0.5 * squares - np.sum(np.log(np.diag(root))))
+    return np.stack(logs)
+
+
+def minima_of(explorer: Explorer, sample: Weighted) -> tuple[Minimum, ...]:
+    """The minima that the data allow, the most probable first."""
+    points, weights, problem = sample.pool.points, sample.weights, explorer.density.problem
+    used = weights > 0.0
+    groups = np.full(len(points), -1)
+    groups[used] = divided(points[used], weights[used], np.random.default_rng(0))
+    minima = []
+    for group in np.unique(groups[used]):
+        members = np.flatnonzero(groups == group)
+        best = members[np.argmax(sample.pool.log_density[members])]
+        values = np.asarray(problem.values(points[best])).tolist()
+        deviance = float(-2.0 * np.sum(sample.pool.groups[best]))
+        minima.append(Minimum(dict(zip(problem.names, values, strict=True)), float(np.sum(weights[members])), deviance))
+    return tuple(sorted((minimum for minimum in minima if minimum.weight > LEAST_WEIGHT), key=lambda m: -m.weight))
+
+
+def roughness(explorer: Explorer, sample: Weighted) -> float:
+    """Root mean square of the distances of predictions from a smooth trend, in units of their errors."""
+    weights, points = sample.weights, sample.pool.points
+    used = (weights > 1e-4 * np.max(weights)) & np.all(np.isfinite(sample.pool.predictions), axis=1)
+    root = np.sqrt(weights[used] / np.sum(weights[used]))[:, None]
+    centred = points[used] - weights[used] @ points[used] / np.sum(weights[used])
+    centred = centred / (np.std(centred, axis=0) + 1e-300)
+    size = centred.shape[1]
+    columns = [np.ones(len(centred)), *centred.T]
+    columns += [centred[:, i] * centred[:, j] for i in range(size) for j in range(i + 1)]
+    terms = np.stack(columns, axis=1)
+    predictions = sample.pool.predictions[used]
+    measurements = explorer.density.measurements
+    predictions = predictions - whole_periods(np, predictions - predictions[0], np.asarray(measurements.period))
+    coefficients, *_ = np.linalg.lstsq(root * terms, root * predictions)
+    off = (predictions - terms @ coefficients) / np.asarray(measurements.error)
+    return float(np.sqrt(np.mean(np.sum(root**2 * off**2, axis=0))))
+
+
+def unsearched(explorer: Explorer, estimate: Float[np.ndarray, " unknowns"]) -> tuple[str, ...]:
+    """A note of estimates that are outside of the searched range, if there are any."""
+    is_inside = explorer.region.searched(estimate)
+    names = [name for name, inside in zip(explorer.density.problem.names, is_inside, strict=True) if not inside]
+    if not names:
+        return ()
+    return (
+        f"{', '.join(names)}: outside of the range in which minima were searched, so better ones may be missing; start "
+        "closer, or state a prior",
+    )
+
+
+def without_prediction(
+    explorer: Explorer, sample: Weighted, distribution: Distribution
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """A concern or a note of candidates whose runs have no prediction, if there are any: a concern if they lie where the
+    posterior does."""
+    problem, points = explorer.density.problem, sample.pool.points
+    evaluated = explorer.region.contains(points)
+    points, failed = points[evaluated], np.any(np.isnan(sample.pool.predictions[evaluated]), axis=1)
+    if not np.any(failed):
+        return (), ()
+    off = points - distribution.estimate
+    values = np.asarray(problem.values(points[failed]))
+    ends = zip(problem.names, np.min(values, axis=0), np.max(values, axis=0), strict=True)
+    places = ", ".join(f"{name} {low:.4g}" + (f" to {high:.4g}" if high > low else "") for name, low, high in ends)
+    words = (
+        f"{np.sum(failed)} of {len(failed)} candidates count as impossible, because a run failed, was unresolved, ended too "
+        f"early or was illegal: at {places}"
+    )
+    if not np.all(np.isfinite(distribution.covariance)):
+        return (), (words,)
+    near = np.sum(np.linalg.solve(np.linalg.cholesky(distribution.covariance), off.T) ** 2, axis=0) < BESIDE**2
+    share = np.mean(failed[near]) if np.any(near) else 0.0
+    if share > CUT:
+        return (f"{words}; of those beside the estimate, {100.0 * share:.0f} %: simulate a run there to see why",), ()
+    return (), (words,)
+
+
+def remarks(
+    explorer: Explorer, sample: Weighted, distribution: Distribution, by_slopes: Float[np.ndarray, "unknowns unknowns"]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What is special about the shape of a posterior: concerns and notes, in words."""
+    problem = explorer.density.problem
+    concerns, notes, skewed = [], [], []
+    for k, (name, unknown) in enumerate(problem.free):
+        concerns += _cut(name, unknown, sample, explorer, k)
+        low, high = distribution.interval(k, 1.96)
+        sides = high - distribution.estimate[k], distribution.estimate[k] - low
+        if max(sides) > SKEWED * max(min(sides), 1e-300):
+            skewed.append(name)
+    if skewed:
+        notes.append(
+            f"the likelihood profile of {', '.join(skewed)} is no parabola: use the interval, not the standard error"
+        )
+    ratios = np.sqrt(np.diag(distribution.covariance) / np.diag(by_slopes))
+    reason = "the predictions are a staircase" if roughness(explorer, sample) > ROUGH else "the predictions bend"
+    for verb, factors in (("understate", ratios), ("overstate", 1.0 / ratios)):
+        worst = int(np.argmax(factors))
+        if factors[worst] > FACTOR:
+            notes.append(f"slopes {verb} the errors {factors[worst]:.1f} times ({problem.names[worst]}): {reason}")
+    return tuple(concerns), tuple(notes)
+
+
+def _cut(name: str, unknown: Unknown, sample: Weighted, explorer: Explorer, k: int) -> list[str]:
+    """Warnings of a bound, or of the edge of the searched region, that cuts the interval of an unknown."""
+    coordinate, weights = sample.pool.points[:, k], sample.weights
+    middle, reach = explorer.region.middle[k], FARTHEST * explorer.region.half_width[k]
+    words = []
+    for side, edge in (("below", middle - reach), ("above", middle + reach)):
+        if np.sum(weights[np.abs(coordinate - edge) < NEAR * 2.0 * reach]) > CUT:
+            words.append(f"the data do not bound {name} from {side}: its interval ends where the search ended")
+    values = np.asarray(unknown.value(coordinate))
+    low, high = quantiles(values, weights, np.array([0.025, 0.975]))
+    for bound, exists in ((unknown.lower, unknown.has_lower), (unknown.upper, unknown.has_upper)):
+        if exists and np.sum(weights[np.abs(values - bound) < NEAR * (high - low)]) > CUT:
+            words.append(f"the bound {float(bound):g} cuts the interval of {name}")
+    return words

@@ -1,0 +1,346 @@
+"""Status lines for long calls, and the shared code of the command lines."""
+
+import gc
+import os
+import signal
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from types import TracebackType
+from typing import Any, NoReturn
+
+from .compilation.cache import forget_programs_if_many, is_off
+
+# Status lines for long calls, on a terminal or in a notebook.
+
+#: How often the line is written [s] (a shorter call shows nothing), how often the thread checks whether the line is due
+#: [s], and how long the thread waits for another call [s]: starting a thread for every call would cost short calls a
+#: millisecond.
+INTERVAL, TICK, LINGER = 0.5, 0.1, 5.0
+
+#: Functions of JAX that run while a program is traced or compiled: module, and start of the function's name.
+COMPILERS = (
+    ("jax._src.interpreters.partial_eval", "trace_to_jaxpr"),
+    ("jax._src.interpreters.mlir", "lower_jaxpr"),
+    ("jax._src.compiler", ""),
+)
+
+
+class Progress:
+    """A status line: what a call does and, once it counts items, how many are done, how fast, and how many are left.
+    Use it as a context manager. If contexts are nested, the innermost context that counts items owns the line,
+    otherwise the outermost. The line disappears at the end, unless the outermost context counts items.
+
+    A separate thread writes the line, because compiling blocks the caller's thread for many seconds. Nothing is written
+    if standard error is neither a terminal nor a notebook's, or with `NONHOLONOMIC_PROGRESS=0`.
+    """
+
+    def __init__(self, total: int | None, unit: str = "", doing: str = "compiling", *, shown: bool = True):
+        """Describe the work.
+
+        **Arguments:**
+
+        - `total`: number of items, `None` if none are counted; `unit`: name of an item.
+        - `doing`: activity before `begin`; while JAX traces or compiles for the caller, the line says "compiling".
+        - `shown`: whether to show anything at all, including calls within this one.
+        """
+        self._total, self._unit, self._doing = total, unit, doing
+        self._heard = not is_off("NONHOLONOMIC_PROGRESS") and is_watched()
+        self._shown = shown
+        self._done, self._first, self._since, self._notes = 0, 0, None, {}
+        self._bar: Any = None
+
+    def begin(self, done: int = 0) -> None:
+        """Start counting; `done` items were done before."""
+        with _LINE.lock:
+            self._done = self._first = done
+            self._since = time.time()
+            self._clear()
+
+    def advance(self, count: int, **notes: Any) -> None:
+        """Count `count` more items as done; `notes` are shown beside their number."""
+        with _LINE.lock:
+            self._done, self._notes = self._done + count, notes
+            if self._bar is not None and self._since is not None:
+                self._bar.set_postfix(notes, refresh=False)
+                self._bar.update(count)
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """Remove the line while something else is written."""
+        with _LINE.lock:
+            self._clear()
+            yield
+
+    def __enter__(self) -> "Progress":
+        self._caller, self._start = threading.get_ident(), time.time()
+        if self._heard:
+            with _LINE.lock:
+                outer = [speaker for speaker in _LINE.speakers if speaker._caller == self._caller]
+                self._shown &= all(speaker._shown for speaker in outer)
+                self._inner = bool(outer)
+                if self._shown:
+                    self._tqdm = bar_class()
+                _LINE.add(self)
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self._heard:
+            with _LINE.lock:
+                _LINE.speakers.remove(self)
+                if self._bar is not None:
+                    self._bar.close()
+                self._bar = None
+
+    def _show(self) -> None:
+        """Write the line, if it is due."""
+        if self._bar is not None and time.time() - self._written < INTERVAL:
+            return
+        self._written = time.time()
+        compiling = is_making_programs(self._caller)
+        if self._bar is None:
+            self._bar = self._line()
+        if self._since is None:
+            self._bar.set_description_str("compiling" if compiling else self._doing, refresh=False)
+        else:
+            self._bar.set_description("compiling" if compiling else None, refresh=False)
+        self._bar.refresh()
+
+    def _line(self) -> Any:
+        """The line in its present state, not yet written."""
+        # Without a delay, tqdm writes the line before everything in it is known.
+        options = {"delay": 1e-9, "leave": self._since is not None and not self._inner}
+        if self._since is None:
+            bar = self._tqdm(bar_format="{desc} [{elapsed}]", **options)
+            bar.start_t = self._start
+            return bar
+        # The rate is that of the whole run without the preparations, because chunks of items differ in cost.
+        bar = self._tqdm(total=self._total, initial=self._first, unit=self._unit, smoothing=0, **options)
+        bar.start_t = self._since
+        bar.n = self._done
+        bar.set_postfix(self._notes, refresh=False)
+        return bar
+
+    def _clear(self) -> None:
+        """Remove the line until it is written again."""
+        if self._bar is not None:
+            self._bar.leave = False
+            self._bar.close()
+        self._bar = None
+
+
+class _Line:
+    """The only status line of the process (there is one standard error), and the thread that writes it.
+
+    - `speakers`: the calls that have something to show, the outermost first.
+    """
+
+    def __init__(self):
+        self.lock, self.speakers = threading.RLock(), []
+        self._writer: threading.Thread | None = None
+
+    def add(self, speaker: Progress) -> None:
+        """Add a call that has something to show."""
+        self.speakers.append(speaker)
+        if self._writer is None or not self._writer.is_alive():
+            self._writer = threading.Thread(target=self._write, daemon=True)
+            self._writer.start()
+
+    def _write(self) -> None:
+        last = time.time()
+        while True:
+            time.sleep(TICK)
+            with self.lock:
+                if self.speakers:
+                    last = time.time()
+                elif time.time() - last > LINGER:
+                    self._writer = None
+                    return
+                self._update()
+
+    def _update(self) -> None:
+        shown = [speaker for speaker in self.speakers if speaker._shown and time.time() - speaker._start >= INTERVAL]
+        if not shown:
+            return
+        owner = next((speaker for speaker in reversed(shown) if speaker._total is not None), shown[0])
+        for hidden_speaker in shown:
+            if hidden_speaker is not owner:
+                hidden_speaker._clear()
+        owner._show()
+
+
+_LINE = _Line()
+
+
+@contextmanager
+def status_line(doing: str, shown: bool = True) -> Iterator[Progress]:
+    """Show a status line while a call compiles; also a decorator for functions. First clear programs that take too much
+    memory (`compilation/cache.py`).
+    """
+    forget_programs_if_many()
+    with Progress(None, doing=doing, shown=shown) as line:
+        yield line
+
+
+def is_making_programs(thread: int) -> bool:
+    """Whether JAX is tracing or compiling in a thread, which JAX itself does not report. The check takes 0.5 ms, twice
+    a second."""
+    frame = sys._current_frames().get(thread)
+    while frame is not None:
+        module, name = frame.f_globals.get("__name__"), frame.f_code.co_name
+        if any(module == compiler and name.startswith(begin) for compiler, begin in COMPILERS):
+            return True
+        frame = frame.f_back
+    return False
+
+
+def is_watched() -> bool:
+    """Whether a status line would be visible: standard error is a terminal, or this process is a notebook."""
+    # A closed stream raises an error.
+    is_open = not getattr(sys.stderr, "closed", False)
+    return (is_open and getattr(sys.stderr, "isatty", bool)()) or is_notebook()
+
+
+def is_notebook() -> bool:
+    """Whether this process is the kernel of a notebook."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return "IPKernelApp" in getattr(shell, "config", {})
+
+
+def bar_class() -> type:
+    """The tqdm bar for a terminal, or for a notebook that has the widgets for it.
+
+    `tqdm.auto` also chooses, but it warns if there are no widgets, and sets the warning filters when it is imported.
+    """
+    if is_notebook() and find_spec("ipywidgets") is not None:
+        from tqdm.notebook import tqdm
+    else:
+        from tqdm import tqdm
+    return tqdm
+
+
+# Shared code of the command lines: how they start, what they print at the end, and how Ctrl-C ends them.
+
+#: Longest time [s] that the main thread may take to report what was saved before the process ends without the report.
+PATIENCE = 1.0
+
+#: The exit status that shells report for a program ended by SIGINT.
+INTERRUPTED = 130
+
+_ending = threading.Lock()
+
+
+def import_quietly() -> None:
+    """End the process with one line instead of a traceback if Ctrl-C arrives while `python -m` imports the packages.
+
+    A `KeyboardInterrupt` would be lost if it arrived during garbage collection, where JAX calls back into Python.
+    """
+    program, excepthook = sys.orig_argv[sys.orig_argv.index("-m") + 1], sys.excepthook
+
+    def end(number: int, frame: Any) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        _end(f"python -m {program}: interrupted")
+
+    # A shell may have told this process to ignore the signal.
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, end)
+
+    def hook(kind: type[BaseException], error: BaseException, trace: Any) -> None:
+        if issubclass(kind, KeyboardInterrupt):
+            print(f"python -m {program}: interrupted", file=sys.stderr)
+        else:
+            excepthook(kind, error, trace)
+
+    sys.excepthook = hook
+
+
+def run_and_exit(main: Callable[[], int], program: str) -> NoReturn:
+    """Run a command line and end the process.
+
+    A command line takes seconds, so it compiles quickly. It also switches off garbage collection, which would take up
+    to a fifth of the time because JAX holds many objects. It shows each warning once, as one line.
+
+    **Arguments:** as for `interruptible`.
+    """
+    # Imported here, because this module must load before JAX does.
+    from .compilation.xla_cpu import compile_quickly
+
+    # After the filters of the user; those of Python hide what concerns developers only. Python's filter "once" repeats a
+    # warning for each module and thread that it points to.
+    warnings.simplefilter("always", UserWarning, append=True)
+    shown_texts: set[str] = set()
+
+    def show(message: Warning | str, *_: Any) -> None:
+        if str(message) not in shown_texts:
+            shown_texts.add(str(message))
+            print(f"python -m {program}: warning: {message}", file=sys.stderr)
+
+    warnings.showwarning = show
+    gc.disable()
+    compile_quickly()
+    status = interruptible(main, program)
+    gc.freeze()
+    sys.exit(status)
+
+
+def closing_lines(runs: int, start_time: float, paths: Iterable[Any], page: str, read_from: Any = None) -> str:
+    """The last lines of a command line.
+
+    **Arguments:** `runs`: number of runs; `start_time`: the start of the call, by `time.perf_counter`; `paths`: the
+    files; `page`: what the page shows, and its path; `read_from`: the folder from which all results were read, or `None`.
+    """
+    duration = time.perf_counter() - start_time
+    files = ", ".join(map(str, paths))
+    included = "compilation included"
+    if read_from is not None:
+        # Another installation of the same version may have stored them.
+        included = f"read from {read_from}, where an earlier run stored the results of these options"
+    return f"\n{runs} runs in {duration:.1f} s, {included}. Wrote {files}.\n{page}"
+
+
+def interruptible(main: Callable[[], int], program: str) -> int:
+    """Run a command line; Ctrl-C ends it within two seconds, even while XLA compiles.
+
+    Python raises `KeyboardInterrupt` only when the main thread returns from C++, which takes up to half a minute while
+    XLA compiles. Python's wake-up descriptor therefore also notifies a second thread, which ends the process if the
+    main thread does not. The process ends without finalization, which would wait for compilations or crash in them; all
+    results are on disk by then.
+
+    **Arguments:** `main`: the command line, a function that returns the exit status; `program`: its name.
+
+    **Returns:** the exit status of `main`.
+    """
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    read_end, write_end = os.pipe()
+    os.set_blocking(write_end, False)
+    signal.set_wakeup_fd(write_end)
+
+    def watch() -> None:
+        while signal.SIGINT not in os.read(read_end, 64):
+            pass
+        # Other threads otherwise keep the interpreter for 5 ms each time the main thread needs it to read a file.
+        sys.setswitchinterval(1e-5)
+        time.sleep(PATIENCE)
+        _end(f"python -m {program}: interrupted; run the same command again to resume")
+
+    threading.Thread(target=watch, daemon=True).start()
+    try:
+        return main()
+    except KeyboardInterrupt as interrupt:
+        _end(f"python -m {program}: {str(interrupt) or 'interrupted; run the same command again to resume'}")
+
+
+def _end(message: str) -> NoReturn:
+    """End the process with one line."""
+    # The first thread that gets here ends the process; the other one waits.
+    _ending.acquire()
+    sys.stdout.flush()
+    # On a terminal, the status line is still visible.
+    start = "\r\x1b[K" if sys.stderr.isatty() else ""
+    print(f"{start}{message}", file=sys.stderr, flush=True)
+    os._exit(INTERRUPTED)

@@ -1,1 +1,0 @@
-"""Recordings of a stroller, and the parameters identified from them."""

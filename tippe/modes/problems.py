@@ -1,0 +1,202 @@
+"""Motion on one smooth contact, as problems for the integrator, and the base of the modes with flights."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from nonholonomic.compilation.xla_cpu import compiled_setup
+from nonholonomic.geometry import Component, Tangent, Vector, cross, dot, rate_in_frame, scale, stacked, sum_vectors
+from nonholonomic.hybrid import AbstractBatchedMode
+from nonholonomic.integration import AbstractPassive, AbstractProblem, ExtendedProblem
+
+from ..model.body import Top
+from ..model.dynamics import NO_COSINE, Dynamics
+from ..model.launch import COS_THETA, Launch, parts
+from ..model.rigid_body import AbstractRigidBody
+from ..model.rigid_dynamics import AbstractRigidDynamics
+from ..model.scene import Scene
+from ..model.stick_slip import ContactMode, StickSlip
+
+# Motion on one smooth contact until theta reaches an angle, or the spin reverses, or the contact ends, for many cells.
+
+
+class StemContact(eqx.Module):
+    """The event that the stem of a top first carries it, in place of an angle that theta reaches."""
+
+
+class InversionProblem(AbstractProblem):
+    """Launches that end when theta reaches an angle or the contact is lost or jams.
+
+    If `cos_angle` is `None`, they end when the spin about the arena's normal reverses; `spin` is the initial spin
+    [rad/s]. For a top with a stem, `stem_counts` is 1 if the event is that the stem first carries the top, and 0 if the
+    event is an angle; one program serves both.
+    """
+
+    dynamics: Dynamics | StickSlip | ContactMode | AbstractRigidDynamics
+    # An array, or `None`.
+    cos_angle: Any
+    states: Float[Array, "components cells"]
+    scales: Float[Array, "components cells"]
+    spin: Float[Array, "..."] | None = None
+    # An array for a top with a stem, or `None`.
+    stem_counts: Any = None
+    # Whether a flight follows where the contact is lost.
+    flies: bool = eqx.field(static=True, default=False, kw_only=True)
+
+    @classmethod
+    def of(
+        cls, scene: Scene[Top], launch: Launch, angle: Float[ArrayLike, "..."] | StemContact | None, cells: int
+    ) -> "InversionProblem":
+        """The problem of the given number of cells; the numbers of scene and launch are scalars or arrays with one
+        number per cell. The frame is that of `Scene.turning_dynamics`, so final states do not contain directions.
+        """
+        event = angle if angle is None or isinstance(angle, StemContact) else jnp.asarray(angle)
+        return _inversion_problem(scene, launch, event, cells)
+
+    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+        return self.states, self.scales
+
+    def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        return self.dynamics.field(state)
+
+    def event_function(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"]:
+        if self.cos_angle is None:
+            assert not isinstance(self.dynamics, Dynamics)
+            assert self.spin is not None
+            return self.dynamics.normal_spin(state) / self.spin
+        return state[COS_THETA] - self.cos_angle
+
+    def domain_margin(
+        self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]
+    ) -> Float[Array, " lanes"]:
+        return self.dynamics.contact_margin(state)
+
+    def lost_at_start(self, state: Float[Array, "components lanes"]) -> Bool[Array, " lanes"] | None:
+        # A top that may fly slides on without load: both are the same motion.
+        return None if self.flies else self.dynamics.unloaded(state, self.scales)
+
+    def margins(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> tuple[Any, ...]:
+        return self.dynamics.margins(state)
+
+
+def beyond_on_stem(
+    value: Float[Array, " cells"], on_stem: Bool[Array, "..."], stem_counts: Float[Array, "..."] | None
+) -> Float[Array, " cells"]:
+    """The event function, or -1 if the stem carries the top and this counts, so that a run which starts on the stem is
+    beyond the event. Later, reset maps determine when the stem takes over."""
+    return value if stem_counts is None else jnp.where(on_stem & (stem_counts > 0.0), -1.0, value)
+
+
+@compiled_setup
+def _inversion_problem(
+    scene: Scene[Top], launch: Launch, angle: Float[Array, "..."] | StemContact | None, cells: int
+) -> InversionProblem:
+    states = scene.state(launch)
+    shape = (states.shape[0], cells)
+    states = jnp.broadcast_to(states.reshape(shape[0], -1), shape)
+    scales = jnp.broadcast_to(scene.scales(launch).reshape(shape[0], -1), shape)
+    dynamics = scene.turning_dynamics
+    if angle is None:
+        return InversionProblem(dynamics, None, states, scales, dynamics.normal_spin(states))
+    if not scene.has_stem:
+        assert not isinstance(angle, StemContact)
+        return InversionProblem(dynamics, jnp.cos(angle), states, scales)
+    if isinstance(angle, StemContact):
+        return InversionProblem(dynamics, jnp.asarray(NO_COSINE), states, scales, stem_counts=jnp.ones(()))
+    return InversionProblem(dynamics, jnp.cos(angle), states, scales, stem_counts=jnp.zeros(()))
+
+
+# Motion on one smooth contact with the path on the arena, the orientation about the axis and the work of friction.
+
+#: Launches with their passive quadratures, without an event.
+TrajectoryProblem = ExtendedProblem[InversionProblem]
+
+#: Number of the passive quadratures after the path.
+BEHIND_PATH = 5
+
+
+class Quadratures(AbstractPassive):
+    """The passive quadratures of a top in contact: the arena's path, the vector c, the spin angle and the work of friction.
+
+    c is a unit vector across the axis that moves with the axis without rotation about it. The body's first axis is c
+    turned about e by the spin angle, so every integrated component changes as slowly as the axis.
+
+    - `axial`: the moment of inertia about the axis [kg m^2].
+    - `of_mass`: whether the path belongs to the centre of mass, along a level plane.
+    """
+
+    axial: Float[Array, "..."]
+    of_mass: bool = eqx.field(static=True, default=False)
+
+    def rates(
+        self, problem: Any, time: Float[Array, "..."], state: Any, passive: Any
+    ) -> Float[Array, "components ..."]:
+        dynamics, (u, e, L, _) = problem.dynamics, parts(state)
+        motion, (*path, c1, c2, c3, _, _) = dynamics.motion(state), passive
+        c, frame_rate = (c1, c2, c3), (None, None) if self.of_mass else motion.frame_rate
+        path_rate = u if self.of_mass else dynamics.frame.cyclic_rate(tuple(path), motion.velocity, frame_rate)
+        # In a frame that turns, the components of the axis have another rate than the axis.
+        if self.of_mass or not isinstance(dynamics, Dynamics):
+            axial_rate = dot(sum_vectors(motion.rate[2:5], scale(-1.0, rate_in_frame(e, frame_rate))), c)
+        else:
+            axial_rate = dot(cross(L, e), c) * dynamics.per_transverse
+        rates = (*path_rate, *c_rate(c, e, axial_rate, frame_rate), motion.spin_momentum / self.axial)
+        return stacked((*motion.rate, *rates, motion.friction_power), state)
+
+
+def c_rate(c: Vector, axis: Vector, axial_rate: Component, frame_rate: Tangent = (None, None)) -> tuple[Component, ...]:
+    """c' = (e x e') x c = -(e'.c) e, with `axial_rate` = e'.c [1/s], in a frame that turns at a rate [rad/s]."""
+    return sum_vectors(scale(-axial_rate, axis), rate_in_frame(c, frame_rate))
+
+
+def trajectory_problem(modules: tuple[Scene, Launch], cells: int | None = None) -> TrajectoryProblem:
+    """The run of one launch, or the runs of several cells; numbers are scalars or arrays with one number per cell."""
+    return _trajectory_problem(*modules, cells)
+
+
+@compiled_setup
+def _trajectory_problem(scene: Scene, launch: Launch, cells: int | None) -> TrajectoryProblem:
+    size, weight = scene.body.size, scene.body.mass * scene.gravity
+    sine, cosine = jnp.sin(launch.theta), jnp.cos(launch.theta)
+    perpendicular = (cosine * jnp.cos(launch.azimuth), cosine * jnp.sin(launch.azimuth), -sine)
+    path, zero, unit = scene.start(launch)[1], jnp.zeros(()), jnp.ones(())
+    values = (*path, *perpendicular, zero, zero)
+    scales = (*[size] * len(path), unit, unit, unit, unit, weight * size)
+    values, scales = (jnp.stack(jnp.broadcast_arrays(*rows)) for rows in (values, scales))
+    rows = (scene.state(launch), scene.scales(launch), values, scales)
+    if cells is not None:
+        rows = tuple(jnp.broadcast_to(row.reshape(len(row), -1), (len(row), cells)) for row in rows)
+    # The equations of a rigid body return the spin in place of the angular momentum about the axis.
+    axial = jnp.ones(()) if isinstance(scene.body, AbstractRigidBody) else scene.body.I3
+    problem = InversionProblem(scene.dynamics, None, rows[0], rows[1])
+    return ExtendedProblem(problem, Quadratures(axial), rows[2], rows[3], ends_on_event=False)
+
+
+# Common base of all modes of runs with flights.
+
+
+class AbstractFlyingMode(AbstractBatchedMode):
+    """A mode of runs that continue through flights.
+
+    - `scene`: a scene with `contact="hybrid"`; `scales`: magnitudes that scale absolute errors of the state.
+    - `cos_angle`: cosine of the theta that is the event.
+    - `stem_counts`: as for `InversionProblem`; `None` for a top without a stem.
+    - `with_quadratures`: whether this is a single run whose path is kept, with passive quadratures after its state.
+    """
+
+    scene: Scene[Top]
+    scales: Float[Array, "components cells"]
+    cos_angle: Float[Array, "..."]
+    with_quadratures: bool = eqx.field(static=True)
+    stem_counts: Any = eqx.field(kw_only=True, default=None)
+
+    def extended(
+        self, problem: AbstractProblem, passive: AbstractPassive, state: Float[Array, "components cells"]
+    ) -> AbstractProblem:
+        """The problem for given states, including the passive quadratures."""
+        size = len(problem.start()[0])
+        if not self.with_quadratures:
+            return problem
+        return ExtendedProblem(problem, passive, state[size:], self.scales[size:])
