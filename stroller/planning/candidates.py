@@ -16,15 +16,12 @@ from .transcription import ORDER, Scales, Task
 INTERVALS = 64
 
 #: Distance to keep from obstacles while planning, in units of the footprint's length, and the share of every limit's
-#: range to keep in reserve: the check examines the ride between the points at which the optimiser looks.
-RESERVE, LIMIT_RESERVE = 0.04, 0.01
+#: range to keep in reserve at first: the check examines the ride between the points at which the optimiser looks.
+RESERVE, LIMIT_RESERVE = 0.04, 0.003
 
 #: Curvature of the arcs of the searches for neighbouring lanes, in units of the greatest one: less, because the fork takes time
 #: to turn, and nearly all, because a somewhat wider turn may need a detour.
 SEARCH_CURVATURES = (0.98, 0.85)
-
-#: First duration of a drive in the least time, in units of the least one that its path and the limits allow.
-UNHURRIED = 1.5
 
 #: Length of the shortest drive that is expected, in units of the path of a search, which consists of arcs.
 OPTIMISTIC = 0.8
@@ -58,13 +55,16 @@ class Outline(NamedTuple):
         """The straight distance [m] from the start to the goal."""
         return float(np.linalg.norm(np.asarray(self.goal - self.start)[: self.problem.scene.surface.axes]))
 
-    def task(self, way: float, t1: float, clearance: float) -> Task:
-        """The task of the optimiser for drives of the length `way` [m]."""
+    def task(
+        self, way: float, t1: float, clearance: float, reserve: float = LIMIT_RESERVE, in_haste: bool = False
+    ) -> Task:
+        """The task of the optimiser for drives of the length `way` [m] and a duration of about `t1` [s], which is minimised
+        in haste."""
         problem, body = self.problem, self.problem.scene.body
         speed = max(way, float(body.wheelbase)) / t1
         launch, goal = problem.launch, problem.goal
         ends = np.array([[launch.steering, launch.speed], [launch.steering, goal.speed]])
-        low, high = problem.limits.arrays(LIMIT_RESERVE)
+        low, high = problem.limits.arrays(reserve)
         # No drive keeps a reserve that its start or its goal does not have.
         low[:2], high[:2] = np.minimum(low[:2], ends.min(axis=0)), np.maximum(high[:2], ends.max(axis=0))
         front_speed = launch.speed / jnp.cos(launch.steering)
@@ -80,6 +80,7 @@ class Outline(NamedTuple):
             high=jnp.asarray(high),
             clearance=jnp.asarray(clearance),
             scales=Scales(body.wheelbase, jnp.asarray(speed), jnp.asarray(force)),
+            haste=jnp.asarray(1.0 / t1 if in_haste else 0.0),
             with_grip=problem.limits.grip is not None,
         )
 

@@ -19,10 +19,10 @@ from ..model.input import Motion
 from ..model.scene import Scene
 from ..model.vehicle import Launch
 from ..runs.trajectory import Trajectory
-from .candidates import UNHURRIED, Outline, prices
+from .candidates import LIMIT_RESERVE, Outline, prices
 from .obstacles import Footprint
 from .planner import Planner, proposed
-from .problem import COMPARED, CONFIRMED, MOST_STEERING, Goal, Limits, Verdict, checked_problem, checked_run
+from .problem import ALLOWED, COMPARED, CONFIRMED, MOST_STEERING, Goal, Limits, Verdict, checked_problem, checked_run
 from .result import Plan
 from .transcription import FINE, ORDER, Candidates, Drive, drive_along, evaluate, interpolate, optimise
 
@@ -37,15 +37,15 @@ TIGHT = 1e-9
 #: A candidate with a greater violation of the constraints (see `transcription.py`) is not worth a run if there is a better one.
 HOPELESS = 0.05
 
-#: How often the clearance is increased for a candidate that touches an obstacle between the optimiser's points.
-MORE_CLEARANCE = 2
+#: How often the clearance, or the reserve of the limits, is increased for a candidate that touches an obstacle, or exceeds a
+#: limit, between the optimiser's points, and the greatest share of its range by which it may exceed a limit then.
+STRICTER, CORRIGIBLE = 2, 0.05
+
+#: Factor of the penalties for later candidates in haste: the first ones may lose a turn of their path to the weight of time.
+FIRMER = 10.0
 
 #: Batches without a path that can be driven in time after which the search goes on; one more ends it.
 PATIENCE = 1
-
-#: The most rounds in which the duration is shortened, the share of the duration to which the first one shortens it, its
-#: exponent after a success, and the difference of the share from 1 at which they end.
-ROUNDS, SHORTER, LONGER_STEP, CLOSE = 16, 0.7, 1.5, 0.02
 
 MINIMISED = ("effort", "time")
 
@@ -58,11 +58,10 @@ class Log(NamedTuple):
 
 
 class Attempt(NamedTuple):
-    """An optimised candidate that was driven: its input and duration [s], its unknowns, its run and what it achieves."""
+    """An optimised candidate that was driven: its input and duration [s], its run and what it achieves."""
 
     drive: Drive
     t1: float
-    unknowns: Any
     run: Trajectory
     verdict: Verdict
 
@@ -112,7 +111,8 @@ def plan(
     - `tolerance`: relative tolerance of the runs that compare candidates, in [1e-14, 1e-2].
     - `progress`: whether to show a status line.
 
-    **Returns:** a `Plan`. If no candidate solves the problem, `reached` is false, and the plan is the best attempt.
+    **Returns:** a `Plan`. If no candidate solves the problem, `reached` is false, and the plan is the best attempt, which may
+    take longer than `t1` if the time is minimised.
 
     **Raises:** `ValueError` for arguments out of range, a start or a goal that touches an obstacle or breaks a limit, and a
     goal outside the ground.
@@ -147,18 +147,16 @@ def plan(
         attempts, log = [], Log([], [])
         in_haste = minimise == "time"
         guesses = _guesses(outline, duration, in_haste, starts, planner, seed, log)
-        for attempt in _attempts(outline, guesses, tolerance, log):
+        for attempt in _attempts(outline, guesses, duration, in_haste, tolerance, log):
             attempts.append(attempt)
             if not attempt.verdict.hindrances:
                 break
         best = min(attempts, key=lambda attempt: attempt.rank)
-        if in_haste and not best.verdict.hindrances:
-            best = _shortened(outline, best, tolerance)
         run, verdict = best.run, best.verdict
         if verdict.hindrances:
             run, verdict = checked_run(problem, best.drive, best.t1, TIGHT, CONFIRMED)
-    if verdict.hindrances:
-        verdict = verdict._replace(hindrances=(*verdict.hindrances, *log.reasons[:1]))
+            verdict = in_time(verdict, best.t1, duration)
+            verdict = verdict._replace(hindrances=(*verdict.hindrances, *log.reasons[:1]))
     return Plan(best.drive, best.t1, run, verdict, problem, jnp.asarray(outline.lines(np.concatenate(log.tried))))
 
 
@@ -182,70 +180,60 @@ def _guesses(
         if len(log.reasons) > PATIENCE:
             return
         way = min(float(path.length.sum()) for path in paths)
-        longest = [UNHURRIED * 2.0**batch * outline.soonest(path) if in_haste else t1 for path in paths]
-        durations = np.minimum(t1, longest)
+        durations = np.array([outline.soonest(path) if in_haste else t1 for path in paths])
         yield way, Candidates(np.stack(list(map(outline.unknowns, paths, durations))), durations)
 
 
 def _attempts(
-    outline: Outline, guesses: Iterator[tuple[float, Candidates]], tolerance: float, log: Log
+    outline: Outline,
+    guesses: Iterator[tuple[float, Candidates]],
+    t1: float,
+    in_haste: bool,
+    tolerance: float,
+    log: Log,
 ) -> Iterator[Attempt]:
     """Attempts at a problem, best first in each batch of candidates."""
-    for way, candidates in guesses:
-        clearance = outline.clearance
-        for _ in range(MORE_CLEARANCE + 1):
-            task = outline.task(way, candidates.durations.mean(), clearance)
-            candidates, violation, objective = optimise(candidates, task)
+    within = float(outline.problem.goal.within)
+    widths = [(name, high - low) for name, (low, high) in outline.problem.limits.ranges().items()]
+    for batch, (way, candidates) in enumerate(guesses):
+        clearance, reserve = outline.clearance, LIMIT_RESERVE
+        for _ in range(STRICTER + 1):
+            task = outline.task(way, candidates.durations.mean(), clearance, reserve, in_haste)
+            candidates, violation, values = optimise(candidates, task, FIRMER if in_haste and batch else 1.0)
             log.tried.append(candidates.unknowns)
-            order = np.lexsort((objective, candidates.durations, violation > HOPELESS))
             attempts = []
-            for lane in order:
+            for lane in np.lexsort((values, violation > HOPELESS)):
                 if attempts and violation[lane] > HOPELESS:
                     break
-                attempts.append(_driven(outline, candidates, lane, tolerance))
+                attempts.append(_driven(outline, candidates, lane, t1, tolerance))
                 yield attempts[-1]
             overlap = -max(attempt.verdict.clearance for attempt in attempts)
-            if overlap <= 0.0 or violation.min() > HOPELESS:
+            shares = [[-attempt.verdict.margins[name] / width for name, width in widths] for attempt in attempts]
+            excess = min(max(share, default=0.0) for share in shares)
+            ends = any(max(attempt.verdict.errors) < within for attempt in attempts)
+            if not ends or not (overlap > 0.0 or ALLOWED < excess < CORRIGIBLE):
                 break
-            clearance += overlap + 0.5 * outline.clearance
+            clearance += (overlap + 0.5 * outline.clearance) * (overlap > 0.0)
+            reserve += 2.0 * excess * (excess > ALLOWED)
 
 
-def _driven(outline: Outline, candidates: Candidates, lane: int, tolerance: float) -> Attempt:
+def _driven(outline: Outline, candidates: Candidates, lane: int, longest: float, tolerance: float) -> Attempt:
     """An optimised candidate, driven; a solution is driven again at a tight tolerance, and this run counts."""
-    dynamics, unknowns, t1 = (
-        outline.problem.scene.dynamics,
-        candidates.unknowns[lane],
-        float(candidates.durations[lane]),
-    )
-    drive = drive_along(dynamics, outline.start, unknowns[:, -2], unknowns[:, -1], t1)
+    t1, splines = float(candidates.durations[lane]), candidates.unknowns[lane].T[-2:]
+    drive = drive_along(outline.problem.scene.dynamics, outline.start, *splines, t1)
     run, verdict = checked_run(outline.problem, drive, t1, tolerance, COMPARED)
     if not verdict.hindrances:
         run, verdict = checked_run(outline.problem, drive, t1, TIGHT, CONFIRMED)
-    return Attempt(drive, t1, unknowns, run, verdict)
+    return Attempt(drive, t1, run, in_time(verdict, t1, longest))
 
 
-def _shortened(outline: Outline, best: Attempt, tolerance: float) -> Attempt:
-    """A solution in less time: the same drive, faster, optimised again for several durations in turn.
-
-    Every duration is a share of that of the best solution yet, and this solution is the first guess. The share is closer to 1
-    after a round without a solution, and further from 1 after one with a solution.
-    """
-    share = SHORTER
-    for _ in range(ROUNDS):
-        durations = best.t1 * share ** (np.arange(LANES, 0, -1) / LANES)
-        faster = np.stack([best.unknowns] * LANES)
-        faster[:, :, -1] *= (best.t1 / durations)[:, None]
-        way = float(np.trapezoid(np.abs(best.run.speed), best.run.t))
-        task = outline.task(way, float(durations.mean()), outline.clearance)
-        candidates, violation, _ = optimise(Candidates(faster, durations), task)
-        hopeful = np.flatnonzero(violation < HOPELESS).tolist()
-        attempts = (_driven(outline, candidates, lane, tolerance) for lane in hopeful)
-        shorter = next((attempt for attempt in attempts if not attempt.verdict.hindrances), None)
-        best = best if shorter is None else shorter
-        share **= 0.5 / LANES if shorter is None else LONGER_STEP
-        if share > 1.0 - CLOSE:
-            break
-    return best
+def in_time(verdict: Verdict, t1: float, longest: float) -> Verdict:
+    """A verdict that is also on the duration `t1` [s], which may be `longest` [s]."""
+    if t1 <= longest:
+        return verdict
+    words = f"the drive takes {t1:.4g} s, longer than t1 = {longest:.4g} s"
+    excess = verdict.excess + t1 / longest - 1.0
+    return verdict._replace(excess=excess, hindrances=(*verdict.hindrances, words))
 
 
 # Feedback that keeps a ride on its plan.

@@ -163,8 +163,12 @@ STEPS = 3
 #: Smallest normal force, in units of the weight.
 LEAST_CONTACT = 0.02
 
-#: Weight of the smoothness of the splines in the objective.
-SMOOTHNESS = 0.02
+#: Places in an interval at which the speed and the steering angle keep their limits too, close to its ends because a drive may
+#: start or stop at a limit.
+BETWEEN = np.array([1.0 / 24.0, 1.0 / 6.0, 0.5, 5.0 / 6.0, 23.0 / 24.0])
+
+#: Weight of the smoothness of the splines in the objective, and of all the effort where the time is minimised.
+SMOOTHNESS, EASE = 0.02, 0.1
 
 
 class Scales(NamedTuple):
@@ -182,6 +186,7 @@ class Task(eqx.Module):
     - `has_heading`: 1 if the goal has a heading, else 0.
     - `low`, `high`: limits of steering, speed, force, torque and grip.
     - `clearance`: the distance [m] to keep from obstacles.
+    - `haste`: weight [1/s] of the duration in the objective; 0 where the duration is given.
     """
 
     dynamics: Dynamics
@@ -194,6 +199,7 @@ class Task(eqx.Module):
     high: Float[Array, " limits"]
     clearance: Any
     scales: Scales
+    haste: Any
     with_grip: bool = eqx.field(static=True)
 
 
@@ -269,7 +275,10 @@ def interval_residuals(window: Any, task: Task, index: Any, intervals: int, dura
     # No interval follows the last one.
     first, last = motion_at(splines, 0.0, duration), motion_at(splines, 1.0, duration)
     at_end, _ = point_residuals(task, end, last)
-    inequalities = jnp.concatenate([inequalities.ravel(), jnp.where(is_last, at_end, 1.0)])
+    between = motion_at(splines, BETWEEN, duration)
+    values = jnp.stack([between.steering, between.front_speed * jnp.cos(between.steering)], axis=-1)
+    within = jnp.concatenate([values - task.low[:2], task.high[:2] - values]) / jnp.stack([1.0, task.scales.speed])
+    inequalities = jnp.concatenate([inequalities.ravel(), jnp.where(is_last, at_end, 1.0), within.ravel()])
     axes, length = task.dynamics.surface.axes, task.scales.length
     units = jnp.concatenate([jnp.full(axes, length), jnp.ones(len(end) - axes)])
     at_start, at_goal = jnp.where(index == 0, 1.0, 0.0), jnp.where(is_last, 1.0, 0.0)
@@ -284,6 +293,7 @@ def interval_residuals(window: Any, task: Task, index: Any, intervals: int, dura
     bends = splines[0][2] - 2.0 * splines[0][1] + splines[0][0], splines[1][2] - 2.0 * splines[1][1] + splines[1][0]
     smooth = SMOOTHNESS * jnp.stack([bends[0], bends[1] / task.scales.speed])
     objective = jnp.concatenate([effort.ravel() / jnp.sqrt(STEPS * intervals), smooth])
+    objective = jnp.where(task.haste > 0.0, EASE, 1.0) * objective
     return Residuals(jnp.concatenate(equalities), inequalities, objective)
 
 
@@ -308,12 +318,8 @@ def residuals(unknowns: Any, task: Task, t1: Any) -> Residuals:
 # Method: Nocedal and Wright, Numerical Optimization (2006), chapters 10 and 17. JAX evaluates the residuals and their
 # slopes in lanes; SciPy solves the banded equations of all lanes as one system.
 
-#: Penalties of the constraints, in turn, and the number of Gauss-Newton steps with each.
-PENALTIES = (100.0, 300.0, *(1e3,) * 6)
-STEPS_EACH = 8
-
-#: Violation of the constraints of a solution, and relative change of the objective at which the optimiser stops.
-FEASIBLE, SETTLED = 2e-4, 0.02
+#: Violation of the constraints of a solution, and gain in a step, relative to the merit, that is not worth another one.
+FEASIBLE, TINY_GAIN = 2e-4, 1e-6
 
 #: The damping: least, first and greatest value.
 LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-6, 1.0, 1e6
@@ -324,6 +330,20 @@ class Candidates(NamedTuple):
 
     unknowns: Any
     durations: Any
+
+
+class Schedule(NamedTuple):
+    """How the optimiser proceeds: the penalties of the constraints, in turn, the most Gauss-Newton steps with each, and the
+    relative change of what is minimised at which it stops."""
+
+    penalties: tuple[float, ...]
+    steps: int
+    settled: float
+
+
+#: Least effort in a given time, and least time: with small penalties the duration soon falls below the least one, and the
+#: multipliers then bring it back. From above, the limits of the speed stop every step.
+CALM, HASTY = Schedule((100.0, 300.0, *(1e3,) * 6), 8, 0.02), Schedule((10.0, *(30.0,) * 15), 60, 2e-3)
 
 
 class Multipliers(NamedTuple):
@@ -345,7 +365,11 @@ def _penalised(evaluation: Residuals, multipliers: Multipliers, penalty: Any) ->
 
 @eqx.filter_jit
 def _normal_equations(candidates: Candidates, task: Task, multipliers: Multipliers, penalty: Any) -> Any:
-    """Merit (lanes,), gradient (lanes, rows, unknowns), and lower band of the Gauss-Newton matrix of every lane."""
+    """Merit (lanes,), gradient, lower band of the Gauss-Newton matrix without its last row, and this row, of every lane.
+
+    The last of the unknowns is the logarithm of the factor of the duration; the speeds change inversely to it, so that the
+    path stays.
+    """
 
     def of_lane(unknowns, t1, multipliers):
         rows, width = unknowns.shape
@@ -356,21 +380,25 @@ def _normal_equations(candidates: Candidates, task: Task, multipliers: Multiplie
 
         def of_interval(window, multipliers, index):
             def terms(numbers):
-                changed = window.ravel().at[used].set(numbers).reshape(window.shape)
-                evaluation = interval_residuals(changed, task, index, intervals, t1 / intervals)
+                duration = t1 * jnp.exp(jnp.where(task.haste > 0.0, numbers[-1], 0.0))
+                changed = window.ravel().at[used].set(numbers[:-1]).reshape(window.shape)
+                changed = changed.at[:, -1].multiply(t1 / duration)
+                evaluation = interval_residuals(changed, task, index, intervals, duration / intervals)
                 value = _penalised(evaluation, multipliers, penalty)
+                value = jnp.append(value, task.haste * duration / jnp.sqrt(intervals))
                 return value, value
 
-            slope, value = jax.jacfwd(terms, has_aux=True)(window.ravel()[used])
+            slope, value = jax.jacfwd(terms, has_aux=True)(jnp.append(window.ravel()[used], 0.0))
             return value @ value, slope.T @ value, slope.T @ slope
 
         merit, gradient, matrix = jax.vmap(of_interval)(windows(unknowns), multipliers, jnp.arange(intervals))
         number = np.arange(intervals)[:, None] * width + used
-        total = jnp.zeros(rows * width).at[number].add(gradient)
+        number = np.append(number, np.full((intervals, 1), rows * width), axis=1)
+        total, edge = (jnp.zeros(rows * width + 1).at[number].add(part) for part in (gradient, matrix[:, -1]))
         row, column = np.tril_indices(len(used))
         band = jnp.zeros((ORDER * width, rows * width))
         band = band.at[(used[row] - used[column])[None], number[:, column]].add(matrix[:, row, column])
-        return merit.sum(), total, band
+        return merit.sum(), total, band, edge
 
     return jax.vmap(of_lane)(*candidates, multipliers)
 
@@ -381,42 +409,51 @@ def constraints(candidates: Candidates, task: Task) -> Residuals:
     return jax.vmap(lambda unknowns, t1: residuals(unknowns, task, t1))(*candidates)
 
 
-def _step(band: np.ndarray, gradient: np.ndarray, damping: np.ndarray) -> np.ndarray:
+def _step(gradient: np.ndarray, band: np.ndarray, edge: np.ndarray, damping: np.ndarray) -> np.ndarray:
     """Damped Gauss-Newton steps of all lanes, solved as one banded system; none in a lane that is not finite."""
     lanes, width, count = band.shape
     usable = np.all(np.isfinite(band), axis=(1, 2), keepdims=True)
     matrix = np.where(usable, band, 0.0)
     # Rounding must not make the matrix indefinite where an unknown far from the others has a very steep residual.
     matrix[:, 0] += damping[:, None] + 1e-12 + 1e-13 * matrix[:, 0].max(axis=1, keepdims=True)
-    joined, slopes = matrix.transpose(1, 0, 2).reshape(width, lanes * count), np.where(usable[..., 0], gradient, 0.0)
-    return -scipy.linalg.solveh_banded(joined, slopes.reshape(-1), lower=True).reshape(lanes, count)
+    joined, sides = matrix.transpose(1, 0, 2).reshape(width, lanes * count), np.stack([gradient, edge], axis=-1)
+    sides = np.where(usable, sides, 0.0)
+    solved = scipy.linalg.solveh_banded(joined, sides[:, :-1].reshape(-1, 2), lower=True).reshape(lanes, count, 2)
+    # The last unknown follows from the Schur complement of the others.
+    inner = np.sum(sides[:, :-1, 1:] * solved, axis=1)
+    last = (inner[:, 0] - sides[:, -1, 0]) / (sides[:, -1, 1] + damping - inner[:, 1])
+    return np.concatenate([-solved[..., 0] - last[:, None] * solved[..., 1], last[:, None]], axis=1)
 
 
 def _minimise(
-    candidates: Candidates, task: Task, multipliers: Multipliers, penalty: float, damping: np.ndarray
+    candidates: Candidates, task: Task, multipliers: Multipliers, penalty: float, steps: int, damping: np.ndarray
 ) -> tuple[Candidates, np.ndarray]:
-    """Gauss-Newton steps for a given penalty, and the damping after them.
+    """At most `steps` Gauss-Newton steps for a given penalty, and the damping after them.
 
     The damping follows the ratio of the gain to the one that the linear model promised (Nielsen, "Damping parameter in
     Marquardt's method", Technical University of Denmark, 1999); a step that does not lower the merit is repeated.
     """
     # A Python number would be a constant of the program.
     weight = jnp.asarray(penalty)
-    merit, gradient, band = (np.array(part) for part in _normal_equations(candidates, task, multipliers, weight))
-    unknowns, growth = np.array(candidates.unknowns), np.full(len(merit), 2.0)
-    for _ in range(STEPS_EACH):
-        step = _step(band, gradient, damping)
-        promised = np.sum(step * (damping[:, None] * step - gradient), axis=1)
-        trial = candidates._replace(unknowns=unknowns + step.reshape(unknowns.shape))
+    merit, *equations = (np.array(part) for part in _normal_equations(candidates, task, multipliers, weight))
+    (unknowns, durations), growth = map(np.array, candidates), np.full(len(merit), 2.0)
+    for _ in range(steps):
+        step = _step(*equations, damping)
+        promised = np.sum(step * (damping[:, None] * step - equations[0]), axis=1)
+        if np.all(promised < TINY_GAIN * merit):
+            break
+        longer, moved = np.exp(step[:, -1]), unknowns + step[:, :-1].reshape(unknowns.shape)
+        moved[..., -1] /= longer[:, None]
+        trial = Candidates(moved, durations * longer)
         new = tuple(map(np.asarray, _normal_equations(trial, task, multipliers, weight)))
         gain = np.where(np.isfinite(new[2]).all((1, 2)), (merit - new[0]) / promised, -1.0).clip(-1.0, 2.0)
         better = gain > 0.0
-        for old, part in zip((merit, gradient, band, unknowns), (*new, trial.unknowns), strict=True):
+        for old, part in zip((merit, *equations, unknowns, durations), (*new, *trial), strict=True):
             old[better] = part[better]
         damping = damping * np.where(better, np.maximum(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), growth)
         damping = np.clip(damping, LEAST_DAMPING, MOST_DAMPING)
         growth = np.where(better, 2.0, 2.0 * growth)
-    return candidates._replace(unknowns=unknowns), damping
+    return Candidates(unknowns, durations), damping
 
 
 def violation(evaluation: Residuals) -> np.ndarray:
@@ -430,12 +467,14 @@ def objective(evaluation: Residuals) -> np.ndarray:
     return np.sum(np.asarray(evaluation.objective) ** 2, axis=(1, 2))
 
 
-def optimise(candidates: Candidates, task: Task) -> tuple[Candidates, np.ndarray, np.ndarray]:
-    """Minimise the effort of all candidates under the constraints, until that of a feasible one changes by less than
-    2 %, or the penalties are used up.
+def optimise(candidates: Candidates, task: Task, firmness: float = 1.0) -> tuple[Candidates, np.ndarray, np.ndarray]:
+    """Minimise the effort or the duration of all candidates under the constraints, until the effort of one of them, or the
+    duration of all, is feasible and settled, or the penalties, times the firmness, are used up.
 
-    **Returns:** the candidates, and the violation and the objective of each.
+    **Returns:** the candidates, and the violation of each and its effort or duration.
     """
+    in_haste = bool(task.haste > 0.0)
+    schedule, enough = (HASTY, np.all) if in_haste else (CALM, np.any)
     # Where the weight makes the effort large, the penalties would be too weak beside it.
     least = float(objective(constraints(candidates, task)).min())
     task = eqx.tree_at(lambda task: task.scales.force, task, task.scales.force * np.sqrt(max(1.0, least)))
@@ -443,12 +482,13 @@ def optimise(candidates: Candidates, task: Task) -> tuple[Candidates, np.ndarray
     multipliers = Multipliers(jnp.zeros_like(evaluation.equalities), jnp.zeros_like(evaluation.inequalities))
     values = np.full(len(candidates.durations), np.inf)
     damping = np.full(len(candidates.durations), FIRST_DAMPING)
-    for last, penalty in zip((PENALTIES[0], *PENALTIES), PENALTIES, strict=False):
-        multipliers = Multipliers(*(part * (last / penalty) for part in multipliers))
-        candidates, damping = _minimise(candidates, task, multipliers, penalty, damping)
+    last, *_ = penalties = firmness * np.array(schedule.penalties)
+    for penalty in penalties:
+        multipliers, last = Multipliers(*(part * (last / penalty) for part in multipliers)), penalty
+        candidates, damping = _minimise(candidates, task, multipliers, penalty, schedule.steps, damping)
         evaluation, before = constraints(candidates, task), values
-        values = objective(evaluation)
-        if np.any((violation(evaluation) < FEASIBLE) & (np.abs(values - before) < SETTLED * values)):
+        values = candidates.durations if in_haste else objective(evaluation)
+        if enough((violation(evaluation) < FEASIBLE) & (np.abs(values - before) < schedule.settled * values)):
             break
         multipliers = Multipliers(
             multipliers.equalities + evaluation.equalities,
@@ -463,7 +503,7 @@ def optimise(candidates: Candidates, task: Task) -> tuple[Candidates, np.ndarray
 STEERING_RATE, SPEED_RATE = 8.0, 4.0
 
 #: Values of force and torque in an interval of the plan, and Runge-Kutta steps between them.
-FINE, FINE_STEPS = 4, 2
+FINE, FINE_STEPS = 8, 1
 
 
 class Drive(eqx.Module):

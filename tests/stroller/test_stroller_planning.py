@@ -282,19 +282,53 @@ def test_a_search_that_is_cut_short_says_so(monkeypatch):
     assert re.match(r"the search ended after \d+ poses without a path; the nearest", reason)
 
 
-@pytest.mark.parametrize(
-    ("heading", "goal", "longest", "shortest"),
-    [(0.0, (0.0, 2.0, np.pi), 20.0, np.pi), (np.pi / 2.0, (4.0, 4.0, 0.0), 17.4, 5.81)],
-)
-def test_a_wide_turn_is_found_however_long_it_may_take(heading, goal, longest, shortest, monkeypatch):
-    """A least turning radius of 1 m, four wheelbases, and forwards only."""
-    monkeypatch.setattr(importlib.import_module("stroller.planning.plan"), "ROUNDS", 3)
-    limits = stroller.Limits(steering=np.arctan(0.25), speed=(0.0, 1.0))
-    launch, away = stroller.Launch((0.0, 0.0), heading, 0.0), [stroller.Box((-9.0, 0.0), (0.5, 0.5))]
-    options = {"obstacles": away, "limits": limits, "minimise": "time", "progress": False}
-    plan = stroller.plan(SCENE, launch, stroller.Goal(goal[:2], goal[2]), longest, **options)
+def in_haste(start, goal, longest, wheelbase=0.25, slowest=0.0, starts=4):
+    """A plan of the least time from rest to rest with a least turning radius of 1 m, with a box out of the way."""
+    body = stroller.Stroller(mass=5.0, wheelbase=wheelbase, inertia=0.1, steering_inertia=0.005)
+    scene, launch = stroller.Scene(body, friction=SCENE.friction), stroller.Launch(start[:2], start[2], 0.0)
+    limits = stroller.Limits(steering=np.arctan(wheelbase), speed=(slowest, 1.0))
+    options = {
+        "obstacles": [stroller.Box((-9.0, 0.0), (0.5, 0.5))],
+        "limits": limits,
+        "minimise": "time",
+        "starts": starts,
+    }
+    return stroller.plan(scene, launch, stroller.Goal(goal[:2], goal[2]), longest, **options, progress=False)
+
+
+@pytest.mark.parametrize("wheelbase", [0.25, 0.5, 1.0])
+def test_a_wide_turn_takes_hardly_more_than_the_shortest_path(wheelbase):
+    """A U-turn forwards only: half a circle, and the time to turn the wheel and to brake."""
+    plan = in_haste((0.0, 0.0, 0.0), (0.0, 2.0, np.pi), 20.0, wheelbase)
     assert plan.reached, str(plan)
-    assert shortest - 0.1 < plan.t1 < 1.3 * shortest
+    assert np.pi - 0.1 < plan.t1 < 1.1 * np.pi
+
+
+def test_the_least_time_does_not_depend_on_the_longest():
+    start, goal, shortest = (0.0, 0.0, np.pi / 2.0), (4.0, 4.0, 0.0), dubins(4.0, -4.0, -np.pi / 2.0)
+    plans = [in_haste(start, goal, longest) for longest in (7.0, 17.4)]
+    assert all(plan.reached for plan in plans), str(plans)
+    assert plans[0].t1 == plans[1].t1
+    assert shortest < plans[0].t1 < 1.05 * shortest
+    plan = in_haste(start, goal, 5.0, starts=2)
+    assert not plan.reached
+    assert f"the drive takes {plans[0].t1:.4g} s, longer than t1 = 5 s" in plan.hindrances
+
+
+@pytest.mark.slow
+def test_a_turn_of_the_path_is_not_lost_to_haste():
+    """A loop to a goal close by: the first candidates cut it off, and the firmer ones drive it."""
+    goal = (2.85786, -0.853442, 1.4733)
+    plan = in_haste((0.0, 0.0, 0.0), goal, 15.8, 0.5)
+    assert plan.reached, str(plan)
+    assert plan.t1 < 1.1 * dubins(*goal)
+
+
+def test_with_reverse_the_least_time_is_close_to_the_shortest_path():
+    goal = (-1.5, 1.0, 0.5)
+    plan = in_haste((0.0, 0.0, 0.0), goal, 20.0, slowest=-1.0)
+    assert plan.reached, str(plan)
+    assert 1.0 < plan.t1 / reeds_shepp(*goal) < 1.2
 
 
 def test_a_goal_very_far_away_gets_a_reason():
@@ -323,18 +357,16 @@ def test_a_goal_that_is_walled_in_is_not_reached():
     assert "no path to the goal was found; the nearest ended" in plan.hindrances[-1]
 
 
-@pytest.mark.parametrize("rounds", [1, pytest.param(16, marks=pytest.mark.slow)])
-def test_less_time_is_less(rounds, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("stroller.planning.plan"), "ROUNDS", rounds)
+def test_less_time_is_less():
     launch, goal = stroller.Launch((0.0, 0.0), 0.0, 0.0), stroller.Goal((1.0, 0.0), 0.0)
     plan = stroller.plan(SCENE, launch, goal, 10.0, obstacles=GAP[:1], minimise="time", **OPTIONS)
     assert plan.reached
     # 0.95 m, which is close enough, takes more than 1.18 s at 0.8 m/s.
-    assert 1.18 < plan.t1 < (8.0 if rounds == 1 else 2.0)
+    assert 1.18 < plan.t1 < 1.4
 
 
 @pytest.mark.slow
-def test_the_shortest_time_does_not_depend_on_the_longest():
+def test_the_shortest_time_around_boxes_does_not_depend_on_the_longest():
     limits = stroller.Limits(steering=1.0, speed=1.0, force=6.0, torque=0.5)
     boxes = [stroller.Box((1.5, 0.2), (0.4, 0.8)), stroller.Box((2.5, -0.5), (0.4, 0.8))]
     options = {"minimise": "time", "obstacles": boxes}
