@@ -160,16 +160,18 @@ def straight(start: Any, goal: Any) -> Path:
 
 
 def prices(outline: Outline, count: int, batch: int, rng: np.random.Generator, in_haste: bool = False) -> list[Costs]:
-    """What the searches of a batch minimise: ordinary prices first, or mostly the length where haste is wanted, then random
-    ones."""
+    """What the searches of a batch minimise: ordinary prices first, or mostly the time at the limits of the speed where haste is
+    wanted, then random ones."""
     length, keep = float(outline.problem.footprint.length), outline.clearance
+    low, high = outline.problem.limits.ranges().get("speed", (-1.0, 1.0))
+    backwards = high / -low if low < 0.0 < high else 1.0
     if batch == 0:
         usual = [Costs(1.5 * length, 0.1, 1.0, 0.9 * keep), Costs(0.5 * length, 0.3, 1.5, 1.8 * keep)]
         if in_haste:
-            usual = [Costs(0.1 * length, 0.0, 1.0, 0.9 * keep), Costs(0.5 * length, 0.1, 1.0, 1.8 * keep)]
+            usual = [Costs(0.1 * length, 0.0, backwards, 0.9 * keep), Costs(0.5 * length, 0.1, backwards, 1.8 * keep)]
         return [usual[k % 2] for k in range(count)]
     spread = np.exp(rng.normal(size=(count, 4)) * np.array([1.0, 0.7, 0.5, 0.5]))
-    middle = np.array([length, 0.2, 1.2, 0.7 * keep])
+    middle = np.array([length, 0.2, 1.2 * backwards if in_haste else 1.2, 0.7 * keep])
     return [Costs(*map(float, row)) for row in middle * spread]
 
 

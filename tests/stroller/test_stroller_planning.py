@@ -271,6 +271,16 @@ def test_the_search_finds_the_shortest_path_on_the_empty_plane():
         assert np.hypot(*(path.poses[-1] - goal)[:2]) < ground.cell
 
 
+@pytest.mark.parametrize(("slowest", "direction"), [(-0.8, -1.0), (-0.1, 1.0)])
+def test_a_search_in_haste_reverses_where_that_takes_less_time(slowest, direction):
+    """To a goal behind the start: straight back, or around with two U-turns forwards."""
+    launch, goal = stroller.Launch((0.0, 0.0), 0.0, 0.0), stroller.Goal((-2.0, 0.0), 0.0)
+    limits = stroller.Limits(steering=1.0, speed=(slowest, 0.8))
+    outline = Outline.of(checked_problem(SCENE, launch, goal, 12.0, (), limits, FOOTPRINT, 1e-6))
+    (path,), _ = outline.paths(prices(outline, 1, 0, np.random.default_rng(0), in_haste=True), 12.0)
+    assert path.length[path.direction == direction].sum() > 0.9 * path.length.sum()
+
+
 def test_a_search_that_is_cut_short_says_so(monkeypatch):
     """The U-turn between two walls needs more poses than it may look at; and a goal that is walled in needs none."""
     launch, goal = stroller.Launch((0.0, 0.0), 0.0, 0.0), stroller.Goal((0.0, 0.0), np.pi)
@@ -296,7 +306,7 @@ def in_haste(start, goal, longest, wheelbase=0.25, slowest=0.0, starts=4):
     return stroller.plan(scene, launch, stroller.Goal(goal[:2], goal[2]), longest, **options, progress=False)
 
 
-@pytest.mark.parametrize("wheelbase", [0.25, 0.5, 1.0])
+@pytest.mark.parametrize("wheelbase", [0.25, *(pytest.param(slow, marks=pytest.mark.slow) for slow in (0.5, 1.0))])
 def test_a_wide_turn_takes_hardly_more_than_the_shortest_path(wheelbase):
     """A U-turn forwards only: half a circle, and the time to turn the wheel and to brake."""
     plan = in_haste((0.0, 0.0, 0.0), (0.0, 2.0, np.pi), 20.0, wheelbase)
@@ -306,13 +316,12 @@ def test_a_wide_turn_takes_hardly_more_than_the_shortest_path(wheelbase):
 
 def test_the_least_time_does_not_depend_on_the_longest():
     start, goal, shortest = (0.0, 0.0, np.pi / 2.0), (4.0, 4.0, 0.0), dubins(4.0, -4.0, -np.pi / 2.0)
-    plans = [in_haste(start, goal, longest) for longest in (7.0, 17.4)]
-    assert all(plan.reached for plan in plans), str(plans)
+    plans = [in_haste(start, goal, longest, starts=2) for longest in (5.0, 17.4)]
     assert plans[0].t1 == plans[1].t1
-    assert shortest < plans[0].t1 < 1.05 * shortest
-    plan = in_haste(start, goal, 5.0, starts=2)
-    assert not plan.reached
-    assert f"the drive takes {plans[0].t1:.4g} s, longer than t1 = 5 s" in plan.hindrances
+    assert shortest < plans[1].t1 < 1.05 * shortest
+    assert plans[1].reached, str(plans[1])
+    assert not plans[0].reached
+    assert f"the drive takes {plans[0].t1:.4g} s, longer than t1 = 5 s" in plans[0].hindrances
 
 
 @pytest.mark.slow
