@@ -1,8 +1,8 @@
 r"""Audit of the paper: each numbered equation as printed, the verdict, the correct form, and the tests for both.
 
-`python benchmarks/papers/tippe_audit.py` prints it; `docs/development/papers.md` has a summary. In the formulas eta is the angle of
-the position from the lowest line, r the arena's radius, rho = r - R the radius of the centre's path, and phi the direction of
-the axis from that of increasing eta.
+`python benchmarks/papers/tippe_audit.py` prints it; `docs/development/papers.md` has a summary. In the formulas
+eta is the angle of the position from the lowest line, r the arena's radius, rho = r - R the radius of the centre's path,
+and phi the direction of the axis from that of increasing eta.
 """
 
 import textwrap
