@@ -286,8 +286,9 @@ def entry(name: str) -> list[str]:
     value = resolve(name)
     if inspect.ismodule(value):
         heading = f"``{name}``"
-        # The names of a room of the engine have entries of their own.
-        members = [] if name.startswith(ENGINE_ROOMS) else ["   :members:"]
+        # The names of most modules have entries of their own.
+        own = any(other.startswith(f"{name}.") for page in PAGES.values() for other in page.names)
+        members = [] if own else ["   :members:"]
         return [heading, "-" * len(heading), "", f".. automodule:: {name}", *members, ""]
     if inspect.isclass(value):
         members = [f"   :members: {', '.join(MEMBERS[name].split())}"] if name in MEMBERS else []

@@ -4,7 +4,7 @@ The paper: "Modeling of Dynamics Object with Non-Holonomic Constraints Based on 
 Its numbers are in g, cm and s and are converted here only.
 
 The printed and the computed times have different trends: the numbers of the paper's top are lost, and its equations of
-motion are not those of a top (`docs/development/tippe_paper.md`). The same launches also run on the plane.
+motion are not those of a top (`benchmarks/papers/tippe_audit.py`). The same launches also run on the plane.
 """
 
 import argparse

@@ -1,4 +1,9 @@
-"""An initial value problem with an event and a domain: its interface, its settings, and how a run ends."""
+"""An initial value problem with an event and a domain: its interface, its settings, and how a run ends.
+
+The codes of an end are `RUNNING`, `REACHED_END` (at the horizon), `CROSSED` (on the event), `LEFT_DOMAIN`, `FAILED` and
+`UNRESOLVED`. `DEFAULT_MAX_STEPS` limits the steps of a run, `MOST_STEPS` those of a short run, and `TIGHTEST` is the smallest
+relative tolerance.
+"""
 
 import abc
 import enum
