@@ -1,7 +1,6 @@
 """The rooms: which way their imports point, and what stays inside them."""
 
 import ast
-import functools
 import importlib.metadata
 import io
 import re
@@ -219,7 +218,6 @@ def test_what_is_imported_at_once_is_required():
     assert imported - packages == set()
 
 
-@functools.cache
 def lines_of_code(text: str) -> int:
     """The lines that hold code: without blank lines, comments and docstrings."""
     skipped = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
