@@ -297,7 +297,7 @@ RULES: dict[str, Callable[..., Bounds]] = {
     "is_finite": lambda box: Bounds(jnp.isfinite(box.low) & jnp.isfinite(box.high), jnp.ones(box.low.shape, bool)),
     "neg": lambda box: Bounds(-box.high, -box.low),
     "not": _opposite,
-    "one_minus_square": lambda box: RULES["sub"](Bounds(1.0, 1.0), _even(box, jnp.square)),
+    "one_minus_square": lambda box: RULES["sub"](Bounds(*2 * [jnp.ones(())]), _even(box, jnp.square)),
     "polynomial": _polynomial,
     "pow": _power,
     "rem": _remainder,

@@ -39,12 +39,12 @@ class Bracket(NamedTuple):
     margin_low: Lanes
     margin_high: Lanes
     stride: Lanes
-    trials: Int[Array, " lanes"]
+    trials: Int[Array, "*lanes"]
 
 
 def refine(
-    bracketing: Bool[Array, " lanes"], old_bracket: Bracket, old_margin: Lanes, margin: Lanes, length: Lanes
-) -> tuple[Bracket, Lanes, Bool[Array, " lanes"]]:
+    bracketing: Bool[Array, "*lanes"], old_bracket: Bracket, old_margin: Lanes, margin: Lanes, length: Lanes
+) -> tuple[Bracket, Lanes, Bool[Array, "*lanes"]]:
     """Narrow the bracket with the result of a trial step (Anderson and Bjorck, BIT 13 (1973) 253).
 
     **Arguments:**
@@ -136,8 +136,8 @@ def missed_double_root(
 
 def missed_loss(
     places: Float[np.ndarray, " places"],
-    margins: Float[Array, "places margins lanes"] | None,
-    free: Bool[Array, " lanes"],
+    margins: Float[Array, "places margins *lanes"] | None,
+    free: Bool[Array, "*lanes"],
 ) -> Lanes:
     """Fraction of a step at which a margin may first fall below zero and return; 2 if nowhere.
 
@@ -189,9 +189,9 @@ def cubic_minimum(
 
 def _least_minimum(
     places: Float[np.ndarray, " places"],
-    values: list[Float[Array, "margins lanes"]],
-    least_value: Float[Array, "margins lanes"],
-) -> tuple[Float[Array, "margins lanes"], Float[Array, "margins lanes"]]:
+    values: list[Float[Array, "margins *lanes"]],
+    least_value: Float[Array, "margins *lanes"],
+) -> tuple[Float[Array, "margins *lanes"], Float[Array, "margins *lanes"]]:
     """Place and value of the minimum of the parabola through three neighbouring places: the place of the least value
     and its neighbours; if the least value is at an end of the step, the three places at that end. The place is 2 if the
     parabola has no minimum.
@@ -227,7 +227,7 @@ def _least_minimum(
 # part is known to have no zero, or one. A function for which there are no bounds, such as one with a loop, is looked at in
 # many places; between them it is a cubic whose error is estimated, and the step is cut where this error could hide a zero.
 
-Functions = Float[Array, "functions lanes"]
+Functions = Float[Array, "functions *lanes"]
 
 #: The error of a state inside a step, as a fraction of the change of its interpolant by the state in the middle.
 STATE_SHARE = 0.25
@@ -296,8 +296,8 @@ def watched(
     path: Path,
     time: Lanes,
     length: Lanes,
-    free: Bool[Array, " lanes"],
-    may_cut: Bool[Array, " lanes"],
+    free: Bool[Array, "*lanes"],
+    may_cut: Bool[Array, "*lanes"],
 ) -> tuple[Lanes, Lanes]:
     """Where a step must end so that no zero of a fast function is missed.
 
@@ -336,8 +336,8 @@ def _bounded(
     path: Path,
     time: Lanes,
     length: Lanes,
-    free: Bool[Array, " lanes"],
-    may_cut: Bool[Array, " lanes"],
+    free: Bool[Array, "*lanes"],
+    may_cut: Bool[Array, "*lanes"],
 ) -> Lanes:
     """The place as in `watched`, by bounds of the functions and their slopes along parts of the step."""
     point = (time, path.start)
@@ -404,7 +404,7 @@ def _looked(
     path: Path,
     time: Lanes,
     length: Lanes,
-    may_cut: Bool[Array, " lanes"],
+    may_cut: Bool[Array, "*lanes"],
 ) -> tuple[Lanes, Lanes]:
     """The place as in `watched`, by looks at the functions; and the least ratio of a value to its error."""
 

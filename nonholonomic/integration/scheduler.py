@@ -178,7 +178,7 @@ class LaneScheduler(eqx.Module):
         """Number of cells of the problem, padding included."""
         return self.fresh.cell.shape[0]
 
-    def pick(self, tree: Any, cell: Int[Array, " lanes"]) -> Any:
+    def pick(self, tree: Any, cell: Int[Array, "*lanes"]) -> Any:
         """The leaves for the given cells; scalars stay unchanged."""
         index = jnp.minimum(cell, self.capacity - 1)
         return jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., index], tree)
@@ -281,7 +281,7 @@ class LaneScheduler(eqx.Module):
         )
         return jax.tree.map(lambda cells, lanes: cells.at[..., targets].set(lanes, mode="drop"), outcome, in_lanes)
 
-    def _load(self, cell: Int[Array, " lanes"]) -> LaneState:
+    def _load(self, cell: Int[Array, "*lanes"]) -> LaneState:
         lane_state = self.pick(self.fresh, cell)
         # There may be fewer cells than lanes: the other lanes stay idle.
         return lane_state._replace(cell=cell, status=jnp.where(cell < self.cells, lane_state.status, REACHED_END))

@@ -91,13 +91,13 @@ def _own_axis(leaf: Any) -> int | None:
 
 def _reader(
     model: AbstractModel, names: tuple[str, ...]
-) -> Callable[[Int[Array, " lanes"], Float[Array, "rows components lanes"]], dict[str, Array]]:
+) -> Callable[[Int[Array, "*lanes"], Float[Array, "rows components *lanes"]], dict[str, Array]]:
     """A function that computes the named quantities of some cells from their states."""
 
     def read_lane(model: AbstractModel, states: Float[Array, "rows components"]) -> dict[str, Array]:
         return model.read(names, jnp.full(len(states), jnp.nan), states.T, None)
 
-    def reader(cell: Int[Array, " lanes"], states: Float[Array, "rows components lanes"]) -> dict[str, Array]:
+    def reader(cell: Int[Array, "*lanes"], states: Float[Array, "rows components *lanes"]) -> dict[str, Array]:
         of_lanes = jax.tree.map(lambda leaf: leaf if _own_axis(leaf) is None else leaf[cell], model)
         return eqx.filter_vmap(read_lane, in_axes=(_own_axis, -1), out_axes=1)(of_lanes, states)
 
