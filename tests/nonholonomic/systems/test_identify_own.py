@@ -8,7 +8,8 @@ import pytest
 from close import assert_close
 from own_modes import GRAVITY, Ball, Sleigh, Slip, Stick
 
-from nonholonomic import Free, Hybrid, Recording, identify, simulate
+from nonholonomic import AbstractMode, EventTimes, Free, Hybrid, Recording, identify, simulate
+from nonholonomic.identification import FitWarning
 from nonholonomic.parameters import Parameters
 
 
@@ -37,6 +38,40 @@ def test_candidates_that_come_to_rest_without_a_mode_for_rest_are_counted_and_pl
     assert_close(float(words.group(4)), (2.0 - fall) / (2.0 + fall), atol=5e-3)
     restitution = 0.3 + 0.65 / (1.0 + np.exp(-fit.distribution.points[:, 0]))
     assert abs(int(words.group(1)) - np.sum(restitution < (2.0 - fall) / (2.0 + fall))) <= 2
+
+
+class Swing(AbstractMode):
+    """An oscillator, with a number that does nothing."""
+
+    frequency: float
+    idle: float = 1.0
+
+    def field(self, t, y):
+        return jnp.stack([y[1], -(self.frequency**2) * y[0]])
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3])
+def test_times_in_milliseconds_and_numbers_that_do_not_act_are_seen_before_the_search(unit):
+    """Samples of cos(w t), and the times at which it falls through 0, pi / (2 w)."""
+    times = np.linspace(0.05, 1.5, 12)
+    swing, free = Hybrid([Swing(3.1)]), {"frequency": 3.1, "idle": 1.0}
+    samples = Recording([1.0, 0.0], unit * times, np.cos(3.0 * times), 1e-2, "y0")
+    events = EventTimes([1.0, 0.0], [unit * np.pi / 6.0], 1e-3 * unit, t1=unit, event=lambda t, y: y[0])
+    if unit > 1.0:
+        with pytest.raises(ValueError, match=r"times: .* are in seconds: did you mean 1e-3"):
+            identify(swing, samples, free, progress=False)
+        with pytest.raises(
+            ValueError, match=r"time: the events are measured 1033 times later.*did you mean 1e-3 \* time"
+        ):
+            identify(swing, events, {"frequency": 3.1}, progress=False)
+        return
+    with pytest.warns(FitWarning) as caught:
+        fit = identify(swing, samples, free, starts=2, progress=False)
+    assert "no prediction depends on system.modes[0].idle" in str(caught[0].message)
+    assert len(fit.distribution.points) == 256
+    assert abs(fit.estimates["frequency"] - 3.0) < 0.01
+    fit = identify(swing, events, {"frequency": 3.1}, starts=2, progress=False)
+    assert_close(fit.estimates["frequency"], 3.0, rtol=1e-6)
 
 
 def test_a_quantity_that_the_system_does_not_have_is_named():
