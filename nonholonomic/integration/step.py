@@ -74,7 +74,8 @@ class LaneState(NamedTuple):
     - `margins`: the margins of the problem, `None` if there are none.
     - `first_crossing`, `crossing_time`: times of the first and the last event passed [s], infinite if there was none.
     - `bracketing`: whether the lane is locating an event; `bracket`: the current bracket.
-    - `steps`: number of all steps; `rejected`: number of steps that step-size control rejected.
+    - `steps`: number of all steps; `rejected`: number of steps that step-size control rejected; `extremes`: the
+      shortest length that it asked for after a rejection, the time of that, and the longest step, all [s].
     - `stages`: memory for the stages of the next step (`explicit_step`); `None` outside of a loop over steps.
 
     **Example:**
@@ -99,6 +100,7 @@ class LaneState(NamedTuple):
     bracket: Bracket
     steps: Int[Array, "*lanes"]
     rejected: Int[Array, "*lanes"]
+    extremes: Float[Array, "3 *lanes"]
     stages: Stages | None = None
 
 
@@ -206,6 +208,7 @@ def after_step(
     # otherwise the compiler would fuse it into several kernels with different round-off, and only some of them would
     # detect the event.
     error, margin = stored(error, stop_gradient(trial.margin))
+    is_known = jnp.isfinite(error)
     # A step to a state that is not finite counts as one with a huge error.
     error = jnp.where(jnp.isfinite(error) & ~jnp.isnan(margin), error, jnp.inf)
     accurate = error <= 1.0
@@ -244,6 +247,10 @@ def after_step(
     time = jnp.where(moved, lane_state.time + tried_length, lane_state.time)
 
     length = tried_length * _factor(error, accurate, control.order)
+    least, place, longest_step = lane_state.extremes
+    is_shorter = free & is_known & ~accurate & (length < least)
+    least, place = (jnp.where(is_shorter, *pair) for pair in ((length, least), (lane_state.time, place)))
+    longest_step = jnp.where(forward, jnp.maximum(longest_step, tried_length), longest_step)
     length = length if longest is None else jnp.where(accurate, jnp.minimum(length, longest), length)
     length = jnp.where(crosses_inside, tried_length * negative, length)
     length = jnp.where(bracketing, guess, jnp.where(hit, bracket.stride, length))
@@ -275,6 +282,7 @@ def after_step(
         bracket=bracket,
         steps=steps,
         rejected=lane_state.rejected + (free & ~forward & ~is_beyond),
+        extremes=stop_gradient(jnp.stack((least, place, longest_step))),
         stages=None if lane_state.stages is None else trial.stages,
     )
 

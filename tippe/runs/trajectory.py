@@ -469,7 +469,9 @@ def _status(model: Any, path: DenseSolution | HybridPath, tolerance: Any) -> str
         state, mode = np.asarray(path.states)[:, -1], 0
     one, none = np.ones(1), np.zeros(1, int)
     state, inf = np.asarray(state)[:, None], np.inf * one
-    outcome = HybridOutcome(none + code, inf, one, state, none, none, none + mode, none[None])
+    outcome = HybridOutcome(
+        none + code, inf, one, state, none, none, np.stack([inf, one, one]), none + mode, none[None]
+    )
     outcome = jax.tree.map(jnp.asarray, outcome)
     return Status(int(_ended(model, outcome, jnp.asarray(tolerance)))).word
 
