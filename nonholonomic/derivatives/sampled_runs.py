@@ -371,9 +371,11 @@ def sampled_run_by_diffrax(
     leading = size if problem.leading is None else problem.leading
     full_problem = probed(problem) if grid is None else problem
     path = sample(full_problem, times, t1, settings, grid=grid, adjoint=adjoint)
-    status, *counts = (part.astype(float) for part in (_status(path, t1), path.accepted, path.rejected))
+    status, accepted, rejected = (part.astype(float) for part in (_status(path, t1), path.accepted, path.rejected))
     states = parted(problem, path.states[:size].T)
-    return SampledRun(*states, path.end_time, path.end_state[:leading], status, *counts, jnp.asarray(UNKNOWN))
+    return SampledRun(
+        *states, path.end_time, path.end_state[:leading], status, accepted, rejected, jnp.asarray(UNKNOWN)
+    )
 
 
 def _status(path: SampledSolution, t1: Float[Array, ""]) -> Int[Array, ""]:
