@@ -180,6 +180,13 @@ FAMILIES = {
         in_box(0.7, 0.1, 0.9),
         9.0,
     ),
+    "toothed rack": Family(
+        Oscillator(),
+        oscillating,
+        lambda t, s: jnp.abs(jnp.mod(6.0 * s[0] + 1.3 * s[1], 1.0) - 0.5) - 0.02,
+        in_box(0.7, 0.1, 0.7),
+        9.0,
+    ),
     "spiral over a grid": Family(
         Spiral(),
         spiralling,

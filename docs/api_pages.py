@@ -237,9 +237,12 @@ MEMBERS = {
 
 
 def public(package: str) -> list[str]:
-    """The names that the `__init__.py` of a package or of a room exports."""
-    text = inspect.getsource(importlib.import_module(package))
-    return sorted(set(re.findall(r"import (?!__)(\w+) as \1$", text, re.M)), key=str.lower)
+    """The names that the `__init__.py` of a package or of a room exports, or that a public module defines."""
+    module = importlib.import_module(package)
+    names = set(re.findall(r"import (?!__)(\w+) as \1$", inspect.getsource(module), re.M)) or {
+        name for name, value in vars(module).items() if name[0] != "_" and getattr(value, "__module__", "") == package
+    }
+    return sorted(names, key=str.lower)
 
 
 def resolve(dotted: str) -> Any:

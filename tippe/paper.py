@@ -21,11 +21,12 @@ import jax
 import numpy as np
 
 from nonholonomic import __version__
+from nonholonomic.command_line import closing_lines
 from nonholonomic.compilation.cache import enable_compilation_cache
 from nonholonomic.compilation.xla_cpu import compiled_quickly
 from nonholonomic.geometry import AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.sweeps import Table
-from nonholonomic.terminal import Progress, closing_lines, status_line
+from nonholonomic.terminal import Progress, status_line
 from nonholonomic.validation import require_folder
 from nonholonomic.views import NO_VIEW, Stage, can_view, page, picture_as_html, table_as_html
 

@@ -68,8 +68,8 @@ class SampledCotangents(NamedTuple):
 class SampledStepRecord(NamedTuple):
     """The steps of a period; whether the last step was accepted, and the index of the next sample, in every lane."""
 
-    accepted: Bool[Array, "*lanes"]
-    sample: Int[Array, "*lanes"]
+    accepted: Bool[Array, " lanes"]
+    sample: Int[Array, " lanes"]
     steps: StepRecord
 
 
@@ -115,7 +115,7 @@ class SampledStepRecorder(StepRecorder):
         at_end = jnp.where(lane_state.status == REACHED_END, self.cotangents.end_state[:, cell], 0.0)
         return jnp.where(has_left, self.cotangents.end_time[cell], 0.0), at_end
 
-    def _cell(self, lane_state: LaneState) -> Int[Array, "*lanes"]:
+    def _cell(self, lane_state: LaneState) -> Int[Array, " lanes"]:
         return jnp.minimum(lane_state.cell, len(self.cotangents.end_time) - 1)
 
 

@@ -13,7 +13,7 @@ import itertools
 import operator
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple
 
 import equinox as eqx
 import jax
@@ -41,7 +41,7 @@ from .mode import AbstractBatchedMode, Transition, mode_of_cells
 MOST_ROUNDS = 2000
 
 
-class HybridOutcome(NamedTuple):
+class HybridOutcome(NamedTuple, Generic[Numbers]):
     """How every cell ended, as in `integration.Outcome`, with the mode in which it ended, and the counters.
 
     **Example:** as for `solve_hybrid`.
@@ -70,7 +70,7 @@ Advance = Callable[[Sequence[int], Carry, Any], Carry]
 
 def at_start(
     xp: Any, mode: Int[Numbers, " cells"], state: Float[Numbers, "components cells"], cells: int, counters: int
-) -> HybridOutcome:
+) -> HybridOutcome[Numbers]:
     """All cells at their start, the first `cells` of them running. **Arguments:** `xp`: `numpy` or `jax.numpy`."""
     zeros = xp.zeros(mode.shape, int)
     return HybridOutcome(
@@ -128,12 +128,14 @@ def traced_rounds(carry: Carry, groups: Sequence[Sequence[int]], solve: Advance,
     return (finished(jnp, runs), *records)
 
 
-def finished(xp: Any, runs: HybridOutcome) -> HybridOutcome:
+def finished(xp: Any, runs: HybridOutcome[Numbers]) -> HybridOutcome[Numbers]:
     """The runs after the last round."""
     return runs._replace(status=xp.where(runs.status == RUNNING, UNRESOLVED, runs.status))
 
 
-def after_solve(xp: Any, runs: HybridOutcome, outcome: Outcome, t1: Float[Numbers, " cells"]) -> HybridOutcome:
+def after_solve(
+    xp: Any, runs: HybridOutcome[Numbers], outcome: Outcome[Numbers], t1: Float[Numbers, " cells"]
+) -> HybridOutcome[Numbers]:
     """Update the cells after an ensemble solve that ended as in `outcome`. **Arguments:** `xp`: `numpy` or `jax.numpy`."""
     start_time = runs.end_time
     # A cell that enters a mode beyond the event passed the event earlier, unless it started there.
@@ -156,7 +158,9 @@ def resolution(start: Float[Numbers, "*runs"], end: Float[Numbers, "*runs"]) -> 
     return 1e-10 * (end - start) + 16.0 * np.finfo(float).eps * end
 
 
-def after_reset(xp: Any, runs: HybridOutcome, transition: Transition, t1: Float[Numbers, " cells"]) -> HybridOutcome:
+def after_reset(
+    xp: Any, runs: HybridOutcome[Numbers], transition: Transition[Numbers], t1: Float[Numbers, " cells"]
+) -> HybridOutcome[Numbers]:
     """Update the cells after the transition to the next mode. **Arguments:** as for `after_solve`."""
     has_event = xp.isfinite(transition.crossing_time)
     # Non-finite states would never finish.
@@ -202,7 +206,7 @@ def solve_hybrid(
     nonterminal: bool = False,
     n_blocks: int = 1,
     most_rounds: int = MOST_ROUNDS,
-) -> HybridOutcome:
+) -> HybridOutcome[np.ndarray]:
     """Run every cell through its modes to its event, to `t1`, or to where the model ends.
 
     The loop runs on the host, round by round, with concrete numbers. All calls with the same number of cells, padding
@@ -259,7 +263,7 @@ def solve_hybrid(
 
 
 def _gathered(
-    runs: HybridOutcome, selected: Int[np.ndarray, " selected"], t1: Float[np.ndarray, " cells"]
+    runs: HybridOutcome[np.ndarray], selected: Int[np.ndarray, " selected"], t1: Float[np.ndarray, " cells"]
 ) -> tuple[Int[np.ndarray, " cells"], Float[np.ndarray, "components cells"], Float[np.ndarray, " cells"]]:
     """The indices, the states and the remaining times of some cells, padded to the full number of cells."""
     padding = np.full(len(runs.status) - selected.size, selected[-1] if selected.size else 0)
@@ -285,7 +289,7 @@ def traced_solve_hybrid(
     counters: int,
     nonterminal: bool = False,
     n_blocks: int = 1,
-) -> HybridOutcome:
+) -> HybridOutcome[Array]:
     """Run every cell through its modes to its event, to `t1`, or to where the model ends.
 
     In each round, every mode runs all cells, but the horizon is 0 for cells in another mode.
@@ -336,7 +340,9 @@ def selected_cells(selected: Bool[Array, " cells"]) -> Int[Array, " cells"]:
     return jnp.where(selected, jnp.arange(selected.size), jnp.argmax(selected))
 
 
-def chosen(selected: Bool[Array, " cells"], new: HybridOutcome, old: HybridOutcome) -> HybridOutcome:
+def chosen(
+    selected: Bool[Array, " cells"], new: HybridOutcome[Array], old: HybridOutcome[Array]
+) -> HybridOutcome[Array]:
     """The new outcome for the selected cells, and the old outcome for the others."""
     return jax.tree.map(lambda a, b: jnp.where(selected, a, b), new, old)
 
@@ -352,7 +358,7 @@ def hybrid_resets(
     settings: Settings,
     *,
     counters: int,
-) -> list[tuple[HybridOutcome, HybridOutcome]]:
+) -> list[tuple[HybridOutcome[np.ndarray], HybridOutcome[np.ndarray]]]:
     """The run of one cell before and after each of its resets.
 
     **Arguments:** as for `solve_hybrid`, for one cell; `number`, `state`: initial mode and state.
@@ -592,7 +598,7 @@ def solve_hybrid_dense(
     return HybridPath(segments, status, end_time, *ending)
 
 
-def _outcome(path: DenseSolution) -> Outcome:
+def _outcome(path: DenseSolution) -> Outcome[np.ndarray]:
     """How the motion in a mode ended, as for an ensemble of one cell."""
     status = FAILED if path.failed else LEFT_DOMAIN if path.left_domain else REACHED_END
     no_crossing, steps = np.full(1, np.inf), path.accepted + path.rejected

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Generic, NamedTuple
 
 import equinox as eqx
 import jax
@@ -34,7 +34,7 @@ class TransitionPath(NamedTuple):
     shown: Int[Array, " stretches 1"]
 
 
-class Transition(NamedTuple):
+class Transition(NamedTuple, Generic[Numbers]):
     """The result of a reset map, one number per cell.
 
     `status` is `RUNNING` where the motion continues in the mode numbered `mode`, otherwise the code for how it ended;

@@ -16,7 +16,7 @@ tolerance, the event is grazing and the derivative has no correct digits; `GRAZI
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple
 
 import equinox as eqx
 import jax
@@ -301,7 +301,7 @@ def variational_start(
 # change of mode.
 
 
-class Slopes(NamedTuple):
+class Slopes(NamedTuple, Generic[Numbers]):
     """Derivatives of the times of the events at which runs ended, (tangents, cells); and a mask of those that are NaN
     because an earlier event was `grazing`, so that the derivative would have no correct digits.
     """
@@ -321,7 +321,7 @@ def solve_hybrid_with_tangents(
     *,
     counters: int,
     ends_on_event: bool = True,
-) -> tuple[HybridOutcome, Slopes]:
+) -> tuple[HybridOutcome[np.ndarray], Slopes[np.ndarray]]:
     """Run every cell through its modes to its event, and differentiate the event's time along tangents.
 
     **Arguments:** as for `solve_hybrid`, and
@@ -359,7 +359,7 @@ def traced_solve_hybrid_with_tangents(
     *,
     counters: int,
     ends_on_event: bool = True,
-) -> tuple[HybridOutcome, Slopes]:
+) -> tuple[HybridOutcome[Array], Slopes[Array]]:
     """`solve_hybrid_with_tangents` inside other transformed functions; arguments and results are traced.
 
     **Example:** as for `solve_hybrid_with_tangents`.
@@ -371,7 +371,7 @@ def traced_solve_hybrid_with_tangents(
     [[0.451524 0.451524]]
     """
 
-    def run(group: tuple[Any, ...]) -> tuple[tuple[HybridOutcome, Array], list[Float[Array, " cells"]]]:
+    def run(group: tuple[Any, ...]) -> tuple[tuple[HybridOutcome[Array], Array], list[Float[Array, " cells"]]]:
         variational = variational_modes(modes, group, settings.tolerance, ends_on_event)
         start, n_blocks = variational_start(state, group), 1 + len(group)
         ended = traced_solve_hybrid(
@@ -386,8 +386,8 @@ def traced_solve_hybrid_with_tangents(
 
 
 def _where_defined(
-    xp: Any, ended: HybridOutcome, slopes: list[Float[Numbers, "tangents cells"]], t1: Any, ends_on_event: bool
-) -> Slopes:
+    xp: Any, ended: HybridOutcome[Numbers], slopes: list[Float[Numbers, "tangents cells"]], t1: Any, ends_on_event: bool
+) -> Slopes[Numbers]:
     """The derivatives of the times of events, of each cell by its mode, where the events happened and the derivatives
     have correct digits.
 
@@ -406,7 +406,7 @@ def _where_defined(
     return Slopes(xp.where(has_event, xp.where(grazing, xp.nan, of_cells), 0.0), grazing)
 
 
-def _without_variations(ended: HybridOutcome, size: int) -> HybridOutcome:
+def _without_variations(ended: HybridOutcome[Numbers], size: int) -> HybridOutcome[Numbers]:
     """A hybrid outcome without its variations."""
     return ended._replace(state=ended.state[:size], counts=ended.counts[:-1])
 

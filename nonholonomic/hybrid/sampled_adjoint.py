@@ -62,7 +62,7 @@ class Recorded(NamedTuple):
 
 def sampled_rounds(
     modes: tuple[VariationalMode, ...],
-    start: HybridOutcome,
+    start: HybridOutcome[Array],
     times: Float[Array, "times cells"],
     t1: Float[Array, " cells"],
     settings: Settings,
@@ -114,7 +114,7 @@ def sampled_rounds(
 
         return jax.lax.cond(jnp.any(lost), after_transition, lambda: carry)
 
-    def _reset(numbers: Sequence[int], runs: HybridOutcome, cell: Array) -> tuple[Any, Array | None]:
+    def _reset(numbers: Sequence[int], runs: HybridOutcome[Array], cell: Array) -> tuple[Any, Array | None]:
         """The transition of some cells, and its output rows with their variations."""
 
         def with_rows(mode: AbstractBatchedMode, state: Array, left: Array) -> Any:
@@ -227,8 +227,8 @@ class Kept(NamedTuple):
     """What is kept of a round: the runs at its start, and at the ends of the modes before the resets; and whether the event
     there was grazing."""
 
-    before: HybridOutcome
-    ended: HybridOutcome
+    before: HybridOutcome[Array]
+    ended: HybridOutcome[Array]
     grazes: Bool[Array, " cells"]
 
 
@@ -239,7 +239,7 @@ class Rounds(NamedTuple):
     that they belong to. The backward pass takes the round before number `limit` next. The checkpoints are `Kept`.
     """
 
-    frontier: HybridOutcome
+    frontier: HybridOutcome[Array]
     output: Recorded
     owner: Int[Array, "times cells"]
     number: Int[Array, ""]
@@ -319,7 +319,7 @@ class Passes:
     shown: Float[Array, "shown times cells"]
     end_time: Float[Array, " cells"]
 
-    def back_to_start(self, runs: HybridOutcome, output: Recorded) -> Costate:
+    def back_to_start(self, runs: HybridOutcome[Array], output: Recorded) -> Costate:
         """The derivatives with respect to the start of the first round, after both passes.
 
         **Arguments:** `runs`, `output`: the runs at their start, without samples.
@@ -389,7 +389,7 @@ class Passes:
             costate = _if_any(active, stage.through_motion, costate)
         return run._replace(limit=number, checkpoints=run.checkpoints.without_latest(), costate=costate)
 
-    def primal(self, runs: HybridOutcome) -> tuple[Float[Array, "components cells"], Float[Array, " cells"]]:
+    def primal(self, runs: HybridOutcome[Array]) -> tuple[Float[Array, "components cells"], Float[Array, " cells"]]:
         """The states of some runs, and the time since their modes began."""
         state = self.modes[0].parts(runs.state)[0]
         return state[:-1], state[-1]

@@ -102,7 +102,7 @@ class Jumps(NamedTuple):
         near = _least(self.ahead, (self.ahead > least) & (self.ahead < most))
         return jnp.where(jnp.isfinite(near), near, jnp.nan)
 
-    def sides(self, time: Lanes) -> tuple[Bool[Array, "*lanes"], Lanes, Lanes, Lanes]:
+    def sides(self, time: Lanes) -> tuple[Bool[Array, " lanes"], Lanes, Lanes, Lanes]:
         """The jump whose near side is this time: a mask of the lanes that have one, its near side, its time, which is
         differentiable, and its far side; all three are the time itself where there is none."""
         distance = self.ahead - time

@@ -7,7 +7,7 @@ waiting for one another. All ensemble solves share this loop; a recorder stores 
 import abc
 import functools
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import diffrax
 import equinox as eqx
@@ -38,7 +38,7 @@ from .runge_kutta import Lanes, States, explicit_order, explicit_tableau, first_
 from .step import Control, LaneState, try_step
 
 #: JAX's arrays, or NumPy's on the host.
-Numbers = Array | np.ndarray
+Numbers = TypeVar("Numbers", Array, np.ndarray)
 
 #: Cost of refilling the lanes, in steps of all lanes, measured on a CPU. The lanes are refilled when idle lanes have
 #: missed as many steps, so the loss is at most twice the loss of the best choice.
@@ -49,7 +49,7 @@ REFILL = 0.25
 SOON, AT_ZERO = 1e-2, 1e-6
 
 
-class Outcome(NamedTuple):
+class Outcome(NamedTuple, Generic[Numbers]):
     """How every cell ended.
 
     `status` is one of the codes of `problem.py`; `first_crossing` and `crossing_time` [s] are the times of the first and
@@ -178,7 +178,7 @@ class LaneScheduler(eqx.Module):
         """Number of cells of the problem, padding included."""
         return self.fresh.cell.shape[0]
 
-    def pick(self, tree: Any, cell: Int[Array, "*lanes"]) -> Any:
+    def pick(self, tree: Any, cell: Int[Array, " lanes"]) -> Any:
         """The leaves for the given cells; scalars stay unchanged."""
         index = jnp.minimum(cell, self.capacity - 1)
         return jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., index], tree)
@@ -281,7 +281,7 @@ class LaneScheduler(eqx.Module):
         )
         return jax.tree.map(lambda cells, lanes: cells.at[..., targets].set(lanes, mode="drop"), outcome, in_lanes)
 
-    def _load(self, cell: Int[Array, "*lanes"]) -> LaneState:
+    def _load(self, cell: Int[Array, " lanes"]) -> LaneState:
         lane_state = self.pick(self.fresh, cell)
         # There may be fewer cells than lanes: the other lanes stay idle.
         return lane_state._replace(cell=cell, status=jnp.where(cell < self.cells, lane_state.status, REACHED_END))

@@ -84,21 +84,21 @@ class LaneState(NamedTuple):
     ('cell', 'status', 'time', 'state', 'rate')
     """
 
-    cell: Int[Array, "*lanes"]
-    status: Int[Array, "*lanes"]
+    cell: Int[Array, " lanes"]
+    status: Int[Array, " lanes"]
     time: Lanes
     state: States
     rate: States
     length: Lanes
     side: Lanes
     margin: Lanes
-    margins: Float[Array, "margins *lanes"] | None
+    margins: Float[Array, "margins lanes"] | None
     first_crossing: Lanes
     crossing_time: Lanes
-    bracketing: Bool[Array, "*lanes"]
+    bracketing: Bool[Array, " lanes"]
     bracket: Bracket
-    steps: Int[Array, "*lanes"]
-    rejected: Int[Array, "*lanes"]
+    steps: Int[Array, " lanes"]
+    rejected: Int[Array, " lanes"]
     stages: Stages | None = None
 
 
@@ -144,7 +144,7 @@ def past_jump(
     is_jump, _, _, far = jumps.sides(new_lanes.time)
     landed = is_jump & (lane_state.status == RUNNING) & (new_lanes.status == REACHED_END) & (near.t1 <= new_lanes.time)
 
-    def moved() -> tuple[States, States, Lanes, Float[Array, "margins *lanes"] | None]:
+    def moved() -> tuple[States, States, Lanes, Float[Array, "margins lanes"] | None]:
         state = problem.across_jump(new_lanes.time, new_lanes.state)
         rate, margins = problem.field(far, state), problem.margins(far, state)
         margin = stop_gradient(least_margin(problem, new_lanes.side, far, state, rate))
@@ -279,7 +279,7 @@ def after_step(
     )
 
 
-def _factor(error: Lanes, accurate: Bool[Array, "*lanes"], order: int) -> Lanes:
+def _factor(error: Lanes, accurate: Bool[Array, " lanes"], order: int) -> Lanes:
     """Growth factor of the next step, as in Diffrax's I controller."""
     factor = SAFETY * inverse_root(jnp.maximum(error, 1e-30), order)
     return jnp.where(accurate, jnp.clip(factor, 1.0, GROW), jnp.clip(factor, SHRINK, SAFETY))
@@ -291,8 +291,8 @@ def _classify(
     lane_state: LaneState,
     trial: Step,
     time: Lanes,
-    hit: Bool[Array, "*lanes"],
-) -> tuple[Int[Array, "*lanes"], Lanes, Lanes, Lanes]:
+    hit: Bool[Array, " lanes"],
+) -> tuple[Int[Array, " lanes"], Lanes, Lanes, Lanes]:
     """Status, side, first and latest crossing time of the lanes, where `hit` marks the lanes in which an event was
     located."""
     crossing, margins = problem.event_function(trial.state), trial.margins

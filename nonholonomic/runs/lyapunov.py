@@ -164,7 +164,7 @@ def exponent_of_model(model: AbstractModel, t1: float, settings: Settings, shape
 _ended = eqx.filter_jit(lambda model, outcome, tolerance: model.ended(outcome, tolerance))
 
 
-def _outcome(growths: Growth) -> Outcome:
+def _outcome(growths: Growth) -> Outcome[Array]:
     """The end of smooth runs, as an outcome without an event."""
     none, steps = jnp.full(growths.status.shape, jnp.inf), jnp.asarray(growths.steps)
     ending = (jnp.asarray(growths.end_time), jnp.asarray(growths.state))

@@ -91,13 +91,13 @@ def _own_axis(leaf: Any) -> int | None:
 
 def _reader(
     model: AbstractModel, names: tuple[str, ...]
-) -> Callable[[Int[Array, "*lanes"], Float[Array, "rows components *lanes"]], dict[str, Array]]:
+) -> Callable[[Int[Array, " lanes"], Float[Array, "rows components lanes"]], dict[str, Array]]:
     """A function that computes the named quantities of some cells from their states."""
 
     def read_lane(model: AbstractModel, states: Float[Array, "rows components"]) -> dict[str, Array]:
         return model.read(names, jnp.full(len(states), jnp.nan), states.T, None)
 
-    def reader(cell: Int[Array, "*lanes"], states: Float[Array, "rows components *lanes"]) -> dict[str, Array]:
+    def reader(cell: Int[Array, " lanes"], states: Float[Array, "rows components lanes"]) -> dict[str, Array]:
         of_lanes = jax.tree.map(lambda leaf: leaf if _own_axis(leaf) is None else leaf[cell], model)
         return eqx.filter_vmap(read_lane, in_axes=(_own_axis, -1), out_axes=1)(of_lanes, states)
 
@@ -115,7 +115,7 @@ def mode_at(number: Float[Array, "..."]) -> Int[Array, "..."]:
     return jnp.where(jnp.isnan(number), -1, number).astype(int)
 
 
-def outcome_of(samples: HybridSamples) -> HybridOutcome:
+def outcome_of(samples: HybridSamples) -> HybridOutcome[Array]:
     """How sampled runs, with the cells along the first axis, have ended."""
     codes = (samples.status, samples.steps, samples.rejected, samples.end_mode)
     status, steps, rejected, mode = (code.astype(int) for code in codes)
@@ -240,7 +240,7 @@ class SampledRows(eqx.Module):
     rows: Float[Array, "rows times"]
     passive: Float[Array, "rows times"] | None
     mode: Int[Array, " times"] | None
-    outcome: HybridOutcome
+    outcome: HybridOutcome[Array]
 
 
 def sampled(

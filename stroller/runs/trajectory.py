@@ -98,7 +98,7 @@ class RideSpec(eqx.Module):
         return self.model.input
 
 
-def stats_of(outcome: HybridOutcome) -> Stats:
+def stats_of(outcome: HybridOutcome[Array]) -> Stats:
     """The statistics of a run of one cell."""
     accepted, rejected = outcome.steps[0] - outcome.rejected[0], outcome.rejected[0]
     return Stats(accepted.astype(int), rejected.astype(int), outcome.status[0] == REACHED_END)
@@ -151,7 +151,7 @@ class Steps(NamedTuple):
 
 
 @eqx.filter_jit
-def _field(spec: RideSpec, times: Float[Array, "*lanes"], states: State) -> State:
+def _field(spec: RideSpec, times: Float[Array, " lanes"], states: State) -> State:
     return spec.scene.dynamics.field(times, states, spec.input)
 
 

@@ -137,7 +137,7 @@ def stage_at_start(model: TopModel, t1: float) -> Stage:
 
 
 @eqx.filter_jit
-def _motion_at_start(model: TopModel) -> DrawnMotion:
+def _motion_at_start(model: TopModel) -> DrawnMotion[Array]:
     modes, number, state = model.modes(1, jnp.asarray(TOLERANCE), None, False)
     # The other tops stand on their stem.
     mode = dataclasses.replace(modes[0], number=number) if isinstance(modes[0], Slide) else modes[0]

@@ -456,7 +456,7 @@ def simulate_launch(
 
 
 @eqx.filter_jit
-def _ended(model: Any, outcome: HybridOutcome, tolerance: Float[Array, ""]) -> Array:
+def _ended(model: Any, outcome: HybridOutcome[Array], tolerance: Float[Array, ""]) -> Array:
     return model.ended(outcome, tolerance)[0]
 
 

@@ -1,7 +1,7 @@
 """The quantities of a top with units and names, and the drawing of a run."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -115,10 +115,10 @@ BLACK, TEAL, PINK = 0x23262B, 0x008C95, 0xC2378E
 
 
 #: JAX's arrays, or NumPy's for drawing.
-Numbers = Array | np.ndarray
+Numbers = TypeVar("Numbers", Array, np.ndarray)
 
 
-class DrawnMotion(NamedTuple):
+class DrawnMotion(NamedTuple, Generic[Numbers]):
     """The drawn quantities of a run: vectors in the fixed frame, (times, 3), and the rotation from the body to this
     frame."""
 
@@ -137,7 +137,7 @@ class DrawnMotion(NamedTuple):
     angular_momentum: Float[Numbers, "times 3"]
 
     @staticmethod
-    def of(run: Any) -> "DrawnMotion":
+    def of(run: Any) -> "DrawnMotion[Array]":
         """The motion of one run, inside or outside of transformations."""
         body, slip = run.scene.body, run.slip
         position, axis, normal, zero = run.position, run.axis, run.normal, jnp.zeros_like(run.t)
@@ -172,7 +172,7 @@ def names_of(runs: list[Any], unit: Any = None) -> list[str]:
     return distinguishing_labels(starts, [run.scene for run in runs], unit=unit)
 
 
-def motion(run: Any) -> DrawnMotion:
+def motion(run: Any) -> DrawnMotion[np.ndarray]:
     """The motion of one run. If the run can be evaluated between its times, the times are close enough to show the
     rotation."""
     if run.dense is not None:
@@ -185,7 +185,7 @@ def motion(run: Any) -> DrawnMotion:
     return DrawnMotion(*(np.asarray(part)[:count] for part in _motion(run.padded())))
 
 
-def show(scene: Scene, motion: DrawnMotion, number: int, name: str) -> Show:
+def show(scene: Scene, motion: DrawnMotion[np.ndarray], number: int, name: str) -> Show:
     """The drawing of one run, the `number`-th of its stage."""
     body, colour = scene.body, COLOURS[number % len(COLOURS)]
     motion = DrawnMotion(*(np.asarray(part)[np.isfinite(motion.theta)] for part in motion))
@@ -212,7 +212,7 @@ def show(scene: Scene, motion: DrawnMotion, number: int, name: str) -> Show:
     )
 
 
-def curve_of_rotation(scene: Scene, motion: DrawnMotion) -> tuple[str, Any]:
+def curve_of_rotation(scene: Scene, motion: DrawnMotion[Any]) -> tuple[str, Any]:
     """Label and values of the curve of the rotation: Jellett's quantity, or, for a body of any shape and inertia, the spin
     about the normal."""
     if isinstance(scene.body, AbstractRigidBody):
@@ -220,7 +220,7 @@ def curve_of_rotation(scene: Scene, motion: DrawnMotion) -> tuple[str, Any]:
     return QUANTITIES["jellett"].label, motion.jellett
 
 
-def arrows(motion: DrawnMotion, offset: float, radius: float, weight: float) -> tuple[Arrow, ...]:
+def arrows(motion: DrawnMotion[np.ndarray], offset: float, radius: float, weight: float) -> tuple[Arrow, ...]:
     """Forces and slip at the contact, weight, angular velocity and momentum at the centre of mass."""
     arrow_start = motion.contact + 0.02 * radius * motion.normal
     centre = motion.position - offset * motion.axis

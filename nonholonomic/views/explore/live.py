@@ -258,7 +258,7 @@ class HybridSimulator(NamedTuple):
     readings: dict[str, Callable[[Numbers, HybridOutcome], Any]]
     frame: Callable[[Numbers, Any, Any, Any], Any] | None = None
 
-    def first(self, values: Numbers) -> HybridOutcome:
+    def first(self, values: Numbers) -> HybridOutcome[Array]:
         """The run for the sliders' numbers, at its start."""
         _, mode, state = self.start(values)
         return at_start(jnp, mode, state, 1, self.counters)
