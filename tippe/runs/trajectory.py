@@ -52,8 +52,6 @@ from ..modes.sticking import lifted
 from .launches import if_balanced, why_unbalanced
 from .observables import AbstractTrajectory, of_each_run
 
-# One run of a tippe top, with its path.
-
 
 class Trajectory(AbstractTrajectory):
     """A run of a tippe top, or a batch of runs, with the batch first.
