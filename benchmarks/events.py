@@ -180,6 +180,13 @@ FAMILIES = {
         in_box(0.7, 0.1, 0.9),
         9.0,
     ),
+    "toothed rack": Family(
+        Oscillator(),
+        oscillating,
+        lambda t, s: jnp.abs(jnp.mod(6.0 * s[0] + 1.3 * s[1], 1.0) - 0.5) - 0.02,
+        in_box(0.7, 0.1, 0.7),
+        9.0,
+    ),
     "spiral over a grid": Family(
         Spiral(),
         spiralling,
@@ -202,14 +209,14 @@ def first_zeros(motion: Any, event: Any, t1: float, start: Any) -> Any:
         values = jax.vmap(lambda t: function(t, s))(times)
         slopes = jax.vmap(lambda t: jax.jvp(lambda t: function(t, s), (t,), (1.0,))[1])(times)
         size = jnp.max(jnp.abs(values))
-        # The least of each gap, by the cubic through values and slopes at its ends.
+        # The least of each gap, where the cubic through values and slopes at its ends has its minimum.
         h = times[1] - times[0]
         fall, rise, climb = h * slopes[:-1], h * slopes[1:], values[1:] - values[:-1]
         cubic, square = 3.0 * (fall + rise - 2.0 * climb), 3.0 * climb - 2.0 * fall - rise
         root = square + jnp.sqrt(jnp.maximum(square * square - cubic * fall, 0.0))
         place = -fall / jnp.where(root == 0.0, 1.0, root)
-        inner = values[:-1] + place * (fall + place * (square + place * cubic / 3.0))
         has_inner = (fall < 0.0) & (rise > 0.0) & (place > 0.0) & (place < 1.0)
+        inner = jax.vmap(lambda t: function(t, s))(times[:-1] + h * jnp.where(has_inner, place, 0.0))
         least = jnp.where(has_inner, inner, jnp.minimum(values[:-1], values[1:]))
         gap = jnp.argmax(least < 0.0)
         crosses = jnp.any(least < 0.0)

@@ -138,7 +138,6 @@ PAGES = {
                 "Stabilized8",
             ),
             "nonholonomic.integration.problem",
-            "nonholonomic.integration.problem",
             *of(
                 "nonholonomic.integration.problem",
                 "legal_run run_bounds tolerance_bound require_run require_times require_adaptive require_adjoint",
@@ -238,9 +237,12 @@ MEMBERS = {
 
 
 def public(package: str) -> list[str]:
-    """The names that the `__init__.py` of a package or of a room exports."""
-    text = inspect.getsource(importlib.import_module(package))
-    return sorted(set(re.findall(r"import (?!__)(\w+) as \1$", text, re.M)), key=str.lower)
+    """The names that the `__init__.py` of a package or of a room exports, or that a public module defines."""
+    module = importlib.import_module(package)
+    names = set(re.findall(r"import (?!__)(\w+) as \1$", inspect.getsource(module), re.M)) or {
+        name for name, value in vars(module).items() if name[0] != "_" and getattr(value, "__module__", "") == package
+    }
+    return sorted(names, key=str.lower)
 
 
 def resolve(dotted: str) -> Any:
@@ -284,8 +286,9 @@ def entry(name: str) -> list[str]:
     value = resolve(name)
     if inspect.ismodule(value):
         heading = f"``{name}``"
-        # The names of a room of the engine have entries of their own.
-        members = [] if name.startswith(ENGINE_ROOMS) else ["   :members:"]
+        # The names of most modules have entries of their own.
+        own = any(other.startswith(f"{name}.") for page in PAGES.values() for other in page.names)
+        members = [] if own else ["   :members:"]
         return [heading, "-" * len(heading), "", f".. automodule:: {name}", *members, ""]
     if inspect.isclass(value):
         members = [f"   :members: {', '.join(MEMBERS[name].split())}"] if name in MEMBERS else []

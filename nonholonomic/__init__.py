@@ -3,7 +3,7 @@
 import os
 import sys
 
-from .terminal import import_quietly as _import_quietly
+from .command_line import import_quietly as _import_quietly
 
 # While `python -m` looks for the module to run, `sys.argv[0]` is "-m".
 if sys.argv[:1] == ["-m"]:

@@ -16,11 +16,12 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from nonholonomic import __version__
+from nonholonomic.command_line import closing_lines, run_and_exit
 from nonholonomic.compilation.cache import are_kept, enable_compilation_cache, kept_files
 from nonholonomic.geometry import CLOSED, AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.integration import ImplicitMidpoint
 from nonholonomic.sweeps import Table
-from nonholonomic.terminal import Progress, closing_lines, run_and_exit, status_line
+from nonholonomic.terminal import Progress, status_line
 from nonholonomic.validation import as_number, replacing, require, require_folder
 from nonholonomic.views import NO_VIEW, can_view, page, picture_as_html
 

@@ -6,10 +6,10 @@ The examples share few scenes, so that what one compiles serves the others.
 import doctest
 import importlib
 import inspect
-import re
 import tempfile
 from typing import Any
 
+import api_pages
 import jax
 import pytest
 from api_pages import ENGINE_ROOMS, PAGES, resolve
@@ -25,9 +25,8 @@ FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 
 def public(package: str) -> dict[str, Any]:
-    """What a package or a room hands out: the names that its `__init__.py` imports as themselves."""
-    module = importlib.import_module(package)
-    return {name: getattr(module, name) for name in re.findall(r"import (\w+) as \1$", inspect.getsource(module), re.M)}
+    """What a package, a room or a public module hands out."""
+    return {name: resolve(f"{package}.{name}") for name in api_pages.public(package)}
 
 
 #: What is handed out, once each, under its first name.

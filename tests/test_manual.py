@@ -1,4 +1,4 @@
-"""The manual has an entry for every public name, a thumbnail for every picture and a derivation for every citation."""
+"""The manual is short, and has an entry for every public name, a thumbnail for every picture and each cited derivation."""
 
 import importlib
 import inspect
@@ -9,6 +9,9 @@ import api_pages
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
+
+#: Words of the pages, cells of code included, as `cat $(git ls-files 'docs/*.md') | wc -w` counts them.
+MOST_WORDS = 22_000
 
 
 def test_every_public_name_is_on_a_page_of_the_api():
@@ -45,3 +48,10 @@ def test_every_section_of_a_derivation_that_a_docstring_cites_exists():
         assert re.search(
             rf"^\({model}-{number}\)=\n## {number}\. ", (DOCS / "concepts" / f"{model}.md").read_text(), re.M
         )
+
+
+def test_the_manual_does_not_grow():
+    """What repeats a docstring, the README or another page can go."""
+    words = {page.relative_to(DOCS): len(page.read_text().split()) for page in DOCS.rglob("*.md")}
+    assert len(words) > 40
+    assert sum(words.values()) <= MOST_WORDS

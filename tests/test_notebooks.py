@@ -72,7 +72,7 @@ def show(source: str, names: dict[str, Any]) -> None:
 
 #: The longest pages; tests of planning, bodies, fits, flights, laws, surfaces and own systems exercise their functions.
 LONG = ("planning", "rattleback", "trust", "hops", "friction", "surface", "egg")
-LONG += ("own_ball", "own_oscillator", "own_sleigh", "own_top")
+LONG += ("own_oscillator", "own_sleigh", "own_systems", "own_top")
 
 
 @pytest.mark.parametrize(
@@ -85,12 +85,11 @@ LONG += ("own_ball", "own_oscillator", "own_sleigh", "own_top")
 )
 def test_the_cells_of_a_page_run(builder, page, monkeypatch, tmp_path):
     """In the process of the tests, whose compiled programs they share; a notebook of its own imports for six seconds."""
-    # What a page may read: its neighbours' sketches, and the examples.
+    # What a page may read: its neighbours' sketches.
     folder = tmp_path / "docs" / page.parent.name
     for path in (folder, tmp_path / "docs" / "concepts"):
         path.mkdir(parents=True, exist_ok=True)
     (tmp_path / "docs" / "concepts" / "sketches.py").symlink_to(DOCS / "concepts" / "sketches.py")
-    (tmp_path / "examples").symlink_to(DOCS.parent / "examples")
     monkeypatch.chdir(folder)
     monkeypatch.syspath_prepend(folder)
     names = {"__name__": "__main__"}

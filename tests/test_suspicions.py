@@ -200,7 +200,7 @@ def test_copies_in_our_threads_repeat_no_warning():
 def test_a_command_line_shows_a_warning_once_and_as_one_line():
     """Also if it comes from several modules, each with a registry of its own."""
     program = (
-        "import warnings; from nonholonomic.terminal import run_and_exit; "
+        "import warnings; from nonholonomic.command_line import run_and_exit; "
         "place = (UserWarning, 'module.py', 1, 'module'); "
         "run_and_exit(lambda: [warnings.warn_explicit(f'too {k % 2}', *place, {}) for k in range(4)] and 0, 'tippe')"
     )

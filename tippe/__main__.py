@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from nonholonomic import __version__
+from nonholonomic.command_line import closing_lines, run_and_exit
 from nonholonomic.compilation.cache import are_kept, enable_compilation_cache, kept_files
 from nonholonomic.geometry import Cylinder, Plane
 from nonholonomic.sweeps import AnotherRun, Table, saved_cells
-from nonholonomic.terminal import Progress, closing_lines, run_and_exit
+from nonholonomic.terminal import Progress
 from nonholonomic.validation import replacing, require_folder
 from nonholonomic.views import NO_VIEW, Page, can_view, page, picture_as_html, table_as_html
 from nonholonomic.views.explore import live_page

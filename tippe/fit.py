@@ -31,8 +31,6 @@ from .runs.launches import angle_of, check_event, check_reversible, check_smooth
 from .runs.model import TopModel
 from .runs.verbs import beyond_horizon, time_of_inversion
 
-# Estimate parameters of a top, its arena and its launches from measured times and motion, and their posterior.
-
 #: The words for data that can be fitted.
 EXPECTED = "an InversionTimes, a ReversalTimes or a Recording"
 

@@ -4,7 +4,7 @@ The paper: "Modeling of Dynamics Object with Non-Holonomic Constraints Based on 
 Its numbers are in g, cm and s and are converted here only.
 
 The printed and the computed times have different trends: the numbers of the paper's top are lost, and its equations of
-motion are not those of a top (`docs/development/tippe_paper.md`). The same launches also run on the plane.
+motion are not those of a top (`benchmarks/papers/tippe_audit.py`). The same launches also run on the plane.
 """
 
 import argparse
@@ -21,11 +21,12 @@ import jax
 import numpy as np
 
 from nonholonomic import __version__
+from nonholonomic.command_line import closing_lines
 from nonholonomic.compilation.cache import enable_compilation_cache
 from nonholonomic.compilation.xla_cpu import compiled_quickly
 from nonholonomic.geometry import AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.sweeps import Table
-from nonholonomic.terminal import Progress, closing_lines, status_line
+from nonholonomic.terminal import Progress, status_line
 from nonholonomic.validation import require_folder
 from nonholonomic.views import NO_VIEW, Stage, can_view, page, picture_as_html, table_as_html
 

@@ -61,40 +61,40 @@ from .model.scene import Scene
 MANY = "jax.vmap maps over several"
 
 
-def require_top(body: Any) -> None:
+def _require_top(body: Any) -> None:
     """Raise `ValueError` unless the body is a `Top`."""
     if not isinstance(body, Top):
         raise ValueError(f"body = {shown(body)} must be a Top: the formulas are those of a sphere")
 
 
-def require_one_top(body: Any, caller: str) -> None:
+def _require_one_top(body: Any, caller: str) -> None:
     """Raise `ValueError` unless the body is a `Top` with known scalars. **Arguments:** `caller`: the function."""
-    require_top(body)
+    _require_top(body)
     require_outside(body, caller, "steady.proportions")
     require_scalars(numbers("body", body), MANY)
 
 
-def require_one_scene(scene: Scene, **values: Any) -> None:
+def _require_one_scene(scene: Scene, **values: Any) -> None:
     """Raise `ValueError` unless the numbers of the scene, and the values, are scalars."""
     require_scalars(numbers("scene", scene, functions=False) | values, MANY)
 
 
-def require_scene_of_a_top(scene: Any) -> None:
+def _require_scene_of_a_top(scene: Any) -> None:
     """Raise `ValueError` unless this is a scene of a `Top`."""
     require_kind(scene, "scene", Scene)
-    require_top(scene.body)
+    _require_top(scene.body)
 
 
-def require_plane(scene: Any) -> None:
+def _require_plane(scene: Any) -> None:
     """Raise `ValueError` unless this is a scene of a `Top` on a level plane."""
-    require_scene_of_a_top(scene)
+    _require_scene_of_a_top(scene)
     if not scene.level:
         raise ValueError(
             f"surface = {shown(scene.surface)} must be a Plane without tilt: on other arenas, no top tumbles steadily"
         )
 
 
-def require_standing(scene: Any, spin: Any, inverted: Any) -> None:
+def _require_standing(scene: Any, spin: Any, inverted: Any) -> None:
     """Raise `ValueError` unless the body of a scene can stand and spin, and the other arguments are legal."""
     require_kind(scene, "scene", Scene)
     if isinstance(scene.body, AbstractRigidBody):
@@ -106,7 +106,7 @@ def require_standing(scene: Any, spin: Any, inverted: Any) -> None:
     require_flag(inverted, "inverted")
 
 
-def require_inclination(theta: Any) -> None:
+def _require_inclination(theta: Any) -> None:
     """Raise `ValueError` unless theta is an angle [rad] in [0, pi], or several."""
     require(theta, "theta", at_least=0.0, at_most=math.pi, unit="rad")
 
@@ -153,9 +153,9 @@ def tumbling(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> Tumbling:
     >>> print(f"{steady.tumbling(scene, 2.0).precession:.2f} rad/s")
     33.55 rad/s
     """
-    require_plane(scene)
+    _require_plane(scene)
     theta = as_number(theta)
-    require_inclination(theta)
+    _require_inclination(theta)
     lever, inertia = _lever_and_inertia(scene, theta)
     require(lever, "I3 (alpha - cos(theta)) + I1 cos(theta)", above=0.0, why="no tumbling top at this inclination")
     alpha, _ = proportions(scene.body)
@@ -172,8 +172,8 @@ def tumbling_is_stable(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> Flo
     >>> bool(steady.tumbling_is_stable(scene, 1.0))
     True
     """
-    require_plane(scene)
-    require_inclination(theta)
+    _require_plane(scene)
+    _require_inclination(theta)
     lever, inertia = _lever_and_inertia(scene, theta)
     return 4.0 * lever**2 + inertia * (scene.body.I1 - scene.body.I3) > 0.0
 
@@ -191,8 +191,8 @@ def effective_energy(
     >>> print(f"{1e3 * steady.effective_energy(scene, 1.0, motion.jellett):.3f} mJ")
     4.886 mJ
     """
-    require_plane(scene)
-    require_inclination(theta)
+    _require_plane(scene)
+    _require_inclination(theta)
     require(jellett, "jellett")
     body = scene.body
     _, inertia = _lever_and_inertia(scene, theta)
@@ -215,9 +215,9 @@ def tumbling_angles(scene: Scene[Top], jellett: float, samples: int = 2001) -> l
     >>> print([round(theta, 3) for theta in steady.tumbling_angles(scene, float(jellett))])
     [1.0]
     """
-    require_plane(scene)
+    _require_plane(scene)
     require(jellett, "jellett")
-    require_one_scene(scene, jellett=jellett)
+    _require_one_scene(scene, jellett=jellett)
     require_whole(samples, "samples", 4)
     grid = jnp.linspace(0.0, jnp.pi, samples)
 
@@ -236,7 +236,7 @@ def tumbling_state(scene: Scene[Top], motion: Tumbling) -> Float[Array, " 8"]:
     >>> print(f"{1e3 * scene.energy(steady.tumbling_state(scene, motion)):.3f} mJ")
     4.886 mJ
     """
-    require_motion(scene, motion)
+    _require_motion(scene, motion)
     body, s, c = scene.body, jnp.sin(motion.theta), jnp.cos(motion.theta)
     zero = jnp.zeros_like(s)
     transverse, axial = -body.I1 * motion.precession * s, body.I3 * motion.spin
@@ -264,9 +264,9 @@ def quarter_turn(state: Float[Array, " 8"]) -> Float[Array, " 8"]:
     return joined((-u2, u1), (-e2, e1, zero), (-L2, L1, zero))
 
 
-def require_motion(scene: Scene[Top], motion: Tumbling) -> None:
+def _require_motion(scene: Scene[Top], motion: Tumbling) -> None:
     """Raise `ValueError` unless this is a scene on the plane and a motion from `tumbling`."""
-    require_plane(scene)
+    _require_plane(scene)
     require_kind(motion, "motion", Tumbling, ", as tumbling(scene, theta) returns it")
 
 
@@ -292,7 +292,7 @@ def proportions(body: Top) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     >>> print(f"{alpha:.2f} {gamma:.3f}")
     0.30 0.936
     """
-    require_top(body)
+    _require_top(body)
     return body.offset / body.radius, body.I1 / body.I3
 
 
@@ -307,7 +307,7 @@ def group(body: Top) -> str:
     >>> steady.group(top)
     'II'
     """
-    require_one_top(body, "steady.group")
+    _require_one_top(body, "steady.group")
     alpha, gamma = (float(number) for number in proportions(body))
     return "I" if gamma <= 1.0 - alpha else "III" if gamma >= 1.0 + alpha else "II"
 
@@ -323,7 +323,7 @@ def folds(body: Top) -> bool:
     >>> steady.folds(top), steady.folds(tippe.Top(0.02, 0.02, 0.006, I1=2.5e-6, I3=3.2e-6))
     (False, True)
     """
-    require_one_top(body, "steady.folds")
+    _require_one_top(body, "steady.folds")
     alpha, gamma = proportions(body)
     delta = (1.0 + 6.0 * alpha + alpha**2 - (1.0 - alpha) * jnp.sqrt(1.0 + 14.0 * alpha + alpha**2)) / 8.0
     return bool(gamma < 1.0 - delta)
@@ -338,7 +338,7 @@ def upright_critical_spin(scene: Scene[Top]) -> Float[Array, "..."]:
     >>> print(f"{steady.upright_critical_spin(scene):.1f} rad/s")
     27.7 rad/s
     """
-    require_scene_of_a_top(scene)
+    _require_scene_of_a_top(scene)
     alpha, gamma = proportions(scene.body)
     weight = scene.body.mass * scene.gravity * scene.body.offset
     return _root_of_ratio(weight * (1.0 - alpha) ** 2 / scene.body.I3, gamma - 1.0 + alpha)
@@ -354,7 +354,7 @@ def inverted_critical_spin(scene: Scene[Top]) -> Float[Array, "..."]:
     >>> print(f"{steady.inverted_critical_spin(scene):.1f} rad/s")
     41.3 rad/s
     """
-    require_scene_of_a_top(scene)
+    _require_scene_of_a_top(scene)
     (_, gamma), body = proportions(scene.body), scene.body
     sphere = body if body.stem is None else body.stem
     alpha, weight = sphere.offset / sphere.radius, body.mass * scene.gravity * sphere.offset
@@ -374,7 +374,7 @@ def jellett_thresholds(scene: Scene[Top]) -> tuple[Float[Array, "..."], Float[Ar
     >>> print(" ".join(f"{jellett:.2e}" for jellett in steady.jellett_thresholds(scene)))
     1.24e-06 3.44e-06
     """
-    require_scene_of_a_top(scene)
+    _require_scene_of_a_top(scene)
     (alpha, _), body = proportions(scene.body), scene.body
     if body.stem is not None:
         raise ValueError(
@@ -412,7 +412,7 @@ def standing_state(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = Fa
     >>> print(f"{scene.theta(steady.standing_state(scene, 100.0, inverted=True)):.4f} rad")
     3.1416 rad
     """
-    require_standing(scene, spin, inverted)
+    _require_standing(scene, spin, inverted)
     state = scene.state(Launch(0.0, spin))
     # The axis and the angular momentum point along n; only their components 4 and 7 are not 0.
     return state.at[np.array([4, 7])].multiply(-1.0 if inverted else 1.0)
@@ -433,8 +433,8 @@ def standing_matrix(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = F
     >>> steady.standing_matrix(scene, 50.0, inverted=True).shape
     (6, 6)
     """
-    require_standing(scene, spin, inverted)
-    require_one_scene(scene, spin=spin)
+    _require_standing(scene, spin, inverted)
+    _require_one_scene(scene, spin=spin)
     body = dataclasses.replace(scene.body, stem=None) if scene.contact == "hybrid" else scene.body
     scene = dataclasses.replace(scene, body=body, contact="stop", restitution=None)
     return _standing_matrix(scene, as_number(spin), bool(inverted))
@@ -474,8 +474,8 @@ def tumbling_matrix(scene: Scene[Top], motion: Tumbling) -> Float[Array, "5 5"]:
     >>> print(f"{steady.growth_rate(steady.tumbling_matrix(scene, motion)):.2f} 1/s")
     -0.35 1/s
     """
-    require_motion(scene, motion)
-    require_one_scene(scene, **{f"motion.{name}": value for name, value in motion._asdict().items()})
+    _require_motion(scene, motion)
+    _require_one_scene(scene, **{f"motion.{name}": value for name, value in motion._asdict().items()})
     return _tumbling_matrix(scene, motion)
 
 

@@ -4,6 +4,7 @@ The paper: "Vector Fields of the Dynamics of Non-Holonomic Constraint System Wit
 coordinates are q = (x, y, theta, phi) on the plane and (eta, mu, theta, phi) on the spheroid of constant xi, with theta
 the direction of the horizontal projection of the heading and phi the steering angle; p are the canonical momenta. The
 fork's inertia is relative. Each function is the corrected form of the equation that its first line names.
+`python benchmarks/papers/stroller_paper.py` prints the table; `docs/development/papers.md` has a summary.
 """
 
 from typing import NamedTuple
@@ -314,11 +315,11 @@ EQUATIONS = (
 
 
 def render() -> str:
-    """The audit as a Markdown page, the content of `docs/development/stroller_paper.md`."""
+    """The audit as a page in Markdown."""
     lines = [
         "# The stroller's paper, equation by equation",
         "",
-        "This page states which equations of *Vector Fields of the Dynamics of Non-Holonomic Constraint System With",
+        "This audit states which equations of *Vector Fields of the Dynamics of Non-Holonomic Constraint System With",
         "Elliptical Configuration Space* hold, and corrects the others. D stands for sinh²ξ + sin²η. The tests, listed in",
         "`benchmarks/papers/stroller_paper.py`, derive each corrected form from the position on the spheroid.",
         "",
@@ -330,3 +331,7 @@ def render() -> str:
     ]
     lines += [f"| {' | '.join(equation[:4])} |" for equation in EQUATIONS]
     return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    print(render(), end="")

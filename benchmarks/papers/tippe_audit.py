@@ -1,8 +1,8 @@
 r"""Audit of the paper: each numbered equation as printed, the verdict, the correct form, and the tests for both.
 
-`python benchmarks/papers/tippe_audit.py` prints the page `docs/development/tippe_paper.md`. In its formulas eta is the angle of
-the position from the lowest line, r the arena's radius, rho = r - R the radius of the centre's path, and phi the direction of
-the axis from that of increasing eta.
+`python benchmarks/papers/tippe_audit.py` prints it; `docs/development/papers.md` has a summary. In the formulas
+eta is the angle of the position from the lowest line, r the arena's radius, rho = r - R the radius of the centre's path,
+and phi the direction of the axis from that of increasing eta.
 """
 
 import textwrap
@@ -235,8 +235,8 @@ AUDIT = (
 TITLE = "# The paper on the tippe top in the cylinder, equation by equation"
 
 PREFACE = """
-This page states which equations of *Modeling of Dynamics Object with Non-Holonomic Constraints Based on Maple in
-Cylinder Coordinate* hold, and corrects the others. The [equations of the top](../concepts/tippe.md) define the symbols;
+This audit states which equations of *Modeling of Dynamics Object with Non-Holonomic Constraints Based on Maple in
+Cylinder Coordinate* hold, and corrects the others. The equations of the top (`docs/concepts/tippe.md`) define the symbols;
 I is I₁ and J is Jellett's quantity λ.
 
 * With sliding friction the top has **no nonholonomic constraint**: the contact is holonomic, and friction is a force.

@@ -49,7 +49,8 @@ def spelled_out(function: Callable[..., Any]) -> Callable[..., Any]:
 def _spelled_out(equation: Any, inputs: list[Any]) -> Sequence[Any]:
     name, params = equation.primitive.name, equation.params
     if name == "dot_general":
-        return [_product(*inputs, params["dimension_numbers"])]
+        left, right = inputs
+        return [_product(left, right, params["dimension_numbers"])]
     return read_program(params["jaxpr"], inputs, _spelled_out) if name in ("jit", "pjit") else bound(equation, inputs)
 
 

@@ -208,7 +208,7 @@ def written_in_place(
 
 
 def written_by_component(
-    stack: Float[Array, "stack components lanes"], entry: Float[Array, "components lanes"], at: Int[Array, ""]
+    stack: Float[Array, "stack components lanes"], entry: Float[Array, "components *lanes"], at: Int[Array, ""]
 ) -> Float[Array, "stack components lanes"]:
     """`written_in_place` for every component separately, from where it is computed.
 

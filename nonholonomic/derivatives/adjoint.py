@@ -184,7 +184,7 @@ class StepRecorder(AbstractRecorder):
 class Derivatives(NamedTuple):
     """Derivatives of the measured quantity with respect to the state and to the parameters, a tree of arrays."""
 
-    state: Float[Array, "components lanes"]
+    state: Float[Array, "components *lanes"]
     numbers: Any
 
 
@@ -639,7 +639,7 @@ def shares_of(count: int) -> Float[np.ndarray, " count"]:
     return (0.5 + np.modf(0.618 * np.arange(count))[0]) / count
 
 
-def _event_time(variational: VariationalProblem, lane_state: LaneState) -> Float[Array, " lanes"]:
+def _event_time(variational: VariationalProblem, lane_state: LaneState) -> Float[Array, "*lanes"]:
     """Zero of the event function for lanes that have ended on the event."""
     problem = variational.problem
     return time_of_zero(problem, problem.event_function, lane_state.time, lane_state.state)

@@ -68,8 +68,8 @@ class SampledCotangents(NamedTuple):
 class SampledStepRecord(NamedTuple):
     """The steps of a period; whether the last step was accepted, and the index of the next sample, in every lane."""
 
-    accepted: Bool[Array, " lanes"]
-    sample: Int[Array, " lanes"]
+    accepted: Bool[Array, "*lanes"]
+    sample: Int[Array, "*lanes"]
     steps: StepRecord
 
 
@@ -115,7 +115,7 @@ class SampledStepRecorder(StepRecorder):
         at_end = jnp.where(lane_state.status == REACHED_END, self.cotangents.end_state[:, cell], 0.0)
         return jnp.where(has_left, self.cotangents.end_time[cell], 0.0), at_end
 
-    def _cell(self, lane_state: LaneState) -> Int[Array, " lanes"]:
+    def _cell(self, lane_state: LaneState) -> Int[Array, "*lanes"]:
         return jnp.minimum(lane_state.cell, len(self.cotangents.end_time) - 1)
 
 
@@ -219,13 +219,17 @@ Build = Callable[[Any, int | None], AbstractProblem]
 #: 5.5 and 4.8 backward (jax 0.10).
 MOST_FORWARD = 2
 
-#: In the derivative of a `SampledRun`: end state, status and numbers of steps.
-NOT_DIFFERENTIATED: tuple[Any, ...] = (None,) * 4
+#: In the derivative of a `SampledRun`: end state, status, and numbers and lengths of steps.
+NOT_DIFFERENTIATED: tuple[Any, ...] = (None,) * 5
+
+#: The extremes of the steps of Diffrax, which does not tell them.
+UNKNOWN = (np.inf, 0.0, 0.0)
 
 
 class SampledRun(NamedTuple):
     """A run at given times, as floats: its states, NaN after its end; when and where it ended; the status code
-    (`REACHED_END`, `LEFT_DOMAIN` or `FAILED`); and the numbers of accepted and rejected steps.
+    (`REACHED_END`, `LEFT_DOMAIN` or `FAILED`); the numbers of accepted and rejected steps; and the extremes of their
+    lengths, as in `integration.Outcome`.
 
     `states` and `end_state` are the core components (the problem's `leading` ones), and `quadratures` are the passive
     quadratures, `None` if there are none. If a program does not use `quadratures`, the ensemble runs without them.
@@ -244,6 +248,7 @@ class SampledRun(NamedTuple):
     status: Float[Array, "*cells"]
     accepted: Float[Array, "*cells"]
     rejected: Float[Array, "*cells"]
+    extremes: Float[Array, "*cells 3"]
 
 
 def sampled_run(
@@ -366,9 +371,11 @@ def sampled_run_by_diffrax(
     leading = size if problem.leading is None else problem.leading
     full_problem = probed(problem) if grid is None else problem
     path = sample(full_problem, times, t1, settings, grid=grid, adjoint=adjoint)
-    status, *counts = (part.astype(float) for part in (_status(path, t1), path.accepted, path.rejected))
+    status, accepted, rejected = (part.astype(float) for part in (_status(path, t1), path.accepted, path.rejected))
     states = parted(problem, path.states[:size].T)
-    return SampledRun(*states, path.end_time, path.end_state[:leading], status, *counts)
+    return SampledRun(
+        *states, path.end_time, path.end_state[:leading], status, accepted, rejected, jnp.asarray(UNKNOWN)
+    )
 
 
 def _status(path: SampledSolution, t1: Float[Array, ""]) -> Int[Array, ""]:
@@ -482,7 +489,7 @@ def _samples_and_slopes(
         n_blocks=1 + len(variational.tangents),
         one_kernel=one_kernel,
     )
-    counts = (outcome.steps - outcome.rejected, outcome.rejected)
+    counts = (outcome.steps - outcome.rejected, outcome.rejected, outcome.extremes.T)
     return _found(variational, samples, (outcome.end_time, outcome.state, outcome.status), counts)
 
 
@@ -490,7 +497,7 @@ def _found(
     variational: VariationalProblem,
     samples: Float[Array, "*cells times components"],
     ends: tuple[Float[Array, "*cells"], Float[Array, "components *cells"], Int[Array, "*cells"]],
-    counts: tuple[Int[Array, "*cells"], Int[Array, "*cells"]],
+    counts: tuple[Int[Array, "*cells"], Int[Array, "*cells"], Float[Array, "*cells 3"]],
 ) -> tuple[SampledRun, list[SampledRun]]:
     """The samples and their derivative along each tangent, given the time, the state and the status at which the runs
     ended."""
@@ -550,7 +557,8 @@ def _follow(
     times, t1, tolerance = arguments
     path = sample(variational, times, t1, spec.settings.with_tolerance(tolerance), grid=spec.grid)
     ends = (path.end_time, path.end_state, _status(path, t1))
-    samples, slopes = _found(variational, path.states.T, ends, (path.accepted, path.rejected))
+    counts = (path.accepted, path.rejected, jnp.asarray(UNKNOWN))
+    samples, slopes = _found(variational, path.states.T, ends, counts)
     problem = variational.problem
 
     def jump_times(problem: AbstractProblem) -> Array | None:

@@ -80,7 +80,7 @@ class VariationalProblem(AbstractProblem):
         variations = [variation(direction) for direction in self.tangents]
         return jnp.concatenate([states, *variations]), jnp.concatenate([scales] * (1 + len(variations)))
 
-    def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+    def field(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> Any:
         point, *variations = self.parts(state)
         if not variations:
             return self.problem.field(time, point)
@@ -91,7 +91,7 @@ class VariationalProblem(AbstractProblem):
     ) -> Array:
         """The value of a function of problem and state, and its change along every tangent."""
 
-        def value(moving: Any, point: Float[Array, "components lanes"]) -> Float[Array, "components lanes"]:
+        def value(moving: Any, point: Float[Array, "components *lanes"]) -> Float[Array, "components *lanes"]:
             return function(eqx.combine(moving, self.problem), point)
 
         # Linearised once: the value is computed once, and the tangents share common subexpressions.
@@ -100,25 +100,25 @@ class VariationalProblem(AbstractProblem):
             [values, *(change(*direction) for direction in zip(self.tangents, variations, strict=True))]
         )
 
-    def event_function(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"] | None:
+    def event_function(self, state: Float[Array, "components *lanes"]) -> Float[Array, "*lanes"] | None:
         return self.problem.event_function(self.parts(state)[0]) if self.ends_on_event else None
 
-    def domain_margin(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+    def domain_margin(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> Any:
         return self.problem.domain_margin(time, self.parts(state)[0])
 
-    def lost_at_start(self, state: Float[Array, "components lanes"]) -> Any:
+    def lost_at_start(self, state: Float[Array, "components *lanes"]) -> Any:
         return self.problem.lost_at_start(self.parts(state)[0])
 
-    def exact_margin(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+    def exact_margin(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> Any:
         return self.problem.exact_margin(time, self.parts(state)[0])
 
-    def margins(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+    def margins(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> Any:
         return self.problem.margins(time, self.parts(state)[0])
 
-    def jumps(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Jumps | None:
+    def jumps(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> Jumps | None:
         return self.problem.jumps(time, self.parts(state)[0])
 
-    def across_jump(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+    def across_jump(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> Any:
         point, *variations = self.parts(state)
         if not variations:
             return self.problem.across_jump(time, point)
@@ -230,7 +230,7 @@ class VariedProblem(AbstractProblem):
         unit_scales = jnp.ones((self.states.shape[0] - len(self.magnitudes), *self.states.shape[1:]))
         return self.states, jnp.concatenate([self.magnitudes, unit_scales])
 
-    def field(self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]) -> Float[Array, "all lanes"]:
+    def field(self, time: Float[Array, "*lanes"], state: Float[Array, "all lanes"]) -> Float[Array, "all lanes"]:
         size = len(self.magnitudes)
         time = time if self.begin is None else time + self.begin
         y, w = state[:size], state[size:-1]
@@ -243,18 +243,18 @@ class VariedProblem(AbstractProblem):
         return None
 
     def domain_margin(
-        self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]
-    ) -> Float[Array, " lanes"] | None:
+        self, time: Float[Array, "*lanes"], state: Float[Array, "all lanes"]
+    ) -> Float[Array, "*lanes"] | None:
         time = time if self.begin is None else time + self.begin
         return self.problem.domain_margin(time, state[: len(self.magnitudes)])
 
     def margins(
-        self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]
-    ) -> tuple[Float[Array, " lanes"], ...]:
+        self, time: Float[Array, "*lanes"], state: Float[Array, "all lanes"]
+    ) -> tuple[Float[Array, "*lanes"], ...]:
         time = time if self.begin is None else time + self.begin
         return self.problem.margins(time, state[: len(self.magnitudes)])
 
-    def jumps(self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]) -> Jumps | None:
+    def jumps(self, time: Float[Array, "*lanes"], state: Float[Array, "all lanes"]) -> Jumps | None:
         begin = 0.0 if self.begin is None else self.begin
         jumps = self.problem.jumps(time + begin, state[: len(self.magnitudes)])
         return None if jumps is None else jumps._replace(times=jumps.times - begin)

@@ -57,6 +57,7 @@ class HybridOutcome(NamedTuple, Generic[Numbers]):
     state: Float[Numbers, "components cells"]
     steps: Int[Numbers, " cells"]
     rejected: Int[Numbers, " cells"]
+    extremes: Float[Numbers, "3 cells"]
     mode: Int[Numbers, " cells"]
     counts: Int[Numbers, "counters cells"]
 
@@ -80,6 +81,7 @@ def at_start(
         state=state,
         steps=zeros,
         rejected=zeros,
+        extremes=xp.stack([xp.full(mode.shape, xp.inf), *xp.zeros((2, len(mode)))]),
         mode=mode,
         counts=xp.zeros((counters, len(mode)), int),
     )
@@ -138,6 +140,9 @@ def after_solve(
 ) -> HybridOutcome[Numbers]:
     """Update the cells after an ensemble solve that ended as in `outcome`. **Arguments:** `xp`: `numpy` or `jax.numpy`."""
     start_time = runs.end_time
+    least, place, longest = outcome.extremes
+    is_least = least < runs.extremes[0]
+    shortest = (xp.where(is_least, *pair) for pair in zip((least, start_time + place), runs.extremes[:2], strict=True))
     # A cell that enters a mode beyond the event passed the event earlier, unless it started there.
     has_event = xp.isfinite(outcome.crossing_time) & ((outcome.crossing_time > 0.0) | xp.isinf(runs.crossing_time))
     return HybridOutcome(
@@ -147,6 +152,7 @@ def after_solve(
         state=outcome.state,
         steps=runs.steps + outcome.steps,
         rejected=runs.rejected + outcome.rejected,
+        extremes=xp.stack([*shortest, xp.maximum(longest, runs.extremes[2])]),
         mode=runs.mode,
         counts=runs.counts,
     )
@@ -172,6 +178,7 @@ def after_reset(
         state=transition.state,
         steps=runs.steps,
         rejected=runs.rejected,
+        extremes=runs.extremes,
         mode=transition.mode,
         counts=runs.counts + transition.counts,
     )
@@ -603,7 +610,8 @@ def _outcome(path: DenseSolution) -> Outcome[np.ndarray]:
     status = FAILED if path.failed else LEFT_DOMAIN if path.left_domain else REACHED_END
     no_crossing, steps = np.full(1, np.inf), path.accepted + path.rejected
     ending = (np.asarray(path.times[-1:]), np.asarray(path.states[:, -1:]))
-    return Outcome(np.full(1, status), no_crossing, no_crossing, *ending, np.full(1, steps), np.full(1, path.rejected))
+    counts = (np.full(1, steps), np.full(1, path.rejected), np.array([[np.inf], [0.0], [0.0]]))
+    return Outcome(np.full(1, status), no_crossing, no_crossing, *ending, *counts)
 
 
 def _way(mode: AbstractBatchedMode, transition: Transition, start: float) -> list[Segment]:

@@ -12,8 +12,6 @@ from jaxtyping import Array, Bool, Float, Int
 from ..integration import AbstractProblem
 from ..integration.scheduler import Numbers
 
-# The interface of a mode: its equations of motion, and its transition to the next mode.
-
 
 class TransitionPath(NamedTuple):
     """Path of a single run from one mode to the next, as successive stretches of motion in closed form.

@@ -39,7 +39,7 @@ class HybridSamples(NamedTuple):
 
     - `shown`: the output rows, NaN after the end of the run; `number`: index of the mode at each time, or `BETWEEN`.
     - `end_time`, `end_state`, `end_mode`: when, where and in which mode the run ended; `status`: the status code.
-    - `steps`, `rejected`; `counts`: the counters.
+    - `steps`, `rejected`, `extremes`: as in `HybridOutcome`; `counts`: the counters.
 
     **Example:** as for `hybrid_samples`.
 
@@ -56,6 +56,7 @@ class HybridSamples(NamedTuple):
     status: Float[Array, "*cells"]
     steps: Float[Array, "*cells"]
     rejected: Float[Array, "*cells"]
+    extremes: Float[Array, "*cells 3"]
     counts: Float[Array, "*cells kinds"]
 
 
@@ -193,7 +194,7 @@ class HybridSampling(AbstractSampling):
         return True
 
     def differentiable(self, primal: HybridSamples) -> HybridSamples:
-        return HybridSamples(primal.shown, UNCHANGED, primal.end_time, *(UNCHANGED,) * 6)
+        return HybridSamples(primal.shown, UNCHANGED, primal.end_time, *(UNCHANGED,) * 7)
 
     def push_forward(
         self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], tangents: tuple[Array, ...]
@@ -279,7 +280,7 @@ def _sampled_with_tangents(
     rows, variations = output_rows(variational, output)
     grazes = ended.counts[-1] > 0
     invalid = jnp.where(times > output.grazing_time, jnp.nan, 0.0)
-    counters_and_codes = (ended.mode, ended.status, ended.steps, ended.rejected, ended.counts[:-1])
+    counters_and_codes = (ended.mode, ended.status, ended.steps, ended.rejected, ended.extremes, ended.counts[:-1])
     parts = (rows, output.number, ended.end_time, ended.state[:size], *counters_and_codes)
     samples = HybridSamples(*(jnp.moveaxis(part.astype(float), -1, 0) for part in parts))
 
@@ -287,6 +288,6 @@ def _sampled_with_tangents(
         # The variation of the time follows that of the state; a horizon does not move.
         delay = jnp.where(grazes, jnp.nan, ended.state[(k + 1) * (size + 1) + size])
         delay = jnp.where(ended.status == REACHED_END, 0.0, delay)
-        return HybridSamples(jnp.moveaxis(rows + invalid, -1, 0), UNCHANGED, delay, *(UNCHANGED,) * 6)
+        return HybridSamples(jnp.moveaxis(rows + invalid, -1, 0), UNCHANGED, delay, *(UNCHANGED,) * 7)
 
     return samples, [slope(k, part) for k, part in enumerate(variations)]

@@ -7,6 +7,7 @@ on the chains, the runs of all chains and draws are computed together; a mixture
 few accepted proposals, and in R-hat and ESS (Tierney, Ann. Stat. 22 (1994) 1701).
 """
 
+import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -23,13 +24,18 @@ from ..validation import require_flag, require_package, require_whole, warn
 from .conclusions import FitWarning
 from .exploration import ROWS, Explorer, Mixture, Weighted, draw_errors
 from .least_squares import BETWEEN, Minima, Refinement, refine
-from .likelihood import Free
-from .posterior import LogDensity, Problem, compile_slopes, deviances
+from .likelihood import Free, whole_periods
+from .posterior import LogDensity, Problem, compile_slopes, deviances, predictions
+from .recording import AbstractRecording
 
 # The search for all minima of a likelihood, and the exploration of its surroundings.
 
 #: Greatest number of steps by slopes before an exploration, where predictions may be a staircase.
 FEW_STEPS = 6
+
+#: Samples that are farther apart [s] may have times in milliseconds: if the best of this many candidates leaves less than this
+#: part of the scatter. Events may be within this factor of a thousandth of their times.
+SPARSE, FEW_CANDIDATES, EXPLAINED, UNIT_FACTOR = 1.0, 64, 0.25, 3.0
 
 #: Number of minima that are refined to the end after an exploration.
 LAST = 4
@@ -46,19 +52,26 @@ def search(
 
     **Returns:** the explorer, which knows the unknowns that do not act; the minima; and the explored sample.
 
-    **Raises:** `ValueError` if no candidate has a finite prediction.
+    **Raises:** `ValueError` if no candidate has a finite prediction, and for times in milliseconds.
     """
     problem, measurements = explorer.density.problem, explorer.density.measurements
     with ThreadPoolExecutor(1) as thread:
         # Compile the slopes while this thread compiles and computes the predictions.
         thread.submit(compile_slopes, problem)
+        _refuse_milliseconds(explorer)
         pool = explorer.begin(seed)
     if not np.any(np.isfinite(pool.predictions)):
         raise ValueError(
             "no start led to finite predictions: simulate a run with the start values of `free` to see whether it fails; an "
             "event must happen before t1, and its function falls through zero"
         )
-    problem = eqx.tree_at(lambda problem: problem.acts, problem, explorer.acting(pool))
+    acts = explorer.acting(pool)
+    if not np.all(acts):
+        names = ", ".join(name for name, has_effect in zip(problem.names, acts, strict=True) if not has_effect)
+        warn(
+            f"no prediction depends on {names}, so the data say nothing about it: fix it, or add other data", FitWarning
+        )
+    problem = eqx.tree_at(lambda problem: problem.acts, problem, acts)
     explorer = explorer._replace(density=eqx.tree_at(lambda density: density.problem, explorer.density, problem))
     recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
     if recorded and problem.step is not None:
@@ -77,6 +90,46 @@ def search(
     has_end = bool(np.all(np.isfinite(minima.covariance(minima.best))))
     sample = explorer.explore(pool, minima.components, progress) if has_end else Weighted.of(pool)
     return explorer, _improved(problem, minima, sample, max_steps, progress), sample
+
+
+def _refuse_milliseconds(explorer: Explorer) -> None:
+    """Raise `ValueError` if the times of the data seem to be in milliseconds: if the events happen at a thousandth of their
+    times, or if the samples are far apart and some candidate explains them at a thousandth of their times, where the motion
+    has hardly begun if they are in seconds.
+    """
+    problem, measurements = explorer.density.problem, explorer.density.measurements
+    data = getattr(problem.model, "recorded", ())
+    if not data:
+        return
+    recorded = [isinstance(source, AbstractRecording) for source in data]
+    is_sample = np.repeat(recorded, [len(source.seen) for source in data])
+    value, error, series = map(np.asarray, (measurements.value, measurements.error, measurements.series))
+    points = explorer.region.points(FEW_CANDIDATES, 0)
+    is_event = ~is_sample & ~np.asarray(measurements.censored)
+    if np.any(is_event):
+        ratio = np.median(value[is_event] / predictions(problem, points[:1])[0, is_event])
+        if 1e3 / UNIT_FACTOR < ratio < 1e3 * UNIT_FACTOR:
+            raise ValueError(
+                f"time: the events are measured {ratio:.0f} times later than at the start values; times are in seconds: did "
+                "you mean 1e-3 * time? Otherwise start closer"
+            )
+    recordings = [source for source in data if isinstance(source, AbstractRecording)]
+    if min((np.median(np.diff(source.times)) for source in recordings if len(source.times) > 2), default=0.0) < SPARSE:
+        return
+    shorter = tuple(
+        dataclasses.replace(source, times=1e-3 * source.times, t0=1e-3 * source.t0) if is_recorded else source
+        for source, is_recorded in zip(data, recorded, strict=True)
+    )
+    model = problem.model.with_recorded(shorter)
+    off = predictions(eqx.tree_at(lambda problem: problem.model, problem, model), points) - value
+    off = off - whole_periods(np, off, np.asarray(measurements.period))
+    least = np.min(np.sum((off / error)[:, is_sample] ** 2, axis=1))
+    parts = [(value / error)[is_sample & (series == number)] for number in np.unique(series[is_sample])]
+    if least < EXPLAINED * sum(part.size * np.var(part) for part in parts):
+        raise ValueError(
+            "times: the model explains the samples at 1e-3 * times; times are in seconds: did you mean 1e-3 * times? "
+            "Otherwise start closer"
+        )
 
 
 def _improved(problem: Problem, minima: Minima, sample: Weighted, max_steps: int, progress: bool) -> Minima:

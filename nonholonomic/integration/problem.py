@@ -1,4 +1,9 @@
-"""An initial value problem with an event and a domain: its interface, its settings, and how a run ends."""
+"""An initial value problem with an event and a domain: its interface, its settings, and how a run ends.
+
+The codes of an end are `RUNNING`, `REACHED_END` (at the horizon), `CROSSED` (on the event), `LEFT_DOMAIN`, `FAILED` and
+`UNRESOLVED`. `DEFAULT_MAX_STEPS` limits the steps of a run, `MOST_STEPS` those of a short run, and `TIGHTEST` is the smallest
+relative tolerance.
+"""
 
 import abc
 import enum
@@ -97,7 +102,7 @@ class Jumps(NamedTuple):
         near = _least(self.ahead, (self.ahead > least) & (self.ahead < most))
         return jnp.where(jnp.isfinite(near), near, jnp.nan)
 
-    def sides(self, time: Lanes) -> tuple[Bool[Array, " lanes"], Lanes, Lanes, Lanes]:
+    def sides(self, time: Lanes) -> tuple[Bool[Array, "*lanes"], Lanes, Lanes, Lanes]:
         """The jump whose near side is this time: a mask of the lanes that have one, its near side, its time, which is
         differentiable, and its far side; all three are the time itself where there is none."""
         distance = self.ahead - time

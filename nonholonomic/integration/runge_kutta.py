@@ -14,9 +14,9 @@ from jaxtyping import Array, Float, Int
 from ..compilation.xla_cpu import written_by_component, written_in_place
 from ..text import shown
 
-Lanes = Float[Array, " lanes"]
-States = Float[Array, "components lanes"]
-Stages = Float[Array, "stages components lanes"]
+Lanes = Float[Array, "*lanes"]
+States = Float[Array, "components *lanes"]
+Stages = Float[Array, "stages components *lanes"]
 
 
 class Step(NamedTuple):
@@ -36,7 +36,7 @@ class Step(NamedTuple):
     error: States
     margin: Lanes
     first_negative: Lanes
-    margins: Float[Array, "places margins lanes"] | None
+    margins: Float[Array, "places margins *lanes"] | None
     rates: Sequence[States]
     middle: States
     stages: Stages | None
@@ -82,7 +82,7 @@ def explicit_step(
     state: States,
     rate: States,
     length: Lanes,
-    margins_before: Float[Array, "margins lanes"] | None,
+    margins_before: Float[Array, "margins *lanes"] | None,
     stages: Stages,
     looks: Sequence[int],
 ) -> Step:
@@ -116,7 +116,7 @@ def explicit_step(
         trial = moved_state(stage, tableau.a_lower[:inner], state, length, stages, first=rate)
         stage_time = time + places[stage] * length
 
-        def look(history: Float[Array, "places margins lanes"]) -> Float[Array, "places margins lanes"]:
+        def look(history: Float[Array, "places margins *lanes"]) -> Float[Array, "places margins *lanes"]:
             return written_in_place(history, jnp.stack(margins(stage_time, trial)), at=rows[stage])
 
         # A branch, because margins in every stage would add a tenth to the cost of a step of a top in a cylinder.
@@ -203,7 +203,7 @@ def lesser(margin: Lanes | None, crossing: Lanes | None, like: Lanes) -> Lanes:
     return margin if crossing is None else jnp.minimum(crossing, margin)
 
 
-def _least(margins: Float[Array, "margins lanes"] | None) -> Lanes | None:
+def _least(margins: Float[Array, "margins *lanes"] | None) -> Lanes | None:
     return None if margins is None else jnp.min(margins, axis=0)
 
 

@@ -26,10 +26,10 @@ from .step import LaneState, after_step, length_to_try, past_jump, trial_step, t
 
 #: The values to keep of some states: (the cells in the lanes, (rows, components, lanes)) -> a tree of arrays
 #: (rows, lanes, ...).
-Read = Callable[[Int[Array, " lanes"], Float[Array, "rows components lanes"]], Any]
+Read = Callable[[Int[Array, "*lanes"], Float[Array, "rows components *lanes"]], Any]
 
 
-def components(cells: Int[Array, " lanes"], states: Float[Array, "rows components lanes"]) -> Array:
+def components(cells: Int[Array, "*lanes"], states: Float[Array, "rows components *lanes"]) -> Array:
     """The states themselves."""
     return jnp.moveaxis(states, 1, -1)
 
@@ -38,14 +38,14 @@ class Rows(NamedTuple):
     """The samples of a period: in each row the states of all lanes, and the index of each lane's sample; where a lane has
     none, the index is the number of samples."""
 
-    state: Float[Array, "rows components lanes"]
-    sample: Int[Array, "rows lanes"]
+    state: Float[Array, "rows components *lanes"]
+    sample: Int[Array, "rows *lanes"]
 
 
 class Collected(NamedTuple):
     """The index of the next sample in every lane, and the samples so far: a tree of arrays (cells, times, ...)."""
 
-    sample: Int[Array, " lanes"]
+    sample: Int[Array, "*lanes"]
     samples: Any
 
 
@@ -77,16 +77,16 @@ class SampleTimes(eqx.Module):
         first_values = self.read(jnp.arange(len(self.first)), starts[None])
         return Collected(self.first_in(lane_state), jax.tree.map(of_start, first_values))
 
-    def first_in(self, lane_state: LaneState) -> Int[Array, " lanes"]:
+    def first_in(self, lane_state: LaneState) -> Int[Array, "*lanes"]:
         """The index of the first sample after the start in every lane."""
         return self.first[self._cell(lane_state)]
 
-    def after(self, time: Lanes, lane_state: LaneState) -> Int[Array, " lanes"]:
+    def after(self, time: Lanes, lane_state: LaneState) -> Int[Array, "*lanes"]:
         """The index of the first sample after a time in every lane."""
         times = self.times[:, None] if self.times.ndim == 1 else self.times[:, self._cell(lane_state)]
         return jnp.sum(times <= time, axis=0)
 
-    def time_of(self, sample: Int[Array, " lanes"], lane_state: LaneState) -> Lanes:
+    def time_of(self, sample: Int[Array, "*lanes"], lane_state: LaneState) -> Lanes:
         """The time of a sample in every lane, infinite after the last one."""
         index = jnp.minimum(sample, len(self) - 1)
         time = self.times[index] if self.times.ndim == 1 else self.times[index, self._cell(lane_state)]
@@ -98,7 +98,7 @@ class SampleTimes(eqx.Module):
         return Rows(state, jnp.full((count, *lane_state.time.shape), len(self)))
 
     def collect(
-        self, collected: Collected, rows: Rows, sample: Int[Array, " lanes"], ended: LaneState, refilled: LaneState
+        self, collected: Collected, rows: Rows, sample: Int[Array, "*lanes"], ended: LaneState, refilled: LaneState
     ) -> Collected:
         """The samples with those of a period; `sample` is the index of the next sample in every lane."""
         cell = self._cell(ended)
@@ -109,7 +109,7 @@ class SampleTimes(eqx.Module):
         samples = jax.tree.map(added, collected.samples, self.read(cell, rows.state))
         return Collected(jnp.where(refilled.cell != ended.cell, self.first_in(refilled), sample), samples)
 
-    def _cell(self, lane_state: LaneState) -> Int[Array, " lanes"]:
+    def _cell(self, lane_state: LaneState) -> Int[Array, "*lanes"]:
         return jnp.minimum(lane_state.cell, len(self.first) - 1)
 
 
@@ -218,7 +218,7 @@ class DenseRecord(NamedTuple):
     """
 
     second: States
-    sample: Int[Array, " lanes"]
+    sample: Int[Array, "*lanes"]
     sample_time: Lanes
     rows: Rows
     filled: Int[Array, ""]
@@ -303,8 +303,8 @@ class Record(NamedTuple):
     """Record of a period: whether the last step was accepted and the number of the next sample, in every lane; after each
     iteration the states, and the numbers of the samples there, if any."""
 
-    accepted: Bool[Array, " lanes"]
-    sample: Int[Array, " lanes"]
+    accepted: Bool[Array, "*lanes"]
+    sample: Int[Array, "*lanes"]
     rows: Rows
 
 
@@ -340,9 +340,9 @@ def step_towards_sample(
     times: SampleTimes,
     in_lanes: InLanes,
     lane_state: LaneState,
-    accepted: Bool[Array, " lanes"],
-    sample: Int[Array, " lanes"],
-) -> tuple[LaneState, Lanes, Bool[Array, " lanes"]]:
+    accepted: Bool[Array, "*lanes"],
+    sample: Int[Array, "*lanes"],
+) -> tuple[LaneState, Lanes, Bool[Array, "*lanes"]]:
     """Try a step in every lane that does not pass its next sample.
 
     **Arguments:** `accepted`: whether the previous step was accepted; `sample`: the index of the next sample.

@@ -54,7 +54,9 @@ class Outcome(NamedTuple, Generic[Numbers]):
 
     `status` is one of the codes of `problem.py`; `first_crossing` and `crossing_time` [s] are the times of the first and
     the last event, which are equal if runs end on the event, and infinite if there was none; `end_time` [s] and `state`
-    are time and state at the end of the run; `steps` counts accepted and rejected steps, `rejected` only rejected ones.
+    are time and state at the end of the run; `steps` counts accepted and rejected steps, `rejected` only rejected ones;
+    `extremes` are the length of the shortest step after a rejection, infinite without one, its time, and the length of the
+    longest step, all [s].
 
     **Example:** the outcome of the subpackage's example, whose runs end on the event.
 
@@ -70,6 +72,7 @@ class Outcome(NamedTuple, Generic[Numbers]):
     state: Float[Numbers, "components cells"]
     steps: Int[Numbers, " cells"]
     rejected: Int[Numbers, " cells"]
+    extremes: Float[Numbers, "3 cells"]
 
 
 class SchedulerState(NamedTuple):
@@ -178,7 +181,7 @@ class LaneScheduler(eqx.Module):
         """Number of cells of the problem, padding included."""
         return self.fresh.cell.shape[0]
 
-    def pick(self, tree: Any, cell: Int[Array, " lanes"]) -> Any:
+    def pick(self, tree: Any, cell: Int[Array, "*lanes"]) -> Any:
         """The leaves for the given cells; scalars stay unchanged."""
         index = jnp.minimum(cell, self.capacity - 1)
         return jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., index], tree)
@@ -281,7 +284,7 @@ class LaneScheduler(eqx.Module):
         )
         return jax.tree.map(lambda cells, lanes: cells.at[..., targets].set(lanes, mode="drop"), outcome, in_lanes)
 
-    def _load(self, cell: Int[Array, " lanes"]) -> LaneState:
+    def _load(self, cell: Int[Array, "*lanes"]) -> LaneState:
         lane_state = self.pick(self.fresh, cell)
         # There may be fewer cells than lanes: the other lanes stay idle.
         return lane_state._replace(cell=cell, status=jnp.where(cell < self.cells, lane_state.status, REACHED_END))
@@ -290,7 +293,8 @@ class LaneScheduler(eqx.Module):
 def outcome_of(lane_state: LaneState) -> Outcome:
     """How the cells in the lanes have ended."""
     times = (lane_state.first_crossing, lane_state.crossing_time, lane_state.time)
-    return Outcome(lane_state.status, *times, lane_state.state, lane_state.steps, lane_state.rejected)
+    counts = (lane_state.steps, lane_state.rejected, lane_state.extremes)
+    return Outcome(lane_state.status, *times, lane_state.state, *counts)
 
 
 def back_to_margin(problem: AbstractProblem, outcome: Outcome) -> Outcome:
@@ -372,6 +376,7 @@ def _lanes_at_start(
         bracket=Bracket(zero, zero, zero, zero, zero, zeros),
         steps=zeros,
         rejected=zeros,
+        extremes=jnp.stack([jnp.full_like(zero, jnp.inf), zero, zero]),
     )
 
 
@@ -523,7 +528,9 @@ def solve_by_diffrax(problem: AbstractProblem, t1: Float[Array, ""], settings: S
             status = jnp.where(occurred | at_start, code, status)
         crossing_time = jnp.where(status == CROSSED, end, jnp.inf)
         steps, rejected = solution.stats["num_steps"], solution.stats["num_rejected_steps"]
-        return Outcome(status, crossing_time, crossing_time, end, final, steps, rejected)
+        return Outcome(
+            status, crossing_time, crossing_time, end, final, steps, rejected, jnp.array([jnp.inf, 0.0, 0.0])
+        )
 
-    axes = Outcome._make((0, 0, 0, 0, -1, 0, 0))
+    axes = Outcome._make((0, 0, 0, 0, -1, 0, 0, -1))
     return jax.vmap(solve_cell, in_axes=(lane_axes, -1, -1), out_axes=axes)(problem, states, scales)

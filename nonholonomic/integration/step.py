@@ -74,7 +74,8 @@ class LaneState(NamedTuple):
     - `margins`: the margins of the problem, `None` if there are none.
     - `first_crossing`, `crossing_time`: times of the first and the last event passed [s], infinite if there was none.
     - `bracketing`: whether the lane is locating an event; `bracket`: the current bracket.
-    - `steps`: number of all steps; `rejected`: number of steps that step-size control rejected.
+    - `steps`: number of all steps; `rejected`: number of steps that step-size control rejected; `extremes`: the
+      shortest length that it asked for after a rejection, the time of that, and the longest step, all [s].
     - `stages`: memory for the stages of the next step (`explicit_step`); `None` outside of a loop over steps.
 
     **Example:**
@@ -84,21 +85,22 @@ class LaneState(NamedTuple):
     ('cell', 'status', 'time', 'state', 'rate')
     """
 
-    cell: Int[Array, " lanes"]
-    status: Int[Array, " lanes"]
+    cell: Int[Array, "*lanes"]
+    status: Int[Array, "*lanes"]
     time: Lanes
     state: States
     rate: States
     length: Lanes
     side: Lanes
     margin: Lanes
-    margins: Float[Array, "margins lanes"] | None
+    margins: Float[Array, "margins *lanes"] | None
     first_crossing: Lanes
     crossing_time: Lanes
-    bracketing: Bool[Array, " lanes"]
+    bracketing: Bool[Array, "*lanes"]
     bracket: Bracket
-    steps: Int[Array, " lanes"]
-    rejected: Int[Array, " lanes"]
+    steps: Int[Array, "*lanes"]
+    rejected: Int[Array, "*lanes"]
+    extremes: Float[Array, "3 *lanes"]
     stages: Stages | None = None
 
 
@@ -144,7 +146,7 @@ def past_jump(
     is_jump, _, _, far = jumps.sides(new_lanes.time)
     landed = is_jump & (lane_state.status == RUNNING) & (new_lanes.status == REACHED_END) & (near.t1 <= new_lanes.time)
 
-    def moved() -> tuple[States, States, Lanes, Float[Array, "margins lanes"] | None]:
+    def moved() -> tuple[States, States, Lanes, Float[Array, "margins *lanes"] | None]:
         state = problem.across_jump(new_lanes.time, new_lanes.state)
         rate, margins = problem.field(far, state), problem.margins(far, state)
         margin = stop_gradient(least_margin(problem, new_lanes.side, far, state, rate))
@@ -206,6 +208,7 @@ def after_step(
     # otherwise the compiler would fuse it into several kernels with different round-off, and only some of them would
     # detect the event.
     error, margin = stored(error, stop_gradient(trial.margin))
+    is_known = jnp.isfinite(error)
     # A step to a state that is not finite counts as one with a huge error.
     error = jnp.where(jnp.isfinite(error) & ~jnp.isnan(margin), error, jnp.inf)
     accurate = error <= 1.0
@@ -244,6 +247,10 @@ def after_step(
     time = jnp.where(moved, lane_state.time + tried_length, lane_state.time)
 
     length = tried_length * _factor(error, accurate, control.order)
+    least, place, longest_step = lane_state.extremes
+    is_shorter = free & is_known & ~accurate & (length < least)
+    least, place = (jnp.where(is_shorter, *pair) for pair in ((length, least), (lane_state.time, place)))
+    longest_step = jnp.where(forward, jnp.maximum(longest_step, tried_length), longest_step)
     length = length if longest is None else jnp.where(accurate, jnp.minimum(length, longest), length)
     length = jnp.where(crosses_inside, tried_length * negative, length)
     length = jnp.where(bracketing, guess, jnp.where(hit, bracket.stride, length))
@@ -275,11 +282,12 @@ def after_step(
         bracket=bracket,
         steps=steps,
         rejected=lane_state.rejected + (free & ~forward & ~is_beyond),
+        extremes=stop_gradient(jnp.stack((least, place, longest_step))),
         stages=None if lane_state.stages is None else trial.stages,
     )
 
 
-def _factor(error: Lanes, accurate: Bool[Array, " lanes"], order: int) -> Lanes:
+def _factor(error: Lanes, accurate: Bool[Array, "*lanes"], order: int) -> Lanes:
     """Growth factor of the next step, as in Diffrax's I controller."""
     factor = SAFETY * inverse_root(jnp.maximum(error, 1e-30), order)
     return jnp.where(accurate, jnp.clip(factor, 1.0, GROW), jnp.clip(factor, SHRINK, SAFETY))
@@ -291,8 +299,8 @@ def _classify(
     lane_state: LaneState,
     trial: Step,
     time: Lanes,
-    hit: Bool[Array, " lanes"],
-) -> tuple[Int[Array, " lanes"], Lanes, Lanes, Lanes]:
+    hit: Bool[Array, "*lanes"],
+) -> tuple[Int[Array, "*lanes"], Lanes, Lanes, Lanes]:
     """Status, side, first and latest crossing time of the lanes, where `hit` marks the lanes in which an event was
     located."""
     crossing, margins = problem.event_function(trial.state), trial.margins

@@ -352,7 +352,7 @@ class Lanes(eqx.Module):
     """
 
     model: AbstractModel
-    is_legal: Bool[Array, " lanes"]
+    is_legal: Bool[Array, "*lanes"]
     horizon: Any
 
 
@@ -475,7 +475,7 @@ _compiled_lanes = eqx.filter_jit(_lanes)
 
 def _predicted_by_tables(
     sources: list[Source], values: list[Values], rows: int, settings: Settings
-) -> Float[Array, " lanes"]:
+) -> Float[Array, "*lanes"]:
     """The times of events in all lanes, by the programs of tables; NaN for illegal parameters and for runs that failed or are
     unresolved."""
     lanes = _compiled_lanes(sources, values, rows)

@@ -168,7 +168,8 @@ def _outcome(growths: Growth) -> Outcome[Array]:
     """The end of smooth runs, as an outcome without an event."""
     none, steps = jnp.full(growths.status.shape, jnp.inf), jnp.asarray(growths.steps)
     ending = (jnp.asarray(growths.end_time), jnp.asarray(growths.state))
-    return Outcome(jnp.asarray(growths.status), none, none, *ending, steps, jnp.zeros_like(steps))
+    counts = (steps, jnp.zeros_like(steps), jnp.stack([none, *jnp.zeros((2, *none.shape))]))
+    return Outcome(jnp.asarray(growths.status), none, none, *ending, *counts)
 
 
 def _through_modes(

@@ -18,7 +18,7 @@ from ..integration import AbstractProblem, Outcome, Settings, explicit_tableau, 
 from ..integration.problem import Status, legal_run, require_times
 from ..sweeps import Axis, Variable, axis
 from ..terminal import status_line
-from ..validation import as_known, as_number, is_traced, nan_unless, require_scalars
+from ..validation import as_known, as_number, is_traced, nan_unless, require_scalars, warn
 from .event import modes_of, problem_of
 from .model import AbstractModel, Names, Start, check_run, model_of
 from .trajectory import Trajectory
@@ -91,13 +91,13 @@ def _own_axis(leaf: Any) -> int | None:
 
 def _reader(
     model: AbstractModel, names: tuple[str, ...]
-) -> Callable[[Int[Array, " lanes"], Float[Array, "rows components lanes"]], dict[str, Array]]:
+) -> Callable[[Int[Array, "*lanes"], Float[Array, "rows components *lanes"]], dict[str, Array]]:
     """A function that computes the named quantities of some cells from their states."""
 
     def read_lane(model: AbstractModel, states: Float[Array, "rows components"]) -> dict[str, Array]:
         return model.read(names, jnp.full(len(states), jnp.nan), states.T, None)
 
-    def reader(cell: Int[Array, " lanes"], states: Float[Array, "rows components lanes"]) -> dict[str, Array]:
+    def reader(cell: Int[Array, "*lanes"], states: Float[Array, "rows components *lanes"]) -> dict[str, Array]:
         of_lanes = jax.tree.map(lambda leaf: leaf if _own_axis(leaf) is None else leaf[cell], model)
         return eqx.filter_vmap(read_lane, in_axes=(_own_axis, -1), out_axes=1)(of_lanes, states)
 
@@ -119,8 +119,9 @@ def outcome_of(samples: HybridSamples) -> HybridOutcome[Array]:
     """How sampled runs, with the cells along the first axis, have ended."""
     codes = (samples.status, samples.steps, samples.rejected, samples.end_mode)
     status, steps, rejected, mode = (code.astype(int) for code in codes)
+    counts = (steps, rejected, samples.extremes.T, mode)
     ending = (jnp.full_like(samples.end_time, jnp.inf), samples.end_time, samples.end_state.T)
-    return HybridOutcome(status, *ending, steps, rejected, mode, samples.counts.astype(int).T)
+    return HybridOutcome(status, *ending, *counts, samples.counts.astype(int).T)
 
 
 @eqx.filter_jit
@@ -150,6 +151,9 @@ def _read_samples(
 
 #: Default number of times to report.
 DEFAULT_TIMES = 201
+
+#: A run warns of steps that are shorter than this fraction of its longest step, if its mean step is below the second one.
+SHORT, MEAN = 1e-6, 0.05
 
 
 @status_line("simulating")
@@ -220,7 +224,17 @@ def simulate_model(
     settings = Settings(tolerance, solver)
     explicit_tableau(settings.for_lanes)
     unchecked = is_traced((model, times, t1, tolerance))
-    return _sampled(model, as_number(times), as_number(t1), settings, unchecked)
+    run, extremes = _sampled(model, as_number(times), as_number(t1), settings, unchecked)
+    if not is_traced(extremes):
+        shortest, time, longest = np.asarray(extremes)
+        # At a kink, only a few steps are short.
+        if shortest < SHORT * longest and float(run.end_time) < MEAN * longest * int(run.steps):
+            warn(
+                f"most of {int(run.steps)} steps are short; near t = {time:.6g} s, they get as short as {shortest:.1g} s, and "
+                f"elsewhere they are up to {longest:.1g} s long: are the coordinates singular there, like Euler angles at "
+                "their pole, or does a function jump? Errors may exceed the tolerance by far"
+            )
+    return run
 
 
 def evenly_spaced(t1: Any) -> Float[Array, " times"]:
@@ -275,7 +289,8 @@ def sampled(
     )
     ending = (jnp.full(1, jnp.inf), run.end_time[None], run.end_state[:, None])
     none = jnp.zeros((0, 1), int)
-    outcome = HybridOutcome(status, *ending, accepted + rejected, rejected, jnp.zeros_like(status), none)
+    counts = (accepted + rejected, rejected, jax.lax.stop_gradient(run.extremes)[:, None])
+    outcome = HybridOutcome(status, *ending, *counts, jnp.zeros_like(status), none)
     passive = None if run.quadratures is None else run.quadratures.T
     return SampledRows(run.states.T, passive, None, outcome)
 
@@ -315,8 +330,9 @@ def problem_of_run(modules: tuple[AbstractModel, Names], cells: int | None) -> A
 @eqx.filter_jit
 def _sampled(
     model: AbstractModel, times: Float[Array, " times"], t1: Float[Array, ""], settings: Settings, unchecked: bool
-) -> Trajectory:
-    """The run, or NaN and "illegal" if a traced number is out of range. **Arguments:** `unchecked`: whether one is traced."""
+) -> tuple[Trajectory, Float[Array, "3"]]:
+    """The run, or NaN and "illegal" if a traced number is out of range; and the extremes of its steps, as in
+    `integration.Outcome`. **Arguments:** `unchecked`: whether a number is traced."""
     if unchecked:
         is_legal, samples, legal_settings = sampled_if_legal(model, times, t1, settings)
     else:
@@ -328,7 +344,7 @@ def _sampled(
     status = model.ended(outcome, legal_settings.tolerance)[0]
     is_reached = is_legal & jnp.all(jnp.isfinite(samples.rows), axis=0)
     mode = jnp.where(is_reached, 0 if samples.mode is None else samples.mode, -1)
-    return Trajectory(
+    run = Trajectory(
         t=times,
         state=jnp.stack([values[name] for name in names], axis=-1),
         mode=mode,
@@ -342,3 +358,4 @@ def _sampled(
         settings=settings,
         names=names,
     )
+    return run, outcome.extremes[:, 0]

@@ -83,6 +83,9 @@ def checksum_of(model: AbstractModel) -> str:
 #: Greatest number of values in the samples of a chunk: 256 MB.
 MOST_SAMPLED = 1 << 25
 
+#: A table warns of cells with more steps than this, and more than this multiple of the median.
+SLOW_STEPS, SLOW = 10_000, 30
+
 
 class Options(NamedTuple):
     """The options of every table; see `sweep`."""
@@ -310,6 +313,14 @@ def compute_table(
         first, of_all = (illegal[0], listed) if listed is not None else (0, columns(grid, int(illegal[0]), 1))
         values = {name: float(values[first]) for name, values in of_all.items()}
         _warn_of_illegal_cells(job.model, values, len(illegal), cells)
+    if "steps" in table:
+        steps = np.ravel(table["steps"])
+        slow = steps > max(SLOW_STEPS, SLOW * float(np.median(steps)))
+        if np.any(slow):
+            warn(
+                f"{np.sum(slow)} of {cells} cells need more than {SLOW} times as many steps as others, up to {np.max(steps)}: "
+                "simulate one of them; it warns if its coordinates are singular, like Euler angles at their pole"
+            )
     return table
 
 

@@ -96,7 +96,10 @@ class ModeProblem(AbstractProblem):
         return self.states, self.scales
 
     def field(self, time: Lanes, state: States) -> States:
-        rates = self._over_lanes(lambda *run: tuple(self.form.function("field", self.mode)(*run)), state)
+        if self.form.traits.large[self.mode]:
+            rates = _rates_out_of_line(self.form, self.mode, self.numbers, tuple(state))
+        else:
+            rates = _rates(self.form, self.mode, self.numbers, tuple(state))
         clock = (jnp.ones_like(state[0]),) if self.form.traits.depends_on_time else ()
         return jnp.stack((*rates, *clock))
 
@@ -192,6 +195,19 @@ def time_and_state(form: Form, parts: tuple[Array, ...]) -> tuple[Array, State]:
     if form.traits.depends_on_time:
         return parts[-1], jnp.stack(parts[:-1])
     return jnp.asarray(jnp.nan), jnp.stack(parts)
+
+
+def _rates(form: Form, mode: int, numbers: Sequence[Array], parts: tuple[Array, ...]) -> tuple[Lanes, ...]:
+    """The field of a mode in every lane, from the components of the states."""
+
+    def of_run(numbers: Sequence[Array], parts: tuple[Array, ...]) -> tuple[Array, ...]:
+        return tuple(form.function("field", mode)(numbers, *time_and_state(form, parts)))
+
+    return over_lanes(of_run, tuple(numbers), parts)
+
+
+#: A large field is a function of its own in every program, which JAX traces, differentiates and lowers once.
+_rates_out_of_line = jax.jit(_rates, static_argnums=(0, 1))
 
 
 class BatchedMode(AbstractBatchedMode):

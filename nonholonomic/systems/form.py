@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..compilation.tracing import depends_on_first, is_elementary, jumps_of, named_errors, spelled_out, warn_of_unclear
+from ..compilation.xla_cpu import opened, programs_in, traced
 from ..formulations import AbstractSystem
 from ..parameters import TreeForm
 from ..text import described, shown
@@ -246,6 +247,10 @@ class Form:
         return _traits(self)
 
 
+#: A field with more operations on arrays is large: that of a car with a trailer has 800, that of a top in Euler angles 150.
+LARGE = 500
+
+
 class Traits(NamedTuple):
     """The traits of a hybrid system, found by tracing its functions.
 
@@ -253,6 +258,7 @@ class Traits(NamedTuple):
     - `elementary`: whether all functions that are evaluated within steps fit a single kernel.
     - `ends`, `resets`: for each mode, the number of its margins, and whether it also has a reset.
     - `projected`: for each mode, whether it has constraints that a state may violate.
+    - `large`: for each mode, whether its field takes much longer to compile than to compute.
     """
 
     depends_on_time: bool
@@ -260,6 +266,7 @@ class Traits(NamedTuple):
     ends: tuple[int, ...]
     resets: tuple[bool, ...]
     projected: tuple[bool, ...]
+    large: tuple[bool, ...]
 
     @property
     def smooth(self) -> bool:
@@ -299,6 +306,10 @@ def _traits(form: Form) -> Traits:
             if own == "field" or ends[k]:
                 warn_of_unclear(_name(own.rstrip("s"), k), functools.partial(form.function(own, k), numbers), y)
 
+    def is_large(field: OfRun) -> bool:
+        program, _ = traced(spelled_out(field), numbers, t, y)
+        return sum(len(opened(inner)[0].eqns) for inner in programs_in(program)) > LARGE
+
     modes = form.system([jnp.zeros((), kind.dtype) for kind in numbers]).modes
     depends_on_time = depends_on_first(combined([*step_functions, *reset_functions]), t, y, *numbers)
     if depends_on_time:
@@ -309,6 +320,7 @@ def _traits(form: Form) -> Traits:
         tuple(ends),
         tuple(resets),
         tuple(getattr(mode, "is_projected", False) for mode in modes),
+        tuple(is_large(form.function("field", k)) for k in range(form.modes)),
     )
 
 

@@ -12,8 +12,6 @@ from ..parameters import meant
 from ..text import likely, readable_unit, shown
 from ..validation import require
 
-# Plots of tables (needs matplotlib).
-
 # Only for type checkers: plots stand below tables and fits, which use them.
 if TYPE_CHECKING:
     from ..sweeps import Table

@@ -26,8 +26,6 @@ from .problem import ALLOWED, COMPARED, CONFIRMED, MOST_STEERING, Goal, Limits, 
 from .result import Plan
 from .transcription import FINE, ORDER, Candidates, Drive, drive_along, evaluate, interpolate, optimise
 
-# Plan a drive to a goal.
-
 #: Candidates that are optimised together.
 LANES = 2
 

@@ -151,7 +151,7 @@ class Steps(NamedTuple):
 
 
 @eqx.filter_jit
-def _field(spec: RideSpec, times: Float[Array, " lanes"], states: State) -> State:
+def _field(spec: RideSpec, times: Float[Array, "*lanes"], states: State) -> State:
     return spec.scene.dynamics.field(times, states, spec.input)
 
 

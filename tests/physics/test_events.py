@@ -17,7 +17,7 @@ def require_none_missed(name: str, starts: int, tolerance: float) -> None:
     assert findings.wrong == 0, findings
 
 
-@pytest.mark.parametrize("name", ["wavy ramp", "narrow dip", "fast ripples"])
+@pytest.mark.parametrize("name", ["wavy ramp", "narrow dip", "toothed rack"])
 def test_no_event_of_a_fast_function_is_missed(name):
     require_none_missed(name, 300, 1e-6)
 
@@ -25,7 +25,7 @@ def test_no_event_of_a_fast_function_is_missed(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("tolerance", [1e-6, 1e-9, 1e-11])
 @pytest.mark.parametrize("name", events.FAMILIES)
-def test_no_event_is_missed_in_ten_families(name, tolerance):
+def test_no_event_is_missed_in_any_family(name, tolerance):
     require_none_missed(name, 10_000, tolerance)
 
 

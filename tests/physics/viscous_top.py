@@ -1,7 +1,10 @@
 """The top under viscous friction F = -mu N v: a reference in NumPy and SciPy, with the contact of `coulomb_top.py`."""
 
 import numpy as np
-from coulomb_top import Body, Contact
+from coulomb_top import Body as Body
+from coulomb_top import Contact
+from coulomb_top import start as start
+from coulomb_top import theta as theta
 from scipy.integrate import solve_ivp
 
 

@@ -208,7 +208,7 @@ def equations(scene: Scene[Top], state: Float[Array, " 8"]) -> tuple[Float[Array
     """The paper's (11), corrected, with (12) among its rows: A (eta'', y'', theta'', phi'', psi'', N) = b.
 
     The first three rows are the momentum of the centre of mass along t1, t2 and n, of which the third is (12); the
-    others are the angular momentum about the centre of mass along e1, e2 and e (`tippe.md`, section 2 (ii)):
+    others are the angular momentum about the centre of mass along e1, e2 and e:
 
         m s'' = N (f1, f2, 1) - m g z,   s'' = O'' - a e''
         I1 p' + I3 omega3 q - I1 q sigma = N M.e1,   I1 q' + I1 p sigma - I3 omega3 p = N M.e2,   I3 omega3' = N M.e

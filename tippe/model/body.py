@@ -113,10 +113,9 @@ class AbstractBody(Bounded):
 # Every part is a homogeneous solid of revolution about the z axis with density 1. A slice of radius r and thickness dz at
 # height z contributes pi r^2 to the volume, pi r^2 z to the first moment, pi r^4 / 2 to the moment of inertia about the
 # axis, and pi r^4 / 4 + pi r^2 z^2 to that about a transverse axis through the origin (the moment of inertia of a thin
-# disc and the
-# parallel-axis theorem; Landau and Lifshitz, Mechanics, section 32). The integrals over z are below; volume and first moment of
-# the truncated ball are those of a spherical segment (Harris and Stocker, Handbook of Mathematics and Computational Science,
-# 1998, section 4.8.4).
+# disc and the parallel-axis theorem; Landau and Lifshitz, Mechanics, section 32). The integrals over z are below; volume and
+# first moment of the truncated ball are those of a spherical segment (Harris and Stocker, Handbook of Mathematics and
+# Computational Science, 1998, section 4.8.4).
 
 Number = Float[Array, ""]
 

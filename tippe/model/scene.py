@@ -197,7 +197,7 @@ class Scene(Bounded, Generic[Body]):
         is_isotropic = self.level and self.friction.isotropic
         if not (isinstance(equations, Dynamics) and isinstance(body, Top)) or not is_isotropic:
             return equations
-        # Tops of group I (`tippe/steady/`) soon stand upright, with the axis close to L; in a turning frame, both would
+        # Tops of group I (`tippe/steady.py`) soon stand upright, with the axis close to L; in a turning frame, both would
         # move.
         may_invert = 1.0 - body.offset / body.radius < body.I1 / body.I3
         return equations.turning(jax.lax.stop_gradient(jnp.where(may_invert, TURNING, 0.0)))

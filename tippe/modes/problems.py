@@ -58,10 +58,10 @@ class InversionProblem(AbstractProblem):
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales
 
-    def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+    def field(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> Any:
         return self.dynamics.field(state)
 
-    def event_function(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"]:
+    def event_function(self, state: Float[Array, "components *lanes"]) -> Float[Array, "*lanes"]:
         if self.cos_angle is None:
             assert not isinstance(self.dynamics, Dynamics)
             assert self.spin is not None
@@ -69,15 +69,15 @@ class InversionProblem(AbstractProblem):
         return state[COS_THETA] - self.cos_angle
 
     def domain_margin(
-        self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]
-    ) -> Float[Array, " lanes"]:
+        self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]
+    ) -> Float[Array, "*lanes"]:
         return self.dynamics.contact_margin(state)
 
-    def lost_at_start(self, state: Float[Array, "components lanes"]) -> Bool[Array, " lanes"] | None:
+    def lost_at_start(self, state: Float[Array, "components *lanes"]) -> Bool[Array, "*lanes"] | None:
         # A top that may fly slides on without load: both are the same motion.
         return None if self.flies else self.dynamics.unloaded(state, self.scales)
 
-    def margins(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> tuple[Any, ...]:
+    def margins(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> tuple[Any, ...]:
         return self.dynamics.margins(state)
 
 

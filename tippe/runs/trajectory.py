@@ -52,8 +52,6 @@ from ..modes.sticking import lifted
 from .launches import if_balanced, why_unbalanced
 from .observables import AbstractTrajectory, of_each_run
 
-# One run of a tippe top, with its path.
-
 
 class Trajectory(AbstractTrajectory):
     """A run of a tippe top, or a batch of runs, with the batch first.
@@ -469,7 +467,9 @@ def _status(model: Any, path: DenseSolution | HybridPath, tolerance: Any) -> str
         state, mode = np.asarray(path.states)[:, -1], 0
     one, none = np.ones(1), np.zeros(1, int)
     state, inf = np.asarray(state)[:, None], np.inf * one
-    outcome = HybridOutcome(none + code, inf, one, state, none, none, none + mode, none[None])
+    outcome = HybridOutcome(
+        none + code, inf, one, state, none, none, np.stack([inf, one, one]), none + mode, none[None]
+    )
     outcome = jax.tree.map(jnp.asarray, outcome)
     return Status(int(_ended(model, outcome, jnp.asarray(tolerance)))).word
 

@@ -362,7 +362,8 @@ def _statements(jaxpr: Any) -> int:
     total = 0
     for equation in opened(jaxpr)[0].eqns:
         inner = programs_of(equation)
-        numbers = sum(math.prod(atom.aval.shape) for atom in equation.outvars)
+        results: list[Any] = [atom.aval for atom in equation.outvars]
+        numbers = sum(math.prod(result.shape) for result in results)
         total += sum(map(_statements, inner)) * equation.params.get("length", 1) if inner else numbers
     return total
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from close import assert_close
 
-import nonholonomic.derivatives.adjoint as periods
+import nonholonomic.derivatives.adjoint as adjoint
 import nonholonomic.hybrid.samples as samples
 from nonholonomic.hybrid import AbstractBatchedMode, Transition, hybrid_samples
 from nonholonomic.integration import AbstractProblem, Settings
@@ -101,7 +101,7 @@ def test_a_single_backward_pass_gives_the_derivatives_of_the_closed_form(monkeyp
     """Only two of the four rounds are kept, so that the others are computed again."""
     monkeypatch.setattr(samples, "MOST_FORWARD", 0)
     monkeypatch.setattr(samples, "MOST_FORWARD_ALONE", 0)
-    monkeypatch.setattr(periods, "SLOTS", 2)
+    monkeypatch.setattr(adjoint, "SLOTS", 2)
 
     def height(restitution, gravity, height):
         point, times = (restitution, gravity, height), jnp.array([0.0, 0.1, 1.2])

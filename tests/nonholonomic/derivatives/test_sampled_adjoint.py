@@ -7,7 +7,6 @@ import pytest
 from close import assert_close
 
 import nonholonomic.derivatives.adjoint as adjoint
-import nonholonomic.derivatives.adjoint as periods
 from nonholonomic.derivatives import sampled_run
 from nonholonomic.integration import AbstractProblem, Settings
 
@@ -126,8 +125,8 @@ def test_a_direction_costs_one_variation_and_a_second_derivative_is_taken_forwar
 def test_what_is_no_longer_kept_is_computed_again(monkeypatch):
     """Periods of two iterations, of which the starts of two are kept, and the steps of the latest one."""
     monkeypatch.setattr(adjoint.StepRecorder, "period", 2)
-    monkeypatch.setattr(periods, "SLOTS", 2)
-    monkeypatch.setattr(periods, "STEPS_KEPT", 1)
+    monkeypatch.setattr(adjoint, "SLOTS", 2)
+    monkeypatch.setattr(adjoint, "STEPS_KEPT", 1)
     assert_close(jax.jit(lambda points: batch_of_gradients(points))(POINTS), EXPECTED, rtol=1e-8, atol=1e-9)
 
 

@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 from close import assert_close
 
-import nonholonomic.derivatives.adjoint as adjoint
-import nonholonomic.derivatives.adjoint as periods
-import nonholonomic.derivatives.adjoint as slopes
-from nonholonomic.derivatives import tangents_of
+from nonholonomic.derivatives import adjoint, tangents_of
 from nonholonomic.integration import AbstractProblem, Settings
 from nonholonomic.integration.problem import CROSSED, LEFT_DOMAIN
 
@@ -54,7 +51,7 @@ def solve(point, tangents, patience, cells, solver, **options):
 
     arguments = (jnp.asarray(50.0), cells, Settings(1e-11, solver))
     directions = tangents_of(build, point, tangents)
-    return slopes.ensemble_solve_with_tangents(
+    return adjoint.ensemble_solve_with_tangents(
         build(*point), directions, *arguments, **({"one_kernel": True} | options)
     )
 
@@ -108,13 +105,13 @@ def test_the_slopes_are_those_of_the_closed_form(names, nonterminal, solver):
 @pytest.mark.parametrize(("count", "backward"), [(1, False), (2, False), (3, True), (5, True)])
 def test_few_directions_are_integrated_forward_and_many_backward(count, backward, monkeypatch):
     """Forward, two numbers cost two thirds of a pass backward, and three a fifth more."""
-    passes = []
+    passes, backward_pass = [], adjoint.solve_with_adjoint
 
     def solve_with_adjoint(*arguments, **options):
         passes.append("backward")
-        return adjoint.solve_with_adjoint(*arguments, **options)
+        return backward_pass(*arguments, **options)
 
-    monkeypatch.setattr(slopes, "solve_with_adjoint", solve_with_adjoint)
+    monkeypatch.setattr(adjoint, "solve_with_adjoint", solve_with_adjoint)
     jax.eval_shape(lambda: found_and_expected(MANY[:count], run=solve)[1])
     assert bool(passes) is backward
 
@@ -147,8 +144,8 @@ def test_runs_longer_than_what_is_kept_are_repeated(kept, steps, monkeypatch):
     the same to the last digit."""
     _, single_pass, _ = found_and_expected()
     monkeypatch.setattr(adjoint.StepRecorder, "period", 2)
-    monkeypatch.setattr(periods, "SLOTS", kept)
-    monkeypatch.setattr(periods, "STEPS_KEPT", steps)
+    monkeypatch.setattr(adjoint, "SLOTS", kept)
+    monkeypatch.setattr(adjoint, "STEPS_KEPT", steps)
     _, segments, expected = found_and_expected(run=compiled_anew())
     for whole_slope, segment_slope, expected_slope in zip(single_pass, segments, expected, strict=True):
         assert_close(whole_slope, segment_slope, rtol=1e-12)
@@ -157,8 +154,8 @@ def test_runs_longer_than_what_is_kept_are_repeated(kept, steps, monkeypatch):
 
 def test_the_starts_that_are_kept_are_spread_out(monkeypatch):
     """Of two hundred checkpoints, eight remain: the first, the last, and others without a gap of more than half the run."""
-    monkeypatch.setattr(periods, "SLOTS", 8)
-    checkpoints = periods.Checkpoints.none(jnp.zeros(()))
+    monkeypatch.setattr(adjoint, "SLOTS", 8)
+    checkpoints = adjoint.Checkpoints.none(jnp.zeros(()))
     for index in range(200):
         checkpoints = checkpoints.added(jnp.asarray(index), jnp.asarray(float(index)))
     indices = np.asarray(checkpoints.index)
@@ -204,7 +201,7 @@ def test_a_component_at_rest_has_its_tangent_integrated(names):
     def run():
         directions = tangents_of(AtRest, point, tangents)
         arguments = (jnp.asarray(5.0), jnp.asarray(4), Settings(1e-10))
-        return slopes.ensemble_solve_with_tangents(AtRest(*point), directions, *arguments, one_kernel=True)
+        return adjoint.ensemble_solve_with_tangents(AtRest(*point), directions, *arguments, one_kernel=True)
 
     _, derivatives = run()
     expected = {"rest": -(1.0 - 1.0 / 500.0), "push": -1.0}

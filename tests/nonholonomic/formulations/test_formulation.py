@@ -95,7 +95,7 @@ def test_structure_constants_of_the_body_frame_are_those_of_so3():
 
 
 def test_free_rigid_body_obeys_euler():
-    """The sign check of `stroller.md`, section 6: Pi' = Pi x Omega."""
+    """A rigid body by F2 (`stroller.md`, section 6): Pi' = Pi x Omega."""
     omega = jnp.array([0.7, -1.1, 0.5])
     rate = jax.jit(lambda state: Hamel(TOP).field(0.0, state))(jnp.concatenate([ORIENTATION, omega]))[3:]
     np.testing.assert_allclose(TOP.moments * rate, np.cross(TOP.moments * omega, omega), atol=1e-14)

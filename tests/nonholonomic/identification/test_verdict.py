@@ -94,8 +94,12 @@ def test_candidates_whose_runs_fail_are_counted_and_placed():
 
 def test_a_number_that_does_not_act_is_seen_at_once():
     """It would otherwise be explored to the end of the region: 20 000 runs."""
-    with pytest.warns(FitWarning, match="the data do not determine level"):
+    with pytest.warns(FitWarning) as caught:
         fit = fitted_with_limit(100.0, 1e-13)
+    assert [str(warning.message) for warning in caught] == [
+        "no prediction depends on level, so the data say nothing about it: fix it, or add other data",
+        "the data do not determine level +0.001",
+    ]
     assert len(fit.distribution.points) == 256
     assert np.isinf(fit.standard_errors["level"])
     assert_close(fit.standard_errors["rate"], 0.02 / np.sqrt(np.sum(T[:8] ** 2)), rtol=1e-3)

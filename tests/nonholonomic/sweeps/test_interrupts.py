@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from cheap_sweep import cheap_sweep, resumed
 
+from nonholonomic.command_line import INTERRUPTED, PATIENCE
 from nonholonomic.sweeps._chunks import ChunkStore
-from nonholonomic.terminal import INTERRUPTED, PATIENCE
 
 #: How long an answer to Ctrl-C may take [s]: twice as long where other programs keep all cores busy.
 PROMPT = 2.0 if os.getloadavg()[0] <= (os.cpu_count() or 1) else 4.0
@@ -78,7 +78,7 @@ if __name__ == "__main__":
 COMMAND = (
     DEAF
     + """
-from nonholonomic.terminal import interruptible
+from nonholonomic.command_line import interruptible
 def main():
     print("begun", flush=True)
     deaf()

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from close import assert_close
 from own_modes import Sleigh
+from scipy.integrate import solve_ivp
 
+from nonholonomic import AbstractSystem, simulate
 from nonholonomic.compilation.components import TooLarge, by_components
-from nonholonomic.formulations import Lagrange
+from nonholonomic.formulations import Lagrange, within_constraints
+from nonholonomic.runs.model import model_of
 
 LANES = tuple(jnp.linspace(0.1, 1.0, 8) * scale for scale in (1.0, -2.0, 0.7, 1.3, 0.4, 3.0))
 SCALARS = tuple(jax.ShapeDtypeStruct((), jnp.float64) for _ in LANES)
@@ -91,3 +94,61 @@ def test_large_functions_and_loops_are_left_in_arrays():
     for function in (large, loop):
         with pytest.raises(TooLarge):
             jax.eval_shape(by_components(function, *SCALARS), *LANES)
+
+
+class CarWithTrailer(AbstractSystem):
+    """A car that pulls a trailer and turns its front wheels: 5 coordinates and 3 wheels that do not slip."""
+
+    base: float = 2.5
+    hitch: float = 0.8
+    length: float = 3.0
+    dimension = 5
+
+    def metric(self, q):
+        heading, trailer = q[2], q[4]
+        zero, one = jnp.zeros_like(heading), jnp.ones_like(heading)
+        sin, cos = jnp.sin, jnp.cos
+        middle = 0.5 * self.base
+        car = jnp.array(
+            [[one, zero, -middle * sin(heading), zero, zero], [zero, one, middle * cos(heading), zero, zero]]
+        )
+        behind = jnp.array(
+            [
+                [one, zero, self.hitch * sin(heading), zero, self.length * sin(trailer)],
+                [zero, one, -self.hitch * cos(heading), zero, -self.length * cos(trailer)],
+            ]
+        )
+        return 1000.0 * car.T @ car + 500.0 * behind.T @ behind + jnp.diag(jnp.array([0.0, 0.0, 1500.0, 5.0, 400.0]))
+
+    def constraints(self, q):
+        _, _, heading, steering, trailer = q
+        sin, cos, zero = jnp.sin, jnp.cos, jnp.zeros_like(heading)
+        return jnp.array(
+            [
+                [sin(heading), -cos(heading), zero, zero, zero],
+                [sin(heading + steering), -cos(heading + steering), -self.base * cos(steering), zero, zero],
+                [sin(trailer), -cos(trailer), self.hitch * cos(heading - trailer), zero, self.length + zero],
+            ]
+        )
+
+    def force(self, t, q, rate):
+        return jnp.array([0.0, 0.0, 0.0, -50.0 * (q[3] - 0.3 * jnp.sin(t)) - 10.0 * rate[3], 0.0])
+
+
+def test_a_large_field_stands_once_in_a_program_and_its_motion_is_that_of_scipy():
+    car, q = CarWithTrailer(), jnp.array([0.0, 0.0, 0.0, 0.05, 0.1])
+    rate = within_constraints(car, q, jnp.array([5.0, 0.0, 0.0, 0.0, 0.0]))
+    problem = model_of(car, (q, rate)).problem(None, None)
+
+    def twice(state):
+        once = problem.field(state[-1], state)
+        return problem.field(state[-1], state + once)
+
+    text = jax.jit(twice).lower(problem.start()[0]).as_text()
+    assert text.count("func.func private @_rates") == 1
+    assert text.count("call @_rates") == 2
+    run = simulate(car, (q, rate), 2.0, times=[2.0])
+    field = jax.jit(Lagrange(car).field)
+    start = np.concatenate([q, rate])
+    expected = solve_ivp(field, (0.0, 2.0), start, method="DOP853", rtol=1e-11, atol=1e-11).y[:, -1]
+    assert_close(run.state[-1], expected, rtol=1e-7)

@@ -3,6 +3,7 @@
 import copy
 import json
 import math
+import re
 import warnings
 
 import jax
@@ -13,9 +14,10 @@ from close import assert_close
 from other_formulations import Routhian
 from own_modes import GRAVITY, Ball, Sleigh, Slip, Stick, bounce, final_turn
 from PIL import Image
+from scipy.integrate import quad
 
 import nonholonomic
-from nonholonomic import AbstractMode, Hybrid, event_time, simulate, sweep
+from nonholonomic import AbstractMode, AbstractSystem, Hybrid, event_time, simulate, sweep
 from nonholonomic.formulations import Hamel, Lagrange
 from nonholonomic.sweeps import Table
 from nonholonomic.systems.system import check_start, formulation_of
@@ -498,3 +500,44 @@ def test_a_recording_says_on_which_side_of_a_reset_its_samples_are(side):
     assert_close(fit.estimates["system.modes[0].decay[0]"], 0.7, atol=1e-5)
     with pytest.raises(ValueError, match=r"side = 'below' must be \"before\" or \"after\""):
         nonholonomic.Recording([1.0, 0.0], times, values, 0.001, "y0", side="below")
+
+
+class EulerTop(AbstractSystem):
+    """A symmetric top with a fixed point, in Euler angles (theta, phi, psi), with moments of inertia 1 and 1/2."""
+
+    dimension = 3
+
+    def metric(self, q):
+        sin, cos = jnp.sin(q[0]), jnp.cos(q[0])
+        return jnp.array([[1.0, 0.0, 0.0], [0.0, sin**2 + 0.5 * cos**2, 0.5 * cos], [0.0, 0.5 * cos, 0.5]])
+
+    def potential(self, q):
+        return jnp.cos(q[0])
+
+
+def test_steps_that_shorten_near_a_pole_of_the_coordinates_are_named():
+    """A top that swings almost through the vertical reaches it as the plane pendulum does; its errors exceed the tolerance."""
+    expected, _ = quad(lambda theta: 1.0 / np.sqrt(1.0 + 2.0 * (np.cos(0.5) - np.cos(theta))), 0.0, 0.5)
+    with pytest.warns(UserWarning, match="coordinates singular there") as caught:
+        run = simulate(EulerTop(), ([0.5, 0.0, 0.0], [-1.0, 1e-6, 0.0]), 1.0, times=[1.0], tolerance=1e-8)
+    assert run.status == "completed"
+    assert_close(float(re.search(r"near t = ([\d.]+) s", str(caught[0].message)).group(1)), expected, atol=1e-4)
+    with pytest.warns(UserWarning, match="1 of 4 cells need more than 30 times as many steps"):
+        sweep(
+            EulerTop(),
+            ([0.5, 0.0, 0.0], [-1.0, 0.1, 0.0]),
+            1.0,
+            axes={"rate[1]": [1e-6, 0.1, 0.2, 0.3]},
+            tolerance=1e-8,
+        )
+    # Nor does a run that keeps away from the pole warn, nor one with a kink, at which steps shorten for a moment.
+    simulate(EulerTop(), ([0.5, 0.0, 0.0], [-1.0, 0.1, 0.0]), 1.0, times=[1.0])
+    kink = simulate(Hybrid([Kink()]), [1.0, 0.0], 10.0)
+    assert int(kink.rejected) > 50
+
+
+class Kink(AbstractMode):
+    """An oscillator on a spring that is stiffer on one side."""
+
+    def field(self, t, y):
+        return jnp.stack([y[1], -y[0] - 3.0 * jnp.maximum(y[0], 0.0)])
