@@ -160,8 +160,8 @@ def straight(start: Any, goal: Any) -> Path:
 
 
 def prices(outline: Outline, count: int, batch: int, rng: np.random.Generator, in_haste: bool = False) -> list[Costs]:
-    """What the searches of a batch minimise: ordinary prices first, or mostly the time at the limits of the speed where haste is
-    wanted, then random ones."""
+    """What the searches of a batch minimise: ordinary prices first, or mostly the time at the limits of the speed in haste,
+    then random ones."""
     length, keep = float(outline.problem.footprint.length), outline.clearance
     low, high = outline.problem.limits.ranges().get("speed", (-1.0, 1.0))
     backwards = high / -low if low < 0.0 < high else 1.0
