@@ -217,8 +217,8 @@ def _attempts(
 
 def _driven(outline: Outline, candidates: Candidates, lane: int, longest: float, tolerance: float) -> Attempt:
     """An optimised candidate, driven; a solution is driven again at a tight tolerance, and this run counts."""
-    t1, splines = float(candidates.durations[lane]), candidates.unknowns[lane].T[-2:]
-    drive = drive_along(outline.problem.scene.dynamics, outline.start, *splines, t1)
+    t1, (steering, front_speed) = float(candidates.durations[lane]), candidates.unknowns[lane].T[-2:]
+    drive = drive_along(outline.problem.scene.dynamics, outline.start, steering, front_speed, t1)
     run, verdict = checked_run(outline.problem, drive, t1, tolerance, COMPARED)
     if not verdict.hindrances:
         run, verdict = checked_run(outline.problem, drive, t1, TIGHT, CONFIRMED)

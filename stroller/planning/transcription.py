@@ -409,8 +409,9 @@ def constraints(candidates: Candidates, task: Task) -> Residuals:
     return jax.vmap(lambda unknowns, t1: residuals(unknowns, task, t1))(*candidates)
 
 
-def _step(gradient: np.ndarray, band: np.ndarray, edge: np.ndarray, damping: np.ndarray) -> np.ndarray:
+def _step(equations: list[np.ndarray], damping: np.ndarray) -> np.ndarray:
     """Damped Gauss-Newton steps of all lanes, solved as one banded system; none in a lane that is not finite."""
+    gradient, band, edge = equations
     lanes, width, count = band.shape
     usable = np.all(np.isfinite(band), axis=(1, 2), keepdims=True)
     matrix = np.where(usable, band, 0.0)
@@ -438,7 +439,7 @@ def _minimise(
     merit, *equations = (np.array(part) for part in _normal_equations(candidates, task, multipliers, weight))
     (unknowns, durations), growth = map(np.array, candidates), np.full(len(merit), 2.0)
     for _ in range(steps):
-        step = _step(*equations, damping)
+        step = _step(equations, damping)
         promised = np.sum(step * (damping[:, None] * step - equations[0]), axis=1)
         if np.all(promised < TINY_GAIN * merit):
             break
