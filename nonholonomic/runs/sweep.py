@@ -25,7 +25,7 @@ from ..sweeps.table import cells_with
 from ..text import likely, shown
 from ..validation import as_number, require_flag, require_outside, require_whole, warn
 from .event import Ensemble
-from .model import AbstractModel, check_horizon, model_of, require_event
+from .model import AbstractModel, AbstractSceneModel, check_horizon, model_of, require_event
 from .simulate import Samples
 from .table import ScatteredJob, TableForm, TableJob
 
@@ -313,7 +313,8 @@ def compute_table(
         first, of_all = (illegal[0], listed) if listed is not None else (0, columns(grid, int(illegal[0]), 1))
         values = {name: float(values[first]) for name, values in of_all.items()}
         _warn_of_illegal_cells(job.model, values, len(illegal), cells)
-    if "steps" in table:
+    # The coordinates of scenes are regular.
+    if "steps" in table and not isinstance(job.model, AbstractSceneModel):
         steps = np.ravel(table["steps"])
         slow = steps > max(SLOW_STEPS, SLOW * float(np.median(steps)))
         if np.any(slow):
