@@ -39,7 +39,7 @@ MOST_LINES = 450
 MOST_FILES_OUTSIDE = 9
 
 #: The size of the three packages: it may shrink. Imports are a share of the lines of code.
-MOST = {"files": 133, "lines": 27_323, "functions": 3208, "Any": 1927, "imports": 0.0970}
+MOST = {"files": 133, "lines": 27_322, "functions": 3208, "Any": 1927, "imports": 0.0970}
 
 
 class Arrow(NamedTuple):
