@@ -53,7 +53,7 @@ def test_it_says_on_a_terminal_what_it_does(regression, monkeypatch):
     monkeypatch.setattr("nonholonomic.terminal.INTERVAL", 0.01)
     # All is compiled by now; the first thing that a fit does is made to take its time.
     compiled = least_squares.linearise
-    monkeypatch.setattr(least_squares, "linearise", lambda *arguments: (time.sleep(0.2), compiled(*arguments))[1])
+    monkeypatch.setattr(least_squares, "linearise", lambda *arguments: (time.sleep(0.6), compiled(*arguments))[1])
     for progress in (True, False):
         stream = Terminal()
         monkeypatch.setattr(sys, "stderr", stream)
