@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, ArrayLike, Bool
 
 from .xla_cpu import bound, called_program, read_program, traced
 
@@ -39,7 +39,7 @@ GROWING = """
 CALLS = "closed_call core_call custom_jvp_call custom_vjp_call jit pjit"
 
 #: Comparisons; and operations that jump, from one whole number to another.
-COMPARISONS, STEPPING = "eq ge gt le lt ne", "argmax argmin ceil convert_element_type floor round sign"
+COMPARISONS, STEPPING = "eq ge gt le lt ne", "ceil convert_element_type floor round sign"
 
 
 class Enclosure(NamedTuple):
@@ -78,7 +78,12 @@ def enclosing(function: Callable[..., Any], *shapes: Any, loose: bool = False) -
 
 def _enclosed(program: Any, boxes: Sequence[Bounds], leaps: list[Any], loose: bool) -> list[Bounds]:
     apply = functools.partial(_applied, leaps=leaps, loose=loose)
-    return read_program(program, boxes, apply, known=lambda constant: Bounds(*2 * [jnp.asarray(constant)]))
+    return read_program(program, boxes, apply, known=_exactly)
+
+
+def _exactly(number: ArrayLike) -> Bounds:
+    """The bounds of a number that is known."""
+    return Bounds(jnp.asarray(number), jnp.asarray(number))
 
 
 def _applied(equation: Any, boxes: list[Bounds], leaps: list[Any], loose: bool) -> list[Bounds]:
@@ -123,7 +128,7 @@ def _bounded(equation: Any, boxes: list[Bounds], leaps: list[Any], loose: bool) 
         return [_even(boxes[0], jnp.square)]
     if name in COMPARISONS.split() and same:
         # Asks whether this is a number.
-        return [Bounds(*2 * [jnp.full(boxes[0].low.shape, name in ("eq", "ge", "le"))])]
+        return [_exactly(jnp.full(boxes[0].low.shape, name in ("eq", "ge", "le")))]
     if name == "integer_pow":
         return [_integer_power(equation.params["y"], *boxes)]
     if name == "reduce_prod":
@@ -169,7 +174,7 @@ def _even(box: Bounds, function: Callable[[Array], Array]) -> Bounds:
 
 def _integer_power(power: int, box: Bounds) -> Bounds:
     if power < 0:
-        return _quotient(Bounds(jnp.ones_like(box.low), jnp.ones_like(box.low)), _integer_power(-power, box))
+        return _quotient(_exactly(jnp.ones_like(box.low)), _integer_power(-power, box))
 
     def raised(x: Array) -> Array:
         return jax.lax.integer_pow(x, power)
@@ -189,10 +194,6 @@ def _cosine(box: Bounds) -> Bounds:
     has_bottom = jnp.floor(box.high / turns - 0.5) >= jnp.ceil(box.low / turns - 0.5)
     ends = _hull(jnp.cos(box.low), jnp.cos(box.high))
     return Bounds(jnp.where(has_bottom, -1.0, ends.low), jnp.where(has_top, 1.0, ends.high))
-
-
-def _sine(box: Bounds) -> Bounds:
-    return _cosine(Bounds(box.low - 0.5 * jnp.pi, box.high - 0.5 * jnp.pi))
 
 
 def _tangent(box: Bounds) -> Bounds:
@@ -224,7 +225,7 @@ def _remainder(x: Bounds, divisor: Bounds) -> Bounds:
 
 
 def _polynomial(x: Bounds, *coefficients: Bounds) -> Bounds:
-    value = Bounds(jnp.zeros_like(x.low), jnp.zeros_like(x.low))
+    value = _exactly(jnp.zeros_like(x.low))
     for part in reversed(coefficients):
         product = _product(value, x)
         value = Bounds(product.low + part.low, product.high + part.high)
@@ -297,13 +298,13 @@ RULES: dict[str, Callable[..., Bounds]] = {
     "is_finite": lambda box: Bounds(jnp.isfinite(box.low) & jnp.isfinite(box.high), jnp.ones(box.low.shape, bool)),
     "neg": lambda box: Bounds(-box.high, -box.low),
     "not": _opposite,
-    "one_minus_square": lambda box: RULES["sub"](Bounds(*2 * [jnp.ones(())]), _even(box, jnp.square)),
+    "one_minus_square": lambda box: RULES["sub"](_exactly(1.0), _even(box, jnp.square)),
     "polynomial": _polynomial,
     "pow": _power,
     "rem": _remainder,
     "rsqrt": lambda box: _everything_where(~(box.low > 0.0), Bounds(jax.lax.rsqrt(box.high), jax.lax.rsqrt(box.low))),
     "select_n": _selected,
-    "sin": _sine,
+    "sin": lambda box: _cosine(Bounds(box.low - 0.5 * jnp.pi, box.high - 0.5 * jnp.pi)),
     "sqrt": lambda box: Bounds(*(jnp.sqrt(jnp.maximum(end, 0.0)) for end in box)),
     "square": lambda box: _even(box, jnp.square),
     "sub": lambda a, b: Bounds(a.low - b.high, a.high - b.low),

@@ -17,7 +17,7 @@ from ..integration import AbstractProblem, CoreProblem, Lanes, LaneState, Settin
 from ..integration.dense import SampledSolution
 from ..integration.problem import FAILED, LEFT_DOMAIN, REACHED_END, event_time
 from ..integration.samples import SampleTimes, components, step_towards_sample
-from ..integration.scheduler import InLanes
+from ..integration.scheduler import NO_EXTREMES, InLanes
 from .adjoint import (
     StepRecord,
     StepRecorder,
@@ -222,9 +222,6 @@ MOST_FORWARD = 2
 #: In the derivative of a `SampledRun`: end state, status, and numbers and lengths of steps.
 NOT_DIFFERENTIATED: tuple[Any, ...] = (None,) * 5
 
-#: The extremes of the steps of Diffrax, which does not tell them.
-UNKNOWN = (np.inf, 0.0, 0.0)
-
 
 class SampledRun(NamedTuple):
     """A run at given times, as floats: its states, NaN after its end; when and where it ended; the status code
@@ -374,7 +371,7 @@ def sampled_run_by_diffrax(
     status, accepted, rejected = (part.astype(float) for part in (_status(path, t1), path.accepted, path.rejected))
     states = parted(problem, path.states[:size].T)
     return SampledRun(
-        *states, path.end_time, path.end_state[:leading], status, accepted, rejected, jnp.asarray(UNKNOWN)
+        *states, path.end_time, path.end_state[:leading], status, accepted, rejected, jnp.asarray(NO_EXTREMES)
     )
 
 
@@ -557,7 +554,7 @@ def _follow(
     times, t1, tolerance = arguments
     path = sample(variational, times, t1, spec.settings.with_tolerance(tolerance), grid=spec.grid)
     ends = (path.end_time, path.end_state, _status(path, t1))
-    counts = (path.accepted, path.rejected, jnp.asarray(UNKNOWN))
+    counts = (path.accepted, path.rejected, jnp.asarray(NO_EXTREMES))
     samples, slopes = _found(variational, path.states.T, ends, counts)
     problem = variational.problem
 

@@ -34,7 +34,7 @@ from ..integration import (
 )
 from ..integration.dense import PIECE_OF_MODE
 from ..integration.problem import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
-from ..integration.scheduler import Numbers
+from ..integration.scheduler import NO_EXTREMES, Numbers
 from .mode import AbstractBatchedMode, Transition, mode_of_cells
 
 #: Largest number of rounds, and so of modes in a run; then unfinished cells end as `UNRESOLVED`.
@@ -610,7 +610,7 @@ def _outcome(path: DenseSolution) -> Outcome[np.ndarray]:
     status = FAILED if path.failed else LEFT_DOMAIN if path.left_domain else REACHED_END
     no_crossing, steps = np.full(1, np.inf), path.accepted + path.rejected
     ending = (np.asarray(path.times[-1:]), np.asarray(path.states[:, -1:]))
-    counts = (np.full(1, steps), np.full(1, path.rejected), np.array([[np.inf], [0.0], [0.0]]))
+    counts = (np.full(1, steps), np.full(1, path.rejected), np.array([NO_EXTREMES]).T)
     return Outcome(np.full(1, status), no_crossing, no_crossing, *ending, *counts)
 
 

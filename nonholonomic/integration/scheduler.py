@@ -48,6 +48,9 @@ REFILL = 0.25
 #: change until then below which the function counts as zero at the start.
 SOON, AT_ZERO = 1e-2, 1e-6
 
+#: The extremes of a run whose steps are not known.
+NO_EXTREMES = (np.inf, 0.0, 0.0)
+
 
 class Outcome(NamedTuple, Generic[Numbers]):
     """How every cell ended.
@@ -528,9 +531,7 @@ def solve_by_diffrax(problem: AbstractProblem, t1: Float[Array, ""], settings: S
             status = jnp.where(occurred | at_start, code, status)
         crossing_time = jnp.where(status == CROSSED, end, jnp.inf)
         steps, rejected = solution.stats["num_steps"], solution.stats["num_rejected_steps"]
-        return Outcome(
-            status, crossing_time, crossing_time, end, final, steps, rejected, jnp.array([jnp.inf, 0.0, 0.0])
-        )
+        return Outcome(status, crossing_time, crossing_time, end, final, steps, rejected, jnp.array(NO_EXTREMES))
 
     axes = Outcome._make((0, 0, 0, 0, -1, 0, 0, -1))
     return jax.vmap(solve_cell, in_axes=(lane_axes, -1, -1), out_axes=axes)(problem, states, scales)
