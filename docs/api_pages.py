@@ -242,7 +242,7 @@ def public(package: str) -> list[str]:
     names = set(re.findall(r"import (?!__)(\w+) as \1$", inspect.getsource(module), re.M)) or {
         name for name, value in vars(module).items() if name[0] != "_" and getattr(value, "__module__", "") == package
     }
-    return sorted(names, key=str.lower)
+    return sorted(names, key=lambda name: (name.lower(), name))
 
 
 def resolve(dotted: str) -> Any:
