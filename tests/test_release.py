@@ -19,8 +19,8 @@ import stroller
 import tippe
 from nonholonomic.sweeps.grid import versions
 from nonholonomic.validation import Bound, as_number
+from tippe.friction import Slip
 from tippe.model.body import AbstractBody, AbstractMeridian, ContactGeometry
-from tippe.model.friction import Slip
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

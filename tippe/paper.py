@@ -30,10 +30,9 @@ from nonholonomic.terminal import Progress, status_line
 from nonholonomic.validation import require_folder
 from nonholonomic.views import NO_VIEW, Stage, can_view, page, picture_as_html, table_as_html
 
+from .friction import AbstractFriction, Coulomb, Viscous
 from .model.body import Top
-from .model.friction import AbstractFriction, Coulomb, Viscous
-from .model.launch import Launch
-from .model.scene import Scene
+from .model.scene import Launch, Scene
 from .runs.explore import Panel, draw_launches
 from .runs.verbs import inversion_table, simulate
 from .runs.view import DrawnMotion, stages

@@ -51,9 +51,9 @@ from nonholonomic.validation import (
 )
 
 from .model.body import Top
-from .model.launch import AXIS, PLACE, Launch, joined, parts
-from .model.rigid_body import AbstractRigidBody
-from .model.scene import Scene
+from .model.dynamics import AXIS, PLACE, joined, parts
+from .model.rigid import AbstractRigidBody
+from .model.scene import Launch, Scene
 
 # Checks of the arguments of steady motions; traced numbers pass.
 

@@ -20,7 +20,7 @@ from test_strong_friction import random_falls
 from tops import homogeneous_ball
 
 import tippe
-from tippe.model.launch import angular_velocity
+from tippe.model.dynamics import angular_velocity
 from tippe.modes.airborne import FLYING
 from tippe.modes.impact import approach, balls, energy, gap_rate, resolve_coulomb_impact
 from tippe.modes.sticking import TOUCH_ROLLING, TOUCH_SLIPPING

@@ -12,7 +12,7 @@ from test_hops import scene_of
 from tops import rutstam_top
 
 import tippe
-from tippe.model.launch import angular_velocity
+from tippe.model.dynamics import angular_velocity
 from tippe.modes.flight import Descent, angle_reached, cone, flown, landing
 from tippe.modes.impact import FreeBody, balls, energy, gap_rate, jellett, resolve_impact
 

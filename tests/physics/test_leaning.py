@@ -14,7 +14,7 @@ from stems import first_contact
 from test_hops import scene_of
 
 import tippe
-from tippe.model.launch import angular_velocity
+from tippe.model.dynamics import angular_velocity
 from tippe.modes.impact import BOTH, FreeBody, LeaningDynamics, as_free_body, at_rest, balls, gap_rate, jellett
 from tippe.modes.impact import energy as energy_of
 

@@ -31,7 +31,7 @@ def test_a_top_sticks_and_slips_as_by_its_own_equations(arena):
             stick_slip.rolling.field(states),
             stick_slip.stopped(states),
             stick_slip.grip_left(states),
-            np.stack(stick_slip.rolling.reaction(states)),
+            np.stack(stick_slip.rolling.evaluate(states)[1]),
             np.stack(stick_slip.rolling.unit_impulse(states, 0)),
             np.stack(stick_slip.rolling.unit_impulse(states, 1)),
             stick_slip.rolling.with_slip(states, Slip(states[0], states[1])),

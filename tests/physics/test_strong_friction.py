@@ -12,8 +12,7 @@ from impact_reference import resolve_impact as reference_impact
 from scipy.integrate import solve_ivp
 
 import tippe
-from tippe.model.dynamics import JAMMED
-from tippe.model.launch import angular_velocity
+from tippe.model.dynamics import JAMMED, angular_velocity
 from tippe.modes.impact import FreeBody, balls, energy, gap_rate, jellett, resolve_impact
 
 # Impacts

@@ -1,6 +1,6 @@
 """Contact lost and regained on any arena: the modes of sliding and of flight, with and without a stem.
 
-In contact the state is that of `tippe/model/launch.py` with a `CarriedFrame`, 14 components. In flight it is, in the
+In contact the state is that of `tippe/model/dynamics.py` with a `CarriedFrame`, 14 components. In flight it is, in the
 surface's axes, the position of the centre of mass [m], its velocity [m/s], the axis, the angular momentum about it, the
 number of the sphere that touched last, and a zero. A flight ends where the distance of the centre of a sphere from the
 arena equals its radius again; then that sphere strikes the tangent plane there (`impact.py`). theta is measured from
@@ -35,10 +35,9 @@ from nonholonomic.hybrid import Transition
 from nonholonomic.integration import AbstractPassive, AbstractProblem
 from nonholonomic.integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED
 
+from ..friction import SetValuedCoulomb
 from ..model.body import Top
-from ..model.dynamics import Dynamics
-from ..model.friction import SetValuedCoulomb
-from ..model.launch import COS_THETA, joined, parts
+from ..model.dynamics import COS_THETA, Dynamics, joined, parts
 from ..model.scene import Scene
 from .impact import (
     CLOSING_SPEED,

@@ -19,8 +19,7 @@ from nonholonomic.integration.dense import halved
 from nonholonomic.integration.problem import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
 
 from ..model.body import Top
-from ..model.dynamics import Dynamics
-from ..model.launch import COS_THETA, parts
+from ..model.dynamics import COS_THETA, Dynamics, parts
 from ..model.scene import Scene
 from .impact import (
     CLOSING_SPEED,

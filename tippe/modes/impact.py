@@ -29,10 +29,9 @@ from nonholonomic.geometry import Component, Vector, add, cross, dot, multiply, 
 from nonholonomic.integration import AbstractProblem, Settings, traced_solve_ensemble
 from nonholonomic.integration.problem import LEFT_DOMAIN, MOST_STEPS
 
+from ..friction import AbstractFriction, ContactLoad, SetValuedCoulomb, Slip, length
 from ..model.body import Round, Top
-from ..model.dynamics import AbstractDynamics, Dynamics
-from ..model.friction import AbstractFriction, ContactLoad, SetValuedCoulomb, Slip, length
-from ..model.launch import angular_velocity, joined, parts
+from ..model.dynamics import AbstractDynamics, Dynamics, angular_velocity, joined, parts
 from ..model.scene import Scene
 from ..model.stick_slip import StickSlip
 
@@ -88,7 +87,7 @@ def standing_on(dynamics: Dynamics | StickSlip, ball: Ball) -> Dynamics:
 def as_free_body(body: Top, ball: Ball, state: Float[Array, "components ..."]) -> FreeBody:
     """A top that stands on a sphere, as a free body: the sphere's centre is at rest along the normal.
 
-    **Arguments:** `state`: (8, ...), as in `tippe/model/launch.py`.
+    **Arguments:** `state`: (8, ...), as in `tippe/model/dynamics.py`.
     """
     velocity, axis, momentum, _ = parts(state)
     height = ball.radius - ball.offset * axis[2]

@@ -12,11 +12,9 @@ from nonholonomic.hybrid import AbstractBatchedMode
 from nonholonomic.integration import AbstractPassive, AbstractProblem, ExtendedProblem
 
 from ..model.body import Top
-from ..model.dynamics import NO_COSINE, Dynamics
-from ..model.launch import COS_THETA, Launch, parts
-from ..model.rigid_body import AbstractRigidBody
-from ..model.rigid_dynamics import AbstractRigidDynamics
-from ..model.scene import Scene
+from ..model.dynamics import COS_THETA, NO_COSINE, Dynamics, parts
+from ..model.rigid import AbstractRigidBody, AbstractRigidDynamics
+from ..model.scene import Launch, Scene
 from ..model.stick_slip import ContactMode, StickSlip
 
 # Motion on one smooth contact until theta reaches an angle, or the spin reverses, or the contact ends, for many cells.

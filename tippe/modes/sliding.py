@@ -19,8 +19,7 @@ from nonholonomic.integration import AbstractProblem
 from nonholonomic.integration.problem import CROSSED, RUNNING, UNRESOLVED
 
 from ..model.body import Top
-from ..model.dynamics import Dynamics
-from ..model.launch import COS_THETA
+from ..model.dynamics import COS_THETA, Dynamics
 from ..model.scene import Scene
 from .flight import (
     OWN,

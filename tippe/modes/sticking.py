@@ -13,8 +13,7 @@ from nonholonomic.integration import AbstractProblem, ExtendedProblem
 from nonholonomic.integration.problem import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING
 
 from ..model.body import Top
-from ..model.dynamics import NO_COSINE
-from ..model.launch import COS_THETA, parts
+from ..model.dynamics import COS_THETA, NO_COSINE, parts
 from ..model.scene import Scene
 from ..model.stick_slip import AT_REST, Change, ContactMode, Onset, StickSlip
 from .airborne import (
@@ -73,7 +72,7 @@ class StickSlipMode(AbstractBatchedMode):
         """The velocity of a rolling top follows from the other components of its state."""
         if not self.kind.rolls:
             return state
-        core_state = self.kind.stick_slip.rolling.carried_along(state[: self._size(state)])
+        core_state = self.kind.rolling.carried_along(state[: self._size(state)])
         return jnp.concatenate([core_state, state[self._size(state) :]])
 
     def between(self, motion: tuple[Onset, Array], passed: Float[Array, " times"]) -> Float[Array, "components times"]:
@@ -82,7 +81,7 @@ class StickSlipMode(AbstractBatchedMode):
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Stick, slip, or end if the contact is lost. Counts the changes from slip to rolling."""
-        slipping = self._under(self.kind.stick_slip.slipping, state)
+        slipping = self._under(self.kind.slipping, state)
         change = self.kind.ended(state, self._size(state), lambda point: slipping.field(left, point), self.scales, left)
         onset, length = change.onset, change.onset.length
         wait_fraction = -change.wait / jnp.where(length > 0.0, length, 1.0)
@@ -116,7 +115,7 @@ class StickSlipMode(AbstractBatchedMode):
         """The function whose fall to zero ends a run."""
         if self.spin is None:
             return state[COS_THETA] - self.cos_angle
-        return self.kind.stick_slip.normal_spin(state[: self._size(state)]) / self.spin
+        return self.kind.normal_spin(state[: self._size(state)]) / self.spin
 
     def _size(self, state: Float[Array, "components ..."]) -> int:
         """Number of components in the equations of motion."""
@@ -156,7 +155,8 @@ def stick_slip_modes(
     """
     stick_slip = problem.dynamics
     assert isinstance(stick_slip, StickSlip)
-    kinds = (ContactMode(stick_slip, jnp.asarray(tolerance, float), rolls) for rolls in (False, True))
+    laws = (stick_slip.slipping, stick_slip.rolling, stick_slip.mu, jnp.asarray(tolerance, float))
+    kinds = (ContactMode(*laws, rolls) for rolls in (False, True))
     options = (problem.cos_angle, problem.scales, last, passive, size, problem.spin)
     both_modes = tuple(StickSlipMode(kind, *options) for kind in kinds)
     return both_modes, _first_mode(stick_slip, problem.states)
@@ -217,9 +217,7 @@ class Touch(AbstractFlyingMode):
         transition = self.contact_state.reset_map(state, left)
         state_after = transition.state
         if self.kind.rolls:
-            state_after = jnp.concatenate(
-                [self.kind.stick_slip.rolling.carried_along(state_after[:OWN]), state_after[OWN:]]
-            )
+            state_after = jnp.concatenate([self.kind.rolling.carried_along(state_after[:OWN]), state_after[OWN:]])
         flies = (transition.status == LEFT_DOMAIN) & (self.kind.loss(state_after[:OWN]) == 0)
         mode = jnp.where(transition.mode == ROLLING, TOUCH_ROLLING, TOUCH_SLIPPING)
         return transition._replace(

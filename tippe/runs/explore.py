@@ -20,11 +20,10 @@ from nonholonomic.text import readable_unit
 from nonholonomic.views import Stage, arena
 from nonholonomic.views.explore import Frame, LiveRun, Summary, quaternion
 
+from ..friction import NoSlip
 from ..model.body import Top
-from ..model.friction import NoSlip
-from ..model.launch import Launch
-from ..model.rigid_body import AbstractRigidBody
-from ..model.scene import Scene
+from ..model.rigid import AbstractRigidBody
+from ..model.scene import Launch, Scene
 from ..modes.sliding import Slide
 from .launches import check_reversible, check_run, event_of
 from .model import TopModel

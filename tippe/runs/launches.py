@@ -19,12 +19,11 @@ from nonholonomic.sweeps import Axis, axis
 from nonholonomic.text import shown
 from nonholonomic.validation import IN_DEGREES, as_number, is_traced, require, require_kind, warn
 
+from ..friction import Frictionless
 from ..model.body import Top
 from ..model.dynamics import NO_COSINE
-from ..model.friction import Frictionless
-from ..model.launch import Launch
-from ..model.rigid_body import AbstractRigidBody
-from ..model.scene import Scene
+from ..model.rigid import AbstractRigidBody
+from ..model.scene import Launch, Scene
 from ..modes.airborne import airborne_modes, modes_with_stem
 from ..modes.impact import energy_in
 from ..modes.problems import InversionProblem, StemContact, trajectory_problem

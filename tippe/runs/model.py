@@ -29,10 +29,9 @@ from nonholonomic.runs import (
 from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.validation import Bound, all_bounds, legal, require_kind, require_scalars
 
+from ..friction import NoSlip
 from ..model.dynamics import LOSSES, NO_COSINE
-from ..model.friction import NoSlip
-from ..model.launch import Launch
-from ..model.scene import Scene, generic_direction
+from ..model.scene import Launch, Scene, generic_direction
 from ..modes.problems import BEHIND_PATH, InversionProblem, StemContact, TrajectoryProblem, trajectory_problem
 from ..modes.sticking import contact_modes, on_the_ground
 from .launches import (

@@ -28,9 +28,8 @@ from nonholonomic.runs import sampled_if_legal
 from nonholonomic.text import shown
 from nonholonomic.validation import as_number, is_traced, nan_unless
 
-from ..model.dynamics import Motion
-from ..model.friction import length
-from ..model.launch import parts
+from ..friction import length
+from ..model.dynamics import Motion, parts
 from ..model.stick_slip import StickSlip
 from ..modes.airborne import (
     FLYING,

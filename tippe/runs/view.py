@@ -33,7 +33,7 @@ from nonholonomic.views import (
 )
 
 from ..model.body import AbstractBody, Top
-from ..model.rigid_body import AbstractRigidBody
+from ..model.rigid import AbstractRigidBody
 from ..model.scene import Scene
 
 # The quantities of a run of a tippe top, with units and names, and the table of a run.
