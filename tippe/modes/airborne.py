@@ -37,7 +37,7 @@ from nonholonomic.integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNI
 
 from ..friction import SetValuedCoulomb
 from ..model.body import Top
-from ..model.dynamics import COS_THETA, Dynamics, joined, parts
+from ..model.dynamics import COS_THETA, Dynamics, from_frame, joined, parts, to_frame
 from ..model.scene import Scene
 from .impact import (
     CLOSING_SPEED,
@@ -140,16 +140,6 @@ def carried_frame(scene: Scene[Top]) -> CarriedFrame:
     """The frame of a scene whose contact may be lost and regained."""
     assert isinstance(scene.frame, CarriedFrame)
     return scene.frame
-
-
-def to_frame(vector: Vector, axes: tuple[Vector, Vector, Vector]) -> Vector:
-    """Components of a vector in a frame."""
-    return (dot(vector, axes[0]), dot(vector, axes[1]), dot(vector, axes[2]))
-
-
-def from_frame(vector: Vector, axes: tuple[Vector, Vector, Vector]) -> Vector:
-    """The vector with given components in a frame."""
-    return vector_of(sum_vectors(*(scale(part, axis) for part, axis in zip(vector, axes, strict=True))))
 
 
 def flying_body(scene: Scene[Top], flying: FlightState, ground: Below, ball: Ball | None = None) -> FreeBody:

@@ -30,7 +30,7 @@ from nonholonomic.integration import AbstractProblem, Settings, traced_solve_ens
 from nonholonomic.integration.problem import LEFT_DOMAIN, MOST_STEPS
 
 from ..friction import AbstractFriction, ContactLoad, SetValuedCoulomb, Slip, length
-from ..model.body import Round, Top
+from ..model.body import ContactGeometry, Top
 from ..model.dynamics import AbstractDynamics, Dynamics, angular_velocity, joined, parts
 from ..model.scene import Scene
 from ..model.stick_slip import StickSlip
@@ -81,7 +81,7 @@ def standing_on(dynamics: Dynamics | StickSlip, ball: Ball) -> Dynamics:
     """
     assert isinstance(dynamics, Dynamics)
     coupling = dynamics.mass * ball.offset * dynamics.per_transverse
-    return dataclasses.replace(dynamics, meridian=Round(ball.offset, ball.radius, coupling))
+    return dataclasses.replace(dynamics, meridian=ContactGeometry(ball.offset, ball.radius, coupling))
 
 
 def as_free_body(body: Top, ball: Ball, state: Float[Array, "components ..."]) -> FreeBody:
