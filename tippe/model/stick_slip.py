@@ -352,6 +352,10 @@ class StickSlip(AbstractContactDynamics):
         slip = self.slipping.motion(state).slip
         return length(slip.x, slip.y)
 
+    def rests(self, state: Float[Array, "components ..."]) -> Bool[Array, "..."]:
+        """Whether the contact is at rest."""
+        return self.slip_speed(state) <= AT_REST * self.speed
+
     def normal_spin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Angular velocity of a rigid body about the arena's normal [rad/s]."""
         return self.rolling.angular_velocity(state)[2]

@@ -17,7 +17,7 @@ and torque by a positive definite matrix.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import diffrax
 import jax
@@ -39,6 +39,9 @@ from ..model.stick_slip import StickSlip
 #
 # In contact the velocity and the height of the centre of mass follow from the axis; for a free body they are part of the
 # state.
+
+#: Two values of the same structure.
+Tree = TypeVar("Tree")
 
 #: Round-off allowed for a sphere that has just left the arena, as a fraction of R. A sphere that returns gets no
 #: allowance, so ten times or a tenth of this value changes no landing.
@@ -75,6 +78,19 @@ def balls(body: Top) -> tuple[Ball, ...]:
     return (main,) if body.stem is None else (main, Ball(body.stem.offset, body.stem.radius))
 
 
+def own_and_other(body: Top, number: Int[Array, "..."]) -> tuple[Ball, Ball | None]:
+    """The sphere of a top with the given number, in the order of `balls`; and the other sphere if there is one."""
+    if body.stem is None:
+        return balls(body)[0], None
+    main, stem = balls(body)
+    return select(number == 0, main, stem), select(number == 0, stem, main)
+
+
+def select(condition: Bool[Array, "..."], first: Tree, second: Tree) -> Tree:
+    """Each leaf of one tree where a condition holds, and of the other tree elsewhere."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), first, second)
+
+
 def standing_on(dynamics: Dynamics | StickSlip, ball: Ball) -> Dynamics:
     """The equations of motion of a top that stands on another of its spheres: the same equations with the parameters of
     this sphere.
@@ -99,22 +115,6 @@ def contact_state(free: FreeBody) -> Float[Array, "components ..."]:
     return joined(free.velocity[:2], free.axis, free.momentum)
 
 
-def shown(body: Top, free: FreeBody, quadratures: Float[Array, "7 ..."]) -> Float[Array, "17 ..."]:
-    """The output rows of a body that may fly.
-
-    **Arguments:** `quadratures`: position (x, y) of the centre of mass [m], the vector c of `problems.py`, spin
-    angle [rad], work [J].
-
-    **Returns:** the state as in contact; position (x, y) of the sphere's centre, c, spin angle, work; and the distance
-    of the top's own sphere from the plane [m] with its rate [m/s].
-    """
-    main = balls(body)[0]
-    place = [x + main.offset * e for x, e in zip(quadratures[:2], free.axis[:2], strict=True)]
-    distance = (gap(main, free), gap_rate(body, main, free))
-    rows = (*free.velocity[:2], *free.axis, *free.momentum, *place, *quadratures[2:], *distance)
-    return jnp.stack(jnp.broadcast_arrays(*rows))
-
-
 def axis_rate(body: Top, axis: Vector, momentum: Vector) -> Vector:
     """Rate of the axis e' = L x e / I1 [1/s]."""
     return scale(1.0 / body.I1, cross(momentum, axis))
@@ -131,7 +131,7 @@ def gap_rate(body: Top, ball: Ball, free: FreeBody) -> Float[Array, "..."]:
 
 
 def still_parting(
-    rate: Float[Array, "..."], gravity: Float[Array, "..."], radius: Float[Array, "..."], rounding: Any = 0.0
+    rate: Float[Array, "..."], gravity: Float[Array, "..."], radius: Float[Array, "..."], rounding: ArrayLike = 0.0
 ) -> Float[Array, "..."]:
     """The round-off allowed for the distance of a sphere, as a fraction of R.
 
@@ -158,21 +158,13 @@ def energy_in(
 
     In flight, the state does not contain the speed of the sphere along the normal.
 
-    **Arguments:** `number`: index of the mode in `sliding.py`; where both spheres touch, either determines the height.
+    **Arguments:** `number`: index of the mode in `plane.py`; where both spheres touch, either determines the height.
     """
     main, stem = balls(scene.body)[0], balls(scene.body)[-1]
-    contact_ball = Ball(
-        *(jnp.where(number == 1, of_stem, of_main) for of_stem, of_main in zip(stem, main, strict=True))
-    )
+    contact_ball = select(number == 1, stem, main)
     free = as_free_body(scene.body, contact_ball, state)
     total = energy(scene.body, scene.gravity, free)
     return total - 0.5 * scene.body.mass * free.velocity[2] ** 2, total
-
-
-def jellett(ball: Ball, free: FreeBody) -> Float[Array, "..."]:
-    """Jellett's quantity L.(R n - a e) [kg m^3/s] for one of the spheres: constant while no force acts on the other
-    sphere."""
-    return ball.radius * free.momentum[2] - ball.offset * dot(free.axis, free.momentum)
 
 
 Cells = Float[Array, " cells"]
@@ -342,6 +334,37 @@ def resolve_impact(
     outcome, _ = traced_solve_ensemble(problem, horizon, cells, settings)
     impulse = problem.ended(outcome.end_time, outcome.state)
     return apply_impulse(body, contact, free, impulse), outcome.status != LEFT_DOMAIN
+
+
+class Strike(NamedTuple):
+    """The effect of an impact on the sphere that strikes.
+
+    - `free`: the body after the impact; `rebounds`: whether the sphere flies off, or else stays in contact.
+    - `is_slow`: whether the impact is so slow that it may be the last; `fails`: whether it could not be computed.
+    """
+
+    free: FreeBody
+    rebounds: Bool[Array, " cells"]
+    is_slow: Bool[Array, " cells"]
+    fails: Bool[Array, " cells"]
+
+
+def closing_speed(scene: Scene[Top]) -> Float[Array, "..."]:
+    """The speed [m/s] of a rebound below which the contact closes."""
+    return CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
+
+
+def strike(scene: Scene[Top], ball: Ball, free: FreeBody) -> Strike:
+    """The impact of a sphere of a free body on the plane; a slow rebound closes the contact."""
+    speed = greatest(-gap_rate(scene.body, ball, free), 0.0)
+    bounce = jnp.zeros_like(speed) + (0.0 if scene.restitution is None else scene.restitution)
+    rebounds = bounce * speed > closing_speed(scene)
+    bounce, law = jnp.where(rebounds, bounce, 0.0), scene.friction
+    if isinstance(law, SetValuedCoulomb):
+        free, fails = resolve_coulomb_impact(scene.body, law, ball, free, bounce)
+    else:
+        free, fails = resolve_impact(scene.body, law, ball, free, bounce)
+    return Strike(free, rebounds, ~rebounds & (speed <= closing_speed(scene)), fails)
 
 
 def apply_impulse(body: Top, contact: Approach, free: FreeBody, impulse: ContactImpulse) -> FreeBody:
@@ -563,6 +586,10 @@ class LeaningDynamics(AbstractDynamics):
         """The equations for the top of a scene."""
         return cls(scene.body, scene.friction, scene.gravity)
 
+    @property
+    def weight(self) -> Float[Array, "..."]:
+        return self.body.mass * self.gravity
+
     def motion(self, state: Float[Array, "components ..."]) -> LeaningMotion:
         """Evaluate the equations of motion.
 
@@ -592,9 +619,8 @@ class LeaningDynamics(AbstractDynamics):
             )
             for ball, load in zip(spheres, loads, strict=True)
         )
-        weight = m * self.gravity
-        N_1 = -(axial_rate * precession * sine2 + weight * m_0) / (m_1 - m_0)
-        normal = (weight - N_1, N_1)
+        N_1 = -(axial_rate * precession * sine2 + self.weight * m_0) / (m_1 - m_0)
+        normal = (self.weight - N_1, N_1)
 
         u_dot = scale(1.0 / m, sum_vectors(*(scale(N, load.force) for N, load in zip(normal, loads, strict=True))))
         pulls = [dot(perpendicular, load.force) for load in loads]
@@ -611,8 +637,7 @@ class LeaningDynamics(AbstractDynamics):
 
     def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
         """Both normal forces as fractions of the weight, plus `HOLDS`."""
-        weight = self.body.mass * self.gravity
-        return tuple(force / weight + HOLDS for force in self.motion(state).normal_forces)
+        return tuple(force / self.weight + HOLDS for force in self.motion(state).normal_forces)
 
     def heavier(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
         """The number of the sphere with the greater normal force: contact remains there when the other force vanishes."""

@@ -24,7 +24,7 @@ from ..friction import NoSlip
 from ..model.body import Top
 from ..model.rigid import AbstractRigidBody
 from ..model.scene import Launch, Scene
-from ..modes.sliding import Slide
+from ..modes.plane import Slide
 from .launches import check_reversible, check_run, event_of
 from .model import TopModel
 from .trajectory import Trajectory

@@ -24,10 +24,10 @@ from ..model.body import Top
 from ..model.dynamics import NO_COSINE
 from ..model.rigid import AbstractRigidBody
 from ..model.scene import Launch, Scene
-from ..modes.airborne import airborne_modes, modes_with_stem
+from ..modes.airborne import airborne_modes
 from ..modes.impact import energy_in
+from ..modes.plane import hopping_modes
 from ..modes.problems import InversionProblem, StemContact, trajectory_problem
-from ..modes.sliding import hopping_modes
 from ..modes.sticking import airborne_energy, airborne_stick_slip_modes, contact_energy, loss, stick_slip_modes
 
 # The events of a top, and checks of the arguments of a run, before anything compiles and inside a program.
@@ -310,7 +310,6 @@ SMOOTH = RunKind((), None, energy_of_state, loss_of_contact)
 STICK_SLIP = RunKind(("sticks",), stick_slip_modes, contact_energy, loss_of_contact)
 HYBRID = RunKind(("hops",), hopping_modes, energy_in, None)
 AIRBORNE = RunKind(("hops",), airborne_modes, airborne_energy, loss, True)
-ON_STEM_TOO = AIRBORNE._replace(modes=modes_with_stem)
 STICK_SLIP_FLY = AIRBORNE._replace(counts=("hops", "sticks"), modes=airborne_stick_slip_modes)
 
 
@@ -321,9 +320,7 @@ def run_kind_of(scene: Scene[Any]) -> RunKind:
         return STICK_SLIP_FLY if hybrid else STICK_SLIP
     if not hybrid:
         return SMOOTH
-    if scene.flies_in_closed_form:
-        return HYBRID
-    return AIRBORNE if scene.body.stem is None else ON_STEM_TOO
+    return HYBRID if scene.flies_in_closed_form else AIRBORNE
 
 
 def flight_modes(scene: Scene[Top], launch: Launch, tolerance: Any, cells: int = 1) -> Start:

@@ -33,7 +33,7 @@ from ..friction import NoSlip
 from ..model.dynamics import LOSSES, NO_COSINE
 from ..model.scene import Launch, Scene, generic_direction
 from ..modes.problems import BEHIND_PATH, InversionProblem, StemContact, TrajectoryProblem, trajectory_problem
-from ..modes.sticking import contact_modes, on_the_ground
+from ..modes.sticking import above_the_ground, contact_modes
 from .launches import (
     COUNTED,
     INVERTED,
@@ -278,7 +278,7 @@ class TopModel(AbstractSceneModel):
     def at_end(self, outcome: Any, start: Float[Array, "components cells"]) -> dict[str, Array]:
         state = jnp.asarray(outcome.state)[: len(start)]
         if self.kind.flight_state:
-            state = on_the_ground(self.scene, state, outcome.mode)
+            state = above_the_ground(self.scene, state, outcome.mode)[0]
         return {"end_theta": self.scene.theta(state)}
 
 

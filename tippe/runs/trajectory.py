@@ -44,9 +44,8 @@ from ..modes.airborne import (
     lift_off,
     standing,
 )
-from ..modes.flight import height
 from ..modes.impact import BOTH, TOUCHING, Ball, FreeBody, approach, as_free_body, balls, energy, standing_on
-from ..modes.sliding import MOST_BOUNCES
+from ..modes.plane import MOST_BOUNCES, height
 from ..modes.sticking import lifted
 from .launches import if_balanced, why_unbalanced
 from .observables import AbstractTrajectory, of_each_run

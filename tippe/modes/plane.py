@@ -1,20 +1,28 @@
-"""Flights and impacts on the level plane, in closed form, until a sphere stays on the plane.
+"""The modes on the level plane: sliding on one sphere or on both; and flights and impacts in closed form, until a sphere
+stays on the plane.
 
 Between two contacts, L is constant and e turns about it at the rate |L| / I1 (`tippe.md`, section 3). The distance of a
 sphere from the plane is therefore a parabola plus a cosine. Between inflections, which are known, its slope is
 monotone: each interval has at most one minimum, and at most one root between points of different sign. The search for
 the landing is therefore complete.
+
+A single run whose path is kept has seven passive quadratures after its state: the position (x, y) of the centre of
+mass [m], the vector c of `problems.py`, the rotation angle of the top about its axis [rad], and the work of
+friction and impacts [J].
 """
 
-from typing import Any, NamedTuple
+from typing import ClassVar, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.compilation.xla_cpu import greatest
+from nonholonomic.compilation.xla_cpu import compiled_setup, greatest
 from nonholonomic.geometry import Vector, cross, dot, scale, subtract, sum_vectors
+from nonholonomic.hybrid import AbstractHoppingMode, Transition, TransitionPath
+from nonholonomic.integration import AbstractProblem
 from nonholonomic.integration.dense import halved
 from nonholonomic.integration.problem import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
 
@@ -22,22 +30,26 @@ from ..model.body import Top
 from ..model.dynamics import COS_THETA, Dynamics, parts
 from ..model.scene import Scene
 from .impact import (
-    CLOSING_SPEED,
     TOUCHING,
     Ball,
+    Cells,
     FreeBody,
     LeaningDynamics,
     as_free_body,
+    at_rest,
     balls,
+    closing_speed,
+    contact_state,
     energy,
     gap,
     gap_rate,
-    resolve_impact,
+    own_and_other,
+    select,
     standing_on,
     still_parting,
+    strike,
 )
-
-Cells = Float[Array, " cells"]
+from .problems import AbstractFlyingMode, InversionProblem, Quadratures
 
 #: Most intervals between inflections that are searched for a landing; the search skips those where the top is too high.
 MOST_STRETCHES = 20_000
@@ -75,19 +87,6 @@ class Descent(NamedTuple):
         angle = self.rate * time
         swing = self.cosine * jnp.sin(angle) + self.sine * 2.0 * jnp.sin(0.5 * angle) ** 2
         return self.speed - self.gravity * time - self.rate * swing
-
-
-class Flight(NamedTuple):
-    """How a flight ended: its duration [s], whether a sphere landed, and which sphere.
-
-    `lost` is true where the search for the landing failed; `log_rate` is the logarithm of the speed of landing.
-    """
-
-    duration: Cells
-    landed: Bool[Array, " cells"]
-    ball: Int[Array, " cells"]
-    lost: Bool[Array, " cells"]
-    log_rate: Cells
 
 
 def angle_less_sine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -141,45 +140,6 @@ def turned(vector: Vector, axis: Vector, angle: Float[Array, "..."]) -> Vector:
     return sum_vectors(parallel, scale(jnp.cos(angle), perpendicular), scale(jnp.sin(angle), binormal))
 
 
-def fly(
-    body: Top,
-    gravity: Float[Array, "..."],
-    spheres: tuple[Ball, ...],
-    free: FreeBody,
-    last_ball: Int[Array, " cells"],
-    rising: Bool[Array, " cells"],
-    max_time: Cells,
-) -> Flight:
-    """Fly until a sphere lands, for a limited time.
-
-    **Arguments:**
-
-    - `spheres`: the spheres that can land.
-    - `free`: the body at the start.
-    - `last_ball`: index of the sphere that has just left the plane.
-    - `rising`: whether that sphere leaves with a speed, as after an impact. Otherwise the sphere was at rest when the
-      normal force vanished, and its distance grows with the third power of time.
-    - `max_time`: time [s] at which the flight is cut off.
-
-    **Returns:** a `Flight`.
-    """
-    times, speeds, has_failed = [], [], jnp.zeros(max_time.shape, bool)
-    for number, ball in enumerate(spheres):
-        descent = _descent(body, gravity, ball, free, (last_ball == number) & ~rising, last_ball == number)
-        # The search is by bisection, which has no derivative.
-        time, given_up = landing(*stop_gradient((descent, max_time)))
-        times.append(landed_at(descent, time))
-        speeds.append(-descent.slope(jnp.where(jnp.isfinite(time), times[-1], 0.0)))
-        has_failed |= given_up
-    first = jnp.argmin(jnp.stack(times), axis=0)
-    time = jnp.min(jnp.stack(times), axis=0)
-    has_landed = time <= max_time
-    duration = jnp.where(has_landed, time, max_time)
-    speed = jnp.take_along_axis(jnp.stack(speeds), first[None], axis=0)[0]
-    log_rate = jnp.log(jnp.maximum(speed, jnp.finfo(speed.dtype).tiny))
-    return Flight(duration, has_landed, first, has_failed, log_rate)
-
-
 def _descent(
     body: Top,
     gravity: Float[Array, "..."],
@@ -211,8 +171,9 @@ def landing(descent: Descent, max_time: Cells) -> tuple[Cells, Bool[Array, " cel
     g, rate, amplitude = descent.gravity, descent.rate, jnp.hypot(descent.cosine, descent.sine)
     # The distance lies between two parabolas, mean +- amplitude.
     mean, drift = descent.start - descent.cosine, descent.speed - descent.sine * rate
-    end = jnp.minimum(max_time, _last_root(mean + amplitude, drift, g) * (1.0 + 1e-9))
-    high_from, high_to = _roots(mean - amplitude, drift, g)
+    end = jnp.minimum(max_time, _roots(mean + amplitude, drift, g)[1] * (1.0 + 1e-9))
+    high_from, high_to, is_never_high = _roots(mean - amplitude, drift, g)
+    high_from, high_to = (jnp.where(is_never_high, jnp.inf, time) for time in (high_from, high_to))
     # The distance is convex where rate^2 amplitude cos(rate t - phase) < -g, for angles between bend and 2 pi - bend.
     mode = jnp.arctan2(descent.sine, descent.cosine)
     ratio = g / jnp.maximum(rate**2 * amplitude, jnp.finfo(g.dtype).tiny)
@@ -259,20 +220,11 @@ def landed_at(descent: Descent, time: Cells) -> Cells:
     return time - jnp.where(is_regular, (value - stop_gradient(value)) / jnp.where(is_regular, slope, 1.0), 0.0)
 
 
-def _roots(height: Cells, speed: Cells, gravity: Cells) -> tuple[Cells, Cells]:
-    """Times between which a body thrown from a height is above zero; infinite if it never is."""
+def _roots(height: Cells, speed: Cells, gravity: Cells) -> tuple[Cells, Cells, Bool[Array, " cells"]]:
+    """Times between which a body thrown from a height is above zero; and whether it never is."""
     square = speed**2 + 2.0 * gravity * height
     root = jnp.sqrt(greatest(square, 0.0))
-    is_below = square <= 0.0
-    return (
-        jnp.where(is_below, jnp.inf, (speed - root) / gravity),
-        jnp.where(is_below, jnp.inf, (speed + root) / gravity),
-    )
-
-
-def _last_root(height: Cells, speed: Cells, gravity: Cells) -> Cells:
-    """Time at which a body thrown from a height, nonnegative up to round-off, is at zero again."""
-    return (speed + jnp.sqrt(greatest(speed**2 + 2.0 * gravity * height, 0.0))) / gravity
+    return (speed - root) / gravity, (speed + root) / gravity, square <= 0.0
 
 
 def angle_reached(body: Top, free: FreeBody, cos_angle: Float[Array, "..."], horizon: Cells, last: bool) -> Cells:
@@ -328,31 +280,6 @@ class Air(NamedTuple):
     quadratures: Float[Array, "7 cells"] | None = None
 
 
-def lost_contact(scene: Scene[Top], number: Int[Array, ""], state: Float[Array, "components cells"]) -> Air:
-    """The top at the end of sliding on the sphere with the given number: its contact is lost or jams, or the other
-    sphere is at the plane.
-    """
-    contact_ball, other_ball = own_and_other(balls(scene.body), number)
-    zero = jnp.zeros_like(state[0])
-    dynamics = standing_on(scene.dynamics, contact_ball)
-    falls, ball, jams = None, jnp.broadcast_to(number, zero.shape), dynamics.loss(state) > 0
-    if other_ball is not None:
-        falls = clearance(dynamics, contact_ball, other_ball, state) <= dynamics.contact_margin(state)
-        ball, jams = jnp.where(falls, 1 - number, number), jams & ~falls
-    return Air(
-        free=as_free_body(scene.body, contact_ball, state),
-        elapsed=zero,
-        ball=ball,
-        rising=jnp.zeros(zero.shape, bool),
-        falls=falls,
-        status=jnp.where(jams, LEFT_DOMAIN, RUNNING),
-        crossing_time=jnp.full_like(zero, jnp.inf),
-        flights=jnp.zeros(zero.shape, int),
-        open=~jams,
-        log_rates=zero,
-    )
-
-
 def take_flight(
     scene: Scene[Top], air: Air, cos_angle: Float[Array, "..."], left: Cells, last: bool
 ) -> tuple[Air, Bool[Array, " cells"]]:
@@ -361,52 +288,61 @@ def take_flight(
 
     **Returns:** the top at the end of the flight; and whether a sphere has reached the plane.
     """
-    body, gravity = scene.body, scene.gravity
-    flight = fly(body, gravity, balls(body), air.free, air.ball, air.rising, greatest(left - air.elapsed, 0.0))
-    crossing_time = angle_reached(body, air.free, cos_angle, flight.duration, last)
+    body, gravity, free = scene.body, scene.gravity, air.free
+    max_time = greatest(left - air.elapsed, 0.0)
+    times, speeds, has_failed = [], [], jnp.zeros(max_time.shape, bool)
+    for number, ball in enumerate(balls(body)):
+        # A sphere that was at rest when the normal force vanished rises with the third power of time.
+        descent = _descent(body, gravity, ball, free, (air.ball == number) & ~air.rising, air.ball == number)
+        # The search is by bisection, which has no derivative.
+        time, given_up = landing(*stop_gradient((descent, max_time)))
+        times.append(landed_at(descent, time))
+        speeds.append(-descent.slope(jnp.where(jnp.isfinite(time), times[-1], 0.0)))
+        has_failed |= given_up
+    first, time = jnp.argmin(jnp.stack(times), axis=0), jnp.min(jnp.stack(times), axis=0)
+    lands = time <= max_time
+    duration = jnp.where(lands, time, max_time)
+    speed = jnp.take_along_axis(jnp.stack(speeds), first[None], axis=0)[0]
+    log_rate = jnp.log(jnp.maximum(speed, jnp.finfo(speed.dtype).tiny))
+
+    crossing_time = angle_reached(body, free, cos_angle, duration, last)
     crosses = jnp.isfinite(crossing_time) & (not last)
-    duration = jnp.where(crosses, crossing_time, flight.duration)
-    has_landed = flight.landed & ~crosses & ~flight.lost
-    status = jnp.where(crosses, CROSSED, jnp.where(flight.landed, air.status, REACHED_END))
-    air_after = Air(
-        free=flown(body, gravity, air.free, duration),
+    duration = jnp.where(crosses, crossing_time, duration)
+    has_landed = lands & ~crosses & ~has_failed
+    status = jnp.where(crosses, CROSSED, jnp.where(lands, air.status, REACHED_END))
+    air_after = air._replace(
+        free=flown(body, gravity, free, duration),
         elapsed=air.elapsed + duration,
-        ball=jnp.where(has_landed, flight.ball, air.ball),
-        rising=air.rising,
-        falls=air.falls,
-        status=jnp.where(flight.lost, FAILED, status),
+        ball=jnp.where(has_landed, first, air.ball),
+        status=jnp.where(has_failed, FAILED, status),
         crossing_time=jnp.where(jnp.isfinite(crossing_time), air.elapsed + crossing_time, air.crossing_time),
         flights=air.flights + 1,
         open=has_landed,
-        log_rates=air.log_rates + jnp.where(has_landed, flight.log_rate, 0.0),
-        quadratures=None if air.quadratures is None else quadratures_after(body, air.free, air.quadratures, duration),
+        log_rates=air.log_rates + jnp.where(has_landed, log_rate, 0.0),
+        quadratures=None if air.quadratures is None else quadratures_after(body, free, air.quadratures, duration),
     )
     return air_after, has_landed
 
 
 def land(scene: Scene[Top], air: Air) -> Air:
     """The impact of the sphere that has reached the plane; a slow rebound closes the contact."""
-    body, spheres = scene.body, balls(scene.body)
-    contact_ball, other_ball = own_and_other(spheres, air.ball)
-    speed = greatest(-gap_rate(body, contact_ball, air.free), 0.0)
-    restitution = (
-        jnp.zeros_like(speed) if scene.restitution is None else jnp.broadcast_to(scene.restitution, speed.shape)
-    )
-    closing = CLOSING_SPEED * jnp.sqrt(scene.gravity * body.radius)
-    rebounds = restitution * speed > closing
-    free, fails = resolve_impact(body, scene.friction, contact_ball, air.free, jnp.where(rebounds, restitution, 0.0))
-    after_impact = air._replace(free=free, rising=rebounds, open=rebounds, status=jnp.where(fails, FAILED, air.status))
+    contact_ball, other_ball = own_and_other(scene.body, air.ball)
+    blow = strike(scene, contact_ball, air.free)
+    status = jnp.where(blow.fails, FAILED, air.status)
+    after_impact = air._replace(free=blow.free, rising=blow.rebounds, open=blow.rebounds, status=status)
     if other_ball is not None:
-        after_impact = _with_other(scene, air, after_impact, other_ball, (speed <= closing) & ~rebounds, closing)
+        after_impact = _with_other(scene, air, after_impact, other_ball, blow.is_slow)
     if air.quadratures is not None:
-        energy_change = energy(body, scene.gravity, after_impact.free) - energy(body, scene.gravity, air.free)
+        energy_change = energy(scene.body, scene.gravity, after_impact.free) - energy(
+            scene.body, scene.gravity, air.free
+        )
         *path, work = air.quadratures
         after_impact = after_impact._replace(quadratures=jnp.stack([*path, work + energy_change]))
-    return after_impact._replace(open=after_impact.open & ~fails)
+    return after_impact._replace(open=after_impact.open & ~blow.fails)
 
 
 def _with_other(
-    scene: Scene[Top], air: Air, after_impact: Air, other_ball: Ball, is_slow: Bool[Array, " cells"], closing: Cells
+    scene: Scene[Top], air: Air, after_impact: Air, other_ball: Ball, is_slow: Bool[Array, " cells"]
 ) -> Air:
     """Effect of an impact on the other sphere if that is at the plane: it also strikes, or the top comes to rest on
     both.
@@ -414,11 +350,13 @@ def _with_other(
     **Arguments:** `air`: the top before the impact; `after_impact`: the top after the impact; `is_slow`: mask of the impacts
     that are so slow that they may be the last.
     """
+    closing = closing_speed(scene)
     touches = gap(other_ball, air.free) < TOUCHING * scene.body.radius
     falls = touches & (gap_rate(scene.body, other_ball, after_impact.free) < -closing)
-    stopped_body, dissipates = LeaningDynamics.of(scene).stopped(air.free)
+    leaning = LeaningDynamics.of(scene)
+    stopped_body, dissipates = leaning.stopped(air.free)
     rests = touches & is_slow & (jnp.abs(gap_rate(scene.body, other_ball, air.free)) <= closing) & dissipates
-    free, number, definite = LeaningDynamics.of(scene).settled(stopped_body)
+    free, number, definite = leaning.settled(stopped_body)
     falls &= ~rests
     return after_impact._replace(
         free=select(rests, free, after_impact.free),
@@ -481,14 +419,230 @@ def height(contact_ball: Ball, other_ball: Ball, state: Float[Array, "components
     return contact_ball.radius - other_ball.radius + (other_ball.offset - contact_ball.offset) * state[COS_THETA]
 
 
-def own_and_other(spheres: tuple[Ball, ...], number: Int[Array, "..."]) -> tuple[Ball, Ball | None]:
-    """The numbered sphere, and the other if there is one."""
+#: Most consecutive bounces before a run fails.
+MOST_BOUNCES = 10_000
+
+#: Angle by which the axis turns between the default output times of a flight [rad].
+SHOWN = 0.4
+
+
+class SlidingOnOne(InversionProblem):
+    """Sliding on one of two spheres until theta reaches an angle, the contact is lost or jams, or the other sphere
+    lands.
+    """
+
+    contact_ball: Ball = eqx.field(kw_only=True)
+    other_ball: Ball = eqx.field(kw_only=True)
+
+    def margins(self, time: Cells, state: Float[Array, "components cells"]) -> tuple[Cells, ...]:
+        assert isinstance(self.dynamics, Dynamics)
+        return (*super().margins(time, state), clearance(self.dynamics, self.contact_ball, self.other_ball, state))
+
+
+class Slide(AbstractFlyingMode, AbstractHoppingMode):
+    """Sliding on the sphere numbered `number`, in the order of `balls`, up to an angle of theta.
+
+    `number` is an array, so that one program serves both spheres. With `last`, a run continues through the angle. A
+    single run whose path is kept records its flights.
+    """
+
+    most_hops: ClassVar[int] = MOST_BOUNCES
+
+    number: Int[Array, ""]
+    last: bool = eqx.field(static=True)
+
+    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+        contact_ball, other_ball = own_and_other(self.scene.body, self.number)
+        contact = (standing_on(self.scene.dynamics, contact_ball), self.cos_angle, state[:OWN], self.scales[:OWN])
+        problem = (
+            InversionProblem(*contact, flies=True)
+            if other_ball is None
+            else SlidingOnOne(
+                *contact,
+                contact_ball=contact_ball,
+                other_ball=other_ball,
+                on_stem=self.number == 1,
+                stem_counts=self.stem_counts,
+                flies=True,
+            )
+        )
+        return self.extended(problem, Quadratures(self.scene.body.I3, of_mass=True), state)
+
+    def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
+        contact_ball, _ = own_and_other(self.scene.body, self.number)
+        return shown(self.scene.body, as_free_body(self.scene.body, contact_ball, state), state[OWN:])
+
+    def between(
+        self, motion: tuple[FreeBody, Float[Array, "7 times"]], passed: Float[Array, " times"]
+    ) -> Float[Array, "17 times"]:
+        free, quadratures = motion
+        free_after = flown(self.scene.body, self.scene.gravity, free, passed)
+        return shown(self.scene.body, free_after, quadratures_after(self.scene.body, free, quadratures, passed))
+
+    def reset_map(self, state: Float[Array, "components cells"], left: Cells) -> Transition:
+        """Fly, and bounce, until a sphere stays on the plane; or let the other sphere land if it touches the plane.
+
+        Counts the flights.
+        """
+
+        def hop(carry: tuple[Air, Array, TransitionPath | None]) -> tuple[Air, Array, TransitionPath | None]:
+            air, count, record = carry
+            air_after, air_landed = self.hop(air, left)
+            return air_landed, count + 1, _with_flight(self.scene.body, record, air, air_after)
+
+        def under_way(carry: tuple[Air, Array, TransitionPath | None]) -> Array:
+            return jnp.any(carry[0].open) & (carry[1] < MOST_BOUNCES)
+
+        start = self.lost(state)
+        record = _no_flights(start) if self.with_quadratures else None
+        air, _, record = jax.lax.while_loop(under_way, hop, (start, jnp.zeros((), int), record))
+        return self.closed(air)._replace(record=record)
+
+    def lost(self, state: Float[Array, "components cells"]) -> Air:
+        """The top at the end of sliding: its contact is lost or jams, or the other sphere is at the plane."""
+        contact_ball, other_ball = own_and_other(self.scene.body, self.number)
+        zero, dynamics = jnp.zeros_like(state[0]), standing_on(self.scene.dynamics, contact_ball)
+        falls, ball, jams = None, jnp.broadcast_to(self.number, zero.shape), dynamics.loss(state) > 0
+        if other_ball is not None:
+            falls = clearance(dynamics, contact_ball, other_ball, state) <= dynamics.contact_margin(state)
+            ball, jams = jnp.where(falls, 1 - self.number, self.number), jams & ~falls
+        # A launch beyond the angle and without contact ends at once.
+        is_beyond = ~jams & (state[COS_THETA] <= self.cos_angle) & (not self.last)
+        return Air(
+            free=as_free_body(self.scene.body, contact_ball, state),
+            elapsed=zero,
+            ball=ball,
+            rising=jnp.zeros(zero.shape, bool),
+            falls=falls,
+            status=jnp.where(is_beyond, CROSSED, jnp.where(jams, LEFT_DOMAIN, RUNNING)),
+            crossing_time=jnp.where(is_beyond, zero, jnp.inf),
+            flights=jnp.zeros(zero.shape, int),
+            open=~jams & ~is_beyond,
+            log_rates=zero,
+            quadratures=state[OWN:] if self.with_quadratures else None,
+        )
+
+    def hop(self, air: Air, left: Cells) -> tuple[Air, Air]:
+        """One flight of a top whose contact is open, and the impact at its end."""
+        air_after, has_landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
+        if air.falls is None:
+            air_landed = land(self.scene, air_after)
+        else:
+            air_after, has_landed = select(air.falls, air, air_after), air.falls | has_landed
+            air_landed = land(self.scene, air_after)
+            if self.stem_counts is not None:
+                air_landed = stem_takes_over(air, air_after.ball == 1, air_landed, self.stem_counts, self.last)
+        return air_after, select(air.open, select(has_landed, air_landed, air_after), air)
+
+    def motion_in(self, air: Air) -> tuple[FreeBody, Float[Array, "7 cells"] | None]:
+        return air.free, air.quadratures
+
+    def closed(self, air: Air) -> Transition:
+        """The transition for a top that has returned to the plane, or whose run has ended."""
+        status, state = jnp.where(air.open, UNRESOLVED, air.status), contact_state(air.free)
+        if air.quadratures is not None:
+            state = jnp.concatenate([state, air.quadratures])
+        counts = air.flights[None]
+        return Transition(air.ball, state, air.elapsed, status, air.crossing_time, counts, log_rates=air.log_rates)
+
+
+class Lean(AbstractFlyingMode):
+    """Sliding on both spheres; numbered after the modes of the single spheres. `last`: as for `Slide`."""
+
+    last: bool = eqx.field(static=True)
+
+    @property
+    def rare(self) -> bool:
+        # Few tops come to rest on both spheres.
+        return True
+
+    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+        contact = (LeaningDynamics.of(self.scene), self.cos_angle, state[:OWN], self.scales[:OWN])
+        # The stem carries a part of the top, so its first event has happened; the sphere still touches, so, with `last`,
+        # that event has not.
+        on_stem = jnp.asarray(not self.last)
+        problem = InversionProblem(*contact, stem_counts=self.stem_counts, on_stem=on_stem, flies=True)
+        return self.extended(problem, Quadratures(self.scene.body.I3, of_mass=True), state)
+
+    def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
+        return shown(self.scene.body, as_free_body(self.scene.body, balls(self.scene.body)[0], state), state[OWN:])
+
+    def reset_map(self, state: Float[Array, "components cells"], left: Cells) -> Transition:
+        """Slide on the sphere whose normal force has not vanished."""
+        number, body = LeaningDynamics.of(self.scene).heavier(state), self.scene.body
+        state_at_rest = contact_state(at_rest(body, as_free_body(body, balls(body)[0], state)))
+        state = jnp.concatenate([state_at_rest, state[OWN:]])
+        zero = jnp.zeros_like(state[0])
+        running, zeros = jnp.full(zero.shape, RUNNING), jnp.zeros((1, *zero.shape), int)
+        leaves_sphere = jnp.zeros(zero.shape, bool)
+        if self.last and self.stem_counts is not None:
+            leaves_sphere = (number == 1) & (self.stem_counts > 0.0)
+        return Transition(number, state, zero, running, jnp.where(leaves_sphere, 0.0, jnp.inf), zeros)
+
+
+def hopping_modes(
+    scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
+) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
+    """The modes of runs, sliding on each sphere and on both if there are two; and the index of the mode in which each
+    starts.
+
+    **Arguments:**
+
+    - `scene`: a scene with `contact="hybrid"`; `problem`: the problem of its launches, which stand on their lower
+      sphere.
+    - `tolerance`: unused by these modes; `last`: whether the last crossing counts; `with_quadratures`: as for
+      `AbstractFlyingMode`.
+    """
+    spheres, arguments = balls(scene.body), (scene, problem.scales, problem.cos_angle, with_quadratures)
+    event = {"stem_counts": problem.stem_counts}
+    slides = tuple(Slide(*arguments, jnp.asarray(number), last, **event) for number in range(len(spheres)))
     if len(spheres) == 1:
-        return spheres[0], None
-    main, stem = spheres
-    return select(number == 0, main, stem), select(number == 0, stem, main)
+        return slides, jnp.zeros(problem.states.shape[1:], int)
+    return (*slides, Lean(*arguments, last, **event)), _first_mode(scene.body, problem.states)
 
 
-def select(condition: Bool[Array, " cells"], first: Any, second: Any) -> Any:
-    """Each leaf of one tree where a condition holds, and of the other tree elsewhere."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), first, second)
+@compiled_setup
+def _first_mode(body: Top, states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+    """The number of the lower of the two spheres."""
+    main, stem = balls(body)
+    return (height(main, stem, states) < 0.0).astype(int)
+
+
+def shown(body: Top, free: FreeBody, quadratures: Float[Array, "7 ..."]) -> Float[Array, "17 ..."]:
+    """The output rows of a body that may fly.
+
+    **Arguments:** `quadratures`: position (x, y) of the centre of mass [m], the vector c of `problems.py`, spin
+    angle [rad], work [J].
+
+    **Returns:** the state as in contact; position (x, y) of the sphere's centre, c, spin angle, work; and the distance
+    of the top's own sphere from the plane [m] with its rate [m/s].
+    """
+    main = balls(body)[0]
+    place = [x + main.offset * e for x, e in zip(quadratures[:2], free.axis[:2], strict=True)]
+    distance = (gap(main, free), gap_rate(body, main, free))
+    rows = (*free.velocity[:2], *free.axis, *free.momentum, *place, *quadratures[2:], *distance)
+    return jnp.stack(jnp.broadcast_arrays(*rows))
+
+
+def _no_flights(start: Air) -> TransitionPath:
+    """An empty record for the flights of a single run."""
+
+    def room(leaf: Array) -> Array:
+        return jnp.zeros((MOST_BOUNCES, *leaf.shape), leaf.dtype)
+
+    motions = jax.tree.map(room, (start.free, start.quadratures))
+    return TransitionPath(jnp.inf + room(start.elapsed), motions, room(start.flights))
+
+
+def _with_flight(body: Top, record: TransitionPath | None, air_before: Air, air_after: Air) -> TransitionPath | None:
+    """The record of a single run, if there is one, with the flight between two states added, if there was one."""
+    if record is None:
+        return None
+    place, has_flown = air_before.flights[0], air_after.flights > air_before.flights
+    angle = cone(body, air_before.free).rate * (air_after.elapsed - air_before.elapsed)
+    new = TransitionPath(
+        jnp.where(has_flown, air_after.elapsed, jnp.inf),
+        (air_before.free, air_before.quadratures),
+        1 + (angle / SHOWN).astype(int),
+    )
+    return jax.tree.map(lambda leaves, leaf: leaves.at[place].set(leaf), record, new)
