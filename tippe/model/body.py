@@ -512,7 +512,9 @@ class ConvexBody(AbstractBody):
     units: ClassVar[dict[str, str]] = {"mass": "kg", "I1": "kg m2", "I3": "kg m2"}
 
     mass: Float[Array, "..."] = eqx.field(converter=as_number)
-    support: eqx.Module = eqx.field(converter=lambda value: as_function(value, "support", ("c",)))
+    support: Callable[[Float[Array, "..."]], Float[Array, "..."]] = eqx.field(
+        converter=lambda value: as_function(value, "support", ("c",))
+    )
     I1: Float[Array, "..."] = eqx.field(converter=as_number)
     I3: Float[Array, "..."] = eqx.field(converter=as_number)
 

@@ -389,9 +389,7 @@ class RigidBody(AbstractRigidBody):
     def _samples(self) -> tuple[Float[Array, "samples ..."], Float[Array, "samples ..."]]:
         """Height of the centre of mass above a plane, and the smaller principal radius of curvature [m], by direction."""
 
-        def sample(
-            normal: Float[Array, "3"], first: Float[Array, "3"], second: Float[Array, "3"]
-        ) -> tuple[Array, Array]:
+        def sample(normal, first, second):
             # A plane that turns about one tangent moves the contact by the radius along the other.
             point, projection = self.contact(tuple(normal), tuple(first))
             _, across = self.contact(tuple(normal), tuple(second))
@@ -406,7 +404,7 @@ class RigidBody(AbstractRigidBody):
 
     @property
     def half_widths(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        def half_width(normal: Float[Array, "3"]) -> Float[Array, ""]:
+        def half_width(normal):
             no_velocity = tuple(jnp.zeros(3))
             (low, _), (high, _) = (self.surface_point(tuple(sign * normal), no_velocity) for sign in (1.0, -1.0))
             return 0.5 * dot(tuple(normal), vector_of(sum_vectors(high, scale(-1.0, low))))
@@ -449,7 +447,7 @@ class Plain(eqx.Module):
         return self.function(direction)
 
 
-def as_support(value: object) -> Callable[[Float[Array, "3"]], Float[Array, ""]]:
+def as_support(value: Any) -> eqx.Module:
     """Convert a support function to a module whose parameters are arrays.
 
     **Raises:** `ValueError` unless it returns one number for a vector of three.

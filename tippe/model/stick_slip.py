@@ -454,7 +454,8 @@ class ContactMode(StickSlip):
             sticks = zero > 0.0
             # The mode ended because of the grip or the room, or there was no contact to begin with, as after an impact.
             room, lost = self.rolling.motion(core_state).room, self.lifts_off(stopped_state)
-            lost |= self.unloaded(core_state, scales[:size])
+            if (unloaded := self.unloaded(core_state, scales[:size])) is not None:
+                lost |= unloaded
             lost = lost if room is None else lost | (room - FITS <= self.grip_left(core_state))
             wait = zero
         else:
