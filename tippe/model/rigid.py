@@ -49,6 +49,7 @@ from .dynamics import (
     AbstractContactDynamics,
     AbstractRollingDynamics,
     Motion,
+    State,
     from_frame,
     joined,
     parts,
@@ -540,7 +541,7 @@ class AbstractRigidDynamics(AbstractContactDynamics):
     def weight(self) -> Float[Array, "..."]:
         return self.body.mass * self.gravity
 
-    def attitude(self, state: Float[Array, "components ..."]) -> Attitude:
+    def attitude(self, state: State) -> Attitude:
         """The attitude and rotation of the body, and its contact point."""
         _, e, L, place = parts(state)
         c = vector_of(place[-3:])
@@ -570,17 +571,17 @@ class AbstractRigidDynamics(AbstractContactDynamics):
         lever_rate = to_frame((subtract(path[0], slip[0]), subtract(path[1], slip[1]), None), axes)
         return ContactMotion(vector_of(sum_vectors(normal_rate, frame_part)), lever_rate, path, frame)
 
-    def angular_velocity(self, state: Float[Array, "components ..."]) -> Vector:
+    def angular_velocity(self, state: State) -> Vector:
         """Angular velocity of the body in the frame [rad/s]."""
         attitude = self.attitude(state)
         return from_frame(attitude.angular_velocity, attitude.axes)
 
-    def mass_from_contact(self, state: Float[Array, "components ..."]) -> Vector:
+    def mass_from_contact(self, state: State) -> Vector:
         """Vector from the contact to the centre of mass [m], in the frame."""
         attitude = self.attitude(state)
         return vector_of(scale(-1.0, from_frame(attitude.lever, attitude.axes)))
 
-    def energy(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    def energy(self, state: State) -> Float[Array, "..."]:
         """Kinetic energy plus weight times the height of the centre of mass [J]."""
         (u1, u2), _, _, place = parts(self.carried_along(state))
         (_, normal, momentum, w, lever, _), place = self.attitude(state), place[:-3]
@@ -589,14 +590,14 @@ class AbstractRigidDynamics(AbstractContactDynamics):
         height = add(self.frame.height(place), dot(self.mass_from_contact(state), self.frame.vertical(place)))
         return self.body.mass * (0.5 * (u1**2 + u2**2 + vertical_speed**2) + self.gravity * height) + rotation
 
-    def normal_spin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    def normal_spin(self, state: State) -> Float[Array, "..."]:
         """Angular velocity about the arena's normal [rad/s]."""
         attitude = self.attitude(state)
         return dot(attitude.angular_velocity, attitude.normal)
 
     def carried_rates(
         self,
-        state: Float[Array, "components ..."],
+        state: State,
         attitude: Attitude,
         contact: ContactMotion,
         push: Tangent,
@@ -619,7 +620,7 @@ class AbstractRigidDynamics(AbstractContactDynamics):
         e_dot, L_dot = sum_vectors(z_rate, rate_in_frame(e, o)), sum_vectors(torque, rate_in_frame(L, o))
         return (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate, *sum_vectors(x_rate, rate_in_frame(place[-3:], o)))
 
-    def carried_along(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+    def carried_along(self, state: State) -> State:
         """The state with the velocity that the friction law imposes; only `NoSlip` imposes a velocity."""
         return state
 
@@ -630,7 +631,7 @@ class RigidSlipping(AbstractRigidDynamics):
     friction: AbstractFriction
     per_mass: Float[Array, "..."]
 
-    def motion(self, state: Float[Array, "components ..."]) -> Motion:
+    def motion(self, state: State) -> Motion:
         """Evaluate the equations of motion, solving for the normal force with friction included.
 
         With q = r x n and J the inertia, all in the body's axes, the centre of mass rises at u.n = -w.q. Its second rate gives
@@ -667,7 +668,7 @@ class RigidSlipping(AbstractRigidDynamics):
 class RigidRolling(AbstractRollingDynamics, AbstractRigidDynamics):
     """The equations of motion of a body whose contact point is at rest: the nonholonomic constraint itself."""
 
-    def evaluate(self, state: Float[Array, "components ..."]) -> tuple[Motion, Vector]:
+    def evaluate(self, state: State) -> tuple[Motion, Vector]:
         """The motion and the reaction F in the frame.
 
         In the body's axes, with the velocity r x w of the centre of mass and r' the rate of r as a vector,
@@ -704,7 +705,7 @@ class RigidRolling(AbstractRollingDynamics, AbstractRigidDynamics):
             inertia.yz - m * r[1] * r[2],
         )
 
-    def with_slip(self, state: Float[Array, "components ..."], slip: Slip) -> Float[Array, "components ..."]:
+    def with_slip(self, state: State, slip: Slip) -> State:
         """As `RollingDynamics.with_slip`."""
         (u1, u2), e, _, place = parts(state)
         attitude = self.attitude(state)
@@ -717,20 +718,20 @@ class RigidRolling(AbstractRollingDynamics, AbstractRigidDynamics):
         u = from_frame(vector_of(sum_vectors(cross(r, w), v)), attitude.axes)
         return joined(u[:2], e, from_frame(self.body.inertia.tensor.times(w), attitude.axes), place)
 
-    def unit_impulse(self, state: Float[Array, "components ..."], axis: int) -> tuple[Component, ...]:
+    def unit_impulse(self, state: State, axis: int) -> tuple[Component, ...]:
         """As `RollingDynamics.unit_impulse`."""
         attitude = self.attitude(state)
         v = vector_of(part[axis] for part in attitude.axes)
         w = self._about_contact(attitude.lever).solve(vector_of(scale(self.body.mass, cross(attitude.lever, v))))
         return scale(self.body.mass, from_frame(vector_of(sum_vectors(cross(attitude.lever, w), v)), attitude.axes))
 
-    def with_unit_axes(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+    def with_unit_axes(self, state: State) -> State:
         """The state with the body's axes at unit length and at right angles."""
         e, x = state[AXIS] / jnp.linalg.norm(state[AXIS], axis=0), state[-3:]
         x = x - jnp.sum(e * x, axis=0) * e
         return state.at[AXIS].set(e).at[-3:].set(x / jnp.linalg.norm(x, axis=0))
 
-    def carried_along(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+    def carried_along(self, state: State) -> State:
         """The state with the velocity r x w of the centre of mass."""
         attitude = self.attitude(state)
         u = from_frame(cross(attitude.lever, attitude.angular_velocity), attitude.axes)

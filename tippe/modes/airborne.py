@@ -35,7 +35,7 @@ from nonholonomic.integration import AbstractPassive, AbstractProblem
 from nonholonomic.integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED
 
 from ..model.body import Top
-from ..model.dynamics import COS_THETA, Dynamics, from_frame, joined, parts, to_frame
+from ..model.dynamics import COS_THETA, Cells, Dynamics, State, States, from_frame, joined, parts, to_frame
 from ..model.scene import Scene
 from .impact import (
     TOUCHING,
@@ -78,7 +78,7 @@ class FlightState(NamedTuple):
     momentum: Vector
 
 
-def flight_state(state: Float[Array, "components ..."]) -> FlightState:
+def flight_state(state: State) -> FlightState:
     """Split a flight state into its parts."""
     return FlightState(*(vector_of(state[k + i] for i in range(3)) for k in range(0, 12, 3)))
 
@@ -186,8 +186,8 @@ class FlightProblem(AbstractProblem):
 
     scene: Scene[Top]
     cos_angle: Float[Array, "..."]
-    states: Float[Array, "components cells"]
-    scales: Float[Array, "components cells"]
+    states: States
+    scales: States
     acceleration: Vector
     strikes: Bool[Array, ""] | None = None
     # As for `InversionProblem`.
@@ -198,7 +198,7 @@ class FlightProblem(AbstractProblem):
         # A flight is smoother than the ground below, which may have waves.
         return self.scene.surface.is_wavy, False
 
-    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+    def start(self) -> tuple[States, States]:
         return self.states, self.scales
 
     def field(self, time, state):
@@ -235,9 +235,7 @@ class QuadraturesInFlight(AbstractPassive):
         return jnp.concatenate([problem.field(time, state), stacked(rates, passive)])
 
 
-def lift_off(
-    scene: Scene[Top], state: Float[Array, "components ..."], with_quadratures: bool, ball: Ball | None = None
-) -> Float[Array, "components ..."]:
+def lift_off(scene: Scene[Top], state: State, with_quadratures: bool, ball: Ball | None = None) -> State:
     """The flight state of a top that has lost contact, from its state in contact, including passive quadratures.
 
     **Arguments:** `ball`: the sphere that touched, by default the top's own.
@@ -278,7 +276,7 @@ class OneOfTwo(InversionProblem):
     contact_ball: Ball = eqx.field(kw_only=True)
     other_ball: Ball = eqx.field(kw_only=True)
 
-    def event_function(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+    def event_function(self, state: States) -> Cells:
         # theta is measured from the normal below the top's own sphere; if this sphere slides, the state contains
         # cos(theta).
         assert self.on_stem is not None
@@ -286,24 +284,18 @@ class OneOfTwo(InversionProblem):
         cosine_of_theta = _cosine_beside(self.scene, self.contact_ball, self.other_ball, state)
         return self.unless_on_stem(jnp.where(self.on_stem, cosine_of_theta, state[COS_THETA]) - self.cos_angle)
 
-    def margins(
-        self, time: Float[Array, " cells"], state: Float[Array, "components cells"]
-    ) -> tuple[Float[Array, " cells"], ...]:
+    def margins(self, time: Cells, state: States) -> tuple[Cells, ...]:
         return (*super().margins(time, state), clearance(self.scene, self.contact_ball, self.other_ball, state))
 
 
 @compiled_setup
-def _cosine_beside(
-    scene: Scene[Top], contact_ball: Ball, other_ball: Ball, state: Float[Array, "components ..."]
-) -> Float[Array, "..."]:
+def _cosine_beside(scene: Scene[Top], contact_ball: Ball, other_ball: Ball, state: State) -> Float[Array, "..."]:
     """The cosine of the angle between the axis and the normal below the other sphere, while a sphere slides."""
     return cosine(scene, flight_state(lift_off(scene, state, False, contact_ball)), other_ball)
 
 
 @compiled_setup
-def clearance(
-    scene: Scene[Top], contact_ball: Ball, other_ball: Ball, state: Float[Array, "components ..."]
-) -> Float[Array, "..."]:
+def clearance(scene: Scene[Top], contact_ball: Ball, other_ball: Ball, state: State) -> Float[Array, "..."]:
     """Distance of the other sphere from the arena as a fraction of R, plus the round-off allowed at lift-off."""
     return gap_margin(scene, flight_state(lift_off(scene, state[:OWN], False, contact_ball)), other_ball, OVERLAP)
 
@@ -316,7 +308,7 @@ class ArenaSlide(AbstractFlyingMode):
 
     number: Int[Array, ""]
 
-    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+    def problem(self, state: States) -> AbstractProblem:
         contact_ball, other_ball = own_and_other(self.scene.body, self.number)
         contact = (standing(self.scene, contact_ball), self.cos_angle, state[:OWN], self.scales[:OWN])
         if other_ball is None:
@@ -341,7 +333,7 @@ class ArenaSlide(AbstractFlyingMode):
         flight = Fly(self.scene, self.scales, self.cos_angle, self.with_quadratures)
         return jnp.where(self.number == 1, flight.shown(lift_off(self.scene, state, True, contact_ball)), rows)
 
-    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
+    def reset_map(self, state: States, left: Cells) -> Transition:
         """Fly if the contact is lost, strike with the other sphere if it is at the arena, and end if the contact jams
         or the sphere does not fit. Counts the flights.
         """
@@ -374,7 +366,7 @@ class Fly(AbstractFlyingMode):
     strikes: Bool[Array, ""] | None = None
     last: bool = eqx.field(static=True, default=False)
 
-    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+    def problem(self, state: States) -> AbstractProblem:
         velocity, momentum = self.scales[0], self.scales[7]
         one = jnp.ones_like(velocity)
         rows = [one * self.scene.body.radius] * 3 + [velocity] * 3 + [one] * 3 + [momentum] * 3 + [one] * 2
@@ -392,7 +384,7 @@ class Fly(AbstractFlyingMode):
         rows = [jnp.stack(c_vector), state[OWN + 3 :], jnp.stack([ground.gap, rate])]
         return jnp.concatenate([in_contact(ground, free), *rows])
 
-    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
+    def reset_map(self, state: States, left: Cells) -> Transition:
         """The impact of the sphere that touches the arena, after which the top rebounds, or slides on that sphere if
         the rebound would be slow.
 
@@ -434,13 +426,13 @@ class Fly(AbstractFlyingMode):
 
     def _after_impact(
         self,
-        state: Float[Array, "components cells"],
+        state: States,
         place: Vector,
         ground: Below,
         body_before: FreeBody,
         body_after: FreeBody,
         flies: Bool[Array, " cells"],
-    ) -> Float[Array, "components cells"]:
+    ) -> States:
         """The state after an impact, including passive quadratures.
 
         **Arguments:** `state`: the state in flight before the impact; `place`: the centre of mass; `ground`: the arena
@@ -494,7 +486,7 @@ def airborne_modes(
 
 
 @compiled_setup
-def _first_mode(scene: Scene[Top], states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+def _first_mode(scene: Scene[Top], states: States) -> Int[Array, " cells"]:
     """The index of the mode in which each run starts."""
     main, stem = balls(scene.body)
     flying = flight_state(lift_off(scene, states[:OWN], False, main))

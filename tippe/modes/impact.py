@@ -31,7 +31,7 @@ from nonholonomic.integration.problem import LEFT_DOMAIN, MOST_STEPS
 
 from ..friction import AbstractFriction, ContactLoad, SetValuedCoulomb, Slip, length
 from ..model.body import ContactGeometry, Top
-from ..model.dynamics import AbstractDynamics, Dynamics, angular_velocity, joined, parts
+from ..model.dynamics import AbstractDynamics, Cells, Dynamics, State, angular_velocity, joined, parts
 from ..model.scene import Scene
 from ..model.stick_slip import StickSlip
 
@@ -100,7 +100,7 @@ def standing_on(dynamics: Dynamics | StickSlip, ball: Ball) -> Dynamics:
     return dataclasses.replace(dynamics, meridian=ContactGeometry(ball.offset, ball.radius, coupling))
 
 
-def as_free_body(body: Top, ball: Ball, state: Float[Array, "components ..."]) -> FreeBody:
+def as_free_body(body: Top, ball: Ball, state: State) -> FreeBody:
     """A top that stands on a sphere, as a free body: the sphere's centre is at rest along the normal.
 
     **Arguments:** `state`: (8, ...), as in `tippe/model/dynamics.py`.
@@ -110,7 +110,7 @@ def as_free_body(body: Top, ball: Ball, state: Float[Array, "components ..."]) -
     return FreeBody((*velocity, -ball.offset * axis_rate(body, axis, momentum)[2]), height, axis, momentum)
 
 
-def contact_state(free: FreeBody) -> Float[Array, "components ..."]:
+def contact_state(free: FreeBody) -> State:
     """The state (8, ...) of a top in contact; the omitted components follow from the contact."""
     return joined(free.velocity[:2], free.axis, free.momentum)
 
@@ -152,7 +152,7 @@ def energy(body: Top, gravity: Float[ArrayLike, "..."], free: FreeBody) -> Float
 
 
 def energy_in(
-    scene: Scene[Top], state: Float[Array, "components ..."], number: Int[Array, "..."]
+    scene: Scene[Top], state: State, number: Int[Array, "..."]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """The least and the greatest energy [J] that a state at the end of a mode, or of a flight from there, may have.
 
@@ -166,8 +166,6 @@ def energy_in(
     total = energy(scene.body, scene.gravity, free)
     return total - 0.5 * scene.body.mass * free.velocity[2] ** 2, total
 
-
-Cells = Float[Array, " cells"]
 
 #: Relative tolerance of an impact's integration: impacts are rare, so this cost is small. A tenfold value changes
 #: inversion times after hundreds of impacts by 1e-14.
@@ -590,7 +588,7 @@ class LeaningDynamics(AbstractDynamics):
     def weight(self) -> Float[Array, "..."]:
         return self.body.mass * self.gravity
 
-    def motion(self, state: Float[Array, "components ..."]) -> LeaningMotion:
+    def motion(self, state: State) -> LeaningMotion:
         """Evaluate the equations of motion.
 
         **Arguments:**
@@ -635,11 +633,11 @@ class LeaningDynamics(AbstractDynamics):
         stiff = (m_1 - m_0) / ((spheres[1].offset - spheres[0].offset) * sine2)
         return LeaningMotion(rate, normal, power, b, stiff)
 
-    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
+    def margins(self, state: State) -> tuple[Float[Array, "..."], ...]:
         """Both normal forces as fractions of the weight, plus `HOLDS`."""
         return tuple(force / self.weight + HOLDS for force in self.motion(state).normal_forces)
 
-    def heavier(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+    def heavier(self, state: State) -> Int[Array, "..."]:
         """The number of the sphere with the greater normal force: contact remains there when the other force vanishes."""
         N_0, N_1 = self.motion(state).normal_forces
         return (N_1 > N_0).astype(int)

@@ -27,12 +27,11 @@ from nonholonomic.integration.dense import halved
 from nonholonomic.integration.problem import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
 
 from ..model.body import Top
-from ..model.dynamics import COS_THETA, Dynamics, parts
+from ..model.dynamics import COS_THETA, Cells, Dynamics, State, States, parts
 from ..model.scene import Scene
 from .impact import (
     TOUCHING,
     Ball,
-    Cells,
     FreeBody,
     LeaningDynamics,
     as_free_body,
@@ -401,9 +400,7 @@ def quadratures_after(
     return jnp.stack([x + u1 * time, y + u2 * time, *c_vector, angle + spin_rate * time, work + 0.0 * time])
 
 
-def clearance(
-    dynamics: Dynamics, contact_ball: Ball, other_ball: Ball, state: Float[Array, "components ..."]
-) -> Float[Array, "..."]:
+def clearance(dynamics: Dynamics, contact_ball: Ball, other_ball: Ball, state: State) -> Float[Array, "..."]:
     """Distance of the other sphere from the plane as a fraction of the radius of the touching sphere, plus the
     round-off allowed at lift-off.
     """
@@ -414,7 +411,7 @@ def clearance(
     )
 
 
-def height(contact_ball: Ball, other_ball: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+def height(contact_ball: Ball, other_ball: Ball, state: State) -> Float[Array, "..."]:
     """Distance [m] of the other sphere from the plane, for a top that stands on the sphere `contact_ball`."""
     return contact_ball.radius - other_ball.radius + (other_ball.offset - contact_ball.offset) * state[COS_THETA]
 
@@ -434,7 +431,7 @@ class SlidingOnOne(InversionProblem):
     contact_ball: Ball = eqx.field(kw_only=True)
     other_ball: Ball = eqx.field(kw_only=True)
 
-    def margins(self, time: Cells, state: Float[Array, "components cells"]) -> tuple[Cells, ...]:
+    def margins(self, time: Cells, state: States) -> tuple[Cells, ...]:
         assert isinstance(self.dynamics, Dynamics)
         return (*super().margins(time, state), clearance(self.dynamics, self.contact_ball, self.other_ball, state))
 
@@ -451,7 +448,7 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
     number: Int[Array, ""]
     last: bool = eqx.field(static=True)
 
-    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+    def problem(self, state: States) -> AbstractProblem:
         contact_ball, other_ball = own_and_other(self.scene.body, self.number)
         contact = (standing_on(self.scene.dynamics, contact_ball), self.cos_angle, state[:OWN], self.scales[:OWN])
         problem = (
@@ -479,7 +476,7 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
         free_after = flown(self.scene.body, self.scene.gravity, free, passed)
         return shown(self.scene.body, free_after, quadratures_after(self.scene.body, free, quadratures, passed))
 
-    def reset_map(self, state: Float[Array, "components cells"], left: Cells) -> Transition:
+    def reset_map(self, state: States, left: Cells) -> Transition:
         """Fly, and bounce, until a sphere stays on the plane; or let the other sphere land if it touches the plane.
 
         Counts the flights.
@@ -498,7 +495,7 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
         air, _, record = jax.lax.while_loop(under_way, hop, (start, jnp.zeros((), int), record))
         return self.closed(air)._replace(record=record)
 
-    def lost(self, state: Float[Array, "components cells"]) -> Air:
+    def lost(self, state: States) -> Air:
         """The top at the end of sliding: its contact is lost or jams, or the other sphere is at the plane."""
         contact_ball, other_ball = own_and_other(self.scene.body, self.number)
         zero, dynamics = jnp.zeros_like(state[0]), standing_on(self.scene.dynamics, contact_ball)
@@ -556,7 +553,7 @@ class Lean(AbstractFlyingMode):
         # Few tops come to rest on both spheres.
         return True
 
-    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+    def problem(self, state: States) -> AbstractProblem:
         contact = (LeaningDynamics.of(self.scene), self.cos_angle, state[:OWN], self.scales[:OWN])
         # The stem carries a part of the top, so its first event has happened; the sphere still touches, so, with `last`,
         # that event has not.
@@ -567,7 +564,7 @@ class Lean(AbstractFlyingMode):
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
         return shown(self.scene.body, as_free_body(self.scene.body, balls(self.scene.body)[0], state), state[OWN:])
 
-    def reset_map(self, state: Float[Array, "components cells"], left: Cells) -> Transition:
+    def reset_map(self, state: States, left: Cells) -> Transition:
         """Slide on the sphere whose normal force has not vanished."""
         number, body = LeaningDynamics.of(self.scene).heavier(state), self.scene.body
         state_at_rest = contact_state(at_rest(body, as_free_body(body, balls(body)[0], state)))
@@ -602,7 +599,7 @@ def hopping_modes(
 
 
 @compiled_setup
-def _first_mode(body: Top, states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+def _first_mode(body: Top, states: States) -> Int[Array, " cells"]:
     """The number of the lower of the two spheres."""
     main, stem = balls(body)
     return (height(main, stem, states) < 0.0).astype(int)

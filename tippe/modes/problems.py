@@ -12,7 +12,7 @@ from nonholonomic.hybrid import AbstractBatchedMode
 from nonholonomic.integration import AbstractPassive, AbstractProblem, ExtendedProblem
 
 from ..model.body import Top
-from ..model.dynamics import COS_THETA, NO_COSINE, AbstractDynamics, Dynamics, parts
+from ..model.dynamics import COS_THETA, NO_COSINE, AbstractDynamics, Dynamics, State, States, parts
 from ..model.rigid import AbstractRigidBody, AbstractRigidDynamics
 from ..model.scene import Launch, Scene
 from ..model.stick_slip import StickSlip
@@ -35,8 +35,8 @@ class InversionProblem(AbstractProblem):
 
     dynamics: AbstractDynamics
     cos_angle: Float[Array, "..."] | None
-    states: Float[Array, "components cells"]
-    scales: Float[Array, "components cells"]
+    states: States
+    scales: States
     spin: Float[Array, "..."] | None = None
     stem_counts: Float[Array, "..."] | None = None
     on_stem: Bool[Array, "..."] | None = None
@@ -53,7 +53,7 @@ class InversionProblem(AbstractProblem):
         event = angle if angle is None or isinstance(angle, StemContact) else jnp.asarray(angle)
         return _inversion_problem(scene, launch, event, cells)
 
-    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+    def start(self) -> tuple[States, States]:
         return self.states, self.scales
 
     def field(
@@ -136,7 +136,7 @@ class Quadratures(AbstractPassive):
         time: Float[Array, "..."],
         state: Float[Array, "core ..."],
         passive: Float[Array, "rest ..."],
-    ) -> Float[Array, "components ..."]:
+    ) -> State:
         dynamics, (u, e, L, _) = problem.dynamics, parts(state)
         motion, (*path, c1, c2, c3, _, _) = dynamics.motion(state), passive
         c, frame_rate = (c1, c2, c3), (None, None) if self.of_mass else motion.frame_rate
@@ -188,14 +188,12 @@ class AbstractFlyingMode(AbstractBatchedMode):
     """
 
     scene: Scene[Top]
-    scales: Float[Array, "components cells"]
+    scales: States
     cos_angle: Float[Array, "..."]
     with_quadratures: bool = eqx.field(static=True)
     stem_counts: Float[Array, "..."] | None = eqx.field(kw_only=True, default=None)
 
-    def extended(
-        self, problem: AbstractProblem, passive: AbstractPassive, state: Float[Array, "components cells"]
-    ) -> AbstractProblem:
+    def extended(self, problem: AbstractProblem, passive: AbstractPassive, state: States) -> AbstractProblem:
         """The problem for given states, including the passive quadratures."""
         size = len(problem.start()[0])
         if not self.with_quadratures:

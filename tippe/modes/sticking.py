@@ -11,7 +11,7 @@ from nonholonomic.integration import AbstractProblem, ExtendedProblem
 from nonholonomic.integration.problem import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING
 
 from ..model.body import Top
-from ..model.dynamics import COS_THETA, NO_COSINE, AbstractDynamics, parts
+from ..model.dynamics import COS_THETA, NO_COSINE, AbstractDynamics, Cells, State, States, parts
 from ..model.scene import Scene
 from ..model.stick_slip import Change, ContactMode, Onset, StickSlip
 from .airborne import (
@@ -36,9 +36,7 @@ from .problems import InversionProblem, Quadratures, TrajectoryProblem
 SLIPPING, ROLLING = range(2)
 
 
-def contact_energy(
-    scene: Scene[Top], state: Float[Array, "components cells"], number: Int[Array, " cells"]
-) -> tuple[Float[Array, " cells"], Float[Array, " cells"]]:
+def contact_energy(scene: Scene[Top], state: States, number: Int[Array, " cells"]) -> tuple[Cells, Cells]:
     """The least and the greatest energy [J] that a state in a mode may have; here these are the same."""
     assert isinstance(scene.dynamics, StickSlip)
     rolls = scene.dynamics.rolling.carried_along(state)
@@ -55,19 +53,19 @@ class StickSlipMode(AbstractBatchedMode):
 
     kind: ContactMode
     cos_angle: Float[Array, "..."] | None
-    scales: Float[Array, "components cells"]
+    scales: States
     last: bool = eqx.field(static=True)
     size: int = eqx.field(static=True)
     passive: Quadratures | None = None
     spin: Float[Array, "..."] | None = None
 
-    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+    def problem(self, state: States) -> AbstractProblem:
         return self._under(self.kind, state)
 
     def shown(self, state: Float[Array, "components times"]) -> Float[Array, "components times"]:
         return self.carried_along(state) if self.kind.rolls else state
 
-    def carried_along(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+    def carried_along(self, state: State) -> State:
         """The state of a rolling top, whose velocity follows from the other components."""
         return jnp.concatenate([self.kind.rolling.carried_along(state[: self.size]), state[self.size :]])
 
@@ -75,7 +73,7 @@ class StickSlipMode(AbstractBatchedMode):
         onset, wait = motion
         return onset.at((passed - wait) / jnp.where(onset.length > 0.0, onset.length, 1.0))
 
-    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
+    def reset_map(self, state: States, left: Cells) -> Transition:
         """Stick, slip, or end if the contact is lost. Counts the changes from slip to rolling."""
         slipping = self._under(self.kind.slipping, state)
         change = self.kind.ended(state, self.size, lambda point: slipping.field(left, point), self.scales, left)
@@ -107,13 +105,13 @@ class StickSlipMode(AbstractBatchedMode):
             record=None if self.passive is None else _recorded(change),
         )
 
-    def _event(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+    def _event(self, state: States) -> Cells:
         """The function whose fall to zero ends a run."""
         if self.spin is None:
             return state[COS_THETA] - self.cos_angle
         return self.kind.normal_spin(state[: self.size]) / self.spin
 
-    def _under(self, equations: AbstractDynamics, state: Float[Array, "components cells"]) -> AbstractProblem:
+    def _under(self, equations: AbstractDynamics, state: States) -> AbstractProblem:
         """The motion from some states under given equations."""
         size = self.size
         problem = InversionProblem(equations, self.cos_angle, state[:size], self.scales[:size], self.spin)
@@ -159,14 +157,14 @@ def stick_slip_modes(
 
 
 @compiled_setup
-def _first_mode(stick_slip: StickSlip, states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+def _first_mode(stick_slip: StickSlip, states: States) -> Int[Array, " cells"]:
     """The index of the mode in which each cell starts."""
     return jnp.where(stick_slip.rests(states), ROLLING, SLIPPING)
 
 
 def contact_modes(
     run: TrajectoryProblem, tolerance: float
-) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"], Float[Array, "components cells"]]:
+) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"], States]:
     """The modes of runs whose path is kept, the index of each first mode, and the initial states.
 
     **Arguments:** `run`: one run, or the runs of some cells, in a scene with `SetValuedCoulomb`; `tolerance`: relative
@@ -198,7 +196,7 @@ class Touch(StickSlipMode):
     def between(self, motion: tuple[Onset, Array], passed: Float[Array, " times"]) -> Float[Array, "21 times"]:
         return _at_no_distance(super().between(motion, passed))
 
-    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
+    def reset_map(self, state: States, left: Cells) -> Transition:
         """Stick, slip, or fly where the contact is lost. Counts flights, and changes from slip to rolling."""
         transition = super().reset_map(state, left)
         state_after = self.carried_along(transition.state) if self.kind.rolls else transition.state
@@ -215,7 +213,7 @@ class Touch(StickSlipMode):
 class Land(Fly):
     """Flying over the arena, to a contact that slips or rolls."""
 
-    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
+    def reset_map(self, state: States, left: Cells) -> Transition:
         """Strike the arena; then rebound, or continue to slip or roll."""
         transition, stick_slip = super().reset_map(state, left), self.scene.dynamics
         assert isinstance(stick_slip, StickSlip)
@@ -246,9 +244,7 @@ def _at_no_distance(rows: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
 # ended.
 
 
-def airborne_energy(
-    scene: Scene[Top], state: Float[Array, "components cells"], mode: Int[Array, " cells"]
-) -> tuple[Float[Array, " cells"], Float[Array, " cells"]]:
+def airborne_energy(scene: Scene[Top], state: States, mode: Int[Array, " cells"]) -> tuple[Cells, Cells]:
     """The least and the greatest energy [J] that a state in a mode may have; here these are the same."""
     state, distance, rate = above_the_ground(scene, state, mode)
     if isinstance(scene.dynamics, StickSlip):
@@ -270,8 +266,8 @@ def lifted(
 
 
 def above_the_ground(
-    scene: Scene[Top], state: Float[Array, "components cells"], mode: Int[Array, " cells"]
-) -> tuple[Float[Array, "14 cells"], Float[Array, " cells"], Float[Array, " cells"]]:
+    scene: Scene[Top], state: States, mode: Int[Array, " cells"]
+) -> tuple[Float[Array, "14 cells"], Cells, Cells]:
     """States of runs, in the layout for sliding on the top's own sphere; and the distance [m] of this sphere from the
     ground with its rate [m/s]. States of other modes refer to the foot below this sphere.
     """
@@ -287,7 +283,7 @@ def above_the_ground(
     return contact, jnp.where(flies, ground.gap, 0.0), jnp.where(flies, rate, 0.0)
 
 
-def loss(scene: Scene[Top], state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+def loss(scene: Scene[Top], state: State) -> Int[Array, "..."]:
     """Why a contact ended, if it was not merely lost: a code in `LOSSES` (`tippe/model/dynamics.py`)."""
     dynamics, state = scene.dynamics, state[:OWN]
     if scene.body.stem is None:
