@@ -6,8 +6,7 @@ along n follows from the axis, because the contact persists. Cyclic coordinates 
 """
 
 import abc
-import dataclasses
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -238,9 +237,11 @@ class AbstractRollingDynamics(AbstractContactDynamics):
 #: The cosine of no angle, for runs without a target angle.
 NO_COSINE = -2.0
 
-#: Rate of a frame that turns with an inverting top, as a fraction of L_n / I1 (`Dynamics.turning`). Among 0.5, 0.7,
-#: 0.85 and 1, this is the fastest at equal error, or close to it, in five scenes on the plane: 1 to 2.6 times as fast
-#: as a frame at rest.
+#: Rate of a frame that turns about n with an inverting top, as a fraction of L_n / I1, for an arena on which all directions
+#: across n are equivalent. While a top inverts, L has a nearly constant direction in a frame at rest, and the axis turns about
+#: L at the rate L / I1. In the turning frame, both turn at a fraction of this rate, so steps are longer. Errors are smaller
+#: because they no longer add up along a circle. Among 0.5, 0.7, 0.85 and 1, this is the fastest at equal error, or close to
+#: it, in five scenes on the plane: 1 to 2.6 times as fast as a frame at rest.
 TURNING = 0.7
 
 
@@ -282,16 +283,6 @@ class Dynamics(AbstractContactDynamics):
     @property
     def weight(self) -> Float[Array, "..."]:
         return self.mass * self.gravity
-
-    def turning(self, turns: Float[Array, "..."]) -> Self:
-        """The same equations in a frame that turns about n, for an arena on which all directions across n are
-        equivalent.
-
-        While a top inverts, L has a nearly constant direction in a frame at rest, and the axis turns about L at the
-        rate L / I1. In the turning frame, both turn at a fraction of this rate, so steps are longer. Errors are smaller
-        because they no longer add up along a circle.
-        """
-        return dataclasses.replace(self, turns=turns)
 
     def unloaded(self, state: State, scales: State) -> Bool[Array, "..."] | None:
         # On a level plane, N = 0 can last only for an instant.

@@ -61,6 +61,9 @@ from .dynamics import (
 #: Rounding error allowed in the moments of a flat body, as a fraction of their sum.
 FLAT = 1e-12
 
+#: What a vector along the body's axes must be.
+ALONG_AXES = "three numbers, along the body's axes x, y and z"
+
 #: Names of the components of inertia.
 COMPONENTS = ("xx", "yy", "zz", "xy", "xz", "yz")
 
@@ -68,20 +71,20 @@ COMPONENTS = ("xx", "yy", "zz", "xy", "xz", "yz")
 DEGREES = (1, 1, 1, 2, 2, 2, 3)
 
 
-def as_numbers(value: object) -> Any:
-    """Several numbers as a tuple of arrays; `None` and single values stay unchanged, for later checks."""
-    if isinstance(value, str) or not isinstance(value, Iterable) or getattr(value, "ndim", 1) == 0:
-        return value
-    return tuple(as_number(part) for part in value)
+def several(name: str, counts: tuple[int, ...], words: str, optional: bool = False) -> Callable[[Any], Any]:
+    """The converter of a vector to a tuple of arrays; if it is `optional`, `None` stays `None`.
 
+    **Arguments:** `counts`: the allowed numbers of components; `words`: what the vector must be, in the message of the
+    `ValueError` about another one.
+    """
 
-def three_numbers(name: str) -> Callable[[object], tuple[Float[Array, "..."], ...]]:
-    """The converter of a vector along the body's axes, which raises `ValueError` unless these are three numbers."""
-
-    def converted(value: object) -> tuple[Float[Array, "..."], ...]:
-        numbers = as_numbers(value)
-        if not isinstance(numbers, tuple) or len(numbers) != 3:
-            raise ValueError(f"{name} = {shown(numbers)} must be three numbers, along the body's axes x, y and z")
+    def converted(value: Any) -> Any:
+        if value is None and optional:
+            return None
+        is_list = isinstance(value, Iterable) and not isinstance(value, str) and getattr(value, "ndim", 1) != 0
+        numbers = tuple(as_number(part) for part in value) if is_list else value
+        if not is_list or len(numbers) not in counts:
+            raise ValueError(f"{name} = {shown(numbers)} must be {words}")
         return numbers
 
     return converted
@@ -307,8 +310,8 @@ class Ellipsoid(AbstractRigidBody):
     units: ClassVar[dict[str, str]] = UNITS | {"semi_axes": "m"} | {f"semi_axes[{k}]": "m" for k in range(3)}
 
     mass: Float[Array, "..."] = eqx.field(converter=as_number)
-    semi_axes: tuple[Float[Array, "..."], ...] = eqx.field(converter=three_numbers("semi_axes"))
-    centre_of_mass: tuple[Float[Array, "..."], ...] = eqx.field(converter=three_numbers("centre_of_mass"))
+    semi_axes: tuple[Float[Array, "..."], ...] = eqx.field(converter=several("semi_axes", (3,), ALONG_AXES))
+    centre_of_mass: tuple[Float[Array, "..."], ...] = eqx.field(converter=several("centre_of_mass", (3,), ALONG_AXES))
     inertia: Inertia = eqx.field(converter=Inertia.of)
 
     def bounds(self) -> Iterator[Bound]:
@@ -378,7 +381,7 @@ class RigidBody(AbstractRigidBody):
     inertia: Inertia = eqx.field(converter=Inertia.of)
     support: Callable[[Float[Array, "3"]], Float[Array, ""]] = eqx.field(converter=lambda value: as_support(value))
     centre_of_mass: tuple[Float[Array, "..."], ...] = eqx.field(
-        converter=three_numbers("centre_of_mass"), default=(0.0, 0.0, 0.0)
+        converter=several("centre_of_mass", (3,), ALONG_AXES), default=(0.0, 0.0, 0.0)
     )
 
     def bounds(self) -> Iterator[Bound]:
@@ -419,11 +422,12 @@ class RigidBody(AbstractRigidBody):
         def of_one(leaves: list[Array], direction: Vector, rate: Vector) -> tuple[Vector, Vector]:
             support = jax.tree.unflatten(structure, leaves)
 
-            def point(direction: Float[Array, "3"]) -> Float[Array, "3"]:
-                # The gradient of |d| h(d / |d|), the support function's extension with degree 1.
-                return jax.grad(lambda d: _length(d) * support(d / _length(d)))(direction)
+            def extended(d: Float[Array, "3"]) -> Float[Array, ""]:
+                """The support function's extension with degree 1, |d| h(d / |d|)."""
+                length = jnp.sqrt(jnp.sum(d * d))
+                return length * support(d / length)
 
-            place, change = jax.jvp(point, (jnp.stack(direction),), (jnp.stack(rate),))
+            place, change = jax.jvp(jax.grad(extended), (jnp.stack(direction),), (jnp.stack(rate),))
             return vector_of(place), vector_of(change)
 
         numbers = (leaves, *(vector_of(scale(-1.0, vector)) for vector in (normal, rate)))
@@ -433,10 +437,6 @@ class RigidBody(AbstractRigidBody):
         if all(jnp.ndim(number) == 0 for number in jax.tree.leaves(numbers)):
             return of_one(*numbers)
         return jax.vmap(of_one, in_axes=jax.tree.map(lambda number: 0 if jnp.ndim(number) else None, numbers))(*numbers)
-
-
-def _length(vector: Float[Array, "3"]) -> Float[Array, ""]:
-    return jnp.sqrt(jnp.sum(vector * vector))
 
 
 class Plain(eqx.Module):

@@ -1,5 +1,6 @@
 """The scene, with its body, arena, friction and gravity; and the launches that start runs in it."""
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from typing import Any, ClassVar, Generic, TypeVar
@@ -48,7 +49,7 @@ from .dynamics import (
     parts,
     to_frame,
 )
-from .rigid import AbstractRigidBody, AbstractRigidDynamics, RigidRolling, RigidSlipping, as_numbers
+from .rigid import AbstractRigidBody, AbstractRigidDynamics, RigidRolling, RigidSlipping, several
 from .stick_slip import StickSlip
 
 #: Spins above this [rad/s] suggest revolutions per minute: by hand a top gets 100 to 300 rad/s, 1000 to 3000 rpm.
@@ -99,10 +100,16 @@ class Launch(Bounded):
     spin: Float[Array, "..."] = eqx.field(converter=as_number)
     eta: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
     azimuth: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
-    place: tuple[Float[Array, "..."], ...] | None = eqx.field(converter=as_numbers, default=None, kw_only=True)
-    velocity: tuple[Float[Array, "..."], ...] | None = eqx.field(converter=as_numbers, default=None, kw_only=True)
+    place: tuple[Float[Array, "..."], ...] | None = eqx.field(
+        converter=several("place", (2, 3), "(x, y), (mu, eta) or (x, y, z)", True), default=None, kw_only=True
+    )
+    velocity: tuple[Float[Array, "..."], ...] | None = eqx.field(
+        converter=several("velocity", (2,), "two numbers, along t1 and t2", True), default=None, kw_only=True
+    )
     angular_velocity: tuple[Float[Array, "..."], ...] | None = eqx.field(
-        converter=as_numbers, default=None, kw_only=True
+        converter=several("angular_velocity", (3,), "three numbers, along t1, t2 and n", True),
+        default=None,
+        kw_only=True,
     )
 
     @classmethod
@@ -137,17 +144,6 @@ class Launch(Bounded):
         require(rpm, "rpm")
         theta, eta, azimuth = (jnp.radians(as_number(angle)) for angle in (theta, eta, azimuth))
         return cls(theta, as_number(rpm) * (2.0 * jnp.pi / 60.0), eta, azimuth, **others)
-
-    def __check_init__(self):
-        allowed = {
-            "place": ((2, 3), "(x, y), (mu, eta) or (x, y, z)"),
-            "velocity": ((2,), "two numbers, along t1 and t2"),
-            "angular_velocity": ((3,), "three numbers, along t1, t2 and n"),
-        }
-        for name, (counts, words) in allowed.items():
-            value = getattr(self, name)
-            if value is not None and not (isinstance(value, tuple) and len(value) in counts):
-                raise ValueError(f"{name} = {shown(value)} must be {words}")
 
     def suspicion(self) -> str | None:
         fastest = largest(self.spin)
@@ -373,7 +369,8 @@ class Scene(Bounded, Generic[Body]):
         # Tops of group I (`tippe/steady.py`) soon stand upright, with the axis close to L; in a turning frame, both would
         # move.
         may_invert = 1.0 - body.offset / body.radius < body.I1 / body.I3
-        return equations.turning(jax.lax.stop_gradient(jnp.where(may_invert, TURNING, 0.0)))
+        turns = jax.lax.stop_gradient(jnp.where(may_invert, TURNING, 0.0))
+        return dataclasses.replace(equations, turns=turns)
 
     def check_start(self, launch: Launch) -> None:
         """Raise `ValueError` if a launch has no place on this arena."""

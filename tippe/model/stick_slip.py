@@ -97,10 +97,6 @@ class Onset(eqx.Module):
         powers = jnp.stack([fraction**k for k in range(STAGES + 1)])
         return self.start + self.length * jnp.einsum("ps,p...,cs...->c...", INTEGRALS, powers, self.rates)
 
-    def of_components(self, components: slice) -> "Onset":
-        """The same step of some components alone."""
-        return Onset(self.start[components], self.length, self.rates[components], self.converged)
-
     def falls_to_zero(
         self, event: Callable[[State], Float[Array, "..."]], first: Float[Array, "..."]
     ) -> Float[Array, "..."]:
@@ -168,7 +164,8 @@ def slip_onset(
 
         # The force of rolling must have changed accordingly, or Newton's first correction would stop the slip.
         rolling_states = state[:, None] + times * rolling_rate[:, None]
-        v = contact.first_guess(times)
+        # The slip velocity in the limit of small times.
+        v = contact.direction[:, None] * (contact.rise[0] + contact.rise[1] * times) * times
         return jax.lax.fori_loop(0, ITERATIONS, newton, (v, rolling_states, v, jnp.zeros_like(rolling_states)))
 
     def shorten(carry):
@@ -237,10 +234,6 @@ class _Contact(eqx.Module):
         unit = 1.0 / jnp.maximum(spin, speed / rolling.body.size)
         inverse_mass = (c / determinant, -b / determinant, a / determinant)
         return cls(d, rise, inverse_mass, load_change, mu, N + load_change[0] * F1 + load_change[1] * F2, speed, unit)
-
-    def first_guess(self, times: Float[Array, "stages ..."]) -> Float[Array, "2 stages ..."]:
-        """The slip velocity in the limit of small times [m/s]."""
-        return self.direction[:, None] * (self.rise[0] + self.rise[1] * times) * times
 
     def correction(
         self, duration: Float[Array, "..."], v: Float[Array, "2 stages ..."], missing: Float[Array, "2 stages ..."]
@@ -367,15 +360,6 @@ class StickSlip(AbstractContactDynamics):
         zero = jnp.zeros_like(state[0])
         return self.rolling.with_slip(self.rolling.with_unit_axes(state), Slip(zero, zero))
 
-    def lifts_off(self, state: State) -> Bool[Array, "..."]:
-        """Whether a contact at rest separates at once: without a force at the contact point, the arena would have to
-        pull.
-
-        Unless the contact jams, the normal force has the same sign for the ending roll, for the following slip and
-        without friction.
-        """
-        return dataclasses.replace(self.slipping, friction=Frictionless()).motion(state).normal_force <= 0.0
-
     def grip_left(self, state: State) -> Float[Array, "..."]:
         """The reserve of a rolling top before it slips, as a fraction of the weight."""
         return self.rolling.grip(state, self.mu) + ROUNDING
@@ -451,7 +435,11 @@ class ContactMode(StickSlip):
         if self.rolls:
             sticks = zero > 0.0
             # The mode ended because of the grip or the room, or there was no contact to begin with, as after an impact.
-            room, lost = self.rolling.motion(core_state).room, self.lifts_off(stopped_state)
+            # The contact separates if the arena would have to pull without a force along it: unless the contact jams, the
+            # normal force has the same sign for the ending roll, for the following slip and without friction.
+            room = self.rolling.motion(core_state).room
+            frictionless = dataclasses.replace(self.slipping, friction=Frictionless())
+            lost = frictionless.motion(stopped_state).normal_force <= 0.0
             if (unloaded := self.unloaded(core_state, scales[:size])) is not None:
                 lost |= unloaded
             lost = lost if room is None else lost | (room - FITS <= self.grip_left(core_state))

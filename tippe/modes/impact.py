@@ -17,6 +17,7 @@ and torque by a positive definite matrix.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
 import diffrax
@@ -26,7 +27,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from nonholonomic.compilation.xla_cpu import greatest, least
 from nonholonomic.geometry import Component, Vector, add, cross, dot, multiply, scale, subtract, sum_vectors, vector_of
-from nonholonomic.integration import AbstractProblem, Settings, traced_solve_ensemble
+from nonholonomic.integration import AbstractProblem, Outcome, Settings, traced_solve_ensemble
 from nonholonomic.integration.problem import LEFT_DOMAIN, MOST_STEPS
 
 from ..friction import AbstractFriction, ContactLoad, SetValuedCoulomb, Slip, length
@@ -280,14 +281,20 @@ class Impact(AbstractProblem):
         return least(missing, jnp.where(approaches > shortfall, approaches, shortfall))
 
     def ended(self, time: Cells, state: Float[Array, "rows cells"]) -> ContactImpulse:
-        """The impulses of an impact whose end has been located, corrected by one step of Newton's method.
+        """The impulses of an impact whose end has been located, corrected."""
+        rates = self.field(time, state)
+        step = newton_step(self.domain_margin, (time, state), (jnp.ones_like(time), rates))
+        return self.impulse(time + step, state + step * rates)
 
-        The search leaves an error of 1e-10, and this step leaves its square, which is round-off.
-        """
-        left, slope = jax.jvp(self.domain_margin, (time, state), (jnp.ones_like(time), self.field(time, state)))
-        step = -left / jnp.where(slope == 0.0, 1.0, slope)
-        step = jnp.where(jnp.abs(step) < 1e-6, step, 0.0)
-        return self.impulse(time + step, state + step * self.field(time, state))
+
+def newton_step(margin: Callable[..., Cells], point: tuple[Array, ...], rates: tuple[Array, ...]) -> Cells:
+    """One step of Newton's method to the zero of a margin along some rates, from its located zero.
+
+    The search leaves an error of 1e-10, and this step leaves its square, which is round-off.
+    """
+    left, slope = jax.jvp(margin, point, rates)
+    step = -left / jnp.where(slope == 0.0, 1.0, slope)
+    return jnp.where(jnp.abs(step) < 1e-6, step, 0.0)
 
 
 def approach(body: Top, ball: Ball, free: FreeBody) -> Approach:
@@ -314,7 +321,7 @@ def resolve_impact(
     """The body after one of its spheres has struck the plane; unchanged if the sphere does not approach the plane.
 
     An impulse at the contact point leaves Jellett's quantity of that sphere unchanged; an impulse of a torque changes
-    it.
+    it. Under `SetValuedCoulomb`, the slip of a contact that sticks is zero up to round-off.
 
     **Arguments:**
 
@@ -325,13 +332,25 @@ def resolve_impact(
     **Returns:** the body after the impact; and whether the impact could not be computed (`MOST_STEPS`, `LARGEST`).
     """
     contact = approach(body, ball, free)
-    impulse_gain = (1.0 + restitution) * greatest(-contact.velocity[2], 0.0)
-    problem = Impact(body, friction, contact, ball.radius, impulse_gain)
-    horizon, cells = jnp.asarray(LARGEST), jnp.asarray(impulse_gain.shape[0])
-    settings = Settings(TOLERANCE, diffrax.Dopri5(), absolute=1.0, max_steps=MOST_STEPS)
-    outcome, _ = traced_solve_ensemble(problem, horizon, cells, settings)
-    impulse = problem.ended(outcome.end_time, outcome.state)
-    return apply_impulse(body, contact, free, impulse), outcome.status != LEFT_DOMAIN
+    gained = (1.0 + restitution) * greatest(-contact.velocity[2], 0.0)
+    impact = Impact(body, friction, contact, ball.radius, gained)
+    if isinstance(friction, SetValuedCoulomb):
+        impulse, status = _coulomb_impulse(impact, friction.mu)
+    else:
+        outcome = _solved(impact, absolute=1.0)
+        impulse, status = impact.ended(outcome.end_time, outcome.state), outcome.status
+    velocity = sum_vectors(free.velocity, scale(1.0 / body.mass, impulse.force))
+    momentum = sum_vectors(free.momentum, cross(contact.arm, impulse.force))
+    if impulse.torque is not None:
+        momentum = sum_vectors(momentum, impulse.torque)
+    return FreeBody(velocity, free.height, free.axis, momentum), status != LEFT_DOMAIN
+
+
+def _solved(problem: "Impact | Skid", absolute: float) -> Outcome:
+    """The end of an impact. **Arguments:** `absolute`: as for `Settings`."""
+    settings = Settings(TOLERANCE, diffrax.Dopri5(), absolute=absolute, max_steps=MOST_STEPS)
+    cells = jnp.asarray(problem.start()[0].shape[1])
+    return traced_solve_ensemble(problem, jnp.asarray(LARGEST), cells, settings)[0]
 
 
 class Strike(NamedTuple):
@@ -357,21 +376,8 @@ def strike(scene: Scene[Top], ball: Ball, free: FreeBody) -> Strike:
     speed = greatest(-gap_rate(scene.body, ball, free), 0.0)
     bounce = jnp.zeros_like(speed) + (0.0 if scene.restitution is None else scene.restitution)
     rebounds = bounce * speed > closing_speed(scene)
-    bounce, law = jnp.where(rebounds, bounce, 0.0), scene.friction
-    if isinstance(law, SetValuedCoulomb):
-        free, fails = resolve_coulomb_impact(scene.body, law, ball, free, bounce)
-    else:
-        free, fails = resolve_impact(scene.body, law, ball, free, bounce)
+    free, fails = resolve_impact(scene.body, scene.friction, ball, free, jnp.where(rebounds, bounce, 0.0))
     return Strike(free, rebounds, ~rebounds & (speed <= closing_speed(scene)), fails)
-
-
-def apply_impulse(body: Top, contact: Approach, free: FreeBody, impulse: ContactImpulse) -> FreeBody:
-    """A free body after an impulse at its contact."""
-    velocity = sum_vectors(free.velocity, scale(1.0 / body.mass, impulse.force))
-    momentum = sum_vectors(free.momentum, cross(contact.arm, impulse.force))
-    if impulse.torque is not None:
-        momentum = sum_vectors(momentum, impulse.torque)
-    return FreeBody(velocity, free.height, free.axis, momentum)
 
 
 # Impact under set-valued Coulomb friction: the slip may stop, and the contact then sticks or slips again.
@@ -429,30 +435,21 @@ class Skid(AbstractProblem):
         return length(*self.velocity(state)[:2]) / self.pace - STOPS
 
 
-def resolve_coulomb_impact(
-    body: Top, friction: SetValuedCoulomb, ball: Ball, free: FreeBody, restitution: Cells
-) -> tuple[FreeBody, Bool[Array, " cells"]]:
-    """The body after one of its spheres has struck the plane; if the contact sticks, its slip is zero up to round-off.
-
-    **Arguments, returns:** as for `resolve_impact`; this is its limit for a slip speed of 0.
-    """
-    contact = approach(body, ball, free)
-    impact = Impact(body, friction, contact, ball.radius, (1.0 + restitution) * greatest(-contact.velocity[2], 0.0))
-    pace = greatest(length(*contact.velocity[:2]), impact.speed)
-    skid = Skid(impact, friction.mu, pace)
-    settings = Settings(TOLERANCE, diffrax.Dopri5(), absolute=0.1, max_steps=MOST_STEPS)
-    outcome, _ = traced_solve_ensemble(skid, jnp.asarray(LARGEST), jnp.asarray(pace.shape[0]), settings)
+def _coulomb_impulse(impact: Impact, mu: Float[Array, "..."]) -> tuple[ContactImpulse, Int[Array, " cells"]]:
+    """The impulse of an impact under set-valued friction, the limit for a slip speed of 0, and the status of its
+    slipping part."""
+    pace = greatest(length(*impact.approach.velocity[:2]), impact.speed)
+    skid = Skid(impact, mu, pace)
+    outcome = _solved(skid, absolute=0.1)
     stops = skid.slip_left(outcome.state) <= STOPS
     rates = skid.field(outcome.end_time, outcome.state)
-    # An impact that ends while it slips is corrected by one step of Newton's method, as in `Impact.ended`.
-    left, slope = jax.jvp(lambda point: impact.domain_margin(point[2], point[:2]), (outcome.state,), (rates,))
-    step = -left / jnp.where(slope == 0.0, 1.0, slope)
-    step = jnp.where(jnp.abs(step) < 1e-6, step, 0.0)
+    # An impact that ends while it slips is corrected.
+    step = newton_step(lambda point: impact.domain_margin(point[2], point[:2]), (outcome.state,), (rates,))
     state = jnp.where(stops, outcome.state, outcome.state + step * rates)
     impulse = impact.impulse(state[2], state[:2])
-    remaining_impulse = _remaining_impulse(impact, friction.mu, impulse.force)
+    remaining_impulse = _remaining_impulse(impact, mu, impulse.force)
     force = vector_of(jnp.where(stops, a + b, a) for a, b in zip(impulse.force, remaining_impulse, strict=True))
-    return apply_impulse(body, contact, free, ContactImpulse(force, None)), outcome.status != LEFT_DOMAIN
+    return ContactImpulse(force, None), outcome.status
 
 
 def _remaining_impulse(impact: Impact, mu: Float[Array, "..."], impulse: Vector) -> Vector:

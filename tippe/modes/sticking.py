@@ -82,7 +82,8 @@ class StickSlipMode(AbstractBatchedMode):
         is_falling = (self._event(state) > 0.0) & (self._event(change.state) <= 0.0)
         if self.spin is None:
             crosses = is_falling & ~change.rolls & ~change.lost
-            cosine = onset.of_components(slice(COS_THETA, COS_THETA + 1))
+            rows = slice(COS_THETA, COS_THETA + 1)
+            cosine = Onset(onset.start[rows], length, onset.rates[rows], onset.converged)
             fraction = cosine.falls_to_zero(lambda part: part[0] - self.cos_angle, wait_fraction)
         else:
             # The impulse that stops a slip changes the spin, too.
