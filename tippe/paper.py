@@ -212,11 +212,11 @@ def rows_of(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[tup
     words = {"not_inverted": "-", "contact_lost": "lost contact", "does_not_fit": "no room"}
     for arena, scene in scenes(options).items():
         table, name = by_arena[arena], shown_name(options, arena)
-        for i, eta in enumerate(options.eta if counts_eta(scene) else [None]):
-            cells, place = (slice(None), "") if eta is None else ((slice(None), i), f"eta={eta:.4g}")
+        places = [(f"eta={eta:.4g}", eta, (slice(None), i)) for i, eta in enumerate(options.eta)]
+        for place, eta, cells in places if counts_eta(scene) else [("", math.nan, (slice(None),))]:
             for crossing, times in (("first", table.first_time), ("last", table.last_time)):
                 ends = zip(times[cells], table.status[cells], strict=True)
-                entries = [f"{end:.4f}" if math.isfinite(end) else words.get(word, word) for end, word in ends]
+                entries = [f"{end:.4f}" if math.isfinite(end) else str(words.get(word, word)) for end, word in ends]
                 columns.append([f"{name} {place}", f"{crossing} [s]", *entries])
             for printed in (TABLE_2, TABLE_3) if arena == "cylinder" else ():
                 if list(options.theta) == [row.theta for row in printed.rows] and math.isclose(eta, printed.eta):

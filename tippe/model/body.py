@@ -11,7 +11,7 @@ c.
 
 import abc
 from collections.abc import Callable, Iterator
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -512,9 +512,7 @@ class ConvexBody(AbstractBody):
     units: ClassVar[dict[str, str]] = {"mass": "kg", "I1": "kg m2", "I3": "kg m2"}
 
     mass: Float[Array, "..."] = eqx.field(converter=as_number)
-    support: Callable[[Float[Array, "..."]], Float[Array, "..."]] = eqx.field(
-        converter=lambda value: as_function(value, "support", ("c",))
-    )
+    support: Any = eqx.field(converter=lambda value: as_function(value, "support", ("c",)))
     I1: Float[Array, "..."] = eqx.field(converter=as_number)
     I3: Float[Array, "..."] = eqx.field(converter=as_number)
 

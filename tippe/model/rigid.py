@@ -82,7 +82,7 @@ def several(name: str, counts: tuple[int, ...], words: str, optional: bool = Fal
         if value is None and optional:
             return None
         is_list = isinstance(value, Iterable) and not isinstance(value, str) and getattr(value, "ndim", 1) != 0
-        numbers = tuple(as_number(part) for part in value) if is_list else value
+        numbers: Any = tuple(as_number(part) for part in value) if is_list else value
         if not is_list or len(numbers) not in counts:
             raise ValueError(f"{name} = {shown(numbers)} must be {words}")
         return numbers
@@ -379,7 +379,7 @@ class RigidBody(AbstractRigidBody):
 
     mass: Float[Array, "..."] = eqx.field(converter=as_number)
     inertia: Inertia = eqx.field(converter=Inertia.of)
-    support: Callable[[Float[Array, "3"]], Float[Array, ""]] = eqx.field(converter=lambda value: as_support(value))
+    support: Any = eqx.field(converter=lambda value: as_support(value))
     centre_of_mass: tuple[Float[Array, "..."], ...] = eqx.field(
         converter=several("centre_of_mass", (3,), ALONG_AXES), default=(0.0, 0.0, 0.0)
     )
@@ -442,7 +442,7 @@ class RigidBody(AbstractRigidBody):
 class Plain(eqx.Module):
     """A support function without parameters; the same function gives the same program."""
 
-    function: Callable[[Float[Array, "3"]], Float[Array, ""]] = eqx.field(static=True)
+    function: Callable[..., Any] = eqx.field(static=True)
 
     def __call__(self, direction: Float[Array, "3"]) -> Float[Array, ""]:
         return self.function(direction)

@@ -280,7 +280,6 @@ class OneOfTwo(InversionProblem):
         # theta is measured from the normal below the top's own sphere; if this sphere slides, the state contains
         # cos(theta).
         assert self.on_stem is not None
-        assert self.cos_angle is not None
         cosine_of_theta = _cosine_beside(self.scene, self.contact_ball, self.other_ball, state)
         return self.unless_on_stem(jnp.where(self.on_stem, cosine_of_theta, state[COS_THETA]) - self.cos_angle)
 

@@ -132,7 +132,10 @@ def gap_rate(body: Top, ball: Ball, free: FreeBody) -> Float[Array, "..."]:
 
 
 def still_parting(
-    rate: Float[Array, "..."], gravity: Float[Array, "..."], radius: Float[Array, "..."], rounding: ArrayLike = 0.0
+    rate: Float[Array, "..."],
+    gravity: Float[Array, "..."],
+    radius: Float[Array, "..."],
+    rounding: Float[Array, "..."] | float = 0.0,
 ) -> Float[Array, "..."]:
     """The round-off allowed for the distance of a sphere, as a fraction of R.
 

@@ -34,7 +34,8 @@ class InversionProblem(AbstractProblem):
     """
 
     dynamics: AbstractDynamics
-    cos_angle: Float[Array, "..."] | None
+    # An array, or `None`.
+    cos_angle: Any
     states: States
     scales: States
     spin: Float[Array, "..."] | None = None

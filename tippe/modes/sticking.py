@@ -1,9 +1,11 @@
 """Stick and slip under set-valued Coulomb friction, with and without flights."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.hybrid import AbstractBatchedMode, Transition, TransitionPath
@@ -52,7 +54,8 @@ class StickSlipMode(AbstractBatchedMode):
     """
 
     kind: ContactMode
-    cos_angle: Float[Array, "..."] | None
+    # An array, or `None`.
+    cos_angle: Any
     scales: States
     last: bool = eqx.field(static=True)
     size: int = eqx.field(static=True)
@@ -255,7 +258,7 @@ def airborne_energy(scene: Scene[Top], state: States, mode: Int[Array, " cells"]
 
 
 def lifted(
-    scene: Scene[Top], state: Float[Array, "14 ..."], distance: Float[Array, "..."], rate: Float[Array, "..."]
+    scene: Scene[Top], state: Float[Array, "14 ..."], distance: ArrayLike, rate: ArrayLike
 ) -> Float[Array, "..."]:
     """Difference [J] between the energy of a flying top and that of the same state in contact; `distance` [m] is that
     of its sphere from the ground, and `rate` [m/s] the rate of this distance."""
