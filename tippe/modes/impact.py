@@ -135,7 +135,7 @@ def still_parting(
     rate: Float[Array, "..."],
     gravity: Float[Array, "..."],
     radius: Float[Array, "..."],
-    rounding: Float[Array, "..."] | float = 0.0,
+    rounding: Cells | float = 0.0,
 ) -> Float[Array, "..."]:
     """The round-off allowed for the distance of a sphere, as a fraction of R.
 
