@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.compilation.components import held, map_methods
 from nonholonomic.compilation.xla_cpu import compiled_setup
@@ -87,7 +87,7 @@ class AbstractFriction(Bounded):
     ```
     """
 
-    def __init_subclass__(cls, **options: Any):
+    def __init_subclass__(cls, **options: object):
         super().__init_subclass__(**options)
         map_methods(cls, ["per_normal_force"])
         # A law derived from another one must declare this again.
@@ -416,7 +416,7 @@ def length(x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."
     return jnp.where(moving, jnp.sqrt(jnp.where(moving, square, 1.0)), 0.0)
 
 
-def drive(law: Any) -> str | None:
+def drive(law: AbstractFriction) -> str | None:
     """The message about a law whose power is positive for one of some slips in eight directions; `None` if the law
     always brakes."""
     angle, speed, turning = (
@@ -453,14 +453,14 @@ class NoLoad(Exception):
 
 
 @compiled_setup
-def _power(law: Any, slip: Slip) -> Component:
+def _power(law: AbstractFriction, slip: Slip) -> Component:
     load = law.per_normal_force(slip)
     if not isinstance(load, ContactLoad):
         raise NoLoad
     return load.power(slip)
 
 
-def suspected_unit(mu: Any, slip_speed: Any = 0.0) -> str | None:
+def suspected_unit(mu: ArrayLike, slip_speed: ArrayLike = 0.0) -> str | None:
     """The suspicion that numbers of Coulomb's law are in another unit; `None` if they are not."""
     if (greatest := largest(mu)) > GREATEST_MU:
         return f"mu = {greatest:g} is large for a coefficient of friction: was it in %? {greatest:g} % are {greatest / 100.0:g}"

@@ -252,12 +252,12 @@ def described(options: argparse.Namespace) -> list[str]:
 
 
 @compiled_quickly
-def moving(scene: Scene[Top], launches: Launch, times: Any, tolerance: Any) -> DrawnMotion:
+def moving(scene: Scene[Top], launches: Launch, times: np.ndarray, tolerance: np.ndarray) -> DrawnMotion:
     """The drawn quantities of every launch at the given times, in one batched run."""
     return jax.vmap(lambda launch: DrawnMotion.of(simulate(scene, launch, times[-1], times, tolerance)))(launches)
 
 
-def drawn(options: argparse.Namespace, t1: float) -> tuple[Any, dict[str, DrawnMotion]]:
+def drawn(options: argparse.Namespace, t1: float) -> tuple[np.ndarray, dict[str, DrawnMotion]]:
     """The times of the plot, up to `t1` [s], and the drawn quantities of every launch in each arena.
 
     All numbers are arrays: another Python number would compile a new program, so the picture and the page could not

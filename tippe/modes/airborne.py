@@ -310,18 +310,10 @@ class ArenaSlide(AbstractFlyingMode):
     def problem(self, state: States) -> AbstractProblem:
         contact_ball, other_ball = own_and_other(self.scene.body, self.number)
         contact = (standing(self.scene, contact_ball), self.cos_angle, state[:OWN], self.scales[:OWN])
-        if other_ball is None:
-            problem = InversionProblem(*contact, flies=True)
-        else:
-            problem = OneOfTwo(
-                *contact,
-                stem_counts=self.stem_counts,
-                on_stem=self.number == 1,
-                flies=True,
-                scene=self.scene,
-                contact_ball=contact_ball,
-                other_ball=other_ball,
-            )
+        problem = InversionProblem(*contact, flies=True)
+        if other_ball is not None:
+            spheres = {"contact_ball": contact_ball, "other_ball": other_ball, "on_stem": self.number == 1}
+            problem = OneOfTwo(*contact, flies=True, stem_counts=self.stem_counts, scene=self.scene, **spheres)
         return self.extended(problem, Quadratures(self.scene.body.I3), state)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:

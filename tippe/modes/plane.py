@@ -332,11 +332,9 @@ def land(scene: Scene[Top], air: Air) -> Air:
     if other_ball is not None:
         after_impact = _with_other(scene, air, after_impact, other_ball, blow.is_slow)
     if air.quadratures is not None:
-        energy_change = energy(scene.body, scene.gravity, after_impact.free) - energy(
-            scene.body, scene.gravity, air.free
-        )
+        before, after = (energy(scene.body, scene.gravity, free) for free in (air.free, after_impact.free))
         *path, work = air.quadratures
-        after_impact = after_impact._replace(quadratures=jnp.stack([*path, work + energy_change]))
+        after_impact = after_impact._replace(quadratures=jnp.stack([*path, work + (after - before)]))
     return after_impact._replace(open=after_impact.open & ~blow.fails)
 
 
@@ -451,18 +449,10 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
     def problem(self, state: States) -> AbstractProblem:
         contact_ball, other_ball = own_and_other(self.scene.body, self.number)
         contact = (standing_on(self.scene.dynamics, contact_ball), self.cos_angle, state[:OWN], self.scales[:OWN])
-        problem = (
-            InversionProblem(*contact, flies=True)
-            if other_ball is None
-            else SlidingOnOne(
-                *contact,
-                contact_ball=contact_ball,
-                other_ball=other_ball,
-                on_stem=self.number == 1,
-                stem_counts=self.stem_counts,
-                flies=True,
-            )
-        )
+        problem = InversionProblem(*contact, flies=True)
+        if other_ball is not None:
+            spheres = {"contact_ball": contact_ball, "other_ball": other_ball, "on_stem": self.number == 1}
+            problem = SlidingOnOne(*contact, flies=True, stem_counts=self.stem_counts, **spheres)
         return self.extended(problem, Quadratures(self.scene.body.I3, of_mass=True), state)
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
