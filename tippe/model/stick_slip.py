@@ -172,7 +172,7 @@ def slip_onset(
         trial, duration, converged, _ = carry
         times = duration * NODES.reshape((-1,) + (1,) * (state.ndim - 1))
         _, states, change, rates = iterated(duration, times)
-        residual = jnp.max(length(*change), axis=0) / contact.speed
+        residual = jnp.max(length(*change), axis=0) / stick_slip.speed
         highest = duration * jnp.abs(jnp.einsum("s,cs...->c...", HIGHEST, rates))
         # The scales of a launch that is upright up to round-off are nearly zero.
         sizes = jnp.maximum(scales, jnp.max(jnp.abs(states), axis=1))
@@ -202,7 +202,7 @@ class _Contact(eqx.Module):
     - `direction`: against the force of rolling; `rise`: the slip's acceleration [m/s^2] and half its rate [m/s^3] at
       the start.
     - `inverse_mass`: M [1/kg] as (M11, M12, M22); `load_change`: n, the change of N by the force along the arena.
-    - `mu`; `free_load`: N without a force along the arena [N]; `speed`: sqrt(g R) [m/s]; `unit`: unit of time [s].
+    - `mu`; `free_load`: N without a force along the arena [N]; `unit`: unit of time [s].
     """
 
     direction: Float[Array, "2 ..."]
@@ -211,7 +211,6 @@ class _Contact(eqx.Module):
     load_change: Float[Array, "2 ..."]
     mu: Float[Array, "..."]
     free_load: Float[Array, "..."]
-    speed: Float[Array, "..."]
     unit: Float[Array, "..."]
 
     @classmethod
@@ -229,11 +228,10 @@ class _Contact(eqx.Module):
         load_change = jnp.stack([b * h - c * f, b * f - a * h]) / determinant
         yields = d[0] * (a * d[0] + b * d[1] + mu * f) + d[1] * (b * d[0] + c * d[1] + mu * h)
         rise = (greatest(-grip, 0.0) * weight / yields, greatest(-grip_rate, 0.0) * weight / (2.0 * yields))
-        speed = stick_slip.speed
         spin = jnp.sqrt(sum(x * x for x in rolling.angular_velocity(state)))
-        unit = 1.0 / jnp.maximum(spin, speed / rolling.body.size)
+        unit = 1.0 / jnp.maximum(spin, stick_slip.speed / rolling.body.size)
         inverse_mass = (c / determinant, -b / determinant, a / determinant)
-        return cls(d, rise, inverse_mass, load_change, mu, N + load_change[0] * F1 + load_change[1] * F2, speed, unit)
+        return cls(d, rise, inverse_mass, load_change, mu, N + load_change[0] * F1 + load_change[1] * F2, unit)
 
     def correction(
         self, duration: Float[Array, "..."], v: Float[Array, "2 stages ..."], missing: Float[Array, "2 stages ..."]

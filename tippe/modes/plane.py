@@ -20,7 +20,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.compilation.xla_cpu import compiled_setup, greatest
-from nonholonomic.geometry import Vector, cross, dot, scale, subtract, sum_vectors
+from nonholonomic.geometry import Vector, cross, dot, scale, subtract, sum_vectors, vector_of
 from nonholonomic.hybrid import AbstractHoppingMode, Transition, TransitionPath
 from nonholonomic.integration import AbstractProblem
 from nonholonomic.integration.dense import halved
@@ -97,46 +97,32 @@ def angle_less_sine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.where(jnp.abs(angle) < 0.5, angle * square / 6.0 * series, angle - jnp.sin(angle))
 
 
+def precession(body: Top, free: FreeBody) -> tuple[Vector, Float[Array, "..."]]:
+    """The direction of L, about which the axis of a free body turns, and the rate [rad/s]."""
+    size = jnp.sqrt(dot(free.momentum, free.momentum))
+    return vector_of(scale(1.0 / jnp.where(size == 0.0, 1.0, size), free.momentum)), size / body.I1
+
+
 def cone(body: Top, free: FreeBody) -> Cone:
     """Motion of the axis of a free body."""
-    size = jnp.sqrt(dot(free.momentum, free.momentum))
-    is_still = size == 0.0
-    direction = scale(1.0 / jnp.where(is_still, 1.0, size), free.momentum)
+    direction, rate = precession(body, free)
     parallel = scale(dot(direction, free.axis), direction)
     perpendicular = tuple(subtract(e, p) for e, p in zip(free.axis, parallel, strict=True))
-    return Cone(size / body.I1, parallel, perpendicular, cross(direction, free.axis))
+    return Cone(rate, parallel, perpendicular, cross(direction, free.axis))
 
 
 def flown(body: Top, gravity: Float[Array, "..."], free: FreeBody, time: Float[Array, "..."]) -> FreeBody:
     """A free body after a time [s]."""
-    precession = cone(body, free)
-    angle = precession.rate * time
-    axis_parts = (
-        precession.parallel,
-        scale(jnp.cos(angle), precession.perpendicular),
-        scale(jnp.sin(angle), precession.binormal),
-    )
-    u1, u2, u3 = free.velocity
+    (direction, rate), (u1, u2, u3) = precession(body, free), free.velocity
     height = free.height + time * (u3 - 0.5 * gravity * time)
-    return FreeBody((u1, u2, u3 - gravity * time), height, sum_vectors(*axis_parts), free.momentum)
-
-
-def c_in_flight(body: Top, free: FreeBody, vector: Vector, time: Float[Array, "..."]) -> Vector:
-    """A vector across the axis after a time [s]; it moves with the axis without rotation about the axis.
-
-    Its angular velocity is L / I1 - (e.L / I1) e: that of the axis about L, without the component along e.
-    """
-    size = jnp.sqrt(dot(free.momentum, free.momentum))
-    direction = scale(1.0 / jnp.where(size == 0.0, 1.0, size), free.momentum)
-    about_axis = turned(vector, free.axis, -dot(free.axis, free.momentum) / body.I1 * time)
-    return turned(about_axis, direction, size / body.I1 * time)
+    return FreeBody((u1, u2, u3 - gravity * time), height, turned(free.axis, direction, rate * time), free.momentum)
 
 
 def turned(vector: Vector, axis: Vector, angle: Float[Array, "..."]) -> Vector:
     """A vector turned about a unit axis by an angle [rad]."""
     parallel, binormal = scale(dot(axis, vector), axis), cross(axis, vector)
     perpendicular = tuple(subtract(v, p) for v, p in zip(vector, parallel, strict=True))
-    return sum_vectors(parallel, scale(jnp.cos(angle), perpendicular), scale(jnp.sin(angle), binormal))
+    return vector_of(sum_vectors(parallel, scale(jnp.cos(angle), perpendicular), scale(jnp.sin(angle), binormal)))
 
 
 def _descent(
@@ -148,16 +134,16 @@ def _descent(
     is_touching: Bool[Array, " cells"],
 ) -> Descent:
     """The distance of a sphere from the plane in flight."""
-    precession = cone(body, free)
+    motion = cone(body, free)
     start = jnp.where(is_touching, 0.0, greatest(gap(ball, free), 0.0))
     speed = gap_rate(body, ball, free)
     speed = jnp.where(at_rest, 0.0, jnp.where(is_touching, greatest(speed, 0.0), speed))
-    cosine, sine = ball.offset * precession.perpendicular[2], ball.offset * precession.binormal[2]
+    cosine, sine = ball.offset * motion.perpendicular[2], ball.offset * motion.binormal[2]
     # Where the normal force vanishes, the distance has no curvature: the remainder is round-off, and may only rise.
-    upper_bound = -gravity / jnp.maximum(precession.rate**2, jnp.finfo(cosine.dtype).tiny)
+    upper_bound = -gravity / jnp.maximum(motion.rate**2, jnp.finfo(cosine.dtype).tiny)
     cosine = jnp.where(at_rest, jnp.minimum(cosine, upper_bound), cosine)
     gravity = jnp.broadcast_to(gravity, start.shape)
-    return Descent(start, speed, gravity, precession.rate, cosine, sine)
+    return Descent(start, speed, gravity, motion.rate, cosine, sine)
 
 
 def landing(descent: Descent, max_time: Cells) -> tuple[Cells, Bool[Array, " cells"]]:
@@ -232,12 +218,12 @@ def angle_reached(body: Top, free: FreeBody, cos_angle: Float[Array, "..."], hor
 
     Along the normal the axis is a constant plus a cosine, so the times are known in closed form.
     """
-    precession = cone(body, free)
-    height = jnp.hypot(precession.perpendicular[2], precession.binormal[2])
-    part = (cos_angle - precession.parallel[2]) / jnp.maximum(height, jnp.finfo(horizon.dtype).tiny)
-    crosses = (jnp.abs(part) < 1.0) & (precession.rate > 0.0)
-    angle = jnp.arctan2(precession.binormal[2], precession.perpendicular[2]) + jnp.arccos(jnp.clip(part, -1.0, 1.0))
-    turn, rate = 2.0 * jnp.pi, jnp.where(precession.rate > 0.0, precession.rate, 1.0)
+    motion = cone(body, free)
+    height = jnp.hypot(motion.perpendicular[2], motion.binormal[2])
+    part = (cos_angle - motion.parallel[2]) / jnp.maximum(height, jnp.finfo(horizon.dtype).tiny)
+    crosses = (jnp.abs(part) < 1.0) & (motion.rate > 0.0)
+    angle = jnp.arctan2(motion.binormal[2], motion.perpendicular[2]) + jnp.arccos(jnp.clip(part, -1.0, 1.0))
+    turn, rate = 2.0 * jnp.pi, jnp.where(motion.rate > 0.0, motion.rate, 1.0)
     angle = jnp.mod(angle, turn)
     if last:
         angle = angle + turn * jnp.floor((rate * horizon - angle) / turn)
@@ -394,7 +380,11 @@ def quadratures_after(
     x, y, *c_vector, angle, work = quadratures
     u1, u2, _ = free.velocity
     spin_rate = dot(free.axis, free.momentum) / body.I3
-    c_vector = c_in_flight(body, free, tuple(c_vector), time)
+    # c moves with the axis without rotation about the axis: its angular velocity is L / I1 - (e.L / I1) e, that of the axis
+    # about L, without the component along e.
+    direction, rate = precession(body, free)
+    about_axis = turned(vector_of(c_vector), free.axis, -dot(free.axis, free.momentum) / body.I1 * time)
+    c_vector = turned(about_axis, direction, rate * time)
     return jnp.stack([x + u1 * time, y + u2 * time, *c_vector, angle + spin_rate * time, work + 0.0 * time])
 
 

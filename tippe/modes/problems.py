@@ -101,12 +101,9 @@ def _inversion_problem(
     dynamics = scene.turning_dynamics
     if angle is None:
         return InversionProblem(dynamics, None, states, scales, dynamics.normal_spin(states))
-    if not scene.has_stem:
-        assert not isinstance(angle, StemContact)
-        return InversionProblem(dynamics, jnp.cos(angle), states, scales)
-    if isinstance(angle, StemContact):
-        return InversionProblem(dynamics, jnp.asarray(NO_COSINE), states, scales, stem_counts=jnp.ones(()))
-    return InversionProblem(dynamics, jnp.cos(angle), states, scales, stem_counts=jnp.zeros(()))
+    cos_angle = jnp.asarray(NO_COSINE) if isinstance(angle, StemContact) else jnp.cos(angle)
+    stem_counts = jnp.asarray(float(isinstance(angle, StemContact))) if scene.has_stem else None
+    return InversionProblem(dynamics, cos_angle, states, scales, stem_counts=stem_counts)
 
 
 # Motion on one smooth contact with the path on the arena, the orientation about the axis and the work of friction.
