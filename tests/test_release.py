@@ -101,9 +101,9 @@ class RoundedDisc(AbstractBody):
     I3: Float[Array, "..."] = eqx.field(converter=as_number)
 
     def bounds(self) -> Iterator[Bound]:
-        for name in ("mass", "radius", "belly", "edge"):
+        yield from super().bounds()
+        for name in ("radius", "belly", "edge"):
             yield Bound(getattr(self, name), name, above=0.0)
-        yield from self.inertia_bounds()
 
     @property
     def meridian(self) -> AbstractMeridian:
