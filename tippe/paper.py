@@ -283,12 +283,12 @@ def picture(options: argparse.Namespace, by_arena: dict[str, Table]) -> Any:
     panels, thetas = [], np.asarray(options.theta)
     for arena, scene in scenes(options).items():
         etas, _ = starts(options, scene)
-        columns_to_print = np.asarray(runs[arena].theta).reshape(len(etas), len(thetas), -1)
+        angles = np.asarray(runs[arena].theta).reshape(len(etas), len(thetas), -1)
         ends = by_arena[arena].last_time.reshape(len(thetas), len(etas))
         for i, eta in enumerate(etas):
             name = shown_name(options, arena)
             title = f"{name}, η(0) = {eta:.4g}" if counts_eta(scene) else name
-            panels.append(Panel(title, times, columns_to_print[i], thetas, ends[:, i]))
+            panels.append(Panel(title, times, angles[i], thetas, ends[:, i]))
     return draw_launches(panels, options.angle, "Dots: above the dashed angle for good")
 
 
@@ -340,11 +340,11 @@ def main(arguments: list[str] | None = None) -> int:
                 drawing = options.out / "theta.png"
                 picture(options, by_arena).savefig(drawing, dpi=130)
                 paths.append(drawing)
-            columns_to_print = write_page(options, by_arena, drawing)
+            page_path = write_page(options, by_arena, drawing)
     except (ValueError, OSError) as error:
         print(f"python -m tippe --paper: {error}", file=sys.stderr)
         return 2
     cells = sum(table.status.size for table in by_arena.values())
-    see = f"To see it, open {columns_to_print}{'' if can_view() else f'. {NO_VIEW}'}"
+    see = f"To see it, open {page_path}{'' if can_view() else f'. {NO_VIEW}'}"
     print(closing_lines(cells, start_time, paths, see))
     return 0
