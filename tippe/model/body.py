@@ -62,8 +62,7 @@ class AbstractBody(Bounded):
 
     `mass` [kg]; `I1`, `I3`: moments of inertia about the centre of mass, across and along the axis [kg m^2].
 
-    The arena's frame moves with the point at the height `size` above the contact. Runs report the path of a point on
-    the body's axis, by default the centre of mass.
+    The arena's frame moves with the point at the height `size` above the contact.
     """
 
     mass: eqx.AbstractVar[Float[Array, "..."]]
@@ -89,10 +88,6 @@ class AbstractBody(Bounded):
         """Vector from the point with which the frame moves to the centre of mass [m], in (t1, t2, n)."""
         r1, r2, r3 = self.meridian.at(axis[2]).contact(axis)
         return (-r1, -r2, -r3 - self.size)
-
-    def path_from_frame(self, axis: Vector) -> Vector:
-        """Vector from the point with which the frame moves to the point whose path is reported [m]."""
-        return self.mass_from_frame(axis)
 
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.mass, "mass", above=0.0)
@@ -363,10 +358,6 @@ class Top(AbstractBody):
 
     def mass_from_frame(self, axis: Vector) -> Vector:
         return (-self.offset * axis[0], -self.offset * axis[1], -self.offset * axis[2])
-
-    def path_from_frame(self, axis: Vector) -> Vector:
-        # The frame moves with the centre of the sphere, whose path is also reported.
-        return (None, None, None)
 
     def suspicion(self) -> str | None:
         numbers = (self.mass, self.radius, self.I1)

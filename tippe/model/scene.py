@@ -533,7 +533,8 @@ class Scene(Bounded, Generic[Body]):
         frame."""
         if isinstance(self.body, AbstractRigidBody):
             return self._rigid_dynamics.mass_from_contact(state)
-        return self.body.path_from_frame(parts(state).axis)
+        # The path of a top is that of its sphere's centre, with which the frame moves.
+        return (None, None, None) if isinstance(self.body, Top) else self.body.mass_from_frame(parts(state).axis)
 
 
 def generic_direction(scene: Scene, launch: Launch, cells: int) -> States:
