@@ -252,7 +252,7 @@ def described(options: argparse.Namespace) -> list[str]:
 
 
 @compiled_quickly
-def moving(scene: Scene[Top], launches: Launch, times: np.ndarray, tolerance: np.ndarray) -> DrawnMotion:
+def moving(scene: Scene[Top], launches: Launch, times: np.ndarray, tolerance: Any) -> DrawnMotion:
     """The drawn quantities of every launch at the given times, in one batched run."""
     return jax.vmap(lambda launch: DrawnMotion.of(simulate(scene, launch, times[-1], times, tolerance)))(launches)
 

@@ -81,11 +81,11 @@ def several(name: str, counts: tuple[int, ...], words: str, optional: bool = Fal
     def converted(value: Any) -> Any:
         if value is None and optional:
             return None
-        is_list = isinstance(value, Iterable) and not isinstance(value, str) and getattr(value, "ndim", 1) != 0
-        numbers: Any = tuple(as_number(part) for part in value) if is_list else value
-        if not is_list or len(numbers) not in counts:
-            raise ValueError(f"{name} = {shown(numbers)} must be {words}")
-        return numbers
+        if isinstance(value, Iterable) and not isinstance(value, str) and getattr(value, "ndim", 1) != 0:
+            value = tuple(as_number(part) for part in value)
+        if not isinstance(value, tuple) or len(value) not in counts:
+            raise ValueError(f"{name} = {shown(value)} must be {words}")
+        return value
 
     return converted
 
