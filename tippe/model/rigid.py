@@ -424,8 +424,7 @@ class RigidBody(AbstractRigidBody):
 
             def extended(d: Float[Array, "3"]) -> Float[Array, ""]:
                 """The support function's extension with degree 1, |d| h(d / |d|)."""
-                length = jnp.sqrt(jnp.sum(d * d))
-                return length * support(d / length)
+                return jnp.sqrt(jnp.sum(d * d)) * support(d / jnp.sqrt(jnp.sum(d * d)))
 
             place, change = jax.jvp(jax.grad(extended), (jnp.stack(direction),), (jnp.stack(rate),))
             return vector_of(place), vector_of(change)
