@@ -412,12 +412,7 @@ class ContactMode(StickSlip):
         return jax.jvp(self.slip_speed, (state,), (self.slipping.field(state),))
 
     def ended(
-        self,
-        state: State,
-        size: int,
-        slipping: Callable[[State], State],
-        scales: State,
-        left: Float[Array, "..."],
+        self, state: State, size: int, slipping: Callable[[State], State], scales: State, left: Float[Array, "..."]
     ) -> Change:
         """The change that follows the end of this kind of motion.
 

@@ -132,10 +132,7 @@ def gap_rate(body: Top, ball: Ball, free: FreeBody) -> Float[Array, "..."]:
 
 
 def still_parting(
-    rate: Float[Array, "..."],
-    gravity: Float[Array, "..."],
-    radius: Float[Array, "..."],
-    rounding: Cells | float = 0.0,
+    rate: Float[Array, "..."], gravity: Float[Array, "..."], radius: Float[Array, "..."], rounding: Cells | float = 0.0
 ) -> Float[Array, "..."]:
     """The round-off allowed for the distance of a sphere, as a fraction of R.
 
