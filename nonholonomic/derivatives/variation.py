@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..integration import AbstractProblem, Jumps, Outcome, Settings, crossing_time, solve_ensemble
-from ..integration.problem import REACHED_END, RUNNING
+from ..integration.problem import REACHED_END, RUNNING, AbstractDerivedProblem
 from ..integration.scheduler import LaneScheduler
 from ..terminal import Progress
 
@@ -37,7 +37,7 @@ def tangent_scale(number: Float[Array, "..."]) -> Float[Array, "..."]:
     return jax.lax.stop_gradient(jnp.where(number == 0.0, 1.0, jnp.abs(number)))
 
 
-class VariationalProblem(AbstractProblem):
+class VariationalProblem(AbstractDerivedProblem):
     """A problem whose state is followed by its first variations along several tangents.
 
     A tangent has the structure of the problem, with the rate at which each number moves in place of the number; `None`
@@ -57,18 +57,6 @@ class VariationalProblem(AbstractProblem):
     problem: AbstractProblem
     tangents: tuple[Any, ...]
     ends_on_event: bool = eqx.field(static=True)
-
-    @property
-    def direction_decides(self) -> bool:
-        return self.problem.direction_decides
-
-    @property
-    def fits_one_kernel(self) -> bool:
-        return self.problem.fits_one_kernel
-
-    @property
-    def fast(self) -> tuple[bool, bool]:
-        return self.problem.fast
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         states, scales = self.problem.start()
@@ -101,22 +89,10 @@ class VariationalProblem(AbstractProblem):
         )
 
     def event_function(self, state: Float[Array, "components *lanes"]) -> Float[Array, "*lanes"] | None:
-        return self.problem.event_function(self.parts(state)[0]) if self.ends_on_event else None
+        return super().event_function(state) if self.ends_on_event else None
 
-    def domain_margin(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> Any:
-        return self.problem.domain_margin(time, self.parts(state)[0])
-
-    def lost_at_start(self, state: Float[Array, "components *lanes"]) -> Any:
-        return self.problem.lost_at_start(self.parts(state)[0])
-
-    def exact_margin(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> Any:
-        return self.problem.exact_margin(time, self.parts(state)[0])
-
-    def margins(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> Any:
-        return self.problem.margins(time, self.parts(state)[0])
-
-    def jumps(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> Jumps | None:
-        return self.problem.jumps(time, self.parts(state)[0])
+    def inner(self, state: Float[Array, "components *lanes"]) -> Float[Array, "components *lanes"]:
+        return self.parts(state)[0]
 
     def across_jump(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> Any:
         point, *variations = self.parts(state)
