@@ -10,16 +10,15 @@ fixed, as in `variation.py`.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Literal
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.xla_cpu import compiled_alone, uncounted, written_by_component, written_in_place
 from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, States
@@ -27,7 +26,7 @@ from ..integration.problem import CROSSED, REACHED_END, RUNNING, time_at_jump
 from ..integration.runge_kutta import Stages, moved_state, over_stages
 from ..integration.scheduler import AbstractRecorder, InLanes, LaneScheduler, SchedulerState, with_crossing_times
 from ..integration.step import length_to_try, try_step, until_jump
-from .variation import VariationalProblem, in_groups, slopes_by_variations
+from .variation import Tangent, VariationalProblem, in_groups, moving_leaves, slopes_by_variations
 
 # The periods of an ensemble solve that are kept for its adjoint: where some of them begin and end, and the steps of the
 # latest ones.
@@ -56,7 +55,7 @@ class StepRecord(NamedTuple):
 
 #: A period without its steps, as a tree of arrays: the lanes before it, and after it but before their refill; or other states
 #: of a run.
-Period = Any
+Period: TypeAlias = PyTree
 
 
 class Checkpoints(NamedTuple):
@@ -141,7 +140,10 @@ def read(stack: Array, index: Int[Array, ""]) -> Array:
 
 #: The quantities measured at the end of a run: (problem, lane state) -> a tree of arrays with the lanes last,
 #: differentiable with respect to the problem's parameters and the lanes' states.
-Measured = Callable[[Any, LaneState], Any]
+Measured: TypeAlias = Callable[[VariationalProblem, LaneState], PyTree]
+
+#: A tree of booleans like a problem: the leaves with respect to which to differentiate.
+Moving: TypeAlias = PyTree
 
 
 class StepRecorder(AbstractRecorder):
@@ -176,7 +178,7 @@ class StepRecorder(AbstractRecorder):
         through later states; `None` if the quantity depends only on the ends of the runs."""
         return None
 
-    def share_of_end(self, lane_state: LaneState) -> Any:
+    def share_of_end(self, lane_state: LaneState) -> PyTree:
         """The factors of the measured quantities at the end of the runs in the lanes."""
         return jnp.ones_like(lane_state.time)
 
@@ -185,7 +187,7 @@ class Derivatives(NamedTuple):
     """Derivatives of the measured quantity with respect to the state and to the parameters, a tree of arrays."""
 
     state: Float[Array, "components *lanes"]
-    numbers: Any
+    numbers: PyTree
 
 
 class Backward(NamedTuple):
@@ -208,8 +210,8 @@ class Backward(NamedTuple):
 
 def solve_with_adjoint(
     problem: VariationalProblem,
-    moving: Any,
-    probe: Any,
+    moving: Moving,
+    probe: Tangent,
     t1: Float[Array, "..."],
     cells: Int[Array, ""],
     settings: Settings,
@@ -217,7 +219,7 @@ def solve_with_adjoint(
     measured: Measured,
     recorder: StepRecorder | None = None,
     one_kernel: bool = False,
-) -> tuple[Outcome, Float[Array, "components cells"], Any]:
+) -> tuple[Outcome, Float[Array, "components cells"], PyTree]:
     """Run every cell to its end, and differentiate a quantity at the end with respect to the problem's parameters.
 
     **Arguments:** as for `ensemble_solve`, except `nonterminal`, and
@@ -234,19 +236,6 @@ def solve_with_adjoint(
     and those with respect to the parameters, one per cell, in a tree like the problem with `None` for the other leaves.
     """
     components, size = problem.start()[0].shape
-    numbers, problem_with_probe = _with_probe(problem, moving, probe, size)
-    scheduler = LaneScheduler.of(problem_with_probe, t1, cells, settings, one_kernel=one_kernel, n_blocks=2)
-    passes = Passes(scheduler, moving, measured, StepRecorder() if recorder is None else recorder)
-    run = passes.start(numbers)
-    run = jax.lax.while_loop(lambda run: uncounted(run.limit > 0, run.outcome.steps[0]), passes.there_and_back, run)
-    return run.outcome._replace(state=run.outcome.state[:components]), run.gradient.state, run.gradient.numbers
-
-
-def _with_probe(problem: VariationalProblem, moving: Any, probe: Any, size: int) -> tuple[Any, VariationalProblem]:
-    """The chosen parameters with one value per cell, and the problem with them and the probe.
-
-    **Arguments:** as for `solve_with_adjoint`; `size`: number of cells, padding included.
-    """
     numbers, static = eqx.partition(problem, moving)
     numbers = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*jnp.shape(leaf)[:-1], size)), numbers)
     problem = eqx.combine(numbers, static)
@@ -257,7 +246,12 @@ def _with_probe(problem: VariationalProblem, moving: Any, probe: Any, size: int)
         problem.problem,
         is_leaf=lambda rate: rate is None,
     )
-    return numbers, dataclasses.replace(problem, tangents=(probe,))
+    problem = dataclasses.replace(problem, tangents=(probe,))
+    scheduler = LaneScheduler.of(problem, t1, cells, settings, one_kernel=one_kernel, n_blocks=2)
+    passes = Passes(scheduler, moving, measured, StepRecorder() if recorder is None else recorder)
+    run = passes.start(numbers)
+    run = jax.lax.while_loop(lambda run: uncounted(run.limit > 0, run.outcome.steps[0]), passes.there_and_back, run)
+    return run.outcome._replace(state=run.outcome.state[:components]), run.gradient.state, run.gradient.numbers
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -268,11 +262,11 @@ class Passes:
     """
 
     scheduler: LaneScheduler
-    moving: Any
+    moving: Moving
     measured: Measured
     recorder: StepRecorder
 
-    def start(self, numbers: Any) -> Backward:
+    def start(self, numbers: PyTree) -> Backward:
         """Both passes before the first period. **Arguments:** `numbers`: the parameters, with one value per cell."""
         scheduler, start = self.scheduler, self.scheduler.start()
         in_lanes = scheduler.in_lanes(start.lane_state)
@@ -351,13 +345,13 @@ class Passes:
         arriving, share = self.recorder.arriving(lane_state, steps), self.recorder.share_of_end(lane_state)
         record = (steps.time, steps.state, steps.length, arriving)
 
-        def loop(carry: Any) -> Any:
+        def loop(carry: PyTree) -> Derivatives:
             lane_state, share, record, count, adjoint = carry
             ended = lane_state.status != RUNNING
             at_end = _at_the_end(problem, self.moving, self.measured, lane_state, share)
             adjoint = jax.tree.map(functools.partial(jnp.where, ended), at_end, adjoint)
 
-            def step(carry: Any) -> Any:
+            def step(carry: tuple[Array, Derivatives, StageMemory]) -> tuple[Array, Derivatives, StageMemory]:
                 index, adjoint, memory = carry
                 time, state, length, at_end = jax.tree.map(functools.partial(read, index=index - 1), record)
                 if at_end is not None:
@@ -377,12 +371,12 @@ def without_probe(lane_state: LaneState) -> LaneState:
 
 
 def _at_the_end(
-    problem: AbstractProblem, moving: Any, measured: Measured, lane_state: LaneState, share: Any
+    problem: VariationalProblem, moving: Moving, measured: Measured, lane_state: LaneState, share: PyTree
 ) -> Derivatives:
     """The derivatives with respect to the final state and the parameters. **Arguments:** `share`: as `share_of_end`."""
     numbers, static = eqx.partition(problem, moving)
 
-    def value(numbers: Any, state: States) -> Any:
+    def value(numbers: PyTree, state: States) -> PyTree:
         return measured(eqx.combine(numbers, static), lane_state._replace(state=state))
 
     by_number, by_state = jax.vjp(value, numbers, lane_state.state)[1](share)
@@ -434,7 +428,7 @@ class StageMemory(NamedTuple):
 def step_taken_back(
     weights: Weights,
     problem: AbstractProblem,
-    moving: Any,
+    moving: Moving,
     time: Lanes,
     state: States,
     length: Lanes,
@@ -472,22 +466,18 @@ def step_taken_back(
     initial_stages = written_in_place(memory.states, state, at=start), memory.rates
     stage_states, rates = over_stages(stages - 1, stage_made, initial_stages)
 
-    def pull(stage_time: Lanes, numbers: Any, parts: tuple[Lanes, ...], by_rate: tuple[Lanes, ...]) -> Any:
-        def field(numbers: Any, parts: tuple[Lanes, ...]) -> States:
-            return eqx.combine(numbers, static).field(stage_time, parts)
-
-        by_number, by_part = jax.vjp(field, numbers, parts)[1](jnp.stack(by_rate))
-        return jnp.stack(by_part), by_number
-
-    def stage_taken_back(count: Int[Array, ""], carry: Any) -> Any:
+    def stage_taken_back(count: Int[Array, ""], carry: tuple[Stages, Derivatives]) -> tuple[Stages, Derivatives]:
         stage, (by_stage, total) = stages - 1 - count, carry
         by_rate = jax.lax.optimization_barrier(moved_state(stage, weights.shares, zero_state, length, by_stage))
         stage_time = time + fractions[stage] * length
-        by_state, by_number = pull(
-            stage_time, numbers, tuple(jnp.unstack(read(stage_states, index=stage))), tuple(jnp.unstack(by_rate))
-        )
+
+        def field(numbers: PyTree, parts: tuple[Lanes, ...]) -> States:
+            return eqx.combine(numbers, static).field(stage_time, parts)
+
+        pull = jax.vjp(field, numbers, tuple(jnp.unstack(read(stage_states, index=stage))))[1]
+        by_number, by_part = pull(jnp.stack(jnp.unstack(by_rate)))
         # If no step was made, values may not be finite.
-        by_state = jax.lax.optimization_barrier(jnp.where(length > 0.0, by_state, 0.0))
+        by_state = jax.lax.optimization_barrier(jnp.where(length > 0.0, jnp.stack(by_part), 0.0))
         total = jax.tree.map(
             lambda sum_so_far, term: sum_so_far + jnp.where(length > 0.0, term, 0.0),
             total,
@@ -503,7 +493,7 @@ def step_taken_back(
 
 
 def jump_taken_back(
-    problem: AbstractProblem, moving: Any, time: Lanes, state: States, adjoint: Derivatives
+    problem: AbstractProblem, moving: Moving, time: Lanes, state: States, adjoint: Derivatives
 ) -> Derivatives:
     """Carry derivatives from the far side of a jump to its near side, in the lanes whose step begins on a far side.
 
@@ -518,7 +508,7 @@ def jump_taken_back(
     near = jnp.where(is_jump, near, time)
 
     def taken_back() -> Derivatives:
-        def across(numbers: Any, state: States) -> States:
+        def across(numbers: PyTree, state: States) -> States:
             return eqx.combine(numbers, static).across_jump(near, state)
 
         # Round-off apart, the states of both sides differ only in their clocks.
@@ -544,7 +534,7 @@ MOST_FORWARD = 2
 
 def ensemble_solve_with_tangents(
     problem: AbstractProblem,
-    tangents: tuple[Any, ...],
+    tangents: tuple[Tangent, ...],
     t1: Float[Array, "..."],
     cells: Int[Array, ""],
     settings: Settings,
@@ -582,14 +572,11 @@ def ensemble_solve_with_tangents(
         # The derivatives need the run only up to the event, whose time is now known.
         horizon = jnp.where(jnp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
     options = (not nonterminal, horizon, cells, settings)
-
-    def with_group(group: tuple[Any, ...]) -> tuple[Outcome, list[Float[Array, " cells"]]]:
-        return slopes_by_variations(problem, group, *options, one_kernel=one_kernel)
-
     if one_kernel and problem.fits_one_kernel and len(tangents) > MOST_FORWARD:
         ended, slopes = _slopes_by_adjoint(problem, tangents, *options)
     else:
-        ended, slopes = in_groups(with_group, tangents)
+        solve = functools.partial(slopes_by_variations, problem, one_kernel=one_kernel)
+        ended, slopes = in_groups(lambda group: solve(group, *options), tangents)
     if not nonterminal:
         outcome = with_crossing_times(problem, ended)
     # An event at the start has a fixed time, whatever the tangent.
@@ -600,21 +587,28 @@ def ensemble_solve_with_tangents(
 
 
 def _slopes_by_adjoint(
-    problem: AbstractProblem, tangents: tuple[Any, ...], ends_on_event: bool, *options: Any
+    problem: AbstractProblem, tangents: tuple[Tangent, ...], ends_on_event: bool, *options: Any
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """The result of `slopes_by_variations`, at a cost that does not depend on the number of tangents."""
-    moving = moving_leaves(problem, tangents[0], _field_and_event)
+
+    def field_and_event(problem: AbstractProblem, states: States) -> PyTree:
+        zero = jnp.zeros_like(states[0])
+        return problem.field(zero, states), problem.event_function(states), problem.jumps(zero, states)
+
+    moving = moving_leaves(problem, tangents[0], field_and_event)
+    shares = shares_of(len(tangents)).tolist()
+    mixture = jax.tree.map(lambda *rates: sum(c * rate for c, rate in zip(shares, rates, strict=True)), *tangents)
     # Without tangents, a `VariationalProblem` is the problem itself, with the option not to end on its event.
     ended, by_start, by_number = solve_with_adjoint(
         VariationalProblem(problem, (), ends_on_event),
         VariationalProblem(moving, (), ends_on_event),
-        _mixed(tangents),
+        mixture,
         *options,
         measured=_event_time,
         one_kernel=True,
     )
 
-    def slope(direction: Any) -> Float[Array, " cells"]:
+    def slope(direction: Tangent) -> Float[Array, " cells"]:
         start = eqx.filter_jvp(lambda problem: problem.start()[0], (problem,), (direction,))[1]
         rates = eqx.filter(direction, moving)
         shares = [
@@ -624,12 +618,6 @@ def _slopes_by_adjoint(
         return sum(shares, jnp.zeros(by_start.shape[1]) if start is None else jnp.sum(by_start * start, axis=0))
 
     return ended, [slope(direction) for direction in tangents]
-
-
-def _mixed(tangents: tuple[Any, ...]) -> Any:
-    """A mixture of some tangents."""
-    shares = shares_of(len(tangents)).tolist()
-    return jax.tree.map(lambda *rates: sum(c * rate for c, rate in zip(shares, rates, strict=True)), *tangents)
 
 
 def shares_of(count: int) -> Float[np.ndarray, " count"]:
@@ -645,7 +633,7 @@ def _event_time(variational: VariationalProblem, lane_state: LaneState) -> Float
     return time_of_zero(problem, problem.event_function, lane_state.time, lane_state.state)
 
 
-def time_of_zero(problem: AbstractProblem, function: Callable[[Any], Any], time: Lanes, state: States) -> Lanes:
+def time_of_zero(problem: AbstractProblem, function: Callable[[States], PyTree], time: Lanes, state: States) -> Lanes:
     """The time at which a function of the state vanishes, for a state at the zero (implicit function theorem).
 
     First order, unlike `event_time`: the event is located to 1e-10 of a step, and its time is not differentiated again.
@@ -654,77 +642,8 @@ def time_of_zero(problem: AbstractProblem, function: Callable[[Any], Any], time:
     return time_at_jump(problem, time, state, time - function(state) / jnp.where(fall == 0.0, 1.0, fall))
 
 
-def _field_and_event(problem: AbstractProblem, states: States) -> Any:
-    zero = jnp.zeros_like(states[0])
-    return problem.field(zero, states), problem.event_function(states), problem.jumps(zero, states)
-
-
-def moving_leaves(problem: AbstractProblem, direction: Any, functions: Callable[[AbstractProblem, States], Any]) -> Any:
-    """The leaves that a tangent moves, as far as some functions of problem and states depend on them, as a tree of
-    booleans."""
-    arrays, static = eqx.partition(problem, eqx.is_array)
-    leaves, structure = jax.tree.flatten(arrays)
-
-    def values(*leaves: Any) -> Any:
-        return functions(eqx.combine(jax.tree.unflatten(structure, leaves), static), problem.start()[0])
-
-    closed = jax.make_jaxpr(values)(*leaves)
-    dependencies = set(closed.jaxpr.outvars)
-    for equation in reversed(closed.jaxpr.eqns):
-        if not dependencies.isdisjoint(equation.outvars):
-            dependencies |= {variable for variable in equation.invars if not isinstance(variable, Literal)}
-    is_dependency = jax.tree.unflatten(structure, [variable in dependencies for variable in closed.jaxpr.invars])
-    return jax.tree.map(
-        lambda rate, is_used: bool(is_used) and rate is not None,
-        direction,
-        is_dependency,
-        is_leaf=lambda rate: rate is None,
-    )
-
-
 # With its docstring.
 _in_one_kernel = functools.partial(ensemble_solve_with_tangents, one_kernel=True)
 solve_ensemble_with_tangents = compiled_alone(functools.update_wrapper(_in_one_kernel, ensemble_solve_with_tangents))
 
 traced_solve_ensemble_with_tangents = eqx.filter_jit(ensemble_solve_with_tangents)
-
-
-def tangents_of(
-    build: Callable[..., Any], numbers: tuple[Any, ...], tangents: list[tuple[Any, ...]]
-) -> tuple[Any, ...]:
-    """The tangents of a problem that is built from numbers.
-
-    **Arguments:**
-
-    - `build`: numbers -> problem.
-    - `numbers`: the arguments of `build`, arrays.
-    - `tangents`: each with the rates at which the numbers move.
-
-    **Returns:** for each tangent the tangent of the problem, `None` for leaves that depend on no number.
-
-    **Example:**
-
-    >>> from nonholonomic.derivatives import tangents_of
-    >>> tangents = tangents_of(Decays, (jnp.ones(2),), [(jnp.array([1.0, 0.0]),)])
-    >>> print(tangents[0].rate)
-    [1. 0.]
-    """
-
-    def built(*numbers: Any) -> Any:
-        # A problem may also hold functions.
-        return eqx.filter(build(*numbers), eqx.is_inexact_array)
-
-    dependents = _reached(jax.make_jaxpr(built)(*numbers))
-    structure = jax.tree.structure(jax.eval_shape(built, *numbers))
-    moving = jax.tree.unflatten(structure, dependents)
-    changes = [jax.jvp(built, numbers, tangent)[1] for tangent in tangents]
-    return tuple(eqx.filter(change, moving) for change in changes)
-
-
-def _reached(closed: Any) -> list[bool]:
-    """Which outputs of a traced function depend on an input."""
-    depends = set(closed.jaxpr.invars)
-    for equation in closed.jaxpr.eqns:
-        if any(not isinstance(variable, Literal) and variable in depends for variable in equation.invars):
-            depends |= set(equation.outvars)
-    return [not isinstance(variable, Literal) and variable in depends for variable in closed.jaxpr.outvars]

@@ -86,6 +86,11 @@ class Layout(NamedTuple):
             variables[name] = np.full((cells, *self.inner_shape(name)), value, kind)
         return variables
 
+    def put(self, variables: dict[str, Values], chunk: int, values: dict[str, Values]) -> None:
+        """Write the values of a chunk into variables of all cells."""
+        for name, cells in values.items():
+            variables[name][slice(*self.ends(chunk))] = cells
+
     def shaped(self, name: str, values: Values) -> Values:
         """A variable in the shape of the grid, with words instead of codes."""
         values = values.reshape((*self.shape, *self.inner_shape(name)))

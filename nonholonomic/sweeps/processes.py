@@ -100,7 +100,7 @@ def _started(place: int, threads: int) -> ProcessPoolExecutor:
     """A process that has its cores and its settings before its first line runs."""
     for _ in range(MAX_STARTS):
         pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin)
-        with _starting, _environment(_settings()), _cores(place, threads), _without_interrupts():
+        with _starting, _starting_in(_settings(), place, threads):
             others = multiprocessing.active_children()
             # The process starts with the first call.
             first_call = pool.submit(int)
@@ -134,45 +134,27 @@ def _settings() -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def _environment(settings: dict[str, str]) -> Iterator[None]:
-    old_values = {name: os.environ.get(name) for name in settings}
-    os.environ.update(settings)
-    try:
-        yield
-    finally:
+def _starting_in(settings: dict[str, str], place: int, threads: int) -> Iterator[None]:
+    """A context whose processes start with their own environment and cores, and postpone Ctrl-C, as this thread does.
+
+    Cores are assigned in turn, and again from the first when none is left.
+    """
+    with contextlib.ExitStack() as stack:
+        old_values = {name: os.environ.get(name) for name in settings}
+        os.environ.update(settings)
         for name, value in old_values.items():
             if value is None:
-                del os.environ[name]
+                stack.callback(os.environ.pop, name)
             else:
-                os.environ[name] = value
-
-
-@contextlib.contextmanager
-def _cores(place: int, threads: int) -> Iterator[None]:
-    """Put this thread on the cores of a process; cores are assigned in turn, and again from the first when none is
-    left."""
-    if not hasattr(os, "sched_setaffinity"):
+                stack.callback(os.environ.update, {name: value})
+        if hasattr(os, "sched_setaffinity"):
+            allowed = sorted(os.sched_getaffinity(0))
+            os.sched_setaffinity(0, {allowed[(place * threads + k) % len(allowed)] for k in range(threads)})
+            stack.callback(os.sched_setaffinity, 0, allowed)
+        if hasattr(signal, "pthread_sigmask"):
+            old_signals = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            stack.callback(signal.pthread_sigmask, signal.SIG_SETMASK, old_signals)
         yield
-        return
-    allowed = sorted(os.sched_getaffinity(0))
-    os.sched_setaffinity(0, {allowed[(place * threads + k) % len(allowed)] for k in range(threads)})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, allowed)
-
-
-@contextlib.contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Make this thread, and processes that it starts, postpone Ctrl-C."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    old_values = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, old_values)
 
 
 def _begin() -> None:
@@ -180,11 +162,6 @@ def _begin() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    _leave_with_the_parent()
-
-
-def _leave_with_the_parent() -> None:
-    """End this process when its parent ends, even if the parent was killed."""
     parent = multiprocessing.parent_process()
 
     def watch() -> None:
@@ -192,4 +169,5 @@ def _leave_with_the_parent() -> None:
         parent.join()
         os._exit(1)
 
+    # This process ends when its parent ends, even if the parent was killed.
     threading.Thread(target=watch, daemon=True).start()

@@ -17,8 +17,7 @@ from ..terminal import status_line
 from ..text import as_html, in_unit, likely, readable_unit, require_unit, require_unit_of, shown, text_as_html
 from ..validation import as_path, replacing, require_package
 from ..views import draw_portrait, draw_series, draw_table, require_others
-from ._chunks import unfinished
-from ._file import LONG_NAMES, MAX_BYTES_IN_MEMORY, Stored, StoredVariables, coded, table_path, write_file
+from ._store import LONG_NAMES, MAX_BYTES_IN_MEMORY, Stored, coded, table_path, unfinished, write_file
 from .grid import UNREACHED, Layout, Values, axes_of, versions
 
 #: Number of cells per checksum in the file of a saved table.
@@ -127,9 +126,8 @@ class Table(eqx.Module):
             require_package("dask", "xarray", "to_xarray with chunks")
         import xarray
 
-        if chunks is not None and isinstance(self.variables, StoredVariables):
-            file = self.variables.stored
-            dataset = xarray.open_dataset(file.path, engine="h5netcdf", chunks=chunks)
+        if chunks is not None and isinstance(self.variables, Stored):
+            dataset = xarray.open_dataset(self.variables.path, engine="h5netcdf", chunks=chunks)
             for name, words in self.words.items():
                 meanings = np.array([*words, UNREACHED])
                 dataset[name] = dataset[name].copy(
@@ -185,15 +183,12 @@ class Table(eqx.Module):
         columns, units = {dim: column(self.coords[dim], (dim,)) for dim in dims}, dict(self.units)
         for name in self.variables:
             own_dims = self.dims(name)
-            for index in np.ndindex(*(len(self.coords[dim]) if dim in component_dims else 1 for dim in own_dims)):
-                parts = [
-                    str(self.coords[dim][k]) for dim, k in zip(own_dims, index, strict=True) if dim in component_dims
-                ]
-                key = tuple(k if dim in component_dims else slice(None) for dim, k in zip(own_dims, index, strict=True))
-                column_name = ".".join([name, *parts])
-                columns[column_name] = column(
-                    self.variables[name][key], tuple(dim for dim in own_dims if dim not in component_dims)
-                )
+            components = [dim for dim in own_dims if dim in component_dims]
+            for index in np.ndindex(*(len(self.coords[dim]) for dim in components)):
+                place = dict(zip(components, index, strict=True))
+                column_name = ".".join([name, *(str(self.coords[dim][k]) for dim, k in place.items())])
+                values = self.variables[name][tuple(place.get(dim, slice(None)) for dim in own_dims)]
+                columns[column_name] = column(values, tuple(dim for dim in own_dims if dim not in place))
                 if name in units:
                     units[column_name] = units[name]
         frame = pandas.DataFrame(columns)
@@ -207,9 +202,9 @@ class Table(eqx.Module):
         format, such as .csv.
         """
         file = table_path(path)
-        if isinstance(self.variables, StoredVariables):
+        if isinstance(self.variables, Stored):
             with replacing(file) as scratch:
-                shutil.copyfile(self.variables.stored.path, scratch)
+                shutil.copyfile(self.variables.path, scratch)
             return
         words, arrays = {}, {}
         for name, values in self.variables.items():
@@ -240,8 +235,7 @@ class Table(eqx.Module):
         layout = stored.layout
         if layout.bytes_of_cells(layout.cells) <= MAX_BYTES_IN_MEMORY:
             return cls.laid_out(layout, {name: stored.whole(name) for name in layout.kinds})
-        variables = StoredVariables(stored)
-        return cls(layout.coords, variables, layout.units, layout.attributes, layout.words, layout.inner)
+        return cls(layout.coords, stored, layout.units, layout.attributes, layout.words, layout.inner)
 
     @classmethod
     def laid_out(cls, layout: Layout, values: dict[str, Values]) -> "Table":
@@ -341,8 +335,8 @@ class Table(eqx.Module):
     @property
     def _rows(self) -> list[tuple[str, str, str]]:
         """A summary of each variable: its name with its dimensions, its range, and its long name."""
-        if isinstance(self.variables, StoredVariables):
-            place = f"in {self.variables.stored.path}"
+        if isinstance(self.variables, Stored):
+            place = f"in {self.variables.path}"
             return [(name, place, self.long_names.get(name, "")) for name in self.variables]
         # Cells that have not been computed appear only in the status.
         computed = self.variables["status"] != UNREACHED if "status" in self.variables else ...
@@ -383,8 +377,8 @@ def cells_with(table: Table, name: str, word: str) -> Int[np.ndarray, " cells"]:
     words, variables = table.words.get(name, ()), table.variables
     if word not in words:
         return np.zeros(0, int)
-    if isinstance(variables, StoredVariables):
-        return np.flatnonzero(variables.stored.whole(name) == words.index(word))
+    if isinstance(variables, Stored):
+        return np.flatnonzero(variables.whole(name) == words.index(word))
     return np.flatnonzero(np.ravel(variables[name]) == word)
 
 
@@ -428,8 +422,7 @@ def concise_strings(
             return f"{word}?"
         return concise(value, error) if np.isfinite(value) else str(word)
 
-    strings = [string(*entry) for entry in zip(values.ravel(), errors.ravel(), words.ravel(), strict=True)]
-    return np.array(strings, dtype=str).reshape(values.shape)
+    return np.vectorize(string, otypes="U")(values, errors, words)
 
 
 # The quantities of a run over its times, as a table, and the methods that every run derives from this table.

@@ -12,7 +12,7 @@ from cheap_sweep import BLOCK, cheap_sweep, finished_blocks, resumed
 from disk_faults import half_finished
 
 from nonholonomic.sweeps import Table
-from nonholonomic.sweeps._chunks import same_request
+from nonholonomic.sweeps._store import same_request
 from nonholonomic.views import Page
 
 pytestmark = pytest.mark.oldest
@@ -190,12 +190,6 @@ def test_foreign_files_and_folders_are_left_alone(images, tmp_path):
     for path in (Path("/proc/table.h5"), text / "table.h5"):
         with pytest.raises(OSError, match=f"cannot write {path}"):
             cheap_sweep(path, pytest.fail)
-
-
-def test_a_file_of_an_earlier_version_names_options_that_were_not_set():
-    """It can be resumed: an empty list is the same as no entry."""
-    assert same_request('{"t1": 1.0, "sensitivities": []}', '{"t1": 1.0}') is None
-    assert "sensitivities is ['mu']" in str(same_request('{"sensitivities": ["mu"]}', "{}"))
 
 
 def test_a_user_s_own_files_beside_a_table_stay(tmp_path):
