@@ -138,16 +138,12 @@ def read(stack: Array, index: Int[Array, ""]) -> Array:
     return jax.lax.dynamic_index_in_dim(stack, index, 0, keepdims=False)
 
 
-#: The quantities measured at the end of a run: (problem, lane state) -> a tree of arrays with the lanes last,
-#: differentiable with respect to the problem's parameters and the lanes' states.
-Measured: TypeAlias = Callable[[VariationalProblem, LaneState], PyTree]
-
 #: A tree of booleans like a problem: the leaves with respect to which to differentiate.
 Moving: TypeAlias = PyTree
 
 
 class StepRecorder(AbstractRecorder):
-    """Records where each step began, and its length; the derivatives begin at the ends of the runs."""
+    """Records where each step began, and its length; what is differentiated is the time of the event at the end."""
 
     # As many iterations as fit in the caches with their record; a period ends with a refill.
     period: ClassVar[int] = 128
@@ -177,6 +173,10 @@ class StepRecorder(AbstractRecorder):
         """The derivatives of the measured quantity with respect to the states at the ends of the steps, apart from those
         through later states; `None` if the quantity depends only on the ends of the runs."""
         return None
+
+    def measured(self, problem: AbstractProblem, lane_state: LaneState) -> PyTree:
+        """The quantities to differentiate, for lanes that have ended: a tree of arrays with the lanes last."""
+        return time_of_zero(problem, problem.event_function, lane_state.time, lane_state.state)
 
     def share_of_end(self, lane_state: LaneState) -> PyTree:
         """The factors of the measured quantities at the end of the runs in the lanes."""
@@ -209,31 +209,27 @@ class Backward(NamedTuple):
 
 
 def solve_with_adjoint(
-    problem: VariationalProblem,
+    problem: AbstractProblem,
     moving: Moving,
     probe: Tangent,
+    ends_on_event: bool,
     t1: Float[Array, "..."],
     cells: Int[Array, ""],
     settings: Settings,
-    *,
-    measured: Measured,
-    recorder: StepRecorder | None = None,
-    one_kernel: bool = False,
-) -> tuple[Outcome, Float[Array, "components cells"], PyTree]:
-    """Run every cell to its end, and differentiate a quantity at the end with respect to the problem's parameters.
+    recorder: StepRecorder,
+) -> tuple[Outcome, Derivatives]:
+    """Run every cell to its end, and differentiate the quantity that a recorder measures there.
 
-    **Arguments:** as for `ensemble_solve`, except `nonterminal`, and
+    **Arguments:** as for `ensemble_solve`, in one kernel, except `nonterminal`, and
 
-    - `problem`: without tangents.
-    - `moving`: a tree of booleans like the problem: the leaves with respect to which to differentiate, scalars or
-      (..., cells).
-    - `probe`: a tangent of the inner problem. Its variation is also integrated and takes part in step-size control, so
-      that the steps suit tangents even where the state is at rest.
-    - `measured`: the quantity to differentiate.
+    - `moving`: the leaves with respect to which to differentiate, scalars or (..., cells).
+    - `probe`: a tangent of the problem. Its variation is also integrated and takes part in step-size control, so that
+      the steps suit tangents even where the state is at rest.
+    - `ends_on_event`: as for `VariationalProblem`.
     - `recorder`: the recorder of the steps, which may add derivatives at the ends of the steps.
 
-    **Returns:** the `Outcome`, without crossing times; the derivatives of every cell with respect to its initial state;
-    and those with respect to the parameters, one per cell, in a tree like the problem with `None` for the other leaves.
+    **Returns:** the `Outcome`, without crossing times; and the derivatives of every cell with respect to its initial
+    state and to the parameters, one per cell, in a tree like the problem with `None` for the other leaves.
     """
     components, size = problem.start()[0].shape
     numbers, static = eqx.partition(problem, moving)
@@ -243,27 +239,28 @@ def solve_with_adjoint(
     probe = jax.tree.map(
         lambda rate, number: None if rate is None else jnp.broadcast_to(rate, jnp.shape(number)),
         probe,
-        problem.problem,
+        problem,
         is_leaf=lambda rate: rate is None,
     )
-    problem = dataclasses.replace(problem, tangents=(probe,))
-    scheduler = LaneScheduler.of(problem, t1, cells, settings, one_kernel=one_kernel, n_blocks=2)
-    passes = Passes(scheduler, moving, measured, StepRecorder() if recorder is None else recorder)
-    run = passes.start(numbers)
+    variational = VariationalProblem(problem, (probe,), ends_on_event)
+    scheduler = LaneScheduler.of(variational, t1, cells, settings, one_kernel=True, n_blocks=2)
+    # Without tangents, a `VariationalProblem` is the problem itself, with the option not to end on its event.
+    passes = Passes(scheduler, VariationalProblem(moving, (), ends_on_event), recorder)
+    run = passes.start(VariationalProblem(numbers, (), ends_on_event))
     run = jax.lax.while_loop(lambda run: uncounted(run.limit > 0, run.outcome.steps[0]), passes.there_and_back, run)
-    return run.outcome._replace(state=run.outcome.state[:components]), run.gradient.state, run.gradient.numbers
+    gradient = Derivatives(run.gradient.state, run.gradient.numbers.problem)
+    return run.outcome._replace(state=run.outcome.state[:components]), gradient
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Passes:
     """The forward pass, which computes periods, and the backward pass, which carries derivatives through them.
 
-    `moving`, `measured`, `recorder`: as for `solve_with_adjoint`.
+    `moving`, `recorder`: as for `solve_with_adjoint`.
     """
 
     scheduler: LaneScheduler
     moving: Moving
-    measured: Measured
     recorder: StepRecorder
 
     def start(self, numbers: PyTree) -> Backward:
@@ -348,7 +345,13 @@ class Passes:
         def loop(carry: PyTree) -> Derivatives:
             lane_state, share, record, count, adjoint = carry
             ended = lane_state.status != RUNNING
-            at_end = _at_the_end(problem, self.moving, self.measured, lane_state, share)
+            numbers, static = eqx.partition(problem, self.moving)
+
+            def measured(numbers: PyTree, state: States) -> PyTree:
+                return self.recorder.measured(eqx.combine(numbers, static).problem, lane_state._replace(state=state))
+
+            by_number, by_state = jax.vjp(measured, numbers, lane_state.state)[1](share)
+            at_end = Derivatives(by_state, by_number)
             adjoint = jax.tree.map(functools.partial(jnp.where, ended), at_end, adjoint)
 
             def step(carry: tuple[Array, Derivatives, StageMemory]) -> tuple[Array, Derivatives, StageMemory]:
@@ -359,7 +362,9 @@ class Passes:
                 point = (time, state, length)
                 return index - 1, *step_taken_back(weights, problem, self.moving, *point, adjoint, memory)
 
-            memory = StageMemory.of(len(weights.fractions), lane_state.state)
+            state, stages = lane_state.state, len(weights.fractions)
+            rooms = (jnp.zeros((count, *state.shape), state.dtype) for count in (stages, stages - 1, stages + 1))
+            memory = StageMemory(*rooms)
             return jax.lax.while_loop(lambda carry: carry[0] > 0, step, (count, adjoint, memory))[1]
 
         return self.scheduler.in_kernel(loop)((lane_state, share, record, count, adjoint))
@@ -368,19 +373,6 @@ class Passes:
 def without_probe(lane_state: LaneState) -> LaneState:
     """The lanes with the states alone, without the variations."""
     return lane_state._replace(state=lane_state.state[: lane_state.state.shape[0] // 2])
-
-
-def _at_the_end(
-    problem: VariationalProblem, moving: Moving, measured: Measured, lane_state: LaneState, share: PyTree
-) -> Derivatives:
-    """The derivatives with respect to the final state and the parameters. **Arguments:** `share`: as `share_of_end`."""
-    numbers, static = eqx.partition(problem, moving)
-
-    def value(numbers: PyTree, state: States) -> PyTree:
-        return measured(eqx.combine(numbers, static), lane_state._replace(state=state))
-
-    by_number, by_state = jax.vjp(value, numbers, lane_state.state)[1](share)
-    return Derivatives(by_state, by_number)
 
 
 class Weights(NamedTuple):
@@ -418,11 +410,6 @@ class StageMemory(NamedTuple):
     states: Stages
     rates: Stages
     adjoints: Stages
-
-    @classmethod
-    def of(cls, stages: int, state: States) -> "StageMemory":
-        """Memory for a number of stages."""
-        return cls(*(jnp.zeros((count, *state.shape), state.dtype) for count in (stages, stages - 1, stages + 1)))
 
 
 def step_taken_back(
@@ -598,14 +585,8 @@ def _slopes_by_adjoint(
     moving = moving_leaves(problem, tangents[0], field_and_event)
     shares = shares_of(len(tangents)).tolist()
     mixture = jax.tree.map(lambda *rates: sum(c * rate for c, rate in zip(shares, rates, strict=True)), *tangents)
-    # Without tangents, a `VariationalProblem` is the problem itself, with the option not to end on its event.
-    ended, by_start, by_number = solve_with_adjoint(
-        VariationalProblem(problem, (), ends_on_event),
-        VariationalProblem(moving, (), ends_on_event),
-        mixture,
-        *options,
-        measured=_event_time,
-        one_kernel=True,
+    ended, (by_start, by_number) = solve_with_adjoint(
+        problem, moving, mixture, ends_on_event, *options, recorder=StepRecorder()
     )
 
     def slope(direction: Tangent) -> Float[Array, " cells"]:
@@ -625,12 +606,6 @@ def shares_of(count: int) -> Float[np.ndarray, " count"]:
     that steps are as short as for one tangent.
     """
     return (0.5 + np.modf(0.618 * np.arange(count))[0]) / count
-
-
-def _event_time(variational: VariationalProblem, lane_state: LaneState) -> Float[Array, "*lanes"]:
-    """Zero of the event function for lanes that have ended on the event."""
-    problem = variational.problem
-    return time_of_zero(problem, problem.event_function, lane_state.time, lane_state.state)
 
 
 def time_of_zero(problem: AbstractProblem, function: Callable[[States], PyTree], time: Lanes, state: States) -> Lanes:

@@ -131,7 +131,7 @@ def differentiable_solve(solve: AbstractDifferentiableSolve, *leaves: Float[Arra
         # Derivatives are `None` where the primal has an array that is not differentiated.
         if solve.prefers_adjoint(active, leaves):
             value = primal(*leaves)
-            change = _pushed_forward(Tangents(active, solve, flat(value)[1]), leaves, active_tangents, value)
+            change = _pushed_forward(LinearSolve(solve, active, flat(value)[1]), leaves, active_tangents, value)
             return value, jax.tree.map(lambda part, change: _change(solve, part, [change], None), value, change)
         value, slopes = _value_and_tangents(solve, active)(*leaves)
         return value, jax.tree.map(lambda part, *rates: _change(solve, part, rates, active_tangents), value, *slopes)
@@ -303,10 +303,10 @@ def _batched(
     size = next(leaf.shape[axis] for leaf, axis in zip(leaves, axes, strict=True) if axis is not None)
     if size == 0:
         return [jnp.zeros((0, cells, *kind.shape), kind.dtype) for kind in kinds], [0] * len(kinds)
-    if isinstance(solve, AbstractLinearSolve) and all(axis is None for axis in axes[: -solve.linear]):
+    if isinstance(solve, LinearSolve) and all(axis is None for axis in axes[: -solve.linear]):
         # All members have the same runs, which may cost more than the derivatives with respect to every number.
         sizes = [leaves[k].size // (cells if flags[k] else 1) for k in solve.active]
-        if sum(sizes) <= size * solve.cost:
+        if sum(sizes) <= size * (TANGENT_COST if solve.parts is None else COTANGENT_COST):
             return jax.vmap(functools.partial(solve.over_cells, request), axes)(*leaves), [0] * len(kinds)
 
     def joined(leaf: Array, has_batch: bool, axis: int | None) -> Array:
@@ -335,31 +335,61 @@ def _only_read(use: list[bool], *arguments: Any) -> tuple[list[bool], Any]:
     return [True] * len(equation.invars), equation.replace(outvars=outputs, params={"request": new_request})
 
 
-# The derivatives of a solve in one direction, and with respect to one combination of its outputs, as solves.
+# The derivatives of a solve in one direction, and with respect to one combination of its outputs, as a solve.
 #
-# Neither needs the derivatives with respect to every number. `Tangents` maps tangents of the leaves to those of the
-# outputs, and `Cotangents` maps cotangents of the outputs to those of the leaves, each by one solve, whatever the number of
-# leaves. JAX's reverse mode turns the first into the second.
+# Neither needs the derivatives with respect to every number: one solve maps tangents of the leaves to those of the outputs,
+# or cotangents of the outputs to those of the leaves, whatever the number of leaves. JAX's reverse mode turns the first
+# into the second.
+
+#: The costs of a tangent and of a cotangent, in units of the cost of the derivatives with respect to a number.
+TANGENT_COST, COTANGENT_COST = 2, 4
 
 
-class AbstractLinearSolve(AbstractSolve):
-    """A solve whose last arguments are tangents or cotangents: the outputs are linear functions of them."""
+class LinearSolve(AbstractSolve):
+    """The tangents of a solve's outputs, as a solve whose last arguments are the tangents of the active leaves; or the
+    cotangents of the active leaves, as a solve whose last arguments are cotangents of the outputs.
 
-    #: The leaves that are differentiated.
-    active: eqx.AbstractVar[tuple[int, ...]]
+    - `active`: the leaves that are differentiated; `structure`: the structure of the primal.
+    - `parts`: the indices of the outputs that have a cotangent; `None` for tangents.
+    """
 
-    #: The cost for one member of a batch of the last arguments, in units of the cost of the derivatives with respect to a
-    #: number.
-    cost: eqx.AbstractClassVar[int]
+    of: AbstractDifferentiableSolve
+    active: tuple[int, ...] = eqx.field(static=True)
+    structure: Structure = eqx.field(static=True)
+    parts: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
     @property
-    @abc.abstractmethod
     def linear(self) -> int:
-        """The number of the last arguments."""
+        """The number of the last arguments, of which the outputs are linear functions."""
+        return len(self.active if self.parts is None else self.parts)
 
-    @abc.abstractmethod
+    def solve(self, cells: int, *arguments: Float[Array, "..."]) -> Primal:
+        leaves, last = arguments[: -self.linear], arguments[-self.linear :]
+        if self.parts is None:
+            return self.of.push_forward(self.active, cells, leaves, last)
+        cotangents = dict(zip(self.parts, last, strict=True))
+        by_part = jax.tree.unflatten(self.structure, [cotangents.get(k) for k in range(self.structure.num_leaves)])
+        return self.of.pull_back(self.active, cells, leaves, by_part)
+
+    def for_parts(self, wanted: tuple[int, ...]) -> Self:
+        return dataclasses.replace(self, of=self.of.for_parts(wanted)) if self.parts is None else self
+
     def from_slopes(self, selection: tuple[int, ...], *arguments: Float[Array, "..."]) -> list[Array]:
         """The selected outputs for a single cell, from the derivatives with respect to every number."""
+        leaves, last = arguments[: -self.linear], arguments[-self.linear :]
+        slopes = [flat(slope)[0] for slope in _value_and_tangents(self.of, self.active)(*leaves)[1]]
+
+        def output(k: int) -> Array:
+            if self.parts is None:
+                pairs = [(slope[k], tangent) for slope, tangent in zip(slopes, last, strict=True)]
+            else:
+                pairs = [
+                    (jnp.moveaxis(slopes[k][part], range(cotangent.ndim), range(-cotangent.ndim, 0)), cotangent)
+                    for part, cotangent in zip(self.parts, last, strict=True)
+                ]
+            return sum((product(*pair) for pair in pairs), jnp.zeros(()))
+
+        return [output(k) for k in selection]
 
     def over_cells(self, request: Request, *arguments: Float[Array, "..."]) -> list[Array]:
         """`from_slopes` for the cells of a request."""
@@ -369,70 +399,6 @@ class AbstractLinearSolve(AbstractSolve):
         return jax.vmap(functools.partial(self.from_slopes, request.selection), axes)(*arguments)
 
 
-class Tangents(AbstractLinearSolve):
-    """The tangents of a solve's outputs, as a solve whose last arguments are the tangents of the active leaves.
-
-    - `active`: the leaves that have a tangent; `structure`: the structure of the primal.
-    """
-
-    active: tuple[int, ...] = eqx.field(static=True)
-    of: AbstractDifferentiableSolve
-    structure: Structure = eqx.field(static=True)
-
-    cost: ClassVar[int] = 2
-
-    @property
-    def linear(self) -> int:
-        return len(self.active)
-
-    def solve(self, cells: int, *arguments: Float[Array, "..."]) -> Primal:
-        return self.of.push_forward(self.active, cells, arguments[: -self.linear], arguments[-self.linear :])
-
-    def slopes(self, leaves: tuple[Float[Array, "..."], ...]) -> list[list[Array]]:
-        """The derivatives of the parts of a single cell's outputs with respect to each active leaf."""
-        return [flat(slope)[0] for slope in _value_and_tangents(self.of, self.active)(*leaves)[1]]
-
-    def for_parts(self, wanted: tuple[int, ...]) -> Self:
-        return dataclasses.replace(self, of=self.of.for_parts(wanted))
-
-    def from_slopes(self, selection: tuple[int, ...], *arguments: Float[Array, "..."]) -> list[Array]:
-        slopes, tangents = self.slopes(arguments[: -self.linear]), arguments[-self.linear :]
-        pairs = list(zip(slopes, tangents, strict=True))
-        return [sum((product(slope[k], tangent) for slope, tangent in pairs), jnp.zeros(())) for k in selection]
-
-
-class Cotangents(AbstractLinearSolve):
-    """The cotangents of a solve's active leaves, as a solve whose last arguments are cotangents of its outputs.
-
-    - `tangents`: the solve for the tangents of the outputs; `parts`: the indices of the outputs that have a cotangent.
-    """
-
-    active: tuple[int, ...] = eqx.field(static=True)
-    tangents: Tangents
-    parts: tuple[int, ...] = eqx.field(static=True)
-
-    cost: ClassVar[int] = 4
-
-    @property
-    def linear(self) -> int:
-        return len(self.parts)
-
-    def solve(self, cells: int, *arguments: Float[Array, "..."]) -> list[Array]:
-        leaves, cotangents = arguments[: -self.linear], dict(zip(self.parts, arguments[-self.linear :], strict=True))
-        structure = self.tangents.structure
-        by_part = jax.tree.unflatten(structure, [cotangents.get(k) for k in range(structure.num_leaves)])
-        return self.tangents.of.pull_back(self.active, cells, leaves, by_part)
-
-    def from_slopes(self, selection: tuple[int, ...], *arguments: Float[Array, "..."]) -> list[Array]:
-        slopes, cotangents = self.tangents.slopes(arguments[: -self.linear]), arguments[-self.linear :]
-
-        def share(slope: Array, cotangent: Array) -> Array:
-            return product(jnp.moveaxis(slope, range(cotangent.ndim), range(-cotangent.ndim, 0)), cotangent)
-
-        pairs = list(zip(self.parts, cotangents, strict=True))
-        return [sum((share(slopes[k][part], cotangent) for part, cotangent in pairs), jnp.zeros(())) for k in selection]
-
-
 def product(slope: Float[Array, "..."], tangent: Float[Array, "..."]) -> Float[Array, "..."]:
     """A derivative, the axes of the leaf last, times a tangent of the leaf. Where the derivative is zero, a tangent that
     is not finite, such as that of an angle at a pole, has no effect."""
@@ -440,7 +406,9 @@ def product(slope: Float[Array, "..."], tangent: Float[Array, "..."]) -> Float[A
     return terms.sum(axis=tuple(range(slope.ndim - jnp.ndim(tangent), slope.ndim)))
 
 
-def _pushed_forward(tangents: Tangents, leaves: Sequence[Array], directions: Sequence[Array], primal: Primal) -> Primal:
+def _pushed_forward(
+    tangents: LinearSolve, leaves: Sequence[Array], directions: Sequence[Array], primal: Primal
+) -> Primal:
     """The tangents of a single cell's outputs: a tree like the primal, with `None` for outputs that have no derivative."""
     parts = flat(tangents.of.differentiable(primal))[0]
     present = {k: part for k, part in enumerate(parts) if part is not None}
@@ -456,7 +424,7 @@ def _jvp(
     """The outputs of a linear solve and their tangents. Those along the leaves are second derivatives, which are taken
     operation by operation."""
     solve, changes = request.solve, tuple(ad.instantiate_zeros(tangent) for tangent in tangents)
-    assert isinstance(solve, AbstractLinearSolve)
+    assert isinstance(solve, LinearSolve)
     outputs = solve_cells.bind(*primals, request=request)
     if all(type(tangent) is ad.Zero for tangent in tangents[: -solve.linear]):
         return outputs, solve_cells.bind(*primals[: -solve.linear], *changes[-solve.linear :], request=request)
@@ -468,7 +436,7 @@ def _transposed(
 ) -> Sequence[Array | ad.Zero | None]:
     """The cotangents of the leaves' tangents, from those of the outputs."""
     tangents = request.solve
-    assert isinstance(tangents, Tangents)
+    assert isinstance(tangents, LinearSolve)
     leaves, directions = arguments[: -tangents.linear], arguments[-tangents.linear :]
     avals = [part.aval if ad.is_undefined_primal(part) else jax.typeof(part) for part in directions]
     flags = request.batch_flags[len(leaves) :]
@@ -476,7 +444,7 @@ def _transposed(
     if not present:
         return [None] * len(leaves) + [ad.Zero(aval) for aval in avals]
     pulled_back = Request(
-        Cotangents(tangents.active, tangents, tuple(present)),
+        dataclasses.replace(tangents, parts=tuple(present)),
         tuple(range(tangents.linear)),
         request.cells,
         (*request.batch_flags[: len(leaves)], *(True for _ in present)),

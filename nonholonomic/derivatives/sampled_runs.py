@@ -118,6 +118,13 @@ class SampledStepRecorder(StepRecorder):
         at_end = jnp.where(lane_state.status == REACHED_END, self.cotangents.end_state[:, cell], 0.0)
         return jnp.where(has_left, self.cotangents.end_time[cell], 0.0), at_end
 
+    def measured(self, problem: AbstractProblem, lane_state: LaneState) -> tuple[Lanes, States]:
+        """The time at which a run leaves the domain, and the state at the end."""
+        time, state = lane_state.time, lane_state.state
+        if problem.domain_margin(time, state) is None:
+            return jnp.zeros_like(time), state
+        return time_of_zero(problem, lambda state: problem.domain_margin(time, state), time, state), state
+
     def _cell(self, lane_state: LaneState) -> Int[Array, "*lanes"]:
         return jnp.minimum(lane_state.cell, len(self.cotangents.end_time) - 1)
 
@@ -144,17 +151,15 @@ def samples_pulled_back(
     """
     problem, cells = build(*point), point[0].shape[-1]
     probe = tangents_of(build, point, [tuple(mixture(point) if rates is None else rates)])[0]
-    moving = moving_leaves(problem, probe, _field_and_margin)
-    outcome, by_start, by_number = solve_with_adjoint(
-        VariationalProblem(problem, (), False),
-        VariationalProblem(moving, (), False),
-        probe,
-        t1,
-        jnp.asarray(cells),
-        settings,
-        measured=_end,
-        recorder=SampledStepRecorder(SampleTimes.of(times, cells, components), cotangents),
-        one_kernel=True,
+
+    def field_and_margin(problem: AbstractProblem, states: States) -> PyTree:
+        time = jnp.zeros_like(states[0])
+        return problem.field(time, states), problem.domain_margin(time, states), problem.jumps(time, states)
+
+    moving = moving_leaves(problem, probe, field_and_margin)
+    recorder = SampledStepRecorder(SampleTimes.of(times, cells, components), cotangents)
+    outcome, (by_start, by_number) = solve_with_adjoint(
+        problem, moving, probe, False, t1, jnp.asarray(cells), settings, recorder
     )
     sample_times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), cells)).T
     is_moved = VariationalProblem(problem, (probe,), False).start()[0][len(by_start) :] != 0.0
@@ -167,7 +172,7 @@ def samples_pulled_back(
         problem = build(*point)
         return eqx.filter(problem, moving), problem.start()[0]
 
-    by_point = jax.vjp(numbers_and_start, *point)[1]((by_number.problem, by_start))
+    by_point = jax.vjp(numbers_and_start, *point)[1]((by_number, by_start))
     return [jnp.where(is_lost & (outcome.status == FAILED), jnp.nan, part) for part in by_point]
 
 
@@ -179,20 +184,6 @@ def mixture(point: tuple[Float[Array, "... cells"], ...]) -> list[Float[Array, "
         jnp.asarray(share).reshape(*number.shape[:-1], 1) * tangent_scale(number)
         for share, number in zip(shares, point, strict=True)
     ]
-
-
-def _field_and_margin(problem: AbstractProblem, states: States) -> PyTree:
-    time = jnp.zeros_like(states[0])
-    return problem.field(time, states), problem.domain_margin(time, states), problem.jumps(time, states)
-
-
-def _end(variational: VariationalProblem, lane_state: LaneState) -> tuple[Lanes, States]:
-    """The time at which a run leaves the domain, and the state at the end."""
-    problem, time = variational.problem, lane_state.time
-    if problem.domain_margin(time, lane_state.state) is None:
-        return jnp.zeros_like(time), lane_state.state
-    end_time = time_of_zero(problem, lambda state: problem.domain_margin(time, state), time, lane_state.state)
-    return end_time, lane_state.state
 
 
 def is_reversible(problem: AbstractProblem) -> bool:

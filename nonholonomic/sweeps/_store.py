@@ -469,30 +469,10 @@ class ChunkStore:
         write_file(header, self.layout, ())
 
     def _check(self, table: Stored) -> None:
-        new_layout, old_layout = self.layout, table.layout
-        new, old = (json.loads(str(layout.attributes.get("versions", "{}"))) for layout in (new_layout, old_layout))
-        # Another version of JAX may write the same equations in other words.
-        ignored = () if new.get("jax") == old.get("jax") else (EQUATIONS,)
-        difference = same_request(str(old_layout.attributes["request"]), new_layout.attributes["request"], ignored)
-        if "status" in json.loads(str(old_layout.attributes["request"])):
-            difference = "it is a single run, not a table of many"
-        if difference is None:
-            for name, values in new_layout.coords.items():
-                if name not in old_layout.coords or not np.array_equal(old_layout.coords[name], values):
-                    difference = f"the axis {name} differs"
-        if difference is None and list(old_layout.coords) != list(new_layout.coords):
-            difference = f"its axes are {', '.join(old_layout.coords)}"
-        if difference is None and old.get("nonholonomic") != new.get("nonholonomic"):
-            difference = f"nonholonomic is {old.get('nonholonomic')} in the file and {new.get('nonholonomic')} here"
-        if difference is None and (old_layout.kinds, old_layout.inner, old_layout.chunk) != (
-            new_layout.kinds,
-            new_layout.inner,
-            new_layout.chunk,
-        ):
-            difference = f"it was not written by a sweep in {new_layout.chunks} chunks"
+        difference = difference_between(table.layout, self.layout)
         if difference is not None:
-            source = self.path if table.path == self.path else self.folder
-            raise AnotherRun(source, difference)
+            raise AnotherRun(self.path if table.path == self.path else self.folder, difference)
+        old, new = table.layout.versions, self.layout.versions
         changed = [name for name in new if name not in ("nonholonomic", "python") and old.get(name) != new[name]]
         if changed and table.path != self.path:
             versions = ", ".join(f"{name} {old.get(name)}, now {new[name]}" for name in changed)
@@ -646,19 +626,30 @@ def read_chunk(folder: Path, layout: Layout, chunk: int) -> dict[str, Values] | 
     return variables if {name: (values.dtype, values.shape) for name, values in variables.items()} == right else None
 
 
-def same_request(left: str, right: str, ignored: tuple[str, ...] = ()) -> str | None:
-    """The first difference between two requests (JSON), in words; `None` if they are the same.
-
-    **Arguments:** `ignored`: names that may differ.
-    """
-    first, second = (
-        {name: value for name, value in json.loads(request).items() if name not in ignored} for request in (left, right)
-    )
-    for name in [*first, *(name for name in second if name not in first)]:
+def difference_between(old: Layout, new: Layout) -> str | None:
+    """How the table in a file differs from the one to compute, in words; `None` if both are results of one request."""
+    in_file, in_call = (json.loads(layout.attributes["request"]) for layout in (old, new))
+    if "status" in in_file:
+        return "it is a single run, not a table of many"
+    old_versions, new_versions = old.versions, new.versions
+    # Another version of JAX may write the same equations in other words.
+    ignored = () if old_versions.get("jax") == new_versions.get("jax") else (EQUATIONS,)
+    for name in dict.fromkeys([*in_file, *in_call]):
         # As texts, in which a missing number, NaN, equals itself.
-        if len({json.dumps(of.get(name), sort_keys=True) for of in (first, second)}) > 1:
-            if name == EQUATIONS:
-                return "the code of the system, its event or its input has changed"
-            in_file, in_call = (repr(of[name]) if name in of else "absent" for of in (first, second))
-            return f"{name} is {in_file} in the file and {in_call} here"
+        if name in ignored or len({json.dumps(of.get(name), sort_keys=True) for of in (in_file, in_call)}) == 1:
+            continue
+        if name == EQUATIONS:
+            return "the code of the system, its event or its input has changed"
+        texts = [repr(request[name]) if name in request else "absent" for request in (in_file, in_call)]
+        return f"{name} is {texts[0]} in the file and {texts[1]} here"
+    for name, values in new.coords.items():
+        if name not in old.coords or not np.array_equal(old.coords[name], values):
+            return f"the axis {name} differs"
+    if list(old.coords) != list(new.coords):
+        return f"its axes are {', '.join(old.coords)}"
+    if old_versions.get("nonholonomic") != new_versions.get("nonholonomic"):
+        texts = [of.get("nonholonomic") for of in (old_versions, new_versions)]
+        return f"nonholonomic is {texts[0]} in the file and {texts[1]} here"
+    if (old.kinds, old.inner, old.chunk) != (new.kinds, new.inner, new.chunk):
+        return f"it was not written by a sweep in {new.chunks} chunks"
     return None

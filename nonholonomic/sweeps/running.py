@@ -5,6 +5,7 @@ import functools
 import itertools
 import json
 import os
+import pickle
 import signal
 import sys
 import threading
@@ -32,7 +33,6 @@ from .grid import (
     Values,
     Variable,
     columns,
-    packed,
     remote_results,
     size_of,
     stamp,
@@ -303,7 +303,13 @@ def workforce(work: ChunkTask, executor: Executor | None) -> Iterator[Callable[[
     elif isinstance(executor, ThreadPoolExecutor):
         yield functools.partial(executor.submit, work.results)
     else:
-        payload, versions_here = packed(work), stamp()
+        try:
+            payload, versions_here = pickle.dumps(work), stamp()
+        except (pickle.PicklingError, AttributeError, TypeError) as error:
+            raise ValueError(
+                f"executor: the work cannot be sent to another process ({error}); a function in it must be defined at the top "
+                "of a module, not inside another function and not as a lambda"
+            ) from None
         yield lambda first, count: executor.submit(
             remote_results, payload, versions_here, first, count, uuid.uuid4().hex
         )

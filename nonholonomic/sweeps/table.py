@@ -7,7 +7,7 @@ import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -19,6 +19,10 @@ from ..validation import as_path, replacing, require_package
 from ..views import draw_portrait, draw_series, draw_table, require_others
 from ._store import LONG_NAMES, MAX_BYTES_IN_MEMORY, Stored, coded, table_path, unfinished, write_file
 from .grid import UNREACHED, Layout, Values, axes_of, versions
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
 
 #: Number of cells per checksum in the file of a saved table.
 CHUNK = 1 << 15
@@ -110,7 +114,7 @@ class Table(eqx.Module):
         """The names of a variable's dimensions: the axes of the grid, and its additional dimensions."""
         return (*axes_of(self.coords, self.inner), *self.inner.get(variable, ()))
 
-    def to_xarray(self, chunks: Any = None) -> Any:
+    def to_xarray(self, chunks: object = None) -> "xarray.Dataset":
         """The table as an `xarray.Dataset` (needs xarray), with named dimensions, units, and statuses as words.
 
         **Arguments:** `chunks`: to read the numbers piece by piece when they are needed, the size of the pieces along
@@ -135,7 +139,7 @@ class Table(eqx.Module):
                 )
             return dataset
 
-        def described(name: str, dims: tuple[str, ...], values: Values) -> tuple[Any, ...]:
+        def described(name: str, dims: tuple[str, ...], values: Values) -> tuple[object, ...]:
             long_name = {"long_name": self.long_names[name]} if name in self.long_names else {}
             return dims, values, long_name | ({"units": self.units[name]} if name in self.units else {})
 
@@ -145,7 +149,7 @@ class Table(eqx.Module):
         dataset = xarray.Dataset(variables, coords, attributes)
         return dataset if chunks is None else dataset.chunk(chunks)
 
-    def to_dataframe(self) -> Any:
+    def to_dataframe(self) -> "pandas.DataFrame":
         """The table as a `pandas.DataFrame` (needs pandas): one row per cell, one column per axis and variable.
 
         If variables have additional dimensions, such as "time", there is a row for each point along these dimensions,
@@ -195,7 +199,7 @@ class Table(eqx.Module):
         frame.attrs["units"] = {name: unit for name, unit in units.items() if name in columns}
         return frame
 
-    def save(self, path: Any) -> None:
+    def save(self, path: object) -> None:
         """Write the table to an HDF5 file that `xarray.open_dataset(path, engine="h5netcdf")` opens.
 
         **Raises:** `OSError` that names the path if the file cannot be written; `ValueError` for the ending of another
@@ -219,7 +223,7 @@ class Table(eqx.Module):
         write_file(file, layout, cut)
 
     @classmethod
-    def load(cls, path: Any) -> "Table":
+    def load(cls, path: object) -> "Table":
         """Read a table from a file that `save` or a sweep wrote. You can read the file before the sweep has finished;
         cells that are not computed yet have the status `pending`.
 
@@ -348,11 +352,8 @@ class Table(eqx.Module):
             rows.append((f"{name}{f' [{unit}]' if unit else ''}{dims}", summary, self.long_names.get(name, "")))
         return rows
 
-    def __str__(self) -> str:
-        return "\n".join([self._title, *(f"  {name}: {summary}" for name, summary, _ in self._rows)])
-
     def __repr__(self) -> str:
-        return str(self)
+        return "\n".join([self._title, *(f"  {name}: {summary}" for name, summary, _ in self._rows)])
 
     def _repr_html_(self) -> str:
         axes = [(name, _summary(self.coords[name]), self.label(name)) for name in self.coords]
@@ -478,7 +479,7 @@ def run_table(
     coords: dict[str, Values],
     values: dict[str, Values],
     axes: list[str],
-    request: dict[str, Any],
+    request: dict[str, object],
 ) -> Table:
     """A table of quantities over time.
 
@@ -543,7 +544,7 @@ class Tabular(abc.ABC):
         **Raises:** `ValueError` for a batch of runs.
         """
 
-    def to_xarray(self) -> Any:
+    def to_xarray(self) -> "xarray.Dataset":
         """The run as an `xarray.Dataset` over "time" (needs xarray), with units and names.
 
         **Raises:** `ValueError` for a batch of runs.
@@ -551,7 +552,7 @@ class Tabular(abc.ABC):
         require_package("xarray", "xarray", "to_xarray")
         return self.to_table().to_xarray()
 
-    def save(self, path: Any) -> None:
+    def save(self, path: object) -> None:
         """Write the run to an HDF5 file that `Table.load` and xarray (`engine="h5netcdf"`) read.
 
         **Raises:** `OSError` that names the path if the file cannot be written; `ValueError` for a batch of runs.
@@ -559,7 +560,7 @@ class Tabular(abc.ABC):
         file = table_path(path)
         self.to_table().save(file)
 
-    def to_dataframe(self) -> Any:
+    def to_dataframe(self) -> "pandas.DataFrame":
         """The run as a `pandas.DataFrame` (needs pandas): a row for each time, a column for each quantity or component.
 
         **Raises:** `ValueError` for a batch of runs.
