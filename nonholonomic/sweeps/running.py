@@ -113,7 +113,7 @@ def handed_out(submit: Callable[[int], Future], chunks: Iterable[int], max_in_fl
             future.cancel()
 
 
-def crashes_reported_by(error: Exception) -> int:
+def crashes_reported_by(error: Any) -> int:
     """Number of workers that a chunk killed, according to the exception of its future."""
     if isinstance(error, BrokenExecutor):
         return 1
@@ -209,10 +209,10 @@ def sweep(
             with contextlib.closing(chunks):
                 if store is not None:
                     return Table.of(store.filled(chunks))
-                variables = layout.empty(layout.cells)
+                of_all_cells = layout.empty(layout.cells)
                 for number, values in chunks:
-                    layout.put(variables, number, values)
-                return Table.laid_out(layout, variables)
+                    layout.put(of_all_cells, number, values)
+                return Table.laid_out(layout, of_all_cells)
     except KeyboardInterrupt:
         none_saved = f"interrupted; without path=, none of {with_spaces(layout.cells)} cells is saved"
         raise KeyboardInterrupt(none_saved if store is None else store.interrupted()) from None

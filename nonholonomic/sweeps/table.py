@@ -114,7 +114,7 @@ class Table(eqx.Module):
         """The names of a variable's dimensions: the axes of the grid, and its additional dimensions."""
         return (*axes_of(self.coords, self.inner), *self.inner.get(variable, ()))
 
-    def to_xarray(self, chunks: object = None) -> "xarray.Dataset":
+    def to_xarray(self, chunks: Any = None) -> "xarray.Dataset":
         """The table as an `xarray.Dataset` (needs xarray), with named dimensions, units, and statuses as words.
 
         **Arguments:** `chunks`: to read the numbers piece by piece when they are needed, the size of the pieces along
