@@ -28,7 +28,6 @@ from nonholonomic.geometry import (
     stacked,
     subtract,
     sum_vectors,
-    vector_of,
 )
 from nonholonomic.integration.problem import Status
 
@@ -75,12 +74,12 @@ def joined(*vectors: tuple[Component, ...]) -> State:
 
 def to_frame(vector: Vector, axes: tuple[Vector, Vector, Vector]) -> Vector:
     """Components of a vector along three axes."""
-    return vector_of(dot(vector, axis) for axis in axes)
+    return tuple(dot(vector, axis) for axis in axes)
 
 
 def from_frame(vector: Vector, axes: tuple[Vector, Vector, Vector]) -> Vector:
     """The vector with given components along three axes."""
-    return vector_of(sum_vectors(*(scale(part, axis) for part, axis in zip(vector, axes, strict=True))))
+    return sum_vectors(*(scale(part, axis) for part, axis in zip(vector, axes, strict=True)))
 
 
 def inclination(axis: Vector) -> Float[Array, "..."]:

@@ -38,7 +38,6 @@ from nonholonomic.geometry import (
     scale,
     subtract,
     sum_vectors,
-    vector_of,
 )
 from nonholonomic.text import shown
 from nonholonomic.validation import UNTRACEABLE, Bound, Bounded, as_number, is_traced
@@ -203,7 +202,7 @@ class SymmetricMatrix(NamedTuple):
     def solve(self, right: Vector) -> Vector:
         """Solution x of A x = right."""
         adjugate = self.adjugate
-        return vector_of(scale(1.0 / self.determinant(adjugate), adjugate.times(right)))
+        return scale(1.0 / self.determinant(adjugate), adjugate.times(right))
 
     @property
     def principal_minors(self) -> tuple[Float[Array, "..."], ...]:
@@ -255,7 +254,7 @@ class AbstractRigidBody(Bounded):
     def contact(self, normal: Vector, rate: Vector) -> tuple[Vector, Vector]:
         """The vector r from the centre of mass to the contact [m] in the body's axes, and its rate; arguments as above."""
         point, point_rate = self.surface_point(normal, rate)
-        return vector_of(sum_vectors(point, scale(-1.0, self.centre_of_mass))), point_rate
+        return sum_vectors(point, scale(-1.0, self.centre_of_mass)), point_rate
 
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.mass, "mass", above=0.0)
@@ -333,15 +332,15 @@ class Ellipsoid(AbstractRigidBody):
 
     def surface_point(self, normal: Vector, rate: Vector) -> tuple[Vector, Vector]:
         # p = -A n / q with q^2 = n.A n, A the squares of the semi-axes.
-        scaled_normal = vector_of(axis * axis * part for axis, part in zip(self.semi_axes, normal, strict=True))
+        scaled_normal = tuple(axis * axis * part for axis, part in zip(self.semi_axes, normal, strict=True))
         per_height = 1.0 / jnp.sqrt(dot(normal, scaled_normal))
-        point = vector_of(scale(-per_height, scaled_normal))
+        point = scale(-per_height, scaled_normal)
         projection = dot(point, rate)
         change = (
             projection * part - axis * axis * component
             for axis, part, component in zip(self.semi_axes, point, rate, strict=True)
         )
-        return point, vector_of(scale(per_height, vector_of(change)))
+        return point, scale(per_height, tuple(change))
 
 
 class RigidBody(AbstractRigidBody):
@@ -411,7 +410,7 @@ class RigidBody(AbstractRigidBody):
         def half_width(normal):
             no_velocity = tuple(jnp.zeros(3))
             (low, _), (high, _) = (self.surface_point(tuple(sign * normal), no_velocity) for sign in (1.0, -1.0))
-            return 0.5 * dot(tuple(normal), vector_of(sum_vectors(high, scale(-1.0, low))))
+            return 0.5 * dot(tuple(normal), sum_vectors(high, scale(-1.0, low)))
 
         half_widths = jax.vmap(half_width)(evenly_spread(SAMPLES)[0])
         return jnp.min(half_widths, axis=0), jnp.max(half_widths, axis=0)
@@ -427,9 +426,9 @@ class RigidBody(AbstractRigidBody):
                 return jnp.sqrt(jnp.sum(d * d)) * support(d / jnp.sqrt(jnp.sum(d * d)))
 
             place, change = jax.jvp(jax.grad(extended), (jnp.stack(direction),), (jnp.stack(rate),))
-            return vector_of(place), vector_of(change)
+            return tuple(place), tuple(change)
 
-        numbers = (leaves, *(vector_of(scale(-1.0, vector)) for vector in (normal, rate)))
+        numbers = (leaves, *(scale(-1.0, vector) for vector in (normal, rate)))
         scalar = jax.ShapeDtypeStruct((), jnp.result_type(float))
         with contextlib.suppress(TooLarge):
             return by_components(of_one, *jax.tree.map(lambda _: scalar, numbers))(*numbers)
@@ -543,11 +542,11 @@ class AbstractRigidDynamics(AbstractContactDynamics):
     def attitude(self, state: State) -> Attitude:
         """The attitude and rotation of the body, and its contact point."""
         _, e, L, place = parts(state)
-        c = vector_of(place[-3:])
+        c = tuple(place[-3:])
         axes = (c, cross(e, c), e)
-        n = vector_of(axis[2] for axis in axes)
-        momentum = vector_of(dot(L, axis) for axis in axes)
-        angular_velocity = vector_of(stored(*self.inverse.times(momentum)))
+        n = tuple(axis[2] for axis in axes)
+        momentum = tuple(dot(L, axis) for axis in axes)
+        angular_velocity = stored(*self.inverse.times(momentum))
         normal_rate = cross(n, angular_velocity)
         lever, lever_rate = self.body.contact(n, normal_rate)
         return Attitude(axes, n, momentum, angular_velocity, lever, (normal_rate, lever_rate))
@@ -561,14 +560,14 @@ class AbstractRigidDynamics(AbstractContactDynamics):
         if isinstance(self.frame, PlaneFrame):
             return ContactMotion(normal_rate, lever_rate, (V1, V2), self.frame.frame_motion(place, (V1, V2)))
         # If n turns along a tangent, the contact moves against it over the body, by H.
-        tangents = [vector_of(axis[k] for axis in axes) for k in (0, 1)]
+        tangents = [tuple(axis[k] for axis in axes) for k in (0, 1)]
         first, second = (from_frame(self.body.contact(attitude.normal, t)[1], axes) for t in tangents)
         H11, H12, H22, V1, V2 = stored(-first[0], -first[1], -second[1], V1, V2)
         frame, path = self.frame.convex_motion(place, (V1, V2), (H11, H12, H22))
         path = stored(*path)
         frame_part = to_frame((subtract(None, frame.frame_rate[0]), subtract(None, frame.frame_rate[1]), None), axes)
         lever_rate = to_frame((subtract(path[0], slip[0]), subtract(path[1], slip[1]), None), axes)
-        return ContactMotion(vector_of(sum_vectors(normal_rate, frame_part)), lever_rate, path, frame)
+        return ContactMotion(sum_vectors(normal_rate, frame_part), lever_rate, path, frame)
 
     def angular_velocity(self, state: State) -> Vector:
         """Angular velocity of the body in the frame [rad/s]."""
@@ -578,7 +577,7 @@ class AbstractRigidDynamics(AbstractContactDynamics):
     def mass_from_contact(self, state: State) -> Vector:
         """Vector from the contact to the centre of mass [m], in the frame."""
         attitude = self.attitude(state)
-        return vector_of(scale(-1.0, from_frame(attitude.lever, attitude.axes)))
+        return scale(-1.0, from_frame(attitude.lever, attitude.axes))
 
     def energy(self, state: State) -> Float[Array, "..."]:
         """Kinetic energy plus weight times the height of the centre of mass [J]."""
@@ -646,7 +645,7 @@ class RigidSlipping(AbstractRigidDynamics):
         slip = Slip(slip_x, slip_y, from_frame(w, axes))
         friction = self.friction.per_normal_force(slip)
         f1, f2 = friction.force
-        moment = vector_of(stored(*sum_vectors(cross(r, (f1, f2, 1.0)), friction.torque)))
+        moment = stored(*sum_vectors(cross(r, (f1, f2, 1.0)), friction.torque))
 
         rise = cross(lever, normal)
         arm = self.inverse.times(rise)
@@ -678,11 +677,11 @@ class RigidRolling(AbstractRollingDynamics, AbstractRigidDynamics):
         contact = self.contact_motion(place[:-3], attitude, (None, None))
         o, up, _, room = contact.frame
         r_dot = sum_vectors(contact.lever_rate, cross(w, r))
-        steady_push = sum_vectors(cross(vector_of(r_dot), w), scale(self.gravity, to_frame(up, attitude.axes)))
-        torque = sum_vectors(cross(attitude.momentum, w), scale(m, cross(r, vector_of(steady_push))))
-        w_dot = self._about_contact(r).solve(vector_of(stored(*torque)))
-        reaction = from_frame(vector_of(scale(m, sum_vectors(steady_push, cross(r, w_dot)))), attitude.axes)
-        F = vector_of(stored(*reaction))
+        steady_push = sum_vectors(cross(r_dot, w), scale(self.gravity, to_frame(up, attitude.axes)))
+        torque = sum_vectors(cross(attitude.momentum, w), scale(m, cross(r, steady_push)))
+        w_dot = self._about_contact(r).solve(stored(*torque))
+        reaction = from_frame(scale(m, sum_vectors(steady_push, cross(r, w_dot))), attitude.axes)
+        F = stored(*reaction)
 
         push = (F[0] / m, F[1] / m)
         u3 = None if o == (None, None) else dot(attitude.normal, cross(r, w))
@@ -712,17 +711,17 @@ class RigidRolling(AbstractRollingDynamics, AbstractRigidDynamics):
         # In the body's axes: the velocity u of the centre of mass, and v.
         u = to_frame((u1, u2, -dot(w, cross(r, attitude.normal))), attitude.axes)
         v = to_frame((slip.x, slip.y, None), attitude.axes)
-        jump = vector_of(sum_vectors(v, scale(-1.0, u)))
-        w = self._about_contact(r).solve(vector_of(sum_vectors(attitude.momentum, scale(m, cross(r, jump)))))
-        u = from_frame(vector_of(sum_vectors(cross(r, w), v)), attitude.axes)
+        jump = sum_vectors(v, scale(-1.0, u))
+        w = self._about_contact(r).solve(sum_vectors(attitude.momentum, scale(m, cross(r, jump))))
+        u = from_frame(sum_vectors(cross(r, w), v), attitude.axes)
         return joined(u[:2], e, from_frame(self.body.inertia.tensor.times(w), attitude.axes), place)
 
     def unit_impulse(self, state: State, axis: int) -> tuple[Component, ...]:
         """As `RollingDynamics.unit_impulse`."""
         attitude = self.attitude(state)
-        v = vector_of(part[axis] for part in attitude.axes)
-        w = self._about_contact(attitude.lever).solve(vector_of(scale(self.body.mass, cross(attitude.lever, v))))
-        return scale(self.body.mass, from_frame(vector_of(sum_vectors(cross(attitude.lever, w), v)), attitude.axes))
+        v = tuple(part[axis] for part in attitude.axes)
+        w = self._about_contact(attitude.lever).solve(scale(self.body.mass, cross(attitude.lever, v)))
+        return scale(self.body.mass, from_frame(sum_vectors(cross(attitude.lever, w), v), attitude.axes))
 
     def with_unit_axes(self, state: State) -> State:
         """The state with the body's axes at unit length and at right angles."""

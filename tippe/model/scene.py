@@ -27,7 +27,6 @@ from nonholonomic.geometry import (
     room_bounds,
     scale,
     sum_vectors,
-    vector_of,
 )
 from nonholonomic.geometry.surface import as_surface
 from nonholonomic.parameters import as_one, numbers
@@ -426,11 +425,11 @@ class Scene(Bounded, Generic[Body]):
             c = (1.0 - fall * t1 * t1, -fall * t1 * t2, -e[0])
             axes = (c, cross(e, c), e)
             w = sum_vectors(scale(launch.spin, e), launch.angular_velocity or (None, None, None))
-            L = from_frame(body.inertia.tensor.times(to_frame(vector_of(w), axes)), axes)
+            L = from_frame(body.inertia.tensor.times(to_frame(w, axes)), axes)
             return self._rigid_dynamics.carried_along(joined(u, e, L, place, c))
         L = scale(body.I3 * launch.spin, e)
         if launch.angular_velocity is not None:
-            w = vector_of(launch.angular_velocity)
+            w = launch.angular_velocity
             axial_rate = dot(w, e)
             L = sum_vectors(L, scale(body.I1, w), scale((body.I3 - body.I1) * axial_rate, e))
             if isinstance(body, Top):
@@ -546,7 +545,7 @@ def generic_direction(scene: Scene, launch: Launch, cells: int) -> States:
     frame, (place, _) = scene.frame, scene.start(launch)
     place = frame.frame_motion(place, (scene.body.size, scene.body.size)).place_rate
     rigid = isinstance(scene.body, AbstractRigidBody)
-    x_axis = cross((r1, r2, r3), vector_of(last[-3:])) if rigid else ()
+    x_axis = cross((r1, r2, r3), tuple(last[-3:])) if rigid else ()
     direction = joined((u1, u2), cross((r1, r2, r3), e), tuple(L), place, x_axis)
     if rigid:
         direction = jax.jvp(scene.dynamics.carried_along, (state,), (direction,))[1]

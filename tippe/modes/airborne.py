@@ -28,7 +28,6 @@ from nonholonomic.geometry import (
     subtract,
     sum_vectors,
     tangents,
-    vector_of,
 )
 from nonholonomic.hybrid import Transition
 from nonholonomic.integration import AbstractPassive, AbstractProblem
@@ -80,7 +79,7 @@ class FlightState(NamedTuple):
 
 def flight_state(state: State) -> FlightState:
     """Split a flight state into its parts."""
-    return FlightState(*(vector_of(state[k + i] for i in range(3)) for k in range(0, 12, 3)))
+    return FlightState(*(tuple(state[k + i] for i in range(3)) for k in range(0, 12, 3)))
 
 
 class Below(NamedTuple):
@@ -95,8 +94,8 @@ def below(scene: Scene[Top], flying: FlightState, ball: Ball | None = None) -> B
     """The point of the arena nearest to the centre of a sphere, by default the top's own sphere, for which theta is
     measured."""
     frame, ball = carried_frame(scene), balls(scene.body)[0] if ball is None else ball
-    centre = vector_of(sum_vectors(flying.place, scale(ball.offset, flying.axis)))
-    foot = vector_of(0.0 * centre[0] if part is None else part for part in scene.surface.nearest(centre))
+    centre = sum_vectors(flying.place, scale(ball.offset, flying.axis))
+    foot = tuple(0.0 * centre[0] if part is None else part for part in scene.surface.nearest(centre))
     n = frame.normal(foot)
     difference = dot(tuple(subtract(a, b) for a, b in zip(centre, foot, strict=True)), n)
     return Below(foot, (*tangents(n), n), difference - ball.radius)
@@ -113,9 +112,9 @@ def landing_site(scene: Scene[Top], flying: FlightState, ball: Ball) -> Below:
     """The point where a sphere lands: the nearest point of the arena at the time of landing. Before that time, only the
     sign of the gap is valid.
     """
-    centre = vector_of(sum_vectors(flying.place, scale(ball.offset, flying.axis)))
+    centre = sum_vectors(flying.place, scale(ball.offset, flying.axis))
     site, zero = scene.surface.ball_gap(centre, ball.radius, carried_frame(scene).side), jnp.zeros_like(flying.place[0])
-    n = vector_of(zero if part is None else part + zero for part in site.normal)
+    n = tuple(zero if part is None else part + zero for part in site.normal)
     return Below(site.foot, (*tangents(n), n), site.gap)
 
 
@@ -230,7 +229,7 @@ class QuadraturesInFlight(AbstractPassive):
         flying = flight_state(state)
         e_dot = axis_rate(self.body, flying.axis, flying.momentum)
         spin = dot(flying.momentum, flying.axis) / self.body.I3
-        c = vector_of(passive[:3])
+        c = tuple(passive[:3])
         rates = (*c_rate(c, flying.axis, dot(e_dot, c)), spin, None)
         return jnp.concatenate([problem.field(time, state), stacked(rates, passive)])
 
@@ -251,7 +250,7 @@ def lift_off(scene: Scene[Top], state: State, with_quadratures: bool, ball: Ball
     flight = in_flight(s, axes, FreeBody(velocity, jnp.zeros_like(state[0]), e, L))
     if not with_quadratures:
         return flight
-    c_vector = from_frame(vector_of(state[OWN + k] for k in range(3)), axes)
+    c_vector = from_frame(tuple(state[OWN + k] for k in range(3)), axes)
     return jnp.concatenate([flight, jnp.stack(c_vector), state[OWN + 3 :]])
 
 
@@ -370,7 +369,7 @@ class Fly(AbstractFlyingMode):
         flying = flight_state(state)
         ground = below(self.scene, flying)
         free = flying_body(self.scene, flying, ground)
-        c_vector = to_frame(vector_of(state[OWN + k] for k in range(3)), ground.axes)
+        c_vector = to_frame(tuple(state[OWN + k] for k in range(3)), ground.axes)
         rate = gap_rate(self.scene.body, balls(self.scene.body)[0], free)
         rows = [jnp.stack(c_vector), state[OWN + 3 :], jnp.stack([ground.gap, rate])]
         return jnp.concatenate([in_contact(ground, free), *rows])
@@ -391,7 +390,7 @@ class Fly(AbstractFlyingMode):
         ground = landing_site(scene, flying, contact_ball)
         misses = missed(scene, ground, contact_ball)
         # If the landing was located slightly below the arena, the next mode would end where it begins.
-        flying = flying._replace(place=vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2]))))
+        flying = flying._replace(place=sum_vectors(flying.place, scale(-ground.gap, ground.axes[2])))
         ground = ground._replace(gap=zero)
         free = flying_body(scene, flying, ground, contact_ball)
         blow = strike(scene, contact_ball, free)
@@ -432,7 +431,7 @@ class Fly(AbstractFlyingMode):
         state_after = jnp.where(flies, in_flight(place, ground.axes, body_after), in_contact(ground, body_after))
         if not self.with_quadratures:
             return state_after
-        c_vector = vector_of(state[OWN + k] for k in range(3))
+        c_vector = tuple(state[OWN + k] for k in range(3))
         c_vector = jnp.where(flies, jnp.stack(c_vector), jnp.stack(to_frame(c_vector, ground.axes)))
         energy_change = energy(self.scene.body, 0.0, body_after) - energy(self.scene.body, 0.0, body_before)
         spin_angle, work = state[OWN + 3 :]

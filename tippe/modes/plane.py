@@ -20,7 +20,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.compilation.xla_cpu import compiled_setup, greatest
-from nonholonomic.geometry import Vector, cross, dot, scale, subtract, sum_vectors, vector_of
+from nonholonomic.geometry import Vector, cross, dot, scale, subtract, sum_vectors
 from nonholonomic.hybrid import AbstractHoppingMode, Transition, TransitionPath
 from nonholonomic.integration import AbstractProblem
 from nonholonomic.integration.dense import halved
@@ -100,7 +100,7 @@ def angle_less_sine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
 def precession(body: Top, free: FreeBody) -> tuple[Vector, Float[Array, "..."]]:
     """The direction of L, about which the axis of a free body turns, and the rate [rad/s]."""
     size = jnp.sqrt(dot(free.momentum, free.momentum))
-    return vector_of(scale(1.0 / jnp.where(size == 0.0, 1.0, size), free.momentum)), size / body.I1
+    return scale(1.0 / jnp.where(size == 0.0, 1.0, size), free.momentum), size / body.I1
 
 
 def cone(body: Top, free: FreeBody) -> Cone:
@@ -122,7 +122,7 @@ def turned(vector: Vector, axis: Vector, angle: Float[Array, "..."]) -> Vector:
     """A vector turned about a unit axis by an angle [rad]."""
     parallel, binormal = scale(dot(axis, vector), axis), cross(axis, vector)
     perpendicular = tuple(subtract(v, p) for v, p in zip(vector, parallel, strict=True))
-    return vector_of(sum_vectors(parallel, scale(jnp.cos(angle), perpendicular), scale(jnp.sin(angle), binormal)))
+    return sum_vectors(parallel, scale(jnp.cos(angle), perpendicular), scale(jnp.sin(angle), binormal))
 
 
 def _descent(
@@ -383,7 +383,7 @@ def quadratures_after(
     # c moves with the axis without rotation about the axis: its angular velocity is L / I1 - (e.L / I1) e, that of the axis
     # about L, without the component along e.
     direction, rate = precession(body, free)
-    about_axis = turned(vector_of(c_vector), free.axis, -dot(free.axis, free.momentum) / body.I1 * time)
+    about_axis = turned(tuple(c_vector), free.axis, -dot(free.axis, free.momentum) / body.I1 * time)
     c_vector = turned(about_axis, direction, rate * time)
     return jnp.stack([x + u1 * time, y + u2 * time, *c_vector, angle + spin_rate * time, work + 0.0 * time])
 
