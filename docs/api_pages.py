@@ -147,8 +147,8 @@ PAGES = {
             "nonholonomic.hybrid",
             *of(
                 "nonholonomic.hybrid",
-                "AbstractBatchedMode AbstractHoppingMode Transition TransitionPath solve_hybrid traced_solve_hybrid "
-                "HybridOutcome solve_hybrid_with_tangents traced_solve_hybrid_with_tangents solve_hybrid_dense HybridPath "
+                "AbstractBatchedMode AbstractHoppingMode Transition TransitionPath solve_hybrid "
+                "HybridOutcome solve_hybrid_with_tangents solve_hybrid_dense HybridPath "
                 "Segment hybrid_resets solve_hybrid_with_samples hybrid_samples HybridSamples",
             ),
             "nonholonomic.derivatives",

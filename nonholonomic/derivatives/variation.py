@@ -146,7 +146,7 @@ def slopes_by_variations(
     variational = VariationalProblem(problem, tangents, ends_on_event)
     # The variations take part in step-size control: the state alone may be at rest while its tangent is not, and the
     # steps would become too long for the tangent.
-    ended, _ = LaneScheduler.of(variational, *options, n_blocks=1 + len(tangents), one_kernel=one_kernel).outcome()
+    ended = LaneScheduler.of(variational, *options, n_blocks=1 + len(tangents), one_kernel=one_kernel).solve()[0]
     state, *variations = variational.parts(ended.state)
 
     def event_time(problem: AbstractProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:

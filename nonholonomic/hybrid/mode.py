@@ -1,16 +1,19 @@
 """A mode: its equations of motion, and its transition to the next mode, which may take time."""
 
 import abc
-from collections.abc import Callable
-from typing import Any, ClassVar, Generic, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import ClassVar, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
-from ..integration import AbstractProblem
+from ..integration import AbstractProblem, Lanes, States
 from ..integration.scheduler import Numbers
+
+#: A kind of mode.
+Mode = TypeVar("Mode", bound="AbstractBatchedMode")
 
 
 class TransitionPath(NamedTuple):
@@ -28,7 +31,7 @@ class TransitionPath(NamedTuple):
     """
 
     ends: Float[Array, " stretches 1"]
-    motions: Any
+    motions: PyTree
     shown: Int[Array, " stretches 1"]
 
 
@@ -68,17 +71,15 @@ class AbstractBatchedMode(eqx.Module):
     [-9.81 -9.81]
     """
 
-    @property
-    def rare(self) -> bool:
-        """Whether few runs enter the mode: its programs are compiled when a run enters it, not beforehand."""
-        return False
+    #: Whether few runs enter the mode: its programs are compiled when a run enters it, not beforehand.
+    rare: ClassVar[bool] = False
 
     @abc.abstractmethod
-    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+    def problem(self, state: States) -> AbstractProblem:
         """The motion in this mode from the given states; the mode ends where the problem's domain margin vanishes."""
 
     @abc.abstractmethod
-    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
+    def reset_map(self, state: States, left: Lanes) -> Transition:
         """Map the states at the end of the mode, where the domain margin vanishes, to the start of the next mode.
 
         **Arguments:**
@@ -93,7 +94,7 @@ class AbstractBatchedMode(eqx.Module):
         """Map mode states to output rows; every mode must return the same number of rows."""
         return state
 
-    def between(self, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "shown times"]:
+    def between(self, motion: PyTree, passed: Float[Array, " times"]) -> Float[Array, "shown times"]:
         """The output rows of one stretch in `Transition.record`, at times [s] counted from its start."""
         raise NotImplementedError(f"{type(self).__name__} records stretches but does not say what they show")
 
@@ -132,148 +133,60 @@ class AbstractHoppingMode(AbstractBatchedMode):
     most_hops: ClassVar[int]
 
     @abc.abstractmethod
-    def lost(self, state: Float[Array, "components cells"]) -> Any:
+    def lost(self, state: States) -> PyTree:
         """The first stretch of motion after the mode, which starts from the states at its end."""
 
     @abc.abstractmethod
-    def hop(self, stretch: Any, left: Float[Array, " cells"]) -> tuple[Any, Any]:
+    def hop(self, stretch: PyTree, left: Lanes) -> tuple[PyTree, PyTree]:
         """Follow one stretch of motion; `left` [s] is the time from the end of the mode to the horizon.
 
         **Returns:** the stretch at its end, before the jump; and the next stretch, after the jump.
         """
 
     @abc.abstractmethod
-    def closed(self, stretch: Any) -> Transition:
+    def closed(self, stretch: PyTree) -> Transition:
         """The transition that the last stretch leads to, without a record."""
 
     @abc.abstractmethod
-    def motion_in(self, stretch: Any) -> Any:
+    def motion_in(self, stretch: PyTree) -> PyTree:
         """The argument of `between` for a stretch that begins."""
 
 
-def over_cells(function: Callable[..., Any], mode: AbstractBatchedMode) -> Callable[..., Any]:
+def over_cells(function: Callable[..., PyTree], mode: AbstractBatchedMode) -> Callable[..., PyTree]:
     """Map a function of the mode of one run, and of more arguments, over cells, which are in the last axis of every
     array."""
 
-    def cells_axis(leaf: Any) -> int | None:
-        return -1 if eqx.is_array(leaf) and leaf.ndim else None
-
-    def mapped(*arguments: Any) -> Any:
-        return eqx.filter_vmap(function, in_axes=(cells_axis, *[-1] * len(arguments)), out_axes=-1)(mode, *arguments)
+    def mapped(*arguments: PyTree) -> PyTree:
+        axes = (lambda leaf: -1 if eqx.is_array(leaf) and leaf.ndim else None, *[-1] * len(arguments))
+        return eqx.filter_vmap(function, in_axes=axes, out_axes=-1)(mode, *arguments)
 
     return mapped
 
 
-def mode_of_cells(mode: AbstractBatchedMode, cell: Int[Numbers, " selected"]) -> AbstractBatchedMode:
+def mode_of_cells(mode: Mode, cell: Int[Numbers, " selected"]) -> Mode:
     """The mode of the cells with these indices."""
     numbers, static = eqx.partition(mode, eqx.is_array)
     return eqx.combine(jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[..., cell], numbers), static)
 
 
-# Output rows of runs between two modes, at given times, for many cells at once.
-
-#: A sample this much later than the last stretch of a transition, as a fraction of the horizon, still belongs to it.
-ROUND_OFF = 1e-13
-
-
-def reset_with_rows(
-    mode: AbstractBatchedMode,
-    state: Float[Array, "components cells"],
-    left: Float[Array, " cells"],
-    times: Float[Array, "times cells"],
-    t1: Float[Array, " cells"],
-    weights: Float[Array, "shown times cells"] | None = None,
-) -> tuple[Transition, Array | None]:
-    """The transition to the next mode, and the output rows on the way.
-
-    **Arguments:** `state`, `left`: as for `AbstractBatchedMode.reset_map`; `times`: the times of the samples [s],
-    counted from the end of the mode; `t1`: horizon [s]; `weights`: factors of the rows, if only a sum of them is needed.
-
-    **Returns:** the `Transition`, and the rows, which are meaningless at times outside the transition, or with `weights`
-    their weighted sum in every cell; `None` if the mode records no path.
-    """
-    if isinstance(mode, AbstractHoppingMode):
-        return _hops_with_rows(mode, state, left, times, ROUND_OFF * t1, weights)
-    transition = mode.reset_map(state, left)
-    if transition.record is None:
-        return transition, None
-    rows = over_cells(_rows_of_path, mode)(transition.record, times)
-    return transition, rows if weights is None else jnp.sum(weighted(weights, rows), axis=(0, 1))
+def program_groups(modes: Sequence[AbstractBatchedMode]) -> list[tuple[int, ...]]:
+    """The indices of the modes, in groups. The modes of a group differ only in the values of their arrays, so they
+    share a program."""
+    # The modes with the shapes of their arrays in place of their values.
+    shapes = [
+        jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)) if eqx.is_array(leaf) else leaf, mode) for mode in modes
+    ]
+    firsts = [next(k for k, other in enumerate(shapes) if eqx.tree_equal(other, shape)) for shape in shapes]
+    return [tuple(k for k, other in enumerate(firsts) if other == first) for first in dict.fromkeys(firsts)]
 
 
-def weighted(weights: Float[Array, "..."], values: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Values times their weights; a value without a weight may be anything."""
-    return jnp.where(weights == 0.0, 0.0, weights * values)
+def mode_numbered(modes: Sequence[Mode], numbers: Sequence[int], selected: Int[Array, "..."]) -> Mode:
+    """The mode numbered `selected` in one of the `program_groups`."""
+    mode = modes[numbers[0]]
+    for number in numbers[1:]:
 
+        def leaf(old: PyTree, new: PyTree, number: int = number) -> PyTree:
+            return old if old is new or not eqx.is_array(old) else jnp.where(selected == number, new, old)
 
-def _rows_of_path(
-    mode: AbstractBatchedMode, record: TransitionPath, times: Float[Array, " times"]
-) -> Float[Array, "shown times"]:
-    """The output rows of one cell; after the last stretch they are meaningless."""
-    ends = record.ends
-    stretch = jnp.minimum(jnp.searchsorted(jax.lax.stop_gradient(ends), jax.lax.stop_gradient(times)), len(ends) - 1)
-    start_time = jnp.where(stretch > 0, ends[jnp.maximum(stretch - 1, 0)], 0.0)
-    motions = jax.tree.map(lambda leaf: jnp.moveaxis(leaf[stretch], 0, -1), record.motions)
-    return mode.between(motions, jnp.where(jnp.isfinite(start_time), times - start_time, 0.0))
-
-
-class Hops(NamedTuple):
-    """A succession of stretches: the current one, the number of stretches so far, the output rows or their weighted sum,
-    and the index of the next sample in every cell."""
-
-    stretch: Any
-    count: Int[Array, ""]
-    rows: Float[Array, "*shown_times cells"]
-    sample: Int[Array, " cells"]
-
-
-def _hops_with_rows(
-    mode: AbstractHoppingMode,
-    state: Float[Array, "components cells"],
-    left: Float[Array, " cells"],
-    times: Float[Array, "times cells"],
-    slack: Float[Array, " cells"],
-    weights: Float[Array, "shown times cells"] | None,
-) -> tuple[Transition, Float[Array, "*shown_times cells"]]:
-    """The stretches one by one, each with the samples inside it. No path is kept, whose length is not known."""
-    cells = jnp.arange(len(left))
-
-    def with_values(rows: Array, row: Int[Array, " cells"], values: Float[Array, "shown cells"]) -> Array:
-        if weights is None:
-            return rows.at[:, row, cells].set(values, mode="drop", unique_indices=True)
-        factors = weights.at[:, row, cells].get(mode="fill", fill_value=0.0)
-        return rows + jnp.sum(weighted(factors, values), axis=0)
-
-    def hop(hops: Hops) -> Hops:
-        stretch, count, rows, sample = hops
-        end, following = mode.hop(stretch, left)
-        motion = mode.motion_in(stretch)
-        # Rounding may put the end of the last stretch before a sample at the end of the transition.
-        reach = end.elapsed + jnp.where(following.open, 0.0, slack)
-
-        def next_time(sample: Int[Array, " cells"]) -> Float[Array, " cells"]:
-            time = times[jnp.minimum(sample, len(times) - 1), cells]
-            return jnp.where(sample < len(times), time, jnp.inf)
-
-        def is_inside(sample: Int[Array, " cells"]) -> Bool[Array, " cells"]:
-            return stretch.open & (next_time(sample) <= reach)
-
-        def filled(carry: tuple[Array, Array]) -> tuple[Array, Array]:
-            rows, sample = carry
-            inside = is_inside(sample)
-            passed = jnp.where(inside, next_time(sample) - stretch.elapsed, 0.0)
-            row = jnp.where(inside, sample, len(times))
-            return with_values(rows, row, mode.between(motion, passed)), sample + inside
-
-        rows, sample = jax.lax.while_loop(lambda carry: jnp.any(is_inside(carry[1])), filled, (rows, sample))
-        return Hops(following, count + 1, rows, sample)
-
-    def goes_on(hops: Hops) -> Bool[Array, ""]:
-        return jnp.any(hops.stretch.open) & (hops.count < mode.most_hops)
-
-    start = mode.lost(state)
-    row = jax.eval_shape(mode.between, mode.motion_in(start), start.elapsed)
-    rows = jnp.zeros((len(row), *times.shape) if weights is None else left.shape)
-    hops = Hops(start, jnp.zeros((), int), rows, jnp.sum(times <= 0.0, axis=0))
-    hops = jax.lax.while_loop(goes_on, hop, hops)
-    return mode.closed(hops.stretch), hops.rows
+        mode = jax.tree.map(leaf, mode, modes[number])
+    return mode

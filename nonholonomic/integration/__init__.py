@@ -40,8 +40,6 @@ from .dense import DenseSolution as DenseSolution
 from .dense import ImplicitMidpoint as ImplicitMidpoint
 from .dense import follow as follow
 from .dense import sample as sample
-from .pairs import Oscillatory8 as Oscillatory8
-from .pairs import Stabilized8 as Stabilized8
 from .problem import AbstractPassive as AbstractPassive
 from .problem import AbstractProblem as AbstractProblem
 from .problem import CoreProblem as CoreProblem
@@ -50,6 +48,8 @@ from .problem import Jumps as Jumps
 from .problem import Settings as Settings
 from .problem import crossing_time as crossing_time
 from .runge_kutta import Lanes as Lanes
+from .runge_kutta import Oscillatory8 as Oscillatory8
+from .runge_kutta import Stabilized8 as Stabilized8
 from .runge_kutta import States as States
 from .runge_kutta import explicit_tableau as explicit_tableau
 from .samples import solve_with_samples as solve_with_samples

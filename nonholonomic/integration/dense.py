@@ -4,7 +4,7 @@ validity."""
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.cache import padded
 from ..geometry import inverse
@@ -97,7 +97,7 @@ def sign_changes(
 
 
 def few_trials(
-    function: Callable[[Brackets], Any], low: Brackets, high: Brackets, at_low: Brackets, at_high: Brackets
+    function: Callable[[Brackets], Brackets], low: Brackets, high: Brackets, at_low: Brackets, at_high: Brackets
 ) -> Brackets:
     """Zeros of a function that is expensive to evaluate, one in each bracket (Anderson and Bjorck, BIT 13 (1973) 253).
 
@@ -136,7 +136,7 @@ def few_trials(
 
 
 def all_crossings(
-    quantity: Callable[[Brackets], Any], time: Float[np.ndarray, " steps"], value: Float[np.ndarray, " steps"]
+    quantity: Callable[[Brackets], Brackets], time: Float[np.ndarray, " steps"], value: Float[np.ndarray, " steps"]
 ) -> Float[np.ndarray, " crossings"]:
     """The times at which a quantity of a run passes zero, in either direction, in increasing order, with pairs of crossings
     inside a step.
@@ -153,7 +153,12 @@ def all_crossings(
     >>> all_crossings(dip, steps, dip(steps)).round(6)
     array([1.5 , 1.52])
     """
-    indices = np.flatnonzero(_may_cross(value))
+    with np.errstate(invalid="ignore"):
+        change = np.abs(np.diff(value))
+        max_change = np.max([change, np.append(change[1:], 0.0), np.insert(change[:-1], 0, 0.0)], axis=0)
+        is_small = np.minimum(np.abs(value[:-1]), np.abs(value[1:])) < max_change
+    # The steps in which the quantity changes its sign, or changes by more than its size, there or in a neighbour.
+    indices = np.flatnonzero(is_small | ((value[:-1] > 0.0) != (value[1:] > 0.0)))
     if indices.size == 0:
         return np.zeros(0)
 
@@ -172,16 +177,6 @@ def all_crossings(
             break
     changes = np.flatnonzero((value[:-1] > 0.0) != (value[1:] > 0.0))
     return few_trials(signed, time[changes], time[changes + 1], value[changes], value[changes + 1])
-
-
-def _may_cross(value: Float[np.ndarray, " steps"]) -> Bool[np.ndarray, " gaps"]:
-    """Steps in which a quantity may be zero: its sign changes, or it changes by more than its size, there or in a
-    neighbour."""
-    with np.errstate(invalid="ignore"):
-        change = np.abs(np.diff(value))
-        max_change = np.max([change, np.append(change[1:], 0.0), np.insert(change[:-1], 0, 0.0)], axis=0)
-        is_small = np.minimum(np.abs(value[:-1]), np.abs(value[1:])) < max_change
-    return is_small | ((value[:-1] > 0.0) != (value[1:] > 0.0))
 
 
 def _nearest(time: Float[np.ndarray, " looks"], value: Float[np.ndarray, " looks"]) -> Float[np.ndarray, " new"]:
@@ -227,7 +222,7 @@ class DenseSolution(NamedTuple):
 
     times: Float[np.ndarray, " times"]
     states: Float[np.ndarray, "components times"]
-    segments: list[Any]
+    segments: list[diffrax.Solution]
     left_domain: bool
     failed: bool
     accepted: int
@@ -250,7 +245,7 @@ def _evaluate(
     return jax.vmap(segment.evaluate)(times)
 
 
-def saved(solution: diffrax.Solution) -> tuple[Any, Any]:
+def saved(solution: diffrax.Solution) -> tuple[PyTree, PyTree]:
     """Times and states of a solution, which Diffrax's types declare as optional."""
     return solution.ts, solution.ys
 
@@ -271,16 +266,17 @@ def _start(
     return jnp.asarray(state), jnp.asarray(scales), margin_at_start(problem, time, state)
 
 
-def _control(settings: Settings, scales: Float[Array, " components"]) -> diffrax.PIDController:
+def _control(
+    problem: AbstractProblem,
+    settings: Settings,
+    state: Float[Array, " components"],
+    scales: Float[Array, " components"],
+    times: Float[Array, " times"] | None = None,
+) -> diffrax.AbstractStepSizeController:
+    """Step-size control whose steps end on given times and on both sides of each jump."""
     # The largest error counts, not the mean: passive cyclic coordinates must not dilute the errors of the others.
     atol = settings.absolute * settings.tolerance * jax.lax.stop_gradient(scales)
-    return diffrax.PIDController(settings.tolerance, atol, norm=optimistix.max_norm)
-
-
-def _clipped(
-    problem: AbstractProblem, controller: Any, state: Float[Array, " components"], times: Float[Array, " times"] | None
-) -> Any:
-    """A controller whose steps end on given times and on both sides of each jump."""
+    controller = diffrax.PIDController(settings.tolerance, atol, norm=optimistix.max_norm)
     jumps = problem.jumps(jnp.zeros_like(state[0]), state)
     ends = [] if times is None else [times]
     ends += [] if jumps is None else [jumps.ahead, jumps.past]
@@ -311,25 +307,22 @@ def _piece(
         first,
         state,
         args=problem,
-        stepsize_controller=_clipped(problem, _control(settings, scales), state, None),
+        stepsize_controller=_control(problem, settings, state, scales),
         saveat=diffrax.SaveAt(t0=True, steps=True, dense=dense or is_watched),
         max_steps=settings.max_steps,
         event=diffrax.Event(lambda t, y, args, **_: args.domain_margin(t, y) < 0.0) if is_watched else None,
         throw=False,
     )
-    ends, _ = saved(solution)
-    lengths = jnp.where(jnp.isfinite(ends[1:]), ends[1:] - ends[:-1], 0.0)
-    starts = jnp.where(jnp.isfinite(ends[:-1]), ends[:-1], t0)
-    return solution, _first_losses(problem, solution, starts, lengths) if is_watched else None
+    return solution, _first_losses(problem, solution, t0) if is_watched else None
 
 
 def _first_losses(
-    problem: AbstractProblem,
-    solution: diffrax.Solution,
-    starts: Float[Array, " steps"],
-    lengths: Float[Array, " steps"],
+    problem: AbstractProblem, solution: diffrax.Solution, t0: Float[Array, ""]
 ) -> Float[Array, "steps 2"]:
     """Brackets [s] of the first zero of the domain margin in every step, infinite where there is none."""
+    ends, _ = saved(solution)
+    lengths = jnp.where(jnp.isfinite(ends[1:]), ends[1:] - ends[:-1], 0.0)
+    starts = jnp.where(jnp.isfinite(ends[:-1]), ends[:-1], t0)
     # The parts of all steps are the lanes of one problem.
     length = jnp.repeat(lengths / PARTS, PARTS)
     time = jnp.repeat(starts, PARTS) + length * jnp.tile(jnp.arange(PARTS), len(starts))
@@ -438,10 +431,10 @@ class _GivenSteps(diffrax.StepTo):
     programs are not cached on disk.
     """
 
-    def wrap(self, direction: Any) -> "_GivenSteps":
+    def wrap(self, direction):
         return self
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: None, args: Any, func: Any, error_order: Any) -> Any:
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         return self.ts[1], 2
 
 
@@ -452,7 +445,7 @@ def _with_fixed_jumps(state: Float[Array, " components"], times: Float[Array, " 
 
 
 @_with_fixed_jumps.def_jvp
-def _nan_if_moved(primals: Any, tangents: Any) -> Any:
+def _nan_if_moved(primals, tangents):
     (state, _), (rates, time_rates) = primals, tangents
     rates = jnp.zeros_like(state) if rates is None else rates
     return state, rates if time_rates is None else rates + jnp.nan * jnp.sum(time_rates)
@@ -513,10 +506,7 @@ def sample(
         times, save_at, max_points = grid, diffrax.SubSaveAt(t0=True, steps=True), grid.size - 1
     else:
         save_at, max_points = diffrax.SubSaveAt(ts=jnp.minimum(times, t1)), settings.max_steps
-    if grid is None:
-        controller = _clipped(problem, _control(settings, scales), state, jnp.minimum(times, t1))
-    else:
-        controller = _GivenSteps(grid)
+    control = _control(problem, settings, state, scales, jnp.minimum(times, t1)) if grid is None else _GivenSteps(grid)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
         settings.for_single_runs if is_watched else settings.for_steps_alone,
@@ -525,7 +515,7 @@ def sample(
         None,
         state,
         args=problem,
-        stepsize_controller=controller,
+        stepsize_controller=control,
         saveat=diffrax.SaveAt(subs=[save_at, diffrax.SubSaveAt(t1=True)]),
         max_steps=max_points,
         event=event if is_watched else None,
@@ -609,8 +599,8 @@ class ImplicitMidpoint(diffrax.AbstractSolver):
 
         z, corrections = jax.lax.scan(improve, guess, length=ITERATIONS)
         converged = corrections[-1] < 1e3 * jnp.finfo(y0.dtype).eps
-        diverged: Any = diffrax.RESULTS.nonlinear_divergence
-        result = diffrax.RESULTS.where(converged, diffrax.RESULTS.successful, diverged)
+        results = diffrax.RESULTS
+        result = results.where(converged, results.successful, results.nonlinear_divergence)
         y1 = y0 + z
         return y1, None, dict(y0=y0, y1=y1), None, result
 

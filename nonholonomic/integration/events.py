@@ -5,7 +5,7 @@ The event therefore has the accuracy of the method, not that of an interpolant.
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -205,7 +205,7 @@ def _least_minimum(
         for slope_before, slope_after, gap in zip(values[:-1], values[1:], gaps, strict=True)
     ]
 
-    def about(k: int) -> tuple[Any, ...]:
+    def about(k: int) -> tuple[Array | float, ...]:
         return slopes[k - 1], slopes[k], values[k], places[k], gaps[k - 1], 1.0 / (gaps[k - 1] + gaps[k])
 
     parabola = about(len(places) - 2)
@@ -269,11 +269,11 @@ class Path(NamedTuple):
         square, cube = 3.0 * step - 2.0 * slope - end_slope, slope + end_slope - 2.0 * step
         return cls(state, slope, square, cube, middle - 0.5 * (state + end_state) - 0.125 * (slope - end_slope))
 
-    def error(self, place: Any) -> Lanes:
+    def error(self, place: Lanes | float) -> Lanes:
         """How many times the bulge the error of the state at a place is."""
         return STATE_SHARE * 16.0 * (place * (1.0 - place)) ** 2
 
-    def derivatives(self, place: Any) -> list[States]:
+    def derivatives(self, place: Lanes | float) -> list[States]:
         """The state at a place, and its four derivatives by the place, each divided by the factorial of its order."""
         left, sides = 1.0 - place, 1.0 - 2.0 * place
         state = self.start + place * (self.slope + place * (self.square + place * self.cube))
@@ -359,7 +359,9 @@ def _bounded(
         slopes = Bounds(slope - change - 3.1 * error, slope + change + 3.1 * error)
         times = Bounds(time + begin * length, time + end * length)
         (values, leaps), (rises, _) = enclosed(times, states), sloping(times, states, Bounds(length, length), slopes)
-        may_leap = functools.reduce(jnp.logical_or, [_in_lanes(leap, time) for leap in leaps], jnp.zeros_like(free))
+        # In all lanes where the axes of the truth values are not those of lanes.
+        leaps = [leap if leap.shape == time.shape else jnp.broadcast_to(jnp.any(leap), time.shape) for leap in leaps]
+        may_leap = functools.reduce(jnp.logical_or, leaps, jnp.zeros_like(free))
         value, along = jax.linearize(functions, time + middle * length, state)
         doubt = path.error(middle) * jnp.abs(along(jnp.zeros_like(time), path.bulge))
         steepest = jnp.maximum(jnp.abs(rises.low), jnp.abs(rises.high)) * half
@@ -386,19 +388,6 @@ def _bounded(
     return jax.lax.while_loop(lambda carry: jnp.any(carry[0] < 1.0), part, start)[2]
 
 
-def _in_lanes(leap: Bool[Array, "..."], time: Lanes) -> Bool[Array, "*lanes"]:
-    """Where a function may jump, in the lanes; in all of them where the axes of the truth values are not those of lanes."""
-    return leap if leap.shape == time.shape else jnp.broadcast_to(jnp.any(leap), time.shape)
-
-
-class Look(NamedTuple):
-    """The functions at a place of the step: value, slope along the step, and the error that the state's error causes."""
-
-    value: Functions
-    slope: Functions
-    error: Functions
-
-
 def _looked(
     functions: Callable[[Lanes, States], Functions],
     path: Path,
@@ -408,10 +397,11 @@ def _looked(
 ) -> tuple[Lanes, Lanes]:
     """The place as in `watched`, by looks at the functions; and the least ratio of a value to its error."""
 
-    def look(place: Any) -> Look:
+    def look(place: Float[Array, ""]) -> tuple[Functions, Functions, Functions]:
+        # The functions, their slopes along the step, and the errors that the state's error causes.
         state, slope, *_ = path.derivatives(place)
         value, along = jax.linearize(functions, time + place * length, state)
-        return Look(value, along(length, slope), path.error(place) * jnp.abs(along(jnp.zeros_like(time), path.bulge)))
+        return value, along(length, slope), path.error(place) * jnp.abs(along(jnp.zeros_like(time), path.bulge))
 
     places, width = jnp.linspace(0.0, 1.0, 1 + INTERVALS), 1.0 / INTERVALS
     value, slope, error = jax.lax.map(look, places)

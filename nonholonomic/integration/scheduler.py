@@ -4,10 +4,9 @@ A lane whose run has ended takes the next cell of the queue, so cheap and expens
 waiting for one another. All ensemble solves share this loop; a recorder stores what they keep of the steps.
 """
 
-import abc
 import functools
 from collections.abc import Callable
-from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+from typing import ClassVar, Generic, NamedTuple, TypeVar
 
 import diffrax
 import equinox as eqx
@@ -16,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.xla_cpu import compiled_alone, in_one_kernel
+from ..text import shown
 from .dense import saved
 from .events import Bracket
 from .problem import (
@@ -31,14 +31,19 @@ from .problem import (
     AbstractProblem,
     Settings,
     crossing_time,
+    lanes_for,
     least_margin,
     margin_at_start,
 )
-from .runge_kutta import Lanes, States, explicit_order, explicit_tableau, first_length, memory_for_stages
+from .runge_kutta import Lanes, States, explicit_tableau, first_length, memory_for_stages
 from .step import Control, LaneState, try_step
 
 #: JAX's arrays, or NumPy's on the host.
 Numbers = TypeVar("Numbers", Array, np.ndarray)
+
+#: A tree of arrays.
+Tree = TypeVar("Tree")
+Result = TypeVar("Result")
 
 #: Cost of refilling the lanes, in steps of all lanes, measured on a CPU. The lanes are refilled when idle lanes have
 #: missed as many steps, so the loss is at most twice the loss of the best choice.
@@ -90,47 +95,40 @@ class SchedulerState(NamedTuple):
 InLanes = tuple[AbstractProblem, Control, States]
 
 
-class AbstractRecorder(eqx.Module):
-    """The part of a solve that records steps, in addition to the `Outcome`. A period ends when enough lanes have
-    ended to refill them, or when the record is full.
+#: What a period carries from step to step: the lanes, the record, the number of steps that idle lanes have missed since the
+#: last refill, and the number of steps.
+Period = tuple[LaneState, PyTree, Int[Array, ""], Int[Array, ""]]
+
+
+class Recorder(eqx.Module):
+    """The part of a solve that records steps, in addition to the `Outcome`; this one records nothing. A period ends when
+    enough lanes have ended to refill them, or when the record is full.
 
     `refill_cost`: cost of a refill, in steps of all lanes.
     """
 
     refill_cost: ClassVar[float] = REFILL
 
-    @abc.abstractmethod
-    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: Any) -> Any:
+    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: PyTree) -> PyTree:
         """The record at the start of a period, from what earlier periods have collected."""
+        return None
 
-    def has_room(self, record: Any, iteration: Int[Array, ""]) -> Bool[Array, ""] | bool:
+    def has_room(self, record: PyTree, iteration: Int[Array, ""]) -> Bool[Array, ""] | bool:
         """Whether the record has room for another iteration of the period; otherwise the period ends."""
         return True
 
-    @abc.abstractmethod
     def step(
-        self, in_lanes: InLanes, lane_state: LaneState, record: Any, iteration: Int[Array, ""]
-    ) -> tuple[LaneState, Any]:
+        self, in_lanes: InLanes, lane_state: LaneState, record: PyTree, iteration: Int[Array, ""]
+    ) -> tuple[LaneState, PyTree]:
         """Try a step in every lane, and record it."""
+        return try_step(*in_lanes, lane_state), None
 
-    def collect(self, collected: Any, record: Any, ended: LaneState, refilled: LaneState) -> Any:
+    def collect(self, collected: PyTree, record: PyTree, ended: LaneState, refilled: LaneState) -> PyTree:
         """What has been collected, with the record of a period added.
 
         **Arguments:** `ended`, `refilled`: the lanes at the end of the period and after the refill.
         """
         return collected
-
-
-class Unrecorded(AbstractRecorder):
-    """A recorder that records nothing."""
-
-    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: None) -> None:
-        return None
-
-    def step(
-        self, in_lanes: InLanes, lane_state: LaneState, record: None, iteration: Int[Array, ""]
-    ) -> tuple[LaneState, None]:
-        return try_step(*in_lanes, lane_state), None
 
 
 class LaneScheduler(eqx.Module):
@@ -164,9 +162,10 @@ class LaneScheduler(eqx.Module):
         **Arguments:** as for `ensemble_solve`, and `n_blocks`: the number of equal blocks of the state, as for `Control`.
         """
         solver, rtol = settings.for_lanes, settings.tolerance
-        control = Control(
-            explicit_tableau(solver), explicit_order(solver), rtol, t1, settings.max_steps, nonterminal, n_blocks
-        )
+        tableau, order = explicit_tableau(solver), solver.order(None)
+        if order is None:
+            raise ValueError(f"solver = {shown(solver)} must have an order, as Dopri8() has")
+        control = Control(tableau, order, rtol, t1, settings.max_steps, nonterminal, n_blocks)
         states, scales = problem.start()
         begin = jnp.zeros_like(states[0])
         if (jumps := problem.jumps(begin, states)) is not None:
@@ -177,14 +176,15 @@ class LaneScheduler(eqx.Module):
         lengths = first_length(problem.field, begin, states, rates, control.order, rtol, atols, n_blocks)
         fresh = _fresh_lanes(problem, control, states, rates, jnp.minimum(stop_gradient(lengths), t1))
         fresh = fresh._replace(time=begin)
-        return cls(problem, control, atols, fresh, cells, settings.lanes_of(states.shape[1]), one_kernel)
+        lanes = lanes_for(states.shape[1]) if settings.lanes is None else settings.lanes
+        return cls(problem, control, atols, fresh, cells, lanes, one_kernel)
 
     @property
     def capacity(self) -> int:
         """Number of cells of the problem, padding included."""
         return self.fresh.cell.shape[0]
 
-    def pick(self, tree: Any, cell: Int[Array, "*lanes"]) -> Any:
+    def pick(self, tree: Tree, cell: Int[Array, "*lanes"]) -> Tree:
         """The leaves for the given cells; scalars stay unchanged."""
         index = jnp.minimum(cell, self.capacity - 1)
         return jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., index], tree)
@@ -194,28 +194,26 @@ class LaneScheduler(eqx.Module):
         control = self.control._replace(t1=self.pick(self.control.t1, lane_state.cell))
         return self.pick(self.problem, lane_state.cell), control, self.pick(self.atols, lane_state.cell)
 
-    def outcome(self) -> tuple[Outcome, Int[Array, ""]]:
+    def solve(
+        self, recorder: Recorder | None = None, collected: PyTree = None
+    ) -> tuple[Outcome, Int[Array, ""], PyTree]:
         """Run every cell.
 
-        **Returns:** the `Outcome`, whose crossing times are those of nonterminal events, and the number of iterations.
-        """
-        outcome, iterations, _ = self.recorded(Unrecorded(), None)
-        return outcome, iterations
-
-    def recorded(self, recorder: AbstractRecorder, collected: Any) -> tuple[Outcome, Int[Array, ""], Any]:
-        """Run every cell, as `outcome` does, and also return what a recorder has collected.
-
         **Arguments:** `recorder`; `collected`: what the recorder has collected before the first step.
-        """
 
-        def period(carry: tuple[SchedulerState, Outcome, Any]) -> tuple[SchedulerState, Outcome, Any]:
+        **Returns:** the `Outcome`, whose crossing times are those of nonterminal events; the number of iterations; and what
+        the recorder has collected.
+        """
+        recorder = Recorder() if recorder is None else recorder
+
+        def period(carry: tuple[SchedulerState, Outcome, PyTree]) -> tuple[SchedulerState, Outcome, PyTree]:
             progress, outcome, collected = carry
             progress, record = self.run(progress, recorder, collected)
             refilled = self.refill(progress)
             collected = recorder.collect(collected, record, progress.lane_state, refilled.lane_state)
             return refilled, self.store(outcome, progress.lane_state), collected
 
-        carry = (self.start(), self.empty(), collected)
+        carry = (self.start(), outcome_of(self.fresh), collected)
         progress, outcome, collected = jax.lax.while_loop(lambda carry: self.unfinished(carry[0]), period, carry)
         outcome = back_to_margin(self.problem, self.store(outcome, progress.lane_state))
         return outcome, progress.iterations, collected
@@ -230,8 +228,8 @@ class LaneScheduler(eqx.Module):
         return jnp.any(progress.lane_state.status == RUNNING) | (progress.loaded < self.cells)
 
     def run(
-        self, progress: SchedulerState, recorder: AbstractRecorder, collected: Any = None
-    ) -> tuple[SchedulerState, Any]:
+        self, progress: SchedulerState, recorder: Recorder, collected: PyTree = None
+    ) -> tuple[SchedulerState, PyTree]:
         """Advance the lanes by a period: until all have ended, the record is full, or a refill pays off while cells
         wait.
 
@@ -239,20 +237,17 @@ class LaneScheduler(eqx.Module):
         """
         in_lanes = self.in_lanes(progress.lane_state)
 
-        def goes_on(carry: tuple[LaneState, Any, Int[Array, ""], Int[Array, ""]]) -> Bool[Array, ""]:
+        def goes_on(carry: Period) -> Bool[Array, ""]:
             lane_state, record, missed, count = carry
             refill = (progress.loaded < self.cells) & (missed >= recorder.refill_cost * self.lanes)
             return jnp.any(lane_state.status == RUNNING) & ~refill & recorder.has_room(record, count)
 
-        def step(
-            carry: tuple[LaneState, Any, Int[Array, ""], Int[Array, ""]],
-        ) -> tuple[LaneState, Any, Int[Array, ""], Int[Array, ""]]:
-            # `missed` counts the steps that idle lanes have missed since the last refill.
+        def step(carry: Period) -> Period:
             lane_state, record, missed, count = carry
             new_state, record = recorder.step(in_lanes, lane_state, record, count)
             return new_state, record, missed + jnp.sum(lane_state.status != RUNNING), count + 1
 
-        def loop(lane_state: LaneState) -> tuple[LaneState, Any, Int[Array, ""]]:
+        def loop(lane_state: LaneState) -> tuple[LaneState, PyTree, Int[Array, ""]]:
             zero, record = jnp.zeros((), int), recorder.begin(in_lanes, lane_state, collected)
             lane_state = lane_state._replace(stages=memory_for_stages(self.control.tableau, lane_state.state))
             lane_state, record, _, count = jax.lax.while_loop(goes_on, step, (lane_state, record, zero, zero))
@@ -261,7 +256,7 @@ class LaneScheduler(eqx.Module):
         lane_state, record, count = self.in_kernel(loop)(progress.lane_state)
         return SchedulerState(lane_state, progress.loaded, progress.iterations + count), record
 
-    def in_kernel(self, loop: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    def in_kernel(self, loop: Callable[[Tree], Result]) -> Callable[[Tree], Result]:
         """A loop over steps, compiled into a single kernel if `one_kernel` is set."""
         return in_one_kernel(loop) if self.one_kernel and self.problem.fits_one_kernel else loop
 
@@ -272,10 +267,6 @@ class LaneScheduler(eqx.Module):
         fresh = self._load(jnp.where(idle, jnp.minimum(loaded + jnp.cumsum(idle) - 1, self.capacity), lane_state.cell))
         lane_state = jax.tree.map(lambda new, old: jnp.where(idle, new, old), fresh, lane_state)
         return SchedulerState(lane_state, jnp.minimum(loaded + jnp.sum(idle), self.cells), iterations)
-
-    def empty(self) -> Outcome:
-        """An empty outcome of the right shapes."""
-        return outcome_of(self.fresh)
 
     def store(self, outcome: Outcome, lane_state: LaneState) -> Outcome:
         """Store the cells whose lanes have ended in the outcome."""
@@ -320,11 +311,7 @@ def back_to_margin(problem: AbstractProblem, outcome: Outcome) -> Outcome:
 
 
 def _fresh_lanes(
-    problem: AbstractProblem,
-    control: Control,
-    states: Float[Array, "components cells"],
-    rates: Float[Array, "components cells"],
-    lengths: Float[Array, " cells"],
+    problem: AbstractProblem, control: Control, states: States, rates: States, lengths: Lanes
 ) -> LaneState:
     """Every cell at its start; a cell that starts beyond the event or outside the domain has ended."""
     zero = jnp.zeros_like(lengths)
@@ -338,30 +325,19 @@ def _fresh_lanes(
             valid = ~lost & (margin > 0.0)
         side = jnp.ones_like(zero) if before_event is None else jnp.where(before_event, 1.0, -1.0).astype(zero.dtype)
         status = jnp.full(zero.shape, RUNNING) if valid is None else jnp.where(valid, RUNNING, LEFT_DOMAIN)
-        return _lanes_at_start(problem, states, rates, lengths, side, status, jnp.full_like(zero, jnp.inf))
-    crossing, domain_margin = problem.event_function(states), margin_at_start(problem, zero, states)
-    is_beyond = false
-    if crossing is not None:
-        # Exactly on the event, the direction of the motion decides.
-        is_falling = jax.jvp(problem.event_function, (states,), (rates,))[1] <= 0.0
-        is_beyond = (crossing < 0.0) | ((crossing == 0.0) & (is_falling | (not control.nonterminal)))
-    side = jnp.where(is_beyond & control.nonterminal, -1.0, 1.0).astype(lengths.dtype)
-    status = jnp.where(is_beyond & (not control.nonterminal), CROSSED, RUNNING)
-    if domain_margin is not None:
-        status = jnp.where(domain_margin <= 0.0, LEFT_DOMAIN, status)
-    return _lanes_at_start(problem, states, rates, lengths, side, status, jnp.where(is_beyond, zero, jnp.inf))
-
-
-def _lanes_at_start(
-    problem: AbstractProblem,
-    states: Float[Array, "components cells"],
-    rates: Float[Array, "components cells"],
-    lengths: Float[Array, " cells"],
-    side: Float[Array, " cells"],
-    status: Int[Array, " cells"],
-    crossing_time: Float[Array, " cells"],
-) -> LaneState:
-    """Every cell at its start, on a side of the event."""
+        crossing_time = jnp.full_like(zero, jnp.inf)
+    else:
+        crossing, domain_margin = problem.event_function(states), margin_at_start(problem, zero, states)
+        is_beyond = false
+        if crossing is not None:
+            # Exactly on the event, the direction of the motion decides.
+            is_falling = jax.jvp(problem.event_function, (states,), (rates,))[1] <= 0.0
+            is_beyond = (crossing < 0.0) | ((crossing == 0.0) & (is_falling | (not control.nonterminal)))
+        side = jnp.where(is_beyond & control.nonterminal, -1.0, 1.0).astype(lengths.dtype)
+        status = jnp.where(is_beyond & (not control.nonterminal), CROSSED, RUNNING)
+        if domain_margin is not None:
+            status = jnp.where(domain_margin <= 0.0, LEFT_DOMAIN, status)
+        crossing_time = jnp.where(is_beyond, zero, jnp.inf)
     zero, zeros = jnp.zeros_like(lengths), jnp.zeros(lengths.shape, int)
     return LaneState(
         cell=jnp.arange(lengths.shape[0]),
@@ -384,11 +360,7 @@ def _lanes_at_start(
 
 
 def _holds(
-    problem: AbstractProblem,
-    function: Callable[[States], Lanes | None],
-    states: Float[Array, "components cells"],
-    rates: Float[Array, "components cells"],
-    lengths: Float[Array, " cells"],
+    problem: AbstractProblem, function: Callable[[States], Lanes | None], states: States, rates: States, lengths: Lanes
 ) -> Bool[Array, " cells"] | None:
     """A mask of the cells in which a function of the state is positive at the start or, if it is zero up to round-off,
     is about to become positive.
@@ -454,7 +426,7 @@ def ensemble_solve(
     [0.693147 0.346574 0.173287] [2. 2. 2.]
     """
     options = {"nonterminal": nonterminal, "one_kernel": one_kernel, "n_blocks": n_blocks}
-    outcome, iterations = LaneScheduler.of(problem, t1, cells, settings, **options).outcome()
+    outcome, iterations, _ = LaneScheduler.of(problem, t1, cells, settings, **options).solve()
     return (outcome if nonterminal else with_crossing_times(problem, outcome)), iterations
 
 
@@ -501,7 +473,7 @@ def solve_by_diffrax(problem: AbstractProblem, t1: Float[Array, ""], settings: S
     lane_axes = jax.tree.map(lambda leaf: None if jnp.ndim(leaf) == 0 else -1, problem)
 
     def solve_cell(cell_problem: AbstractProblem, state: Array, scale: Array) -> Outcome:
-        conditions: dict[int, Any] = {}
+        conditions: dict[int, Callable[..., Lanes]] = {}
         if problem.event_function(states) is not None:
             conditions[CROSSED] = lambda t, y, args, **_: args.event_function(y)
         if problem.domain_margin(states[0], states) is not None:

@@ -246,7 +246,8 @@ def after_step(
     moved = forward | hit
     time = jnp.where(moved, lane_state.time + tried_length, lane_state.time)
 
-    length = tried_length * _factor(error, accurate, control.order)
+    factor = SAFETY * inverse_root(jnp.maximum(error, 1e-30), control.order)
+    length = tried_length * jnp.where(accurate, jnp.clip(factor, 1.0, GROW), jnp.clip(factor, SHRINK, SAFETY))
     least, place, longest_step = lane_state.extremes
     is_shorter = free & is_known & ~accurate & (length < least)
     least, place = (jnp.where(is_shorter, *pair) for pair in ((length, least), (lane_state.time, place)))
@@ -287,12 +288,6 @@ def after_step(
     )
 
 
-def _factor(error: Lanes, accurate: Bool[Array, "*lanes"], order: int) -> Lanes:
-    """Growth factor of the next step, as in Diffrax's I controller."""
-    factor = SAFETY * inverse_root(jnp.maximum(error, 1e-30), order)
-    return jnp.where(accurate, jnp.clip(factor, 1.0, GROW), jnp.clip(factor, SHRINK, SAFETY))
-
-
 def _classify(
     problem: AbstractProblem,
     control: Control,
@@ -307,10 +302,8 @@ def _classify(
     # The located event belongs to the lesser of the margins and the event function, whose sign may be round-off.
     by_margin = hit
     if crossing is not None:
-        by_loss = (
-            False if margins is None else jnp.min(stop_gradient(margins[-1]), axis=0) <= lane_state.side * crossing
-        )
-        by_margin = hit & by_loss
+        least = None if margins is None else jnp.min(stop_gradient(margins[-1]), axis=0)
+        by_margin = hit & (False if least is None else least <= lane_state.side * crossing)
     crossed = hit & ~by_margin
     if not control.nonterminal:
         status = jnp.where(hit, jnp.where(by_margin, LEFT_DOMAIN, CROSSED), lane_state.status)

@@ -22,7 +22,7 @@ from nonholonomic.integration import (
     solve_ensemble,
 )
 from nonholonomic.integration.problem import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END
-from nonholonomic.integration.scheduler import AbstractRecorder, LaneScheduler, ensemble_solve
+from nonholonomic.integration.scheduler import LaneScheduler, Recorder, ensemble_solve
 from nonholonomic.integration.step import try_step
 
 pytestmark = pytest.mark.oldest
@@ -116,7 +116,7 @@ def test_steps_reuse_the_memory_of_their_stages():
     """Filling 50 KB with zeros in every step took a tenth of the time of a table."""
     sizes = []
 
-    class Watching(AbstractRecorder):
+    class Watching(Recorder):
         def begin(self, in_lanes, lane_state, collected):
             return None
 
