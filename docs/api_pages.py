@@ -133,7 +133,7 @@ PAGES = {
             *of(
                 "nonholonomic.integration",
                 "AbstractProblem CoreProblem AbstractPassive ExtendedProblem Settings "
-                "solve_ensemble traced_solve_ensemble solve_with_samples Outcome "
+                "solve_ensemble solve_with_samples Outcome "
                 "crossing_time LaneState Jumps solve_by_diffrax follow DenseSolution sample explicit_tableau Oscillatory8 "
                 "Stabilized8",
             ),

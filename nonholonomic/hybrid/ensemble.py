@@ -31,7 +31,6 @@ from ..integration import (
     States,
     follow,
     solve_ensemble,
-    traced_solve_ensemble,
 )
 from ..integration.dense import PIECE_OF_MODE
 from ..integration.problem import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
@@ -313,7 +312,7 @@ def _traced_advances(
         (runs,), cell = carry, selected_cells(active)
         left = jnp.where(active, greatest(t1 - runs.end_time, 0.0), 0.0)
         problem = mode_of_cells(modes[numbers[0]], cell).problem(runs.state[:, cell])
-        outcome, _ = traced_solve_ensemble(problem, left, jnp.asarray(len(active)), settings, **options)
+        outcome, _ = solve_ensemble(problem, left, jnp.asarray(len(active)), settings, traced=True, **options)
         return (chosen(active, after_solve(runs, outcome, t1), runs),)
 
     def reset(numbers: Sequence[int], carry: Carry, lost: Bool[Array, " cells"]) -> Carry:

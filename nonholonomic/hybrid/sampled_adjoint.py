@@ -21,7 +21,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.xla_cpu import greatest, uncounted
-from ..derivatives import in_groups, tangents_by, tangents_of
+from ..derivatives import tangents_by, tangents_of
 from ..derivatives.adjoint import Checkpoints
 from ..derivatives.differentiable import AbstractSampling, ProblemSpec, by_active, solve_for_samples, tangent_along
 from ..derivatives.differentiable import over_cells as with_cells
@@ -147,12 +147,8 @@ class HybridSampling(AbstractSampling):
             )
         build, numbers, horizon, settings = self._builder(leaves)
         built, tangents, gather = tangents_by(build, active, numbers, cells)
-
-        def run(group: tuple[PyTree, ...]) -> tuple[HybridSamples, list[HybridSamples]]:
-            hybrid_tangents = tuple((tangent[0], tangent[2]) for tangent in group)
-            return sampled_with_tangents(built, hybrid_tangents, horizon, cells, settings, self.counters)
-
-        samples, slopes = in_groups(run, tangents)
+        tangents = tuple((tangent[0], tangent[2]) for tangent in tangents)
+        samples, slopes = sampled_with_tangents(built, tangents, horizon, cells, settings, self.counters)
         return samples, gather(slopes)
 
     def prefers_adjoint(self, active: tuple[int, ...], leaves: tuple[Array, ...]) -> bool:

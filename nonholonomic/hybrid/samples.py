@@ -306,12 +306,7 @@ def solve_hybrid_with_samples(
     [0.330492 0.639204] [0. 0.]
     """
     built = (modes, jnp.asarray(mode), jnp.asarray(state))
-    horizon = (jnp.asarray(times), jnp.asarray(t1))
-
-    def run(group: Tangents) -> tuple[HybridSamples, list[HybridSamples]]:
-        return sampled_with_tangents(built, group, horizon, cells, settings, counters)
-
-    return in_groups(run, tangents)
+    return sampled_with_tangents(built, tangents, (jnp.asarray(times), jnp.asarray(t1)), cells, settings, counters)
 
 
 def sampled_with_tangents(
@@ -326,21 +321,25 @@ def sampled_with_tangents(
     (modes, first, state), (times, t1) = built, horizon
     size, runs = state.shape
     times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), runs))
-    variational = variational_modes(modes, tangents, settings.tolerance, False)
-    start = at_start(first, variational_start(state, tangents), cells, counters + 1)
-    rounds = sampled_rounds(variational, start, times, jnp.broadcast_to(t1, (runs,)), settings, 1 + len(tangents))
-    ended, output = all_rounds(*rounds)
-    rows, variations = output_rows(variational, output)
-    grazes = ended.counts[-1] > 0
-    invalid = jnp.where(times > output.grazing_time, jnp.nan, 0.0)
-    counters_and_codes = (ended.mode, ended.status, ended.steps, ended.rejected, ended.extremes, ended.counts[:-1])
-    parts = (rows, output.number, ended.end_time, ended.state[:size], *counters_and_codes)
-    samples = HybridSamples(*(jnp.moveaxis(part.astype(float), -1, 0) for part in parts))
 
-    def slope(k: int, rows: Float[Array, "shown times cells"]) -> HybridSamples:
-        # The variation of the time follows that of the state; a horizon does not move.
-        delay = jnp.where(grazes, jnp.nan, ended.state[(k + 1) * (size + 1) + size])
-        delay = jnp.where(ended.status == REACHED_END, 0.0, delay)
-        return HybridSamples(jnp.moveaxis(rows + invalid, -1, 0), UNCHANGED, delay, *(UNCHANGED,) * 7)
+    def run(group: Tangents) -> tuple[HybridSamples, list[HybridSamples]]:
+        variational = variational_modes(modes, group, settings.tolerance, False)
+        start = at_start(first, variational_start(state, group), cells, counters + 1)
+        rounds = sampled_rounds(variational, start, times, jnp.broadcast_to(t1, (runs,)), settings, 1 + len(group))
+        ended, output = all_rounds(*rounds)
+        rows, variations = output_rows(variational, output)
+        grazes = ended.counts[-1] > 0
+        invalid = jnp.where(times > output.grazing_time, jnp.nan, 0.0)
+        counters_and_codes = (ended.mode, ended.status, ended.steps, ended.rejected, ended.extremes, ended.counts[:-1])
+        parts = (rows, output.number, ended.end_time, ended.state[:size], *counters_and_codes)
+        samples = HybridSamples(*(jnp.moveaxis(part.astype(float), -1, 0) for part in parts))
+        slopes = []
+        for k, variation in enumerate(variations):
+            # The variation of the time follows that of the state; a horizon does not move.
+            delay = jnp.where(grazes, jnp.nan, ended.state[(k + 1) * (size + 1) + size])
+            delay = jnp.where(ended.status == REACHED_END, 0.0, delay)
+            shown = jnp.moveaxis(variation + invalid, -1, 0)
+            slopes.append(HybridSamples(shown, UNCHANGED, delay, *(UNCHANGED,) * 7))
+        return samples, slopes
 
-    return samples, [slope(k, part) for k, part in enumerate(variations)]
+    return in_groups(run, tangents)

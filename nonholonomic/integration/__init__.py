@@ -56,5 +56,4 @@ from .samples import solve_with_samples as solve_with_samples
 from .scheduler import Outcome as Outcome
 from .scheduler import solve_by_diffrax as solve_by_diffrax
 from .scheduler import solve_ensemble as solve_ensemble
-from .scheduler import traced_solve_ensemble as traced_solve_ensemble
 from .step import LaneState as LaneState

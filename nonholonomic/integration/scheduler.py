@@ -159,7 +159,7 @@ class LaneScheduler(eqx.Module):
     ) -> "LaneScheduler":
         """The scheduler of a problem.
 
-        **Arguments:** as for `ensemble_solve`, and `n_blocks`: the number of equal blocks of the state, as for `Control`.
+        **Arguments:** as for `solve_ensemble`, and `n_blocks`: the number of equal blocks of the state, as for `Control`.
         """
         solver, rtol = settings.for_lanes, settings.tolerance
         tableau, order = explicit_tableau(solver), solver.order(None)
@@ -387,20 +387,18 @@ def _holds(
 # first derivatives faster.
 
 
-def ensemble_solve(
+def solve_ensemble(
     problem: AbstractProblem,
     t1: Float[Array, "..."],
     cells: Int[Array, ""],
     settings: Settings,
     *,
     nonterminal: bool = False,
-    one_kernel: bool = False,
+    one_kernel: bool | None = None,
     n_blocks: int = 1,
+    traced: bool = False,
 ) -> tuple[Outcome, Int[Array, ""]]:
     """Run every cell of a problem from t = 0 to its event, to the end of the model's validity, or to `t1`.
-
-    `solve_ensemble` is compiled on its own, for use outside of other transformed functions; `traced_solve_ensemble` is for
-    use inside them.
 
     **Arguments:**
 
@@ -411,23 +409,34 @@ def ensemble_solve(
     - `settings`: settings with an explicit Runge-Kutta solver of Diffrax.
     - `nonterminal`: whether the event is nonterminal: a run continues through it, in either direction.
     - `one_kernel`: whether to compile the loop into a single kernel on a CPU, which halves its cost; not for programs
-      that are differentiated again.
+      that are differentiated again. By default unless `traced`.
     - `n_blocks`: number of equal blocks of the state, as for `LaneScheduler.of`.
+    - `traced`: whether this is a part of another transformed function; otherwise it is compiled on its own.
 
     **Returns:** the `Outcome`, and the number of iterations, each of which advanced all lanes.
 
-    **Example:** inside `jit`, with `traced_solve_ensemble`. With `nonterminal`, the runs continue to `t1`.
+    **Example:** inside `jit`. With `nonterminal`, the runs continue to `t1`.
 
-    >>> from nonholonomic.integration import traced_solve_ensemble
     >>> def solve(problem, t1):
-    ...     return traced_solve_ensemble(problem, t1, jnp.asarray(3), settings, nonterminal=True)[0]
+    ...     return solve_ensemble(problem, t1, jnp.asarray(3), settings, nonterminal=True, traced=True)[0]
     >>> continued = jax.jit(solve)(problem, jnp.asarray(2.0))
     >>> print(continued.crossing_time.round(6), continued.end_time)
     [0.693147 0.346574 0.173287] [2. 2. 2.]
     """
-    options = {"nonterminal": nonterminal, "one_kernel": one_kernel, "n_blocks": n_blocks}
+    one_kernel = not traced if one_kernel is None else one_kernel
+    solve = _ensemble_in_program if traced else _ensemble_alone
+    return solve(problem, t1, cells, settings, nonterminal=nonterminal, one_kernel=one_kernel, n_blocks=n_blocks)
+
+
+def ensemble_solve(
+    problem: AbstractProblem, t1: Float[Array, "..."], cells: Int[Array, ""], settings: Settings, **options: bool | int
+) -> tuple[Outcome, Int[Array, ""]]:
+    """`solve_ensemble`, not compiled. **Arguments:** `options`: as for `LaneScheduler.of`."""
     outcome, iterations, _ = LaneScheduler.of(problem, t1, cells, settings, **options).solve()
-    return (outcome if nonterminal else with_crossing_times(problem, outcome)), iterations
+    return (outcome if options.get("nonterminal") else with_crossing_times(problem, outcome)), iterations
+
+
+_ensemble_alone, _ensemble_in_program = compiled_alone(ensemble_solve), eqx.filter_jit(ensemble_solve)
 
 
 def with_crossing_times(problem: AbstractProblem, outcome: Outcome) -> Outcome:
@@ -439,14 +448,6 @@ def with_crossing_times(problem: AbstractProblem, outcome: Outcome) -> Outcome:
     time = jnp.where(outcome.end_time > 0.0, time, 0.0)
     time = jnp.where(outcome.status == CROSSED, time, jnp.inf)
     return outcome._replace(first_crossing=time, crossing_time=time)
-
-
-# With its docstring.
-solve_ensemble = compiled_alone(
-    functools.update_wrapper(functools.partial(ensemble_solve, one_kernel=True), ensemble_solve)
-)
-
-traced_solve_ensemble = eqx.filter_jit(ensemble_solve)
 
 
 # The outcome of every cell by vmapped `diffrax.diffeqsolve`: slow, and independent of the ensemble solver.

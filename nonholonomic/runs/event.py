@@ -41,7 +41,6 @@ from ..integration import (
     States,
     explicit_tableau,
     solve_ensemble,
-    traced_solve_ensemble,
 )
 from ..integration.problem import CROSSED, REACHED_END, RUNNING, Status, legal_run
 from ..parameters import Parameters
@@ -355,10 +354,8 @@ class Ensemble(eqx.Module):
         may be traced.
         """
         if self.problem is not None:
-            horizon = (jnp.asarray(t1), jnp.asarray(cells), settings)
-            if traced:
-                return traced_solve_ensemble(self.problem, *horizon, nonterminal=self.continues, one_kernel=True)[0]
-            return solve_ensemble(self.problem, *horizon, nonterminal=self.continues)[0]
+            arguments = (self.problem, jnp.asarray(t1), jnp.asarray(cells), settings)
+            return solve_ensemble(*arguments, nonterminal=self.continues, one_kernel=True, traced=traced)[0]
         options = {"counters": self.counters, "nonterminal": self.continues, "traced": traced}
         return solve_hybrid(self.modes, self.first, self.states, t1, cells, settings, **options)
 
