@@ -23,15 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.cache import padded
 from ..compilation.xla_cpu import compiled_quickly, greatest
-from ..integration import (
-    AbstractProblem,
-    Lanes,
-    Outcome,
-    Settings,
-    States,
-    follow,
-    solve_ensemble,
-)
+from ..integration import AbstractProblem, Lanes, Outcome, Settings, States, follow, solve_ensemble
 from ..integration.dense import PIECE_OF_MODE
 from ..integration.problem import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
 from ..integration.scheduler import NO_EXTREMES, Numbers

@@ -29,17 +29,7 @@ from ..derivatives.sampled_runs import SampledCotangents, mixture, samples_pulle
 from ..derivatives.variation import where_active
 from ..integration import AbstractProblem, Jumps, Lanes, Settings, States
 from ..integration.problem import LEFT_DOMAIN, REACHED_END, RUNNING
-from .ensemble import (
-    BETWEEN,
-    MOST_ROUNDS,
-    Advance,
-    Carry,
-    HybridOutcome,
-    at_start,
-    chosen,
-    one_round,
-    selected_cells,
-)
+from .ensemble import BETWEEN, MOST_ROUNDS, Advance, Carry, HybridOutcome, at_start, chosen, one_round, selected_cells
 from .mode import AbstractBatchedMode, mode_numbered, mode_of_cells, over_cells, program_groups
 from .saltation import VariationalMode, along, delay, variational_modes, variational_start
 from .samples import (

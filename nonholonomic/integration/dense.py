@@ -336,8 +336,8 @@ def _first_losses(
     if problem.fast[0]:
         start, side = states(0.0), jnp.ones_like(time)
         rate, end_rate = problem.field(time, start), problem.field(time + length, end)
-        path = Path.of((start, rate), states(0.5), (end, end_rate), length)
-        inside, _ = watched(problem, side, path, time, length, length > 0.0, length < 0.0)
+        path = Path.of(time, length, (start, rate), states(0.5), (end, end_rate))
+        inside, _ = watched(problem, side, path, length > 0.0, length < 0.0)
         place = jnp.minimum(place, jnp.where(inside < 1.0, inside, jnp.inf))
     brackets = jnp.stack([jnp.where(place < jnp.inf, time, jnp.inf), time + place * length], axis=1)
     first = jnp.argmin(brackets[:, 1].reshape(-1, PARTS), axis=1)

@@ -31,7 +31,7 @@ from ..validation import (
     require_scalars,
     warn,
 )
-from .runge_kutta import AbstractTunedPair, Lanes, Oscillatory8, States, lesser
+from .runge_kutta import AbstractTunedPair, Lanes, Mask, Oscillatory8, States, lesser
 
 # Times at which a field jumps or has a kink: a step ends just before such a time, and the next begins just after it.
 #
@@ -101,7 +101,7 @@ class Jumps(NamedTuple):
         near = jnp.min(jnp.where((self.ahead > least) & (self.ahead < most), self.ahead, jnp.inf), axis=0)
         return jnp.where(jnp.isfinite(near), near, jnp.nan)
 
-    def sides(self, time: Lanes) -> tuple[Bool[Array, "*lanes"], Lanes, Lanes, Lanes]:
+    def sides(self, time: Lanes) -> tuple[Mask, Lanes, Lanes, Lanes]:
         """The jump whose near side is this time: a mask of the lanes that have one, its near side, its time, which is
         differentiable, and its far side; all three are the time itself where there is none."""
         distance = self.ahead - time

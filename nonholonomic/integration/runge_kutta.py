@@ -19,13 +19,15 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..compilation.xla_cpu import written_by_component, written_in_place
 from ..text import shown
 
 Lanes = Float[Array, "*lanes"]
 States = Float[Array, "components *lanes"]
+Mask = Bool[Array, "*lanes"]
+Integers = Int[Array, "*lanes"]
 Stages = Float[Array, "stages components *lanes"]
 History = Float[Array, "places margins *lanes"]
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.xla_cpu import written_in_place
 from .problem import FAILED, REACHED_END, RUNNING, AbstractProblem, Settings
-from .runge_kutta import AbstractTunedPair, Lanes, States, weighted_sum
+from .runge_kutta import AbstractTunedPair, Integers, Lanes, Mask, States, weighted_sum
 from .scheduler import InLanes, LaneScheduler, Outcome, Recorder
 from .step import LaneState, after_step, length_to_try, past_jump, trial_step, try_step, until_jump
 
@@ -25,10 +25,10 @@ from .step import LaneState, after_step, length_to_try, past_jump, trial_step, t
 
 #: The values to keep of some states: (the cells in the lanes, (rows, components, lanes)) -> a tree of arrays
 #: (rows, lanes, ...).
-Read = Callable[[Int[Array, "*lanes"], Float[Array, "rows components *lanes"]], PyTree]
+Read = Callable[[Integers, Float[Array, "rows components *lanes"]], PyTree]
 
 
-def components(cells: Int[Array, "*lanes"], states: Float[Array, "rows components *lanes"]) -> Array:
+def components(cells: Integers, states: Float[Array, "rows components *lanes"]) -> Array:
     """The states themselves."""
     return jnp.moveaxis(states, 1, -1)
 
@@ -44,7 +44,7 @@ class Rows(NamedTuple):
 class Collected(NamedTuple):
     """The index of the next sample in every lane, and the samples so far: a tree of arrays (cells, times, ...)."""
 
-    sample: Int[Array, "*lanes"]
+    sample: Integers
     samples: PyTree
 
 
@@ -76,22 +76,22 @@ class SampleTimes(eqx.Module):
         first_values = self.read(jnp.arange(len(self.first)), starts[None])
         return Collected(self.first_in(lane_state), jax.tree.map(of_start, first_values))
 
-    def first_in(self, lane_state: LaneState) -> Int[Array, "*lanes"]:
+    def first_in(self, lane_state: LaneState) -> Integers:
         """The index of the first sample after the start in every lane."""
         return self.first[self.cell_of(lane_state)]
 
-    def after(self, time: Lanes, lane_state: LaneState) -> Int[Array, "*lanes"]:
+    def after(self, time: Lanes, lane_state: LaneState) -> Integers:
         """The index of the first sample after a time in every lane."""
         times = self.times[:, None] if self.times.ndim == 1 else self.times[:, self.cell_of(lane_state)]
         return jnp.sum(times <= time, axis=0)
 
-    def time_of(self, sample: Int[Array, "*lanes"], lane_state: LaneState) -> Lanes:
+    def time_of(self, sample: Integers, lane_state: LaneState) -> Lanes:
         """The time of a sample in every lane, infinite after the last one."""
         index = jnp.minimum(sample, len(self) - 1)
         time = self.times[index] if self.times.ndim == 1 else self.times[index, self.cell_of(lane_state)]
         return jnp.where(sample < len(self), time, jnp.inf)
 
-    def cell_of(self, lane_state: LaneState) -> Int[Array, "*lanes"]:
+    def cell_of(self, lane_state: LaneState) -> Integers:
         """The cells in the lanes; the last one in a lane without a cell."""
         return jnp.minimum(lane_state.cell, len(self.first) - 1)
 
@@ -224,7 +224,7 @@ class DenseRecord(NamedTuple):
     """
 
     second: States
-    sample: Int[Array, "*lanes"]
+    sample: Integers
     sample_time: Lanes
     rows: Rows
     filled: Int[Array, ""]
@@ -293,8 +293,8 @@ class Record(NamedTuple):
     """Record of a period: whether the last step was accepted and the number of the next sample, in every lane; after each
     iteration the states, and the numbers of the samples there, if any."""
 
-    accepted: Bool[Array, "*lanes"]
-    sample: Int[Array, "*lanes"]
+    accepted: Mask
+    sample: Integers
     rows: Rows
 
 
@@ -322,12 +322,8 @@ class SampleRecorder(AbstractSampleRecorder):
 
 
 def step_towards_sample(
-    times: SampleTimes,
-    in_lanes: InLanes,
-    lane_state: LaneState,
-    accepted: Bool[Array, "*lanes"],
-    sample: Int[Array, "*lanes"],
-) -> tuple[LaneState, Lanes, Bool[Array, "*lanes"]]:
+    times: SampleTimes, in_lanes: InLanes, lane_state: LaneState, accepted: Mask, sample: Integers
+) -> tuple[LaneState, Lanes, Mask]:
     """Try a step in every lane that does not pass its next sample.
 
     **Arguments:** `accepted`: whether the previous step was accepted; `sample`: the index of the next sample.

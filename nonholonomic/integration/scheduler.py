@@ -35,7 +35,7 @@ from .problem import (
     least_margin,
     margin_at_start,
 )
-from .runge_kutta import Lanes, States, explicit_tableau, first_length, memory_for_stages
+from .runge_kutta import Integers, Lanes, States, explicit_tableau, first_length, memory_for_stages
 from .step import Control, LaneState, try_step
 
 #: JAX's arrays, or NumPy's on the host.
@@ -184,7 +184,7 @@ class LaneScheduler(eqx.Module):
         """Number of cells of the problem, padding included."""
         return self.fresh.cell.shape[0]
 
-    def pick(self, tree: Tree, cell: Int[Array, "*lanes"]) -> Tree:
+    def pick(self, tree: Tree, cell: Integers) -> Tree:
         """The leaves for the given cells; scalars stay unchanged."""
         index = jnp.minimum(cell, self.capacity - 1)
         return jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., index], tree)
@@ -278,7 +278,7 @@ class LaneScheduler(eqx.Module):
         )
         return jax.tree.map(lambda cells, lanes: cells.at[..., targets].set(lanes, mode="drop"), outcome, in_lanes)
 
-    def _load(self, cell: Int[Array, "*lanes"]) -> LaneState:
+    def _load(self, cell: Integers) -> LaneState:
         lane_state = self.pick(self.fresh, cell)
         # There may be fewer cells than lanes: the other lanes stay idle.
         return lane_state._replace(cell=cell, status=jnp.where(cell < self.cells, lane_state.status, REACHED_END))

@@ -10,7 +10,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from ..compilation.xla_cpu import stored
 from .events import Bracket, Path, missed_double_root, missed_loss, refine, watched
@@ -26,7 +26,9 @@ from .problem import (
     side_of,
 )
 from .runge_kutta import (
+    Integers,
     Lanes,
+    Mask,
     Stages,
     States,
     Step,
@@ -85,8 +87,8 @@ class LaneState(NamedTuple):
     ('cell', 'status', 'time', 'state', 'rate')
     """
 
-    cell: Int[Array, "*lanes"]
-    status: Int[Array, "*lanes"]
+    cell: Integers
+    status: Integers
     time: Lanes
     state: States
     rate: States
@@ -96,10 +98,10 @@ class LaneState(NamedTuple):
     margins: Float[Array, "margins *lanes"] | None
     first_crossing: Lanes
     crossing_time: Lanes
-    bracketing: Bool[Array, "*lanes"]
+    bracketing: Mask
     bracket: Bracket
-    steps: Int[Array, "*lanes"]
-    rejected: Int[Array, "*lanes"]
+    steps: Integers
+    rejected: Integers
     extremes: Float[Array, "3 *lanes"]
     stages: Stages | None = None
 
@@ -214,21 +216,20 @@ def after_step(
     accurate = error <= 1.0
     # Negative inside the step: end the step there and check again, so that the first of several events is located.
     fast_margins, fast_event = problem.fast
-    start = (lane_state.time, lane_state.state, lane_state.rate)
+    start = (lane_state.state, lane_state.rate)
     negative = trial.first_negative
     if not fast_event:
-        event = missed_double_root(problem.event_function, lane_state.side, start[1:], trial, tried_length)
+        event = missed_double_root(problem.event_function, lane_state.side, start, trial, tried_length)
         negative = jnp.minimum(negative, stop_gradient(event))
     if not fast_margins:
         places = watched_places(control.tableau, looks_of(problem, control.tableau, lane_state))
         negative = jnp.minimum(negative, missed_loss(places, stop_gradient(trial.margins), free & accurate))
     longest = None
     if fast_margins or fast_event:
-        path = Path.of(start[1:], trial.middle, (trial.state, trial.rate), tried_length)
+        path = Path.of(lane_state.time, tried_length, start, trial.middle, (trial.state, trial.rate))
         checked = free & accurate
         may_cut = checked & (tried_length > SHORTEST_CUT * control.t1)
-        step = (path, lane_state.time, tried_length)
-        place, longest = watched(problem, lane_state.side, *step, checked, may_cut)
+        place, longest = watched(problem, lane_state.side, path, checked, may_cut)
         negative = jnp.minimum(negative, place)
     crosses_inside = accurate & (negative < 1.0)
     is_beyond = accurate & ~crosses_inside & (margin <= 0.0)
@@ -289,13 +290,8 @@ def after_step(
 
 
 def _classify(
-    problem: AbstractProblem,
-    control: Control,
-    lane_state: LaneState,
-    trial: Step,
-    time: Lanes,
-    hit: Bool[Array, "*lanes"],
-) -> tuple[Int[Array, "*lanes"], Lanes, Lanes, Lanes]:
+    problem: AbstractProblem, control: Control, lane_state: LaneState, trial: Step, time: Lanes, hit: Mask
+) -> tuple[Integers, Lanes, Lanes, Lanes]:
     """Status, side, first and latest crossing time of the lanes, where `hit` marks the lanes in which an event was
     located."""
     crossing, margins = problem.event_function(trial.state), trial.margins
