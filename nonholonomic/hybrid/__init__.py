@@ -44,16 +44,16 @@ is the number of the segment of a `HybridPath` between two modes.
 
 from .ensemble import BETWEEN as BETWEEN
 from .ensemble import MOST_ROUNDS as MOST_ROUNDS
+from .ensemble import AbstractBatchedMode as AbstractBatchedMode
+from .ensemble import AbstractHoppingMode as AbstractHoppingMode
 from .ensemble import HybridOutcome as HybridOutcome
 from .ensemble import HybridPath as HybridPath
 from .ensemble import Segment as Segment
+from .ensemble import Transition as Transition
+from .ensemble import TransitionPath as TransitionPath
 from .ensemble import hybrid_resets as hybrid_resets
 from .ensemble import solve_hybrid as solve_hybrid
 from .ensemble import solve_hybrid_dense as solve_hybrid_dense
-from .mode import AbstractBatchedMode as AbstractBatchedMode
-from .mode import AbstractHoppingMode as AbstractHoppingMode
-from .mode import Transition as Transition
-from .mode import TransitionPath as TransitionPath
 from .saltation import solve_hybrid_with_tangents as solve_hybrid_with_tangents
 from .sampled_adjoint import hybrid_samples as hybrid_samples
 from .samples import HybridSamples as HybridSamples

@@ -30,8 +30,7 @@ from ..derivatives.variation import where_active
 from ..integration import AbstractPassive, AbstractProblem, ExtendedProblem, Lanes, Settings, States
 from ..integration.problem import CROSSED, REACHED_END
 from ..integration.scheduler import Numbers
-from .ensemble import HybridOutcome, solve_hybrid
-from .mode import AbstractBatchedMode, Transition
+from .ensemble import AbstractBatchedMode, HybridOutcome, Transition, solve_hybrid
 
 #: An event is grazing if a relative change of the numbers by the tolerance, or an error of the state that the tolerance
 #: allows, changes its rate by more than this fraction. The relative error of the derivative is then about as large.

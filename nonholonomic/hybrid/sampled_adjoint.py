@@ -29,8 +29,22 @@ from ..derivatives.sampled_runs import SampledCotangents, mixture, samples_pulle
 from ..derivatives.variation import where_active
 from ..integration import AbstractProblem, Jumps, Lanes, Settings, States
 from ..integration.problem import LEFT_DOMAIN, REACHED_END, RUNNING
-from .ensemble import BETWEEN, MOST_ROUNDS, Advance, Carry, HybridOutcome, at_start, chosen, one_round, selected_cells
-from .mode import AbstractBatchedMode, mode_numbered, mode_of_cells, over_cells, program_groups
+from ..integration.scheduler import of_cells
+from .ensemble import (
+    BETWEEN,
+    MOST_ROUNDS,
+    AbstractBatchedMode,
+    Advance,
+    Carry,
+    HybridOutcome,
+    at_start,
+    chosen,
+    mode_numbered,
+    one_round,
+    over_cells,
+    program_groups,
+    selected_cells,
+)
 from .saltation import VariationalMode, along, delay, variational_modes, variational_start
 from .samples import (
     UNCHANGED,
@@ -377,18 +391,22 @@ class Passes:
     def there_and_back(self, run: Rounds) -> Rounds:
         """Compute all rounds up to the one that the backward pass needs, and take back those with a checkpoint."""
         is_first = run.limit == MOST_ROUNDS
-        run = jax.lax.while_loop(self.is_ahead, self.forward, run)
+
+        def is_ahead(run: Rounds) -> Bool[Array, ""]:
+            return jnp.any(run.frontier.status == RUNNING) & (run.number < run.limit)
+
+        def is_kept(run: Rounds) -> Bool[Array, ""]:
+            number, _ = run.checkpoints.latest()
+            return (run.checkpoints.depth > 0) & (number == run.limit - 1)
+
+        run = jax.lax.while_loop(is_ahead, self.forward, run)
         # At first, the derivatives begin at the ends of the runs; a horizon does not move.
         by_end = jnp.where(run.frontier.status == REACHED_END, 0.0, self.end_time)
         costate = run.costate._replace(start_time=jnp.where(is_first, by_end, run.costate.start_time))
         run = run._replace(limit=jnp.minimum(run.limit, run.number), costate=costate)
-        run = jax.lax.while_loop(self.is_kept, self.backward, run)
+        run = jax.lax.while_loop(is_kept, self.backward, run)
         number, kept = run.checkpoints.latest()
         return run._replace(frontier=kept.before, number=number, checkpoints=run.checkpoints.without_latest())
-
-    def is_ahead(self, run: Rounds) -> Bool[Array, ""]:
-        """Whether a round that the backward pass needs has not been computed."""
-        return jnp.any(run.frontier.status == RUNNING) & (run.number < run.limit)
 
     def forward(self, run: Rounds) -> Rounds:
         """Compute the next round."""
@@ -411,11 +429,6 @@ class Passes:
             number=run.number + 1,
             checkpoints=run.checkpoints.added(run.number, Kept(before, ended, after.counts[-1] > before.counts[-1])),
         )
-
-    def is_kept(self, run: Rounds) -> Bool[Array, ""]:
-        """Whether the round that the backward pass takes next is a checkpoint."""
-        number, _ = run.checkpoints.latest()
-        return (run.checkpoints.depth > 0) & (number == run.limit - 1)
 
     def backward(self, run: Rounds) -> Rounds:
         """Carry the derivatives through the latest round."""
@@ -530,7 +543,7 @@ class _Stage:
         self, cell: Int[Array, " cells"]
     ) -> tuple[list[Float[Array, "... cells"]], list[Array], Callable[..., AbstractBatchedMode]]:
         """The moving numbers of the mode of some cells, their rates, and the mode as a function of the numbers."""
-        mode = mode_of_cells(mode_numbered(self.passes.modes, self.group, self.kept.before.mode), cell)
+        mode = of_cells(mode_numbered(self.passes.modes, self.group, self.kept.before.mode), cell)
         numbers, build = mode.active_numbers()
         numbers, rates = ([with_cells(leaf, len(cell)) for leaf in leaves] for leaves in (numbers, mode.rates()[0]))
         return numbers, rates, build

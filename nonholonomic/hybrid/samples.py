@@ -12,28 +12,26 @@ from ..compilation.xla_cpu import compiled_alone, greatest
 from ..derivatives import in_groups
 from ..integration import Lanes, Settings, States, solve_with_samples
 from ..integration.problem import LEFT_DOMAIN, REACHED_END
+from ..integration.scheduler import of_cells
 from .ensemble import (
     BETWEEN,
+    AbstractBatchedMode,
+    AbstractHoppingMode,
     Advance,
     Carry,
     HybridOutcome,
+    Transition,
+    TransitionPath,
     after_reset,
     after_solve,
     all_rounds,
     at_start,
     chosen,
-    resolution,
-    selected_cells,
-)
-from .mode import (
-    AbstractBatchedMode,
-    AbstractHoppingMode,
-    Transition,
-    TransitionPath,
     mode_numbered,
-    mode_of_cells,
     over_cells,
     program_groups,
+    resolution,
+    selected_cells,
 )
 from .saltation import Tangents, VariationalMode, variational_modes, variational_start
 
@@ -177,7 +175,7 @@ def sampled_rounds(
 
     def solve(numbers: Sequence[int], carry: Carry, active: Bool[Array, " cells"]) -> Carry:
         (runs, output), cell = carry, selected_cells(active)
-        mode = mode_of_cells(mode_numbered(modes, numbers, runs.mode), cell)
+        mode = of_cells(mode_numbered(modes, numbers, runs.mode), cell)
         # Runs in another mode spend no time in this one.
         left = jnp.where(active, greatest(t1 - runs.end_time, 0.0), 0.0)
         times_in_mode = times - runs.end_time
@@ -216,7 +214,7 @@ def sampled_rounds(
             # If the event happens later, less time passes from the event to a fixed time, and to the horizon.
             return reset_with_rows(mode, state, left, times[:, cell] - t1[cell] + left, t1[cell])
 
-        mode = mode_of_cells(mode_numbered(modes, numbers, runs.mode), cell)
+        mode = of_cells(mode_numbered(modes, numbers, runs.mode), cell)
         left = greatest(t1[cell] - runs.end_time[cell], 0.0)
         transition, rows, variations = mode.reset_with_path(runs.state[:, cell], left, with_rows)
         return transition, None if rows is None else jnp.concatenate([rows[None], variations])

@@ -185,9 +185,8 @@ class LaneScheduler(eqx.Module):
         return self.fresh.cell.shape[0]
 
     def pick(self, tree: Tree, cell: Integers) -> Tree:
-        """The leaves for the given cells; scalars stay unchanged."""
-        index = jnp.minimum(cell, self.capacity - 1)
-        return jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., index], tree)
+        """The numbers of the given cells, as `of_cells`; of the last cell for greater indices."""
+        return of_cells(tree, jnp.minimum(cell, self.capacity - 1))
 
     def in_lanes(self, lane_state: LaneState) -> InLanes:
         """Problem, control and absolute tolerances of the cells in the lanes."""
@@ -282,6 +281,15 @@ class LaneScheduler(eqx.Module):
         lane_state = self.pick(self.fresh, cell)
         # There may be fewer cells than lanes: the other lanes stay idle.
         return lane_state._replace(cell=cell, status=jnp.where(cell < self.cells, lane_state.status, REACHED_END))
+
+
+def of_cells(tree: Tree, cell: Int[Numbers, "..."] | int) -> Tree:
+    """A tree with the numbers of the cells with these indices; scalars stay unchanged."""
+
+    def picked(leaf: PyTree) -> PyTree:
+        return leaf[..., cell] if isinstance(leaf, jax.Array | np.ndarray) and leaf.ndim else leaf
+
+    return jax.tree.map(picked, tree)
 
 
 def outcome_of(lane_state: LaneState) -> Outcome:

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ...hybrid import MOST_ROUNDS, AbstractBatchedMode, AbstractHoppingMode, HybridOutcome
-from ...hybrid.ensemble import after_reset, after_solve, at_start
-from ...hybrid.mode import mode_numbered, program_groups
+from ...hybrid.ensemble import after_reset, after_solve, at_start, mode_numbered, program_groups
 from ...integration import AbstractProblem, LaneState, Settings, explicit_tableau
 from ...integration.problem import LEFT_DOMAIN, RUNNING, UNRESOLVED, Status
 from ...integration.runge_kutta import Step, inner_stages, middle_weights, watched_places
