@@ -345,7 +345,13 @@ def hybrid_samples_pulled_back(
         rate = jnp.where(first == number, of_mode, rate)
     shown = jnp.where((times <= 0.0) & (rate == 0.0), 0.0, shown)
     passes = Passes(variational, groups, (solve, reset), (times, t1), settings, shown, end_time)
-    costate = passes.back_to_start(runs, output)
+    count, no_cells = jnp.zeros((), int), jnp.zeros(cells, bool)
+    none = [[jnp.zeros((*jnp.shape(leaf)[:-1], cells)) for leaf in mode.active_numbers()[0]] for mode in variational]
+    costate = Costate(jnp.zeros_like(passes.primal(runs)[0]), jnp.zeros(cells), none, no_cells)
+    checkpoints, owner = Checkpoints.none(Kept(runs, runs, no_cells)), jnp.full(times.shape, -1)
+    run = Rounds(runs, output, owner, count, count + MOST_ROUNDS, checkpoints, costate)
+    run = jax.lax.while_loop(lambda run: uncounted(run.limit > 0, run.number), passes.there_and_back, run)
+    costate = run.costate
 
     def numbers_and_start(*point: Float[Array, "... cells"]) -> PyTree:
         modes, _, state = build(*point)
@@ -371,22 +377,6 @@ class Passes:
     settings: Settings
     shown: Float[Array, "shown times cells"]
     end_time: Lanes
-
-    def back_to_start(self, runs: HybridOutcome[Array], output: Recorded) -> Costate:
-        """The derivatives with respect to the start of the first round, after both passes.
-
-        **Arguments:** `runs`, `output`: the runs at their start, without samples.
-        """
-        cells, count = len(runs.mode), jnp.zeros((), int)
-        no_cells = jnp.zeros(cells, bool)
-        numbers = [
-            [jnp.zeros((*jnp.shape(leaf)[:-1], cells)) for leaf in mode.active_numbers()[0]] for mode in self.modes
-        ]
-        costate = Costate(jnp.zeros_like(self.primal(runs)[0]), jnp.zeros(cells), numbers, no_cells)
-        checkpoints = Checkpoints.none(Kept(runs, runs, no_cells))
-        owner = jnp.full(self.horizon[0].shape, -1)
-        run = Rounds(runs, output, owner, count, count + MOST_ROUNDS, checkpoints, costate)
-        return jax.lax.while_loop(lambda run: uncounted(run.limit > 0, run.number), self.there_and_back, run).costate
 
     def there_and_back(self, run: Rounds) -> Rounds:
         """Compute all rounds up to the one that the backward pass needs, and take back those with a checkpoint."""

@@ -74,11 +74,7 @@ class SampleTimes(eqx.Module):
             return jnp.where(is_initial.reshape(*is_initial.shape, *[1] * (values.ndim - 2)), values, jnp.nan)
 
         first_values = self.read(jnp.arange(len(self.first)), starts[None])
-        return Collected(self.first_in(lane_state), jax.tree.map(of_start, first_values))
-
-    def first_in(self, lane_state: LaneState) -> Integers:
-        """The index of the first sample after the start in every lane."""
-        return self.first[self.cell_of(lane_state)]
+        return Collected(self.first[self.cell_of(lane_state)], jax.tree.map(of_start, first_values))
 
     def after(self, time: Lanes, lane_state: LaneState) -> Integers:
         """The index of the first sample after a time in every lane."""
@@ -115,7 +111,7 @@ class AbstractSampleRecorder(Recorder):
             return samples.at[cell[None], rows.sample].set(values, mode="drop", unique_indices=True)
 
         samples = jax.tree.map(added, collected.samples, self.times.read(cell, rows.state))
-        sample = jnp.where(refilled.cell != ended.cell, self.times.first_in(refilled), record.sample)
+        sample = jnp.where(refilled.cell != ended.cell, self.times.first[self.times.cell_of(refilled)], record.sample)
         return Collected(sample, samples)
 
 

@@ -285,11 +285,7 @@ class LaneScheduler(eqx.Module):
 
 def of_cells(tree: Tree, cell: Int[Numbers, "..."] | int) -> Tree:
     """A tree with the numbers of the cells with these indices; scalars stay unchanged."""
-
-    def picked(leaf: PyTree) -> PyTree:
-        return leaf[..., cell] if isinstance(leaf, jax.Array | np.ndarray) and leaf.ndim else leaf
-
-    return jax.tree.map(picked, tree)
+    return jax.tree.map(lambda leaf: leaf[..., cell] if eqx.is_array_like(leaf) and np.ndim(leaf) else leaf, tree)
 
 
 def outcome_of(lane_state: LaneState) -> Outcome:
