@@ -4,7 +4,7 @@ validity."""
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -599,7 +599,7 @@ class ImplicitMidpoint(diffrax.AbstractSolver):
 
         z, corrections = jax.lax.scan(improve, guess, length=ITERATIONS)
         converged = corrections[-1] < 1e3 * jnp.finfo(y0.dtype).eps
-        results = diffrax.RESULTS
+        results: Any = diffrax.RESULTS
         result = results.where(converged, results.successful, results.nonlinear_divergence)
         y1 = y0 + z
         return y1, None, dict(y0=y0, y1=y1), None, result

@@ -273,11 +273,11 @@ class Path(NamedTuple):
         bulge = middle - 0.5 * (state + end_state) - 0.125 * (slope - end_slope)
         return cls(time, length, state, slope, square, cube, bulge)
 
-    def error(self, place: Lanes | float) -> Lanes:
+    def error(self, place: Lanes) -> Lanes:
         """How many times the bulge the error of the state at a place is."""
         return STATE_SHARE * 16.0 * (place * (1.0 - place)) ** 2
 
-    def derivatives(self, place: Lanes | float) -> list[States]:
+    def derivatives(self, place: Lanes) -> list[States]:
         """The state at a place, and its four derivatives by the place, each divided by the factorial of its order."""
         left, sides = 1.0 - place, 1.0 - 2.0 * place
         state = self.start + place * (self.slope + place * (self.square + place * self.cube))

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from ..parameters import numbers
 from ..text import shown
@@ -330,9 +330,7 @@ def crossing_time(problem: AbstractProblem, time: Lanes, state: States) -> Lanes
     return event_time(problem, problem.event_function, time, state)
 
 
-def event_time(
-    problem: AbstractProblem, function: Callable[[States], Lanes | None], time: Lanes, state: States
-) -> Lanes:
+def event_time(problem: AbstractProblem, function: Callable[[States], PyTree], time: Lanes, state: States) -> Lanes:
     """Time at which a function of the state vanishes along a motion, for a state close to the zero, to third order in
     the distance.
 
@@ -618,7 +616,7 @@ def require_run(
     require_scalars(values, lists)
 
 
-def require_times(times: object, t1: object) -> None:
+def require_times(times: ArrayLike | None, t1: object) -> None:
     """Raise `ValueError` unless the times of output are an increasing list within [0, t1].
 
     **Example:**

@@ -433,11 +433,19 @@ def solve_ensemble(
 
 
 def ensemble_solve(
-    problem: AbstractProblem, t1: Float[Array, "..."], cells: Int[Array, ""], settings: Settings, **options: bool | int
+    problem: AbstractProblem,
+    t1: Float[Array, "..."],
+    cells: Int[Array, ""],
+    settings: Settings,
+    *,
+    nonterminal: bool = False,
+    one_kernel: bool = False,
+    n_blocks: int = 1,
 ) -> tuple[Outcome, Int[Array, ""]]:
-    """`solve_ensemble`, not compiled. **Arguments:** `options`: as for `LaneScheduler.of`."""
+    """`solve_ensemble`, not compiled."""
+    options = {"nonterminal": nonterminal, "one_kernel": one_kernel, "n_blocks": n_blocks}
     outcome, iterations, _ = LaneScheduler.of(problem, t1, cells, settings, **options).solve()
-    return (outcome if options.get("nonterminal") else with_crossing_times(problem, outcome)), iterations
+    return (outcome if nonterminal else with_crossing_times(problem, outcome)), iterations
 
 
 _ensemble_alone, _ensemble_in_program = compiled_alone(ensemble_solve), eqx.filter_jit(ensemble_solve)

@@ -357,7 +357,8 @@ class Ensemble(eqx.Module):
             arguments = (self.problem, jnp.asarray(t1), jnp.asarray(cells), settings)
             return solve_ensemble(*arguments, nonterminal=self.continues, one_kernel=True, traced=traced)[0]
         options = {"counters": self.counters, "nonterminal": self.continues, "traced": traced}
-        return solve_hybrid(self.modes, self.first, self.states, t1, cells, settings, **options)
+        start: Any = (self.first, self.states)
+        return solve_hybrid(self.modes, *start, t1, cells, settings, **options)
 
     def solve_with_tangents(
         self,
@@ -390,9 +391,8 @@ class Ensemble(eqx.Module):
             t1 = xp.where(xp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
         pairs = tuple((tangent.modes, tangent.states) for tangent in tangents)
         options = {"counters": self.counters, "ends_on_event": not self.continues, "traced": traced}
-        run, sensitivities = solve_hybrid_with_tangents(
-            self.modes, pairs, self.first, self.states, t1, cells, settings, **options
-        )
+        start: Any = (self.first, self.states)
+        run, sensitivities = solve_hybrid_with_tangents(self.modes, pairs, *start, t1, cells, settings, **options)
         return run if outcome is None else outcome, sensitivities.slopes, sensitivities.grazing
 
     @property
