@@ -2,8 +2,8 @@
 
 `solve_ensemble` runs many cells of a problem in lanes that step together; `follow` and `sample` integrate single runs
 with any solver of Diffrax. `solve_by_diffrax` is an independent reference. Hybrid runs are in `nonholonomic.hybrid`.
-`Settings` holds the options. Import more from three modules of this subpackage: the codes of how a run ended from
-`status`, checks of arguments from `checks`, and zeros of functions from `zeros`.
+`Settings` holds the options. Import more from two modules of this subpackage: the codes of how a run ended, and checks of
+arguments, from `problem`; zeros of functions from `dense`.
 
 A `nonholonomic.AbstractMode` has functions of one state, and the package maps them over cells. An `AbstractProblem` has
 functions of all cells at once: components along the first axis, cells along the last. `Lanes` is the type of one number
