@@ -220,7 +220,7 @@ def solve_with_adjoint(
 ) -> tuple[Outcome, Float[Array, "components cells"], Any]:
     """Run every cell to its end, and differentiate a quantity at the end with respect to the problem's parameters.
 
-    **Arguments:** as for `ensemble_solve`, except `nonterminal`, and
+    **Arguments:** as for `solve_ensemble`, except `nonterminal`, and
 
     - `problem`: without tangents.
     - `moving`: a tree of booleans like the problem: the leaves with respect to which to differentiate, scalars or

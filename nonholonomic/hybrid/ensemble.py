@@ -436,7 +436,7 @@ HostProgram = Callable[[int, Int[np.ndarray, " selected"], HybridOutcome[np.ndar
 
 
 def _host_programs(
-    modes: tuple[AbstractBatchedMode, ...], t1: Float[np.ndarray, " cells"], settings: Settings, options: dict[str, int]
+    modes: tuple[AbstractBatchedMode, ...], t1: Float[np.ndarray, " cells"], settings: Settings, options: PyTree
 ) -> tuple[HostProgram, HostProgram]:
     """The programs that solve a mode, and that reset its cells. **Arguments:** `options`: of `solve_ensemble`."""
 
@@ -473,7 +473,7 @@ def _on_host(program: HostProgram, update: Callable[..., HybridOutcome], t1: Flo
 
 
 def _traced_advances(
-    modes: tuple[AbstractBatchedMode, ...], t1: Float[Array, " cells"], settings: Settings, options: dict[str, int]
+    modes: tuple[AbstractBatchedMode, ...], t1: Float[Array, " cells"], settings: Settings, options: PyTree
 ) -> tuple[Advance, Advance]:
     """The same for traced numbers, as parts of one program."""
 

@@ -428,24 +428,17 @@ def solve_ensemble(
     [0.693147 0.346574 0.173287] [2. 2. 2.]
     """
     one_kernel = not traced if one_kernel is None else one_kernel
-    solve = _ensemble_in_program if traced else _ensemble_alone
-    return solve(problem, t1, cells, settings, nonterminal=nonterminal, one_kernel=one_kernel, n_blocks=n_blocks)
+    options = {"nonterminal": nonterminal, "one_kernel": one_kernel, "n_blocks": n_blocks}
+    return (_ensemble_in_program if traced else _ensemble_alone)(problem, t1, cells, settings, options)
 
 
 def ensemble_solve(
-    problem: AbstractProblem,
-    t1: Float[Array, "..."],
-    cells: Int[Array, ""],
-    settings: Settings,
-    *,
-    nonterminal: bool = False,
-    one_kernel: bool = False,
-    n_blocks: int = 1,
+    problem: AbstractProblem, t1: Float[Array, "..."], cells: Int[Array, ""], settings: Settings, options: PyTree
 ) -> tuple[Outcome, Int[Array, ""]]:
-    """`solve_ensemble`, not compiled."""
-    options = {"nonterminal": nonterminal, "one_kernel": one_kernel, "n_blocks": n_blocks}
-    outcome, iterations, _ = LaneScheduler.of(problem, t1, cells, settings, **options).solve()
-    return (outcome if nonterminal else with_crossing_times(problem, outcome)), iterations
+    """`solve_ensemble`, not compiled. **Arguments:** `options`: of `LaneScheduler.of`, by name."""
+    scheduler = LaneScheduler.of(problem, t1, cells, settings, **options)
+    outcome, iterations, _ = scheduler.solve()
+    return (outcome if scheduler.control.nonterminal else with_crossing_times(problem, outcome)), iterations
 
 
 _ensemble_alone, _ensemble_in_program = compiled_alone(ensemble_solve), eqx.filter_jit(ensemble_solve)
