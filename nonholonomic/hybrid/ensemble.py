@@ -15,7 +15,7 @@ import itertools
 import operator
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import ClassVar, Generic, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -240,7 +240,7 @@ Advance = Callable[[Sequence[int], Carry, Bool[Numbers, " cells"]], Carry]
 
 
 def at_start(
-    mode: Int[Numbers, " cells"], state: Float[Numbers, "components cells"], cells: int, counters: int
+    mode: Int[Numbers, " cells"], state: Float[Numbers, "components cells"], cells: Int[Array, ""] | int, counters: int
 ) -> HybridOutcome[Numbers]:
     """All cells at their start, the first `cells` of them running."""
     xp = mode.__array_namespace__()
@@ -414,20 +414,21 @@ def solve_hybrid(
     [0.722438 0.812743]
     """
     options = {"nonterminal": nonterminal, "n_blocks": n_blocks}
-    xp = jnp if traced else np
-    t1, groups = xp.broadcast_to(xp.asarray(t1, float), len(mode)), [(number,) for number in range(len(modes))]
+    xp: Any = jnp if traced else np
+    horizon, groups = xp.broadcast_to(xp.asarray(t1, float), len(mode)), [(number,) for number in range(len(modes))]
     runs = at_start(xp.asarray(mode), xp.asarray(state), cells, counters)
     if traced:
-        return all_rounds((runs,), groups, *_traced_advances(modes, t1, settings, options), most_rounds)[0]
-    programs = _host_programs(modes, t1, settings, options)
+        solve, reset = _traced_advances(modes, horizon, settings, options)
+        return all_rounds((runs,), groups, solve, reset, most_rounds)[0]
+    programs = _host_programs(modes, horizon, settings, options)
     if cells == 0:
         # Compile the programs by running no cells: two at once, because the compiler uses little more than one core.
         common = [number for number, of_number in enumerate(modes) if not of_number.rare]
         with ThreadPoolExecutor(2) as threads:
             calls = itertools.product(programs, common)
             list(threads.map(lambda call: call[0](call[1], np.arange(0), runs), calls))
-    updates = zip(programs, (after_solve, after_reset), strict=True)
-    return all_rounds((runs,), groups, *(_on_host(*pair, t1) for pair in updates), most_rounds)[0]
+    solve, reset = _on_host(programs[0], after_solve, horizon), _on_host(programs[1], after_reset, horizon)
+    return all_rounds((runs,), groups, solve, reset, most_rounds)[0]
 
 
 #: (the index of a mode, the indices of some cells in this mode, the runs of all cells) -> how these cells end, in the first
@@ -532,7 +533,7 @@ def hybrid_resets(
     """
     horizon, resets = np.full(1, float(t1)), []
     programs = _host_programs(modes, horizon, settings, {})
-    solve, leave = (_on_host(*pair, horizon) for pair in zip(programs, (after_solve, after_reset), strict=True))
+    solve, leave = _on_host(programs[0], after_solve, horizon), _on_host(programs[1], after_reset, horizon)
 
     def reset(numbers: Sequence[int], carry: Carry, lost: Bool[np.ndarray, "1"]) -> Carry:
         after = leave(numbers, carry, lost)
@@ -653,7 +654,7 @@ class HybridPath(NamedTuple):
 
 
 @eqx.filter_jit
-def _problem(mode: AbstractBatchedMode, state: Float[Array | np.ndarray, " components"]) -> AbstractProblem:
+def _problem(mode: AbstractBatchedMode, state: States) -> AbstractProblem:
     """The motion in a mode of one cell, as a problem without an axis of cells."""
     return of_cells(mode, 0).problem(state)
 

@@ -16,7 +16,7 @@ tolerance, the event is grazing and the derivative has no correct digits; `GRAZI
 
 import math
 from collections.abc import Callable
-from typing import Generic, NamedTuple
+from typing import Any, Generic, NamedTuple
 
 import equinox as eqx
 import jax
@@ -319,12 +319,12 @@ def solve_hybrid_with_tangents(
     >>> print(sensitivities.slopes.round(6))  # the time of the fall
     [[0.451524 0.451524]]
     """
-    xp, size = jnp if traced else np, len(state)
-    slopes_of = VariationalMode.slopes if traced else _slopes
+    xp: Any = jnp if traced else np
+    size, slopes_of = len(state), VariationalMode.slopes if traced else _slopes
 
     def run(group: Tangents) -> tuple[PyTree, list[Float[Numbers, " cells"]]]:
         variational = variational_modes(modes, group, settings.tolerance, ends_on_event)
-        start = variational_start(jnp.asarray(state), group)
+        start = xp.asarray(variational_start(jnp.asarray(state), group))
         options = {"counters": counters + 1, "n_blocks": 1 + len(group), "traced": traced}
         ended = solve_hybrid(variational, mode, start, t1, cells, settings, **options)
         # A run that has ended between two modes is in neither. Its event is the end of the previous mode, whose variation is

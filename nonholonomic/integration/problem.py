@@ -626,7 +626,7 @@ def require_times(times: ArrayLike | None, t1: object) -> None:
     Traceback (most recent call last):
     ValueError: times ...
     """
-    if np.ndim(times) == 0 and not isinstance(times, str) and times is not None:
+    if times is not None and not isinstance(times, str) and np.ndim(times) == 0:
         raise ValueError(
             f"times = {shown(times)} must be a list of at least one number; np.linspace makes evenly spaced ones"
         )

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from ..compilation.xla_cpu import compiled_alone, in_one_kernel
 from ..text import shown
@@ -394,7 +394,7 @@ def _holds(
 def solve_ensemble(
     problem: AbstractProblem,
     t1: Float[Array, "..."],
-    cells: Int[Array, ""],
+    cells: Int[ArrayLike, ""],
     settings: Settings,
     *,
     nonterminal: bool = False,
@@ -433,10 +433,10 @@ def solve_ensemble(
 
 
 def ensemble_solve(
-    problem: AbstractProblem, t1: Float[Array, "..."], cells: Int[Array, ""], settings: Settings, options: PyTree
+    problem: AbstractProblem, t1: Float[Array, "..."], cells: Int[ArrayLike, ""], settings: Settings, options: PyTree
 ) -> tuple[Outcome, Int[Array, ""]]:
     """`solve_ensemble`, not compiled. **Arguments:** `options`: of `LaneScheduler.of`, by name."""
-    scheduler = LaneScheduler.of(problem, t1, cells, settings, **options)
+    scheduler = LaneScheduler.of(problem, t1, jnp.asarray(cells), settings, **options)
     outcome, iterations, _ = scheduler.solve()
     return (outcome if scheduler.control.nonterminal else with_crossing_times(problem, outcome)), iterations
 

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..compilation.components import over_lanes
 from ..compilation.tracing import depends_on_first, is_elementary, spelled_out, with_own_numbers
@@ -333,10 +333,10 @@ class Ensemble(eqx.Module):
     """
 
     problem: AbstractProblem | None
-    # A tuple, or `None`.
+    # A tuple and two arrays, or `None`.
     modes: Any
-    first: Int[Array, " cells"] | None
-    states: Float[Array, "components cells"] | None
+    first: Any
+    states: Any
     counters: int = eqx.field(static=True)
     continues: bool = eqx.field(static=True)
 
@@ -357,8 +357,7 @@ class Ensemble(eqx.Module):
             arguments = (self.problem, jnp.asarray(t1), jnp.asarray(cells), settings)
             return solve_ensemble(*arguments, nonterminal=self.continues, one_kernel=True, traced=traced)[0]
         options = {"counters": self.counters, "nonterminal": self.continues, "traced": traced}
-        start: Any = (self.first, self.states)
-        return solve_hybrid(self.modes, *start, t1, cells, settings, **options)
+        return solve_hybrid(self.modes, self.first, self.states, t1, cells, settings, **options)
 
     def solve_with_tangents(
         self,
@@ -391,8 +390,8 @@ class Ensemble(eqx.Module):
             t1 = xp.where(xp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
         pairs = tuple((tangent.modes, tangent.states) for tangent in tangents)
         options = {"counters": self.counters, "ends_on_event": not self.continues, "traced": traced}
-        start: Any = (self.first, self.states)
-        run, sensitivities = solve_hybrid_with_tangents(self.modes, pairs, *start, t1, cells, settings, **options)
+        arguments = (self.modes, pairs, self.first, self.states, t1, cells, settings)
+        run, sensitivities = solve_hybrid_with_tangents(*arguments, **options)
         return run if outcome is None else outcome, sensitivities.slopes, sensitivities.grazing
 
     @property
