@@ -89,8 +89,8 @@ class VariationalMode(AbstractBatchedMode):
             )
 
         point = (with_row(primal[:-1], jnp.zeros_like(primal[-1])), *numbers)
-        tangents = [(variation, *rates) for variation, rates in zip(variations, self.rates(), strict=True)]
-        return VariationalProblem(clocked(*point), tangents_of(clocked, point, tangents), self.ends_on_event)
+        tangents = tangents_of(clocked, point, self.directions(variations))
+        return VariationalProblem(clocked(*point), tangents, self.ends_on_event)
 
     def reset_map(self, state: States, left: Lanes) -> Transition:
         """The reset map of the mode itself, with variations. The last row of the counters counts grazing events."""
@@ -119,7 +119,7 @@ class VariationalMode(AbstractBatchedMode):
         zero_rates = [jnp.zeros_like(number) for number in numbers]
         rates = self.mode.problem(primal).field(duration, primal)
         # The last tangent is an error of the state.
-        directions = [(part[:-1], *moves) for part, moves in zip(variations, self.rates(), strict=True)]
+        directions = self.directions([part[:-1] for part in variations])
         directions.append((self._error(primal, duration, rates), *zero_rates))
         delays, log_rates = self._delays(primal, duration, [*directions, (rates, *zero_rates)])
 
@@ -184,10 +184,7 @@ class VariationalMode(AbstractBatchedMode):
             return output(primal), jnp.zeros((0, *output(primal).shape))
         rates = self.mode.problem(primal).field(duration, primal)
         # If the mode begins later, the state has advanced less at the same time.
-        directions = [
-            (variation[:-1] - rates * variation[-1], *rates_of_numbers)
-            for variation, rates_of_numbers in zip(variations, self.rates(), strict=True)
-        ]
+        directions = self.directions([variation[:-1] - rates * variation[-1] for variation in variations])
         return along(output, (primal, *numbers), directions)
 
     def slopes(self, state: States) -> Float[Array, "tangents cells"]:
@@ -208,8 +205,8 @@ class VariationalMode(AbstractBatchedMode):
             return start_time + delay(problem.event_function, primal, problem.field(start_time, primal))
 
         duration, point = primal[-1], (primal[:-1], jnp.zeros_like(primal[-1]), *numbers)
-        tangents = [(part[:-1], part[-1], *rates) for part, rates in zip(variations, self.rates(), strict=True)]
-        return along(time, point, tangents)[1]
+        directions = self.directions([part[:-1] for part in variations], [part[-1] for part in variations])
+        return along(time, point, directions)[1]
 
     def parts(self, state: States) -> list[States]:
         """The state with its clock, and the variations of both."""
@@ -231,9 +228,9 @@ class VariationalMode(AbstractBatchedMode):
         numbers, structure = jax.tree.flatten(where_active(self.mode, self.tangents[0]))
         return numbers, lambda *numbers: eqx.combine(jax.tree.unflatten(structure, numbers), self.mode)
 
-    def rates(self) -> list[list[Array]]:
-        """For each tangent the rates at which these numbers move."""
-        return [jax.tree.leaves(direction) for direction in self.tangents]
+    def directions(self, *moves: list[Array]) -> list[tuple[Array, ...]]:
+        """For each tangent the rates at which some arrays move, followed by those of the active numbers."""
+        return [(*arrays, *jax.tree.leaves(tangent)) for *arrays, tangent in zip(*moves, self.tangents, strict=True)]
 
 
 def delay(function: Callable[[States], Lanes | None], state: States, rates: States) -> Lanes:

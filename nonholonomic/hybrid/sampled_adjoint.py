@@ -535,7 +535,9 @@ class _Stage:
         """The moving numbers of the mode of some cells, their rates, and the mode as a function of the numbers."""
         mode = of_cells(mode_numbered(self.passes.modes, self.group, self.kept.before.mode), cell)
         numbers, build = mode.active_numbers()
-        numbers, rates = ([with_cells(leaf, len(cell)) for leaf in leaves] for leaves in (numbers, mode.rates()[0]))
+        numbers, rates = (
+            [with_cells(leaf, len(cell)) for leaf in leaves] for leaves in (numbers, mode.directions()[0])
+        )
         return numbers, rates, build
 
     def _added(
