@@ -40,6 +40,7 @@ from .dense import DenseSolution as DenseSolution
 from .dense import ImplicitMidpoint as ImplicitMidpoint
 from .dense import follow as follow
 from .dense import sample as sample
+from .dense import solve_by_diffrax as solve_by_diffrax
 from .problem import AbstractPassive as AbstractPassive
 from .problem import AbstractProblem as AbstractProblem
 from .problem import CoreProblem as CoreProblem
@@ -54,6 +55,5 @@ from .runge_kutta import States as States
 from .runge_kutta import explicit_tableau as explicit_tableau
 from .samples import solve_with_samples as solve_with_samples
 from .scheduler import Outcome as Outcome
-from .scheduler import solve_by_diffrax as solve_by_diffrax
 from .scheduler import solve_ensemble as solve_ensemble
 from .step import LaneState as LaneState

@@ -212,6 +212,20 @@ class AbstractProblem(eqx.Module):
         (base, rate), _ = jax.lax.scan(stage, (state, jnp.zeros_like(state)), (times, moves, looks))
         return base + second * rate
 
+    def margin_at_start(self, time: Lanes, state: States) -> Lanes | None:
+        """The domain margin at the start, at most 0 where the model ceases to hold at once."""
+        margin, lost = self.domain_margin(time, state), self.lost_at_start(state)
+        return margin if margin is None or lost is None else jnp.where(lost, jnp.minimum(margin, 0.0), margin)
+
+    def crossing_on(self, side: Lanes, state: States, rate: States) -> Lanes | None:
+        """`crossing_along` with the sign that makes it positive on the lane's side of the event, 1 or -1."""
+        value = self.crossing_along(state, rate)
+        return None if value is None else side * value
+
+    def least_margin(self, side: Lanes, time: Lanes, state: States, rate: States) -> Lanes:
+        """The lesser of the domain margin and the event function on the lane's side of the event."""
+        return lesser(self.domain_margin(time, state), self.crossing_on(side, state, rate), side)
+
 
 class AbstractDerivedProblem(AbstractProblem):
     """A problem with the event, the margins and the jumps of another problem, `problem`, which reads its own state from
@@ -284,29 +298,6 @@ class CoreProblem(AbstractDerivedProblem):
         state = jnp.stack(state) if isinstance(state, tuple) else state
         missing = len(self.problem.start()[0]) - self.size
         return jnp.concatenate([state, jnp.zeros((missing, *state.shape[1:]))])
-
-
-def margin_at_start(problem: AbstractProblem, time: Lanes, state: States) -> Lanes | None:
-    """The domain margin at the start, at most 0 where the model ceases to hold at once."""
-    margin, lost = problem.domain_margin(time, state), problem.lost_at_start(state)
-    return margin if margin is None or lost is None else jnp.where(lost, jnp.minimum(margin, 0.0), margin)
-
-
-def least_margin(problem: AbstractProblem, side: Lanes, time: Lanes, state: States, rate: States) -> Lanes:
-    """The lesser of the domain margin and the event function, if the field is known. The event function has the sign
-    that makes it positive on the lane's side of the event.
-    """
-    return lesser(problem.domain_margin(time, state), side_of(problem, side)(state, rate), side)
-
-
-def side_of(problem: AbstractProblem, side: Lanes) -> Callable[[States, States], Lanes | None]:
-    """The event function of state and rate, with the sign that makes it positive on the lane's side of the event."""
-
-    def crossing(state: States, rate: States) -> Lanes | None:
-        value = problem.crossing_along(state, rate)
-        return None if value is None else side * value
-
-    return crossing
 
 
 def crossing_time(problem: AbstractProblem, time: Lanes, state: States) -> Lanes:
@@ -515,6 +506,10 @@ class Settings(eqx.Module):
     def with_tolerance(self, tolerance: Float[Array, ""] | None) -> Self:
         """The same settings with another tolerance, or without a tolerance if the caller stores it."""
         return eqx.tree_at(lambda settings: settings.tolerance, self, tolerance, is_leaf=lambda leaf: leaf is None)
+
+    def lanes_of(self, cells: int) -> int:
+        """Number of a problem's cells that advance together."""
+        return lanes_for(cells) if self.lanes is None else self.lanes
 
 
 def lanes_for(cells: int) -> int:

@@ -4,37 +4,20 @@ A lane whose run has ended takes the next cell of the queue, so cheap and expens
 waiting for one another. All ensemble solves share this loop; a recorder stores what they keep of the steps.
 """
 
-import functools
 from collections.abc import Callable
 from typing import ClassVar, Generic, NamedTuple, TypeVar
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix
 from jax.lax import stop_gradient
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from ..compilation.xla_cpu import compiled_alone, in_one_kernel
 from ..text import shown
-from .dense import saved
 from .events import Bracket
-from .problem import (
-    CROSSED,
-    FAILED,
-    LEFT_DOMAIN,
-    MOST_STEPS,
-    REACHED_END,
-    RUNNING,
-    AbstractProblem,
-    Settings,
-    crossing_time,
-    lanes_for,
-    least_margin,
-    margin_at_start,
-)
+from .problem import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING, AbstractProblem, Settings, crossing_time
 from .runge_kutta import Integers, Lanes, States, explicit_tableau, first_length, memory_for_stages
 from .step import Control, LaneState, try_step
 
@@ -176,8 +159,7 @@ class LaneScheduler(eqx.Module):
         lengths = first_length(problem.field, begin, states, rates, control.order, rtol, atols, n_blocks)
         fresh = _fresh_lanes(problem, control, states, rates, jnp.minimum(stop_gradient(lengths), t1))
         fresh = fresh._replace(time=begin)
-        lanes = lanes_for(states.shape[1]) if settings.lanes is None else settings.lanes
-        return cls(problem, control, atols, fresh, cells, lanes, one_kernel)
+        return cls(problem, control, atols, fresh, cells, settings.lanes_of(states.shape[1]), one_kernel)
 
     @property
     def capacity(self) -> int:
@@ -331,7 +313,7 @@ def _fresh_lanes(
         status = jnp.full(zero.shape, RUNNING) if valid is None else jnp.where(valid, RUNNING, LEFT_DOMAIN)
         crossing_time = jnp.full_like(zero, jnp.inf)
     else:
-        crossing, domain_margin = problem.event_function(states), margin_at_start(problem, zero, states)
+        crossing, domain_margin = problem.event_function(states), problem.margin_at_start(zero, states)
         is_beyond = false
         if crossing is not None:
             # Exactly on the event, the direction of the motion decides.
@@ -351,7 +333,7 @@ def _fresh_lanes(
         rate=rates,
         length=lengths,
         side=side,
-        margin=stop_gradient(least_margin(problem, side, zero, states, rates)),
+        margin=stop_gradient(problem.least_margin(side, zero, states, rates)),
         margins=stop_gradient(jnp.stack(margins)) if (margins := problem.margins(zero, states)) else None,
         first_crossing=crossing_time,
         crossing_time=crossing_time,
@@ -453,63 +435,3 @@ def with_crossing_times(problem: AbstractProblem, outcome: Outcome) -> Outcome:
     time = jnp.where(outcome.end_time > 0.0, time, 0.0)
     time = jnp.where(outcome.status == CROSSED, time, jnp.inf)
     return outcome._replace(first_crossing=time, crossing_time=time)
-
-
-# The outcome of every cell by vmapped `diffrax.diffeqsolve`: slow, and independent of the ensemble solver.
-
-
-@eqx.filter_jit
-def solve_by_diffrax(problem: AbstractProblem, t1: Float[Array, ""], settings: Settings) -> Outcome:
-    """Run every cell from t = 0 to its event, to the end of the model's validity, or to `t1`.
-
-    The domain margin is checked at the ends of steps, so a short loss can be missed; events are located on Diffrax's
-    dense output.
-
-    **Arguments:** as for `solve_ensemble`, but any solver of Diffrax works.
-
-    **Returns:** the `Outcome`.
-
-    **Example:**
-
-    >>> from nonholonomic.integration import solve_by_diffrax
-    >>> print(solve_by_diffrax(problem, jnp.asarray(5.0), settings).crossing_time.round(6))
-    [0.693147 0.346574 0.173287]
-    """
-    (states, scales), rtol = problem.start(), settings.tolerance
-    lane_axes = jax.tree.map(lambda leaf: None if jnp.ndim(leaf) == 0 else -1, problem)
-
-    def solve_cell(cell_problem: AbstractProblem, state: Array, scale: Array) -> Outcome:
-        conditions: dict[int, Callable[..., Lanes]] = {}
-        if problem.event_function(states) is not None:
-            conditions[CROSSED] = lambda t, y, args, **_: args.event_function(y)
-        if problem.domain_margin(states[0], states) is not None:
-            conditions[LEFT_DOMAIN] = lambda t, y, args, **_: args.domain_margin(t, y)
-        # Diffrax detects only changes of a condition's sign, so a cell that starts with a negative condition must end
-        # at once.
-        at_once = [condition(jnp.zeros(()), state, cell_problem) <= 0.0 for condition in conditions.values()]
-        ends_at_once = functools.reduce(jnp.logical_or, at_once, jnp.asarray(False))
-        event = diffrax.Event(list(conditions.values()), root_finder=optimistix.Newton(1e-13, 1e-13))
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
-            settings.for_single_runs,
-            0.0,
-            jnp.where(ends_at_once, 0.0, t1),
-            None,
-            state,
-            args=cell_problem,
-            stepsize_controller=diffrax.PIDController(rtol, settings.absolute * rtol * scale),
-            max_steps=min(settings.max_steps, MOST_STEPS),
-            event=event if conditions else None,
-            throw=False,
-        )
-        ends, finals = saved(solution)
-        end, final = ends[0], finals[0]
-        status = jnp.where(end >= t1, REACHED_END, FAILED)
-        for code, occurred, at_start in zip(conditions, solution.event_mask or [], at_once, strict=True):
-            status = jnp.where(occurred | at_start, code, status)
-        crossing_time = jnp.where(status == CROSSED, end, jnp.inf)
-        steps, rejected = solution.stats["num_steps"], solution.stats["num_rejected_steps"]
-        return Outcome(status, crossing_time, crossing_time, end, final, steps, rejected, jnp.array(NO_EXTREMES))
-
-    axes = Outcome._make((0, 0, 0, 0, -1, 0, 0, -1))
-    return jax.vmap(solve_cell, in_axes=(lane_axes, -1, -1), out_axes=axes)(problem, states, scales)

@@ -4,6 +4,7 @@ When a step ends beyond an event, the lane locates the event: it repeats the ste
 lengths, until the step ends on the event. The time of the event therefore has the accuracy of the method.
 """
 
+import functools
 from typing import NamedTuple
 
 import diffrax
@@ -14,17 +15,7 @@ from jaxtyping import Array, Float
 
 from ..compilation.xla_cpu import stored
 from .events import Bracket, Path, missed_double_root, missed_loss, refine, watched
-from .problem import (
-    CROSSED,
-    FAILED,
-    LEFT_DOMAIN,
-    REACHED_END,
-    RUNNING,
-    AbstractProblem,
-    crossing_time,
-    least_margin,
-    side_of,
-)
+from .problem import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, AbstractProblem, crossing_time
 from .runge_kutta import (
     Integers,
     Lanes,
@@ -151,7 +142,7 @@ def past_jump(
     def moved() -> tuple[States, States, Lanes, Float[Array, "margins *lanes"] | None]:
         state = problem.across_jump(new_lanes.time, new_lanes.state)
         rate, margins = problem.field(far, state), problem.margins(far, state)
-        margin = stop_gradient(least_margin(problem, new_lanes.side, far, state, rate))
+        margin = stop_gradient(problem.least_margin(new_lanes.side, far, state, rate))
         of_far_side = (state, rate, margin, stop_gradient(jnp.stack(margins)) if margins else None)
         return jax.tree.map(lambda new, old: jnp.where(landed, new, old), of_far_side, of_near_side)
 
@@ -179,7 +170,7 @@ def past_jump(
 def trial_step(problem: AbstractProblem, control: Control, lane_state: LaneState) -> tuple[Lanes, Step]:
     """The length of each lane's next step [s], and the step."""
     tried_length = length_to_try(control, lane_state)
-    crossing = side_of(problem, lane_state.side)
+    crossing = functools.partial(problem.crossing_on, lane_state.side)
     start = (lane_state.time, lane_state.state, lane_state.rate, tried_length, lane_state.margins)
     stages = memory_for_stages(control.tableau, lane_state.state) if lane_state.stages is None else lane_state.stages
     looks = looks_of(problem, control.tableau, lane_state)
