@@ -23,10 +23,16 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from ..compilation.xla_cpu import greatest, uncounted
 from ..derivatives import tangents_by, tangents_of
 from ..derivatives.adjoint import Checkpoints
-from ..derivatives.differentiable import AbstractSampling, ProblemSpec, by_active, solve_for_samples, tangent_along
-from ..derivatives.differentiable import over_cells as with_cells
-from ..derivatives.sampled_runs import SampledCotangents, mixture, samples_pulled_back
-from ..derivatives.variation import where_active
+from ..derivatives.sampled_runs import (
+    AbstractSampling,
+    ProblemSpec,
+    SampledCotangents,
+    mixture,
+    samples_pulled_back,
+    solve_for_samples,
+)
+from ..derivatives.variation import by_active, tangent_along, where_active
+from ..derivatives.variation import over_cells as with_cells
 from ..integration import AbstractProblem, Jumps, Lanes, Settings, States
 from ..integration.problem import LEFT_DOMAIN, REACHED_END, RUNNING
 from ..integration.scheduler import of_cells

@@ -228,8 +228,7 @@ class AbstractProblem(eqx.Module):
 
 
 class AbstractDerivedProblem(AbstractProblem):
-    """A problem with the event, the margins and the jumps of another problem, `problem`, which reads its own state from
-    `inner`."""
+    """A problem with more or fewer components than another one, which decides where its runs end and jump."""
 
     problem: eqx.AbstractVar[AbstractProblem]
 
@@ -722,7 +721,7 @@ class ExtendedProblem(AbstractDerivedProblem, Generic[Core]):
         return jnp.concatenate([states, self.values]), jnp.concatenate([scales, self.scales])
 
     def field(self, time: Lanes, state: States) -> States:
-        return self.passive.rates(self.problem, time, state[: self.leading], state[self.leading :])
+        return self.passive.rates(self.problem, time, self.inner(state), state[self.leading :])
 
     def inner(self, state: States) -> States:
         return state[: self.leading]
