@@ -27,7 +27,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from nonholonomic.compilation.xla_cpu import greatest, least
 from nonholonomic.geometry import Component, Vector, add, cross, dot, multiply, scale, subtract, sum_vectors
-from nonholonomic.integration import AbstractProblem, Outcome, Settings, traced_solve_ensemble
+from nonholonomic.integration import AbstractProblem, Outcome, Settings, solve_ensemble
 from nonholonomic.integration.problem import LEFT_DOMAIN, MOST_STEPS
 
 from ..friction import AbstractFriction, ContactLoad, SetValuedCoulomb, Slip, length
@@ -350,7 +350,7 @@ def _solved(problem: "Impact | Skid", absolute: float) -> Outcome:
     """The end of an impact. **Arguments:** `absolute`: as for `Settings`."""
     settings = Settings(TOLERANCE, diffrax.Dopri5(), absolute=absolute, max_steps=MOST_STEPS)
     cells = jnp.asarray(problem.start()[0].shape[1])
-    return traced_solve_ensemble(problem, jnp.asarray(LARGEST), cells, settings)[0]
+    return solve_ensemble(problem, jnp.asarray(LARGEST), cells, settings, traced=True)[0]
 
 
 class Strike(NamedTuple):
