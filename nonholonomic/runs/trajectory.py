@@ -1,5 +1,6 @@
 """One run of any model: its quantities, its plots and its page."""
 
+import abc
 import dataclasses
 import functools
 import math
@@ -123,7 +124,8 @@ def page_of(model: AbstractModel, sliders: Any, t1: float) -> tuple[LiveRun, Sta
 
     >>> import jax.numpy as jnp
     >>> import nonholonomic
-    >>> from nonholonomic.runs import model_of, page_of
+    >>> from nonholonomic.runs import model_of
+    >>> from nonholonomic.runs.trajectory import page_of
     >>> class Decay(nonholonomic.AbstractMode):
     ...     rate: float = 2.0
     ...
@@ -335,7 +337,60 @@ REASONS = {
 }
 
 
-class Trajectory(Viewable, Tabular, eqx.Module):
+class AbstractRun(Viewable, Tabular, eqx.Module):
+    """A run of any model at its times `t`, the first axis of its arrays; a batch has an axis before it."""
+
+    @property
+    @abc.abstractmethod
+    def of_page(self) -> tuple[AbstractModel, float]:
+        """The model of the run, and the end of the runs on its page [s]."""
+
+    @property
+    def codes(self) -> Any:
+        """How the runs of a batch ended, as integers of `Status`; `None` if this is unknown."""
+        return None
+
+    @abc.abstractmethod
+    def in_words(self) -> str:
+        """The text of a single run."""
+
+    def explore(
+        self, path: Any = None, sliders: dict[str, tuple[float, float]] | None = None, unit: Any = None
+    ) -> Page:
+        """A page with sliders that simulates the run in the browser, until its end; see `nonholonomic.explore`.
+
+        **Raises:** as for `nonholonomic.explore`, and `ValueError` for a batch of runs.
+        """
+        require_one_run(self, "explore", "")
+        model, t1 = self.of_page
+        return explore_model(model, path, sliders, t1, unit)
+
+    @status_line("reading off")
+    def to_table(self) -> Table:
+        return self.table_of(())
+
+    def stages(self, others: Sequence[Any] = (), overlaid: bool = False, unit: Any = None) -> list[Stage]:
+        return stages_of(self, [self, *others], overlaid, unit)
+
+    @status_line("reading off")
+    def __str__(self) -> str:
+        # A batch, or a run inside a transformation, has no single values to show.
+        if is_traced((self.t, self.codes)) or np.ndim(self.t) != 1:
+            codes = [] if self.codes is None or is_traced(self.codes) else np.ravel(self.codes)
+            return batch_title(np.shape(self.t), [Status(int(code)).word for code in codes])
+        return self.in_words()
+
+
+@functools.singledispatch
+def stages_of(run: AbstractRun, runs: list[Any], overlaid: bool, unit: Any) -> list[Stage]:
+    """The stages on which runs of one kind are drawn: one for each, or a common one for overlaid runs.
+
+    Each kind of run registers its own function. **Arguments:** `run`: the first of the `runs`; `unit`: as for `plot`.
+    """
+    raise NotImplementedError(f"{type(run).__name__} has no picture")
+
+
+class Trajectory(AbstractRun):
     """A run of your own system at given times. The times are the first axis of the arrays; `jax.vmap` adds an axis
     before it.
 
@@ -398,6 +453,14 @@ class Trajectory(Viewable, Tabular, eqx.Module):
     @property
     def portrait_axes(self) -> tuple[str, str]:
         return self.names[0], self.names[-1]
+
+    @property
+    def of_page(self) -> tuple[AbstractModel, float]:
+        return self.model, float(self.t1)
+
+    @property
+    def codes(self) -> Int[Array, "..."]:
+        return self.code
 
     @functools.cached_property
     def resets(self) -> Table:
@@ -495,18 +558,9 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         times = times_within(times, self.end_time, "run")
         return self.model.simulate(self.t1, times, self.settings.tolerance, self.settings.solver, None)
 
-    def stages(self, others: Sequence[Any] = (), overlaid: bool = False, unit: Any = None) -> list[Stage]:
-        return portraits([run._with_resets() for run in (self, *others)], overlaid)
-
     def table_of(self, names: Sequence[str]) -> Table:
         """The table that pictures draw, with the states before and after each reset."""
         return self._with_resets().to_table()
-
-    def explore(
-        self, path: Any = None, sliders: dict[str, tuple[float, float]] | None = None, unit: Any = None
-    ) -> Page:
-        """A page with sliders that simulates the run in the browser; see `nonholonomic.explore`."""
-        return explore_model(self.model, path, sliders, float(self.t1), unit)
 
     def labels_of(self, runs: list[Any], unit: Any) -> list[str]:
         """Labels that tell runs apart by the numbers of their systems and starts that differ."""
@@ -532,10 +586,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         axes.legend()
         return figure if ax is None else ax
 
-    def __str__(self) -> str:
-        if is_traced(self.code) or np.ndim(self.t) != 1:
-            codes = [] if is_traced(self.code) else np.ravel(self.code)
-            return batch_title(jnp.shape(self.state)[:-1], [Status(int(code)).word for code in codes])
+    def in_words(self) -> str:
         table = str(self.to_table()).splitlines()[1 : 1 + len(self.names)]
         lines = [f"Trajectory of {np.size(self.t)} times, {self.status} at {float(self.end_time):.6g} s", *table]
         lines.append(f"  resets: {int(self.switches)}")
@@ -558,3 +609,8 @@ def brief_names(values: dict[str, list[str]]) -> dict[str, str]:
     names = [name for name in values if name in shared or not (groups[name] or of_all_modes(name) in shared)]
     ends = [name.rsplit(".", 1)[-1] for name in names]
     return {name: end if ends.count(end) == 1 else name for name, end in zip(names, ends, strict=True)}
+
+
+@stages_of.register(Trajectory)
+def _(run: Trajectory, runs: list[Any], overlaid: bool, unit: Any) -> list[Stage]:
+    return portraits([run._with_resets() for run in runs], overlaid)

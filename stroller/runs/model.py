@@ -12,20 +12,12 @@ from jaxtyping import Array, Bool, Float, Int
 from nonholonomic.compilation.components import Held
 from nonholonomic.geometry import Plane
 from nonholonomic.hybrid import HybridOutcome
+from nonholonomic.hybrid.saltation import UNMEASURED, Clock
 from nonholonomic.integration import AbstractProblem, ExtendedProblem, Outcome
-from nonholonomic.integration.problem import Status, run_bounds
+from nonholonomic.integration.problem import Status, require_run, run_bounds
 from nonholonomic.parameters import description, numbers, numbers_of
-from nonholonomic.runs import (
-    UNMEASURED,
-    AbstractModel,
-    AbstractSceneModel,
-    Clock,
-    EventFunction,
-    Names,
-    model_of,
-    statuses,
-    with_event,
-)
+from nonholonomic.runs.event import EventFunction, with_event
+from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, model_of, statuses
 from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.text import name_of
 from nonholonomic.validation import require_all, require_kind, require_scalars
@@ -33,8 +25,7 @@ from nonholonomic.validation import require_all, require_kind, require_scalars
 from ..model.input import Formula, Input, PerRide, Steady, as_jumps, at_start, check_input
 from ..model.scene import RideProblem, Scene, as_module, has_arrays
 from ..model.vehicle import Damping, Launch, RollingResistance, Stroller
-from .trajectory import DEFAULT_STEPS, Trajectory, ride
-from .view import QUANTITIES, TIMED, VECTORS, RideState
+from .trajectory import DEFAULT_STEPS, QUANTITIES, TIMED, VECTORS, RideState, Trajectory, heading, ride
 
 #: Names of the coordinates of a place in the fixed frame.
 FIXED = (("x", "m"), ("y", "m"), ("z", "m"))
@@ -251,11 +242,10 @@ class RideModel(AbstractSceneModel):
         size = len(jax.eval_shape(lambda: scene.state(self.launch, self.input is not None)))
         states = scene.dynamics.righted(outcome.state[:size])
         motion = scene.dynamics.geometry(states).motion
-        _, east, north = surface.chart(surface.place_at(motion.position))
         energy = scene.energy(states)
         position = surface.in_fixed_frame(motion.position)
         return dict(zip("xyz", position, strict=True)) | {
-            "heading": scene.dynamics.heading.angle(motion.heading, east, north),
+            "heading": heading(scene, motion),
             "end_steering": motion.steering,
             "end_speed": motion.speed,
             "energy": energy,
@@ -271,3 +261,12 @@ def _(system: Scene, start: Any, event: Any = None, input: Input | None = None, 
     system.check(start)
     check_input(input, system, start, jumps)
     return RideModel.of(system, start, input, event, jumps)
+
+
+def check_run(scene: Any, launch: Any, t1: Any, input: Any, tolerance: Any, jumps: Any = None) -> None:
+    """Raise `ValueError` unless scene, launch, horizon, input and tolerance are legal and the scene can start with the
+    launch."""
+    lists = "axes of sweep take lists, and jax.vmap maps over them"
+    require_run(scene, launch, t1, tolerance, (Scene, Launch), lists)
+    scene.check(launch)
+    check_input(input, scene, launch, jumps)

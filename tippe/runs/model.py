@@ -3,53 +3,149 @@
 import dataclasses
 import functools
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.geometry import Plane
-from nonholonomic.hybrid import BETWEEN, HybridOutcome
+from nonholonomic.hybrid import BETWEEN, AbstractBatchedMode, HybridOutcome
 from nonholonomic.integration import AbstractProblem, CoreProblem, Outcome
 from nonholonomic.integration.problem import FAILED, Status
 from nonholonomic.parameters import description, full_name, numbers, numbers_of
-from nonholonomic.runs import (
-    AbstractModel,
-    AbstractSceneModel,
-    EventFunction,
-    Names,
-    Start,
-    TableForm,
-    model_of,
-    statuses,
-    with_event,
-)
+from nonholonomic.runs.event import EventFunction, with_event
+from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Start, model_of, statuses
+from nonholonomic.runs.table import TableForm
 from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.validation import Bound, all_bounds, legal, require_kind, require_scalars
 
+from ..model.body import Top
 from ..model.dynamics import LOSSES, NO_COSINE
 from ..model.friction import NoSlip
 from ..model.launch import Launch
 from ..model.scene import Scene, generic_direction
+from ..modes.airborne import airborne_modes, modes_with_stem
+from ..modes.impact import energy_in
 from ..modes.problems import BEHIND_PATH, InversionProblem, StemContact, TrajectoryProblem, trajectory_problem
-from ..modes.sticking import contact_modes, on_the_ground
-from .launches import (
-    COUNTED,
-    INVERTED,
-    NUMBERS_OF_A_LAUNCH,
-    RunKind,
-    allowance,
-    event_of,
-    flight_modes,
-    labels,
-    run_kind_of,
-    variable_numbers,
+from ..modes.sliding import hopping_modes
+from ..modes.sticking import (
+    airborne_energy,
+    airborne_stick_slip_modes,
+    contact_energy,
+    contact_modes,
+    loss,
+    on_the_ground,
+    stick_slip_modes,
 )
-from .observables import AbstractTrajectory
-from .trajectory import ArenaTrajectory, HybridTrajectory, StickSlipArenaTrajectory, Trajectory, simulate_launch
-from .view import COMPONENTS, DIRECTION, ON_CURVED, PASSIVE, PATH, quantities_of
+from .launches import INVERTED, NUMBERS_OF_A_LAUNCH, event_of, labels, variable_numbers
+from .observables import (
+    COMPONENTS,
+    DIRECTION,
+    ON_CURVED,
+    PASSIVE,
+    PATH,
+    AbstractTrajectory,
+    allowance,
+    quantities_of,
+)
+from .trajectory import ArenaTrajectory, HybridTrajectory, Trajectory, simulate_launch
+
+# The kinds of runs: one smooth motion, or several modes of contact and flight.
+
+
+class RunKind(NamedTuple):
+    """How to run a kind of scene: its counters besides steps, and its modes.
+
+    `modes` is a function of (scene, problem, tolerance, last) that returns the modes and the index of each cell's first
+    mode; `None` for smooth runs. `energy_in` is a function of (scene, state, mode) that returns the least and the
+    greatest energy [J] that the state may have. `loss` is a function of (scene, state) that returns how a run left its
+    domain, as a code in `LOSSES`; `None` for runs that can only jam, because they continue when contact is lost, and the
+    ball fits everywhere. `flight_state` is true if states in flight have another layout.
+    """
+
+    counts: tuple[str, ...]
+    modes: Callable[..., tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]] | None
+    energy_in: Callable[..., tuple[Float[Array, " cells"], Float[Array, " cells"]]]
+    loss: Callable[..., Int[Array, " cells"]] | None
+    flight_state: bool = False
+
+    @property
+    def smooth(self) -> bool:
+        """Whether a run is one smooth motion."""
+        return self.modes is None
+
+
+#: Descriptions of the counters of a run.
+COUNTED = {"hops": "flights", "sticks": "changes from slip to rolling"}
+
+
+def energy_of_state(
+    scene: Scene[Any], state: Float[Array, "components cells"], mode: Any
+) -> tuple[Float[Array, " cells"], Float[Array, " cells"]]:
+    """The least and the greatest energy [J] of a state of one smooth motion, which are the same."""
+    total = scene.energy(state)
+    return total, total
+
+
+def loss_of_contact(scene: Scene[Any], state: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+    """How a contact has ended, as a code in `LOSSES`."""
+    return scene.dynamics.loss(state)
+
+
+SMOOTH = RunKind((), None, energy_of_state, loss_of_contact)
+STICK_SLIP = RunKind(("sticks",), stick_slip_modes, contact_energy, loss_of_contact)
+HYBRID = RunKind(("hops",), hopping_modes, energy_in, None)
+AIRBORNE = RunKind(("hops",), airborne_modes, airborne_energy, loss, True)
+ON_STEM_TOO = AIRBORNE._replace(modes=modes_with_stem)
+STICK_SLIP_FLY = AIRBORNE._replace(counts=("hops", "sticks"), modes=airborne_stick_slip_modes)
+
+
+def run_kind_of(scene: Scene[Any]) -> RunKind:
+    """The run kind of a scene."""
+    hybrid = scene.contact == "hybrid"
+    if scene.friction.set_valued:
+        return STICK_SLIP_FLY if hybrid else STICK_SLIP
+    if not hybrid:
+        return SMOOTH
+    if scene.flies_in_closed_form:
+        return HYBRID
+    return AIRBORNE if scene.body.stem is None else ON_STEM_TOO
+
+
+def flight_modes(scene: Scene[Top], launch: Launch, tolerance: Any, cells: int = 1) -> Start:
+    """The modes of launches of a hybrid scene, with their path, rotation and work; the index of each first mode; and the
+    initial states."""
+    problem, modes = _start_of_flights(scene, launch, cells), run_kind_of(scene).modes
+    assert modes is not None
+    return (*modes(scene, problem, tolerance, last=False, with_quadratures=True), problem.states)
+
+
+@compiled_setup
+def _start_of_flights(scene: Scene[Top], launch: Launch, cells: int) -> InversionProblem:
+    """The launches, with the passive quadratures."""
+    state, scales = trajectory_problem((scene, launch), cells).start()
+    if scene.flies_in_closed_form:
+        # The path is that of the centre of mass.
+        place = state[8:10] - scene.body.offset * state[2:4]
+        state = jnp.concatenate([state[:8], place, state[10:]])
+    return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state, scales)
+
+
+def why_unresolved(kind: RunKind) -> str:
+    """The reasons why a run of this kind may be unresolved."""
+    grown = (
+        "its energy has grown by more than the tolerance allows, although nothing drives the top: the law of friction pushes "
+        "it, or the arena's heights do not fit its normals"
+    )
+    reasons = "the model does not determine the motion from there on, or the mode changed too often, or"
+    return grown if kind.smooth else f"{reasons} {grown}; tippe.simulate states which"
+
+
+# The top as a model.
 
 #: The words of tables, in the order of the integers in their files, which is older than `Status`.
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit", "unresolved")
@@ -241,16 +337,14 @@ class TopModel(AbstractSceneModel):
             # Rows without a path, or without rotation and work, end earlier.
             missing = core + len(scene.start(self.launch)[1]) + BEHIND_PATH - len(rows)
             rows = jnp.concatenate([rows, jnp.zeros((missing, *zeros.shape))]) if missing > 0 else rows
-        return kind(zeros, scene, **kind.parts_of(rows, mode, core))
+        return kind(zeros, scene, **kind.parts_of(scene, rows, mode, core))
 
     @property
     def trajectories(self) -> type[AbstractTrajectory]:
         """The class of trajectories of the scene."""
         if self.scene.contact != "hybrid":
             return Trajectory
-        if self.scene.flies_in_closed_form:
-            return HybridTrajectory
-        return StickSlipArenaTrajectory if self.scene.friction.set_valued else ArenaTrajectory
+        return HybridTrajectory if self.scene.flies_in_closed_form else ArenaTrajectory
 
     @property
     def words(self) -> tuple[str, ...]:

@@ -24,13 +24,14 @@ from nonholonomic.integration.problem import (
     require_adjoint,
     require_times,
 )
-from nonholonomic.runs import sampled_if_legal
+from nonholonomic.runs.simulate import sampled_if_legal
 from nonholonomic.text import shown
 from nonholonomic.validation import as_number, is_traced, nan_unless
 
 from ..model.dynamics import Motion
 from ..model.friction import length
 from ..model.launch import parts
+from ..model.scene import Scene
 from ..model.stick_slip import StickSlip
 from ..modes.airborne import (
     FLYING,
@@ -49,8 +50,7 @@ from ..modes.flight import height
 from ..modes.impact import BOTH, TOUCHING, Ball, FreeBody, approach, as_free_body, balls, energy, standing_on
 from ..modes.sliding import MOST_BOUNCES
 from ..modes.sticking import lifted
-from .launches import if_balanced, why_unbalanced
-from .observables import AbstractTrajectory, of_each_run
+from .observables import AbstractTrajectory, if_balanced, of_each_run, why_unbalanced
 
 
 class Trajectory(AbstractTrajectory):
@@ -139,7 +139,7 @@ class Trajectory(AbstractTrajectory):
         return super().__str__() + (f"\n  unresolved: {why_unbalanced(self)}" if unresolved else "")
 
     def with_rows(self, times: Float[np.ndarray, " times"], rows: Any, mode: Any) -> "Trajectory":
-        parts = {"t": times, **self.parts_of(rows, mode, len(self.start))}
+        parts = {"t": times, **self.parts_of(self.scene, rows, mode, len(self.start))}
         return dataclasses.replace(self, **dict(zip(parts, on_device(*parts.values()), strict=True)))
 
 
@@ -211,7 +211,7 @@ class HybridTrajectory(AbstractTrajectory):
         if not self.scene.has_stem:
             return np.inf
         segments = self.dense.segments
-        on_stem = [segment.begin for segment in segments if self.touching(np.asarray(segment.number)) >= 1]
+        on_stem = [segment.begin for segment in segments if self.touching(self.scene, np.asarray(segment.number)) >= 1]
         # The stem may bounce before it slides. Values at the end of a flight are those before the impact.
         ends = np.unique([segment.end for segment in segments])
         first = min([*on_stem, np.inf])
@@ -261,18 +261,13 @@ class HybridTrajectory(AbstractTrajectory):
         return jnp.stack(approach(self.scene.body, self._ball, self._free).velocity[:2], axis=-1)
 
     @classmethod
-    def parts_of(cls, rows: Any, mode: Any, core: int) -> dict[str, Any]:
+    def parts_of(cls, scene: Scene, rows: Any, mode: Any, core: int) -> dict[str, Any]:
         # The rows end with the distance and its rate.
-        parts = super().parts_of(rows[:-2], mode, core)
-        return parts | {"distance": rows[-2:], "contact": cls.touching(mode)}
+        parts = super().parts_of(scene, rows[:-2], mode, core)
+        return parts | {"distance": rows[-2:], "contact": cls.touching(scene, mode)}
 
     @staticmethod
-    def work_in(piece: Segment) -> float:
-        """The work [J] of friction in a segment of the path, without the work of impacts."""
-        return 0.0 if piece.number == BETWEEN else piece.motion.states[-1, -1] - piece.motion.states[-1, 0]
-
-    @staticmethod
-    def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:
+    def touching(scene: Scene, numbers: Int[Array | np.ndarray, " times"]) -> Any:
         """The sphere that touches, for each mode index."""
         return numbers
 
@@ -392,27 +387,12 @@ class ArenaTrajectory(HybridTrajectory):
         return "a flight does not end at the arena"
 
     @staticmethod
-    def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:
+    def touching(scene: Scene, numbers: Int[Array | np.ndarray, " times"]) -> Any:
+        if scene.friction.set_valued:
+            # Between two modes, a slip begins.
+            return -1 * (numbers == FLYING)
         # Also for traced numbers; -1 after the end of a run.
         return (numbers == ON_STEM) - 1 * ((numbers == FLYING) | (numbers == STRIKING) | (numbers < 0))
-
-
-class StickSlipArenaTrajectory(ArenaTrajectory):
-    """An `ArenaTrajectory` under exact Coulomb friction; `stats` also holds `sticks`, the number of changes from slip
-    to rolling."""
-
-    @staticmethod
-    def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:
-        # Between two modes, a slip begins.
-        return -1 * (numbers == FLYING)
-
-    @staticmethod
-    def work_in(piece: Segment) -> float:
-        if piece.number == BETWEEN:
-            rows = piece.at(np.array([piece.begin, piece.end]))
-            # The last rows are the distance and its rate.
-            return float(np.diff(rows[-3])[0])
-        return ArenaTrajectory.work_in(piece)
 
 
 # Simulate one launch of a top: a single run with its path, or a run inside a transformation.
@@ -492,9 +472,20 @@ def _along(model: Any, path: DenseSolution | HybridPath, tolerance: Any) -> Any:
         hops = np.array([(segment.begin, segment.end) for segment in segments]).reshape(-1, 2)
         run = dataclasses.replace(run, hops=hops)
         # The remaining work is that of the impacts.
-        in_contact = sum(kind.work_in(segment) for segment in path.segments)
+        in_contact = sum(work_in(scene, segment) for segment in path.segments)
         counted = {"impact_loss": float(in_contact - path.state[-1]), **counted}
     return if_balanced(run.with_stats(path, **counted), tolerance)
+
+
+def work_in(scene: Scene, piece: Segment) -> float:
+    """The work [J] of friction in a segment of the path, without the work of impacts."""
+    if piece.number != BETWEEN:
+        return piece.motion.states[-1, -1] - piece.motion.states[-1, 0]
+    if not scene.friction.set_valued:
+        return 0.0
+    rows = piece.at(np.array([piece.begin, piece.end]))
+    # The last rows are the distance and its rate.
+    return float(np.diff(rows[-3])[0])
 
 
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
@@ -518,7 +509,7 @@ def _traced(
     stats = {"accepted": outcome.steps[0] - rejected, "rejected": rejected}
     stats |= {name: count[0] for name, count in zip(model.counters, outcome.counts, strict=True)}
     kind, rows = model.trajectories, run.rows
-    parts = kind.parts_of(rows, run.mode, len(start))
+    parts = kind.parts_of(scene, rows, run.mode, len(start))
     if run.passive is not None:
         parts = {"states": rows, "cyclic": run.passive[:-2], "spin_angle": run.passive[-2], "work": run.passive[-1]}
     trajectory = kind(

@@ -24,26 +24,14 @@ from nonholonomic.integration.problem import (
     require_times,
     run_bounds,
 )
-from nonholonomic.runs import (
-    EventTime,
-    LyapunovExponent,
-    Options,
-    TableForm,
-    TableJob,
-    check_cells,
-    compute_table,
-    explore_model,
-    exponent_of_model,
-    full_sensitivities,
-    samples_of,
-    time_of_event,
-)
-from nonholonomic.runs.trajectory import TOLERANCE
+from nonholonomic.runs.event import EventTime, time_of_event
+from nonholonomic.runs.lyapunov import LyapunovExponent, exponent_of_model
+from nonholonomic.runs.sweep import Options, check_cells, compute_table, full_sensitivities, samples_of
+from nonholonomic.runs.table import TableForm, TableJob
 from nonholonomic.sweeps import Table
 from nonholonomic.terminal import status_line
 from nonholonomic.text import shown
 from nonholonomic.validation import as_number, is_traced, require, require_all, require_kind, require_outside, warn
-from nonholonomic.views import Page
 
 from ..model.launch import Launch, inclination, parts
 from ..model.scene import Scene
@@ -58,11 +46,10 @@ from .launches import (
     launches,
     require_rigid,
     warn_if_it_cannot_invert,
-    why_unresolved,
 )
-from .model import INVERSIONS, REVERSALS, TopModel
+from .model import INVERSIONS, REVERSALS, TopModel, why_unresolved
+from .observables import QUANTITIES, quantities_of
 from .trajectory import HybridTrajectory, Trajectory
-from .view import QUANTITIES, quantities_of
 
 # Tables of many launches: inversion times, reversal times, and trajectories.
 
@@ -442,54 +429,6 @@ def simulate(
     """
     check_run(scene, launch, t1, tolerance, "jax.vmap(simulate) takes lists, and so does trajectory_table")
     return TopModel(scene=scene, launch=launch).simulate(t1, times, tolerance, solver, adjoint)
-
-
-@status_line("writing a page")
-def explore(
-    scene: Scene,
-    launch: Launch,
-    path: Any = None,
-    sliders: dict[str, tuple[float, float]] | None = None,
-    t1: float = 8.0,
-    unit: str | Sequence[str] | None = None,
-) -> Page:
-    """Make a page with sliders that simulates the top in the browser while you move a slider. The page is one file that
-    needs no network; a notebook shows the returned `Page`. The equations of motion, the Runge-Kutta pair, the step-size
-    control and the location of the event are generated from those of `inversion_table`, or, under `NoSlip`, of
-    `reversal_table`, so times and statuses are the same, at a tolerance of 1e-7. The page also computes a map of these
-    times over two of the sliders; click on the map to set both. The address of the page contains the slider values, so
-    that you can copy a link to a run. Press space to play or pause, and r to reset the sliders.
-
-    **Arguments:**
-
-    - `scene`, `launch`: the run at the start; all numbers must be scalars.
-    - `path`: file to write the page to, or `None`.
-    - `sliders`: name of a parameter -> (lowest, highest) value. The end of a name is enough if only one parameter
-      matches, such as "theta", "spin", "mu", "friction.mu" or "offset". By default theta, spin, the coefficient of
-      friction and, for a top without a stem, the offset; under `NoSlip` theta and spin in both senses.
-    - `t1`: horizon [s].
-    - `unit`: unit of the curves, such as "deg" for all angles.
-
-    **Returns:** a `Page`, with its `html`.
-
-    **Raises:** `ValueError` for arguments out of range, an unknown slider, or equations with an operation of JAX that cannot
-    be written in JavaScript; `ModuleNotFoundError` if the library for views is not installed; `OSError` if the file cannot be
-    written.
-
-    **Example:** a page with two sliders.
-
-    ```
-    >>> import tippe
-    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
-    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
-    >>> page = tippe.explore(scene, tippe.Launch(0.1, 155.0), sliders={"theta": (0.05, 0.5), "spin": (60.0, 200.0)})
-    >>> len(page.html) < 2.5e6
-    True
-
-    ```
-    """
-    check_run(scene, launch, t1, TOLERANCE)
-    return explore_model(TopModel(scene=scene, launch=launch), path, sliders, float(t1), unit)
 
 
 @status_line("simulating")
