@@ -6,15 +6,16 @@ import functools
 from collections.abc import Iterable
 from typing import Any, ClassVar, Self
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..hybrid import AbstractBatchedMode, HybridOutcome
-from ..integration import AbstractProblem, Outcome
-from ..integration.problem import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED, Status, run_bounds
+from ..integration import AbstractProblem, Outcome, Settings, explicit_tableau
+from ..integration.problem import CROSSED, DEFAULT_MAX_STEPS, FAILED, LEFT_DOMAIN, UNRESOLVED, Status, run_bounds
 from ..parameters import full_name, numbers, with_numbers
 from ..sweeps import Axis, Quantity, Variable
 from ..text import shown
@@ -299,6 +300,15 @@ def check_horizon(t1: Any, tolerance: Any) -> None:
     for name, number in {"t1": t1, "tolerance": tolerance}.items():
         if np.ndim(number) != 0:
             raise ValueError(f"{name} must be one number, not of shape {np.shape(number)}; jax.vmap or sweep runs many")
+
+
+def settings_for_lanes(
+    tolerance: Float[ArrayLike, ""], solver: diffrax.AbstractSolver | None, max_steps: int = DEFAULT_MAX_STEPS
+) -> Settings:
+    """The settings of runs in lanes; raises `ValueError` unless the solver is an explicit Runge-Kutta method."""
+    settings = Settings(tolerance, solver, max_steps=max_steps)
+    explicit_tableau(settings.for_lanes)
+    return settings
 
 
 def require_event(model: AbstractModel, purpose: str = "") -> None:

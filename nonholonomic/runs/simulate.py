@@ -14,11 +14,11 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from ..compilation.xla_cpu import compiled_alone
 from ..derivatives import sampled_run, sampled_run_by_diffrax
 from ..hybrid import HybridOutcome, HybridSamples, hybrid_samples, solve_hybrid_with_samples
-from ..integration import AbstractProblem, Outcome, Settings, explicit_tableau, solve_with_samples
+from ..integration import AbstractProblem, Outcome, Settings, solve_with_samples
 from ..integration.problem import Status, legal_run, require_times
 from ..sweeps import Axis, Variable, axis
 from ..terminal import status_line
-from ..validation import as_known, as_number, is_traced, nan_unless, require_scalars, warn
+from ..validation import as_known, as_number, is_traced, nan_unless, warn
 from .event import modes_of, problem_of
 from .model import AbstractModel, Names, Start, check_run, model_of
 from .trajectory import Trajectory
@@ -209,20 +209,18 @@ def simulate(
 
     ```
     """
-    require_scalars({"t1": t1, "tolerance": tolerance}, "jax.vmap or sweep runs many")
     model = model_of(system, start, None, input, jumps)
+    check_run(model, t1, tolerance)
     return model.simulate(t1, times, tolerance, solver, adjoint)
 
 
 def simulate_model(
     model: AbstractModel, t1: Any, times: Any, tolerance: Any, solver: diffrax.AbstractSolver | None = None
 ) -> Trajectory:
-    """The run of a model at given times, or at equally spaced ones. **Arguments:** as for `simulate`."""
-    check_run(model, t1, tolerance)
+    """The run of a model at given times, or at equally spaced ones. **Arguments:** as for `simulate`, checked but `times`."""
     times = evenly_spaced(as_known(t1)) if times is None else times
     require_times(times, t1)
-    settings = Settings(tolerance, solver)
-    explicit_tableau(settings.for_lanes)
+    settings = settings_for_lanes(tolerance, solver)
     unchecked = is_traced((model, times, t1, tolerance))
     run, extremes = _sampled(model, as_number(times), as_number(t1), settings, unchecked)
     if not is_traced(extremes):

@@ -17,7 +17,7 @@ from jaxtyping import Array
 
 from .. import sweeps
 from ..compilation.xla_cpu import opened, programs_in
-from ..integration import Settings, explicit_tableau
+from ..integration import Settings
 from ..integration.problem import DEFAULT_MAX_STEPS, Status, require_times
 from ..sweeps import Axis, Quantity, Table, Variable, axis, cells_to_check, chunk_for, scattered_cells, size_of
 from ..sweeps.grid import EQUATIONS, columns
@@ -25,7 +25,7 @@ from ..sweeps.table import cells_with
 from ..text import likely, shown
 from ..validation import as_number, require_flag, require_outside, require_whole, warn
 from .event import Ensemble
-from .model import AbstractModel, AbstractSceneModel, check_horizon, model_of, require_event
+from .model import AbstractModel, AbstractSceneModel, check_horizon, model_of, require_event, settings_for_lanes
 from .simulate import Samples
 from .table import ScatteredJob, TableForm, TableJob
 
@@ -104,9 +104,7 @@ class Options(NamedTuple):
     def settings(self) -> Settings:
         """The settings of the integration, checked."""
         require_whole(self.max_steps, "max_steps", 1)
-        settings = Settings(self.tolerance, self.solver, max_steps=int(self.max_steps))
-        explicit_tableau(settings.for_lanes)
-        return settings
+        return settings_for_lanes(self.tolerance, self.solver, int(self.max_steps))
 
 
 def sweep(

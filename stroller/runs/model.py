@@ -14,13 +14,13 @@ from nonholonomic.geometry import Plane
 from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.hybrid.saltation import UNMEASURED, Clock
 from nonholonomic.integration import AbstractProblem, ExtendedProblem, Outcome
-from nonholonomic.integration.problem import Status, require_run, run_bounds
+from nonholonomic.integration.problem import Status, require_run
 from nonholonomic.parameters import description, numbers, numbers_of
 from nonholonomic.runs.event import EventFunction, with_event
 from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, model_of, statuses
 from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.text import name_of
-from nonholonomic.validation import require_all, require_kind, require_scalars
+from nonholonomic.validation import require_kind, require_scalars
 
 from ..model.input import Formula, Input, PerRide, Steady, as_jumps, at_start, check_input
 from ..model.scene import RideProblem, Scene, as_module, has_arrays
@@ -204,7 +204,6 @@ class RideModel(AbstractSceneModel):
         return ExtendedProblem(ride, Clock(), clock, clock + UNMEASURED)
 
     def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Trajectory:
-        require_all(run_bounds(t1, tolerance))
         return ride(self, t1, times, tolerance, solver, DEFAULT_STEPS, adjoint)
 
     def without_event(self) -> "RideModel":

@@ -30,7 +30,7 @@ from ..model.launch import Launch
 from ..model.scene import Scene, generic_direction
 from ..modes.airborne import airborne_modes, modes_with_stem
 from ..modes.impact import energy_in
-from ..modes.problems import BEHIND_PATH, InversionProblem, StemContact, TrajectoryProblem, trajectory_problem
+from ..modes.problems import BEHIND_PATH, InversionProblem, StemContact, trajectory_problem
 from ..modes.sliding import hopping_modes
 from ..modes.sticking import (
     airborne_energy,
@@ -83,20 +83,13 @@ class RunKind(NamedTuple):
 COUNTED = {"hops": "flights", "sticks": "changes from slip to rolling"}
 
 
-def energy_of_state(
-    scene: Scene[Any], state: Float[Array, "components cells"], mode: Any
-) -> tuple[Float[Array, " cells"], Float[Array, " cells"]]:
-    """The least and the greatest energy [J] of a state of one smooth motion, which are the same."""
-    total = scene.energy(state)
-    return total, total
-
-
 def loss_of_contact(scene: Scene[Any], state: Float[Array, "components cells"]) -> Int[Array, " cells"]:
     """How a contact has ended, as a code in `LOSSES`."""
     return scene.dynamics.loss(state)
 
 
-SMOOTH = RunKind((), None, energy_of_state, loss_of_contact)
+# The state of one smooth motion has one energy.
+SMOOTH = RunKind((), None, lambda scene, state, mode: (scene.energy(state),) * 2, loss_of_contact)
 STICK_SLIP = RunKind(("sticks",), stick_slip_modes, contact_energy, loss_of_contact)
 HYBRID = RunKind(("hops",), hopping_modes, energy_in, None)
 AIRBORNE = RunKind(("hops",), airborne_modes, airborne_energy, loss, True)
@@ -299,10 +292,18 @@ class TopModel(AbstractSceneModel):
             problem = self._problem_without_path(cells, names)
             # A turning frame turns by a different angle for each launch, and the difference would count as divergence.
             return dataclasses.replace(problem, dynamics=self.scene.dynamics) if names else problem
-        run = trajectory_problem((self.scene, self.launch), cells)
-        if names is None or any(self.quantities[name].needs >= PASSIVE for name in names):
+        scene, run = self.scene, trajectory_problem((self.scene, self.launch), cells)
+        needs = {PASSIVE} if names is None else set().union(*(self.quantities[name].needs for name in names))
+        if PASSIVE in needs:
             return run
-        return with_parts(run, self.scene, names)
+        # Only some quantities need the path, and few need rotation or work. On the plane, a run without path, rotation and
+        # work takes half the time. If no quantity has a direction, the frame turns on the level plane, and samples are
+        # thirty to a hundred times as accurate.
+        if scene.level and DIRECTION not in needs:
+            turning = eqx.tree_at(lambda run: run.problem.dynamics, run, scene.turning_dynamics)
+            return CoreProblem(turning, run.leading)
+        has_path = PATH in needs or (ON_CURVED in needs and not isinstance(scene.surface, Plane))
+        return CoreProblem(run, len(run.start()[0]) - BEHIND_PATH if has_path else run.leading)
 
     def modes(self, cells: int, tolerance: Any, names: Names, continues: bool) -> Start:
         scene, launch = self.scene, self.launch
@@ -383,21 +384,6 @@ def _integrated(scene: Scene) -> Scene:
     if scene.contact == "hybrid" and scene.flies_in_closed_form:
         return eqx.tree_at(lambda scene: scene.surface, scene, Plane(NO_TILT))
     return scene
-
-
-def with_parts(run: TrajectoryProblem, scene: Scene, names: tuple[str, ...]) -> CoreProblem:
-    """A run with the parts that the named quantities need.
-
-    Only some quantities need the path, and few need rotation or work. On the plane, a run without path, rotation and
-    work takes half the time. If no quantity has a direction, the frame turns on the level plane, and samples are thirty
-    to a hundred times as accurate.
-    """
-    needs = frozenset().union(*(quantities_of(scene)[name].needs for name in names))
-    if scene.level and DIRECTION.isdisjoint(needs):
-        turning = eqx.tree_at(lambda run: run.problem.dynamics, run, scene.turning_dynamics)
-        return CoreProblem(turning, run.leading)
-    path = PATH if isinstance(scene.surface, Plane) else PATH | ON_CURVED
-    return CoreProblem(run, run.leading if path.isdisjoint(needs) else len(run.start()[0]) - BEHIND_PATH)
 
 
 @model_of.register(Scene)

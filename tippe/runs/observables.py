@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeVar
 
 import equinox as eqx
 import jax
@@ -36,34 +36,32 @@ from .launches import INVERTED
 
 #: What a quantity may need in addition to the state: a frame that does not turn about n; the path on a curved arena, or on
 #: any arena; the rotation about the axis and the work; the start of the run.
-DIRECTION, ON_CURVED, PATH, PASSIVE, START = (
-    frozenset({name}) for name in ("direction", "curved", "path", "passive", "start")
-)
+DIRECTION, ON_CURVED, PATH, PASSIVE, START = "direction", "curved", "path", "passive", "start"
 
 QUANTITIES = {
     "theta": Quantity("rad", "inclination θ"),
-    "eta": Quantity("rad", "place η", needs=ON_CURVED),
-    "azimuth": Quantity("rad", "azimuth φ", needs=DIRECTION),
+    "eta": Quantity("rad", "place η", needs=frozenset({ON_CURVED})),
+    "azimuth": Quantity("rad", "azimuth φ", needs=frozenset({DIRECTION})),
     "spin": Quantity("rad s-1", "spin ω₃"),
     "theta_rate": Quantity("rad s-1", "θ'"),
     "energy": Quantity("J", "energy"),
     "jellett": Quantity("kg m3 s-1", "Jellett's quantity"),
     "normal_force": Quantity("N", "normal force"),
-    "axis": Quantity("1", "axis e", "component", needs=DIRECTION | ON_CURVED),
-    "position": Quantity("m", "position of the centre", "component", needs=DIRECTION | PATH),
-    "velocity": Quantity("m s-1", "velocity of the centre", "component", needs=DIRECTION | ON_CURVED),
-    "angular_momentum": Quantity("kg m2 s-1", "angular momentum", "component", needs=DIRECTION | ON_CURVED),
-    "slip": Quantity("m s-1", "slip velocity", "tangent", needs=DIRECTION),
-    "jellett_drift": Quantity("1", "relative drift of Jellett's quantity", needs=START),
-    "spin_angle": Quantity("rad", "spin angle", needs=PASSIVE),
-    "work": Quantity("J", "work of friction", needs=PASSIVE),
+    "axis": Quantity("1", "axis e", "component", needs=frozenset({DIRECTION, ON_CURVED})),
+    "position": Quantity("m", "position of the centre", "component", needs=frozenset({DIRECTION, PATH})),
+    "velocity": Quantity("m s-1", "velocity of the centre", "component", needs=frozenset({DIRECTION, ON_CURVED})),
+    "angular_momentum": Quantity("kg m2 s-1", "angular momentum", "component", needs=frozenset({DIRECTION, ON_CURVED})),
+    "slip": Quantity("m s-1", "slip velocity", "tangent", needs=frozenset({DIRECTION})),
+    "jellett_drift": Quantity("1", "relative drift of Jellett's quantity", needs=frozenset({START})),
+    "spin_angle": Quantity("rad", "spin angle", needs=frozenset({PASSIVE})),
+    "work": Quantity("J", "work of friction", needs=frozenset({PASSIVE})),
 }
 
 #: Quantities of a body of any shape and inertia.
 OF_RIGID_BODIES = {
     "normal_spin": Quantity("rad s-1", "spin about the normal"),
     "grip": Quantity("1", "friction over normal force"),
-    "reaction": Quantity("N", "force of the arena", "component", needs=DIRECTION | ON_CURVED),
+    "reaction": Quantity("N", "force of the arena", "component", needs=frozenset({DIRECTION, ON_CURVED})),
 }
 
 #: Names of components: in the fixed frame, and in the moving frame.
@@ -313,18 +311,6 @@ class AbstractTrajectory(AbstractRun):
     def labels_of(self, runs: list[Any], unit: Any) -> list[str]:
         return names_of(runs, unit) if len(runs) > 1 else [""]
 
-    def with_stats(self, path: DenseSolution | HybridPath, **more: Any) -> Self:
-        """The same run with its statistics: steps, the greatest drift of |e|, the greatest |E - E(0) - work| [J], and
-        more."""
-        energy, work = np.asarray(self.energy), np.asarray(self.work)
-        stats = {
-            "accepted": path.accepted,
-            "rejected": path.rejected,
-            "axis_drift": float(np.max(np.abs(np.linalg.norm(np.asarray(self.states)[2:5], axis=0) - 1.0))),
-            "energy_residual": float(np.max(np.abs(energy - energy[0] - work))),
-        }
-        return eqx.tree_at(lambda run: run.stats, self, stats | more)
-
     @of_each_run
     def normal(self) -> Float[Array, "times 3"]:
         """The arena's unit normal n where the top is, from the arena to the sphere's centre."""
@@ -402,20 +388,31 @@ class AbstractTrajectory(AbstractRun):
 BALANCED = 1e4
 
 
+#: The kind of a run.
+Run = TypeVar("Run", bound=AbstractTrajectory)
+
+
 def allowance(scene: Scene[Any], energy: Any, tolerance: Any) -> Any:
     """The allowed error [J] of an energy of the given size [J] at a tolerance."""
     return BALANCED * tolerance * (abs(energy) + scene.body.mass * scene.gravity * scene.body.size)
 
 
-def if_balanced(run: Any, tolerance: float | Float[Array, ""]) -> Any:
-    """A single run, with the status "unresolved" if its energy has grown or does not balance the work of friction and
-    impacts."""
-    energy = np.asarray(run.energy)
+def audited(run: Run, path: DenseSolution | HybridPath, tolerance: ArrayLike, **more: float) -> Run:
+    """A single run with its statistics: steps, the greatest drift of |e|, the greatest |E - E(0) - work| [J], and more. Its
+    status is "unresolved" if its energy has grown or does not balance the work of friction and impacts."""
+    energy, work = np.asarray(run.energy), np.asarray(run.work)
+    residual = float(np.max(np.abs(energy - energy[0] - work)))
+    axis_drift = float(np.max(np.abs(np.linalg.norm(np.asarray(run.states)[2:5], axis=0) - 1.0)))
+    stats = {
+        "accepted": path.accepted,
+        "rejected": path.rejected,
+        "axis_drift": axis_drift,
+        "energy_residual": residual,
+    }
     limit = float(allowance(run.scene, np.max(np.abs(energy)), tolerance))
-    balanced = run.stats["energy_residual"] <= limit and energy[-1] <= energy[0] + limit
-    if balanced or run.status == Status.FAILED.word:
-        return run
-    return dataclasses.replace(run, status=Status.UNRESOLVED.word)
+    balanced = residual <= limit and energy[-1] <= energy[0] + limit
+    status = run.status if balanced or run.status == Status.FAILED.word else Status.UNRESOLVED.word
+    return dataclasses.replace(run, stats=stats | more, status=status)
 
 
 def why_unbalanced(run: Any) -> str:

@@ -50,7 +50,7 @@ from ..modes.flight import height
 from ..modes.impact import BOTH, TOUCHING, Ball, FreeBody, approach, as_free_body, balls, energy, standing_on
 from ..modes.sliding import MOST_BOUNCES
 from ..modes.sticking import lifted
-from .observables import AbstractTrajectory, if_balanced, of_each_run, why_unbalanced
+from .observables import AbstractTrajectory, audited, of_each_run, why_unbalanced
 
 
 class Trajectory(AbstractTrajectory):
@@ -474,7 +474,7 @@ def _along(model: Any, path: DenseSolution | HybridPath, tolerance: Any) -> Any:
         # The remaining work is that of the impacts.
         in_contact = sum(work_in(scene, segment) for segment in path.segments)
         counted = {"impact_loss": float(in_contact - path.state[-1]), **counted}
-    return if_balanced(run.with_stats(path, **counted), tolerance)
+    return audited(run, path, tolerance, **counted)
 
 
 def work_in(scene: Scene, piece: Segment) -> float:

@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from nonholonomic.compilation.xla_cpu import greatest, least
 from nonholonomic.derivatives import VariationalProblem, differentiable_solve, in_groups, tangents_by
-from nonholonomic.integration import Lanes, Settings, crossing_time, explicit_tableau, traced_solve_ensemble
+from nonholonomic.integration import Lanes, Settings, crossing_time, traced_solve_ensemble
 from nonholonomic.integration.problem import (
     CROSSED,
     DEFAULT_MAX_STEPS,
@@ -26,6 +26,7 @@ from nonholonomic.integration.problem import (
 )
 from nonholonomic.runs.event import EventTime, time_of_event
 from nonholonomic.runs.lyapunov import LyapunovExponent, exponent_of_model
+from nonholonomic.runs.model import settings_for_lanes
 from nonholonomic.runs.sweep import Options, check_cells, compute_table, full_sensitivities, samples_of
 from nonholonomic.runs.table import TableForm, TableJob
 from nonholonomic.sweeps import Table
@@ -485,7 +486,7 @@ def inversion_time(
     check_event(angle, crossing)
     warn_if_it_cannot_invert(scene, launch, launch.theta, angle)
     model = TopModel.timed(scene, launch, event_of(scene, angle))
-    return first_or_last_time(model, t1, crossing, Settings(tolerance, solver))
+    return first_or_last_time(model, t1, crossing, settings_for_lanes(tolerance, solver))
 
 
 @status_line("simulating")
@@ -532,7 +533,7 @@ def reversal_time(
     check_run(scene, launch, t1, tolerance, "reversal_table takes lists, and jax.vmap maps over them")
     require_rigid(scene)
     check_reversible(launch, {})
-    return first_or_last_time(TopModel.timed(scene, launch, None), t1, "first", Settings(tolerance, solver))
+    return first_or_last_time(TopModel.timed(scene, launch, None), t1, "first", settings_for_lanes(tolerance, solver))
 
 
 def first_or_last_time(model: TopModel, t1: Any, crossing: str, settings: Settings) -> Float[Array, ""]:
@@ -540,7 +541,6 @@ def first_or_last_time(model: TopModel, t1: Any, crossing: str, settings: Settin
 
     **Raises:** `ValueError` for a run that needed too many steps. A warning states any other failure.
     """
-    explicit_tableau(settings.for_lanes)
     time = time_of_event(model, t1, settings, crossing == "last")
     if is_traced((model, t1, time, settings)) or not np.isnan(time):
         return time
@@ -596,8 +596,7 @@ def lyapunov_exponent(
     require_kind(launch, "launch", Launch)
     require_outside((scene, launch, t1, tolerance), "lyapunov_exponent", "lists in the launch in place of vmap")
     require_all(run_bounds(t1, tolerance))
-    settings = Settings(tolerance, solver)
-    explicit_tableau(settings.for_lanes)
+    settings = settings_for_lanes(tolerance, solver)
     shapes = {np.shape(leaf) for leaf in jax.tree.leaves((scene, launch))} - {()}
     if len(shapes) > 1 or any(len(shape) > 1 for shape in shapes):
         raise ValueError(f"scene and launch must hold scalars or one number per launch, not arrays of shapes {shapes}")

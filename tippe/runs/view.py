@@ -317,7 +317,6 @@ def _(model: TopModel, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
 def page_of_launch(model: TopModel, sliders: dict[str, tuple[float, float]] | None, t1: float) -> LiveRun:
     """The contents of the page. **Arguments:** `model`: without an event; the others as for `explore`."""
     scene, launch = model.scene, model.launch
-    check_run(scene, launch, t1, TOLERANCE)
     # A body that rolls keeps its energy: it does not invert, and the page shows times of reversal.
     reverses = isinstance(scene.friction, NoSlip)
     if reverses:
