@@ -50,7 +50,7 @@ from ..parameters import Parameters
 from ..terminal import status_line
 from ..text import described, gathered, likely, name_of, shown
 from ..validation import UNTRACEABLE, as_number, is_traced, nan_unless, warn
-from .model import AbstractModel, Names, Start, check_run, model_of, require_event, settings_for_lanes
+from .model import AbstractModel, Names, Number, Start, check_run, model_of, require_event, settings_for_lanes
 
 
 class Motion:
@@ -246,7 +246,7 @@ def value_in_lanes(model: AbstractModel, mode: AbstractBatchedMode | None, index
         for component in np.ndindex(shape)
     ]
 
-    def of_run(leaves: Any, parts: tuple[Array, ...]) -> Float[Array, ""]:
+    def of_run(leaves: Sequence[Array], parts: tuple[Array, ...]) -> Float[Array, ""]:
         time, *components = parts
         of_one_run = dict(zip(values, gathered(components, shapes), strict=True))
         return jax.tree.unflatten(structure, leaves)(time, of_one_run)
@@ -308,7 +308,7 @@ def problem_of(model: AbstractModel, cells: int | None, names: Names) -> Abstrac
     return EventProblem.of(problem, model, clock)
 
 
-def modes_of(model: AbstractModel, cells: int, tolerance: Any, names: Names, continues: bool = False) -> Start:
+def modes_of(model: AbstractModel, cells: int, tolerance: Number, names: Names, continues: bool = False) -> Start:
     """The modes of a model with its event, and the start in them."""
     if model.event is None:
         return model.modes(cells, tolerance, names, continues)
@@ -346,13 +346,13 @@ class Ensemble(eqx.Module):
     continues: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, model: AbstractModel, cells: int, tolerance: Any, continues: bool) -> "Ensemble":
+    def of(cls, model: AbstractModel, cells: int, tolerance: Number, continues: bool) -> "Ensemble":
         """The runs of some cells of a model, whose numbers are scalars or arrays with one number per cell."""
         if model.smooth:
             return cls(problem_of(model, cells, ()), None, None, None, 0, continues)
         return cls(None, *modes_of(model, cells, tolerance, (), continues), len(model.counters), continues)
 
-    def solve(self, t1: Any, cells: Any, settings: Settings, traced: bool = False) -> Outcome | HybridOutcome:
+    def solve(self, t1: Number, cells: Number, settings: Settings, traced: bool = False) -> Outcome | HybridOutcome:
         """The outcome of the runs.
 
         **Arguments:** `t1`: horizon [s]; `cells`: number of cells to run, the rest is padding; `traced`: whether numbers
@@ -370,8 +370,8 @@ class Ensemble(eqx.Module):
     def solve_with_tangents(
         self,
         tangents: Sequence[Any],
-        t1: Any,
-        cells: Any,
+        t1: Number,
+        cells: Number,
         settings: Settings,
         traced: bool = False,
         one_kernel: bool = True,
@@ -425,7 +425,7 @@ class Ensemble(eqx.Module):
         return (outcome.status == REACHED_END) & (value <= 0.0) & jnp.isfinite(outcome.crossing_time)
 
 
-def status_of(model: AbstractModel, ensemble: Ensemble, outcome: Outcome | HybridOutcome, tolerance: Any) -> Any:
+def status_of(model: AbstractModel, ensemble: Ensemble, outcome: Outcome | HybridOutcome, tolerance: Number) -> Any:
     """How each run has ended, as an integer of `Status`: `EVENT` for the runs whose event counts."""
     status, has_event = model.ended(outcome, tolerance), ensemble.has_event(outcome)
     is_sound = (status == int(Status.EVENT)) | (status == int(Status.COMPLETED))
@@ -437,16 +437,16 @@ def status_of(model: AbstractModel, ensemble: Ensemble, outcome: Outcome | Hybri
 
 @status_line("simulating")
 def event_time(
-    system: Any,
-    start: Any,
+    system: object,
+    start: object,
     t1: Float[ArrayLike, ""],
     event: Callable[..., Any] | None = None,
     tolerance: float = 1e-9,
     solver: diffrax.AbstractERK | None = None,
     *,
     crossing: str = "first",
-    input: Any = None,
-    jumps: Any = None,
+    input: object = None,
+    jumps: object = None,
 ) -> Float[Array, ""]:
     """Time of the event of a run; works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and their compositions.
 
@@ -530,7 +530,7 @@ def event_time(
 
 
 def time_of_event(
-    model: AbstractModel, t1: Any, settings: Settings, last: bool, unchecked: bool | None = None
+    model: AbstractModel, t1: Number, settings: Settings, last: bool, unchecked: bool | None = None
 ) -> Float[Array, ""]:
     """The time of the event of a model.
 
@@ -561,7 +561,7 @@ class EventTime(AbstractDifferentiableSolve):
 
     @classmethod
     def of(
-        cls, model: AbstractModel, t1: ArrayLike, settings: Settings, last: bool, unchecked: bool | None = None
+        cls, model: AbstractModel, t1: Number, settings: Settings, last: bool, unchecked: bool | None = None
     ) -> tuple[Any, ...]:
         """The solve and its leaves. **Arguments:** as for `time_of_event`."""
         unchecked = is_traced((model, t1, settings.tolerance)) if unchecked is None else unchecked
@@ -588,7 +588,7 @@ class EventTime(AbstractDifferentiableSolve):
         model = self.model(leaves)
         model.require_differentiable(nested, self.last)
 
-        def build(floats: tuple[Array, ...], cells: Any) -> Ensemble:
+        def build(floats: tuple[Array, ...], cells: Number) -> Ensemble:
             return Ensemble.of(self.model((*floats, *leaves[self.movable :])), cells, settings.tolerance, self.last)
 
         # Cells are independent, so varying a parameter in all of them at once gives each its own derivative.
@@ -597,12 +597,12 @@ class EventTime(AbstractDifferentiableSolve):
         outcome, slopes, _ = ensemble.solve_with_tangents(tangents, t1, cells, settings, **options)
         return self._times(leaves, is_legal, settings, ensemble, outcome, gather([*slopes]))
 
-    def model(self, leaves: Any) -> AbstractModel:
+    def model(self, leaves: Sequence[Array]) -> AbstractModel:
         """The model of the leaves."""
         parts = zip(self.structures, (leaves[: self.movable], leaves[self.movable : -2]), strict=True)
         return eqx.combine(*(jax.tree.unflatten(structure, part) for structure, part in parts), self.rest)
 
-    def permitted(self, leaves: Any) -> tuple[Bool[Array, "..."], Float[Array, "..."], Settings]:
+    def permitted(self, leaves: Sequence[Array]) -> tuple[Bool[Array, "..."], Float[Array, "..."], Settings]:
         """A mask of the cells with legal numbers; the horizons, 0 for all other cells; and the settings.
 
         A batch has one tolerance: the smallest.
@@ -615,7 +615,7 @@ class EventTime(AbstractDifferentiableSolve):
 
     def _times(
         self,
-        leaves: Any,
+        leaves: Sequence[Array],
         is_legal: Bool[Array, "..."],
         settings: Settings,
         ensemble: Ensemble,

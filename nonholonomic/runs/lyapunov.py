@@ -85,13 +85,13 @@ class LyapunovExponent(NamedTuple):
 
 @status_line("simulating")
 def lyapunov_exponent(
-    system: Any,
-    start: Any,
+    system: object,
+    start: object,
     t1: float,
     tolerance: float = 1e-9,
     solver: diffrax.AbstractERK | None = None,
-    input: Any = None,
-    jumps: Any = None,
+    input: object = None,
+    jumps: object = None,
 ) -> LyapunovExponent:
     """The largest Lyapunov exponent of a run, by the variational equation, through resets by the saltation matrix.
 

@@ -3,15 +3,15 @@
 import abc
 import dataclasses
 import functools
-from collections.abc import Iterable
-from typing import Any, ClassVar, Self
+from collections.abc import Iterable, Sequence
+from typing import Any, ClassVar, Self, TypeAlias
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from ..hybrid import AbstractBatchedMode, HybridOutcome
 from ..integration import AbstractProblem, Outcome, Settings, explicit_tableau
@@ -20,6 +20,15 @@ from ..parameters import full_name, numbers, with_numbers
 from ..sweeps import Axis, Quantity, Variable
 from ..text import shown
 from ..validation import require_all
+
+#: A single number, or one for each cell.
+Number: TypeAlias = Array | np.ndarray | float
+
+#: Unit of the drawn numbers, such as "deg", or several.
+Unit: TypeAlias = str | Sequence[str] | None
+
+#: The ranges of sliders: name of a parameter -> (lowest, highest) value.
+Sliders: TypeAlias = dict[str, tuple[float, float]]
 
 #: The names of the quantities that will be read, which choose the layout of the state; `None` for all quantities, with
 #: the path of the run.
@@ -64,7 +73,7 @@ class AbstractModel(eqx.Module):
         """The full names of the parameters; those of the start begin with "start" or "launch"."""
 
     @abc.abstractmethod
-    def value(self, name: str) -> Any:
+    def value(self, name: str) -> Array:
         """The value of a parameter by its full name."""
 
     @abc.abstractmethod
@@ -76,7 +85,7 @@ class AbstractModel(eqx.Module):
         """For each full name the name of an axis, its unit, and a description."""
 
     @abc.abstractmethod
-    def description(self) -> dict[str, Any]:
+    def description(self) -> dict[str, object]:
         """The model as plain data, for the request of a table."""
 
     @property
@@ -155,13 +164,13 @@ class AbstractModel(eqx.Module):
     def problem(self, cells: int | None, names: Names) -> AbstractProblem:
         """The motion of a smooth model, with the event of the model itself unless it has another."""
 
-    def modes(self, cells: int, tolerance: Any, names: Names, continues: bool) -> Start:
+    def modes(self, cells: int, tolerance: Number, names: Names, continues: bool) -> Start:
         """The modes of a model that is not smooth, and the start in them; `continues`: whether a run continues through
         its event."""
         raise NotImplementedError(f"{type(self).__name__} is smooth and has no modes")
 
     @abc.abstractmethod
-    def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Any:
+    def simulate(self, t1: Number, times: Any, tolerance: Number, solver: Any, adjoint: Any) -> Any:
         """The run as a trajectory. **Arguments:** as for `nonholonomic.simulate`."""
 
     @abc.abstractmethod
@@ -192,7 +201,7 @@ class AbstractModel(eqx.Module):
 
     @abc.abstractmethod
     def read(
-        self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: Any
+        self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: Int[ArrayLike, "..."] | None
     ) -> dict[str, Array]:
         """The named quantities of states, (*cells, ...).
 
@@ -206,7 +215,7 @@ class AbstractModel(eqx.Module):
         """The words for how a run ends, in the order of the integers in files."""
 
     @abc.abstractmethod
-    def ended(self, outcome: Outcome | HybridOutcome, tolerance: Any) -> Int[Array, " cells"]:
+    def ended(self, outcome: Outcome | HybridOutcome, tolerance: Number) -> Int[Array, " cells"]:
         """How each run has ended, as an integer of `Status`."""
 
     @property
@@ -234,7 +243,7 @@ class AbstractSceneModel(AbstractModel):
 
     @property
     @abc.abstractmethod
-    def roots(self) -> dict[str, Any]:
+    def roots(self) -> dict[str, PyTree]:
         """The trees whose numbers are parameters, which are fields of the model."""
 
     @property
@@ -249,7 +258,7 @@ class AbstractSceneModel(AbstractModel):
     def full_name(self, argument: str, name: str) -> str:
         return full_name(argument, name, [*self.known, *self.known_of_event])
 
-    def value(self, name: str) -> Any:
+    def value(self, name: str) -> Array:
         if name.startswith("event.") and self.event is not None:
             return self.event.parameters.value(name)
         root = name.partition(".")[0]
@@ -263,7 +272,9 @@ class AbstractSceneModel(AbstractModel):
 
 
 @functools.singledispatch
-def model_of(system: Any, start: Any, event: Any = None, input: Any = None, jumps: Any = None) -> AbstractModel:
+def model_of(
+    system: object, start: object, event: Any = None, input: object = None, jumps: object = None
+) -> AbstractModel:
     """The model of a system, for the functions of this room.
 
     Each kind of system registers its own function.
@@ -288,13 +299,13 @@ def model_of(system: Any, start: Any, event: Any = None, input: Any = None, jump
     )
 
 
-def check_run(model: AbstractModel, t1: Any, tolerance: Any) -> None:
+def check_run(model: AbstractModel, t1: Number, tolerance: Number) -> None:
     """Raise `ValueError` unless the model may run, and horizon and tolerance are single legal numbers."""
     model.check()
     check_horizon(t1, tolerance)
 
 
-def check_horizon(t1: Any, tolerance: Any) -> None:
+def check_horizon(t1: Number, tolerance: Number) -> None:
     """Raise `ValueError` unless horizon and tolerance are single legal numbers."""
     require_all(run_bounds(t1, tolerance))
     for name, number in {"t1": t1, "tolerance": tolerance}.items():

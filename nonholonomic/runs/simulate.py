@@ -20,7 +20,7 @@ from ..sweeps import Axis, Variable, axis
 from ..terminal import status_line
 from ..validation import as_known, as_number, is_traced, nan_unless, warn
 from .event import modes_of, problem_of
-from .model import AbstractModel, Names, Start, check_run, model_of
+from .model import AbstractModel, Names, Number, Start, check_run, model_of
 from .trajectory import Trajectory
 
 # Quantities of many runs at given times, in lanes.
@@ -158,15 +158,15 @@ SHORT, MEAN = 1e-6, 0.05
 
 @status_line("simulating")
 def simulate(
-    system: Any,
-    start: Any,
+    system: object,
+    start: object,
     t1: Float[ArrayLike, ""],
     times: Float[ArrayLike, " times"] | None = None,
     tolerance: Float[ArrayLike, ""] = 1e-9,
     solver: diffrax.AbstractSolver | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
-    input: Any = None,
-    jumps: Any = None,
+    input: object = None,
+    jumps: object = None,
 ) -> Any:
     """Simulate one run of a system to `t1`; works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and their compositions.
 
@@ -215,7 +215,7 @@ def simulate(
 
 
 def simulate_model(
-    model: AbstractModel, t1: Any, times: Any, tolerance: Any, solver: diffrax.AbstractSolver | None = None
+    model: AbstractModel, t1: Number, times: Any, tolerance: Number, solver: diffrax.AbstractSolver | None = None
 ) -> Trajectory:
     """The run of a model at given times, or at equally spaced ones. **Arguments:** as for `simulate`, checked but `times`."""
     times = evenly_spaced(as_known(t1)) if times is None else times
@@ -235,7 +235,7 @@ def simulate_model(
     return run
 
 
-def evenly_spaced(t1: Any) -> Float[Array, " times"]:
+def evenly_spaced(t1: Number) -> Float[Array, " times"]:
     """The default times of output; known inside a transformation if `t1` is known."""
     return jnp.linspace(0.0, t1, DEFAULT_TIMES) if is_traced(t1) else as_known(np.linspace(0.0, t1, DEFAULT_TIMES))
 

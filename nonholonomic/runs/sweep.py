@@ -5,6 +5,7 @@ import hashlib
 import re
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import diffrax
@@ -25,7 +26,7 @@ from ..sweeps.table import cells_with
 from ..text import likely, shown
 from ..validation import as_number, require_flag, require_outside, require_whole, warn
 from .event import Ensemble
-from .model import AbstractModel, AbstractSceneModel, check_horizon, model_of, require_event, settings_for_lanes
+from .model import AbstractModel, AbstractSceneModel, Number, check_horizon, model_of, require_event, settings_for_lanes
 from .simulate import Samples
 from .table import ScatteredJob, TableForm, TableJob
 
@@ -96,7 +97,7 @@ class Options(NamedTuple):
     scattered: bool = False
     errors: bool = False
     sensitivities: Sequence[str] = ()
-    path: Any = None
+    path: str | Path | None = None
     progress: bool = True
     executor: Executor | None = None
 
@@ -108,8 +109,8 @@ class Options(NamedTuple):
 
 
 def sweep(
-    system: Any,
-    start: Any,
+    system: object,
+    start: object,
     t1: float,
     *,
     axes: dict[str, Any],
@@ -123,11 +124,11 @@ def sweep(
     max_steps: int = DEFAULT_MAX_STEPS,
     tolerance: float = 1e-9,
     solver: diffrax.AbstractERK | None = None,
-    path: Any = None,
+    path: str | Path | None = None,
     progress: bool = True,
     executor: Executor | None = None,
-    input: Any = None,
-    jumps: Any = None,
+    input: object = None,
+    jumps: object = None,
 ) -> Table:
     """Event times, ends and samples of all runs over a grid of parameters, in one batched call on all cores.
 
@@ -206,7 +207,7 @@ def sweep(
     return table_of(model, named, float(t1), crossing, options, TableForm(model.words), samples=samples, timed=timed)
 
 
-def samples_of(known: dict[str, Quantity], times: Any, quantities: Any, t1: Any) -> Samples | None:
+def samples_of(known: dict[str, Quantity], times: Any, quantities: Any, t1: Number) -> Samples | None:
     """The samples of a table, checked. **Arguments:** `known`: the quantities of the model."""
     if times is None and not len(quantities):
         return None
@@ -268,7 +269,7 @@ def check_cells(model: AbstractModel, grid: list[Axis], options: Options) -> Non
 
 
 def compute_table(
-    job: TableJob, grid: list[Axis], units: dict[str, str], request: dict[str, Any], options: Options
+    job: TableJob, grid: list[Axis], units: dict[str, str], request: dict[str, object], options: Options
 ) -> Table:
     """Compute the cells of a grid, which were checked.
 

@@ -15,7 +15,7 @@ from ..integration.problem import TIGHTEST, TIGHTEST_IN_SINGLE, Status
 from ..sweeps import Variable
 from ..validation import as_number
 from .event import SILENT, Ensemble, status_of
-from .model import AbstractModel
+from .model import AbstractModel, Number
 from .simulate import Samples, solve_samples
 
 #: Descriptions of the counters of every run.
@@ -231,7 +231,7 @@ class TableJob(NamedTuple):
 
 
 def first_events(
-    cells: AbstractModel, t1: Any, size: int, count: int, settings: Settings
+    cells: AbstractModel, t1: Number, size: int, count: int, settings: Settings
 ) -> tuple[Int[np.ndarray, " cells"], Float[np.ndarray, " cells"], dict[str, Array]]:
     """The `Status` of runs that end on their event, the times of the events, infinite in cells that end otherwise, and the
     variables that describe the ends."""

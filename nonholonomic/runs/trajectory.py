@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -23,7 +24,7 @@ from ..validation import IN_DEGREES, is_traced, require_all, require_file, requi
 from ..views import COLOURS, PALE, Arena, Body, Curve, Mesh, Page, Show, Stage, Trace, Viewable, new_figure
 from ..views.explore import Answer, Frame, HybridSimulator, LiveRun, Simulator, Slider, Summary, live_page
 from ..views.stage import curves_in
-from .model import AbstractModel, model_of
+from .model import AbstractModel, Sliders, Unit, model_of
 
 # A page with sliders that simulates any model in the browser.
 
@@ -39,14 +40,14 @@ OF_MESHES = ("scene.surface.", "scene.body.radius", "scene.body.equatorial", "sc
 
 @status_line("writing a page")
 def explore(
-    system: Any,
-    start: Any,
-    path: Any = None,
-    sliders: dict[str, tuple[float, float]] | None = None,
+    system: object,
+    start: object,
+    path: str | Path | None = None,
+    sliders: Sliders | None = None,
     t1: float = 8.0,
-    input: Any = None,
-    unit: Any = None,
-    jumps: Any = None,
+    input: object = None,
+    unit: Unit = None,
+    jumps: object = None,
 ) -> Page:
     """Make a page with sliders that simulates a run in the browser while you move a slider.
 
@@ -95,7 +96,7 @@ def explore(
     return explore_model(model_of(system, start, None, input, jumps), path, sliders, float(t1), unit)
 
 
-def explore_model(model: AbstractModel, path: Any, sliders: Any, t1: float, unit: Any) -> Page:
+def explore_model(model: AbstractModel, path: Any, sliders: Sliders | None, t1: float, unit: Unit) -> Page:
     """The page of a model. **Arguments:** as for `explore`."""
     if path is not None:
         require_file(path, "path", ".html", ".htm")
@@ -111,7 +112,7 @@ def explore_model(model: AbstractModel, path: Any, sliders: Any, t1: float, unit
 
 
 @functools.singledispatch
-def page_of(model: AbstractModel, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
+def page_of(model: AbstractModel, sliders: Sliders | None, t1: float) -> tuple[LiveRun, Stage]:
     """The contents of the page of a model, and the stage on which the page draws the run.
 
     Each kind of model registers its own function.
@@ -354,9 +355,7 @@ class AbstractRun(Viewable, Tabular, eqx.Module):
     def in_words(self) -> str:
         """The text of a single run."""
 
-    def explore(
-        self, path: Any = None, sliders: dict[str, tuple[float, float]] | None = None, unit: Any = None
-    ) -> Page:
+    def explore(self, path: str | Path | None = None, sliders: Sliders | None = None, unit: Unit = None) -> Page:
         """A page with sliders that simulates the run in the browser, until its end; see `nonholonomic.explore`.
 
         **Raises:** as for `nonholonomic.explore`, and `ValueError` for a batch of runs.
@@ -369,7 +368,7 @@ class AbstractRun(Viewable, Tabular, eqx.Module):
     def to_table(self) -> Table:
         return self.table_of(())
 
-    def stages(self, others: Sequence[Any] = (), overlaid: bool = False, unit: Any = None) -> list[Stage]:
+    def stages(self, others: Sequence[Any] = (), overlaid: bool = False, unit: Unit = None) -> list[Stage]:
         return stages_of(self, [self, *others], overlaid, unit)
 
     @status_line("reading off")
@@ -382,7 +381,7 @@ class AbstractRun(Viewable, Tabular, eqx.Module):
 
 
 @functools.singledispatch
-def stages_of(run: AbstractRun, runs: list[Any], overlaid: bool, unit: Any) -> list[Stage]:
+def stages_of(run: AbstractRun, runs: list[Any], overlaid: bool, unit: Unit) -> list[Stage]:
     """The stages on which runs of one kind are drawn: one for each, or a common one for overlaid runs.
 
     Each kind of run registers its own function. **Arguments:** `run`: the first of the `runs`; `unit`: as for `plot`.
@@ -562,7 +561,7 @@ class Trajectory(AbstractRun):
         """The table that pictures draw, with the states before and after each reset."""
         return self._with_resets().to_table()
 
-    def labels_of(self, runs: list[Any], unit: Any) -> list[str]:
+    def labels_of(self, runs: list[Any], unit: Unit) -> list[str]:
         """Labels that tell runs apart by the numbers of their systems and starts that differ."""
         models = [run.model for run in runs]
         names = models[0].known
@@ -573,7 +572,7 @@ class Trajectory(AbstractRun):
         numbers = list(zip(*texts, strict=True))
         return distinguishing_labels(numbers) if len(set(numbers)) > 1 else Tabular.labels_of(self, runs, unit)
 
-    def overview(self, runs: list[Any], labels: Sequence[str], unit: Any, ax: Any) -> Any:
+    def overview(self, runs: list[Any], labels: Sequence[str], unit: Unit, ax: Any) -> Any:
         """Draw all components of a run in one picture, or a panel for each component of several runs."""
         if len(runs) > 1 or unit is not None:
             return Tabular.overview(self, [run._with_resets() for run in runs], labels, unit, ax)
@@ -612,5 +611,5 @@ def brief_names(values: dict[str, list[str]]) -> dict[str, str]:
 
 
 @stages_of.register(Trajectory)
-def _(run: Trajectory, runs: list[Any], overlaid: bool, unit: Any) -> list[Stage]:
+def _(run: Trajectory, runs: list[Any], overlaid: bool, unit: Unit) -> list[Stage]:
     return portraits([run._with_resets() for run in runs], overlaid)

@@ -21,9 +21,9 @@ from ..compilation.components import over_lanes
 from ..compilation.tracing import in_cells
 from ..compilation.xla_cpu import least
 from ..hybrid import AbstractBatchedMode, Transition
-from ..hybrid.saltation import UNMEASURED
 from ..integration import AbstractProblem, Jumps, Lanes, States
 from ..integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
+from ..runs.event import UNMEASURED
 from .form import Form, OfRun, State
 
 #: A function counts as zero if changing every component of the state by this fraction of its size could make it zero:

@@ -7,17 +7,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from nonholonomic.compilation.components import Held
 from nonholonomic.geometry import Plane
 from nonholonomic.hybrid import HybridOutcome
-from nonholonomic.hybrid.saltation import UNMEASURED, Clock
 from nonholonomic.integration import AbstractProblem, ExtendedProblem, Outcome
 from nonholonomic.integration.problem import Status, require_run
 from nonholonomic.parameters import description, numbers, numbers_of
-from nonholonomic.runs.event import EventFunction, with_event
-from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, model_of, statuses
+from nonholonomic.runs.event import UNMEASURED, Clock, EventFunction, with_event
+from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Number, model_of, statuses
 from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.text import name_of
 from nonholonomic.validation import require_kind, require_scalars
@@ -104,7 +103,7 @@ class RideModel(AbstractSceneModel):
     comparable = ("speed",)
 
     @classmethod
-    def of(cls, scene: Scene, launch: Launch, controls: Any, event: Any = None, jumps: Any = None) -> AbstractModel:
+    def of(cls, scene: Scene, launch: Launch, controls: Any, event: Any = None, jumps: object = None) -> AbstractModel:
         """The model of a ride, with a user's event if there is one."""
         module = as_module(controls, scene, launch)
         original = None if isinstance(module, Held) or module is controls else Original(controls)
@@ -118,7 +117,7 @@ class RideModel(AbstractSceneModel):
         return RideModel.of, (self.scene, self.launch, controls, event, self.jumps)
 
     @property
-    def roots(self) -> dict[str, Any]:
+    def roots(self) -> dict[str, PyTree]:
         """The trees whose numbers are parameters."""
         module = {} if self.input is None or self.original is not None else {"input": self.input}
         return {"scene": self.scene, "launch": self.launch} | module
@@ -152,7 +151,7 @@ class RideModel(AbstractSceneModel):
             labels[full] = (name, unit, LONG_NAMES.get(full, LONG_NAMES.get(name, name.replace("_", " "))))
         return labels
 
-    def description(self) -> dict[str, Any]:
+    def description(self) -> dict[str, object]:
         controls: Any = self.input if self.original is None else self.original.input
         if isinstance(controls, eqx.Module):
             controls = description("input", controls)
@@ -203,7 +202,7 @@ class RideModel(AbstractSceneModel):
         clock = jnp.zeros_like(ride.states[:1])
         return ExtendedProblem(ride, Clock(), clock, clock + UNMEASURED)
 
-    def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Trajectory:
+    def simulate(self, t1: Number, times: Any, tolerance: Number, solver: Any, adjoint: Any) -> Trajectory:
         return ride(self, t1, times, tolerance, solver, DEFAULT_STEPS, adjoint)
 
     def without_event(self) -> "RideModel":
@@ -218,14 +217,14 @@ class RideModel(AbstractSceneModel):
         return VECTORS | {"coordinate": tuple(name for name, _ in self.scene.surface.coordinates)}
 
     def read(
-        self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: Any
+        self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: Int[ArrayLike, "..."] | None
     ) -> dict[str, Array]:
         size = len(jax.eval_shape(lambda: self.scene.state(self.launch, self.input is not None)))
         time = rows[size] if len(rows) > size else time
         state = RideState(self.scene, self.input, time, rows[:size])
         return {name: QUANTITIES[name].of(name, state) for name in names}
 
-    def ended(self, outcome: Outcome | HybridOutcome, tolerance: Any) -> Int[Array, " cells"]:
+    def ended(self, outcome: Outcome | HybridOutcome, tolerance: Number) -> Int[Array, " cells"]:
         status = statuses(outcome.status, Status.RANK_LOST)
         if self.event is not None:
             return status
@@ -253,7 +252,9 @@ class RideModel(AbstractSceneModel):
 
 
 @model_of.register(Scene)
-def _(system: Scene, start: Any, event: Any = None, input: Input | None = None, jumps: Any = None) -> AbstractModel:
+def _(
+    system: Scene, start: object, event: Any = None, input: Input | None = None, jumps: object = None
+) -> AbstractModel:
     require_kind(start, "start", Launch)
     lists = "axes of sweep take lists, and jax.vmap maps over them"
     require_scalars(numbers("scene", system, functions=False) | numbers("launch", start), lists)
@@ -262,7 +263,7 @@ def _(system: Scene, start: Any, event: Any = None, input: Input | None = None, 
     return RideModel.of(system, start, input, event, jumps)
 
 
-def check_run(scene: Any, launch: Any, t1: Any, input: Any, tolerance: Any, jumps: Any = None) -> None:
+def check_run(scene: Any, launch: Any, t1: Number, input: Any, tolerance: Number, jumps: object = None) -> None:
     """Raise `ValueError` unless scene, launch, horizon, input and tolerance are legal and the scene can start with the
     launch."""
     lists = "axes of sweep take lists, and jax.vmap maps over them"

@@ -17,7 +17,7 @@ from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_ve
 from nonholonomic.integration import ImplicitMidpoint, Settings, explicit_tableau, follow, sample
 from nonholonomic.integration.dense import all_crossings
 from nonholonomic.integration.problem import REACHED_END, require_adaptive, require_adjoint, require_times
-from nonholonomic.runs.model import AbstractModel
+from nonholonomic.runs.model import AbstractModel, Number, Unit
 from nonholonomic.runs.simulate import evenly_spaced, sampled_if_legal
 from nonholonomic.runs.trajectory import AbstractRun
 from nonholonomic.sweeps import Quantity, Table, chosen, run_table
@@ -175,7 +175,7 @@ def side_force(
     return scene.dynamics.projected_side_force(t, states, controls)
 
 
-def table_of(runs: list[Any], names: list[str], request: dict[str, Any], only: Sequence[str] = ()) -> Table:
+def table_of(runs: list[Any], names: list[str], request: dict[str, object], only: Sequence[str] = ()) -> Table:
     """All quantities of several runs with the same times, over these times.
 
     **Arguments:**
@@ -198,7 +198,7 @@ def table_of(runs: list[Any], names: list[str], request: dict[str, Any], only: S
     return run_table(quantities, coords, values, [*(["ride"] if names else []), "time"], request)
 
 
-def names_of(runs: list[Any], unit: Any = None) -> list[str]:
+def names_of(runs: list[Any], unit: Unit = None) -> list[str]:
     """Names of rides, by what differs in their durations, scenes and launches. **Arguments:** `unit`: as for `plot`."""
     for run in runs:
         require_one_run(run, "a picture", ", and pass the others as others=")
@@ -532,7 +532,7 @@ class Trajectory(AbstractRun):
         require_one_run(self, "to_table", "; stroller.sweep makes a table of many")
         return table_of([self], [], self.model.description() | {"status": self.status}, names)
 
-    def labels_of(self, runs: list[Any], unit: Any) -> list[str]:
+    def labels_of(self, runs: list[Any], unit: Unit) -> list[str]:
         return names_of(runs, unit) if len(runs) > 1 else [""]
 
     def in_words(self) -> str:
@@ -590,9 +590,9 @@ DEFAULT_STEPS = 65536
 
 def ride(
     model: Any,
-    t1: Any,
+    t1: Number,
     times: Any,
-    tolerance: Any,
+    tolerance: Number,
     solver: diffrax.AbstractSolver | None,
     max_steps: int,
     adjoint: diffrax.AbstractAdjoint | None,

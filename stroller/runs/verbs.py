@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from pathlib import Path
 from typing import Any, ClassVar
 
 import diffrax
@@ -113,7 +114,7 @@ def sweep(
     input: Input | None = None,
     tolerance: float = 1e-9,
     solver: diffrax.AbstractERK | None = None,
-    path: Any = None,
+    path: str | Path | None = None,
     progress: bool = True,
     executor: Executor | None = None,
     max_steps: int = DEFAULT_MAX_STEPS,
@@ -301,7 +302,7 @@ class Recording(AbstractRecording):
     input: Input | None = None
     t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
-    jumps: Any = None
+    jumps: object = None
     quantities: ClassVar[Quantities] = QUANTITIES
 
     def model(self, scene: Scene) -> AbstractModel:
@@ -325,7 +326,7 @@ def read_recording(
     t0: float = 0.0,
     student: float | None = None,
     decimal: str = ".",
-    jumps: Any = None,
+    jumps: object = None,
 ) -> Recording:
     """A recording of a ride from a text file of columns with a header line (CSV).
 

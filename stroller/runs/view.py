@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ from nonholonomic.geometry import AbstractQuadric, AbstractSurface, vector_of
 from nonholonomic.integration import AbstractPassive, ExtendedProblem
 from nonholonomic.integration.problem import Status
 from nonholonomic.parameters import numbers
+from nonholonomic.runs.model import Sliders, Unit
 from nonholonomic.runs.trajectory import (
     TOLERANCE,
     explore_model,
@@ -72,7 +74,7 @@ GREEN, BLUE, VIOLET, GOLD = 0x1F8A4C, 0x1B6CA8, 0x7B4FA3, 0xE0A100
 
 
 @stages_of.register(Trajectory)
-def _(run: Trajectory, runs: list[Any], overlaid: bool, unit: Any) -> list[Stage]:
+def _(run: Trajectory, runs: list[Any], overlaid: bool, unit: Unit) -> list[Stage]:
     numbered = list(enumerate(runs))
     return grouped([numbered] if overlaid else [[ride] for ride in numbered], names_of(runs, unit))
 
@@ -246,8 +248,8 @@ SHOWN = ("position", "direction", "steering", "speed", "front_speed", "energy", 
 def explore(
     scene: Scene,
     launch: Launch,
-    path: Any = None,
-    sliders: dict[str, tuple[float, float]] | None = None,
+    path: str | Path | None = None,
+    sliders: Sliders | None = None,
     t1: float = 8.0,
     input: Input | None = None,
     unit: str | Sequence[str] | None = None,
@@ -296,7 +298,7 @@ def explore(
 
 
 @page_of.register(RideModel)
-def page_of_ride(model: RideModel, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
+def page_of_ride(model: RideModel, sliders: Sliders | None, t1: float) -> tuple[LiveRun, Stage]:
     """The contents of the page, and the stage."""
     knobs = sliders_of(model, default_ranges(model.scene, model.launch) if sliders is None else sliders)
     live = live_run(

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from nonholonomic.integration.problem import require_run
 from nonholonomic.parameters import full_axes, numbers, with_numbers
+from nonholonomic.runs.model import Number
 from nonholonomic.sweeps import Axis, axis
 from nonholonomic.text import shown
 from nonholonomic.validation import IN_DEGREES, as_number, is_traced, require, require_kind, warn
@@ -27,7 +28,7 @@ from ..modes.problems import StemContact
 INVERTED = 0.95 * math.pi
 
 
-def event_of(scene: Scene[Any], angle: Any) -> Float[Array, "..."] | StemContact:
+def event_of(scene: Scene, angle: Any) -> Float[Array, "..."] | StemContact:
     """The event of a run: theta reaches the angle [rad]; or, without an angle, the top has turned over.
 
     A top with a stem has turned over when its stem first carries it: when the stem bears a force or, as it lands, an
@@ -39,7 +40,7 @@ def event_of(scene: Scene[Any], angle: Any) -> Float[Array, "..."] | StemContact
     return as_number(INVERTED if angle is None else angle)
 
 
-def angle_of(scene: Scene[Any], angle: Any) -> Float[Array, "..."]:
+def angle_of(scene: Scene, angle: Any) -> Float[Array, "..."]:
     """The angle [rad] itself; or, without an angle, the inclination beyond which the top has turned over on a level
     plane."""
     event = event_of(scene, angle)
@@ -50,7 +51,7 @@ def angle_of(scene: Scene[Any], angle: Any) -> Float[Array, "..."]:
 LISTS = "inversion_table takes lists, and jax.vmap maps over them"
 
 
-def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str = LISTS) -> None:
+def check_run(scene: Any, launch: Any, t1: Number, tolerance: Number, lists: str = LISTS) -> None:
     """Raise `ValueError` unless the arguments are a scene, a launch that the scene allows, a positive horizon and a
     legal tolerance.
 
@@ -202,7 +203,12 @@ def labels(
 
 
 def launches(
-    scene: Any, launch_values: dict[str, Any], axes: Any, t1: Any, tolerance: Any, taken: Collection[str] = ()
+    scene: Any,
+    launch_values: dict[str, Any],
+    axes: Any,
+    t1: Number,
+    tolerance: Number,
+    taken: Collection[str] = (),
 ) -> tuple[dict[str, Any], list[Axis]]:
     """The scene and launch that all cells share, and the axes of the grid.
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.geometry import Plane
@@ -18,7 +18,7 @@ from nonholonomic.integration import AbstractProblem, CoreProblem, Outcome
 from nonholonomic.integration.problem import FAILED, Status
 from nonholonomic.parameters import description, full_name, numbers, numbers_of
 from nonholonomic.runs.event import EventFunction, with_event
-from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Start, model_of, statuses
+from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Number, Start, model_of, statuses
 from nonholonomic.runs.table import TableForm
 from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.validation import Bound, all_bounds, legal, require_kind, require_scalars
@@ -83,7 +83,7 @@ class RunKind(NamedTuple):
 COUNTED = {"hops": "flights", "sticks": "changes from slip to rolling"}
 
 
-def loss_of_contact(scene: Scene[Any], state: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+def loss_of_contact(scene: Scene, state: Float[Array, "components cells"]) -> Int[Array, " cells"]:
     """How a contact has ended, as a code in `LOSSES`."""
     return scene.dynamics.loss(state)
 
@@ -97,7 +97,7 @@ ON_STEM_TOO = AIRBORNE._replace(modes=modes_with_stem)
 STICK_SLIP_FLY = AIRBORNE._replace(counts=("hops", "sticks"), modes=airborne_stick_slip_modes)
 
 
-def run_kind_of(scene: Scene[Any]) -> RunKind:
+def run_kind_of(scene: Scene) -> RunKind:
     """The run kind of a scene."""
     hybrid = scene.contact == "hybrid"
     if scene.friction.set_valued:
@@ -109,7 +109,7 @@ def run_kind_of(scene: Scene[Any]) -> RunKind:
     return AIRBORNE if scene.body.stem is None else ON_STEM_TOO
 
 
-def flight_modes(scene: Scene[Top], launch: Launch, tolerance: Any, cells: int = 1) -> Start:
+def flight_modes(scene: Scene[Top], launch: Launch, tolerance: Number, cells: int = 1) -> Start:
     """The modes of launches of a hybrid scene, with their path, rotation and work; the index of each first mode; and the
     initial states."""
     problem, modes = _start_of_flights(scene, launch, cells), run_kind_of(scene).modes
@@ -201,7 +201,7 @@ class TopModel(AbstractSceneModel):
         return generic_direction(self.scene, self.launch, cells)
 
     @property
-    def roots(self) -> dict[str, Any]:
+    def roots(self) -> dict[str, PyTree]:
         """The trees whose numbers are parameters."""
         return {"scene": self.scene, "launch": self.launch}
 
@@ -222,7 +222,7 @@ class TopModel(AbstractSceneModel):
         taken = (*self.quantities, "time", "status", "end_time", *self.ends, *self.counters, "steps", "rejected")
         return labels(self.scene, self.launch, names, taken)
 
-    def description(self) -> dict[str, Any]:
+    def description(self) -> dict[str, object]:
         request = {path: value for name, root in self.roots.items() for path, value in description(name, root).items()}
         return request if self.event is None else request | {"event": self.event.name}
 
@@ -305,7 +305,7 @@ class TopModel(AbstractSceneModel):
         has_path = PATH in needs or (ON_CURVED in needs and not isinstance(scene.surface, Plane))
         return CoreProblem(run, len(run.start()[0]) - BEHIND_PATH if has_path else run.leading)
 
-    def modes(self, cells: int, tolerance: Any, names: Names, continues: bool) -> Start:
+    def modes(self, cells: int, tolerance: Number, names: Names, continues: bool) -> Start:
         scene, launch = self.scene, self.launch
         if self._is_without_path(names):
             assert self.kind.modes is not None
@@ -315,7 +315,7 @@ class TopModel(AbstractSceneModel):
             return contact_modes(trajectory_problem((scene, launch), cells), tolerance)
         return flight_modes(scene, launch, tolerance, cells)
 
-    def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Any:
+    def simulate(self, t1: Number, times: Any, tolerance: Number, solver: Any, adjoint: Any) -> Any:
         return simulate_launch(self, t1, times, tolerance, solver, adjoint)
 
     @property
@@ -323,12 +323,12 @@ class TopModel(AbstractSceneModel):
         return quantities_of(self.scene)
 
     def read(
-        self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: Any
+        self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: Int[ArrayLike, "..."] | None
     ) -> dict[str, Array]:
         run = dataclasses.replace(self.moment(rows, mode), start=self.scene.state(self.launch))
         return {name: getattr(run, name) for name in names}
 
-    def moment(self, rows: Float[Array, "rows *cells"], mode: Any) -> Any:
+    def moment(self, rows: Float[Array, "rows *cells"], mode: Int[ArrayLike, "..."] | None) -> Any:
         """The states as a trajectory without times."""
         scene, kind, zeros = self.scene, self.trajectories, jnp.zeros(rows.shape[1:])
         core = len(scene.state(self.launch))
@@ -351,7 +351,7 @@ class TopModel(AbstractSceneModel):
     def words(self) -> tuple[str, ...]:
         return ("event", "completed", *WORDS[2:])
 
-    def ended(self, outcome: Outcome | HybridOutcome, tolerance: Any) -> Int[Array, " cells"]:
+    def ended(self, outcome: Outcome | HybridOutcome, tolerance: Number) -> Int[Array, " cells"]:
         scene, kind = self.scene, self.kind
         cells = outcome.status.shape[0]
         start = InversionProblem.of(scene, self.launch, None if self.reverses else INVERTED, cells)
@@ -387,7 +387,7 @@ def _integrated(scene: Scene) -> Scene:
 
 
 @model_of.register(Scene)
-def _(system: Scene, start: Any, event: Any = None, input: Any = None, jumps: Any = None) -> AbstractModel:
+def _(system: Scene, start: object, event: Any = None, input: object = None, jumps: object = None) -> AbstractModel:
     require_kind(start, "start", Launch)
     if input is not None or jumps is not None:
         name = "jumps" if input is None else "input"

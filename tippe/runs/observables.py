@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Self, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -18,7 +18,7 @@ from nonholonomic.integration import DenseSolution
 from nonholonomic.integration.dense import all_crossings
 from nonholonomic.integration.problem import Status
 from nonholonomic.parameters import description
-from nonholonomic.runs.model import AbstractModel, model_of
+from nonholonomic.runs.model import AbstractModel, Number, Unit, model_of
 from nonholonomic.runs.trajectory import AbstractRun
 from nonholonomic.sweeps import Quantity, Table, chosen, run_table
 from nonholonomic.text import distinguishing_labels, in_unit
@@ -90,7 +90,7 @@ def table_of(run: Any, names: Sequence[str] = ()) -> Table:
     return run_table(quantities, coords, values, ["time"], request)
 
 
-def names_of(runs: list[Any], unit: Any = None) -> list[str]:
+def names_of(runs: list[Any], unit: Unit = None) -> list[str]:
     """Names of runs, by what differs in their launches and scenes. **Arguments:** `unit`: as for `plot`."""
     for run in runs:
         require_one_run(run, "a picture", ", and pass the others as others=")
@@ -103,6 +103,10 @@ def names_of(runs: list[Any], unit: Any = None) -> list[str]:
 
 
 # The run of a top: one state at each time.
+
+
+#: JAX's arrays, or NumPy's outside of transformations.
+Values: TypeAlias = Array | np.ndarray
 
 
 def of_each_run(function: Callable[[Any], Array]) -> property:
@@ -135,12 +139,12 @@ class AbstractTrajectory(AbstractRun):
     Vectors are arrays (times, 3) in the fixed frame (x, y, z); see `Trajectory`.
     """
 
-    t: Float[Any, " times"]
+    t: Float[Values, " times"]
     scene: Scene
-    states: Float[Any, "components times"]
-    cyclic: Float[Any, "paths times"]
-    spin_angle: Float[Any, " times"]
-    work: Float[Any, " times"]
+    states: Float[Values, "components times"]
+    cyclic: Float[Values, "paths times"]
+    spin_angle: Float[Values, " times"]
+    work: Float[Values, " times"]
     # The end of the run; not needed where only the times are read, as in a page.
     status: Any = None
     end_time: Any = None
@@ -181,7 +185,7 @@ class AbstractTrajectory(AbstractRun):
         """Kinetic and potential energy [J]."""
 
     @classmethod
-    def parts_of(cls, scene: Scene, rows: Float[Any, "rows times"], mode: Any, core: int) -> dict[str, Any]:
+    def parts_of(cls, scene: Scene, rows: Values, mode: Values | None, core: int) -> dict[str, Values]:
         """The fields `by_time` but the times, from output rows.
 
         **Arguments:** `mode`: the indices of the modes at these times, or `None` for a smooth run; `core`: the number of
@@ -189,7 +193,7 @@ class AbstractTrajectory(AbstractRun):
         """
         return {"states": rows[:core], "cyclic": rows[core:-2], "spin_angle": rows[-2], "work": rows[-1]}
 
-    def with_rows(self, times: Float[np.ndarray, " times"], rows: Any, mode: Any) -> Self:
+    def with_rows(self, times: Float[np.ndarray, " times"], rows: Values, mode: Values | None) -> Self:
         """The same run at other times, from the output rows there."""
         return dataclasses.replace(self, t=times, **self.parts_of(self.scene, rows, mode, len(self.start)))
 
@@ -308,7 +312,7 @@ class AbstractTrajectory(AbstractRun):
     def table_of(self, names: Sequence[str]) -> Table:
         return table_of(self, names)
 
-    def labels_of(self, runs: list[Any], unit: Any) -> list[str]:
+    def labels_of(self, runs: list[Any], unit: Unit) -> list[str]:
         return names_of(runs, unit) if len(runs) > 1 else [""]
 
     @of_each_run
@@ -392,12 +396,12 @@ BALANCED = 1e4
 Run = TypeVar("Run", bound=AbstractTrajectory)
 
 
-def allowance(scene: Scene[Any], energy: Any, tolerance: Any) -> Any:
+def allowance(scene: Scene, energy: Values, tolerance: Number) -> Values:
     """The allowed error [J] of an energy of the given size [J] at a tolerance."""
     return BALANCED * tolerance * (abs(energy) + scene.body.mass * scene.gravity * scene.body.size)
 
 
-def audited(run: Run, path: DenseSolution | HybridPath, tolerance: ArrayLike, **more: float) -> Run:
+def audited(run: Run, path: DenseSolution | HybridPath, tolerance: Number, **more: float) -> Run:
     """A single run with its statistics: steps, the greatest drift of |e|, the greatest |E - E(0) - work| [J], and more. Its
     status is "unresolved" if its energy has grown or does not balance the work of friction and impacts."""
     energy, work = np.asarray(run.energy), np.asarray(run.work)

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from nonholonomic.compilation.xla_cpu import on_device
 from nonholonomic.geometry import scale, sum_vectors, vector_of
@@ -24,6 +24,7 @@ from nonholonomic.integration.problem import (
     require_adjoint,
     require_times,
 )
+from nonholonomic.runs.model import Number
 from nonholonomic.runs.simulate import sampled_if_legal
 from nonholonomic.text import shown
 from nonholonomic.validation import as_number, is_traced, nan_unless
@@ -50,7 +51,7 @@ from ..modes.flight import height
 from ..modes.impact import BOTH, TOUCHING, Ball, FreeBody, approach, as_free_body, balls, energy, standing_on
 from ..modes.sliding import MOST_BOUNCES
 from ..modes.sticking import lifted
-from .observables import AbstractTrajectory, audited, of_each_run, why_unbalanced
+from .observables import AbstractTrajectory, Values, audited, of_each_run, why_unbalanced
 
 
 class Trajectory(AbstractTrajectory):
@@ -138,7 +139,7 @@ class Trajectory(AbstractTrajectory):
         unresolved = isinstance(self.status, str) and self.status == Status.UNRESOLVED.word
         return super().__str__() + (f"\n  unresolved: {why_unbalanced(self)}" if unresolved else "")
 
-    def with_rows(self, times: Float[np.ndarray, " times"], rows: Any, mode: Any) -> "Trajectory":
+    def with_rows(self, times: Float[np.ndarray, " times"], rows: Values, mode: Values | None) -> "Trajectory":
         parts = {"t": times, **self.parts_of(self.scene, rows, mode, len(self.start))}
         return dataclasses.replace(self, **dict(zip(parts, on_device(*parts.values()), strict=True)))
 
@@ -222,7 +223,7 @@ class HybridTrajectory(AbstractTrajectory):
         return float(min([*strokes, first]))
 
     @of_each_run
-    def _stem_gap(self) -> Float[Any, " times"]:
+    def _stem_gap(self) -> Float[Array, " times"]:
         """Distance of the stem from the arena [m]."""
         main, stem = balls(self.scene.body)
         return self.above[0] + height(main, stem, self.states)
@@ -261,13 +262,13 @@ class HybridTrajectory(AbstractTrajectory):
         return jnp.stack(approach(self.scene.body, self._ball, self._free).velocity[:2], axis=-1)
 
     @classmethod
-    def parts_of(cls, scene: Scene, rows: Any, mode: Any, core: int) -> dict[str, Any]:
+    def parts_of(cls, scene: Scene, rows: Values, mode: Values | None, core: int) -> dict[str, Values]:
         # The rows end with the distance and its rate.
         parts = super().parts_of(scene, rows[:-2], mode, core)
         return parts | {"distance": rows[-2:], "contact": cls.touching(scene, mode)}
 
     @staticmethod
-    def touching(scene: Scene, numbers: Int[Array | np.ndarray, " times"]) -> Any:
+    def touching(scene: Scene, numbers: Values) -> Values:
         """The sphere that touches, for each mode index."""
         return numbers
 
@@ -387,7 +388,7 @@ class ArenaTrajectory(HybridTrajectory):
         return "a flight does not end at the arena"
 
     @staticmethod
-    def touching(scene: Scene, numbers: Int[Array | np.ndarray, " times"]) -> Any:
+    def touching(scene: Scene, numbers: Values) -> Values:
         if scene.friction.set_valued:
             # Between two modes, a slip begins.
             return -1 * (numbers == FLYING)
@@ -400,9 +401,9 @@ class ArenaTrajectory(HybridTrajectory):
 
 def simulate_launch(
     model: Any,
-    t1: Any,
+    t1: Number,
     times: Any,
-    tolerance: Any,
+    tolerance: Number,
     solver: diffrax.AbstractSolver | None,
     adjoint: diffrax.AbstractAdjoint | None,
 ) -> Trajectory | HybridTrajectory:
@@ -438,7 +439,7 @@ def _ended(model: Any, outcome: HybridOutcome[Array], tolerance: Float[Array, ""
     return model.ended(outcome, tolerance)[0]
 
 
-def _status(model: Any, path: DenseSolution | HybridPath, tolerance: Any) -> str:
+def _status(model: Any, path: DenseSolution | HybridPath, tolerance: Number) -> str:
     """The word for how a single run has ended."""
     if isinstance(path, HybridPath):
         code, state, mode = path.status, path.state, path.mode
@@ -454,7 +455,7 @@ def _status(model: Any, path: DenseSolution | HybridPath, tolerance: Any) -> str
     return Status(int(_ended(model, outcome, jnp.asarray(tolerance)))).word
 
 
-def _along(model: Any, path: DenseSolution | HybridPath, tolerance: Any) -> Any:
+def _along(model: Any, path: DenseSolution | HybridPath, tolerance: Number) -> Any:
     """The run along its path, at the times of its steps. A run whose energy does not balance the work of friction and
     impacts ends as "unresolved"."""
     scene, kind, times = model.scene, model.trajectories, path.times
@@ -491,7 +492,7 @@ def work_in(scene: Scene, piece: Segment) -> float:
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
 @eqx.filter_jit
 def _traced(
-    model: Any, times: Any, t1: Any, settings: Settings, adjoint: diffrax.AbstractAdjoint | None
+    model: Any, times: Any, t1: Number, settings: Settings, adjoint: diffrax.AbstractAdjoint | None
 ) -> Trajectory | HybridTrajectory:
     """The run inside a transformation; NaN and the status "illegal" if a traced number is out of range."""
     if times is None:

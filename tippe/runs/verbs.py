@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from pathlib import Path
 from typing import Any
 
 import diffrax
@@ -26,7 +27,7 @@ from nonholonomic.integration.problem import (
 )
 from nonholonomic.runs.event import EventTime, time_of_event
 from nonholonomic.runs.lyapunov import LyapunovExponent, exponent_of_model
-from nonholonomic.runs.model import settings_for_lanes
+from nonholonomic.runs.model import Number, settings_for_lanes
 from nonholonomic.runs.sweep import Options, check_cells, compute_table, full_sensitivities, samples_of
 from nonholonomic.runs.table import TableForm, TableJob
 from nonholonomic.sweeps import Table
@@ -77,7 +78,7 @@ def inversion_table(
     angle: float | None = None,
     tolerance: float = 1e-9,
     crossing: str = "first",
-    path: Any = None,
+    path: str | Path | None = None,
     azimuth: Any = 0.0,
     axes: dict[str, Any] | None = None,
     solver: diffrax.AbstractERK | None = None,
@@ -190,7 +191,7 @@ def reversal_table(
     mu: Any = None,
     t1: float,
     tolerance: float = 1e-9,
-    path: Any = None,
+    path: str | Path | None = None,
     axes: dict[str, Any] | None = None,
     solver: diffrax.AbstractERK | None = None,
     scattered: bool = False,
@@ -260,7 +261,7 @@ def event_table(
     axis_values = {axis.number: axis.values for axis in grid}
     if angle is None:
         check_reversible(roots["launch"], axis_values)
-        request: dict[str, Any] = {"event": "reversal"}
+        request: dict[str, object] = {"event": "reversal"}
     else:
         on_stem = isinstance(angle, StemContact)
         theta = axis_values.get("launch.theta", roots["launch"].theta)
@@ -306,7 +307,7 @@ def trajectory_table(
     axes: dict[str, Any] | None = None,
     quantities: Sequence[str] = ("theta", "eta"),
     tolerance: float = 1e-9,
-    path: Any = None,
+    path: str | Path | None = None,
     progress: bool = True,
     executor: Executor | None = None,
     max_steps: int = DEFAULT_MAX_STEPS,
@@ -536,7 +537,7 @@ def reversal_time(
     return first_or_last_time(TopModel.timed(scene, launch, None), t1, "first", settings_for_lanes(tolerance, solver))
 
 
-def first_or_last_time(model: TopModel, t1: Any, crossing: str, settings: Settings) -> Float[Array, ""]:
+def first_or_last_time(model: TopModel, t1: Number, crossing: str, settings: Settings) -> Float[Array, ""]:
     """The time of the event of a launch. **Arguments:** as for `inversion_time`, checked.
 
     **Raises:** `ValueError` for a run that needed too many steps. A warning states any other failure.
@@ -654,7 +655,7 @@ def extended_inversion_time(
     return time_of_inversion(TopModel.timed(scene, launch, as_number(angle)), t1, settings)
 
 
-def time_of_inversion(model: TopModel, t1: Any, settings: Settings) -> Float[Array, ""]:
+def time_of_inversion(model: TopModel, t1: Number, settings: Settings) -> Float[Array, ""]:
     """The extended time of a smooth model until its angle, for checked arguments."""
     return differentiable_solve(*ExtendedTime.of(model, t1, settings, False))
 
@@ -706,7 +707,7 @@ class ExtendedTime(EventTime):
         return times, slopes
 
 
-def beyond_horizon(end: Lanes, start: Lanes, angle: Any, t1: Any) -> Lanes:
+def beyond_horizon(end: Lanes, start: Lanes, angle: Any, t1: Number) -> Lanes:
     """The time [s] of a top that has not inverted by `t1`, with theta at the end and at the start of the run [rad]; see
     `extended_inversion_time`."""
 

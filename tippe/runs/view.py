@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -16,6 +17,7 @@ from nonholonomic.integration import Settings, crossing_time
 from nonholonomic.integration.problem import CROSSED, REACHED_END, Status
 from nonholonomic.parameters import numbers, numbers_of, with_numbers
 from nonholonomic.runs.event import Ensemble
+from nonholonomic.runs.model import Sliders, Unit
 from nonholonomic.runs.table import at_the_end
 from nonholonomic.runs.trajectory import (
     TOLERANCE,
@@ -190,7 +192,7 @@ def arrows(motion: DrawnMotion[np.ndarray], offset: float, radius: float, weight
 
 
 @stages_of.register(AbstractTrajectory)
-def _(run: AbstractTrajectory, runs: list[Any], overlaid: bool, unit: Any) -> list[Stage]:
+def _(run: AbstractTrajectory, runs: list[Any], overlaid: bool, unit: Unit) -> list[Stage]:
     drawn = [(name, run.scene, motion(run)) for name, run in zip(names_of(runs, unit), runs, strict=True)]
     return stages([drawn] if overlaid else [[one] for one in drawn])
 
@@ -262,8 +264,8 @@ REVERSED = {int(Status.INVERTED): "reversed", int(Status.NOT_INVERTED): "not_rev
 def explore(
     scene: Scene,
     launch: Launch,
-    path: Any = None,
-    sliders: dict[str, tuple[float, float]] | None = None,
+    path: str | Path | None = None,
+    sliders: Sliders | None = None,
     t1: float = 8.0,
     unit: str | Sequence[str] | None = None,
 ) -> Page:
@@ -307,14 +309,14 @@ def explore(
 
 
 @page_of.register(TopModel)
-def _(model: TopModel, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
+def _(model: TopModel, sliders: Sliders | None, t1: float) -> tuple[LiveRun, Stage]:
     live = page_of_launch(model, sliders, t1)
     if model.scene.contact == "hybrid" and model.scene.level:
         return live, stage_at_start(model, t1)
     return live, stage_of_runs(runs_at_ends(model, live.sliders, t1))
 
 
-def page_of_launch(model: TopModel, sliders: dict[str, tuple[float, float]] | None, t1: float) -> LiveRun:
+def page_of_launch(model: TopModel, sliders: Sliders | None, t1: float) -> LiveRun:
     """The contents of the page. **Arguments:** `model`: without an event; the others as for `explore`."""
     scene, launch = model.scene, model.launch
     # A body that rolls keeps its energy: it does not invert, and the page shows times of reversal.
