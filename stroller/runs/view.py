@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from nonholonomic import views
 from nonholonomic.geometry import AbstractQuadric, AbstractSurface, vector_of
 from nonholonomic.integration import AbstractPassive, ExtendedProblem
 from nonholonomic.integration.problem import Status
@@ -24,26 +25,6 @@ from nonholonomic.runs.trajectory import (
     stages_of,
 )
 from nonholonomic.terminal import status_line
-from nonholonomic.views import (
-    COLOURS,
-    DARK,
-    PALE,
-    Arrow,
-    Body,
-    Curve,
-    Mesh,
-    Page,
-    Show,
-    Stage,
-    Trace,
-    arena,
-    bar,
-    box,
-    css,
-    distinguished_by_colour,
-    turned,
-    wheel,
-)
 from nonholonomic.views.explore import Frame, LiveRun, Summary, quaternion
 
 from ..model.dynamics import State
@@ -74,22 +55,22 @@ GREEN, BLUE, VIOLET, GOLD = 0x1F8A4C, 0x1B6CA8, 0x7B4FA3, 0xE0A100
 
 
 @stages_of.register(Trajectory)
-def _(run: Trajectory, runs: list[Any], overlaid: bool, unit: Unit) -> list[Stage]:
+def _(run: Trajectory, runs: list[Any], overlaid: bool, unit: Unit) -> list[views.Stage]:
     numbered = list(enumerate(runs))
     return grouped([numbered] if overlaid else [[ride] for ride in numbered], names_of(runs, unit))
 
 
-def grouped(groups: list[list[tuple[int, Any]]], names: list[str]) -> list[Stage]:
+def grouped(groups: list[list[tuple[int, Any]]], names: list[str]) -> list[views.Stage]:
     """A stage for each group of numbered rides on a common ground; `names` are the names of the rides."""
     stages = []
     for group in groups:
         scene = group[0][1].model.scene
         length = float(scene.body.wheelbase)
-        shows = distinguished_by_colour(tuple(show(run, k, names[k]) for k, run in group))
+        shows = views.distinguished_by_colour(tuple(show(run, k, names[k]) for k, run in group))
         points = np.concatenate([np.asarray(run.position) for _, run in group])
         normal = normals(np, scene.surface, scene.side, np.asarray(group[0][1].position)[:1])[0]
-        ground = arena(scene.surface, points, normal, 3.0 * length, length)
-        stages.append(Stage("; ".join(body.name for body in shows), ground, shows))
+        ground = views.arena(scene.surface, points, normal, 3.0 * length, length)
+        stages.append(views.Stage("; ".join(body.name for body in shows), ground, shows))
     return stages
 
 
@@ -145,10 +126,10 @@ class Posture(NamedTuple):
         )
 
 
-def show(run: Any, number: int, name: str) -> Show:
+def show(run: Any, number: int, name: str) -> views.Show:
     """The drawing of one ride, the `number`-th of all."""
     scene = run.model.scene
-    length, colour = float(scene.body.wheelbase), COLOURS[number % len(COLOURS)]
+    length, colour = float(scene.body.wheelbase), views.COLOURS[number % len(views.COLOURS)]
     radius, half = RADIUS * length, TRACK * length / 2.0
     times, reader = refined(run, radius)
     normal = reader(normals(np, scene.surface, scene.side, np.asarray(run.position)))
@@ -157,7 +138,7 @@ def show(run: Any, number: int, name: str) -> Show:
     angles = [reader(_integral(np.asarray(run.t), speed / radius)) for speed in speeds]
     drawn = (reader(run.position), reader(run.direction), normal, reader(run.steering))
     posture = Posture.of(np, length, *drawn, angles)
-    wheel_mesh = wheel(radius, WIDTH * length, (DARK, PALE))
+    wheel_mesh = views.wheel(radius, WIDTH * length, (views.DARK, views.PALE))
     names = ("frame", "left wheel", "right wheel", "front wheel")
     meshes = (vehicle(length, colour), wheel_mesh, wheel_mesh, wheel_mesh)
     parts = zip(names, posture.places, posture.rotations, meshes, strict=True)
@@ -166,29 +147,29 @@ def show(run: Any, number: int, name: str) -> Show:
     scale, width = WEIGHT * length / float(scene.body.mass * scene.gravity), 0.035 * length
     grip = np.asarray(run["grip"])[:, : len(run.loaded_axles)]
     warning = f"needs friction {np.max(grip):.2g}, more than any tyre provides: a real stroller would slip"
-    return Show(
+    return views.Show(
         name,
         colour,
         times,
         normal,
         SIZE * length,
-        tuple(Body(part, place, turned(rotation), mesh) for part, place, rotation, mesh in parts),
+        tuple(views.Body(part, place, views.turned(rotation), mesh) for part, place, rotation, mesh in parts),
         (
-            Trace("path of the rear axle", rear, GREEN, 0.05 * length),
-            Trace("path of the front wheel", front, BLUE, 0.025 * length),
+            views.Trace("path of the rear axle", rear, GREEN, 0.05 * length),
+            views.Trace("path of the front wheel", front, BLUE, 0.025 * length),
         ),
         (
-            Arrow("normal force, rear", rear, loads[:, :1] * up, "N", scale, VIOLET, width, through=True),
-            Arrow("normal force, front", front, loads[:, 1:] * up, "N", scale, VIOLET, width, through=True),
-            Arrow("side force, rear", rear, forces[:, :1] * rear_left, "N", scale, GOLD, width, 2.0 * length),
-            Arrow("side force, front", front, forces[:, 1:] * front_left, "N", scale, GOLD, width, 2.0 * length),
+            views.Arrow("normal force, rear", rear, loads[:, :1] * up, "N", scale, VIOLET, width, through=True),
+            views.Arrow("normal force, front", front, loads[:, 1:] * up, "N", scale, VIOLET, width, through=True),
+            views.Arrow("side force, rear", rear, forces[:, :1] * rear_left, "N", scale, GOLD, width, 2.0 * length),
+            views.Arrow("side force, front", front, forces[:, 1:] * front_left, "N", scale, GOLD, width, 2.0 * length),
         ),
         (
-            Curve("speed [m/s]", reader(run.speed)),
-            Curve("steering angle [rad]", reader(run.steering)),
-            Curve("energy [J]", reader(run.energy)),
-            Curve("normal force [N]", reader(run.normal_force)),
-            Curve("friction that the tyres need [1]", reader(np.minimum(grip, DRAWN_GRIP).max(axis=-1))),
+            views.Curve("speed [m/s]", reader(run.speed)),
+            views.Curve("steering angle [rad]", reader(run.steering)),
+            views.Curve("energy [J]", reader(run.energy)),
+            views.Curve("normal force [N]", reader(run.normal_force)),
+            views.Curve("friction that the tyres need [1]", reader(np.minimum(grip, DRAWN_GRIP).max(axis=-1))),
         ),
         warning if np.max(grip) > MOST_GRIP else "",
     )
@@ -212,21 +193,25 @@ def refined(run: Any, radius: float) -> tuple[np.ndarray, Any]:
     return refined_times, lambda values: CubicSpline(times, np.asarray(values))(refined_times)
 
 
-def vehicle(length: float, colour: int) -> tuple[Mesh, ...]:
+def vehicle(length: float, colour: int) -> tuple[views.Mesh, ...]:
     """Axle, chassis, basket, handle and fork, as seen from the middle of the rear axle."""
     half, thickness = TRACK * length / 2.0, 0.025 * length
     low, high = 0.12 * length, 0.62 * length
     handle = [(-0.55 * length, sign * 0.3 * half, 0.95 * length) for sign in (1.0, -1.0)]
-    posts = [bar((0.0, 0.3 * half * sign, low), handle[k], thickness, DARK) for k, sign in enumerate((1.0, -1.0))]
+    posts = [
+        views.bar((0.0, 0.3 * half * sign, low), handle[k], thickness, views.DARK) for k, sign in enumerate((1.0, -1.0))
+    ]
     return (
-        bar((0.0, -half, 0.0), (0.0, half, 0.0), thickness, DARK),
-        bar((0.0, 0.0, 0.0), (0.92 * length, 0.0, 0.30 * length), thickness, DARK),
-        bar((length, 0.0, 0.22 * length), (length, 0.0, 0.34 * length), 1.4 * thickness, DARK),
-        bar((0.92 * length, 0.0, 0.30 * length), (length, 0.0, 0.30 * length), thickness, DARK),
-        box((0.62 * length, 1.1 * half, high - low), (0.22 * length, 0.0, (low + high) / 2.0 + 0.06 * length), colour),
-        box((0.5 * length, 0.9 * half, 0.02 * length), (0.22 * length, 0.0, high + 0.07 * length), PALE),
+        views.bar((0.0, -half, 0.0), (0.0, half, 0.0), thickness, views.DARK),
+        views.bar((0.0, 0.0, 0.0), (0.92 * length, 0.0, 0.30 * length), thickness, views.DARK),
+        views.bar((length, 0.0, 0.22 * length), (length, 0.0, 0.34 * length), 1.4 * thickness, views.DARK),
+        views.bar((0.92 * length, 0.0, 0.30 * length), (length, 0.0, 0.30 * length), thickness, views.DARK),
+        views.box(
+            (0.62 * length, 1.1 * half, high - low), (0.22 * length, 0.0, (low + high) / 2.0 + 0.06 * length), colour
+        ),
+        views.box((0.5 * length, 0.9 * half, 0.02 * length), (0.22 * length, 0.0, high + 0.07 * length), views.PALE),
         *posts,
-        bar(handle[0], handle[1], 1.3 * thickness, DARK),
+        views.bar(handle[0], handle[1], 1.3 * thickness, views.DARK),
     )
 
 
@@ -254,7 +239,7 @@ def explore(
     input: Input | None = None,
     unit: str | Sequence[str] | None = None,
     jumps: Sequence[Any] | Array | None = None,
-) -> Page:
+) -> views.Page:
     """Make a page with sliders that simulates the ride in the browser while you move a slider.
 
     The page is one file that needs no network; a notebook shows the returned `Page`. The equations of motion, the
@@ -298,7 +283,7 @@ def explore(
 
 
 @page_of.register(RideModel)
-def page_of_ride(model: RideModel, sliders: Sliders | None, t1: float) -> tuple[LiveRun, Stage]:
+def page_of_ride(model: RideModel, sliders: Sliders | None, t1: float) -> tuple[LiveRun, views.Stage]:
     """The contents of the page, and the stage."""
     knobs = sliders_of(model, default_ranges(model.scene, model.launch) if sliders is None else sliders)
     live = live_run(
@@ -356,14 +341,14 @@ def outcome(model: RideModel, problem: Any, lane: Any) -> tuple[Int[Array, ""], 
     return status, jnp.where(status == int(Status.COMPLETED), jnp.sqrt(sum(squares))[0], jnp.inf)
 
 
-def stage(rides: list[Any]) -> Stage:
+def stage(rides: list[Any]) -> views.Stage:
     """The stage of the first ride, on a part of the ground that contains all rides."""
     (first,), scene = rides[0].stages(), rides[0].model.scene
     length = float(scene.body.wheelbase)
     points = np.concatenate([np.asarray(ride.position) for ride in rides])
     # The page would not update the curve of the friction that the tyres need, which `frame` does not compute.
     shows = tuple(show._replace(curves=show.curves[:CURVES]) for show in first.shows)
-    ground = arena(scene.surface, points, first.arena.normal, 3.0 * length, length)
+    ground = views.arena(scene.surface, points, first.arena.normal, 3.0 * length, length)
     return first._replace(shows=shows, arena=ground)
 
 
@@ -410,7 +395,7 @@ def draw_rides(grounds: dict[str, AbstractSurface], rides: dict[tuple[str, str],
     figure = Figure(figsize=(18.0, 4.2 * len(grounds)), layout="constrained")
     layout = figure.add_gridspec(len(grounds), 4, width_ratios=(1.5, 1.0, 1.0, 1.0))
     # As on the page, whose curves are those of all grounds.
-    colours = {name: css(COLOURS[number % len(COLOURS)]) for number, name in enumerate(rides)}
+    colours = {name: views.css(views.COLOURS[number % len(views.COLOURS)]) for number, name in enumerate(rides)}
     for row, (name, ground) in enumerate(grounds.items()):
         on_ground = {ride: run for (place_name, ride), run in rides.items() if place_name == name}
         space = figure.add_subplot(layout[row, 0], projection="3d")

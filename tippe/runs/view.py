@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from nonholonomic import views
 from nonholonomic.geometry import vector_of
 from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import Settings, crossing_time
@@ -31,25 +32,6 @@ from nonholonomic.runs.trajectory import (
 from nonholonomic.sweeps import chunk_for
 from nonholonomic.terminal import status_line
 from nonholonomic.text import readable_unit
-from nonholonomic.views import (
-    COLOURS,
-    DARK,
-    PALE,
-    Arrow,
-    Body,
-    Curve,
-    Mesh,
-    Page,
-    Show,
-    Stage,
-    Trace,
-    arena,
-    ball,
-    distinguished_by_colour,
-    rod,
-    striped,
-    turned,
-)
 from nonholonomic.views.explore import Frame, LiveRun, Summary, quaternion
 
 from ..model.body import AbstractBody, Top
@@ -134,29 +116,29 @@ def motion(run: Any) -> DrawnMotion[np.ndarray]:
     return DrawnMotion(*(np.asarray(part)[:count] for part in _motion(run.padded())))
 
 
-def show(scene: Scene, motion: DrawnMotion[np.ndarray], number: int, name: str) -> Show:
+def show(scene: Scene, motion: DrawnMotion[np.ndarray], number: int, name: str) -> views.Show:
     """The drawing of one run, the `number`-th of its stage."""
-    body, colour = scene.body, COLOURS[number % len(COLOURS)]
+    body, colour = scene.body, views.COLOURS[number % len(views.COLOURS)]
     motion = DrawnMotion(*(np.asarray(part)[np.isfinite(motion.theta)] for part in motion))
     radius, weight = float(body.size), float(body.mass * scene.gravity)
     arrow_start = motion.contact + 0.02 * radius * motion.normal
-    return Show(
+    return views.Show(
         name,
         colour,
         motion.times,
         motion.normal,
         radius,
-        (Body("top", motion.position, turned(motion.rotation), meshes(body, colour)),),
+        (views.Body("top", motion.position, views.turned(motion.rotation), meshes(body, colour)),),
         (
-            Trace("contact", arrow_start, GREEN, 0.06 * radius),
-            Trace("path of the axis", AXIS * radius * motion.axis, BLUE, 0.012 * radius, motion.position, False),
+            views.Trace("contact", arrow_start, GREEN, 0.06 * radius),
+            views.Trace("path of the axis", AXIS * radius * motion.axis, BLUE, 0.012 * radius, motion.position, False),
         ),
         arrows(motion, float(body.offset) if isinstance(body, Top) else 0.0, radius, weight),
         (
-            Curve("θ, normal to axis [rad]", motion.theta),
-            Curve(QUANTITIES["energy"].label, motion.energy),
-            Curve(*curve_of_rotation(scene, motion)),
-            Curve(QUANTITIES["normal_force"].label, motion.normal_force),
+            views.Curve("θ, normal to axis [rad]", motion.theta),
+            views.Curve(QUANTITIES["energy"].label, motion.energy),
+            views.Curve(*curve_of_rotation(scene, motion)),
+            views.Curve(QUANTITIES["normal_force"].label, motion.normal_force),
         ),
     )
 
@@ -169,7 +151,7 @@ def curve_of_rotation(scene: Scene, motion: DrawnMotion[Any]) -> tuple[str, Any]
     return QUANTITIES["jellett"].label, motion.jellett
 
 
-def arrows(motion: DrawnMotion[np.ndarray], offset: float, radius: float, weight: float) -> tuple[Arrow, ...]:
+def arrows(motion: DrawnMotion[np.ndarray], offset: float, radius: float, weight: float) -> tuple[views.Arrow, ...]:
     """Forces and slip at the contact, weight, angular velocity and momentum at the centre of mass."""
     arrow_start = motion.contact + 0.02 * radius * motion.normal
     centre = motion.position - offset * motion.axis
@@ -178,8 +160,8 @@ def arrows(motion: DrawnMotion[np.ndarray], offset: float, radius: float, weight
     weight_vector = np.broadcast_to([0.0, 0.0, -weight], centre.shape)
     push, width = motion.normal_force[:, None] * motion.normal, 0.05 * radius
     arrows = [
-        Arrow("normal force", arrow_start, push, "N", WEIGHT * radius / weight, VIOLET, width, through=True),
-        Arrow("slip", arrow_start, motion.slip, "m/s", SLIP * radius / common, GOLD, width, SLIP * radius),
+        views.Arrow("normal force", arrow_start, push, "N", WEIGHT * radius / weight, VIOLET, width, through=True),
+        views.Arrow("slip", arrow_start, motion.slip, "m/s", SLIP * radius / common, GOLD, width, SLIP * radius),
     ]
     for name, vector, unit, length, colour in (
         ("weight at the centre of mass", weight_vector, "N", WEIGHT, BLACK),
@@ -187,43 +169,51 @@ def arrows(motion: DrawnMotion[np.ndarray], offset: float, radius: float, weight
         ("angular momentum", motion.angular_momentum, "kg m²/s", SPIN, PINK),
     ):
         scale = length * radius / max(float(np.linalg.norm(vector, axis=-1).max()), 1e-300)
-        arrows.append(Arrow(name, centre, vector, unit, scale, colour, width, None, True, False))
+        arrows.append(views.Arrow(name, centre, vector, unit, scale, colour, width, None, True, False))
     return tuple(arrows)
 
 
 @stages_of.register(AbstractTrajectory)
-def _(run: AbstractTrajectory, runs: list[Any], overlaid: bool, unit: Unit) -> list[Stage]:
+def _(run: AbstractTrajectory, runs: list[Any], overlaid: bool, unit: Unit) -> list[views.Stage]:
     drawn = [(name, run.scene, motion(run)) for name, run in zip(names_of(runs, unit), runs, strict=True)]
     return stages([drawn] if overlaid else [[one] for one in drawn])
 
 
-def stages(groups: list[list[tuple[str, Scene, DrawnMotion]]]) -> list[Stage]:
+def stages(groups: list[list[tuple[str, Scene, DrawnMotion]]]) -> list[views.Stage]:
     """A stage for each group of runs on a common arena, with their names; all runs have different colours."""
     all_stages, number = [], 0
     for group in groups:
         (_, scene, first), radius = group[0], float(group[0][1].body.size)
         points = np.concatenate([motion.contact for _, _, motion in group])
-        ground = arena(scene.surface, points, first.normal[0], 4.0 * radius, 2.5 * radius)
-        shows = distinguished_by_colour(
+        ground = views.arena(scene.surface, points, first.normal[0], 4.0 * radius, 2.5 * radius)
+        shows = views.distinguished_by_colour(
             tuple(show(of_run, motion, number + k, name) for k, (name, of_run, motion) in enumerate(group))
         )
-        all_stages.append(Stage("; ".join(name for name, _, _ in group), ground, shows))
+        all_stages.append(views.Stage("; ".join(name for name, _, _ in group), ground, shows))
         number += len(group)
     return all_stages
 
 
-def meshes(body: AbstractBody | AbstractRigidBody, colour: int) -> tuple[Mesh, ...]:
+def meshes(body: AbstractBody | AbstractRigidBody, colour: int) -> tuple[views.Mesh, ...]:
     """The body in two colours; a top has its stem, or a short stem that only shows the axis."""
     if isinstance(body, AbstractRigidBody):
-        return tuple(mesh._replace(vertices=touching(body, mesh.vertices)) for mesh in ball(1.0, (colour, PALE)))
+        return tuple(
+            mesh._replace(vertices=touching(body, mesh.vertices)) for mesh in views.ball(1.0, (colour, views.PALE))
+        )
     if not isinstance(body, Top):
-        return striped(profile(body), (colour, PALE))
+        return views.striped(profile(body), (colour, views.PALE))
     radius = float(body.radius)
     if body.stem is None:
-        sphere = ball(radius, (colour, PALE))
-        return (*sphere, rod(0.10 * radius, 0.9 * radius, AXIS * radius - 0.16 * radius, 0.16 * radius, DARK))
+        sphere = views.ball(radius, (colour, views.PALE))
+        return (
+            *sphere,
+            views.rod(0.10 * radius, 0.9 * radius, AXIS * radius - 0.16 * radius, 0.16 * radius, views.DARK),
+        )
     knob, end = float(body.stem.radius), float(body.stem.offset - body.offset)
-    return (*striped(truncated(radius, knob, end), (colour, PALE)), rod(0.999 * knob, 0.0, end, knob, DARK))
+    return (
+        *views.striped(truncated(radius, knob, end), (colour, views.PALE)),
+        views.rod(0.999 * knob, 0.0, end, knob, views.DARK),
+    )
 
 
 def touching(body: AbstractRigidBody, directions: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
@@ -240,8 +230,8 @@ def truncated(radius: float, knob: float, end: float) -> Float[np.ndarray, "poin
     """
     lower_radius = min(radius * (radius - knob) / end, 0.9 * radius)
     polar = np.linspace(np.arccos((radius - 0.8 * (radius - lower_radius)) / radius), np.pi, 25)
-    ball = radius * np.stack([np.sin(polar), np.cos(polar)], axis=-1)
-    return np.concatenate([[[0.0, ball[0, 1]]], ball])
+    sphere = radius * np.stack([np.sin(polar), np.cos(polar)], axis=-1)
+    return np.concatenate([[[0.0, sphere[0, 1]]], sphere])
 
 
 def profile(body: AbstractBody) -> Float[np.ndarray, "points 2"]:
@@ -268,7 +258,7 @@ def explore(
     sliders: Sliders | None = None,
     t1: float = 8.0,
     unit: str | Sequence[str] | None = None,
-) -> Page:
+) -> views.Page:
     """Make a page with sliders that simulates the top in the browser while you move a slider. The page is one file that
     needs no network; a notebook shows the returned `Page`. The equations of motion, the Runge-Kutta pair, the step-size
     control and the location of the event are generated from those of `inversion_table`, or, under `NoSlip`, of
@@ -309,7 +299,7 @@ def explore(
 
 
 @page_of.register(TopModel)
-def _(model: TopModel, sliders: Sliders | None, t1: float) -> tuple[LiveRun, Stage]:
+def _(model: TopModel, sliders: Sliders | None, t1: float) -> tuple[LiveRun, views.Stage]:
     live = page_of_launch(model, sliders, t1)
     if model.scene.contact == "hybrid" and model.scene.level:
         return live, stage_at_start(model, t1)
@@ -379,14 +369,14 @@ def outcome(model: TopModel, problem: Any, ended: Any) -> tuple[Int[Array, ""], 
     return status, jnp.where(ended.status[0] == CROSSED, time[0], jnp.inf)
 
 
-def stage_of_runs(runs: list[Trajectory]) -> Stage:
+def stage_of_runs(runs: list[Trajectory]) -> views.Stage:
     """The first run, on a part of the arena that also contains the others."""
     (first,), scene = runs[0].stages(), runs[0].scene
     points, size = np.concatenate([motion(run).contact for run in runs]), float(scene.body.size)
-    return first._replace(arena=arena(scene.surface, points, first.arena.normal, 4.0 * size, 2.5 * size))
+    return first._replace(arena=views.arena(scene.surface, points, first.arena.normal, 4.0 * size, 2.5 * size))
 
 
-def stage_at_start(model: TopModel, t1: float) -> Stage:
+def stage_at_start(model: TopModel, t1: float) -> views.Stage:
     """The top on a level plane at its launch; the page replaces it by a simulated run before it is visible."""
     scene = model.scene
     start = DrawnMotion(*(np.repeat(np.asarray(part), 2, axis=0) for part in _motion_at_start(model)))
@@ -398,8 +388,8 @@ def stage_at_start(model: TopModel, t1: float) -> Stage:
     slip = slip._replace(scale=slip.limit / max(fastest, 1e-12))
     initial_show = initial_show._replace(arrows=(normal_force, slip, *arrows))
     reach = REACH * math.sqrt(float(scene.gravity) * size) * t1
-    ground = arena(scene.surface, start.contact, start.normal[0], max(reach, 10.0 * size), 2.5 * size)
-    return Stage("", ground, (initial_show,), follows=True)
+    ground = views.arena(scene.surface, start.contact, start.normal[0], max(reach, 10.0 * size), 2.5 * size)
+    return views.Stage("", ground, (initial_show,), follows=True)
 
 
 @eqx.filter_jit
