@@ -352,7 +352,7 @@ class Ensemble(eqx.Module):
             return cls(problem_of(model, cells, ()), None, None, None, 0, continues)
         return cls(None, *modes_of(model, cells, tolerance, (), continues), len(model.counters), continues)
 
-    def solve(self, t1: Number, cells: Number, settings: Settings, traced: bool = False) -> Outcome | HybridOutcome:
+    def solve(self, t1: Any, cells: Any, settings: Settings, traced: bool = False) -> Outcome | HybridOutcome:
         """The outcome of the runs.
 
         **Arguments:** `t1`: horizon [s]; `cells`: number of cells to run, the rest is padding; `traced`: whether numbers
@@ -370,8 +370,8 @@ class Ensemble(eqx.Module):
     def solve_with_tangents(
         self,
         tangents: Sequence[Any],
-        t1: Number,
-        cells: Number,
+        t1: Any,
+        cells: Any,
         settings: Settings,
         traced: bool = False,
         one_kernel: bool = True,
@@ -588,7 +588,8 @@ class EventTime(AbstractDifferentiableSolve):
         model = self.model(leaves)
         model.require_differentiable(nested, self.last)
 
-        def build(floats: tuple[Array, ...], cells: Number) -> Ensemble:
+        def build(floats: tuple[Array, ...], cells: int | None) -> Ensemble:
+            assert cells is not None
             return Ensemble.of(self.model((*floats, *leaves[self.movable :])), cells, settings.tolerance, self.last)
 
         # Cells are independent, so varying a parameter in all of them at once gives each its own derivative.

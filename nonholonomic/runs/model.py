@@ -85,7 +85,7 @@ class AbstractModel(eqx.Module):
         """For each full name the name of an axis, its unit, and a description."""
 
     @abc.abstractmethod
-    def description(self) -> dict[str, object]:
+    def description(self) -> dict[str, Any]:
         """The model as plain data, for the request of a table."""
 
     @property
@@ -170,7 +170,7 @@ class AbstractModel(eqx.Module):
         raise NotImplementedError(f"{type(self).__name__} is smooth and has no modes")
 
     @abc.abstractmethod
-    def simulate(self, t1: Number, times: Any, tolerance: Number, solver: Any, adjoint: Any) -> Any:
+    def simulate(self, t1: ArrayLike, times: Any, tolerance: ArrayLike, solver: Any, adjoint: Any) -> Any:
         """The run as a trajectory. **Arguments:** as for `nonholonomic.simulate`."""
 
     @abc.abstractmethod
@@ -299,13 +299,13 @@ def model_of(
     )
 
 
-def check_run(model: AbstractModel, t1: Number, tolerance: Number) -> None:
+def check_run(model: AbstractModel, t1: ArrayLike, tolerance: ArrayLike) -> None:
     """Raise `ValueError` unless the model may run, and horizon and tolerance are single legal numbers."""
     model.check()
     check_horizon(t1, tolerance)
 
 
-def check_horizon(t1: Number, tolerance: Number) -> None:
+def check_horizon(t1: ArrayLike, tolerance: ArrayLike) -> None:
     """Raise `ValueError` unless horizon and tolerance are single legal numbers."""
     require_all(run_bounds(t1, tolerance))
     for name, number in {"t1": t1, "tolerance": tolerance}.items():

@@ -20,7 +20,7 @@ from ..sweeps import Axis, Variable, axis
 from ..terminal import status_line
 from ..validation import as_known, as_number, is_traced, nan_unless, warn
 from .event import modes_of, problem_of
-from .model import AbstractModel, Names, Number, Start, check_run, model_of
+from .model import AbstractModel, Names, Number, Start, check_run, model_of, settings_for_lanes
 from .trajectory import Trajectory
 
 # Quantities of many runs at given times, in lanes.
@@ -215,7 +215,7 @@ def simulate(
 
 
 def simulate_model(
-    model: AbstractModel, t1: Number, times: Any, tolerance: Number, solver: diffrax.AbstractSolver | None = None
+    model: AbstractModel, t1: ArrayLike, times: Any, tolerance: ArrayLike, solver: diffrax.AbstractSolver | None = None
 ) -> Trajectory:
     """The run of a model at given times, or at equally spaced ones. **Arguments:** as for `simulate`, checked but `times`."""
     times = evenly_spaced(as_known(t1)) if times is None else times

@@ -207,7 +207,7 @@ def sweep(
     return table_of(model, named, float(t1), crossing, options, TableForm(model.words), samples=samples, timed=timed)
 
 
-def samples_of(known: dict[str, Quantity], times: Any, quantities: Any, t1: Number) -> Samples | None:
+def samples_of(known: dict[str, Quantity], times: Any, quantities: Any, t1: Number | None) -> Samples | None:
     """The samples of a table, checked. **Arguments:** `known`: the quantities of the model."""
     if times is None and not len(quantities):
         return None
@@ -269,7 +269,7 @@ def check_cells(model: AbstractModel, grid: list[Axis], options: Options) -> Non
 
 
 def compute_table(
-    job: TableJob, grid: list[Axis], units: dict[str, str], request: dict[str, object], options: Options
+    job: TableJob, grid: list[Axis], units: dict[str, str], request: dict[str, Any], options: Options
 ) -> Table:
     """Compute the cells of a grid, which were checked.
 

@@ -151,7 +151,7 @@ class RideModel(AbstractSceneModel):
             labels[full] = (name, unit, LONG_NAMES.get(full, LONG_NAMES.get(name, name.replace("_", " "))))
         return labels
 
-    def description(self) -> dict[str, object]:
+    def description(self) -> dict[str, Any]:
         controls: Any = self.input if self.original is None else self.original.input
         if isinstance(controls, eqx.Module):
             controls = description("input", controls)
@@ -202,7 +202,7 @@ class RideModel(AbstractSceneModel):
         clock = jnp.zeros_like(ride.states[:1])
         return ExtendedProblem(ride, Clock(), clock, clock + UNMEASURED)
 
-    def simulate(self, t1: Number, times: Any, tolerance: Number, solver: Any, adjoint: Any) -> Trajectory:
+    def simulate(self, t1: ArrayLike, times: Any, tolerance: ArrayLike, solver: Any, adjoint: Any) -> Trajectory:
         return ride(self, t1, times, tolerance, solver, DEFAULT_STEPS, adjoint)
 
     def without_event(self) -> "RideModel":
@@ -252,9 +252,7 @@ class RideModel(AbstractSceneModel):
 
 
 @model_of.register(Scene)
-def _(
-    system: Scene, start: object, event: Any = None, input: Input | None = None, jumps: object = None
-) -> AbstractModel:
+def _(system: Scene, start: Any, event: Any = None, input: Input | None = None, jumps: object = None) -> AbstractModel:
     require_kind(start, "start", Launch)
     lists = "axes of sweep take lists, and jax.vmap maps over them"
     require_scalars(numbers("scene", system, functions=False) | numbers("launch", start), lists)
@@ -263,7 +261,7 @@ def _(
     return RideModel.of(system, start, input, event, jumps)
 
 
-def check_run(scene: Any, launch: Any, t1: Number, input: Any, tolerance: Number, jumps: object = None) -> None:
+def check_run(scene: Any, launch: Any, t1: ArrayLike, input: Any, tolerance: ArrayLike, jumps: object = None) -> None:
     """Raise `ValueError` unless scene, launch, horizon, input and tolerance are legal and the scene can start with the
     launch."""
     lists = "axes of sweep take lists, and jax.vmap maps over them"

@@ -17,7 +17,7 @@ from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_ve
 from nonholonomic.integration import ImplicitMidpoint, Settings, explicit_tableau, follow, sample
 from nonholonomic.integration.dense import all_crossings
 from nonholonomic.integration.problem import REACHED_END, require_adaptive, require_adjoint, require_times
-from nonholonomic.runs.model import AbstractModel, Number, Unit
+from nonholonomic.runs.model import AbstractModel, Unit
 from nonholonomic.runs.simulate import evenly_spaced, sampled_if_legal
 from nonholonomic.runs.trajectory import AbstractRun
 from nonholonomic.sweeps import Quantity, Table, chosen, run_table
@@ -175,7 +175,7 @@ def side_force(
     return scene.dynamics.projected_side_force(t, states, controls)
 
 
-def table_of(runs: list[Any], names: list[str], request: dict[str, object], only: Sequence[str] = ()) -> Table:
+def table_of(runs: list[Any], names: list[str], request: dict[str, Any], only: Sequence[str] = ()) -> Table:
     """All quantities of several runs with the same times, over these times.
 
     **Arguments:**
@@ -590,9 +590,9 @@ DEFAULT_STEPS = 65536
 
 def ride(
     model: Any,
-    t1: Number,
+    t1: ArrayLike,
     times: Any,
-    tolerance: Number,
+    tolerance: ArrayLike,
     solver: diffrax.AbstractSolver | None,
     max_steps: int,
     adjoint: diffrax.AbstractAdjoint | None,

@@ -222,7 +222,7 @@ class TopModel(AbstractSceneModel):
         taken = (*self.quantities, "time", "status", "end_time", *self.ends, *self.counters, "steps", "rejected")
         return labels(self.scene, self.launch, names, taken)
 
-    def description(self) -> dict[str, object]:
+    def description(self) -> dict[str, Any]:
         request = {path: value for name, root in self.roots.items() for path, value in description(name, root).items()}
         return request if self.event is None else request | {"event": self.event.name}
 
@@ -315,7 +315,7 @@ class TopModel(AbstractSceneModel):
             return contact_modes(trajectory_problem((scene, launch), cells), tolerance)
         return flight_modes(scene, launch, tolerance, cells)
 
-    def simulate(self, t1: Number, times: Any, tolerance: Number, solver: Any, adjoint: Any) -> Any:
+    def simulate(self, t1: ArrayLike, times: Any, tolerance: ArrayLike, solver: Any, adjoint: Any) -> Any:
         return simulate_launch(self, t1, times, tolerance, solver, adjoint)
 
     @property
@@ -328,7 +328,7 @@ class TopModel(AbstractSceneModel):
         run = dataclasses.replace(self.moment(rows, mode), start=self.scene.state(self.launch))
         return {name: getattr(run, name) for name in names}
 
-    def moment(self, rows: Float[Array, "rows *cells"], mode: Int[ArrayLike, "..."] | None) -> Any:
+    def moment(self, rows: Float[Array, "rows *cells"], mode: Any) -> Any:
         """The states as a trajectory without times."""
         scene, kind, zeros = self.scene, self.trajectories, jnp.zeros(rows.shape[1:])
         core = len(scene.state(self.launch))
@@ -387,7 +387,7 @@ def _integrated(scene: Scene) -> Scene:
 
 
 @model_of.register(Scene)
-def _(system: Scene, start: object, event: Any = None, input: object = None, jumps: object = None) -> AbstractModel:
+def _(system: Scene, start: Any, event: Any = None, input: object = None, jumps: object = None) -> AbstractModel:
     require_kind(start, "start", Launch)
     if input is not None or jumps is not None:
         name = "jumps" if input is None else "input"

@@ -139,12 +139,12 @@ class AbstractTrajectory(AbstractRun):
     Vectors are arrays (times, 3) in the fixed frame (x, y, z); see `Trajectory`.
     """
 
-    t: Float[Values, " times"]
+    t: Float[Any, " times"]
     scene: Scene
-    states: Float[Values, "components times"]
-    cyclic: Float[Values, "paths times"]
-    spin_angle: Float[Values, " times"]
-    work: Float[Values, " times"]
+    states: Float[Any, "components times"]
+    cyclic: Float[Any, "paths times"]
+    spin_angle: Float[Any, " times"]
+    work: Float[Any, " times"]
     # The end of the run; not needed where only the times are read, as in a page.
     status: Any = None
     end_time: Any = None
@@ -185,7 +185,7 @@ class AbstractTrajectory(AbstractRun):
         """Kinetic and potential energy [J]."""
 
     @classmethod
-    def parts_of(cls, scene: Scene, rows: Values, mode: Values | None, core: int) -> dict[str, Values]:
+    def parts_of(cls, scene: Scene, rows: Values, mode: Values | None, core: int) -> dict[str, Any]:
         """The fields `by_time` but the times, from output rows.
 
         **Arguments:** `mode`: the indices of the modes at these times, or `None` for a smooth run; `core`: the number of

@@ -223,7 +223,7 @@ class HybridTrajectory(AbstractTrajectory):
         return float(min([*strokes, first]))
 
     @of_each_run
-    def _stem_gap(self) -> Float[Array, " times"]:
+    def _stem_gap(self) -> Values:
         """Distance of the stem from the arena [m]."""
         main, stem = balls(self.scene.body)
         return self.above[0] + height(main, stem, self.states)
@@ -262,7 +262,7 @@ class HybridTrajectory(AbstractTrajectory):
         return jnp.stack(approach(self.scene.body, self._ball, self._free).velocity[:2], axis=-1)
 
     @classmethod
-    def parts_of(cls, scene: Scene, rows: Values, mode: Values | None, core: int) -> dict[str, Values]:
+    def parts_of(cls, scene: Scene, rows: Values, mode: Any, core: int) -> dict[str, Any]:
         # The rows end with the distance and its rate.
         parts = super().parts_of(scene, rows[:-2], mode, core)
         return parts | {"distance": rows[-2:], "contact": cls.touching(scene, mode)}
@@ -401,27 +401,27 @@ class ArenaTrajectory(HybridTrajectory):
 
 def simulate_launch(
     model: Any,
-    t1: Number,
+    t1: ArrayLike,
     times: Any,
-    tolerance: Number,
+    tolerance: ArrayLike,
     solver: diffrax.AbstractSolver | None,
     adjoint: diffrax.AbstractAdjoint | None,
 ) -> Trajectory | HybridTrajectory:
     """The run of a `TopModel`. **Arguments:** as for `tippe.simulate`."""
     require_adaptive(solver)
     require_adjoint(adjoint)
-    settings = Settings(tolerance, solver)
+    settings, horizon = Settings(tolerance, solver), as_number(t1)
     if times is not None:
         times = as_number(times)
         require_times(times, t1)
     if is_traced((model, times, t1, tolerance)):
-        return _traced(model, times, as_number(t1), settings, adjoint)
+        return _traced(model, times, horizon, settings, adjoint)
     if model.smooth:
-        path = follow(model.problem(None, None), float(t1), settings)
+        path = follow(model.problem(None, None), float(horizon), settings)
     else:
         modes, first, state = model.modes(1, settings.tolerance, None, False)
         start = int(np.asarray(first)[0]), np.asarray(state)[:, 0]
-        path = solve_hybrid_dense(modes, *start, float(t1), settings, counters=len(model.counters))
+        path = solve_hybrid_dense(modes, *start, float(horizon), settings, counters=len(model.counters))
     run = _along(model, path, settings.tolerance)
     if times is None:
         return run
@@ -492,7 +492,7 @@ def work_in(scene: Scene, piece: Segment) -> float:
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
 @eqx.filter_jit
 def _traced(
-    model: Any, times: Any, t1: Number, settings: Settings, adjoint: diffrax.AbstractAdjoint | None
+    model: Any, times: Any, t1: Array, settings: Settings, adjoint: diffrax.AbstractAdjoint | None
 ) -> Trajectory | HybridTrajectory:
     """The run inside a transformation; NaN and the status "illegal" if a traced number is out of range."""
     if times is None:

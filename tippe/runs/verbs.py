@@ -707,7 +707,7 @@ class ExtendedTime(EventTime):
         return times, slopes
 
 
-def beyond_horizon(end: Lanes, start: Lanes, angle: Any, t1: Number) -> Lanes:
+def beyond_horizon(end: Lanes, start: Lanes, angle: Any, t1: Any) -> Lanes:
     """The time [s] of a top that has not inverted by `t1`, with theta at the end and at the start of the run [rad]; see
     `extended_inversion_time`."""
 
