@@ -57,9 +57,6 @@ class AbstractModel(eqx.Module):
     #: The names that choose a layout in which states of nearby runs can be compared.
     comparable: ClassVar[Names] = ()
 
-    #: Smallest number of cells in a chunk of a large table; `None` for the default.
-    least_chunk: ClassVar[int | None] = None
-
     # The parameters by name.
 
     @abc.abstractmethod
@@ -87,11 +84,6 @@ class AbstractModel(eqx.Module):
     @abc.abstractmethod
     def description(self) -> dict[str, Any]:
         """The model as plain data, for the request of a table."""
-
-    @property
-    @abc.abstractmethod
-    def users(self) -> Any:
-        """The parts of the model that may have a user's code, for `equations.has_users_code`."""
 
     # Whether a run may begin.
 
@@ -146,14 +138,10 @@ class AbstractModel(eqx.Module):
         """The slopes that guide a fit: "exact", or "differences" if derivatives do not show the trend of times."""
         return "exact"
 
-    def for_lanes(self) -> "AbstractModel":
-        """The model in a form that is fastest where runs in transformations share lanes."""
-        return self
-
-    @property
-    def arrays_in_lanes(self) -> bool:
-        """Whether arrays among the leaves have the lanes in their last axis."""
-        return False
+    def for_lanes(self) -> tuple["AbstractModel", bool]:
+        """The model in a form that is fastest where runs in transformations share lanes, and whether arrays among its leaves
+        have the lanes in their last axis."""
+        return self, False
 
     @property
     def counters(self) -> dict[str, str]:
@@ -245,10 +233,6 @@ class AbstractSceneModel(AbstractModel):
     @abc.abstractmethod
     def roots(self) -> dict[str, PyTree]:
         """The trees whose numbers are parameters, which are fields of the model."""
-
-    @property
-    def users(self) -> Any:
-        return self.roots, None if self.event is None else self.event.function
 
     @property
     def known_of_event(self) -> list[str]:

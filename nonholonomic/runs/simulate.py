@@ -277,9 +277,8 @@ def sampled(
         of_one_cell = jax.tree.map(lambda part: part[None], samples)
         return SampledRows(samples.shown, None, mode_at(samples.number), outcome_of(of_one_cell))
     if adjoint is None:
-        prepared = model.for_lanes()
-        lanes = {"arrays_in_lanes": prepared.arrays_in_lanes}
-        run = sampled_run(problem_of_run, (prepared, names), times, t1, settings, grid, **lanes)
+        prepared, in_lanes = model.for_lanes()
+        run = sampled_run(problem_of_run, (prepared, names), times, t1, settings, grid, arrays_in_lanes=in_lanes)
     else:
         run = sampled_run_by_diffrax(problem_of_run((model, names), None), times, t1, settings, adjoint, grid)
     status, accepted, rejected = (

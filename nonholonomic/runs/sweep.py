@@ -84,6 +84,9 @@ def checksum_of(model: AbstractModel) -> str:
 #: Greatest number of values in the samples of a chunk: 256 MB.
 MOST_SAMPLED = 1 << 25
 
+#: Smallest number of cells in a chunk of a large table of an own system.
+LEAST_CHUNK = 1024
+
 #: A table warns of cells with more steps than this, and more than this multiple of the median.
 SLOW_STEPS, SLOW = 10_000, 30
 
@@ -287,7 +290,7 @@ def compute_table(
     request |= {"max_steps": int(options.max_steps)} if options.max_steps != DEFAULT_MAX_STEPS else {}
     request |= {"errors": True} if options.errors else {}
     request |= {"sensitivities": list(slopes)} if slopes else {}
-    if options.path is not None and has_users_code(job.model.users):
+    if options.path is not None and has_users_code(job.model.__reduce__()[1]):
         request |= {EQUATIONS: checksum_of(job.model)}
     work: Any = job
     listed: dict[str, Any] | None = None
@@ -297,8 +300,8 @@ def compute_table(
         variables = {axis.name: Variable(axis.unit, np.float64, long_name=axis.long_name) for axis in grid} | variables
         work = ScatteredJob(job, listed, {axis.number: axis.name for axis in grid})
         grid = [Axis("cell", "cell", "1", np.arange(len(grid[0].values)), "cell")]
-    cells, least = size_of(grid), job.model.least_chunk
-    chunk = max(least, chunk_for(cells)) if least is not None and cells > 4 * least else None
+    cells, is_scene = size_of(grid), isinstance(job.model, AbstractSceneModel)
+    chunk = None if is_scene or cells <= 4 * LEAST_CHUNK else max(LEAST_CHUNK, chunk_for(cells))
     inner, most = [], None
     if job.samples is not None:
         request |= {"quantities": list(job.samples.names)}
@@ -313,7 +316,7 @@ def compute_table(
         values = {name: float(values[first]) for name, values in of_all.items()}
         _warn_of_illegal_cells(job.model, values, len(illegal), cells)
     # The coordinates of scenes are regular.
-    if "steps" in table and not isinstance(job.model, AbstractSceneModel):
+    if "steps" in table and not is_scene:
         steps = np.ravel(table["steps"])
         slow = steps > max(SLOW_STEPS, SLOW * float(np.median(steps)))
         if np.any(slow):

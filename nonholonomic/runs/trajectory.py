@@ -218,37 +218,28 @@ def live_run(
     def at(model: Any, values: Float[Array, " numbers"]) -> Any:
         return model.replaced({slider.path: value for slider, value in zip(sliders, values, strict=True)})
 
+    def answers(values: Array, problem: Any, ended: Any) -> tuple[Array, Array]:
+        return outcome(at(model, values), problem, ended)
+
+    def drawing(values: Array, mode: Any, rows: Array, time: Any) -> Frame:
+        return frame(at(drawn, values), time, rows, mode)
+
     if model.smooth:
-        problem = motion or (lambda drawn: drawn.problem(1, None))
+        shown_motion = motion or (lambda drawn: drawn.problem(1, None))
+        ends_late = model.continues and model.has_event
         answering: Any = Simulator(
-            lambda values: at(model, values).problem(1, ()),
-            t1,
-            settings,
-            {"outcome": lambda values, problem, lane: outcome(at(model, values), problem, lane)},
-            model.continues and model.has_event,
+            lambda values: at(model, values).problem(1, ()), t1, settings, {"outcome": answers}, ends_late
         )
-        moving: Any = Simulator(
-            lambda values: problem(at(drawn, values)),
-            t1,
-            settings,
-            {"frame": lambda values, problem, lane: frame(at(drawn, values), lane.time, lane.state, None)},
-        )
+        frames = {"frame": lambda values, problem, lane: drawing(values, None, lane.state, lane.time)}
+        moving: Any = Simulator(lambda values: shown_motion(at(drawn, values)), t1, settings, frames)
     else:
-        counters = len(model.counters)
+        options = (t1, settings, len(model.counters))
+        outcomes = {"outcome": lambda values, runs: answers(values, None, runs)}
         answering = HybridSimulator(
-            lambda values: at(model, values).modes(1, settings.tolerance, (), False),
-            t1,
-            settings,
-            counters,
-            {"outcome": lambda values, runs: outcome(at(model, values), None, runs)},
+            lambda values: at(model, values).modes(1, settings.tolerance, (), False), *options, outcomes
         )
         moving = HybridSimulator(
-            lambda values: at(drawn, values).modes(1, settings.tolerance, None, False),
-            t1,
-            settings,
-            counters,
-            {},
-            lambda values, mode, rows, time: frame(at(drawn, values), time, rows, mode),
+            lambda values: at(drawn, values).modes(1, settings.tolerance, None, False), *options, {}, drawing
         )
     result = Answer(*answer, answering, words or {})
     return LiveRun(title, sliders, lambda values: jnp.all(at(model, values).legal()), result, moving, summaries)

@@ -123,10 +123,6 @@ class RideModel(AbstractSceneModel):
         return {"scene": self.scene, "launch": self.launch} | module
 
     @property
-    def users(self) -> Any:
-        return super().users, self.input if self.original is None else self.original.input
-
-    @property
     def known(self) -> list[str]:
         """The full names of the parameters that can be varied: single numbers, including omitted ones, which are 0."""
         values, level = numbers_of(self.roots), isinstance(self.scene.surface, Plane)
@@ -175,16 +171,12 @@ class RideModel(AbstractSceneModel):
     def words(self) -> tuple[str, ...]:
         return ("completed", "contact_lost", "rank_lost", "failed", "event")
 
-    def for_lanes(self) -> "RideModel":
+    def for_lanes(self) -> tuple["RideModel", bool]:
         if not isinstance(self.input, Formula | Held) or has_arrays((self.scene, self.launch)):
-            return self
+            return self, isinstance(self.input, PerRide)
         t, motion = eqx.filter_eval_shape(at_start, self.scene, self.launch)
         controls = self.input.whole if isinstance(self.input, Held) else self.input
-        return dataclasses.replace(self, input=PerRide.of(controls, t, motion))
-
-    @property
-    def arrays_in_lanes(self) -> bool:
-        return isinstance(self.input, PerRide)
+        return dataclasses.replace(self, input=PerRide.of(controls, t, motion)), True
 
     @property
     def has_event(self) -> bool:

@@ -1,7 +1,6 @@
 """The top as a model for the functions of `nonholonomic.runs`."""
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -190,8 +189,7 @@ class TopModel(AbstractSceneModel):
     def __reduce__(self) -> Any:
         # A traced function cannot be pickled, so each process traces it.
         if self.event is None:
-            numbers = {"scene": self.scene, "launch": self.launch, "angle": self.angle}
-            return functools.partial(TopModel, **numbers, reverses=self.reverses), ()
+            return TopModel, (self.scene, self.launch, self.angle, None, self.reverses)
         return TopModel.of, (self.scene, self.launch, self.event.function)
 
     def without_event(self) -> "TopModel":

@@ -268,7 +268,7 @@ def test_a_request_is_that_of_the_code_and_its_data(kind):
             stroller.presets.light(), stroller.Graph(GROUNDS[kind](heights)), stroller.Damping(2.0, 1.0, 0.2, 0.05)
         )
         model = model_of(scene, stroller.Launch((0.0, -0.8), 0.3, 2.0))
-        assert has_users_code(model.users)
+        assert has_users_code(model.__reduce__()[1])
         description = json.dumps(model.description())
         assert " at 0x" not in description
         return description, checksum_of(model)
