@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.compilation.xla_cpu import on_device
 from nonholonomic.geometry import scale, sum_vectors, vector_of
