@@ -254,7 +254,9 @@ HALF, RADIUS, WIDTH = 1.0, 0.03, 0.012
 LINES = 9
 
 
-def portraits(runs: list[Any], overlaid: bool, drawn: tuple[np.ndarray, np.ndarray] | None = None) -> list[Stage]:
+def portraits(
+    runs: list["Trajectory"], overlaid: bool, drawn: tuple[np.ndarray, np.ndarray] | None = None
+) -> list[Stage]:
     """Runs as stages: one stage for each, or a common one for overlaid runs.
 
     **Arguments:** `drawn`: middle and scales of the drawn part of the plane, by default that of the runs.
@@ -272,7 +274,7 @@ def portraits(runs: list[Any], overlaid: bool, drawn: tuple[np.ndarray, np.ndarr
     return stages
 
 
-def plane_points(run: Any) -> Float[np.ndarray, "times 2"]:
+def plane_points(run: "Trajectory") -> Float[np.ndarray, "times 2"]:
     """The drawn components of a run."""
     return np.stack([np.asarray(run[name], float) for name in run.portrait_axes], axis=-1)
 
@@ -285,7 +287,7 @@ def frame_of(points: Float[np.ndarray, "points 2"]) -> tuple[np.ndarray, np.ndar
     return 0.5 * (low + high), 1.8 * HALF / span
 
 
-def show(run: Any, number: int, centre: np.ndarray, scale: np.ndarray) -> Show:
+def show(run: "Trajectory", number: int, centre: np.ndarray, scale: np.ndarray) -> Show:
     """The drawing of one run, the `number`-th of all."""
     colour = COLOURS[number % len(COLOURS)]
     is_reached = np.all(np.isfinite(np.asarray(run.state)), axis=-1)
@@ -338,7 +340,7 @@ class AbstractRun(Viewable, Tabular, eqx.Module):
         """The model of the run, and the end of the runs on its page [s]."""
 
     @property
-    def codes(self) -> Any:
+    def codes(self) -> Int[Array, "..."] | str | None:
         """How the runs of a batch ended, as integers of `Status`; `None` if this is unknown."""
         return None
 
@@ -602,5 +604,5 @@ def brief_names(values: dict[str, list[str]]) -> dict[str, str]:
 
 
 @stages_of.register(Trajectory)
-def _(run: Trajectory, runs: list[Any], overlaid: bool, unit: Unit) -> list[Stage]:
+def _(run: Trajectory, runs: list[Trajectory], overlaid: bool, unit: Unit) -> list[Stage]:
     return portraits([run._with_resets() for run in runs], overlaid)

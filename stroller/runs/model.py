@@ -74,7 +74,7 @@ class Original:
     """A user's input before it was traced, for files and for other processes. All are equal: the traced input decides
     whether a program is compiled again."""
 
-    def __init__(self, controls: Any):
+    def __init__(self, controls: Input):
         self.input = controls
 
     def __eq__(self, other: object) -> bool:

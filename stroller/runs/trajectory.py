@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from nonholonomic.compilation.xla_cpu import compiled_quickly
 from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_vectors
@@ -114,7 +114,7 @@ QUANTITIES = {
 }
 
 #: What a run has in addition, which no table shows.
-FURTHER: dict[str, Callable[[RideState], Any]] = {
+FURTHER: dict[str, Callable[[RideState], PyTree[Array]]] = {
     "power": lambda state: state.power,
     "constraint": lambda state: state.vector(side_slip(state)),
     "departure": lambda state: state.number(state.scene.surface.offset(state.geometry.motion.position)),
@@ -267,7 +267,7 @@ class Steps(NamedTuple):
         states[:, times > self.times[-1]] = np.nan
         return states
 
-    def _between(self, spec: RideSpec, step: Any, length: Lanes) -> States:
+    def _between(self, spec: RideSpec, step: Int[np.ndarray, " lanes"], length: Lanes) -> States:
         """The states at given times [s] after the starts of some steps."""
 
         def field(times: Lanes, states: States) -> States:
@@ -295,7 +295,7 @@ def _field(spec: RideSpec, times: Float[Array, "*lanes"], states: State) -> Stat
     return model.scene.dynamics.field(times, states, model.input)
 
 
-def in_blocks(function: Callable[..., Any], *columns: Any) -> Any:
+def in_blocks(function: Callable[..., Array], *columns: np.ndarray) -> np.ndarray:
     """A compiled function of any number of columns, `WIDTH` at a time; the last block is padded with its last column."""
     count = columns[0].shape[-1]
     results = []
@@ -386,7 +386,7 @@ class Trajectory(AbstractRun):
     """
 
     t: Float[Array, " times"]
-    values: dict[str, Any]
+    values: dict[str, PyTree[Array]]
     stats: Stats
     spec: RideSpec
     steps: Steps | None

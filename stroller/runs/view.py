@@ -1,9 +1,10 @@
 """The drawing of a ride, and its page with sliders."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import Any, NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from nonholonomic import views
 from nonholonomic.geometry import AbstractQuadric, AbstractSurface, vector_of
-from nonholonomic.integration import AbstractPassive, ExtendedProblem
+from nonholonomic.integration import AbstractPassive, ExtendedProblem, LaneState
 from nonholonomic.integration.problem import Status
 from nonholonomic.parameters import numbers
 from nonholonomic.runs.model import Sliders, Unit
@@ -34,6 +35,9 @@ from ..model.vehicle import Launch
 from .model import RideModel, check_run
 from .trajectory import MOST_GRIP, QUANTITIES, RideState, Trajectory, names_of
 
+#: JAX's arrays for a page, or NumPy's for a picture.
+Values: TypeAlias = Array | np.ndarray
+
 # The drawing of a ride: the vehicle, the traces of its wheels, forces, and curves over time.
 
 #: Drawn lengths in units of the wheelbase, the only length of the model: radius and width of the wheels, and the track.
@@ -55,12 +59,12 @@ GREEN, BLUE, VIOLET, GOLD = 0x1F8A4C, 0x1B6CA8, 0x7B4FA3, 0xE0A100
 
 
 @stages_of.register(Trajectory)
-def _(run: Trajectory, runs: list[Any], overlaid: bool, unit: Unit) -> list[views.Stage]:
+def _(run: Trajectory, runs: list[Trajectory], overlaid: bool, unit: Unit) -> list[views.Stage]:
     numbered = list(enumerate(runs))
     return grouped([numbered] if overlaid else [[ride] for ride in numbered], names_of(runs, unit))
 
 
-def grouped(groups: list[list[tuple[int, Any]]], names: list[str]) -> list[views.Stage]:
+def grouped(groups: list[list[tuple[int, Trajectory]]], names: list[str]) -> list[views.Stage]:
     """A stage for each group of numbered rides on a common ground; `names` are the names of the rides."""
     stages = []
     for group in groups:
@@ -74,7 +78,7 @@ def grouped(groups: list[list[tuple[int, Any]]], names: list[str]) -> list[views
     return stages
 
 
-def normals(xp: Any, surface: AbstractSurface, side: str | None, position: Any) -> Any:
+def normals(xp: ModuleType, surface: AbstractSurface, side: str | None, position: Values) -> Values:
     """Unit normals at positions (*times, 3), towards the side on which the stroller is. **Arguments:** `xp`: NumPy, or
     `jax.numpy` for a page."""
     components = surface.normal(surface.in_own_axes(vector_of(position.T)))
@@ -91,15 +95,22 @@ class Posture(NamedTuple):
       the ground's forces act there.
     """
 
-    places: tuple[Any, ...]
-    rotations: tuple[Any, ...]
-    contacts: tuple[Any, Any]
-    up: Any
-    left: tuple[Any, Any]
+    places: tuple[Values, ...]
+    rotations: tuple[Values, ...]
+    contacts: tuple[Values, Values]
+    up: Values
+    left: tuple[Values, Values]
 
     @classmethod
     def of(
-        cls, xp: Any, length: Any, position: Any, direction: Any, normal: Any, steering: Any, angles: Any
+        cls,
+        xp: ModuleType,
+        length: Values | float,
+        position: Values,
+        direction: Values,
+        normal: Values,
+        steering: Values,
+        angles: Sequence[Values] | Values,
     ) -> "Posture":
         """The parts of a vehicle with a wheelbase [m], for its quantities (*times, ...), the ground's normal, and the
         angles [rad] by which left, right and front wheel have rolled. **Arguments:** `xp`: as for `normals`."""
@@ -112,7 +123,7 @@ class Posture(NamedTuple):
         radius, half = RADIUS * length, 0.5 * TRACK * length
         axle, front = position + radius * z, position + length * x + radius * z
 
-        def rolled(ahead: Any, axis: Any, angle: Any) -> Any:
+        def rolled(ahead: Values, axis: Values, angle: Values) -> Values:
             cosine, sine = xp.cos(angle)[..., None], xp.sin(angle)[..., None]
             return xp.stack([cosine * ahead - sine * z, axis, sine * ahead + cosine * z], axis=-1)
 
@@ -126,7 +137,7 @@ class Posture(NamedTuple):
         )
 
 
-def show(run: Any, number: int, name: str) -> views.Show:
+def show(run: Trajectory, number: int, name: str) -> views.Show:
     """The drawing of one ride, the `number`-th of all."""
     scene = run.model.scene
     length, colour = float(scene.body.wheelbase), views.COLOURS[number % len(views.COLOURS)]
@@ -175,7 +186,7 @@ def show(run: Any, number: int, name: str) -> views.Show:
     )
 
 
-def refined(run: Any, radius: float) -> tuple[np.ndarray, Any]:
+def refined(run: Trajectory, radius: float) -> tuple[np.ndarray, Callable[[Values], np.ndarray]]:
     """Times so close that the wheels roll little between them, including the times of the ride, and a function that
     returns the ride's numbers at these times."""
     times = np.asarray(run.t)
@@ -317,7 +328,7 @@ def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float
 class WheelAngles(AbstractPassive):
     """The rolling angles of the left, the right and the front wheel of a ride."""
 
-    def rates(self, problem: Any, time: Float[Array, "..."], state: State, passive: State) -> State:
+    def rates(self, problem: RideProblem, time: Float[Array, "..."], state: State, passive: State) -> State:
         """Each rear wheel, half a track from the middle, rolls as fast as the ground passes below it."""
         length = problem.dynamics.body.wheelbase
         motion = problem.dynamics.geometry(state).motion
@@ -332,7 +343,7 @@ def rolling_ride(model: RideModel) -> ExtendedProblem[RideProblem]:
     return ExtendedProblem(ride, WheelAngles(), jnp.zeros((3, 1)), jnp.ones((3, 1)))
 
 
-def outcome(model: RideModel, problem: Any, lane: Any) -> tuple[Int[Array, ""], Float[Array, ""]]:
+def outcome(model: RideModel, problem: RideProblem, lane: LaneState) -> tuple[Int[Array, ""], Float[Array, ""]]:
     """The `Status` of a ride and the distance of its end from its start [m], infinite if the ride is not completed."""
     first, last = problem.dynamics.unpack(problem.states)[0], problem.dynamics.unpack(lane.state)[0]
     squares = [(a - b) ** 2 for a, b in zip(first, last, strict=True) if a is not None and b is not None]
@@ -341,7 +352,7 @@ def outcome(model: RideModel, problem: Any, lane: Any) -> tuple[Int[Array, ""], 
     return status, jnp.where(status == int(Status.COMPLETED), jnp.sqrt(sum(squares))[0], jnp.inf)
 
 
-def stage(rides: list[Any]) -> views.Stage:
+def stage(rides: list[Trajectory]) -> views.Stage:
     """The stage of the first ride, on a part of the ground that contains all rides."""
     (first,), scene = rides[0].stages(), rides[0].model.scene
     length = float(scene.body.wheelbase)
@@ -352,7 +363,7 @@ def stage(rides: list[Any]) -> views.Stage:
     return first._replace(shows=shows, arena=ground)
 
 
-def frame(scene: Scene, controls: Input | None, time: Any, rows: Float[Array, "rows 1"]) -> Frame:
+def frame(scene: Scene, controls: Input | None, time: Array, rows: Float[Array, "rows 1"]) -> Frame:
     """The drawn quantities of a stroller at one time, in the order of `show`. The rows end with the rolling angles of
     the wheels."""
     state = RideState(scene, controls, time, rows[:-3])
@@ -380,7 +391,7 @@ def frame(scene: Scene, controls: Input | None, time: Any, rows: Float[Array, "r
 # The plot of the main job (needs matplotlib): paths on the ground, speed, energy and side forces.
 
 
-def draw_rides(grounds: dict[str, AbstractSurface], rides: dict[tuple[str, str], Any]) -> Any:
+def draw_rides(grounds: dict[str, AbstractSurface], rides: dict[tuple[str, str], Trajectory]) -> Any:
     """Draw rides, one row of plots per ground.
 
     **Arguments:**
@@ -421,7 +432,7 @@ def draw_rides(grounds: dict[str, AbstractSurface], rides: dict[tuple[str, str],
     return figure
 
 
-def _draw_ground(space: Any, ground: AbstractSurface, rides: dict[str, Any]) -> None:
+def _draw_ground(space: Any, ground: AbstractSurface, rides: dict[str, Trajectory]) -> None:
     """A wire frame of the ground as far as the rides go."""
     from matplotlib.ticker import MaxNLocator
 

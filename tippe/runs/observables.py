@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from nonholonomic.compilation.cache import padded
 from nonholonomic.geometry import Component, Vector, dot, rate_in_frame, scale, stacked, sum_vectors
@@ -68,7 +68,7 @@ OF_RIGID_BODIES = {
 COMPONENTS = {"component": ("x", "y", "z"), "tangent": ("t1", "t2")}
 
 
-def quantities_of(scene: Any) -> dict[str, Quantity]:
+def quantities_of(scene: Scene) -> dict[str, Quantity]:
     """The quantities of runs in a scene."""
     return QUANTITIES | OF_RIGID_BODIES if isinstance(scene.body, AbstractRigidBody) else QUANTITIES
 
@@ -306,7 +306,7 @@ class AbstractTrajectory(AbstractRun):
         return model_of(self.scene, self.launch), float(self.end_time)
 
     @property
-    def codes(self) -> Any:
+    def codes(self) -> Int[Array, "..."] | str | None:
         return self.status
 
     def table_of(self, names: Sequence[str]) -> Table:

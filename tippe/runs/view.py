@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from nonholonomic import views
 from nonholonomic.geometry import vector_of
 from nonholonomic.hybrid import HybridOutcome
-from nonholonomic.integration import Settings, crossing_time
+from nonholonomic.integration import AbstractProblem, Settings, crossing_time
 from nonholonomic.integration.problem import CROSSED, REACHED_END, Status
 from nonholonomic.parameters import numbers, numbers_of, with_numbers
 from nonholonomic.runs.event import Ensemble
@@ -86,7 +86,7 @@ class DrawnMotion(NamedTuple, Generic[Numbers]):
     angular_momentum: Float[Numbers, "times 3"]
 
     @staticmethod
-    def of(run: Any) -> "DrawnMotion[Array]":
+    def of(run: AbstractTrajectory) -> "DrawnMotion[Array]":
         """The motion of one run, inside or outside of transformations."""
         body, slip = run.scene.body, run.slip
         position, axis, normal, zero = run.position, run.axis, run.normal, jnp.zeros_like(run.t)
@@ -103,7 +103,7 @@ _motion = eqx.filter_jit(DrawnMotion.of)
 _rotation_rate = eqx.filter_jit(lambda run: jnp.linalg.norm(run.angular_velocity, axis=-1))
 
 
-def motion(run: Any) -> DrawnMotion[np.ndarray]:
+def motion(run: AbstractTrajectory) -> DrawnMotion[np.ndarray]:
     """The motion of one run. If the run can be evaluated between its times, the times are close enough to show the
     rotation."""
     if run.dense is not None:
@@ -143,7 +143,7 @@ def show(scene: Scene, motion: DrawnMotion[np.ndarray], number: int, name: str) 
     )
 
 
-def curve_of_rotation(scene: Scene, motion: DrawnMotion[Any]) -> tuple[str, Any]:
+def curve_of_rotation(scene: Scene, motion: DrawnMotion[Numbers]) -> tuple[str, Numbers]:
     """Label and values of the curve of the rotation: Jellett's quantity, or, for a body of any shape and inertia, the spin
     about the normal."""
     if isinstance(scene.body, AbstractRigidBody):
@@ -174,7 +174,7 @@ def arrows(motion: DrawnMotion[np.ndarray], offset: float, radius: float, weight
 
 
 @stages_of.register(AbstractTrajectory)
-def _(run: AbstractTrajectory, runs: list[Any], overlaid: bool, unit: Unit) -> list[views.Stage]:
+def _(run: AbstractTrajectory, runs: list[AbstractTrajectory], overlaid: bool, unit: Unit) -> list[views.Stage]:
     drawn = [(name, run.scene, motion(run)) for name, run in zip(names_of(runs, unit), runs, strict=True)]
     return stages([drawn] if overlaid else [[one] for one in drawn])
 
@@ -356,7 +356,9 @@ def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float
     return ranges
 
 
-def outcome(model: TopModel, problem: Any, ended: Any) -> tuple[Int[Array, ""], Float[Array, ""]]:
+def outcome(
+    model: TopModel, problem: AbstractProblem | None, ended: LaneState | HybridOutcome
+) -> tuple[Int[Array, ""], Float[Array, ""]]:
     """The `Status` of a run that ends with the inversion, and its inversion time [s], or infinity. **Arguments:** as for
     the function `outcome` of `live_run`."""
     time = ended.crossing_time
@@ -400,7 +402,7 @@ def _motion_at_start(model: TopModel) -> DrawnMotion[Array]:
     return DrawnMotion.of(model.moment(mode.shown(state), number))
 
 
-def frame(scene: Scene, run: Any) -> Frame:
+def frame(scene: Scene, run: AbstractTrajectory) -> Frame:
     """The drawn quantities of a top for a run with a single time, in the order of `view.show`."""
     motion = DrawnMotion(*(part[0] for part in DrawnMotion.of(run)))
     radius = scene.body.size
