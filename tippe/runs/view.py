@@ -356,9 +356,7 @@ def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float
     return ranges
 
 
-def outcome(
-    model: TopModel, problem: AbstractProblem | None, ended: LaneState | HybridOutcome
-) -> tuple[Int[Array, ""], Float[Array, ""]]:
+def outcome(model: TopModel, problem: AbstractProblem | None, ended: Any) -> tuple[Int[Array, ""], Float[Array, ""]]:
     """The `Status` of a run that ends with the inversion, and its inversion time [s], or infinity. **Arguments:** as for
     the function `outcome` of `live_run`."""
     time = ended.crossing_time
