@@ -41,11 +41,9 @@ are in `nonholonomic.hybrid`.
 """
 
 from .adjoint import solve_ensemble_with_tangents as solve_ensemble_with_tangents
-from .adjoint import tangents_of as tangents_of
 from .adjoint import traced_solve_ensemble_with_tangents as traced_solve_ensemble_with_tangents
 from .differentiable import AbstractDifferentiableSolve as AbstractDifferentiableSolve
 from .differentiable import differentiable_solve as differentiable_solve
-from .differentiable import tangents_by as tangents_by
 from .sampled_runs import SampledRun as SampledRun
 from .sampled_runs import sampled_run as sampled_run
 from .sampled_runs import sampled_run_by_diffrax as sampled_run_by_diffrax
@@ -54,3 +52,5 @@ from .variation import exponent_of as exponent_of
 from .variation import growth as growth
 from .variation import in_groups as in_groups
 from .variation import tangent_scale as tangent_scale
+from .variation import tangents_by as tangents_by
+from .variation import tangents_of as tangents_of

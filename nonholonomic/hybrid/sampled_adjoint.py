@@ -23,8 +23,8 @@ from jaxtyping import Array, Bool, Float, Int
 from ..compilation.xla_cpu import greatest, uncounted
 from ..derivatives import tangents_of
 from ..derivatives.adjoint import Checkpoints
-from ..derivatives.differentiable import over_cells as with_cells
 from ..derivatives.sampled_runs import SampledCotangents, mixture, samples_pulled_back
+from ..derivatives.variation import over_cells as with_cells
 from ..derivatives.variation import where_active
 from ..integration import AbstractProblem, Jumps, Lanes, Settings, States, solve_with_samples
 from ..integration.problem import LEFT_DOMAIN, REACHED_END, RUNNING

@@ -11,7 +11,8 @@ from jaxtyping import Array, Float
 
 from ..compilation.xla_cpu import compiled_alone
 from ..derivatives import in_groups, tangents_by
-from ..derivatives.differentiable import AbstractSampling, ProblemSpec, by_active, solve_for_samples, tangent_along
+from ..derivatives.sampled_runs import AbstractSampling, ProblemSpec, solve_for_samples
+from ..derivatives.variation import by_active, tangent_along
 from ..integration import Settings
 from ..integration.problem import REACHED_END
 from .ensemble import at_start, traced_rounds

@@ -234,12 +234,52 @@ class AbstractProblem(eqx.Module):
         return state if jumps is None else moved_across(jumps, self.field, time, state)[1]
 
 
-class CoreProblem(AbstractProblem):
+class AbstractDerivedProblem(AbstractProblem):
+    """A problem with more or fewer components than another one, which decides where its runs end and jump."""
+
+    problem: eqx.AbstractVar[AbstractProblem]
+
+    @abc.abstractmethod
+    def inner(self, state: States) -> States:
+        """The state of the other problem."""
+
+    @property
+    def direction_decides(self) -> bool:
+        return self.problem.direction_decides
+
+    @property
+    def fits_one_kernel(self) -> bool:
+        return self.problem.fits_one_kernel
+
+    @property
+    def fast(self) -> tuple[bool, bool]:
+        return self.problem.fast
+
+    def event_function(self, state: States) -> Lanes | None:
+        return self.problem.event_function(self.inner(state))
+
+    def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
+        return self.problem.domain_margin(time, self.inner(state))
+
+    def lost_at_start(self, state: States) -> Bool[Array, "..."] | None:
+        return self.problem.lost_at_start(self.inner(state))
+
+    def exact_margin(self, time: Lanes, state: States) -> Lanes | None:
+        return self.problem.exact_margin(time, self.inner(state))
+
+    def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
+        return self.problem.margins(time, self.inner(state))
+
+    def jumps(self, time: Lanes, state: States) -> Jumps | None:
+        return self.problem.jumps(time, self.inner(state))
+
+
+class CoreProblem(AbstractDerivedProblem):
     """The core state of a problem: the leading components, on which the others do not act.
 
     **Arguments:**
 
-    - `whole`: the problem.
+    - `problem`: the problem.
     - `size`: number of leading components.
 
     **Example:**
@@ -249,50 +289,20 @@ class CoreProblem(AbstractProblem):
     (1, 3)
     """
 
-    whole: AbstractProblem
+    problem: AbstractProblem
     size: int = eqx.field(static=True)
 
-    @property
-    def direction_decides(self) -> bool:
-        return self.whole.direction_decides
-
-    @property
-    def fits_one_kernel(self) -> bool:
-        return self.whole.fits_one_kernel
-
-    @property
-    def fast(self) -> tuple[bool, bool]:
-        return self.whole.fast
-
     def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
-        state, scales = self.whole.start()
+        state, scales = self.problem.start()
         return state[: self.size], scales[: self.size]
 
     def field(self, time: Lanes, state: States) -> States:
         # The compiler drops the omitted components and everything that only they depend on.
-        return self.whole.field(time, self._longer(state))[: self.size]
+        return self.problem.field(time, self.inner(state))[: self.size]
 
-    def event_function(self, state: States) -> Lanes | None:
-        return self.whole.event_function(self._longer(state))
-
-    def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
-        return self.whole.domain_margin(time, self._longer(state))
-
-    def lost_at_start(self, state: States) -> Bool[Array, "..."] | None:
-        return self.whole.lost_at_start(self._longer(state))
-
-    def exact_margin(self, time: Lanes, state: States) -> Lanes | None:
-        return self.whole.exact_margin(time, self._longer(state))
-
-    def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
-        return self.whole.margins(time, self._longer(state))
-
-    def jumps(self, time: Lanes, state: States) -> Jumps | None:
-        return self.whole.jumps(time, self._longer(state))
-
-    def _longer(self, state: States) -> States:
+    def inner(self, state: States) -> States:
         state = jnp.stack(state) if isinstance(state, tuple) else state
-        missing = len(self.whole.start()[0]) - self.size
+        missing = len(self.problem.start()[0]) - self.size
         return jnp.concatenate([state, jnp.zeros((missing, *state.shape[1:]))])
 
 
@@ -710,7 +720,7 @@ class AbstractPassive(eqx.Module):
         together because they share work."""
 
 
-class ExtendedProblem(AbstractProblem, Generic[Core]):
+class ExtendedProblem(AbstractDerivedProblem, Generic[Core]):
     """A problem with passive components after its state; event function and domain margin are those of the problem.
 
     - `passive`: the rates; `values`, `scales`: initial values, and the magnitudes that scale absolute errors.
@@ -738,39 +748,15 @@ class ExtendedProblem(AbstractProblem, Generic[Core]):
     def leading(self) -> int:
         return len(self.problem.start()[0])
 
-    @property
-    def direction_decides(self) -> bool:
-        return self.problem.direction_decides
-
-    @property
-    def fits_one_kernel(self) -> bool:
-        return self.problem.fits_one_kernel
-
-    @property
-    def fast(self) -> tuple[bool, bool]:
-        return self.problem.fast
-
     def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
         states, scales = self.problem.start()
         return jnp.concatenate([states, self.values]), jnp.concatenate([scales, self.scales])
 
     def field(self, time: Lanes, state: States) -> States:
-        return self.passive.rates(self.problem, time, state[: self.leading], state[self.leading :])
+        return self.passive.rates(self.problem, time, self.inner(state), state[self.leading :])
 
     def event_function(self, state: States) -> Lanes | None:
-        return self.problem.event_function(state[: self.leading]) if self.ends_on_event else None
+        return super().event_function(state) if self.ends_on_event else None
 
-    def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
-        return self.problem.domain_margin(time, state[: self.leading])
-
-    def lost_at_start(self, state: States) -> Bool[Array, "..."] | None:
-        return self.problem.lost_at_start(state[: self.leading])
-
-    def exact_margin(self, time: Lanes, state: States) -> Lanes | None:
-        return self.problem.exact_margin(time, state[: self.leading])
-
-    def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
-        return self.problem.margins(time, state[: self.leading])
-
-    def jumps(self, time: Lanes, state: States) -> Jumps | None:
-        return self.problem.jumps(time, state[: self.leading])
+    def inner(self, state: States) -> States:
+        return state[: self.leading]

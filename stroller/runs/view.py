@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nonholonomic import views
-from nonholonomic.geometry import AbstractQuadric, AbstractSurface, vector_of
+from nonholonomic.geometry import AbstractQuadric, AbstractSurface
 from nonholonomic.integration import AbstractPassive, ExtendedProblem, LaneState
 from nonholonomic.integration.problem import Status
 from nonholonomic.parameters import numbers
@@ -81,9 +81,9 @@ def grouped(groups: list[list[tuple[int, Trajectory]]], names: list[str]) -> lis
 def normals(xp: ModuleType, surface: AbstractSurface, side: str | None, position: Values) -> Values:
     """Unit normals at positions (*times, 3), towards the side on which the stroller is. **Arguments:** `xp`: NumPy, or
     `jax.numpy` for a page."""
-    components = surface.normal(surface.in_own_axes(vector_of(position.T)))
+    components = surface.normal(surface.in_own_axes(tuple(position.T)))
     zero = xp.zeros(position.shape[:-1])
-    filled = vector_of(zero if part is None else xp.asarray(part) + zero for part in components)
+    filled = tuple(zero if part is None else xp.asarray(part) + zero for part in components)
     return surface.sign(side, DRIVES) * xp.stack([xp.asarray(part) for part in surface.in_fixed_frame(filled)], axis=-1)
 
 

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from nonholonomic.compilation.xla_cpu import greatest, least
-from nonholonomic.geometry import Component, Vector, add, cross, dot, multiply, scale, subtract, sum_vectors, vector_of
+from nonholonomic.geometry import Component, Vector, add, cross, dot, multiply, scale, subtract, sum_vectors
 from nonholonomic.integration import AbstractProblem, Settings, traced_solve_ensemble
 from nonholonomic.integration.problem import LEFT_DOMAIN, MOST_STEPS
 
@@ -431,7 +431,7 @@ def resolve_coulomb_impact(
     state = jnp.where(stops, outcome.state, outcome.state + step * rates)
     impulse = impact.impulse(state[2], state[:2])
     remaining_impulse = _remaining_impulse(impact, friction.mu, impulse.force)
-    force = vector_of(jnp.where(stops, a + b, a) for a, b in zip(impulse.force, remaining_impulse, strict=True))
+    force = tuple(jnp.where(stops, a + b, a) for a, b in zip(impulse.force, remaining_impulse, strict=True))
     return apply_impulse(body, contact, free, ContactImpulse(force, None)), outcome.status != LEFT_DOMAIN
 
 
@@ -637,7 +637,8 @@ class LeaningDynamics(AbstractDynamics):
         forces, torques, gains = [], [], []
         for ball in spheres:
             contact = approach(self.body, ball, free)
-            slip = Slip(*contact.velocity[:2], (w1, w2, w3 if self.friction.uses_spin else None))
+            x, y, _ = contact.velocity
+            slip = Slip(x, y, (w1, w2, w3 if self.friction.uses_spin else None))
             load = self.friction.per_normal_force(slip)
             forces.append(tuple(zero if part is None else part for part in (*load.force, 1.0 + zero)))
             torques.append(sum_vectors(cross(contact.arm, forces[-1]), load.torque))

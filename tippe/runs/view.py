@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nonholonomic import views
-from nonholonomic.geometry import vector_of
 from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import AbstractProblem, Settings, crossing_time
 from nonholonomic.integration.problem import CROSSED, REACHED_END, Status
@@ -219,7 +218,7 @@ def meshes(body: AbstractBody | AbstractRigidBody, colour: int) -> tuple[views.M
 def touching(body: AbstractRigidBody, directions: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
     """The points of a body's surface at which it has the given outward unit normals, from the centre of mass, in the
     body's axes [m]."""
-    normal, zero = vector_of(-jnp.asarray(directions).T), jnp.zeros(len(directions))
+    normal, zero = tuple(-jnp.asarray(directions).T), jnp.zeros(len(directions))
     return np.stack(body.contact(normal, (zero, zero, zero))[0], axis=-1)
 
 
