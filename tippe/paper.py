@@ -33,9 +33,8 @@ from nonholonomic.views import NO_VIEW, Stage, can_view, page, picture_as_html, 
 from .friction import AbstractFriction, Coulomb, Viscous
 from .model.body import Top
 from .model.scene import Launch, Scene
-from .runs.explore import Panel, draw_launches
 from .runs.verbs import inversion_table, simulate
-from .runs.view import DrawnMotion, stages
+from .runs.view import DrawnMotion, Panel, draw_launches, stages
 
 #: The paper's units in SI.
 GRAM, CENTIMETRE = 1e-3, 1e-2
