@@ -55,7 +55,7 @@ class Progress:
             self._since = time.time()
             self._clear()
 
-    def advance(self, count: int, **notes: Any) -> None:
+    def advance(self, count: int, **notes: object) -> None:
         """Count `count` more items as done; `notes` are shown beside their number."""
         with _LINE.lock:
             self._done, self._notes = self._done + count, notes
