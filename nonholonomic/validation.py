@@ -78,6 +78,10 @@ UNTRACEABLE = (
 )
 
 
+#: A number or numbers with which others are compared, or `None`.
+Limit = Any
+
+
 def as_number(value: object) -> Float[Array, "..."]:
     """Convert to a floating-point array of the default precision; anything that is not a number stays unchanged, for
     `require` to reject."""
@@ -127,10 +131,10 @@ def require(
     value: object,
     name: str,
     *,
-    above: ArrayLike | None = None,
-    at_least: ArrayLike | None = None,
-    below: ArrayLike | None = None,
-    at_most: ArrayLike | None = None,
+    above: Limit = None,
+    at_least: Limit = None,
+    below: Limit = None,
+    at_most: Limit = None,
     why: str = "",
     unit: str = "",
 ) -> None:
@@ -362,10 +366,10 @@ class Bound(NamedTuple):
 
     value: Any
     name: str
-    above: ArrayLike | None = None
-    at_least: ArrayLike | None = None
-    below: ArrayLike | None = None
-    at_most: ArrayLike | None = None
+    above: Limit = None
+    at_least: Limit = None
+    below: Limit = None
+    at_most: Limit = None
     why: str = ""
     unit: str = ""
 

@@ -89,22 +89,26 @@ def by_components(function: Function, *shapes: PyTree) -> Function:
     return evaluated
 
 
-def over_lanes(function: Function, numbers: tuple[Array, ...], parts: tuple[Array, ...]) -> PyTree:
+def over_lanes(function: Function, *arguments: PyTree) -> PyTree:
     """A function of one run, evaluated in every lane.
 
-    **Arguments:** `function`: a function of the numbers and of the components of the state, all scalars; `numbers`: each
-    a scalar or one number per lane; `parts`: the components, one number per lane, or scalars for a single run.
+    **Arguments:** `function`: a function of trees of scalars; `arguments`: the trees, with scalars or one number per lane.
 
-    **Returns:** the results, scalars in place of which each lane has its own.
+    **Returns:** the results, with one number per lane, or scalars if no argument has lanes.
     """
-    shapes = tuple(tuple(jax.ShapeDtypeStruct((), jnp.asarray(x).dtype) for x in xs) for xs in (numbers, parts))
+    leaves, structure = jax.tree.flatten(arguments)
+    kinds = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct((), jnp.result_type(leaf)) for leaf in leaves])
+    shape = np.broadcast_shapes(*map(jnp.shape, leaves))
     with contextlib.suppress(TooLarge):
-        results = by_components(function, *shapes)(numbers, parts)
-        return jax.tree.map(lambda result: jnp.broadcast_to(result, parts[0].shape), results)
-    if parts[0].ndim == 0:
-        return spelled_out(function)(numbers, parts)
-    axes = tuple(0 if jnp.ndim(number) else None for number in numbers)
-    return jax.vmap(spelled_out(function), in_axes=(axes, 0))(numbers, parts)
+        results = by_components(function, *kinds)(*arguments)
+        return jax.tree.map(lambda result: jnp.broadcast_to(result, shape), results)
+
+    def of_run(*numbers: Array) -> tuple[Array, ...]:
+        results = spelled_out(function)(*jax.tree.unflatten(structure, numbers))
+        return tuple(map(jnp.asarray, jax.tree.leaves(results)))
+
+    structure_of_results = jax.tree.structure(jax.eval_shape(function, *kinds))
+    return jax.tree.unflatten(structure_of_results, jnp.vectorize(of_run)(*leaves))
 
 
 class AbstractScalarReader(abc.ABC):
@@ -504,20 +508,12 @@ def method_over_lanes(method: Function) -> Function:
         if all(jnp.ndim(leaf) == 0 for leaf in jax.tree.leaves((own, arguments))):
             return method(joined(self), *arguments)
         arrays, static = eqx.partition((self, arguments), is_array)
-        leaves, structure = jax.tree.flatten(arrays)
 
-        def of_run(*numbers: Array) -> PyTree:
-            whole, arguments = joined(eqx.combine(jax.tree.unflatten(structure, numbers), static))
+        def of_run(arrays: PyTree) -> PyTree:
+            whole, arguments = joined(eqx.combine(arrays, static))
             return jax.tree.map(jnp.asarray, method(whole, *arguments))
 
-        kinds = [jax.ShapeDtypeStruct((), jnp.result_type(leaf)) for leaf in leaves]
-        shape = np.broadcast_shapes(*map(jnp.shape, leaves))
-        with contextlib.suppress(TooLarge):
-            results = by_components(of_run, *kinds)(*leaves)
-            return jax.tree.map(lambda result: jnp.broadcast_to(result, shape), results)
-        structure_of_results = jax.tree.structure(jax.eval_shape(of_run, *kinds))
-        results = jnp.vectorize(lambda *numbers: tuple(jax.tree.leaves(of_run(*numbers))))(*leaves)
-        return jax.tree.unflatten(structure_of_results, results)
+        return over_lanes(of_run, arrays)
 
     return mapped
 

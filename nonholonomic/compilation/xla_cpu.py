@@ -168,15 +168,12 @@ def compile_quickly() -> None:
     os.environ.setdefault("XLA_FLAGS", QUICK_FLAGS)
 
 
-#: A value to be stored, or `None`.
-Stored = TypeVar("Stored", bound=Array | None)
-
 #: For preparations that run once before a run: called on their own they are one program and not dozens of small ones,
 #: each of which takes 40 ms to compile; inside other programs this has no effect.
 compiled_setup = _compiler(inline=True)
 
 
-def stored(*values: Stored) -> tuple[Stored, ...]:
+def stored(*values: Float[Array, "..."] | None) -> tuple[Any, ...]:
     """The same values, computed once even if several results depend on them; `None` stays `None`.
 
     Otherwise XLA fuses every result with everything that leads to it, and evaluates the common part again for each
@@ -192,7 +189,7 @@ def stored(*values: Stored) -> tuple[Stored, ...]:
 
 
 @jax.custom_jvp
-def stored_with_tangents(*values: Stored) -> tuple[Stored, ...]:
+def stored_with_tangents(*values: Float[Array, "..."] | None) -> tuple[Any, ...]:
     """The same values; in programs that differentiate them, values and tangents are `stored`.
 
     Without derivatives, XLA computes cheap values faster where they are used. Tangents cost more, and are used more often:
@@ -203,9 +200,7 @@ def stored_with_tangents(*values: Stored) -> tuple[Stored, ...]:
 
 
 @stored_with_tangents.defjvp
-def _stored_tangents(
-    values: tuple[Stored, ...], tangents: tuple[Stored, ...]
-) -> tuple[tuple[Stored, ...], tuple[Stored, ...]]:
+def _stored_tangents(values: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     return stored(*values), stored(*tangents)
 
 
