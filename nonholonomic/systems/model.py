@@ -67,15 +67,13 @@ from .mechanics import (
 class OwnModel(AbstractModel):
     """A `Hybrid` or an `AbstractSystem`, its start and its event, which is a part of `parameters`.
 
-    `form`: the form of the hybrid system; `components_of`: the names of the components of a state.
+    `form`: the form of the hybrid system; `names`: those of the components of a state.
     """
 
     parameters: Parameters
     form: Form = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
     event: None = None
-
-    least_chunk = 1024
 
     @classmethod
     def of(cls, tree: dict[str, Any]) -> "OwnModel":
@@ -114,10 +112,6 @@ class OwnModel(AbstractModel):
         name = None if event is None else name_of(event)
         values = zip(self.parameters.names, self.parameters.values, strict=True)
         return {"system": type(system).__name__, "event": name} | {name: float(value) for name, value in values}
-
-    @property
-    def users(self) -> dict[str, Any]:
-        return self.parameters.tree
 
     def check(self) -> None:
         if is_traced(self):
