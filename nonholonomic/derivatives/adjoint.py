@@ -24,7 +24,7 @@ from ..compilation.xla_cpu import compiled_alone, uncounted, written_by_componen
 from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, States
 from ..integration.problem import CROSSED, REACHED_END, RUNNING, time_at_jump
 from ..integration.runge_kutta import Stages, moved_state, over_stages
-from ..integration.scheduler import AbstractRecorder, InLanes, LaneScheduler, SchedulerState, with_crossing_times
+from ..integration.scheduler import InLanes, LaneScheduler, Recorder, SchedulerState, outcome_of, with_crossing_times
 from ..integration.step import length_to_try, try_step, until_jump
 from .variation import Tangent, VariationalProblem, in_groups, moving_leaves, slopes_by_variations
 
@@ -142,7 +142,7 @@ def read(stack: Array, index: Int[Array, ""]) -> Array:
 Moving: TypeAlias = PyTree
 
 
-class StepRecorder(AbstractRecorder):
+class StepRecorder(Recorder):
     """Records where each step began, and its length; what is differentiated is the time of the event at the end."""
 
     # As many iterations as fit in the caches with their record; a period ends with a refill.
@@ -220,7 +220,7 @@ def solve_with_adjoint(
 ) -> tuple[Outcome, Derivatives]:
     """Run every cell to its end, and differentiate the quantity that a recorder measures there.
 
-    **Arguments:** as for `ensemble_solve`, in one kernel, except `nonterminal`, and
+    **Arguments:** as for `solve_ensemble`, in one kernel, except `nonterminal`, and
 
     - `moving`: the leaves with respect to which to differentiate, scalars or (..., cells).
     - `probe`: a tangent of the problem. Its variation is also integrated and takes part in step-size control, so that
@@ -275,7 +275,7 @@ class Passes:
             limit=jnp.asarray(jnp.iinfo(jnp.arange(0).dtype).max),
             checkpoints=Checkpoints.none((start, start)),
             latest_steps=LatestSteps.none(record, scheduler.capacity),
-            outcome=scheduler.empty(),
+            outcome=outcome_of(scheduler.fresh),
             adjoint=jax.tree.map(jnp.zeros_like, Derivatives(state, scheduler.pick(numbers, start.lane_state.cell))),
             gradient=jax.tree.map(jnp.zeros_like, Derivatives(states, numbers)),
         )
@@ -555,7 +555,7 @@ def ensemble_solve_with_tangents(
     horizon = t1
     if nonterminal:
         scheduler = LaneScheduler.of(problem, t1, cells, settings, nonterminal=True, one_kernel=one_kernel)
-        outcome = scheduler.outcome()[0]
+        outcome = scheduler.solve()[0]
         # The derivatives need the run only up to the event, whose time is now known.
         horizon = jnp.where(jnp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
     options = (not nonterminal, horizon, cells, settings)

@@ -293,7 +293,7 @@ def slopes_by_variations(
     # The variations take part in step-size control: the state alone may be at rest while its tangent is not, and the
     # steps would become too long for the tangent.
     blocks = 1 + len(tangents)
-    ended, _ = LaneScheduler.of(variational, t1, cells, settings, n_blocks=blocks, one_kernel=one_kernel).outcome()
+    ended = LaneScheduler.of(variational, t1, cells, settings, n_blocks=blocks, one_kernel=one_kernel).solve()[0]
     state, *variations = variational.parts(ended.state)
 
     def event_time(problem: AbstractProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
