@@ -519,7 +519,7 @@ def jump_taken_back(
 MOST_FORWARD = 2
 
 
-def ensemble_solve_with_tangents(
+def solve_ensemble_with_tangents(
     problem: AbstractProblem,
     tangents: tuple[Tangent, ...],
     t1: Float[Array, "..."],
@@ -527,12 +527,10 @@ def ensemble_solve_with_tangents(
     settings: Settings,
     *,
     nonterminal: bool = False,
-    one_kernel: bool = False,
+    one_kernel: bool | None = None,
+    traced: bool = False,
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """Run every cell, and differentiate the time of its event along tangents.
-
-    `solve_ensemble_with_tangents` is compiled on its own, for use outside of other transformed functions;
-    `traced_solve_ensemble_with_tangents` is for use inside them.
 
     **Arguments:** as for `solve_ensemble`, and
 
@@ -552,6 +550,21 @@ def ensemble_solve_with_tangents(
     >>> print(outcome.crossing_time.round(6), slopes[0].round(6))
     [0.693147 0.346574] [-0.693147 -0.173287]
     """
+    one_kernel = not traced if one_kernel is None else one_kernel
+    solve = _in_program if traced else _alone
+    return solve(problem, tangents, t1, cells, settings, nonterminal, one_kernel)
+
+
+def ensemble_solve_with_tangents(
+    problem: AbstractProblem,
+    tangents: tuple[Tangent, ...],
+    t1: Float[Array, "..."],
+    cells: Int[Array, ""],
+    settings: Settings,
+    nonterminal: bool,
+    one_kernel: bool,
+) -> tuple[Outcome, list[Float[Array, " cells"]]]:
+    """`solve_ensemble_with_tangents`, not compiled."""
     horizon = t1
     if nonterminal:
         scheduler = LaneScheduler.of(problem, t1, cells, settings, nonterminal=True, one_kernel=one_kernel)
@@ -571,6 +584,9 @@ def ensemble_solve_with_tangents(
     # With its variations a run takes other steps: where it does not reach the event, it has no derivative.
     arrived = ended.status == (REACHED_END if nonterminal else CROSSED)
     return outcome, [jnp.where(has_delay, jnp.where(arrived, slope, jnp.nan), 0.0) for slope in slopes]
+
+
+_alone, _in_program = compiled_alone(ensemble_solve_with_tangents), eqx.filter_jit(ensemble_solve_with_tangents)
 
 
 def _slopes_by_adjoint(
@@ -615,10 +631,3 @@ def time_of_zero(problem: AbstractProblem, function: Callable[[States], PyTree],
     """
     fall = stop_gradient(jax.jvp(function, (stop_gradient(state),), (problem.field(time, state),))[1])
     return time_at_jump(problem, time, state, time - function(state) / jnp.where(fall == 0.0, 1.0, fall))
-
-
-# With its docstring.
-_in_one_kernel = functools.partial(ensemble_solve_with_tangents, one_kernel=True)
-solve_ensemble_with_tangents = compiled_alone(functools.update_wrapper(_in_one_kernel, ensemble_solve_with_tangents))
-
-traced_solve_ensemble_with_tangents = eqx.filter_jit(ensemble_solve_with_tangents)
