@@ -75,14 +75,11 @@ class Checkpoints(NamedTuple):
         room = jax.tree.map(lambda leaf: jnp.zeros((SLOTS, *leaf.shape), leaf.dtype), example)
         return cls(jnp.zeros((), int), jnp.zeros(SLOTS, int), jnp.arange(SLOTS), room)
 
-    def latest(self) -> tuple[Int[Array, ""], Period]:
-        """The latest period, and its number."""
+    def latest(self) -> tuple[Int[Array, ""], Period, "Checkpoints"]:
+        """The number of the latest period, the period, and the checkpoints without it."""
         last = self.depth - 1
-        return self.index[last], jax.tree.map(functools.partial(read, index=self.slot[last]), self.periods)
-
-    def without_latest(self) -> "Checkpoints":
-        """All but the latest period."""
-        return self._replace(depth=self.depth - 1)
+        period = jax.tree.map(functools.partial(read, index=self.slot[last]), self.periods)
+        return self.index[last], period, self._replace(depth=last)
 
     def added(self, index: Int[Array, ""], period: Period) -> "Checkpoints":
         """Add a period; if all slots are full, drop the period whose neighbours are closest."""
@@ -286,11 +283,11 @@ class Passes:
         run = run._replace(limit=jnp.minimum(run.limit, run.number))
         run = jax.lax.while_loop(self.is_recorded, self.backward, run)
         # The steps before are gone: continue from the latest checkpoint.
-        number, (lanes_before, _) = run.checkpoints.latest()
+        number, (lanes_before, _), checkpoints = run.checkpoints.latest()
         return run._replace(
             frontier=lanes_before,
             number=number,
-            checkpoints=run.checkpoints.without_latest(),
+            checkpoints=checkpoints,
             latest_steps=run.latest_steps._replace(first=lanes_before.iterations),
         )
 
@@ -311,13 +308,13 @@ class Passes:
 
     def is_recorded(self, run: Backward) -> Bool[Array, ""]:
         """Whether the steps of the period that the backward pass takes next are kept."""
-        number, (lanes_before, _) = run.checkpoints.latest()
+        number, (lanes_before, _), _ = run.checkpoints.latest()
         recorded = (number == run.limit - 1) & (lanes_before.iterations >= run.latest_steps.first)
         return uncounted((run.checkpoints.depth > 0) & recorded, run.number)
 
     def backward(self, run: Backward) -> Backward:
         """Carry the derivatives through the latest period."""
-        scheduler, (number, (lanes_before, lanes_after)) = self.scheduler, run.checkpoints.latest()
+        scheduler, (number, (lanes_before, lanes_after), checkpoints) = self.scheduler, run.checkpoints.latest()
         steps = run.latest_steps.of_period(lanes_before.iterations, self.recorder.period)
         count = lanes_after.iterations - lanes_before.iterations
         adjoint = self.taken_back(lanes_after.lane_state, steps, count, run.adjoint)
@@ -327,7 +324,6 @@ class Passes:
         gradient = jax.tree.map(
             lambda of_cells, of_lanes: of_cells.at[..., cell].set(of_lanes, mode="drop"), run.gradient, adjoint
         )
-        checkpoints = run.checkpoints.without_latest()
         return run._replace(limit=number, checkpoints=checkpoints, adjoint=adjoint, gradient=gradient)
 
     def taken_back(

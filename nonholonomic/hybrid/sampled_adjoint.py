@@ -368,8 +368,7 @@ class Passes:
             return jnp.any(run.frontier.status == RUNNING) & (run.number < run.limit)
 
         def is_kept(run: Rounds) -> Bool[Array, ""]:
-            number, _ = run.checkpoints.latest()
-            return (run.checkpoints.depth > 0) & (number == run.limit - 1)
+            return (run.checkpoints.depth > 0) & (run.checkpoints.latest()[0] == run.limit - 1)
 
         run = jax.lax.while_loop(is_ahead, self.forward, run)
         # At first, the derivatives begin at the ends of the runs; a horizon does not move.
@@ -377,8 +376,8 @@ class Passes:
         costate = run.costate._replace(start_time=jnp.where(is_first, by_end, run.costate.start_time))
         run = run._replace(limit=jnp.minimum(run.limit, run.number), costate=costate)
         run = jax.lax.while_loop(is_kept, self.backward, run)
-        number, kept = run.checkpoints.latest()
-        return run._replace(frontier=kept.before, number=number, checkpoints=run.checkpoints.without_latest())
+        number, kept, checkpoints = run.checkpoints.latest()
+        return run._replace(frontier=kept.before, number=number, checkpoints=checkpoints)
 
     def forward(self, run: Rounds) -> Rounds:
         """Compute the next round."""
@@ -404,7 +403,7 @@ class Passes:
 
     def backward(self, run: Rounds) -> Rounds:
         """Carry the derivatives through the latest round."""
-        (number, kept), costate = run.checkpoints.latest(), run.costate
+        (number, kept, checkpoints), costate = run.checkpoints.latest(), run.costate
         for group in self.groups:
             active = functools.reduce(jnp.logical_or, (kept.before.mode == number for number in group))
             active = active & (kept.before.status == RUNNING)
@@ -412,7 +411,7 @@ class Passes:
             lost = active & (kept.ended.status == LEFT_DOMAIN)
             for cells, step in ((lost, stage.through_reset), (active, stage.through_motion)):
                 costate = jax.lax.cond(jnp.any(cells), step, lambda _, costate: costate, cells, costate)
-        return run._replace(limit=number, checkpoints=run.checkpoints.without_latest(), costate=costate)
+        return run._replace(limit=number, checkpoints=checkpoints, costate=costate)
 
     def primal(self, runs: HybridOutcome[Array]) -> tuple[States, Lanes]:
         """The states of some runs, and the time since their modes began."""
