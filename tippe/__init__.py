@@ -14,7 +14,7 @@ from nonholonomic.geometry import Torus as Torus
 from nonholonomic.identification import FitWarning as FitWarning
 from nonholonomic.identification import Free as Free
 from nonholonomic.integration.problem import Status as Status
-from nonholonomic.runs import LyapunovExponent as LyapunovExponent
+from nonholonomic.runs.lyapunov import LyapunovExponent as LyapunovExponent
 from nonholonomic.sweeps import Table as Table
 
 from . import presets as presets
@@ -44,7 +44,6 @@ from .model.rigid_body import RigidBody as RigidBody
 from .model.scene import Scene as Scene
 from .runs.trajectory import HybridTrajectory as HybridTrajectory
 from .runs.trajectory import Trajectory as Trajectory
-from .runs.verbs import explore as explore
 from .runs.verbs import extended_inversion_time as extended_inversion_time
 from .runs.verbs import inversion_table as inversion_table
 from .runs.verbs import inversion_time as inversion_time
@@ -53,6 +52,7 @@ from .runs.verbs import reversal_table as reversal_table
 from .runs.verbs import reversal_time as reversal_time
 from .runs.verbs import simulate as simulate
 from .runs.verbs import trajectory_table as trajectory_table
+from .runs.view import explore as explore
 
 # `import *` exports the names above, and not the subpackages.
 __all__ = [

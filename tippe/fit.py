@@ -21,7 +21,8 @@ from nonholonomic.identification import (
 )
 from nonholonomic.integration import Settings
 from nonholonomic.parameters import numbers
-from nonholonomic.runs import AbstractEventTimes, AbstractModel, fit_runs, posterior_of_runs, search_options, sources_of
+from nonholonomic.runs.identify import AbstractEventTimes, fit_runs, posterior_of_runs, search_options, sources_of
+from nonholonomic.runs.model import AbstractModel
 from nonholonomic.text import distinguishing_labels
 from nonholonomic.validation import as_number, as_number_or_none, is_traced, require_kind, require_scalars, warn
 

@@ -34,9 +34,8 @@ from .model.body import Top
 from .model.friction import AbstractFriction, Coulomb, Viscous
 from .model.launch import Launch
 from .model.scene import Scene
-from .runs.explore import Panel, draw_launches
 from .runs.verbs import inversion_table, simulate
-from .runs.view import DrawnMotion, stages
+from .runs.view import DrawnMotion, Panel, draw_launches, stages
 
 #: The paper's units in SI.
 GRAM, CENTIMETRE = 1e-3, 1e-2

@@ -18,7 +18,7 @@ from test_leaning import REFERENCE as FOUND_ON_THE_PLANE
 import tippe
 from nonholonomic.hybrid.ensemble import program_groups
 from tippe.modes.airborne import ON_STEM, STRIKING, FlyBoth
-from tippe.runs.launches import flight_modes
+from tippe.runs.model import flight_modes
 
 REFERENCE = recorded()
 STEM = tippe.Stem(radius=5e-3, offset=0.016)
