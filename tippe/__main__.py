@@ -24,13 +24,12 @@ from nonholonomic.views import Page, picture_as_html, table_as_html
 from nonholonomic.views.explore import live_page
 
 from . import paper, presets, steady
-from .model.friction import Coulomb
-from .model.launch import Launch
-from .model.scene import Scene
-from .runs.explore import Panel, draw_launches, page_of_launch, stage_at_start, theta_over_time
+from .friction import Coulomb
+from .model.scene import Launch, Scene
 from .runs.launches import INVERTED
 from .runs.model import TopModel
 from .runs.verbs import inversion_table
+from .runs.view import Panel, draw_launches, page_of_launch, stage_at_start, theta_over_time
 
 # Only for type checkers: matplotlib is optional.
 if TYPE_CHECKING:

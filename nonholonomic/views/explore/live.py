@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ...hybrid import MOST_ROUNDS, AbstractBatchedMode, AbstractHoppingMode, HybridOutcome
-from ...hybrid.ensemble import after_reset, after_solve, at_start
-from ...hybrid.sampled_adjoint import mode_numbered, program_groups
+from ...hybrid.ensemble import after_reset, after_solve, at_start, mode_numbered, program_groups
 from ...integration import AbstractProblem, LaneState, Settings, explicit_tableau
 from ...integration.problem import LEFT_DOMAIN, RUNNING, UNRESOLVED, Status
 from ...integration.runge_kutta import Step, inner_stages, middle_weights, watched_places
@@ -238,7 +237,7 @@ class HybridSimulator(NamedTuple):
     def first(self, values: Numbers) -> HybridOutcome[Array]:
         """The run for the sliders' numbers, at its start."""
         _, mode, state = self.start(values)
-        return at_start(jnp, mode, state, 1, self.counters)
+        return at_start(mode, state, 1, self.counters)
 
     def read(self, name: str, values: Numbers) -> PyTree:
         """A reading at the start of a run."""
@@ -285,11 +284,11 @@ class HybridSimulator(NamedTuple):
         def ended(constants: PyTree, lane: LaneState, runs: HybridOutcome) -> HybridOutcome:
             problem = stepper.run(constants)[0]
             outcome = with_crossing_times(problem, back_to_margin(problem, outcome_of(lane)))
-            return after_solve(jnp, runs, outcome, t1)
+            return after_solve(runs, outcome, t1)
 
         def reset(values: Numbers, runs: HybridOutcome) -> HybridOutcome:
             transition = mode_of(values, runs).reset_map(runs.state, _left(t1, runs))
-            return after_reset(jnp, runs, transition, t1)
+            return after_reset(runs, transition, t1)
 
         def lost(values: Numbers, runs: HybridOutcome) -> PyTree:
             stretch = mode_of(values, runs).lost(runs.state)
@@ -299,8 +298,13 @@ class HybridSimulator(NamedTuple):
             state_after, following = mode_of(values, runs).hop(stretch, _left(t1, runs))
             return following.open, state_after.elapsed, following
 
+<<<<<<< HEAD
         def closed(values: Numbers, runs: HybridOutcome, stretch: PyTree) -> HybridOutcome:
             return after_reset(jnp, runs, mode_of(values, runs).closed(stretch), t1)
+=======
+        def closed(values: Numbers, runs: HybridOutcome, stretch: Any) -> HybridOutcome:
+            return after_reset(runs, mode_of(values, runs).closed(stretch), t1)
+>>>>>>> main
 
         def between(values: Numbers, runs: HybridOutcome, stretch: PyTree, elapsed: Array) -> PyTree:
             mode = mode_of(values, runs)
