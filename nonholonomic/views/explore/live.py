@@ -298,13 +298,8 @@ class HybridSimulator(NamedTuple):
             state_after, following = mode_of(values, runs).hop(stretch, _left(t1, runs))
             return following.open, state_after.elapsed, following
 
-<<<<<<< HEAD
         def closed(values: Numbers, runs: HybridOutcome, stretch: PyTree) -> HybridOutcome:
-            return after_reset(jnp, runs, mode_of(values, runs).closed(stretch), t1)
-=======
-        def closed(values: Numbers, runs: HybridOutcome, stretch: Any) -> HybridOutcome:
             return after_reset(runs, mode_of(values, runs).closed(stretch), t1)
->>>>>>> main
 
         def between(values: Numbers, runs: HybridOutcome, stretch: PyTree, elapsed: Array) -> PyTree:
             mode = mode_of(values, runs)
