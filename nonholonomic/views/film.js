@@ -2,8 +2,8 @@
 "use strict";
 window.views = window.views || {};
 (() => {
-  //: Height of the line with the time, greatest width of a film in pixels, and frames between two key frames.
-  const HEAD = 28, WIDEST = 1920, KEY_EVERY = 50;
+  //: Height of the line with the time, width of the margins, greatest width of a film in pixels, and frames between two key frames.
+  const HEAD = 28, MARGIN = 8, WIDEST = 1920, KEY_EVERY = 50;
   //: Codec (VP9), and its bits per second for each pixel of a frame.
   const CODEC = "vp09.00.41.08", BITS = 4;
 
@@ -11,19 +11,19 @@ window.views = window.views || {};
 
   // An empty canvas for the stages and the curves of a player; videos need even numbers of pixels.
   function blank({ root, parts }) {
-    const width = size(root).width, height = HEAD + parts.reduce((sum, part) => sum + size(part).height + 8, 0);
+    const width = size(root).width + 2 * MARGIN, height = HEAD + parts.reduce((sum, part) => sum + size(part).height + MARGIN, 0);
     const scale = Math.min(window.devicePixelRatio || 1, WIDEST / width), even = (length) => 2 * Math.round((length * scale) / 2);
     return Object.assign(document.createElement("canvas"), { width: even(width), height: even(height) });
   }
 
   // Paint the canvases, the colours of the legend, and the texts of the page; `words` stand in the line above.
   function paint(canvas, { root, parts }, words) {
-    const pen = canvas.getContext("2d"), left = size(root).left, scale = canvas.width / size(root).width;
+    const pen = canvas.getContext("2d"), left = size(root).left - MARGIN, scale = canvas.width / (size(root).width + 2 * MARGIN);
     pen.setTransform(scale, 0, 0, scale, 0, 0);
     Object.assign(pen, { fillStyle: "#fff", textBaseline: "middle" });
     pen.fillRect(0, 0, canvas.width, canvas.height);
     Object.assign(pen, { fillStyle: "#23262b", font: "15px system-ui, sans-serif" });
-    pen.fillText(words, 4, HEAD / 2);
+    pen.fillText(words, MARGIN, HEAD / 2);
     let top = HEAD;
     for (const part of parts) {
       const { top: before, height } = size(part), at = (box) => [box.left - left, box.top - before + top, box.width, box.height];
@@ -41,7 +41,7 @@ window.views = window.views || {};
         Object.assign(pen, { fillStyle: style.color, font: `${style.fontWeight} ${style.fontSize} ${style.fontFamily}` });
         pen.fillText(texts.currentNode.data, x, y + high / 2, wide);
       }
-      top += height + 8;
+      top += height + MARGIN;
     }
   }
 

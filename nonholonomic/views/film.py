@@ -250,9 +250,13 @@ def recorded(html_page: Page, browser: str) -> bytes:
             [*command, f"http://127.0.0.1:{server.server_port}/"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
         try:
-            while not server.posts.keys() & {"/film", "/error"}:
+            while True:
                 server.handle_request()
-                if process.poll() is not None:
+                # In this order: a browser that has ended has posted all that it will.
+                has_ended = process.poll() is not None
+                if server.posts.keys() & {"/film", "/error"}:
+                    break
+                if has_ended:
                     raise OSError(f"{browser} ended with the status {process.returncode} before the film was complete")
                 if time.monotonic() - server.heard > PATIENCE:
                     raise OSError(f"{browser} has drawn nothing for {PATIENCE:g} s")

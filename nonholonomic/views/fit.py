@@ -109,7 +109,7 @@ def draw_fit(fit: "Identification", labels: Sequence[str], unit: Unit) -> "Figur
     rows = figure.add_gridspec(2, 1, height_ratios=(1.0 + 2.0 * most, 1.6))
     columns = rows[0].subgridspec(1, len(blocks))
     for column, block in enumerate(blocks):
-        _draw_block(fit, drawn, block, has_time[block[0]], labels, columns[column])
+        _draw_block(fit, drawn, block, has_time[block[0]], labels, figure, columns[column])
     grid = rows[1].subgridspec(1, lower)
     concerns = [*fit.verdict.concerns]
     for k, name in enumerate(profiled):
@@ -133,13 +133,19 @@ def _with_unit(name: str, unit: str) -> str:
 
 
 def _draw_block(
-    fit: "Identification", drawn: _Drawn, block: list[int], has_time: bool, labels: Sequence[str], place: "SubplotSpec"
+    fit: "Identification",
+    drawn: _Drawn,
+    block: list[int],
+    has_time: bool,
+    labels: Sequence[str],
+    figure: "Figure",
+    place: "SubplotSpec",
 ) -> None:
     """Draw series over their times, or over the numbers of their measurements: the data and the residuals."""
     indices = np.concatenate([drawn.series[k] for k in block])
     abscissa = np.full(len(drawn.value), np.nan)
     abscissa[indices] = np.asarray(fit.measurements.time)[indices] if has_time else np.arange(len(indices))
-    panels, figure, first = drawn.panels(block), place.get_gridspec().figure, None
+    panels, first = drawn.panels(block), None
     grid = place.subgridspec(len(panels) + 1, 1, height_ratios=[2.0] * len(panels) + [1.0])
     for row, (name, series) in enumerate(panels.items()):
         axes = figure.add_subplot(grid[row], sharex=first)

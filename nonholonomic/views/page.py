@@ -192,7 +192,7 @@ class _Numbers:
             return fields | ({"colour": css(part.colour)} if isinstance(part, Show | Trace | Arrow) else {})
         if isinstance(part, tuple):
             return [self.described(item) for item in part]
-        return self.add(np.asarray(part)) if np.ndim(part) else part
+        return part if isinstance(part, str | float | int | None) else self.add(np.asarray(part))
 
 
 def _stage(stage: Stage, numbers: _Numbers) -> dict[str, object]:

@@ -139,25 +139,33 @@ window.views = window.views || {};
         this.root.classList.remove("filming");
         canvas.toBlob((blob) => save(blob, `-${this.now.toFixed(3)}s.png`));
       } });
-      const form = element("form", this.root, { id: "film", hidden: true, ariaLabel: "film" });
-      const field = (label, input) => { const one = element("label", form, { textContent: `${label} ` }); one.append(input); return input; };
-      const seconds = field("length [s]", Object.assign(document.createElement("input"), { id: "film-seconds", type: "number", min: 0.1, step: "any", required: true }));
-      const speed = field("speed", this.speeds.cloneNode(true));
-      speed.id = "film-speed";
-      element("button", form, { textContent: "Record" });
-      const told = element("output", form), start = () => (this.now < this.length ? this.now : 0);
-      const longest = () => { seconds.value = Number(((this.length - start()) / Number(speed.value)).toFixed(3)); };
-      const opened = (open) => { form.hidden = !open; film.setAttribute("aria-expanded", String(open)); };
-      opened(false);
-      speed.onchange = longest;
+      let form = null;
+      film.setAttribute("aria-expanded", "false");
       film.onclick = () => {
         if (this.filming) { this.filming = false; return; }
-        opened(form.hidden);
-        if (form.hidden) return;
-        speed.value = this.speeds.value;
-        longest();
-        seconds.select();
+        if (form) form.remove();
+        form = form ? null : this.filmForm(film, save);
+        film.setAttribute("aria-expanded", String(form !== null));
       };
+    }
+    // The form for the length and the speed of a film, which shows how much is done; `film` is the button that opened it.
+    filmForm(film, save) {
+      const { element } = views, form = Object.assign(document.createElement("form"), { id: "film", ariaLabel: "film" });
+      this.parts[1].before(form);
+      const field = (words, input) => { const label = element("label", form, { textContent: `${words} ` }); label.append(input); return input; };
+      const seconds = field("length [s]", Object.assign(document.createElement("input"), { type: "number", min: 0.001, step: "any", required: true }));
+      const speed = field("speed", this.speeds.cloneNode(true));
+      speed.removeAttribute("id");
+      speed.value = this.speeds.value;
+      element("button", form, { textContent: "Record" });
+      const told = element("output", form), start = () => (this.now < this.length ? this.now : 0);
+      let chosen = false;
+      const longest = () => { if (!chosen) seconds.value = Number(((this.length - start()) / Number(speed.value)).toFixed(3)); };
+      seconds.oninput = () => { chosen = true; };
+      speed.onchange = longest;
+      longest();
+      seconds.focus();
+      seconds.select();
       form.onsubmit = async (event) => {
         event.preventDefault();
         if (this.filming) return;
@@ -174,6 +182,7 @@ window.views = window.views || {};
         this.filming = false;
         film.innerHTML = "<span>Save </span>film";
       };
+      return form;
     }
     // A film of a run at `times`, or `from` a time on at a speed for some seconds, but not beyond the end.
     film({ times = null, from = 0, seconds = Infinity, speed = 1, fps = 25 }, tell = () => true) {

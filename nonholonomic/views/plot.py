@@ -4,7 +4,7 @@ import functools
 import io
 import itertools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -213,7 +213,7 @@ def _draw_map(drawing: "Axes", table: "Table", names: list[str], visible: np.nda
     scale = (LogNorm if log else Normalize)(low, high)
     x, y = table.coords[names[0]], table.coords[names[1]]
     image = drawing.pcolormesh(x, y, visible.T, shading="nearest", norm=scale)
-    is_clipped = values.size and (values.min() < low, values.max() > high)
+    is_clipped = (bool(np.any(values < low)), bool(np.any(values > high)))
     extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(is_clipped, "neither")
     bar = drawing.figure.colorbar(image, ax=drawing, label=label, extend=extend)
     if log:
@@ -250,7 +250,8 @@ def _mark_words(drawing: "Axes", table: "Table", names: list[str], words: np.nda
             for vertical, rows in (("upper", slice(-height, None)), ("lower", slice(height)))
             for horizontal, columns in (("right", slice(-width, None)), ("left", slice(width)))
         }
-        drawing.legend(handles=patches, loc=max(shares, key=lambda corner: shares[corner]))
+        emptiest: Any = max(shares, key=lambda corner: shares[corner])
+        drawing.legend(handles=patches, loc=emptiest)
 
 
 def draw_portrait(table: "Table", x: str, y: str, ax: "Axes | None" = None) -> "FigureBase | Axes":
@@ -327,8 +328,11 @@ def draw_series(
     """
     if ax is not None and len(names) > 1:
         raise ValueError(f"ax takes one quantity, not {len(names)}: {', '.join(names)}")
-    figure = new_figure(PANEL[0], 1.5 + PANEL[1] * len(names)) if ax is None else None
-    panels = [ax] if figure is None else figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    if ax is None:
+        figure = new_figure(PANEL[0], 1.5 + PANEL[1] * len(names))
+        panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    else:
+        figure, panels = None, [ax]
     for panel, name in zip(panels, names, strict=True):
         for table, label in zip(tables, labels, strict=True):
             lines, quantity = _lines(table, name)

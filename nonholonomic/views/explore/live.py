@@ -154,7 +154,8 @@ def stepper_of(begin: Callable[..., LaneScheduler], examples: tuple[PyTree, ...]
         return past_jump(problem, control, near, lane, new_lane)
 
     def length(constants: PyTree, lane: LaneState) -> Array:
-        return length_to_try(until_jump(*run(constants)[:2], lane), lane)
+        problem, control, _ = run(constants)
+        return length_to_try(until_jump(problem, control, lane), lane)
 
     functions: Functions = {
         "begin": (lambda *inputs: eqx.filter(_started(begin, *inputs), eqx.is_array), examples),
