@@ -12,10 +12,10 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from nonholonomic.compilation.components import Held
 from nonholonomic.geometry import Plane
 from nonholonomic.hybrid import HybridOutcome
-from nonholonomic.integration import AbstractProblem, ExtendedProblem, Outcome
+from nonholonomic.integration import AbstractProblem, Outcome
 from nonholonomic.integration.problem import Status, require_run
 from nonholonomic.parameters import description, numbers, numbers_of
-from nonholonomic.runs.event import UNMEASURED, Clock, EventFunction, with_event
+from nonholonomic.runs.event import EventFunction, with_clock, with_event
 from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Number, model_of, statuses
 from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.text import name_of
@@ -189,10 +189,7 @@ class RideModel(AbstractSceneModel):
             watched = self.event is None and names is not None and not names
             ride = RideProblem.of(self.scene, self.launch, self.input, cells, watched, self.jumps)
         # The state ends with the time if a quantity depends on the input.
-        if self.input is None or names is None or TIMED.isdisjoint(names):
-            return ride
-        clock = jnp.zeros_like(ride.states[:1])
-        return ExtendedProblem(ride, Clock(), clock, clock + UNMEASURED)
+        return ride if self.input is None or names is None or TIMED.isdisjoint(names) else with_clock(ride)
 
     def simulate(self, t1: ArrayLike, times: Any, tolerance: ArrayLike, solver: Any, adjoint: Any) -> Trajectory:
         return ride(self, t1, times, tolerance, solver, DEFAULT_STEPS, adjoint)
