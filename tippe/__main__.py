@@ -25,9 +25,8 @@ from nonholonomic.views import NO_VIEW, Page, can_view, page, picture_as_html, t
 from nonholonomic.views.explore import live_page
 
 from . import paper, presets, steady
-from .model.friction import Coulomb
-from .model.launch import Launch
-from .model.scene import Scene
+from .friction import Coulomb
+from .model.scene import Launch, Scene
 from .runs.launches import INVERTED
 from .runs.model import TopModel
 from .runs.verbs import inversion_table

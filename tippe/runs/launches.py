@@ -15,11 +15,10 @@ from nonholonomic.sweeps import Axis, axis
 from nonholonomic.text import shown
 from nonholonomic.validation import IN_DEGREES, as_number, is_traced, require, require_kind, warn
 
+from ..friction import Frictionless
 from ..model.body import Top
-from ..model.friction import Frictionless
-from ..model.launch import Launch
-from ..model.rigid_body import AbstractRigidBody
-from ..model.scene import Scene
+from ..model.rigid import AbstractRigidBody
+from ..model.scene import Launch, Scene
 from ..modes.problems import StemContact
 
 # The events of a top, and checks of the arguments of a run, before anything compiles and inside a program.

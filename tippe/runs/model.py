@@ -22,22 +22,21 @@ from nonholonomic.runs.table import TableForm
 from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.validation import Bound, all_bounds, legal, require_kind, require_scalars
 
+from ..friction import NoSlip
 from ..model.body import Top
 from ..model.dynamics import LOSSES, NO_COSINE
-from ..model.friction import NoSlip
-from ..model.launch import Launch
-from ..model.scene import Scene, generic_direction
-from ..modes.airborne import airborne_modes, modes_with_stem
+from ..model.scene import Launch, Scene, generic_direction
+from ..modes.airborne import airborne_modes
 from ..modes.impact import energy_in
+from ..modes.plane import hopping_modes
 from ..modes.problems import BEHIND_PATH, InversionProblem, StemContact, trajectory_problem
-from ..modes.sliding import hopping_modes
 from ..modes.sticking import (
+    above_the_ground,
     airborne_energy,
     airborne_stick_slip_modes,
     contact_energy,
     contact_modes,
     loss,
-    on_the_ground,
     stick_slip_modes,
 )
 from .launches import INVERTED, NUMBERS_OF_A_LAUNCH, event_of, labels, variable_numbers
@@ -92,7 +91,6 @@ SMOOTH = RunKind((), None, lambda scene, state, mode: (scene.energy(state),) * 2
 STICK_SLIP = RunKind(("sticks",), stick_slip_modes, contact_energy, loss_of_contact)
 HYBRID = RunKind(("hops",), hopping_modes, energy_in, None)
 AIRBORNE = RunKind(("hops",), airborne_modes, airborne_energy, loss, True)
-ON_STEM_TOO = AIRBORNE._replace(modes=modes_with_stem)
 STICK_SLIP_FLY = AIRBORNE._replace(counts=("hops", "sticks"), modes=airborne_stick_slip_modes)
 
 
@@ -103,9 +101,7 @@ def run_kind_of(scene: Scene) -> RunKind:
         return STICK_SLIP_FLY if hybrid else STICK_SLIP
     if not hybrid:
         return SMOOTH
-    if scene.flies_in_closed_form:
-        return HYBRID
-    return AIRBORNE if scene.body.stem is None else ON_STEM_TOO
+    return HYBRID if scene.flies_in_closed_form else AIRBORNE
 
 
 def flight_modes(scene: Scene[Top], launch: Launch, tolerance: Number, cells: int = 1) -> Start:
@@ -372,7 +368,7 @@ class TopModel(AbstractSceneModel):
     def at_end(self, outcome: Any, start: Float[Array, "components cells"]) -> dict[str, Array]:
         state = jnp.asarray(outcome.state)[: len(start)]
         if self.kind.flight_state:
-            state = on_the_ground(self.scene, state, outcome.mode)
+            state = above_the_ground(self.scene, state, outcome.mode)[0]
         return {"end_theta": self.scene.theta(state)}
 
 

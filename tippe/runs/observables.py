@@ -24,11 +24,10 @@ from nonholonomic.sweeps import Quantity, Table, chosen, run_table
 from nonholonomic.text import distinguishing_labels, in_unit
 from nonholonomic.validation import is_traced, require_one_run, times_within
 
+from ..friction import Frictionless
 from ..model.body import AbstractBody, Top
-from ..model.friction import Frictionless
-from ..model.launch import Launch
-from ..model.rigid_body import AbstractRigidBody
-from ..model.scene import Scene
+from ..model.rigid import AbstractRigidBody
+from ..model.scene import Launch, Scene
 from ..steady import group
 from .launches import INVERTED
 

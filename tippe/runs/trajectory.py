@@ -29,9 +29,8 @@ from nonholonomic.runs.simulate import sampled_if_legal
 from nonholonomic.text import shown
 from nonholonomic.validation import as_number, is_traced, nan_unless
 
-from ..model.dynamics import Motion
-from ..model.friction import length
-from ..model.launch import parts
+from ..friction import length
+from ..model.dynamics import Motion, parts
 from ..model.scene import Scene
 from ..model.stick_slip import StickSlip
 from ..modes.airborne import (
@@ -47,9 +46,8 @@ from ..modes.airborne import (
     lift_off,
     standing,
 )
-from ..modes.flight import height
 from ..modes.impact import BOTH, TOUCHING, Ball, FreeBody, approach, as_free_body, balls, energy, standing_on
-from ..modes.sliding import MOST_BOUNCES
+from ..modes.plane import MOST_BOUNCES, height
 from ..modes.sticking import lifted
 from .observables import AbstractTrajectory, Values, audited, of_each_run, why_unbalanced
 

@@ -35,8 +35,8 @@ from nonholonomic.terminal import status_line
 from nonholonomic.text import shown
 from nonholonomic.validation import as_number, is_traced, require, require_all, require_kind, require_outside, warn
 
-from ..model.launch import Launch, inclination, parts
-from ..model.scene import Scene
+from ..model.dynamics import inclination, parts
+from ..model.scene import Launch, Scene
 from ..modes.problems import InversionProblem, StemContact
 from .launches import (
     check_event,

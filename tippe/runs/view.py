@@ -33,12 +33,11 @@ from nonholonomic.terminal import status_line
 from nonholonomic.text import readable_unit
 from nonholonomic.views.explore import Frame, LiveRun, Summary, quaternion
 
+from ..friction import NoSlip
 from ..model.body import AbstractBody, Top
-from ..model.friction import NoSlip
-from ..model.launch import Launch
-from ..model.rigid_body import AbstractRigidBody
-from ..model.scene import Scene
-from ..modes.sliding import Slide
+from ..model.rigid import AbstractRigidBody
+from ..model.scene import Launch, Scene
+from ..modes.plane import Slide
 from .launches import check_reversible, check_run, event_of
 from .model import TopModel
 from .observables import OF_RIGID_BODIES, QUANTITIES, AbstractTrajectory, names_of
