@@ -399,6 +399,9 @@ class Trajectory(AbstractRun):
         values = vars(self).get("values", {})
         return values[name] if name in values else super().__getattr__(name)
 
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *self.values]
+
     def __getitem__(self, name: str) -> Any:
         return self.values[name] if name in QUANTITIES else super().__getitem__(name)
 
