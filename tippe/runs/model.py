@@ -299,7 +299,7 @@ class TopModel(AbstractSceneModel):
         has_path = PATH in needs or (ON_CURVED in needs and not isinstance(scene.surface, Plane))
         return CoreProblem(run, len(run.start()[0]) - BEHIND_PATH if has_path else run.leading)
 
-    def modes(self, cells: int, tolerance: Number, names: Names, continues: bool) -> Start:
+    def modes(self, cells: int, tolerance: Any, names: Names, continues: bool) -> Start:
         scene, launch = self.scene, self.launch
         if self._is_without_path(names):
             assert self.kind.modes is not None

@@ -221,7 +221,7 @@ class HybridTrajectory(AbstractTrajectory):
         return float(min([*strokes, first]))
 
     @of_each_run
-    def _stem_gap(self) -> Values:
+    def _stem_gap(self) -> Any:
         """Distance of the stem from the arena [m]."""
         main, stem = balls(self.scene.body)
         return self.above[0] + height(main, stem, self.states)
