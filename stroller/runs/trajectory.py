@@ -587,18 +587,15 @@ read_off_compiled: Callable[..., Trajectory] = eqx.filter_jit(read_off)
 
 # One ride: with its steps outside of transformations, and sampled inside.
 
-#: Default limit of the steps of a ride.
-DEFAULT_STEPS = 65536
-
 
 def ride(
     model: Any,
     t1: ArrayLike,
-    times: Any,
+    times: ArrayLike | None,
     tolerance: ArrayLike,
-    solver: diffrax.AbstractSolver | None,
-    max_steps: int,
-    adjoint: diffrax.AbstractAdjoint | None,
+    solver: diffrax.AbstractSolver | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    max_steps: int = 65536,
 ) -> Trajectory:
     """The trajectory of a `RideModel`. **Arguments:** as for `stroller.simulate`; the model was checked."""
     if not isinstance(solver, ImplicitMidpoint):

@@ -400,10 +400,10 @@ class ArenaTrajectory(HybridTrajectory):
 def simulate_launch(
     model: Any,
     t1: ArrayLike,
-    times: Any,
+    times: ArrayLike | None,
     tolerance: ArrayLike,
-    solver: diffrax.AbstractSolver | None,
-    adjoint: diffrax.AbstractAdjoint | None,
+    solver: diffrax.AbstractSolver | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
 ) -> Trajectory | HybridTrajectory:
     """The run of a `TopModel`. **Arguments:** as for `tippe.simulate`."""
     require_adaptive(solver)

@@ -50,7 +50,7 @@ from .launches import (
 )
 from .model import INVERSIONS, REVERSALS, TopModel, why_unresolved
 from .observables import QUANTITIES, quantities_of
-from .trajectory import HybridTrajectory, Trajectory
+from .trajectory import HybridTrajectory, Trajectory, simulate_launch
 
 # Tables of many launches: inversion times, reversal times, and trajectories.
 
@@ -428,7 +428,7 @@ def simulate(
     ```
     """
     check_run(scene, launch, t1, tolerance, "jax.vmap(simulate) takes lists, and so does trajectory_table")
-    return TopModel(scene=scene, launch=launch).simulate(t1, times, tolerance, solver, adjoint)
+    return simulate_launch(TopModel(scene=scene, launch=launch), t1, times, tolerance, solver, adjoint)
 
 
 @status_line("simulating")
