@@ -366,8 +366,9 @@ class Trajectory(AbstractRun):
     - `normal_force` [N] of the ground, and `load` [N] on the rear and the front axle, (times, 2);
     - `constraint` [m/s]: speed at which the rear axle and the front wheel slip sideways, (times, 2);
     - `departure`: distance of the position from the ground [m], an integration error;
-    - `stats` of the integration; `spec`: the specification of the run; `steps`: the ends of its steps. They are `None`
-      for a run inside a transformation; if you request events of such a run, the run is repeated.
+    - `stats` of the integration; `model`: its `scene`, `launch` and `input`; `spec`: the model, the horizon and the settings;
+      `steps`: the ends of the steps, `None` for a run inside a transformation; if you request events of such a run, the
+      run is repeated.
 
     **Example:**
 
