@@ -22,7 +22,6 @@ from ..derivatives import (
     differentiable_solve,
     solve_ensemble_with_tangents,
     tangents_by,
-    traced_solve_ensemble_with_tangents,
 )
 from ..hybrid import (
     AbstractBatchedMode,
@@ -367,11 +366,8 @@ class Ensemble(eqx.Module):
         """
         if self.problem is not None:
             arguments = (tuple(tangent.problem for tangent in tangents), jnp.asarray(t1), jnp.asarray(cells), settings)
-            if not traced:
-                outcome, slopes = solve_ensemble_with_tangents(self.problem, *arguments, nonterminal=self.continues)
-                return outcome, slopes, False
-            options = {"nonterminal": self.continues, "one_kernel": one_kernel}
-            return *traced_solve_ensemble_with_tangents(self.problem, *arguments, **options), False
+            options = {"nonterminal": self.continues, "one_kernel": one_kernel, "traced": traced}
+            return *solve_ensemble_with_tangents(self.problem, *arguments, **options), False
         outcome, xp = None, jnp if traced else np
         if self.continues:
             # The derivatives need the run only up to the event, whose time is known.
