@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from ..compilation.xla_cpu import compiled_alone
+from ..compilation.xla_cpu import compiled_alone, compiled_for_one
 from ..derivatives import sampled_run, sampled_run_by_diffrax
 from ..hybrid import HybridOutcome, HybridSamples, hybrid_samples, solve_hybrid_with_samples
 from ..integration import AbstractProblem, Outcome, Settings, solve_with_samples
@@ -229,8 +229,12 @@ def simulate_model(
     times = evenly_spaced(as_known(t1)) if times is None else times
     require_times(times, t1)
     settings = settings_for_lanes(tolerance, solver)
-    unchecked = is_traced((model, times, t1, tolerance))
-    run, extremes = _sampled(model.without_event(), as_number(times), as_number(t1), settings, unchecked)
+    eventless = model.without_event()
+    unchecked = is_traced((eventless, times, t1, tolerance))
+    # Inside `jit`, a new array is traced.
+    is_alone = not is_traced((as_number(0.0), eventless, times, t1, tolerance))
+    run_sampled = _sampled_alone if eventless.compiles_slowly and is_alone else _sampled
+    run, extremes = run_sampled(eventless, as_number(times), as_number(t1), settings, unchecked)
     if not is_traced(extremes):
         shortest, time, longest = np.asarray(extremes)
         # At a kink, only a few steps are short.
@@ -332,8 +336,7 @@ def problem_of_run(modules: tuple[AbstractModel, Names], cells: int | None) -> A
     return problem_of(model, cells, names)
 
 
-@eqx.filter_jit
-def _sampled(
+def _run_and_extremes(
     model: AbstractModel, times: Float[Array, " times"], t1: Float[Array, ""], settings: Settings, unchecked: bool
 ) -> tuple[Trajectory, Float[Array, "3"]]:
     """The run, or NaN and "illegal" if a traced number is out of range; and the extremes of its steps, as in
@@ -364,3 +367,6 @@ def _sampled(
         names=names,
     )
     return run, outcome.extremes[:, 0]
+
+
+_sampled, _sampled_alone = eqx.filter_jit(_run_and_extremes), compiled_for_one(_run_and_extremes)
