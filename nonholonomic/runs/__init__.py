@@ -6,6 +6,7 @@ parameters by name. `model_of` finds the model of a scene or of a user's own sys
 
 from ..hybrid.saltation import UNMEASURED as UNMEASURED
 from ..hybrid.saltation import Clock as Clock
+from ..identification.posterior import Prior as Prior
 from .event import Ensemble as Ensemble
 from .event import EventFunction as EventFunction
 from .event import EventTime as EventTime
@@ -13,14 +14,13 @@ from .event import event_time as event_time
 from .event import time_of_event as time_of_event
 from .event import with_event as with_event
 from .identify import AbstractEventTimes as AbstractEventTimes
+from .identify import Data as Data
 from .identify import EventTimes as EventTimes
 from .identify import Recording as Recording
 from .identify import fit_runs as fit_runs
 from .identify import identify as identify
 from .identify import log_density as log_density
 from .identify import posterior_of_runs as posterior_of_runs
-from .identify import search_options as search_options
-from .identify import sources_of as sources_of
 from .lyapunov import LyapunovExponent as LyapunovExponent
 from .lyapunov import exponent_of_model as exponent_of_model
 from .lyapunov import lyapunov_exponent as lyapunov_exponent

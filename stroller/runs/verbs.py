@@ -1,8 +1,9 @@
 """The functions of the stroller: rides, tables, crossings, fits, plots and pages."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from os import PathLike
 from typing import Any, ClassVar
 
 import diffrax
@@ -14,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from nonholonomic.geometry import AbstractQuadric, AbstractSurface
 from nonholonomic.identification import (
     AbstractRecording,
+    Free,
     Identification,
     LogDensity,
     Quantities,
@@ -25,7 +27,9 @@ from nonholonomic.integration.problem import DEFAULT_MAX_STEPS, Status, require_
 from nonholonomic.parameters import full_axes, numbers
 from nonholonomic.runs import (
     AbstractModel,
+    Data,
     Options,
+    Prior,
     TableForm,
     explore_model,
     fit_runs,
@@ -33,16 +37,14 @@ from nonholonomic.runs import (
     page_of,
     posterior_of_runs,
     runs_at_ends,
-    search_options,
     sliders_of,
-    sources_of,
     table_of,
 )
 from nonholonomic.runs.trajectory import TOLERANCE
 from nonholonomic.sweeps import Table
 from nonholonomic.terminal import status_line
 from nonholonomic.text import shown
-from nonholonomic.validation import as_number, as_number_or_none, require_kind, require_outside
+from nonholonomic.validation import require_kind, require_outside
 from nonholonomic.views import COLOURS, Page, Stage, arena, css
 from nonholonomic.views.explore import Frame, LiveRun, Summary, quaternion
 
@@ -438,8 +440,8 @@ EXPECTED = "a Recording or a nonholonomic.EventTimes"
 
 def identify(
     scene: Scene,
-    data: Any,
-    free: dict[str, Any],
+    data: Data | Sequence[Data],
+    free: Mapping[str, Free | float],
     *,
     starts: int = 16,
     spread: float = 2.0,
@@ -480,13 +482,18 @@ def identify(
 
     ```
     """
-    search = search_options(starts, spread, seed, max_steps, progress)
+    search = {"starts": starts, "spread": spread, "seed": seed, "max_steps": max_steps, "progress": progress}
     require_kind(scene, "scene", Scene)
-    return fit_runs(scene, sources_of(data, EXPECTED), free, tolerance, search)
+    return fit_runs(scene, data, free, EXPECTED, tolerance, search)
 
 
 def log_density(
-    scene: Scene, data: Any, free: dict[str, Any], priors: dict[str, Any] | None = None, *, tolerance: float = 1e-8
+    scene: Scene,
+    data: Data | Sequence[Data],
+    free: Mapping[str, Free | float],
+    priors: Mapping[str, Prior] | None = None,
+    *,
+    tolerance: float = 1e-8,
 ) -> LogDensity:
     """The log of the posterior density of the parameters of a scene and its launch, as a function of unbounded coordinates.
 
@@ -511,7 +518,7 @@ def log_density(
     ```
     """
     require_kind(scene, "scene", Scene)
-    return posterior_of_runs(scene, sources_of(data, EXPECTED), free, priors, tolerance)
+    return posterior_of_runs(scene, data, free, priors, EXPECTED, tolerance)
 
 
 # Recorded rides of strollers, from arrays and from files.
@@ -539,10 +546,11 @@ class Recording(AbstractRecording):
     - `quantity`: "position" ("x", "y", "z") [m] of the rear axle in the fixed frame, "heading", "steering" [rad],
       "speed" [m/s], "yaw_rate" or "steering_rate" [rad/s], all as in `Trajectory`; or a tuple of some of these words. A
       heading may differ by whole turns.
-    - `input`, `jumps`: the input of the ride and the times at which it jumps, as for `simulate`.
     - `t0`: the clock's reading [s] at the launch. Before this time, the stroller is at its launch position.
     - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for data with outliers;
       `None` for Gaussian errors.
+    - `side`: as for `nonholonomic.Recording`; a ride has no resets.
+    - `input`, `jumps`: the input of the ride and the times at which it jumps, as for `simulate`.
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
 
@@ -558,9 +566,7 @@ class Recording(AbstractRecording):
     launch: Launch
     quantity: str | tuple[str, ...] = eqx.field(static=True, default="position", converter=as_quantity)
     input: Input | None = None
-    t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
-    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
-    jumps: Any = None
+    jumps: Sequence[float] | Array | None = None
     quantities: ClassVar[Quantities] = QUANTITIES
 
     def model(self, scene: Scene) -> AbstractModel:
@@ -574,17 +580,17 @@ class Recording(AbstractRecording):
 
 
 def read_recording(
-    path: Any,
-    columns: Any = None,
+    path: str | PathLike[str],
+    columns: Mapping[str, object] | None = None,
     fps: float | None = None,
     *,
     launch: Launch,
-    error: Any = None,
+    error: Mapping[str, object] | None = None,
     input: Input | None = None,
     t0: float = 0.0,
     student: float | None = None,
     decimal: str = ".",
-    jumps: Any = None,
+    jumps: Sequence[float] | Array | None = None,
 ) -> Recording:
     """A recording of a ride from a text file of columns with a header line (CSV).
 
