@@ -344,7 +344,8 @@ class DataModel(eqx.Module):
         moves_times = any(own_name(name) == "t0" for name in names)
         if moves_times and not all(source.model.smooth for source in self.data):
             return "differences"
-        return self.data[0].model.fit_slopes
+        model = self.data[0].model
+        return "differences" if model.compiles_slowly else model.fit_slopes
 
     @property
     def series_units(self) -> tuple[str, ...]:
