@@ -21,9 +21,8 @@ from .likelihood import Free, Measurements, Unknown, as_free, as_gaussian
 
 Rows = Float[np.ndarray, "rows unknowns"]
 
-#: Number of rows in a call of a model without and with slopes; without, of a model on the host, whose calls take nearly as long
-#: for fewer; on an accelerator.
-ROWS_OF_CALL, ROWS_WITH_SLOPES, ROWS_ON_HOST, MOST_ROWS = 64, 8, 32, 512
+#: Number of rows in a call of a model without and with slopes; on an accelerator.
+ROWS_OF_CALL, ROWS_WITH_SLOPES, MOST_ROWS = 64, 8, 512
 
 #: Number of predictions that are compared with measurements at once.
 COMPARED = 4096
@@ -160,7 +159,10 @@ def predictions_and_slopes(
 
 def predictions(problem: Problem, coordinates: Rows) -> np.ndarray:
     """Predictions without slopes, for every row of coordinates; rows of NaN take no time."""
-    predict, rows = (Problem.predict, ROWS_ON_HOST) if problem.on_host else (_predicted, ROWS_OF_CALL)
+    predict, rows = Problem.predict if problem.on_host else _predicted, ROWS_OF_CALL
+    if problem.on_host and len(problem.names) == 1:
+        # Rounds are small, and calls take nearly as long for fewer rows: the cores share a round.
+        rows = ROWS_OF_CALL // 2
     return _in_parts(lambda part: (predict(problem, jnp.asarray(part)),), coordinates, rows)[0]
 
 

@@ -276,7 +276,6 @@ AT_ONCE = 1e-6
 #: Parameters of one set of data, name -> (rows,).
 Values = dict[str, Float[Array, " rows"]]
 
-
 #: A set of data of runs.
 Data = AbstractRecording | AbstractEventTimes
 
