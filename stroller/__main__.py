@@ -27,10 +27,9 @@ from nonholonomic.views import NO_VIEW, can_view, page, picture_as_html
 
 from .model.scene import FORKS, Scene
 from .model.vehicle import Damping, Launch, Stroller
-from .planning.obstacles import Box
 from .planning.plan import plan
-from .planning.problem import Goal, Limits
-from .planning.result import Plan, draw_plan, planned_stage
+from .planning.problem import Box, Goal, Limits
+from .planning.result import Plan, planned_stage
 from .runs.trajectory import Trajectory
 from .runs.verbs import draw_rides, simulate
 from .runs.view import grouped, table_of
@@ -279,7 +278,7 @@ def computed(options: argparse.Namespace) -> dict[str, bytes]:
         table(options, rides).save(paths[0])
         if has_matplotlib():
             grounds = {ground: scene.surface for (ground, _), (scene, _) in scenes(options).items()}
-            figures = {"parked.png": draw_plan(parking), "rides.png": draw_rides(grounds, rides)}
+            figures = {"parked.png": parking.plot(), "rides.png": draw_rides(grounds, rides)}
             for name, figure in figures.items():
                 figure.savefig(options.out / name, dpi=110)
             paths += [options.out / name for name in figures]

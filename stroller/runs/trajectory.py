@@ -186,7 +186,7 @@ def _counted(accepted: int, rejected: int, finished: bool) -> Stats:
 
 @eqx.filter_jit
 def _problem(spec: RideSpec) -> RideProblem:
-    return RideProblem.single(spec.scene, spec.launch, spec.input, spec.model.jumps)
+    return RideProblem.of(spec.scene, spec.launch, spec.input, jumps=spec.model.jumps)
 
 
 @compiled_quickly
