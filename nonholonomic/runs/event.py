@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..compilation.components import over_lanes
 from ..compilation.tracing import depends_on_first, is_elementary, spelled_out, with_own_numbers
@@ -30,8 +30,6 @@ from ..hybrid import (
     Transition,
     solve_hybrid,
     solve_hybrid_with_tangents,
-    traced_solve_hybrid,
-    traced_solve_hybrid_with_tangents,
 )
 from ..hybrid.saltation import UNMEASURED
 from ..integration import (
@@ -43,7 +41,6 @@ from ..integration import (
     States,
     explicit_tableau,
     solve_ensemble,
-    traced_solve_ensemble,
 )
 from ..integration.problem import CROSSED, REACHED_END, RUNNING, Status, legal_run
 from ..parameters import Parameters
@@ -336,10 +333,10 @@ class Ensemble(eqx.Module):
     """
 
     problem: AbstractProblem | None
-    # A tuple, or `None`.
+    # A tuple and two arrays, or `None`.
     modes: Any
-    first: Int[Array, " cells"] | None
-    states: Float[Array, "components cells"] | None
+    first: Any
+    states: Any
     counters: int = eqx.field(static=True)
     continues: bool = eqx.field(static=True)
 
@@ -357,13 +354,10 @@ class Ensemble(eqx.Module):
         may be traced.
         """
         if self.problem is not None:
-            horizon = (jnp.asarray(t1), jnp.asarray(cells), settings)
-            if traced:
-                return traced_solve_ensemble(self.problem, *horizon, nonterminal=self.continues, one_kernel=True)[0]
-            return solve_ensemble(self.problem, *horizon, nonterminal=self.continues)[0]
-        solve, xp = (traced_solve_hybrid, jnp) if traced else (solve_hybrid, np)
-        start, options = self._start(xp), {"counters": self.counters, "nonterminal": self.continues}
-        return solve(self.modes, *start, t1, cells, settings, **options)
+            arguments = (self.problem, jnp.asarray(t1), jnp.asarray(cells), settings)
+            return solve_ensemble(*arguments, nonterminal=self.continues, one_kernel=True, traced=traced)[0]
+        options = {"counters": self.counters, "nonterminal": self.continues, "traced": traced}
+        return solve_hybrid(self.modes, self.first, self.states, t1, cells, settings, **options)
 
     def solve_with_tangents(
         self,
@@ -389,19 +383,16 @@ class Ensemble(eqx.Module):
                 return outcome, slopes, False
             options = {"nonterminal": self.continues, "one_kernel": one_kernel}
             return *traced_solve_ensemble_with_tangents(self.problem, *arguments, **options), False
-        solve, xp = (traced_solve_hybrid_with_tangents, jnp) if traced else (solve_hybrid_with_tangents, np)
-        outcome = None
+        outcome, xp = None, jnp if traced else np
         if self.continues:
             # The derivatives need the run only up to the event, whose time is known.
             outcome = self.solve(t1, cells, settings, traced)
             t1 = xp.where(xp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
         pairs = tuple((tangent.modes, tangent.states) for tangent in tangents)
-        options = {"counters": self.counters, "ends_on_event": not self.continues}
-        run, sensitivities = solve(self.modes, pairs, *self._start(xp), t1, cells, settings, **options)
+        options = {"counters": self.counters, "ends_on_event": not self.continues, "traced": traced}
+        arguments = (self.modes, pairs, self.first, self.states, t1, cells, settings)
+        run, sensitivities = solve_hybrid_with_tangents(*arguments, **options)
         return run if outcome is None else outcome, sensitivities.slopes, sensitivities.grazing
-
-    def _start(self, xp: Any) -> tuple[Any, Any]:
-        return xp.asarray(self.first), xp.asarray(self.states)
 
     @property
     def starts(self) -> Float[Array, "components cells"]:

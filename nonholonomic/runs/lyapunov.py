@@ -185,7 +185,7 @@ def _through_modes(
     state, mode, size = np.asarray(variational_start(states, (tangent,))), np.asarray(first), len(states)
     state = np.asarray(_rescaled(modes, jnp.asarray(mode), jnp.asarray(state), size)[1])
     stretch, count = t1 / STRETCHES, len(model.counters)
-    logarithms, ending = [], at_start(np, mode, state[:size], cells, count)
+    logarithms, ending = [], at_start(mode, state[:size], cells, count)
     for _ in range(STRETCHES):
         outcome = solve_hybrid(variational, mode, state, stretch, cells, settings, counters=count + 1, n_blocks=2)
         rescaled = _rescaled(modes, jnp.asarray(outcome.mode), jnp.asarray(outcome.state), size)

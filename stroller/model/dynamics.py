@@ -336,5 +336,4 @@ class Dynamics(eqx.Module):
 
 def padded(components: State) -> Vector:
     """A vector made from its components; missing components at the end vanish identically."""
-    vector = (*components, None, None)
-    return vector[0], vector[1], vector[2]
+    return (*components, None, None)[:3]

@@ -22,6 +22,7 @@ from nonholonomic.geometry import (
     scale,
     subtract,
     sum_vectors,
+    unit,
 )
 from nonholonomic.parameters import as_one
 from nonholonomic.text import shown
@@ -313,7 +314,7 @@ class Heading(eqx.Module):
         """
         if not self.projected:
             heading = sum_vectors(heading, scale(subtract(None, dot(heading, normal)), normal))
-        return scale(1.0 / jnp.sqrt(dot(heading, heading)), heading)
+        return unit(heading)
 
     def direction(self, heading: Vector, normal: Vector, side: float) -> tuple[Vector, Component, Component]:
         """The vector d along the ground, its square d.d, and the factor nu, from the outward normal and the side: 1

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 from scipy.interpolate import CubicSpline
 
-from nonholonomic.geometry import AbstractSurface, cross, dot, scale, subtract, vector_of
+from nonholonomic.geometry import AbstractSurface, cross, difference, dot, scale
 from nonholonomic.terminal import status_line
 from nonholonomic.text import shown
 from nonholonomic.validation import require_flag, require_kind, require_whole
@@ -245,7 +245,7 @@ class Tracker(eqx.Module):
         axes = self.surface.axes
         heading, target = padded(components[axes:]), padded(components[:axes])
         left = scale(self.side, cross(self.surface.normal(motion.position), motion.heading))
-        away = vector_of(subtract(a, b) for a, b in zip(target, motion.position, strict=True))
+        away = difference(target, motion.position)
         return dot(away, motion.heading), dot(away, left), dot(heading, left), dot(heading, motion.heading)
 
     def storage(self, t: Numbers, motion: Motion) -> Numbers:

@@ -18,7 +18,7 @@ import scipy.linalg
 from jaxtyping import Array, Float, Int
 from scipy.interpolate import make_interp_spline
 
-from nonholonomic.geometry import Vector, add, dot, multiply, scale, subtract, vector_of
+from nonholonomic.geometry import Vector, add, dot, multiply, scale, subtract
 
 from ..model.dynamics import Dynamics, padded
 from ..model.input import Motion
@@ -572,7 +572,7 @@ def drive_along(
     duration, splines = jnp.asarray(t1, dtype=float), (jnp.asarray(steering), jnp.asarray(front_speed))
     force, torque, poses = _needed(dynamics, pose, splines, duration)
     body = dynamics.body
-    weight = vector_of(scale(body.mass * dynamics.gravity, dynamics.up))
+    weight = scale(body.mass * dynamics.gravity, dynamics.up)
     force = subtract(force, dot(weight, padded(poses[:, dynamics.surface.axes :].T)))
     return Drive(
         duration,

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import AbstractSurface, Component, Plane, dot, multiply, scale, sum_vectors, vector_of
+from nonholonomic.geometry import AbstractSurface, Component, Plane, dot, multiply, scale, sum_vectors
 from nonholonomic.sweeps import Quantity, Table, chosen, run_table
 from nonholonomic.text import distinguishing_labels
 from nonholonomic.validation import require_one_run
@@ -297,9 +297,9 @@ def grouped(groups: list[list[tuple[int, Any]]], names: list[str]) -> list[Stage
 def normals(xp: Any, surface: AbstractSurface, side: str | None, position: Any) -> Any:
     """Unit normals at positions (*times, 3), towards the side on which the stroller is. **Arguments:** `xp`: NumPy, or
     `jax.numpy` for a page."""
-    components = surface.normal(surface.in_own_axes(vector_of(position.T)))
+    components = surface.normal(surface.in_own_axes(tuple(position.T)))
     zero = xp.zeros(position.shape[:-1])
-    filled = vector_of(zero if part is None else xp.asarray(part) + zero for part in components)
+    filled = tuple(zero if part is None else xp.asarray(part) + zero for part in components)
     return surface.sign(side, DRIVES) * xp.stack([xp.asarray(part) for part in surface.in_fixed_frame(filled)], axis=-1)
 
 

@@ -16,7 +16,7 @@ from hop_reference import CASES as ON_THE_PLANE
 from test_leaning import REFERENCE as FOUND_ON_THE_PLANE
 
 import tippe
-from nonholonomic.hybrid.sampled_adjoint import program_groups
+from nonholonomic.hybrid.ensemble import program_groups
 from tippe.modes.airborne import ON_STEM, STRIKING, FlyBoth
 from tippe.runs.launches import flight_modes
 

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from nonholonomic.compilation.components import TooLarge, by_components
 from nonholonomic.compilation.tracing import with_own_numbers
-from nonholonomic.geometry import Vector, dot, scale, sum_vectors, vector_of
+from nonholonomic.geometry import Vector, dot, scale, sum_vectors
 from nonholonomic.text import shown
 from nonholonomic.validation import UNTRACEABLE, Bound, Bounded, as_number, is_traced
 
@@ -162,7 +162,7 @@ class SymmetricMatrix(eqx.Module):
     def solve(self, right: Vector) -> Vector:
         """Solution x of A x = right."""
         adjugate = self.adjugate
-        return vector_of(scale(1.0 / self.determinant(adjugate), adjugate.times(right)))
+        return scale(1.0 / self.determinant(adjugate), adjugate.times(right))
 
     @property
     def principal_minors(self) -> tuple[Float[Array, "..."], ...]:
@@ -210,7 +210,7 @@ class AbstractRigidBody(Bounded):
     def contact(self, normal: Vector, rate: Vector) -> tuple[Vector, Vector]:
         """The vector r from the centre of mass to the contact [m] in the body's axes, and its rate; arguments as above."""
         point, point_rate = self.surface_point(normal, rate)
-        return vector_of(sum_vectors(point, scale(-1.0, self.centre_of_mass))), point_rate
+        return sum_vectors(point, scale(-1.0, self.centre_of_mass)), point_rate
 
     def check_components(self) -> None:
         """Raise `ValueError` unless the centre of mass has three components."""
@@ -298,15 +298,15 @@ class Ellipsoid(AbstractRigidBody):
 
     def surface_point(self, normal: Vector, rate: Vector) -> tuple[Vector, Vector]:
         # p = -A n / q with q^2 = n.A n, A the squares of the semi-axes.
-        scaled_normal = vector_of(axis * axis * part for axis, part in zip(self.semi_axes, normal, strict=True))
+        scaled_normal = tuple(axis * axis * part for axis, part in zip(self.semi_axes, normal, strict=True))
         per_height = 1.0 / jnp.sqrt(dot(normal, scaled_normal))
-        point = vector_of(scale(-per_height, scaled_normal))
+        point = scale(-per_height, scaled_normal)
         projection = dot(point, rate)
         change = (
             projection * part - axis * axis * component
             for axis, part, component in zip(self.semi_axes, point, rate, strict=True)
         )
-        return point, vector_of(scale(per_height, vector_of(change)))
+        return point, scale(per_height, tuple(change))
 
 
 class RigidBody(AbstractRigidBody):
@@ -379,7 +379,7 @@ class RigidBody(AbstractRigidBody):
         def half_width(normal: Float[Array, "3"]) -> Any:
             no_velocity = tuple(jnp.zeros(3))
             (low, _), (high, _) = (self.surface_point(tuple(sign * normal), no_velocity) for sign in (1.0, -1.0))
-            return 0.5 * dot(tuple(normal), vector_of(sum_vectors(high, scale(-1.0, low))))
+            return 0.5 * dot(tuple(normal), sum_vectors(high, scale(-1.0, low)))
 
         half_widths = jax.vmap(half_width)(evenly_spread(SAMPLES)[0])
         return jnp.min(half_widths, axis=0), jnp.max(half_widths, axis=0)
@@ -395,9 +395,9 @@ class RigidBody(AbstractRigidBody):
                 return jax.grad(lambda d: _length(d) * support(d / _length(d)))(direction)
 
             place, change = jax.jvp(point, (jnp.stack(direction),), (jnp.stack(rate),))
-            return vector_of(place), vector_of(change)
+            return tuple(place), tuple(change)
 
-        numbers = (leaves, *(vector_of(scale(-1.0, vector)) for vector in (normal, rate)))
+        numbers = (leaves, *(scale(-1.0, vector) for vector in (normal, rate)))
         scalar = jax.ShapeDtypeStruct((), jnp.result_type(float))
         with contextlib.suppress(TooLarge):
             return by_components(of_one, *jax.tree.map(lambda _: scalar, numbers))(*numbers)

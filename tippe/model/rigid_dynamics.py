@@ -38,7 +38,6 @@ from nonholonomic.geometry import (
     scale,
     subtract,
     sum_vectors,
-    vector_of,
 )
 
 from .dynamics import AbstractContactDynamics, Motion
@@ -66,19 +65,19 @@ class Attitude(NamedTuple):
     def in_frame(self, vector: Vector) -> Vector:
         """A vector in the frame, from its components in the body's axes."""
         x, y, z = (scale(part, axis) for part, axis in zip(vector, self.axes, strict=True))
-        return vector_of(sum_vectors(x, y, z))
+        return sum_vectors(x, y, z)
 
     @property
     def axis_rates(self) -> tuple[Vector, Vector]:
         """Rates of change of the body's axes x and z, which turn with it."""
         (x, y, z), (w1, w2, w3) = self.axes, self.angular_velocity
-        return vector_of(w3 * b - w2 * c for b, c in zip(y, z, strict=True)), vector_of(
+        return tuple(w3 * b - w2 * c for b, c in zip(y, z, strict=True)), tuple(
             w2 * a - w1 * b for a, b in zip(x, y, strict=True)
         )
 
     def in_body(self, vector: Vector) -> Vector:
         """A vector in the body's axes, from its components in the frame."""
-        return vector_of(dot(vector, axis) for axis in self.axes)
+        return tuple(dot(vector, axis) for axis in self.axes)
 
 
 class ContactMotion(NamedTuple):
@@ -128,11 +127,11 @@ class AbstractRigidDynamics(AbstractContactDynamics):
     def attitude(self, state: Float[Array, "components ..."]) -> Attitude:
         """The attitude and rotation of the body, and its contact point."""
         _, e, L, place = parts(state)
-        c = vector_of(place[-3:])
+        c = tuple(place[-3:])
         axes = (c, cross(e, c), e)
-        n = vector_of(axis[2] for axis in axes)
-        momentum = vector_of(dot(L, axis) for axis in axes)
-        angular_velocity = vector_of(stored(*self.inverse.times(momentum)))
+        n = tuple(axis[2] for axis in axes)
+        momentum = tuple(dot(L, axis) for axis in axes)
+        angular_velocity = stored(*self.inverse.times(momentum))
         normal_rate = cross(n, angular_velocity)
         lever, lever_rate = self.body.contact(n, normal_rate)
         return Attitude(axes, n, momentum, angular_velocity, lever, (normal_rate, lever_rate))
@@ -148,14 +147,14 @@ class AbstractRigidDynamics(AbstractContactDynamics):
                 normal_rate, lever_rate, contact_velocity, self.frame.frame_motion(place, contact_velocity)
             )
         # If n turns along a tangent, the contact moves against it over the body, by H.
-        tangents = [vector_of(axis[k] for axis in attitude.axes) for k in (0, 1)]
+        tangents = [tuple(axis[k] for axis in attitude.axes) for k in (0, 1)]
         first, second = (attitude.in_frame(self.body.contact(attitude.normal, t)[1]) for t in tangents)
         H11, H12, H22, *contact_velocity = stored(-first[0], -first[1], -second[1], *contact_velocity)
         frame, path = self.frame.convex_motion(place, (contact_velocity[0], contact_velocity[1]), (H11, H12, H22))
         path = stored(*path)
         frame_part = attitude.in_body((subtract(None, frame.frame_rate[0]), subtract(None, frame.frame_rate[1]), None))
         lever_rate_in_body = attitude.in_body((subtract(path[0], slip[0]), subtract(path[1], slip[1]), None))
-        return ContactMotion(vector_of(sum_vectors(normal_rate, frame_part)), lever_rate_in_body, path, frame)
+        return ContactMotion(sum_vectors(normal_rate, frame_part), lever_rate_in_body, path, frame)
 
     def angular_velocity(self, state: Float[Array, "components ..."]) -> Vector:
         """Angular velocity of the body in the frame [rad/s]."""
@@ -165,7 +164,7 @@ class AbstractRigidDynamics(AbstractContactDynamics):
     def mass_from_contact(self, state: Float[Array, "components ..."]) -> Vector:
         """Vector from the contact to the centre of mass [m], in the frame."""
         attitude = self.attitude(state)
-        return vector_of(scale(-1.0, attitude.in_frame(attitude.lever)))
+        return scale(-1.0, attitude.in_frame(attitude.lever))
 
     def energy(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Kinetic energy plus weight times the height of the centre of mass [J]."""
@@ -217,7 +216,7 @@ class AbstractRigidDynamics(AbstractContactDynamics):
         fall = 1.0 - axis[2]
         c = (1.0 - fall * x * x, -fall * x * y, -axis[0])
         axes = (c, cross(axis, c), axis)
-        momentum = self.body.inertia.tensor.times(vector_of(dot(angular_velocity, axis) for axis in axes))
+        momentum = self.body.inertia.tensor.times(tuple(dot(angular_velocity, axis) for axis in axes))
         x, y, z = (scale(part, axis) for part, axis in zip(momentum, axes, strict=True))
         state = joined(launch.velocity or (zero, zero), axis, sum_vectors(x, y, z), place, c)
         return self.carried_along(state)
@@ -255,14 +254,14 @@ class RigidSlipping(AbstractRigidDynamics):
         slip = Slip(slip_x, slip_y, attitude.in_frame(attitude.angular_velocity))
         friction = self.friction.per_normal_force(slip)
         f1, f2 = friction.force
-        moment = vector_of(stored(*sum_vectors(cross(r, (f1, f2, 1.0)), friction.torque)))
+        moment = stored(*sum_vectors(cross(r, (f1, f2, 1.0)), friction.torque))
 
         lever, normal = attitude.lever, attitude.normal
         rise = cross(lever, normal)
         arm = self.inverse.times(rise)
         lever_rate_in_body = sum_vectors(cross(contact.lever_rate, normal), cross(lever, contact.normal_rate))
         bend = dot(arm, cross(attitude.momentum, attitude.angular_velocity)) + dot(
-            attitude.angular_velocity, vector_of(lever_rate_in_body)
+            attitude.angular_velocity, tuple(lever_rate_in_body)
         )
         mass = self.body.mass
         painleve_factor = 1.0 + mass * dot(arm, attitude.in_body(moment))
@@ -305,11 +304,11 @@ class RigidRolling(AbstractRigidDynamics):
         contact = self.contact_motion(place[:-3], attitude, (None, None))
         o, up, _, room = contact.frame
         r_dot = sum_vectors(contact.lever_rate, cross(w, r))
-        steady_push = sum_vectors(cross(vector_of(r_dot), w), scale(self.gravity, attitude.in_body(up)))
-        torque = sum_vectors(cross(attitude.momentum, w), scale(m, cross(r, vector_of(steady_push))))
-        w_dot = self._about_contact(r).solve(vector_of(stored(*torque)))
-        reaction = attitude.in_frame(vector_of(scale(m, sum_vectors(steady_push, cross(r, w_dot)))))
-        F = vector_of(stored(*reaction))
+        steady_push = sum_vectors(cross(tuple(r_dot), w), scale(self.gravity, attitude.in_body(up)))
+        torque = sum_vectors(cross(attitude.momentum, w), scale(m, cross(r, tuple(steady_push))))
+        w_dot = self._about_contact(r).solve(stored(*torque))
+        reaction = attitude.in_frame(scale(m, sum_vectors(steady_push, cross(r, w_dot))))
+        F = stored(*reaction)
 
         push = (F[0] / m, F[1] / m)
         u3 = None if o == (None, None) else dot(attitude.normal, cross(r, w))
@@ -348,17 +347,17 @@ class RigidRolling(AbstractRigidDynamics):
         # In the body's axes: the velocity u of the centre of mass, and v.
         u = attitude.in_body((u1, u2, -dot(w, cross(r, attitude.normal))))
         v = attitude.in_body((slip.x, slip.y, None))
-        jump = vector_of(sum_vectors(v, scale(-1.0, u)))
-        w = self._about_contact(r).solve(vector_of(sum_vectors(attitude.momentum, scale(m, cross(r, jump)))))
-        u = attitude.in_frame(vector_of(sum_vectors(cross(r, w), v)))
+        jump = sum_vectors(v, scale(-1.0, u))
+        w = self._about_contact(r).solve(sum_vectors(attitude.momentum, scale(m, cross(r, jump))))
+        u = attitude.in_frame(sum_vectors(cross(r, w), v))
         return joined(u[:2], e, attitude.in_frame(self.body.inertia.tensor.times(w)), place)
 
     def unit_impulse(self, state: Float[Array, "components ..."], axis: int) -> tuple[Component, ...]:
         """As `rolling.RollingDynamics.unit_impulse`."""
         attitude = self.attitude(state)
-        v = vector_of(part[axis] for part in attitude.axes)
-        w = self._about_contact(attitude.lever).solve(vector_of(scale(self.body.mass, cross(attitude.lever, v))))
-        return scale(self.body.mass, attitude.in_frame(vector_of(sum_vectors(cross(attitude.lever, w), v))))
+        v = tuple(part[axis] for part in attitude.axes)
+        w = self._about_contact(attitude.lever).solve(scale(self.body.mass, cross(attitude.lever, v)))
+        return scale(self.body.mass, attitude.in_frame(sum_vectors(cross(attitude.lever, w), v)))
 
     def with_unit_axes(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """The state with the body's axes at unit length and at right angles."""

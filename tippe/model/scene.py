@@ -28,7 +28,6 @@ from nonholonomic.geometry import (
     room_bounds,
     scale,
     sum_vectors,
-    vector_of,
 )
 from nonholonomic.geometry.surface import as_surface
 from nonholonomic.parameters import numbers
@@ -251,10 +250,10 @@ class Scene(Bounded, Generic[Body]):
         e = (sine * jnp.cos(launch.azimuth), sine * jnp.sin(launch.azimuth), jnp.cos(launch.theta))
         if isinstance(body, AbstractRigidBody):
             w = sum_vectors(scale(launch.spin, e), launch.angular_velocity or (None, None, None))
-            return self._rigid_dynamics.start(launch, self.start(launch)[0], e, vector_of(w))
+            return self._rigid_dynamics.start(launch, self.start(launch)[0], e, tuple(w))
         L, u = scale(body.I3 * launch.spin, e), launch.velocity or (zero, zero)
         if launch.angular_velocity is not None:
-            w = vector_of(launch.angular_velocity)
+            w = tuple(launch.angular_velocity)
             axial_rate = dot(w, e)
             L = sum_vectors(L, scale(body.I1, w), scale((body.I3 - body.I1) * axial_rate, e))
             u = sum_vectors(u, scale(multiply(-1.0, body.offset_of_path), cross(w, e)[:2]))
@@ -426,7 +425,7 @@ def generic_direction(scene: Scene, launch: Launch, cells: int) -> Float[Array, 
     frame, (place, _) = scene.frame, scene.start(launch)
     place = frame.frame_motion(place, (scene.body.size, scene.body.size)).place_rate
     rigid = isinstance(scene.body, AbstractRigidBody)
-    x_axis = cross((r1, r2, r3), vector_of(last[-3:])) if rigid else ()
+    x_axis = cross((r1, r2, r3), tuple(last[-3:])) if rigid else ()
     direction = joined((u1, u2), cross((r1, r2, r3), e), tuple(L), place, x_axis)
     if rigid:
         direction = jax.jvp(scene.dynamics.carried_along, (state,), (direction,))[1]

@@ -29,7 +29,6 @@ from nonholonomic.geometry import (
     subtract,
     sum_vectors,
     tangents,
-    vector_of,
 )
 from nonholonomic.hybrid import Transition
 from nonholonomic.integration import AbstractPassive, AbstractProblem
@@ -82,7 +81,7 @@ class FlightState(NamedTuple):
 
 def flight_state(state: Float[Array, "components ..."]) -> FlightState:
     """Split a flight state into its parts."""
-    return FlightState(*(vector_of(state[k + i] for i in range(3)) for k in range(0, 12, 3)))
+    return FlightState(*(tuple(state[k + i] for i in range(3)) for k in range(0, 12, 3)))
 
 
 class Below(NamedTuple):
@@ -98,7 +97,7 @@ def below(scene: Scene[Top], flying: FlightState, ball: Ball | None = None) -> B
     measured."""
     frame, ball = carried_frame(scene), balls(scene.body)[0] if ball is None else ball
     centre = centre_of(flying, ball)
-    foot = vector_of(0.0 * centre[0] if part is None else part for part in scene.surface.nearest(centre))
+    foot = tuple(0.0 * centre[0] if part is None else part for part in scene.surface.nearest(centre))
     n = frame.normal(foot)
     difference = dot(tuple(subtract(a, b) for a, b in zip(centre, foot, strict=True)), n)
     return Below(foot, (*tangents(n), n), difference - ball.radius)
@@ -117,7 +116,7 @@ def landing_site(scene: Scene[Top], flying: FlightState, ball: Ball) -> Below:
     """
     centre = centre_of(flying, ball)
     site, zero = scene.surface.ball_gap(centre, ball.radius, carried_frame(scene).side), jnp.zeros_like(flying.place[0])
-    n = vector_of(zero if part is None else part + zero for part in site.normal)
+    n = tuple(zero if part is None else part + zero for part in site.normal)
     return Below(site.foot, (*tangents(n), n), site.gap)
 
 
@@ -150,7 +149,7 @@ def to_frame(vector: Vector, axes: tuple[Vector, Vector, Vector]) -> Vector:
 
 def from_frame(vector: Vector, axes: tuple[Vector, Vector, Vector]) -> Vector:
     """The vector with given components in a frame."""
-    return vector_of(sum_vectors(*(scale(part, axis) for part, axis in zip(vector, axes, strict=True))))
+    return sum_vectors(*(scale(part, axis) for part, axis in zip(vector, axes, strict=True)))
 
 
 def flying_body(scene: Scene[Top], flying: FlightState, ground: Below, ball: Ball | None = None) -> FreeBody:
@@ -244,7 +243,7 @@ class QuadraturesInFlight(AbstractPassive):
         flying = flight_state(state)
         e_dot = axis_rate(self.body, flying.axis, flying.momentum)
         spin = dot(flying.momentum, flying.axis) / self.body.I3
-        c = vector_of(passive[:3])
+        c = tuple(passive[:3])
         rates = (*c_rate(c, flying.axis, dot(e_dot, c)), spin, None)
         return jnp.concatenate([problem.field(time, state), stacked(rates, passive)])
 
@@ -292,7 +291,7 @@ def lift_off(
     flight = in_flight(s, axes, FreeBody(velocity, jnp.zeros_like(state[0]), e, L))
     if not with_quadratures:
         return flight
-    c_vector = from_frame(vector_of(state[OWN + k] for k in range(3)), axes)
+    c_vector = from_frame(tuple(state[OWN + k] for k in range(3)), axes)
     return jnp.concatenate([flight, jnp.stack(c_vector), state[OWN + 3 :]])
 
 
@@ -316,7 +315,7 @@ class Fly(AbstractFlyingMode):
         flying = flight_state(state)
         ground = below(self.scene, flying)
         free = flying_body(self.scene, flying, ground)
-        c_vector = to_frame(vector_of(state[OWN + k] for k in range(3)), ground.axes)
+        c_vector = to_frame(tuple(state[OWN + k] for k in range(3)), ground.axes)
         rate = gap_rate(self.scene.body, balls(self.scene.body)[0], free)
         rows = [jnp.stack(c_vector), state[OWN + 3 :], jnp.stack([ground.gap, rate])]
         return jnp.concatenate([in_contact(ground, free), *rows])
@@ -335,7 +334,7 @@ class Fly(AbstractFlyingMode):
         else:
             body_after, fails = resolve_impact(scene.body, scene.friction, ball, free, bounce)
         # If the landing was located slightly below the arena, the next flight would end where it begins.
-        place_on_arena = vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2])))
+        place_on_arena = sum_vectors(flying.place, scale(-ground.gap, ground.axes[2]))
         return Transition(
             mode=jnp.where(rebounds, FLYING, SLIDING),
             state=self.after_impact(state, place_on_arena, ground, free, body_after, rebounds),
@@ -362,7 +361,7 @@ class Fly(AbstractFlyingMode):
         state_after = jnp.where(flies, in_flight(place, ground.axes, body_after), in_contact(ground, body_after))
         if not self.with_quadratures:
             return state_after
-        c_vector = vector_of(state[OWN + k] for k in range(3))
+        c_vector = tuple(state[OWN + k] for k in range(3))
         c_vector = jnp.where(flies, jnp.stack(c_vector), jnp.stack(to_frame(c_vector, ground.axes)))
         energy_change = energy(self.scene.body, 0.0, body_after) - energy(self.scene.body, 0.0, body_before)
         spin_angle, work = state[OWN + 3 :]
@@ -509,7 +508,7 @@ class FlyBoth(Fly):
         ground = landing_site(scene, flying, contact_ball)
         misses = missed(scene, ground, contact_ball)
         # If the landing was located slightly below the arena, the next mode would end where it begins.
-        flying = flying._replace(place=vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2]))))
+        flying = flying._replace(place=sum_vectors(flying.place, scale(-ground.gap, ground.axes[2])))
         ground = ground._replace(gap=zero)
         free = flying_body(scene, flying, ground, contact_ball)
         impact = resolve_arena_impact(scene, flying, ground, free, contact_ball, other_ball)

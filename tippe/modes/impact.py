@@ -25,8 +25,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from nonholonomic.compilation.xla_cpu import greatest, least
-from nonholonomic.geometry import Component, Vector, add, cross, dot, multiply, scale, subtract, sum_vectors, vector_of
-from nonholonomic.integration import AbstractProblem, Settings, traced_solve_ensemble
+from nonholonomic.geometry import Component, Vector, add, cross, dot, multiply, scale, subtract, sum_vectors
+from nonholonomic.integration import AbstractProblem, Settings, solve_ensemble
 from nonholonomic.integration.problem import LEFT_DOMAIN, MOST_STEPS
 
 from ..model.body import Round, Top
@@ -340,7 +340,7 @@ def resolve_impact(
     problem = Impact(body, friction, contact, ball.radius, impulse_gain)
     horizon, cells = jnp.asarray(LARGEST), jnp.asarray(impulse_gain.shape[0])
     settings = Settings(TOLERANCE, diffrax.Dopri5(), absolute=1.0, max_steps=MOST_STEPS)
-    outcome, _ = traced_solve_ensemble(problem, horizon, cells, settings)
+    outcome, _ = solve_ensemble(problem, horizon, cells, settings, traced=True)
     impulse = problem.ended(outcome.end_time, outcome.state)
     return apply_impulse(body, contact, free, impulse), outcome.status != LEFT_DOMAIN
 
@@ -421,7 +421,7 @@ def resolve_coulomb_impact(
     pace = greatest(length(*contact.velocity[:2]), impact.speed)
     skid = Skid(impact, friction.mu, pace)
     settings = Settings(TOLERANCE, diffrax.Dopri5(), absolute=0.1, max_steps=MOST_STEPS)
-    outcome, _ = traced_solve_ensemble(skid, jnp.asarray(LARGEST), jnp.asarray(pace.shape[0]), settings)
+    outcome, _ = solve_ensemble(skid, jnp.asarray(LARGEST), jnp.asarray(pace.shape[0]), settings, traced=True)
     stops = skid.slip_left(outcome.state) <= STOPS
     rates = skid.field(outcome.end_time, outcome.state)
     # An impact that ends while it slips is corrected by one step of Newton's method, as in `Impact.ended`.
@@ -431,7 +431,7 @@ def resolve_coulomb_impact(
     state = jnp.where(stops, outcome.state, outcome.state + step * rates)
     impulse = impact.impulse(state[2], state[:2])
     remaining_impulse = _remaining_impulse(impact, friction.mu, impulse.force)
-    force = vector_of(jnp.where(stops, a + b, a) for a, b in zip(impulse.force, remaining_impulse, strict=True))
+    force = tuple(jnp.where(stops, a + b, a) for a, b in zip(impulse.force, remaining_impulse, strict=True))
     return apply_impulse(body, contact, free, ContactImpulse(force, None)), outcome.status != LEFT_DOMAIN
 
 
@@ -637,7 +637,8 @@ class LeaningDynamics(AbstractDynamics):
         forces, torques, gains = [], [], []
         for ball in spheres:
             contact = approach(self.body, ball, free)
-            slip = Slip(*contact.velocity[:2], (w1, w2, w3 if self.friction.uses_spin else None))
+            x, y, _ = contact.velocity
+            slip = Slip(x, y, (w1, w2, w3 if self.friction.uses_spin else None))
             load = self.friction.per_normal_force(slip)
             forces.append(tuple(zero if part is None else part for part in (*load.force, 1.0 + zero)))
             torques.append(sum_vectors(cross(contact.arm, forces[-1]), load.torque))

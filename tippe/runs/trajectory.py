@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.compilation.xla_cpu import on_device
-from nonholonomic.geometry import scale, sum_vectors, vector_of
+from nonholonomic.geometry import scale, sum_vectors
 from nonholonomic.hybrid import BETWEEN, MOST_ROUNDS, HybridOutcome, HybridPath, Segment, solve_hybrid_dense
 from nonholonomic.integration import DenseSolution, Settings, explicit_tableau, follow
 from nonholonomic.integration.problem import (
@@ -369,7 +369,7 @@ class ArenaTrajectory(HybridTrajectory):
         # The flying top is treated as one whose own sphere is larger by the distance, so that this sphere touches.
         flying = flight_state(lift_off(scene, self.states, False, Ball(main.offset, main.radius + distance)))
         normal_velocity = scale(rate, carried_frame(scene).normal(place[:3]))
-        return flying._replace(velocity=vector_of(sum_vectors(flying.velocity, normal_velocity)))
+        return flying._replace(velocity=sum_vectors(flying.velocity, normal_velocity))
 
     @property
     def _on_stem(self) -> Motion:

@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from nonholonomic.compilation.xla_cpu import greatest, least
 from nonholonomic.derivatives import VariationalProblem, differentiable_solve, in_groups, tangents_by
-from nonholonomic.integration import Lanes, Settings, crossing_time, explicit_tableau, traced_solve_ensemble
+from nonholonomic.integration import Lanes, Settings, crossing_time, explicit_tableau, solve_ensemble
 from nonholonomic.integration.problem import (
     CROSSED,
     DEFAULT_MAX_STEPS,
@@ -747,9 +747,8 @@ class ExtendedTime(EventTime):
         """The extended times of every cell, and their derivatives along tangents (as of `VariationalProblem`)."""
         is_legal, t1, settings = self.permitted(leaves)
         variational = VariationalProblem(problem, tangents, True)
-        outcome, _ = traced_solve_ensemble(
-            variational, t1, jnp.asarray(cells), settings, one_kernel=not nested, n_blocks=1 + len(tangents)
-        )
+        options = {"one_kernel": not nested, "n_blocks": 1 + len(tangents), "traced": True}
+        outcome, _ = solve_ensemble(variational, t1, jnp.asarray(cells), settings, **options)
         state, *variations = variational.parts(outcome.state)
         has_crossed = outcome.status == CROSSED
 

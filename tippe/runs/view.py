@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import vector_of
 from nonholonomic.parameters import description
 from nonholonomic.sweeps import Quantity, Table, chosen, run_table
 from nonholonomic.text import distinguishing_labels, in_unit
@@ -274,7 +273,7 @@ def meshes(body: AbstractBody | AbstractRigidBody, colour: int) -> tuple[Mesh, .
 def touching(body: AbstractRigidBody, directions: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
     """The points of a body's surface at which it has the given outward unit normals, from the centre of mass, in the
     body's axes [m]."""
-    normal, zero = vector_of(-jnp.asarray(directions).T), jnp.zeros(len(directions))
+    normal, zero = tuple(-jnp.asarray(directions).T), jnp.zeros(len(directions))
     return np.stack(body.contact(normal, (zero, zero, zero))[0], axis=-1)
 
 
