@@ -22,7 +22,6 @@ from nonholonomic.geometry import (
     scale,
     subtract,
     sum_vectors,
-    unit,
 )
 from nonholonomic.parameters import as_one
 from nonholonomic.text import shown
@@ -314,7 +313,7 @@ class Heading(eqx.Module):
         """
         if not self.projected:
             heading = sum_vectors(heading, scale(subtract(None, dot(heading, normal)), normal))
-        return unit(heading)
+        return scale(1.0 / jnp.sqrt(dot(heading, heading)), heading)
 
     def direction(self, heading: Vector, normal: Vector, side: float) -> tuple[Vector, Component, Component]:
         """The vector d along the ground, its square d.d, and the factor nu, from the outward normal and the side: 1
