@@ -208,7 +208,7 @@ class Formula(eqx.Module):
     searched: bool = eqx.field(static=True, default=True)
 
     @classmethod
-    def of(cls, controls: Input, t: Any, motion: Any) -> "Formula":
+    def of(cls, controls: Any, t: Any, motion: Any) -> "Formula":
         """The formula of a function that takes scalars of these types; their values do not matter."""
         closed = jax.make_jaxpr(lambda *arguments: tuple(map(as_number, controls(*arguments))))(t, motion)
         # The arrays become the first arguments.

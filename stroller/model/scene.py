@@ -281,10 +281,10 @@ class RideProblem(AbstractProblem):
         if controls is not None:
             # The types of the arguments in a single ride.
             arguments = eqx.filter_eval_shape(at_start, scene, launch)
-            arguments = jax.tree.map(lambda part: jnp.zeros((), part.dtype), arguments)
+            t, motion = jax.tree.map(lambda part: jnp.zeros((), part.dtype), arguments)
             if cells is not None and isinstance(controls, Formula) and has_arrays(controls):
-                controls = PerRide.of(controls, *arguments).of_cells(cells)
-            times = jump_times(controls, jumps, *arguments, cells)
+                controls = PerRide.of(controls, t, motion).of_cells(cells)
+            times = jump_times(controls, jumps, t, motion, cells)
         states, scales = scene.state(launch, driven), scene.scales(launch, driven)
         if cells is not None:
             states, scales = (
