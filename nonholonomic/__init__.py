@@ -19,7 +19,6 @@ if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
 
 from .compilation.cache import enable_compilation_cache as enable_compilation_cache
-from .formulations import AbstractSystem as AbstractSystem
 from .geometry import AbstractSurface as AbstractSurface
 from .geometry import Cylinder as Cylinder
 from .geometry import Graph as Graph
@@ -32,17 +31,18 @@ from .geometry import Torus as Torus
 from .identification import FitWarning as FitWarning
 from .identification import Free as Free
 from .integration.problem import Status as Status
-from .runs import EventTimes as EventTimes
-from .runs import Recording as Recording
-from .runs import Trajectory as Trajectory
-from .runs import event_time as event_time
-from .runs import explore as explore
-from .runs import identify as identify
-from .runs import log_density as log_density
-from .runs import lyapunov_exponent as lyapunov_exponent
-from .runs import simulate as simulate
-from .runs import sweep as sweep
+from .runs.event import event_time as event_time
+from .runs.identify import EventTimes as EventTimes
+from .runs.identify import Recording as Recording
+from .runs.identify import identify as identify
+from .runs.identify import log_density as log_density
+from .runs.lyapunov import lyapunov_exponent as lyapunov_exponent
+from .runs.simulate import simulate as simulate
+from .runs.sweep import sweep as sweep
+from .runs.trajectory import Trajectory as Trajectory
+from .runs.trajectory import explore as explore
 from .sweeps import Table as Table
 from .sweeps import local_processes as local_processes
 from .systems import AbstractMode as AbstractMode
+from .systems import AbstractSystem as AbstractSystem
 from .systems import Hybrid as Hybrid

@@ -14,7 +14,7 @@ import tippe
 from nonholonomic.integration import Oscillatory8, Settings, solve_ensemble
 from stroller.model.scene import RideProblem
 from tippe.modes.problems import InversionProblem
-from tippe.runs.launches import run_kind_of
+from tippe.runs.model import run_kind_of
 
 T1, TOLERANCE, SETTINGS = 8.0, 1e-6, Settings(1e-6, Oscillatory8())
 THETAS, TIMES = jnp.linspace(0.05, 0.15, 4), jnp.linspace(0.0, 1.0, 11)

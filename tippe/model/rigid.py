@@ -1,4 +1,5 @@
-"""Bodies of any shape and any inertia: an unbalanced top, a rattleback.
+"""Bodies of any shape and any inertia, such as an unbalanced top or a rattleback, and their equations of motion, free of
+trigonometry and of coordinate singularities.
 
 A strictly convex body touches an arena at the point that is farthest in the direction opposite to the arena's normal.
 In the body's own axes this point is p(d) = grad h at d = -normal. The support function h(d), extended to all vectors
@@ -9,33 +10,83 @@ Source: Bonnesen and Fenchel, Theorie der konvexen Koerper (1934), section 15.
 
 import abc
 import contextlib
-from collections.abc import Iterator
-from typing import Any, ClassVar
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.compilation.components import TooLarge, by_components
 from nonholonomic.compilation.tracing import with_own_numbers
-from nonholonomic.geometry import Vector, dot, scale, sum_vectors
+from nonholonomic.compilation.xla_cpu import stored
+from nonholonomic.geometry import (
+    AbstractFrame,
+    Component,
+    FrameMotion,
+    Place,
+    PlaneFrame,
+    Tangent,
+    Vector,
+    add,
+    cross,
+    dot,
+    multiply,
+    rate_in_frame,
+    scale,
+    subtract,
+    sum_vectors,
+)
 from nonholonomic.text import shown
 from nonholonomic.validation import UNTRACEABLE, Bound, Bounded, as_number, is_traced
 
-from .launch import as_numbers
+from ..friction import AbstractFriction, ContactLoad, Slip
+from .dynamics import (
+    AXIS,
+    AbstractContactDynamics,
+    AbstractRollingDynamics,
+    Motion,
+    State,
+    from_frame,
+    joined,
+    parts,
+    to_frame,
+)
 
 # The inertia tensor of a rigid body, and symmetric matrices stored by their six components.
 
 #: Rounding error allowed in the moments of a flat body, as a fraction of their sum.
 FLAT = 1e-12
 
+#: What a vector along the body's axes must be.
+ALONG_AXES = "three numbers, along the body's axes x, y and z"
+
 #: Names of the components of inertia.
 COMPONENTS = ("xx", "yy", "zz", "xy", "xz", "yz")
 
 #: Degrees of the principal minors of a matrix in its components, in the order of `SymmetricMatrix.principal_minors`.
 DEGREES = (1, 1, 1, 2, 2, 2, 3)
+
+
+def several(name: str, counts: tuple[int, ...], words: str, optional: bool = False) -> Callable[[Any], Any]:
+    """The converter of a vector to a tuple of arrays; if it is `optional`, `None` stays `None`.
+
+    **Arguments:** `counts`: the allowed numbers of components; `words`: what the vector must be, in the message of the
+    `ValueError` about another one.
+    """
+
+    def converted(value: Any) -> Any:
+        if value is None and optional:
+            return None
+        if isinstance(value, Iterable) and not isinstance(value, str) and getattr(value, "ndim", 1) != 0:
+            value = tuple(as_number(part) for part in value)
+        if not isinstance(value, tuple) or len(value) not in counts:
+            raise ValueError(f"{name} = {shown(value)} must be {words}")
+        return value
+
+    return converted
 
 
 class Inertia(Bounded):
@@ -58,7 +109,7 @@ class Inertia(Bounded):
     yz: Float[Array, "..."] = eqx.field(converter=as_number)
 
     @classmethod
-    def of(cls, matrix: Any) -> "Inertia":
+    def of(cls, matrix: "ArrayLike | Inertia") -> "Inertia":
         """The tensor from a symmetric matrix (3, 3); for a traced matrix, its symmetric part."""
         if isinstance(matrix, Inertia):
             return matrix
@@ -80,9 +131,9 @@ class Inertia(Bounded):
         return cls(xx, yy, zz, xy, xz, yz)
 
     def bounds(self) -> Iterator[Bound]:
-        for name in COMPONENTS:
-            yield Bound(getattr(self, name), name)
-        xx, yy, zz, xy, xz, yz = self.numbers
+        xx, yy, zz, xy, xz, yz = self.tensor
+        for name, number in zip(COMPONENTS, self.tensor, strict=True):
+            yield Bound(number, name)
         half = 0.5 * (xx + yy + zz)
         # Half the trace minus the tensor is the matrix of the second moments of the mass, which is positive
         # semidefinite; the tensor is positive definite. Both are divided by powers of the trace, so that rounding
@@ -96,33 +147,22 @@ class Inertia(Bounded):
             yield Bound(number / half**degree, "inertia: product of moments", above=0.0, why=positive)
 
     @property
-    def numbers(self) -> tuple[Float[Array, "..."], ...]:
-        """The six components, in the order of the fields."""
-        return self.xx, self.yy, self.zz, self.xy, self.xz, self.yz
-
-    @property
     def tensor(self) -> "SymmetricMatrix":
         """The tensor, without checks."""
-        return SymmetricMatrix(*self.numbers)
-
-    @property
-    def matrix(self) -> Float[Array, "3 3"]:
-        """The tensor as a matrix."""
-        xx, yy, zz, xy, xz, yz = self.numbers
-        return jnp.stack([jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])])
+        return SymmetricMatrix(self.xx, self.yy, self.zz, self.xy, self.xz, self.yz)
 
     @property
     def _moments(self) -> str:
         """The principal moments of a known tensor, as an addition to messages."""
-        if any(is_traced(number) or np.ndim(number) for number in self.numbers):
+        if any(is_traced(number) or np.ndim(number) for number in self.tensor):
             return ""
         # In NumPy: inside a transformation, JAX would trace this even for known numbers.
-        xx, yy, zz, xy, xz, yz = map(float, self.numbers)
+        xx, yy, zz, xy, xz, yz = map(float, self.tensor)
         moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         return f"; here they are {', '.join(f'{moment:.4g}' for moment in moments)}"
 
 
-class SymmetricMatrix(eqx.Module):
+class SymmetricMatrix(NamedTuple):
     """A symmetric matrix as six components, each a scalar or one per lane."""
 
     xx: Float[Array, "..."]
@@ -144,7 +184,7 @@ class SymmetricMatrix(eqx.Module):
     @property
     def adjugate(self) -> "SymmetricMatrix":
         """The matrix of the cofactors."""
-        xx, yy, zz, xy, xz, yz = self.xx, self.yy, self.zz, self.xy, self.xz, self.yz
+        xx, yy, zz, xy, xz, yz = self
         diagonal = (yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy)
         return SymmetricMatrix(*diagonal, xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - yz * xx)
 
@@ -157,7 +197,7 @@ class SymmetricMatrix(eqx.Module):
         """The inverse."""
         adjugate = self.adjugate
         determinant = self.determinant(adjugate)
-        return jax.tree.map(lambda cofactor: cofactor / determinant, adjugate)
+        return SymmetricMatrix(*(cofactor / determinant for cofactor in adjugate))
 
     def solve(self, right: Vector) -> Vector:
         """Solution x of A x = right."""
@@ -169,8 +209,7 @@ class SymmetricMatrix(eqx.Module):
         """The seven principal minors, from one row to three rows; all are nonnegative if the matrix is positive
         semidefinite."""
         adjugate = self.adjugate
-        minors = (self.xx, self.yy, self.zz, adjugate.xx, adjugate.yy, adjugate.zz)
-        return (*minors, self.determinant(adjugate))
+        return (*self[:3], *adjugate[:3], self.determinant(adjugate))
 
 
 #: Number of directions in which a support function is evaluated to check that the body is convex.
@@ -193,6 +232,11 @@ class AbstractRigidBody(Bounded):
         """A length of the body [m], the unit for places and velocities."""
 
     @property
+    def moments(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """The magnitudes of the moments of inertia across and along the body's z axis [kg m^2]."""
+        return 0.5 * (self.inertia.xx + self.inertia.yy), self.inertia.zz
+
+    @property
     @abc.abstractmethod
     def half_widths(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Half the least and half the greatest distance [m] of parallel planes that touch the body."""
@@ -212,15 +256,10 @@ class AbstractRigidBody(Bounded):
         point, point_rate = self.surface_point(normal, rate)
         return sum_vectors(point, scale(-1.0, self.centre_of_mass)), point_rate
 
-    def check_components(self) -> None:
-        """Raise `ValueError` unless the centre of mass has three components."""
-        require_three(self.centre_of_mass, "centre_of_mass")
-
-
-def require_three(value: Any, name: str) -> None:
-    """Raise `ValueError` unless these are three numbers."""
-    if not isinstance(value, tuple) or len(value) != 3:
-        raise ValueError(f"{name} = {shown(value)} must be three numbers, along the body's axes x, y and z")
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.mass, "mass", above=0.0)
+        for k in range(3):
+            yield Bound(self.centre_of_mass[k], f"centre_of_mass[{k}]")
 
 
 #: Units of the common parameters of rigid bodies, with their names in scenes and tables.
@@ -270,19 +309,14 @@ class Ellipsoid(AbstractRigidBody):
     units: ClassVar[dict[str, str]] = UNITS | {"semi_axes": "m"} | {f"semi_axes[{k}]": "m" for k in range(3)}
 
     mass: Float[Array, "..."] = eqx.field(converter=as_number)
-    semi_axes: tuple[Float[Array, "..."], ...] = eqx.field(converter=as_numbers)
-    centre_of_mass: tuple[Float[Array, "..."], ...] = eqx.field(converter=as_numbers)
+    semi_axes: tuple[Float[Array, "..."], ...] = eqx.field(converter=several("semi_axes", (3,), ALONG_AXES))
+    centre_of_mass: tuple[Float[Array, "..."], ...] = eqx.field(converter=several("centre_of_mass", (3,), ALONG_AXES))
     inertia: Inertia = eqx.field(converter=Inertia.of)
 
-    def __check_init__(self):
-        self.check_components()
-        require_three(self.semi_axes, "semi_axes")
-
     def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.mass, "mass", above=0.0)
+        yield from super().bounds()
         for k in range(3):
             yield Bound(self.semi_axes[k], f"semi_axes[{k}]", above=0.0)
-            yield Bound(self.centre_of_mass[k], f"centre_of_mass[{k}]")
         depth = sum((place / axis) ** 2 for place, axis in zip(self.centre_of_mass, self.semi_axes, strict=True))
         yield Bound(depth, "sum of (centre_of_mass / semi_axes)^2", below=1.0, why="the centre of mass lies inside")
 
@@ -345,15 +379,12 @@ class RigidBody(AbstractRigidBody):
     mass: Float[Array, "..."] = eqx.field(converter=as_number)
     inertia: Inertia = eqx.field(converter=Inertia.of)
     support: Any = eqx.field(converter=lambda value: as_support(value))
-    centre_of_mass: tuple[Float[Array, "..."], ...] = eqx.field(converter=as_numbers, default=(0.0, 0.0, 0.0))
-
-    def __check_init__(self):
-        self.check_components()
+    centre_of_mass: tuple[Float[Array, "..."], ...] = eqx.field(
+        converter=several("centre_of_mass", (3,), ALONG_AXES), default=(0.0, 0.0, 0.0)
+    )
 
     def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.mass, "mass", above=0.0)
-        for k in range(3):
-            yield Bound(self.centre_of_mass[k], f"centre_of_mass[{k}]")
+        yield from super().bounds()
         height, min_radius = (jnp.min(part, axis=0) for part in self._samples())
         yield Bound(height, "least support seen from centre_of_mass", above=0.0, why="the centre of mass lies inside")
         yield Bound(min_radius, "least radius of curvature by support", above=0.0, why="the body is strictly convex")
@@ -361,7 +392,7 @@ class RigidBody(AbstractRigidBody):
     def _samples(self) -> tuple[Float[Array, "samples ..."], Float[Array, "samples ..."]]:
         """Height of the centre of mass above a plane, and the smaller principal radius of curvature [m], by direction."""
 
-        def sample(normal: Float[Array, "3"], first: Float[Array, "3"], second: Float[Array, "3"]) -> tuple[Any, Any]:
+        def sample(normal, first, second):
             # A plane that turns about one tangent moves the contact by the radius along the other.
             point, projection = self.contact(tuple(normal), tuple(first))
             _, across = self.contact(tuple(normal), tuple(second))
@@ -376,7 +407,7 @@ class RigidBody(AbstractRigidBody):
 
     @property
     def half_widths(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        def half_width(normal: Float[Array, "3"]) -> Any:
+        def half_width(normal):
             no_velocity = tuple(jnp.zeros(3))
             (low, _), (high, _) = (self.surface_point(tuple(sign * normal), no_velocity) for sign in (1.0, -1.0))
             return 0.5 * dot(tuple(normal), sum_vectors(high, scale(-1.0, low)))
@@ -387,14 +418,14 @@ class RigidBody(AbstractRigidBody):
     def surface_point(self, normal: Vector, rate: Vector) -> tuple[Vector, Vector]:
         leaves, structure = jax.tree.flatten(self.support)
 
-        def of_one(leaves: list[Any], direction: Vector, rate: Vector) -> tuple[Vector, Vector]:
+        def of_one(leaves: list[Array], direction: Vector, rate: Vector) -> tuple[Vector, Vector]:
             support = jax.tree.unflatten(structure, leaves)
 
-            def point(direction: Float[Array, "3"]) -> Float[Array, "3"]:
-                # The gradient of |d| h(d / |d|), the support function's extension with degree 1.
-                return jax.grad(lambda d: _length(d) * support(d / _length(d)))(direction)
+            def extended(d: Float[Array, "3"]) -> Float[Array, ""]:
+                """The support function's extension with degree 1, |d| h(d / |d|)."""
+                return jnp.sqrt(jnp.sum(d * d)) * support(d / jnp.sqrt(jnp.sum(d * d)))
 
-            place, change = jax.jvp(point, (jnp.stack(direction),), (jnp.stack(rate),))
+            place, change = jax.jvp(jax.grad(extended), (jnp.stack(direction),), (jnp.stack(rate),))
             return tuple(place), tuple(change)
 
         numbers = (leaves, *(scale(-1.0, vector) for vector in (normal, rate)))
@@ -406,14 +437,10 @@ class RigidBody(AbstractRigidBody):
         return jax.vmap(of_one, in_axes=jax.tree.map(lambda number: 0 if jnp.ndim(number) else None, numbers))(*numbers)
 
 
-def _length(vector: Float[Array, "3"]) -> Float[Array, ""]:
-    return jnp.sqrt(jnp.sum(vector * vector))
-
-
 class Plain(eqx.Module):
     """A support function without parameters; the same function gives the same program."""
 
-    function: Any = eqx.field(static=True)
+    function: Callable[..., Any] = eqx.field(static=True)
 
     def __call__(self, direction: Float[Array, "3"]) -> Float[Array, ""]:
         return self.function(direction)
@@ -445,7 +472,7 @@ def as_support(value: Any) -> eqx.Module:
     return closed if isinstance(closed, eqx.Module) else Plain(value)
 
 
-def evenly_spread(count: int) -> tuple[Any, ...]:
+def evenly_spread(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Unit vectors (count, 3) that cover a sphere evenly, along a spiral, and two unit vectors across each."""
     z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
     angle = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(count)
@@ -453,3 +480,257 @@ def evenly_spread(count: int) -> tuple[Any, ...]:
     normal = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1)
     first = np.stack([-np.sin(angle), np.cos(angle), np.zeros(count)], axis=-1)
     return normal, first, np.cross(normal, first)
+
+
+# The equations of motion.
+#
+# The state is that of a top (`dynamics.py`) with an additional vector: in the arena's frame (t1, t2, n) the velocity (u1,
+# u2) of the centre of mass along the arena, the body's z axis e, the angular momentum L about the centre of mass, the
+# arena's place, and the body's x axis c. With d = e x c, the components of n in the body's axes are (c.n, d.n, e.n),
+# which determine the contact.
+#
+# With r from the centre of mass to the contact, the laws of motion are L' = r x F + N tau and m u' = F - m g z; the contact
+# persists if the contact point has no velocity along n. The frame moves with the contact point, whose velocity along the arena
+# is q' = (1 - H S)^-1 (v - H (n x w)), with the slip velocity v, the shape operator S of the arena, and the operator H whose
+# eigenvalues are the body's principal radii of curvature; n' = -S q'. Source: Newton and Euler; for the contact, Montana,
+# Int. J. Robotics Research 7 (1988) 17; for rolling, Garcia and Hubbard, Proc. R. Soc. A 418 (1988) 165, and Kane and
+# Levinson, Int. J. Non-Linear Mechanics 17 (1982) 175.
+
+
+class Attitude(NamedTuple):
+    """The attitude and rotation of a body, and its contact point.
+
+    - `axes`: the body's axes x, y and z in the frame (t1, t2, n).
+    - `normal`, `momentum`, `angular_velocity`: n, angular momentum and angular velocity in the body's axes.
+    - `lever`: the vector r from the centre of mass to the contact [m] in the body's axes.
+    - `fixed_rates`: rates of change of the components of n and of r if n is fixed, as on a plane.
+    """
+
+    axes: tuple[Vector, Vector, Vector]
+    normal: Vector
+    momentum: Vector
+    angular_velocity: Vector
+    lever: Vector
+    fixed_rates: tuple[Vector, Vector]
+
+
+class ContactMotion(NamedTuple):
+    """The motion of the contact point.
+
+    - `normal_rate`, `lever_rate`: rates of change of the components of n and of r in the body's axes.
+    - `contact_velocity`: velocity of the contact point along the arena [m/s]; `frame`: motion of the frame.
+    """
+
+    normal_rate: Vector
+    lever_rate: Vector
+    contact_velocity: Tangent
+    frame: FrameMotion
+
+
+class AbstractRigidDynamics(AbstractContactDynamics):
+    """A scene with a rigid body, with the precomputed combinations of its numbers; in place of `Dynamics`."""
+
+    frame: AbstractFrame
+    body: AbstractRigidBody
+    gravity: Float[Array, "..."]
+    inverse: SymmetricMatrix
+
+    @property
+    def weight(self) -> Float[Array, "..."]:
+        return self.body.mass * self.gravity
+
+    def attitude(self, state: State) -> Attitude:
+        """The attitude and rotation of the body, and its contact point."""
+        _, e, L, place = parts(state)
+        c = tuple(place[-3:])
+        axes = (c, cross(e, c), e)
+        n = tuple(axis[2] for axis in axes)
+        momentum = tuple(dot(L, axis) for axis in axes)
+        angular_velocity = stored(*self.inverse.times(momentum))
+        normal_rate = cross(n, angular_velocity)
+        lever, lever_rate = self.body.contact(n, normal_rate)
+        return Attitude(axes, n, momentum, angular_velocity, lever, (normal_rate, lever_rate))
+
+    def contact_motion(self, place: Place, attitude: Attitude, slip: Tangent) -> ContactMotion:
+        """The motion of the contact point. **Arguments:** `place`: place of the frame; `slip`: velocity v along the
+        arena [m/s]."""
+        normal_rate, lever_rate = attitude.fixed_rates
+        over_body, axes = from_frame(lever_rate, attitude.axes), attitude.axes
+        V1, V2 = add(slip[0], over_body[0]), add(slip[1], over_body[1])
+        if isinstance(self.frame, PlaneFrame):
+            return ContactMotion(normal_rate, lever_rate, (V1, V2), self.frame.frame_motion(place, (V1, V2)))
+        # If n turns along a tangent, the contact moves against it over the body, by H.
+        tangents = [tuple(axis[k] for axis in axes) for k in (0, 1)]
+        first, second = (from_frame(self.body.contact(attitude.normal, t)[1], axes) for t in tangents)
+        H11, H12, H22, V1, V2 = stored(-first[0], -first[1], -second[1], V1, V2)
+        frame, path = self.frame.convex_motion(place, (V1, V2), (H11, H12, H22))
+        path = stored(*path)
+        frame_part = to_frame((subtract(None, frame.frame_rate[0]), subtract(None, frame.frame_rate[1]), None), axes)
+        lever_rate = to_frame((subtract(path[0], slip[0]), subtract(path[1], slip[1]), None), axes)
+        return ContactMotion(sum_vectors(normal_rate, frame_part), lever_rate, path, frame)
+
+    def angular_velocity(self, state: State) -> Vector:
+        """Angular velocity of the body in the frame [rad/s]."""
+        attitude = self.attitude(state)
+        return from_frame(attitude.angular_velocity, attitude.axes)
+
+    def mass_from_contact(self, state: State) -> Vector:
+        """Vector from the contact to the centre of mass [m], in the frame."""
+        attitude = self.attitude(state)
+        return scale(-1.0, from_frame(attitude.lever, attitude.axes))
+
+    def energy(self, state: State) -> Float[Array, "..."]:
+        """Kinetic energy plus weight times the height of the centre of mass [J]."""
+        (u1, u2), _, _, place = parts(self.carried_along(state))
+        (_, normal, momentum, w, lever, _), place = self.attitude(state), place[:-3]
+        vertical_speed = -dot(w, cross(lever, normal))
+        rotation = 0.5 * dot(w, momentum)
+        height = add(self.frame.height(place), dot(self.mass_from_contact(state), self.frame.vertical(place)))
+        return self.body.mass * (0.5 * (u1**2 + u2**2 + vertical_speed**2) + self.gravity * height) + rotation
+
+    def normal_spin(self, state: State) -> Float[Array, "..."]:
+        """Angular velocity about the arena's normal [rad/s]."""
+        attitude = self.attitude(state)
+        return dot(attitude.angular_velocity, attitude.normal)
+
+    def carried_rates(
+        self,
+        state: State,
+        attitude: Attitude,
+        contact: ContactMotion,
+        push: Tangent,
+        rise: Component,
+        torque: tuple[Component, ...],
+    ) -> tuple[Component, ...]:
+        """Rate of change of the state's components, in the frame that moves with the contact.
+
+        **Arguments:** `push`: force along the arena, over the mass [m/s^2]; `rise`: velocity of the centre of mass along n
+        [m/s]; `torque`: L' [N m].
+        """
+        _, e, L, place = parts(state)
+        o, up, place_rate, _ = contact.frame
+        # The body's axes turn with it.
+        (x, y, z), (w1, w2, w3) = attitude.axes, attitude.angular_velocity
+        x_rate = tuple(w3 * b - w2 * c for b, c in zip(y, z, strict=True))
+        z_rate = tuple(w2 * a - w1 * b for a, b in zip(x, y, strict=True))
+        u1_dot = add(push[0], multiply(-self.gravity, up[0]), multiply(o[0], rise))
+        u2_dot = add(push[1], multiply(-self.gravity, up[1]), multiply(o[1], rise))
+        e_dot, L_dot = sum_vectors(z_rate, rate_in_frame(e, o)), sum_vectors(torque, rate_in_frame(L, o))
+        return (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate, *sum_vectors(x_rate, rate_in_frame(place[-3:], o)))
+
+    def carried_along(self, state: State) -> State:
+        """The state with the velocity that the friction law imposes; only `NoSlip` imposes a velocity."""
+        return state
+
+
+class RigidSlipping(AbstractRigidDynamics):
+    """The equations of motion under a friction law that determines the force from the slip."""
+
+    friction: AbstractFriction
+    per_mass: Float[Array, "..."]
+
+    def motion(self, state: State) -> Motion:
+        """Evaluate the equations of motion, solving for the normal force with friction included.
+
+        With q = r x n and J the inertia, all in the body's axes, the centre of mass rises at u.n = -w.q. Its second rate gives
+        N (1 + m (J^-1 q).M) = m (g z.n + u.S q' - (J^-1 q).(L x w) - w.q'), M the moment per unit normal force.
+        """
+        (u1, u2), _, _, place = parts(state)
+        attitude = self.attitude(state)
+        axes, normal, momentum, w, lever, _ = attitude
+        r, swing = from_frame(lever, axes), from_frame(cross(w, lever), axes)
+        slip_x, slip_y = stored(u1 + swing[0], u2 + swing[1])
+        contact = self.contact_motion(place[:-3], attitude, (slip_x, slip_y))
+        o, up, _, room = contact.frame
+        slip = Slip(slip_x, slip_y, from_frame(w, axes))
+        friction = self.friction.per_normal_force(slip)
+        f1, f2 = friction.force
+        moment = stored(*sum_vectors(cross(r, (f1, f2, 1.0)), friction.torque))
+
+        rise = cross(lever, normal)
+        arm = self.inverse.times(rise)
+        rise_rate = sum_vectors(cross(contact.lever_rate, normal), cross(lever, contact.normal_rate))
+        bend = dot(arm, cross(momentum, w)) + dot(w, rise_rate)
+        mass = self.body.mass
+        painleve_factor = 1.0 + mass * dot(arm, to_frame(moment, axes))
+        pull = add(multiply(self.gravity, up[2]), dot((u1, u2), o))
+        N = mass * (pull - bend) / painleve_factor
+
+        thrust = N * self.per_mass
+        push = (multiply(thrust, f1), multiply(thrust, f2))
+        u3 = None if o == (None, None) else -dot(w, rise)
+        rates = self.carried_rates(state, attitude, contact, push, u3, scale(N, moment))
+        return Motion(rates, N, friction, slip, contact.contact_velocity, o, w[2], painleve_factor, room)
+
+
+class RigidRolling(AbstractRollingDynamics, AbstractRigidDynamics):
+    """The equations of motion of a body whose contact point is at rest: the nonholonomic constraint itself."""
+
+    def evaluate(self, state: State) -> tuple[Motion, Vector]:
+        """The motion and the reaction F in the frame.
+
+        In the body's axes, with the velocity r x w of the centre of mass and r' the rate of r as a vector,
+        (J + m (r^2 - r r^T)) w' = L x w + m r x (r' x w + g z), and F = m (r' x w + r x w' + g z).
+        """
+        place, attitude = parts(state).place, self.attitude(state)
+        m, r, w = self.body.mass, attitude.lever, attitude.angular_velocity
+        contact = self.contact_motion(place[:-3], attitude, (None, None))
+        o, up, _, room = contact.frame
+        r_dot = sum_vectors(contact.lever_rate, cross(w, r))
+        steady_push = sum_vectors(cross(r_dot, w), scale(self.gravity, to_frame(up, attitude.axes)))
+        torque = sum_vectors(cross(attitude.momentum, w), scale(m, cross(r, steady_push)))
+        w_dot = self._about_contact(r).solve(stored(*torque))
+        reaction = from_frame(scale(m, sum_vectors(steady_push, cross(r, w_dot))), attitude.axes)
+        F = stored(*reaction)
+
+        push = (F[0] / m, F[1] / m)
+        u3 = None if o == (None, None) else dot(attitude.normal, cross(r, w))
+        rates = self.carried_rates(state, attitude, contact, push, u3, cross(from_frame(r, attitude.axes), F))
+        load = ContactLoad((F[0] / F[2], F[1] / F[2]))
+        zero = jnp.zeros_like(F[2])
+        slip = Slip(zero, zero, from_frame(w, attitude.axes))
+        return Motion(rates, F[2], load, slip, contact.contact_velocity, o, w[2], 1.0 + zero, room), F
+
+    def _about_contact(self, lever: Vector) -> SymmetricMatrix:
+        """The inertia about the contact, J + m (r^2 - r r^T), in the body's axes."""
+        m, r, square, inertia = self.body.mass, lever, dot(lever, lever), self.body.inertia
+        return SymmetricMatrix(
+            inertia.xx + m * (square - r[0] * r[0]),
+            inertia.yy + m * (square - r[1] * r[1]),
+            inertia.zz + m * (square - r[2] * r[2]),
+            inertia.xy - m * r[0] * r[1],
+            inertia.xz - m * r[0] * r[2],
+            inertia.yz - m * r[1] * r[2],
+        )
+
+    def with_slip(self, state: State, slip: Slip) -> State:
+        """As `RollingDynamics.with_slip`."""
+        (u1, u2), e, _, place = parts(state)
+        attitude = self.attitude(state)
+        r, w, m = attitude.lever, attitude.angular_velocity, self.body.mass
+        # In the body's axes: the velocity u of the centre of mass, and v.
+        u = to_frame((u1, u2, -dot(w, cross(r, attitude.normal))), attitude.axes)
+        v = to_frame((slip.x, slip.y, None), attitude.axes)
+        jump = sum_vectors(v, scale(-1.0, u))
+        w = self._about_contact(r).solve(sum_vectors(attitude.momentum, scale(m, cross(r, jump))))
+        u = from_frame(sum_vectors(cross(r, w), v), attitude.axes)
+        return joined(u[:2], e, from_frame(self.body.inertia.tensor.times(w), attitude.axes), place)
+
+    def unit_impulse(self, state: State, axis: int) -> tuple[Component, ...]:
+        """As `RollingDynamics.unit_impulse`."""
+        attitude = self.attitude(state)
+        v = tuple(part[axis] for part in attitude.axes)
+        w = self._about_contact(attitude.lever).solve(scale(self.body.mass, cross(attitude.lever, v)))
+        return scale(self.body.mass, from_frame(sum_vectors(cross(attitude.lever, w), v), attitude.axes))
+
+    def with_unit_axes(self, state: State) -> State:
+        """The state with the body's axes at unit length and at right angles."""
+        e, x = state[AXIS] / jnp.linalg.norm(state[AXIS], axis=0), state[-3:]
+        x = x - jnp.sum(e * x, axis=0) * e
+        return state.at[AXIS].set(e).at[-3:].set(x / jnp.linalg.norm(x, axis=0))
+
+    def carried_along(self, state: State) -> State:
+        """The state with the velocity r x w of the centre of mass."""
+        attitude = self.attitude(state)
+        u = from_frame(cross(attitude.lever, attitude.angular_velocity), attitude.axes)
+        return state.at[:2].set(jnp.stack(jnp.broadcast_arrays(*u[:2], state[0])[:2]))
