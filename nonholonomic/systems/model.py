@@ -17,12 +17,11 @@ from ..hybrid import HybridOutcome
 from ..integration import AbstractProblem, Outcome
 from ..integration.problem import CROSSED, FAILED, UNRESOLVED, Status
 from ..parameters import Parameters, check_again, has_checks, require_apart, short_names
-from ..runs.model import AbstractModel, Names, Start, model_of, statuses
+from ..runs.model import AbstractModel, Names, Start, model_of, run_of, statuses
 from ..runs.simulate import simulate_model
 from ..runs.trajectory import (
     RADIUS,
     TOLERANCE,
-    Trajectory,
     frame_of,
     live_run,
     page_of,
@@ -190,11 +189,6 @@ class OwnModel(AbstractModel):
         leaves = zip(jax.tree.leaves(batch), jax.tree.leaves(single), depends, strict=True)
         return jax.tree.unflatten(jax.tree.structure(single), [a if d else b for a, b, d in leaves])
 
-    def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Trajectory:
-        # A run continues through its event, which only its page shows.
-        run = simulate_model(self.without_event(), t1, times, tolerance, solver)
-        return dataclasses.replace(run, model=self)
-
     def without_event(self) -> "OwnModel":
         """The same model without an event."""
         tree = self.parameters.tree
@@ -241,6 +235,9 @@ class OwnModel(AbstractModel):
 
     def at_end(self, outcome: Outcome | HybridOutcome, start: Array) -> dict[str, Array]:
         return dict(zip(self.names, self.components_of(jnp.asarray(outcome.state)), strict=True))
+
+
+run_of.register(OwnModel, simulate_model)
 
 
 def state_of(start: Array | dict[str, Array]) -> Array:

@@ -1,8 +1,8 @@
-"""Pictures, animations and pages of results. The subpackages above compute the results, and use these functions to draw
+"""Pictures, films and pages of results. The subpackages above compute the results, and use these functions to draw
 them."""
 
-from .animation import Viewable as Viewable
-from .animation import require_others as require_others
+from .film import Viewable as Viewable
+from .film import require_others as require_others
 from .fit import draw_fit as draw_fit
 from .page import NO_VIEW as NO_VIEW
 from .page import Page as Page
