@@ -1,5 +1,4 @@
-"""Shared code of the command lines: how they start, the picture and the page that they write, what they print at the end, and
-how Ctrl-C ends them."""
+"""Shared code of the command lines: how they start, and how Ctrl-C ends them."""
 
 import gc
 import os
@@ -9,14 +8,8 @@ import threading
 import time
 import warnings
 from collections.abc import Callable
-from importlib.util import find_spec
-from pathlib import Path
 from types import FrameType, TracebackType
-from typing import TYPE_CHECKING, NamedTuple, NoReturn
-
-# Only for type checkers: this module must load before JAX does.
-if TYPE_CHECKING:
-    from .views import Page, Stage
+from typing import NoReturn
 
 #: Longest time [s] that the main thread may take to report what was saved before the process ends without the report.
 PATIENCE = 1.0
@@ -78,64 +71,6 @@ def run_and_exit(main: Callable[[], int], program: str) -> NoReturn:
     status = interruptible(main, program)
     gc.freeze()
     sys.exit(status)
-
-
-class Outputs(NamedTuple):
-    """What a job has written.
-
-    - `runs`: number of runs; `files`: the tables and pictures; `page`: the page.
-    - `read_from`: the folder from which all results were read, or `None`.
-    """
-
-    runs: int
-    files: list[Path]
-    page: Path
-    read_from: Path | None = None
-
-
-def run_job(job: Callable[[], Outputs], program: str, purpose: str = "To see it") -> int:
-    """Run the job of a command line and print what it has written, or an error as one line.
-
-    **Arguments:** `program`: the name of the command line; `purpose`: what the page is for.
-
-    **Returns:** the exit status: 0, or 2 for input that cannot be used.
-    """
-    start_time = time.perf_counter()
-    try:
-        outputs = job()
-    except (ValueError, OSError) as error:
-        print(f"python -m {program}: {error}", file=sys.stderr)
-        return 2
-    if not can_draw():
-        print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
-    included = "compilation included"
-    if outputs.read_from is not None:
-        # Another installation of the same version may have stored them.
-        included = f"read from {outputs.read_from}, where an earlier run stored the results of these options"
-    files, duration = ", ".join(map(str, outputs.files)), time.perf_counter() - start_time
-    print(f"\n{outputs.runs} runs in {duration:.1f} s, {included}. Wrote {files}.")
-    print(". ".join(filter(None, [f"{purpose}, open {outputs.page}", without_motion()])))
-    return 0
-
-
-def can_draw() -> bool:
-    """Whether matplotlib is installed."""
-    return find_spec("matplotlib") is not None
-
-
-def without_motion() -> str:
-    """Why pages have no motion; empty if three.js is installed."""
-    from .views import NO_VIEW, can_view
-
-    return "" if can_view() else NO_VIEW
-
-
-def page_of_job(stages: Callable[[], list["Stage"]], title: str, speed: float, below: str) -> "Page":
-    """The page of a job: the stages if three.js is installed, and HTML below them."""
-    from .views import page
-
-    note = f'<p class="note">{without_motion()}</p>' if without_motion() else ""
-    return page([] if note else stages(), title, speed, note, below)
 
 
 def interruptible(main: Callable[[], int], program: str) -> int:

@@ -14,13 +14,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic import __version__
-from nonholonomic.command_line import Outputs, can_draw, page_of_job, run_and_exit, run_job
+from nonholonomic.command_line import run_and_exit
 from nonholonomic.compilation.cache import are_kept, enable_compilation_cache, kept_files
 from nonholonomic.geometry import CLOSED, AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.integration import ImplicitMidpoint
 from nonholonomic.terminal import Progress, status_line
 from nonholonomic.validation import as_number, replacing, require, require_folder
-from nonholonomic.views import Stage, picture_as_html
+from nonholonomic.views import Outputs, Stage, can_draw, page_of_job, picture_as_html, run_job
 
 from .model.input import Motion
 from .model.scene import FORKS, Scene

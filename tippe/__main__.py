@@ -14,13 +14,22 @@ import numpy as np
 from jaxtyping import Float
 
 from nonholonomic import __version__
-from nonholonomic.command_line import Outputs, can_draw, page_of_job, run_and_exit, run_job, without_motion
+from nonholonomic.command_line import run_and_exit
 from nonholonomic.compilation.cache import are_kept, enable_compilation_cache, kept_files
 from nonholonomic.geometry import Cylinder, Plane
 from nonholonomic.sweeps import AnotherRun, Table, saved_cells
 from nonholonomic.terminal import Progress
 from nonholonomic.validation import replacing, require_folder
-from nonholonomic.views import Page, picture_as_html, table_as_html
+from nonholonomic.views import (
+    Outputs,
+    Page,
+    can_draw,
+    page_of_job,
+    picture_as_html,
+    run_job,
+    table_as_html,
+    without_motion,
+)
 from nonholonomic.views.explore import live_page
 
 from . import paper, presets, steady

@@ -18,14 +18,13 @@ import jax
 import numpy as np
 
 from nonholonomic import __version__
-from nonholonomic.command_line import Outputs, can_draw, page_of_job, run_job
 from nonholonomic.compilation.cache import enable_compilation_cache
 from nonholonomic.compilation.xla_cpu import compiled_quickly
 from nonholonomic.geometry import AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.sweeps import Table
 from nonholonomic.terminal import Progress, status_line
 from nonholonomic.validation import require_folder
-from nonholonomic.views import Stage, picture_as_html, table_as_html
+from nonholonomic.views import Outputs, Stage, can_draw, page_of_job, picture_as_html, run_job, table_as_html
 
 from .friction import AbstractFriction, Coulomb, Viscous
 from .model.body import Top

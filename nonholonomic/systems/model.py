@@ -255,7 +255,7 @@ def assembled(tree: dict[str, Any]) -> tuple[Hybrid, Array, AbstractFormulation 
     return Hybrid([MechanicalMode(formulation)], event), formulation.state(start["q"], start["rate"]), formulation
 
 
-def _all_left(left: Parts) -> Bool[Array, "..."]:
+def _all_left(left: Parts) -> Any:
     """Whether no rule of a start is broken."""
     return functools.reduce(operator.and_, (room >= 0.0 for room in left.values()))
 
@@ -299,19 +299,19 @@ def _(
             "t > self.switch, and the times are found"
         )
     check_start(system, start)
-    is_hybrid = isinstance(system, Hybrid)
     # With a mechanical system among the modes, a state is (q, rate).
-    is_mechanical = not is_hybrid or any(isinstance(mode, AbstractSystem) for mode in system.modes)
+    modes = system.modes if isinstance(system, Hybrid) else (system,)
+    is_mechanical = any(isinstance(mode, AbstractSystem) for mode in modes)
     has_pair = is_mechanical and is_pair(start)
     numbers = dict(zip(("q", "rate"), map(as_number, start), strict=True)) if has_pair else as_number(start)
-    if is_hybrid and event is None:
+    if event is None and isinstance(system, Hybrid):
         event = system.event
     if event is not None:
         require_event(event)
         state = state_of(numbers)
         with named_errors("event(t, y)", arguments_in_words(state.size)):
             event = with_own_numbers(event, jnp.zeros(()), state)
-        if is_hybrid:
+        if isinstance(system, Hybrid):
             system, event = dataclasses.replace(system, event=event), None
     return OwnModel.of({"system": system, "start": numbers, "event": event})
 

@@ -9,8 +9,10 @@ import base64
 import html
 import json
 import os
+import sys
+import time
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
@@ -236,3 +238,60 @@ def view_from(stage: Stage) -> tuple[list[float], list[float], bool]:
     distance = 1.05 * (reach + 1.6 * size) / np.sin(np.radians(ANGLE) / 2.0)
     place = middle + distance * direction / np.linalg.norm(direction)
     return place.tolist(), middle.tolist(), follow
+
+
+# What a command line writes and prints at the end.
+
+
+class Outputs(NamedTuple):
+    """What a job has written.
+
+    - `runs`: number of runs; `files`: the tables and pictures; `page`: the page.
+    - `read_from`: the folder from which all results were read, or `None`.
+    """
+
+    runs: int
+    files: list[Path]
+    page: Path
+    read_from: Path | None = None
+
+
+def run_job(job: Callable[[], Outputs], program: str, purpose: str = "To see it") -> int:
+    """Run the job of a command line and print what it has written, or an error as one line.
+
+    **Arguments:** `program`: the name of the command line; `purpose`: what the page is for.
+
+    **Returns:** the exit status: 0, or 2 for input that cannot be used.
+    """
+    start_time = time.perf_counter()
+    try:
+        outputs = job()
+    except (ValueError, OSError) as error:
+        print(f"python -m {program}: {error}", file=sys.stderr)
+        return 2
+    if not can_draw():
+        print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
+    included = "compilation included"
+    if outputs.read_from is not None:
+        # Another installation of the same version may have stored them.
+        included = f"read from {outputs.read_from}, where an earlier run stored the results of these options"
+    files, duration = ", ".join(map(str, outputs.files)), time.perf_counter() - start_time
+    print(f"\n{outputs.runs} runs in {duration:.1f} s, {included}. Wrote {files}.")
+    print(". ".join(filter(None, [f"{purpose}, open {outputs.page}", without_motion()])))
+    return 0
+
+
+def can_draw() -> bool:
+    """Whether matplotlib is installed."""
+    return find_spec("matplotlib") is not None
+
+
+def without_motion() -> str:
+    """Why pages have no motion; empty if three.js is installed."""
+    return "" if can_view() else NO_VIEW
+
+
+def page_of_job(stages: Callable[[], list[Stage]], title: str, speed: float, below: str) -> Page:
+    """The page of a job: the stages if three.js is installed, and HTML below them."""
+    note = f'<p class="note">{without_motion()}</p>' if without_motion() else ""
+    return page([] if note else stages(), title, speed, note, below)
