@@ -278,11 +278,8 @@ class AbstractSampling(AbstractDifferentiableSolve):
         **Returns:** a function (the modules' numbers, cells) -> problem; the modules' numbers, in a block scalars or with
         the cells last; the horizon; the whole spec, with the tolerance; and the number of cells, `None` outside of blocks.
         """
-        numbers, (times, t1, tolerance), spec = (
-            leaves[: self.movable],
-            leaves[self.movable :][:3],
-            self.whole_spec(leaves),
-        )
+        numbers, spec = leaves[: self.movable], self.whole_spec(leaves)
+        times, t1, tolerance = leaves[self.movable : self.movable + 3]
         if self.in_blocks:
             numbers = tuple(cells_last(number, axes, cells) for number, axes in zip(numbers, spec.axes, strict=True))
             # One tolerance serves the whole ensemble: the smallest of the batch.
