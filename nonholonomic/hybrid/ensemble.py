@@ -286,19 +286,17 @@ def all_rounds(
     carry: Carry, groups: Sequence[Sequence[int]], solve: Advance, reset: Advance, most_rounds: int = MOST_ROUNDS
 ) -> Carry:
     """Loop over rounds while a cell is running, on the host if the runs are NumPy arrays. **Arguments:** as for `one_round`."""
-    rounds, xp = (
-        functools.partial(one_round, groups=groups, solve=solve, reset=reset),
-        carry[0].status.__array_namespace__(),
-    )
+    xp = carry[0].status.__array_namespace__()
+    advance = functools.partial(one_round, groups=groups, solve=solve, reset=reset)
     if xp is np:
         for _ in range(most_rounds):
-            carry = rounds(carry)
+            carry = advance(carry)
             if not (carry[0].status == RUNNING).any():
                 break
     else:
         carry, _ = jax.lax.while_loop(
             lambda loop: jnp.any(loop[0][0].status == RUNNING) & (loop[1] < most_rounds),
-            lambda loop: (rounds(loop[0]), loop[1] + 1),
+            lambda loop: (advance(loop[0]), loop[1] + 1),
             (carry, jnp.zeros((), int)),
         )
     runs, *records = carry
