@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from ..compilation.components import over_lanes
-from ..compilation.tracing import depends_on_first, is_elementary, spelled_out, with_own_numbers
+from ..compilation.components import over_lanes, spelled_out
+from ..compilation.tracing import depends_on_first, is_elementary, with_own_numbers
 from ..derivatives import (
     AbstractDifferentiableSolve,
     differentiable_solve,

@@ -658,7 +658,7 @@ class _Fit(NamedTuple):
         moves_times = any(name.rpartition(".")[2] == "t0" for name in self.unknowns)
         if moves_times and not all(model.smooth for model in models):
             return "differences"
-        return models[0].fit_slopes
+        return "differences" if models[0].compiles_slowly else models[0].fit_slopes
 
     @property
     def series_units(self) -> tuple[str, ...]:

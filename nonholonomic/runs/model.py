@@ -138,6 +138,11 @@ class AbstractModel(eqx.Module):
         """The slopes that guide a fit: "exact", or "differences" if derivatives do not show the trend of times."""
         return "exact"
 
+    @property
+    def compiles_slowly(self) -> bool:
+        """Whether programs take much longer to compile than to run, above all those with derivatives."""
+        return False
+
     def for_lanes(self) -> tuple["AbstractModel", bool]:
         """The model in a form that is fastest where runs in transformations share lanes, and whether arrays among its leaves
         have the lanes in their last axis."""

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from ..compilation.xla_cpu import compiled_alone
+from ..compilation.xla_cpu import compiled_alone, compiled_for_one
 from ..derivatives import sampled_run, sampled_run_by_diffrax
 from ..hybrid import HybridOutcome, HybridSamples, hybrid_samples, solve_hybrid_with_samples
 from ..integration import AbstractProblem, Outcome, Settings, solve_with_samples
@@ -222,7 +222,10 @@ def simulate_model(
     require_times(times, t1)
     settings = settings_for_lanes(tolerance, solver)
     unchecked = is_traced((model, times, t1, tolerance))
-    run, extremes = _sampled(model, as_number(times), as_number(t1), settings, unchecked)
+    # Inside `jit`, a new array is traced.
+    is_alone = not is_traced((as_number(0.0), model, times, t1, tolerance))
+    run_sampled = _sampled_alone if model.compiles_slowly and is_alone else _sampled
+    run, extremes = run_sampled(model, as_number(times), as_number(t1), settings, unchecked)
     if not is_traced(extremes):
         shortest, time, longest = np.asarray(extremes)
         # At a kink, only a few steps are short.
@@ -324,8 +327,7 @@ def problem_of_run(modules: tuple[AbstractModel, Names], cells: int | None) -> A
     return problem_of(model, cells, names)
 
 
-@eqx.filter_jit
-def _sampled(
+def _run_and_extremes(
     model: AbstractModel, times: Float[Array, " times"], t1: Float[Array, ""], settings: Settings, unchecked: bool
 ) -> tuple[Trajectory, Float[Array, "3"]]:
     """The run, or NaN and "illegal" if a traced number is out of range; and the extremes of its steps, as in
@@ -356,3 +358,6 @@ def _sampled(
         names=names,
     )
     return run, outcome.extremes[:, 0]
+
+
+_sampled, _sampled_alone = eqx.filter_jit(_run_and_extremes), compiled_for_one(_run_and_extremes)

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.compilation.components import TooLarge, by_components, over_last_axis
-from nonholonomic.compilation.tracing import in_cells, is_elementary, jumps_of, spelled_out, warn_of_unclear
+from nonholonomic.compilation.components import TooLarge, by_components, over_last_axis, spelled_out
+from nonholonomic.compilation.tracing import in_cells, is_elementary, jumps_of, warn_of_unclear
 from nonholonomic.geometry import Vector
 from nonholonomic.text import AbstractHeld, is_users, name_of, shown
 from nonholonomic.validation import Bound, Bounded, as_number, is_traced

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.formulations import AbstractSystem, Coordinates
 from nonholonomic.geometry import AbstractQuadric, Plane, add, inverse, multiply, subtract
+from nonholonomic.systems.mechanics import AbstractSystem, Coordinates
 from stroller.model.dynamics import State
 from stroller.model.input import Input, Motion
 from stroller.model.scene import FORKS, Scene

@@ -18,9 +18,9 @@ from scipy.integrate import quad
 
 import nonholonomic
 from nonholonomic import AbstractMode, AbstractSystem, Hybrid, event_time, simulate, sweep
-from nonholonomic.formulations import Hamel, Lagrange
 from nonholonomic.sweeps import Table
-from nonholonomic.systems.system import check_start, formulation_of
+from nonholonomic.systems.form import check_start
+from nonholonomic.systems.mechanics import Hamel, Lagrange, formulation_of
 
 START = [1.0, 0.0, 0.0]
 TIMES = jnp.array([0.3, 0.7, 1.1, 1.5])
