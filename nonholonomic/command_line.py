@@ -1,4 +1,4 @@
-"""Shared code of the command lines: how they start, what they print at the end, and how Ctrl-C ends them."""
+"""Shared code of the command lines: how they start, and how Ctrl-C ends them."""
 
 import gc
 import os
@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from types import FrameType, TracebackType
 from typing import NoReturn
 
@@ -71,21 +71,6 @@ def run_and_exit(main: Callable[[], int], program: str) -> NoReturn:
     status = interruptible(main, program)
     gc.freeze()
     sys.exit(status)
-
-
-def closing_lines(runs: int, start_time: float, paths: Iterable[object], page: str, read_from: object = None) -> str:
-    """The last lines of a command line.
-
-    **Arguments:** `runs`: number of runs; `start_time`: the start of the call, by `time.perf_counter`; `paths`: the
-    files; `page`: what the page shows, and its path; `read_from`: the folder from which all results were read, or `None`.
-    """
-    duration = time.perf_counter() - start_time
-    files = ", ".join(map(str, paths))
-    included = "compilation included"
-    if read_from is not None:
-        # Another installation of the same version may have stored them.
-        included = f"read from {read_from}, where an earlier run stored the results of these options"
-    return f"\n{runs} runs in {duration:.1f} s, {included}. Wrote {files}.\n{page}"
 
 
 def interruptible(main: Callable[[], int], program: str) -> int:

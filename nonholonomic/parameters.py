@@ -9,7 +9,7 @@ all modes that have it.
 import dataclasses
 import math
 import re
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -71,7 +71,7 @@ def is_number(leaf: object) -> bool:
     return eqx.is_array(leaf) or isinstance(leaf, np.ndarray | np.inexact | float)
 
 
-def with_numbers(roots: dict[str, PyTree], values: dict[str, ArrayLike]) -> dict[str, PyTree]:
+def with_numbers(roots: dict[str, PyTree], values: Mapping[str, ArrayLike]) -> dict[str, PyTree]:
     """The trees with some parameters replaced; the modules check the new values.
 
     **Arguments:**
@@ -195,7 +195,7 @@ def _unknown_axis(name: str, known: list[str]) -> ValueError:
     )
 
 
-def _replaced(name: str, tree: PyTree, values: dict[str, ArrayLike]) -> PyTree:
+def _replaced(name: str, tree: PyTree, values: Mapping[str, Any]) -> PyTree:
     if isinstance(tree, AbstractHeld):
         return type(tree)(_replaced(name, tree.function, values))
     changes = {}
@@ -306,7 +306,7 @@ class Parameters(eqx.Module):
         """The trees, for values that are scalars."""
         return self.form.tree(self.values)
 
-    def replaced(self, changes: dict[str, ArrayLike]) -> "Parameters":
+    def replaced(self, changes: Mapping[str, Any]) -> "Parameters":
         """The parameters with replacements, by name; a name such as `"system.modes[*].drag"` replaces several."""
         values = tuple(
             changes.get(name, changes.get(of_all_modes(name), value))

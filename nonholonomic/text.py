@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, DTypeLike, PyTree
+from jaxtyping import Array, ArrayLike, PyTree
 
 # Users' objects, which are written for a single run, with their arrays as separate numbers.
 
@@ -26,7 +26,7 @@ OWN = ("nonholonomic", "tippe", "stroller")
 class Numbers(eqx.Module):
     """An array as separate numbers, each a leaf with one value for all lanes or one per lane; and its shape."""
 
-    numbers: tuple[Array, ...]
+    numbers: tuple[Any, ...]
     shape: tuple[int, ...] = eqx.field(static=True)
 
     @property
@@ -37,7 +37,7 @@ class Numbers(eqx.Module):
     def __jax_array__(self) -> Array:
         return self.array
 
-    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> np.ndarray:
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return np.asarray(self.array, dtype)
 
 
@@ -279,7 +279,7 @@ def described(result: PyTree) -> str:
     return "None" if result is None else f"a {type(result).__name__}{count}"
 
 
-def contents(module: eqx.Module, with_units: bool = True) -> list[tuple[str, str]]:
+def contents(module: PyTree, with_units: bool = True) -> list[tuple[str, str]]:
     """The fields of a module as (name, value as text); omitted fields are left out."""
     fields = [(field.name, getattr(module, field.name, None)) for field in dataclasses.fields(module)]
     units = getattr(module, "units", {})
@@ -320,7 +320,7 @@ def batch_title(shape: tuple[int, ...], words: Iterable[str] = ()) -> str:
     return f"{runs}: {ends}" if ends else runs
 
 
-def one_line(module: eqx.Module, with_units: bool = True) -> str:
+def one_line(module: PyTree, with_units: bool = True) -> str:
     """A module in one line: `Plane(tilt=0.05 rad)`."""
     return f"{type(module).__name__}({', '.join(f'{name}={text}' for name, text in contents(module, with_units))})"
 
@@ -332,7 +332,7 @@ def in_lines(title: str, rows: list[tuple[str, str]]) -> str:
 
 
 def distinguishing_labels(
-    starts: list[tuple[str, ...]], *groups: list[eqx.Module], unit: str | Sequence[str] | None = None
+    starts: list[tuple[str, ...]], *groups: list[Any], unit: str | Sequence[str] | None = None
 ) -> list[str]:
     """Labels that distinguish runs, by what differs between them only.
 

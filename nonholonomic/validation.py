@@ -178,7 +178,7 @@ def require(
             raise ValueError(message + (IN_DEGREES.format(number) if degrees else ""))
 
 
-def require_scalars(values: Mapping[str, ArrayLike | None], otherwise: str) -> None:
+def require_scalars(values: Mapping[str, Any], otherwise: str) -> None:
     """Raise `ValueError` unless each named value is a single number or omitted; `otherwise` is the advice for lists."""
     for name, value in values.items():
         if value is not None and np.ndim(value) != 0:

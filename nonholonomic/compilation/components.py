@@ -161,9 +161,10 @@ class AbstractScalarReader(abc.ABC):
     def reduced(self, name: str, elements: Elements, axes: Sequence[int]) -> Elements:
         """Combine the elements along some axes, one by one."""
         kept = [size for k, size in enumerate(elements.shape) if k not in axes]
-        rows = np.moveaxis(elements, axes, range(-len(axes), 0)).reshape(*kept, -1) if elements.size else ()
-        terms = rows_along(rows, -1) if len(rows) else [self.constants(np.zeros(kept))]
-        return functools.reduce(functools.partial(self.each, name), terms)
+        if not elements.size:
+            return self.constants(np.zeros(kept))
+        rows = np.moveaxis(elements, axes, range(-len(axes), 0)).reshape(*kept, -1)
+        return functools.reduce(functools.partial(self.each, name), rows_along(rows, -1))
 
     def _product(self, left: Elements, right: Elements, contracted: Axes, batches: Axes) -> Elements:
         """The sum over the contracted axes; batch axes come first, then those of the left and those of the right."""

@@ -54,7 +54,7 @@ def is_elementary(function: Function, *args: PyTree) -> bool:
     return operations(program) <= set(ELEMENTARY.split())
 
 
-def depends_on_first(function: Function, first: ArrayLike, *args: PyTree) -> bool:
+def depends_on_first(function: Function, first: PyTree, *args: PyTree) -> bool:
     """Whether a function's results depend on its first argument, a number."""
     closed = jax.make_jaxpr(function)(first, *args)
     return any(_reached(closed, [k == 0 for k in range(len(closed.in_avals))]))
@@ -225,7 +225,7 @@ STAIRS = ["floor", "ceil", "round"]
 SMOOTH = ["sinc"]
 
 
-def jumps_of(function: Function, t: ArrayLike, *others: PyTree) -> tuple[Float[Array, " jumps"], tuple[str, ...]]:
+def jumps_of(function: Function, t: PyTree, *others: PyTree) -> tuple[Float[Array, " jumps"], tuple[str, ...]]:
     """The times at which a function of time and of other arguments may jump or have a kink.
 
     **Arguments:** the function, and examples of its arguments; the numbers that it closes over may be traced.
@@ -291,7 +291,7 @@ class _Reader(NamedTuple):
         """The kinds of the results of a program."""
         return read_program(program, inputs, self.apply, Known)
 
-    def apply(self, equation: Equation, inputs: list[Kind]) -> Sequence[Kind]:
+    def apply(self, equation: Equation, inputs: list[Any]) -> Sequence[Kind]:
         """The kinds of the results of an equation."""
         name, parameters, count = equation.primitive.name, equation.params, len(equation.outvars)
         values = [kind.value for kind in inputs if isinstance(kind, Known)]

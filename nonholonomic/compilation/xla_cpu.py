@@ -127,7 +127,7 @@ def operations(program: Program) -> set[str]:
 Result = TypeVar("Result")
 
 
-def _compiler(**options: object) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
+def _compiler(**options: Any) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
     """`filter_jit` with options of `jax.jit`, which Equinox's types omit; compiled functions also accept NumPy
     arrays."""
     return eqx.filter_jit(**options)
@@ -254,7 +254,11 @@ def least(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
     >>> jax.grad(lambda x: least(2.0 * x, 1.0))(0.3).item()
     2.0
     """
-    return functools.reduce(lambda a, b: jnp.where(jnp.less(a, b) | jnp.isnan(a), a, b), numbers)
+
+    def lesser(a: Any, b: Any) -> Any:
+        return jnp.where((a < b) | jnp.isnan(a), a, b)
+
+    return functools.reduce(lesser, numbers)
 
 
 def greatest(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
@@ -266,7 +270,11 @@ def greatest(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
     >>> jax.grad(lambda x: greatest(2.0 * x, 0.0))(0.3).item()
     2.0
     """
-    return functools.reduce(lambda a, b: jnp.where(jnp.greater(a, b) | jnp.isnan(a), a, b), numbers)
+
+    def greater(a: Any, b: Any) -> Any:
+        return jnp.where((a > b) | jnp.isnan(a), a, b)
+
+    return functools.reduce(greater, numbers)
 
 
 def on_device(*arrays: Float[ArrayLike, "..."]) -> tuple[Float[Array, "..."], ...]:

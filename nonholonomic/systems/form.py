@@ -37,7 +37,7 @@ Margin = Float[Array, "..."] | dict[str, Float[Array, ""]] | None
 Reset = tuple[State, Any] | None
 
 
-def exit_of(margin: Margin, number: ArrayLike) -> tuple[Any, ...]:
+def exit_of(margin: Any, number: ArrayLike) -> tuple[Any, ...]:
     """The further argument of a reset after the margin of this index has fallen, if there are several: the index, or for a
     dict whether it is the margin of each name."""
     if isinstance(margin, dict):
@@ -195,7 +195,8 @@ class MechanicalMode(AbstractMode):
         return self.formulation.system.margin(t, *self.formulation.split(y))
 
     def reset(self, t: Float[Array, ""], y: State, *exit: Any) -> Reset:
-        following = self.formulation.system.reset(t, *self.formulation.split(y), *exit)
+        system: Any = self.formulation.system
+        following = system.reset(t, *self.formulation.split(y), *exit)
         if following is None:
             return None
         q, rate, *number = following

@@ -368,7 +368,7 @@ ROUND_OFF = 64.0
 RULES = ("start", "finite", "symmetry", "rank", "metric", "constraints", "frame", "margin")
 
 #: What the rules compare, by name; for several cells, the cells are along the first axis.
-Parts = dict[str, Float[Array | np.ndarray, "..."]]
+Parts = dict[str, Any]
 
 
 def parts_of_system(system: AbstractSystem, q: Coordinates, rate: Coordinates) -> Parts:

@@ -17,12 +17,11 @@ from ..hybrid import HybridOutcome
 from ..integration import AbstractProblem, Outcome
 from ..integration.problem import CROSSED, FAILED, UNRESOLVED, Status
 from ..parameters import Parameters, check_again, has_checks, require_apart, short_names
-from ..runs.model import AbstractModel, Names, Start, model_of, statuses
+from ..runs.model import AbstractModel, Names, Start, model_of, run_of, statuses
 from ..runs.simulate import simulate_model
 from ..runs.trajectory import (
     RADIUS,
     TOLERANCE,
-    Trajectory,
     frame_of,
     live_run,
     page_of,
@@ -190,11 +189,6 @@ class OwnModel(AbstractModel):
         leaves = zip(jax.tree.leaves(batch), jax.tree.leaves(single), depends, strict=True)
         return jax.tree.unflatten(jax.tree.structure(single), [a if d else b for a, b, d in leaves])
 
-    def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Trajectory:
-        # A run continues through its event, which only its page shows.
-        run = simulate_model(self.without_event(), t1, times, tolerance, solver)
-        return dataclasses.replace(run, model=self)
-
     def without_event(self) -> "OwnModel":
         """The same model without an event."""
         tree = self.parameters.tree
@@ -243,6 +237,9 @@ class OwnModel(AbstractModel):
         return dict(zip(self.names, self.components_of(jnp.asarray(outcome.state)), strict=True))
 
 
+run_of.register(OwnModel, simulate_model)
+
+
 def state_of(start: Array | dict[str, Array]) -> Array:
     """The state at a start, which may be {"q": coordinates, "rate": rates}."""
     return jnp.concatenate([start["q"], start["rate"]]) if isinstance(start, dict) else start
@@ -258,7 +255,7 @@ def assembled(tree: dict[str, Any]) -> tuple[Hybrid, Array, AbstractFormulation 
     return Hybrid([MechanicalMode(formulation)], event), formulation.state(start["q"], start["rate"]), formulation
 
 
-def _all_left(left: Parts) -> Bool[Array, "..."]:
+def _all_left(left: Parts) -> Any:
     """Whether no rule of a start is broken."""
     return functools.reduce(operator.and_, (room >= 0.0 for room in left.values()))
 
@@ -302,19 +299,19 @@ def _(
             "t > self.switch, and the times are found"
         )
     check_start(system, start)
-    is_hybrid = isinstance(system, Hybrid)
     # With a mechanical system among the modes, a state is (q, rate).
-    is_mechanical = not is_hybrid or any(isinstance(mode, AbstractSystem) for mode in system.modes)
+    modes = system.modes if isinstance(system, Hybrid) else (system,)
+    is_mechanical = any(isinstance(mode, AbstractSystem) for mode in modes)
     has_pair = is_mechanical and is_pair(start)
     numbers = dict(zip(("q", "rate"), map(as_number, start), strict=True)) if has_pair else as_number(start)
-    if is_hybrid and event is None:
+    if event is None and isinstance(system, Hybrid):
         event = system.event
     if event is not None:
         require_event(event)
         state = state_of(numbers)
         with named_errors("event(t, y)", arguments_in_words(state.size)):
             event = with_own_numbers(event, jnp.zeros(()), state)
-        if is_hybrid:
+        if isinstance(system, Hybrid):
             system, event = dataclasses.replace(system, event=event), None
     return OwnModel.of({"system": system, "start": numbers, "event": event})
 

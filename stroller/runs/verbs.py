@@ -102,7 +102,7 @@ def simulate(
     ```
     """
     check_run(scene, launch, t1, input, tolerance, jumps)
-    return ride(RideModel.of(scene, launch, input, None, jumps), t1, times, tolerance, solver, max_steps, adjoint)
+    return ride(RideModel.of(scene, launch, input, None, jumps), t1, times, tolerance, solver, adjoint, max_steps)
 
 
 def sweep(

@@ -1,4 +1,4 @@
-"""The stroller in coordinates, as data for the formulations of `nonholonomic/formulations.py`.
+"""The stroller in coordinates, as data for the formulations of `nonholonomic/systems/mechanics.py`.
 
 The coordinates are q = (x, y, theta, phi) on a plane and (eta, mu, psi, phi), reduced latitude first as in the paper,
 on a sphere or spheroid, where psi is the paper's theta if the heading is projected. Unlike the P-form, these equations
