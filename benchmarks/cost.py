@@ -28,7 +28,7 @@ from nonholonomic.integration import AbstractProblem, Oscillatory8, Settings, so
 from nonholonomic.parameters import with_numbers
 from stroller.model.scene import RideProblem
 from tippe.modes.problems import InversionProblem
-from tippe.runs.launches import run_kind_of
+from tippe.runs.model import run_kind_of
 
 RECORD = Path(__file__).with_name("cost.json")
 

@@ -1,4 +1,4 @@
-"""Compute `MIDDLE` of both pairs in `pairs.py`: weights of the state in the middle of a step.
+"""Compute `MIDDLE` of both pairs in `runge_kutta.py`: weights of the state in the middle of a step.
 
     python benchmarks/tune_middle.py
 

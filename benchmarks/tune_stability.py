@@ -26,7 +26,7 @@ from tuning.family import STAGES, Pair, Unknowns, pair_of, unknowns_of
 from tuning.trees import error_coefficients
 
 from nonholonomic.integration import Oscillatory8
-from nonholonomic.integration.pairs import CAUTION
+from nonholonomic.integration.runge_kutta import CAUTION
 
 #: The pair is stable for -INTERVAL <= z <= 0, with |R(z)| <= DAMPING beyond z = -3. For degree 12 and eighth order, 17.2
 #: would be the limit without damping.

@@ -133,7 +133,7 @@ PAGES = {
             *of(
                 "nonholonomic.integration",
                 "AbstractProblem CoreProblem AbstractPassive ExtendedProblem Settings "
-                "solve_ensemble traced_solve_ensemble solve_with_samples Outcome "
+                "solve_ensemble solve_with_samples Outcome "
                 "crossing_time LaneState Jumps solve_by_diffrax follow DenseSolution sample explicit_tableau Oscillatory8 "
                 "Stabilized8",
             ),
@@ -147,8 +147,8 @@ PAGES = {
             "nonholonomic.hybrid",
             *of(
                 "nonholonomic.hybrid",
-                "AbstractBatchedMode AbstractHoppingMode Transition TransitionPath solve_hybrid traced_solve_hybrid "
-                "HybridOutcome solve_hybrid_with_tangents traced_solve_hybrid_with_tangents solve_hybrid_dense HybridPath "
+                "AbstractBatchedMode AbstractHoppingMode Transition TransitionPath solve_hybrid "
+                "HybridOutcome solve_hybrid_with_tangents solve_hybrid_dense HybridPath "
                 "Segment hybrid_resets solve_hybrid_with_samples hybrid_samples HybridSamples",
             ),
             "nonholonomic.derivatives",

@@ -31,9 +31,9 @@ from .planning.obstacles import Box
 from .planning.plan import plan
 from .planning.problem import Goal, Limits
 from .planning.result import Plan, draw_plan, planned_stage
-from .runs.trajectory import Trajectory
-from .runs.verbs import draw_rides, simulate
-from .runs.view import grouped, table_of
+from .runs.trajectory import Trajectory, table_of
+from .runs.verbs import simulate
+from .runs.view import draw_rides, grouped
 
 RIDES = ("without friction", "with friction")
 

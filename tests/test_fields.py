@@ -18,7 +18,7 @@ from stroller.model.scene import RideProblem
 from tippe.modes.impact import FreeBody, Impact, Skid, approach, balls
 from tippe.modes.problems import InversionProblem, trajectory_problem
 from tippe.modes.sticking import contact_modes
-from tippe.runs.launches import flight_modes, run_kind_of
+from tippe.runs.model import flight_modes, run_kind_of
 
 #: 16 to 44 ns for each number on a CPU, where a product takes one.
 SLOW = {"sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "exp2", "expm1"}

@@ -19,8 +19,8 @@ import stroller
 import tippe
 from nonholonomic.sweeps.grid import versions
 from nonholonomic.validation import Bound, as_number
+from tippe.friction import Slip
 from tippe.model.body import AbstractBody, AbstractMeridian, ContactGeometry
-from tippe.model.friction import Slip
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -101,9 +101,9 @@ class RoundedDisc(AbstractBody):
     I3: Float[Array, "..."] = eqx.field(converter=as_number)
 
     def bounds(self) -> Iterator[Bound]:
-        for name in ("mass", "radius", "belly", "edge"):
+        yield from super().bounds()
+        for name in ("radius", "belly", "edge"):
             yield Bound(getattr(self, name), name, above=0.0)
-        yield from self.inertia_bounds()
 
     @property
     def meridian(self) -> AbstractMeridian:

@@ -12,9 +12,9 @@ from tops import rutstam_top
 import stroller
 import tippe
 from nonholonomic.identification import Identification, LogDensity, Measurements, identify
+from nonholonomic.runs.trajectory import AbstractRun
 from nonholonomic.sweeps import Tabular
 from nonholonomic.views import Viewable
-from tippe.runs.observables import AbstractTrajectory
 
 pytestmark = pytest.mark.oldest
 
@@ -59,22 +59,8 @@ CALLS = {
     "page": (lambda: SlowRun().view(), None, None),
     "animation": (lambda: SlowRun().animate("a.gif"), None, None),
     "curves": (lambda: SlowRun().plot(), None, None),
-    "table of a run": (lambda: tippe.Trajectory.to_table(SimpleNamespace(t=0.0)), "tippe.runs.observables", "table_of"),
-    "table of a ride": (
-        lambda: stroller.Trajectory.to_table(SimpleNamespace()),
-        "stroller.runs.trajectory",
-        "table_of_one",
-    ),
-    "words on a run": (
-        lambda: AbstractTrajectory.__str__(SimpleNamespace(t=0.0)),
-        "tippe.runs.observables",
-        "is_traced",
-    ),
-    "words on a ride": (
-        lambda: stroller.Trajectory.__str__(SimpleNamespace(t=0.0)),
-        "stroller.runs.trajectory",
-        "is_traced",
-    ),
+    "table of a run": (lambda: AbstractRun.to_table(stub("table_of")), None, None),
+    "words on a run": (lambda: AbstractRun.__str__(stub("in_words", t=np.zeros(1), codes=None)), None, None),
 }
 
 
@@ -97,8 +83,8 @@ class SlowRun(Viewable, Tabular):
         raise NotImplementedError
 
 
-def stub(name):
-    return SimpleNamespace(**{name: waits}, of_prediction=None)
+def stub(name, **attributes):
+    return SimpleNamespace(**{name: waits}, of_prediction=None, **attributes)
 
 
 def fitted():

@@ -25,13 +25,12 @@ from nonholonomic.views import NO_VIEW, Page, can_view, page, picture_as_html, t
 from nonholonomic.views.explore import live_page
 
 from . import paper, presets, steady
-from .model.friction import Coulomb
-from .model.launch import Launch
-from .model.scene import Scene
-from .runs.explore import Panel, draw_launches, page_of_launch, stage_at_start, theta_over_time
+from .friction import Coulomb
+from .model.scene import Launch, Scene
 from .runs.launches import INVERTED
 from .runs.model import TopModel
 from .runs.verbs import inversion_table
+from .runs.view import Panel, draw_launches, page_of_launch, stage_at_start, theta_over_time
 
 TOPS = {top.__name__: top for top in (presets.wooden, presets.rutstam, presets.cohen, presets.leine_glocker)}
 

@@ -21,12 +21,12 @@ from nonholonomic.identification import (
 )
 from nonholonomic.integration import Settings
 from nonholonomic.parameters import numbers
-from nonholonomic.runs import AbstractEventTimes, AbstractModel, fit_runs, posterior_of_runs, search_options, sources_of
+from nonholonomic.runs.identify import AbstractEventTimes, fit_runs, posterior_of_runs, search_options, sources_of
+from nonholonomic.runs.model import AbstractModel
 from nonholonomic.text import distinguishing_labels
 from nonholonomic.validation import as_number, as_number_or_none, is_traced, require_kind, require_scalars, warn
 
-from .model.launch import Launch, as_launch
-from .model.scene import Scene
+from .model.scene import Launch, Scene, as_launch
 from .runs.launches import angle_of, check_event, check_reversible, check_smooth, event_of, require_rigid
 from .runs.model import TopModel
 from .runs.verbs import beyond_horizon, time_of_inversion

@@ -30,13 +30,11 @@ from nonholonomic.terminal import Progress, status_line
 from nonholonomic.validation import require_folder
 from nonholonomic.views import NO_VIEW, Stage, can_view, page, picture_as_html, table_as_html
 
+from .friction import AbstractFriction, Coulomb, Viscous
 from .model.body import Top
-from .model.friction import AbstractFriction, Coulomb, Viscous
-from .model.launch import Launch
-from .model.scene import Scene
-from .runs.explore import Panel, draw_launches
+from .model.scene import Launch, Scene
 from .runs.verbs import inversion_table, simulate
-from .runs.view import DrawnMotion, stages
+from .runs.view import DrawnMotion, Panel, draw_launches, stages
 
 #: The paper's units in SI.
 GRAM, CENTIMETRE = 1e-3, 1e-2
@@ -206,82 +204,59 @@ def tables(options: argparse.Namespace) -> dict[str, Table]:
     return by_arena
 
 
-def printed_times(options: argparse.Namespace, eta: float) -> list[str] | None:
-    """The paper's times for a place, if the launches are those of the paper."""
-    for table in (TABLE_2, TABLE_3):
-        if list(options.theta) == [row.theta for row in table.rows] and math.isclose(eta, table.eta):
-            return ["-" if row.time is None else f"{row.time:g}" for row in table.rows]
-    return None
-
-
-def columns(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[tuple[str, list[str]]]:
-    """The columns of the report: a heading of two words or more, and an entry for every theta(0)."""
-    columns_to_print = [("theta(0)|[rad]", [f"{theta:.4g}" for theta in options.theta])]
-    places = []
-    for arena, scene in scenes(options).items():
-        etas = [(f"eta={eta:.4g}", (slice(None), i)) for i, eta in enumerate(options.eta)]
-        places += [(arena, *place) for place in (etas if counts_eta(scene) else [("", (slice(None),))])]
-    for arena, place, cells in places:
-        table = by_arena[arena]
-        for crossing, times in (("first", table.first_time), ("last", table.last_time)):
-            entries = [_entry(t, word) for t, word in zip(times[cells], table.status[cells], strict=True)]
-            columns_to_print.append((f"{shown_name(options, arena)} {place}|{crossing} [s]", entries))
-        printed = printed_times(options, options.eta[cells[1]]) if arena == "cylinder" else None
-        if printed is not None:
-            columns_to_print.append(("paper|[s]", printed))
-    return columns_to_print
-
-
-def _entry(seconds: float, word: str) -> str:
-    if math.isfinite(seconds):
-        return f"{seconds:.4f}"
+def rows_of(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[tuple[str, ...]]:
+    """The rows of the report: two headings, and a row for every theta(0) with the times in each arena and place, beside
+    those of the paper if the launches are its own."""
+    columns = [["theta(0)", "[rad]", *(f"{theta:.4g}" for theta in options.theta)]]
     words = {"not_inverted": "-", "contact_lost": "lost contact", "does_not_fit": "no room"}
-    return words.get(word, word)
+    for arena, scene in scenes(options).items():
+        table, name = by_arena[arena], shown_name(options, arena)
+        places = [(f"eta={eta:.4g}", eta, (slice(None), i)) for i, eta in enumerate(options.eta)]
+        for place, eta, cells in places if counts_eta(scene) else [("", math.nan, (slice(None),))]:
+            for crossing, times in (("first", table.first_time), ("last", table.last_time)):
+                ends = zip(times[cells], table.status[cells], strict=True)
+                entries = [f"{end:.4f}" if math.isfinite(end) else str(words.get(word, word)) for end, word in ends]
+                columns.append([f"{name} {place}", f"{crossing} [s]", *entries])
+            for printed in (TABLE_2, TABLE_3) if arena == "cylinder" else ():
+                if list(options.theta) == [row.theta for row in printed.rows] and math.isclose(eta, printed.eta):
+                    columns.append(
+                        ["paper", "[s]", *("-" if row.time is None else f"{row.time:g}" for row in printed.rows)]
+                    )
+    return list(zip(*columns, strict=True))
 
 
 def report(options: argparse.Namespace, by_arena: dict[str, Table]) -> str:
     """The tables side by side, as text."""
-    columns_to_print = columns(options, by_arena)
-    heads = [heading.split("|") for heading, _ in columns_to_print]
-    widths = [
-        max(len(text) for text in (*head, *entries)) for head, (_, entries) in zip(heads, columns_to_print, strict=True)
-    ]
-    rows = [list(row) for row in zip(*heads, strict=True)]
-    rows += [list(row) for row in zip(*(entries for _, entries in columns_to_print), strict=True)]
-    lines = [*described(options), ""]
-    lines += ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return "\n".join(lines)
+    rows = rows_of(options, by_arena)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return "\n".join([*described(options), "", *lines])
 
 
 def described(options: argparse.Namespace) -> list[str]:
     """The lines above the report."""
     scene = scenes(options)["cylinder"]
-    body = scene.body
+    body, law = scene.body, scene.friction
+    friction = f"{'viscous' if isinstance(law, Viscous) else 'Coulomb'} mu = {options.mu:g}"
+    friction += " s/m" if isinstance(law, Viscous) else f", slip speed {options.slip_speed:g} m/s"
     return [
         "Inversion of a tippe top: time at which theta reaches "
         f"{options.angle:.4g} rad, for the first time (first) and for good (last).",
         f"Top: m = {float(body.mass):g} kg, R = {float(body.radius):g} m, a = {float(body.offset):g} m, "
-        f"I1 = {float(body.I1):.4g}, I3 = {float(body.I3):.4g} kg m^2; friction {_friction(scene.friction)}; "
+        f"I1 = {float(body.I1):.4g}, I3 = {float(body.I3):.4g} kg m^2; friction {friction}; "
         f"cylinder {options.cylinder_radius:g} m.",
         "The numbers of the paper's Table 1 are lost, so we use Rutstam's top: compare trends, not digits.",
         f"-: not inverted within {options.t1:g} s.",
     ]
 
 
-def _friction(law: AbstractFriction) -> str:
-    if isinstance(law, Coulomb):
-        return f"Coulomb mu = {float(law.mu):g}, slip speed {float(law.slip_speed):g} m/s"
-    assert isinstance(law, Viscous)
-    return f"viscous mu = {float(law.mu):g} s/m"
-
-
 @compiled_quickly
-def moving(scene: Scene[Top], launches: Launch, times: Any, tolerance: Any) -> DrawnMotion:
+def moving(scene: Scene[Top], launches: Launch, times: np.ndarray, tolerance: Any) -> DrawnMotion:
     """The drawn quantities of every launch at the given times, in one batched run."""
     return jax.vmap(lambda launch: DrawnMotion.of(simulate(scene, launch, times[-1], times, tolerance)))(launches)
 
 
-def drawn(options: argparse.Namespace, t1: float) -> tuple[Any, dict[str, DrawnMotion]]:
+def drawn(options: argparse.Namespace, t1: float) -> tuple[np.ndarray, dict[str, DrawnMotion]]:
     """The times of the plot, up to `t1` [s], and the drawn quantities of every launch in each arena.
 
     All numbers are arrays: another Python number would compile a new program, so the picture and the page could not
@@ -307,12 +282,12 @@ def picture(options: argparse.Namespace, by_arena: dict[str, Table]) -> Any:
     panels, thetas = [], np.asarray(options.theta)
     for arena, scene in scenes(options).items():
         etas, _ = starts(options, scene)
-        columns_to_print = np.asarray(runs[arena].theta).reshape(len(etas), len(thetas), -1)
+        angles = np.asarray(runs[arena].theta).reshape(len(etas), len(thetas), -1)
         ends = by_arena[arena].last_time.reshape(len(thetas), len(etas))
         for i, eta in enumerate(etas):
             name = shown_name(options, arena)
             title = f"{name}, η(0) = {eta:.4g}" if counts_eta(scene) else name
-            panels.append(Panel(title, times, columns_to_print[i], thetas, ends[:, i]))
+            panels.append(Panel(title, times, angles[i], thetas, ends[:, i]))
     return draw_launches(panels, options.angle, "Dots: above the dashed angle for good")
 
 
@@ -334,13 +309,8 @@ def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[Sta
 
 def write_page(options: argparse.Namespace, by_arena: dict[str, Table], drawing: Path | None) -> Path:
     """Write the page: two moving tops if three.js is installed, the tables, and the picture if there is one."""
-    paragraphs, rows = (
-        described(options),
-        [list(row) for row in zip(*(heading.split("|") for heading, _ in columns(options, by_arena)), strict=True)],
-    )
-    rows += [list(row) for row in zip(*(entries for _, entries in columns(options, by_arena)), strict=True)]
-    sections = "<h2>Inversion times</h2>" + table_as_html(rows, 2)
-    sections += "".join(f'<p class="note">{escape(line)}</p>' for line in paragraphs)
+    sections = "<h2>Inversion times</h2>" + table_as_html(list(map(list, rows_of(options, by_arena))), 2)
+    sections += "".join(f'<p class="note">{escape(line)}</p>' for line in described(options))
     sections += "" if drawing is None else "<h2>θ(t) of every launch</h2>" + picture_as_html(drawing)
     note = "" if can_view() else f'<p class="note">{NO_VIEW}</p>'
     path = options.out / "index.html"
@@ -369,11 +339,11 @@ def main(arguments: list[str] | None = None) -> int:
                 drawing = options.out / "theta.png"
                 picture(options, by_arena).savefig(drawing, dpi=130)
                 paths.append(drawing)
-            columns_to_print = write_page(options, by_arena, drawing)
+            page_path = write_page(options, by_arena, drawing)
     except (ValueError, OSError) as error:
         print(f"python -m tippe --paper: {error}", file=sys.stderr)
         return 2
     cells = sum(table.status.size for table in by_arena.values())
-    see = f"To see it, open {columns_to_print}{'' if can_view() else f'. {NO_VIEW}'}"
+    see = f"To see it, open {page_path}{'' if can_view() else f'. {NO_VIEW}'}"
     print(closing_lines(cells, start_time, paths, see))
     return 0

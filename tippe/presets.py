@@ -19,8 +19,8 @@ Coulomb(mu=0.3, slip_speed=0.05 m/s) hybrid
 
 from nonholonomic.geometry import AbstractSurface, Plane
 
+from .friction import Coulomb
 from .model.body import Stem, Top
-from .model.friction import Coulomb
 from .model.scene import Scene
 
 

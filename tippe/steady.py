@@ -28,7 +28,7 @@ an inverted top is stable above 41.31 rad/s
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -51,9 +51,9 @@ from nonholonomic.validation import (
 )
 
 from .model.body import Top
-from .model.launch import AXIS, PLACE, Launch, joined, parts
-from .model.rigid_body import AbstractRigidBody
-from .model.scene import Scene
+from .model.dynamics import AXIS, PLACE, joined, parts
+from .model.rigid import AbstractRigidBody
+from .model.scene import Launch, Scene
 
 # Checks of the arguments of steady motions; traced numbers pass.
 
@@ -61,31 +61,31 @@ from .model.scene import Scene
 MANY = "jax.vmap maps over several"
 
 
-def _require_top(body: Any) -> None:
+def _require_top(body: object) -> None:
     """Raise `ValueError` unless the body is a `Top`."""
     if not isinstance(body, Top):
         raise ValueError(f"body = {shown(body)} must be a Top: the formulas are those of a sphere")
 
 
-def _require_one_top(body: Any, caller: str) -> None:
+def _require_one_top(body: Top, caller: str) -> None:
     """Raise `ValueError` unless the body is a `Top` with known scalars. **Arguments:** `caller`: the function."""
     _require_top(body)
     require_outside(body, caller, "steady.proportions")
     require_scalars(numbers("body", body), MANY)
 
 
-def _require_one_scene(scene: Scene, **values: Any) -> None:
+def _require_one_scene(scene: Scene, **values: object) -> None:
     """Raise `ValueError` unless the numbers of the scene, and the values, are scalars."""
     require_scalars(numbers("scene", scene, functions=False) | values, MANY)
 
 
-def _require_scene_of_a_top(scene: Any) -> None:
+def _require_scene_of_a_top(scene: Scene) -> None:
     """Raise `ValueError` unless this is a scene of a `Top`."""
     require_kind(scene, "scene", Scene)
     _require_top(scene.body)
 
 
-def _require_plane(scene: Any) -> None:
+def _require_plane(scene: Scene) -> None:
     """Raise `ValueError` unless this is a scene of a `Top` on a level plane."""
     _require_scene_of_a_top(scene)
     if not scene.level:
@@ -94,7 +94,7 @@ def _require_plane(scene: Any) -> None:
         )
 
 
-def _require_standing(scene: Any, spin: Any, inverted: Any) -> None:
+def _require_standing(scene: Scene, spin: object, inverted: object) -> None:
     """Raise `ValueError` unless the body of a scene can stand and spin, and the other arguments are legal."""
     require_kind(scene, "scene", Scene)
     if isinstance(scene.body, AbstractRigidBody):
@@ -104,11 +104,6 @@ def _require_standing(scene: Any, spin: Any, inverted: Any) -> None:
         )
     require(spin, "spin")
     require_flag(inverted, "inverted")
-
-
-def _require_inclination(theta: Any) -> None:
-    """Raise `ValueError` unless theta is an angle [rad] in [0, pi], or several."""
-    require(theta, "theta", at_least=0.0, at_most=math.pi, unit="rad")
 
 
 # Tumbling tops on the plane: the motion, its stability, its energy and its state.
@@ -153,9 +148,7 @@ def tumbling(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> Tumbling:
     >>> print(f"{steady.tumbling(scene, 2.0).precession:.2f} rad/s")
     33.55 rad/s
     """
-    _require_plane(scene)
     theta = as_number(theta)
-    _require_inclination(theta)
     lever, inertia = _lever_and_inertia(scene, theta)
     require(lever, "I3 (alpha - cos(theta)) + I1 cos(theta)", above=0.0, why="no tumbling top at this inclination")
     alpha, _ = proportions(scene.body)
@@ -172,8 +165,6 @@ def tumbling_is_stable(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> Flo
     >>> bool(steady.tumbling_is_stable(scene, 1.0))
     True
     """
-    _require_plane(scene)
-    _require_inclination(theta)
     lever, inertia = _lever_and_inertia(scene, theta)
     return 4.0 * lever**2 + inertia * (scene.body.I1 - scene.body.I3) > 0.0
 
@@ -191,11 +182,9 @@ def effective_energy(
     >>> print(f"{1e3 * steady.effective_energy(scene, 1.0, motion.jellett):.3f} mJ")
     4.886 mJ
     """
-    _require_plane(scene)
-    _require_inclination(theta)
+    _, inertia = _lever_and_inertia(scene, theta)
     require(jellett, "jellett")
     body = scene.body
-    _, inertia = _lever_and_inertia(scene, theta)
     height = body.radius - body.offset * jnp.cos(theta)
     return as_number(jellett) ** 2 / (2.0 * body.radius**2 * inertia) + body.mass * scene.gravity * height
 
@@ -271,7 +260,12 @@ def _require_motion(scene: Scene[Top], motion: Tumbling) -> None:
 
 
 def _lever_and_inertia(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> tuple[Array, Array]:
-    """D = I3 (alpha - cos) + I1 cos and G = I1 sin^2 + I3 (cos - alpha)^2 [kg m^2]."""
+    """D = I3 (alpha - cos) + I1 cos and G = I1 sin^2 + I3 (cos - alpha)^2 [kg m^2].
+
+    **Raises:** `ValueError` unless this is a scene on the plane, and theta an angle [rad] in [0, pi], or several.
+    """
+    _require_plane(scene)
+    require(theta, "theta", at_least=0.0, at_most=math.pi, unit="rad")
     alpha, _ = proportions(scene.body)
     s, c = jnp.sin(theta), jnp.cos(theta)
     lever = scene.body.I3 * (alpha - c) + scene.body.I1 * c
@@ -443,19 +437,15 @@ def standing_matrix(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = F
 @eqx.filter_jit
 def _standing_matrix(scene: Scene, spin: Float[Array, ""], inverted: bool) -> Float[Array, "k k"]:
     state = standing_state(scene, spin, inverted)
-    components = [0, 1, 2, 3, 5, 6, *_places_across(scene)]
+    # The place components that matter near the arena's lowest point.
+    places = max(len(scene.frame.place_scales(1.0)) - 1, 0)
+    if isinstance(scene.frame, CarriedFrame):
+        # The foot (x, y, z), whose z is along n, and the first tangent, which is only the frame's choice of axes.
+        places = 1 if isinstance(scene.surface, Torus) else 2
+    components = [0, 1, 2, 3, 5, 6, *range(PLACE.start, PLACE.start + places)]
     scales = scene.scales(Launch(0.0, spin))
     jacobian = jax.jacfwd(scene.field)(state) * scales / scales[:, None]
     return jacobian[np.ix_(components, components)]
-
-
-def _places_across(scene: Scene) -> range:
-    """Indices of the place components that matter for the motion near the arena's lowest point."""
-    count = max(len(scene.frame.place_scales(1.0)) - 1, 0)
-    if isinstance(scene.frame, CarriedFrame):
-        # The foot (x, y, z), whose z is along n, and the first tangent, which is only the frame's choice of axes.
-        count = 1 if isinstance(scene.surface, Torus) else 2
-    return range(PLACE.start, PLACE.start + count)
 
 
 def tumbling_matrix(scene: Scene[Top], motion: Tumbling) -> Float[Array, "5 5"]:

@@ -17,7 +17,7 @@ from hard.lagrange import theta_by_lagrange
 from hard.limits import rutstam_top
 from hard.row import Row, of_runs
 from nonholonomic.integration import DenseSolution, Settings, follow
-from tippe.model.friction import Slip
+from tippe.friction import Slip
 from tippe.modes.problems import trajectory_problem
 
 GRAVITY = 9.81

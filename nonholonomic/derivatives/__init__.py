@@ -10,7 +10,7 @@ are in `nonholonomic.hybrid`.
 >>> import jax.numpy as jnp
 >>> from nonholonomic.derivatives import AbstractDifferentiableSolve, differentiable_solve, tangents_by
 >>> from nonholonomic.derivatives import traced_solve_ensemble_with_tangents
->>> from nonholonomic.integration import AbstractProblem, Settings, traced_solve_ensemble
+>>> from nonholonomic.integration import AbstractProblem, Settings, solve_ensemble
 >>> class Decays(AbstractProblem):
 ...     rate: jax.Array  # (cells,), or () for a single run
 ...     def start(self):
@@ -28,7 +28,8 @@ are in `nonholonomic.hybrid`.
 ...     def absent(self, value):
 ...         return jnp.isinf(value)
 ...     def solve(self, cells, rate):
-...         return traced_solve_ensemble(build((rate,), cells), t1, jnp.asarray(cells), settings)[0].crossing_time
+...         options = (t1, jnp.asarray(cells), settings)
+...         return solve_ensemble(build((rate,), cells), *options, traced=True)[0].crossing_time
 ...     def value_and_tangents(self, active, nested, cells, rate):
 ...         problem, tangents, gather = tangents_by(build, active, (rate,), cells)
 ...         options = (t1, jnp.asarray(cells), settings)
@@ -41,11 +42,9 @@ are in `nonholonomic.hybrid`.
 """
 
 from .adjoint import solve_ensemble_with_tangents as solve_ensemble_with_tangents
-from .adjoint import tangents_of as tangents_of
 from .adjoint import traced_solve_ensemble_with_tangents as traced_solve_ensemble_with_tangents
 from .differentiable import AbstractDifferentiableSolve as AbstractDifferentiableSolve
 from .differentiable import differentiable_solve as differentiable_solve
-from .differentiable import tangents_by as tangents_by
 from .sampled_runs import SampledRun as SampledRun
 from .sampled_runs import sampled_run as sampled_run
 from .sampled_runs import sampled_run_by_diffrax as sampled_run_by_diffrax
@@ -54,3 +53,5 @@ from .variation import exponent_of as exponent_of
 from .variation import growth as growth
 from .variation import in_groups as in_groups
 from .variation import tangent_scale as tangent_scale
+from .variation import tangents_by as tangents_by
+from .variation import tangents_of as tangents_of

@@ -10,24 +10,23 @@ fixed, as in `variation.py`.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Literal
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.xla_cpu import compiled_alone, uncounted, written_by_component, written_in_place
 from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, States
 from ..integration.problem import CROSSED, REACHED_END, RUNNING, time_at_jump
 from ..integration.runge_kutta import Stages, moved_state, over_stages
-from ..integration.scheduler import AbstractRecorder, InLanes, LaneScheduler, SchedulerState, with_crossing_times
+from ..integration.scheduler import InLanes, LaneScheduler, Recorder, SchedulerState, outcome_of, with_crossing_times
 from ..integration.step import length_to_try, try_step, until_jump
-from .variation import VariationalProblem, in_groups, slopes_by_variations
+from .variation import Tangent, VariationalProblem, in_groups, moving_leaves, slopes_by_variations
 
 # The periods of an ensemble solve that are kept for its adjoint: where some of them begin and end, and the steps of the
 # latest ones.
@@ -56,7 +55,7 @@ class StepRecord(NamedTuple):
 
 #: A period without its steps, as a tree of arrays: the lanes before it, and after it but before their refill; or other states
 #: of a run.
-Period = Any
+Period: TypeAlias = PyTree
 
 
 class Checkpoints(NamedTuple):
@@ -139,13 +138,12 @@ def read(stack: Array, index: Int[Array, ""]) -> Array:
     return jax.lax.dynamic_index_in_dim(stack, index, 0, keepdims=False)
 
 
-#: The quantities measured at the end of a run: (problem, lane state) -> a tree of arrays with the lanes last,
-#: differentiable with respect to the problem's parameters and the lanes' states.
-Measured = Callable[[Any, LaneState], Any]
+#: A tree of booleans like a problem: the leaves with respect to which to differentiate.
+Moving: TypeAlias = PyTree
 
 
-class StepRecorder(AbstractRecorder):
-    """Records where each step began, and its length; the derivatives begin at the ends of the runs."""
+class StepRecorder(Recorder):
+    """Records where each step began, and its length; what is differentiated is the time of the event at the end."""
 
     # As many iterations as fit in the caches with their record; a period ends with a refill.
     period: ClassVar[int] = 128
@@ -176,7 +174,11 @@ class StepRecorder(AbstractRecorder):
         through later states; `None` if the quantity depends only on the ends of the runs."""
         return None
 
-    def share_of_end(self, lane_state: LaneState) -> Any:
+    def measured(self, problem: AbstractProblem, lane_state: LaneState) -> PyTree:
+        """The quantities to differentiate, for lanes that have ended: a tree of arrays with the lanes last."""
+        return time_of_zero(problem, problem.event_function, lane_state.time, lane_state.state)
+
+    def share_of_end(self, lane_state: LaneState) -> PyTree:
         """The factors of the measured quantities at the end of the runs in the lanes."""
         return jnp.ones_like(lane_state.time)
 
@@ -185,7 +187,7 @@ class Derivatives(NamedTuple):
     """Derivatives of the measured quantity with respect to the state and to the parameters, a tree of arrays."""
 
     state: Float[Array, "components *lanes"]
-    numbers: Any
+    numbers: PyTree
 
 
 class Backward(NamedTuple):
@@ -207,46 +209,29 @@ class Backward(NamedTuple):
 
 
 def solve_with_adjoint(
-    problem: VariationalProblem,
-    moving: Any,
-    probe: Any,
+    problem: AbstractProblem,
+    moving: Moving,
+    probe: Tangent,
+    ends_on_event: bool,
     t1: Float[Array, "..."],
     cells: Int[Array, ""],
     settings: Settings,
-    *,
-    measured: Measured,
-    recorder: StepRecorder | None = None,
-    one_kernel: bool = False,
-) -> tuple[Outcome, Float[Array, "components cells"], Any]:
-    """Run every cell to its end, and differentiate a quantity at the end with respect to the problem's parameters.
+    recorder: StepRecorder,
+) -> tuple[Outcome, Derivatives]:
+    """Run every cell to its end, and differentiate the quantity that a recorder measures there.
 
-    **Arguments:** as for `ensemble_solve`, except `nonterminal`, and
+    **Arguments:** as for `solve_ensemble`, in one kernel, except `nonterminal`, and
 
-    - `problem`: without tangents.
-    - `moving`: a tree of booleans like the problem: the leaves with respect to which to differentiate, scalars or
-      (..., cells).
-    - `probe`: a tangent of the inner problem. Its variation is also integrated and takes part in step-size control, so
-      that the steps suit tangents even where the state is at rest.
-    - `measured`: the quantity to differentiate.
+    - `moving`: the leaves with respect to which to differentiate, scalars or (..., cells).
+    - `probe`: a tangent of the problem. Its variation is also integrated and takes part in step-size control, so that
+      the steps suit tangents even where the state is at rest.
+    - `ends_on_event`: as for `VariationalProblem`.
     - `recorder`: the recorder of the steps, which may add derivatives at the ends of the steps.
 
-    **Returns:** the `Outcome`, without crossing times; the derivatives of every cell with respect to its initial state;
-    and those with respect to the parameters, one per cell, in a tree like the problem with `None` for the other leaves.
+    **Returns:** the `Outcome`, without crossing times; and the derivatives of every cell with respect to its initial
+    state and to the parameters, one per cell, in a tree like the problem with `None` for the other leaves.
     """
     components, size = problem.start()[0].shape
-    numbers, problem_with_probe = _with_probe(problem, moving, probe, size)
-    scheduler = LaneScheduler.of(problem_with_probe, t1, cells, settings, one_kernel=one_kernel, n_blocks=2)
-    passes = Passes(scheduler, moving, measured, StepRecorder() if recorder is None else recorder)
-    run = passes.start(numbers)
-    run = jax.lax.while_loop(lambda run: uncounted(run.limit > 0, run.outcome.steps[0]), passes.there_and_back, run)
-    return run.outcome._replace(state=run.outcome.state[:components]), run.gradient.state, run.gradient.numbers
-
-
-def _with_probe(problem: VariationalProblem, moving: Any, probe: Any, size: int) -> tuple[Any, VariationalProblem]:
-    """The chosen parameters with one value per cell, and the problem with them and the probe.
-
-    **Arguments:** as for `solve_with_adjoint`; `size`: number of cells, padding included.
-    """
     numbers, static = eqx.partition(problem, moving)
     numbers = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*jnp.shape(leaf)[:-1], size)), numbers)
     problem = eqx.combine(numbers, static)
@@ -254,25 +239,31 @@ def _with_probe(problem: VariationalProblem, moving: Any, probe: Any, size: int)
     probe = jax.tree.map(
         lambda rate, number: None if rate is None else jnp.broadcast_to(rate, jnp.shape(number)),
         probe,
-        problem.problem,
+        problem,
         is_leaf=lambda rate: rate is None,
     )
-    return numbers, dataclasses.replace(problem, tangents=(probe,))
+    variational = VariationalProblem(problem, (probe,), ends_on_event)
+    scheduler = LaneScheduler.of(variational, t1, cells, settings, one_kernel=True, n_blocks=2)
+    # Without tangents, a `VariationalProblem` is the problem itself, with the option not to end on its event.
+    passes = Passes(scheduler, VariationalProblem(moving, (), ends_on_event), recorder)
+    run = passes.start(VariationalProblem(numbers, (), ends_on_event))
+    run = jax.lax.while_loop(lambda run: uncounted(run.limit > 0, run.outcome.steps[0]), passes.there_and_back, run)
+    gradient = Derivatives(run.gradient.state, run.gradient.numbers.problem)
+    return run.outcome._replace(state=run.outcome.state[:components]), gradient
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Passes:
     """The forward pass, which computes periods, and the backward pass, which carries derivatives through them.
 
-    `moving`, `measured`, `recorder`: as for `solve_with_adjoint`.
+    `moving`, `recorder`: as for `solve_with_adjoint`.
     """
 
     scheduler: LaneScheduler
-    moving: Any
-    measured: Measured
+    moving: Moving
     recorder: StepRecorder
 
-    def start(self, numbers: Any) -> Backward:
+    def start(self, numbers: PyTree) -> Backward:
         """Both passes before the first period. **Arguments:** `numbers`: the parameters, with one value per cell."""
         scheduler, start = self.scheduler, self.scheduler.start()
         in_lanes = scheduler.in_lanes(start.lane_state)
@@ -284,7 +275,7 @@ class Passes:
             limit=jnp.asarray(jnp.iinfo(jnp.arange(0).dtype).max),
             checkpoints=Checkpoints.none((start, start)),
             latest_steps=LatestSteps.none(record, scheduler.capacity),
-            outcome=scheduler.empty(),
+            outcome=outcome_of(scheduler.fresh),
             adjoint=jax.tree.map(jnp.zeros_like, Derivatives(state, scheduler.pick(numbers, start.lane_state.cell))),
             gradient=jax.tree.map(jnp.zeros_like, Derivatives(states, numbers)),
         )
@@ -351,13 +342,19 @@ class Passes:
         arriving, share = self.recorder.arriving(lane_state, steps), self.recorder.share_of_end(lane_state)
         record = (steps.time, steps.state, steps.length, arriving)
 
-        def loop(carry: Any) -> Any:
+        def loop(carry: PyTree) -> Derivatives:
             lane_state, share, record, count, adjoint = carry
             ended = lane_state.status != RUNNING
-            at_end = _at_the_end(problem, self.moving, self.measured, lane_state, share)
+            numbers, static = eqx.partition(problem, self.moving)
+
+            def measured(numbers: PyTree, state: States) -> PyTree:
+                return self.recorder.measured(eqx.combine(numbers, static).problem, lane_state._replace(state=state))
+
+            by_number, by_state = jax.vjp(measured, numbers, lane_state.state)[1](share)
+            at_end = Derivatives(by_state, by_number)
             adjoint = jax.tree.map(functools.partial(jnp.where, ended), at_end, adjoint)
 
-            def step(carry: Any) -> Any:
+            def step(carry: tuple[Array, Derivatives, StageMemory]) -> tuple[Array, Derivatives, StageMemory]:
                 index, adjoint, memory = carry
                 time, state, length, at_end = jax.tree.map(functools.partial(read, index=index - 1), record)
                 if at_end is not None:
@@ -365,7 +362,9 @@ class Passes:
                 point = (time, state, length)
                 return index - 1, *step_taken_back(weights, problem, self.moving, *point, adjoint, memory)
 
-            memory = StageMemory.of(len(weights.fractions), lane_state.state)
+            state, stages = lane_state.state, len(weights.fractions)
+            rooms = (jnp.zeros((count, *state.shape), state.dtype) for count in (stages, stages - 1, stages + 1))
+            memory = StageMemory(*rooms)
             return jax.lax.while_loop(lambda carry: carry[0] > 0, step, (count, adjoint, memory))[1]
 
         return self.scheduler.in_kernel(loop)((lane_state, share, record, count, adjoint))
@@ -374,19 +373,6 @@ class Passes:
 def without_probe(lane_state: LaneState) -> LaneState:
     """The lanes with the states alone, without the variations."""
     return lane_state._replace(state=lane_state.state[: lane_state.state.shape[0] // 2])
-
-
-def _at_the_end(
-    problem: AbstractProblem, moving: Any, measured: Measured, lane_state: LaneState, share: Any
-) -> Derivatives:
-    """The derivatives with respect to the final state and the parameters. **Arguments:** `share`: as `share_of_end`."""
-    numbers, static = eqx.partition(problem, moving)
-
-    def value(numbers: Any, state: States) -> Any:
-        return measured(eqx.combine(numbers, static), lane_state._replace(state=state))
-
-    by_number, by_state = jax.vjp(value, numbers, lane_state.state)[1](share)
-    return Derivatives(by_state, by_number)
 
 
 class Weights(NamedTuple):
@@ -425,16 +411,11 @@ class StageMemory(NamedTuple):
     rates: Stages
     adjoints: Stages
 
-    @classmethod
-    def of(cls, stages: int, state: States) -> "StageMemory":
-        """Memory for a number of stages."""
-        return cls(*(jnp.zeros((count, *state.shape), state.dtype) for count in (stages, stages - 1, stages + 1)))
-
 
 def step_taken_back(
     weights: Weights,
     problem: AbstractProblem,
-    moving: Any,
+    moving: Moving,
     time: Lanes,
     state: States,
     length: Lanes,
@@ -472,22 +453,18 @@ def step_taken_back(
     initial_stages = written_in_place(memory.states, state, at=start), memory.rates
     stage_states, rates = over_stages(stages - 1, stage_made, initial_stages)
 
-    def pull(stage_time: Lanes, numbers: Any, parts: tuple[Lanes, ...], by_rate: tuple[Lanes, ...]) -> Any:
-        def field(numbers: Any, parts: tuple[Lanes, ...]) -> States:
-            return eqx.combine(numbers, static).field(stage_time, parts)
-
-        by_number, by_part = jax.vjp(field, numbers, parts)[1](jnp.stack(by_rate))
-        return jnp.stack(by_part), by_number
-
-    def stage_taken_back(count: Int[Array, ""], carry: Any) -> Any:
+    def stage_taken_back(count: Int[Array, ""], carry: tuple[Stages, Derivatives]) -> tuple[Stages, Derivatives]:
         stage, (by_stage, total) = stages - 1 - count, carry
         by_rate = jax.lax.optimization_barrier(moved_state(stage, weights.shares, zero_state, length, by_stage))
         stage_time = time + fractions[stage] * length
-        by_state, by_number = pull(
-            stage_time, numbers, tuple(jnp.unstack(read(stage_states, index=stage))), tuple(jnp.unstack(by_rate))
-        )
+
+        def field(numbers: PyTree, parts: tuple[Lanes, ...]) -> States:
+            return eqx.combine(numbers, static).field(stage_time, parts)
+
+        pull = jax.vjp(field, numbers, tuple(jnp.unstack(read(stage_states, index=stage))))[1]
+        by_number, by_part = pull(jnp.stack(jnp.unstack(by_rate)))
         # If no step was made, values may not be finite.
-        by_state = jax.lax.optimization_barrier(jnp.where(length > 0.0, by_state, 0.0))
+        by_state = jax.lax.optimization_barrier(jnp.where(length > 0.0, jnp.stack(by_part), 0.0))
         total = jax.tree.map(
             lambda sum_so_far, term: sum_so_far + jnp.where(length > 0.0, term, 0.0),
             total,
@@ -503,7 +480,7 @@ def step_taken_back(
 
 
 def jump_taken_back(
-    problem: AbstractProblem, moving: Any, time: Lanes, state: States, adjoint: Derivatives
+    problem: AbstractProblem, moving: Moving, time: Lanes, state: States, adjoint: Derivatives
 ) -> Derivatives:
     """Carry derivatives from the far side of a jump to its near side, in the lanes whose step begins on a far side.
 
@@ -518,7 +495,7 @@ def jump_taken_back(
     near = jnp.where(is_jump, near, time)
 
     def taken_back() -> Derivatives:
-        def across(numbers: Any, state: States) -> States:
+        def across(numbers: PyTree, state: States) -> States:
             return eqx.combine(numbers, static).across_jump(near, state)
 
         # Round-off apart, the states of both sides differ only in their clocks.
@@ -544,7 +521,7 @@ MOST_FORWARD = 2
 
 def ensemble_solve_with_tangents(
     problem: AbstractProblem,
-    tangents: tuple[Any, ...],
+    tangents: tuple[Tangent, ...],
     t1: Float[Array, "..."],
     cells: Int[Array, ""],
     settings: Settings,
@@ -578,18 +555,15 @@ def ensemble_solve_with_tangents(
     horizon = t1
     if nonterminal:
         scheduler = LaneScheduler.of(problem, t1, cells, settings, nonterminal=True, one_kernel=one_kernel)
-        outcome = scheduler.outcome()[0]
+        outcome = scheduler.solve()[0]
         # The derivatives need the run only up to the event, whose time is now known.
         horizon = jnp.where(jnp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
     options = (not nonterminal, horizon, cells, settings)
-
-    def with_group(group: tuple[Any, ...]) -> tuple[Outcome, list[Float[Array, " cells"]]]:
-        return slopes_by_variations(problem, group, *options, one_kernel=one_kernel)
-
     if one_kernel and problem.fits_one_kernel and len(tangents) > MOST_FORWARD:
         ended, slopes = _slopes_by_adjoint(problem, tangents, *options)
     else:
-        ended, slopes = in_groups(with_group, tangents)
+        solve = functools.partial(slopes_by_variations, problem, one_kernel=one_kernel)
+        ended, slopes = in_groups(lambda group: solve(group, *options), tangents)
     if not nonterminal:
         outcome = with_crossing_times(problem, ended)
     # An event at the start has a fixed time, whatever the tangent.
@@ -600,21 +574,22 @@ def ensemble_solve_with_tangents(
 
 
 def _slopes_by_adjoint(
-    problem: AbstractProblem, tangents: tuple[Any, ...], ends_on_event: bool, *options: Any
+    problem: AbstractProblem, tangents: tuple[Tangent, ...], ends_on_event: bool, *options: Any
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """The result of `slopes_by_variations`, at a cost that does not depend on the number of tangents."""
-    moving = moving_leaves(problem, tangents[0], _field_and_event)
-    # Without tangents, a `VariationalProblem` is the problem itself, with the option not to end on its event.
-    ended, by_start, by_number = solve_with_adjoint(
-        VariationalProblem(problem, (), ends_on_event),
-        VariationalProblem(moving, (), ends_on_event),
-        _mixed(tangents),
-        *options,
-        measured=_event_time,
-        one_kernel=True,
+
+    def field_and_event(problem: AbstractProblem, states: States) -> PyTree:
+        zero = jnp.zeros_like(states[0])
+        return problem.field(zero, states), problem.event_function(states), problem.jumps(zero, states)
+
+    moving = moving_leaves(problem, tangents[0], field_and_event)
+    shares = shares_of(len(tangents)).tolist()
+    mixture = jax.tree.map(lambda *rates: sum(c * rate for c, rate in zip(shares, rates, strict=True)), *tangents)
+    ended, (by_start, by_number) = solve_with_adjoint(
+        problem, moving, mixture, ends_on_event, *options, recorder=StepRecorder()
     )
 
-    def slope(direction: Any) -> Float[Array, " cells"]:
+    def slope(direction: Tangent) -> Float[Array, " cells"]:
         start = eqx.filter_jvp(lambda problem: problem.start()[0], (problem,), (direction,))[1]
         rates = eqx.filter(direction, moving)
         shares = [
@@ -626,12 +601,6 @@ def _slopes_by_adjoint(
     return ended, [slope(direction) for direction in tangents]
 
 
-def _mixed(tangents: tuple[Any, ...]) -> Any:
-    """A mixture of some tangents."""
-    shares = shares_of(len(tangents)).tolist()
-    return jax.tree.map(lambda *rates: sum(c * rate for c, rate in zip(shares, rates, strict=True)), *tangents)
-
-
 def shares_of(count: int) -> Float[np.ndarray, " count"]:
     """Shares for a mixture of some tangents that are unlikely to cancel. The mixture is about as large as each tangent, so
     that steps are as short as for one tangent.
@@ -639,13 +608,7 @@ def shares_of(count: int) -> Float[np.ndarray, " count"]:
     return (0.5 + np.modf(0.618 * np.arange(count))[0]) / count
 
 
-def _event_time(variational: VariationalProblem, lane_state: LaneState) -> Float[Array, "*lanes"]:
-    """Zero of the event function for lanes that have ended on the event."""
-    problem = variational.problem
-    return time_of_zero(problem, problem.event_function, lane_state.time, lane_state.state)
-
-
-def time_of_zero(problem: AbstractProblem, function: Callable[[Any], Any], time: Lanes, state: States) -> Lanes:
+def time_of_zero(problem: AbstractProblem, function: Callable[[States], PyTree], time: Lanes, state: States) -> Lanes:
     """The time at which a function of the state vanishes, for a state at the zero (implicit function theorem).
 
     First order, unlike `event_time`: the event is located to 1e-10 of a step, and its time is not differentiated again.
@@ -654,77 +617,8 @@ def time_of_zero(problem: AbstractProblem, function: Callable[[Any], Any], time:
     return time_at_jump(problem, time, state, time - function(state) / jnp.where(fall == 0.0, 1.0, fall))
 
 
-def _field_and_event(problem: AbstractProblem, states: States) -> Any:
-    zero = jnp.zeros_like(states[0])
-    return problem.field(zero, states), problem.event_function(states), problem.jumps(zero, states)
-
-
-def moving_leaves(problem: AbstractProblem, direction: Any, functions: Callable[[AbstractProblem, States], Any]) -> Any:
-    """The leaves that a tangent moves, as far as some functions of problem and states depend on them, as a tree of
-    booleans."""
-    arrays, static = eqx.partition(problem, eqx.is_array)
-    leaves, structure = jax.tree.flatten(arrays)
-
-    def values(*leaves: Any) -> Any:
-        return functions(eqx.combine(jax.tree.unflatten(structure, leaves), static), problem.start()[0])
-
-    closed = jax.make_jaxpr(values)(*leaves)
-    dependencies = set(closed.jaxpr.outvars)
-    for equation in reversed(closed.jaxpr.eqns):
-        if not dependencies.isdisjoint(equation.outvars):
-            dependencies |= {variable for variable in equation.invars if not isinstance(variable, Literal)}
-    is_dependency = jax.tree.unflatten(structure, [variable in dependencies for variable in closed.jaxpr.invars])
-    return jax.tree.map(
-        lambda rate, is_used: bool(is_used) and rate is not None,
-        direction,
-        is_dependency,
-        is_leaf=lambda rate: rate is None,
-    )
-
-
 # With its docstring.
 _in_one_kernel = functools.partial(ensemble_solve_with_tangents, one_kernel=True)
 solve_ensemble_with_tangents = compiled_alone(functools.update_wrapper(_in_one_kernel, ensemble_solve_with_tangents))
 
 traced_solve_ensemble_with_tangents = eqx.filter_jit(ensemble_solve_with_tangents)
-
-
-def tangents_of(
-    build: Callable[..., Any], numbers: tuple[Any, ...], tangents: list[tuple[Any, ...]]
-) -> tuple[Any, ...]:
-    """The tangents of a problem that is built from numbers.
-
-    **Arguments:**
-
-    - `build`: numbers -> problem.
-    - `numbers`: the arguments of `build`, arrays.
-    - `tangents`: each with the rates at which the numbers move.
-
-    **Returns:** for each tangent the tangent of the problem, `None` for leaves that depend on no number.
-
-    **Example:**
-
-    >>> from nonholonomic.derivatives import tangents_of
-    >>> tangents = tangents_of(Decays, (jnp.ones(2),), [(jnp.array([1.0, 0.0]),)])
-    >>> print(tangents[0].rate)
-    [1. 0.]
-    """
-
-    def built(*numbers: Any) -> Any:
-        # A problem may also hold functions.
-        return eqx.filter(build(*numbers), eqx.is_inexact_array)
-
-    dependents = _reached(jax.make_jaxpr(built)(*numbers))
-    structure = jax.tree.structure(jax.eval_shape(built, *numbers))
-    moving = jax.tree.unflatten(structure, dependents)
-    changes = [jax.jvp(built, numbers, tangent)[1] for tangent in tangents]
-    return tuple(eqx.filter(change, moving) for change in changes)
-
-
-def _reached(closed: Any) -> list[bool]:
-    """Which outputs of a traced function depend on an input."""
-    depends = set(closed.jaxpr.invars)
-    for equation in closed.jaxpr.eqns:
-        if any(not isinstance(variable, Literal) and variable in depends for variable in equation.invars):
-            depends |= set(equation.outvars)
-    return [not isinstance(variable, Literal) and variable in depends for variable in closed.jaxpr.outvars]

@@ -1,32 +1,54 @@
 """Solves with their own derivative rules: functions of scalars for `jit`, `vmap`, `grad`, `jvp` and their compositions.
 
 A run is not differentiated operation by operation. A solve returns its primal together with the derivatives with
-respect to some of the parameters (forward or adjoint), and JAX's rules combine these. A batch under `vmap` is solved as
-one ensemble.
+respect to some of the parameters (forward or adjoint), and JAX's rules combine these.
+
+Solves are a JAX primitive, so that a batch under `vmap` is solved as one ensemble. `custom_vmap` also batches, but
+computes all outputs as soon as one is used. The rule for unused outputs is JAX's `partial_eval.dce_rules`, as in its own
+`scan`.
 """
 
 import abc
+import dataclasses
 import functools
-from collections.abc import Callable
-from typing import Any, ClassVar, Self
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, Self, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir, partial_eval
+from jaxtyping import Array, Bool, Float, PyTree
 
-from ..integration import Settings
-from ..validation import as_number, is_traced
-from .adjoint import tangents_of
-from .primitives import Request, Tangents, flat, product, push_forward, solve_one
-from .variation import tangent_scale
+from ..compilation.xla_cpu import compiled_alone, compiled_for_one
+from ..validation import is_traced
 
 #: The primal output of a solve: arrays of floats, the cells along the first axis.
-Primal = Any
+Primal: TypeAlias = PyTree
+
+#: JAX's PyTreeDef, which type checkers take for a variable.
+Structure: TypeAlias = Any
 
 
-class AbstractDifferentiableSolve(eqx.Module):
+class AbstractSolve(eqx.Module):
+    """A function of leaves for some cells at once."""
+
+    @abc.abstractmethod
+    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Primal:
+        """The primal in every cell; each leaf is a scalar or an array with one number per cell."""
+
+    def for_parts(self, wanted: tuple[int, ...]) -> Self:
+        """A solve that may replace outputs that are not wanted by `None`; by default it replaces none.
+
+        **Arguments:** `wanted`: indices into the parts of the primal, or of the primal followed by its derivatives.
+        """
+        return self
+
+
+class AbstractDifferentiableSolve(AbstractSolve):
     """A solve as a function of `leaves`; the first `movable` leaves are differentiable.
 
     **Example:** the solve of the subpackage's example, for two cells.
@@ -43,10 +65,6 @@ class AbstractDifferentiableSolve(eqx.Module):
     @abc.abstractmethod
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         """Where an entry of the primal means "none", such as an infinite time: its derivative is 0 there."""
-
-    @abc.abstractmethod
-    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Primal:
-        """The primal in every cell; each leaf is a scalar or an array with one number per cell."""
 
     @abc.abstractmethod
     def value_and_tangents(
@@ -84,13 +102,6 @@ class AbstractDifferentiableSolve(eqx.Module):
         """The cotangents of the active leaves in every cell, from those of the primal, `None` for parts without one."""
         raise NotImplementedError
 
-    def for_parts(self, wanted: tuple[int, ...]) -> Self:
-        """A solve that may replace outputs that are not wanted by `None`; by default it replaces none.
-
-        **Arguments:** `wanted`: indices into the parts of the primal, or of the primal followed by its derivatives.
-        """
-        return self
-
 
 def differentiable_solve(solve: AbstractDifferentiableSolve, *leaves: Float[Array, "..."]) -> Primal:
     """Solve for one member. Where there is no event the derivative is zero, whatever the cotangent.
@@ -107,7 +118,7 @@ def differentiable_solve(solve: AbstractDifferentiableSolve, *leaves: Float[Arra
 
     @jax.custom_jvp
     def primal(*leaves):
-        return _of_one(Request(solve), *leaves)
+        return _of_one(solve, solve.in_blocks, leaves)
 
     @functools.partial(primal.defjvp, symbolic_zeros=True)
     def variation(leaves, tangents):
@@ -117,36 +128,32 @@ def differentiable_solve(solve: AbstractDifferentiableSolve, *leaves: Float[Arra
             value = primal(*leaves)
             return value, jax.tree.map(jnp.zeros_like, value)
         active_tangents = [tangents[i] for i in active]
+        # Derivatives are `None` where the primal has an array that is not differentiated.
         if solve.prefers_adjoint(active, leaves):
             value = primal(*leaves)
-            linear_solve = Tangents(active, solve, flat(value)[1], _value_and_tangents)
-            change = push_forward(linear_solve, leaves, active_tangents, value)
-            return value, jax.tree.map(functools.partial(_where_present, solve), value, change)
+            change = _pushed_forward(LinearSolve(solve, active, flat(value)[1]), leaves, active_tangents, value)
+            return value, jax.tree.map(lambda part, change: _change(solve, part, [change], None), value, change)
         value, slopes = _value_and_tangents(solve, active)(*leaves)
-        # Derivatives are `None` where the primal has an array that is not differentiated.
         return value, jax.tree.map(lambda part, *rates: _change(solve, part, rates, active_tangents), value, *slopes)
 
-    return primal(*_canonical(leaves))
+    # JAX rejects the NumPy arrays that `vmap` passes on to a function with its own rule inside `jit`.
+    return primal(*[jnp.array(leaf) if is_traced(leaf) else leaf for leaf in leaves])
 
 
-def _canonical(leaves: tuple[Any, ...]) -> list[Any]:
-    """Convert the leaves for a function with its own rule inside `jit`: JAX rejects the NumPy arrays that `vmap` passes
-    on.
+def _change(
+    solve: AbstractDifferentiableSolve, value: Array, slopes: Sequence[Array | None], tangents: list[Array] | None
+) -> Array:
+    """The tangent of an output, 0 where it is absent; a symbolic zero if the output is not differentiable.
+
+    **Arguments:** `slopes`: the derivatives with respect to the active leaves, and their `tangents`; or the tangent of the
+    output alone.
     """
-    return [jnp.array(leaf) if is_traced(leaf) else leaf for leaf in leaves]
-
-
-def _where_present(solve: AbstractDifferentiableSolve, value: Array, change: Array | None) -> Any:
-    """The tangent of an output, 0 where it is absent; a symbolic zero if the output is not differentiable."""
-    if change is None:
-        return jax.custom_derivatives.zero_from_primal(value, symbolic_zeros=True)
-    return jnp.where(solve.absent(value), 0.0, change)
-
-
-def _change(solve: AbstractDifferentiableSolve, value: Array, slopes: tuple[Any, ...], tangents: list[Array]) -> Any:
-    if slopes[0] is None:
+    present = [slope for slope in slopes if slope is not None]
+    if not present:
         return jax.custom_derivatives.zero_from_primal(value, symbolic_zeros=True)
     is_absent = solve.absent(value)
+    if tangents is None:
+        return jnp.where(is_absent, 0.0, present[0])
 
     def share(slope: Array, tangent: Array) -> Array:
         # Selected before and after, so that an infinite tangent or cotangent of an absent output is dropped, not
@@ -154,7 +161,20 @@ def _change(solve: AbstractDifferentiableSolve, value: Array, slopes: tuple[Any,
         factor = jnp.where(jnp.all(is_absent), 0.0, tangent)
         return jnp.where(is_absent, 0.0, product(slope, factor))
 
-    return sum(share(slope, tangent) for slope, tangent in zip(slopes, tangents, strict=True))
+    return sum(map(share, present, tangents), jnp.zeros(()))
+
+
+class ValueAndTangents(AbstractSolve):
+    """The primal of a solve, with its derivatives with respect to the `active` leaves."""
+
+    of: AbstractDifferentiableSolve
+    active: tuple[int, ...] = eqx.field(static=True)
+
+    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> tuple[Primal, list[Primal]]:
+        return self.of.value_and_tangents(self.active, False, cells, *leaves)
+
+    def for_parts(self, wanted: tuple[int, ...]) -> Self:
+        return dataclasses.replace(self, of=self.of.for_parts(wanted))
 
 
 def _value_and_tangents(
@@ -164,7 +184,7 @@ def _value_and_tangents(
 
     @jax.custom_jvp
     def primal(*leaves):
-        return _of_one(Request(solve, active), *leaves)
+        return _of_one(ValueAndTangents(solve, active), solve.in_blocks, leaves)
 
     @primal.defjvp
     def second_variation(leaves, tangents):
@@ -176,179 +196,268 @@ def _value_and_tangents(
 
 # Compiled as a whole even outside of `jit`.
 @eqx.filter_jit
-def _nested(solve: AbstractDifferentiableSolve, active: tuple[int, ...], *leaves: Float[Array, "..."]) -> Any:
+def _nested(solve: AbstractDifferentiableSolve, active: tuple[int, ...], *leaves: Float[Array, "..."]) -> PyTree:
     """Primal and derivatives of one run as differentiable operations."""
     return _only(solve.value_and_tangents(active, True, 1, *leaves))
 
 
-def _of_one(request: Request, *leaves: Float[Array, "..."]) -> Any:
-    """The outputs for one run."""
-    return solve_one(request, *leaves) if request.solve.in_blocks else _only(request.tree(1, *leaves))
-
-
-def _only(results: Any) -> Any:
+def _only(results: PyTree) -> PyTree:
     return jax.tree.map(lambda result: result[0], results)
 
 
-def tangents_by(
-    build: Callable[[tuple[Array, ...], int | None], Any],
-    active: tuple[int, ...],
-    leaves: tuple[Array, ...],
-    cells: int | None,
-) -> tuple[Any, tuple[Any, ...], Callable[[list[Primal]], list[Primal]]]:
-    """Build a problem and its tangents along leaves, each scaled by the leaf's own size.
+# The primitive: parts of the outputs of a solve for a number of cells.
 
-    **Arguments:**
 
-    - `build`: (leaves, cells) -> problem.
-    - `active`, `leaves`: the leaves to move, and all leaves, of any shape. With `cells`, a leaf is a scalar or has the
-      cells in its last axis. Each entry of a leaf has its own tangent.
+# Compared by identity: JAX hashes the request, and its fields may not be hashable.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Request:
+    """Which outputs of a solve to compute for a number of cells.
 
-    **Returns:** the problem; its tangents; and a function that turns derivatives along the tangents (trees of arrays,
-    with `cells` in the first axis) into derivatives with respect to each leaf, the leaf's own axes last.
-
-    **Example:** the tangent of a problem moves its rate by its own size.
-
-    >>> problem, tangents, gather = tangents_by(build, (0,), (jnp.array([1.0, 2.0]),), 2)
-    >>> print(tangents[0].rate)
-    [1. 2.]
+    - `selection`: indices of the parts of the outputs; parts that are `None` count.
+    - `batch_flags`: whether each leaf has a value per cell.
+    - `kinds`: the shapes and dtypes of the selected parts of one cell.
     """
 
-    rebuilt, point = by_active(build, active, leaves, cells)
-    sizes = [tangent_scale(leaf) for leaf in point]
-    zeros = tuple(jnp.zeros_like(size) for size in sizes)
-    own_shapes = [size.shape if cells is None else size.shape[:-1] for size in sizes]
-    entries = [(k, index) for k, shape in enumerate(own_shapes) for index in np.ndindex(shape)]
+    solve: AbstractSolve
+    selection: tuple[int, ...]
+    cells: int
+    batch_flags: tuple[bool, ...]
+    kinds: tuple[ShapedArray, ...]
 
-    def along(k: int, index: tuple[int, ...]) -> tuple[Array, ...]:
-        return (*zeros[:k], zeros[k].at[index].set(sizes[k][index]), *zeros[k + 1 :])
-
-    def gather(slopes: list[Primal]) -> list[Primal]:
-        by_entry = [
-            jax.tree.map(functools.partial(_by_size, sizes[k][index]), slope)
-            for (k, index), slope in zip(entries, slopes, strict=True)
-        ]
-
-        def of_leaf(k: int, shape: tuple[int, ...]) -> Primal:
-            parts = [slope for (leaf, _), slope in zip(entries, by_entry, strict=True) if leaf == k]
-            return jax.tree.map(lambda *parts: jnp.stack(parts, axis=-1).reshape(*parts[0].shape, *shape), *parts)
-
-        return [of_leaf(k, shape) for k, shape in enumerate(own_shapes)]
-
-    return rebuilt(*point), tangents_of(rebuilt, point, [along(*entry) for entry in entries]), gather
+    @classmethod
+    def of_one(
+        cls, solve: AbstractSolve, parts: dict[int, Array | jax.ShapeDtypeStruct], leaves: Sequence[Array]
+    ) -> "Request":
+        """A request for a single cell. **Arguments:** `parts`: the wanted parts, for their shapes and dtypes."""
+        kinds = tuple(ShapedArray(jnp.shape(part), part.dtype) for part in parts.values())
+        return cls(solve, tuple(parts), 1, (False,) * len(leaves), kinds)
 
 
-def _by_size(size: Array, part: Array) -> Array:
-    """Convert a derivative along a number to one with respect to it; the number is a scalar or has one value per cell."""
-    return part / size.reshape((-1,) + (1,) * (part.ndim - 1) if size.ndim else ())
+solve_cells = Primitive("solve_cells")
+solve_cells.multiple_results = True
 
 
-def by_active(
-    build: Callable[[tuple[Array, ...], int | None], Any],
-    active: tuple[int, ...],
-    leaves: tuple[Array, ...],
-    cells: int | None,
-) -> tuple[Callable[..., Any], tuple[Float[Array, "..."], ...]]:
-    """A problem as a function of its active leaves, and these leaves; with `cells`, they have the cells in the last axis.
+def _of_one(solve: AbstractSolve, in_blocks: bool, leaves: Sequence[Float[Array, "..."]]) -> PyTree:
+    """The outputs for a single cell, without the axis of cells; under `vmap` the batch is solved as one ensemble if it is
+    run in blocks."""
+    if not in_blocks:
+        return _only(solve.solve(1, *leaves))
+    # Without the weak type of Python's numbers, with which everything would be traced and compiled once more.
+    leaves = tuple(jnp.asarray(leaf, jnp.result_type(leaf)) for leaf in leaves)
+    typed = (jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
+    shapes, structure = flat(jax.eval_shape(lambda *leaves: _only(_compiled_solve(solve, *leaves)), *typed))
+    present = {k: shape for k, shape in enumerate(shapes) if shape is not None}
+    parts = iter(solve_cells.bind(*leaves, request=Request.of_one(solve, present, leaves)))
+    return jax.tree.unflatten(structure, [None if shape is None else next(parts)[0] for shape in shapes])
 
-    **Arguments:** as for `tangents_by`.
+
+@eqx.filter_jit
+def _compiled_solve(solve: AbstractSolve, *leaves: Float[Array, "..."]) -> PyTree:
+    """The outputs for a single cell, traced once for equal solves: for the shapes, and as a part of a program."""
+    return solve.solve(1, *leaves)
+
+
+def _parts(solve: AbstractSolve, selection: tuple[int, ...], cells: int, leaves: Sequence[Array]) -> list[Array]:
+    """The selected parts, as one program that serves all equal solves, whatever the values of the leaves.
+
+    Otherwise, outside `jit`, each operation would be a separate program, and every call would compile its loops again.
+    """
+    # The trace that gave the shapes of a single cell serves again: of derivatives through flights, it is half of the wait.
+    parts = flat(_compiled_solve(solve, *leaves) if cells == 1 else solve.solve(cells, *leaves))[0]
+    return [parts[k] for k in selection]
+
+
+#: One run is not worth the optimisations (`compiled_for_one`), of which a hybrid scene would also need three times the memory;
+#: 256 runs at once take 2.5 times as long without them.
+_parts_of_one = compiled_for_one(_parts)
+_parts_of_many = compiled_alone(_parts)
+
+
+def flat(tree: PyTree) -> tuple[list[Any], Structure]:
+    """The parts of a tree and its structure, in which `None` counts as a part."""
+    return jax.tree.flatten(tree, is_leaf=lambda part: part is None)
+
+
+@solve_cells.def_impl
+def _run(*leaves: Array, request: Request) -> list[Array]:
+    # Python numbers would become part of the program.
+    arrays = [leaf if isinstance(leaf, jax.Array) else jax.device_put(np.asarray(leaf)) for leaf in leaves]
+    compiled = _parts_of_one if request.cells == 1 else _parts_of_many
+    return compiled(request.solve, request.selection, request.cells, arrays)
+
+
+@solve_cells.def_abstract_eval
+def _shaped(*leaves: ShapedArray, request: Request) -> list[ShapedArray]:
+    return [ShapedArray((request.cells, *kind.shape), kind.dtype) for kind in request.kinds]
+
+
+def _traced(*leaves: Array, request: Request) -> list[Array]:
+    return _parts(request.solve, request.selection, request.cells, leaves)
+
+
+def _batched(
+    leaves: tuple[Array, ...], axes: Sequence[int | None], *, request: Request
+) -> tuple[list[Array], list[int]]:
+    """Merge a batch of ensembles into one ensemble."""
+    solve, cells, flags, kinds = request.solve, request.cells, request.batch_flags, request.kinds
+    size = next(leaf.shape[axis] for leaf, axis in zip(leaves, axes, strict=True) if axis is not None)
+    if size == 0:
+        return [jnp.zeros((0, cells, *kind.shape), kind.dtype) for kind in kinds], [0] * len(kinds)
+    if isinstance(solve, LinearSolve) and all(axis is None for axis in axes[: -solve.linear]):
+        # All members have the same runs, which may cost more than the derivatives with respect to every number.
+        sizes = [leaves[k].size // (cells if flags[k] else 1) for k in solve.active]
+        if sum(sizes) <= size * (TANGENT_COST if solve.parts is None else COTANGENT_COST):
+            return jax.vmap(functools.partial(solve.over_cells, request), axes)(*leaves), [0] * len(kinds)
+
+    def joined(leaf: Array, has_batch: bool, axis: int | None) -> Array:
+        if axis is None:
+            return jnp.tile(leaf, (size,) + (1,) * (leaf.ndim - 1)) if has_batch else leaf
+        leaf = jnp.moveaxis(leaf, axis, 0)
+        return leaf.reshape(size * cells, *leaf.shape[2:]) if has_batch else jnp.repeat(leaf, cells, axis=0)
+
+    merged_flags = tuple(flag or axis is not None for flag, axis in zip(flags, axes, strict=True))
+    merged = dataclasses.replace(request, cells=size * cells, batch_flags=merged_flags)
+    outputs = solve_cells.bind(*map(joined, leaves, flags, axes), request=merged)
+    return [part.reshape(size, cells, *part.shape[1:]) for part in outputs], [0] * len(outputs)
+
+
+def _only_read(use: list[bool], *arguments: Any) -> tuple[list[bool], Any]:
+    """The operation restricted to the parts that are used."""
+    # Since JAX 0.12, a list of inputs comes before the equation.
+    equation = arguments[-1]
+    if not any(use):
+        return [False] * len(equation.invars), None
+    request, used = equation.params["request"], [k for k, is_used in enumerate(use) if is_used]
+    selection, kinds = (tuple(items[k] for k in used) for items in (request.selection, request.kinds))
+    solve = request.solve.for_parts(selection)
+    new_request = dataclasses.replace(request, solve=solve, selection=selection, kinds=kinds)
+    outputs = [equation.outvars[k] for k in used]
+    return [True] * len(equation.invars), equation.replace(outvars=outputs, params={"request": new_request})
+
+
+# The derivatives of a solve in one direction, and with respect to one combination of its outputs, as a solve.
+#
+# Neither needs the derivatives with respect to every number: one solve maps tangents of the leaves to those of the outputs,
+# or cotangents of the outputs to those of the leaves, whatever the number of leaves. JAX's reverse mode turns the first
+# into the second.
+
+#: The costs of a tangent and of a cotangent, in units of the cost of the derivatives with respect to a number.
+TANGENT_COST, COTANGENT_COST = 2, 4
+
+
+class LinearSolve(AbstractSolve):
+    """The tangents of a solve's outputs, as a solve whose last arguments are the tangents of the active leaves; or the
+    cotangents of the active leaves, as a solve whose last arguments are cotangents of the outputs.
+
+    - `active`: the leaves that are differentiated; `structure`: the structure of the primal.
+    - `parts`: the indices of the outputs that have a cotangent; `None` for tangents.
     """
 
-    def rebuilt(*moving: Array) -> Any:
-        arguments = list(leaves)
-        for i, leaf in zip(active, moving, strict=True):
-            arguments[i] = leaf
-        return build(tuple(arguments), cells)
+    of: AbstractDifferentiableSolve
+    active: tuple[int, ...] = eqx.field(static=True)
+    structure: Structure = eqx.field(static=True)
+    parts: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
-    return rebuilt, tuple(leaves[i] if cells is None else over_cells(leaves[i], cells) for i in active)
+    @property
+    def linear(self) -> int:
+        """The number of the last arguments, of which the outputs are linear functions."""
+        return len(self.active if self.parts is None else self.parts)
 
+    def solve(self, cells: int, *arguments: Float[Array, "..."]) -> Primal:
+        leaves, last = arguments[: -self.linear], arguments[-self.linear :]
+        if self.parts is None:
+            return self.of.push_forward(self.active, cells, leaves, last)
+        cotangents = dict(zip(self.parts, last, strict=True))
+        by_part = jax.tree.unflatten(self.structure, [cotangents.get(k) for k in range(self.structure.num_leaves)])
+        return self.of.pull_back(self.active, cells, leaves, by_part)
 
-def over_cells(leaf: Float[Array, "..."], cells: int) -> Float[Array, "... cells"]:
-    """A leaf with the cells in its last axis, from such a leaf or a scalar."""
-    return jnp.broadcast_to(leaf, (*jnp.shape(leaf)[:-1], cells))
+    def for_parts(self, wanted: tuple[int, ...]) -> Self:
+        return dataclasses.replace(self, of=self.of.for_parts(wanted)) if self.parts is None else self
 
+    def from_slopes(self, selection: tuple[int, ...], *arguments: Float[Array, "..."]) -> list[Array]:
+        """The selected outputs for a single cell, from the derivatives with respect to every number."""
+        leaves, last = arguments[: -self.linear], arguments[-self.linear :]
+        slopes = [flat(slope)[0] for slope in _value_and_tangents(self.of, self.active)(*leaves)[1]]
 
-def tangent_along(
-    build: Callable[[tuple[Array, ...], int | None], Any],
-    active: tuple[int, ...],
-    leaves: tuple[Array, ...],
-    tangents: tuple[Array, ...],
-    cells: int,
-) -> tuple[Any, Any, Float[Array, " cells"]]:
-    """Build a problem and its tangent in one direction of its leaves, which is scaled by the size of the leaves.
+        def output(k: int) -> Array:
+            if self.parts is None:
+                pairs = [(slope[k], tangent) for slope, tangent in zip(slopes, last, strict=True)]
+            else:
+                pairs = [
+                    (jnp.moveaxis(slopes[k][part], range(cotangent.ndim), range(-cotangent.ndim, 0)), cotangent)
+                    for part, cotangent in zip(self.parts, last, strict=True)
+                ]
+            return sum((product(*pair) for pair in pairs), jnp.zeros(()))
 
-    **Arguments:** as for `tangents_by`; `tangents`: those of the active leaves.
+        return [output(k) for k in selection]
 
-    **Returns:** the problem, the tangent, and the size of the direction in every cell.
-    """
-    rebuilt, point = by_active(build, active, leaves, cells)
-    directions = [over_cells(tangent, cells) for tangent in tangents]
-    ratios = [jnp.abs(tangent) / tangent_scale(leaf) for tangent, leaf in zip(directions, point, strict=True)]
-    size = functools.reduce(jnp.maximum, [jnp.max(ratio.reshape(-1, cells), axis=0) for ratio in ratios])
-    scaled = tuple(jnp.where(size > 0.0, tangent / jnp.where(size > 0.0, size, 1.0), 0.0) for tangent in directions)
-    return rebuilt(*point), tangents_of(rebuilt, point, [scaled])[0], size
-
-
-# Samples of a run as a differentiable solve: its leaves, and how they are assembled into a problem.
-
-
-class ProblemSpec(eqx.Module):
-    """How to build a problem from numbers and how to integrate it, except for the tolerance."""
-
-    build: Callable[..., Any] = eqx.field(static=True)
-    # JAX's PyTreeDef, which type checkers take for a variable.
-    structure: Any = eqx.field(static=True)
-    rest: Any
-    settings: Settings
-    grid: Float[Array, " steps"] | None
-    # The numbers of axes of the modules' numbers, without an axis of cells.
-    axes: tuple[int, ...] = eqx.field(static=True)
-
-    def built(self, numbers: tuple[Array, ...], *extra: Any) -> Any:
-        """Build the problem from the modules, with their numbers replaced, and from the extra arguments of `build`."""
-        return self.build(eqx.combine(jax.tree.unflatten(self.structure, numbers), self.rest), *extra)
+    def over_cells(self, request: Request, *arguments: Float[Array, "..."]) -> list[Array]:
+        """`from_slopes` for the cells of a request."""
+        if not any(request.batch_flags):
+            return [part[None] for part in self.from_slopes(request.selection, *arguments)]
+        axes = tuple(0 if flag else None for flag in request.batch_flags)
+        return jax.vmap(functools.partial(self.from_slopes, request.selection), axes)(*arguments)
 
 
-class AbstractSampling(AbstractDifferentiableSolve):
-    """Samples of a run. The leaves are the modules' numbers, the times, the horizon, the tolerance and the arrays of
-    the spec. `spec` is the rest of the spec, and `places` the positions of the arrays in it.
-    """
-
-    spec: eqx.AbstractVar[ProblemSpec]
-    places: eqx.AbstractVar[Any]
-
-    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
-        return jnp.isnan(value)
-
-    def _sorted(self, leaves: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, Array, Array], ProblemSpec]:
-        """Split the leaves into the modules' numbers; times, horizon and tolerance; and the whole spec."""
-        numbers, (times, t1, tolerance, *arrays_of_spec) = leaves[: self.movable], leaves[self.movable :]
-        return numbers, (times, t1, tolerance), eqx.combine(self.spec, jax.tree.unflatten(self.places, arrays_of_spec))
+def product(slope: Float[Array, "..."], tangent: Float[Array, "..."]) -> Float[Array, "..."]:
+    """A derivative, the axes of the leaf last, times a tangent of the leaf. Where the derivative is zero, a tangent that
+    is not finite, such as that of an angle at a pole, has no effect."""
+    terms = jnp.where(slope == 0.0, 0.0, slope * tangent)
+    return terms.sum(axis=tuple(range(slope.ndim - jnp.ndim(tangent), slope.ndim)))
 
 
-def solve_for_samples(
-    sampling: Callable[[int, ProblemSpec, Any], AbstractSampling],
-    build: Callable[..., Any],
-    modules: Any,
-    times: Float[Array, " times"],
-    t1: Float[Array, ""],
-    settings: Settings,
-    grid: Float[Array, " steps"] | None = None,
-) -> Any:
-    """Solve for the samples of a run.
+def _pushed_forward(
+    tangents: LinearSolve, leaves: Sequence[Array], directions: Sequence[Array], primal: Primal
+) -> Primal:
+    """The tangents of a single cell's outputs: a tree like the primal, with `None` for outputs that have no derivative."""
+    parts = flat(tangents.of.differentiable(primal))[0]
+    present = {k: part for k, part in enumerate(parts) if part is not None}
+    arguments = (*leaves, *directions)
+    outputs = solve_cells.bind(*arguments, request=Request.of_one(tangents, present, arguments))
+    changes = dict(zip(present, (output[0] for output in outputs), strict=True))
+    return jax.tree.unflatten(tangents.structure, [changes.get(k) for k in range(len(parts))])
 
-    **Arguments:** `sampling`: a function that returns the solve, given its first three fields; `build`: a function that
-    returns the problem, given the modules and extra arguments of the solve (the function is compared by identity);
-    other arguments as for `sampled_run`.
-    """
-    numbers, static = eqx.partition(modules, eqx.is_inexact_array)
-    leaves, structure = jax.tree.flatten(numbers)
-    # Arrays, such as those of the solver, may be traced, so they belong to the leaves.
-    arrays, spec = eqx.partition(
-        ProblemSpec(build, structure, static, settings.with_tolerance(None), grid, tuple(map(jnp.ndim, leaves))),
-        eqx.is_array,
+
+def _jvp(
+    primals: tuple[Array, ...], tangents: tuple[Array | ad.Zero, ...], *, request: Request
+) -> tuple[list[Array], list[Array]]:
+    """The outputs of a linear solve and their tangents. Those along the leaves are second derivatives, which are taken
+    operation by operation."""
+    solve, changes = request.solve, tuple(ad.instantiate_zeros(tangent) for tangent in tangents)
+    assert isinstance(solve, LinearSolve)
+    outputs = solve_cells.bind(*primals, request=request)
+    if all(type(tangent) is ad.Zero for tangent in tangents[: -solve.linear]):
+        return outputs, solve_cells.bind(*primals[: -solve.linear], *changes[-solve.linear :], request=request)
+    return outputs, jax.jvp(functools.partial(solve.over_cells, request), primals, changes)[1]
+
+
+def _transposed(
+    cotangents: Sequence[Array | ad.Zero], *arguments: Array | ad.UndefinedPrimal, request: Request
+) -> Sequence[Array | ad.Zero | None]:
+    """The cotangents of the leaves' tangents, from those of the outputs."""
+    tangents = request.solve
+    assert isinstance(tangents, LinearSolve)
+    leaves, directions = arguments[: -tangents.linear], arguments[-tangents.linear :]
+    avals = [part.aval if ad.is_undefined_primal(part) else jax.typeof(part) for part in directions]
+    flags = request.batch_flags[len(leaves) :]
+    present = {k: part for k, part in zip(request.selection, cotangents, strict=True) if type(part) is not ad.Zero}
+    if not present:
+        return [None] * len(leaves) + [ad.Zero(aval) for aval in avals]
+    pulled_back = Request(
+        dataclasses.replace(tangents, parts=tuple(present)),
+        tuple(range(tangents.linear)),
+        request.cells,
+        (*request.batch_flags[: len(leaves)], *(True for _ in present)),
+        tuple(ShapedArray(aval.shape[flag:], aval.dtype) for aval, flag in zip(avals, flags, strict=True)),
     )
-    arrays_of_spec, places = jax.tree.flatten(arrays)
-    return differentiable_solve(
-        sampling(len(leaves), spec, places), *leaves, times, as_number(t1), settings.tolerance, *arrays_of_spec
-    )
+    outputs = solve_cells.bind(*leaves, *present.values(), request=pulled_back)
+    # A tangent that all cells share has the sum of their cotangents.
+    shares = [output if flag else output.sum(axis=0) for output, flag in zip(outputs, flags, strict=True)]
+    return [None] * len(leaves) + shares
+
+
+mlir.register_lowering(solve_cells, mlir.lower_fun(_traced, multiple_results=True))
+batching.primitive_batchers[solve_cells] = _batched
+partial_eval.dce_rules[solve_cells] = _only_read
+ad.primitive_jvps[solve_cells] = _jvp
+ad.primitive_transposes[solve_cells] = _transposed

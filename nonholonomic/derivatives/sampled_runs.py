@@ -3,14 +3,14 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, TypeAlias
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.xla_cpu import written_in_place
 from ..integration import AbstractProblem, CoreProblem, Lanes, LaneState, Settings, States, sample, solve_with_samples
@@ -18,18 +18,21 @@ from ..integration.dense import SampledSolution
 from ..integration.problem import FAILED, LEFT_DOMAIN, REACHED_END, event_time
 from ..integration.samples import SampleTimes, components, step_towards_sample
 from ..integration.scheduler import NO_EXTREMES, InLanes
-from .adjoint import (
-    StepRecord,
-    StepRecorder,
+from ..validation import as_number
+from .adjoint import StepRecord, StepRecorder, shares_of, solve_with_adjoint, time_of_zero, without_probe
+from .differentiable import AbstractDifferentiableSolve, Structure, differentiable_solve
+from .variation import (
+    Tangent,
+    VariationalProblem,
+    by_active,
+    in_groups,
     moving_leaves,
-    shares_of,
-    solve_with_adjoint,
+    probed,
+    tangent_along,
+    tangent_scale,
+    tangents_by,
     tangents_of,
-    time_of_zero,
-    without_probe,
 )
-from .differentiable import AbstractSampling, ProblemSpec, by_active, solve_for_samples, tangent_along, tangents_by
-from .variation import VariationalProblem, in_groups, probed, tangent_scale
 
 # The derivatives of a sum over the samples of a run with respect to any number of parameters, by one backward pass.
 #
@@ -115,6 +118,13 @@ class SampledStepRecorder(StepRecorder):
         at_end = jnp.where(lane_state.status == REACHED_END, self.cotangents.end_state[:, cell], 0.0)
         return jnp.where(has_left, self.cotangents.end_time[cell], 0.0), at_end
 
+    def measured(self, problem: AbstractProblem, lane_state: LaneState) -> tuple[Lanes, States]:
+        """The time at which a run leaves the domain, and the state at the end."""
+        time, state = lane_state.time, lane_state.state
+        if problem.domain_margin(time, state) is None:
+            return jnp.zeros_like(time), state
+        return time_of_zero(problem, lambda state: problem.domain_margin(time, state), time, state), state
+
     def _cell(self, lane_state: LaneState) -> Int[Array, "*lanes"]:
         return jnp.minimum(lane_state.cell, len(self.cotangents.end_time) - 1)
 
@@ -141,17 +151,15 @@ def samples_pulled_back(
     """
     problem, cells = build(*point), point[0].shape[-1]
     probe = tangents_of(build, point, [tuple(mixture(point) if rates is None else rates)])[0]
-    moving = moving_leaves(problem, probe, _field_and_margin)
-    outcome, by_start, by_number = solve_with_adjoint(
-        VariationalProblem(problem, (), False),
-        VariationalProblem(moving, (), False),
-        probe,
-        t1,
-        jnp.asarray(cells),
-        settings,
-        measured=_end,
-        recorder=SampledStepRecorder(SampleTimes.of(times, cells, components), cotangents),
-        one_kernel=True,
+
+    def field_and_margin(problem: AbstractProblem, states: States) -> PyTree:
+        time = jnp.zeros_like(states[0])
+        return problem.field(time, states), problem.domain_margin(time, states), problem.jumps(time, states)
+
+    moving = moving_leaves(problem, probe, field_and_margin)
+    recorder = SampledStepRecorder(SampleTimes.of(times, cells, components), cotangents)
+    outcome, (by_start, by_number) = solve_with_adjoint(
+        problem, moving, probe, False, t1, jnp.asarray(cells), settings, recorder
     )
     sample_times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), cells)).T
     is_moved = VariationalProblem(problem, (probe,), False).start()[0][len(by_start) :] != 0.0
@@ -160,11 +168,11 @@ def samples_pulled_back(
     is_lost |= jnp.any(cotangents.end_state != 0.0, axis=0)
     by_start = by_start + jnp.sum(initial, axis=1).T
 
-    def numbers_and_start(*point: Float[Array, "... cells"]) -> Any:
+    def numbers_and_start(*point: Float[Array, "... cells"]) -> PyTree:
         problem = build(*point)
         return eqx.filter(problem, moving), problem.start()[0]
 
-    by_point = jax.vjp(numbers_and_start, *point)[1]((by_number.problem, by_start))
+    by_point = jax.vjp(numbers_and_start, *point)[1]((by_number, by_start))
     return [jnp.where(is_lost & (outcome.status == FAILED), jnp.nan, part) for part in by_point]
 
 
@@ -178,40 +186,86 @@ def mixture(point: tuple[Float[Array, "... cells"], ...]) -> list[Float[Array, "
     ]
 
 
-def _field_and_margin(problem: AbstractProblem, states: States) -> Any:
-    time = jnp.zeros_like(states[0])
-    return problem.field(time, states), problem.domain_margin(time, states), problem.jumps(time, states)
-
-
-def _end(variational: VariationalProblem, lane_state: LaneState) -> tuple[Lanes, States]:
-    """The time at which a run leaves the domain, and the state at the end."""
-    problem, time = variational.problem, lane_state.time
-    if problem.domain_margin(time, lane_state.state) is None:
-        return jnp.zeros_like(time), lane_state.state
-    end_time = time_of_zero(problem, lambda state: problem.domain_margin(time, state), time, lane_state.state)
-    return end_time, lane_state.state
-
-
 def is_reversible(problem: AbstractProblem) -> bool:
     """Whether the field of a single run has a backward pass; a loop without a fixed number of iterations has none."""
     arrays, static = eqx.partition(problem, eqx.is_inexact_array)
 
-    def pulled_back(arrays: Any, state: States) -> Any:
-        def field(arrays: Any, state: States) -> States:
-            return eqx.combine(arrays, static).field(jnp.zeros_like(state[0]), state)
-
-        rates, pull = jax.vjp(field, arrays, state)
-        return pull(jnp.ones_like(rates))
+    def summed(arrays: PyTree, state: States) -> Float[Array, ""]:
+        return jnp.sum(eqx.combine(arrays, static).field(jnp.zeros_like(state[0]), state))
 
     try:
-        jax.eval_shape(pulled_back, arrays, problem.start()[0])
+        jax.eval_shape(jax.grad(summed, (0, 1)), arrays, problem.start()[0])
     except ValueError:
         return False
     return True
 
 
+# Samples of a run as a differentiable solve: its leaves, and how they are assembled into a problem.
+
+
+class ProblemSpec(eqx.Module):
+    """How to build a problem from numbers and how to integrate it, except for the tolerance."""
+
+    build: Callable[..., PyTree] = eqx.field(static=True)
+    structure: Structure = eqx.field(static=True)
+    rest: PyTree
+    settings: Settings
+    grid: Float[Array, " steps"] | None
+    # The numbers of axes of the modules' numbers, without an axis of cells.
+    axes: tuple[int, ...] = eqx.field(static=True)
+
+    def built(self, numbers: tuple[Array, ...], *extra: object) -> PyTree:
+        """Build the problem from the modules, with their numbers replaced, and from the extra arguments of `build`."""
+        return self.build(eqx.combine(jax.tree.unflatten(self.structure, numbers), self.rest), *extra)
+
+
+class AbstractSampling(AbstractDifferentiableSolve):
+    """Samples of a run. The leaves are the modules' numbers, the times, the horizon, the tolerance and the arrays of
+    the spec. `spec` is the rest of the spec, and `places` the positions of the arrays in it.
+    """
+
+    spec: eqx.AbstractVar[ProblemSpec]
+    places: eqx.AbstractVar[Structure]
+
+    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
+        return jnp.isnan(value)
+
+    def _sorted(self, leaves: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, Array, Array], ProblemSpec]:
+        """Split the leaves into the modules' numbers; times, horizon and tolerance; and the whole spec."""
+        numbers, (times, t1, tolerance, *arrays_of_spec) = leaves[: self.movable], leaves[self.movable :]
+        return numbers, (times, t1, tolerance), eqx.combine(self.spec, jax.tree.unflatten(self.places, arrays_of_spec))
+
+
+def solve_for_samples(
+    sampling: Callable[[int, ProblemSpec, Structure], AbstractSampling],
+    build: Callable[..., PyTree],
+    modules: PyTree,
+    times: Float[Array, " times"],
+    t1: Float[Array, ""],
+    settings: Settings,
+    grid: Float[Array, " steps"] | None = None,
+) -> Any:
+    """Solve for the samples of a run.
+
+    **Arguments:** `sampling`: a function that returns the solve, given its first three fields; `build`: a function that
+    returns the problem, given the modules and extra arguments of the solve (the function is compared by identity);
+    other arguments as for `sampled_run`.
+    """
+    numbers, static = eqx.partition(modules, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(numbers)
+    # Arrays, such as those of the solver, may be traced, so they belong to the leaves.
+    arrays, spec = eqx.partition(
+        ProblemSpec(build, structure, static, settings.with_tolerance(None), grid, tuple(map(jnp.ndim, leaves))),
+        eqx.is_array,
+    )
+    arrays_of_spec, places = jax.tree.flatten(arrays)
+    return differentiable_solve(
+        sampling(len(leaves), spec, places), *leaves, times, as_number(t1), settings.tolerance, *arrays_of_spec
+    )
+
+
 #: Build a problem from some modules (scene, launch, ...) and a number of cells, `None` for a single run.
-Build = Callable[[Any, int | None], AbstractProblem]
+Build: TypeAlias = Callable[[PyTree, int | None], AbstractProblem]
 
 
 #: Up to this many numbers, the derivatives with respect to all of them are integrated forward, beside the run; with more,
@@ -250,7 +304,7 @@ class SampledRun(NamedTuple):
 
 def sampled_run(
     build: Build,
-    modules: Any,
+    modules: PyTree,
     times: Float[Array, " times"],
     t1: Float[Array, ""],
     settings: Settings,
@@ -302,7 +356,7 @@ def _at_times(
     samples: Float[Array, "times rows"],
     leading: Float[Array, "times components"] | None,
     times: Float[Array, " times"],
-    modules: Any,
+    modules: PyTree,
     build: Build,
 ) -> Float[Array, "times rows"]:
     """The samples themselves, with derivatives with respect to their times from the field. The samples are the core
@@ -312,7 +366,7 @@ def _at_times(
 
 
 @_at_times.def_jvp
-def _later(primals: Any, tangents: Any) -> Any:
+def _later(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
     (samples, leading, times, modules, build), (sample_rates, _, time_rates, *_) = primals, tangents
     sample_rates = jnp.zeros_like(samples) if sample_rates is None else sample_rates
     if time_rates is None:
@@ -385,7 +439,7 @@ class BlockSampling(AbstractSampling):
 
     movable: int
     spec: ProblemSpec
-    places: Any = eqx.field(static=True)
+    places: Structure = eqx.field(static=True)
     core_only: bool = eqx.field(static=True, default=False)
 
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
@@ -398,7 +452,7 @@ class BlockSampling(AbstractSampling):
         build, numbers, arguments, settings = self._builder(leaves, cells)
         problem, tangents, gather = tangents_by(build, active, numbers, cells)
 
-        def run(group: tuple[Any, ...]) -> tuple[SampledRun, list[SampledRun]]:
+        def run(group: tuple[Tangent, ...]) -> tuple[SampledRun, list[SampledRun]]:
             return _samples_and_slopes(VariationalProblem(problem, group, False), arguments, settings, not nested)
 
         samples, slopes = in_groups(run, tangents)
@@ -447,7 +501,7 @@ class BlockSampling(AbstractSampling):
 
     def _builder(
         self, leaves: tuple[Array, ...], cells: int
-    ) -> tuple[Callable[..., AbstractProblem], Any, Any, Settings]:
+    ) -> tuple[Callable[..., AbstractProblem], tuple[Array, ...], tuple[Array, Array, Array], Settings]:
         """A function (the modules' numbers, cells) -> problem; the modules' numbers, scalars or with the cells last;
         times, horizon and tolerance; the settings."""
         numbers, arguments, spec = self._sorted(leaves)
@@ -505,7 +559,7 @@ def _found(
     def end_time(problem: AbstractProblem, state: Float[Array, "components *cells"]) -> Float[Array, "*cells"]:
         return event_time(problem, lambda point: problem.domain_margin(time, point), time, state)
 
-    def slope(direction: Any, variation: Array, at_end: Array) -> SampledRun:
+    def slope(direction: Tangent, variation: Array, at_end: Array) -> SampledRun:
         if variational.problem.domain_margin(time, end) is None:
             end_delay = jnp.zeros_like(time)
         else:
@@ -527,7 +581,7 @@ class SingleSampling(AbstractSampling):
 
     movable: int
     spec: ProblemSpec
-    places: Any = eqx.field(static=True)
+    places: Structure = eqx.field(static=True)
 
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
         numbers, arguments, spec = self._sorted(leaves)
@@ -540,7 +594,7 @@ class SingleSampling(AbstractSampling):
         numbers, arguments, spec = self._sorted(leaves)
         problem, tangents, gather = tangents_by(spec.built, active, numbers, None)
 
-        def run(group: tuple[Any, ...]) -> tuple[SampledRun, list[SampledRun]]:
+        def run(group: tuple[Tangent, ...]) -> tuple[SampledRun, list[SampledRun]]:
             return _follow(VariationalProblem(problem, group, False), arguments, spec)
 
         samples, slopes = in_groups(run, tangents)

@@ -1,28 +1,35 @@
-"""Variations of the state along a run: first derivatives of event times, and the rate at which runs diverge.
+"""Tangents of problems, variations of the state along a run, and the rate at which runs diverge.
 
 A problem and its variations are one problem with a longer state, and run through the same loop as the problem alone;
 differentiating the loop as a whole costs several times as much. For many tangents see `adjoint.py`.
 """
 
+import functools
 import math
 import operator
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jax.interpreters import partial_eval
+from jaxtyping import Array, Float, Int, PyTree
 
-from ..integration import AbstractProblem, Jumps, Outcome, Settings, crossing_time, solve_ensemble
-from ..integration.problem import REACHED_END, RUNNING
+from ..compilation.tracing import dependent_outputs
+from ..integration import AbstractProblem, Jumps, Lanes, Outcome, Settings, States, crossing_time, solve_ensemble
+from ..integration.problem import REACHED_END, RUNNING, AbstractDerivedProblem
 from ..integration.scheduler import LaneScheduler
 from ..terminal import Progress
 
-#: Number of tangents that are integrated together. Two together take 0.6 to 1.0 times as long as two in turn, and an
-#: eighth longer to compile; four together take 1.1 times as long as two pairs.
-GROUP = 2
+# Tangents of problems.
+
+#: A tree like the problem, with the rate at which each number moves in its place; `None` for numbers that do not move.
+Tangent: TypeAlias = PyTree
+
+#: From leaves and a number of cells, `None` for a single run, to a problem.
+Build: TypeAlias = Callable[[tuple[Array, ...], int | None], PyTree]
 
 
 def tangent_scale(number: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -37,7 +44,163 @@ def tangent_scale(number: Float[Array, "..."]) -> Float[Array, "..."]:
     return jax.lax.stop_gradient(jnp.where(number == 0.0, 1.0, jnp.abs(number)))
 
 
-class VariationalProblem(AbstractProblem):
+def tangents_of(
+    build: Callable[..., PyTree], numbers: tuple[Array, ...], tangents: list[tuple[Array, ...]]
+) -> tuple[Tangent, ...]:
+    """The tangents of a problem that is built from numbers.
+
+    **Arguments:**
+
+    - `build`: numbers -> problem.
+    - `numbers`: the arguments of `build`, arrays.
+    - `tangents`: each with the rates at which the numbers move.
+
+    **Returns:** for each tangent the tangent of the problem, `None` for leaves that depend on no number.
+
+    **Example:**
+
+    >>> from nonholonomic.derivatives import tangents_of
+    >>> tangents = tangents_of(Decays, (jnp.ones(2),), [(jnp.array([1.0, 0.0]),)])
+    >>> print(tangents[0].rate)
+    [1. 0.]
+    """
+
+    def built(*numbers: Array) -> PyTree:
+        # A problem may also hold functions.
+        return eqx.filter(build(*numbers), eqx.is_inexact_array)
+
+    structure = jax.tree.structure(jax.eval_shape(built, *numbers))
+    moving = jax.tree.unflatten(structure, dependent_outputs(built, *numbers))
+    changes = [jax.jvp(built, numbers, tangent)[1] for tangent in tangents]
+    return tuple(eqx.filter(change, moving) for change in changes)
+
+
+def where_active(problem: PyTree, direction: Tangent) -> PyTree:
+    """The numbers of a problem that a tangent moves, `None` for the others."""
+    return jax.tree.map(
+        lambda rate, number: None if rate is None else number, direction, problem, is_leaf=lambda rate: rate is None
+    )
+
+
+def moving_leaves(
+    problem: AbstractProblem, direction: Tangent, functions: Callable[[AbstractProblem, States], PyTree]
+) -> PyTree:
+    """The leaves that a tangent moves, as far as some functions of problem and states depend on them, as a tree of
+    booleans."""
+    arrays, static = eqx.partition(problem, eqx.is_array)
+    leaves, structure = jax.tree.flatten(arrays)
+
+    def values(*leaves: Array) -> PyTree:
+        return functions(eqx.combine(jax.tree.unflatten(structure, leaves), static), problem.start()[0])
+
+    closed = jax.make_jaxpr(values)(*leaves)
+    is_used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))[1]
+    return jax.tree.map(
+        lambda rate, is_used: is_used and rate is not None,
+        direction,
+        jax.tree.unflatten(structure, is_used),
+        is_leaf=lambda rate: rate is None,
+    )
+
+
+def tangents_by(
+    build: Build, active: tuple[int, ...], leaves: tuple[Array, ...], cells: int | None
+) -> tuple[PyTree, tuple[Tangent, ...], Callable[[list[PyTree]], list[PyTree]]]:
+    """Build a problem and its tangents along leaves, each scaled by the leaf's own size.
+
+    **Arguments:**
+
+    - `build`: (leaves, cells) -> problem.
+    - `active`, `leaves`: the leaves to move, and all leaves, of any shape. With `cells`, a leaf is a scalar or has the
+      cells in its last axis. Each entry of a leaf has its own tangent.
+
+    **Returns:** the problem; its tangents; and a function that turns derivatives along the tangents (trees of arrays,
+    with `cells` in the first axis) into derivatives with respect to each leaf, the leaf's own axes last.
+
+    **Example:** the tangent of a problem moves its rate by its own size.
+
+    >>> problem, tangents, gather = tangents_by(build, (0,), (jnp.array([1.0, 2.0]),), 2)
+    >>> print(tangents[0].rate)
+    [1. 2.]
+    """
+
+    rebuilt, point = by_active(build, active, leaves, cells)
+    sizes = [tangent_scale(leaf) for leaf in point]
+    zeros = tuple(jnp.zeros_like(size) for size in sizes)
+    own_shapes = [size.shape if cells is None else size.shape[:-1] for size in sizes]
+    entries = [(k, index) for k, shape in enumerate(own_shapes) for index in np.ndindex(shape)]
+
+    def along(k: int, index: tuple[int, ...]) -> tuple[Array, ...]:
+        return (*zeros[:k], zeros[k].at[index].set(sizes[k][index]), *zeros[k + 1 :])
+
+    def gather(slopes: list[PyTree]) -> list[PyTree]:
+        remaining = iter(slopes)
+
+        def of_leaf(size: Array, shape: tuple[int, ...]) -> PyTree:
+            parts = [jax.tree.map(functools.partial(_by_size, size[k]), next(remaining)) for k in np.ndindex(shape)]
+            return jax.tree.map(lambda *parts: jnp.stack(parts, axis=-1).reshape(*parts[0].shape, *shape), *parts)
+
+        return [of_leaf(size, shape) for size, shape in zip(sizes, own_shapes, strict=True)]
+
+    return rebuilt(*point), tangents_of(rebuilt, point, [along(*entry) for entry in entries]), gather
+
+
+def _by_size(size: Array, part: Array) -> Array:
+    """Convert a derivative along a number to one with respect to it; the number is a scalar or has one value per cell."""
+    return part / size.reshape((-1,) + (1,) * (part.ndim - 1) if size.ndim else ())
+
+
+def by_active(
+    build: Build, active: tuple[int, ...], leaves: tuple[Array, ...], cells: int | None
+) -> tuple[Callable[..., PyTree], tuple[Float[Array, "..."], ...]]:
+    """A problem as a function of its active leaves, and these leaves; with `cells`, they have the cells in the last axis.
+
+    **Arguments:** as for `tangents_by`.
+    """
+
+    def rebuilt(*moving: Array) -> PyTree:
+        arguments = list(leaves)
+        for i, leaf in zip(active, moving, strict=True):
+            arguments[i] = leaf
+        return build(tuple(arguments), cells)
+
+    return rebuilt, tuple(leaves[i] if cells is None else over_cells(leaves[i], cells) for i in active)
+
+
+def over_cells(leaf: Float[Array, "..."], cells: int) -> Float[Array, "... cells"]:
+    """A leaf with the cells in its last axis, from such a leaf or a scalar."""
+    return jnp.broadcast_to(leaf, (*jnp.shape(leaf)[:-1], cells))
+
+
+def tangent_along(
+    build: Build,
+    active: tuple[int, ...],
+    leaves: tuple[Array, ...],
+    tangents: tuple[Array, ...],
+    cells: int,
+) -> tuple[PyTree, Tangent, Float[Array, " cells"]]:
+    """Build a problem and its tangent in one direction of its leaves, which is scaled by the size of the leaves.
+
+    **Arguments:** as for `tangents_by`; `tangents`: those of the active leaves.
+
+    **Returns:** the problem, the tangent, and the size of the direction in every cell.
+    """
+    rebuilt, point = by_active(build, active, leaves, cells)
+    directions = [over_cells(tangent, cells) for tangent in tangents]
+    ratios = [jnp.abs(tangent) / tangent_scale(leaf) for tangent, leaf in zip(directions, point, strict=True)]
+    size = functools.reduce(jnp.maximum, [jnp.max(ratio.reshape(-1, cells), axis=0) for ratio in ratios])
+    scaled = tuple(jnp.where(size > 0.0, tangent / jnp.where(size > 0.0, size, 1.0), 0.0) for tangent in directions)
+    return rebuilt(*point), tangents_of(rebuilt, point, [scaled])[0], size
+
+
+# Variations of the state along a run.
+
+#: Number of tangents that are integrated together. Two together take 0.6 to 1.0 times as long as two in turn, and an
+#: eighth longer to compile; four together take 1.1 times as long as two pairs.
+GROUP = 2
+
+
+class VariationalProblem(AbstractDerivedProblem):
     """A problem whose state is followed by its first variations along several tangents.
 
     A tangent has the structure of the problem, with the rate at which each number moves in place of the number; `None`
@@ -55,32 +218,20 @@ class VariationalProblem(AbstractProblem):
     """
 
     problem: AbstractProblem
-    tangents: tuple[Any, ...]
+    tangents: tuple[Tangent, ...]
     ends_on_event: bool = eqx.field(static=True)
-
-    @property
-    def direction_decides(self) -> bool:
-        return self.problem.direction_decides
-
-    @property
-    def fits_one_kernel(self) -> bool:
-        return self.problem.fits_one_kernel
-
-    @property
-    def fast(self) -> tuple[bool, bool]:
-        return self.problem.fast
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         states, scales = self.problem.start()
 
-        def variation(direction: Any) -> Float[Array, "components cells"]:
+        def variation(direction: Tangent) -> Float[Array, "components cells"]:
             change = eqx.filter_jvp(lambda problem: problem.start()[0], (self.problem,), (direction,))[1]
             return jnp.zeros_like(states) if change is None else change
 
         variations = [variation(direction) for direction in self.tangents]
         return jnp.concatenate([states, *variations]), jnp.concatenate([scales] * (1 + len(variations)))
 
-    def field(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> Any:
+    def field(self, time: Lanes, state: States) -> States:
         point, *variations = self.parts(state)
         if not variations:
             return self.problem.field(time, point)
@@ -91,7 +242,7 @@ class VariationalProblem(AbstractProblem):
     ) -> Array:
         """The value of a function of problem and state, and its change along every tangent."""
 
-        def value(moving: Any, point: Float[Array, "components *lanes"]) -> Float[Array, "components *lanes"]:
+        def value(moving: PyTree, point: States) -> States:
             return function(eqx.combine(moving, self.problem), point)
 
         # Linearised once: the value is computed once, and the tangents share common subexpressions.
@@ -100,25 +251,13 @@ class VariationalProblem(AbstractProblem):
             [values, *(change(*direction) for direction in zip(self.tangents, variations, strict=True))]
         )
 
-    def event_function(self, state: Float[Array, "components *lanes"]) -> Float[Array, "*lanes"] | None:
-        return self.problem.event_function(self.parts(state)[0]) if self.ends_on_event else None
+    def event_function(self, state: States) -> Lanes | None:
+        return super().event_function(state) if self.ends_on_event else None
 
-    def domain_margin(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> Any:
-        return self.problem.domain_margin(time, self.parts(state)[0])
+    def inner(self, state: States) -> States:
+        return self.parts(state)[0]
 
-    def lost_at_start(self, state: Float[Array, "components *lanes"]) -> Any:
-        return self.problem.lost_at_start(self.parts(state)[0])
-
-    def exact_margin(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> Any:
-        return self.problem.exact_margin(time, self.parts(state)[0])
-
-    def margins(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> Any:
-        return self.problem.margins(time, self.parts(state)[0])
-
-    def jumps(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> Jumps | None:
-        return self.problem.jumps(time, self.parts(state)[0])
-
-    def across_jump(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> Any:
+    def across_jump(self, time: Lanes, state: States) -> States:
         point, *variations = self.parts(state)
         if not variations:
             return self.problem.across_jump(time, point)
@@ -130,7 +269,14 @@ class VariationalProblem(AbstractProblem):
 
 
 def slopes_by_variations(
-    problem: AbstractProblem, tangents: tuple[Any, ...], ends_on_event: bool, *options: Any, one_kernel: bool
+    problem: AbstractProblem,
+    tangents: tuple[Tangent, ...],
+    ends_on_event: bool,
+    t1: Float[Array, "..."],
+    cells: Int[Array, ""],
+    settings: Settings,
+    *,
+    one_kernel: bool,
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """Run every cell with its variations, and differentiate the time of the event at its end.
 
@@ -139,14 +285,15 @@ def slopes_by_variations(
     - `problem`, `tangents`: as for `VariationalProblem`.
     - `ends_on_event`: whether runs end on the event; otherwise they end at the horizon, which then counts as the
       event's time.
-    - `options`, `one_kernel`: horizon, number of cells and settings, as for `LaneScheduler.of`.
+    - The others as for `LaneScheduler.of`.
 
     **Returns:** the `Outcome`, without crossing times, and for each tangent the derivative of the event's time.
     """
     variational = VariationalProblem(problem, tangents, ends_on_event)
     # The variations take part in step-size control: the state alone may be at rest while its tangent is not, and the
     # steps would become too long for the tangent.
-    ended, _ = LaneScheduler.of(variational, *options, n_blocks=1 + len(tangents), one_kernel=one_kernel).outcome()
+    blocks = 1 + len(tangents)
+    ended = LaneScheduler.of(variational, t1, cells, settings, n_blocks=blocks, one_kernel=one_kernel).solve()[0]
     state, *variations = variational.parts(ended.state)
 
     def event_time(problem: AbstractProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
@@ -159,7 +306,9 @@ def slopes_by_variations(
     return ended._replace(state=state), slopes
 
 
-def in_groups(run: Callable[..., tuple[Any, list[Any]]], tangents: tuple[Any, ...]) -> tuple[Any, list[Any]]:
+def in_groups(
+    run: Callable[..., tuple[PyTree, list[PyTree]]], tangents: tuple[Tangent, ...]
+) -> tuple[PyTree, list[PyTree]]:
     """Apply `run` to many tangents, a few at a time, with one program.
 
     **Arguments:**
@@ -187,15 +336,6 @@ def in_groups(run: Callable[..., tuple[Any, list[Any]]], tangents: tuple[Any, ..
     groups = range(len(padded) // GROUP)
     tangent_slopes = [jax.tree.map(operator.itemgetter(group), slope) for group in groups for slope in slopes]
     return jax.tree.map(lambda leaf: leaf[0], results), tangent_slopes[: len(tangents)]
-
-
-def where_active(problem: Any, direction: Any) -> Any:
-    """The numbers of a problem that a tangent moves, `None` for the others."""
-
-    def moved(rate: Any, number: Any) -> Any:
-        return None if rate is None else number
-
-    return jax.tree.map(moved, direction, problem, is_leaf=lambda rate: rate is None)
 
 
 # The largest Lyapunov exponent of a problem: the mean rate at which nearby runs diverge, by the variational equation.
@@ -230,34 +370,31 @@ class VariedProblem(AbstractProblem):
         unit_scales = jnp.ones((self.states.shape[0] - len(self.magnitudes), *self.states.shape[1:]))
         return self.states, jnp.concatenate([self.magnitudes, unit_scales])
 
-    def field(self, time: Float[Array, "*lanes"], state: Float[Array, "all lanes"]) -> Float[Array, "all lanes"]:
-        size = len(self.magnitudes)
-        time = time if self.begin is None else time + self.begin
+    def field(self, time: Lanes, state: States) -> States:
+        size, time = len(self.magnitudes), self._clock(time)
         y, w = state[:size], state[size:-1]
         rate, carried = jax.jvp(lambda point: self.problem.field(time, point), (y,), (w * self.magnitudes,))
         carried = carried / self.magnitudes
         growth = jnp.sum(w * carried, axis=0) / jnp.sum(w * w, axis=0)
         return jnp.concatenate([rate, carried - growth * w, growth[None]])
 
-    def event_function(self, state: Float[Array, "all lanes"]) -> None:
+    def event_function(self, state: States) -> None:
         return None
 
-    def domain_margin(
-        self, time: Float[Array, "*lanes"], state: Float[Array, "all lanes"]
-    ) -> Float[Array, "*lanes"] | None:
-        time = time if self.begin is None else time + self.begin
-        return self.problem.domain_margin(time, state[: len(self.magnitudes)])
+    def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
+        return self.problem.domain_margin(self._clock(time), state[: len(self.magnitudes)])
 
-    def margins(
-        self, time: Float[Array, "*lanes"], state: Float[Array, "all lanes"]
-    ) -> tuple[Float[Array, "*lanes"], ...]:
-        time = time if self.begin is None else time + self.begin
-        return self.problem.margins(time, state[: len(self.magnitudes)])
+    def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
+        return self.problem.margins(self._clock(time), state[: len(self.magnitudes)])
 
-    def jumps(self, time: Float[Array, "*lanes"], state: Float[Array, "all lanes"]) -> Jumps | None:
+    def jumps(self, time: Lanes, state: States) -> Jumps | None:
+        jumps = self.problem.jumps(self._clock(time), state[: len(self.magnitudes)])
         begin = 0.0 if self.begin is None else self.begin
-        jumps = self.problem.jumps(time + begin, state[: len(self.magnitudes)])
         return None if jumps is None else jumps._replace(times=jumps.times - begin)
+
+    def _clock(self, time: Lanes) -> Lanes:
+        """The time of the problem."""
+        return time if self.begin is None else time + self.begin
 
 
 def probed(problem: AbstractProblem) -> VariedProblem:

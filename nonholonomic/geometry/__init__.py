@@ -5,12 +5,6 @@ coordinates in which users name the place. A frame moves with a ball along a sur
 Components that vanish identically are `None`, so that nothing is computed for them.
 """
 
-from .closed_forms import AbstractQuadric as AbstractQuadric
-from .closed_forms import Cylinder as Cylinder
-from .closed_forms import Plane as Plane
-from .closed_forms import Sphere as Sphere
-from .closed_forms import Spheroid as Spheroid
-from .closed_forms import Torus as Torus
 from .frames import AbstractFrame as AbstractFrame
 from .frames import CarriedFrame as CarriedFrame
 from .frames import FrameMotion as FrameMotion
@@ -23,14 +17,21 @@ from .frames import room_bounds as room_bounds
 from .level_sets import Graph as Graph
 from .level_sets import Implicit as Implicit
 from .level_sets import Paraboloid as Paraboloid
+from .level_sets import as_function as as_function
 from .surface import CLOSED as CLOSED
+from .surface import AbstractQuadric as AbstractQuadric
 from .surface import AbstractSurface as AbstractSurface
+from .surface import Cylinder as Cylinder
 from .surface import Place as Place
-from .surface import as_function as as_function
+from .surface import Plane as Plane
+from .surface import Sphere as Sphere
+from .surface import Spheroid as Spheroid
+from .surface import Torus as Torus
 from .vector import Component as Component
 from .vector import Vector as Vector
 from .vector import add as add
 from .vector import cross as cross
+from .vector import difference as difference
 from .vector import dot as dot
 from .vector import inverse as inverse
 from .vector import multiply as multiply
@@ -42,4 +43,3 @@ from .vector import stacked as stacked
 from .vector import subtract as subtract
 from .vector import sum_vectors as sum_vectors
 from .vector import tangents as tangents
-from .vector import vector_of as vector_of

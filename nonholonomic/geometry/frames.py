@@ -14,7 +14,7 @@ or cylinder is the same from both sides, except for the sign of its radius, whic
 
 import abc
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -22,8 +22,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..compilation.xla_cpu import least, stored
 from ..validation import Bound, as_number
-from .closed_forms import Cylinder, Plane, Sphere, Torus
-from .surface import AbstractSurface
+from .surface import AbstractSurface, Cylinder, Place, Plane, Sphere, Torus
 from .vector import (
     Component,
     Vector,
@@ -36,19 +35,16 @@ from .vector import (
     subtract,
     sum_vectors,
     tangents,
-    vector_of,
+    unit,
 )
 
-#: The numbers that a frame integrates, as components along axis 0 of a state.
-Place = tuple[Component, ...]
-Tangent = tuple[Component, Component]
+#: A vector's components along t1 and t2.
+Tangent: TypeAlias = tuple[Component, Component]
 #: The components 11, 12 and 22 of a symmetric operator on the tangent plane.
-TangentOperator = tuple[Component, Component, Component]
-#: A vector's three components in the fixed frame (x, y, z), z up.
-Fixed = tuple[Any, Any, Any]
+TangentOperator: TypeAlias = Vector
 
 
-def rate_in_frame(vector: tuple[Component, ...], frame_rate: Tangent) -> tuple[Component, ...]:
+def rate_in_frame(vector: Vector, frame_rate: Tangent) -> Vector:
     """Rate of the components of a fixed vector in a moving frame with t1' = o1 n, t2' = o2 n, n' = -(o1 t1 + o2 t2)."""
     along_normal = dot(frame_rate, vector[:2])
     return (multiply(frame_rate[0], vector[2]), multiply(frame_rate[1], vector[2]), subtract(None, along_normal))
@@ -107,11 +103,11 @@ class AbstractFrame(eqx.Module):
         """Place and cyclic coordinates at the angle `eta` [rad] from the lowest point, in the x-z plane."""
 
     @abc.abstractmethod
-    def at_foot(self, foot: Fixed) -> tuple[Place, Place]:
+    def at_foot(self, foot: Vector) -> tuple[Place, Place]:
         """Place and cyclic coordinates of a ball that touches the surface at a point [m], given in the surface's axes."""
 
     @abc.abstractmethod
-    def place_scales(self, size: Component) -> tuple[Component, ...]:
+    def place_scales(self, size: Component) -> Place:
         """Magnitudes of the place's components. **Arguments:** `size`: size of the body [m]."""
 
     @abc.abstractmethod
@@ -143,11 +139,11 @@ class AbstractFrame(eqx.Module):
         """Angle eta [rad] from the lowest point."""
 
     @abc.abstractmethod
-    def axes(self, place: Place, cyclic: Place) -> tuple[Fixed, Fixed, Fixed]:
+    def axes(self, place: Place, cyclic: Place) -> tuple[Vector, Vector, Vector]:
         """The vectors t1, t2 and n in the fixed frame."""
 
     @abc.abstractmethod
-    def position(self, place: Place, cyclic: Place) -> Fixed:
+    def position(self, place: Place, cyclic: Place) -> Vector:
         """Position of the centre [m] in the fixed frame."""
 
 
@@ -165,13 +161,13 @@ class PlaneFrame(AbstractFrame):
         zero = jnp.zeros_like(as_number(eta))
         return self._along(zero, zero)
 
-    def at_foot(self, foot: Fixed) -> tuple[Place, Place]:
+    def at_foot(self, foot: Vector) -> tuple[Place, Place]:
         return self._along(foot[0], foot[1])
 
     def _along(self, x: Component, y: Component) -> tuple[Place, Place]:
         return ((), (x, y)) if self.slope is None else ((x,), (y,))
 
-    def place_scales(self, size: Component) -> tuple[Component, ...]:
+    def place_scales(self, size: Component) -> Place:
         return () if self.slope is None else (size,)
 
     def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
@@ -194,23 +190,21 @@ class PlaneFrame(AbstractFrame):
     def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
         return jnp.zeros_like(cyclic[0])
 
-    def axes(self, place: Place, cyclic: Place) -> tuple[Fixed, Fixed, Fixed]:
+    def axes(self, place: Place, cyclic: Place) -> tuple[Vector, Vector, Vector]:
         zero, unit = jnp.zeros_like(cyclic[0]), jnp.ones_like(cyclic[0])
         if self.slope is None:
             return (unit, zero, zero), (zero, unit, zero), (zero, zero, unit)
         sine, cosine = unit * self.slope[0], unit * self.slope[1]
         return (cosine, zero, sine), (zero, unit, zero), (-sine, zero, cosine)
 
-    def position(self, place: Place, cyclic: Place) -> Fixed:
+    def position(self, place: Place, cyclic: Place) -> Vector:
         x, y = (*place, *cyclic)
         t1, t2, normal = self.axes(place, cyclic)
         return sum_vectors(scale(x, t1), scale(y, t2), scale(self.distance, normal))
 
 
-class CylinderFrame(AbstractFrame):
-    """Inside or outside of a cylinder whose axis is y: t2 along y, n = (-sin c, 0, cos c), and the place is (sin c, cos c).
-
-    Inside, c is eta and t1 points along growing eta; outside, c = eta - pi.
+class AbstractRoundFrame(AbstractFrame):
+    """Inside or outside of a cylinder or a sphere.
 
     - `radius`: radius of the path of the centre [m], negative outside; `distance`: R [m].
     """
@@ -219,21 +213,43 @@ class CylinderFrame(AbstractFrame):
     distance: Float[Array, "..."]
     inside: bool = eqx.field(static=True, default=True)
 
+    @property
+    def side(self) -> float:
+        """1 inside, -1 outside."""
+        return 1.0 if self.inside else -1.0
+
+    @abc.abstractmethod
+    def shape(self, curvature: Component) -> TangentOperator:
+        """The shape operator S [1/m] at a curvature [1/m]."""
+
+    def convex_motion(self, place: Place, velocity: Tangent, radii: TangentOperator) -> tuple[FrameMotion, Tangent]:
+        contact_rate, _, room = contact_velocity(self.shape(1.0 / self.radius), radii, velocity)
+        return self.frame_motion(place, contact_rate)._replace(room=room), contact_rate
+
+    def height(self, place: Place) -> Component:
+        # The lowest point is at the distance of the radius below the axis or the centre, on either side.
+        return self.side * (self.radius + self.distance) - self.radius * place[-1]
+
+
+class CylinderFrame(AbstractRoundFrame):
+    """A cylinder whose axis is y: t2 along y, n = (-sin c, 0, cos c), and the place is (sin c, cos c).
+
+    Inside, c is eta and t1 points along growing eta; outside, c = eta - pi.
+    """
+
     def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
         eta = as_number(eta)
-        place = (jnp.sin(eta), jnp.cos(eta))
-        return scale(self._side, place), (eta, jnp.zeros_like(eta))
+        return scale(self.side, (jnp.sin(eta), jnp.cos(eta))), (eta, jnp.zeros_like(eta))
 
-    def at_foot(self, foot: Fixed) -> tuple[Place, Place]:
+    def at_foot(self, foot: Vector) -> tuple[Place, Place]:
         x, y, z = foot
         place, (eta, _) = self.at_angle(jnp.arctan2(x, -z))
         return place, (eta, y)
 
-    @property
-    def _side(self) -> float:
-        return 1.0 if self.inside else -1.0
+    def shape(self, curvature: Component) -> TangentOperator:
+        return (curvature, None, None)
 
-    def place_scales(self, size: Component) -> tuple[Component, ...]:
+    def place_scales(self, size: Component) -> Place:
         return (1.0, 1.0)
 
     def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
@@ -241,17 +257,9 @@ class CylinderFrame(AbstractFrame):
         rate = velocity[0] / self.radius
         return FrameMotion((rate, None), self.vertical(place), (multiply(rate, cosine), -multiply(rate, sine)))
 
-    def convex_motion(self, place: Place, velocity: Tangent, radii: TangentOperator) -> tuple[FrameMotion, Tangent]:
-        contact_rate, _, room = contact_velocity((1.0 / self.radius, None, None), radii, velocity)
-        return self.frame_motion(place, contact_rate)._replace(room=room), contact_rate
-
     def vertical(self, place: Place) -> Vector:
         sine, cosine = place
         return (sine, None, cosine)
-
-    def height(self, place: Place) -> Component:
-        # The lowest point is at the distance of the radius below the axis, on either side.
-        return self._side * (self.radius + self.distance) - self.radius * place[1]
 
     def cyclic_rate(self, cyclic: Place, velocity: Tangent, frame_rate: Tangent) -> Place:
         return (frame_rate[0], velocity[1])
@@ -259,79 +267,63 @@ class CylinderFrame(AbstractFrame):
     def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
         return cyclic[0]
 
-    def axes(self, place: Place, cyclic: Place) -> tuple[Fixed, Fixed, Fixed]:
+    def axes(self, place: Place, cyclic: Place) -> tuple[Vector, Vector, Vector]:
         sine, cosine = place
         zero, unit = jnp.zeros_like(sine), jnp.ones_like(sine)
         return (cosine, zero, sine), (zero, unit, zero), (-sine, zero, cosine)
 
-    def position(self, place: Place, cyclic: Place) -> Fixed:
+    def position(self, place: Place, cyclic: Place) -> Vector:
         sine, cosine = place
         return (self.radius * sine, cyclic[1], -self.radius * cosine)
 
 
-class SphereFrame(AbstractFrame):
-    """Inside or outside of a sphere; the frame is carried parallel to itself, so no place is singular.
+class SphereFrame(AbstractRoundFrame):
+    """A sphere; the frame is carried parallel to itself, so no place is singular.
 
-    The place is the vertical z seen in the frame; `cyclic` adds the horizontal x axis seen in it. The fields are those of
-    `CylinderFrame`.
+    The place is the vertical z seen in the frame; `cyclic` adds the horizontal x axis seen in it.
     """
-
-    radius: Float[Array, "..."]
-    distance: Float[Array, "..."]
-    inside: bool = eqx.field(static=True, default=True)
 
     def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
         eta = as_number(eta)
-        zero, side = jnp.zeros_like(eta), self._side
-        sine, cosine = side * jnp.sin(eta), side * jnp.cos(eta)
+        zero, sine, cosine = jnp.zeros_like(eta), self.side * jnp.sin(eta), self.side * jnp.cos(eta)
         return (sine, zero, cosine), (cosine, zero, -sine)
 
-    def at_foot(self, foot: Fixed) -> tuple[Place, Place]:
-        n = scale(-self._side / jnp.sqrt(dot(foot, foot)), foot)
+    def at_foot(self, foot: Vector) -> tuple[Place, Place]:
+        n = scale(-self.side / jnp.sqrt(dot(foot, foot)), foot)
         t1, t2 = tangents(n)
         return (t1[2], t2[2], n[2]), (t1[0], t2[0], n[0])
 
-    @property
-    def _side(self) -> float:
-        return 1.0 if self.inside else -1.0
+    def shape(self, curvature: Component) -> TangentOperator:
+        return (curvature, None, curvature)
 
-    def place_scales(self, size: Component) -> tuple[Component, ...]:
+    def place_scales(self, size: Component) -> Place:
         return (1.0, 1.0, 1.0)
 
     def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
         frame_rate = (velocity[0] / self.radius, velocity[1] / self.radius)
         return FrameMotion(frame_rate, self.vertical(place), rate_in_frame(place, frame_rate))
 
-    def convex_motion(self, place: Place, velocity: Tangent, radii: TangentOperator) -> tuple[FrameMotion, Tangent]:
-        curvature = 1.0 / self.radius
-        contact_rate, _, room = contact_velocity((curvature, None, curvature), radii, velocity)
-        return self.frame_motion(place, contact_rate)._replace(room=room), contact_rate
-
     def vertical(self, place: Place) -> Vector:
-        return (place[0], place[1], place[2])
-
-    def height(self, place: Place) -> Component:
-        return self._side * (self.radius + self.distance) - self.radius * place[2]
+        return tuple(place)
 
     def cyclic_rate(self, cyclic: Place, velocity: Tangent, frame_rate: Tangent) -> Place:
         return rate_in_frame(cyclic, frame_rate)
 
     def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
-        return jnp.arctan2(planar_length(place[0], place[1]), self._side * place[2])
+        return jnp.arctan2(planar_length(place[0], place[1]), self.side * place[2])
 
-    def axes(self, place: Place, cyclic: Place) -> tuple[Fixed, Fixed, Fixed]:
-        x, z = cyclic, place
-        y = (z[1] * x[2] - z[2] * x[1], z[2] * x[0] - z[0] * x[2], z[0] * x[1] - z[1] * x[0])
-        return (x[0], y[0], z[0]), (x[1], y[1], z[1]), (x[2], y[2], z[2])
+    def axes(self, place: Place, cyclic: Place) -> tuple[Vector, Vector, Vector]:
+        y = cross(place, cyclic)
+        t1, t2, n = zip(cyclic, y, place, strict=True)
+        return t1, t2, n
 
-    def position(self, place: Place, cyclic: Place) -> Fixed:
+    def position(self, place: Place, cyclic: Place) -> Vector:
         return scale(-self.radius, self.axes(place, cyclic)[2])
 
 
-def along(n: Fixed, direction: Fixed) -> tuple[Fixed, Fixed]:
+def along(n: Vector, direction: Vector) -> tuple[Vector, Vector]:
     """Unit vectors across n: t1 along the projection of a direction onto the tangent plane, and t2 = n x t1."""
-    projected = sum_vectors(direction, scale(-1.0 * dot(n, direction), n))
-    t1 = scale(1.0 / jnp.sqrt(dot(projected, projected)), projected)
+    t1 = unit(sum_vectors(direction, scale(-1.0 * dot(n, direction), n)))
     return t1, cross(n, t1)
 
 
@@ -413,23 +405,23 @@ class CarriedFrame(AbstractFrame):
         foot = self.surface.chart(place_named(self.surface, place))[0]
         return self._start(foot, along_eta=isinstance(self.surface, Cylinder | Sphere))
 
-    def at_foot(self, foot: Fixed) -> tuple[Place, Place]:
+    def at_foot(self, foot: Vector) -> tuple[Place, Place]:
         return self._start(foot, along_eta=isinstance(self.surface, Cylinder))
 
-    def _start(self, foot: Fixed, along_eta: bool) -> tuple[Place, Place]:
+    def _start(self, foot: Vector, along_eta: bool) -> tuple[Place, Place]:
         """The frame at a foot. `along_eta`: whether t1 points along growing eta inside, as in `CylinderFrame`; the
         projection of the x axis reverses its direction at eta = pi/2."""
-        foot = vector_of(jnp.broadcast_arrays(*(0.0 if x is None else x for x in foot)))
+        foot = tuple(jnp.broadcast_arrays(*(0.0 if x is None else x for x in foot)))
         normal = self.normal(foot)
         t1 = (normal[2], jnp.zeros_like(normal[1]), -normal[0]) if along_eta else tangents(normal)[0]
         return (*foot, *t1), ()
 
-    def normal(self, foot: Fixed) -> Fixed:
+    def normal(self, foot: Vector) -> Vector:
         """The normal n at a foot, in the surface's axes."""
         normal = scale(self.side, self.surface.normal(foot))
-        return vector_of(jnp.broadcast_to(0.0 if x is None else x, jnp.shape(foot[0])) for x in normal)
+        return tuple(jnp.broadcast_to(0.0 if x is None else x, jnp.shape(foot[0])) for x in normal)
 
-    def place_scales(self, size: Component) -> tuple[Component, ...]:
+    def place_scales(self, size: Component) -> Place:
         return (size,) * 3 + (1.0,) * 3
 
     def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
@@ -448,41 +440,33 @@ class CarriedFrame(AbstractFrame):
         foot_velocity, frame_rate, room = contact_velocity(shape, radii, velocity)
         return self._moved(place[:3], axes, foot_velocity, frame_rate, room), foot_velocity
 
-    def _bent(self, place: Place) -> tuple[tuple[Fixed, Fixed, Fixed], TangentOperator]:
+    def _bent(self, place: Place) -> tuple[tuple[Vector, Vector, Vector], TangentOperator]:
         """The vectors t1, t2 and n in the surface's axes, and the shape operator of the arena."""
         # Stored, because otherwise each of the values below, and each of their derivatives, would compute these again.
         n = stored(*self.normal(place[:3]))
         # If the first tangent has drifted, only its direction along the surface counts.
         t1 = stored(*along(n, place[3:])[0])
         t2 = cross(n, t1)
-        return (t1, t2, n), stored(*self._shape(place[:3], t1, t2))
+        bending, zero = scale(-self.side, self.surface.bending(place[:3], t1, t2)), jnp.zeros_like(place[0])
+        return (t1, t2, n), stored(*(zero if S is None else S for S in bending))
 
     def _moved(
-        self, foot: Fixed, axes: tuple[Fixed, Fixed, Fixed], velocity: Tangent, frame_rate: Tangent, room: Component
+        self, foot: Vector, axes: tuple[Vector, Vector, Vector], velocity: Tangent, frame_rate: Tangent, room: Component
     ) -> FrameMotion:
         """The motion of the frame. **Arguments:** `velocity`: velocity of the foot, along the axes."""
         t1, t2, n = axes
-        o1, o2, *up = stored(*frame_rate, *self._seen(t1, t2, n))
+        o1, o2, *up = stored(*frame_rate, *(dot(axis, self.up) for axis in axes))
         pull_back = -self.pull * self.side * self.surface.offset(foot)
         carried = sum_vectors(scale(velocity[0], t1), scale(velocity[1], t2), scale(pull_back, n))
-        return FrameMotion((o1, o2), vector_of(up), (*carried, *scale(o1, n)), room)
+        return FrameMotion((o1, o2), tuple(up), (*carried, *scale(o1, n)), room)
 
-    def _shape(self, foot: Fixed, t1: Fixed, t2: Fixed) -> TangentOperator:
-        """The shape operator of the arena, n' = -S_a q', as (S11, S12, S22)."""
-        bending, zero = scale(-self.side, self.surface.bending(foot, t1, t2)), jnp.zeros_like(foot[0])
-        return vector_of(zero if S is None else S for S in bending)
-
-    def _seen(self, *axes: Fixed) -> Vector:
-        """The upward vertical in the frame."""
-        return vector_of(dot(axis, self.up) for axis in axes)
-
-    def own_axes(self, place: Place) -> tuple[Fixed, Fixed, Fixed]:
+    def own_axes(self, place: Place) -> tuple[Vector, Vector, Vector]:
         """The vectors t1, t2 and n in the surface's axes."""
         n = self.normal(place[:3])
         return (*along(n, place[3:]), n)
 
     def vertical(self, place: Place) -> Vector:
-        return self._seen(*self.own_axes(place))
+        return tuple(dot(axis, self.up) for axis in self.own_axes(place))
 
     def height(self, place: Place) -> Component:
         return self.surface.elevation(place[:3]) + self.distance * dot(self.normal(place[:3]), self.up)
@@ -500,9 +484,10 @@ class CarriedFrame(AbstractFrame):
         eta = self.surface.place_at(foot)[names.index("eta")]
         return eta + 0.5 * jnp.pi if names[0] == "mu" else eta
 
-    def axes(self, place: Place, cyclic: Place) -> tuple[Fixed, Fixed, Fixed]:
-        return vector_of(self.surface.in_fixed_frame(axis) for axis in self.own_axes(place))
+    def axes(self, place: Place, cyclic: Place) -> tuple[Vector, Vector, Vector]:
+        t1, t2, n = map(self.surface.in_fixed_frame, self.own_axes(place))
+        return t1, t2, n
 
-    def position(self, place: Place, cyclic: Place) -> Fixed:
+    def position(self, place: Place, cyclic: Place) -> Vector:
         centre = sum_vectors(place[:3], scale(self.distance, self.normal(place[:3])))
         return self.surface.in_fixed_frame(centre)

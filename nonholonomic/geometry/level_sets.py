@@ -1,4 +1,4 @@
-"""Surfaces on which a function vanishes: the paraboloid, the graph of a function, and any zero set.
+"""Surfaces on which a function vanishes: the paraboloid, the graph of a user's function, and its zero set.
 
 Both searches here are minimisations. The nearest point minimises the distance over the surface, which may have many
 local minima for positions farther than the surface's least radius of curvature. The region that can contain the nearest
@@ -18,11 +18,108 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jax.core import eval_jaxpr
+from jaxtyping import Array, Bool, Float, Int
 
-from ..validation import Bound, as_number
-from .surface import DIVIDED, OPEN, AbstractSurface, BallGap, Place, as_function, partials, second_derivative
-from .vector import Component, Vector, dot, scale, subtract, sum_vectors, tangents, vector_of
+from ..compilation.components import Held
+from ..text import gathered, parted, shown, spread
+from ..validation import UNTRACEABLE, Bound, as_number, is_traced
+from .surface import DIVIDED, OPEN, AbstractGradientSurface, AbstractSurface, BallGap, Place
+from .vector import Component, Vector, difference, dot, scale, sum_vectors, tangents, unit
+
+# User functions for surfaces: convert them to modules with visible parameters, check them, and differentiate them.
+
+
+class Plain(eqx.Module):
+    """A function without parameters; the same function gives the same program."""
+
+    function: Callable[..., Component] = eqx.field(static=True)
+
+    def __call__(self, *at: Float[Array, "..."]) -> Float[Array, "..."]:
+        # Users may compare, sort and look up numbers, or join them, which would mix lanes.
+        return jnp.vectorize(lambda *numbers: jnp.asarray(self.function(*numbers)))(*at)
+
+
+class Closure(eqx.Module):
+    """A function whose leaves are the traced numbers that it closes over. It was traced with single numbers; since
+    then, each may have become one number per lane."""
+
+    numbers: tuple[Component, ...]
+    # JAX's Jaxpr; equal only if it is the same object.
+    program: Any = eqx.field(static=True)
+
+    def __call__(self, *at: Float[Array, "..."]) -> Float[Array, "..."]:
+        shapes, count = tuple(constant.aval.shape for constant in self.program.constvars), len(self.numbers)
+
+        def value(*scalars: Float[Array, ""]) -> Float[Array, ""]:
+            return eval_jaxpr(self.program, gathered(scalars[:count], shapes), *scalars[count:])[0]
+
+        return jnp.vectorize(value)(*self.numbers, *at)
+
+
+def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> Any:
+    """Convert a function of lengths [m] to a module whose parameters are arrays.
+
+    **Raises:** `ValueError` unless the function returns one number for numbers.
+    """
+    if not callable(value):
+        raise ValueError(f"{name} = {shown(value)} must be a function of ({', '.join(arguments)})")
+    if isinstance(value, eqx.Module):
+        value = jax.tree.map(lambda leaf: as_number(leaf) if isinstance(leaf, float | np.ndarray) else leaf, value)
+    zeros = (jnp.zeros(()),) * len(arguments)
+    try:
+        program = jax.make_jaxpr(value)(*zeros)
+    except jax.errors.JAXTypeError as error:
+        raise ValueError(f"{name} = {shown(value)} {UNTRACEABLE}") from error
+    except TypeError as error:
+        raise ValueError(f"{name} = {shown(value)} must be a function of ({', '.join(arguments)}): {error}") from error
+    # The parameters of a module may have one value per lane.
+    shapes = {(), *(leaf.shape for leaf in jax.tree.leaves(value) if eqx.is_array(leaf))}
+    results = program.out_avals
+    if len(results) != 1 or results[0].shape not in shapes or not jnp.issubdtype(results[0].dtype, jnp.floating):
+        names_of_results = ", ".join(map(str, results))
+        raise ValueError(
+            f"{name} = {shown(value)} must return one number for numbers {', '.join(arguments)}, not {names_of_results}"
+        )
+    if isinstance(value, eqx.Module):
+        # If the parameters have one number per lane, so have the results.
+        of_one_run = results[0].shape == () and (len(shapes) > 1 or not _takes_lanes(value, len(arguments)))
+        return Held(parted(value)) if of_one_run and not isinstance(value, Held) else value
+    if any(is_traced(constant) for constant in program.consts):
+        return Closure(spread(program.consts), program.jaxpr)
+    # Equinox warns of the arrays of a tree, such as JAX's partial functions, but not of those of its method.
+    return Plain(value if jax.tree_util.all_leaves([value]) else value.__call__)
+
+
+def _takes_lanes(function: Any, count: int) -> bool:
+    """Whether a function of numbers, whose parameters are single numbers, takes one number per lane, too."""
+    lanes = jax.ShapeDtypeStruct((2,), float)
+    try:
+        return jax.eval_shape(function, *(lanes,) * count).shape == lanes.shape
+    except Exception:
+        # Any error: the function is a user's.
+        return False
+
+
+def partials(function: Callable[..., Component], at: Vector) -> Vector:
+    """Partial derivatives of a function of several numbers, each a number or an array over lanes."""
+
+    def along(k: int) -> Float[Array, "..."]:
+        return jax.jvp(
+            lambda coordinate: function(*at[:k], coordinate, *at[k + 1 :]), (at[k],), (jnp.ones_like(at[k]),)
+        )[1]
+
+    return tuple(along(k) for k in range(len(at)))
+
+
+def second_derivative(function: Callable[..., Component], at: Vector, a: Vector, b: Vector) -> Float[Array, "..."]:
+    """Second derivative of a function of several numbers along two vectors, each component a number or an array over lanes."""
+    size, numbers = len(at), tuple(jnp.broadcast_arrays(*at, *a, *b))
+    place, first, second = numbers[:size], numbers[size : 2 * size], numbers[2 * size :]
+    return jax.jvp(lambda *point: jax.jvp(function, point, first)[1], place, second)[1]
+
+
+# Searches for the nearest point and for the gap below a ball.
 
 #: Most iterations of a search. Most searches take three to six; ten times as many would not move any point.
 MOST_ITERATIONS = 40
@@ -73,17 +170,17 @@ def descended(
     - `start`: a vector on the surface; `size`: unit for steps; `reach`: the longest first step.
     """
 
-    def going_on(carry: tuple[Descent, Any]) -> Bool[Array, ""]:
+    def going_on(carry: tuple[Descent, Int[Array, ""]]) -> Bool[Array, ""]:
         descent, count = carry
         return ~jnp.all(descent.ended) & (count < MOST_ITERATIONS)
 
-    def descend(carry: tuple[Descent, Any]) -> tuple[Descent, Any]:
+    def descend(carry: tuple[Descent, Int[Array, ""]]) -> tuple[Descent, Int[Array, ""]]:
         descent, count = carry
-        point = vector_of(descent.point)
+        point = tuple(descent.point)
         s1, s2, t1, t2 = step(point)
         length = jnp.sqrt(s1 * s1 + s2 * s2)
         cut = jnp.minimum(1.0, descent.reach / jnp.where(length > 0.0, length, 1.0))
-        trial = onto(vector_of(sum_vectors(point, scale(cut * s1, t1), scale(cut * s2, t2))))
+        trial = onto(sum_vectors(point, scale(cut * s1, t1), scale(cut * s2, t2)))
         trial_value = value(trial)
         improves = (trial_value <= descent.value) | (length <= UNSEEN * size)
         accepted = improves & ~descent.ended
@@ -101,10 +198,10 @@ def descended(
     zero = jnp.zeros_like(first[0])
     initial = Descent(first, value(start) + zero, reach + zero, zero > 0.0)
     minimum, _ = jax.lax.while_loop(going_on, descend, (initial, jnp.zeros((), int)))
-    return vector_of(minimum.point)
+    return tuple(minimum.point)
 
 
-class AbstractLevel(AbstractSurface):
+class AbstractLevel(AbstractGradientSurface):
     """A surface on which a function is zero; bodies are where the function is positive."""
 
     #: Start points for the search for the nearest point, about a position; its distance is less than 1 in their unit.
@@ -115,10 +212,6 @@ class AbstractLevel(AbstractSurface):
         """The function at a position [m]."""
 
     @abc.abstractmethod
-    def gradient(self, position: Vector) -> Vector:
-        """Gradient of the function at a position [m], along the normal."""
-
-    @abc.abstractmethod
     def second_derivative(self, position: Vector, a: Vector, b: Vector) -> Component:
         """Second derivative of the function at a position [m], along two vectors."""
 
@@ -126,20 +219,15 @@ class AbstractLevel(AbstractSurface):
         gradient = self.gradient(position)
         return self.level(position) / jnp.sqrt(dot(gradient, gradient))
 
-    def normal(self, position: Vector) -> Vector:
-        gradient = self.gradient(position)
-        return scale(1.0 / jnp.sqrt(dot(gradient, gradient)), gradient)
-
-    def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
+    def gradient_rate(self, position: Vector, velocity: Vector) -> Vector:
         numbers = jnp.broadcast_arrays(*position, *velocity)
-        return jax.jvp(self.normal, (vector_of(numbers[:3]),), (vector_of(numbers[3:]),))[1]
+        return jax.jvp(self.gradient, (tuple(numbers[:3]),), (tuple(numbers[3:]),))[1]
 
-    def bending(self, position: Vector, a: Vector, b: Vector) -> tuple[Component, Component, Component]:
-        # The gradient's size changes the normal only along n, which is perpendicular to a and b.
+    def bending(self, position: Vector, a: Vector, b: Vector) -> Vector:
+        # As for any gradient; these derivatives cost less than its rate.
         gradient = self.gradient(position)
-        per_size = 1.0 / jnp.sqrt(dot(gradient, gradient))
-        aa, ab, bb = (self.second_derivative(position, *pair) for pair in ((a, a), (a, b), (b, b)))
-        return per_size * aa, per_size * ab, per_size * bb
+        second = (self.second_derivative(position, *pair) for pair in ((a, a), (a, b), (b, b)))
+        return scale(1.0 / jnp.sqrt(dot(gradient, gradient)), tuple(second))
 
     def gaussian_curvature(self, position: Vector) -> Component:
         aa, ab, bb = self.bending(position, *tangents(self.normal(position)))
@@ -147,8 +235,7 @@ class AbstractLevel(AbstractSurface):
 
     def onto(self, position: Vector) -> Vector:
         for _ in range(2):
-            difference = scale(self.offset(position), self.normal(position))
-            position = vector_of(subtract(a, b) for a, b in zip(position, difference, strict=True))
+            position = difference(position, scale(self.offset(position), self.normal(position)))
         return position
 
     def nearest(self, position: Vector) -> Vector:
@@ -161,22 +248,22 @@ class AbstractLevel(AbstractSurface):
         def step(foot: Vector) -> tuple[Component, Component, Vector, Vector]:
             return surface._step_on_surface(place, foot)
 
-        def in_sector(k: Any, nearest: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
-            def start(i: Any, nearest: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
-                start_point = vector_of(x + distance * starts[k, i, axis] for axis, x in enumerate(place))
+        def in_sector(k: Int[Array, ""], nearest: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
+            def start(i: Int[Array, ""], nearest: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
+                start_point = tuple(x + distance * starts[k, i, axis] for axis, x in enumerate(place))
                 return nearer(nearest, surface.onto(start_point))
 
-            initial = vector_of(jax.lax.fori_loop(0, self.starts.shape[1], start, _stacked(first)))
+            initial = tuple(jax.lax.fori_loop(0, self.starts.shape[1], start, _stacked(first)))
             initial = surface.onto(surface.onto(initial))
             searched = (step, surface.onto, lambda foot: _square(place, foot), initial, distance, 0.25 * distance)
             return nearer(nearest, descended(*searched))
 
         def nearer(old: Float[Array, "3 ..."], new: Vector) -> Float[Array, "3 ..."]:
-            return jnp.where(_square(place, new) < _square(place, vector_of(old)), _stacked(new), old)
+            return jnp.where(_square(place, new) < _square(place, tuple(old)), _stacked(new), old)
 
-        foot = vector_of(jax.lax.fori_loop(0, len(self.starts), in_sector, _stacked(first)))
+        foot = tuple(jax.lax.fori_loop(0, len(self.starts), in_sector, _stacked(first)))
         s1, s2, t1, t2 = self._step_on_surface(position, foot)
-        return self.onto(vector_of(sum_vectors(foot, scale(s1, t1), scale(s2, t2))))
+        return self.onto(sum_vectors(foot, scale(s1, t1), scale(s2, t2)))
 
     def ball_gap(self, centre: Vector, radius: Component, side: float) -> BallGap:
         surface, place, size = _held(self), jax.lax.stop_gradient(centre), jax.lax.stop_gradient(radius)
@@ -187,9 +274,9 @@ class AbstractLevel(AbstractSurface):
         def value(normal: Vector) -> Component:
             return surface.level(_lowered(place, size, normal))
 
-        normal = descended(step, _unit, value, surface.normal(place), 1.0, 0.5)
+        normal = descended(step, unit, value, surface.normal(place), 1.0, 0.5)
         s1, s2, t1, t2 = self._step_on_ball(centre, radius, normal)
-        normal = _unit(vector_of(sum_vectors(normal, scale(s1, t1), scale(s2, t2))))
+        normal = unit(sum_vectors(normal, scale(s1, t1), scale(s2, t2)))
         minimum = _lowered(centre, radius, normal)
         gap = self.offset(minimum)
         return BallGap(_lowered(minimum, gap, normal), normal, gap)
@@ -198,10 +285,10 @@ class AbstractLevel(AbstractSurface):
         """Newton's step from a foot towards the least squared distance to a position, and the two tangents at the foot
         for its components."""
         n = self.normal(foot)
-        difference = vector_of(subtract(a, b) for a, b in zip(position, foot, strict=True))
-        d, (t1, t2) = dot(difference, n), tangents(n)
+        away, (t1, t2) = difference(position, foot), tangents(n)
+        d = dot(away, n)
         aa, ab, bb = self.bending(foot, t1, t2)
-        return *newton_step(1.0 + d * aa, d * ab, 1.0 + d * bb, dot(difference, t1), dot(difference, t2)), t1, t2
+        return *newton_step(1.0 + d * aa, d * ab, 1.0 + d * bb, dot(away, t1), dot(away, t2)), t1, t2
 
     def _step_on_ball(
         self, centre: Vector, radius: Component, normal: Vector
@@ -225,16 +312,11 @@ def _stacked(vector: Vector) -> Float[Array, "3 ..."]:
 
 
 def _square(a: Vector, b: Vector) -> Component:
-    difference = vector_of(subtract(x, y) for x, y in zip(a, b, strict=True))
-    return dot(difference, difference)
-
-
-def _unit(vector: Vector) -> Vector:
-    return vector_of(scale(1.0 / jnp.sqrt(dot(vector, vector)), vector))
+    return dot(difference(a, b), difference(a, b))
 
 
 def _lowered(position: Vector, distance: Component, normal: Vector) -> Vector:
-    return vector_of(subtract(x, distance * n) for x, n in zip(position, normal, strict=True))
+    return difference(position, scale(distance, normal))
 
 
 # Open surfaces: the paraboloid and the graph of any smooth function.
@@ -271,7 +353,7 @@ class AbstractOpen(AbstractSurface):
         """Height z [m] of the surface at (x, y) [m]."""
 
 
-class Paraboloid(AbstractOpen):
+class Paraboloid(AbstractOpen, AbstractGradientSurface):
     """The bowl z = (x^2 + y^2) / (2 p).
 
     **Arguments:**
@@ -300,18 +382,11 @@ class Paraboloid(AbstractOpen):
     def ground(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
         return (x * x + y * y) / (2.0 * self.p)
 
-    def normal(self, position: Vector) -> Vector:
-        x, y, _ = position
-        per_length = 1.0 / jnp.sqrt(x * x + y * y + self.p * self.p)
-        return (-x * per_length, -y * per_length, self.p * per_length)
+    def gradient(self, position: Vector) -> Vector:
+        return (-position[0], -position[1], self.p)
 
-    def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
-        x, y, _ = position
-        per_length, normal = 1.0 / jnp.sqrt(x * x + y * y + self.p * self.p), self.normal(position)
-        gradient_rate = (-velocity[0], -velocity[1], None)
-        correction = scale(subtract(None, dot(normal, gradient_rate)), normal)
-        rate = scale(per_length, sum_vectors(gradient_rate, correction))
-        return (rate[0], rate[1], rate[2])
+    def gradient_rate(self, position: Vector, velocity: Vector) -> Vector:
+        return (-velocity[0], -velocity[1], None)
 
     def gaussian_curvature(self, position: Vector) -> Component:
         x, y, _ = position
@@ -384,7 +459,7 @@ class Graph(AbstractOpen, AbstractLevel):
 
     starts: ClassVar[Float[np.ndarray, "sectors starts 3"]] = _disc(5, 12)
 
-    height: Any = eqx.field(converter=lambda height: as_function(height, "height", ("x", "y")))
+    height: Callable[..., Component] = eqx.field(converter=lambda height: as_function(height, "height", ("x", "y")))
 
     def ground(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
         return self.height(x, y)
@@ -445,11 +520,12 @@ class Implicit(AbstractLevel):
 
     starts: ClassVar[Float[np.ndarray, "sectors starts 3"]] = _sphere()
 
-    function: Any = eqx.field(converter=lambda function: as_function(function, "function", ("x", "y", "z")))
+    function: Callable[..., Component] = eqx.field(
+        converter=lambda function: as_function(function, "function", ("x", "y", "z"))
+    )
 
     def gradient(self, position: Vector) -> Vector:
-        slope = partials(self.function, position)
-        return (slope[0], slope[1], slope[2])
+        return partials(self.function, position)
 
     def second_derivative(self, position: Vector, a: Vector, b: Vector) -> Component:
         return second_derivative(self.function, position, a, b)
@@ -461,8 +537,8 @@ class Implicit(AbstractLevel):
         return position[2]
 
     def place_at(self, position: Vector) -> Place:
-        return (position[0], position[1], position[2])
+        return tuple(position)
 
     def charted(self, place: Place) -> tuple[Vector, Vector, Vector]:
-        position = self.nearest((place[0], place[1], place[2]))
+        position = self.nearest(place)
         return position, *tangents(self.normal(position))

@@ -1,4 +1,4 @@
-"""The interface of all surfaces, and users' functions that describe one.
+"""The interface of all surfaces, and those in closed form: plane, cylinder, sphere, spheroid and torus.
 
 A surface has its own axes, in which positions, velocities and normals are given. These are the axes of the fixed frame
 (x, y, z), z up, except on a tilted plane, whose third axis is its normal; `up` is the vertical in the surface's axes.
@@ -13,22 +13,37 @@ Vectors are tuples of three components, each a number or an array over lanes, or
 """
 
 import abc
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any, ClassVar, NamedTuple
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar, NamedTuple, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.core import eval_jaxpr
 from jaxtyping import Array, Float
 
-from ..compilation.components import Held, held, map_methods
-from ..text import gathered, parted, shown, spread
-from ..validation import UNTRACEABLE, Bound, Bounded, as_number, is_traced
-from .vector import Component, Vector, dot, scale, subtract
+from ..compilation.components import held, map_methods
+from ..text import shown
+from ..validation import Bound, Bounded, as_number, require
+from .vector import (
+    Component,
+    Vector,
+    difference,
+    dot,
+    multiply,
+    none_if_zero,
+    planar_length,
+    scale,
+    subtract,
+    sum_vectors,
+    unit,
+)
 
-Place = tuple[Any, ...]
+#: A surface, or a value that the checks of a scene reject.
+Other = TypeVar("Other")
+
+#: The coordinates of a place, or the numbers that a frame integrates.
+Place: TypeAlias = tuple[Component, ...]
 
 #: Largest distance of a place (x, y, z) from its surface, relative to its size, that counts as round-off.
 ROUND_OFF = 1e-9
@@ -104,7 +119,7 @@ class AbstractSurface(Bounded):
         """Rate n' [1/s] of the normal at a position [m] that moves with a velocity [m/s]: minus the shape operator
         times the velocity."""
 
-    def bending(self, position: Vector, a: Vector, b: Vector) -> tuple[Component, Component, Component]:
+    def bending(self, position: Vector, a: Vector, b: Vector) -> Vector:
         """(a . n'(a), a . n'(b), b . n'(b)) [1/m] for two vectors along the surface: minus its second fundamental form."""
         by_a, by_b = self.normal_rate(position, a), self.normal_rate(position, b)
         return dot(a, by_a), dot(b, by_a), dot(b, by_b)
@@ -131,13 +146,9 @@ class AbstractSurface(Bounded):
         **Arguments:** `centre`, `radius`: centre and radius of the ball [m]; the radius must be less than the radii of
         curvature where the surface is concave; `side`: 1.0 if the ball is on the side to which n points, else -1.0.
         """
-        foot = self.nearest(centre)
-        foot = tuple(0.0 * centre[0] if part is None else part for part in foot)
+        foot = tuple(0.0 * centre[0] if part is None else part for part in self.nearest(centre))
         normal = scale(side, self.normal(foot))
-        difference = tuple(subtract(a, b) for a, b in zip(centre, foot, strict=True))
-        return BallGap(
-            (foot[0], foot[1], foot[2]), (normal[0], normal[1], normal[2]), subtract(dot(difference, normal), radius)
-        )
+        return BallGap(foot, normal, subtract(dot(difference(centre, foot), normal), radius))
 
     def offset(self, position: Vector) -> Component:
         """Distance [m] of a position close to the surface, exact, or to first order if that is cheaper."""
@@ -146,8 +157,7 @@ class AbstractSurface(Bounded):
     def distance(self, position: Vector) -> Component:
         """Distance [m] of a position from the surface, positive on the side to which n points."""
         foot = self.nearest(position)
-        difference = (subtract(position[0], foot[0]), subtract(position[1], foot[1]), subtract(position[2], foot[2]))
-        return dot(difference, self.normal(foot))
+        return dot(difference(position, foot), self.normal(foot))
 
     @abc.abstractmethod
     def place_at(self, position: Vector) -> Place:
@@ -165,10 +175,10 @@ class AbstractSurface(Bounded):
         - `place`: numbers named by `coordinates`, or (x, y, z) [m] in the fixed frame, which is moved to the nearest point.
         """
         if len(place) > len(self.coordinates):
-            place = self.place_at(self.nearest(self.in_own_axes((place[0], place[1], place[2]))))
+            place = self.place_at(self.nearest(self.in_own_axes(place)))
         return self.charted(place)
 
-    def place_bounds(self, place: Place, size: Any) -> Iterator[Bound]:
+    def place_bounds(self, place: Place, size: Component) -> Iterator[Bound]:
         """The ranges of the numbers of a place.
 
         **Arguments:** `place`: as for `chart`; `size`: a length [m] of the body, the scale for round-off.
@@ -181,7 +191,7 @@ class AbstractSurface(Bounded):
             three = "" if count == 3 else " or (x [m], y [m], z [m])"
             raise ValueError(f"place = {shown(place)} must be ({names}){three} on a {type(self).__name__}")
         if len(place) == 3:
-            distance = self.offset(self.in_own_axes((place[0], place[1], place[2])))
+            distance = self.offset(self.in_own_axes(place))
             tolerance = ROUND_OFF * (size + jnp.sqrt(place[0] ** 2 + place[1] ** 2 + place[2] ** 2))
             reason = "of the place from the surface, in metres: the place must be on the surface up to round-off"
             yield Bound(
@@ -205,7 +215,7 @@ class AbstractSurface(Bounded):
             raise ValueError(f"side = {shown(side)} must be {next(iter(self.sides))!r} on a {type(self).__name__}")
         return self.sides[side]
 
-    def in_fixed_frame(self, vector: Vector) -> tuple[Any, Any, Any]:
+    def in_fixed_frame(self, vector: Vector) -> Vector:
         """Components of a vector in the fixed frame (x, y, z), z up."""
         x, y, z = vector
         return (x, y, jnp.zeros_like(x) if z is None else z)
@@ -215,102 +225,443 @@ class AbstractSurface(Bounded):
         return vector
 
 
-def as_surface(surface: Any) -> Any:
+class AbstractGradientSurface(AbstractSurface):
+    """A surface whose normal is the direction of a vector with a simple rate, such as a gradient."""
+
+    @abc.abstractmethod
+    def gradient(self, position: Vector) -> Vector:
+        """A vector along the normal at a position [m]."""
+
+    @abc.abstractmethod
+    def gradient_rate(self, position: Vector, velocity: Vector) -> Vector:
+        """Rate [1/s] of the gradient at a position [m] that moves with a velocity [m/s]."""
+
+    def normal(self, position: Vector) -> Vector:
+        return unit(self.gradient(position))
+
+    def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
+        gradient, gradient_rate = self.gradient(position), self.gradient_rate(position, velocity)
+        normal, per_size = unit(gradient), 1.0 / jnp.sqrt(dot(gradient, gradient))
+        along_normal = scale(subtract(None, dot(normal, gradient_rate)), normal)
+        return scale(per_size, sum_vectors(gradient_rate, along_normal))
+
+    def bending(self, position: Vector, a: Vector, b: Vector) -> Vector:
+        # The gradient's size changes the normal only along n, which is perpendicular to a and b.
+        gradient, by_a, by_b = self.gradient(position), self.gradient_rate(position, a), self.gradient_rate(position, b)
+        return scale(1.0 / jnp.sqrt(dot(gradient, gradient)), (dot(a, by_a), dot(b, by_a), dot(b, by_b)))
+
+
+def as_surface(surface: Other) -> Other:
     """A user's surface with every number of its arrays as a leaf, in a scene with many lanes; anything else unchanged."""
     if not isinstance(surface, AbstractSurface):
         return surface
     return held(surface, lambda surface: surface.normal((jnp.zeros(()), jnp.zeros(()), jnp.ones(()))))
 
 
-# User functions for surfaces: convert them to modules with visible parameters, check them, and differentiate them.
+# The plane, level or tilted.
 
 
-class Plain(eqx.Module):
-    """A function without parameters; the same function gives the same program."""
+class Plane(AbstractSurface):
+    """A plane through the origin; its axes are x, along which it rises, y, and its normal. A level plane adds no terms.
 
-    function: Callable[..., Any] = eqx.field(static=True)
+    A place on it is (x, y) [m], along the plane; east is its x axis and north y.
 
-    def __call__(self, *at: Float[Array, "..."]) -> Float[Array, "..."]:
-        # Users may compare, sort and look up numbers, or join them, which would mix lanes.
-        return jnp.vectorize(lambda *numbers: jnp.asarray(self.function(*numbers)))(*at)
+    **Arguments:**
 
+    - `tilt`: angle [rad] by which the plane rises along its own x axis, in [-pi/2, pi/2].
 
-class Closure(eqx.Module):
-    """A function whose leaves are the traced numbers that it closes over. It was traced with single numbers; since
-    then, each may have become one number per lane."""
+    **Example:**
 
-    numbers: tuple[Any, ...]
-    # JAX's Jaxpr; equal only if it is the same object.
-    program: Any = eqx.field(static=True)
+    ```
+    >>> import tippe
+    >>> tippe.Plane()
+    Plane()
+    >>> tippe.Plane(tilt=0.1)
+    Plane(tilt=0.1 rad)
 
-    def __call__(self, *at: Float[Array, "..."]) -> Float[Array, "..."]:
-        shapes, count = tuple(constant.aval.shape for constant in self.program.constvars), len(self.numbers)
-
-        def value(*scalars: Float[Array, ""]) -> Float[Array, ""]:
-            return eval_jaxpr(self.program, gathered(scalars[:count], shapes), *scalars[count:])[0]
-
-        return jnp.vectorize(value)(*self.numbers, *at)
-
-
-def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module:
-    """Convert a function of lengths [m] to a module whose parameters are arrays.
-
-    **Raises:** `ValueError` unless the function returns one number for numbers.
+    ```
     """
-    if not callable(value):
-        raise ValueError(f"{name} = {shown(value)} must be a function of ({', '.join(arguments)})")
-    if isinstance(value, eqx.Module):
-        value = jax.tree.map(lambda leaf: as_number(leaf) if isinstance(leaf, float | np.ndarray) else leaf, value)
-    zeros = (jnp.zeros(()),) * len(arguments)
-    try:
-        program = jax.make_jaxpr(value)(*zeros)
-    except jax.errors.JAXTypeError as error:
-        raise ValueError(f"{name} = {shown(value)} {UNTRACEABLE}") from error
-    except TypeError as error:
-        raise ValueError(f"{name} = {shown(value)} must be a function of ({', '.join(arguments)}): {error}") from error
-    # The parameters of a module may have one value per lane.
-    shapes = {(), *(leaf.shape for leaf in jax.tree.leaves(value) if eqx.is_array(leaf))}
-    results = program.out_avals
-    if len(results) != 1 or results[0].shape not in shapes or not jnp.issubdtype(results[0].dtype, jnp.floating):
-        names_of_results = ", ".join(map(str, results))
-        raise ValueError(
-            f"{name} = {shown(value)} must return one number for numbers {', '.join(arguments)}, not {names_of_results}"
+
+    units: ClassVar[dict[str, str]] = {"tilt": "rad"}
+    is_wavy: ClassVar[bool] = False
+
+    axes: ClassVar[int] = 2
+    # "outside" is accepted for the only side of a plane, so that grounds can be compared.
+    sides: ClassVar[Mapping[str, float]] = {"outside": CLOSED["outside"], **OPEN}
+    coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("x", "m"), ("y", "m"))
+
+    tilt: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)
+
+    def bounds(self) -> Iterator[Bound]:
+        if self.tilt is not None:
+            yield Bound(self.tilt, "tilt", at_least=-math.pi / 2.0, at_most=math.pi / 2.0, unit="rad")
+
+    @property
+    def up(self) -> Vector:
+        return (None, None, 1.0) if self.tilt is None else (jnp.sin(self.tilt), None, jnp.cos(self.tilt))
+
+    def normal(self, position: Vector) -> Vector:
+        return (None, None, 1.0)
+
+    def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
+        return (None, None, None)
+
+    def elevation(self, position: Vector) -> Component:
+        return dot(position, self.up)
+
+    def gaussian_curvature(self, position: Vector) -> Component:
+        return None
+
+    def nearest(self, position: Vector) -> Vector:
+        return (position[0], position[1], None)
+
+    def place_at(self, position: Vector) -> Place:
+        return position[:2]
+
+    def charted(self, place: Place) -> tuple[Vector, Vector, Vector]:
+        unit = jnp.ones_like(place[0])
+        return (place[0], place[1], None), (unit, jnp.zeros_like(unit), None), (jnp.zeros_like(unit), unit, None)
+
+    def in_fixed_frame(self, vector: Vector) -> Vector:
+        x, y, z = super().in_fixed_frame(vector)
+        if self.tilt is None:
+            return (x, y, z)
+        sine, cosine = jnp.sin(self.tilt), jnp.cos(self.tilt)
+        return (x * cosine - z * sine, y, x * sine + z * cosine)
+
+    def in_own_axes(self, vector: Vector) -> Vector:
+        if self.tilt is None:
+            return vector
+        (x, y, z), sine, cosine = vector, jnp.sin(self.tilt), jnp.cos(self.tilt)
+        return (x * cosine + z * sine, y, z * cosine - x * sine)
+
+
+# The cylinder with a horizontal axis.
+
+
+class Cylinder(AbstractGradientSurface):
+    """A cylinder whose axis is the y axis.
+
+    A place on it is (y, eta): along the axis [m], and the angle [rad] about it from the lowest line, towards x; east is y
+    and north is along growing eta.
+
+    **Arguments:**
+
+    - `radius`: radius [m], positive.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> tippe.Cylinder(radius=0.3)
+    Cylinder(radius=0.3 m)
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"radius": "m"}
+    is_wavy: ClassVar[bool] = False
+
+    coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("y", "m"), ("eta", "rad"))
+
+    radius: Float[Array, "..."] = eqx.field(converter=as_number)
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.radius, "surface radius", above=0.0)
+
+    def gradient(self, position: Vector) -> Vector:
+        return (position[0], None, position[2])
+
+    def gradient_rate(self, position: Vector, velocity: Vector) -> Vector:
+        return (velocity[0], None, velocity[2])
+
+    def elevation(self, position: Vector) -> Component:
+        return position[2] + self.radius
+
+    def gaussian_curvature(self, position: Vector) -> Component:
+        return None
+
+    def nearest(self, position: Vector) -> Vector:
+        part = self.radius / _across(position)
+        return (multiply(part, position[0]), position[1], multiply(part, position[2]))
+
+    def distance(self, position: Vector) -> Component:
+        return _across(position) - self.radius
+
+    def place_at(self, position: Vector) -> Place:
+        return (position[1], jnp.arctan2(position[0], -position[2]))
+
+    def charted(self, place: Place) -> tuple[Vector, Vector, Vector]:
+        axial, eta = place
+        sine, cosine, zero = jnp.sin(eta), jnp.cos(eta), jnp.zeros_like(eta)
+        return (
+            (self.radius * sine, axial, -self.radius * cosine),
+            (zero, jnp.ones_like(eta), zero),
+            (cosine, zero, sine),
         )
-    if isinstance(value, eqx.Module):
-        # If the parameters have one number per lane, so have the results.
-        of_one_run = results[0].shape == () and (len(shapes) > 1 or not _takes_lanes(value, len(arguments)))
-        return Held(parted(value)) if of_one_run and not isinstance(value, Held) else value
-    if any(is_traced(constant) for constant in program.consts):
-        return Closure(spread(program.consts), program.jaxpr)
-    # Equinox warns of the arrays of a tree, such as JAX's partial functions, but not of those of its method.
-    return Plain(value if jax.tree_util.all_leaves([value]) else value.__call__)
 
 
-def _takes_lanes(function: Any, count: int) -> bool:
-    """Whether a function of numbers, whose parameters are single numbers, takes one number per lane, too."""
-    lanes = jax.ShapeDtypeStruct((2,), float)
-    try:
-        return jax.eval_shape(function, *(lanes,) * count).shape == lanes.shape
-    except Exception:
-        # Any error: the function is a user's.
-        return False
+def _across(position: Vector) -> Component:
+    """Distance [m] of a position from the axis."""
+    return jnp.sqrt(position[0] * position[0] + position[2] * position[2])
 
 
-def partials(function: Callable[..., Any], at: tuple[Any, ...]) -> tuple[Float[Array, "..."], ...]:
-    """Partial derivatives of a function of several numbers, each a number or an array over lanes."""
+# Sphere and spheroid: the quadrics of revolution about the vertical.
 
-    def along(k: int) -> Float[Array, "..."]:
-        return jax.jvp(
-            lambda coordinate: function(*at[:k], coordinate, *at[k + 1 :]), (at[k],), (jnp.ones_like(at[k]),)
-        )[1]
+#: Newton steps to the nearest point of a spheroid: enough for the worst positions.
+NEWTON_STEPS = 12
 
-    return tuple(along(k) for k in range(len(at)))
+#: A negligible distance [m], to avoid division by zero.
+TINY = 1e-100
 
 
-def second_derivative(
-    function: Callable[..., Any], at: tuple[Any, ...], a: tuple[Any, ...], b: tuple[Any, ...]
-) -> Float[Array, "..."]:
-    """Second derivative of a function of several numbers along two vectors, each component a number or an array over lanes."""
-    size, numbers = len(at), tuple(jnp.broadcast_arrays(*at, *a, *b))
-    place, first, second = numbers[:size], numbers[size : 2 * size], numbers[2 * size :]
-    return jax.jvp(lambda *point: jax.jvp(function, point, first)[1], place, second)[1]
+class AbstractQuadric(AbstractGradientSurface):
+    """A sphere or spheroid r.N r = 1, N = diag(1/A^2, 1/A^2, 1/c^2), about the origin, its axis vertical.
+
+    A place on it is (mu, eta) [rad], azimuth and reduced latitude: -pi/2 at the lowest point, pi/2 at the highest.
+    """
+
+    is_wavy: ClassVar[bool] = False
+
+    @property
+    @abc.abstractmethod
+    def semi_axes(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Equatorial radius A and polar semi-axis c [m]."""
+
+    def gradient(self, position: Vector) -> Vector:
+        # N r [1/m] has unit length on the surface.
+        equatorial, polar = self.semi_axes
+        across, along = 1.0 / (equatorial * equatorial), 1.0 / (polar * polar)
+        return (multiply(across, position[0]), multiply(across, position[1]), multiply(along, position[2]))
+
+    def gradient_rate(self, position: Vector, velocity: Vector) -> Vector:
+        return self.gradient(velocity)
+
+    def elevation(self, position: Vector) -> Component:
+        return position[2] + self.semi_axes[1]
+
+    def gaussian_curvature(self, position: Vector) -> Component:
+        equatorial, polar = self.semi_axes
+        gradient = self.gradient(position)
+        return 1.0 / (equatorial**2 * polar * dot(gradient, gradient)) ** 2
+
+    def place_at(self, position: Vector) -> Place:
+        equatorial, polar = self.semi_axes
+        x, y, z = position
+        return (jnp.arctan2(y, x), jnp.arctan2(z / polar, planar_length(x, y) / equatorial))
+
+    def charted(self, place: Place) -> tuple[Vector, Vector, Vector]:
+        (equatorial, polar), (mu, eta) = self.semi_axes, place
+        east = (-jnp.sin(mu), jnp.cos(mu), jnp.zeros_like(mu))
+        outwards, across, along = (jnp.cos(mu), jnp.sin(mu)), equatorial * jnp.cos(eta), polar * jnp.sin(eta)
+        inwards, rise = -equatorial * jnp.sin(eta), polar * jnp.cos(eta)
+        per_length = 1.0 / jnp.sqrt(inwards**2 + rise**2)
+        north = scale(per_length, (inwards * outwards[0], inwards * outwards[1], rise))
+        return (across * outwards[0], across * outwards[1], along), east, north
+
+    def place_bounds(self, place: Place, size: Component) -> Iterator[Bound]:
+        yield from super().place_bounds(place, size)
+        if len(place) == 2:
+            limit = math.pi / 2.0 + 1e-12
+            reason = "reduced latitude, from -pi/2 to pi/2"
+            yield Bound(place[1], "place[1]", at_least=-limit, at_most=limit, why=reason, unit="rad")
+
+
+class Sphere(AbstractQuadric):
+    """A sphere about the origin.
+
+    **Arguments:**
+
+    - `radius`: radius [m], positive.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> tippe.Sphere(radius=0.5)
+    Sphere(radius=0.5 m)
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"radius": "m"}
+
+    radius: Float[Array, "..."] = eqx.field(converter=as_number)
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.radius, "surface radius", above=0.0)
+
+    @property
+    def semi_axes(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        return self.radius, self.radius
+
+    def nearest(self, position: Vector) -> Vector:
+        return scale(self.radius / jnp.sqrt(dot(position, position)), position)
+
+    def distance(self, position: Vector) -> Component:
+        return jnp.sqrt(dot(position, position)) - self.radius
+
+
+class Spheroid(AbstractQuadric):
+    """An ellipsoid of revolution with a vertical axis, oblate or prolate.
+
+    **Arguments:**
+
+    - `equatorial`: equatorial radius A [m], positive.
+    - `polar`: polar semi-axis c [m], positive.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> stroller.Spheroid(equatorial=6.0, polar=3.0)
+    Spheroid(equatorial=6 m, polar=3 m)
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"equatorial": "m", "polar": "m"}
+
+    equatorial: Float[Array, "..."] = eqx.field(converter=as_number)
+    polar: Float[Array, "..."] = eqx.field(converter=as_number)
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.equatorial, "equatorial", above=0.0)
+        yield Bound(self.polar, "polar", above=0.0)
+
+    @classmethod
+    def from_oblate(cls, a: Float[Array, "..."], xi: Float[Array, "..."]) -> "Spheroid":
+        """The spheroid of constant xi in oblate spheroidal coordinates: A = a cosh xi, c = a sinh xi.
+
+        **Arguments:**
+
+        - `a`: focal radius [m], positive.
+        - `xi`: coordinate [1], positive.
+
+        **Raises:** `ValueError` for numbers outside these ranges.
+
+        **Example:**
+
+        ```
+        >>> import stroller
+        >>> stroller.Spheroid.from_oblate(a=2.0, xi=0.8)
+        Spheroid(equatorial=2.67487 m, polar=1.77621 m)
+
+        ```
+        """
+        a, xi = as_number(a), as_number(xi)
+        require(a, "a", above=0.0)
+        require(xi, "xi", above=0.0)
+        return cls(equatorial=a * jnp.cosh(xi), polar=a * jnp.sinh(xi))
+
+    @property
+    def semi_axes(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        return self.equatorial, self.polar
+
+    def offset(self, position: Vector) -> Component:
+        gradient = self.gradient(position)
+        return 0.5 * (dot(position, gradient) - 1.0) / jnp.sqrt(dot(gradient, gradient))
+
+    def nearest(self, position: Vector) -> Vector:
+        # q = (1 + t N)^-1 r, with the greatest t for which q is on the surface: this is the nearest solution. The
+        # inverse length of N^1/2 q is almost linear in t, so Newton's method needs few steps (Moré and Sorensen, SIAM
+        # Journal on Scientific and Statistical Computing 4 (1983) 553).
+        equatorial, polar = self.semi_axes
+        x, y, z = position
+        # Where the nearest points in all directions are equally near, take the point in the direction of growing
+        # coordinates.
+        radial, axial = jnp.sqrt(jnp.maximum(x * x + y * y, TINY * TINY)), jnp.maximum(jnp.abs(z), TINY)
+        minor = jnp.minimum(equatorial, polar)
+        numbers = (equatorial * radial, polar * axial, equatorial**2 - minor**2, polar**2 - minor**2)
+
+        def closer(s: Component, u: Component, v: Component, p: Component, q: Component) -> Component:
+            a, b = u / (s + p), v / (s + q)
+            square = a * a + b * b
+            return s + square * (jnp.sqrt(square) - 1.0) / (a * a / (s + p) + b * b / (s + q))
+
+        u, v, p, q = constants = jax.lax.stop_gradient(numbers)
+        s = jax.lax.fori_loop(0, NEWTON_STEPS, lambda _, s: closer(s, *constants), jnp.maximum(u - p, v - q))
+        s = closer(s, *numbers)
+        radial_factor, axial_factor = equatorial**2 / (s + numbers[2]), polar**2 / (s + numbers[3])
+        x = x + jnp.where((x == 0.0) & (y == 0.0), TINY, 0.0)
+        return (radial_factor * x, radial_factor * y, axial_factor * (z + jnp.where(z == 0.0, TINY, 0.0)))
+
+
+# The torus with a vertical axis.
+
+
+class Torus(AbstractGradientSurface):
+    """A ring-shaped tube about the vertical axis, its middle at the height of the origin.
+
+    A place on it is (mu, eta) [rad]: azimuth, and angle about the tube from its outermost circle upwards, so that -pi/2 is
+    its lowest circle and pi/2 its highest.
+
+    **Arguments:**
+
+    - `ring`: radius [m] of the circle along the middle of the tube, positive.
+    - `tube`: radius [m] of the tube, positive and less than `ring`.
+
+    **Example:**
+
+    ```
+    >>> import nonholonomic
+    >>> tube = nonholonomic.Torus(ring=2.0, tube=0.5)
+    >>> print(round(float(tube.gaussian_curvature((2.5, 0.0, 0.0))), 6))
+    0.8
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"ring": "m", "tube": "m"}
+    is_wavy: ClassVar[bool] = False
+
+    ring: Float[Array, "..."] = eqx.field(converter=as_number)
+    tube: Float[Array, "..."] = eqx.field(converter=as_number)
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.ring, "ring", above=0.0)
+        yield Bound(self.tube, "tube", above=0.0)
+        yield Bound(
+            self.tube, "tube", below=self.ring, why="the radius of the ring: otherwise the tube would intersect itself"
+        )
+
+    def from_middle(self, position: Vector) -> Vector:
+        """The vector [m] to a position from the nearest point of the circle along the middle of the tube."""
+        x, y, z = position
+        part = 1.0 - self.ring / jnp.sqrt(x * x + y * y)
+        return (part * x, part * y, z)
+
+    def gradient(self, position: Vector) -> Vector:
+        return self.from_middle(position)
+
+    def gradient_rate(self, position: Vector, velocity: Vector) -> Vector:
+        x, y, _ = position
+        per_axis = 1.0 / (x * x + y * y)
+        # The nearest point of the circle moves along it at this rate about the axis.
+        turn = self.ring * (x * velocity[1] - y * velocity[0]) * per_axis * jnp.sqrt(per_axis)
+        return (velocity[0] + y * turn, velocity[1] - x * turn, velocity[2])
+
+    def elevation(self, position: Vector) -> Component:
+        return position[2] + self.tube
+
+    def gaussian_curvature(self, position: Vector) -> Component:
+        # cos(eta) / (tube (ring + tube cos(eta))), with the distance from the axis for ring + tube cos(eta).
+        from_axis = jnp.sqrt(position[0] ** 2 + position[1] ** 2)
+        return (1.0 - self.ring / from_axis) / self.tube**2
+
+    def nearest(self, position: Vector) -> Vector:
+        return difference(position, scale(self.distance(position), self.normal(position)))
+
+    def distance(self, position: Vector) -> Component:
+        spoke = self.from_middle(position)
+        return jnp.sqrt(dot(spoke, spoke)) - self.tube
+
+    def place_at(self, position: Vector) -> Place:
+        x, y, z = position
+        return (jnp.arctan2(y, x), jnp.arctan2(z, jnp.sqrt(x * x + y * y) - self.ring))
+
+    def charted(self, place: Place) -> tuple[Vector, Vector, Vector]:
+        (mu, eta), zero = place, jnp.zeros_like(place[0])
+        cm, sm, ce, se = jnp.cos(mu), jnp.sin(mu), jnp.cos(eta), jnp.sin(eta)
+        from_axis = self.ring + self.tube * ce
+        return (from_axis * cm, from_axis * sm, self.tube * se), (-sm, cm, zero), (-se * cm, -se * sm, ce)

@@ -1,11 +1,10 @@
 """Vectors in which an exact zero costs nothing, lengths in a plane, and small linear systems.
 
-A vector is a tuple of components, each an array over the lanes, or `None` where the model says that the component
+A vector is a tuple of three components, each an array over the lanes, or `None` where the model says that the component
 vanishes identically (no curvature on a plane, no force without friction). Sums skip `None` and products with `None` are
 `None`, so the same formula serves every scene, and each scene evaluates only its own terms.
 """
 
-from collections.abc import Iterable
 from typing import Any, TypeAlias
 
 import jax
@@ -20,25 +19,19 @@ from ..validation import as_number, is_traced
 
 #: An array over the lanes, a number, or `None` where the component vanishes identically.
 Component: TypeAlias = Any
-Vector: TypeAlias = tuple[Component, Component, Component]
+Vector: TypeAlias = tuple[Component, ...]
 
 #: Square of the sine of the angle to x below which a normal counts as along x.
 ALONG = 1e-12
 
 
-def none_if_zero(value: Any) -> Any:
+def none_if_zero(value: Component) -> Component:
     """A number as an array, or `None` if it is known to be zero everywhere, so that it costs nothing."""
     if value is None:
         return None
     number = as_number(value)
     # An empty list stays unchanged, so that the module rejects it.
     return None if not is_traced(number) and np.size(number) and np.all(np.asarray(number) == 0.0) else number
-
-
-def vector_of(components: Iterable[Component]) -> Vector:
-    """Three components as a vector."""
-    x, y, z = components
-    return (x, y, z)
 
 
 def add(*terms: Component) -> Component:
@@ -67,12 +60,12 @@ def multiply(*factors: Component) -> Component:
     return product
 
 
-def scale(factor: Component, vector: tuple[Component, ...]) -> tuple[Component, ...]:
+def scale(factor: Component, vector: Vector) -> Vector:
     """The vector `factor * vector`."""
     return tuple(multiply(factor, component) for component in vector)
 
 
-def dot(left: tuple[Component, ...], right: tuple[Component, ...]) -> Component:
+def dot(left: Vector, right: Vector) -> Component:
     """Scalar product of two vectors of the same length."""
     return add(*(multiply(a, b) for a, b in zip(left, right, strict=True)))
 
@@ -87,12 +80,22 @@ def cross(left: Vector, right: Vector) -> Vector:
     )
 
 
-def sum_vectors(*vectors: tuple[Component, ...]) -> tuple[Component, ...]:
+def sum_vectors(*vectors: Vector) -> Vector:
     """Sum of vectors of the same length."""
     return tuple(add(*components) for components in zip(*vectors, strict=True))
 
 
-def stacked(vector: tuple[Component, ...], example: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+def difference(left: Vector, right: Vector) -> Vector:
+    """Difference `left - right` of two vectors of the same length."""
+    return tuple(map(subtract, left, right))
+
+
+def unit(vector: Vector) -> Vector:
+    """The vector divided by its length."""
+    return scale(1.0 / jnp.sqrt(dot(vector, vector)), vector)
+
+
+def stacked(vector: Vector, example: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
     """The components along axis 0, in the shape of the components of `example`, with zeros for those that vanish
     identically."""
     zero = jnp.zeros_like(example[0])
@@ -103,16 +106,15 @@ def tangents(normal: Vector) -> tuple[Vector, Vector]:
     """Two unit vectors across a unit normal n: t1, the projection of x (of y where n is along x), and t2 = n x t1."""
     nx, ny, nz = normal
     along_x = 1.0 - nx * nx < ALONG
-    first = _projected((1.0 - nx * nx, -nx * ny, -nx * nz), ~along_x)
-    second = _projected((-ny * nx, 1.0 - ny * ny, -ny * nz), along_x)
-    t1 = vector_of(jnp.where(along_x, b, a) for a, b in zip(first, second, strict=True))
+
+    def projected(vector: Vector, is_used: Component) -> Vector:
+        # Where the vector is not used, its length is replaced, so that its derivatives are finite, too.
+        return scale(1.0 / jnp.sqrt(jnp.where(is_used, dot(vector, vector), 1.0)), vector)
+
+    first = projected((1.0 - nx * nx, -nx * ny, -nx * nz), ~along_x)
+    second = projected((-ny * nx, 1.0 - ny * ny, -ny * nz), along_x)
+    t1 = tuple(jnp.where(along_x, b, a) for a, b in zip(first, second, strict=True))
     return t1, cross(normal, t1)
-
-
-def _projected(vector: Vector, component: Component) -> Vector:
-    """The vector at unit length; where it is not used, a finite vector with finite derivatives."""
-    square = jnp.where(component, dot(vector, vector), 1.0)
-    return scale(1.0 / jnp.sqrt(square), vector)
 
 
 # Small linear systems in plain JAX operations.
@@ -174,7 +176,7 @@ def planar_length(x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array
 
 
 @planar_length.defjvp
-def _change(primals: Any, tangents: Any) -> Any:
+def _change(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
     length = planar_length(*primals)
     (x, y), (dx, dy) = jnp.broadcast_arrays(*primals), jnp.broadcast_arrays(*tangents)
     at_pole = length == 0.0
@@ -190,11 +192,11 @@ _departure.def_abstract_eval(lambda dx, dy: ShapedArray(dx.shape, dx.dtype))
 mlir.register_lowering(_departure, mlir.lower_fun(lambda dx, dy: jnp.hypot(dx, dy), multiple_results=False))
 
 
-def _second_change(primals: Any, tangents: Any) -> Any:
+def _second_change(primals: tuple[Array, Array], tangents: tuple[Array | ad.Zero, ...]) -> tuple[Array, Array]:
     return jax.jvp(planar_length, primals, tuple(ad.instantiate_zeros(tangent) for tangent in tangents))
 
 
-def _taken_back(cotangent: Any, dx: Any, dy: Any) -> Any:
+def _taken_back(cotangent: Array | ad.Zero, dx: Array | ad.UndefinedPrimal, dy: Array | ad.UndefinedPrimal) -> Vector:
     if isinstance(cotangent, ad.Zero):
         return None, None
     doubt = jnp.where(cotangent == 0.0, 0.0, jnp.nan)

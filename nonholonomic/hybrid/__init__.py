@@ -1,9 +1,9 @@
 """Hybrid systems: smooth motion in modes with resets between them, for ensembles and single runs, with their
 derivatives.
 
-`solve_hybrid` integrates an ensemble of runs, each through the modes of a system (`traced_solve_hybrid` inside other
-transformed functions); `solve_hybrid_dense` integrates a single run with its path, and `hybrid_resets` returns the
-resets of one. `solve_hybrid_with_tangents` carries tangents through every reset by the saltation matrix.
+`solve_hybrid` integrates an ensemble of runs, each through the modes of a system; `solve_hybrid_dense` integrates a single
+run with its path, and `hybrid_resets` returns the resets of one. `solve_hybrid_with_tangents` carries tangents through every
+reset by the saltation matrix. With `traced=True`, both functions for ensembles work inside other transformed functions.
 `solve_hybrid_with_samples` returns the states of an ensemble at times, and `hybrid_samples` those of a run inside a
 transformation, both with their derivatives. A run that is not over after `MOST_ROUNDS` modes is `UNRESOLVED`; `BETWEEN`
 is the number of the segment of a `HybridPath` between two modes.
@@ -44,19 +44,17 @@ is the number of the segment of a `HybridPath` between two modes.
 
 from .ensemble import BETWEEN as BETWEEN
 from .ensemble import MOST_ROUNDS as MOST_ROUNDS
+from .ensemble import AbstractBatchedMode as AbstractBatchedMode
+from .ensemble import AbstractHoppingMode as AbstractHoppingMode
 from .ensemble import HybridOutcome as HybridOutcome
 from .ensemble import HybridPath as HybridPath
 from .ensemble import Segment as Segment
+from .ensemble import Transition as Transition
+from .ensemble import TransitionPath as TransitionPath
 from .ensemble import hybrid_resets as hybrid_resets
 from .ensemble import solve_hybrid as solve_hybrid
 from .ensemble import solve_hybrid_dense as solve_hybrid_dense
-from .ensemble import traced_solve_hybrid as traced_solve_hybrid
-from .mode import AbstractBatchedMode as AbstractBatchedMode
-from .mode import AbstractHoppingMode as AbstractHoppingMode
-from .mode import Transition as Transition
-from .mode import TransitionPath as TransitionPath
 from .saltation import solve_hybrid_with_tangents as solve_hybrid_with_tangents
-from .saltation import traced_solve_hybrid_with_tangents as traced_solve_hybrid_with_tangents
+from .sampled_adjoint import hybrid_samples as hybrid_samples
 from .samples import HybridSamples as HybridSamples
-from .samples import hybrid_samples as hybrid_samples
 from .samples import solve_hybrid_with_samples as solve_hybrid_with_samples

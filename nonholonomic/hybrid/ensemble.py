@@ -1,4 +1,5 @@
-"""Hybrid motion: smooth modes with resets between them, for many cells at once and for one run with its path.
+"""Hybrid motion: smooth modes with resets between them, which may take time, for many cells at once and for one run with
+its path.
 
 A mode has its own equations of motion and ends where they cease to hold: a contact opens or closes, slipping ends. The
 mode's `reset_map` gives the transition to the next mode: an impact, a flight in closed form, other equations. All modes
@@ -7,35 +8,203 @@ share one layout of the state. The cells advance in rounds: each round solves th
 end. The loop over rounds runs on the host, with concrete numbers, or inside other transformed functions.
 """
 
+import abc
 import dataclasses
 import functools
 import itertools
 import operator
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Generic, NamedTuple
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.cache import padded
 from ..compilation.xla_cpu import compiled_quickly, greatest
-from ..integration import (
-    AbstractProblem,
-    DenseSolution,
-    Outcome,
-    Settings,
-    follow,
-    solve_ensemble,
-    traced_solve_ensemble,
-)
+from ..integration import AbstractProblem, Lanes, Outcome, Settings, States, follow, solve_ensemble
 from ..integration.dense import PIECE_OF_MODE
 from ..integration.problem import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
-from ..integration.scheduler import NO_EXTREMES, Numbers
-from .mode import AbstractBatchedMode, Transition, mode_of_cells
+from ..integration.scheduler import NO_EXTREMES, Numbers, of_cells
+
+#: A kind of mode.
+Mode = TypeVar("Mode", bound="AbstractBatchedMode")
+
+
+class TransitionPath(NamedTuple):
+    """Path of a single run from one mode to the next, as successive stretches of motion in closed form.
+
+    - `ends`: when each stretch ends [s], counted from the end of the mode; infinite for unused entries.
+    - `motions`: for each stretch the argument of `AbstractBatchedMode.between`; the first axis of every leaf counts the
+      stretches.
+    - `shown`: number of default output times of each stretch.
+
+    **Example:** a hop of 0.4 s in closed form, drawn with three points.
+
+    >>> from nonholonomic.hybrid import TransitionPath
+    >>> record = TransitionPath(jnp.array([[0.4]]), {"speed": jnp.array([[1.962]])}, jnp.array([[3]]))
+    """
+
+    ends: Float[Array, " stretches 1"]
+    motions: PyTree
+    shown: Int[Array, " stretches 1"]
+
+
+class Transition(NamedTuple, Generic[Numbers]):
+    """The result of a reset map, one number per cell.
+
+    `status` is `RUNNING` where the motion continues in the mode numbered `mode`, otherwise the code for how it ended;
+    `state` is the new state, `elapsed` [s] the duration of the transition, and `crossing_time` [s] the last time of the
+    event during the transition, infinite if there was none. `counts` contains the counters, one per row. `record` is
+    the path of a single run (`ensemble.py`); `None` for instantaneous transitions, or where no path is kept. `log_rates` is
+    the sum of the logarithms of the rates of the event functions at the events during the transition; `None` if there
+    are none.
+
+    **Example:** the bounce of both balls at 5 m/s.
+
+    >>> transition = modes[0].reset_map(jnp.array([[0.0, 0.0], [-5.0, -5.0]]), jnp.ones(2))
+    >>> print(transition.state[1], transition.mode)
+    [3. 4.] [0 0]
+    """
+
+    mode: Int[Numbers, " cells"]
+    state: Float[Numbers, "components cells"]
+    elapsed: Float[Numbers, " cells"]
+    status: Int[Numbers, " cells"]
+    crossing_time: Float[Numbers, " cells"]
+    counts: Int[Numbers, "counters cells"]
+    record: TransitionPath | None = None
+    log_rates: Float[Numbers, " cells"] | None = None
+
+
+class AbstractBatchedMode(eqx.Module):
+    """One mode of a hybrid system. Its leaves are scalars, or hold one number per cell in their last axis.
+
+    **Example:** the mode of the subpackage's example, at its start.
+
+    >>> print(modes[0].problem(start).field(0.0, start)[1])
+    [-9.81 -9.81]
+    """
+
+    #: Whether few runs enter the mode: its programs are compiled when a run enters it, not beforehand.
+    rare: ClassVar[bool] = False
+
+    @abc.abstractmethod
+    def problem(self, state: States) -> AbstractProblem:
+        """The motion in this mode from the given states; the mode ends where the problem's domain margin vanishes."""
+
+    @abc.abstractmethod
+    def reset_map(self, state: States, left: Lanes) -> Transition:
+        """Map the states at the end of the mode, where the domain margin vanishes, to the start of the next mode.
+
+        **Arguments:**
+
+        - `state`: the states at the end of the mode.
+        - `left`: time [s] to the horizon.
+
+        **Returns:** a `Transition`, which ends with `REACHED_END` where it would take longer than `left`.
+        """
+
+    def shown(self, state: Float[Array, "components times"]) -> Float[Array, "shown times"]:
+        """Map mode states to output rows; every mode must return the same number of rows."""
+        return state
+
+    def between(self, motion: PyTree, passed: Float[Array, " times"]) -> Float[Array, "shown times"]:
+        """The output rows of one stretch in `Transition.record`, at times [s] counted from its start."""
+        raise NotImplementedError(f"{type(self).__name__} records stretches but does not say what they show")
+
+
+class AbstractHoppingMode(AbstractBatchedMode):
+    """A mode whose reset map is a succession of stretches of motion in closed form, each with a jump at its end.
+
+    The reset map continues while `open` is true for the current stretch, for at most `most_hops` stretches; `elapsed`
+    [s] of a stretch is the time since the end of the mode.
+
+    **Example:** small hops of a ball, and the first of them.
+
+    >>> from typing import NamedTuple
+    >>> from nonholonomic.hybrid import AbstractHoppingMode
+    >>> class Hop(NamedTuple):
+    ...     speed: jax.Array
+    ...     elapsed: jax.Array
+    ...     open: jax.Array
+    >>> class Hops(Bounce, AbstractHoppingMode):
+    ...     most_hops = 100
+    ...     def lost(self, state):
+    ...         return Hop(-self.restitution * state[1], 0.0 * state[1], state[1] < -0.1)
+    ...     def hop(self, stretch, left):
+    ...         end = stretch._replace(elapsed=stretch.elapsed + 2.0 * stretch.speed / 9.81)
+    ...         return end, Hop(self.restitution * stretch.speed, end.elapsed, stretch.speed > 0.1)
+    ...     def closed(self, stretch):
+    ...         return self.reset_map(jnp.stack([0.0 * stretch.speed, -stretch.speed]), stretch.elapsed)
+    ...     def motion_in(self, stretch):
+    ...         return stretch.speed
+    >>> hops = Hops(jnp.array([0.6, 0.8]))
+    >>> end, following = hops.hop(hops.lost(jnp.array([[0.0, 0.0], [-9.81, -9.81]])), jnp.ones(2))
+    >>> print(end.elapsed, (following.speed / 9.81).round(2))
+    [1.2 1.6] [0.36 0.64]
+    """
+
+    most_hops: ClassVar[int]
+
+    @abc.abstractmethod
+    def lost(self, state: States) -> PyTree:
+        """The first stretch of motion after the mode, which starts from the states at its end."""
+
+    @abc.abstractmethod
+    def hop(self, stretch: PyTree, left: Lanes) -> tuple[PyTree, PyTree]:
+        """Follow one stretch of motion; `left` [s] is the time from the end of the mode to the horizon.
+
+        **Returns:** the stretch at its end, before the jump; and the next stretch, after the jump.
+        """
+
+    @abc.abstractmethod
+    def closed(self, stretch: PyTree) -> Transition:
+        """The transition that the last stretch leads to, without a record."""
+
+    @abc.abstractmethod
+    def motion_in(self, stretch: PyTree) -> PyTree:
+        """The argument of `between` for a stretch that begins."""
+
+
+def over_cells(function: Callable[..., PyTree], mode: AbstractBatchedMode) -> Callable[..., PyTree]:
+    """Map a function of the mode of one run, and of more arguments, over cells, which are in the last axis of every
+    array."""
+
+    def mapped(*arguments: PyTree) -> PyTree:
+        axes = (lambda leaf: -1 if eqx.is_array(leaf) and leaf.ndim else None, *[-1] * len(arguments))
+        return eqx.filter_vmap(function, in_axes=axes, out_axes=-1)(mode, *arguments)
+
+    return mapped
+
+
+def program_groups(modes: Sequence[AbstractBatchedMode]) -> list[tuple[int, ...]]:
+    """The indices of the modes, in groups. The modes of a group differ only in the values of their arrays, so they
+    share a program."""
+    # The modes with the shapes of their arrays in place of their values.
+    shapes = [
+        jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)) if eqx.is_array(leaf) else leaf, mode) for mode in modes
+    ]
+    firsts = [next(k for k, other in enumerate(shapes) if eqx.tree_equal(other, shape)) for shape in shapes]
+    return [tuple(k for k, other in enumerate(firsts) if other == first) for first in dict.fromkeys(firsts)]
+
+
+def mode_numbered(modes: Sequence[Mode], numbers: Sequence[int], selected: Int[Array, "..."]) -> Mode:
+    """The mode numbered `selected` in one of the `program_groups`."""
+    mode = modes[numbers[0]]
+    for number in numbers[1:]:
+
+        def leaf(old: PyTree, new: PyTree, number: int = number) -> PyTree:
+            return old if old is new or not eqx.is_array(old) else jnp.where(selected == number, new, old)
+
+        mode = jax.tree.map(leaf, mode, modes[number])
+    return mode
+
+
+# The rounds.
 
 #: Largest number of rounds, and so of modes in a run; then unfinished cells end as `UNRESOLVED`.
 MOST_ROUNDS = 2000
@@ -63,25 +232,27 @@ class HybridOutcome(NamedTuple, Generic[Numbers]):
 
 
 #: The `HybridOutcome` of some runs, and further data that is kept of them.
-Carry = tuple[Any, ...]
+Carry = tuple[PyTree, ...]
 
-#: (the indices of some modes, carry, a mask of cells in these modes) -> the carry after these cells have advanced.
-Advance = Callable[[Sequence[int], Carry, Any], Carry]
+#: (the indices of some modes, carry, a mask of cells in these modes, of which there is at least one) -> the carry after
+#: these cells have advanced.
+Advance = Callable[[Sequence[int], Carry, Bool[Numbers, " cells"]], Carry]
 
 
 def at_start(
-    xp: Any, mode: Int[Numbers, " cells"], state: Float[Numbers, "components cells"], cells: int, counters: int
+    mode: Int[Numbers, " cells"], state: Float[Numbers, "components cells"], cells: Int[Array, ""] | int, counters: int
 ) -> HybridOutcome[Numbers]:
-    """All cells at their start, the first `cells` of them running. **Arguments:** `xp`: `numpy` or `jax.numpy`."""
-    zeros = xp.zeros(mode.shape, int)
+    """All cells at their start, the first `cells` of them running."""
+    xp = mode.__array_namespace__()
+    zeros, shape = xp.zeros(mode.shape, int), mode.shape
     return HybridOutcome(
         status=zeros + xp.where(xp.arange(len(mode)) < cells, RUNNING, REACHED_END),
-        crossing_time=xp.full(mode.shape, xp.inf),
-        end_time=xp.zeros(mode.shape),
+        crossing_time=xp.full(shape, xp.inf),
+        end_time=xp.zeros(shape),
         state=state,
         steps=zeros,
         rejected=zeros,
-        extremes=xp.stack([xp.full(mode.shape, xp.inf), *xp.zeros((2, len(mode)))]),
+        extremes=xp.stack([xp.full(shape, xp.inf), *xp.zeros((2, len(mode)))]),
         mode=mode,
         counts=xp.zeros((counters, len(mode)), int),
     )
@@ -95,51 +266,50 @@ def one_round(carry: Carry, groups: Sequence[Sequence[int]], solve: Advance, res
     - `groups`: the indices of the modes, in groups; one program serves the modes of a group.
     - `solve`, `reset`: advance the cells to the end of their mode, and through the reset map.
     """
+
+    def advanced(advance: Advance, numbers: Sequence[int], carry: Carry, mask: Bool[Numbers, " cells"]) -> Carry:
+        if isinstance(mask, np.ndarray):
+            return advance(numbers, carry, mask) if mask.any() else carry
+        return jax.lax.cond(jnp.any(mask), lambda: advance(numbers, carry, mask), lambda: carry)
+
     # A cell that changes its mode during the round waits for the next round.
     mode_before = carry[0].mode
     for numbers in groups:
         active = functools.reduce(operator.or_, (mode_before == number for number in numbers))
         active = active & (carry[0].status == RUNNING)
-        carry = solve(numbers, carry, active)
-        carry = reset(numbers, carry, active & (carry[0].status == LEFT_DOMAIN))
+        carry = advanced(solve, numbers, carry, active)
+        carry = advanced(reset, numbers, carry, active & (carry[0].status == LEFT_DOMAIN))
     return carry
 
 
-def host_rounds(
+def all_rounds(
     carry: Carry, groups: Sequence[Sequence[int]], solve: Advance, reset: Advance, most_rounds: int = MOST_ROUNDS
 ) -> Carry:
-    """Loop over rounds while a cell is running, on the host. **Arguments:** as for `one_round`."""
-    for _ in range(most_rounds):
-        carry = one_round(carry, groups, solve, reset)
-        if not (carry[0].status == RUNNING).any():
-            break
-    return (finished(np, carry[0]), *carry[1:])
-
-
-def traced_rounds(carry: Carry, groups: Sequence[Sequence[int]], solve: Advance, reset: Advance) -> Carry:
-    """Loop over rounds while a cell is running. **Arguments:** as for `one_round`, traced."""
-
-    def under_way(carry: tuple[Carry, Int[Array, ""]]) -> Bool[Array, ""]:
-        (runs, *_), rounds = carry
-        return jnp.any(runs.status == RUNNING) & (rounds < MOST_ROUNDS)
-
-    def advance(carry: tuple[Carry, Int[Array, ""]]) -> tuple[Carry, Int[Array, ""]]:
-        return one_round(carry[0], groups, solve, reset), carry[1] + 1
-
-    (runs, *records), _ = jax.lax.while_loop(under_way, advance, (carry, jnp.zeros((), int)))
-    return (finished(jnp, runs), *records)
-
-
-def finished(xp: Any, runs: HybridOutcome[Numbers]) -> HybridOutcome[Numbers]:
-    """The runs after the last round."""
-    return runs._replace(status=xp.where(runs.status == RUNNING, UNRESOLVED, runs.status))
+    """Loop over rounds while a cell is running, on the host if the runs are NumPy arrays. **Arguments:** as for `one_round`."""
+    rounds, xp = (
+        functools.partial(one_round, groups=groups, solve=solve, reset=reset),
+        carry[0].status.__array_namespace__(),
+    )
+    if xp is np:
+        for _ in range(most_rounds):
+            carry = rounds(carry)
+            if not (carry[0].status == RUNNING).any():
+                break
+    else:
+        carry, _ = jax.lax.while_loop(
+            lambda loop: jnp.any(loop[0][0].status == RUNNING) & (loop[1] < most_rounds),
+            lambda loop: (rounds(loop[0]), loop[1] + 1),
+            (carry, jnp.zeros((), int)),
+        )
+    runs, *records = carry
+    return (runs._replace(status=xp.where(runs.status == RUNNING, UNRESOLVED, runs.status)), *records)
 
 
 def after_solve(
-    xp: Any, runs: HybridOutcome[Numbers], outcome: Outcome[Numbers], t1: Float[Numbers, " cells"]
+    runs: HybridOutcome[Numbers], outcome: Outcome[Numbers], t1: Float[Numbers, " cells"]
 ) -> HybridOutcome[Numbers]:
-    """Update the cells after an ensemble solve that ended as in `outcome`. **Arguments:** `xp`: `numpy` or `jax.numpy`."""
-    start_time = runs.end_time
+    """Update the cells after an ensemble solve that ended as in `outcome`."""
+    xp, start_time = runs.status.__array_namespace__(), runs.end_time
     least, place, longest = outcome.extremes
     is_least = least < runs.extremes[0]
     shortest = (xp.where(is_least, *pair) for pair in zip((least, start_time + place), runs.extremes[:2], strict=True))
@@ -165,20 +335,18 @@ def resolution(start: Float[Numbers, "*runs"], end: Float[Numbers, "*runs"]) -> 
 
 
 def after_reset(
-    xp: Any, runs: HybridOutcome[Numbers], transition: Transition[Numbers], t1: Float[Numbers, " cells"]
+    runs: HybridOutcome[Numbers], transition: Transition[Numbers], t1: Float[Numbers, " cells"]
 ) -> HybridOutcome[Numbers]:
-    """Update the cells after the transition to the next mode. **Arguments:** as for `after_solve`."""
+    """Update the cells after the transition to the next mode."""
+    xp = runs.status.__array_namespace__()
     has_event = xp.isfinite(transition.crossing_time)
     # Non-finite states would never finish.
     sound = xp.isfinite(transition.state).all(axis=0) & xp.isfinite(transition.elapsed)
-    return HybridOutcome(
+    return runs._replace(
         status=xp.where(sound, transition.status, FAILED),
         crossing_time=xp.where(has_event, runs.end_time + transition.crossing_time, runs.crossing_time),
         end_time=xp.where(transition.status == REACHED_END, t1, runs.end_time + transition.elapsed),
         state=transition.state,
-        steps=runs.steps,
-        rejected=runs.rejected,
-        extremes=runs.extremes,
         mode=transition.mode,
         counts=runs.counts + transition.counts,
     )
@@ -188,24 +356,19 @@ def after_reset(
 def problem_of_cells(
     mode: AbstractBatchedMode, cell: Int[Numbers, " cells"], state: Float[Numbers, "components cells"]
 ) -> AbstractProblem:
-    return mode_of_cells(mode, cell).problem(jnp.asarray(state))
+    return of_cells(mode, cell).problem(jnp.asarray(state))
 
 
 @compiled_quickly
-def reset_of_cells(
-    mode: AbstractBatchedMode,
-    cell: Int[Array, " cells"],
-    state: Float[Array, "components cells"],
-    left: Float[Array, " cells"],
-) -> Transition:
-    return mode_of_cells(mode, cell).reset_map(state, left)
+def reset_of_cells(mode: AbstractBatchedMode, cell: Int[Array, " cells"], state: States, left: Lanes) -> Transition:
+    return of_cells(mode, cell).reset_map(state, left)
 
 
 def solve_hybrid(
     modes: tuple[AbstractBatchedMode, ...],
-    mode: Int[np.ndarray, " cells"],
-    state: Float[np.ndarray, "components cells"],
-    t1: float | Float[np.ndarray, " cells"],
+    mode: Int[Numbers, " cells"],
+    state: Float[Numbers, "components cells"],
+    t1: float | Float[Numbers, "*cells"],
     cells: int,
     settings: Settings,
     *,
@@ -213,11 +376,13 @@ def solve_hybrid(
     nonterminal: bool = False,
     n_blocks: int = 1,
     most_rounds: int = MOST_ROUNDS,
-) -> HybridOutcome[np.ndarray]:
+    traced: bool = False,
+) -> HybridOutcome[Numbers]:
     """Run every cell through its modes to its event, to `t1`, or to where the model ends.
 
     The loop runs on the host, round by round, with concrete numbers. All calls with the same number of cells, padding
-    included, share their compiled programs.
+    included, share their compiled programs. If `traced`, the loop is one program, for use inside other transformed functions;
+    in each round, every mode then runs all cells, but the horizon is 0 for cells in another mode.
 
     **Arguments:**
 
@@ -230,115 +395,103 @@ def solve_hybrid(
     - `counters`: number of counters, the rows of `Transition.counts`.
     - `nonterminal`, `n_blocks`: as for `solve_ensemble`.
     - `most_rounds`: a cell that needs more ends as `UNRESOLVED`.
+    - `traced`: whether numbers may be traced, except that of `cells`.
 
-    **Returns:** a `HybridOutcome`.
+    **Returns:** a `HybridOutcome`, of NumPy arrays, or of JAX's if `traced`.
 
     **Example:** the balls of the subpackage's example, through their highest points up to 1 s.
 
     >>> last = solve_hybrid(modes, first, start, 1.0, 2, settings, counters=1, nonterminal=True)
     >>> print(last.crossing_time.round(6), last.end_time)
     [0.722438 0.812743] [1. 1.]
-    """
-    t1 = np.broadcast_to(np.asarray(t1, float), len(mode))
-    runs = at_start(np, np.asarray(mode), np.asarray(state), cells, counters)
 
-    def solve(mode: AbstractBatchedMode, count: int, cell: Any, state: Any, left: Any) -> Outcome:
-        options = {"nonterminal": nonterminal, "n_blocks": n_blocks}
-        return solve_ensemble(problem_of_cells(mode, cell, state), left, np.asarray(count), settings, **options)[0]
+    Inside `jit`:
 
-    def reset(mode: AbstractBatchedMode, count: int, cell: Any, state: Any, left: Any) -> Transition:
-        return reset_of_cells(mode, cell, state, left)
-
-    def advanced(
-        program: Callable[..., Any], update: Any, numbers: Sequence[int], carry: Carry, mask: Bool[np.ndarray, " cells"]
-    ) -> Carry:
-        (runs,), selected = carry, np.flatnonzero(mask)
-        if not selected.size:
-            return carry
-        result = program(modes[numbers[0]], selected.size, *_gathered(runs, selected, t1))
-        result = jax.tree.map(lambda values: np.asarray(values)[..., : selected.size], result)
-        new = update(np, HybridOutcome(*(values[..., selected] for values in runs)), result, t1[selected])
-        return (HybridOutcome(*(_with(*values, selected) for values in zip(runs, new, strict=True))),)
-
-    if cells == 0:
-        # Compile the programs by running no cells: two at once, because the compiler uses little more than one core.
-        inputs, common = _gathered(runs, np.arange(0), t1), [mode for mode in modes if not mode.rare]
-        with ThreadPoolExecutor(2) as threads:
-            list(threads.map(lambda call: call[0](call[1], 0, *inputs), itertools.product((solve, reset), common)))
-    programs = (functools.partial(advanced, solve, after_solve), functools.partial(advanced, reset, after_reset))
-    return host_rounds((runs,), [(number,) for number in range(len(modes))], *programs, most_rounds)[0]
-
-
-def _gathered(
-    runs: HybridOutcome[np.ndarray], selected: Int[np.ndarray, " selected"], t1: Float[np.ndarray, " cells"]
-) -> tuple[Int[np.ndarray, " cells"], Float[np.ndarray, "components cells"], Float[np.ndarray, " cells"]]:
-    """The indices, the states and the remaining times of some cells, padded to the full number of cells."""
-    padding = np.full(len(runs.status) - selected.size, selected[-1] if selected.size else 0)
-    cell = np.concatenate([selected, padding])
-    return cell, runs.state[:, cell], np.maximum(t1[cell] - runs.end_time[cell], 0.0)
-
-
-def _with(values: np.ndarray, new: np.ndarray, selected: Int[np.ndarray, " selected"]) -> np.ndarray:
-    """The values of all cells with the new ones of some."""
-    values = values.copy()
-    values[..., selected] = new
-    return values
-
-
-def traced_solve_hybrid(
-    modes: tuple[AbstractBatchedMode, ...],
-    mode: Int[Array, " cells"],
-    state: Float[Array, "components cells"],
-    t1: Float[Array, "..."],
-    cells: int,
-    settings: Settings,
-    *,
-    counters: int,
-    nonterminal: bool = False,
-    n_blocks: int = 1,
-) -> HybridOutcome[Array]:
-    """Run every cell through its modes to its event, to `t1`, or to where the model ends.
-
-    In each round, every mode runs all cells, but the horizon is 0 for cells in another mode.
-
-    **Arguments:** as for `solve_hybrid`.
-
-    **Returns:** a `HybridOutcome`, of traced numbers.
-
-    **Example:**
-
-    >>> from nonholonomic.hybrid import traced_solve_hybrid
-    >>> solve = lambda t1: traced_solve_hybrid(modes, jnp.asarray(first), jnp.asarray(start), t1, 2, settings, counters=1)
+    >>> solve = lambda t1: solve_hybrid(
+    ...     modes, jnp.asarray(first), jnp.asarray(start), t1, 2, settings, counters=1, traced=True
+    ... )
     >>> print(jax.jit(solve)(5.0).crossing_time.round(6))
     [0.722438 0.812743]
     """
-    size = state.shape[1]
-    t1 = jnp.broadcast_to(t1, (size,))
+    options = {"nonterminal": nonterminal, "n_blocks": n_blocks}
+    xp: Any = jnp if traced else np
+    horizon, groups = xp.broadcast_to(xp.asarray(t1, float), len(mode)), [(number,) for number in range(len(modes))]
+    runs = at_start(xp.asarray(mode), xp.asarray(state), cells, counters)
+    if traced:
+        solve, reset = _traced_advances(modes, horizon, settings, options)
+        return all_rounds((runs,), groups, solve, reset, most_rounds)[0]
+    programs = _host_programs(modes, horizon, settings, options)
+    if cells == 0:
+        # Compile the programs by running no cells: two at once, because the compiler uses little more than one core.
+        common = [number for number, of_number in enumerate(modes) if not of_number.rare]
+        with ThreadPoolExecutor(2) as threads:
+            calls = itertools.product(programs, common)
+            list(threads.map(lambda call: call[0](call[1], np.arange(0), runs), calls))
+    solve, reset = _on_host(programs[0], after_solve, horizon), _on_host(programs[1], after_reset, horizon)
+    return all_rounds((runs,), groups, solve, reset, most_rounds)[0]
+
+
+#: (the index of a mode, the indices of some cells in this mode, the runs of all cells) -> how these cells end, in the first
+#: entries of the last axis.
+HostProgram = Callable[[int, Int[np.ndarray, " selected"], HybridOutcome[np.ndarray]], PyTree]
+
+
+def _host_programs(
+    modes: tuple[AbstractBatchedMode, ...], t1: Float[np.ndarray, " cells"], settings: Settings, options: PyTree
+) -> tuple[HostProgram, HostProgram]:
+    """The programs that solve a mode, and that reset its cells. **Arguments:** `options`: of `solve_ensemble`."""
+
+    def inputs(number: int, selected: Int[np.ndarray, " selected"], runs: HybridOutcome[np.ndarray]) -> tuple:
+        # Padded to the full number of cells.
+        padding = np.full(len(runs.status) - selected.size, selected[-1] if selected.size else 0)
+        cell = np.concatenate([selected, padding])
+        return modes[number], cell, runs.state[:, cell], np.maximum(t1[cell] - runs.end_time[cell], 0.0)
+
+    def solve(number: int, selected: Int[np.ndarray, " selected"], runs: HybridOutcome[np.ndarray]) -> Outcome:
+        *problem, left = inputs(number, selected, runs)
+        return solve_ensemble(problem_of_cells(*problem), left, np.asarray(selected.size), settings, **options)[0]
+
+    def reset(number: int, selected: Int[np.ndarray, " selected"], runs: HybridOutcome[np.ndarray]) -> Transition:
+        return reset_of_cells(*inputs(number, selected, runs))
+
+    return solve, reset
+
+
+def _on_host(program: HostProgram, update: Callable[..., HybridOutcome], t1: Float[np.ndarray, " cells"]) -> Advance:
+    """Advance cells by a program, with concrete numbers. **Arguments:** `update`: `after_solve` or `after_reset`."""
+
+    def advance(numbers: Sequence[int], carry: Carry, mask: Bool[np.ndarray, " cells"]) -> Carry:
+        (runs,), selected = carry, np.flatnonzero(mask)
+        result = program(numbers[0], selected, runs)
+        result = jax.tree.map(lambda values: np.asarray(values)[..., : selected.size], result)
+        advanced = update(HybridOutcome(*(values[..., selected] for values in runs)), result, t1[selected])
+        runs = HybridOutcome(*(values.copy() for values in runs))
+        for values, of_selected in zip(runs, advanced, strict=True):
+            values[..., selected] = of_selected
+        return (runs,)
+
+    return advance
+
+
+def _traced_advances(
+    modes: tuple[AbstractBatchedMode, ...], t1: Float[Array, " cells"], settings: Settings, options: PyTree
+) -> tuple[Advance, Advance]:
+    """The same for traced numbers, as parts of one program."""
 
     def solve(numbers: Sequence[int], carry: Carry, active: Bool[Array, " cells"]) -> Carry:
-        def solved() -> Carry:
-            (runs,), cell = carry, selected_cells(active)
-            left = jnp.where(active, greatest(t1 - runs.end_time, 0.0), 0.0)
-            problem = mode_of_cells(modes[numbers[0]], cell).problem(runs.state[:, cell])
-            outcome, _ = traced_solve_ensemble(
-                problem, left, jnp.asarray(size), settings, nonterminal=nonterminal, n_blocks=n_blocks
-            )
-            return (chosen(active, after_solve(jnp, runs, outcome, t1), runs),)
-
-        return jax.lax.cond(jnp.any(active), solved, lambda: carry)
+        (runs,), cell = carry, selected_cells(active)
+        left = jnp.where(active, greatest(t1 - runs.end_time, 0.0), 0.0)
+        problem = of_cells(modes[numbers[0]], cell).problem(runs.state[:, cell])
+        outcome, _ = solve_ensemble(problem, left, jnp.asarray(len(active)), settings, traced=True, **options)
+        return (chosen(active, after_solve(runs, outcome, t1), runs),)
 
     def reset(numbers: Sequence[int], carry: Carry, lost: Bool[Array, " cells"]) -> Carry:
-        def after_transition() -> Carry:
-            (runs,), cell = carry, selected_cells(lost)
-            left = greatest(t1[cell] - runs.end_time[cell], 0.0)
-            transition = mode_of_cells(modes[numbers[0]], cell).reset_map(runs.state[:, cell], left)
-            return (chosen(lost, after_reset(jnp, runs, transition, t1), runs),)
+        (runs,), cell = carry, selected_cells(lost)
+        left = greatest(t1[cell] - runs.end_time[cell], 0.0)
+        transition = of_cells(modes[numbers[0]], cell).reset_map(runs.state[:, cell], left)
+        return (chosen(lost, after_reset(runs, transition, t1), runs),)
 
-        return jax.lax.cond(jnp.any(lost), after_transition, lambda: carry)
-
-    groups = [(number,) for number in range(len(modes))]
-    (runs,) = traced_rounds((at_start(jnp, mode, state, cells, counters),), groups, solve, reset)
-    return runs
+    return solve, reset
 
 
 def selected_cells(selected: Bool[Array, " cells"]) -> Int[Array, " cells"]:
@@ -352,9 +505,6 @@ def chosen(
 ) -> HybridOutcome[Array]:
     """The new outcome for the selected cells, and the old outcome for the others."""
     return jax.tree.map(lambda a, b: jnp.where(selected, a, b), new, old)
-
-
-# The resets of one hybrid run: the states before and after each of them.
 
 
 def hybrid_resets(
@@ -381,27 +531,18 @@ def hybrid_resets(
     >>> print(after.end_time.round(6), before.state[1].round(6), after.state[1].round(6))
     [0.451524] [-4.429447] [2.657668]
     """
-    horizon, cell = np.full(1, float(t1)), np.zeros(1, int)
-
-    def solve(numbers: Sequence[int], carry: Carry, active: Bool[np.ndarray, "1"]) -> Carry:
-        if not active[0]:
-            return carry
-        runs, resets = carry
-        problem, left = problem_of_cells(modes[numbers[0]], cell, runs.state), np.maximum(horizon - runs.end_time, 0.0)
-        outcome = jax.tree.map(np.asarray, solve_ensemble(problem, left, np.asarray(1), settings)[0])
-        return after_solve(np, runs, outcome, horizon), resets
+    horizon, resets = np.full(1, float(t1)), []
+    programs = _host_programs(modes, horizon, settings, {})
+    solve, leave = _on_host(programs[0], after_solve, horizon), _on_host(programs[1], after_reset, horizon)
 
     def reset(numbers: Sequence[int], carry: Carry, lost: Bool[np.ndarray, "1"]) -> Carry:
-        if not lost[0]:
-            return carry
-        runs, resets = carry
-        left = np.maximum(horizon - runs.end_time, 0.0)
-        transition = reset_of_cells(modes[numbers[0]], cell, runs.state, left)
-        runs_after = after_reset(np, runs, jax.tree.map(np.asarray, transition), horizon)
-        return runs_after, [*resets, (runs, runs_after)]
+        after = leave(numbers, carry, lost)
+        resets.append((*carry, *after))
+        return after
 
-    start = at_start(np, np.full(1, number), np.asarray(state)[:, None], 1, counters)
-    return host_rounds((start, []), [(mode,) for mode in range(len(modes))], solve, reset)[1]
+    runs = at_start(np.full(1, number), np.asarray(state)[:, None], 1, counters)
+    all_rounds((runs,), [(mode,) for mode in range(len(modes))], solve, reset)
+    return resets
 
 
 # One hybrid run with its path: each mode is integrated by any solver of Diffrax.
@@ -428,7 +569,7 @@ class Segment(NamedTuple):
     end: float
     number: int
     mode: AbstractBatchedMode
-    motion: Any
+    motion: PyTree
     shown: Float[np.ndarray, " times"]
 
     def at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "shown times"]:
@@ -513,25 +654,13 @@ class HybridPath(NamedTuple):
 
 
 @eqx.filter_jit
-def _problem(mode: AbstractBatchedMode, state: Float[Array | np.ndarray, " components"]) -> AbstractProblem:
+def _problem(mode: AbstractBatchedMode, state: States) -> AbstractProblem:
     """The motion in a mode of one cell, as a problem without an axis of cells."""
-    mode_of_cell = jax.tree.map(lambda leaf: leaf[..., 0] if eqx.is_array(leaf) and leaf.ndim else leaf, mode)
-    return mode_of_cell.problem(state)
+    return of_cells(mode, 0).problem(state)
 
 
-@compiled_quickly
-def _leave(mode: AbstractBatchedMode, state: Float[Array, " components"], left: Float[Array, ""]) -> Transition:
-    return mode.reset_map(state[:, None], left[None])
-
-
-@eqx.filter_jit
-def _shown(mode: AbstractBatchedMode, states: Float[Array, "components times"]) -> Float[Array, "shown times"]:
-    return mode.shown(states)
-
-
-@eqx.filter_jit
-def _between(mode: AbstractBatchedMode, motion: Any, elapsed: Float[Array, " times"]) -> Float[Array, "shown times"]:
-    return mode.between(motion, elapsed)
+_shown = eqx.filter_jit(lambda mode, states: mode.shown(states))
+_between = eqx.filter_jit(lambda mode, motion, elapsed: mode.between(motion, elapsed))
 
 
 def solve_hybrid_dense(
@@ -573,29 +702,39 @@ def solve_hybrid_dense(
     [0.28647 0.33049] [-1  0]
     """
 
-    def solve(numbers: Sequence[int], carry: Carry, active: Bool[np.ndarray, "1"]) -> Carry:
-        if not active[0]:
-            return carry
-        (runs, segments), (number,), mode, start_time = carry, numbers, modes[numbers[0]], float(carry[0].end_time[0])
-        mode_settings = dataclasses.replace(settings, max_steps=settings.max_steps - int(runs.steps[0]))
-        problem = _problem(mode, jnp.asarray(runs.state[:, 0]))
-        path = follow(problem, t1 - start_time, mode_settings, piece=PIECE_OF_MODE)
-        end = start_time + float(path.times[-1])
-        segment = Segment(start_time, end, number, mode, path, start_time + path.times[1:])
-        return after_solve(np, runs, _outcome(path), np.full(1, t1)), [*segments, segment]
+    horizon, segments = np.full(1, float(t1)), []
+    _, leave = _host_programs(modes, horizon, settings, {})
 
-    def reset(numbers: Sequence[int], carry: Carry, lost: Bool[np.ndarray, "1"]) -> Carry:
-        if not lost[0]:
-            return carry
-        (runs, segments), mode, start_time = carry, modes[numbers[0]], float(carry[0].end_time[0])
-        transition = _leave(mode, jnp.asarray(runs.state[:, 0]), jnp.asarray(t1 - start_time))
-        segments = segments + _way(mode, transition, start_time)
-        # NumPy slices these arrays, because JAX would compile every slice.
-        transition = jax.tree.map(np.asarray, transition._replace(record=None))
-        return after_reset(np, runs, transition, np.full(1, t1)), segments
+    def solve(number: int, _: Int[np.ndarray, "1"], runs: HybridOutcome[np.ndarray]) -> Outcome[np.ndarray]:
+        begin, steps = runs.end_time[0].item(), runs.steps[0].item()
+        problem = _problem(modes[number], jnp.asarray(runs.state[:, 0]))
+        rest = dataclasses.replace(settings, max_steps=settings.max_steps - steps)
+        path = follow(problem, t1 - begin, rest, piece=PIECE_OF_MODE)
+        end = begin + float(path.times[-1])
+        segments.append(Segment(begin, end, number, modes[number], path, begin + path.times[1:]))
+        # As for an ensemble of one cell.
+        status = FAILED if path.failed else LEFT_DOMAIN if path.left_domain else REACHED_END
+        none, ending = np.full(1, np.inf), (np.asarray(path.times[-1:]), np.asarray(path.states[:, -1:]))
+        counts = (np.full(1, path.accepted + path.rejected), np.full(1, path.rejected), np.array([NO_EXTREMES]).T)
+        return Outcome(np.full(1, status), none, none, *ending, *counts)
 
-    start = at_start(np, np.full(1, number), np.asarray(state)[:, None], 1, counters)
-    runs, segments = host_rounds((start, []), [(mode,) for mode in range(len(modes))], solve, reset)
+    def reset(number: int, selected: Int[np.ndarray, "1"], runs: HybridOutcome[np.ndarray]) -> Transition:
+        transition = leave(number, selected, runs)
+        if transition.record is not None:
+            # NumPy slices these arrays, because JAX would compile every slice.
+            ends, motions, parts = jax.tree.map(np.asarray, transition.record)
+            begin = runs.end_time[0].item()
+            ends = begin + ends[np.isfinite(ends[:, 0]), 0]
+            for index, (end, count) in enumerate(zip(ends.tolist(), parts[:, 0].tolist(), strict=False)):
+                motion = jax.tree.map(lambda leaf, index=index: leaf[index].copy(), motions)
+                times = begin + (end - begin) * np.linspace(0.0, 1.0, count + 1)[1:]
+                segments.append(Segment(begin, end, BETWEEN, modes[number], motion, times))
+                begin = end
+        return transition._replace(record=None)
+
+    start = at_start(np.full(1, number), np.asarray(state)[:, None], 1, counters)
+    advances = (_on_host(solve, after_solve, horizon), _on_host(reset, after_reset, horizon))
+    (runs,) = all_rounds((start,), [(mode,) for mode in range(len(modes))], *advances)
     end_time, status, steps, rejected = (
         values[0].item() for values in (runs.end_time, runs.status, runs.steps, runs.rejected)
     )
@@ -603,27 +742,3 @@ def solve_hybrid_dense(
         end_time = segments[-1].end
     ending = (runs.state[:, 0], runs.counts[:, 0], steps - rejected, rejected, runs.mode[0].item())
     return HybridPath(segments, status, end_time, *ending)
-
-
-def _outcome(path: DenseSolution) -> Outcome[np.ndarray]:
-    """How the motion in a mode ended, as for an ensemble of one cell."""
-    status = FAILED if path.failed else LEFT_DOMAIN if path.left_domain else REACHED_END
-    no_crossing, steps = np.full(1, np.inf), path.accepted + path.rejected
-    ending = (np.asarray(path.times[-1:]), np.asarray(path.states[:, -1:]))
-    counts = (np.full(1, steps), np.full(1, path.rejected), np.array([NO_EXTREMES]).T)
-    return Outcome(np.full(1, status), no_crossing, no_crossing, *ending, *counts)
-
-
-def _way(mode: AbstractBatchedMode, transition: Transition, start: float) -> list[Segment]:
-    """The segments of a transition that begins at a time [s]."""
-    if transition.record is None:
-        return []
-    ends = np.asarray(transition.record.ends)[:, 0]
-    ends, segments = start + ends[np.isfinite(ends)], []
-    motions, parts = jax.tree.map(np.asarray, (transition.record.motions, transition.record.shown))
-    for index, end in enumerate(ends):
-        start = float(ends[index - 1]) if index else start
-        motion = jax.tree.map(lambda leaf, index=index: leaf[index].copy(), motions)
-        output_times = start + (end - start) * np.linspace(0.0, 1.0, int(parts[index, 0]) + 1)[1:]
-        segments.append(Segment(start, float(end), BETWEEN, mode, motion, output_times))
-    return segments

@@ -23,15 +23,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..derivatives import VariationalProblem, in_groups, tangents_of
 from ..derivatives.variation import where_active
 from ..integration import AbstractPassive, AbstractProblem, ExtendedProblem, Lanes, Settings, States
 from ..integration.problem import CROSSED, REACHED_END
 from ..integration.scheduler import Numbers
-from .ensemble import HybridOutcome, solve_hybrid, traced_solve_hybrid
-from .mode import AbstractBatchedMode, Transition
+from .ensemble import AbstractBatchedMode, HybridOutcome, Transition, solve_hybrid
 
 #: An event is grazing if a relative change of the numbers by the tolerance, or an error of the state that the tolerance
 #: allows, changes its rate by more than this fraction. The relative error of the derivative is then about as large.
@@ -44,6 +43,10 @@ NEARLY = 1e-6
 UNMEASURED = 1e9
 
 
+#: Pairs of the tangents of the modes and the tangent of the states, with `None` for leaves that do not move.
+Tangents = tuple[tuple[tuple[PyTree, ...], PyTree], ...]
+
+
 class Clock(AbstractPassive):
     """The time since a mode began, as a passive component. The variation of this component is the variation of the time
     at which the mode began."""
@@ -52,7 +55,7 @@ class Clock(AbstractPassive):
         return jnp.concatenate([problem.field(time, state), jnp.ones_like(passive)])
 
 
-def with_row(state: Float[Array, "components cells"], row: Float[Array, " cells"]) -> Float[Array, "more cells"]:
+def with_row(state: States, row: Lanes) -> States:
     """A state with one more component."""
     return jnp.concatenate([state, row[None]])
 
@@ -67,7 +70,7 @@ class VariationalMode(AbstractBatchedMode):
     """
 
     mode: AbstractBatchedMode
-    tangents: tuple[Any, ...]
+    tangents: tuple[PyTree, ...]
     tolerance: Float[Array, ""]
     ends_on_event: bool = eqx.field(static=True)
 
@@ -75,27 +78,27 @@ class VariationalMode(AbstractBatchedMode):
     def rare(self) -> bool:
         return self.mode.rare
 
-    def problem(self, state: Float[Array, "components cells"]) -> VariationalProblem:
+    def problem(self, state: States) -> VariationalProblem:
         primal, *variations = self.parts(state)
         numbers, build = self.active_numbers()
 
-        def clocked(state: Float[Array, "components cells"], *numbers: Array) -> ExtendedProblem:
+        def clocked(state: States, *numbers: Array) -> ExtendedProblem:
             start_time = state[-1:]
             return ExtendedProblem(
                 build(*numbers).problem(state[:-1]), Clock(), start_time, jnp.full_like(start_time, UNMEASURED)
             )
 
         point = (with_row(primal[:-1], jnp.zeros_like(primal[-1])), *numbers)
-        tangents = [(variation, *rates) for variation, rates in zip(variations, self.rates(), strict=True)]
-        return VariationalProblem(clocked(*point), tangents_of(clocked, point, tangents), self.ends_on_event)
+        tangents = tangents_of(clocked, point, self.directions(variations))
+        return VariationalProblem(clocked(*point), tangents, self.ends_on_event)
 
-    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
+    def reset_map(self, state: States, left: Lanes) -> Transition:
         """The reset map of the mode itself, with variations. The last row of the counters counts grazing events."""
         return self.reset_with_path(state, left, lambda mode, state, left: (mode.reset_map(state, left), ()))[0]
 
     def reset_with_path(
-        self, state: Float[Array, "components cells"], left: Float[Array, " cells"], reset_with_path: Callable[..., Any]
-    ) -> tuple[Transition, Any, Any]:
+        self, state: States, left: Lanes, reset_with_path: Callable[..., tuple[Transition, PyTree]]
+    ) -> tuple[Transition, PyTree, PyTree]:
         """The transition, and numbers that describe its path.
 
         **Arguments:** `reset_with_path`: function of the mode, the state and `left` that returns the mode's `Transition`
@@ -109,37 +112,25 @@ class VariationalMode(AbstractBatchedMode):
             # Nothing is differentiated, so no event is grazing.
             transition, path = reset_with_path(self.mode, primal, left)
             no_grazes, clock = jnp.zeros_like(transition.counts[:1]), jnp.zeros_like(duration)
-            return (
-                transition._replace(
-                    state=with_row(transition.state, clock),
-                    counts=jnp.concatenate([transition.counts, no_grazes]),
-                    record=None,
-                    log_rates=None,
-                ),
-                path,
-                jax.tree.map(lambda value: jnp.zeros((0, *value.shape)), path),
-            )
+            state, counts = with_row(transition.state, clock), jnp.concatenate([transition.counts, no_grazes])
+            transition = transition._replace(state=state, counts=counts, record=None, log_rates=None)
+            return transition, path, jax.tree.map(lambda value: jnp.zeros((0, *value.shape)), path)
         numbers, build = self.active_numbers()
         zero_rates = [jnp.zeros_like(number) for number in numbers]
         rates = self.mode.problem(primal).field(duration, primal)
         # The last tangent is an error of the state.
-        directions = [
-            (variation[:-1], *direction) for variation, direction in zip(variations, self.rates(), strict=True)
-        ]
+        directions = self.directions([part[:-1] for part in variations])
         directions.append((self._error(primal, duration, rates), *zero_rates))
         delays, log_rates = self._delays(primal, duration, [*directions, (rates, *zero_rates)])
 
-        def reset(primal: Float[Array, "components cells"], left: Float[Array, " cells"], *numbers: Array) -> Any:
+        def reset(primal: States, left: Lanes, *numbers: Array) -> tuple[PyTree, Transition]:
             transition, path = reset_with_path(build(*numbers), primal, left)
-            reset_log_rates = jnp.zeros_like(left) if transition.log_rates is None else transition.log_rates
-            return (transition.state, transition.elapsed, reset_log_rates, path), transition._replace(
-                record=None, log_rates=None
-            )
+            log_rates = jnp.zeros_like(left) if transition.log_rates is None else transition.log_rates
+            changing = (transition.state, transition.elapsed, log_rates, path)
+            return changing, transition._replace(record=None, log_rates=None)
 
-        start_delays = (
-            jnp.concatenate([*[variation[None, -1] for variation in variations], jnp.zeros_like(duration)[None]])
-            + delays
-        )
+        begins = [*[variation[None, -1] for variation in variations], jnp.zeros_like(duration)[None]]
+        start_delays = jnp.concatenate(begins) + delays
         after_event = [
             (direction[0] + shift * rates, -start_delay, *direction[1:])
             for direction, shift, start_delay in zip(directions, delays, start_delays, strict=True)
@@ -153,16 +144,12 @@ class VariationalMode(AbstractBatchedMode):
         # The run itself is valid, so variations without correct digits must not end the run.
         new_variations = jnp.where(finite, new_variations, 0.0)
         extended_state = jnp.concatenate([transition.state, jnp.zeros_like(duration)[None], *new_variations])
-        transition = transition._replace(
-            state=extended_state, counts=jnp.concatenate([transition.counts, grazes.astype(int)[None]])
-        )
+        counts = jnp.concatenate([transition.counts, grazes.astype(int)[None]])
+        transition = transition._replace(state=extended_state, counts=counts)
         return transition, values[-1], jax.tree.map(lambda change: change[:count], changes)
 
     def _delays(
-        self,
-        primal: Float[Array, "components cells"],
-        duration: Float[Array, " cells"],
-        directions: list[tuple[Array, ...]],
+        self, primal: States, duration: Lanes, directions: list[tuple[Array, ...]]
     ) -> tuple[Float[Array, "tangents cells"], Float[Array, "tangents cells"]]:
         """The variations of the time at which the mode ends, and of the logarithm of the rate of its margin there.
 
@@ -170,11 +157,10 @@ class VariationalMode(AbstractBatchedMode):
         """
         numbers, build = self.active_numbers()
 
-        def margin_and_rate(primal: Float[Array, "components cells"], *numbers: Array) -> tuple[Array, Array]:
+        def margin_and_rate(primal: States, *numbers: Array) -> tuple[Array, Array]:
             problem = build(*numbers).problem(primal)
-            return jax.jvp(
-                lambda primal: problem.domain_margin(duration, primal), (primal,), (problem.field(duration, primal),)
-            )
+            rates = problem.field(duration, primal)
+            return jax.jvp(lambda primal: problem.domain_margin(duration, primal), (primal,), (rates,))
 
         (_, rate), (domain_margins, changes) = along(margin_and_rate, (primal, *numbers), directions)
         # A mode that ended when it began has not reached its event.
@@ -198,18 +184,15 @@ class VariationalMode(AbstractBatchedMode):
             return output(primal), jnp.zeros((0, *output(primal).shape))
         rates = self.mode.problem(primal).field(duration, primal)
         # If the mode begins later, the state has advanced less at the same time.
-        directions = [
-            (variation[:-1] - rates * variation[-1], *rates_of_numbers)
-            for variation, rates_of_numbers in zip(variations, self.rates(), strict=True)
-        ]
+        directions = self.directions([variation[:-1] - rates * variation[-1] for variation in variations])
         return along(output, (primal, *numbers), directions)
 
-    def slopes(self, state: Float[Array, "components cells"]) -> Float[Array, "tangents cells"]:
+    def slopes(self, state: States) -> Float[Array, "tangents cells"]:
         """The derivative of the time of the event at which runs have ended in this mode, or in the transition to it."""
         primal, *variations = self.parts(state)
         numbers, build = self.active_numbers()
 
-        def time(primal: Float[Array, "components cells"], start_time: Float[Array, " cells"], *numbers: Array) -> Any:
+        def time(primal: States, start_time: Lanes, *numbers: Array) -> Lanes:
             problem = build(*numbers).problem(primal)
             if problem.event_function(primal) is None:
                 return start_time
@@ -222,21 +205,14 @@ class VariationalMode(AbstractBatchedMode):
             return start_time + delay(problem.event_function, primal, problem.field(start_time, primal))
 
         duration, point = primal[-1], (primal[:-1], jnp.zeros_like(primal[-1]), *numbers)
-        tangents = [
-            (variation[:-1], variation[-1], *rates) for variation, rates in zip(variations, self.rates(), strict=True)
-        ]
-        return along(time, point, tangents)[1]
+        directions = self.directions([part[:-1] for part in variations], [part[-1] for part in variations])
+        return along(time, point, directions)[1]
 
-    def parts(self, state: Float[Array, "components cells"]) -> list[Float[Array, "components cells"]]:
+    def parts(self, state: States) -> list[States]:
         """The state with its clock, and the variations of both."""
         return jnp.split(state, 1 + len(self.tangents))
 
-    def _error(
-        self,
-        primal: Float[Array, "components cells"],
-        duration: Float[Array, " cells"],
-        rates: Float[Array, "components cells"],
-    ) -> Float[Array, "components cells"]:
+    def _error(self, primal: States, duration: Lanes, rates: States) -> States:
         """The error of the state at the end of the mode, divided by the tolerance, from the change of the state and
         from the magnitudes.
         """
@@ -245,29 +221,31 @@ class VariationalMode(AbstractBatchedMode):
         shares = [(-1.0) ** k * (0.5 + math.modf(0.618 * k)[0]) for k in range(len(sizes))]
         return jnp.asarray(shares)[:, None] * sizes
 
-    def active_numbers(self) -> tuple[list[Array], Any]:
+    def active_numbers(self) -> tuple[list[Array], Callable[..., AbstractBatchedMode]]:
         """The mode's active numbers, and the mode as a function of them."""
         if not self.tangents:
             return [], lambda: self.mode
         numbers, structure = jax.tree.flatten(where_active(self.mode, self.tangents[0]))
         return numbers, lambda *numbers: eqx.combine(jax.tree.unflatten(structure, numbers), self.mode)
 
-    def rates(self) -> list[list[Array]]:
-        """For each tangent the rates at which these numbers move."""
-        return [jax.tree.leaves(direction) for direction in self.tangents]
+    def directions(self, *moves: list[Array]) -> list[tuple[Array, ...]]:
+        """For each tangent the rates at which some arrays move, followed by those of the active numbers."""
+        return [(*arrays, *jax.tree.leaves(tangent)) for *arrays, tangent in zip(*moves, self.tangents, strict=True)]
 
 
-def delay(function: Any, state: Float[Array, "components cells"], rates: Float[Array, "components cells"]) -> Any:
+def delay(function: Callable[[States], Lanes | None], state: States, rates: States) -> Lanes:
     """A number that is zero, and whose variation is that of the time at which a function of the state vanishes
     (implicit function theorem)."""
     value, rate = jax.jvp(function, (state,), (rates,))
     return -(value - stop_gradient(value)) / stop_gradient(jnp.where(rate == 0.0, jnp.inf, rate))
 
 
-def along(function: Any, point: tuple[Array, ...], tangents: list[tuple[Array, ...]], has_aux: bool = False) -> Any:
+def along(
+    function: Callable[..., PyTree], point: tuple[Array, ...], tangents: list[tuple[Array, ...]], has_aux: bool = False
+) -> PyTree:
     """A function's value, its variations along tangents with these on the first axis, and its auxiliary output if any."""
 
-    def moved(tangent: tuple[Array, ...]) -> Any:
+    def moved(tangent: tuple[Array, ...]) -> PyTree:
         return jax.jvp(function, point, tangent, has_aux=has_aux)
 
     # The function itself is computed once, whatever the number of tangents.
@@ -276,10 +254,7 @@ def along(function: Any, point: tuple[Array, ...], tangents: list[tuple[Array, .
 
 
 def variational_modes(
-    modes: tuple[AbstractBatchedMode, ...],
-    tangents: tuple[tuple[tuple[Any, ...], Any], ...],
-    tolerance: Float[Array, ""],
-    ends_on_event: bool,
+    modes: tuple[AbstractBatchedMode, ...], tangents: Tangents, tolerance: Float[Array, ""], ends_on_event: bool
 ) -> tuple[VariationalMode, ...]:
     """The modes with their variations. **Arguments:** as for `solve_hybrid_with_tangents`."""
     return tuple(
@@ -288,9 +263,7 @@ def variational_modes(
     )
 
 
-def variational_start(
-    state: Float[Array, "components cells"], tangents: tuple[tuple[tuple[Any, ...], Any], ...]
-) -> Float[Array, "more cells"]:
+def variational_start(state: States, tangents: Tangents) -> States:
     """Initial states with their clocks, followed by the variations of both."""
     zero = jnp.zeros_like(state[0])
     variations = [jnp.zeros_like(state) if direction[1] is None else direction[1] for direction in tangents]
@@ -312,16 +285,17 @@ class Slopes(NamedTuple, Generic[Numbers]):
 
 def solve_hybrid_with_tangents(
     modes: tuple[AbstractBatchedMode, ...],
-    tangents: tuple[tuple[tuple[Any, ...], Any], ...],
-    mode: Int[np.ndarray, " cells"],
-    state: Float[np.ndarray, "components cells"],
-    t1: float | Float[np.ndarray, "..."],
+    tangents: Tangents,
+    mode: Int[Numbers, " cells"],
+    state: Float[Numbers, "components cells"],
+    t1: float | Float[Numbers, "..."],
     cells: int,
     settings: Settings,
     *,
     counters: int,
     ends_on_event: bool = True,
-) -> tuple[HybridOutcome[np.ndarray], Slopes[np.ndarray]]:
+    traced: bool = False,
+) -> tuple[HybridOutcome[Numbers], Slopes[Numbers]]:
     """Run every cell through its modes to its event, and differentiate the event's time along tangents.
 
     **Arguments:** as for `solve_hybrid`, and
@@ -329,6 +303,7 @@ def solve_hybrid_with_tangents(
     - `tangents`: pairs of the tangents of the modes and the tangent of the states, with `None` for leaves that do not
       move.
     - `ends_on_event`: whether runs end on the event; otherwise they end at `t1`, which then counts as the event's time.
+    - `traced`: whether numbers may be traced; then arguments and results are JAX's arrays.
 
     **Returns:** the `HybridOutcome`, and the `Slopes`, 0 where there is no event or the event is at the start.
     Source: implicit function theorem at the event, saltation at every change of mode.
@@ -341,74 +316,30 @@ def solve_hybrid_with_tangents(
     >>> print(sensitivities.slopes.round(6))  # the time of the fall
     [[0.451524 0.451524]]
     """
-    variational = variational_modes(modes, tangents, settings.tolerance, ends_on_event)
-    start, n_blocks = np.asarray(variational_start(jnp.asarray(state), tangents)), 1 + len(tangents)
-    ended = solve_hybrid(variational, mode, start, t1, cells, settings, counters=counters + 1, n_blocks=n_blocks)
-    slopes = [np.asarray(_slopes(varied_mode, jnp.asarray(ended.state))) for varied_mode in variational]
-    return _without_variations(ended, len(state)), _where_defined(np, ended, slopes, t1, ends_on_event)
+    xp: Any = jnp if traced else np
+    size, slopes_of = len(state), VariationalMode.slopes if traced else _slopes
 
-
-def traced_solve_hybrid_with_tangents(
-    modes: tuple[AbstractBatchedMode, ...],
-    tangents: tuple[tuple[tuple[Any, ...], Any], ...],
-    mode: Int[Array, " cells"],
-    state: Float[Array, "components cells"],
-    t1: Float[Array, "..."],
-    cells: int,
-    settings: Settings,
-    *,
-    counters: int,
-    ends_on_event: bool = True,
-) -> tuple[HybridOutcome[Array], Slopes[Array]]:
-    """`solve_hybrid_with_tangents` inside other transformed functions; arguments and results are traced.
-
-    **Example:** as for `solve_hybrid_with_tangents`.
-
-    >>> from nonholonomic.hybrid import traced_solve_hybrid_with_tangents
-    >>> tangents, options = (((Bounce(jnp.ones(2)),), None),), (jnp.asarray(first), jnp.asarray(start), 5.0, 2, settings)
-    >>> _, sensitivities = traced_solve_hybrid_with_tangents(modes, tangents, *options, counters=1)
-    >>> print(sensitivities.slopes.round(6))
-    [[0.451524 0.451524]]
-    """
-
-    def run(group: tuple[Any, ...]) -> tuple[tuple[HybridOutcome[Array], Array], list[Float[Array, " cells"]]]:
+    def run(group: Tangents) -> tuple[PyTree, list[Float[Numbers, " cells"]]]:
         variational = variational_modes(modes, group, settings.tolerance, ends_on_event)
-        start, n_blocks = variational_start(state, group), 1 + len(group)
-        ended = traced_solve_hybrid(
-            variational, mode, start, t1, cells, settings, counters=counters + 1, n_blocks=n_blocks
-        )
-        slopes = [varied_mode.slopes(ended.state) for varied_mode in variational]
-        mask = _where_defined(jnp, ended, slopes, t1, ends_on_event)
-        return (_without_variations(ended, len(state)), mask.grazing), list(mask.slopes)
+        start = xp.asarray(variational_start(jnp.asarray(state), group))
+        options = {"counters": counters + 1, "n_blocks": 1 + len(group), "traced": traced}
+        ended = solve_hybrid(variational, mode, start, t1, cells, settings, **options)
+        # A run that has ended between two modes is in neither. Its event is the end of the previous mode, whose variation is
+        # the last row.
+        slopes = xp.reshape(ended.state, (1 + len(group), -1, len(ended.mode)))[1:, -1]
+        for number, of_mode in enumerate(variational):
+            slopes = xp.where(ended.mode == number, xp.asarray(slopes_of(of_mode, jnp.asarray(ended.state))), slopes)
+        event_time = ended.crossing_time if ends_on_event else xp.broadcast_to(t1, ended.mode.shape)
+        # An event at the start has a fixed time, whatever the tangent.
+        has_event = xp.isfinite(event_time) & (event_time > 0.0)
+        # With its variations a run takes other steps: where it does not reach the event, it has no derivative.
+        arrived = ended.status == (CROSSED if ends_on_event else REACHED_END)
+        grazing = has_event & ((ended.counts[-1] > 0) | ~arrived)
+        slopes = xp.where(has_event, xp.where(grazing, xp.nan, slopes), 0.0)
+        return (ended._replace(state=ended.state[:size], counts=ended.counts[:-1]), grazing), list(slopes)
 
-    (outcome, grazing), slopes = in_groups(run, tangents)
-    return outcome, Slopes(jnp.stack(slopes), grazing)
-
-
-def _where_defined(
-    xp: Any, ended: HybridOutcome[Numbers], slopes: list[Float[Numbers, "tangents cells"]], t1: Any, ends_on_event: bool
-) -> Slopes[Numbers]:
-    """The derivatives of the times of events, of each cell by its mode, where the events happened and the derivatives
-    have correct digits.
-
-    A run that has ended between two modes is in neither. Its event is the end of the previous mode, whose variation is
-    the last row.
-    """
-    of_cells = xp.reshape(ended.state, (1 + len(slopes[0]), -1, len(ended.mode)))[1:, -1]
-    for number, of_mode in enumerate(slopes):
-        of_cells = xp.where(ended.mode == number, of_mode, of_cells)
-    event_time = ended.crossing_time if ends_on_event else xp.broadcast_to(t1, ended.mode.shape)
-    # An event at the start has a fixed time, whatever the tangent.
-    has_event = xp.isfinite(event_time) & (event_time > 0.0)
-    # With its variations a run takes other steps: where it does not reach the event, it has no derivative.
-    arrived = ended.status == (CROSSED if ends_on_event else REACHED_END)
-    grazing = has_event & ((ended.counts[-1] > 0) | ~arrived)
-    return Slopes(xp.where(has_event, xp.where(grazing, xp.nan, of_cells), 0.0), grazing)
-
-
-def _without_variations(ended: HybridOutcome[Numbers], size: int) -> HybridOutcome[Numbers]:
-    """A hybrid outcome without its variations."""
-    return ended._replace(state=ended.state[:size], counts=ended.counts[:-1])
+    (outcome, grazing), slopes = in_groups(run, tangents) if traced else run(tangents)
+    return outcome, Slopes(xp.stack(slopes), grazing)
 
 
 _slopes = eqx.filter_jit(VariationalMode.slopes)

@@ -11,177 +11,242 @@ samples, of the checkpoints, and of the adjoint of one mode.
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.xla_cpu import greatest, uncounted
-from ..derivatives import tangents_of
+from ..derivatives import tangents_by, tangents_of
 from ..derivatives.adjoint import Checkpoints
-from ..derivatives.differentiable import over_cells as with_cells
-from ..derivatives.sampled_runs import SampledCotangents, mixture, samples_pulled_back
-from ..derivatives.variation import where_active
-from ..integration import AbstractProblem, Jumps, Lanes, Settings, States, solve_with_samples
+from ..derivatives.sampled_runs import (
+    AbstractSampling,
+    ProblemSpec,
+    SampledCotangents,
+    mixture,
+    samples_pulled_back,
+    solve_for_samples,
+)
+from ..derivatives.variation import by_active, tangent_along, where_active
+from ..derivatives.variation import over_cells as with_cells
+from ..integration import AbstractProblem, Jumps, Lanes, Settings, States
 from ..integration.problem import LEFT_DOMAIN, REACHED_END, RUNNING
+from ..integration.scheduler import of_cells
 from .ensemble import (
     BETWEEN,
     MOST_ROUNDS,
+    AbstractBatchedMode,
     Advance,
     Carry,
     HybridOutcome,
-    after_reset,
-    after_solve,
     at_start,
     chosen,
+    mode_numbered,
     one_round,
-    resolution,
+    over_cells,
+    program_groups,
     selected_cells,
 )
-from .mode import AbstractBatchedMode, mode_of_cells, over_cells, reset_with_rows, weighted
 from .saltation import VariationalMode, along, delay, variational_modes, variational_start
+from .samples import (
+    UNCHANGED,
+    HybridSamples,
+    Recorded,
+    reset_with_rows,
+    sampled_rounds,
+    sampled_with_tangents,
+    weighted,
+)
 
-# The rounds of hybrid runs with samples at given times, and the output rows of the samples.
+#: The modes, the index of the first mode of every cell, and the initial states.
+Built = tuple[tuple[AbstractBatchedMode, ...], Array, States]
+
+#: From some modules (scene, launch, ...), the tolerance and a number of cells to the modes, the index of the first mode
+#: of every cell, and the initial states.
+Build = Callable[[PyTree, Array, int], Built]
 
 
-class Recorded(NamedTuple):
-    """The samples so far: states of the modes, and their mode, NaN where still missing; the output rows between modes
-    with their variations, the rows first, `None` if no mode records its path; and the time [s] of the first grazing
-    event, infinite if there was none.
-    """
-
-    state: Float[Array, "components times cells"]
-    number: Float[Array, "times cells"]
-    between: Float[Array, "values shown times cells"] | None
-    grazing_time: Float[Array, " cells"]
+#: Up to this many numbers, the derivatives are integrated forward; with more, a gradient takes one backward pass. For 64
+#: bouncing balls, the gradient by 3 and 5 numbers costs 6 and 7 values forward, and 6 backward; for 64 hopping tops, that
+#: by 10 numbers costs 24 forward and 12 backward (jax 0.10). A single run waits for its program, not for its steps, and
+#: the backward pass takes up to twice as long to compile.
+MOST_FORWARD, MOST_FORWARD_ALONE = 6, 32
 
 
-def sampled_rounds(
-    modes: tuple[VariationalMode, ...],
-    start: HybridOutcome[Array],
-    times: Float[Array, "times cells"],
-    t1: Float[Array, " cells"],
+def hybrid_samples(
+    build: Build,
+    modules: PyTree,
+    times: Float[Array, " times"],
+    t1: Float[Array, ""],
     settings: Settings,
-    n_blocks: int,
-) -> tuple[Carry, list[tuple[int, ...]], Advance, Advance]:
-    """The rounds of `traced_solve_hybrid` with samples of every mode and of the transition to the next.
+    counters: int,
+) -> HybridSamples:
+    """Run one cell through its modes inside a transformation and sample it, with derivatives that take part in
+    step-size control. A batch under `vmap` is solved as one ensemble. The gradient of a function of its samples by many
+    numbers takes one backward pass.
 
-    **Returns:** the arguments of `traced_rounds`; the carry is a `HybridOutcome` and the `Recorded` samples.
+    **Arguments:**
+
+    - `build`: function of the modules, the tolerance and the number of cells that returns the modes, the index of each
+      cell's first mode, (cells,), and the starts, (components, cells). Functions are compared by identity, so do not
+      create a new one for each call.
+    - `modules`: the tree whose numbers, all scalars, are differentiable; there are no second derivatives.
+    - `times`: times of the samples [s], increasing; `t1`: horizon [s]. Neither is differentiable.
+    - `settings`: settings with an explicit Runge-Kutta solver; their tolerance may be traced.
+    - `counters`: number of counters, the rows of `Transition.counts`.
+
+    **Returns:** `HybridSamples`; the output rows and the end time have derivatives, NaN after a grazing event.
+
+    **Raises:** `ValueError` for derivatives with respect to the times, and for second derivatives.
+
+    **Example:** the height at 0.8 s, after a bounce, and its derivative with respect to the restitution: v (t - T) with
+    the speed v at the ground, and the time T of the bounce.
+
+    >>> from nonholonomic.hybrid import hybrid_samples
+    >>> def build(restitution, tolerance, cells):
+    ...     start = jnp.array([[1.0], [0.0]])
+    ...     return (Bounce(restitution),), jnp.zeros(cells, int), jnp.broadcast_to(start, (2, cells))
+    >>> def height(restitution):
+    ...     return hybrid_samples(build, restitution, jnp.array([0.8]), jnp.asarray(1.0), settings, 1).shown[0, 0]
+    >>> slope, speed = jax.grad(height)(0.6), np.sqrt(2 * 9.81)
+    >>> print(f"{slope:.6f} {speed * (0.8 - speed / 9.81):.6f}")
+    1.543558 1.543558
     """
-    size = times.shape[1]
-
-    def solve(numbers: Sequence[int], carry: Carry, active: Bool[Array, " cells"]) -> Carry:
-        def solved() -> Carry:
-            (runs, output), cell = carry, selected_cells(active)
-            mode = mode_of_cells(mode_numbered(modes, numbers, runs.mode), cell)
-            # Runs in another mode spend no time in this one.
-            left = jnp.where(active, greatest(t1 - runs.end_time, 0.0), 0.0)
-            times_in_mode = times - runs.end_time
-            problem, count = mode.problem(runs.state[:, cell]), jnp.asarray(size)
-            options = {"n_blocks": n_blocks, "one_kernel": True}
-            outcome, samples = solve_with_samples(problem, times_in_mode, left, count, settings, **options)
-            after = chosen(active, after_solve(jnp, runs, outcome, t1), runs)
-            # A sample at the time of a reset is the state before it.
-            is_last = abs(times - after.end_time) <= resolution(runs.end_time, after.end_time)
-            is_last &= outcome.status == LEFT_DOMAIN
-            samples = jnp.moveaxis(samples, -1, 0).swapaxes(1, 2)
-            samples = jnp.where(is_last, outcome.state[:, None], samples)
-            is_within = (times_in_mode >= 0.0) & (times <= after.end_time)
-            is_new = active & (is_within | is_last) & jnp.isnan(output.number)
-            state = jnp.where(is_new, samples, output.state)
-            return after, output._replace(state=state, number=jnp.where(is_new, runs.mode, output.number))
-
-        return jax.lax.cond(jnp.any(active), solved, lambda: carry)
-
-    def reset(numbers: Sequence[int], carry: Carry, lost: Bool[Array, " cells"]) -> Carry:
-        def after_transition() -> Carry:
-            (runs, output), cell = carry, selected_cells(lost)
-            transition, rows = _reset(numbers, runs, cell)
-            after = chosen(lost, after_reset(jnp, runs, transition, t1), runs)
-            if rows is not None:
-                assert output.between is not None
-                is_new = lost & (times > runs.end_time) & (times <= after.end_time) & jnp.isnan(output.number)
-                output = output._replace(
-                    between=jnp.where(is_new, rows, output.between), number=jnp.where(is_new, BETWEEN, output.number)
-                )
-            grazes = after.counts[-1] > runs.counts[-1]
-            grazing_time = jnp.where(grazes, jnp.minimum(output.grazing_time, runs.end_time), output.grazing_time)
-            return after, output._replace(grazing_time=grazing_time)
-
-        return jax.lax.cond(jnp.any(lost), after_transition, lambda: carry)
-
-    def _reset(numbers: Sequence[int], runs: HybridOutcome[Array], cell: Array) -> tuple[Any, Array | None]:
-        """The transition of some cells, and its output rows with their variations."""
-
-        def with_rows(mode: AbstractBatchedMode, state: Array, left: Array) -> Any:
-            # If the event happens later, less time passes from the event to a fixed time, and to the horizon.
-            return reset_with_rows(mode, state, left, times[:, cell] - t1[cell] + left, t1[cell])
-
-        mode: Any = mode_of_cells(mode_numbered(modes, numbers, runs.mode), cell)
-        left = greatest(t1[cell] - runs.end_time[cell], 0.0)
-        transition, rows, variations = mode.reset_with_path(runs.state[:, cell], left, with_rows)
-        return transition, None if rows is None else jnp.concatenate([rows[None], variations])
-
-    groups = program_groups(modes)
-    rows = [jax.eval_shape(functools.partial(_reset, group), start, jnp.arange(size))[1] for group in groups]
-    between = next((jnp.zeros(shape.shape) for shape in rows if shape is not None), None)
-    missing = jnp.full((len(start.state), *times.shape), jnp.nan)
-    empty = Recorded(missing, missing[0], between, jnp.full(size, jnp.inf))
-    return (start, empty), groups, solve, reset
+    sampling = functools.partial(HybridSampling, counters=counters)
+    return solve_for_samples(sampling, build, modules, _fixed(times), t1, settings)
 
 
-def output_rows(
-    modes: tuple[VariationalMode, ...], output: Recorded
-) -> tuple[Float[Array, "shown times cells"], Float[Array, "tangents shown times cells"]]:
-    """The output rows, NaN where a sample is missing, and their variations."""
-    shapes = jax.eval_shape(over_cells(VariationalMode.output_rows, modes[0]), output.state)
-    rows = jax.tree.map(jnp.full_like, shapes, (jnp.nan, 0.0))
-    for number, mode in enumerate(modes):
-        of_this = over_cells(VariationalMode.output_rows, mode)(output.state)
-        rows = jax.tree.map(functools.partial(jnp.where, output.number == number), of_this, rows)
-    if output.between is not None:
-        between = (output.between[0], output.between[1:])
-        rows = jax.tree.map(functools.partial(jnp.where, output.number == BETWEEN), between, rows)
-    return rows
+@eqx.filter_custom_jvp
+def _fixed(times: Float[Array, " times"]) -> Float[Array, " times"]:
+    """The times themselves, marked as not differentiable."""
+    return times
 
 
-def program_groups(modes: tuple[AbstractBatchedMode, ...]) -> list[tuple[int, ...]]:
-    """The indices of the modes, in groups. The modes of a group differ only in the values of their arrays, so they
-    share a program."""
-    groups: list[list[int]] = []
-    for number, mode in enumerate(modes):
-        shape = _shape(mode)
-        group = next((group for group in groups if eqx.tree_equal(_shape(modes[group[0]]), shape)), None)
-        if group is None:
-            groups.append([number])
-        else:
-            group.append(number)
-    return [tuple(group) for group in groups]
+@_fixed.def_jvp
+def _refused(primals, tangents):
+    if tangents[0] is not None:
+        raise ValueError(
+            "derivatives with respect to times or t1 are not available for runs with resets; differentiate with respect to "
+            "the start or the parameters"
+        )
+    return primals[0], jnp.zeros_like(primals[0])
 
 
-def _shape(mode: AbstractBatchedMode) -> Any:
-    """A mode with the shapes of its arrays in place of their values."""
-    return jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)) if eqx.is_array(leaf) else leaf, mode)
+class HybridSampling(AbstractSampling):
+    """Samples of hybrid runs."""
+
+    movable: int
+    spec: ProblemSpec
+    places: PyTree = eqx.field(static=True)
+    counters: int = eqx.field(static=True)
+
+    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> HybridSamples:
+        build, numbers, horizon, settings = self._builder(leaves)
+        return sampled_with_tangents(build(numbers, cells), (), horizon, cells, settings, self.counters)[0]
+
+    def value_and_tangents(
+        self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
+    ) -> tuple[HybridSamples, list[HybridSamples]]:
+        if nested:
+            raise ValueError(
+                "second derivatives are not available through changes of mode; take differences of a gradient instead"
+            )
+        build, numbers, horizon, settings = self._builder(leaves)
+        built, tangents, gather = tangents_by(build, active, numbers, cells)
+        tangents = tuple((tangent[0], tangent[2]) for tangent in tangents)
+        samples, slopes = sampled_with_tangents(built, tangents, horizon, cells, settings, self.counters)
+        return samples, gather(slopes)
+
+    def prefers_adjoint(self, active: tuple[int, ...], leaves: tuple[Array, ...]) -> bool:
+        if len(active) <= MOST_FORWARD:
+            return False
+        typed = [jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves]
+        try:
+            jax.eval_shape(functools.partial(_backward, self), *typed)
+        except ValueError:
+            return False
+        return True
+
+    def differentiable(self, primal: HybridSamples) -> HybridSamples:
+        return HybridSamples(primal.shown, UNCHANGED, primal.end_time, *(UNCHANGED,) * 7)
+
+    def push_forward(
+        self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], tangents: tuple[Array, ...]
+    ) -> HybridSamples:
+        build, numbers, horizon, settings = self._builder(leaves)
+        built, direction, size = tangent_along(build, active, numbers, tangents, cells)
+        hybrid_tangent = (direction[0], direction[2])
+        _, (slope,) = sampled_with_tangents(built, (hybrid_tangent,), horizon, cells, settings, self.counters)
+        return jax.tree.map(lambda part: part * size.reshape(-1, *[1] * (part.ndim - 1)), slope)
+
+    def pull_back(
+        self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], cotangents: HybridSamples
+    ) -> list[Lanes]:
+        if cells == 1 and len(active) <= MOST_FORWARD_ALONE:
+            slopes = self.value_and_tangents(active, False, cells, *leaves)[1]
+            return [_product(slope, cotangents) for slope in slopes]
+        build, numbers, (times, t1), settings = self._builder(leaves)
+        rebuilt, point = by_active(build, active, numbers, cells)
+        times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), cells))
+        shown, end_time = cotangents.shown, cotangents.end_time
+        if shown is None:
+            modes, _, state = rebuilt(*point)
+            shown = jnp.zeros((cells, len(jax.eval_shape(modes[0].shown, state)), len(times)))
+        end_time = jnp.zeros(cells) if end_time is None else end_time
+        options = (times, jnp.broadcast_to(t1, (cells,)), settings, self.counters)
+        return hybrid_samples_pulled_back(rebuilt, point, jnp.moveaxis(shown, 0, -1), end_time, *options)
+
+    def _builder(
+        self, leaves: tuple[Array, ...]
+    ) -> tuple[Callable[..., Built], tuple[Array, ...], tuple[Array, Array], Settings]:
+        """A function (the modules' numbers, cells) -> modes and start; the numbers; times and horizon; the settings."""
+        numbers, (times, t1, tolerance), spec = self._sorted(leaves)
+        # One tolerance serves the whole ensemble: the smallest of the batch.
+        settings = spec.settings.with_tolerance(jnp.min(tolerance))
+
+        def build(numbers: tuple[Array, ...], cells: int | None) -> Built:
+            return spec.built(numbers, settings.tolerance, cells)
+
+        return build, numbers, (times if times.ndim == 1 else times.T, t1), settings
 
 
-def mode_numbered(modes: tuple[VariationalMode, ...], numbers: Sequence[int], selected: Array) -> Any:
-    """The mode numbered `selected` in one of the `program_groups`."""
-    mode = modes[numbers[0]]
-    for number in numbers[1:]:
-
-        def leaf(old: Any, new: Any, number: int = number) -> Any:
-            return old if old is new or not eqx.is_array(old) else jnp.where(selected == number, new, old)
-
-        mode = jax.tree.map(leaf, mode, modes[number])
-    return mode
+def _product(slope: HybridSamples, cotangents: HybridSamples) -> Lanes:
+    """The derivative of a sum over samples, from their derivatives and their cotangents; a derivative that is zero counts
+    for nothing, whatever the cotangent."""
+    pairs = ((slope.shown, cotangents.shown), (slope.end_time, cotangents.end_time))
+    terms = [weighted(one, other).reshape(len(one), -1) for one, other in pairs if other is not None]
+    return sum((jnp.sum(term, axis=1) for term in terms), jnp.zeros(len(slope.end_time)))
 
 
-#: From numbers with the cells last to the modes, the index of the first mode of every cell, and the initial states.
-Build = Callable[..., tuple[tuple[AbstractBatchedMode, ...], Array, Float[Array, "components cells"]]]
+# Compiled, so that JAX traces it once for equal solves.
+@eqx.filter_jit
+def _backward(sampling: HybridSampling, *leaves: Array) -> list[PyTree]:
+    """The backward passes of the fields and of the output rows of a single run, for their shapes.
+
+    **Raises:** `ValueError` if one of them has a loop without a fixed number of iterations.
+    """
+    build, numbers, _, _ = sampling._builder(leaves)
+    modes, _, state = build(numbers, 1)
+
+    def of_mode(mode: AbstractBatchedMode) -> PyTree:
+        arrays, static = eqx.partition(mode, eqx.is_inexact_array)
+
+        def values(arrays: PyTree, state: States) -> PyTree:
+            mode = eqx.combine(arrays, static)
+            shown = over_cells(lambda mode, states: mode.shown(states), mode)(state[:, None])
+            return mode.problem(state).field(jnp.zeros_like(state[0]), state), shown
+
+        results, pull = jax.vjp(values, arrays, state)
+        return pull(jax.tree.map(jnp.ones_like, results))
+
+    return [of_mode(modes[group[0]]) for group in program_groups(modes)]
+
+
+# The backward pass.
 
 
 class EndlessProblem(AbstractProblem):
@@ -193,7 +258,7 @@ class EndlessProblem(AbstractProblem):
     def fits_one_kernel(self) -> bool:
         return self.whole.fits_one_kernel
 
-    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+    def start(self) -> tuple[States, States]:
         return self.whole.start()
 
     def field(self, time: Lanes, state: States) -> States:
@@ -217,8 +282,8 @@ class Costate(NamedTuple):
     - `invalid`: whether a grazing event lies between the start of the round and a sample with a cotangent.
     """
 
-    state: Float[Array, "components cells"]
-    start_time: Float[Array, " cells"]
+    state: States
+    start_time: Lanes
     numbers: list[list[Array]]
     invalid: Bool[Array, " cells"]
 
@@ -249,12 +314,12 @@ class Rounds(NamedTuple):
 
 
 def hybrid_samples_pulled_back(
-    build: Build,
+    build: Callable[..., Built],
     point: tuple[Float[Array, "... cells"], ...],
     shown: Float[Array, "shown times cells"],
-    end_time: Float[Array, " cells"],
+    end_time: Lanes,
     times: Float[Array, "times cells"],
-    t1: Float[Array, " cells"],
+    t1: Lanes,
     settings: Settings,
     counters: int,
 ) -> list[Float[Array, "... cells"]]:
@@ -275,32 +340,32 @@ def hybrid_samples_pulled_back(
     tangent = tangents_of(lambda *point: build(*point)[::2], point, [tuple(mixture(point))])
     variational = variational_modes(modes, tangent, settings.tolerance, False)
     cells, states = state.shape[1], variational_start(state, tangent)
-    start = at_start(jnp, first, states, cells, counters + 1)
+    start = at_start(first, states, cells, counters + 1)
     (runs, output), groups, solve, reset = sampled_rounds(variational, start, times, t1, settings, 2)
-    shown = jnp.where((times <= 0.0) & ~_moved_rows(variational, first, states), 0.0, shown)
+    # At the start, only the output rows that the tangent moves count.
+    rates = [
+        over_cells(lambda mode, states: mode.output_rows(states)[1][0], mode)(states[:, None]) for mode in variational
+    ]
+    rate = rates[0]
+    for number, of_mode in enumerate(rates):
+        rate = jnp.where(first == number, of_mode, rate)
+    shown = jnp.where((times <= 0.0) & (rate == 0.0), 0.0, shown)
     passes = Passes(variational, groups, (solve, reset), (times, t1), settings, shown, end_time)
-    costate = passes.back_to_start(runs, output)
+    count, no_cells = jnp.zeros((), int), jnp.zeros(cells, bool)
+    none = [[jnp.zeros((*jnp.shape(leaf)[:-1], cells)) for leaf in mode.active_numbers()[0]] for mode in variational]
+    costate = Costate(jnp.zeros_like(passes.primal(runs)[0]), jnp.zeros(cells), none, no_cells)
+    checkpoints, owner = Checkpoints.none(Kept(runs, runs, no_cells)), jnp.full(times.shape, -1)
+    run = Rounds(runs, output, owner, count, count + MOST_ROUNDS, checkpoints, costate)
+    run = jax.lax.while_loop(lambda run: uncounted(run.limit > 0, run.number), passes.there_and_back, run)
+    costate = run.costate
 
-    def numbers_and_start(*point: Float[Array, "... cells"]) -> Any:
+    def numbers_and_start(*point: Float[Array, "... cells"]) -> PyTree:
         modes, _, state = build(*point)
         numbers = [jax.tree.leaves(where_active(mode, rate)) for mode, rate in zip(modes, tangent[0][0], strict=True)]
         return jax.tree.map(lambda number: with_cells(number, cells), numbers), state
 
     by_point = jax.vjp(numbers_and_start, *point)[1]((costate.numbers, costate.state))
     return [jnp.where(costate.invalid, jnp.nan, part) for part in by_point]
-
-
-def _moved_rows(
-    modes: tuple[VariationalMode, ...], first: Int[Array, " cells"], state: Float[Array, "components cells"]
-) -> Bool[Array, "shown 1 cells"]:
-    """Which output rows the tangent moves at the start."""
-    variations = [
-        over_cells(lambda mode, states: mode.output_rows(states)[1][0], mode)(state[:, None]) for mode in modes
-    ]
-    moved = variations[0]
-    for number, variation in enumerate(variations):
-        moved = jnp.where(first == number, variation, moved)
-    return moved != 0.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -314,42 +379,30 @@ class Passes:
     modes: tuple[VariationalMode, ...]
     groups: Sequence[Sequence[int]]
     advance: tuple[Advance, Advance]
-    horizon: tuple[Float[Array, "times cells"], Float[Array, " cells"]]
+    horizon: tuple[Float[Array, "times cells"], Lanes]
     settings: Settings
     shown: Float[Array, "shown times cells"]
-    end_time: Float[Array, " cells"]
-
-    def back_to_start(self, runs: HybridOutcome[Array], output: Recorded) -> Costate:
-        """The derivatives with respect to the start of the first round, after both passes.
-
-        **Arguments:** `runs`, `output`: the runs at their start, without samples.
-        """
-        cells, count = len(runs.mode), jnp.zeros((), int)
-        no_cells = jnp.zeros(cells, bool)
-        numbers = [
-            [jnp.zeros((*jnp.shape(leaf)[:-1], cells)) for leaf in mode.active_numbers()[0]] for mode in self.modes
-        ]
-        costate = Costate(jnp.zeros_like(self.primal(runs)[0]), jnp.zeros(cells), numbers, no_cells)
-        checkpoints = Checkpoints.none(Kept(runs, runs, no_cells))
-        owner = jnp.full(self.horizon[0].shape, -1)
-        run = Rounds(runs, output, owner, count, count + MOST_ROUNDS, checkpoints, costate)
-        return jax.lax.while_loop(lambda run: uncounted(run.limit > 0, run.number), self.there_and_back, run).costate
+    end_time: Lanes
 
     def there_and_back(self, run: Rounds) -> Rounds:
         """Compute all rounds up to the one that the backward pass needs, and take back those with a checkpoint."""
         is_first = run.limit == MOST_ROUNDS
-        run = jax.lax.while_loop(self.is_ahead, self.forward, run)
+
+        def is_ahead(run: Rounds) -> Bool[Array, ""]:
+            return jnp.any(run.frontier.status == RUNNING) & (run.number < run.limit)
+
+        def is_kept(run: Rounds) -> Bool[Array, ""]:
+            number, _ = run.checkpoints.latest()
+            return (run.checkpoints.depth > 0) & (number == run.limit - 1)
+
+        run = jax.lax.while_loop(is_ahead, self.forward, run)
         # At first, the derivatives begin at the ends of the runs; a horizon does not move.
         by_end = jnp.where(run.frontier.status == REACHED_END, 0.0, self.end_time)
         costate = run.costate._replace(start_time=jnp.where(is_first, by_end, run.costate.start_time))
         run = run._replace(limit=jnp.minimum(run.limit, run.number), costate=costate)
-        run = jax.lax.while_loop(self.is_kept, self.backward, run)
+        run = jax.lax.while_loop(is_kept, self.backward, run)
         number, kept = run.checkpoints.latest()
         return run._replace(frontier=kept.before, number=number, checkpoints=run.checkpoints.without_latest())
-
-    def is_ahead(self, run: Rounds) -> Bool[Array, ""]:
-        """Whether a round that the backward pass needs has not been computed."""
-        return jnp.any(run.frontier.status == RUNNING) & (run.number < run.limit)
 
     def forward(self, run: Rounds) -> Rounds:
         """Compute the next round."""
@@ -373,11 +426,6 @@ class Passes:
             checkpoints=run.checkpoints.added(run.number, Kept(before, ended, after.counts[-1] > before.counts[-1])),
         )
 
-    def is_kept(self, run: Rounds) -> Bool[Array, ""]:
-        """Whether the round that the backward pass takes next is a checkpoint."""
-        number, _ = run.checkpoints.latest()
-        return (run.checkpoints.depth > 0) & (number == run.limit - 1)
-
     def backward(self, run: Rounds) -> Rounds:
         """Carry the derivatives through the latest round."""
         (number, kept), costate = run.checkpoints.latest(), run.costate
@@ -385,21 +433,15 @@ class Passes:
             active = functools.reduce(jnp.logical_or, (kept.before.mode == number for number in group))
             active = active & (kept.before.status == RUNNING)
             stage = _Stage(self, group, kept, run.output, active & (run.owner == number))
-            costate = _if_any(active & (kept.ended.status == LEFT_DOMAIN), stage.through_reset, costate)
-            costate = _if_any(active, stage.through_motion, costate)
+            lost = active & (kept.ended.status == LEFT_DOMAIN)
+            for cells, step in ((lost, stage.through_reset), (active, stage.through_motion)):
+                costate = jax.lax.cond(jnp.any(cells), step, lambda _, costate: costate, cells, costate)
         return run._replace(limit=number, checkpoints=run.checkpoints.without_latest(), costate=costate)
 
-    def primal(self, runs: HybridOutcome[Array]) -> tuple[Float[Array, "components cells"], Float[Array, " cells"]]:
+    def primal(self, runs: HybridOutcome[Array]) -> tuple[States, Lanes]:
         """The states of some runs, and the time since their modes began."""
         state = self.modes[0].parts(runs.state)[0]
         return state[:-1], state[-1]
-
-
-def _if_any(
-    cells: Bool[Array, " cells"], step: Callable[[Bool[Array, " cells"], Costate], Costate], costate: Costate
-) -> Costate:
-    """The derivatives after a step of the backward pass, if there are cells that take it."""
-    return jax.lax.cond(jnp.any(cells), step, lambda _, costate: costate, cells, costate)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -424,9 +466,7 @@ class _Stage:
         by_state, by_time = jnp.where(lost, costate.state, 0.0), jnp.where(lost, costate.start_time, 0.0)
         weights = jnp.where(self.owned & (self.output.number == BETWEEN), self.passes.shown, 0.0)
 
-        def share(
-            primal: Float[Array, "components cells"], start_time: Float[Array, " cells"], *numbers: Array
-        ) -> Array:
+        def share(primal: States, start_time: Lanes, *numbers: Array) -> Array:
             """The share of the later run in the sum; the reset moves with the event (`saltation.py`)."""
             mode = build(*numbers)
             problem = mode.problem(primal)
@@ -495,11 +535,15 @@ class _Stage:
             numbers=self._added(costate.numbers, active, by_numbers),
         )
 
-    def _mode(self, cell: Int[Array, " cells"]) -> tuple[list[Float[Array, "... cells"]], list[Array], Any]:
+    def _mode(
+        self, cell: Int[Array, " cells"]
+    ) -> tuple[list[Float[Array, "... cells"]], list[Array], Callable[..., AbstractBatchedMode]]:
         """The moving numbers of the mode of some cells, their rates, and the mode as a function of the numbers."""
-        mode: Any = mode_of_cells(mode_numbered(self.passes.modes, self.group, self.kept.before.mode), cell)
+        mode = of_cells(mode_numbered(self.passes.modes, self.group, self.kept.before.mode), cell)
         numbers, build = mode.active_numbers()
-        numbers, rates = ([with_cells(leaf, len(cell)) for leaf in leaves] for leaves in (numbers, mode.rates()[0]))
+        numbers, rates = (
+            [with_cells(leaf, len(cell)) for leaf in leaves] for leaves in (numbers, mode.directions()[0])
+        )
         return numbers, rates, build
 
     def _added(
@@ -517,7 +561,7 @@ class _Stage:
 
 
 def _gradients(
-    function: Callable[..., Float[Array, " cells"]], point: tuple[Float[Array, "... cells"], ...]
+    function: Callable[..., Lanes], point: tuple[Float[Array, "... cells"], ...]
 ) -> list[Float[Array, "... cells"]]:
     """The derivatives of a value in every cell with respect to the cell's numbers."""
     try:

@@ -1,34 +1,246 @@
-"""Hybrid runs sampled at given times: of many cells at once, and inside other transformations, with derivatives."""
+"""Hybrid runs of many cells with samples at given times: the states in the modes, and the output rows between two modes."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ..compilation.xla_cpu import compiled_alone
-from ..derivatives import in_groups, tangents_by
-from ..derivatives.differentiable import AbstractSampling, ProblemSpec, by_active, solve_for_samples, tangent_along
-from ..integration import Settings
-from ..integration.problem import REACHED_END
-from .ensemble import at_start, traced_rounds
-from .mode import AbstractBatchedMode, over_cells, weighted
-from .saltation import variational_modes, variational_start
-from .sampled_adjoint import hybrid_samples_pulled_back, output_rows, program_groups, sampled_rounds
+from ..compilation.xla_cpu import compiled_alone, greatest
+from ..derivatives import in_groups
+from ..integration import Lanes, Settings, States, solve_with_samples
+from ..integration.problem import LEFT_DOMAIN, REACHED_END
+from ..integration.scheduler import of_cells
+from .ensemble import (
+    BETWEEN,
+    AbstractBatchedMode,
+    AbstractHoppingMode,
+    Advance,
+    Carry,
+    HybridOutcome,
+    Transition,
+    TransitionPath,
+    after_reset,
+    after_solve,
+    all_rounds,
+    at_start,
+    chosen,
+    mode_numbered,
+    over_cells,
+    program_groups,
+    resolution,
+    selected_cells,
+)
+from .saltation import Tangents, VariationalMode, variational_modes, variational_start
 
-#: From some modules (scene, launch, ...), the tolerance and a number of cells to the modes, the index of the first mode
-#: of every cell, and the initial states.
-Build = Callable[[Any, Array, int], tuple[tuple[AbstractBatchedMode, ...], Array, Float[Array, "components cells"]]]
+# Output rows of runs between two modes, at given times, for many cells at once.
+
+#: A sample this much later than the last stretch of a transition, as a fraction of the horizon, still belongs to it.
+ROUND_OFF = 1e-13
 
 
-#: Up to this many numbers, the derivatives are integrated forward; with more, a gradient takes one backward pass. For 64
-#: bouncing balls, the gradient by 3 and 5 numbers costs 6 and 7 values forward, and 6 backward; for 64 hopping tops, that
-#: by 10 numbers costs 24 forward and 12 backward (jax 0.10). A single run waits for its program, not for its steps, and
-#: the backward pass takes up to twice as long to compile.
-MOST_FORWARD, MOST_FORWARD_ALONE = 6, 32
+def reset_with_rows(
+    mode: AbstractBatchedMode,
+    state: States,
+    left: Lanes,
+    times: Float[Array, "times cells"],
+    t1: Lanes,
+    weights: Float[Array, "shown times cells"] | None = None,
+) -> tuple[Transition, Array | None]:
+    """The transition to the next mode, and the output rows on the way.
+
+    **Arguments:** `state`, `left`: as for `AbstractBatchedMode.reset_map`; `times`: the times of the samples [s],
+    counted from the end of the mode; `t1`: horizon [s]; `weights`: factors of the rows, if only a sum of them is needed.
+
+    **Returns:** the `Transition`, and the rows, which are meaningless at times outside the transition, or with `weights`
+    their weighted sum in every cell; `None` if the mode records no path.
+    """
+    if isinstance(mode, AbstractHoppingMode):
+        return _hops_with_rows(mode, state, left, times, ROUND_OFF * t1, weights)
+    transition = mode.reset_map(state, left)
+    if transition.record is None:
+        return transition, None
+    rows = over_cells(_rows_of_path, mode)(transition.record, times)
+    return transition, rows if weights is None else jnp.sum(weighted(weights, rows), axis=(0, 1))
+
+
+def weighted(weights: Float[Array, "..."], values: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Values times their weights; a value without a weight may be anything."""
+    return jnp.where(weights == 0.0, 0.0, weights * values)
+
+
+def _rows_of_path(
+    mode: AbstractBatchedMode, record: TransitionPath, times: Float[Array, " times"]
+) -> Float[Array, "shown times"]:
+    """The output rows of one cell; after the last stretch they are meaningless."""
+    ends = record.ends
+    stretch = jnp.minimum(jnp.searchsorted(jax.lax.stop_gradient(ends), jax.lax.stop_gradient(times)), len(ends) - 1)
+    start_time = jnp.where(stretch > 0, ends[jnp.maximum(stretch - 1, 0)], 0.0)
+    motions = jax.tree.map(lambda leaf: jnp.moveaxis(leaf[stretch], 0, -1), record.motions)
+    return mode.between(motions, jnp.where(jnp.isfinite(start_time), times - start_time, 0.0))
+
+
+class Hops(NamedTuple):
+    """A succession of stretches: the current one, the number of stretches so far, the output rows or their weighted sum,
+    and the index of the next sample in every cell."""
+
+    stretch: PyTree
+    count: Int[Array, ""]
+    rows: Float[Array, "*shown_times cells"]
+    sample: Int[Array, " cells"]
+
+
+def _hops_with_rows(
+    mode: AbstractHoppingMode,
+    state: States,
+    left: Lanes,
+    times: Float[Array, "times cells"],
+    slack: Lanes,
+    weights: Float[Array, "shown times cells"] | None,
+) -> tuple[Transition, Float[Array, "*shown_times cells"]]:
+    """The stretches one by one, each with the samples inside it. No path is kept, whose length is not known."""
+    cells = jnp.arange(len(left))
+
+    def with_values(rows: Array, row: Int[Array, " cells"], values: Float[Array, "shown cells"]) -> Array:
+        if weights is None:
+            return rows.at[:, row, cells].set(values, mode="drop", unique_indices=True)
+        factors = weights.at[:, row, cells].get(mode="fill", fill_value=0.0)
+        return rows + jnp.sum(weighted(factors, values), axis=0)
+
+    def hop(hops: Hops) -> Hops:
+        stretch, count, rows, sample = hops
+        end, following = mode.hop(stretch, left)
+        motion = mode.motion_in(stretch)
+        # Rounding may put the end of the last stretch before a sample at the end of the transition.
+        reach = end.elapsed + jnp.where(following.open, 0.0, slack)
+
+        def next_time(sample: Int[Array, " cells"]) -> Lanes:
+            time = times[jnp.minimum(sample, len(times) - 1), cells]
+            return jnp.where(sample < len(times), time, jnp.inf)
+
+        def is_inside(sample: Int[Array, " cells"]) -> Bool[Array, " cells"]:
+            return stretch.open & (next_time(sample) <= reach)
+
+        def filled(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+            rows, sample = carry
+            inside = is_inside(sample)
+            passed = jnp.where(inside, next_time(sample) - stretch.elapsed, 0.0)
+            row = jnp.where(inside, sample, len(times))
+            return with_values(rows, row, mode.between(motion, passed)), sample + inside
+
+        rows, sample = jax.lax.while_loop(lambda carry: jnp.any(is_inside(carry[1])), filled, (rows, sample))
+        return Hops(following, count + 1, rows, sample)
+
+    def goes_on(hops: Hops) -> Bool[Array, ""]:
+        return jnp.any(hops.stretch.open) & (hops.count < mode.most_hops)
+
+    start = mode.lost(state)
+    row = jax.eval_shape(mode.between, mode.motion_in(start), start.elapsed)
+    rows = jnp.zeros((len(row), *times.shape) if weights is None else left.shape)
+    hops = Hops(start, jnp.zeros((), int), rows, jnp.sum(times <= 0.0, axis=0))
+    hops = jax.lax.while_loop(goes_on, hop, hops)
+    return mode.closed(hops.stretch), hops.rows
+
+
+# The rounds of hybrid runs with samples at given times, and the output rows of the samples.
+
+
+class Recorded(NamedTuple):
+    """The samples so far: states of the modes, and their mode, NaN where still missing; the output rows between modes
+    with their variations, the rows first, `None` if no mode records its path; and the time [s] of the first grazing
+    event, infinite if there was none.
+    """
+
+    state: Float[Array, "components times cells"]
+    number: Float[Array, "times cells"]
+    between: Float[Array, "values shown times cells"] | None
+    grazing_time: Lanes
+
+
+def sampled_rounds(
+    modes: tuple[VariationalMode, ...],
+    start: HybridOutcome[Array],
+    times: Float[Array, "times cells"],
+    t1: Lanes,
+    settings: Settings,
+    n_blocks: int,
+) -> tuple[Carry, list[tuple[int, ...]], Advance, Advance]:
+    """The rounds of `solve_hybrid` with samples of every mode and of the transition to the next.
+
+    **Returns:** the arguments of `all_rounds`; the carry is a `HybridOutcome` and the `Recorded` samples.
+    """
+    size = times.shape[1]
+
+    def solve(numbers: Sequence[int], carry: Carry, active: Bool[Array, " cells"]) -> Carry:
+        (runs, output), cell = carry, selected_cells(active)
+        mode = of_cells(mode_numbered(modes, numbers, runs.mode), cell)
+        # Runs in another mode spend no time in this one.
+        left = jnp.where(active, greatest(t1 - runs.end_time, 0.0), 0.0)
+        times_in_mode = times - runs.end_time
+        problem, count = mode.problem(runs.state[:, cell]), jnp.asarray(size)
+        options = {"n_blocks": n_blocks, "one_kernel": True}
+        outcome, samples = solve_with_samples(problem, times_in_mode, left, count, settings, **options)
+        after = chosen(active, after_solve(runs, outcome, t1), runs)
+        # A sample at the time of a reset is the state before it.
+        is_last = abs(times - after.end_time) <= resolution(runs.end_time, after.end_time)
+        is_last &= outcome.status == LEFT_DOMAIN
+        samples = jnp.moveaxis(samples, -1, 0).swapaxes(1, 2)
+        samples = jnp.where(is_last, outcome.state[:, None], samples)
+        is_within = (times_in_mode >= 0.0) & (times <= after.end_time)
+        is_new = active & (is_within | is_last) & jnp.isnan(output.number)
+        state = jnp.where(is_new, samples, output.state)
+        return after, output._replace(state=state, number=jnp.where(is_new, runs.mode, output.number))
+
+    def reset(numbers: Sequence[int], carry: Carry, lost: Bool[Array, " cells"]) -> Carry:
+        runs, output = carry
+        transition, rows = _reset(numbers, runs, selected_cells(lost))
+        after = chosen(lost, after_reset(runs, transition, t1), runs)
+        if rows is not None:
+            is_new = lost & (times > runs.end_time) & (times <= after.end_time) & jnp.isnan(output.number)
+            between, number = jnp.where(is_new, rows, output.between), jnp.where(is_new, BETWEEN, output.number)
+            output = output._replace(between=between, number=number)
+        grazes = after.counts[-1] > runs.counts[-1]
+        grazing_time = jnp.where(grazes, jnp.minimum(output.grazing_time, runs.end_time), output.grazing_time)
+        return after, output._replace(grazing_time=grazing_time)
+
+    def _reset(
+        numbers: Sequence[int], runs: HybridOutcome[Array], cell: Int[Array, " cells"]
+    ) -> tuple[Transition, Array | None]:
+        """The transition of some cells, and its output rows with their variations."""
+
+        def with_rows(mode: AbstractBatchedMode, state: States, left: Lanes) -> tuple[Transition, Array | None]:
+            # If the event happens later, less time passes from the event to a fixed time, and to the horizon.
+            return reset_with_rows(mode, state, left, times[:, cell] - t1[cell] + left, t1[cell])
+
+        mode = of_cells(mode_numbered(modes, numbers, runs.mode), cell)
+        left = greatest(t1[cell] - runs.end_time[cell], 0.0)
+        transition, rows, variations = mode.reset_with_path(runs.state[:, cell], left, with_rows)
+        return transition, None if rows is None else jnp.concatenate([rows[None], variations])
+
+    groups = program_groups(modes)
+    rows = [jax.eval_shape(functools.partial(_reset, group), start, jnp.arange(size))[1] for group in groups]
+    between = next((jnp.zeros(shape.shape) for shape in rows if shape is not None), None)
+    missing = jnp.full((len(start.state), *times.shape), jnp.nan)
+    empty = Recorded(missing, missing[0], between, jnp.full(size, jnp.inf))
+    return (start, empty), groups, solve, reset
+
+
+def output_rows(
+    modes: tuple[VariationalMode, ...], output: Recorded
+) -> tuple[Float[Array, "shown times cells"], Float[Array, "tangents shown times cells"]]:
+    """The output rows, NaN where a sample is missing, and their variations."""
+    shapes = jax.eval_shape(over_cells(VariationalMode.output_rows, modes[0]), output.state)
+    rows = jax.tree.map(jnp.full_like, shapes, (jnp.nan, 0.0))
+    for number, mode in enumerate(modes):
+        of_this = over_cells(VariationalMode.output_rows, mode)(output.state)
+        rows = jax.tree.map(functools.partial(jnp.where, output.number == number), of_this, rows)
+    if output.between is not None:
+        between = (output.between[0], output.between[1:])
+        rows = jax.tree.map(functools.partial(jnp.where, output.number == BETWEEN), between, rows)
+    return rows
+
 
 #: In the derivative of `HybridSamples`: the entries that have none.
 UNCHANGED: Any = None
@@ -60,56 +272,18 @@ class HybridSamples(NamedTuple):
     counts: Float[Array, "*cells kinds"]
 
 
-def hybrid_samples(
-    build: Build, modules: Any, times: Float[Array, " times"], t1: Float[Array, ""], settings: Settings, counters: int
-) -> HybridSamples:
-    """Run one cell through its modes inside a transformation and sample it, with derivatives that take part in
-    step-size control. A batch under `vmap` is solved as one ensemble. The gradient of a function of its samples by many
-    numbers takes one backward pass.
-
-    **Arguments:**
-
-    - `build`: function of the modules, the tolerance and the number of cells that returns the modes, the index of each
-      cell's first mode, (cells,), and the starts, (components, cells). Functions are compared by identity, so do not
-      create a new one for each call.
-    - `modules`: the tree whose numbers, all scalars, are differentiable; there are no second derivatives.
-    - `times`: times of the samples [s], increasing; `t1`: horizon [s]. Neither is differentiable.
-    - `settings`: settings with an explicit Runge-Kutta solver; their tolerance may be traced.
-    - `counters`: number of counters, the rows of `Transition.counts`.
-
-    **Returns:** `HybridSamples`; the output rows and the end time have derivatives, NaN after a grazing event.
-
-    **Raises:** `ValueError` for derivatives with respect to the times, and for second derivatives.
-
-    **Example:** the height at 0.8 s, after a bounce, and its derivative with respect to the restitution: v (t - T) with
-    the speed v at the ground, and the time T of the bounce.
-
-    >>> from nonholonomic.hybrid import hybrid_samples
-    >>> def build(restitution, tolerance, cells):
-    ...     start = jnp.array([[1.0], [0.0]])
-    ...     return (Bounce(restitution),), jnp.zeros(cells, int), jnp.broadcast_to(start, (2, cells))
-    >>> def height(restitution):
-    ...     return hybrid_samples(build, restitution, jnp.array([0.8]), jnp.asarray(1.0), settings, 1).shown[0, 0]
-    >>> slope, speed = jax.grad(height)(0.6), np.sqrt(2 * 9.81)
-    >>> print(f"{slope:.6f} {speed * (0.8 - speed / 9.81):.6f}")
-    1.543558 1.543558
-    """
-    sampling = functools.partial(HybridSampling, counters=counters)
-    return solve_for_samples(sampling, build, modules, _fixed(times), t1, settings)
-
-
 @compiled_alone
 def solve_hybrid_with_samples(
     modes: tuple[AbstractBatchedMode, ...],
-    mode: Array,
-    state: Float[Array, "components cells"],
+    mode: Int[Array, " cells"],
+    state: States,
     times: Float[Array, "times *cells"],
     t1: Float[Array, "..."],
-    cells: Any,
+    cells: Int[Array, ""] | int,
     settings: Settings,
     *,
     counters: int,
-    tangents: tuple[tuple[tuple[Any, ...], Any], ...] = (),
+    tangents: Tangents = (),
 ) -> tuple[HybridSamples, list[HybridSamples]]:
     """Run every cell through its modes to `t1`, or to where the model ends, and sample it.
 
@@ -130,164 +304,40 @@ def solve_hybrid_with_samples(
     [0.330492 0.639204] [0. 0.]
     """
     built = (modes, jnp.asarray(mode), jnp.asarray(state))
-    horizon = (jnp.asarray(times), jnp.asarray(t1))
-
-    def run(group: tuple[Any, ...]) -> tuple[HybridSamples, list[HybridSamples]]:
-        return _sampled_with_tangents(built, group, horizon, cells, settings, counters)
-
-    return in_groups(run, tangents)
+    return sampled_with_tangents(built, tangents, (jnp.asarray(times), jnp.asarray(t1)), cells, settings, counters)
 
 
-@eqx.filter_custom_jvp
-def _fixed(times: Float[Array, " times"]) -> Float[Array, " times"]:
-    """The times themselves, marked as not differentiable."""
-    return times
-
-
-@_fixed.def_jvp
-def _refused(primals: Any, tangents: Any) -> Any:
-    if tangents[0] is not None:
-        raise ValueError(
-            "derivatives with respect to times or t1 are not available for runs with resets; differentiate with respect to "
-            "the start or the parameters"
-        )
-    return primals[0], jnp.zeros_like(primals[0])
-
-
-class HybridSampling(AbstractSampling):
-    """Samples of hybrid runs."""
-
-    movable: int
-    spec: ProblemSpec
-    places: Any = eqx.field(static=True)
-    counters: int = eqx.field(static=True)
-
-    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> HybridSamples:
-        build, numbers, horizon, settings = self._builder(leaves)
-        return _sampled_with_tangents(build(numbers, cells), (), horizon, cells, settings, self.counters)[0]
-
-    def value_and_tangents(
-        self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
-    ) -> tuple[HybridSamples, list[HybridSamples]]:
-        if nested:
-            raise ValueError(
-                "second derivatives are not available through changes of mode; take differences of a gradient instead"
-            )
-        build, numbers, horizon, settings = self._builder(leaves)
-        built, tangents, gather = tangents_by(build, active, numbers, cells)
-
-        def run(group: tuple[Any, ...]) -> tuple[HybridSamples, list[HybridSamples]]:
-            hybrid_tangents = tuple((tangent[0], tangent[2]) for tangent in group)
-            return _sampled_with_tangents(built, hybrid_tangents, horizon, cells, settings, self.counters)
-
-        samples, slopes = in_groups(run, tangents)
-        return samples, gather(slopes)
-
-    def prefers_adjoint(self, active: tuple[int, ...], leaves: tuple[Array, ...]) -> bool:
-        if len(active) <= MOST_FORWARD:
-            return False
-        typed = [jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves]
-        try:
-            jax.eval_shape(functools.partial(_backward, self), *typed)
-        except ValueError:
-            return False
-        return True
-
-    def differentiable(self, primal: HybridSamples) -> HybridSamples:
-        return HybridSamples(primal.shown, UNCHANGED, primal.end_time, *(UNCHANGED,) * 7)
-
-    def push_forward(
-        self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], tangents: tuple[Array, ...]
-    ) -> HybridSamples:
-        build, numbers, horizon, settings = self._builder(leaves)
-        built, direction, size = tangent_along(build, active, numbers, tangents, cells)
-        hybrid_tangent = (direction[0], direction[2])
-        _, (slope,) = _sampled_with_tangents(built, (hybrid_tangent,), horizon, cells, settings, self.counters)
-        return jax.tree.map(lambda part: part * size.reshape(-1, *[1] * (part.ndim - 1)), slope)
-
-    def pull_back(
-        self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], cotangents: HybridSamples
-    ) -> list[Float[Array, " cells"]]:
-        if cells == 1 and len(active) <= MOST_FORWARD_ALONE:
-            slopes = self.value_and_tangents(active, False, cells, *leaves)[1]
-            return [_product(slope, cotangents) for slope in slopes]
-        build, numbers, (times, t1), settings = self._builder(leaves)
-        rebuilt, point = by_active(build, active, numbers, cells)
-        times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), cells))
-        shown, end_time = cotangents.shown, cotangents.end_time
-        if shown is None:
-            modes, _, state = rebuilt(*point)
-            shown = jnp.zeros((cells, len(jax.eval_shape(modes[0].shown, state)), len(times)))
-        end_time = jnp.zeros(cells) if end_time is None else end_time
-        options = (times, jnp.broadcast_to(t1, (cells,)), settings, self.counters)
-        return hybrid_samples_pulled_back(rebuilt, point, jnp.moveaxis(shown, 0, -1), end_time, *options)
-
-    def _builder(self, leaves: tuple[Array, ...]) -> tuple[Callable[..., Any], tuple[Array, ...], Any, Settings]:
-        """A function (the modules' numbers, cells) -> modes and start; the numbers; times and horizon; the settings."""
-        numbers, (times, t1, tolerance), spec = self._sorted(leaves)
-        # One tolerance serves the whole ensemble: the smallest of the batch.
-        settings = spec.settings.with_tolerance(jnp.min(tolerance))
-
-        def build(numbers: tuple[Array, ...], cells: int | None) -> Any:
-            return spec.built(numbers, settings.tolerance, cells)
-
-        return build, numbers, (times if times.ndim == 1 else times.T, t1), settings
-
-
-def _product(slope: HybridSamples, cotangents: HybridSamples) -> Float[Array, " cells"]:
-    """The derivative of a sum over samples, from their derivatives and their cotangents; a derivative that is zero counts
-    for nothing, whatever the cotangent."""
-    pairs = ((slope.shown, cotangents.shown), (slope.end_time, cotangents.end_time))
-    terms = [weighted(one, other).reshape(len(one), -1) for one, other in pairs if other is not None]
-    return sum((jnp.sum(term, axis=1) for term in terms), jnp.zeros(len(slope.end_time)))
-
-
-# Compiled, so that JAX traces it once for equal solves.
-@eqx.filter_jit
-def _backward(sampling: HybridSampling, *leaves: Array) -> list[Any]:
-    """The backward passes of the fields and of the output rows of a single run, for their shapes.
-
-    **Raises:** `ValueError` if one of them has a loop without a fixed number of iterations.
-    """
-    build, numbers, _, _ = sampling._builder(leaves)
-    modes, _, state = build(numbers, 1)
-
-    def of_mode(mode: AbstractBatchedMode) -> Any:
-        arrays, static = eqx.partition(mode, eqx.is_inexact_array)
-
-        def values(arrays: Any, state: Float[Array, "components cells"]) -> Any:
-            mode = eqx.combine(arrays, static)
-            shown = over_cells(lambda mode, states: mode.shown(states), mode)(state[:, None])
-            return mode.problem(state).field(jnp.zeros_like(state[0]), state), shown
-
-        results, pull = jax.vjp(values, arrays, state)
-        return pull(jax.tree.map(jnp.ones_like, results))
-
-    return [of_mode(modes[group[0]]) for group in program_groups(modes)]
-
-
-def _sampled_with_tangents(
-    built: Any, tangents: tuple[Any, ...], horizon: tuple[Array, Array], cells: Any, settings: Settings, counters: int
+def sampled_with_tangents(
+    built: tuple[tuple[AbstractBatchedMode, ...], Array, States],
+    tangents: Tangents,
+    horizon: tuple[Array, Array],
+    cells: Int[Array, ""] | int,
+    settings: Settings,
+    counters: int,
 ) -> tuple[HybridSamples, list[HybridSamples]]:
     """The runs, and their derivative along each tangent."""
     (modes, first, state), (times, t1) = built, horizon
     size, runs = state.shape
     times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), runs))
-    variational = variational_modes(modes, tangents, settings.tolerance, False)
-    start = at_start(jnp, first, variational_start(state, tangents), cells, counters + 1)
-    rounds = sampled_rounds(variational, start, times, jnp.broadcast_to(t1, (runs,)), settings, 1 + len(tangents))
-    ended, output = traced_rounds(*rounds)
-    rows, variations = output_rows(variational, output)
-    grazes = ended.counts[-1] > 0
-    invalid = jnp.where(times > output.grazing_time, jnp.nan, 0.0)
-    counters_and_codes = (ended.mode, ended.status, ended.steps, ended.rejected, ended.extremes, ended.counts[:-1])
-    parts = (rows, output.number, ended.end_time, ended.state[:size], *counters_and_codes)
-    samples = HybridSamples(*(jnp.moveaxis(part.astype(float), -1, 0) for part in parts))
 
-    def slope(k: int, rows: Float[Array, "shown times cells"]) -> HybridSamples:
-        # The variation of the time follows that of the state; a horizon does not move.
-        delay = jnp.where(grazes, jnp.nan, ended.state[(k + 1) * (size + 1) + size])
-        delay = jnp.where(ended.status == REACHED_END, 0.0, delay)
-        return HybridSamples(jnp.moveaxis(rows + invalid, -1, 0), UNCHANGED, delay, *(UNCHANGED,) * 7)
+    def run(group: Tangents) -> tuple[HybridSamples, list[HybridSamples]]:
+        variational = variational_modes(modes, group, settings.tolerance, False)
+        start = at_start(first, variational_start(state, group), cells, counters + 1)
+        rounds = sampled_rounds(variational, start, times, jnp.broadcast_to(t1, (runs,)), settings, 1 + len(group))
+        ended, output = all_rounds(*rounds)
+        rows, variations = output_rows(variational, output)
+        grazes = ended.counts[-1] > 0
+        invalid = jnp.where(times > output.grazing_time, jnp.nan, 0.0)
+        counters_and_codes = (ended.mode, ended.status, ended.steps, ended.rejected, ended.extremes, ended.counts[:-1])
+        parts = (rows, output.number, ended.end_time, ended.state[:size], *counters_and_codes)
+        samples = HybridSamples(*(jnp.moveaxis(part.astype(float), -1, 0) for part in parts))
+        slopes = []
+        for k, variation in enumerate(variations):
+            # The variation of the time follows that of the state; a horizon does not move.
+            delay = jnp.where(grazes, jnp.nan, ended.state[(k + 1) * (size + 1) + size])
+            delay = jnp.where(ended.status == REACHED_END, 0.0, delay)
+            shown = jnp.moveaxis(variation + invalid, -1, 0)
+            slopes.append(HybridSamples(shown, UNCHANGED, delay, *(UNCHANGED,) * 7))
+        return samples, slopes
 
-    return samples, [slope(k, part) for k, part in enumerate(variations)]
+    return in_groups(run, tangents)

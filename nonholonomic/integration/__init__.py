@@ -2,8 +2,8 @@
 
 `solve_ensemble` runs many cells of a problem in lanes that step together; `follow` and `sample` integrate single runs
 with any solver of Diffrax. `solve_by_diffrax` is an independent reference. Hybrid runs are in `nonholonomic.hybrid`.
-`Settings` holds the options. Import more from three modules of this subpackage: the codes of how a run ended from
-`status`, checks of arguments from `checks`, and zeros of functions from `zeros`.
+`Settings` holds the options. Import more from two modules of this subpackage: the codes of how a run ended, and checks of
+arguments, from `problem`; zeros of functions from `dense`.
 
 A `nonholonomic.AbstractMode` has functions of one state, and the package maps them over cells. An `AbstractProblem` has
 functions of all cells at once: components along the first axis, cells along the last. `Lanes` is the type of one number
@@ -40,8 +40,7 @@ from .dense import DenseSolution as DenseSolution
 from .dense import ImplicitMidpoint as ImplicitMidpoint
 from .dense import follow as follow
 from .dense import sample as sample
-from .pairs import Oscillatory8 as Oscillatory8
-from .pairs import Stabilized8 as Stabilized8
+from .dense import solve_by_diffrax as solve_by_diffrax
 from .problem import AbstractPassive as AbstractPassive
 from .problem import AbstractProblem as AbstractProblem
 from .problem import CoreProblem as CoreProblem
@@ -50,11 +49,11 @@ from .problem import Jumps as Jumps
 from .problem import Settings as Settings
 from .problem import crossing_time as crossing_time
 from .runge_kutta import Lanes as Lanes
+from .runge_kutta import Oscillatory8 as Oscillatory8
+from .runge_kutta import Stabilized8 as Stabilized8
 from .runge_kutta import States as States
 from .runge_kutta import explicit_tableau as explicit_tableau
 from .samples import solve_with_samples as solve_with_samples
 from .scheduler import Outcome as Outcome
-from .scheduler import solve_by_diffrax as solve_by_diffrax
 from .scheduler import solve_ensemble as solve_ensemble
-from .scheduler import traced_solve_ensemble as traced_solve_ensemble
 from .step import LaneState as LaneState

@@ -1,5 +1,5 @@
-"""Integrate one trajectory with any solver of Diffrax, with dense output or at given times, to the end of the model's
-validity."""
+"""Integrate with any solver of Diffrax to the end of the model's validity: one trajectory with dense output or at given
+times, and, as a reference, an ensemble."""
 
 import dataclasses
 import functools
@@ -12,14 +12,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.cache import padded
 from ..geometry import inverse
 from ..text import one_line
 from ..validation import as_known, require
 from .events import Path, watched
-from .problem import AbstractProblem, Settings, margin_at_start
+from .problem import CROSSED, FAILED, LEFT_DOMAIN, MOST_STEPS, REACHED_END, AbstractProblem, Settings
+from .runge_kutta import Lanes
+from .scheduler import NO_EXTREMES, Outcome
 
 # Find many zeros of functions of one variable at once. (Events within a step are located in `events.py`.)
 
@@ -97,7 +99,7 @@ def sign_changes(
 
 
 def few_trials(
-    function: Callable[[Brackets], Any], low: Brackets, high: Brackets, at_low: Brackets, at_high: Brackets
+    function: Callable[[Brackets], Brackets], low: Brackets, high: Brackets, at_low: Brackets, at_high: Brackets
 ) -> Brackets:
     """Zeros of a function that is expensive to evaluate, one in each bracket (Anderson and Bjorck, BIT 13 (1973) 253).
 
@@ -136,7 +138,7 @@ def few_trials(
 
 
 def all_crossings(
-    quantity: Callable[[Brackets], Any], time: Float[np.ndarray, " steps"], value: Float[np.ndarray, " steps"]
+    quantity: Callable[[Brackets], Brackets], time: Float[np.ndarray, " steps"], value: Float[np.ndarray, " steps"]
 ) -> Float[np.ndarray, " crossings"]:
     """The times at which a quantity of a run passes zero, in either direction, in increasing order, with pairs of crossings
     inside a step.
@@ -153,7 +155,12 @@ def all_crossings(
     >>> all_crossings(dip, steps, dip(steps)).round(6)
     array([1.5 , 1.52])
     """
-    indices = np.flatnonzero(_may_cross(value))
+    with np.errstate(invalid="ignore"):
+        change = np.abs(np.diff(value))
+        max_change = np.max([change, np.append(change[1:], 0.0), np.insert(change[:-1], 0, 0.0)], axis=0)
+        is_small = np.minimum(np.abs(value[:-1]), np.abs(value[1:])) < max_change
+    # The steps in which the quantity changes its sign, or changes by more than its size, there or in a neighbour.
+    indices = np.flatnonzero(is_small | ((value[:-1] > 0.0) != (value[1:] > 0.0)))
     if indices.size == 0:
         return np.zeros(0)
 
@@ -172,16 +179,6 @@ def all_crossings(
             break
     changes = np.flatnonzero((value[:-1] > 0.0) != (value[1:] > 0.0))
     return few_trials(signed, time[changes], time[changes + 1], value[changes], value[changes + 1])
-
-
-def _may_cross(value: Float[np.ndarray, " steps"]) -> Bool[np.ndarray, " gaps"]:
-    """Steps in which a quantity may be zero: its sign changes, or it changes by more than its size, there or in a
-    neighbour."""
-    with np.errstate(invalid="ignore"):
-        change = np.abs(np.diff(value))
-        max_change = np.max([change, np.append(change[1:], 0.0), np.insert(change[:-1], 0, 0.0)], axis=0)
-        is_small = np.minimum(np.abs(value[:-1]), np.abs(value[1:])) < max_change
-    return is_small | ((value[:-1] > 0.0) != (value[1:] > 0.0))
 
 
 def _nearest(time: Float[np.ndarray, " looks"], value: Float[np.ndarray, " looks"]) -> Float[np.ndarray, " new"]:
@@ -227,7 +224,7 @@ class DenseSolution(NamedTuple):
 
     times: Float[np.ndarray, " times"]
     states: Float[np.ndarray, "components times"]
-    segments: list[Any]
+    segments: list[diffrax.Solution]
     left_domain: bool
     failed: bool
     accepted: int
@@ -250,7 +247,7 @@ def _evaluate(
     return jax.vmap(segment.evaluate)(times)
 
 
-def saved(solution: diffrax.Solution) -> tuple[Any, Any]:
+def saved(solution: diffrax.Solution) -> tuple[PyTree, PyTree]:
     """Times and states of a solution, which Diffrax's types declare as optional."""
     return solution.ts, solution.ys
 
@@ -268,19 +265,20 @@ def _start(
 ) -> tuple[Float[Array, " components"], Float[Array, " components"], Float[Array, ""] | None]:
     """State, scales and domain margin at the start: one program, where JAX would compile each of their operations."""
     state, scales = problem.start()
-    return jnp.asarray(state), jnp.asarray(scales), margin_at_start(problem, time, state)
+    return jnp.asarray(state), jnp.asarray(scales), problem.margin_at_start(time, state)
 
 
-def _control(settings: Settings, scales: Float[Array, " components"]) -> diffrax.PIDController:
+def _control(
+    problem: AbstractProblem,
+    settings: Settings,
+    state: Float[Array, " components"],
+    scales: Float[Array, " components"],
+    times: Float[Array, " times"] | None = None,
+) -> diffrax.AbstractStepSizeController:
+    """Step-size control whose steps end on given times and on both sides of each jump."""
     # The largest error counts, not the mean: passive cyclic coordinates must not dilute the errors of the others.
     atol = settings.absolute * settings.tolerance * jax.lax.stop_gradient(scales)
-    return diffrax.PIDController(settings.tolerance, atol, norm=optimistix.max_norm)
-
-
-def _clipped(
-    problem: AbstractProblem, controller: Any, state: Float[Array, " components"], times: Float[Array, " times"] | None
-) -> Any:
-    """A controller whose steps end on given times and on both sides of each jump."""
+    controller = diffrax.PIDController(settings.tolerance, atol, norm=optimistix.max_norm)
     jumps = problem.jumps(jnp.zeros_like(state[0]), state)
     ends = [] if times is None else [times]
     ends += [] if jumps is None else [jumps.ahead, jumps.past]
@@ -311,25 +309,22 @@ def _piece(
         first,
         state,
         args=problem,
-        stepsize_controller=_clipped(problem, _control(settings, scales), state, None),
+        stepsize_controller=_control(problem, settings, state, scales),
         saveat=diffrax.SaveAt(t0=True, steps=True, dense=dense or is_watched),
         max_steps=settings.max_steps,
         event=diffrax.Event(lambda t, y, args, **_: args.domain_margin(t, y) < 0.0) if is_watched else None,
         throw=False,
     )
-    ends, _ = saved(solution)
-    lengths = jnp.where(jnp.isfinite(ends[1:]), ends[1:] - ends[:-1], 0.0)
-    starts = jnp.where(jnp.isfinite(ends[:-1]), ends[:-1], t0)
-    return solution, _first_losses(problem, solution, starts, lengths) if is_watched else None
+    return solution, _first_losses(problem, solution, t0) if is_watched else None
 
 
 def _first_losses(
-    problem: AbstractProblem,
-    solution: diffrax.Solution,
-    starts: Float[Array, " steps"],
-    lengths: Float[Array, " steps"],
+    problem: AbstractProblem, solution: diffrax.Solution, t0: Float[Array, ""]
 ) -> Float[Array, "steps 2"]:
     """Brackets [s] of the first zero of the domain margin in every step, infinite where there is none."""
+    ends, _ = saved(solution)
+    lengths = jnp.where(jnp.isfinite(ends[1:]), ends[1:] - ends[:-1], 0.0)
+    starts = jnp.where(jnp.isfinite(ends[:-1]), ends[:-1], t0)
     # The parts of all steps are the lanes of one problem.
     length = jnp.repeat(lengths / PARTS, PARTS)
     time = jnp.repeat(starts, PARTS) + length * jnp.tile(jnp.arange(PARTS), len(starts))
@@ -343,8 +338,8 @@ def _first_losses(
     if problem.fast[0]:
         start, side = states(0.0), jnp.ones_like(time)
         rate, end_rate = problem.field(time, start), problem.field(time + length, end)
-        path = Path.of((start, rate), states(0.5), (end, end_rate), length)
-        inside, _ = watched(problem, side, path, time, length, length > 0.0, length < 0.0)
+        path = Path.of(time, length, (start, rate), states(0.5), (end, end_rate))
+        inside, _ = watched(problem, side, path, length > 0.0, length < 0.0)
         place = jnp.minimum(place, jnp.where(inside < 1.0, inside, jnp.inf))
     brackets = jnp.stack([jnp.where(place < jnp.inf, time, jnp.inf), time + place * length], axis=1)
     first = jnp.argmin(brackets[:, 1].reshape(-1, PARTS), axis=1)
@@ -438,10 +433,10 @@ class _GivenSteps(diffrax.StepTo):
     programs are not cached on disk.
     """
 
-    def wrap(self, direction: Any) -> "_GivenSteps":
+    def wrap(self, direction):
         return self
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: None, args: Any, func: Any, error_order: Any) -> Any:
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         return self.ts[1], 2
 
 
@@ -452,7 +447,7 @@ def _with_fixed_jumps(state: Float[Array, " components"], times: Float[Array, " 
 
 
 @_with_fixed_jumps.def_jvp
-def _nan_if_moved(primals: Any, tangents: Any) -> Any:
+def _nan_if_moved(primals, tangents):
     (state, _), (rates, time_rates) = primals, tangents
     rates = jnp.zeros_like(state) if rates is None else rates
     return state, rates if time_rates is None else rates + jnp.nan * jnp.sum(time_rates)
@@ -500,7 +495,7 @@ def sample(
     state, scales = problem.start()
     if (jumps := problem.jumps(jnp.zeros_like(t1), state)) is not None:
         state = _with_fixed_jumps(state, jumps.times)
-    margin = margin_at_start(problem, jnp.zeros_like(t1), state)
+    margin = problem.margin_at_start(jnp.zeros_like(t1), state)
     is_watched = margin is not None
     # Diffrax detects only changes of the margin's sign, so a run that starts outside the domain must end at once.
     at_once = jnp.zeros((), bool) if margin is None else margin <= 0.0
@@ -513,10 +508,7 @@ def sample(
         times, save_at, max_points = grid, diffrax.SubSaveAt(t0=True, steps=True), grid.size - 1
     else:
         save_at, max_points = diffrax.SubSaveAt(ts=jnp.minimum(times, t1)), settings.max_steps
-    if grid is None:
-        controller = _clipped(problem, _control(settings, scales), state, jnp.minimum(times, t1))
-    else:
-        controller = _GivenSteps(grid)
+    control = _control(problem, settings, state, scales, jnp.minimum(times, t1)) if grid is None else _GivenSteps(grid)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
         settings.for_single_runs if is_watched else settings.for_steps_alone,
@@ -525,7 +517,7 @@ def sample(
         None,
         state,
         args=problem,
-        stepsize_controller=controller,
+        stepsize_controller=control,
         saveat=diffrax.SaveAt(subs=[save_at, diffrax.SubSaveAt(t1=True)]),
         max_steps=max_points,
         event=event if is_watched else None,
@@ -539,6 +531,66 @@ def sample(
     states = jnp.where(times <= end, states.T, jnp.nan)
     counts = solution.stats
     return SampledSolution(states, end, ends_at[0], lost, counts["num_accepted_steps"], counts["num_rejected_steps"])
+
+
+# The outcome of every cell by vmapped `diffrax.diffeqsolve`: slow, and independent of the ensemble solver.
+
+
+@eqx.filter_jit
+def solve_by_diffrax(problem: AbstractProblem, t1: Float[Array, ""], settings: Settings) -> Outcome:
+    """Run every cell from t = 0 to its event, to the end of the model's validity, or to `t1`.
+
+    The domain margin is checked at the ends of steps, so a short loss can be missed; events are located on Diffrax's
+    dense output.
+
+    **Arguments:** as for `solve_ensemble`, but any solver of Diffrax works.
+
+    **Returns:** the `Outcome`.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import solve_by_diffrax
+    >>> print(solve_by_diffrax(problem, jnp.asarray(5.0), settings).crossing_time.round(6))
+    [0.693147 0.346574 0.173287]
+    """
+    (states, scales), rtol = problem.start(), settings.tolerance
+    lane_axes = jax.tree.map(lambda leaf: None if jnp.ndim(leaf) == 0 else -1, problem)
+
+    def solve_cell(cell_problem: AbstractProblem, state: Array, scale: Array) -> Outcome:
+        conditions: dict[int, Callable[..., Lanes]] = {}
+        if problem.event_function(states) is not None:
+            conditions[CROSSED] = lambda t, y, args, **_: args.event_function(y)
+        if problem.domain_margin(states[0], states) is not None:
+            conditions[LEFT_DOMAIN] = lambda t, y, args, **_: args.domain_margin(t, y)
+        # Diffrax detects only changes of a condition's sign, so a cell that starts with a negative condition must end
+        # at once.
+        at_once = [condition(jnp.zeros(()), state, cell_problem) <= 0.0 for condition in conditions.values()]
+        ends_at_once = functools.reduce(jnp.logical_or, at_once, jnp.asarray(False))
+        event = diffrax.Event(list(conditions.values()), root_finder=optimistix.Newton(1e-13, 1e-13))
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
+            settings.for_single_runs,
+            0.0,
+            jnp.where(ends_at_once, 0.0, t1),
+            None,
+            state,
+            args=cell_problem,
+            stepsize_controller=diffrax.PIDController(rtol, settings.absolute * rtol * scale),
+            max_steps=min(settings.max_steps, MOST_STEPS),
+            event=event if conditions else None,
+            throw=False,
+        )
+        ends, finals = saved(solution)
+        end, final = ends[0], finals[0]
+        status = jnp.where(end >= t1, REACHED_END, FAILED)
+        for code, occurred, at_start in zip(conditions, solution.event_mask or [], at_once, strict=True):
+            status = jnp.where(occurred | at_start, code, status)
+        crossing_time = jnp.where(status == CROSSED, end, jnp.inf)
+        steps, rejected = solution.stats["num_steps"], solution.stats["num_rejected_steps"]
+        return Outcome(status, crossing_time, crossing_time, end, final, steps, rejected, jnp.array(NO_EXTREMES))
+
+    axes = Outcome._make((0, 0, 0, 0, -1, 0, 0, -1))
+    return jax.vmap(solve_cell, in_axes=(lane_axes, -1, -1), out_axes=axes)(problem, states, scales)
 
 
 # The implicit midpoint rule, whose energy balance closes to round-off on the P-form.
@@ -609,8 +661,8 @@ class ImplicitMidpoint(diffrax.AbstractSolver):
 
         z, corrections = jax.lax.scan(improve, guess, length=ITERATIONS)
         converged = corrections[-1] < 1e3 * jnp.finfo(y0.dtype).eps
-        diverged: Any = diffrax.RESULTS.nonlinear_divergence
-        result = diffrax.RESULTS.where(converged, diffrax.RESULTS.successful, diverged)
+        results: Any = diffrax.RESULTS
+        result = results.where(converged, results.successful, results.nonlinear_divergence)
         y1 = y0 + z
         return y1, None, dict(y0=y0, y1=y1), None, result
 

@@ -5,18 +5,18 @@ The event therefore has the accuracy of the method, not that of an interpolant.
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from ..compilation.bounds import Bounds, UnboundedError, enclosing
 from .problem import AbstractProblem
-from .runge_kutta import Lanes, States, Step, inverse_root
+from .runge_kutta import Integers, Lanes, Mask, States, Step, inverse_root
 
 #: An event is located once the next trial would differ by less than this fraction of the step that contains it. The
 #: time at which contact ends then has a relative error of 2e-13, or of 2e-12 with ten times this value; `crossing_time`
@@ -39,12 +39,12 @@ class Bracket(NamedTuple):
     margin_low: Lanes
     margin_high: Lanes
     stride: Lanes
-    trials: Int[Array, "*lanes"]
+    trials: Integers
 
 
 def refine(
-    bracketing: Bool[Array, "*lanes"], old_bracket: Bracket, old_margin: Lanes, margin: Lanes, length: Lanes
-) -> tuple[Bracket, Lanes, Bool[Array, "*lanes"]]:
+    bracketing: Mask, old_bracket: Bracket, old_margin: Lanes, margin: Lanes, length: Lanes
+) -> tuple[Bracket, Lanes, Mask]:
     """Narrow the bracket with the result of a trial step (Anderson and Bjorck, BIT 13 (1973) 253).
 
     **Arguments:**
@@ -135,9 +135,7 @@ def missed_double_root(
 
 
 def missed_loss(
-    places: Float[np.ndarray, " places"],
-    margins: Float[Array, "places margins *lanes"] | None,
-    free: Bool[Array, "*lanes"],
+    places: Float[np.ndarray, " places"], margins: Float[Array, "places margins *lanes"] | None, free: Mask
 ) -> Lanes:
     """Fraction of a step at which a margin may first fall below zero and return; 2 if nowhere.
 
@@ -205,7 +203,7 @@ def _least_minimum(
         for slope_before, slope_after, gap in zip(values[:-1], values[1:], gaps, strict=True)
     ]
 
-    def about(k: int) -> tuple[Any, ...]:
+    def about(k: int) -> tuple[Array | float, ...]:
         return slopes[k - 1], slopes[k], values[k], places[k], gaps[k - 1], 1.0 / (gaps[k - 1] + gaps[k])
 
     parabola = about(len(places) - 2)
@@ -251,10 +249,13 @@ SHARE, RESOLVED = 0.25, 0.1
 class Path(NamedTuple):
     """The motion inside a step as a polynomial of the place, from 0 to 1.
 
+    - `time`, `length`: when the step begins, and how long it is [s].
     - `start`, `slope`, `square`, `cube`, `bulge`: state + place (slope + place (square + place cube)) + hump bulge, where
       the hump is 16 place^2 (1 - place)^2; the bulge is what the state in the middle adds to the cubic through the ends.
     """
 
+    time: Lanes
+    length: Lanes
     start: States
     slope: States
     square: States
@@ -262,18 +263,21 @@ class Path(NamedTuple):
     bulge: States
 
     @classmethod
-    def of(cls, start: tuple[States, States], middle: States, end: tuple[States, States], length: Lanes) -> "Path":
+    def of(
+        cls, time: Lanes, length: Lanes, start: tuple[States, States], middle: States, end: tuple[States, States]
+    ) -> "Path":
         """The motion with given states and rates at the ends, and a state in the middle."""
         (state, rate), (end_state, end_rate) = start, end
         step, slope, end_slope = end_state - state, length * rate, length * end_rate
         square, cube = 3.0 * step - 2.0 * slope - end_slope, slope + end_slope - 2.0 * step
-        return cls(state, slope, square, cube, middle - 0.5 * (state + end_state) - 0.125 * (slope - end_slope))
+        bulge = middle - 0.5 * (state + end_state) - 0.125 * (slope - end_slope)
+        return cls(time, length, state, slope, square, cube, bulge)
 
-    def error(self, place: Any) -> Lanes:
+    def error(self, place: Lanes) -> Lanes:
         """How many times the bulge the error of the state at a place is."""
         return STATE_SHARE * 16.0 * (place * (1.0 - place)) ** 2
 
-    def derivatives(self, place: Any) -> list[States]:
+    def derivatives(self, place: Lanes) -> list[States]:
         """The state at a place, and its four derivatives by the place, each divided by the factorial of its order."""
         left, sides = 1.0 - place, 1.0 - 2.0 * place
         state = self.start + place * (self.slope + place * (self.square + place * self.cube))
@@ -290,21 +294,13 @@ class Path(NamedTuple):
         return [cubic + hump * self.bulge for cubic, hump in zip(cubics, humps, strict=True)]
 
 
-def watched(
-    problem: AbstractProblem,
-    side: Lanes,
-    path: Path,
-    time: Lanes,
-    length: Lanes,
-    free: Bool[Array, "*lanes"],
-    may_cut: Bool[Array, "*lanes"],
-) -> tuple[Lanes, Lanes]:
+def watched(problem: AbstractProblem, side: Lanes, path: Path, free: Mask, may_cut: Mask) -> tuple[Lanes, Lanes]:
     """Where a step must end so that no zero of a fast function is missed.
 
     **Arguments:**
 
     - `problem`: the problem, with functions that are `fast`; `side`: of the event.
-    - `path`: the motion inside the step, which begins at `time` [s] and has a `length` [s].
+    - `path`: the motion inside the step.
     - `free`: the lanes to check; `may_cut`: those whose step may be cut where an error could hide a zero.
 
     **Returns:** the place at which to end the step instead, as a fraction of the step, 2 where the step may stand as it is;
@@ -313,7 +309,8 @@ def watched(
     """
     numbers, static = eqx.partition(problem, eqx.is_array)
     problem = eqx.combine(stop_gradient(numbers), static)
-    side, path, time, length = stop_gradient((side, path, time, length))
+    side, path = stop_gradient((side, path))
+    length = path.length
     any_length = jnp.full_like(length, jnp.inf)
 
     def functions(time: Lanes, state: States) -> Functions:
@@ -322,25 +319,18 @@ def watched(
         values = [*margins, *([] if event is None else [side * event])]
         return jnp.stack(values) if values else jnp.zeros((0, *time.shape))
 
-    if not len(jax.eval_shape(functions, time, path.start)):
+    if not len(jax.eval_shape(functions, path.time, path.start)):
         return jnp.full_like(length, 2.0), any_length
     try:
-        return _bounded(functions, path, time, length, free, may_cut), any_length
+        return _bounded(functions, path, free, may_cut), any_length
     except UnboundedError:
-        place, room = _looked(functions, path, time, length, may_cut)
+        place, room = _looked(functions, path, may_cut)
         return jnp.where(free, place, 2.0), length * 0.9 * inverse_root(1.0 / jnp.clip(room, 1.0, 1e5), 4)
 
 
-def _bounded(
-    functions: Callable[[Lanes, States], Functions],
-    path: Path,
-    time: Lanes,
-    length: Lanes,
-    free: Bool[Array, "*lanes"],
-    may_cut: Bool[Array, "*lanes"],
-) -> Lanes:
+def _bounded(functions: Callable[[Lanes, States], Functions], path: Path, free: Mask, may_cut: Mask) -> Lanes:
     """The place as in `watched`, by bounds of the functions and their slopes along parts of the step."""
-    point = (time, path.start)
+    time, length, point = path.time, path.length, (path.time, path.start)
     enclosed = enclosing(functions, *point)
     # Where the slope has no bounds, those of the values decide alone.
     sloping = enclosing(lambda *point: jax.jvp(functions, point[:2], point[2:])[1], *point, *point, loose=True)
@@ -359,7 +349,9 @@ def _bounded(
         slopes = Bounds(slope - change - 3.1 * error, slope + change + 3.1 * error)
         times = Bounds(time + begin * length, time + end * length)
         (values, leaps), (rises, _) = enclosed(times, states), sloping(times, states, Bounds(length, length), slopes)
-        may_leap = functools.reduce(jnp.logical_or, [_in_lanes(leap, time) for leap in leaps], jnp.zeros_like(free))
+        # In all lanes where the axes of the truth values are not those of lanes.
+        leaps = [leap if leap.shape == time.shape else jnp.broadcast_to(jnp.any(leap), time.shape) for leap in leaps]
+        may_leap = functools.reduce(jnp.logical_or, leaps, jnp.zeros_like(free))
         value, along = jax.linearize(functions, time + middle * length, state)
         doubt = path.error(middle) * jnp.abs(along(jnp.zeros_like(time), path.bulge))
         steepest = jnp.maximum(jnp.abs(rises.low), jnp.abs(rises.high)) * half
@@ -386,32 +378,15 @@ def _bounded(
     return jax.lax.while_loop(lambda carry: jnp.any(carry[0] < 1.0), part, start)[2]
 
 
-def _in_lanes(leap: Bool[Array, "..."], time: Lanes) -> Bool[Array, "*lanes"]:
-    """Where a function may jump, in the lanes; in all of them where the axes of the truth values are not those of lanes."""
-    return leap if leap.shape == time.shape else jnp.broadcast_to(jnp.any(leap), time.shape)
-
-
-class Look(NamedTuple):
-    """The functions at a place of the step: value, slope along the step, and the error that the state's error causes."""
-
-    value: Functions
-    slope: Functions
-    error: Functions
-
-
-def _looked(
-    functions: Callable[[Lanes, States], Functions],
-    path: Path,
-    time: Lanes,
-    length: Lanes,
-    may_cut: Bool[Array, "*lanes"],
-) -> tuple[Lanes, Lanes]:
+def _looked(functions: Callable[[Lanes, States], Functions], path: Path, may_cut: Mask) -> tuple[Lanes, Lanes]:
     """The place as in `watched`, by looks at the functions; and the least ratio of a value to its error."""
+    time, length = path.time, path.length
 
-    def look(place: Any) -> Look:
+    def look(place: Float[Array, ""]) -> tuple[Functions, Functions, Functions]:
+        # The functions, their slopes along the step, and the errors that the state's error causes.
         state, slope, *_ = path.derivatives(place)
         value, along = jax.linearize(functions, time + place * length, state)
-        return Look(value, along(length, slope), path.error(place) * jnp.abs(along(jnp.zeros_like(time), path.bulge)))
+        return value, along(length, slope), path.error(place) * jnp.abs(along(jnp.zeros_like(time), path.bulge))
 
     places, width = jnp.linspace(0.0, 1.0, 1 + INTERVALS), 1.0 / INTERVALS
     value, slope, error = jax.lax.map(look, places)

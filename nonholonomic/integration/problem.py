@@ -8,7 +8,7 @@ relative tolerance.
 import abc
 import enum
 from collections.abc import Callable, Iterator
-from typing import Any, Generic, NamedTuple, Self, TypeVar
+from typing import ClassVar, Generic, NamedTuple, Self, TypeVar
 
 import diffrax
 import equinox as eqx
@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from ..parameters import numbers
 from ..text import shown
@@ -31,8 +31,7 @@ from ..validation import (
     require_scalars,
     warn,
 )
-from .pairs import AbstractTunedPair, Oscillatory8
-from .runge_kutta import Lanes, States, lesser
+from .runge_kutta import AbstractTunedPair, Lanes, Mask, Oscillatory8, States, lesser
 
 # Times at which a field jumps or has a kink: a step ends just before such a time, and the next begins just after it.
 #
@@ -68,7 +67,7 @@ class Jumps(NamedTuple):
     gaps: Float[Array, "jumps *cells"]
 
     @classmethod
-    def at(cls, times: Float[Array, "jumps *cells"], clock: Any = 0.0) -> "Jumps":
+    def at(cls, times: Float[Array, "jumps *cells"], clock: Lanes | float = 0.0) -> "Jumps":
         """The jumps at these times, of which those that are not finite never come.
 
         **Arguments:** `clock`: the reading of the clock of `times` where the run begins.
@@ -89,7 +88,7 @@ class Jumps(NamedTuple):
 
     def next(self, time: Lanes) -> Lanes:
         """The near side of the next jump after a time; infinite if there is none."""
-        return _least(self.ahead, self.ahead > time)
+        return jnp.min(jnp.where(self.ahead > time, self.ahead, jnp.inf), axis=0)
 
     def begin(self, time: Lanes) -> Lanes:
         """The time itself, or the far side of a jump that is there."""
@@ -99,10 +98,10 @@ class Jumps(NamedTuple):
     def before(self, time: Lanes) -> Lanes:
         """The near side of the jump whose far side is this time; NaN if there is none."""
         least, most = time - (CLUSTER + 2.5) * self.gaps, time - 1.5 * self.gaps
-        near = _least(self.ahead, (self.ahead > least) & (self.ahead < most))
+        near = jnp.min(jnp.where((self.ahead > least) & (self.ahead < most), self.ahead, jnp.inf), axis=0)
         return jnp.where(jnp.isfinite(near), near, jnp.nan)
 
-    def sides(self, time: Lanes) -> tuple[Bool[Array, "*lanes"], Lanes, Lanes, Lanes]:
+    def sides(self, time: Lanes) -> tuple[Mask, Lanes, Lanes, Lanes]:
         """The jump whose near side is this time: a mask of the lanes that have one, its near side, its time, which is
         differentiable, and its far side; all three are the time itself where there is none."""
         distance = self.ahead - time
@@ -111,34 +110,6 @@ class Jumps(NamedTuple):
         jump = jnp.sum(jnp.where(is_near, self.times, 0.0), axis=0) / jnp.maximum(jnp.sum(is_near, axis=0), 1)
         past = jnp.max(jnp.where(jnp.abs(distance) <= CLUSTER * self.gaps, self.past, -jnp.inf), axis=0)
         return is_jump, time, jnp.where(is_jump, jump, time), jnp.where(is_jump, past, time)
-
-
-def _least(values: Float[Array, "jumps *cells"], mask: Bool[Array, "jumps *cells"]) -> Lanes:
-    return jnp.min(jnp.where(mask, values, jnp.inf), axis=0)
-
-
-def moved_across(
-    jumps: Jumps, field: Callable[[Lanes, States], States], time: Lanes, state: States
-) -> tuple[Lanes, States]:
-    """Time and state just after the jump whose near side is this time; unchanged in lanes that have none.
-
-    The state follows the field before the jump up to the jump, and then the field after it, each by a midpoint step.
-    Therefore the result has first and second derivatives with respect to the time of the jump.
-    """
-    _, near, jump, far = jumps.sides(stop_gradient(time))
-    first, second, none = jump - near, far - jump, jnp.zeros_like(near)
-    # After the jump, every time is that of a point beyond it, because the state may contain a clock.
-    times = jnp.stack([near, near + 0.5 * first, far, far - 0.5 * second])
-    moves, looks = jnp.stack([none, none, first, none]), jnp.stack([none, 0.5 * first, second, 0.5 * second])
-
-    def stage(carry: tuple[States, States], row: tuple[Lanes, Lanes, Lanes]) -> tuple[tuple[States, States], None]:
-        (base, rate), (stage_time, move, look) = carry, row
-        base = base + move * rate
-        return (base, field(stage_time, base + look * rate)), None
-
-    # A loop, so that the field is compiled once.
-    (base, rate), _ = jax.lax.scan(stage, (state, jnp.zeros_like(state)), (times, moves, looks))
-    return far, base + second * rate
 
 
 # The interface of an initial value problem with an event and a domain.
@@ -157,35 +128,24 @@ class AbstractProblem(eqx.Module):
     [0.5 0.5 0.5] [-1. -2. -4.]
     """
 
-    @property
-    def leading(self) -> int | None:
-        """Number of leading components (the core state) that evolve independently of the rest; the event function and
-        the domain margin depend only on these. `None` if all components are coupled.
-        """
-        return None
+    #: Number of leading components (the core state) that evolve independently of the rest; the event function and the
+    #: domain margin depend only on these. `None` if all components are coupled.
+    leading: ClassVar[int | None] = None
 
-    @property
-    def direction_decides(self) -> bool:
-        """Whether a run may start at a zero of the event function or of the domain margin, so that the direction of
-        motion decides on which side the run is. If true, a run that starts beyond the event continues until the event
-        function next falls through zero; otherwise the run ends at once.
-        """
-        return False
+    #: Whether a run may start at a zero of the event function or of the domain margin, so that the direction of motion
+    #: decides on which side the run is. If true, a run that starts beyond the event continues until the event function
+    #: next falls through zero; otherwise the run ends at once.
+    direction_decides: ClassVar[bool] = False
 
-    @property
-    def fits_one_kernel(self) -> bool:
-        """Whether XLA can compile a loop over the field into a single kernel on a CPU (`xla_cpu.in_one_kernel`)."""
-        return True
+    #: Whether XLA can compile a loop over the field into a single kernel on a CPU (`xla_cpu.in_one_kernel`).
+    fits_one_kernel: ClassVar[bool] = True
 
-    @property
-    def fast(self) -> tuple[bool, bool]:
-        """Whether the margins, and whether the event function, may change faster than the state, as a user's functions may:
-        steps then resolve them where they are near zero (`events.py`).
-        """
-        return False, False
+    #: Whether the margins, and whether the event function, may change faster than the state, as a user's functions may:
+    #: steps then resolve them where they are near zero (`events.py`).
+    fast: ClassVar[tuple[bool, bool]] = False, False
 
     @abc.abstractmethod
-    def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
+    def start(self) -> tuple[States, States]:
         """The initial state of every cell, and the magnitudes that scale its absolute errors."""
 
     @abc.abstractmethod
@@ -229,17 +189,90 @@ class AbstractProblem(eqx.Module):
         return None
 
     def across_jump(self, time: Lanes, state: States) -> States:
-        """The state just after the jump whose near side is this time."""
+        """The state just after the jump whose near side is this time; unchanged in lanes that have none.
+
+        The state follows the field before the jump up to the jump, and then the field after it, each by a midpoint step.
+        Therefore the result has first and second derivatives with respect to the time of the jump.
+        """
         jumps = self.jumps(time, state)
-        return state if jumps is None else moved_across(jumps, self.field, time, state)[1]
+        if jumps is None:
+            return state
+        _, near, jump, far = jumps.sides(stop_gradient(time))
+        first, second, none = jump - near, far - jump, jnp.zeros_like(near)
+        # After the jump, every time is that of a point beyond it, because the state may contain a clock.
+        times = jnp.stack([near, near + 0.5 * first, far, far - 0.5 * second])
+        moves, looks = jnp.stack([none, none, first, none]), jnp.stack([none, 0.5 * first, second, 0.5 * second])
+
+        def stage(carry: tuple[States, States], row: tuple[Lanes, Lanes, Lanes]) -> tuple[tuple[States, States], None]:
+            (base, rate), (stage_time, move, look) = carry, row
+            base = base + move * rate
+            return (base, self.field(stage_time, base + look * rate)), None
+
+        # A loop, so that the field is compiled once.
+        (base, rate), _ = jax.lax.scan(stage, (state, jnp.zeros_like(state)), (times, moves, looks))
+        return base + second * rate
+
+    def margin_at_start(self, time: Lanes, state: States) -> Lanes | None:
+        """The domain margin at the start, at most 0 where the model ceases to hold at once."""
+        margin, lost = self.domain_margin(time, state), self.lost_at_start(state)
+        return margin if margin is None or lost is None else jnp.where(lost, jnp.minimum(margin, 0.0), margin)
+
+    def crossing_on(self, side: Lanes, state: States, rate: States) -> Lanes | None:
+        """`crossing_along` with the sign that makes it positive on the lane's side of the event, 1 or -1."""
+        value = self.crossing_along(state, rate)
+        return None if value is None else side * value
+
+    def least_margin(self, side: Lanes, time: Lanes, state: States, rate: States) -> Lanes:
+        """The lesser of the domain margin and the event function on the lane's side of the event."""
+        return lesser(self.domain_margin(time, state), self.crossing_on(side, state, rate), side)
 
 
-class CoreProblem(AbstractProblem):
+class AbstractDerivedProblem(AbstractProblem):
+    """A problem with more or fewer components than another one, which decides where its runs end and jump."""
+
+    problem: eqx.AbstractVar[AbstractProblem]
+
+    @abc.abstractmethod
+    def inner(self, state: States) -> States:
+        """The state of the other problem."""
+
+    @property
+    def direction_decides(self) -> bool:
+        return self.problem.direction_decides
+
+    @property
+    def fits_one_kernel(self) -> bool:
+        return self.problem.fits_one_kernel
+
+    @property
+    def fast(self) -> tuple[bool, bool]:
+        return self.problem.fast
+
+    def event_function(self, state: States) -> Lanes | None:
+        return self.problem.event_function(self.inner(state))
+
+    def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
+        return self.problem.domain_margin(time, self.inner(state))
+
+    def lost_at_start(self, state: States) -> Bool[Array, "..."] | None:
+        return self.problem.lost_at_start(self.inner(state))
+
+    def exact_margin(self, time: Lanes, state: States) -> Lanes | None:
+        return self.problem.exact_margin(time, self.inner(state))
+
+    def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
+        return self.problem.margins(time, self.inner(state))
+
+    def jumps(self, time: Lanes, state: States) -> Jumps | None:
+        return self.problem.jumps(time, self.inner(state))
+
+
+class CoreProblem(AbstractDerivedProblem):
     """The core state of a problem: the leading components, on which the others do not act.
 
     **Arguments:**
 
-    - `whole`: the problem.
+    - `problem`: the problem.
     - `size`: number of leading components.
 
     **Example:**
@@ -249,74 +282,21 @@ class CoreProblem(AbstractProblem):
     (1, 3)
     """
 
-    whole: AbstractProblem
+    problem: AbstractProblem
     size: int = eqx.field(static=True)
 
-    @property
-    def direction_decides(self) -> bool:
-        return self.whole.direction_decides
-
-    @property
-    def fits_one_kernel(self) -> bool:
-        return self.whole.fits_one_kernel
-
-    @property
-    def fast(self) -> tuple[bool, bool]:
-        return self.whole.fast
-
-    def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
-        state, scales = self.whole.start()
+    def start(self) -> tuple[States, States]:
+        state, scales = self.problem.start()
         return state[: self.size], scales[: self.size]
 
     def field(self, time: Lanes, state: States) -> States:
         # The compiler drops the omitted components and everything that only they depend on.
-        return self.whole.field(time, self._longer(state))[: self.size]
+        return self.problem.field(time, self.inner(state))[: self.size]
 
-    def event_function(self, state: States) -> Lanes | None:
-        return self.whole.event_function(self._longer(state))
-
-    def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
-        return self.whole.domain_margin(time, self._longer(state))
-
-    def lost_at_start(self, state: States) -> Bool[Array, "..."] | None:
-        return self.whole.lost_at_start(self._longer(state))
-
-    def exact_margin(self, time: Lanes, state: States) -> Lanes | None:
-        return self.whole.exact_margin(time, self._longer(state))
-
-    def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
-        return self.whole.margins(time, self._longer(state))
-
-    def jumps(self, time: Lanes, state: States) -> Jumps | None:
-        return self.whole.jumps(time, self._longer(state))
-
-    def _longer(self, state: States) -> States:
+    def inner(self, state: States) -> States:
         state = jnp.stack(state) if isinstance(state, tuple) else state
-        missing = len(self.whole.start()[0]) - self.size
+        missing = len(self.problem.start()[0]) - self.size
         return jnp.concatenate([state, jnp.zeros((missing, *state.shape[1:]))])
-
-
-def margin_at_start(problem: AbstractProblem, time: Lanes, state: States) -> Lanes | None:
-    """The domain margin at the start, at most 0 where the model ceases to hold at once."""
-    margin, lost = problem.domain_margin(time, state), problem.lost_at_start(state)
-    return margin if margin is None or lost is None else jnp.where(lost, jnp.minimum(margin, 0.0), margin)
-
-
-def least_margin(problem: AbstractProblem, side: Lanes, time: Lanes, state: States, rate: States) -> Lanes:
-    """The lesser of the domain margin and the event function, if the field is known. The event function has the sign
-    that makes it positive on the lane's side of the event.
-    """
-    return lesser(problem.domain_margin(time, state), side_of(problem, side)(state, rate), side)
-
-
-def side_of(problem: AbstractProblem, side: Lanes) -> Callable[[States, States], Lanes | None]:
-    """The event function of state and rate, with the sign that makes it positive on the lane's side of the event."""
-
-    def crossing(state: States, rate: States) -> Lanes | None:
-        value = problem.crossing_along(state, rate)
-        return None if value is None else side * value
-
-    return crossing
 
 
 def crossing_time(problem: AbstractProblem, time: Lanes, state: States) -> Lanes:
@@ -340,7 +320,7 @@ def crossing_time(problem: AbstractProblem, time: Lanes, state: States) -> Lanes
     return event_time(problem, problem.event_function, time, state)
 
 
-def event_time(problem: AbstractProblem, function: Callable[[States], Any], time: Lanes, state: States) -> Lanes:
+def event_time(problem: AbstractProblem, function: Callable[[States], PyTree], time: Lanes, state: States) -> Lanes:
     """Time at which a function of the state vanishes along a motion, for a state close to the zero, to third order in
     the distance.
 
@@ -460,7 +440,7 @@ MOST_STEPS = 100_000
 TIGHTEST_IN_SINGLE = 1e-5
 
 
-def as_tolerance(value: Any) -> Float[Array, ""]:
+def as_tolerance(value: object) -> Float[Array, ""]:
     """Convert a tolerance to a number; in single precision to one of at least `TIGHTEST_IN_SINGLE`, with a warning."""
     tolerance = as_number(value)
     if not isinstance(tolerance, jax.Array) or tolerance.dtype != jnp.float32:
@@ -552,7 +532,7 @@ def lanes_for(cells: int) -> int:
 TIGHTEST, LOOSEST = 1e-14, 1e-2
 
 
-def tolerance_bound(tolerance: Any) -> Bound:
+def tolerance_bound(tolerance: object) -> Bound:
     """The legal range of the relative tolerance.
 
     **Example:**
@@ -565,7 +545,7 @@ def tolerance_bound(tolerance: Any) -> Bound:
     return Bound(tolerance, "tolerance", at_least=TIGHTEST, at_most=LOOSEST)
 
 
-def run_bounds(t1: Any, tolerance: Any) -> Iterator[Bound]:
+def run_bounds(t1: object, tolerance: object) -> Iterator[Bound]:
     """The ranges of the horizon [s] and of the tolerance.
 
     **Example:**
@@ -578,16 +558,11 @@ def run_bounds(t1: Any, tolerance: Any) -> Iterator[Bound]:
     yield tolerance_bound(tolerance)
 
 
-def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
-    """The range of the times of output [s]."""
-    yield Bound(times, "times", at_least=0.0, at_most=t1)
-
-
 def legal_run(
     others: Bool[Array, "..."] | bool,
     t1: Float[ArrayLike, "..."],
     tolerance: Float[ArrayLike, "..."],
-    times: Any = None,
+    times: Float[ArrayLike, " times"] | None = None,
 ) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
     """Whether the traced numbers of a run are legal, and its horizon and tolerance. A run with illegal numbers might
     never end, so it gets the horizon 0, and the largest tolerance, which does not affect its batch.
@@ -606,11 +581,14 @@ def legal_run(
     """
     is_legal = jnp.asarray(others) & legal(run_bounds(t1, tolerance))
     if times is not None:
-        is_legal = jnp.all(is_legal & jnp.all(legal(times_bounds(times, t1)))) & jnp.all(jnp.diff(times) > 0.0)
+        within = jnp.all(legal([Bound(times, "times", at_least=0.0, at_most=t1)]))
+        is_legal = jnp.all(is_legal & within) & jnp.all(jnp.diff(times) > 0.0)
     return is_legal, jnp.where(is_legal, t1, 0.0), jnp.where(is_legal, tolerance, LOOSEST)
 
 
-def require_run(scene: Any, launch: Any, t1: Any, tolerance: Any, kinds: tuple[type, type], lists: str) -> None:
+def require_run(
+    scene: object, launch: object, t1: object, tolerance: object, kinds: tuple[type, type], lists: str
+) -> None:
     """Raise `ValueError` unless scene and launch are of these kinds and have scalars only, the horizon is positive, and
     the tolerance is legal.
 
@@ -632,7 +610,7 @@ def require_run(scene: Any, launch: Any, t1: Any, tolerance: Any, kinds: tuple[t
     require_scalars(values, lists)
 
 
-def require_times(times: Any, t1: Any) -> None:
+def require_times(times: ArrayLike | None, t1: object) -> None:
     """Raise `ValueError` unless the times of output are an increasing list within [0, t1].
 
     **Example:**
@@ -642,15 +620,15 @@ def require_times(times: Any, t1: Any) -> None:
     Traceback (most recent call last):
     ValueError: times ...
     """
-    if np.ndim(times) == 0 and not isinstance(times, str) and times is not None:
+    if times is not None and not isinstance(times, str) and np.ndim(times) == 0:
         raise ValueError(
             f"times = {shown(times)} must be a list of at least one number; np.linspace makes evenly spaced ones"
         )
-    require_all(times_bounds(times, t1))
+    require_all([Bound(times, "times", at_least=0.0, at_most=t1)])
     require_increasing(times, "times")
 
 
-def require_adaptive(solver: Any, others: str = "") -> None:
+def require_adaptive(solver: object, others: str = "") -> None:
     """Raise `ValueError` unless the solver is `None` or a solver of Diffrax that estimates its errors and integrates a
     single field (others add a stiff part or noise). **Arguments:** `others`: further allowed solvers, for the message.
 
@@ -669,7 +647,7 @@ def require_adaptive(solver: Any, others: str = "") -> None:
         )
 
 
-def require_adjoint(adjoint: Any) -> None:
+def require_adjoint(adjoint: object) -> None:
     """Raise `ValueError` unless this is `None` or an adjoint method of Diffrax.
 
     **Example:**
@@ -710,7 +688,7 @@ class AbstractPassive(eqx.Module):
         together because they share work."""
 
 
-class ExtendedProblem(AbstractProblem, Generic[Core]):
+class ExtendedProblem(AbstractDerivedProblem, Generic[Core]):
     """A problem with passive components after its state; event function and domain margin are those of the problem.
 
     - `passive`: the rates; `values`, `scales`: initial values, and the magnitudes that scale absolute errors.
@@ -738,39 +716,15 @@ class ExtendedProblem(AbstractProblem, Generic[Core]):
     def leading(self) -> int:
         return len(self.problem.start()[0])
 
-    @property
-    def direction_decides(self) -> bool:
-        return self.problem.direction_decides
-
-    @property
-    def fits_one_kernel(self) -> bool:
-        return self.problem.fits_one_kernel
-
-    @property
-    def fast(self) -> tuple[bool, bool]:
-        return self.problem.fast
-
-    def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
+    def start(self) -> tuple[States, States]:
         states, scales = self.problem.start()
         return jnp.concatenate([states, self.values]), jnp.concatenate([scales, self.scales])
 
     def field(self, time: Lanes, state: States) -> States:
-        return self.passive.rates(self.problem, time, state[: self.leading], state[self.leading :])
+        return self.passive.rates(self.problem, time, self.inner(state), state[self.leading :])
+
+    def inner(self, state: States) -> States:
+        return state[: self.leading]
 
     def event_function(self, state: States) -> Lanes | None:
-        return self.problem.event_function(state[: self.leading]) if self.ends_on_event else None
-
-    def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
-        return self.problem.domain_margin(time, state[: self.leading])
-
-    def lost_at_start(self, state: States) -> Bool[Array, "..."] | None:
-        return self.problem.lost_at_start(state[: self.leading])
-
-    def exact_margin(self, time: Lanes, state: States) -> Lanes | None:
-        return self.problem.exact_margin(time, state[: self.leading])
-
-    def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
-        return self.problem.margins(time, state[: self.leading])
-
-    def jumps(self, time: Lanes, state: States) -> Jumps | None:
-        return self.problem.jumps(time, state[: self.leading])
+        return super().event_function(state) if self.ends_on_event else None

@@ -7,29 +7,28 @@ iteration, and the samples of a period are stored together. Dense samples lie in
 import functools
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.xla_cpu import written_in_place
-from .pairs import AbstractTunedPair
 from .problem import FAILED, REACHED_END, RUNNING, AbstractProblem, Settings
-from .runge_kutta import Lanes, States, weighted_sum
-from .scheduler import AbstractRecorder, InLanes, LaneScheduler, Outcome
+from .runge_kutta import AbstractTunedPair, Integers, Lanes, Mask, States, weighted_sum
+from .scheduler import InLanes, LaneScheduler, Outcome, Recorder
 from .step import LaneState, after_step, length_to_try, past_jump, trial_step, try_step, until_jump
 
 # The times at which the cells of a problem are sampled, and the samples so far.
 
 #: The values to keep of some states: (the cells in the lanes, (rows, components, lanes)) -> a tree of arrays
 #: (rows, lanes, ...).
-Read = Callable[[Int[Array, "*lanes"], Float[Array, "rows components *lanes"]], Any]
+Read = Callable[[Integers, Float[Array, "rows components *lanes"]], PyTree]
 
 
-def components(cells: Int[Array, "*lanes"], states: Float[Array, "rows components *lanes"]) -> Array:
+def components(cells: Integers, states: Float[Array, "rows components *lanes"]) -> Array:
     """The states themselves."""
     return jnp.moveaxis(states, 1, -1)
 
@@ -45,8 +44,8 @@ class Rows(NamedTuple):
 class Collected(NamedTuple):
     """The index of the next sample in every lane, and the samples so far: a tree of arrays (cells, times, ...)."""
 
-    sample: Int[Array, "*lanes"]
-    samples: Any
+    sample: Integers
+    samples: PyTree
 
 
 class SampleTimes(eqx.Module):
@@ -75,42 +74,45 @@ class SampleTimes(eqx.Module):
             return jnp.where(is_initial.reshape(*is_initial.shape, *[1] * (values.ndim - 2)), values, jnp.nan)
 
         first_values = self.read(jnp.arange(len(self.first)), starts[None])
-        return Collected(self.first_in(lane_state), jax.tree.map(of_start, first_values))
+        return Collected(self.first[self.cell_of(lane_state)], jax.tree.map(of_start, first_values))
 
-    def first_in(self, lane_state: LaneState) -> Int[Array, "*lanes"]:
-        """The index of the first sample after the start in every lane."""
-        return self.first[self._cell(lane_state)]
-
-    def after(self, time: Lanes, lane_state: LaneState) -> Int[Array, "*lanes"]:
+    def after(self, time: Lanes, lane_state: LaneState) -> Integers:
         """The index of the first sample after a time in every lane."""
-        times = self.times[:, None] if self.times.ndim == 1 else self.times[:, self._cell(lane_state)]
+        times = self.times[:, None] if self.times.ndim == 1 else self.times[:, self.cell_of(lane_state)]
         return jnp.sum(times <= time, axis=0)
 
-    def time_of(self, sample: Int[Array, "*lanes"], lane_state: LaneState) -> Lanes:
+    def time_of(self, sample: Integers, lane_state: LaneState) -> Lanes:
         """The time of a sample in every lane, infinite after the last one."""
         index = jnp.minimum(sample, len(self) - 1)
-        time = self.times[index] if self.times.ndim == 1 else self.times[index, self._cell(lane_state)]
+        time = self.times[index] if self.times.ndim == 1 else self.times[index, self.cell_of(lane_state)]
         return jnp.where(sample < len(self), time, jnp.inf)
+
+    def cell_of(self, lane_state: LaneState) -> Integers:
+        """The cells in the lanes; the last one in a lane without a cell."""
+        return jnp.minimum(lane_state.cell, len(self.first) - 1)
+
+
+class AbstractSampleRecorder(Recorder):
+    """Collects the samples of every cell. Its records have `rows`, and `sample`, the index of each lane's next sample."""
+
+    times: SampleTimes
 
     def empty_rows(self, count: int, lane_state: LaneState) -> Rows:
         """Rows without samples."""
         state = jnp.zeros((count, *lane_state.state.shape), lane_state.state.dtype)
-        return Rows(state, jnp.full((count, *lane_state.time.shape), len(self)))
+        return Rows(state, jnp.full((count, *lane_state.time.shape), len(self.times)))
 
     def collect(
-        self, collected: Collected, rows: Rows, sample: Int[Array, "*lanes"], ended: LaneState, refilled: LaneState
+        self, collected: Collected, record: "DenseRecord | Record", ended: LaneState, refilled: LaneState
     ) -> Collected:
-        """The samples with those of a period; `sample` is the index of the next sample in every lane."""
-        cell = self._cell(ended)
+        cell, rows = self.times.cell_of(ended), record.rows
 
         def added(samples: Float[Array, "cells times ..."], values: Float[Array, "rows lanes ..."]) -> Array:
             return samples.at[cell[None], rows.sample].set(values, mode="drop", unique_indices=True)
 
-        samples = jax.tree.map(added, collected.samples, self.read(cell, rows.state))
-        return Collected(jnp.where(refilled.cell != ended.cell, self.first_in(refilled), sample), samples)
-
-    def _cell(self, lane_state: LaneState) -> Int[Array, "*lanes"]:
-        return jnp.minimum(lane_state.cell, len(self.first) - 1)
+        samples = jax.tree.map(added, collected.samples, self.times.read(cell, rows.state))
+        sample = jnp.where(refilled.cell != ended.cell, self.times.first[self.times.cell_of(refilled)], record.sample)
+        return Collected(sample, samples)
 
 
 # Sample many runs at closely spaced times, by interpolation inside steps.
@@ -218,16 +220,15 @@ class DenseRecord(NamedTuple):
     """
 
     second: States
-    sample: Int[Array, "*lanes"]
+    sample: Integers
     sample_time: Lanes
     rows: Rows
     filled: Int[Array, ""]
 
 
-class DenseSampleRecorder(AbstractRecorder):
+class DenseSampleRecorder(AbstractSampleRecorder):
     """Collects the samples of every cell, which lie inside steps; `middle_weights`: of the pair, `AbstractTunedPair.middle`."""
 
-    times: SampleTimes
     middle_weights: tuple[float, ...] = eqx.field(static=True)
 
     def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: Collected) -> DenseRecord:
@@ -236,7 +237,7 @@ class DenseSampleRecorder(AbstractRecorder):
             second_derivative(in_lanes[0], *point),
             collected.sample,
             self.times.time_of(collected.sample, lane_state),
-            self.times.empty_rows(ROWS, lane_state),
+            self.empty_rows(ROWS, lane_state),
             jnp.zeros((), int),
         )
 
@@ -261,37 +262,22 @@ class DenseSampleRecorder(AbstractRecorder):
         states_inside = continuous_extension(self.middle_weights, problem, start, end, length, trial.rates)
         has_moved = new_lanes.time > lane_state.time
         last_time = jnp.where(has_moved, new_lanes.time, -jnp.inf)
-        record = self._with_samples(record, new_lanes, last_time, (lane_state.time, length), states_inside)
+
+        def add(record: DenseRecord) -> DenseRecord:
+            is_sample = record.sample_time <= last_time
+            state = states_inside((record.sample_time - lane_state.time) / length)
+            entry = Rows(state, jnp.where(is_sample, record.sample, len(self.times)))
+            rows = jax.tree.map(functools.partial(written_in_place, at=record.filled), record.rows, entry)
+            sample = record.sample + is_sample
+            return DenseRecord(record.second, sample, self.times.time_of(sample, new_lanes), rows, record.filled + 1)
+
+        # The samples up to `last_time` are all inside this step.
+        record = jax.lax.while_loop(lambda record: jnp.any(record.sample_time <= last_time), add, record)
         if new_lanes is not near_lanes:
             has_jumped = new_lanes.time > near_lanes.time
             of_far_side = second_derivative(problem, length, new_lanes.time, new_lanes.state, new_lanes.rate)
             second = jnp.where(has_jumped, of_far_side, second)
         return new_lanes, record._replace(second=jnp.where(has_moved, second, record.second))
-
-    def _with_samples(
-        self,
-        record: DenseRecord,
-        lane_state: LaneState,
-        last_time: Lanes,
-        step: tuple[Lanes, Lanes],
-        states_inside: StatesInside,
-    ) -> DenseRecord:
-        """Add the samples up to `last_time`, all inside the latest step; `step`: start and length of that step [s]."""
-        start_time, length = step
-
-        def add(record: DenseRecord) -> DenseRecord:
-            is_sample = record.sample_time <= last_time
-            state = states_inside((record.sample_time - start_time) / length)
-            entry = Rows(state, jnp.where(is_sample, record.sample, len(self.times)))
-            rows = jax.tree.map(functools.partial(written_in_place, at=record.filled), record.rows, entry)
-            sample = record.sample + is_sample
-            sample_time = self.times.time_of(sample, lane_state)
-            return DenseRecord(record.second, sample, sample_time, rows, record.filled + 1)
-
-        return jax.lax.while_loop(lambda record: jnp.any(record.sample_time <= last_time), add, record)
-
-    def collect(self, collected: Collected, record: DenseRecord, ended: LaneState, refilled: LaneState) -> Collected:
-        return self.times.collect(collected, record.rows, record.sample, ended, refilled)
 
 
 #: Largest factor by which a step is stretched to end on a sample: its error stays below the tolerance, because steps
@@ -303,22 +289,20 @@ class Record(NamedTuple):
     """Record of a period: whether the last step was accepted and the number of the next sample, in every lane; after each
     iteration the states, and the numbers of the samples there, if any."""
 
-    accepted: Bool[Array, "*lanes"]
-    sample: Int[Array, "*lanes"]
+    accepted: Mask
+    sample: Integers
     rows: Rows
 
 
-class SampleRecorder(AbstractRecorder):
+class SampleRecorder(AbstractSampleRecorder):
     """Lets steps end on the sample times of every cell, and collects the samples."""
-
-    times: SampleTimes
 
     # As many iterations as fit the caches with their record.
     period: ClassVar[int] = 64
 
     def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: Collected) -> Record:
         accepted = jnp.ones(collected.sample.shape, bool)
-        return Record(accepted, collected.sample, self.times.empty_rows(self.period, lane_state))
+        return Record(accepted, collected.sample, self.empty_rows(self.period, lane_state))
 
     def has_room(self, record: Record, iteration: Int[Array, ""]) -> Bool[Array, ""]:
         return iteration < self.period
@@ -332,17 +316,10 @@ class SampleRecorder(AbstractRecorder):
         rows = jax.tree.map(functools.partial(written_in_place, at=iteration), rows, entry)
         return new_lanes, Record(new_lanes.time > lane_state.time, sample + is_sample, rows)
 
-    def collect(self, collected: Collected, record: Record, ended: LaneState, refilled: LaneState) -> Collected:
-        return self.times.collect(collected, record.rows, record.sample, ended, refilled)
-
 
 def step_towards_sample(
-    times: SampleTimes,
-    in_lanes: InLanes,
-    lane_state: LaneState,
-    accepted: Bool[Array, "*lanes"],
-    sample: Int[Array, "*lanes"],
-) -> tuple[LaneState, Lanes, Bool[Array, "*lanes"]]:
+    times: SampleTimes, in_lanes: InLanes, lane_state: LaneState, accepted: Mask, sample: Integers
+) -> tuple[LaneState, Lanes, Mask]:
     """Try a step in every lane that does not pass its next sample.
 
     **Arguments:** `accepted`: whether the previous step was accepted; `sample`: the index of the next sample.
@@ -354,10 +331,13 @@ def step_towards_sample(
     control_to_target = control._replace(t1=jnp.minimum(next_time, control.t1))
     # Even lengths up to the sample or, if it comes first, to the jump.
     target = until_jump(problem, control_to_target, lane_state).t1
-    even_length = _even(lane_state.length, target - lane_state.time, lane_state.bracketing)
+    length, left = lane_state.length, target - lane_state.time
+    reach = STRETCH * length
+    # Changed a little if one or two steps then end on the sample; NaN if its time is NaN, so that the run ends.
+    fitting = jnp.where(reach >= left, left, jnp.where(2.0 * reach >= left, 0.5 * left, jnp.minimum(length, left)))
+    even_length = jnp.where(lane_state.bracketing, length, fitting)
     # The step after a rejected step is shorter on purpose, because it may have to end on a minimum of a margin.
-    length = jnp.where(accepted, even_length, jnp.minimum(even_length, lane_state.length))
-    lane_state = lane_state._replace(length=length)
+    lane_state = lane_state._replace(length=jnp.where(accepted, even_length, jnp.minimum(even_length, length)))
     new_lanes = try_step(problem, control_to_target, atol, lane_state)
     at_target = (lane_state.status == RUNNING) & (new_lanes.status == REACHED_END)
     goes_on = at_target & (new_lanes.time < control.t1)
@@ -378,7 +358,7 @@ def solve_with_samples(
     one_kernel: bool = False,
     read: Read = components,
     dense: bool = False,
-) -> tuple[Outcome, Any]:
+) -> tuple[Outcome, PyTree]:
     """Run every cell from t = 0 to its event, to the end of the model's validity, or to `t1`, and sample it.
 
     **Arguments:** as for `LaneScheduler.of`, and
@@ -410,13 +390,5 @@ def solve_with_samples(
     if dense and isinstance(solver, AbstractTunedPair):
         recorder = DenseSampleRecorder(sample_times, solver.middle)
     at_start = sample_times.at_start(scheduler.start().lane_state, scheduler.fresh.state)
-    outcome, _, collected = scheduler.recorded(recorder, at_start)
+    outcome, _, collected = scheduler.solve(recorder, at_start)
     return outcome, collected.samples
-
-
-def _even(length: Lanes, left: Lanes, bracketing: Array) -> Lanes:
-    """The length of a step, changed a little if one or two steps then end on the next sample; NaN if the time of the sample
-    is NaN, so that the run ends."""
-    reach = STRETCH * length
-    fitting = jnp.where(reach >= left, left, jnp.where(2.0 * reach >= left, 0.5 * left, jnp.minimum(length, left)))
-    return jnp.where(bracketing, length, fitting)

@@ -4,41 +4,29 @@ A lane whose run has ended takes the next cell of the queue, so cheap and expens
 waiting for one another. All ensemble solves share this loop; a recorder stores what they keep of the steps.
 """
 
-import abc
-import functools
 from collections.abc import Callable
-from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+from typing import ClassVar, Generic, NamedTuple, TypeVar
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from ..compilation.xla_cpu import compiled_alone, in_one_kernel
-from .dense import saved
+from ..text import shown
 from .events import Bracket
-from .problem import (
-    CROSSED,
-    FAILED,
-    LEFT_DOMAIN,
-    MOST_STEPS,
-    REACHED_END,
-    RUNNING,
-    AbstractProblem,
-    Settings,
-    crossing_time,
-    least_margin,
-    margin_at_start,
-)
-from .runge_kutta import Lanes, States, explicit_order, explicit_tableau, first_length, memory_for_stages
+from .problem import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING, AbstractProblem, Settings, crossing_time
+from .runge_kutta import Integers, Lanes, States, explicit_tableau, first_length, memory_for_stages
 from .step import Control, LaneState, try_step
 
 #: JAX's arrays, or NumPy's on the host.
 Numbers = TypeVar("Numbers", Array, np.ndarray)
+
+#: A tree of arrays.
+Tree = TypeVar("Tree")
+Result = TypeVar("Result")
 
 #: Cost of refilling the lanes, in steps of all lanes, measured on a CPU. The lanes are refilled when idle lanes have
 #: missed as many steps, so the loss is at most twice the loss of the best choice.
@@ -90,47 +78,40 @@ class SchedulerState(NamedTuple):
 InLanes = tuple[AbstractProblem, Control, States]
 
 
-class AbstractRecorder(eqx.Module):
-    """The part of a solve that records steps, in addition to the `Outcome`. A period ends when enough lanes have
-    ended to refill them, or when the record is full.
+#: What a period carries from step to step: the lanes, the record, the number of steps that idle lanes have missed since the
+#: last refill, and the number of steps.
+Period = tuple[LaneState, PyTree, Int[Array, ""], Int[Array, ""]]
+
+
+class Recorder(eqx.Module):
+    """The part of a solve that records steps, in addition to the `Outcome`; this one records nothing. A period ends when
+    enough lanes have ended to refill them, or when the record is full.
 
     `refill_cost`: cost of a refill, in steps of all lanes.
     """
 
     refill_cost: ClassVar[float] = REFILL
 
-    @abc.abstractmethod
-    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: Any) -> Any:
+    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: PyTree) -> PyTree:
         """The record at the start of a period, from what earlier periods have collected."""
+        return None
 
-    def has_room(self, record: Any, iteration: Int[Array, ""]) -> Bool[Array, ""] | bool:
+    def has_room(self, record: PyTree, iteration: Int[Array, ""]) -> Bool[Array, ""] | bool:
         """Whether the record has room for another iteration of the period; otherwise the period ends."""
         return True
 
-    @abc.abstractmethod
     def step(
-        self, in_lanes: InLanes, lane_state: LaneState, record: Any, iteration: Int[Array, ""]
-    ) -> tuple[LaneState, Any]:
+        self, in_lanes: InLanes, lane_state: LaneState, record: PyTree, iteration: Int[Array, ""]
+    ) -> tuple[LaneState, PyTree]:
         """Try a step in every lane, and record it."""
+        return try_step(*in_lanes, lane_state), None
 
-    def collect(self, collected: Any, record: Any, ended: LaneState, refilled: LaneState) -> Any:
+    def collect(self, collected: PyTree, record: PyTree, ended: LaneState, refilled: LaneState) -> PyTree:
         """What has been collected, with the record of a period added.
 
         **Arguments:** `ended`, `refilled`: the lanes at the end of the period and after the refill.
         """
         return collected
-
-
-class Unrecorded(AbstractRecorder):
-    """A recorder that records nothing."""
-
-    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: None) -> None:
-        return None
-
-    def step(
-        self, in_lanes: InLanes, lane_state: LaneState, record: None, iteration: Int[Array, ""]
-    ) -> tuple[LaneState, None]:
-        return try_step(*in_lanes, lane_state), None
 
 
 class LaneScheduler(eqx.Module):
@@ -161,12 +142,13 @@ class LaneScheduler(eqx.Module):
     ) -> "LaneScheduler":
         """The scheduler of a problem.
 
-        **Arguments:** as for `ensemble_solve`, and `n_blocks`: the number of equal blocks of the state, as for `Control`.
+        **Arguments:** as for `solve_ensemble`, and `n_blocks`: the number of equal blocks of the state, as for `Control`.
         """
         solver, rtol = settings.for_lanes, settings.tolerance
-        control = Control(
-            explicit_tableau(solver), explicit_order(solver), rtol, t1, settings.max_steps, nonterminal, n_blocks
-        )
+        tableau, order = explicit_tableau(solver), solver.order(None)
+        if order is None:
+            raise ValueError(f"solver = {shown(solver)} must have an order, as Dopri8() has")
+        control = Control(tableau, order, rtol, t1, settings.max_steps, nonterminal, n_blocks)
         states, scales = problem.start()
         begin = jnp.zeros_like(states[0])
         if (jumps := problem.jumps(begin, states)) is not None:
@@ -184,38 +166,35 @@ class LaneScheduler(eqx.Module):
         """Number of cells of the problem, padding included."""
         return self.fresh.cell.shape[0]
 
-    def pick(self, tree: Any, cell: Int[Array, "*lanes"]) -> Any:
-        """The leaves for the given cells; scalars stay unchanged."""
-        index = jnp.minimum(cell, self.capacity - 1)
-        return jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., index], tree)
+    def pick(self, tree: Tree, cell: Integers) -> Tree:
+        """The numbers of the given cells, as `of_cells`; of the last cell for greater indices."""
+        return of_cells(tree, jnp.minimum(cell, self.capacity - 1))
 
     def in_lanes(self, lane_state: LaneState) -> InLanes:
         """Problem, control and absolute tolerances of the cells in the lanes."""
         control = self.control._replace(t1=self.pick(self.control.t1, lane_state.cell))
         return self.pick(self.problem, lane_state.cell), control, self.pick(self.atols, lane_state.cell)
 
-    def outcome(self) -> tuple[Outcome, Int[Array, ""]]:
+    def solve(
+        self, recorder: Recorder | None = None, collected: PyTree = None
+    ) -> tuple[Outcome, Int[Array, ""], PyTree]:
         """Run every cell.
 
-        **Returns:** the `Outcome`, whose crossing times are those of nonterminal events, and the number of iterations.
-        """
-        outcome, iterations, _ = self.recorded(Unrecorded(), None)
-        return outcome, iterations
-
-    def recorded(self, recorder: AbstractRecorder, collected: Any) -> tuple[Outcome, Int[Array, ""], Any]:
-        """Run every cell, as `outcome` does, and also return what a recorder has collected.
-
         **Arguments:** `recorder`; `collected`: what the recorder has collected before the first step.
-        """
 
-        def period(carry: tuple[SchedulerState, Outcome, Any]) -> tuple[SchedulerState, Outcome, Any]:
+        **Returns:** the `Outcome`, whose crossing times are those of nonterminal events; the number of iterations; and what
+        the recorder has collected.
+        """
+        recorder = Recorder() if recorder is None else recorder
+
+        def period(carry: tuple[SchedulerState, Outcome, PyTree]) -> tuple[SchedulerState, Outcome, PyTree]:
             progress, outcome, collected = carry
             progress, record = self.run(progress, recorder, collected)
             refilled = self.refill(progress)
             collected = recorder.collect(collected, record, progress.lane_state, refilled.lane_state)
             return refilled, self.store(outcome, progress.lane_state), collected
 
-        carry = (self.start(), self.empty(), collected)
+        carry = (self.start(), outcome_of(self.fresh), collected)
         progress, outcome, collected = jax.lax.while_loop(lambda carry: self.unfinished(carry[0]), period, carry)
         outcome = back_to_margin(self.problem, self.store(outcome, progress.lane_state))
         return outcome, progress.iterations, collected
@@ -230,8 +209,8 @@ class LaneScheduler(eqx.Module):
         return jnp.any(progress.lane_state.status == RUNNING) | (progress.loaded < self.cells)
 
     def run(
-        self, progress: SchedulerState, recorder: AbstractRecorder, collected: Any = None
-    ) -> tuple[SchedulerState, Any]:
+        self, progress: SchedulerState, recorder: Recorder, collected: PyTree = None
+    ) -> tuple[SchedulerState, PyTree]:
         """Advance the lanes by a period: until all have ended, the record is full, or a refill pays off while cells
         wait.
 
@@ -239,20 +218,17 @@ class LaneScheduler(eqx.Module):
         """
         in_lanes = self.in_lanes(progress.lane_state)
 
-        def goes_on(carry: tuple[LaneState, Any, Int[Array, ""], Int[Array, ""]]) -> Bool[Array, ""]:
+        def goes_on(carry: Period) -> Bool[Array, ""]:
             lane_state, record, missed, count = carry
             refill = (progress.loaded < self.cells) & (missed >= recorder.refill_cost * self.lanes)
             return jnp.any(lane_state.status == RUNNING) & ~refill & recorder.has_room(record, count)
 
-        def step(
-            carry: tuple[LaneState, Any, Int[Array, ""], Int[Array, ""]],
-        ) -> tuple[LaneState, Any, Int[Array, ""], Int[Array, ""]]:
-            # `missed` counts the steps that idle lanes have missed since the last refill.
+        def step(carry: Period) -> Period:
             lane_state, record, missed, count = carry
             new_state, record = recorder.step(in_lanes, lane_state, record, count)
             return new_state, record, missed + jnp.sum(lane_state.status != RUNNING), count + 1
 
-        def loop(lane_state: LaneState) -> tuple[LaneState, Any, Int[Array, ""]]:
+        def loop(lane_state: LaneState) -> tuple[LaneState, PyTree, Int[Array, ""]]:
             zero, record = jnp.zeros((), int), recorder.begin(in_lanes, lane_state, collected)
             lane_state = lane_state._replace(stages=memory_for_stages(self.control.tableau, lane_state.state))
             lane_state, record, _, count = jax.lax.while_loop(goes_on, step, (lane_state, record, zero, zero))
@@ -261,7 +237,7 @@ class LaneScheduler(eqx.Module):
         lane_state, record, count = self.in_kernel(loop)(progress.lane_state)
         return SchedulerState(lane_state, progress.loaded, progress.iterations + count), record
 
-    def in_kernel(self, loop: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    def in_kernel(self, loop: Callable[[Tree], Result]) -> Callable[[Tree], Result]:
         """A loop over steps, compiled into a single kernel if `one_kernel` is set."""
         return in_one_kernel(loop) if self.one_kernel and self.problem.fits_one_kernel else loop
 
@@ -273,10 +249,6 @@ class LaneScheduler(eqx.Module):
         lane_state = jax.tree.map(lambda new, old: jnp.where(idle, new, old), fresh, lane_state)
         return SchedulerState(lane_state, jnp.minimum(loaded + jnp.sum(idle), self.cells), iterations)
 
-    def empty(self) -> Outcome:
-        """An empty outcome of the right shapes."""
-        return outcome_of(self.fresh)
-
     def store(self, outcome: Outcome, lane_state: LaneState) -> Outcome:
         """Store the cells whose lanes have ended in the outcome."""
         # A run that ends on a jump may be on its far side.
@@ -287,10 +259,15 @@ class LaneScheduler(eqx.Module):
         )
         return jax.tree.map(lambda cells, lanes: cells.at[..., targets].set(lanes, mode="drop"), outcome, in_lanes)
 
-    def _load(self, cell: Int[Array, "*lanes"]) -> LaneState:
+    def _load(self, cell: Integers) -> LaneState:
         lane_state = self.pick(self.fresh, cell)
         # There may be fewer cells than lanes: the other lanes stay idle.
         return lane_state._replace(cell=cell, status=jnp.where(cell < self.cells, lane_state.status, REACHED_END))
+
+
+def of_cells(tree: Tree, cell: Int[Numbers, "..."] | int) -> Tree:
+    """A tree with the numbers of the cells with these indices; scalars stay unchanged."""
+    return jax.tree.map(lambda leaf: leaf[..., cell] if eqx.is_array_like(leaf) and np.ndim(leaf) else leaf, tree)
 
 
 def outcome_of(lane_state: LaneState) -> Outcome:
@@ -320,11 +297,7 @@ def back_to_margin(problem: AbstractProblem, outcome: Outcome) -> Outcome:
 
 
 def _fresh_lanes(
-    problem: AbstractProblem,
-    control: Control,
-    states: Float[Array, "components cells"],
-    rates: Float[Array, "components cells"],
-    lengths: Float[Array, " cells"],
+    problem: AbstractProblem, control: Control, states: States, rates: States, lengths: Lanes
 ) -> LaneState:
     """Every cell at its start; a cell that starts beyond the event or outside the domain has ended."""
     zero = jnp.zeros_like(lengths)
@@ -338,30 +311,19 @@ def _fresh_lanes(
             valid = ~lost & (margin > 0.0)
         side = jnp.ones_like(zero) if before_event is None else jnp.where(before_event, 1.0, -1.0).astype(zero.dtype)
         status = jnp.full(zero.shape, RUNNING) if valid is None else jnp.where(valid, RUNNING, LEFT_DOMAIN)
-        return _lanes_at_start(problem, states, rates, lengths, side, status, jnp.full_like(zero, jnp.inf))
-    crossing, domain_margin = problem.event_function(states), margin_at_start(problem, zero, states)
-    is_beyond = false
-    if crossing is not None:
-        # Exactly on the event, the direction of the motion decides.
-        is_falling = jax.jvp(problem.event_function, (states,), (rates,))[1] <= 0.0
-        is_beyond = (crossing < 0.0) | ((crossing == 0.0) & (is_falling | (not control.nonterminal)))
-    side = jnp.where(is_beyond & control.nonterminal, -1.0, 1.0).astype(lengths.dtype)
-    status = jnp.where(is_beyond & (not control.nonterminal), CROSSED, RUNNING)
-    if domain_margin is not None:
-        status = jnp.where(domain_margin <= 0.0, LEFT_DOMAIN, status)
-    return _lanes_at_start(problem, states, rates, lengths, side, status, jnp.where(is_beyond, zero, jnp.inf))
-
-
-def _lanes_at_start(
-    problem: AbstractProblem,
-    states: Float[Array, "components cells"],
-    rates: Float[Array, "components cells"],
-    lengths: Float[Array, " cells"],
-    side: Float[Array, " cells"],
-    status: Int[Array, " cells"],
-    crossing_time: Float[Array, " cells"],
-) -> LaneState:
-    """Every cell at its start, on a side of the event."""
+        crossing_time = jnp.full_like(zero, jnp.inf)
+    else:
+        crossing, domain_margin = problem.event_function(states), problem.margin_at_start(zero, states)
+        is_beyond = false
+        if crossing is not None:
+            # Exactly on the event, the direction of the motion decides.
+            is_falling = jax.jvp(problem.event_function, (states,), (rates,))[1] <= 0.0
+            is_beyond = (crossing < 0.0) | ((crossing == 0.0) & (is_falling | (not control.nonterminal)))
+        side = jnp.where(is_beyond & control.nonterminal, -1.0, 1.0).astype(lengths.dtype)
+        status = jnp.where(is_beyond & (not control.nonterminal), CROSSED, RUNNING)
+        if domain_margin is not None:
+            status = jnp.where(domain_margin <= 0.0, LEFT_DOMAIN, status)
+        crossing_time = jnp.where(is_beyond, zero, jnp.inf)
     zero, zeros = jnp.zeros_like(lengths), jnp.zeros(lengths.shape, int)
     return LaneState(
         cell=jnp.arange(lengths.shape[0]),
@@ -371,7 +333,7 @@ def _lanes_at_start(
         rate=rates,
         length=lengths,
         side=side,
-        margin=stop_gradient(least_margin(problem, side, zero, states, rates)),
+        margin=stop_gradient(problem.least_margin(side, zero, states, rates)),
         margins=stop_gradient(jnp.stack(margins)) if (margins := problem.margins(zero, states)) else None,
         first_crossing=crossing_time,
         crossing_time=crossing_time,
@@ -384,11 +346,7 @@ def _lanes_at_start(
 
 
 def _holds(
-    problem: AbstractProblem,
-    function: Callable[[States], Lanes | None],
-    states: Float[Array, "components cells"],
-    rates: Float[Array, "components cells"],
-    lengths: Float[Array, " cells"],
+    problem: AbstractProblem, function: Callable[[States], Lanes | None], states: States, rates: States, lengths: Lanes
 ) -> Bool[Array, " cells"] | None:
     """A mask of the cells in which a function of the state is positive at the start or, if it is zero up to round-off,
     is about to become positive.
@@ -415,20 +373,18 @@ def _holds(
 # first derivatives faster.
 
 
-def ensemble_solve(
+def solve_ensemble(
     problem: AbstractProblem,
     t1: Float[Array, "..."],
-    cells: Int[Array, ""],
+    cells: Int[ArrayLike, ""],
     settings: Settings,
     *,
     nonterminal: bool = False,
-    one_kernel: bool = False,
+    one_kernel: bool | None = None,
     n_blocks: int = 1,
+    traced: bool = False,
 ) -> tuple[Outcome, Int[Array, ""]]:
     """Run every cell of a problem from t = 0 to its event, to the end of the model's validity, or to `t1`.
-
-    `solve_ensemble` is compiled on its own, for use outside of other transformed functions; `traced_solve_ensemble` is for
-    use inside them.
 
     **Arguments:**
 
@@ -439,23 +395,35 @@ def ensemble_solve(
     - `settings`: settings with an explicit Runge-Kutta solver of Diffrax.
     - `nonterminal`: whether the event is nonterminal: a run continues through it, in either direction.
     - `one_kernel`: whether to compile the loop into a single kernel on a CPU, which halves its cost; not for programs
-      that are differentiated again.
+      that are differentiated again. By default unless `traced`.
     - `n_blocks`: number of equal blocks of the state, as for `LaneScheduler.of`.
+    - `traced`: whether this is a part of another transformed function; otherwise it is compiled on its own.
 
     **Returns:** the `Outcome`, and the number of iterations, each of which advanced all lanes.
 
-    **Example:** inside `jit`, with `traced_solve_ensemble`. With `nonterminal`, the runs continue to `t1`.
+    **Example:** inside `jit`. With `nonterminal`, the runs continue to `t1`.
 
-    >>> from nonholonomic.integration import traced_solve_ensemble
     >>> def solve(problem, t1):
-    ...     return traced_solve_ensemble(problem, t1, jnp.asarray(3), settings, nonterminal=True)[0]
+    ...     return solve_ensemble(problem, t1, jnp.asarray(3), settings, nonterminal=True, traced=True)[0]
     >>> continued = jax.jit(solve)(problem, jnp.asarray(2.0))
     >>> print(continued.crossing_time.round(6), continued.end_time)
     [0.693147 0.346574 0.173287] [2. 2. 2.]
     """
+    one_kernel = not traced if one_kernel is None else one_kernel
     options = {"nonterminal": nonterminal, "one_kernel": one_kernel, "n_blocks": n_blocks}
-    outcome, iterations = LaneScheduler.of(problem, t1, cells, settings, **options).outcome()
-    return (outcome if nonterminal else with_crossing_times(problem, outcome)), iterations
+    return (_ensemble_in_program if traced else _ensemble_alone)(problem, t1, cells, settings, options)
+
+
+def ensemble_solve(
+    problem: AbstractProblem, t1: Float[Array, "..."], cells: Int[ArrayLike, ""], settings: Settings, options: PyTree
+) -> tuple[Outcome, Int[Array, ""]]:
+    """`solve_ensemble`, not compiled. **Arguments:** `options`: of `LaneScheduler.of`, by name."""
+    scheduler = LaneScheduler.of(problem, t1, jnp.asarray(cells), settings, **options)
+    outcome, iterations, _ = scheduler.solve()
+    return (outcome if scheduler.control.nonterminal else with_crossing_times(problem, outcome)), iterations
+
+
+_ensemble_alone, _ensemble_in_program = compiled_alone(ensemble_solve), eqx.filter_jit(ensemble_solve)
 
 
 def with_crossing_times(problem: AbstractProblem, outcome: Outcome) -> Outcome:
@@ -467,71 +435,3 @@ def with_crossing_times(problem: AbstractProblem, outcome: Outcome) -> Outcome:
     time = jnp.where(outcome.end_time > 0.0, time, 0.0)
     time = jnp.where(outcome.status == CROSSED, time, jnp.inf)
     return outcome._replace(first_crossing=time, crossing_time=time)
-
-
-# With its docstring.
-solve_ensemble = compiled_alone(
-    functools.update_wrapper(functools.partial(ensemble_solve, one_kernel=True), ensemble_solve)
-)
-
-traced_solve_ensemble = eqx.filter_jit(ensemble_solve)
-
-
-# The outcome of every cell by vmapped `diffrax.diffeqsolve`: slow, and independent of the ensemble solver.
-
-
-@eqx.filter_jit
-def solve_by_diffrax(problem: AbstractProblem, t1: Float[Array, ""], settings: Settings) -> Outcome:
-    """Run every cell from t = 0 to its event, to the end of the model's validity, or to `t1`.
-
-    The domain margin is checked at the ends of steps, so a short loss can be missed; events are located on Diffrax's
-    dense output.
-
-    **Arguments:** as for `solve_ensemble`, but any solver of Diffrax works.
-
-    **Returns:** the `Outcome`.
-
-    **Example:**
-
-    >>> from nonholonomic.integration import solve_by_diffrax
-    >>> print(solve_by_diffrax(problem, jnp.asarray(5.0), settings).crossing_time.round(6))
-    [0.693147 0.346574 0.173287]
-    """
-    (states, scales), rtol = problem.start(), settings.tolerance
-    lane_axes = jax.tree.map(lambda leaf: None if jnp.ndim(leaf) == 0 else -1, problem)
-
-    def solve_cell(cell_problem: AbstractProblem, state: Array, scale: Array) -> Outcome:
-        conditions: dict[int, Any] = {}
-        if problem.event_function(states) is not None:
-            conditions[CROSSED] = lambda t, y, args, **_: args.event_function(y)
-        if problem.domain_margin(states[0], states) is not None:
-            conditions[LEFT_DOMAIN] = lambda t, y, args, **_: args.domain_margin(t, y)
-        # Diffrax detects only changes of a condition's sign, so a cell that starts with a negative condition must end
-        # at once.
-        at_once = [condition(jnp.zeros(()), state, cell_problem) <= 0.0 for condition in conditions.values()]
-        ends_at_once = functools.reduce(jnp.logical_or, at_once, jnp.asarray(False))
-        event = diffrax.Event(list(conditions.values()), root_finder=optimistix.Newton(1e-13, 1e-13))
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
-            settings.for_single_runs,
-            0.0,
-            jnp.where(ends_at_once, 0.0, t1),
-            None,
-            state,
-            args=cell_problem,
-            stepsize_controller=diffrax.PIDController(rtol, settings.absolute * rtol * scale),
-            max_steps=min(settings.max_steps, MOST_STEPS),
-            event=event if conditions else None,
-            throw=False,
-        )
-        ends, finals = saved(solution)
-        end, final = ends[0], finals[0]
-        status = jnp.where(end >= t1, REACHED_END, FAILED)
-        for code, occurred, at_start in zip(conditions, solution.event_mask or [], at_once, strict=True):
-            status = jnp.where(occurred | at_start, code, status)
-        crossing_time = jnp.where(status == CROSSED, end, jnp.inf)
-        steps, rejected = solution.stats["num_steps"], solution.stats["num_rejected_steps"]
-        return Outcome(status, crossing_time, crossing_time, end, final, steps, rejected, jnp.array(NO_EXTREMES))
-
-    axes = Outcome._make((0, 0, 0, 0, -1, 0, 0, -1))
-    return jax.vmap(solve_cell, in_axes=(lane_axes, -1, -1), out_axes=axes)(problem, states, scales)

@@ -4,29 +4,22 @@ When a step ends beyond an event, the lane locates the event: it repeats the ste
 lengths, until the step ends on the event. The time of the event therefore has the accuracy of the method.
 """
 
+import functools
 from typing import NamedTuple
 
 import diffrax
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from ..compilation.xla_cpu import stored
 from .events import Bracket, Path, missed_double_root, missed_loss, refine, watched
-from .problem import (
-    CROSSED,
-    FAILED,
-    LEFT_DOMAIN,
-    REACHED_END,
-    RUNNING,
-    AbstractProblem,
-    crossing_time,
-    least_margin,
-    side_of,
-)
+from .problem import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, AbstractProblem, crossing_time
 from .runge_kutta import (
+    Integers,
     Lanes,
+    Mask,
     Stages,
     States,
     Step,
@@ -85,8 +78,8 @@ class LaneState(NamedTuple):
     ('cell', 'status', 'time', 'state', 'rate')
     """
 
-    cell: Int[Array, "*lanes"]
-    status: Int[Array, "*lanes"]
+    cell: Integers
+    status: Integers
     time: Lanes
     state: States
     rate: States
@@ -96,10 +89,10 @@ class LaneState(NamedTuple):
     margins: Float[Array, "margins *lanes"] | None
     first_crossing: Lanes
     crossing_time: Lanes
-    bracketing: Bool[Array, "*lanes"]
+    bracketing: Mask
     bracket: Bracket
-    steps: Int[Array, "*lanes"]
-    rejected: Int[Array, "*lanes"]
+    steps: Integers
+    rejected: Integers
     extremes: Float[Array, "3 *lanes"]
     stages: Stages | None = None
 
@@ -149,7 +142,7 @@ def past_jump(
     def moved() -> tuple[States, States, Lanes, Float[Array, "margins *lanes"] | None]:
         state = problem.across_jump(new_lanes.time, new_lanes.state)
         rate, margins = problem.field(far, state), problem.margins(far, state)
-        margin = stop_gradient(least_margin(problem, new_lanes.side, far, state, rate))
+        margin = stop_gradient(problem.least_margin(new_lanes.side, far, state, rate))
         of_far_side = (state, rate, margin, stop_gradient(jnp.stack(margins)) if margins else None)
         return jax.tree.map(lambda new, old: jnp.where(landed, new, old), of_far_side, of_near_side)
 
@@ -177,7 +170,7 @@ def past_jump(
 def trial_step(problem: AbstractProblem, control: Control, lane_state: LaneState) -> tuple[Lanes, Step]:
     """The length of each lane's next step [s], and the step."""
     tried_length = length_to_try(control, lane_state)
-    crossing = side_of(problem, lane_state.side)
+    crossing = functools.partial(problem.crossing_on, lane_state.side)
     start = (lane_state.time, lane_state.state, lane_state.rate, tried_length, lane_state.margins)
     stages = memory_for_stages(control.tableau, lane_state.state) if lane_state.stages is None else lane_state.stages
     looks = looks_of(problem, control.tableau, lane_state)
@@ -214,21 +207,20 @@ def after_step(
     accurate = error <= 1.0
     # Negative inside the step: end the step there and check again, so that the first of several events is located.
     fast_margins, fast_event = problem.fast
-    start = (lane_state.time, lane_state.state, lane_state.rate)
+    start = (lane_state.state, lane_state.rate)
     negative = trial.first_negative
     if not fast_event:
-        event = missed_double_root(problem.event_function, lane_state.side, start[1:], trial, tried_length)
+        event = missed_double_root(problem.event_function, lane_state.side, start, trial, tried_length)
         negative = jnp.minimum(negative, stop_gradient(event))
     if not fast_margins:
         places = watched_places(control.tableau, looks_of(problem, control.tableau, lane_state))
         negative = jnp.minimum(negative, missed_loss(places, stop_gradient(trial.margins), free & accurate))
     longest = None
     if fast_margins or fast_event:
-        path = Path.of(start[1:], trial.middle, (trial.state, trial.rate), tried_length)
+        path = Path.of(lane_state.time, tried_length, start, trial.middle, (trial.state, trial.rate))
         checked = free & accurate
         may_cut = checked & (tried_length > SHORTEST_CUT * control.t1)
-        step = (path, lane_state.time, tried_length)
-        place, longest = watched(problem, lane_state.side, *step, checked, may_cut)
+        place, longest = watched(problem, lane_state.side, path, checked, may_cut)
         negative = jnp.minimum(negative, place)
     crosses_inside = accurate & (negative < 1.0)
     is_beyond = accurate & ~crosses_inside & (margin <= 0.0)
@@ -246,7 +238,8 @@ def after_step(
     moved = forward | hit
     time = jnp.where(moved, lane_state.time + tried_length, lane_state.time)
 
-    length = tried_length * _factor(error, accurate, control.order)
+    factor = SAFETY * inverse_root(jnp.maximum(error, 1e-30), control.order)
+    length = tried_length * jnp.where(accurate, jnp.clip(factor, 1.0, GROW), jnp.clip(factor, SHRINK, SAFETY))
     least, place, longest_step = lane_state.extremes
     is_shorter = free & is_known & ~accurate & (length < least)
     least, place = (jnp.where(is_shorter, *pair) for pair in ((length, least), (lane_state.time, place)))
@@ -287,30 +280,17 @@ def after_step(
     )
 
 
-def _factor(error: Lanes, accurate: Bool[Array, "*lanes"], order: int) -> Lanes:
-    """Growth factor of the next step, as in Diffrax's I controller."""
-    factor = SAFETY * inverse_root(jnp.maximum(error, 1e-30), order)
-    return jnp.where(accurate, jnp.clip(factor, 1.0, GROW), jnp.clip(factor, SHRINK, SAFETY))
-
-
 def _classify(
-    problem: AbstractProblem,
-    control: Control,
-    lane_state: LaneState,
-    trial: Step,
-    time: Lanes,
-    hit: Bool[Array, "*lanes"],
-) -> tuple[Int[Array, "*lanes"], Lanes, Lanes, Lanes]:
+    problem: AbstractProblem, control: Control, lane_state: LaneState, trial: Step, time: Lanes, hit: Mask
+) -> tuple[Integers, Lanes, Lanes, Lanes]:
     """Status, side, first and latest crossing time of the lanes, where `hit` marks the lanes in which an event was
     located."""
     crossing, margins = problem.event_function(trial.state), trial.margins
     # The located event belongs to the lesser of the margins and the event function, whose sign may be round-off.
     by_margin = hit
     if crossing is not None:
-        by_loss = (
-            False if margins is None else jnp.min(stop_gradient(margins[-1]), axis=0) <= lane_state.side * crossing
-        )
-        by_margin = hit & by_loss
+        least = None if margins is None else jnp.min(stop_gradient(margins[-1]), axis=0)
+        by_margin = hit & (False if least is None else least <= lane_state.side * crossing)
     crossed = hit & ~by_margin
     if not control.nonterminal:
         status = jnp.where(hit, jnp.where(by_margin, LEFT_DOMAIN, CROSSED), lane_state.status)

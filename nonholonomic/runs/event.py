@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from ..compilation.components import over_lanes
 from ..compilation.tracing import depends_on_first, is_elementary, spelled_out, with_own_numbers
@@ -30,27 +30,24 @@ from ..hybrid import (
     Transition,
     solve_hybrid,
     solve_hybrid_with_tangents,
-    traced_solve_hybrid,
-    traced_solve_hybrid_with_tangents,
 )
-from ..hybrid.saltation import UNMEASURED
+from ..hybrid.saltation import UNMEASURED, Clock
 from ..integration import (
     AbstractProblem,
+    ExtendedProblem,
     Jumps,
     Lanes,
     Outcome,
     Settings,
     States,
-    explicit_tableau,
     solve_ensemble,
-    traced_solve_ensemble,
 )
 from ..integration.problem import CROSSED, REACHED_END, RUNNING, Status, legal_run
 from ..parameters import Parameters
 from ..terminal import status_line
 from ..text import described, gathered, likely, name_of, shown
 from ..validation import UNTRACEABLE, as_number, is_traced, nan_unless, warn
-from .model import AbstractModel, Names, Start, check_run, model_of, require_event
+from .model import AbstractModel, Names, Number, Start, check_run, model_of, require_event, settings_for_lanes
 
 
 class Motion:
@@ -161,29 +158,39 @@ def with_event(model: AbstractModel, event: Any) -> AbstractModel:
     leaves, structure = jax.tree.flatten(model)
     rows = rows_of(model, names)
     types = (t, rows, *(jax.ShapeDtypeStruct((), jnp.asarray(leaf).dtype) for leaf in leaves))
-    elementary = model.smooth and is_elementary(
-        spelled_out(lambda t, rows, *leaves: _value(jax.tree.unflatten(structure, leaves), index, t, rows)), *types
-    )
+
+    def of_leaves(t: Array, rows: Array, *leaves: Array) -> Float[Array, ""]:
+        moved = jax.tree.unflatten(structure, leaves)
+        return moved.event(t, moved.read(names, t, rows, index))
+
+    elementary = model.smooth and is_elementary(spelled_out(of_leaves), *types)
     return dataclasses.replace(model, event=dataclasses.replace(model.event, elementary=elementary))
-
-
-def _value(model: AbstractModel, mode: Any, t: Array, rows: Array) -> Float[Array, ""]:
-    """The event function of one state."""
-    return model.event(t, model.read(model.event.names, t, rows, mode))
 
 
 class EventProblem(AbstractProblem):
     """A problem with a user's event in place of its own.
 
+    - `motion`: the problem, extended by a clock if the event depends on time.
     - `model`: the model with the event; `mode`, `index`: the mode of the problem and its index, or `None`.
-    - `clock`: the time [s] at the start, (1, cells), if the event depends on time; otherwise (0, cells).
     """
 
     motion: AbstractProblem
     model: AbstractModel
-    clock: Float[Array, "clocks *cells"]
     mode: AbstractBatchedMode | None = None
     index: int | None = eqx.field(static=True, default=None)
+
+    @classmethod
+    def of(
+        cls,
+        problem: AbstractProblem,
+        model: AbstractModel,
+        clock: Float[Array, "clocks *cells"],
+        mode: AbstractBatchedMode | None = None,
+        index: int | None = None,
+    ) -> "EventProblem":
+        """**Arguments:** `clock`: the time [s] at the start, (1, cells), if the event depends on time; otherwise (0, cells)."""
+        timed = ExtendedProblem(problem, Clock(), clock, jnp.full_like(clock, UNMEASURED))
+        return cls(timed if len(clock) else problem, model, mode, index)
 
     @property
     def direction_decides(self) -> bool:
@@ -198,31 +205,25 @@ class EventProblem(AbstractProblem):
         return self.motion.fast[0], True
 
     def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
-        states, scales = self.motion.start()
-        return jnp.concatenate([states, self.clock]), jnp.concatenate([scales, jnp.full_like(self.clock, UNMEASURED)])
+        return self.motion.start()
 
     def field(self, time: Lanes, state: States) -> States:
-        core = self._core(state)
-        rates = self.motion.field(time, core)
-        return jnp.concatenate([rates, jnp.ones_like(state[len(core) :])]) if len(self.clock) else rates
+        return self.motion.field(time, state)
 
     def event_function(self, state: States) -> Lanes:
         return value_in_lanes(self.model, self.mode, self.index, state)
 
     def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
-        return self.motion.domain_margin(time, self._core(state))
+        return self.motion.domain_margin(time, state)
 
     def lost_at_start(self, state: States) -> Bool[Array, "..."] | None:
-        return self.motion.lost_at_start(self._core(state))
+        return self.motion.lost_at_start(state)
 
     def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
-        return self.motion.margins(time, self._core(state))
+        return self.motion.margins(time, state)
 
     def jumps(self, time: Lanes, state: States) -> Jumps | None:
-        return self.motion.jumps(time, self._core(state))
-
-    def _core(self, state: Any) -> Any:
-        return state[:-1] if len(self.clock) else state
+        return self.motion.jumps(time, state)
 
 
 def value_in_lanes(model: AbstractModel, mode: AbstractBatchedMode | None, index: int | None, state: States) -> Lanes:
@@ -242,7 +243,7 @@ def value_in_lanes(model: AbstractModel, mode: AbstractBatchedMode | None, index
         for component in np.ndindex(shape)
     ]
 
-    def of_run(leaves: Any, parts: tuple[Array, ...]) -> Float[Array, ""]:
+    def of_run(leaves: Sequence[Array], parts: tuple[Array, ...]) -> Float[Array, ""]:
         time, *components = parts
         of_one_run = dict(zip(values, gathered(components, shapes), strict=True))
         return jax.tree.unflatten(structure, leaves)(time, of_one_run)
@@ -264,7 +265,7 @@ class EventMode(AbstractBatchedMode):
     def problem(self, state: Float[Array, "components cells"]) -> EventProblem:
         core, clock = self._parts(state)
         mode = self.modes[self.index]
-        return EventProblem(mode.problem(core), self.model, clock, mode, self.index)
+        return EventProblem.of(mode.problem(core), self.model, clock, mode, self.index)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         core, clock = self._parts(state)
@@ -299,18 +300,16 @@ def problem_of(model: AbstractModel, cells: int | None, names: Names) -> Abstrac
     """The motion of a smooth model with its event."""
     if model.event is None:
         return model.problem(cells, names)
-    names = None if names is None else (*names, *(name for name in model.event.names if name not in names))
-    problem = model.problem(cells, names)
-    states = problem.start()[0]
-    clock = jnp.zeros((int(model.event.depends_on_time), *states.shape[1:]))
-    return EventProblem(problem, model, clock)
+    problem = model.problem(cells, None if names is None else (*dict.fromkeys((*names, *model.event.names)),))
+    clock = jnp.zeros((int(model.event.depends_on_time), *problem.start()[0].shape[1:]))
+    return EventProblem.of(problem, model, clock)
 
 
-def modes_of(model: AbstractModel, cells: int, tolerance: Any, names: Names, continues: bool = False) -> Start:
+def modes_of(model: AbstractModel, cells: int, tolerance: Number, names: Names, continues: bool = False) -> Start:
     """The modes of a model with its event, and the start in them."""
     if model.event is None:
         return model.modes(cells, tolerance, names, continues)
-    names = None if names is None else (*names, *(name for name in model.event.names if name not in names))
+    names = None if names is None else (*dict.fromkeys((*names, *model.event.names)),)
     modes, first, states = model.modes(cells, tolerance, names, continues)
     clock = jnp.zeros((int(model.event.depends_on_time), states.shape[1]))
     with_events = tuple(EventMode(modes, model, index, continues) for index in range(len(modes)))
@@ -336,15 +335,15 @@ class Ensemble(eqx.Module):
     """
 
     problem: AbstractProblem | None
-    # A tuple, or `None`.
+    # A tuple and two arrays, or `None`.
     modes: Any
-    first: Int[Array, " cells"] | None
-    states: Float[Array, "components cells"] | None
+    first: Any
+    states: Any
     counters: int = eqx.field(static=True)
     continues: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, model: AbstractModel, cells: int, tolerance: Any, continues: bool) -> "Ensemble":
+    def of(cls, model: AbstractModel, cells: int, tolerance: Number, continues: bool) -> "Ensemble":
         """The runs of some cells of a model, whose numbers are scalars or arrays with one number per cell."""
         if model.smooth:
             return cls(problem_of(model, cells, ()), None, None, None, 0, continues)
@@ -357,13 +356,10 @@ class Ensemble(eqx.Module):
         may be traced.
         """
         if self.problem is not None:
-            horizon = (jnp.asarray(t1), jnp.asarray(cells), settings)
-            if traced:
-                return traced_solve_ensemble(self.problem, *horizon, nonterminal=self.continues, one_kernel=True)[0]
-            return solve_ensemble(self.problem, *horizon, nonterminal=self.continues)[0]
-        solve, xp = (traced_solve_hybrid, jnp) if traced else (solve_hybrid, np)
-        start, options = self._start(xp), {"counters": self.counters, "nonterminal": self.continues}
-        return solve(self.modes, *start, t1, cells, settings, **options)
+            arguments = (self.problem, jnp.asarray(t1), jnp.asarray(cells), settings)
+            return solve_ensemble(*arguments, nonterminal=self.continues, one_kernel=True, traced=traced)[0]
+        options = {"counters": self.counters, "nonterminal": self.continues, "traced": traced}
+        return solve_hybrid(self.modes, self.first, self.states, t1, cells, settings, **options)
 
     def solve_with_tangents(
         self,
@@ -389,19 +385,16 @@ class Ensemble(eqx.Module):
                 return outcome, slopes, False
             options = {"nonterminal": self.continues, "one_kernel": one_kernel}
             return *traced_solve_ensemble_with_tangents(self.problem, *arguments, **options), False
-        solve, xp = (traced_solve_hybrid_with_tangents, jnp) if traced else (solve_hybrid_with_tangents, np)
-        outcome = None
+        outcome, xp = None, jnp if traced else np
         if self.continues:
             # The derivatives need the run only up to the event, whose time is known.
             outcome = self.solve(t1, cells, settings, traced)
             t1 = xp.where(xp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
         pairs = tuple((tangent.modes, tangent.states) for tangent in tangents)
-        options = {"counters": self.counters, "ends_on_event": not self.continues}
-        run, sensitivities = solve(self.modes, pairs, *self._start(xp), t1, cells, settings, **options)
+        options = {"counters": self.counters, "ends_on_event": not self.continues, "traced": traced}
+        arguments = (self.modes, pairs, self.first, self.states, t1, cells, settings)
+        run, sensitivities = solve_hybrid_with_tangents(*arguments, **options)
         return run if outcome is None else outcome, sensitivities.slopes, sensitivities.grazing
-
-    def _start(self, xp: Any) -> tuple[Any, Any]:
-        return xp.asarray(self.first), xp.asarray(self.states)
 
     @property
     def starts(self) -> Float[Array, "components cells"]:
@@ -423,7 +416,7 @@ class Ensemble(eqx.Module):
         return (outcome.status == REACHED_END) & (value <= 0.0) & jnp.isfinite(outcome.crossing_time)
 
 
-def status_of(model: AbstractModel, ensemble: Ensemble, outcome: Outcome | HybridOutcome, tolerance: Any) -> Any:
+def status_of(model: AbstractModel, ensemble: Ensemble, outcome: Outcome | HybridOutcome, tolerance: Number) -> Any:
     """How each run has ended, as an integer of `Status`: `EVENT` for the runs whose event counts."""
     status, has_event = model.ended(outcome, tolerance), ensemble.has_event(outcome)
     is_sound = (status == int(Status.EVENT)) | (status == int(Status.COMPLETED))
@@ -435,16 +428,16 @@ def status_of(model: AbstractModel, ensemble: Ensemble, outcome: Outcome | Hybri
 
 @status_line("simulating")
 def event_time(
-    system: Any,
-    start: Any,
+    system: object,
+    start: object,
     t1: Float[ArrayLike, ""],
     event: Callable[..., Any] | None = None,
     tolerance: float = 1e-9,
     solver: diffrax.AbstractERK | None = None,
     *,
     crossing: str = "first",
-    input: Any = None,
-    jumps: Any = None,
+    input: object = None,
+    jumps: object = None,
 ) -> Float[Array, ""]:
     """Time of the event of a run; works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and their compositions.
 
@@ -512,28 +505,23 @@ def event_time(
     model = model_of(system, start, event, input, jumps)
     check_run(model, t1, tolerance)
     require_event(model)
-    settings = Settings(tolerance, solver)
-    explicit_tableau(settings.for_lanes)
+    settings = settings_for_lanes(tolerance, solver)
     time = _compiled(model, as_number(t1), settings, crossing == "last", is_traced((model, t1, tolerance)))
     if not is_traced(time) and np.ndim(time) == 0 and np.isnan(time):
-        _warn_of_failure(model, float(np.asarray(t1)), settings, crossing == "last")
+        # Repeat the run to find how it ended.
+        ensemble = Ensemble.of(model, 1, settings.tolerance, crossing == "last")
+        outcome = ensemble.solve(float(np.asarray(t1)), 1, settings)
+        word = Status(int(np.ravel(status_of(model, ensemble, outcome, settings.tolerance))[0])).word
+        end = np.ravel(outcome.end_time)[0]
+        warn(
+            f"the time of the event is NaN: the run ended as {word!r} at {end:.6g} s; nonholonomic.simulate returns the run "
+            "up to there, and states the reason"
+        )
     return time
 
 
-def _warn_of_failure(model: AbstractModel, t1: float, settings: Settings, last: bool) -> None:
-    """Warn of a run without a result: this repeats the run to find how it ended."""
-    ensemble = Ensemble.of(model, 1, settings.tolerance, last)
-    outcome = ensemble.solve(t1, 1, settings)
-    word = Status(int(np.ravel(status_of(model, ensemble, outcome, settings.tolerance))[0])).word
-    end = np.ravel(outcome.end_time)[0]
-    warn(
-        f"the time of the event is NaN: the run ended as {word!r} at {end:.6g} s; nonholonomic.simulate returns the run up to "
-        "there, and states the reason"
-    )
-
-
 def time_of_event(
-    model: AbstractModel, t1: Any, settings: Settings, last: bool, unchecked: bool | None = None
+    model: AbstractModel, t1: Number, settings: Settings, last: bool, unchecked: bool | None = None
 ) -> Float[Array, ""]:
     """The time of the event of a model.
 
@@ -550,33 +538,30 @@ _compiled = eqx.filter_jit(time_of_event)
 class EventTime(AbstractDifferentiableSolve):
     """Times of the events of cells. The leaves are the numbers of the model, floats first, the horizon and the tolerance.
 
-    - `structure`, `rest`: the model without its numbers; `is_float`: which of them are floats; `settings`: without the
-      tolerance.
+    - `structures`, `rest`: the model without its floats and its other numbers; `settings`: without the tolerance.
     - `last`: whether the last crossing counts; `unchecked`: whether numbers were traced, so that nothing checked them.
     """
 
     movable: int
-    # JAX's PyTreeDef, which type checkers take for a variable.
-    structure: Any = eqx.field(static=True)
-    is_float: tuple[bool, ...] = eqx.field(static=True)
-    rest: Any
+    # JAX's PyTreeDefs, which type checkers take for variables.
+    structures: tuple[Any, Any] = eqx.field(static=True)
+    rest: PyTree
     settings: Settings
     last: bool = eqx.field(static=True)
     unchecked: bool = eqx.field(static=True)
 
     @classmethod
     def of(
-        cls, model: AbstractModel, t1: Any, settings: Settings, last: bool, unchecked: bool | None = None
+        cls, model: AbstractModel, t1: Number, settings: Settings, last: bool, unchecked: bool | None = None
     ) -> tuple[Any, ...]:
         """The solve and its leaves. **Arguments:** as for `time_of_event`."""
         unchecked = is_traced((model, t1, settings.tolerance)) if unchecked is None else unchecked
-        arrays, rest = eqx.partition(model, eqx.is_array)
-        leaves, structure = jax.tree.flatten(arrays)
-        is_float = tuple(eqx.is_inexact_array(leaf) for leaf in leaves)
-        floats = [leaf for leaf in leaves if eqx.is_inexact_array(leaf)]
-        others = [leaf for leaf in leaves if not eqx.is_inexact_array(leaf)]
-        solve = cls(len(floats), structure, is_float, rest, settings.with_tolerance(None), last, unchecked)
-        return (solve, *floats, *others, as_number(t1), settings.tolerance)
+        floats, rest = eqx.partition(model, eqx.is_inexact_array)
+        others, rest = eqx.partition(rest, eqx.is_array)
+        numbers, further = (jax.tree.flatten(part) for part in (floats, others))
+        structures = (numbers[1], further[1])
+        solve = cls(len(numbers[0]), structures, rest, settings.with_tolerance(None), last, unchecked)
+        return (solve, *numbers[0], *further[0], as_number(t1), settings.tolerance)
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.isinf(value)
@@ -594,7 +579,8 @@ class EventTime(AbstractDifferentiableSolve):
         model = self.model(leaves)
         model.require_differentiable(nested, self.last)
 
-        def build(floats: tuple[Array, ...], cells: Any) -> Ensemble:
+        def build(floats: tuple[Array, ...], cells: int | None) -> Ensemble:
+            assert cells is not None
             return Ensemble.of(self.model((*floats, *leaves[self.movable :])), cells, settings.tolerance, self.last)
 
         # Cells are independent, so varying a parameter in all of them at once gives each its own derivative.
@@ -603,13 +589,12 @@ class EventTime(AbstractDifferentiableSolve):
         outcome, slopes, _ = ensemble.solve_with_tangents(tangents, t1, cells, settings, **options)
         return self._times(leaves, is_legal, settings, ensemble, outcome, gather([*slopes]))
 
-    def model(self, leaves: Any) -> AbstractModel:
+    def model(self, leaves: Sequence[Array]) -> AbstractModel:
         """The model of the leaves."""
-        floats, others = iter(leaves[: self.movable]), iter(leaves[self.movable :])
-        arrays = [next(floats if is_float else others) for is_float in self.is_float]
-        return eqx.combine(jax.tree.unflatten(self.structure, arrays), self.rest)
+        parts = zip(self.structures, (leaves[: self.movable], leaves[self.movable : -2]), strict=True)
+        return eqx.combine(*(jax.tree.unflatten(structure, part) for structure, part in parts), self.rest)
 
-    def permitted(self, leaves: Any) -> tuple[Bool[Array, "..."], Float[Array, "..."], Settings]:
+    def permitted(self, leaves: Sequence[Array]) -> tuple[Bool[Array, "..."], Float[Array, "..."], Settings]:
         """A mask of the cells with legal numbers; the horizons, 0 for all other cells; and the settings.
 
         A batch has one tolerance: the smallest.
@@ -622,7 +607,7 @@ class EventTime(AbstractDifferentiableSolve):
 
     def _times(
         self,
-        leaves: Any,
+        leaves: Sequence[Array],
         is_legal: Bool[Array, "..."],
         settings: Settings,
         ensemble: Ensemble,

@@ -14,12 +14,12 @@ from ..derivatives.variation import Growth
 from ..hybrid import AbstractBatchedMode, HybridOutcome, solve_hybrid
 from ..hybrid.ensemble import at_start
 from ..hybrid.saltation import VariationalMode, variational_start
-from ..integration import Outcome, Settings, explicit_tableau
+from ..integration import Outcome, Settings
 from ..integration.problem import REACHED_END, RUNNING, Status
 from ..terminal import status_line
 from ..validation import require_outside
 from .event import modes_of
-from .model import AbstractModel, check_run, model_of
+from .model import AbstractModel, check_run, model_of, settings_for_lanes
 
 #: What to use instead of transformations, in the message.
 INSTEAD = "a Python loop (for tops, tippe.lyapunov_exponent takes lists) in place of vmap"
@@ -85,13 +85,13 @@ class LyapunovExponent(NamedTuple):
 
 @status_line("simulating")
 def lyapunov_exponent(
-    system: Any,
-    start: Any,
+    system: object,
+    start: object,
     t1: float,
     tolerance: float = 1e-9,
     solver: diffrax.AbstractERK | None = None,
-    input: Any = None,
-    jumps: Any = None,
+    input: object = None,
+    jumps: object = None,
 ) -> LyapunovExponent:
     """The largest Lyapunov exponent of a run, by the variational equation, through resets by the saltation matrix.
 
@@ -129,9 +129,7 @@ def lyapunov_exponent(
     require_outside((system, start, t1, tolerance), "lyapunov_exponent", INSTEAD)
     model = model_of(system, start, None, input, jumps).without_event()
     check_run(model, t1, tolerance)
-    settings = Settings(tolerance, solver)
-    explicit_tableau(settings.for_lanes)
-    return exponent_of_model(model, float(t1), settings, ())
+    return exponent_of_model(model, float(t1), settings_for_lanes(tolerance, solver), ())
 
 
 def exponent_of_model(model: AbstractModel, t1: float, settings: Settings, shape: tuple[int, ...]) -> LyapunovExponent:
@@ -185,7 +183,7 @@ def _through_modes(
     state, mode, size = np.asarray(variational_start(states, (tangent,))), np.asarray(first), len(states)
     state = np.asarray(_rescaled(modes, jnp.asarray(mode), jnp.asarray(state), size)[1])
     stretch, count = t1 / STRETCHES, len(model.counters)
-    logarithms, ending = [], at_start(np, mode, state[:size], cells, count)
+    logarithms, ending = [], at_start(mode, state[:size], cells, count)
     for _ in range(STRETCHES):
         outcome = solve_hybrid(variational, mode, state, stretch, cells, settings, counters=count + 1, n_blocks=2)
         rescaled = _rescaled(modes, jnp.asarray(outcome.mode), jnp.asarray(outcome.state), size)

@@ -3,22 +3,32 @@
 import abc
 import dataclasses
 import functools
-from collections.abc import Iterable
-from typing import Any, ClassVar, Self
+from collections.abc import Iterable, Sequence
+from typing import Any, ClassVar, Self, TypeAlias
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from ..hybrid import AbstractBatchedMode, HybridOutcome
-from ..integration import AbstractProblem, Outcome
-from ..integration.problem import CROSSED, FAILED, LEFT_DOMAIN, UNRESOLVED, Status, run_bounds
+from ..integration import AbstractProblem, Outcome, Settings, explicit_tableau
+from ..integration.problem import CROSSED, DEFAULT_MAX_STEPS, FAILED, LEFT_DOMAIN, UNRESOLVED, Status, run_bounds
 from ..parameters import full_name, numbers, with_numbers
 from ..sweeps import Axis, Quantity, Variable
 from ..text import shown
 from ..validation import require_all
+
+#: A single number, or one for each cell.
+Number: TypeAlias = Array | np.ndarray | float
+
+#: Unit of the drawn numbers, such as "deg", or several.
+Unit: TypeAlias = str | Sequence[str] | None
+
+#: The ranges of sliders: name of a parameter -> (lowest, highest) value.
+Sliders: TypeAlias = dict[str, tuple[float, float]]
 
 #: The names of the quantities that will be read, which choose the layout of the state; `None` for all quantities, with
 #: the path of the run.
@@ -47,9 +57,6 @@ class AbstractModel(eqx.Module):
     #: The names that choose a layout in which states of nearby runs can be compared.
     comparable: ClassVar[Names] = ()
 
-    #: Smallest number of cells in a chunk of a large table; `None` for the default.
-    least_chunk: ClassVar[int | None] = None
-
     # The parameters by name.
 
     @abc.abstractmethod
@@ -63,7 +70,7 @@ class AbstractModel(eqx.Module):
         """The full names of the parameters; those of the start begin with "start" or "launch"."""
 
     @abc.abstractmethod
-    def value(self, name: str) -> Any:
+    def value(self, name: str) -> Array:
         """The value of a parameter by its full name."""
 
     @abc.abstractmethod
@@ -77,11 +84,6 @@ class AbstractModel(eqx.Module):
     @abc.abstractmethod
     def description(self) -> dict[str, Any]:
         """The model as plain data, for the request of a table."""
-
-    @property
-    @abc.abstractmethod
-    def users(self) -> Any:
-        """The parts of the model that may have a user's code, for `equations.has_users_code`."""
 
     # Whether a run may begin.
 
@@ -136,14 +138,10 @@ class AbstractModel(eqx.Module):
         """The slopes that guide a fit: "exact", or "differences" if derivatives do not show the trend of times."""
         return "exact"
 
-    def for_lanes(self) -> "AbstractModel":
-        """The model in a form that is fastest where runs in transformations share lanes."""
-        return self
-
-    @property
-    def arrays_in_lanes(self) -> bool:
-        """Whether arrays among the leaves have the lanes in their last axis."""
-        return False
+    def for_lanes(self) -> tuple["AbstractModel", bool]:
+        """The model in a form that is fastest where runs in transformations share lanes, and whether arrays among its leaves
+        have the lanes in their last axis."""
+        return self, False
 
     @property
     def counters(self) -> dict[str, str]:
@@ -154,13 +152,13 @@ class AbstractModel(eqx.Module):
     def problem(self, cells: int | None, names: Names) -> AbstractProblem:
         """The motion of a smooth model, with the event of the model itself unless it has another."""
 
-    def modes(self, cells: int, tolerance: Any, names: Names, continues: bool) -> Start:
+    def modes(self, cells: int, tolerance: Number, names: Names, continues: bool) -> Start:
         """The modes of a model that is not smooth, and the start in them; `continues`: whether a run continues through
         its event."""
         raise NotImplementedError(f"{type(self).__name__} is smooth and has no modes")
 
     @abc.abstractmethod
-    def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Any:
+    def simulate(self, t1: ArrayLike, times: Any, tolerance: ArrayLike, solver: Any, adjoint: Any) -> Any:
         """The run as a trajectory. **Arguments:** as for `nonholonomic.simulate`."""
 
     @abc.abstractmethod
@@ -191,7 +189,7 @@ class AbstractModel(eqx.Module):
 
     @abc.abstractmethod
     def read(
-        self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: Any
+        self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: Int[ArrayLike, "..."] | None
     ) -> dict[str, Array]:
         """The named quantities of states, (*cells, ...).
 
@@ -205,7 +203,7 @@ class AbstractModel(eqx.Module):
         """The words for how a run ends, in the order of the integers in files."""
 
     @abc.abstractmethod
-    def ended(self, outcome: Outcome | HybridOutcome, tolerance: Any) -> Int[Array, " cells"]:
+    def ended(self, outcome: Outcome | HybridOutcome, tolerance: Number) -> Int[Array, " cells"]:
         """How each run has ended, as an integer of `Status`."""
 
     @property
@@ -233,12 +231,8 @@ class AbstractSceneModel(AbstractModel):
 
     @property
     @abc.abstractmethod
-    def roots(self) -> dict[str, Any]:
+    def roots(self) -> dict[str, PyTree]:
         """The trees whose numbers are parameters, which are fields of the model."""
-
-    @property
-    def users(self) -> Any:
-        return self.roots, None if self.event is None else self.event.function
 
     @property
     def known_of_event(self) -> list[str]:
@@ -248,7 +242,7 @@ class AbstractSceneModel(AbstractModel):
     def full_name(self, argument: str, name: str) -> str:
         return full_name(argument, name, [*self.known, *self.known_of_event])
 
-    def value(self, name: str) -> Any:
+    def value(self, name: str) -> Array:
         if name.startswith("event.") and self.event is not None:
             return self.event.parameters.value(name)
         root = name.partition(".")[0]
@@ -262,7 +256,9 @@ class AbstractSceneModel(AbstractModel):
 
 
 @functools.singledispatch
-def model_of(system: Any, start: Any, event: Any = None, input: Any = None, jumps: Any = None) -> AbstractModel:
+def model_of(
+    system: object, start: object, event: Any = None, input: object = None, jumps: object = None
+) -> AbstractModel:
     """The model of a system, for the functions of this room.
 
     Each kind of system registers its own function.
@@ -287,18 +283,27 @@ def model_of(system: Any, start: Any, event: Any = None, input: Any = None, jump
     )
 
 
-def check_run(model: AbstractModel, t1: Any, tolerance: Any) -> None:
+def check_run(model: AbstractModel, t1: ArrayLike, tolerance: ArrayLike) -> None:
     """Raise `ValueError` unless the model may run, and horizon and tolerance are single legal numbers."""
     model.check()
     check_horizon(t1, tolerance)
 
 
-def check_horizon(t1: Any, tolerance: Any) -> None:
+def check_horizon(t1: ArrayLike, tolerance: ArrayLike) -> None:
     """Raise `ValueError` unless horizon and tolerance are single legal numbers."""
     require_all(run_bounds(t1, tolerance))
     for name, number in {"t1": t1, "tolerance": tolerance}.items():
         if np.ndim(number) != 0:
             raise ValueError(f"{name} must be one number, not of shape {np.shape(number)}; jax.vmap or sweep runs many")
+
+
+def settings_for_lanes(
+    tolerance: Float[ArrayLike, ""], solver: diffrax.AbstractSolver | None, max_steps: int = DEFAULT_MAX_STEPS
+) -> Settings:
+    """The settings of runs in lanes; raises `ValueError` unless the solver is an explicit Runge-Kutta method."""
+    settings = Settings(tolerance, solver, max_steps=max_steps)
+    explicit_tableau(settings.for_lanes)
+    return settings
 
 
 def require_event(model: AbstractModel, purpose: str = "") -> None:

@@ -14,13 +14,13 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from ..compilation.xla_cpu import compiled_alone
 from ..derivatives import sampled_run, sampled_run_by_diffrax
 from ..hybrid import HybridOutcome, HybridSamples, hybrid_samples, solve_hybrid_with_samples
-from ..integration import AbstractProblem, Outcome, Settings, explicit_tableau, solve_with_samples
+from ..integration import AbstractProblem, Outcome, Settings, solve_with_samples
 from ..integration.problem import Status, legal_run, require_times
 from ..sweeps import Axis, Variable, axis
 from ..terminal import status_line
-from ..validation import as_known, as_number, is_traced, nan_unless, require_scalars, warn
+from ..validation import as_known, as_number, is_traced, nan_unless, warn
 from .event import modes_of, problem_of
-from .model import AbstractModel, Names, Start, check_run, model_of
+from .model import AbstractModel, Names, Number, Start, check_run, model_of, settings_for_lanes
 from .trajectory import Trajectory
 
 # Quantities of many runs at given times, in lanes.
@@ -158,15 +158,15 @@ SHORT, MEAN = 1e-6, 0.05
 
 @status_line("simulating")
 def simulate(
-    system: Any,
-    start: Any,
+    system: object,
+    start: object,
     t1: Float[ArrayLike, ""],
     times: Float[ArrayLike, " times"] | None = None,
     tolerance: Float[ArrayLike, ""] = 1e-9,
     solver: diffrax.AbstractSolver | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
-    input: Any = None,
-    jumps: Any = None,
+    input: object = None,
+    jumps: object = None,
 ) -> Any:
     """Simulate one run of a system to `t1`; works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and their compositions.
 
@@ -209,20 +209,18 @@ def simulate(
 
     ```
     """
-    require_scalars({"t1": t1, "tolerance": tolerance}, "jax.vmap or sweep runs many")
     model = model_of(system, start, None, input, jumps)
+    check_run(model, t1, tolerance)
     return model.simulate(t1, times, tolerance, solver, adjoint)
 
 
 def simulate_model(
-    model: AbstractModel, t1: Any, times: Any, tolerance: Any, solver: diffrax.AbstractSolver | None = None
+    model: AbstractModel, t1: ArrayLike, times: Any, tolerance: ArrayLike, solver: diffrax.AbstractSolver | None = None
 ) -> Trajectory:
-    """The run of a model at given times, or at equally spaced ones. **Arguments:** as for `simulate`."""
-    check_run(model, t1, tolerance)
+    """The run of a model at given times, or at equally spaced ones. **Arguments:** as for `simulate`, checked but `times`."""
     times = evenly_spaced(as_known(t1)) if times is None else times
     require_times(times, t1)
-    settings = Settings(tolerance, solver)
-    explicit_tableau(settings.for_lanes)
+    settings = settings_for_lanes(tolerance, solver)
     unchecked = is_traced((model, times, t1, tolerance))
     run, extremes = _sampled(model, as_number(times), as_number(t1), settings, unchecked)
     if not is_traced(extremes):
@@ -237,7 +235,7 @@ def simulate_model(
     return run
 
 
-def evenly_spaced(t1: Any) -> Float[Array, " times"]:
+def evenly_spaced(t1: Number) -> Float[Array, " times"]:
     """The default times of output; known inside a transformation if `t1` is known."""
     return jnp.linspace(0.0, t1, DEFAULT_TIMES) if is_traced(t1) else as_known(np.linspace(0.0, t1, DEFAULT_TIMES))
 
@@ -279,9 +277,8 @@ def sampled(
         of_one_cell = jax.tree.map(lambda part: part[None], samples)
         return SampledRows(samples.shown, None, mode_at(samples.number), outcome_of(of_one_cell))
     if adjoint is None:
-        prepared = model.for_lanes()
-        lanes = {"arrays_in_lanes": prepared.arrays_in_lanes}
-        run = sampled_run(problem_of_run, (prepared, names), times, t1, settings, grid, **lanes)
+        prepared, in_lanes = model.for_lanes()
+        run = sampled_run(problem_of_run, (prepared, names), times, t1, settings, grid, arrays_in_lanes=in_lanes)
     else:
         run = sampled_run_by_diffrax(problem_of_run((model, names), None), times, t1, settings, adjoint, grid)
     status, accepted, rejected = (

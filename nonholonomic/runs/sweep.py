@@ -5,6 +5,7 @@ import hashlib
 import re
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import diffrax
@@ -17,7 +18,7 @@ from jaxtyping import Array
 
 from .. import sweeps
 from ..compilation.xla_cpu import opened, programs_in
-from ..integration import Settings, explicit_tableau
+from ..integration import Settings
 from ..integration.problem import DEFAULT_MAX_STEPS, Status, require_times
 from ..sweeps import Axis, Quantity, Table, Variable, axis, cells_to_check, chunk_for, scattered_cells, size_of
 from ..sweeps.grid import EQUATIONS, columns
@@ -25,7 +26,7 @@ from ..sweeps.table import cells_with
 from ..text import likely, shown
 from ..validation import as_number, require_flag, require_outside, require_whole, warn
 from .event import Ensemble
-from .model import AbstractModel, AbstractSceneModel, check_horizon, model_of, require_event
+from .model import AbstractModel, AbstractSceneModel, Number, check_horizon, model_of, require_event, settings_for_lanes
 from .simulate import Samples
 from .table import ScatteredJob, TableForm, TableJob
 
@@ -83,6 +84,9 @@ def checksum_of(model: AbstractModel) -> str:
 #: Greatest number of values in the samples of a chunk: 256 MB.
 MOST_SAMPLED = 1 << 25
 
+#: Smallest number of cells in a chunk of a large table of an own system.
+LEAST_CHUNK = 1024
+
 #: A table warns of cells with more steps than this, and more than this multiple of the median.
 SLOW_STEPS, SLOW = 10_000, 30
 
@@ -96,7 +100,7 @@ class Options(NamedTuple):
     scattered: bool = False
     errors: bool = False
     sensitivities: Sequence[str] = ()
-    path: Any = None
+    path: str | Path | None = None
     progress: bool = True
     executor: Executor | None = None
 
@@ -104,14 +108,12 @@ class Options(NamedTuple):
     def settings(self) -> Settings:
         """The settings of the integration, checked."""
         require_whole(self.max_steps, "max_steps", 1)
-        settings = Settings(self.tolerance, self.solver, max_steps=int(self.max_steps))
-        explicit_tableau(settings.for_lanes)
-        return settings
+        return settings_for_lanes(self.tolerance, self.solver, int(self.max_steps))
 
 
 def sweep(
-    system: Any,
-    start: Any,
+    system: object,
+    start: object,
     t1: float,
     *,
     axes: dict[str, Any],
@@ -125,11 +127,11 @@ def sweep(
     max_steps: int = DEFAULT_MAX_STEPS,
     tolerance: float = 1e-9,
     solver: diffrax.AbstractERK | None = None,
-    path: Any = None,
+    path: str | Path | None = None,
     progress: bool = True,
     executor: Executor | None = None,
-    input: Any = None,
-    jumps: Any = None,
+    input: object = None,
+    jumps: object = None,
 ) -> Table:
     """Event times, ends and samples of all runs over a grid of parameters, in one batched call on all cores.
 
@@ -208,7 +210,7 @@ def sweep(
     return table_of(model, named, float(t1), crossing, options, TableForm(model.words), samples=samples, timed=timed)
 
 
-def samples_of(known: dict[str, Quantity], times: Any, quantities: Any, t1: Any) -> Samples | None:
+def samples_of(known: dict[str, Quantity], times: Any, quantities: Any, t1: Number | None) -> Samples | None:
     """The samples of a table, checked. **Arguments:** `known`: the quantities of the model."""
     if times is None and not len(quantities):
         return None
@@ -288,7 +290,7 @@ def compute_table(
     request |= {"max_steps": int(options.max_steps)} if options.max_steps != DEFAULT_MAX_STEPS else {}
     request |= {"errors": True} if options.errors else {}
     request |= {"sensitivities": list(slopes)} if slopes else {}
-    if options.path is not None and has_users_code(job.model.users):
+    if options.path is not None and has_users_code(job.model.__reduce__()[1]):
         request |= {EQUATIONS: checksum_of(job.model)}
     work: Any = job
     listed: dict[str, Any] | None = None
@@ -298,8 +300,8 @@ def compute_table(
         variables = {axis.name: Variable(axis.unit, np.float64, long_name=axis.long_name) for axis in grid} | variables
         work = ScatteredJob(job, listed, {axis.number: axis.name for axis in grid})
         grid = [Axis("cell", "cell", "1", np.arange(len(grid[0].values)), "cell")]
-    cells, least = size_of(grid), job.model.least_chunk
-    chunk = max(least, chunk_for(cells)) if least is not None and cells > 4 * least else None
+    cells, is_scene = size_of(grid), isinstance(job.model, AbstractSceneModel)
+    chunk = None if is_scene or cells <= 4 * LEAST_CHUNK else max(LEAST_CHUNK, chunk_for(cells))
     inner, most = [], None
     if job.samples is not None:
         request |= {"quantities": list(job.samples.names)}
@@ -314,7 +316,7 @@ def compute_table(
         values = {name: float(values[first]) for name, values in of_all.items()}
         _warn_of_illegal_cells(job.model, values, len(illegal), cells)
     # The coordinates of scenes are regular.
-    if "steps" in table and not isinstance(job.model, AbstractSceneModel):
+    if "steps" in table and not is_scene:
         steps = np.ravel(table["steps"])
         slow = steps > max(SLOW_STEPS, SLOW * float(np.median(steps)))
         if np.any(slow):

@@ -15,7 +15,7 @@ from ..integration.problem import TIGHTEST, TIGHTEST_IN_SINGLE, Status
 from ..sweeps import Variable
 from ..validation import as_number
 from .event import SILENT, Ensemble, status_of
-from .model import AbstractModel
+from .model import AbstractModel, Number
 from .simulate import Samples, solve_samples
 
 #: Descriptions of the counters of every run.
@@ -100,7 +100,14 @@ class TableJob(NamedTuple):
         if self.slopes and not self.model.smooth:
             variables |= {"grazes": Variable("1", np.int8, long_name="whether an event on the way was grazing")}
         if self.errors:
-            variables |= self._error_variables(variables)
+            for name in self.bounded:
+                long_name = f"error of the {variables[name].long_name}"
+                variables[f"{name}_error"] = Variable(variables[name].unit, np.float64, long_name=long_name)
+            long_name = "whether the two runs disagree on the status"
+            variables["status_error"] = Variable("1", np.int8, long_name=long_name)
+            for name, words in self.model.counters.items():
+                long_name = f"difference of the two runs in {words}"
+                variables[f"{name}_error"] = Variable("1", np.int64, long_name=long_name)
         if self.samples is not None:
             variables |= self.samples.variables(self.model)
         return variables if self.form.order is None else {name: variables[name] for name in self.form.order}
@@ -120,19 +127,6 @@ class TableJob(NamedTuple):
         ends = self.model.ends if self.samples is None else ()
         return (*self.times, *self.model.further_times, "end_time", *ends)
 
-    def _error_variables(self, variables: dict[str, Variable]) -> dict[str, Variable]:
-        """The variables that describe the accuracy of others."""
-        errors = {
-            name: Variable(variables[name].unit, np.float64, long_name=f"error of the {variables[name].long_name}")
-            for name in self.bounded
-        }
-        errors |= {"status": Variable("1", np.int8, long_name="whether the two runs disagree on the status")}
-        errors |= {
-            name: Variable("1", np.int64, long_name=f"difference of the two runs in {words}")
-            for name, words in self.model.counters.items()
-        }
-        return {f"{name}_error": variable for name, variable in errors.items()}
-
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
         """The variables of some cells, of which only the first `count` are run."""
         if self.by_diffrax and count == 0:
@@ -147,15 +141,15 @@ class TableJob(NamedTuple):
         order = np.argsort(~legal | (np.arange(len(legal)) >= count), kind="stable")
         ordered = {name: values[order] for name, values in columns.items()}
         variables = self._of_legal(ordered, int(legal[:count].sum()))
-        back = np.argsort(order)
-        return {name: self._unless_illegal(name, legal, np.asarray(values)[back]) for name, values in variables.items()}
-
-    def _unless_illegal(self, name: str, legal: Bool[np.ndarray, " cells"], values: np.ndarray) -> np.ndarray:
-        """A variable of which the illegal cells are NaN, or 0 for integers, with the status "illegal"."""
-        nothing: Any = np.nan if np.issubdtype(values.dtype, np.floating) else 0
-        if name == "status":
-            nothing = self.form.codes[Status.ILLEGAL]
-        return np.where(legal.reshape(-1, *(1,) * (values.ndim - 1)), values, nothing).astype(values.dtype)
+        results = {}
+        for name, values in variables.items():
+            # Illegal cells are NaN, or 0 for integers, with the status "illegal".
+            values = np.asarray(values)[np.argsort(order)]
+            nothing = np.nan if np.issubdtype(values.dtype, np.floating) else 0
+            nothing = self.form.codes[Status.ILLEGAL] if name == "status" else nothing
+            is_legal = legal.reshape(-1, *(1,) * (values.ndim - 1))
+            results[name] = np.where(is_legal, values, nothing).astype(values.dtype)
+        return results
 
     def _of_legal(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
         """The variables of some cells, of which only the first `count` are run, which are legal."""
@@ -167,10 +161,10 @@ class TableJob(NamedTuple):
             sampled["status"] = self.form.codes[np.asarray(status)]
         if not self.timed:
             return sampled
-        variables = self._results(cells, columns, size, count, self.settings, self.slopes)
+        variables = self._results(cells, columns, size, count, self.slopes)
         if self.errors:
             settings = self.settings.with_tolerance(as_number(second_tolerance(float(self.settings.tolerance))))
-            second = self._results(cells, columns, size, count, settings, None)
+            second = self._replace(settings=settings)._results(cells, columns, size, count, None)
             silent = tuple(self.form.codes[list(SILENT)])
             variables |= errors_of(variables, second, self.bounded, tuple(self.model.counters), silent)
         names = () if self.samples is None else self.samples.names
@@ -182,12 +176,10 @@ class TableJob(NamedTuple):
         columns: dict[str, Any],
         size: int,
         count: int,
-        settings: Settings,
         slopes: dict[str, str] | None,
     ) -> dict[str, Any]:
         """The variables of one run of every cell."""
-
-        derivatives, grazing = {}, False
+        derivatives, grazing, settings = {}, False, self.settings
         if slopes:
             names = tuple(slopes)
             ensemble, tangents, scales = _with_tangents(
@@ -239,7 +231,7 @@ class TableJob(NamedTuple):
 
 
 def first_events(
-    cells: AbstractModel, t1: Any, size: int, count: int, settings: Settings
+    cells: AbstractModel, t1: Number, size: int, count: int, settings: Settings
 ) -> tuple[Int[np.ndarray, " cells"], Float[np.ndarray, " cells"], dict[str, Array]]:
     """The `Status` of runs that end on their event, the times of the events, infinite in cells that end otherwise, and the
     variables that describe the ends."""

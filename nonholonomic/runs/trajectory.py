@@ -1,9 +1,11 @@
 """One run of any model: its quantities, its plots and its page."""
 
+import abc
 import dataclasses
 import functools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -22,7 +24,7 @@ from ..validation import IN_DEGREES, is_traced, require_all, require_file, requi
 from ..views import COLOURS, PALE, Arena, Body, Curve, Mesh, Page, Show, Stage, Trace, Viewable, new_figure
 from ..views.explore import Answer, Frame, HybridSimulator, LiveRun, Simulator, Slider, Summary, live_page
 from ..views.stage import curves_in
-from .model import AbstractModel, model_of
+from .model import AbstractModel, Sliders, Unit, model_of
 
 # A page with sliders that simulates any model in the browser.
 
@@ -38,14 +40,14 @@ OF_MESHES = ("scene.surface.", "scene.body.radius", "scene.body.equatorial", "sc
 
 @status_line("writing a page")
 def explore(
-    system: Any,
-    start: Any,
-    path: Any = None,
-    sliders: dict[str, tuple[float, float]] | None = None,
+    system: object,
+    start: object,
+    path: str | Path | None = None,
+    sliders: Sliders | None = None,
     t1: float = 8.0,
-    input: Any = None,
-    unit: Any = None,
-    jumps: Any = None,
+    input: object = None,
+    unit: Unit = None,
+    jumps: object = None,
 ) -> Page:
     """Make a page with sliders that simulates a run in the browser while you move a slider.
 
@@ -94,7 +96,7 @@ def explore(
     return explore_model(model_of(system, start, None, input, jumps), path, sliders, float(t1), unit)
 
 
-def explore_model(model: AbstractModel, path: Any, sliders: Any, t1: float, unit: Any) -> Page:
+def explore_model(model: AbstractModel, path: Any, sliders: Sliders | None, t1: float, unit: Unit) -> Page:
     """The page of a model. **Arguments:** as for `explore`."""
     if path is not None:
         require_file(path, "path", ".html", ".htm")
@@ -110,7 +112,7 @@ def explore_model(model: AbstractModel, path: Any, sliders: Any, t1: float, unit
 
 
 @functools.singledispatch
-def page_of(model: AbstractModel, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
+def page_of(model: AbstractModel, sliders: Sliders | None, t1: float) -> tuple[LiveRun, Stage]:
     """The contents of the page of a model, and the stage on which the page draws the run.
 
     Each kind of model registers its own function.
@@ -123,7 +125,8 @@ def page_of(model: AbstractModel, sliders: Any, t1: float) -> tuple[LiveRun, Sta
 
     >>> import jax.numpy as jnp
     >>> import nonholonomic
-    >>> from nonholonomic.runs import model_of, page_of
+    >>> from nonholonomic.runs import model_of
+    >>> from nonholonomic.runs.trajectory import page_of
     >>> class Decay(nonholonomic.AbstractMode):
     ...     rate: float = 2.0
     ...
@@ -215,37 +218,28 @@ def live_run(
     def at(model: Any, values: Float[Array, " numbers"]) -> Any:
         return model.replaced({slider.path: value for slider, value in zip(sliders, values, strict=True)})
 
+    def answers(values: Array, problem: Any, ended: Any) -> tuple[Array, Array]:
+        return outcome(at(model, values), problem, ended)
+
+    def drawing(values: Array, mode: Any, rows: Array, time: Any) -> Frame:
+        return frame(at(drawn, values), time, rows, mode)
+
     if model.smooth:
-        problem = motion or (lambda drawn: drawn.problem(1, None))
+        shown_motion = motion or (lambda drawn: drawn.problem(1, None))
+        ends_late = model.continues and model.has_event
         answering: Any = Simulator(
-            lambda values: at(model, values).problem(1, ()),
-            t1,
-            settings,
-            {"outcome": lambda values, problem, lane: outcome(at(model, values), problem, lane)},
-            model.continues and model.has_event,
+            lambda values: at(model, values).problem(1, ()), t1, settings, {"outcome": answers}, ends_late
         )
-        moving: Any = Simulator(
-            lambda values: problem(at(drawn, values)),
-            t1,
-            settings,
-            {"frame": lambda values, problem, lane: frame(at(drawn, values), lane.time, lane.state, None)},
-        )
+        frames = {"frame": lambda values, problem, lane: drawing(values, None, lane.state, lane.time)}
+        moving: Any = Simulator(lambda values: shown_motion(at(drawn, values)), t1, settings, frames)
     else:
-        counters = len(model.counters)
+        options = (t1, settings, len(model.counters))
+        outcomes = {"outcome": lambda values, runs: answers(values, None, runs)}
         answering = HybridSimulator(
-            lambda values: at(model, values).modes(1, settings.tolerance, (), False),
-            t1,
-            settings,
-            counters,
-            {"outcome": lambda values, runs: outcome(at(model, values), None, runs)},
+            lambda values: at(model, values).modes(1, settings.tolerance, (), False), *options, outcomes
         )
         moving = HybridSimulator(
-            lambda values: at(drawn, values).modes(1, settings.tolerance, None, False),
-            t1,
-            settings,
-            counters,
-            {},
-            lambda values, mode, rows, time: frame(at(drawn, values), time, rows, mode),
+            lambda values: at(drawn, values).modes(1, settings.tolerance, None, False), *options, {}, drawing
         )
     result = Answer(*answer, answering, words or {})
     return LiveRun(title, sliders, lambda values: jnp.all(at(model, values).legal()), result, moving, summaries)
@@ -260,7 +254,9 @@ HALF, RADIUS, WIDTH = 1.0, 0.03, 0.012
 LINES = 9
 
 
-def portraits(runs: list[Any], overlaid: bool, drawn: tuple[np.ndarray, np.ndarray] | None = None) -> list[Stage]:
+def portraits(
+    runs: list["Trajectory"], overlaid: bool, drawn: tuple[np.ndarray, np.ndarray] | None = None
+) -> list[Stage]:
     """Runs as stages: one stage for each, or a common one for overlaid runs.
 
     **Arguments:** `drawn`: middle and scales of the drawn part of the plane, by default that of the runs.
@@ -278,7 +274,7 @@ def portraits(runs: list[Any], overlaid: bool, drawn: tuple[np.ndarray, np.ndarr
     return stages
 
 
-def plane_points(run: Any) -> Float[np.ndarray, "times 2"]:
+def plane_points(run: "Trajectory") -> Float[np.ndarray, "times 2"]:
     """The drawn components of a run."""
     return np.stack([np.asarray(run[name], float) for name in run.portrait_axes], axis=-1)
 
@@ -291,7 +287,7 @@ def frame_of(points: Float[np.ndarray, "points 2"]) -> tuple[np.ndarray, np.ndar
     return 0.5 * (low + high), 1.8 * HALF / span
 
 
-def show(run: Any, number: int, centre: np.ndarray, scale: np.ndarray) -> Show:
+def show(run: "Trajectory", number: int, centre: np.ndarray, scale: np.ndarray) -> Show:
     """The drawing of one run, the `number`-th of all."""
     colour = COLOURS[number % len(COLOURS)]
     is_reached = np.all(np.isfinite(np.asarray(run.state)), axis=-1)
@@ -335,7 +331,58 @@ REASONS = {
 }
 
 
-class Trajectory(Viewable, Tabular, eqx.Module):
+class AbstractRun(Viewable, Tabular, eqx.Module):
+    """A run of any model at its times `t`, the first axis of its arrays; a batch has an axis before it."""
+
+    @property
+    @abc.abstractmethod
+    def of_page(self) -> tuple[AbstractModel, float]:
+        """The model of the run, and the end of the runs on its page [s]."""
+
+    @property
+    def codes(self) -> Int[Array, "..."] | str | None:
+        """How the runs of a batch ended, as integers of `Status`; `None` if this is unknown."""
+        return None
+
+    @abc.abstractmethod
+    def in_words(self) -> str:
+        """The text of a single run."""
+
+    def explore(self, path: str | Path | None = None, sliders: Sliders | None = None, unit: Unit = None) -> Page:
+        """A page with sliders that simulates the run in the browser, until its end; see `nonholonomic.explore`.
+
+        **Raises:** as for `nonholonomic.explore`, and `ValueError` for a batch of runs.
+        """
+        require_one_run(self, "explore", "")
+        model, t1 = self.of_page
+        return explore_model(model, path, sliders, t1, unit)
+
+    @status_line("reading off")
+    def to_table(self) -> Table:
+        return self.table_of(())
+
+    def stages(self, others: Sequence[Any] = (), overlaid: bool = False, unit: Unit = None) -> list[Stage]:
+        return stages_of(self, [self, *others], overlaid, unit)
+
+    @status_line("reading off")
+    def __str__(self) -> str:
+        # A batch, or a run inside a transformation, has no single values to show.
+        if is_traced((self.t, self.codes)) or np.ndim(self.t) != 1:
+            codes = [] if self.codes is None or is_traced(self.codes) else np.ravel(self.codes)
+            return batch_title(np.shape(self.t), [Status(int(code)).word for code in codes])
+        return self.in_words()
+
+
+@functools.singledispatch
+def stages_of(run: AbstractRun, runs: list[Any], overlaid: bool, unit: Unit) -> list[Stage]:
+    """The stages on which runs of one kind are drawn: one for each, or a common one for overlaid runs.
+
+    Each kind of run registers its own function. **Arguments:** `run`: the first of the `runs`; `unit`: as for `plot`.
+    """
+    raise NotImplementedError(f"{type(run).__name__} has no picture")
+
+
+class Trajectory(AbstractRun):
     """A run of your own system at given times. The times are the first axis of the arrays; `jax.vmap` adds an axis
     before it.
 
@@ -398,6 +445,14 @@ class Trajectory(Viewable, Tabular, eqx.Module):
     @property
     def portrait_axes(self) -> tuple[str, str]:
         return self.names[0], self.names[-1]
+
+    @property
+    def of_page(self) -> tuple[AbstractModel, float]:
+        return self.model, float(self.t1)
+
+    @property
+    def codes(self) -> Int[Array, "..."]:
+        return self.code
 
     @functools.cached_property
     def resets(self) -> Table:
@@ -495,20 +550,11 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         times = times_within(times, self.end_time, "run")
         return self.model.simulate(self.t1, times, self.settings.tolerance, self.settings.solver, None)
 
-    def stages(self, others: Sequence[Any] = (), overlaid: bool = False, unit: Any = None) -> list[Stage]:
-        return portraits([run._with_resets() for run in (self, *others)], overlaid)
-
     def table_of(self, names: Sequence[str]) -> Table:
         """The table that pictures draw, with the states before and after each reset."""
         return self._with_resets().to_table()
 
-    def explore(
-        self, path: Any = None, sliders: dict[str, tuple[float, float]] | None = None, unit: Any = None
-    ) -> Page:
-        """A page with sliders that simulates the run in the browser; see `nonholonomic.explore`."""
-        return explore_model(self.model, path, sliders, float(self.t1), unit)
-
-    def labels_of(self, runs: list[Any], unit: Any) -> list[str]:
+    def labels_of(self, runs: list[Any], unit: Unit) -> list[str]:
         """Labels that tell runs apart by the numbers of their systems and starts that differ."""
         models = [run.model for run in runs]
         names = models[0].known
@@ -519,7 +565,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         numbers = list(zip(*texts, strict=True))
         return distinguishing_labels(numbers) if len(set(numbers)) > 1 else Tabular.labels_of(self, runs, unit)
 
-    def overview(self, runs: list[Any], labels: Sequence[str], unit: Any, ax: Any) -> Any:
+    def overview(self, runs: list[Any], labels: Sequence[str], unit: Unit, ax: Any) -> Any:
         """Draw all components of a run in one picture, or a panel for each component of several runs."""
         if len(runs) > 1 or unit is not None:
             return Tabular.overview(self, [run._with_resets() for run in runs], labels, unit, ax)
@@ -532,10 +578,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         axes.legend()
         return figure if ax is None else ax
 
-    def __str__(self) -> str:
-        if is_traced(self.code) or np.ndim(self.t) != 1:
-            codes = [] if is_traced(self.code) else np.ravel(self.code)
-            return batch_title(jnp.shape(self.state)[:-1], [Status(int(code)).word for code in codes])
+    def in_words(self) -> str:
         table = str(self.to_table()).splitlines()[1 : 1 + len(self.names)]
         lines = [f"Trajectory of {np.size(self.t)} times, {self.status} at {float(self.end_time):.6g} s", *table]
         lines.append(f"  resets: {int(self.switches)}")
@@ -558,3 +601,8 @@ def brief_names(values: dict[str, list[str]]) -> dict[str, str]:
     names = [name for name in values if name in shared or not (groups[name] or of_all_modes(name) in shared)]
     ends = [name.rsplit(".", 1)[-1] for name in names]
     return {name: end if ends.count(end) == 1 else name for name, end in zip(names, ends, strict=True)}
+
+
+@stages_of.register(Trajectory)
+def _(run: Trajectory, runs: list[Trajectory], overlaid: bool, unit: Unit) -> list[Stage]:
+    return portraits([run._with_resets() for run in runs], overlaid)

@@ -17,8 +17,8 @@ interruption. Any executor can compute the chunks, such as that of `local_proces
  [0.346574 1.151293]]
 """
 
-from ._chunks import AnotherRun as AnotherRun
-from ._chunks import saved_cells as saved_cells
+from ._store import AnotherRun as AnotherRun
+from ._store import saved_cells as saved_cells
 from .grid import Axis as Axis
 from .grid import Variable as Variable
 from .grid import axis as axis

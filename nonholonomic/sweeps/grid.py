@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+import json
 import math
 import os
 import pickle
@@ -65,6 +66,11 @@ class Layout(NamedTuple):
         """Number of chunks."""
         return -(-self.cells // self.chunk)
 
+    @property
+    def versions(self) -> dict[str, str]:
+        """The versions with which the table was computed."""
+        return json.loads(self.attributes.get("versions", "{}"))
+
     def ends(self, chunk: int) -> tuple[int, int]:
         """The index of the first cell of a chunk, and of the cell after its last."""
         return chunk * self.chunk, min((chunk + 1) * self.chunk, self.cells)
@@ -85,6 +91,11 @@ class Layout(NamedTuple):
             value = status if name in self.words else np.nan if kind.kind == "f" else PENDING
             variables[name] = np.full((cells, *self.inner_shape(name)), value, kind)
         return variables
+
+    def put(self, variables: dict[str, Values], chunk: int, values: dict[str, Values]) -> None:
+        """Write the values of a chunk into variables of all cells."""
+        for name, cells in values.items():
+            variables[name][slice(*self.ends(chunk))] = cells
 
     def shaped(self, name: str, values: Values) -> Values:
         """A variable in the shape of the grid, with words instead of codes."""
@@ -157,13 +168,13 @@ class Variable(NamedTuple):
     """
 
     unit: str
-    kind: Any
+    kind: type | str
     words: tuple[str, ...] | None = None
     inner: tuple[str, ...] = ()
     long_name: str = ""
 
 
-def axis(name: str, number: str, unit: str, values: Any, long_name: str = "") -> Axis:
+def axis(name: str, number: str, unit: str, values: object, long_name: str = "") -> Axis:
     """An axis, checked.
 
     **Arguments:** `name`: name in the table; `number`: full name of the varied parameter; `unit`; `values`, (values,);
@@ -290,24 +301,10 @@ class ChunkTask(NamedTuple):
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def packed(work: ChunkTask) -> bytes:
-    """The task in a form that can be sent to another process.
-
-    **Raises:** `ValueError` that names the object that cannot be sent.
-    """
-    try:
-        return pickle.dumps(work)
-    except (pickle.PicklingError, AttributeError, TypeError) as error:
-        raise ValueError(
-            f"executor: the work cannot be sent to another process ({error}); a function in it must be defined at the top of a "
-            "module, not inside another function and not as a lambda"
-        ) from None
-
-
 def remote_results(payload: bytes, needed: dict[str, str], first: int, count: int, mark: str) -> dict[str, Values]:
     """Compute the results of several cells in a worker process.
 
-    **Arguments:** `payload`: the result of `packed`; `needed`: the `stamp` of the sender; `first`, `count`: as for
+    **Arguments:** `payload`: a pickled `ChunkTask`; `needed`: the `stamp` of the sender; `first`, `count`: as for
     `ChunkTask.results`; `mark`: different in every call, because Dask merges calls with equal arguments.
 
     **Raises:** `RuntimeError` that names the worker if a package there has another version, which may give other
@@ -348,7 +345,6 @@ def versions() -> dict[str, str]:
 
 
 def stamp() -> dict[str, str]:
-    """The versions in this process of the packages in `MUST_AGREE`."""
+    """The versions and the precision of numbers in this process."""
     # Float64 may have been switched off by hand.
-    local = versions() | {"float": str(np.dtype(jnp.result_type(float)))}
-    return {name: local[name] for name in MUST_AGREE}
+    return versions() | {"float": str(np.dtype(jnp.result_type(float)))}

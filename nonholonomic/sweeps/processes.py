@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from queue import SimpleQueue
-from typing import Any
+from typing import ParamSpec, TypeVar
 
 import jax
 
@@ -51,6 +51,11 @@ def local_processes(n: int, threads: int = 1) -> Iterator[Executor]:
         executor.shutdown(cancel_futures=True)
 
 
+#: The arguments and the result of a call.
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
 class LocalProcesses(Executor):
     """An executor of single-process pools, so that a process that dies loses only its own call."""
 
@@ -63,7 +68,7 @@ class LocalProcesses(Executor):
             self._free.put(place)
         self._callers = ThreadPoolExecutor(n)
 
-    def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future:
+    def submit(self, function: Callable[P, T], /, *arguments: P.args, **options: P.kwargs) -> Future[T]:
         """Call a function in one of the processes; its future raises `BrokenProcessPool` if the process dies."""
         return self._callers.submit(self._called, function, arguments, options)
 
@@ -74,7 +79,7 @@ class LocalProcesses(Executor):
             if pool is not None:
                 pool.shutdown(wait, cancel_futures=cancel_futures)
 
-    def _called(self, function: Callable[..., Any], arguments: tuple[Any, ...], options: dict[str, Any]) -> Any:
+    def _called(self, function: Callable[..., T], arguments: tuple[object, ...], options: dict[str, object]) -> T:
         place = self._free.get()
         try:
             pool = self._pools[place]
@@ -100,7 +105,7 @@ def _started(place: int, threads: int) -> ProcessPoolExecutor:
     """A process that has its cores and its settings before its first line runs."""
     for _ in range(MAX_STARTS):
         pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin)
-        with _starting, _environment(_settings()), _cores(place, threads), _without_interrupts():
+        with _starting, _starting_in(place, threads):
             others = multiprocessing.active_children()
             # The process starts with the first call.
             first_call = pool.submit(int)
@@ -123,56 +128,34 @@ def _started(place: int, threads: int) -> ProcessPoolExecutor:
     )
 
 
-def _settings() -> dict[str, str]:
-    """The environment of a process: it computes on the CPU, and shares the store of compiled programs."""
+@contextlib.contextmanager
+def _starting_in(place: int, threads: int) -> Iterator[None]:
+    """A context whose processes start with their own environment and cores, and postpone Ctrl-C, as this thread does.
+
+    They compute on the CPU, and share the store of compiled programs. Cores are assigned in turn, and again from the
+    first when none is left.
+    """
     settings = {"JAX_PLATFORMS": "cpu"}
     folder = getattr(jax.config, "jax_compilation_cache_dir", None)
     if folder:
         settings |= {"JAX_COMPILATION_CACHE_DIR": str(folder), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
         settings |= {"JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1"}
-    return settings
-
-
-@contextlib.contextmanager
-def _environment(settings: dict[str, str]) -> Iterator[None]:
-    old_values = {name: os.environ.get(name) for name in settings}
-    os.environ.update(settings)
-    try:
-        yield
-    finally:
+    with contextlib.ExitStack() as stack:
+        old_values = {name: os.environ.get(name) for name in settings}
+        os.environ.update(settings)
         for name, value in old_values.items():
             if value is None:
-                del os.environ[name]
+                stack.callback(os.environ.pop, name)
             else:
-                os.environ[name] = value
-
-
-@contextlib.contextmanager
-def _cores(place: int, threads: int) -> Iterator[None]:
-    """Put this thread on the cores of a process; cores are assigned in turn, and again from the first when none is
-    left."""
-    if not hasattr(os, "sched_setaffinity"):
+                stack.callback(os.environ.update, {name: value})
+        if hasattr(os, "sched_setaffinity"):
+            allowed = sorted(os.sched_getaffinity(0))
+            os.sched_setaffinity(0, {allowed[(place * threads + k) % len(allowed)] for k in range(threads)})
+            stack.callback(os.sched_setaffinity, 0, allowed)
+        if hasattr(signal, "pthread_sigmask"):
+            old_signals = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            stack.callback(signal.pthread_sigmask, signal.SIG_SETMASK, old_signals)
         yield
-        return
-    allowed = sorted(os.sched_getaffinity(0))
-    os.sched_setaffinity(0, {allowed[(place * threads + k) % len(allowed)] for k in range(threads)})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, allowed)
-
-
-@contextlib.contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Make this thread, and processes that it starts, postpone Ctrl-C."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    old_values = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, old_values)
 
 
 def _begin() -> None:
@@ -180,11 +163,6 @@ def _begin() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    _leave_with_the_parent()
-
-
-def _leave_with_the_parent() -> None:
-    """End this process when its parent ends, even if the parent was killed."""
     parent = multiprocessing.parent_process()
 
     def watch() -> None:
@@ -192,4 +170,5 @@ def _leave_with_the_parent() -> None:
         parent.join()
         os._exit(1)
 
+    # This process ends when its parent ends, even if the parent was killed.
     threading.Thread(target=watch, daemon=True).start()

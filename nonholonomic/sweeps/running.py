@@ -5,6 +5,7 @@ import functools
 import itertools
 import json
 import os
+import pickle
 import signal
 import sys
 import threading
@@ -23,8 +24,7 @@ from ..compilation.cache import forget_programs_if_many, memory_of_machine
 from ..terminal import Progress
 from ..text import shown
 from ..validation import require_flag, warn
-from ._chunks import ChunkStore, with_spaces
-from ._file import LONG_NAMES, Stored
+from ._store import LONG_NAMES, ChunkStore, with_spaces
 from .grid import (
     Axis,
     ChunkTask,
@@ -33,7 +33,6 @@ from .grid import (
     Values,
     Variable,
     columns,
-    packed,
     remote_results,
     size_of,
     stamp,
@@ -136,9 +135,9 @@ def sweep(
     job: Job,
     axes: list[Axis],
     variables: dict[str, Variable],
-    request: dict[str, Any],
+    request: dict[str, object],
     *,
-    path: Any = None,
+    path: object = None,
     chunk: int | None = None,
     most: int | None = None,
     inner: Sequence[Axis] = (),
@@ -195,25 +194,38 @@ def sweep(
     layout = layout._replace(chunk=chunk_size * chunks_together(layout, chunk_size))
     forget_programs_if_many()
     work = ChunkTask(job, axes, chunk_size)
-    store = Held(layout) if path is None else ChunkStore(path, layout)
+    required, room = layout.bytes_of_cells(layout.cells), memory_of_machine()
+    if path is None and 0.0 < room < required:
+        raise ValueError(
+            f"path = None: {layout.cells:.3g} cells take {1e-9 * required:.3g} GB, and this machine has "
+            f"{1e-9 * room:.3g} GB of memory; pass path= to keep them in a file"
+        )
+    store = None if path is None else ChunkStore(path, layout)
     try:
         with no_interrupt_lost() as raise_lost_interrupt:
-            chunks = computed(work, layout, store.finished, executor, progress, raise_lost_interrupt)
+            finished = set() if store is None else store.finished
+            chunks = computed(work, layout, finished, executor, progress, raise_lost_interrupt)
             # Ctrl-C may arrive while a chunk is saved. The traceback would then keep `chunks` alive, and its workers busy.
             with contextlib.closing(chunks):
-                result = store.filled(chunks)
-        return Table.of(result) if isinstance(result, Stored) else Table.laid_out(layout, result)
+                if store is not None:
+                    return Table.of(store.filled(chunks))
+                of_all_cells = layout.empty(layout.cells)
+                for number, values in chunks:
+                    layout.put(of_all_cells, number, values)
+                return Table.laid_out(layout, of_all_cells)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(store.interrupted()) from None
+        none_saved = f"interrupted; without path=, none of {with_spaces(layout.cells)} cells is saved"
+        raise KeyboardInterrupt(none_saved if store is None else store.interrupted()) from None
     except ExecutorBroken as error:
         state_of_file = (
             "without path=, nothing is saved"
-            if path is None
+            if store is None
             else f"{path} has the finished chunks; repeat the call to resume"
         )
         raise RuntimeError(f"{error}, {state_of_file}") from error.__cause__
     finally:
-        store.close()
+        if store is not None:
+            store.close()
 
 
 def computed(
@@ -231,7 +243,12 @@ def computed(
         is_compiled = executor is None
         if is_compiled:
             if todo:
-                in_a_thread(work.compile)
+                # In another thread, so that this one receives Ctrl-C: XLA compiles for many seconds without checking.
+                pool = ThreadPoolExecutor(1)
+                try:
+                    pool.submit(work.compile).result()
+                finally:
+                    pool.shutdown(wait=False)
             display.begin(finished_cells)
         try:
             for chunk, values in handed_out(lambda chunk: submit(chunk * layout.chunk, layout.chunk), todo, HANDED_OUT):
@@ -249,7 +266,7 @@ def computed(
 
 
 def layout_of(
-    axes: list[Axis], inner: Sequence[Axis], variables: dict[str, Variable], request: dict[str, Any], chunk: int
+    axes: list[Axis], inner: Sequence[Axis], variables: dict[str, Variable], request: dict[str, object], chunk: int
 ) -> Layout:
     """The layout of a sweep's table; see `sweep`."""
     coords = {variable.name: variable.values for variable in (*axes, *inner)}
@@ -271,49 +288,6 @@ def layout_of(
     return Layout(coords, kinds, units, attributes, words, dims, chunk)
 
 
-class Held:
-    """The chunks of a table without a file: like `ChunkStore`, in memory."""
-
-    def __init__(self, layout: Layout):
-        """Set the layout of the table.
-
-        **Raises:** `ValueError` if this machine does not have enough memory.
-        """
-        required, room = layout.bytes_of_cells(layout.cells), memory_of_machine()
-        if 0.0 < room < required:
-            raise ValueError(
-                f"path = None: {layout.cells:.3g} cells take {1e-9 * required:.3g} GB, and this machine has "
-                f"{1e-9 * room:.3g} GB of memory; pass path= to keep them in a file"
-            )
-        self.finished: set[int] = set()
-        self._layout, self._values = layout, layout.empty(layout.cells)
-
-    def filled(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> dict[str, Values]:
-        """Store the computed chunks, and return the variables with all cells along the first axis."""
-        for chunk, values in computed:
-            first, end = self._layout.ends(chunk)
-            for name, values_of_chunk in values.items():
-                self._values[name][first:end] = values_of_chunk
-        return self._values
-
-    def interrupted(self) -> str:
-        """Message after Ctrl-C."""
-        return f"interrupted; without path=, none of {with_spaces(self._layout.cells)} cells is saved"
-
-    def close(self) -> None:
-        """There is nothing to close."""
-
-
-def in_a_thread(function: Callable[[], None]) -> None:
-    """Call a function in another thread, so that this one receives Ctrl-C: XLA compiles for many seconds without
-    checking."""
-    pool = ThreadPoolExecutor(1)
-    try:
-        pool.submit(function).result()
-    finally:
-        pool.shutdown(wait=False)
-
-
 @contextlib.contextmanager
 def workforce(work: ChunkTask, executor: Executor | None) -> Iterator[Callable[[int, int], Future]]:
     """A function that submits the computation of `count` cells, starting with cell `first`.
@@ -329,7 +303,13 @@ def workforce(work: ChunkTask, executor: Executor | None) -> Iterator[Callable[[
     elif isinstance(executor, ThreadPoolExecutor):
         yield functools.partial(executor.submit, work.results)
     else:
-        payload, versions_here = packed(work), stamp()
+        try:
+            payload, versions_here = pickle.dumps(work), stamp()
+        except (pickle.PicklingError, AttributeError, TypeError) as error:
+            raise ValueError(
+                f"executor: the work cannot be sent to another process ({error}); a function in it must be defined at the top "
+                "of a module, not inside another function and not as a lambda"
+            ) from None
         yield lambda first, count: executor.submit(
             remote_results, payload, versions_here, first, count, uuid.uuid4().hex
         )
@@ -393,7 +373,7 @@ def no_interrupt_lost() -> Iterator[Callable[[], None]]:
     """
     arrived, hook = False, sys.unraisablehook
 
-    def print_others(ignored: Any) -> None:
+    def print_others(ignored: "sys.UnraisableHookArgs") -> None:
         if not issubclass(ignored.exc_type, KeyboardInterrupt):
             hook(ignored)
 

@@ -7,7 +7,7 @@ import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -17,9 +17,12 @@ from ..terminal import status_line
 from ..text import as_html, in_unit, likely, readable_unit, require_unit, require_unit_of, shown, text_as_html
 from ..validation import as_path, replacing, require_package
 from ..views import draw_portrait, draw_series, draw_table, require_others
-from ._chunks import unfinished
-from ._file import LONG_NAMES, MAX_BYTES_IN_MEMORY, Stored, StoredVariables, coded, table_path, write_file
+from ._store import LONG_NAMES, MAX_BYTES_IN_MEMORY, Stored, coded, table_path, unfinished, write_file
 from .grid import UNREACHED, Layout, Values, axes_of, versions
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
 
 #: Number of cells per checksum in the file of a saved table.
 CHUNK = 1 << 15
@@ -111,7 +114,7 @@ class Table(eqx.Module):
         """The names of a variable's dimensions: the axes of the grid, and its additional dimensions."""
         return (*axes_of(self.coords, self.inner), *self.inner.get(variable, ()))
 
-    def to_xarray(self, chunks: Any = None) -> Any:
+    def to_xarray(self, chunks: Any = None) -> "xarray.Dataset":
         """The table as an `xarray.Dataset` (needs xarray), with named dimensions, units, and statuses as words.
 
         **Arguments:** `chunks`: to read the numbers piece by piece when they are needed, the size of the pieces along
@@ -127,9 +130,8 @@ class Table(eqx.Module):
             require_package("dask", "xarray", "to_xarray with chunks")
         import xarray
 
-        if chunks is not None and isinstance(self.variables, StoredVariables):
-            file = self.variables.stored
-            dataset = xarray.open_dataset(file.path, engine="h5netcdf", chunks=chunks)
+        if chunks is not None and isinstance(self.variables, Stored):
+            dataset = xarray.open_dataset(self.variables.path, engine="h5netcdf", chunks=chunks)
             for name, words in self.words.items():
                 meanings = np.array([*words, UNREACHED])
                 dataset[name] = dataset[name].copy(
@@ -137,7 +139,7 @@ class Table(eqx.Module):
                 )
             return dataset
 
-        def described(name: str, dims: tuple[str, ...], values: Values) -> tuple[Any, ...]:
+        def described(name: str, dims: tuple[str, ...], values: Values) -> tuple[object, ...]:
             long_name = {"long_name": self.long_names[name]} if name in self.long_names else {}
             return dims, values, long_name | ({"units": self.units[name]} if name in self.units else {})
 
@@ -147,7 +149,7 @@ class Table(eqx.Module):
         dataset = xarray.Dataset(variables, coords, attributes)
         return dataset if chunks is None else dataset.chunk(chunks)
 
-    def to_dataframe(self) -> Any:
+    def to_dataframe(self) -> "pandas.DataFrame":
         """The table as a `pandas.DataFrame` (needs pandas): one row per cell, one column per axis and variable.
 
         If variables have additional dimensions, such as "time", there is a row for each point along these dimensions,
@@ -185,31 +187,28 @@ class Table(eqx.Module):
         columns, units = {dim: column(self.coords[dim], (dim,)) for dim in dims}, dict(self.units)
         for name in self.variables:
             own_dims = self.dims(name)
-            for index in np.ndindex(*(len(self.coords[dim]) if dim in component_dims else 1 for dim in own_dims)):
-                parts = [
-                    str(self.coords[dim][k]) for dim, k in zip(own_dims, index, strict=True) if dim in component_dims
-                ]
-                key = tuple(k if dim in component_dims else slice(None) for dim, k in zip(own_dims, index, strict=True))
-                column_name = ".".join([name, *parts])
-                columns[column_name] = column(
-                    self.variables[name][key], tuple(dim for dim in own_dims if dim not in component_dims)
-                )
+            components = [dim for dim in own_dims if dim in component_dims]
+            for index in np.ndindex(*(len(self.coords[dim]) for dim in components)):
+                place = dict(zip(components, index, strict=True))
+                column_name = ".".join([name, *(str(self.coords[dim][k]) for dim, k in place.items())])
+                values = self.variables[name][tuple(place.get(dim, slice(None)) for dim in own_dims)]
+                columns[column_name] = column(values, tuple(dim for dim in own_dims if dim not in place))
                 if name in units:
                     units[column_name] = units[name]
         frame = pandas.DataFrame(columns)
         frame.attrs["units"] = {name: unit for name, unit in units.items() if name in columns}
         return frame
 
-    def save(self, path: Any) -> None:
+    def save(self, path: object) -> None:
         """Write the table to an HDF5 file that `xarray.open_dataset(path, engine="h5netcdf")` opens.
 
         **Raises:** `OSError` that names the path if the file cannot be written; `ValueError` for the ending of another
         format, such as .csv.
         """
         file = table_path(path)
-        if isinstance(self.variables, StoredVariables):
+        if isinstance(self.variables, Stored):
             with replacing(file) as scratch:
-                shutil.copyfile(self.variables.stored.path, scratch)
+                shutil.copyfile(self.variables.path, scratch)
             return
         words, arrays = {}, {}
         for name, values in self.variables.items():
@@ -224,7 +223,7 @@ class Table(eqx.Module):
         write_file(file, layout, cut)
 
     @classmethod
-    def load(cls, path: Any) -> "Table":
+    def load(cls, path: object) -> "Table":
         """Read a table from a file that `save` or a sweep wrote. You can read the file before the sweep has finished;
         cells that are not computed yet have the status `pending`.
 
@@ -240,8 +239,7 @@ class Table(eqx.Module):
         layout = stored.layout
         if layout.bytes_of_cells(layout.cells) <= MAX_BYTES_IN_MEMORY:
             return cls.laid_out(layout, {name: stored.whole(name) for name in layout.kinds})
-        variables = StoredVariables(stored)
-        return cls(layout.coords, variables, layout.units, layout.attributes, layout.words, layout.inner)
+        return cls(layout.coords, stored, layout.units, layout.attributes, layout.words, layout.inner)
 
     @classmethod
     def laid_out(cls, layout: Layout, values: dict[str, Values]) -> "Table":
@@ -341,8 +339,8 @@ class Table(eqx.Module):
     @property
     def _rows(self) -> list[tuple[str, str, str]]:
         """A summary of each variable: its name with its dimensions, its range, and its long name."""
-        if isinstance(self.variables, StoredVariables):
-            place = f"in {self.variables.stored.path}"
+        if isinstance(self.variables, Stored):
+            place = f"in {self.variables.path}"
             return [(name, place, self.long_names.get(name, "")) for name in self.variables]
         # Cells that have not been computed appear only in the status.
         computed = self.variables["status"] != UNREACHED if "status" in self.variables else ...
@@ -354,11 +352,8 @@ class Table(eqx.Module):
             rows.append((f"{name}{f' [{unit}]' if unit else ''}{dims}", summary, self.long_names.get(name, "")))
         return rows
 
-    def __str__(self) -> str:
-        return "\n".join([self._title, *(f"  {name}: {summary}" for name, summary, _ in self._rows)])
-
     def __repr__(self) -> str:
-        return str(self)
+        return "\n".join([self._title, *(f"  {name}: {summary}" for name, summary, _ in self._rows)])
 
     def _repr_html_(self) -> str:
         axes = [(name, _summary(self.coords[name]), self.label(name)) for name in self.coords]
@@ -383,8 +378,8 @@ def cells_with(table: Table, name: str, word: str) -> Int[np.ndarray, " cells"]:
     words, variables = table.words.get(name, ()), table.variables
     if word not in words:
         return np.zeros(0, int)
-    if isinstance(variables, StoredVariables):
-        return np.flatnonzero(variables.stored.whole(name) == words.index(word))
+    if isinstance(variables, Stored):
+        return np.flatnonzero(variables.whole(name) == words.index(word))
     return np.flatnonzero(np.ravel(variables[name]) == word)
 
 
@@ -428,8 +423,7 @@ def concise_strings(
             return f"{word}?"
         return concise(value, error) if np.isfinite(value) else str(word)
 
-    strings = [string(*entry) for entry in zip(values.ravel(), errors.ravel(), words.ravel(), strict=True)]
-    return np.array(strings, dtype=str).reshape(values.shape)
+    return np.vectorize(string, otypes="U")(values, errors, words)
 
 
 # The quantities of a run over its times, as a table, and the methods that every run derives from this table.
@@ -485,7 +479,7 @@ def run_table(
     coords: dict[str, Values],
     values: dict[str, Values],
     axes: list[str],
-    request: dict[str, Any],
+    request: dict[str, object],
 ) -> Table:
     """A table of quantities over time.
 
@@ -550,7 +544,7 @@ class Tabular(abc.ABC):
         **Raises:** `ValueError` for a batch of runs.
         """
 
-    def to_xarray(self) -> Any:
+    def to_xarray(self) -> "xarray.Dataset":
         """The run as an `xarray.Dataset` over "time" (needs xarray), with units and names.
 
         **Raises:** `ValueError` for a batch of runs.
@@ -558,7 +552,7 @@ class Tabular(abc.ABC):
         require_package("xarray", "xarray", "to_xarray")
         return self.to_table().to_xarray()
 
-    def save(self, path: Any) -> None:
+    def save(self, path: object) -> None:
         """Write the run to an HDF5 file that `Table.load` and xarray (`engine="h5netcdf"`) read.
 
         **Raises:** `OSError` that names the path if the file cannot be written; `ValueError` for a batch of runs.
@@ -566,7 +560,7 @@ class Tabular(abc.ABC):
         file = table_path(path)
         self.to_table().save(file)
 
-    def to_dataframe(self) -> Any:
+    def to_dataframe(self) -> "pandas.DataFrame":
         """The run as a `pandas.DataFrame` (needs pandas): a row for each time, a column for each quantity or component.
 
         **Raises:** `ValueError` for a batch of runs.

@@ -23,7 +23,7 @@ from ..compilation.xla_cpu import least
 from ..hybrid import AbstractBatchedMode, Transition
 from ..integration import AbstractProblem, Jumps, Lanes, States
 from ..integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
-from ..runs import UNMEASURED
+from ..runs.event import UNMEASURED
 from .form import Form, OfRun, State
 
 #: A function counts as zero if changing every component of the state by this fraction of its size could make it zero:

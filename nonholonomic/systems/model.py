@@ -65,8 +65,6 @@ class OwnModel(AbstractModel):
     names: tuple[str, ...] = eqx.field(static=True)
     event: None = None
 
-    least_chunk = 1024
-
     @classmethod
     def of(cls, tree: dict[str, Any]) -> "OwnModel":
         """The model of a system, its start and its event."""
@@ -104,10 +102,6 @@ class OwnModel(AbstractModel):
         name = None if event is None else name_of(event)
         values = zip(self.parameters.names, self.parameters.values, strict=True)
         return {"system": type(system).__name__, "event": name} | {name: float(value) for name, value in values}
-
-    @property
-    def users(self) -> Any:
-        return self.parameters.tree
 
     def check(self) -> None:
         if is_traced(self):

@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..geometry import AbstractSurface, vector_of
+from ..geometry import AbstractSurface
 from ..text import in_unit, require_unit_of
 
 Points = Float[np.ndarray, "times 3"]
@@ -442,13 +442,13 @@ class _Patch:
 
 def own(surface: AbstractSurface, position: np.ndarray) -> tuple:
     """A position (3, ...) in the fixed frame, converted to the surface's axes."""
-    return surface.in_own_axes(vector_of(np.asarray(part, dtype=float) for part in position))
+    return surface.in_own_axes(tuple(np.asarray(part, dtype=float) for part in position))
 
 
 def fixed(surface: AbstractSurface, vector: tuple) -> np.ndarray:
     """A vector in the surface's axes, converted to the fixed frame, (..., 3)."""
     example = next(part for part in vector if part is not None)
-    components = vector_of(
+    components = tuple(
         np.zeros_like(np.asarray(example, dtype=float)) if part is None else np.asarray(part) for part in vector
     )
     return np.stack(np.broadcast_arrays(*(np.asarray(part) for part in surface.in_fixed_frame(components))), axis=-1)

@@ -407,14 +407,14 @@ def _corners(dynamics: Any, footprint: Footprint, states: Any) -> Any:
 
 def inputs_of(run: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """The force [N] and the torque [N m] of a run at its times."""
-    force, torque = _inputs(run.spec, run.t, run.state)
+    force, torque = _inputs(run.model, run.t, run.state)
     return np.asarray(force), np.asarray(torque)
 
 
 @eqx.filter_jit
-def _inputs(spec: Any, times: Any, states: Any) -> Any:
+def _inputs(model: Any, times: Any, states: Any) -> Any:
     def at(t, state):
-        return spec.input(t, spec.scene.dynamics.geometry(state).motion)
+        return model.input(t, model.scene.dynamics.geometry(state).motion)
 
     return jax.vmap(at)(times, states)
 
@@ -470,7 +470,7 @@ def judge(run: Trajectory, problem: Problem) -> Verdict:
 def effort_of(run: Trajectory) -> float:
     """The effort [N^2 s]: the integral over time of F^2 + (torque / l)^2, with the force F and the wheelbase l."""
     force, torque = inputs_of(run)
-    squares = force**2 + (torque / float(run.spec.scene.body.wheelbase)) ** 2
+    squares = force**2 + (torque / float(run.model.scene.body.wheelbase)) ** 2
     return float(np.trapezoid(squares, np.asarray(run.t)))
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import Vector, add, cross, dot, multiply, scale, stacked, subtract, vector_of
+from nonholonomic.geometry import Vector, add, cross, dot, multiply, scale, stacked, subtract
 
 from ..model.dynamics import Dynamics, padded
 from ..model.input import Motion
@@ -589,7 +589,7 @@ def drive_along(dynamics: Dynamics, pose: Any, steering: np.ndarray, front_speed
     """The input that gives a stroller, from a pose, the steering angle and the speed of two splines."""
     force, torque, poses = _needed(dynamics, pose, steering, front_speed, jnp.asarray(t1, dtype=float))
     body = dynamics.body
-    weight = vector_of(scale(body.mass * dynamics.gravity, dynamics.up))
+    weight = scale(body.mass * dynamics.gravity, dynamics.up)
     force = subtract(force, dot(weight, padded(poses[:, dynamics.surface.axes :].T)))
     return Drive(
         duration=jnp.asarray(t1, dtype=float),

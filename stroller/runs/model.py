@@ -7,34 +7,24 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from nonholonomic.compilation.components import Held
 from nonholonomic.geometry import Plane
 from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import AbstractProblem, ExtendedProblem, Outcome
-from nonholonomic.integration.problem import Status, run_bounds
+from nonholonomic.integration.problem import Status, require_run
 from nonholonomic.parameters import description, numbers, numbers_of
-from nonholonomic.runs import (
-    UNMEASURED,
-    AbstractModel,
-    AbstractSceneModel,
-    Clock,
-    EventFunction,
-    Names,
-    model_of,
-    statuses,
-    with_event,
-)
+from nonholonomic.runs.event import UNMEASURED, Clock, EventFunction, with_event
+from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Number, model_of, statuses
 from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.text import name_of
-from nonholonomic.validation import require_all, require_kind, require_scalars
+from nonholonomic.validation import require_kind, require_scalars
 
 from ..model.input import Formula, Input, PerRide, Steady, as_jumps, at_start, check_input
 from ..model.scene import RideProblem, Scene, as_module, has_arrays
 from ..model.vehicle import Damping, Launch, RollingResistance, Stroller
-from .trajectory import DEFAULT_STEPS, Trajectory, ride
-from .view import QUANTITIES, TIMED, VECTORS, RideState
+from .trajectory import DEFAULT_STEPS, QUANTITIES, TIMED, VECTORS, RideState, Trajectory, heading, ride
 
 #: Names of the coordinates of a place in the fixed frame.
 FIXED = (("x", "m"), ("y", "m"), ("z", "m"))
@@ -84,7 +74,7 @@ class Original:
     """A user's input before it was traced, for files and for other processes. All are equal: the traced input decides
     whether a program is compiled again."""
 
-    def __init__(self, controls: Any):
+    def __init__(self, controls: Input):
         self.input = controls
 
     def __eq__(self, other: object) -> bool:
@@ -113,7 +103,7 @@ class RideModel(AbstractSceneModel):
     comparable = ("speed",)
 
     @classmethod
-    def of(cls, scene: Scene, launch: Launch, controls: Any, event: Any = None, jumps: Any = None) -> AbstractModel:
+    def of(cls, scene: Scene, launch: Launch, controls: Any, event: Any = None, jumps: object = None) -> AbstractModel:
         """The model of a ride, with a user's event if there is one."""
         module = as_module(controls, scene, launch)
         original = None if isinstance(module, Held) or module is controls else Original(controls)
@@ -127,14 +117,10 @@ class RideModel(AbstractSceneModel):
         return RideModel.of, (self.scene, self.launch, controls, event, self.jumps)
 
     @property
-    def roots(self) -> dict[str, Any]:
+    def roots(self) -> dict[str, PyTree]:
         """The trees whose numbers are parameters."""
         module = {} if self.input is None or self.original is not None else {"input": self.input}
         return {"scene": self.scene, "launch": self.launch} | module
-
-    @property
-    def users(self) -> Any:
-        return super().users, self.input if self.original is None else self.original.input
 
     @property
     def known(self) -> list[str]:
@@ -185,16 +171,12 @@ class RideModel(AbstractSceneModel):
     def words(self) -> tuple[str, ...]:
         return ("completed", "contact_lost", "rank_lost", "failed", "event")
 
-    def for_lanes(self) -> "RideModel":
+    def for_lanes(self) -> tuple["RideModel", bool]:
         if not isinstance(self.input, Formula | Held) or has_arrays((self.scene, self.launch)):
-            return self
+            return self, isinstance(self.input, PerRide)
         t, motion = eqx.filter_eval_shape(at_start, self.scene, self.launch)
         controls = self.input.whole if isinstance(self.input, Held) else self.input
-        return dataclasses.replace(self, input=PerRide.of(controls, t, motion))
-
-    @property
-    def arrays_in_lanes(self) -> bool:
-        return isinstance(self.input, PerRide)
+        return dataclasses.replace(self, input=PerRide.of(controls, t, motion)), True
 
     @property
     def has_event(self) -> bool:
@@ -212,8 +194,7 @@ class RideModel(AbstractSceneModel):
         clock = jnp.zeros_like(ride.states[:1])
         return ExtendedProblem(ride, Clock(), clock, clock + UNMEASURED)
 
-    def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Trajectory:
-        require_all(run_bounds(t1, tolerance))
+    def simulate(self, t1: ArrayLike, times: Any, tolerance: ArrayLike, solver: Any, adjoint: Any) -> Trajectory:
         return ride(self, t1, times, tolerance, solver, DEFAULT_STEPS, adjoint)
 
     def without_event(self) -> "RideModel":
@@ -228,14 +209,14 @@ class RideModel(AbstractSceneModel):
         return VECTORS | {"coordinate": tuple(name for name, _ in self.scene.surface.coordinates)}
 
     def read(
-        self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: Any
+        self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: Int[ArrayLike, "..."] | None
     ) -> dict[str, Array]:
         size = len(jax.eval_shape(lambda: self.scene.state(self.launch, self.input is not None)))
         time = rows[size] if len(rows) > size else time
         state = RideState(self.scene, self.input, time, rows[:size])
         return {name: QUANTITIES[name].of(name, state) for name in names}
 
-    def ended(self, outcome: Outcome | HybridOutcome, tolerance: Any) -> Int[Array, " cells"]:
+    def ended(self, outcome: Outcome | HybridOutcome, tolerance: Number) -> Int[Array, " cells"]:
         status = statuses(outcome.status, Status.RANK_LOST)
         if self.event is not None:
             return status
@@ -251,11 +232,10 @@ class RideModel(AbstractSceneModel):
         size = len(jax.eval_shape(lambda: scene.state(self.launch, self.input is not None)))
         states = scene.dynamics.righted(outcome.state[:size])
         motion = scene.dynamics.geometry(states).motion
-        _, east, north = surface.chart(surface.place_at(motion.position))
         energy = scene.energy(states)
         position = surface.in_fixed_frame(motion.position)
         return dict(zip("xyz", position, strict=True)) | {
-            "heading": scene.dynamics.heading.angle(motion.heading, east, north),
+            "heading": heading(scene, motion),
             "end_steering": motion.steering,
             "end_speed": motion.speed,
             "energy": energy,
@@ -264,10 +244,19 @@ class RideModel(AbstractSceneModel):
 
 
 @model_of.register(Scene)
-def _(system: Scene, start: Any, event: Any = None, input: Input | None = None, jumps: Any = None) -> AbstractModel:
+def _(system: Scene, start: Any, event: Any = None, input: Input | None = None, jumps: object = None) -> AbstractModel:
     require_kind(start, "start", Launch)
     lists = "axes of sweep take lists, and jax.vmap maps over them"
     require_scalars(numbers("scene", system, functions=False) | numbers("launch", start), lists)
     system.check(start)
     check_input(input, system, start, jumps)
     return RideModel.of(system, start, input, event, jumps)
+
+
+def check_run(scene: Any, launch: Any, t1: ArrayLike, input: Any, tolerance: ArrayLike, jumps: object = None) -> None:
+    """Raise `ValueError` unless scene, launch, horizon, input and tolerance are legal and the scene can start with the
+    launch."""
+    lists = "axes of sweep take lists, and jax.vmap maps over them"
+    require_run(scene, launch, t1, tolerance, (Scene, Launch), lists)
+    scene.check(launch)
+    check_input(input, scene, launch, jumps)

@@ -1,7 +1,8 @@
-"""One ride of the stroller: its steps, the states between them, and its quantities."""
+"""One ride of the stroller: its quantities, its steps, and the states between them."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+import functools
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax
@@ -9,17 +10,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from nonholonomic.compilation.xla_cpu import compiled_quickly
-from nonholonomic.hybrid import HybridOutcome
+from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_vectors
 from nonholonomic.integration import ImplicitMidpoint, Settings, explicit_tableau, follow, sample
 from nonholonomic.integration.dense import all_crossings
 from nonholonomic.integration.problem import REACHED_END, require_adaptive, require_adjoint, require_times
-from nonholonomic.runs import evenly_spaced, explore_model, sampled_if_legal
-from nonholonomic.sweeps import Quantity, Table, Tabular
-from nonholonomic.terminal import status_line
-from nonholonomic.text import batch_title
+from nonholonomic.runs.model import AbstractModel, Unit
+from nonholonomic.runs.simulate import evenly_spaced, sampled_if_legal
+from nonholonomic.runs.trajectory import AbstractRun
+from nonholonomic.sweeps import Quantity, Table, chosen, run_table
+from nonholonomic.text import distinguishing_labels
 from nonholonomic.validation import (
     as_known,
     is_traced,
@@ -29,13 +31,181 @@ from nonholonomic.validation import (
     require_whole,
     times_within,
 )
-from nonholonomic.views import Page, Stage, Viewable
 
-from ..model.dynamics import Power, State
-from ..model.input import Input
+from ..model.dynamics import Geometry, Power, State, padded
+from ..model.input import Input, Motion
 from ..model.scene import CONTACT_ROUND_OFF, RANK_LOST, RideProblem, Scene
-from ..model.vehicle import Launch
-from .view import MOST_GRIP, QUANTITIES, RideState, as_stages, grip, names_of, spread, table_of_one
+
+# The quantities of a ride, with units and names, as functions of its states, and the table of a run.
+
+
+class RideState:
+    """The states of a ride at times `t` [s], and what several quantities share; the states may have an axis of times or of
+    cells, which is the first axis of every quantity."""
+
+    def __init__(self, scene: Scene, controls: Input | None, t: Float[Array, "..."], states: State):
+        self.scene, self.controls, self.t = scene, controls, t
+        self.integrated, self.states = states, scene.dynamics.righted(states)
+
+    @functools.cached_property
+    def geometry(self) -> Geometry:
+        return self.scene.dynamics.geometry(self.states)
+
+    @functools.cached_property
+    def power(self) -> Power:
+        dynamics, geometry = self.scene.dynamics, self.geometry
+        power = dynamics.power(geometry, dynamics.forces(self.t, geometry, self.controls))
+        return Power(*(self.number(part) for part in power))
+
+    @functools.cached_property
+    def load(self) -> Float[Array, "... 2"]:
+        front_load = self.number(self.geometry.front_load)
+        return self.vector((self.number(self.geometry.normal_force) - front_load, front_load))
+
+    @functools.cached_property
+    def side_force(self) -> Float[Array, "... 2"]:
+        return self.vector(side_force(self.scene, self.t, self.states, self.controls))
+
+    def number(self, component: Component) -> Float[Array, "..."]:
+        """A component as an array, with zeros if it vanishes identically."""
+        example = self.states[0]
+        return jnp.zeros_like(example) if component is None else jnp.broadcast_to(component, example.shape)
+
+    def vector(self, components: Iterable[Component]) -> Float[Array, "... components"]:
+        """Components along the last axis."""
+        return jnp.stack([self.number(component) for component in components], axis=-1)
+
+
+#: The quantities of a ride; `read` gets a `RideState`.
+QUANTITIES = {
+    "place": Quantity(
+        "m or rad",
+        "place",
+        "coordinate",
+        lambda state: state.vector(state.scene.surface.place_at(state.geometry.motion.position)),
+    ),
+    "position": Quantity(
+        "m",
+        "position of the rear axle",
+        "component",
+        lambda state: state.vector(state.scene.surface.in_fixed_frame(state.geometry.motion.position)),
+    ),
+    "direction": Quantity(
+        "1",
+        "direction of the heading",
+        "component",
+        lambda state: state.vector(state.scene.surface.in_fixed_frame(state.geometry.motion.heading)),
+    ),
+    "heading": Quantity("rad", "heading ψ", None, lambda state: heading(state.scene, state.geometry.motion)),
+    "steering": Quantity("rad", "steering angle φ", None, lambda state: state.geometry.motion.steering),
+    "steering_rate": Quantity("rad s-1", "φ'", None, lambda state: state.number(state.geometry.motion.steering_rate)),
+    "speed": Quantity("m s-1", "speed v", None, lambda state: state.geometry.motion.speed),
+    "front_speed": Quantity("m s-1", "speed of the front wheel", None, lambda state: state.geometry.motion.front_speed),
+    "yaw_rate": Quantity("rad s-1", "yaw rate", None, lambda state: state.geometry.motion.yaw_rate),
+    "energy": Quantity("J", "energy", None, lambda state: state.scene.energy(state.states)),
+    "work": Quantity("J", "work of inputs and friction", None, lambda state: state.scene.work(state.states)),
+    "drive_power": Quantity("W", "power of the drive", None, lambda state: state.power.drive),
+    "steering_power": Quantity("W", "power of the steering", None, lambda state: state.power.steering),
+    "friction_power": Quantity("W", "power of friction", None, lambda state: sum(state.power[2:])),
+    "side_force": Quantity("N", "side force", "axle", lambda state: state.side_force),
+    "grip": Quantity("1", "friction that the tyres need", "axle", lambda state: grip(state.side_force, state.load)),
+    "load": Quantity("N", "load", "axle", lambda state: state.load),
+    "normal_force": Quantity("N", "normal force", None, lambda state: state.number(state.geometry.normal_force)),
+}
+
+#: What a run has in addition, which no table shows.
+FURTHER: dict[str, Callable[[RideState], PyTree[Array]]] = {
+    "power": lambda state: state.power,
+    "constraint": lambda state: state.vector(side_slip(state)),
+    "departure": lambda state: state.number(state.scene.surface.offset(state.geometry.motion.position)),
+    "state": lambda state: jnp.moveaxis(state.integrated, 0, -1),
+}
+
+#: The quantities that depend on the input, and so on the time.
+TIMED = {"drive_power", "steering_power", "friction_power", "side_force", "grip"}
+
+#: Names of the components of vectors, by dimension.
+VECTORS = {"component": ("x", "y", "z"), "axle": ("rear", "front")}
+
+#: The coefficient of friction [1] that no tyre exceeds on a dry road: 0.7 to 1.0 is usual, and 1.8 is that of racing slicks
+#: (Milliken and Milliken, Race Car Vehicle Dynamics (1995), chapter 2).
+MOST_GRIP = 1.8
+
+
+def heading(scene: Scene, motion: Motion) -> Float[Array, "..."]:
+    """The heading [rad] in the surface's own coordinates."""
+    _, east, north = scene.surface.chart(scene.surface.place_at(motion.position))
+    return scene.dynamics.heading.angle(motion.heading, east, north)
+
+
+def grip(side_force: Float[Array, "... 2"], load: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
+    """Coefficient of friction that each axle needs to avoid slip; infinite for a force without a load."""
+    force = jnp.abs(side_force)
+    return jnp.where(force == 0.0, 0.0, force / jnp.maximum(load, 0.0))
+
+
+def side_slip(ride: RideState) -> tuple[Component, Component]:
+    """Speeds [m/s] at which the rear axle and the front wheel slip sideways.
+
+    They come from the rates of the position r and of the heading, with the front wheel l ahead of the rear axle.
+    """
+    scene, state, g = ride.scene, ride.states, ride.geometry
+    dynamics, rate = scene.dynamics, scene.dynamics.field(ride.t, state, ride.controls)
+
+    def heading_components(state):
+        return [component for component in dynamics.geometry(state).motion.heading if component is not None]
+
+    velocity = dynamics.unpack(rate)[0]
+    heading_rate = padded(jax.jvp(heading_components, (state,), (rate,))[1])
+    if scene.heading == "projected":
+        heading, left = g.motion.heading, (-g.motion.heading[1], g.motion.heading[0], None)
+    else:
+        heading, left = g.direction, g.left
+    sideways = sum_vectors(scale(-g.sine, heading), scale(g.cosine, left))
+    front = sum_vectors(velocity, scale(multiply(scene.body.wheelbase, dot(heading_rate, left)), left))
+    return dot(velocity, left), dot(front, sideways)
+
+
+def side_force(
+    scene: Scene, t: Float[Array, "..."], states: State, controls: Input | None
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Side forces [N] on the rear axle and the front wheel, to the left of each."""
+    if scene.heading == "intrinsic" or isinstance(scene.surface, Plane):
+        return scene.dynamics.side_force(t, states, controls)
+    return scene.dynamics.projected_side_force(t, states, controls)
+
+
+def table_of(runs: list[Any], names: list[str], request: dict[str, Any], only: Sequence[str] = ()) -> Table:
+    """All quantities of several runs with the same times, over these times.
+
+    **Arguments:**
+
+    - `runs`: the trajectories.
+    - `names`: names of the runs, without spaces, for the axis "ride"; empty for a single run.
+    - `request`: plain data that describes the computation.
+    - `only`: names of quantities, as for `chosen`.
+    """
+    flat = {isinstance(run.model.scene.surface, Plane) for run in runs}
+    # On grounds of different kinds, a place has no common unit.
+    places, unit = {True: (("x", "y"), "m"), False: (("mu", "eta"), "rad")}[flat.pop()]
+    places, unit = (("first", "second"), "m or rad") if flat else (places, unit)
+    coords = {"ride": np.array(names)} if names else {}
+    coords |= {"time": np.asarray(runs[0].t), "coordinate": np.array(places)}
+    coords |= {dim: np.array(names) for dim, names in VECTORS.items()}
+    quantities = chosen(QUANTITIES | {"place": QUANTITIES["place"]._replace(unit=unit)}, only)
+    of_runs = {name: [np.asarray(run[name]) for run in runs] for name in quantities}
+    values = {name: np.stack(of_each) if names else of_each[0] for name, of_each in of_runs.items()}
+    return run_table(quantities, coords, values, [*(["ride"] if names else []), "time"], request)
+
+
+def names_of(runs: list[Any], unit: Unit = None) -> list[str]:
+    """Names of rides, by what differs in their durations, scenes and launches. **Arguments:** `unit`: as for `plot`."""
+    for run in runs:
+        require_one_run(run, "a picture", ", and pass the others as others=")
+    starts = [(f"ride of {float(run.t[-1]):.3g} s",) for run in runs]
+    scenes, launches = ([getattr(run.model, name) for run in runs] for name in ("scene", "launch"))
+    return distinguishing_labels(starts, scenes, launches, unit=unit)
+
 
 # The steps of a ride, the states between them, found by repeating a step with another length, and zero crossings.
 #
@@ -51,57 +221,26 @@ class Stats(NamedTuple):
     finished: Bool[Array, ""]
 
 
+class Ride(NamedTuple):
+    """A ride: its `RideModel`, its end [s], the settings, and the ends of the steps [s] of a solver without an error
+    estimate."""
+
+    model: Any
+    t1: Array
+    settings: Settings
+    grid: Float[Array, " steps"] | None
+
+
 class RideSpec(eqx.Module):
-    """A ride and the options of its integration, in a form that can leave a transformation: its numbers are leaves and
-    everything else is static."""
+    """A ride in a form that can leave a transformation: its numbers are leaves and everything else is static."""
 
-    numbers: Any
-    static: Any = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, model: Any, t1: Array, settings: Settings, grid: Float[Array, " steps"] | None) -> "RideSpec":
-        """The specification of a ride.
-
-        **Arguments:** `model`: the `RideModel`; `t1`: end [s]; `grid`: the ends of the steps [s] of a solver without an
-        error estimate.
-        """
-        return cls(*eqx.partition((model, t1, settings, grid), eqx.is_array_like))
+    numbers: Ride
+    static: Ride = eqx.field(static=True)
 
     @property
-    def parts(self) -> tuple[Any, Array, Settings, Array | None]:
-        """The arguments of `of`."""
+    def ride(self) -> Ride:
+        """The ride."""
         return eqx.combine(self.numbers, self.static)
-
-    @property
-    def model(self) -> Any:
-        """The `RideModel`."""
-        return self.parts[0]
-
-    @property
-    def settings(self) -> Settings:
-        """The settings of the integration."""
-        return self.parts[2]
-
-    @property
-    def scene(self) -> Scene:
-        """The scene of the ride."""
-        return self.model.scene
-
-    @property
-    def launch(self) -> Launch:
-        """The launch of the ride."""
-        return self.model.launch
-
-    @property
-    def input(self) -> Input | None:
-        """The input of the ride."""
-        return self.model.input
-
-
-def stats_of(outcome: HybridOutcome[Array]) -> Stats:
-    """The statistics of a run of one cell."""
-    accepted, rejected = outcome.steps[0] - outcome.rejected[0], outcome.rejected[0]
-    return Stats(accepted.astype(int), rejected.astype(int), outcome.status[0] == REACHED_END)
 
 
 Lanes = Float[np.ndarray, " lanes"]
@@ -128,13 +267,13 @@ class Steps(NamedTuple):
         states[:, times > self.times[-1]] = np.nan
         return states
 
-    def _between(self, spec: RideSpec, step: Any, length: Lanes) -> States:
+    def _between(self, spec: RideSpec, step: Int[np.ndarray, " lanes"], length: Lanes) -> States:
         """The states at given times [s] after the starts of some steps."""
 
         def field(times: Lanes, states: States) -> States:
             return in_blocks(lambda *arguments: _field(spec, *arguments), times, states)
 
-        time, start, solver = self.times[step], self.states[:, step], spec.settings.for_steps_alone
+        time, start, solver = self.times[step], self.states[:, step], spec.ride.settings.for_steps_alone
         rates = [field(time, start)]
         if not isinstance(solver, diffrax.AbstractERK):
             # Use the cubic through states and rates at both ends; repeating an implicit step would be expensive.
@@ -152,10 +291,11 @@ class Steps(NamedTuple):
 
 @eqx.filter_jit
 def _field(spec: RideSpec, times: Float[Array, "*lanes"], states: State) -> State:
-    return spec.scene.dynamics.field(times, states, spec.input)
+    model = spec.ride.model
+    return model.scene.dynamics.field(times, states, model.input)
 
 
-def in_blocks(function: Callable[..., Any], *columns: Any) -> Any:
+def in_blocks(function: Callable[..., Array], *columns: np.ndarray) -> np.ndarray:
     """A compiled function of any number of columns, `WIDTH` at a time; the last block is padded with its last column."""
     count = columns[0].shape[-1]
     results = []
@@ -167,32 +307,29 @@ def in_blocks(function: Callable[..., Any], *columns: Any) -> Any:
 
 def followed(spec: RideSpec) -> tuple[Steps, Stats]:
     """Run a ride outside of transformations, and keep its steps."""
-    problem, (_, t1, settings, grid) = _problem(spec), spec.parts
+    model, t1, settings, grid = spec.ride
+    problem = _problem(model)
     if grid is None:
         path = follow(problem, float(t1), settings, dense=False)
-        return Steps(path.times, path.states), _counted(path.accepted, path.rejected, not path.failed)
-    solution = _on_grid(problem, spec)
-    ends = np.asarray(grid)
-    mask = ends <= float(solution.end_time)
-    steps = Steps(ends[mask], np.asarray(solution.states)[:, mask])
-    return steps, _counted(int(solution.accepted), int(solution.rejected), bool(mask.all()))
-
-
-def _counted(accepted: int, rejected: int, finished: bool) -> Stats:
-    """Statistics as arrays: plain numbers would be constants of a program, and other values would compile another
-    program."""
-    return Stats(jnp.asarray(accepted), jnp.asarray(rejected), jnp.asarray(finished))
+        steps, counts = Steps(path.times, path.states), (path.accepted, path.rejected, not path.failed)
+    else:
+        solution, ends = _on_grid(problem, spec), np.asarray(grid)
+        mask = ends <= float(solution.end_time)
+        steps = Steps(ends[mask], np.asarray(solution.states)[:, mask])
+        counts = (int(solution.accepted), int(solution.rejected), bool(mask.all()))
+    # Plain numbers would be constants of a program, and other values would compile another program.
+    return steps, Stats(*map(jnp.asarray, counts))
 
 
 @eqx.filter_jit
-def _problem(spec: RideSpec) -> RideProblem:
-    return RideProblem.single(spec.scene, spec.launch, spec.input, spec.model.jumps)
+def _problem(model: Any) -> RideProblem:
+    return model.problem(None, None)
 
 
 @compiled_quickly
 def _on_grid(problem: RideProblem, spec: RideSpec) -> Any:
     """A ride with given steps, sampled at their ends."""
-    _, t1, settings, grid = spec.parts
+    _, t1, settings, grid = spec.ride
     return sample(problem, None, t1, settings, grid=grid)
 
 
@@ -208,21 +345,15 @@ def watched(spec: RideSpec, states: States, name: str) -> Lanes:
 
 @eqx.filter_jit
 def _watched(spec: RideSpec, states: State) -> Float[Array, "watched lanes"]:
-    dynamics = spec.scene.dynamics
+    dynamics = spec.ride.model.scene.dynamics
     quantities = (dynamics.contact(states), dynamics.geometry(states).cosine, dynamics.rank(states))
     return jnp.stack(jnp.broadcast_arrays(*quantities))
-
-
-def crossings(spec: RideSpec, steps: Steps, name: str, level: float) -> Float[np.ndarray, " times"]:
-    """Times [s] at which a watched quantity passes a level, in either direction, in increasing order."""
-    value = watched(spec, steps.states, name) - level
-    return all_crossings(lambda times: watched(spec, steps.at(spec, times), name) - level, steps.times, value)
 
 
 # One run of the stroller and its quantities.
 
 
-class Trajectory(Viewable, Tabular, eqx.Module):
+class Trajectory(AbstractRun):
     """A run at the given times. Times are the first axis of every array.
 
     - `t` [s]; `place`, as the surface names it (see `Launch`), (times, 2), or (times, 3) on an implicit surface; `position`
@@ -255,30 +386,30 @@ class Trajectory(Viewable, Tabular, eqx.Module):
     """
 
     t: Float[Array, " times"]
-    place: Float[Array, "times numbers"]
-    position: Float[Array, "times 3"]
-    heading: Float[Array, " times"]
-    direction: Float[Array, "times 3"]
-    steering: Float[Array, " times"]
-    speed: Float[Array, " times"]
-    front_speed: Float[Array, " times"]
-    steering_rate: Float[Array, " times"]
-    yaw_rate: Float[Array, " times"]
-    energy: Float[Array, " times"]
-    work: Float[Array, " times"]
-    power: Power
-    side_force: Float[Array, "times 2"]
-    normal_force: Float[Array, " times"]
-    load: Float[Array, "times 2"]
-    constraint: Float[Array, "times 2"]
-    departure: Float[Array, " times"]
-    state: Float[Array, "times components"]
+    values: dict[str, PyTree[Array]]
     stats: Stats
     spec: RideSpec
     steps: Steps | None
 
     readable: ClassVar[tuple[str, ...]] = tuple(QUANTITIES)
     quantities: ClassVar[dict[str, Quantity]] = QUANTITIES
+
+    def __getattr__(self, name: str) -> Any:
+        # Python calls this only for names that are not attributes, also while a copy has none yet.
+        values = vars(self).get("values", {})
+        return values[name] if name in values else super().__getattr__(name)
+
+    def __getitem__(self, name: str) -> Any:
+        return self.values[name] if name in QUANTITIES else super().__getitem__(name)
+
+    @property
+    def model(self) -> Any:
+        """The `RideModel`."""
+        return self.spec.ride.model
+
+    @property
+    def of_page(self) -> tuple[AbstractModel, float]:
+        return self.model, float(self.spec.ride.t1)
 
     @property
     def portrait_axes(self) -> tuple[str, str]:
@@ -296,19 +427,19 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         K is the Gaussian curvature (`stroller.md`, section 9). The model holds if the wheelbase is short compared with
         the radii of curvature.
         """
-        scene = self.spec.scene
-        states = self.state.T
-        curvature = scene.surface.gaussian_curvature(scene.dynamics.unpack(states)[0])
-        return jnp.abs(spread(curvature, states[0])) * scene.body.wheelbase**2 / 6.0
+        scene = self.model.scene
+        state = RideState(scene, None, self.t, self.state.T)
+        curvature = scene.surface.gaussian_curvature(scene.dynamics.unpack(state.integrated)[0])
+        return jnp.abs(state.number(curvature)) * scene.body.wheelbase**2 / 6.0
 
     def grip(self) -> Float[Array, "times 2"]:
         """Coefficient of friction that each axle needs to avoid slip; infinite for a force without a load."""
-        return grip(self.side_force, self.load)
+        return self["grip"]
 
     @property
     def loaded_axles(self) -> tuple[str, ...]:
         """The axles that carry a load: only the rear one if the centre of mass is above it (`centre` 0)."""
-        return ("rear",) if self.spec.scene.body.centre is None else ("rear", "front")
+        return ("rear",) if self.model.scene.body.centre is None else ("rear", "front")
 
     def grip_margin(self, coefficient: Float[Array, ""]) -> Float[Array, "times 2"]:
         """Reserve of side force [N] of each axle before it slips, for a given coefficient of friction [1]."""
@@ -356,21 +487,27 @@ class Trajectory(Viewable, Tabular, eqx.Module):
     @property
     def rank_lost_at(self) -> float:
         """Time [s] at which the constraints first lose rank (only with a projected heading); otherwise infinite."""
-        return self.with_steps()._first_below("rank", RANK_LOST)
+        return self._first_below("rank", RANK_LOST)
 
     @property
     def jackknifed_at(self) -> Float[np.ndarray, " times"]:
         """Times [s] at which the steering angle passes a right angle, where the rear axle reverses."""
+        return self._crossings("steering_cosine", 0.0)[1]
+
+    def _crossings(self, name: str, level: float) -> tuple[float, Float[np.ndarray, " times"]]:
+        """A watched quantity less a level at the start, and the times [s] at which it passes this level."""
         steps = self.with_steps().steps
         assert steps is not None
-        return crossings(self.spec, steps, "steering_cosine", 0.0)
+        value = watched(self.spec, steps.states, name) - level
+        times = all_crossings(
+            lambda times: watched(self.spec, steps.at(self.spec, times), name) - level, steps.times, value
+        )
+        return value[0], times
 
     def _first_below(self, name: str, level: float) -> float:
         """Time [s] at which a watched quantity is first below a level; infinite if it never is."""
-        assert self.steps is not None
-        if watched(self.spec, self.steps.states[:, :1], name)[0] < level:
-            return float(self.steps.times[0])
-        return float(min(crossings(self.spec, self.steps, name, level), default=np.inf))
+        start, times = self._crossings(name, level)
+        return 0.0 if start < 0.0 else float(min(times, default=np.inf))
 
     @property
     def status(self) -> Any:
@@ -384,42 +521,21 @@ class Trajectory(Viewable, Tabular, eqx.Module):
             count = self.t.shape[0]
             return np.array([jax.tree.map(lambda leaf, k=k: leaf[k], self).status for k in range(count)])
         if not (bool(self.stats.finished) and np.all(np.isfinite(self.state))):
-            is_legal = self.spec.parts[0].legal()
+            is_legal = self.model.legal()
             return "failed" if np.all(is_legal) else "illegal"
         run = self.with_steps()
         if np.isfinite(run.rank_lost_at):
             return "rank_lost"
         return "contact_lost" if np.isfinite(run.contact_lost_at) else "completed"
 
-    def explore(
-        self, path: Any = None, sliders: dict[str, tuple[float, float]] | None = None, unit: Any = None
-    ) -> Page:
-        """A page with sliders that simulates the ride in the browser; see `stroller.explore`.
-
-        **Raises:** as for `stroller.explore`, and `ValueError` for a batch of rides.
-        """
-        require_one_run(self, "explore", "")
-        model, t1, *_ = self.spec.parts
-        return explore_model(model, path, sliders, float(t1), unit)
-
-    @status_line("reading off")
-    def to_table(self) -> Table:
-        return table_of_one(self)
-
     def table_of(self, names: Sequence[str]) -> Table:
-        return table_of_one(self, names)
+        require_one_run(self, "to_table", "; stroller.sweep makes a table of many")
+        return table_of([self], [], self.model.description() | {"status": self.status}, names)
 
-    def labels_of(self, runs: list[Any], unit: Any) -> list[str]:
+    def labels_of(self, runs: list[Any], unit: Unit) -> list[str]:
         return names_of(runs, unit) if len(runs) > 1 else [""]
 
-    def stages(self, others: Sequence[Any] = (), overlaid: bool = False, unit: Any = None) -> list[Stage]:
-        return as_stages([self, *others], overlaid, unit)
-
-    @status_line("reading off")
-    def __str__(self) -> str:
-        # A batch, or a run inside a transformation, has no single values to show.
-        if is_traced(self.t) or self.t.ndim > 1:
-            return batch_title(self.t.shape)
+    def in_words(self) -> str:
         self = self.with_steps()
         jackknives = self.jackknifed_at
         lines = [
@@ -455,9 +571,11 @@ def read_off(
     spec: RideSpec, t: Float[Array, " times"], states: Float[Array, "components times"], stats: Stats
 ) -> Trajectory:
     """The trajectory of the given states at the given times."""
-    state = RideState(spec.scene, spec.input, t, states)
-    arrays = {field.name: getattr(state, field.name) for field in dataclasses.fields(Trajectory)[:-3]}
-    return Trajectory(**arrays, stats=stats, spec=spec, steps=None)
+    model = spec.ride.model
+    state = RideState(model.scene, model.input, t, states)
+    values = {name: quantity.of(name, state) for name, quantity in QUANTITIES.items()}
+    values |= {name: read(state) for name, read in FURTHER.items()}
+    return Trajectory(t, values, stats, spec, None)
 
 
 # Compiled functions also accept NumPy arrays.
@@ -472,9 +590,9 @@ DEFAULT_STEPS = 65536
 
 def ride(
     model: Any,
-    t1: Any,
+    t1: ArrayLike,
     times: Any,
-    tolerance: Any,
+    tolerance: ArrayLike,
     solver: diffrax.AbstractSolver | None,
     max_steps: int,
     adjoint: diffrax.AbstractAdjoint | None,
@@ -495,7 +613,8 @@ def ride(
         max_steps = grid.size
     settings = Settings(tolerance, solver, max_steps=max_steps)
     # Inside a transformation, this traces all numbers, even if they are known.
-    spec = RideSpec.of(model, jnp.add(end, 0.0), settings, grid)
+    ride = Ride(model, jnp.add(end, 0.0), settings, grid)
+    spec = RideSpec(*eqx.partition(ride, eqx.is_array_like))
     inside = is_traced((spec, times))
     # Steps of other implicit solvers cannot be repeated cheaply, so they end on the times.
     if inside or not isinstance(settings.for_steps_alone, diffrax.AbstractERK | ImplicitMidpoint):
@@ -508,10 +627,13 @@ def ride(
 @eqx.filter_jit
 def _sampled(spec: RideSpec, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None) -> Trajectory:
     """The run at `times`; NaN and `finished` false if a traced number is out of range."""
-    model, t1, settings, grid = spec.parts
+    model, t1, settings, grid = spec.ride
     is_legal, samples, _ = sampled_if_legal(model, times, t1, settings, grid, adjoint)
-    run = read_off(spec, times, samples.rows, stats_of(samples.outcome))
-    stats = run.stats._replace(finished=run.stats.finished & is_legal)
+    outcome = samples.outcome
+    rejected = outcome.rejected[0].astype(int)
+    accepted = (outcome.steps[0] - outcome.rejected[0]).astype(int)
+    stats = Stats(accepted, rejected, is_legal & (outcome.status[0] == REACHED_END))
+    run = read_off(spec, times, samples.rows, stats)
     return eqx.tree_at(lambda trajectory: (trajectory.t, trajectory.stats), nan_unless(is_legal, run), (times, stats))
 
 

@@ -1,17 +1,14 @@
 """The functions of the stroller: rides, tables, crossings, fits, plots and pages."""
 
-import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from pathlib import Path
 from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
-import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.geometry import AbstractQuadric, AbstractSurface
 from nonholonomic.identification import (
     AbstractRecording,
     Identification,
@@ -20,39 +17,22 @@ from nonholonomic.identification import (
     as_quantity,
     read_columns,
 )
-from nonholonomic.integration import AbstractPassive, ExtendedProblem
-from nonholonomic.integration.problem import DEFAULT_MAX_STEPS, Status, require_run
-from nonholonomic.parameters import full_axes, numbers
-from nonholonomic.runs import (
-    AbstractModel,
-    Options,
-    TableForm,
-    explore_model,
-    fit_runs,
-    live_run,
-    page_of,
-    posterior_of_runs,
-    runs_at_ends,
-    search_options,
-    sliders_of,
-    sources_of,
-    table_of,
-)
-from nonholonomic.runs.trajectory import TOLERANCE
+from nonholonomic.integration.problem import DEFAULT_MAX_STEPS
+from nonholonomic.parameters import full_axes
+from nonholonomic.runs.identify import fit_runs, posterior_of_runs, search_options, sources_of
+from nonholonomic.runs.model import AbstractModel
+from nonholonomic.runs.sweep import Options, table_of
+from nonholonomic.runs.table import TableForm
 from nonholonomic.sweeps import Table
 from nonholonomic.terminal import status_line
 from nonholonomic.text import shown
 from nonholonomic.validation import as_number, as_number_or_none, require_kind, require_outside
-from nonholonomic.views import COLOURS, Page, Stage, arena, css
-from nonholonomic.views.explore import Frame, LiveRun, Summary, quaternion
 
-from ..model.dynamics import State
-from ..model.input import Input, check_input
-from ..model.scene import RideProblem, Scene
+from ..model.input import Input
+from ..model.scene import Scene
 from ..model.vehicle import USUAL, Launch
-from .model import TAKEN, RideModel
+from .model import TAKEN, RideModel, check_run
 from .trajectory import Trajectory, ride
-from .view import RADIUS, TRACK, Posture, RideState, normals
 
 # The functions of the stroller, on those of `nonholonomic.runs`.
 
@@ -134,7 +114,7 @@ def sweep(
     input: Input | None = None,
     tolerance: float = 1e-9,
     solver: diffrax.AbstractERK | None = None,
-    path: Any = None,
+    path: str | Path | None = None,
     progress: bool = True,
     executor: Executor | None = None,
     max_steps: int = DEFAULT_MAX_STEPS,
@@ -190,244 +170,6 @@ def sweep(
     model = RideModel.of(scene, launch, input, None, jumps)
     options = Options(tolerance, solver, max_steps, path=path, progress=progress, executor=executor)
     return table_of(model, full_axes(axes, model.known), float(t1), "first", options, FORM)
-
-
-@status_line("writing a page")
-def explore(
-    scene: Scene,
-    launch: Launch,
-    path: Any = None,
-    sliders: dict[str, tuple[float, float]] | None = None,
-    t1: float = 8.0,
-    input: Input | None = None,
-    unit: str | Sequence[str] | None = None,
-    jumps: Sequence[Any] | Array | None = None,
-) -> Page:
-    """Make a page with sliders that simulates the ride in the browser while you move a slider.
-
-    The page is one file that needs no network; a notebook shows the returned `Page`. The equations of motion, the
-    Runge-Kutta pair and the step-size control are generated from those of `simulate` and of tables, at a tolerance of
-    1e-7. The page also computes a map, over two of the sliders, of the distance between the ends of the ride; click on
-    the map to set both sliders. The address of the page contains the slider values, so that you can copy a link to a
-    ride. Press space to play or pause, and r to reset the sliders.
-
-    **Arguments:**
-
-    - `scene`, `launch`, `input`: the ride at the start, as for `simulate`.
-    - `path`: file to write the page to, or `None`.
-    - `sliders`: name of a parameter -> (lowest, highest) value. The end of a name is enough if only one parameter
-      matches, such as "launch.speed", "launch.steering" or "inertia". By default speed, steering angle, heading and
-      friction.
-    - `t1`: horizon [s].
-    - `unit`: unit of the curves, such as "deg" for all angles.
-    - `jumps`: times [s] at which the input jumps, as for `simulate`.
-
-    **Returns:** a `Page`, with its `html`.
-
-    **Raises:** `ValueError` for arguments out of range, an unknown slider, or equations with an operation of JAX that cannot
-    be written in JavaScript; `ModuleNotFoundError` if the library for views is not installed; `OSError` if the file cannot be
-    written.
-
-    **Example:** a page with two sliders.
-
-    ```
-    >>> import stroller
-    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
-    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
-    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
-    >>> page = stroller.explore(scene, launch, sliders={"speed": (0.5, 3.0), "launch.steering": (-0.5, 0.5)}, t1=2.0)
-    >>> len(page.html) < 2.5e6
-    True
-
-    ```
-    """
-    check_run(scene, launch, t1, input, TOLERANCE, jumps)
-    return explore_model(RideModel.of(scene, launch, input, None, jumps), path, sliders, float(t1), unit)
-
-
-def check_run(scene: Any, launch: Any, t1: Any, input: Any, tolerance: Any, jumps: Any = None) -> None:
-    """Raise `ValueError` unless scene, launch, horizon, input and tolerance are legal and the scene can start with the
-    launch."""
-    lists = "axes of sweep take lists, and jax.vmap maps over them"
-    require_run(scene, launch, t1, tolerance, (Scene, Launch), lists)
-    scene.check(launch)
-    check_input(input, scene, launch, jumps)
-
-
-# A page with sliders that simulates a ride in the browser.
-
-#: Number of curves of `view.show` that the page computes.
-CURVES = 4
-
-#: The quantities of a ride that the page draws.
-SHOWN = ("position", "direction", "steering", "speed", "front_speed", "energy", "normal_force", "load", "side_force")
-
-
-@page_of.register(RideModel)
-def page_of_ride(model: RideModel, sliders: Any, t1: float) -> tuple[LiveRun, Stage]:
-    """The contents of the page, and the stage."""
-    knobs = sliders_of(model, default_ranges(model.scene, model.launch) if sliders is None else sliders)
-    live = live_run(
-        model,
-        model,
-        knobs,
-        t1,
-        outcome,
-        lambda drawn, time, rows, mode: frame(drawn.scene, drawn.input, time, rows),
-        title=f"Stroller on a {type(model.scene.surface).__name__.lower()}",
-        answer=("distance from the start", "m"),
-        summaries=(Summary("speed", "m/s", 0), Summary("energy", "J", 2)),
-        motion=rolling_ride,
-    )
-    return live, stage(runs_at_ends(model, knobs, t1))
-
-
-def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float]]:
-    """The default sliders: speed, steering angle, heading, and the parameters of friction."""
-    speed, steering, heading = float(launch.speed), abs(float(launch.steering)), float(launch.heading)
-    ranges = {
-        "launch.speed": (min(0.0, 2.0 * speed), max(3.0, 2.0 * speed)),
-        "launch.steering": (-max(0.9, steering), max(0.9, steering)),
-        "launch.heading": (heading - math.pi, heading + math.pi),
-    }
-    friction = numbers("scene.friction", scene.friction).items()
-    damping = {path: float(value) for path, value in friction if value is not None and path.endswith("ing")}
-    return ranges | {path: (0.0, 3.0 * value) for path, value in damping.items() if value > 0.0}
-
-
-class WheelAngles(AbstractPassive):
-    """The rolling angles of the left, the right and the front wheel of a ride."""
-
-    def rates(self, problem: Any, time: Float[Array, "..."], state: State, passive: State) -> State:
-        """Each rear wheel, half a track from the middle, rolls as fast as the ground passes below it."""
-        length = problem.dynamics.body.wheelbase
-        motion = problem.dynamics.geometry(state).motion
-        side_offset = 0.5 * TRACK * length * motion.yaw_rate
-        speeds = jnp.stack([motion.speed - side_offset, motion.speed + side_offset, motion.front_speed])
-        return jnp.concatenate([problem.field(time, state), speeds / (RADIUS * length)])
-
-
-def rolling_ride(model: RideModel) -> ExtendedProblem[RideProblem]:
-    """A ride of one cell with the rolling angles of its wheels."""
-    ride = RideProblem.of(model.scene, model.launch, model.input, 1, False, model.jumps)
-    return ExtendedProblem(ride, WheelAngles(), jnp.zeros((3, 1)), jnp.ones((3, 1)))
-
-
-def outcome(model: RideModel, problem: Any, lane: Any) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """The `Status` of a ride and the distance of its end from its start [m], infinite if the ride is not completed."""
-    first, last = problem.dynamics.unpack(problem.states)[0], problem.dynamics.unpack(lane.state)[0]
-    squares = [(a - b) ** 2 for a, b in zip(first, last, strict=True) if a is not None and b is not None]
-    status = model.ended(lane._replace(crossing_time=lane.first_crossing), TOLERANCE)[0]
-    status = jnp.where(status == int(Status.EVENT), int(Status.CONTACT_LOST), status)
-    return status, jnp.where(status == int(Status.COMPLETED), jnp.sqrt(sum(squares))[0], jnp.inf)
-
-
-def stage(rides: list[Trajectory]) -> Stage:
-    """The stage of the first ride, on a part of the ground that contains all rides."""
-    (first,), scene = rides[0].stages(), rides[0].spec.scene
-    length = float(scene.body.wheelbase)
-    points = np.concatenate([np.asarray(ride.position) for ride in rides])
-    # The page would not update the curve of the friction that the tyres need, which `frame` does not compute.
-    shows = tuple(show._replace(curves=show.curves[:CURVES]) for show in first.shows)
-    ground = arena(scene.surface, points, first.arena.normal, 3.0 * length, length)
-    return first._replace(shows=shows, arena=ground)
-
-
-def frame(scene: Scene, controls: Input | None, time: Any, rows: Float[Array, "rows 1"]) -> Frame:
-    """The drawn quantities of a stroller at one time, in the order of `view.show`. The rows end with the rolling angles of
-    the wheels."""
-    state = RideState(scene, controls, time, rows[:-3])
-    outputs = {name: getattr(state, name)[0] for name in SHOWN}
-    length, position = scene.body.wheelbase, outputs["position"]
-    normal = normals(jnp, scene.surface, scene.side, position)
-    posture = Posture.of(jnp, length, position, outputs["direction"], normal, outputs["steering"], rows[-3:, 0])
-    rotations = [quaternion(rotation) for rotation in posture.rotations]
-    (rear, front), load, side_force = posture.contacts, outputs["load"], outputs["side_force"]
-    return Frame(
-        normal=normal,
-        bodies=tuple(zip(posture.places, rotations, strict=True)),
-        traces=((rear, None), (front, None)),
-        arrows=(
-            (rear, load[0] * posture.up),
-            (front, load[1] * posture.up),
-            (rear, side_force[0] * posture.left[0]),
-            (front, side_force[1] * posture.left[1]),
-        ),
-        curves=(outputs["speed"], outputs["steering"], outputs["energy"], outputs["normal_force"]),
-        turning_rate=jnp.maximum(jnp.abs(outputs["speed"]), jnp.abs(outputs["front_speed"])) / (RADIUS * length),
-    )
-
-
-# The plot of the main job (needs matplotlib): paths on the ground, speed, energy and side forces.
-
-
-def draw_rides(grounds: dict[str, AbstractSurface], rides: dict[tuple[str, str], Trajectory]) -> Any:
-    """Draw rides, one row of plots per ground.
-
-    **Arguments:**
-
-    - `grounds`: name of a ground -> the ground.
-    - `rides`: (name of a ground, name of a ride) -> its trajectory.
-
-    **Returns:** a matplotlib figure.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(18.0, 4.2 * len(grounds)), layout="constrained")
-    layout = figure.add_gridspec(len(grounds), 4, width_ratios=(1.5, 1.0, 1.0, 1.0))
-    # As on the page, whose curves are those of all grounds.
-    colours = {name: css(COLOURS[number % len(COLOURS)]) for number, name in enumerate(rides)}
-    for row, (name, ground) in enumerate(grounds.items()):
-        on_ground = {ride: run for (place_name, ride), run in rides.items() if place_name == name}
-        space = figure.add_subplot(layout[row, 0], projection="3d")
-        _draw_ground(space, ground, on_ground)
-        panels = [figure.add_subplot(layout[row, column]) for column in (1, 2, 3)]
-        for name_of_ride, run in on_ground.items():
-            colour = colours[name, name_of_ride]
-            space.plot(*np.asarray(run.position).T, color=colour, linewidth=1.4, label=name_of_ride)
-            panels[0].plot(run.t, run.speed, color=colour)
-            panels[1].plot(run.t, run.energy, color=colour)
-            panels[1].plot(run.t, run.energy[0] + run.work, color="black", linewidth=0.8, linestyle=":")
-            panels[2].plot(run.t, run.side_force[:, 0], color=colour)
-            panels[2].plot(run.t, run.side_force[:, 1], color=colour, linestyle="--")
-        space.set_title(name)
-        space.legend(fontsize="small")
-        for panel, label in zip(panels, ("speed [m/s]", "energy [J]", "side force [N]"), strict=True):
-            panel.set_xlabel("time [s]")
-            panel.set_ylabel(label)
-        # The legend beside the path explains the colours; this one explains the line styles, above, where it hides
-        # nothing.
-        panels[1].set_title("dotted: start plus work", fontsize="small")
-        panels[2].set_title("full: rear axle, dashed: front wheel", fontsize="small")
-    return figure
-
-
-def _draw_ground(space: Any, ground: AbstractSurface, rides: dict[str, Trajectory]) -> None:
-    """A wire frame of the ground as far as the rides go."""
-    from matplotlib.ticker import MaxNLocator
-
-    places = np.concatenate([np.asarray(run.place) for run in rides.values()])
-    first, second = (
-        np.linspace(part.min() - 0.3, part.max() + 0.3, 13) if unit == "m" else np.linspace(-np.pi, np.pi, 49)
-        for part, (_, unit) in zip(places.T, ground.coordinates, strict=True)
-    )
-    if isinstance(ground, AbstractQuadric):
-        second = np.linspace(-np.pi / 2, min(places[:, 1].max() + 0.1, np.pi / 2), 13)
-    grid = tuple(np.meshgrid(first, second, indexing="ij"))
-    x, y, z = (np.asarray(part) for part in ground.in_fixed_frame(ground.chart(grid)[0]))
-    space.plot_wireframe(x, y, z, color="0.75", linewidth=0.4)
-    space.set_xlabel("x [m]", labelpad=8)
-    space.set_ylabel("y [m]", labelpad=8)
-    space.set_zlabel("z [m]")
-    # As many ticks along each axis as there is room for.
-    spans = [np.ptp(part) for part in (x, y, z)]
-    for axis, span in zip((space.xaxis, space.yaxis, space.zaxis), spans, strict=True):
-        axis.set_major_locator(MaxNLocator(max(round(4.0 * span / max(spans)), 1)))
-    # A plane has nearly no height to show.
-    if spans[2] < 0.1 * max(spans):
-        space.set_zticks([])
-        space.set_zlabel("")
-    space.set_aspect("equal")
 
 
 # Estimate parameters of a stroller, its ground and its launch from recorded rides, and their posterior.
@@ -560,7 +302,7 @@ class Recording(AbstractRecording):
     input: Input | None = None
     t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
-    jumps: Any = None
+    jumps: object = None
     quantities: ClassVar[Quantities] = QUANTITIES
 
     def model(self, scene: Scene) -> AbstractModel:
@@ -584,7 +326,7 @@ def read_recording(
     t0: float = 0.0,
     student: float | None = None,
     decimal: str = ".",
-    jumps: Any = None,
+    jumps: object = None,
 ) -> Recording:
     """A recording of a ride from a text file of columns with a header line (CSV).
 

@@ -11,11 +11,10 @@ from jax import export
 
 import stroller
 import tippe
-from nonholonomic.integration import Oscillatory8, Settings
-from nonholonomic.integration.scheduler import ensemble_solve
+from nonholonomic.integration import Oscillatory8, Settings, solve_ensemble
 from stroller.model.scene import RideProblem
 from tippe.modes.problems import InversionProblem
-from tippe.runs.launches import run_kind_of
+from tippe.runs.model import run_kind_of
 
 T1, TOLERANCE, SETTINGS = 8.0, 1e-6, Settings(1e-6, Oscillatory8())
 THETAS, TIMES = jnp.linspace(0.05, 0.15, 4), jnp.linspace(0.0, 1.0, 11)
@@ -33,7 +32,8 @@ def time(scene, theta=0.1, spin=155.0):
 
 
 def ended(problem, count, **options):
-    return ensemble_solve(problem, jnp.asarray(T1), jnp.asarray(count), SETTINGS, one_kernel=True, **options)[0]
+    arguments = (problem, jnp.asarray(T1), jnp.asarray(count), SETTINGS)
+    return solve_ensemble(*arguments, one_kernel=True, traced=True, **options)[0]
 
 
 def table(thetas):

@@ -18,8 +18,7 @@ import tippe
 from nonholonomic.compilation.xla_cpu import compile_quickly
 from nonholonomic.integration import Settings
 from nonholonomic.parameters import with_numbers
-from nonholonomic.runs import TableJob
-from nonholonomic.runs.table import errors_of, second_tolerance
+from nonholonomic.runs.table import TableJob, errors_of, second_tolerance
 from tippe.runs.model import INVERSIONS, TopModel
 
 ANGLE, TOLERANCE = 0.95 * np.pi, 1e-9

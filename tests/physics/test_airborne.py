@@ -13,7 +13,7 @@ import tippe
 from nonholonomic.hybrid import solve_hybrid_dense
 from nonholonomic.integration import Settings
 from tippe.modes.airborne import FLYING, SLIDING
-from tippe.runs.launches import flight_modes
+from tippe.runs.model import flight_modes
 
 REFERENCE = recorded()
 

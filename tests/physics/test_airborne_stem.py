@@ -16,9 +16,9 @@ from hop_reference import CASES as ON_THE_PLANE
 from test_leaning import REFERENCE as FOUND_ON_THE_PLANE
 
 import tippe
-from nonholonomic.hybrid.sampled_adjoint import program_groups
-from tippe.modes.airborne import ON_STEM, STRIKING, FlyBoth
-from tippe.runs.launches import flight_modes
+from nonholonomic.hybrid.ensemble import program_groups
+from tippe.modes.airborne import ON_STEM, STRIKING, Fly
+from tippe.runs.model import flight_modes
 
 REFERENCE = recorded()
 STEM = tippe.Stem(radius=5e-3, offset=0.016)
@@ -199,7 +199,7 @@ def test_one_blow_may_throw_the_other_sphere_into_the_arena(monkeypatch):
     L = float(TOP.I1) * w + float(TOP.I3 - TOP.I1) * (e @ w) * e[:, None]
     rest = np.zeros((2, cells))
     states = np.concatenate([np.tile(place[:, None], cells), u, np.tile(e[:, None], cells), L, rest])
-    mode = FlyBoth(scene, jnp.ones((14, cells)), jnp.asarray(-2.0), False, jnp.asarray(True))
+    mode = Fly(scene, jnp.ones((14, cells)), jnp.asarray(-2.0), False, jnp.asarray(True))
     transition = eqx.filter_jit(mode.reset_map)(jnp.asarray(states), jnp.ones(cells))
     top, outcomes = TwoSpheres(case), []
     for sphere in top.spheres:

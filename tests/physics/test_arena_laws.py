@@ -14,7 +14,7 @@ from close import assert_close
 from tops import rutstam_top
 
 import tippe
-from tippe.model.launch import joined, parts
+from tippe.model.dynamics import joined, parts
 
 #: Lanes: thirds of them, and halves.
 COUNT = 36

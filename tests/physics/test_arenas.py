@@ -15,8 +15,8 @@ from tops import rutstam_top
 import tippe
 from nonholonomic.geometry import CarriedFrame
 from nonholonomic.validation import as_number
+from tippe.friction import AbstractFriction, ContactLoad
 from tippe.model.dynamics import Dynamics
-from tippe.model.friction import AbstractFriction, ContactLoad
 
 REFERENCE = recorded()
 

@@ -7,7 +7,7 @@ import pytest
 from tops import rutstam_top
 
 import tippe
-from tippe.model.friction import ContactLoad
+from tippe.friction import ContactLoad
 
 UNRESOLVED = int(tippe.Status.UNRESOLVED)
 LAUNCH = tippe.Launch(0.1, 155.0)

@@ -20,15 +20,15 @@ from test_strong_friction import random_falls
 from tops import homogeneous_ball
 
 import tippe
-from tippe.model.launch import angular_velocity
+from tippe.model.dynamics import angular_velocity
 from tippe.modes.airborne import FLYING
-from tippe.modes.impact import approach, balls, energy, gap_rate, resolve_coulomb_impact
+from tippe.modes.impact import approach, balls, energy, gap_rate, resolve_impact
 from tippe.modes.sticking import TOUCH_ROLLING, TOUCH_SLIPPING
 
 NUMBERS, MU, THETA, SPIN, T1 = (0.02, 0.02, 0.016, 1.6e-6, 1.9e-6), 0.5, 1.5, 350.0, 0.276
 
 impact_of = eqx.filter_jit(
-    lambda impacts: resolve_coulomb_impact(
+    lambda impacts: resolve_impact(
         impacts.body,
         tippe.SetValuedCoulomb(impacts.friction.mu),
         balls(impacts.body)[0],

@@ -8,13 +8,14 @@ import pytest
 from close import assert_close
 from hop_reference import Case
 from hop_reference import resolve_impact as reference_impact
+from stems import jellett
 from test_hops import scene_of
 from tops import rutstam_top
 
 import tippe
-from tippe.model.launch import angular_velocity
-from tippe.modes.flight import Descent, angle_reached, cone, flown, landing
-from tippe.modes.impact import FreeBody, balls, energy, gap_rate, jellett, resolve_impact
+from tippe.model.dynamics import angular_velocity
+from tippe.modes.impact import FreeBody, balls, energy, gap_rate, resolve_impact
+from tippe.modes.plane import Descent, angle_reached, cone, flown, landing
 
 search = eqx.filter_jit(landing)
 

@@ -11,7 +11,7 @@ from tops import rutstam_top
 
 import tippe
 from nonholonomic.integration import Oscillatory8, Settings
-from nonholonomic.runs import TableJob
+from nonholonomic.runs.table import TableJob
 from tippe.runs.model import INVERSIONS, TopModel
 
 ROWS = list(csv.DictReader(Path(__file__).with_name("gradient_reference.csv").read_text().splitlines()))

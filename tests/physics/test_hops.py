@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from close import assert_close
 from hop_reference import CASES, Case, row
-from stems import first_contact
+from stems import first_contact, jellett
 from tops import rutstam_top
 
 import tippe
 from tippe import steady
-from tippe.modes.impact import balls, jellett, standing_on
+from tippe.modes.impact import balls, standing_on
 
 REFERENCE = list(csv.DictReader(Path(__file__).with_name("hop_reference.csv").read_text().splitlines()))
 

@@ -10,12 +10,12 @@ import pytest
 from close import assert_close
 from hop_reference import CASES, Case, contact, energy, gap, rate, watched
 from scipy.integrate import solve_ivp
-from stems import first_contact
+from stems import first_contact, jellett
 from test_hops import scene_of
 
 import tippe
-from tippe.model.launch import angular_velocity
-from tippe.modes.impact import BOTH, FreeBody, LeaningDynamics, as_free_body, at_rest, balls, gap_rate, jellett
+from tippe.model.dynamics import angular_velocity
+from tippe.modes.impact import BOTH, FreeBody, LeaningDynamics, as_free_body, at_rest, balls, gap_rate
 from tippe.modes.impact import energy as energy_of
 
 REFERENCE = list(csv.DictReader(Path(__file__).with_name("hop_reference.csv").read_text().splitlines()))

@@ -37,17 +37,7 @@ def beginning(scene, start, scales, tolerance):
     """A slip's beginning from a contact at rest, and the slip's velocity at its middle and end."""
     stick_slip = scene.dynamics
     state = stick_slip.stopped(start)
-    onset = slip_onset(
-        stick_slip.slipping,
-        stick_slip.rolling,
-        stick_slip.mu,
-        stick_slip.slipping.field,
-        state,
-        11,
-        scales,
-        jnp.asarray(0.1),
-        tolerance,
-    )
+    onset = slip_onset(stick_slip, stick_slip.slipping.field, state, 11, scales, jnp.asarray(0.1), tolerance)
     slips = [stick_slip.slipping.motion(point).slip for point in (onset.at(jnp.asarray(0.5)), onset.end)]
     return onset, [jnp.stack([slip.x, slip.y]) for slip in slips]
 

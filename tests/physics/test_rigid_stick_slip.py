@@ -9,6 +9,7 @@ from tops import random_states, rutstam_top
 
 import tippe
 from tippe.friction import Slip
+from tippe.model.dynamics import from_frame
 from tippe.modes.sticking import ROLLING
 
 
@@ -31,7 +32,7 @@ def test_a_top_sticks_and_slips_as_by_its_own_equations(arena):
             stick_slip.rolling.field(states),
             stick_slip.stopped(states),
             stick_slip.grip_left(states),
-            np.stack(stick_slip.rolling.reaction(states)),
+            np.stack(stick_slip.rolling.evaluate(states)[1]),
             np.stack(stick_slip.rolling.unit_impulse(states, 0)),
             np.stack(stick_slip.rolling.unit_impulse(states, 1)),
             stick_slip.rolling.with_slip(states, Slip(states[0], states[1])),
@@ -72,7 +73,7 @@ def test_a_blow_that_stops_the_slip_takes_energy():
 
     def about_contact(state):
         attitude = stick_slip.rolling.attitude(state)
-        r, w = (np.stack(attitude.in_frame(vector)) for vector in (attitude.lever, attitude.angular_velocity))
+        r, w = (np.stack(from_frame(vector, attitude.axes)) for vector in (attitude.lever, attitude.angular_velocity))
         u = np.stack([*np.asarray(state[:2]), -np.cross(w, r, axis=0)[2]])
         return np.asarray(state[5:8]) - np.cross(r, u, axis=0)
 

@@ -14,8 +14,8 @@ from scipy.special import ellipk
 from tops import homogeneous_ball, random_states, rutstam_top
 
 import tippe
+from tippe.friction import AbstractFriction, ContactLoad, Slip
 from tippe.model.dynamics import RollingDynamics
-from tippe.model.friction import AbstractFriction, ContactLoad, Slip
 
 ARENAS = [tippe.Plane(), tippe.Cylinder(0.1), tippe.Sphere(0.1)]
 
@@ -23,7 +23,7 @@ ARENAS = [tippe.Plane(), tippe.Cylinder(0.1), tippe.Sphere(0.1)]
 def rolling_top(arena, body=None) -> tuple[tippe.Scene, RollingDynamics]:
     """A scene and its rolling motion."""
     scene = tippe.Scene(rutstam_top() if body is None else body, arena)
-    return scene, RollingDynamics.of(scene.body, scene.frame, scene.gravity)
+    return scene, RollingDynamics(scene.frame, scene.body, scene.gravity)
 
 
 def rolling_states(scene: tippe.Scene, rolling: RollingDynamics, count: int):

@@ -10,11 +10,11 @@ from hop_reference import Case, contact, launch, rate, row
 from impact_reference import Body, Law
 from impact_reference import resolve_impact as reference_impact
 from scipy.integrate import solve_ivp
+from stems import jellett
 
 import tippe
-from tippe.model.dynamics import JAMMED
-from tippe.model.launch import angular_velocity
-from tippe.modes.impact import FreeBody, balls, energy, gap_rate, jellett, resolve_impact
+from tippe.model.dynamics import JAMMED, angular_velocity
+from tippe.modes.impact import FreeBody, balls, energy, gap_rate, resolve_impact
 
 # Impacts
 

@@ -13,7 +13,7 @@ from test_hops import scene_of
 from test_strong_friction import COUNT, Falls, impact_of, random_falls
 
 import tippe
-from tippe.model.launch import angular_velocity
+from tippe.model.dynamics import angular_velocity
 from tippe.modes.impact import balls, energy, gap_rate
 
 

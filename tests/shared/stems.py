@@ -1,8 +1,9 @@
-"""A closed form of a top with a stem on the plane (`tippe.md`, section 4; Leine and Glocker 2003)."""
+"""Closed forms of a top with a stem on the plane (`tippe.md`, section 4; Leine and Glocker 2003)."""
 
 import math
 
 import tippe
+from nonholonomic.geometry import dot
 
 
 def first_contact(body: tippe.Top) -> float:
@@ -11,3 +12,9 @@ def first_contact(body: tippe.Top) -> float:
     Below it a top stands on its sphere, above it on its stem.
     """
     return math.acos(float((body.stem.radius - body.radius) / (body.stem.offset - body.offset)))
+
+
+def jellett(ball, free):
+    """Jellett's quantity L.(R n - a e) [kg m^3/s] for one of the spheres: constant while no force acts on the other
+    sphere."""
+    return ball.radius * free.momentum[2] - ball.offset * dot(free.axis, free.momentum)

@@ -9,7 +9,7 @@ import pytest
 
 import stroller
 from stroller import Damping, ImplicitMidpoint, Launch, RollingResistance, Scene, Sphere, Spheroid, Steady, Stroller
-from stroller.runs.verbs import check_run
+from stroller.runs.model import check_run
 
 BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05)
 FULL = Scene(BODY, Spheroid(2.0, 1.1), Damping(0.3, 0.2, 0.1, 0.15), side="inside", fork="absolute")

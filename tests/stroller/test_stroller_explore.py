@@ -8,10 +8,10 @@ import pytest
 from browser import complaints, needs_browser, open_browser, wait
 
 import stroller
-from nonholonomic.runs import TOLERANCE
+from nonholonomic.runs.trajectory import TOLERANCE
 from nonholonomic.views.explore import programs
 from stroller.runs.model import RideModel
-from stroller.runs.verbs import page_of_ride
+from stroller.runs.view import page_of_ride
 
 pytestmark = needs_browser
 

@@ -61,7 +61,7 @@ def test_a_ride_goes_to_xarray_a_file_and_a_picture(tmp_path):
     with xarray.open_dataset(tmp_path / "ride.h5", engine="h5netcdf") as dataset:
         np.testing.assert_array_equal(dataset["position"], run.position)
         assert set(dataset.variables) == set(data.variables)
-        assert json.loads(dataset.attrs["request"])["launch.speed"] == float(run.spec.launch.speed)
+        assert json.loads(dataset.attrs["request"])["launch.speed"] == float(run.model.launch.speed)
     assert run.portrait("position.x", "position.y").axes[0].get_ylabel() == "position of the rear axle, y [m]"
     assert "completed" in run._repr_html_()
     assert "Damping(rolling=2 N s/m, front=1 N s/m, scrub=0.2 N m s, steering=0.05 N m s)" in str(SCENE)

@@ -10,10 +10,10 @@ from rigid import rattleback
 from tops import rutstam_top
 
 import tippe
-from nonholonomic.runs import TOLERANCE
+from nonholonomic.runs.trajectory import TOLERANCE
 from nonholonomic.views.explore import programs
-from tippe.runs.explore import page_of_launch
 from tippe.runs.model import TopModel
+from tippe.runs.view import page_of_launch
 
 pytestmark = needs_browser
 

@@ -14,7 +14,7 @@ from hard.friction import hertz_disc
 from tops import random_states, rutstam_top
 
 import tippe
-from tippe.model.friction import ContactLoad, Slip
+from tippe.friction import ContactLoad, Slip
 
 ARENAS = {"plane": tippe.Plane(), "cylinder": tippe.Cylinder(0.3), "sphere": tippe.Sphere(0.3)}
 BOTH = tippe.Rolling(2e-3, 3.0, tippe.Contensou(0.4, 4e-3, 0.1))

@@ -9,8 +9,15 @@ from tops import rutstam_top
 
 import tippe
 from nonholonomic.integration import Settings
-from nonholonomic.runs import TableJob
-from nonholonomic.runs.table import FINER, SAFETY, SAFETY_OF_HISTORIES, error_bound, errors_of, second_tolerance
+from nonholonomic.runs.table import (
+    FINER,
+    SAFETY,
+    SAFETY_OF_HISTORIES,
+    TableJob,
+    error_bound,
+    errors_of,
+    second_tolerance,
+)
 from nonholonomic.sweeps.table import concise, concise_strings
 from tippe import steady
 from tippe.runs.model import INVERSIONS, TopModel

@@ -18,9 +18,9 @@ from jaxtyping import Array, Float
 
 from nonholonomic.geometry import rate_in_frame
 from nonholonomic.text import shown
+from tippe.friction import Slip
 from tippe.model.body import Top
-from tippe.model.friction import Slip
-from tippe.model.launch import AXIS, MOMENTUM, PLACE, VELOCITY
+from tippe.model.dynamics import AXIS, MOMENTUM, PLACE, VELOCITY
 from tippe.model.scene import Scene
 
 
@@ -46,7 +46,7 @@ def from_vector_state(scene: Scene[Top], state: Float[Array, " components"]) -> 
     **Arguments:**
 
     - `scene`: a `Scene` on a `Plane` or a `Cylinder`.
-    - `state`: (8 or 10,) as in `tippe/model/launch.py`.
+    - `state`: (8 or 10,) as in `tippe/model/dynamics.py`.
 
     **Returns:** (eta or x, theta, phi, and the rates of eta or x, y, theta, phi, psi), an array (8,) in rad, m and s; x
     is 0.

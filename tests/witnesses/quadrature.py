@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from nonholonomic.integration.dense import halved
 from tippe.model.body import Top
-from tippe.model.launch import AXIS, MOMENTUM, VELOCITY
+from tippe.model.dynamics import AXIS, MOMENTUM, VELOCITY
 from tippe.model.scene import Scene
 
 #: Gauss points for the divided difference along each direction, and cosines for the time as a function of chi.

@@ -14,9 +14,9 @@ from euler_angles import from_vector_state
 from jaxtyping import Array, Float
 
 from nonholonomic.text import shown
+from tippe.friction import Slip
 from tippe.model.body import Top
-from tippe.model.friction import Slip
-from tippe.model.launch import AXIS, VELOCITY
+from tippe.model.dynamics import AXIS, VELOCITY
 from tippe.model.scene import Scene
 
 

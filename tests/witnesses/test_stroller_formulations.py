@@ -12,7 +12,7 @@ from stroller_chart import Chart, coordinates, coordinates_and_rates
 import stroller
 from nonholonomic.formulations import Hamel
 from stroller import Damping, Frictionless, Launch, Plane, RollingResistance, Scene, Spheroid, Stroller
-from stroller.runs.view import side_force
+from stroller.runs.trajectory import side_force
 
 FORMULATIONS = (Multipliers, Hamel, ConstrainedConnection, ReducedBracket)
 BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05, steering_spring=0.3)

@@ -10,16 +10,16 @@ c.
 """
 
 import abc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.geometry import Component, Vector, as_function
+from nonholonomic.geometry import Component, Vector, as_function, scale, sum_vectors
 from nonholonomic.text import shown
 from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require, warn
 
@@ -30,12 +30,18 @@ class ContactGeometry(NamedTuple):
     - `offset`, `radius`: A and B [m].
     - `coupling`: m A / I1 [1/m], which the equation of the normal force needs.
     - `growth`: A'(c) [m]; `None` for a sphere, where it vanishes.
+
+    A sphere's contact geometry does not depend on the inclination, so this is also the meridian of a sphere.
     """
 
     offset: Float[Array, "..."]
     radius: Float[Array, "..."]
     coupling: Float[Array, "..."]
     growth: Component = None
+
+    def at(self, cosine: Float[Array, "..."]) -> "ContactGeometry":
+        """The contact geometry at every cos(theta)."""
+        return self
 
     def contact(self, axis: Vector) -> Vector:
         """The vector r from the centre of mass to the contact [m], in the frame (t1, t2, n)."""
@@ -44,23 +50,11 @@ class ContactGeometry(NamedTuple):
 
 
 class AbstractMeridian(eqx.Module):
-    """The meridian of a body, in the form that the equations of motion use."""
+    """The meridian of a body other than a sphere, in the form that the equations of motion use."""
 
     @abc.abstractmethod
     def at(self, cosine: Float[Array, "..."]) -> ContactGeometry:
         """The contact geometry at cos(theta)."""
-
-
-class Round(AbstractMeridian):
-    """A sphere, whose contact geometry does not depend on the inclination; the fields are those of
-    `ContactGeometry`."""
-
-    offset: Float[Array, "..."]
-    radius: Float[Array, "..."]
-    coupling: Float[Array, "..."]
-
-    def at(self, cosine: Float[Array, "..."]) -> ContactGeometry:
-        return ContactGeometry(self.offset, self.radius, self.coupling)
 
 
 class AbstractBody(Bounded):
@@ -68,8 +62,7 @@ class AbstractBody(Bounded):
 
     `mass` [kg]; `I1`, `I3`: moments of inertia about the centre of mass, across and along the axis [kg m^2].
 
-    The arena's frame moves with the point at the height `size` above the contact. Runs report the path of a point on
-    the body's axis, by default the centre of mass.
+    The arena's frame moves with the point at the height `size` above the contact.
     """
 
     mass: eqx.AbstractVar[Float[Array, "..."]]
@@ -78,7 +71,7 @@ class AbstractBody(Bounded):
 
     @property
     @abc.abstractmethod
-    def meridian(self) -> AbstractMeridian:
+    def meridian(self) -> AbstractMeridian | ContactGeometry:
         """The body's meridian."""
 
     @property
@@ -87,22 +80,17 @@ class AbstractBody(Bounded):
         """A length of the body [m], the unit for places and velocities: for a sphere the radius."""
 
     @property
-    def offset_of_path(self) -> Component:
-        """Distance along e from the centre of mass to the point whose path is reported [m]; `None` for the centre of
-        mass."""
-        return None
+    def moments(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """The magnitudes of the moments of inertia across and along the axis [kg m^2]."""
+        return self.I1, self.I3
 
     def mass_from_frame(self, axis: Vector) -> Vector:
         """Vector from the point with which the frame moves to the centre of mass [m], in (t1, t2, n)."""
         r1, r2, r3 = self.meridian.at(axis[2]).contact(axis)
         return (-r1, -r2, -r3 - self.size)
 
-    def path_from_frame(self, axis: Vector) -> Vector:
-        """Vector from the point with which the frame moves to the point whose path is reported [m]."""
-        return self.mass_from_frame(axis)
-
-    def inertia_bounds(self) -> Iterator[Bound]:
-        """The ranges of the moments of inertia."""
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.mass, "mass", above=0.0)
         yield Bound(self.I1, "I1", above=0.0)
         yield Bound(self.I3, "I3", above=0.0)
         yield Bound(self.I3, "I3", at_most=2.0 * self.I1, why="I3 <= 2 I1 for every rigid body")
@@ -117,112 +105,40 @@ class AbstractBody(Bounded):
 # first moment of the truncated ball are those of a spherical segment (Harris and Stocker, Handbook of Mathematics and
 # Computational Science, 1998, section 4.8.4).
 
-Number = Float[Array, ""]
+Number = Float[Array, "..."]
 
-
-class Moments(NamedTuple):
-    """Volume [m^3], first moment along the axis [m^4], axial and transverse second moments about the origin [m^5]."""
-
-    volume: Number
-    first: Number
-    axial: Number
-    transverse: Number
-
-    def plus(self, other: "Moments", sign: float = 1.0) -> "Moments":
-        """Both solids together, or, with `sign` -1, this solid without the other."""
-        return Moments(*(a + sign * b for a, b in zip(self, other, strict=True)))
+#: Volume [m^3], first moment along the axis [m^4], axial and transverse second moments about the origin [m^5].
+Moments = tuple[Number, Number, Number, Number]
 
 
 def truncated_ball(radius: Number, cut: Number) -> Moments:
     """A ball about the origin without the part above z = `cut`: r^2 = radius^2 - z^2 from -radius to `cut`."""
 
-    def axial(z):
-        return radius**4 * z - 2.0 * radius**2 * z**3 / 3.0 + z**5 / 5.0
+    def integrals(z: Number) -> tuple[Number, Number]:
+        """The integrals over r^4 and over r^2 z^2."""
+        fourth = radius**4 * z - 2.0 * radius**2 * z**3 / 3.0 + z**5 / 5.0
+        return fourth, radius**2 * z**3 / 3.0 - z**5 / 5.0
 
-    def vertical(z):
-        return radius**2 * z**3 / 3.0 - z**5 / 5.0
-
-    transverse = jnp.pi / 2.0 * (axial(cut) - axial(-radius))
-    return Moments(
-        jnp.pi * (2.0 * radius**3 / 3.0 + radius**2 * cut - cut**3 / 3.0),
-        -jnp.pi / 4.0 * (radius**2 - cut**2) ** 2,
-        transverse,
-        transverse / 2.0 + jnp.pi * (vertical(cut) - vertical(-radius)),
-    )
+    (fourth_to, vertical_to), (fourth_from, vertical_from) = integrals(cut), integrals(-radius)
+    axial = jnp.pi / 2.0 * (fourth_to - fourth_from)
+    volume = jnp.pi * (2.0 * radius**3 / 3.0 + radius**2 * cut - cut**3 / 3.0)
+    first = -jnp.pi / 4.0 * (radius**2 - cut**2) ** 2
+    return volume, first, axial, axial / 2.0 + jnp.pi * (vertical_to - vertical_from)
 
 
 def cylinder(radius: Number, low: Number, high: Number) -> Moments:
     """A cylinder between two heights."""
     section = jnp.pi * radius**2
-    transverse = section * (high - low) * radius**2 / 2.0
-    return Moments(
-        section * (high - low),
-        section * (high**2 - low**2) / 2.0,
-        transverse,
-        transverse / 2.0 + section * (high**3 - low**3) / 3.0,
-    )
+    axial = section * (high - low) * radius**2 / 2.0
+    first = section * (high**2 - low**2) / 2.0
+    return section * (high - low), first, axial, axial / 2.0 + section * (high**3 - low**3) / 3.0
 
 
 def half_ball(radius: Number, centre: Number) -> Moments:
     """The upper half of a ball about a point on the axis."""
     volume, moment = 2.0 * jnp.pi * radius**3 / 3.0, jnp.pi * radius**4 / 4.0
-    second = 2.0 * volume * radius**2 / 5.0
-    return Moments(volume, volume * centre + moment, second, second + 2.0 * moment * centre + volume * centre**2)
-
-
-class Shape(NamedTuple):
-    """The shape of a turned top: lengths [m], with heights above the centre of its sphere along the stem."""
-
-    radius: Number
-    cut: Number
-    stem_radius: Number
-    stem_length: Number
-    hole_radius: Number
-    hole_depth: Number
-
-    @classmethod
-    def checked(cls, lengths: dict[str, Any]) -> "Shape":
-        """A shape with checked numbers.
-
-        **Raises:** `ValueError` for numbers that are impossible for such a top.
-        """
-        for name, length in lengths.items():
-            if name.startswith("hole"):
-                require(length, name, at_least=0.0)
-            else:
-                require(length, name, above=0.0)
-        shape = cls(**{name: as_number(length) for name, length in lengths.items()})
-        radius, cut, stem = shape.radius, shape.cut, shape.stem_radius
-        require(cut, "cut", below=radius, why="the radius of the sphere")
-        rim = jnp.sqrt(radius**2 - cut**2)
-        require(stem, "stem_radius", below=rim, why="the radius of the flat that the cut leaves")
-        require(shape.stem_length, "stem_length", above=stem, why="the stem ends in a half ball")
-        if lengths["hole_radius"] or lengths["hole_depth"]:
-            require(shape.hole_radius, "hole_radius", above=stem, why="the hole is drilled around the stem")
-            require(shape.hole_radius, "hole_radius", below=rim, why="the radius of the flat that the cut leaves")
-            wall = cut + jnp.sqrt(radius**2 - shape.hole_radius**2)
-            require(shape.hole_depth, "hole_depth", above=0.0, below=wall, why="the hole must not pierce the sphere")
-        # On the level plane, sphere and stem touch together where cos(theta) is (stem - radius) / tip; the rim touches
-        # where it is -cut / radius.
-        reason = "else the rim of the cut touches the table before the stem; lengthen the stem, or cut less off"
-        require(shape.tip, "cut + stem_length - stem_radius", above=radius * (radius - stem) / cut, why=reason)
-        return shape
-
-    @property
-    def tip(self) -> Number:
-        """Height of the centre of the stem's end [m]."""
-        return self.cut + self.stem_length - self.stem_radius
-
-    @property
-    def moments(self) -> Moments:
-        """Moments of the whole top with density 1, about the centre of the sphere."""
-        bottom = self.cut - self.hole_depth
-        return (
-            truncated_ball(self.radius, self.cut)
-            .plus(cylinder(self.hole_radius, bottom, self.cut), -1.0)
-            .plus(cylinder(self.stem_radius, bottom, self.tip))
-            .plus(half_ball(self.stem_radius, self.tip))
-        )
+    axial = 2.0 * volume * radius**2 / 5.0
+    return volume, volume * centre + moment, axial, axial + 2.0 * moment * centre + volume * centre**2
 
 
 # The body: an eccentric sphere whose mass is symmetric about the axis through its two centres.
@@ -313,15 +229,15 @@ class Top(AbstractBody):
     @classmethod
     def turned(
         cls,
-        radius: Any,
-        density: Any = None,
+        radius: ArrayLike,
+        density: ArrayLike | None = None,
         *,
-        mass: Any = None,
-        cut: Any,
-        stem_radius: Any,
-        stem_length: Any,
-        hole_radius: Any = 0.0,
-        hole_depth: Any = 0.0,
+        mass: ArrayLike | None = None,
+        cut: ArrayLike,
+        stem_radius: ArrayLike,
+        stem_length: ArrayLike,
+        hole_radius: ArrayLike = 0.0,
+        hole_depth: ArrayLike = 0.0,
     ) -> "Top":
         """A top turned from one material: a sphere with its cap cut off, a cylindrical stem, and optionally a hole
         around the stem.
@@ -373,33 +289,56 @@ class Top(AbstractBody):
                 f"{min_density:g} g/cm^3 are {1e3 * min_density:g} kg/m^3"
             )
         lengths = {"radius": radius, "cut": cut, "stem_radius": stem_radius, "stem_length": stem_length}
-        shape = Shape.checked(lengths | {"hole_radius": hole_radius, "hole_depth": hole_depth})
-        moments = shape.moments
-        offset = -moments.first / moments.volume
+        for name, length in lengths.items():
+            require(length, name, above=0.0)
+        for name, length in {"hole_radius": hole_radius, "hole_depth": hole_depth}.items():
+            require(length, name, at_least=0.0)
+        is_drilled = bool(hole_radius or hole_depth)
+        radius, cut, stem_radius, stem_length = map(as_number, lengths.values())
+        hole_radius, hole_depth = as_number(hole_radius), as_number(hole_depth)
+        require(cut, "cut", below=radius, why="the radius of the sphere")
+        rim = jnp.sqrt(radius**2 - cut**2)
+        require(stem_radius, "stem_radius", below=rim, why="the radius of the flat that the cut leaves")
+        require(stem_length, "stem_length", above=stem_radius, why="the stem ends in a half ball")
+        if is_drilled:
+            require(hole_radius, "hole_radius", above=stem_radius, why="the hole is drilled around the stem")
+            require(hole_radius, "hole_radius", below=rim, why="the radius of the flat that the cut leaves")
+            wall = cut + jnp.sqrt(radius**2 - hole_radius**2)
+            require(hole_depth, "hole_depth", above=0.0, below=wall, why="the hole must not pierce the sphere")
+        # The height of the centre of the stem's end. On the level plane, sphere and stem touch together where cos(theta) is
+        # (stem_radius - radius) / tip; the rim touches where it is -cut / radius.
+        tip, least_tip = cut + stem_length - stem_radius, radius * (radius - stem_radius) / cut
+        reason = "else the rim of the cut touches the table before the stem; lengthen the stem, or cut less off"
+        require(tip, "cut + stem_length - stem_radius", above=least_tip, why=reason)
+        # Of the whole top with density 1, about the centre of the sphere.
+        bottom = cut - hole_depth
+        hole, shaft = cylinder(hole_radius, bottom, cut), cylinder(stem_radius, bottom, tip)
+        parts = (truncated_ball(radius, cut), scale(-1.0, hole), shaft, half_ball(stem_radius, tip))
+        volume, first, axial, transverse = sum_vectors(*parts)
+        offset = -first / volume
         reason = "the centre of mass lies above the centre of the sphere: shorten the stem, or drill a hole around it"
         require(offset, "offset", at_least=0.0, why=reason)
-        transverse = moments.transverse - moments.volume * offset**2
-        stem = Stem(shape.stem_radius, shape.tip + offset)
-        density = as_number(density) if mass is None else as_number(mass) / moments.volume
-        return cls(density * moments.volume, shape.radius, offset, density * transverse, density * moments.axial, stem)
+        transverse = transverse - volume * offset**2
+        density = as_number(density) if mass is None else as_number(mass) / volume
+        stem = Stem(stem_radius, tip + offset)
+        return cls(density * volume, radius, offset, density * transverse, density * axial, stem)
 
     def __check_init__(self):
         if self.stem is not None and not isinstance(self.stem, Stem):
             raise ValueError(f"stem = {shown(self.stem)} must be a Stem")
 
     def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.mass, "mass", above=0.0)
+        yield from super().bounds()
         yield Bound(self.radius, "radius", above=0.0)
         yield Bound(self.offset, "offset", at_least=0.0)
         yield Bound(self.offset, "offset", below=self.radius, why="the centre of mass lies inside the sphere")
-        yield from self.inertia_bounds()
         if self.stem is not None:
             reach = self.offset + jnp.abs(self.radius - self.stem.radius)
             yield Bound(self.stem.offset, "stem offset", above=reach, why="neither sphere lies within the other")
 
     @property
-    def meridian(self) -> Round:
-        return Round(self.offset, self.radius, self.mass * self.offset / self.I1)
+    def meridian(self) -> ContactGeometry:
+        return ContactGeometry(self.offset, self.radius, self.mass * self.offset / self.I1)
 
     @property
     def size(self) -> Float[Array, "..."]:
@@ -417,16 +356,8 @@ class Top(AbstractBody):
             return jnp.full(jnp.shape(self.radius), jnp.nan)
         return jnp.arccos((self.stem.radius - self.radius) / (self.stem.offset - self.offset))
 
-    @property
-    def offset_of_path(self) -> Float[Array, "..."]:
-        return self.offset
-
     def mass_from_frame(self, axis: Vector) -> Vector:
         return (-self.offset * axis[0], -self.offset * axis[1], -self.offset * axis[2])
-
-    def path_from_frame(self, axis: Vector) -> Vector:
-        # The frame moves with the centre of the sphere, whose path is also reported.
-        return (None, None, None)
 
     def suspicion(self) -> str | None:
         numbers = (self.mass, self.radius, self.I1)
@@ -504,12 +435,11 @@ class SpheroidBody(AbstractBody):
     offset: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
 
     def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.mass, "mass", above=0.0)
+        yield from super().bounds()
         yield Bound(self.equatorial, "equatorial", above=0.0)
         yield Bound(self.polar, "polar", above=0.0)
         yield Bound(self.offset, "offset", at_least=0.0)
         yield Bound(self.offset, "offset", below=self.polar, why="the centre of mass lies inside the spheroid")
-        yield from self.inertia_bounds()
 
     @property
     def meridian(self) -> "SpheroidMeridian":
@@ -578,8 +508,7 @@ class ConvexBody(AbstractBody):
     I3: Float[Array, "..."] = eqx.field(converter=as_number)
 
     def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.mass, "mass", above=0.0)
-        yield from self.inertia_bounds()
+        yield from super().bounds()
         height, radius, meridian = (jnp.min(part, axis=0) for part in self._samples())
         yield Bound(height, "least support", above=0.0, why="the centre of mass lies inside the body")
         for radius_part in (radius, meridian):
@@ -606,7 +535,7 @@ class ConvexBody(AbstractBody):
 class SupportMeridian(AbstractMeridian):
     """The contact geometry by differentiation of the support function; `per_inertia`: m / I1 [1/m^2]."""
 
-    support: Any
+    support: Callable[[Float[Array, "..."]], Float[Array, "..."]]
     per_inertia: Float[Array, "..."]
 
     def at(self, cosine: Float[Array, "..."]) -> ContactGeometry:

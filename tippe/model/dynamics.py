@@ -1,13 +1,12 @@
-"""The equations of motion of the tippe top that slides or rolls, in vector form and free of trigonometry.
+"""The state of a top in contact, and the equations of motion of the top that slides or rolls, in vector form and free of
+trigonometry.
 
-The state is that of `launch.py`: velocity, axis and angular momentum in the arena's moving frame (t1, t2, n), and the place.
-The velocity along n follows from the axis, because the contact persists. Cyclic coordinates (position, spin angle) are not
-part of it.
+The state is the velocity, axis and angular momentum in the arena's moving frame (t1, t2, n), and the place. The velocity
+along n follows from the axis, because the contact persists. Cyclic coordinates (position, spin angle) are not part of it.
 """
 
 import abc
-import dataclasses
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -23,6 +22,7 @@ from nonholonomic.geometry import (
     cross,
     dot,
     multiply,
+    planar_length,
     rate_in_frame,
     scale,
     stacked,
@@ -31,9 +31,67 @@ from nonholonomic.geometry import (
 )
 from nonholonomic.integration.problem import Status
 
-from .body import AbstractBody, AbstractMeridian, Top
-from .friction import AbstractFriction, ContactLoad, Slip, length
-from .launch import AXIS, angular_velocity, joined, parts
+from ..friction import AbstractFriction, ContactLoad, Slip, length
+from .body import AbstractBody, AbstractMeridian, ContactGeometry, Top
+
+# The state of a top in contact, and its parts by name.
+#
+# In the arena's moving frame (t1, t2, n): velocity (u1, u2) of the centre of mass along the arena [m/s], axis (e1, e2,
+# e3) [1], angular momentum (L1, L2, L3) about the centre of mass [kg m^2/s], then the arena's place. The components are
+# along axis 0.
+
+#: A state: its components along axis 0, each a scalar or one number per lane; the states of cells; a number for each cell.
+State = Float[Array, "components ..."]
+States = Float[Array, "components cells"]
+Cells = Float[Array, " cells"]
+
+#: Indices of the parts in a state.
+VELOCITY, AXIS, MOMENTUM, PLACE = slice(0, 2), slice(2, 5), slice(5, 8), slice(8, None)
+
+#: Index of the component of the axis along n, cos(theta).
+COS_THETA = 4
+
+
+class Parts(NamedTuple):
+    """The parts of a state."""
+
+    velocity: Tangent
+    axis: Vector
+    momentum: Vector
+    place: tuple[Component, ...]
+
+
+def parts(state: State) -> Parts:
+    """Split a state into its parts."""
+    u1, u2, e1, e2, e3, L1, L2, L3, *place = (state[k] for k in range(len(state)))
+    return Parts((u1, u2), (e1, e2, e3), (L1, L2, L3), tuple(place))
+
+
+def joined(*vectors: tuple[Component, ...]) -> State:
+    """The state made of its parts, in order; a component is a scalar or has one number per lane."""
+    return jnp.stack(jnp.broadcast_arrays(*(component for part in vectors for component in part)))
+
+
+def to_frame(vector: Vector, axes: tuple[Vector, Vector, Vector]) -> Vector:
+    """Components of a vector along three axes."""
+    return tuple(dot(vector, axis) for axis in axes)
+
+
+def from_frame(vector: Vector, axes: tuple[Vector, Vector, Vector]) -> Vector:
+    """The vector with given components along three axes."""
+    return sum_vectors(*(scale(part, axis) for part, axis in zip(vector, axes, strict=True)))
+
+
+def inclination(axis: Vector) -> Float[Array, "..."]:
+    """The angle theta [rad] from the arena's normal to the axis, in [0, pi]."""
+    return jnp.arctan2(planar_length(axis[0], axis[1]), axis[2])
+
+
+def angular_velocity(body: AbstractBody, axis: Vector, momentum: Vector) -> Vector:
+    """w = L / I1 + (1 / I3 - 1 / I1) (L.e) e [rad/s]."""
+    factor = (1.0 / body.I3 - 1.0 / body.I1) * dot(momentum, axis)
+    return sum_vectors(scale(1.0 / body.I1, momentum), scale(factor, axis))
+
 
 # The interface of the equations of motion of a body in contact, and how a contact ends.
 
@@ -86,44 +144,53 @@ class AbstractDynamics(eqx.Module):
     """Equations of motion, with the precomputed combinations of a scene's numbers; they hold while all margins are
     positive."""
 
-    @abc.abstractmethod
-    def motion(self, state: Float[Array, "components ..."]) -> Any:
-        """Evaluate the equations of motion.
-
-        **Arguments:** `state`: as `launch.py` describes it.
-
-        **Returns:** a `Motion`, or at least the `rate` of one.
-        """
-
-    @abc.abstractmethod
-    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
-        """The smooth functions whose least value is the contact margin."""
-
-    def unloaded(
-        self, state: Float[Array, "components ..."], scales: Float[Array, "components ..."]
-    ) -> Bool[Array, "..."] | None:
-        """A mask of the states whose contact carries no load and is about to carry none; `None` if the contact margin
-        alone decides."""
-        return None
-
-    def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-        """Rate of change of the state, (components, ...)."""
-        return stacked(self.motion(state).rate, state)
-
-    def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """The least of `margins`."""
-        return least(*self.margins(state))
-
-
-class AbstractContactDynamics(AbstractDynamics):
-    """Equations of motion of a body on a single contact, which ends as one of `LOSSES`."""
-
     @property
     @abc.abstractmethod
     def weight(self) -> Float[Array, "..."]:
         """Weight of the body [N]."""
 
-    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
+    @abc.abstractmethod
+    def motion(self, state: State) -> Any:
+        """Evaluate the equations of motion.
+
+        **Arguments:** `state`: velocity, axis and angular momentum, and the place, as above.
+
+        **Returns:** a `Motion`, or at least the `rate` of one.
+        """
+
+    @abc.abstractmethod
+    def margins(self, state: State) -> tuple[Float[Array, "..."], ...]:
+        """The smooth functions whose least value is the contact margin."""
+
+    def field(self, state: State) -> State:
+        """Rate of change of the state, (components, ...)."""
+        return stacked(self.motion(state).rate, state)
+
+    def contact_margin(self, state: State) -> Float[Array, "..."]:
+        """The least of `margins`."""
+        return least(*self.margins(state))
+
+    def unloaded(self, state: State, scales: State) -> Bool[Array, "..."] | None:
+        """A mask of the states with N = 0, up to round-off, whose motion does not increase N; `None` if the contact
+        margin alone decides.
+
+        On a wall the first derivative of N may vanish too; so the state moves on by the midpoint rule, by the part `AHEAD`
+        of the magnitudes `scales`, to see whether N grows.
+        """
+        state, scales = jnp.asarray(state), jnp.asarray(scales)
+        motion = self.motion(state)
+        rate = stacked(motion.rate, state)
+        fastest = jnp.max(jnp.abs(rate) / scales, axis=0)
+        time = AHEAD / jnp.where(fastest > 0.0, fastest, 1.0)
+        later = self.motion(state + time * self.field(state + 0.5 * time * rate))
+        threshold = NO_LOAD * self.weight
+        return (jnp.abs(motion.normal_force) <= threshold) & ~(later.normal_force > threshold)
+
+
+class AbstractContactDynamics(AbstractDynamics):
+    """Equations of motion of a body on a single contact, which ends as one of `LOSSES`."""
+
+    def margins(self, state: State) -> tuple[Float[Array, "..."], ...]:
         """The margin for each of `LOSSES`: the normal force as a fraction of the weight, plus a round-off allowance for
         a start with N = 0; the excess of the Painlevé factor over `JAMMED`; and the excess of the room over `FITS`, if
         the arena has places where the ball does not fit."""
@@ -131,13 +198,7 @@ class AbstractContactDynamics(AbstractDynamics):
         lost, jammed = motion.normal_force / self.weight + NO_LOAD, motion.painleve_factor - JAMMED
         return (lost, jammed) if motion.room is None else (lost, jammed, motion.room - FITS)
 
-    def unloaded(
-        self, state: Float[Array, "components ..."], scales: Float[Array, "components ..."]
-    ) -> Bool[Array, "..."]:
-        """See `AbstractDynamics.unloaded`."""
-        return carries_no_load(self, self.weight, state, scales)
-
-    def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+    def loss(self, state: State) -> Int[Array, "..."]:
         """How a contact with zero margin has ended: a code in `LOSSES`."""
         lost, *others = self.margins(state)
         # At the located end, the margin is round-off of either sign; if another margin has vanished, N is many times
@@ -145,32 +206,41 @@ class AbstractContactDynamics(AbstractDynamics):
         return len(others) - jnp.argmin(jnp.stack([*others[::-1], jnp.maximum(lost, 0.0)]), axis=0)
 
 
-def carries_no_load(
-    dynamics: AbstractDynamics,
-    weight: Float[Array, "..."],
-    state: Float[Array, "components ..."],
-    scales: Float[Array, "components ..."],
-) -> Bool[Array, "..."]:
-    """A mask of the states with N = 0, up to round-off, whose motion does not increase N.
+class AbstractRollingDynamics(AbstractContactDynamics):
+    """Equations of motion of a body whose contact point is at rest on the arena.
 
-    On a wall the first derivative of N may vanish too; so the state moves on by the midpoint rule, by the part `AHEAD`
-    of the magnitudes `scales`, to see whether N grows.
+    Friction is the force that rolling requires; the caller must check whether the friction law allows it (`grip`). The
+    velocity follows from axis and angular momentum; its two components in the state are integrated but not used.
     """
-    state, scales = jnp.asarray(state), jnp.asarray(scales)
-    motion = dynamics.motion(state)
-    rate = stacked(motion.rate, state)
-    fastest = jnp.max(jnp.abs(rate) / scales, axis=0)
-    time = AHEAD / jnp.where(fastest > 0.0, fastest, 1.0)
-    later = dynamics.motion(state + time * dynamics.field(state + 0.5 * time * rate))
-    return (jnp.abs(motion.normal_force) <= NO_LOAD * weight) & ~(later.normal_force > NO_LOAD * weight)
+
+    @abc.abstractmethod
+    def evaluate(self, state: State) -> tuple[Motion, Vector]:
+        """The motion, whose `friction` is the force along the arena per unit normal force; and the force of the arena on
+        the body [N] in the moving frame: the components along the arena, and the normal force."""
+
+    def motion(self, state: State) -> Motion:
+        return self.evaluate(state)[0]
+
+    def grip(self, state: State, mu: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Reserve of friction, mu N - |F_t|, as a fraction of the weight; negative where the top must slip.
+
+        **Arguments:**
+
+        - `state`: (8 + the arena's place, ...).
+        - `mu`: coefficient of friction [1].
+        """
+        F1, F2, N = self.evaluate(state)[1]
+        return (mu * N - length(F1, F2)) / self.weight
 
 
 #: The cosine of no angle, for runs without a target angle.
 NO_COSINE = -2.0
 
-#: Rate of a frame that turns with an inverting top, as a fraction of L_n / I1 (`Dynamics.turning`). Among 0.5, 0.7,
-#: 0.85 and 1, this is the fastest at equal error, or close to it, in five scenes on the plane: 1 to 2.6 times as fast
-#: as a frame at rest.
+#: Rate of a frame that turns about n with an inverting top, as a fraction of L_n / I1, for an arena on which all directions
+#: across n are equivalent. While a top inverts, L has a nearly constant direction in a frame at rest, and the axis turns about
+#: L at the rate L / I1. In the turning frame, both turn at a fraction of this rate, so steps are longer. Errors are smaller
+#: because they no longer add up along a circle. Among 0.5, 0.7, 0.85 and 1, this is the fastest at equal error, or close to
+#: it, in five scenes on the plane: 1 to 2.6 times as fast as a frame at rest.
 TURNING = 0.7
 
 
@@ -182,7 +252,7 @@ class Dynamics(AbstractContactDynamics):
 
     frame: AbstractFrame
     friction: AbstractFriction
-    meridian: AbstractMeridian
+    meridian: AbstractMeridian | ContactGeometry
     mass: Float[Array, "..."]
     gravity: Float[Array, "..."]
     per_mass: Float[Array, "..."]
@@ -213,28 +283,16 @@ class Dynamics(AbstractContactDynamics):
     def weight(self) -> Float[Array, "..."]:
         return self.mass * self.gravity
 
-    def turning(self, turns: Float[Array, "..."]) -> Self:
-        """The same equations in a frame that turns about n, for an arena on which all directions across n are
-        equivalent.
-
-        While a top inverts, L has a nearly constant direction in a frame at rest, and the axis turns about L at the
-        rate L / I1. In the turning frame, both turn at a fraction of this rate, so steps are longer. Errors are smaller
-        because they no longer add up along a circle.
-        """
-        return dataclasses.replace(self, turns=turns)
-
-    def unloaded(
-        self, state: Float[Array, "components ..."], scales: Float[Array, "components ..."]
-    ) -> Bool[Array, "..."] | None:
-        """See `AbstractDynamics.unloaded`. On a level plane, N = 0 can last only for an instant."""
+    def unloaded(self, state: State, scales: State) -> Bool[Array, "..."] | None:
+        # On a level plane, N = 0 can last only for an instant.
         return None if self.turns is not None else super().unloaded(state, scales)
 
-    def motion(self, state: Float[Array, "components ..."]) -> Motion:
+    def motion(self, state: State) -> Motion:
         """Evaluate the equations of motion, solving for the normal force with friction included.
 
         **Arguments:**
 
-        - `state`: (8 + the arena's place, ...) as `launch.py` describes it.
+        - `state`: (8 + the arena's place, ...).
 
         **Returns:** a `Motion`; `rate` is (m/s^2, 1/s, N m, 1/s). Source: `tippe.md`, section 2 (i)-(iii); for other
         bodies on the plane, with the A and B of `body.py` in place of a and R, and with the second derivative of the
@@ -299,92 +357,41 @@ def turned(vector: Vector, rate: Float[Array, "..."]) -> Vector:
     return rate * vector[1], -(rate * vector[0]), None
 
 
-# The top that rolls without slipping, in vector form and free of trigonometry (`tippe.md`, section 5 d).
-#
-# The state has the layout of `dynamics.py`, so that a run can slip and roll in turn. While the top rolls, its velocity
-# follows from axis and angular momentum, u = r x w with r = a e - R n from the centre of mass to the contact; the two
-# velocity components of the state are integrated but not used.
+class RollingDynamics(AbstractRollingDynamics):
+    """The top that rolls without slipping, in vector form and free of trigonometry (`tippe.md`, section 5 d).
 
-
-class RollingDynamics(eqx.Module):
-    """The equations of motion of a body whose contact point is at rest on the arena.
-
-    Friction is the force that rolling requires; the caller must check whether the friction law allows it
-    (`RollingDynamics.grip`).
+    The state has the layout of `Dynamics`, so that a run can slip and roll in turn. While the top rolls, u = r x w with
+    r = a e - R n from the centre of mass to the contact.
     """
 
     frame: AbstractFrame
-    radius: Float[Array, "..."]
-    offset: Float[Array, "..."]
-    mass: Float[Array, "..."]
+    body: Top
     gravity: Float[Array, "..."]
-    I1: Float[Array, "..."]
-    I3: Float[Array, "..."]
-
-    @classmethod
-    def of(cls, body: Top, frame: AbstractFrame, gravity: Float[Array, "..."]) -> "RollingDynamics":
-        """The equations for a body on an arena.
-
-        **Arguments:** as for `Dynamics.of`.
-        """
-        return cls(frame, body.radius, body.offset, body.mass, gravity, body.I1, body.I3)
 
     @property
-    def size(self) -> Float[Array, "..."]:
-        """A length of the body [m]: the radius."""
-        return self.radius
+    def weight(self) -> Float[Array, "..."]:
+        return self.body.mass * self.gravity
 
-    def motion(self, state: Float[Array, "components ..."]) -> Motion:
-        """Evaluate the equations of motion and the reaction.
-
-        **Arguments:**
-
-        - `state`: (8 + the arena's place, ...) as `tippe/model/dynamics.py` states it.
-
-        **Returns:** a `Motion`; `friction` is the force along the arena per unit normal force.
-        """
-        return self._evaluate(state)[0]
-
-    def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-        """Rate of change of the state, (components, ...)."""
-        return stacked(self.motion(state).rate, state)
-
-    def reaction(self, state: Float[Array, "components ..."]) -> Vector:
-        """Force of the arena on the top [N] in the moving frame: the components along the arena, and the normal
-        force."""
-        return self._evaluate(state)[1]
-
-    def grip(self, state: Float[Array, "components ..."], mu: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Reserve of friction, mu N - |F_t|, as a fraction of the weight; negative where the top must slip.
-
-        **Arguments:**
-
-        - `state`: (8 + the arena's place, ...).
-        - `mu`: coefficient of friction [1].
-        """
-        F1, F2, N = self.reaction(state)
-        return (mu * N - length(F1, F2)) / (self.mass * self.gravity)
-
-    def carried_along(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+    def carried_along(self, state: State) -> State:
         """The state with the velocity that follows from axis and angular momentum of the rolling top."""
         _, e, L, place = parts(state)
-        u = cross(self._contact(e), angular_velocity(self, e, L))
+        u = cross(self.body.meridian.contact(e), angular_velocity(self.body, e, L))
         return joined(u[:2], e, L, place)
 
-    def _evaluate(self, state: Float[Array, "components ..."]) -> tuple[Motion, Vector]:
-        """The motion and the reaction F (`tippe.md`, section 5 d).
+    def evaluate(self, state: State) -> tuple[Motion, Vector]:
+        """The motion and the reaction F.
 
         (J + m (r^2 - r r^T)) w' = -w x L + m r x (r' x w) + m g r x z, with r' = a e' - R n'; then u' = r' x w + r x w',
         F = m (u' + g z), and L' = r x F.
         """
         _, e, L, place = parts(state)
-        R, a, m = self.radius, self.offset, self.mass
+        R, a, m = self.body.radius, self.body.offset, self.body.mass
 
-        w = angular_velocity(self, e, L)
+        w = angular_velocity(self.body, e, L)
         e_dot = cross(w, e)
         V: Tangent = (R * w[1], -R * w[0])
         o, up, place_rate, room = self.frame.frame_motion(place, V)
-        r = self._contact(e)
+        r = self.body.meridian.contact(e)
         # n' = -(o1 t1 + o2 t2), and r' as a vector, not as the rate of its components.
         r_dot = sum_vectors(scale(a, e_dot), scale(R, (*o, None)))
         u = cross(r, w)
@@ -405,7 +412,7 @@ class RollingDynamics(eqx.Module):
         slip = Slip(zero, zero, (w[0], w[1], None))
         return Motion(rate, F[2], load, slip, V, o, dot(L, e), 1.0 + zero, room), F
 
-    def with_slip(self, state: Float[Array, "components ..."], slip: Slip) -> Float[Array, "components ..."]:
+    def with_slip(self, state: State, slip: Slip) -> State:
         """The state after an impulse at the contact that gives the contact point the given velocity along the arena.
 
         The angular momentum about the contact, K = L - m r x u, does not change in the impulse: w solves (J + m (r^2 -
@@ -420,23 +427,23 @@ class RollingDynamics(eqx.Module):
         **Returns:** the state, of the same shape.
         """
         (u1, u2), e, L, place = parts(state)
-        r = self._contact(e)
-        e_dot = cross(angular_velocity(self, e, L), e)
-        u = (u1, u2, multiply(-self.offset, e_dot[2]))
+        r = self.body.meridian.contact(e)
+        e_dot = cross(angular_velocity(self.body, e, L), e)
+        u = (u1, u2, multiply(-self.body.offset, e_dot[2]))
         v = (slip.x, slip.y, None)
         lever = cross(r, sum_vectors(v, scale(-1.0, u)))
-        w = self._over_inertia(e, r, sum_vectors(L, scale(self.mass, lever)))
+        w = self._over_inertia(e, r, sum_vectors(L, scale(self.body.mass, lever)))
         u = sum_vectors(cross(r, w), v)
         axial_rate = dot(w, e)
-        L = sum_vectors(scale(self.I1, w), scale((self.I3 - self.I1) * axial_rate, e))
+        L = sum_vectors(scale(self.body.I1, w), scale((self.body.I3 - self.body.I1) * axial_rate, e))
         return joined(u[:2], e, L, place)
 
-    def with_unit_axes(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+    def with_unit_axes(self, state: State) -> State:
         """The state with the axis at unit length."""
         axis = state[AXIS]
         return state.at[AXIS].set(axis / jnp.sqrt(jnp.sum(axis * axis, axis=0)))
 
-    def unit_impulse(self, state: Float[Array, "components ..."], axis: int) -> tuple[Component, ...]:
+    def unit_impulse(self, state: State, axis: int) -> tuple[Component, ...]:
         """The impulse at the contact that changes the velocity of the contact point by 1 m/s along an axis of the arena
         [N s].
 
@@ -445,19 +452,15 @@ class RollingDynamics(eqx.Module):
         - `state`: (8 + the arena's place, ...); `axis`: 0 for t1, 1 for t2.
         """
         e = parts(state).axis
-        r, unit = self._contact(e), jnp.ones_like(state[0])
+        r, unit = self.body.meridian.contact(e), jnp.ones_like(state[0])
         v = (unit, None, None) if axis == 0 else (None, unit, None)
-        w = self._over_inertia(e, r, scale(self.mass, cross(r, v)))
-        return scale(self.mass, sum_vectors(cross(r, w), v))
+        w = self._over_inertia(e, r, scale(self.body.mass, cross(r, v)))
+        return scale(self.body.mass, sum_vectors(cross(r, w), v))
 
-    def _contact(self, e: Vector) -> Vector:
-        """From the centre of mass to the contact, r = a e - R n [m]."""
-        return (self.offset * e[0], self.offset * e[1], self.offset * e[2] - self.radius)
-
-    def angular_velocity(self, state: Float[Array, "components ..."]) -> Vector:
+    def angular_velocity(self, state: State) -> Vector:
         """Angular velocity of the body [rad/s] in the moving frame."""
         _, e, L, _ = parts(state)
-        return angular_velocity(self, e, L)
+        return angular_velocity(self.body, e, L)
 
     def _over_inertia(self, e: Vector, r: Vector, torque: tuple[Component, ...]) -> Vector:
         """Solution x of (J + m (r^2 - r r^T)) x = torque, J = I1 + (I3 - I1) e e^T.
@@ -465,12 +468,11 @@ class RollingDynamics(eqx.Module):
         With A = I1 + m r^2, A x = torque - (I3 - I1) (e.x) e + m (r.x) r; its products with e and r are two equations for
         e.x and r.x, whose determinant is positive.
         """
-        m, excess = self.mass, self.I3 - self.I1
-        r2, er = dot(r, r), dot(e, r)
-        A = self.I1 + m * r2
+        m, I1, I3 = self.body.mass, self.body.I1, self.body.I3
+        excess, r2, er = I3 - I1, dot(r, r), dot(e, r)
         te, tr = dot(torque, e), dot(torque, r)
-        determinant = (self.I3 + m * r2) * self.I1 + m * excess * er * er
-        ex = (self.I1 * te + m * er * tr) / determinant
-        rx = ((self.I3 + m * r2) * tr - excess * er * te) / determinant
+        determinant = (I3 + m * r2) * I1 + m * excess * er * er
+        ex = (I1 * te + m * er * tr) / determinant
+        rx = ((I3 + m * r2) * tr - excess * er * te) / determinant
         torque_residual = sum_vectors(torque, scale(subtract(None, excess * ex), e), scale(m * rx, r))
-        return stored(*scale(1.0 / A, torque_residual))
+        return stored(*scale(1.0 / (I1 + m * r2), torque_residual))

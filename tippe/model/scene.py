@@ -1,5 +1,6 @@
-"""The scene: body, arena, friction and gravity."""
+"""The scene, with its body, arena, friction and gravity; and the launches that start runs in it."""
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from typing import Any, ClassVar, Generic, TypeVar
@@ -7,8 +8,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.geometry import (
     AbstractFrame,
@@ -22,26 +22,153 @@ from nonholonomic.geometry import (
     cross,
     dot,
     frame_of,
-    multiply,
     none_if_zero,
     place_named,
     room_bounds,
     scale,
     sum_vectors,
-    vector_of,
 )
 from nonholonomic.geometry.surface import as_surface
-from nonholonomic.parameters import numbers
+from nonholonomic.parameters import as_one, numbers
 from nonholonomic.text import likely_fix, shown, suspected_gravity
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced, largest, require_all, require_kind
+from nonholonomic.validation import Bound, Bounded, as_number, largest, require, require_all, require_kind
 
+from ..friction import A_LAW, AbstractFriction, Frictionless, NoSlip, SetValuedCoulomb, as_law
 from .body import AbstractBody, Top
-from .dynamics import TURNING, Dynamics
-from .friction import A_LAW, AbstractFriction, Frictionless, NoSlip, as_law
-from .launch import Launch, angular_velocity, as_launch, inclination, joined, parts
-from .rigid_body import AbstractRigidBody
-from .rigid_dynamics import AbstractRigidDynamics, rigid_dynamics
+from .dynamics import (
+    TURNING,
+    Dynamics,
+    RollingDynamics,
+    State,
+    States,
+    angular_velocity,
+    from_frame,
+    inclination,
+    joined,
+    parts,
+    to_frame,
+)
+from .rigid import AbstractRigidBody, AbstractRigidDynamics, RigidRolling, RigidSlipping, several
 from .stick_slip import StickSlip
+
+#: Spins above this [rad/s] suggest revolutions per minute: by hand a top gets 100 to 300 rad/s, 1000 to 3000 rpm.
+FASTEST = 1000.0
+
+
+class Launch(Bounded):
+    """A launch: position on the arena, inclination, spin and velocity of the top.
+
+    The axis is e = cos(theta) n + sin(theta) (cos(azimuth) t1 + sin(azimuth) t2), with n the arena's normal towards the
+    top. In a cylinder, t1 points along growing eta and t2 along y. On other arenas, t1 is the projection of the x axis
+    onto the tangent plane (of the y axis where n is along x), and t2 = n x t1; inside a sphere, if the place is given
+    by `eta`, t1 points along growing eta.
+
+    **Arguments:**
+
+    - `theta`: angle [rad] from the arena's normal to the axis, in [0, pi]; 0 is stem out, pi is stem in.
+    - `spin`: angular velocity about the axis [rad/s].
+    - `eta`: angle [rad] of the place from the arena's lowest point, in [-pi, pi]; 0 on arenas without such an angle.
+    - `azimuth`: direction [rad] in which the axis leans, from t1 towards t2.
+    - `place`: where the top touches the arena, instead of `eta`. On a plane, paraboloid or graph, (x, y) [m], which on
+      a tilted plane are measured along the plane. On a cylinder, (y, eta). On a sphere, spheroid or torus, (mu, eta)
+      [rad], azimuth and angle from the lowest point. On any arena, (x, y, z) [m], a point of the arena up to round-off.
+    - `velocity`: velocity of the sphere's centre, or of the centre of mass for other bodies, along (t1, t2), (2,)
+      [m/s]; zero by default.
+    - `angular_velocity`: (3,) [rad/s] in (t1, t2, n), in addition to the spin about the axis; zero by default.
+
+    **Raises:** `ValueError` for numbers outside these ranges.
+
+    **Example:** half a metre up the x side of a bowl, moving sideways at 0.2 m/s.
+
+    ```
+    >>> import tippe
+    >>> tippe.Launch(theta=0.1, spin=155.0)
+    Launch(theta=0.1 rad, spin=155 rad/s, eta=0 rad, azimuth=0 rad)
+    >>> launch = tippe.Launch(0.1, 100.0, place=(0.5, 0.0), velocity=(0.0, 0.2))
+    >>> scene = tippe.Scene(tippe.Top(0.02, 0.02, 0.006, 3e-6, 3.2e-6), tippe.Paraboloid(1.0), tippe.Viscous(0.3))
+    >>> print(f"{scene.normal_force(scene.state(launch)):.3f} N")
+    0.176 N
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"theta": "rad", "spin": "rad s-1", "eta": "rad", "azimuth": "rad"}
+    units |= {"place": "m or rad", "velocity": "m s-1", "angular_velocity": "rad s-1"}
+
+    theta: Float[Array, "..."] = eqx.field(converter=as_number)
+    spin: Float[Array, "..."] = eqx.field(converter=as_number)
+    eta: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
+    azimuth: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
+    place: tuple[Float[Array, "..."], ...] | None = eqx.field(
+        converter=several("place", (2, 3), "(x, y), (mu, eta) or (x, y, z)", True), default=None, kw_only=True
+    )
+    velocity: tuple[Float[Array, "..."], ...] | None = eqx.field(
+        converter=several("velocity", (2,), "two numbers, along t1 and t2", True), default=None, kw_only=True
+    )
+    angular_velocity: tuple[Float[Array, "..."], ...] | None = eqx.field(
+        converter=several("angular_velocity", (3,), "three numbers, along t1, t2 and n", True),
+        default=None,
+        kw_only=True,
+    )
+
+    @classmethod
+    def degrees(
+        cls, theta: ArrayLike, rpm: ArrayLike, *, eta: ArrayLike = 0.0, azimuth: ArrayLike = 0.0, **others: Any
+    ) -> "Launch":
+        """A launch in degrees and revolutions per minute.
+
+        **Arguments:**
+
+        - `theta`: angle [deg] from the arena's normal to the axis, in [0, 180].
+        - `rpm`: spin about the axis [revolutions per minute].
+        - `eta`, `azimuth`: as for `Launch`, in degrees.
+        - `others`: `place`, `velocity` and `angular_velocity`, as for `Launch`, in SI units.
+
+        **Returns:** a `Launch` with numbers in SI units.
+
+        **Raises:** `ValueError` for numbers outside these ranges.
+
+        **Example:**
+
+        ```
+        >>> import tippe
+        >>> tippe.Launch.degrees(theta=6, rpm=1800)
+        Launch(theta=0.10472 rad, spin=188.496 rad/s, eta=0 rad, azimuth=0 rad)
+
+        ```
+        """
+        require(theta, "theta", at_least=0.0, at_most=180.0, why="in degrees")
+        require(eta, "eta", at_least=-180.0, at_most=180.0, why="in degrees")
+        require(azimuth, "azimuth", why="in degrees")
+        require(rpm, "rpm")
+        theta, eta, azimuth = (jnp.radians(as_number(angle)) for angle in (theta, eta, azimuth))
+        return cls(theta, as_number(rpm) * (2.0 * jnp.pi / 60.0), eta, azimuth, **others)
+
+    def suspicion(self) -> str | None:
+        fastest = largest(self.spin)
+        if fastest <= FASTEST:
+            return None
+        return (
+            f"spin = {fastest:g} rad/s is {fastest * 30.0 / math.pi:.3g} revolutions a minute, fast for a top: was it in rpm? "
+            f"{fastest:g} rpm are {fastest * math.pi / 30.0:.4g} rad/s"
+        )
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.theta, "theta", at_least=0.0, at_most=math.pi, unit="rad")
+        yield Bound(self.spin, "spin")
+        yield Bound(self.eta, "eta", at_least=-math.pi, at_most=math.pi, unit="rad")
+        if self.place is not None:
+            yield Bound(self.eta, "eta", at_least=0.0, at_most=0.0, why="place is given")
+        yield Bound(self.azimuth, "azimuth")
+        for name in ("place", "velocity", "angular_velocity"):
+            for k, number in enumerate(getattr(self, name) or ()):
+                yield Bound(number, f"{name}[{k}]")
+
+
+def as_launch(value: Any) -> Any:
+    """A list of launches as one `Launch` whose numbers are lists; anything else stays unchanged, for later checks."""
+    return as_one(value, "launch", Launch)
+
 
 #: The body's class: code that needs a sphere takes a `Scene[Top]`.
 Body = TypeVar("Body", bound=AbstractBody | AbstractRigidBody)
@@ -111,33 +238,67 @@ class Scene(Bounded, Generic[Body]):
     side: str | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        check_parts(self)
+        body, surface, friction = self.body, self.surface, self.friction
+        if not isinstance(body, AbstractBody | AbstractRigidBody):
+            kinds = f"a Top, a SpheroidBody, a ConvexBody, an Ellipsoid or a RigidBody{likely_fix(body)}"
+            raise ValueError(f"body = {shown(body)} must be {kinds}")
+        require_kind(surface, "surface", AbstractSurface, ", such as tippe.Plane() or tippe.Cylinder(0.3)")
+        require_kind(friction, "friction", AbstractFriction, A_LAW)
+        # This raises an error if the surface has no such side.
+        surface.sign(self.side, "inside")
+        if self.contact not in ("stop", "hybrid"):
+            raise ValueError(f"contact = {shown(self.contact)} must be 'stop' or 'hybrid'")
+        if self.restitution is not None and self.contact == "stop":
+            raise ValueError(
+                f"restitution = {shown(self.restitution)} needs contact='hybrid', because a run without flights has no "
+                "impacts"
+            )
+        # What only a sphere allows, whose contact follows from the place of its centre, and only some bodies.
+        kind, is_rigid = type(body).__name__, isinstance(body, AbstractRigidBody)
+        if isinstance(friction, NoSlip) and not is_rigid:
+            raise ValueError(
+                f"friction = NoSlip() must be another law for a {kind}, such as Coulomb; describe the body as an Ellipsoid "
+                "or a RigidBody to roll it"
+            )
+        if not isinstance(body, Top):
+            kind = f"an {kind}" if kind[0] in "AEIOU" else f"a {kind}"
+            if not isinstance(surface, Plane) and not is_rigid:
+                allowed_bodies = "a Top runs on any arena, as an Ellipsoid or a RigidBody does"
+                raise ValueError(f"surface = {shown(surface)} must be a Plane for {kind}; {allowed_bodies}")
+            if self.contact != "stop":
+                raise ValueError(f"contact = {shown(self.contact)} must be 'stop' for {kind}; only a Top can fly")
+            if friction.set_valued and not is_rigid:
+                raise ValueError(
+                    f"friction = {shown(friction)} must be a law with a single mode for {kind}, such as Coulomb; describe "
+                    "the body as an Ellipsoid or a RigidBody to stick and slip"
+                )
+        elif friction.set_valued and body.stem is not None:
+            raise ValueError(
+                f"friction = {shown(friction)} must be a law with a single mode for a top with a stem, such as Coulomb: "
+                "with two contacts it is undetermined which one sticks"
+            )
+        elif self.contact == "stop" and body.stem is not None:
+            raise ValueError(
+                "a top with a stem needs contact='hybrid', as in Scene(top, contact='hybrid'): it hops from its sphere onto "
+                "its stem; the default, 'stop', ends a run where the contact is lost"
+            )
 
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.gravity, "gravity", above=0.0)
         if not isinstance(self.surface, Plane):
-            yield from room_bounds(self.surface, self.surface.sign(self.side, "inside"), self._least_room)
+            # The radius that a closed arena must exceed so that the body can be inside.
+            room = self.body.size
+            if isinstance(self.body, AbstractRigidBody):
+                lowest, highest = self.body.half_widths
+                room = highest if isinstance(self.surface, Sphere) else lowest
+            yield from room_bounds(self.surface, self.surface.sign(self.side, "inside"), room)
         if self.restitution is not None:
             yield Bound(self.restitution, "restitution", at_least=0.0, at_most=1.0)
-
-    @property
-    def _least_room(self) -> Float[Array, "..."]:
-        """The radius [m] that a closed arena must exceed so that the body can be inside."""
-        if not isinstance(self.body, AbstractRigidBody):
-            return self.body.size
-        lowest, highest = self.body.half_widths
-        return highest if isinstance(self.surface, Sphere) else lowest
 
     def suspicion(self) -> str | None:
         for name, value in numbers("surface", self.surface, functions=False).items():
             unit = self.surface.units.get(name.removeprefix("surface."), "1")
-            if (
-                unit == "m"
-                and isinstance(value, jax.Array)
-                and not is_traced(value)
-                and np.any(np.asarray(value) > LARGEST_ARENA)
-            ):
-                size = float(np.max(np.asarray(value)))
+            if unit == "m" and (size := largest(value)) > LARGEST_ARENA:
                 unit = "mm" if size > 10.0 * LARGEST_ARENA else "cm"
                 return f"{name} = {size:g} m is larger than a room: was it in {unit}? There a top moves as on a Plane"
         return suspected_gravity(largest(self.gravity))
@@ -172,12 +333,19 @@ class Scene(Bounded, Generic[Body]):
     def dynamics(self) -> Any:
         """The equations of motion, with the precomputed combinations of the scene's numbers: a `Dynamics`, a `StickSlip` or an
         `AbstractRigidDynamics`."""
-        numbers = (self.frame, self.friction, self.gravity)
-        if self.friction.set_valued and isinstance(self.body, Top | AbstractRigidBody):
-            return StickSlip.of(self.body, *numbers)
-        if isinstance(self.body, AbstractRigidBody):
-            return rigid_dynamics(self.body, *numbers)
-        return Dynamics.of(self.body, *numbers)
+        body, frame, friction, gravity = self.body, self.frame, self.friction, self.gravity
+        if isinstance(body, AbstractRigidBody):
+            arguments = (frame, body, gravity, body.inertia.tensor.inverse)
+            rolling = RigidRolling(*arguments)
+            if isinstance(friction, NoSlip):
+                return rolling
+            slipping = RigidSlipping(*arguments, friction, 1.0 / body.mass)
+            return StickSlip(slipping, rolling, friction.mu) if isinstance(friction, SetValuedCoulomb) else slipping
+        slipping = Dynamics.of(body, frame, friction, gravity)
+        if not isinstance(friction, SetValuedCoulomb):
+            return slipping
+        assert isinstance(body, Top)
+        return StickSlip(slipping, RollingDynamics(frame, body, gravity), friction.mu)
 
     @property
     def _rigid_dynamics(self) -> AbstractRigidDynamics:
@@ -200,7 +368,8 @@ class Scene(Bounded, Generic[Body]):
         # Tops of group I (`tippe/steady.py`) soon stand upright, with the axis close to L; in a turning frame, both would
         # move.
         may_invert = 1.0 - body.offset / body.radius < body.I1 / body.I3
-        return equations.turning(jax.lax.stop_gradient(jnp.where(may_invert, TURNING, 0.0)))
+        turns = jax.lax.stop_gradient(jnp.where(may_invert, TURNING, 0.0))
+        return dataclasses.replace(equations, turns=turns)
 
     def check_start(self, launch: Launch) -> None:
         """Raise `ValueError` if a launch has no place on this arena."""
@@ -237,7 +406,7 @@ class Scene(Bounded, Generic[Body]):
             return self.frame.at_angle(launch.eta)
         return self.frame.at_foot(self.surface.chart(place_named(self.surface, launch.place))[0])
 
-    def state(self, launch: Launch) -> Float[Array, "components ..."]:
+    def state(self, launch: Launch) -> State:
         """The state at the start of a run (see `launch.py` for its components).
 
         **Arguments:**
@@ -248,19 +417,27 @@ class Scene(Bounded, Generic[Body]):
         """
         launch = as_launch(launch)
         body, sine, zero = self.body, jnp.sin(launch.theta), jnp.zeros_like(launch.theta)
-        e = (sine * jnp.cos(launch.azimuth), sine * jnp.sin(launch.azimuth), jnp.cos(launch.theta))
+        t1, t2 = jnp.cos(launch.azimuth), jnp.sin(launch.azimuth)
+        e, u = (sine * t1, sine * t2, jnp.cos(launch.theta)), launch.velocity or (zero, zero)
         if isinstance(body, AbstractRigidBody):
+            # The body's axes are those of the frame, rotated about a direction across n, so that z becomes e.
+            fall, (place, _) = 1.0 - e[2], self.start(launch)
+            c = (1.0 - fall * t1 * t1, -fall * t1 * t2, -e[0])
+            axes = (c, cross(e, c), e)
             w = sum_vectors(scale(launch.spin, e), launch.angular_velocity or (None, None, None))
-            return self._rigid_dynamics.start(launch, self.start(launch)[0], e, vector_of(w))
-        L, u = scale(body.I3 * launch.spin, e), launch.velocity or (zero, zero)
+            L = from_frame(body.inertia.tensor.times(to_frame(w, axes)), axes)
+            return self._rigid_dynamics.carried_along(joined(u, e, L, place, c))
+        L = scale(body.I3 * launch.spin, e)
         if launch.angular_velocity is not None:
-            w = vector_of(launch.angular_velocity)
+            w = launch.angular_velocity
             axial_rate = dot(w, e)
             L = sum_vectors(L, scale(body.I1, w), scale((body.I3 - body.I1) * axial_rate, e))
-            u = sum_vectors(u, scale(multiply(-1.0, body.offset_of_path), cross(w, e)[:2]))
+            if isinstance(body, Top):
+                # The launch has the velocity of the sphere's centre.
+                u = sum_vectors(u, scale(-body.offset, cross(w, e)[:2]))
         return joined(u, e, L, self.start(launch)[0])
 
-    def scales(self, launch: Launch) -> Float[Array, "components ..."]:
+    def scales(self, launch: Launch) -> State:
         """Scales of absolute errors of the state, component by component.
 
         Velocities are measured in units of sqrt(g R) with the body's size R, directions in units of 1, angular momenta
@@ -274,7 +451,7 @@ class Scene(Bounded, Generic[Body]):
         one = jnp.ones_like(launch.theta)
         rate = jnp.sqrt(self.gravity / self.body.size)
         velocity = rate * self.body.size
-        I1, I3 = self._moments
+        I1, I3 = self.body.moments
         momentum = jnp.maximum(I3 * jnp.abs(launch.spin), I1 * rate)
         if launch.angular_velocity is not None:
             w = launch.angular_velocity
@@ -287,34 +464,26 @@ class Scene(Bounded, Generic[Body]):
         x_axis = (one, one, tilt) if isinstance(self.body, AbstractRigidBody) else ()
         return joined(velocities, (tilt, tilt, one), momenta, place, x_axis)
 
-    @property
-    def _moments(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """The magnitudes of the body's moments of inertia across and along its axis [kg m^2]."""
-        if isinstance(self.body, AbstractRigidBody):
-            inertia = self.body.inertia
-            return 0.5 * (inertia.xx + inertia.yy), inertia.zz
-        return self.body.I1, self.body.I3
-
-    def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+    def field(self, state: State) -> State:
         """Rate of change of the state: (m/s^2, 1/s, N m, 1/s) for (velocity, axis, angular momentum, place)."""
         return self.dynamics.field(state)
 
-    def normal_force(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    def normal_force(self, state: State) -> Float[Array, "..."]:
         """Force of the arena on the top along n [N]; at zero the contact is lost."""
         return self.dynamics.motion(state).normal_force
 
-    def slip_velocity(self, state: Float[Array, "components ..."]) -> Float[Array, "2 ..."]:
+    def slip_velocity(self, state: State) -> Float[Array, "2 ..."]:
         """Velocity of the material contact point in the moving frame [m/s]."""
         slip = self.dynamics.motion(state).slip
         return jnp.stack([slip.x, slip.y])
 
-    def friction_power(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    def friction_power(self, state: State) -> Float[Array, "..."]:
         """Power of friction N (f.v_s + tau.w) [W], at most 0 (`tippe.md`, section 2)."""
         motion = self.dynamics.motion(state)
         power = motion.friction_power
         return jnp.zeros_like(motion.normal_force) if power is None else power
 
-    def energy(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    def energy(self, state: State) -> Float[Array, "..."]:
         """Kinetic energy plus weight times the height of the centre of mass above the arena's lowest point [J]."""
         body, dynamics = self.body, self.dynamics
         if isinstance(body, AbstractRigidBody):
@@ -327,7 +496,7 @@ class Scene(Bounded, Generic[Body]):
         height = dynamics.frame.height(place) + dot(body.mass_from_frame(e), dynamics.frame.vertical(place))
         return 0.5 * body.mass * speed2 + rotation + body.mass * self.gravity * height
 
-    def jellett(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    def jellett(self, state: State) -> Float[Array, "..."]:
         """Jellett's quantity L.(R n - a e) [kg m^3/s]: for a sphere on the plane, constant under every friction at the
         contact point. For other bodies -L.r, which is nearly constant while they spin fast.
 
@@ -340,84 +509,34 @@ class Scene(Bounded, Generic[Body]):
         lever = self.body.meridian.at(e[2])
         return lever.radius * L[2] - lever.offset * dot(e, L)
 
-    def theta(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    def theta(self, state: State) -> Float[Array, "..."]:
         """Angle [rad] from the arena's normal to the axis, in [0, pi]."""
         return inclination(parts(state).axis)
 
-    def spin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    def spin(self, state: State) -> Float[Array, "..."]:
         """Angular velocity about the axis, w.e [rad/s]."""
         _, e, L, _ = parts(state)
         if isinstance(self.body, AbstractRigidBody):
             return dot(e, self.angular_velocity(state))
         return dot(e, L) / self.body.I3
 
-    def angular_velocity(self, state: Float[Array, "components ..."]) -> Vector:
+    def angular_velocity(self, state: State) -> Vector:
         """Angular velocity of the body in the moving frame [rad/s]."""
         if isinstance(self.body, AbstractRigidBody):
             return self._rigid_dynamics.angular_velocity(state)
         _, e, L, _ = parts(state)
         return angular_velocity(self.body, e, L)
 
-    def path_from_frame(self, state: Float[Array, "components ..."]) -> Vector:
+    def path_from_frame(self, state: State) -> Vector:
         """Vector from the point with which the frame moves to the point whose path is reported [m], in the moving
         frame."""
         if isinstance(self.body, AbstractRigidBody):
             return self._rigid_dynamics.mass_from_contact(state)
-        return self.body.path_from_frame(parts(state).axis)
+        # The path of a top is that of its sphere's centre, with which the frame moves.
+        return (None, None, None) if isinstance(self.body, Top) else self.body.mass_from_frame(parts(state).axis)
 
 
-def check_parts(scene: Any) -> None:
-    """Raise `ValueError` if a part of a scene is of the wrong kind, or does not allow another part or an option."""
-    if not isinstance(scene.body, AbstractBody | AbstractRigidBody):
-        kinds = f"a Top, a SpheroidBody, a ConvexBody, an Ellipsoid or a RigidBody{likely_fix(scene.body)}"
-        raise ValueError(f"body = {shown(scene.body)} must be {kinds}")
-    require_kind(scene.surface, "surface", AbstractSurface, ", such as tippe.Plane() or tippe.Cylinder(0.3)")
-    require_kind(scene.friction, "friction", AbstractFriction, A_LAW)
-    # This raises an error if the surface has no such side.
-    scene.surface.sign(scene.side, "inside")
-    if scene.contact not in ("stop", "hybrid"):
-        raise ValueError(f"contact = {shown(scene.contact)} must be 'stop' or 'hybrid'")
-    if scene.restitution is not None and scene.contact == "stop":
-        raise ValueError(
-            f"restitution = {shown(scene.restitution)} needs contact='hybrid', because a run without flights has no impacts"
-        )
-    if isinstance(scene.friction, NoSlip) and not isinstance(scene.body, AbstractRigidBody):
-        raise ValueError(
-            f"friction = NoSlip() must be another law for a {type(scene.body).__name__}, such as Coulomb; describe the "
-            "body as an Ellipsoid or a RigidBody to roll it"
-        )
-    if not isinstance(scene.body, Top):
-        _check_convex(scene)
-        return
-    if scene.friction.set_valued and scene.body.stem is not None:
-        raise ValueError(
-            f"friction = {shown(scene.friction)} must be a law with a single mode for a top with a stem, such as Coulomb: "
-            "with two contacts it is undetermined which one sticks"
-        )
-    if scene.contact == "stop" and scene.body.stem is not None:
-        raise ValueError(
-            "a top with a stem needs contact='hybrid', as in Scene(top, contact='hybrid'): it hops from its sphere onto its "
-            "stem; the default, 'stop', ends a run where the contact is lost"
-        )
-
-
-def _check_convex(scene: Any) -> None:
-    """Raise `ValueError` for options that need a sphere, whose contact follows from the place of its centre."""
-    kind = type(scene.body).__name__
-    kind = f"an {kind}" if kind[0] in "AEIOU" else f"a {kind}"
-    if not isinstance(scene.surface, Plane) and isinstance(scene.body, AbstractBody):
-        allowed_bodies = "a Top runs on any arena, as an Ellipsoid or a RigidBody does"
-        raise ValueError(f"surface = {shown(scene.surface)} must be a Plane for {kind}; {allowed_bodies}")
-    if scene.contact != "stop":
-        raise ValueError(f"contact = {shown(scene.contact)} must be 'stop' for {kind}; only a Top can fly")
-    if scene.friction.set_valued and isinstance(scene.body, AbstractBody):
-        raise ValueError(
-            f"friction = {shown(scene.friction)} must be a law with a single mode for {kind}, such as Coulomb; describe the "
-            "body as an Ellipsoid or a RigidBody to stick and slip"
-        )
-
-
-def generic_direction(scene: Scene, launch: Launch, cells: int) -> Float[Array, "components cells"]:
+def generic_direction(scene: Scene, launch: Launch, cells: int) -> States:
     """A generic direction, tangent to the set of states: the body's axes keep their length and right angle, and the
     vertical keeps length 1; a body that rolls keeps rolling."""
     magnitudes, state = scene.scales(launch), scene.state(launch)
@@ -426,7 +545,7 @@ def generic_direction(scene: Scene, launch: Launch, cells: int) -> Float[Array, 
     frame, (place, _) = scene.frame, scene.start(launch)
     place = frame.frame_motion(place, (scene.body.size, scene.body.size)).place_rate
     rigid = isinstance(scene.body, AbstractRigidBody)
-    x_axis = cross((r1, r2, r3), vector_of(last[-3:])) if rigid else ()
+    x_axis = cross((r1, r2, r3), tuple(last[-3:])) if rigid else ()
     direction = joined((u1, u2), cross((r1, r2, r3), e), tuple(L), place, x_axis)
     if rigid:
         direction = jax.jvp(scene.dynamics.carried_along, (state,), (direction,))[1]

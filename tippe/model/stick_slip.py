@@ -22,11 +22,9 @@ from numpy.polynomial import Polynomial, legendre
 from nonholonomic.compilation.xla_cpu import greatest
 from nonholonomic.geometry import AbstractFrame
 
-from .body import Top
-from .dynamics import FITS, NO_LOAD, AbstractDynamics, Dynamics, Motion, RollingDynamics, carries_no_load
-from .friction import AbstractFriction, Frictionless, SetValuedCoulomb, Slip, length
-from .rigid_body import AbstractRigidBody
-from .rigid_dynamics import RigidRolling, RigidSlipping
+from ..friction import Frictionless, Slip, length
+from .dynamics import FITS, AbstractContactDynamics, Dynamics, Motion, RollingDynamics, State
+from .rigid import RigidRolling, RigidSlipping
 
 # The onset of a slip: an implicit step from a contact at rest to a slipping contact, of the length that the tolerance
 # allows.
@@ -89,22 +87,18 @@ class Onset(eqx.Module):
     - `converged`: whether the step reached the tolerance.
     """
 
-    start: Float[Array, "components ..."]
+    start: State
     length: Float[Array, "..."]
     rates: Float[Array, "components stages ..."]
     converged: Bool[Array, "..."]
 
-    def at(self, fraction: Float[Array, "..."]) -> Float[Array, "components ..."]:
+    def at(self, fraction: Float[Array, "..."]) -> State:
         """The state after a fraction of the step."""
         powers = jnp.stack([fraction**k for k in range(STAGES + 1)])
         return self.start + self.length * jnp.einsum("ps,p...,cs...->c...", INTEGRALS, powers, self.rates)
 
-    def of_components(self, components: slice) -> "Onset":
-        """The same step of some components alone."""
-        return Onset(self.start[components], self.length, self.rates[components], self.converged)
-
     def falls_to_zero(
-        self, event: Callable[[Float[Array, "components ..."]], Float[Array, "..."]], first: Float[Array, "..."]
+        self, event: Callable[[State], Float[Array, "..."]], first: Float[Array, "..."]
     ) -> Float[Array, "..."]:
         """The fraction of the step, after `first`, at which a function of the state falls to zero; 1 if it does not fall
         so far."""
@@ -123,20 +117,18 @@ class Onset(eqx.Module):
         return fraction - jnp.where(is_inside, shift, 0.0)
 
     @property
-    def end(self) -> Float[Array, "components ..."]:
+    def end(self) -> State:
         """The state at the end of the step, NaN if the step did not converge."""
         state = self.start + self.length * jnp.einsum("s,cs...->c...", WEIGHTS[-1], self.rates)
         return jnp.where(self.converged, state, jnp.nan)
 
 
 def slip_onset(
-    slipping: Dynamics | RigidSlipping,
-    rolling: RollingDynamics | RigidRolling,
-    mu: Float[Array, "..."],
-    field: Callable[[Float[Array, "components ..."]], Float[Array, "components ..."]],
-    state: Float[Array, "components ..."],
+    stick_slip: "StickSlip",
+    field: Callable[[State], State],
+    state: State,
     size: int,
-    scales: Float[Array, "components ..."],
+    scales: State,
     max_duration: Float[Array, "..."],
     tolerance: Float[Array, ""],
 ) -> Onset:
@@ -144,7 +136,7 @@ def slip_onset(
 
     **Arguments:**
 
-    - `slipping`, `rolling`: the equations with slip and without; `mu`: coefficient of friction [1].
+    - `stick_slip`: the equations with slip and without.
     - `field`: rate of the slipping state, including other integrated components.
     - `state`: a state at rest, (components, ...); the equations use the first `size` components; `scales`: their
       magnitudes.
@@ -152,9 +144,9 @@ def slip_onset(
 
     **Returns:** an `Onset`.
     """
-    core_state = state[:size]
+    core_state, slipping, rolling = state[:size], stick_slip.slipping, stick_slip.rolling
     rolling_rate = rolling.field(core_state)
-    contact = _Contact.of(rolling, mu, core_state, rolling_rate)
+    contact = _Contact.of(stick_slip, core_state, rolling_rate)
     rolling_rate = jnp.concatenate([rolling_rate, jnp.zeros_like(state[size:])])
     scales = scales.reshape(scales.shape[:1] + (1,) * (state.ndim - scales.ndim) + scales.shape[1:])
 
@@ -172,14 +164,15 @@ def slip_onset(
 
         # The force of rolling must have changed accordingly, or Newton's first correction would stop the slip.
         rolling_states = state[:, None] + times * rolling_rate[:, None]
-        v = contact.first_guess(times)
+        # The slip velocity in the limit of small times.
+        v = contact.direction[:, None] * (contact.rise[0] + contact.rise[1] * times) * times
         return jax.lax.fori_loop(0, ITERATIONS, newton, (v, rolling_states, v, jnp.zeros_like(rolling_states)))
 
     def shorten(carry):
         trial, duration, converged, _ = carry
         times = duration * NODES.reshape((-1,) + (1,) * (state.ndim - 1))
         _, states, change, rates = iterated(duration, times)
-        residual = jnp.max(length(*change), axis=0) / contact.speed
+        residual = jnp.max(length(*change), axis=0) / stick_slip.speed
         highest = duration * jnp.abs(jnp.einsum("s,cs...->c...", HIGHEST, rates))
         # The scales of a launch that is upright up to round-off are nearly zero.
         sizes = jnp.maximum(scales, jnp.max(jnp.abs(states), axis=1))
@@ -209,7 +202,7 @@ class _Contact(eqx.Module):
     - `direction`: against the force of rolling; `rise`: the slip's acceleration [m/s^2] and half its rate [m/s^3] at
       the start.
     - `inverse_mass`: M [1/kg] as (M11, M12, M22); `load_change`: n, the change of N by the force along the arena.
-    - `mu`; `free_load`: N without a force along the arena [N]; `speed`: sqrt(g R) [m/s]; `unit`: unit of time [s].
+    - `mu`; `free_load`: N without a force along the arena [N]; `unit`: unit of time [s].
     """
 
     direction: Float[Array, "2 ..."]
@@ -218,20 +211,13 @@ class _Contact(eqx.Module):
     load_change: Float[Array, "2 ..."]
     mu: Float[Array, "..."]
     free_load: Float[Array, "..."]
-    speed: Float[Array, "..."]
     unit: Float[Array, "..."]
 
     @classmethod
-    def of(
-        cls,
-        rolling: RollingDynamics | RigidRolling,
-        mu: Float[Array, "..."],
-        state: Float[Array, "components ..."],
-        rate: Float[Array, "components ..."],
-    ) -> "_Contact":
-        weight = rolling.mass * rolling.gravity
+    def of(cls, stick_slip: "StickSlip", state: State, rate: State) -> "_Contact":
+        rolling, mu, weight = stick_slip.rolling, stick_slip.mu, stick_slip.weight
         grip, grip_rate = jax.jvp(lambda point: rolling.grip(point, mu), (state,), (rate,))
-        F1, F2, N = rolling.reaction(state)
+        F1, F2, N = rolling.evaluate(state)[1]
         force = length(F1, F2)
         force = jnp.where(force > 0.0, force, 1.0)
         d = jnp.stack([-F1 / force, -F2 / force])
@@ -242,15 +228,10 @@ class _Contact(eqx.Module):
         load_change = jnp.stack([b * h - c * f, b * f - a * h]) / determinant
         yields = d[0] * (a * d[0] + b * d[1] + mu * f) + d[1] * (b * d[0] + c * d[1] + mu * h)
         rise = (greatest(-grip, 0.0) * weight / yields, greatest(-grip_rate, 0.0) * weight / (2.0 * yields))
-        speed = jnp.sqrt(rolling.gravity * rolling.size)
         spin = jnp.sqrt(sum(x * x for x in rolling.angular_velocity(state)))
-        unit = 1.0 / jnp.maximum(spin, speed / rolling.size)
+        unit = 1.0 / jnp.maximum(spin, stick_slip.speed / rolling.body.size)
         inverse_mass = (c / determinant, -b / determinant, a / determinant)
-        return cls(d, rise, inverse_mass, load_change, mu, N + load_change[0] * F1 + load_change[1] * F2, speed, unit)
-
-    def first_guess(self, times: Float[Array, "stages ..."]) -> Float[Array, "2 stages ..."]:
-        """The slip velocity in the limit of small times [m/s]."""
-        return self.direction[:, None] * (self.rise[0] + self.rise[1] * times) * times
+        return cls(d, rise, inverse_mass, load_change, mu, N + load_change[0] * F1 + load_change[1] * F2, unit)
 
     def correction(
         self, duration: Float[Array, "..."], v: Float[Array, "2 stages ..."], missing: Float[Array, "2 stages ..."]
@@ -311,7 +292,7 @@ AT_REST = 1e-10
 ROUNDING = 1e-13
 
 
-class StickSlip(AbstractDynamics):
+class StickSlip(AbstractContactDynamics):
     """The equations of motion of a scene with `SetValuedCoulomb`, in place of `Dynamics`.
 
     A state whose contact is at rest rolls; any other state slips.
@@ -324,24 +305,9 @@ class StickSlip(AbstractDynamics):
     rolling: RollingDynamics | RigidRolling
     mu: Float[Array, "..."]
 
-    @classmethod
-    def of(
-        cls,
-        body: Top | AbstractRigidBody,
-        frame: AbstractFrame,
-        friction: AbstractFriction,
-        gravity: Float[Array, "..."],
-    ) -> "StickSlip":
-        """The equations for a body on an arena.
-
-        **Arguments:** as for `Dynamics.of`, with a `SetValuedCoulomb`.
-        """
-        assert isinstance(friction, SetValuedCoulomb)
-        if isinstance(body, AbstractRigidBody):
-            arguments = (frame, body, gravity, body.inertia.tensor.inverse)
-            return cls(RigidSlipping(*arguments, friction, 1.0 / body.mass), RigidRolling(*arguments), friction.mu)
-        slipping = Dynamics.of(body, frame, friction, gravity)
-        return cls(slipping, RollingDynamics.of(body, frame, gravity), friction.mu)
+    @property
+    def weight(self) -> Float[Array, "..."]:
+        return self.slipping.weight
 
     @property
     def frame(self) -> AbstractFrame:
@@ -351,9 +317,9 @@ class StickSlip(AbstractDynamics):
     @property
     def speed(self) -> Float[Array, "..."]:
         """The speed sqrt(g R) [m/s]."""
-        return jnp.sqrt(self.slipping.gravity * self.rolling.size)
+        return jnp.sqrt(self.slipping.gravity * self.rolling.body.size)
 
-    def motion(self, state: Float[Array, "components ..."]) -> Motion:
+    def motion(self, state: State) -> Motion:
         """Evaluate the equations of motion for the state's kind of motion.
 
         **Arguments:**
@@ -366,27 +332,24 @@ class StickSlip(AbstractDynamics):
         kinds = (self.slipping.motion(state), self.rolling.motion(state))
         return jax.tree.map(lambda slipping, rolling: jnp.where(slips, slipping, rolling), *kinds)
 
-    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
-        """Normal force as a fraction of the weight, plus a round-off allowance for a start with N = 0 exactly; and the
-        remaining room, if the arena has places where the body does not fit."""
-        motion = self.motion(state)
-        margin = motion.normal_force / (self.slipping.mass * self.slipping.gravity) + NO_LOAD
-        return (margin,) if motion.room is None else (margin, motion.room - FITS)
-
-    def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+    def loss(self, state: State) -> Int[Array, "..."]:
         """How a contact with zero margin has ended: a code in `LOSSES`. Only a slipping contact can jam."""
         return self.slipping.loss(state)
 
-    def slip_speed(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    def slip_speed(self, state: State) -> Float[Array, "..."]:
         """Speed of the contact point along the arena [m/s]."""
         slip = self.slipping.motion(state).slip
         return length(slip.x, slip.y)
 
-    def normal_spin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    def rests(self, state: State) -> Bool[Array, "..."]:
+        """Whether the contact is at rest."""
+        return self.slip_speed(state) <= AT_REST * self.speed
+
+    def normal_spin(self, state: State) -> Float[Array, "..."]:
         """Angular velocity of a rigid body about the arena's normal [rad/s]."""
         return self.rolling.angular_velocity(state)[2]
 
-    def stopped(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+    def stopped(self, state: State) -> State:
         """The state after the impulse that stops the slip, with the body's axes at unit length.
 
         Step errors change this length, so the slip after the impulse would be as large as these errors; but
@@ -395,16 +358,7 @@ class StickSlip(AbstractDynamics):
         zero = jnp.zeros_like(state[0])
         return self.rolling.with_slip(self.rolling.with_unit_axes(state), Slip(zero, zero))
 
-    def lifts_off(self, state: Float[Array, "components ..."]) -> Bool[Array, "..."]:
-        """Whether a contact at rest separates at once: without a force at the contact point, the arena would have to
-        pull.
-
-        Unless the contact jams, the normal force has the same sign for the ending roll, for the following slip and
-        without friction.
-        """
-        return dataclasses.replace(self.slipping, friction=Frictionless()).motion(state).normal_force <= 0.0
-
-    def grip_left(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    def grip_left(self, state: State) -> Float[Array, "..."]:
         """The reserve of a rolling top before it slips, as a fraction of the weight."""
         return self.rolling.grip(state, self.mu) + ROUNDING
 
@@ -417,7 +371,7 @@ class Change(NamedTuple):
     - `elapsed`: time until the motion continues [s].
     """
 
-    state: Float[Array, "components ..."]
+    state: State
     rolls: Bool[Array, "..."]
     lost: Bool[Array, "..."]
     onset: Onset
@@ -425,67 +379,40 @@ class Change(NamedTuple):
     elapsed: Float[Array, "..."]
 
 
-class ContactMode(AbstractDynamics):
-    """One of the two kinds of motion of a `StickSlip`, in place of `Dynamics`; its contact margin falls to zero at its
-    end.
+class ContactMode(StickSlip):
+    """One of the two kinds of motion of a `StickSlip`; its contact margin falls to zero at its end.
 
-    - `stick_slip`: the equations of the scene; `tolerance`: relative tolerance of the integration.
-    - `rolls`: whether the top rolls or slips.
+    - `tolerance`: relative tolerance of the integration; `rolls`: whether the top rolls or slips.
     """
 
-    stick_slip: StickSlip
     tolerance: Float[Array, ""]
     rolls: bool = eqx.field(static=True)
 
-    @property
-    def frame(self) -> AbstractFrame:
-        """The frame of the body on the arena."""
-        return self.stick_slip.frame
-
-    def motion(self, state: Float[Array, "components ..."]) -> Motion:
+    def motion(self, state: State) -> Motion:
         """The equations of motion of this kind."""
-        return (self.stick_slip.rolling if self.rolls else self.stick_slip.slipping).motion(state)
+        return (self.rolling if self.rolls else self.slipping).motion(state)
 
-    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
+    def margins(self, state: State) -> tuple[Float[Array, "..."], ...]:
         """Positive while this kind of motion lasts. Rolling leaves the friction cone before the normal force
         vanishes."""
         if self.rolls:
-            grip, room = self.stick_slip.grip_left(state), self.stick_slip.rolling.motion(state).room
+            grip, room = self.grip_left(state), self.rolling.motion(state).room
             return (grip,) if room is None else (grip, room - FITS)
-        return (*self.stick_slip.slipping.margins(state), self.slip_left(state))
+        return (*self.slipping.margins(state), self.slip_left(state))
 
-    def unloaded(
-        self, state: Float[Array, "components ..."], scales: Float[Array, "components ..."]
-    ) -> Bool[Array, "..."]:
-        """See `AbstractDynamics.unloaded`."""
-        return carries_no_load(self, self.stick_slip.slipping.weight, state, scales)
-
-    def normal_spin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """As `StickSlip.normal_spin`."""
-        return self.stick_slip.normal_spin(state)
-
-    def slip_left(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    def slip_left(self, state: State) -> Float[Array, "..."]:
         """Excess of the slip speed over the speed at which a slip ends, in units of sqrt(g R). A slip that grows does
         not end."""
         speed, change = self._slowing(state)
-        way = LEFT * self.tolerance * self.stick_slip.rolling.size
-        return (speed - jnp.sqrt(2.0 * way * greatest(-change, 0.0))) / self.stick_slip.speed
+        way = LEFT * self.tolerance * self.rolling.body.size
+        return (speed - jnp.sqrt(2.0 * way * greatest(-change, 0.0))) / self.speed
 
-    def _slowing(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    def _slowing(self, state: State) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """The slip's speed [m/s] and its rate."""
-        return jax.jvp(self.stick_slip.slip_speed, (state,), (self.stick_slip.slipping.field(state),))
-
-    def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
-        """How a contact with zero margin has ended: a code in `LOSSES`."""
-        return self.stick_slip.loss(state)
+        return jax.jvp(self.slip_speed, (state,), (self.slipping.field(state),))
 
     def ended(
-        self,
-        state: Float[Array, "components ..."],
-        size: int,
-        slipping: Callable[[Float[Array, "components ..."]], Float[Array, "components ..."]],
-        scales: Float[Array, "components ..."],
-        left: Float[Array, "..."],
+        self, state: State, size: int, slipping: Callable[[State], State], scales: State, left: Float[Array, "..."]
     ) -> Change:
         """The change that follows the end of this kind of motion.
 
@@ -495,36 +422,40 @@ class ContactMode(AbstractDynamics):
         - `slipping`: rate of the whole state during slip; `scales`: its magnitudes.
         - `left`: time [s] to the horizon; the beginning of a slip is not longer.
         """
-        stick_slip, core_state, quadratures = self.stick_slip, state[:size], state[size:]
-        stopped_state = stick_slip.stopped(core_state)
+        core_state, quadratures = state[:size], state[size:]
+        stopped_state = self.stopped(core_state)
         zero = jnp.zeros_like(core_state[0])
         if self.rolls:
             sticks = zero > 0.0
             # The mode ended because of the grip or the room, or there was no contact to begin with, as after an impact.
-            room, lost = stick_slip.rolling.motion(core_state).room, stick_slip.lifts_off(stopped_state)
-            lost |= self.unloaded(core_state, scales[:size])
-            lost = lost if room is None else lost | (room - FITS <= stick_slip.grip_left(core_state))
+            # The contact separates if the arena would have to pull without a force along it: unless the contact jams, the
+            # normal force has the same sign for the ending roll, for the following slip and without friction.
+            room = self.rolling.motion(core_state).room
+            frictionless = dataclasses.replace(self.slipping, friction=Frictionless())
+            lost = frictionless.motion(stopped_state).normal_force <= 0.0
+            if (unloaded := self.unloaded(core_state, scales[:size])) is not None:
+                lost |= unloaded
+            lost = lost if room is None else lost | (room - FITS <= self.grip_left(core_state))
             wait = zero
         else:
-            sticks = stick_slip.rolling.grip(stopped_state, stick_slip.mu) >= 0.0
-            lost = stick_slip.slipping.contact_margin(core_state) <= self.slip_left(core_state)
+            sticks = self.rolling.grip(stopped_state, self.mu) >= 0.0
+            lost = self.slipping.contact_margin(core_state) <= self.slip_left(core_state)
             # A slip that reverses continues through zero, which it reaches in its remaining time. A slip along which the
             # force of rolling pulls does not reverse: it begins anew.
             speed, change = self._slowing(core_state)
-            slip, (F1, F2, _) = stick_slip.slipping.motion(core_state).slip, stick_slip.rolling.reaction(stopped_state)
+            slip, (F1, F2, _) = self.slipping.motion(core_state).slip, self.rolling.evaluate(stopped_state)[1]
             reverses = (change < 0.0) & (slip.x * F1 + slip.y * F2 > 0.0)
             wait = jnp.where(reverses & ~sticks & ~lost, -speed / jnp.where(reverses, change, 1.0), 0.0)
             wait = jnp.minimum(wait, left)
-            stopped_state = stopped_state + wait * stick_slip.rolling.field(
-                stopped_state + 0.5 * wait * stick_slip.rolling.field(stopped_state)
+            stopped_state = stopped_state + wait * self.rolling.field(
+                stopped_state + 0.5 * wait * self.rolling.field(stopped_state)
             )
             quadratures = quadratures + wait * slipping(state)[size:]
             # Until then, the force of rolling may have returned into the friction cone.
-            sticks = stick_slip.rolling.grip(stopped_state, stick_slip.mu) >= 0.0
+            sticks = self.rolling.grip(stopped_state, self.mu) >= 0.0
         new_state = jnp.concatenate([stopped_state, quadratures])
         slips = ~(sticks | lost)
         max_duration = jnp.where(slips, left - wait, 0.0)
-        laws = (stick_slip.slipping, stick_slip.rolling, stick_slip.mu)
-        onset = slip_onset(*laws, slipping, new_state, size, scales, max_duration, self.tolerance)
+        onset = slip_onset(self, slipping, new_state, size, scales, max_duration, self.tolerance)
         state_after = jnp.where(slips, onset.end, jnp.where(lost, state, new_state))
         return Change(state_after, sticks, lost, onset, wait, wait + jnp.where(slips, onset.length, 0.0))

@@ -17,7 +17,8 @@ and torque by a positive definite matrix.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
 
 import diffrax
 import jax
@@ -25,14 +26,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from nonholonomic.compilation.xla_cpu import greatest, least
-from nonholonomic.geometry import Component, Vector, add, cross, dot, multiply, scale, subtract, sum_vectors, vector_of
-from nonholonomic.integration import AbstractProblem, Settings, traced_solve_ensemble
+from nonholonomic.geometry import Component, Vector, add, cross, dot, multiply, scale, subtract, sum_vectors
+from nonholonomic.integration import AbstractProblem, Outcome, Settings, solve_ensemble
 from nonholonomic.integration.problem import LEFT_DOMAIN, MOST_STEPS
 
-from ..model.body import Round, Top
-from ..model.dynamics import AbstractDynamics, Dynamics
-from ..model.friction import AbstractFriction, ContactLoad, SetValuedCoulomb, Slip, length
-from ..model.launch import angular_velocity, joined, parts
+from ..friction import AbstractFriction, ContactLoad, SetValuedCoulomb, Slip, length
+from ..model.body import ContactGeometry, Top
+from ..model.dynamics import AbstractDynamics, Cells, Dynamics, State, angular_velocity, joined, parts
 from ..model.scene import Scene
 from ..model.stick_slip import StickSlip
 
@@ -40,6 +40,9 @@ from ..model.stick_slip import StickSlip
 #
 # In contact the velocity and the height of the centre of mass follow from the axis; for a free body they are part of the
 # state.
+
+#: Two values of the same structure.
+Tree = TypeVar("Tree")
 
 #: Round-off allowed for a sphere that has just left the arena, as a fraction of R. A sphere that returns gets no
 #: allowance, so ten times or a tenth of this value changes no landing.
@@ -76,44 +79,41 @@ def balls(body: Top) -> tuple[Ball, ...]:
     return (main,) if body.stem is None else (main, Ball(body.stem.offset, body.stem.radius))
 
 
+def own_and_other(body: Top, number: Int[Array, "..."]) -> tuple[Ball, Ball | None]:
+    """The sphere of a top with the given number, in the order of `balls`; and the other sphere if there is one."""
+    if body.stem is None:
+        return balls(body)[0], None
+    main, stem = balls(body)
+    return select(number == 0, main, stem), select(number == 0, stem, main)
+
+
+def select(condition: Bool[Array, "..."], first: Tree, second: Tree) -> Tree:
+    """Each leaf of one tree where a condition holds, and of the other tree elsewhere."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), first, second)
+
+
 def standing_on(dynamics: Dynamics | StickSlip, ball: Ball) -> Dynamics:
     """The equations of motion of a top that stands on another of its spheres: the same equations with the parameters of
     this sphere.
     """
     assert isinstance(dynamics, Dynamics)
     coupling = dynamics.mass * ball.offset * dynamics.per_transverse
-    return dataclasses.replace(dynamics, meridian=Round(ball.offset, ball.radius, coupling))
+    return dataclasses.replace(dynamics, meridian=ContactGeometry(ball.offset, ball.radius, coupling))
 
 
-def as_free_body(body: Top, ball: Ball, state: Float[Array, "components ..."]) -> FreeBody:
+def as_free_body(body: Top, ball: Ball, state: State) -> FreeBody:
     """A top that stands on a sphere, as a free body: the sphere's centre is at rest along the normal.
 
-    **Arguments:** `state`: (8, ...), as in `tippe/model/launch.py`.
+    **Arguments:** `state`: (8, ...), as in `tippe/model/dynamics.py`.
     """
     velocity, axis, momentum, _ = parts(state)
     height = ball.radius - ball.offset * axis[2]
     return FreeBody((*velocity, -ball.offset * axis_rate(body, axis, momentum)[2]), height, axis, momentum)
 
 
-def contact_state(free: FreeBody) -> Float[Array, "components ..."]:
+def contact_state(free: FreeBody) -> State:
     """The state (8, ...) of a top in contact; the omitted components follow from the contact."""
     return joined(free.velocity[:2], free.axis, free.momentum)
-
-
-def shown(body: Top, free: FreeBody, quadratures: Float[Array, "7 ..."]) -> Float[Array, "17 ..."]:
-    """The output rows of a body that may fly.
-
-    **Arguments:** `quadratures`: position (x, y) of the centre of mass [m], the vector c of `problems.py`, spin
-    angle [rad], work [J].
-
-    **Returns:** the state as in contact; position (x, y) of the sphere's centre, c, spin angle, work; and the distance
-    of the top's own sphere from the plane [m] with its rate [m/s].
-    """
-    main = balls(body)[0]
-    place = [x + main.offset * e for x, e in zip(quadratures[:2], free.axis[:2], strict=True)]
-    distance = (gap(main, free), gap_rate(body, main, free))
-    rows = (*free.velocity[:2], *free.axis, *free.momentum, *place, *quadratures[2:], *distance)
-    return jnp.stack(jnp.broadcast_arrays(*rows))
 
 
 def axis_rate(body: Top, axis: Vector, momentum: Vector) -> Vector:
@@ -132,7 +132,7 @@ def gap_rate(body: Top, ball: Ball, free: FreeBody) -> Float[Array, "..."]:
 
 
 def still_parting(
-    rate: Float[Array, "..."], gravity: Float[Array, "..."], radius: Float[Array, "..."], rounding: Any = 0.0
+    rate: Float[Array, "..."], gravity: Float[Array, "..."], radius: Float[Array, "..."], rounding: Cells | float = 0.0
 ) -> Float[Array, "..."]:
     """The round-off allowed for the distance of a sphere, as a fraction of R.
 
@@ -153,30 +153,20 @@ def energy(body: Top, gravity: Float[ArrayLike, "..."], free: FreeBody) -> Float
 
 
 def energy_in(
-    scene: Scene[Top], state: Float[Array, "components ..."], number: Int[Array, "..."]
+    scene: Scene[Top], state: State, number: Int[Array, "..."]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """The least and the greatest energy [J] that a state at the end of a mode, or of a flight from there, may have.
 
     In flight, the state does not contain the speed of the sphere along the normal.
 
-    **Arguments:** `number`: index of the mode in `sliding.py`; where both spheres touch, either determines the height.
+    **Arguments:** `number`: index of the mode in `plane.py`; where both spheres touch, either determines the height.
     """
     main, stem = balls(scene.body)[0], balls(scene.body)[-1]
-    contact_ball = Ball(
-        *(jnp.where(number == 1, of_stem, of_main) for of_stem, of_main in zip(stem, main, strict=True))
-    )
+    contact_ball = select(number == 1, stem, main)
     free = as_free_body(scene.body, contact_ball, state)
     total = energy(scene.body, scene.gravity, free)
     return total - 0.5 * scene.body.mass * free.velocity[2] ** 2, total
 
-
-def jellett(ball: Ball, free: FreeBody) -> Float[Array, "..."]:
-    """Jellett's quantity L.(R n - a e) [kg m^3/s] for one of the spheres: constant while no force acts on the other
-    sphere."""
-    return ball.radius * free.momentum[2] - ball.offset * dot(free.axis, free.momentum)
-
-
-Cells = Float[Array, " cells"]
 
 #: Relative tolerance of an impact's integration: impacts are rare, so this cost is small. A tenfold value changes
 #: inversion times after hundreds of impacts by 1e-14.
@@ -291,14 +281,20 @@ class Impact(AbstractProblem):
         return least(missing, jnp.where(approaches > shortfall, approaches, shortfall))
 
     def ended(self, time: Cells, state: Float[Array, "rows cells"]) -> ContactImpulse:
-        """The impulses of an impact whose end has been located, corrected by one step of Newton's method.
+        """The impulses of an impact whose end has been located, corrected."""
+        rates = self.field(time, state)
+        step = newton_step(self.domain_margin, (time, state), (jnp.ones_like(time), rates))
+        return self.impulse(time + step, state + step * rates)
 
-        The search leaves an error of 1e-10, and this step leaves its square, which is round-off.
-        """
-        left, slope = jax.jvp(self.domain_margin, (time, state), (jnp.ones_like(time), self.field(time, state)))
-        step = -left / jnp.where(slope == 0.0, 1.0, slope)
-        step = jnp.where(jnp.abs(step) < 1e-6, step, 0.0)
-        return self.impulse(time + step, state + step * self.field(time, state))
+
+def newton_step(margin: Callable[..., Cells], point: tuple[Array, ...], rates: tuple[Array, ...]) -> Cells:
+    """One step of Newton's method to the zero of a margin along some rates, from its located zero.
+
+    The search leaves an error of 1e-10, and this step leaves its square, which is round-off.
+    """
+    left, slope = jax.jvp(margin, point, rates)
+    step = -left / jnp.where(slope == 0.0, 1.0, slope)
+    return jnp.where(jnp.abs(step) < 1e-6, step, 0.0)
 
 
 def approach(body: Top, ball: Ball, free: FreeBody) -> Approach:
@@ -325,7 +321,7 @@ def resolve_impact(
     """The body after one of its spheres has struck the plane; unchanged if the sphere does not approach the plane.
 
     An impulse at the contact point leaves Jellett's quantity of that sphere unchanged; an impulse of a torque changes
-    it.
+    it. Under `SetValuedCoulomb`, the slip of a contact that sticks is zero up to round-off.
 
     **Arguments:**
 
@@ -336,22 +332,52 @@ def resolve_impact(
     **Returns:** the body after the impact; and whether the impact could not be computed (`MOST_STEPS`, `LARGEST`).
     """
     contact = approach(body, ball, free)
-    impulse_gain = (1.0 + restitution) * greatest(-contact.velocity[2], 0.0)
-    problem = Impact(body, friction, contact, ball.radius, impulse_gain)
-    horizon, cells = jnp.asarray(LARGEST), jnp.asarray(impulse_gain.shape[0])
-    settings = Settings(TOLERANCE, diffrax.Dopri5(), absolute=1.0, max_steps=MOST_STEPS)
-    outcome, _ = traced_solve_ensemble(problem, horizon, cells, settings)
-    impulse = problem.ended(outcome.end_time, outcome.state)
-    return apply_impulse(body, contact, free, impulse), outcome.status != LEFT_DOMAIN
-
-
-def apply_impulse(body: Top, contact: Approach, free: FreeBody, impulse: ContactImpulse) -> FreeBody:
-    """A free body after an impulse at its contact."""
+    gained = (1.0 + restitution) * greatest(-contact.velocity[2], 0.0)
+    impact = Impact(body, friction, contact, ball.radius, gained)
+    if isinstance(friction, SetValuedCoulomb):
+        impulse, status = _coulomb_impulse(impact, friction.mu)
+    else:
+        outcome = _solved(impact, absolute=1.0)
+        impulse, status = impact.ended(outcome.end_time, outcome.state), outcome.status
     velocity = sum_vectors(free.velocity, scale(1.0 / body.mass, impulse.force))
     momentum = sum_vectors(free.momentum, cross(contact.arm, impulse.force))
     if impulse.torque is not None:
         momentum = sum_vectors(momentum, impulse.torque)
-    return FreeBody(velocity, free.height, free.axis, momentum)
+    return FreeBody(velocity, free.height, free.axis, momentum), status != LEFT_DOMAIN
+
+
+def _solved(problem: "Impact | Skid", absolute: float) -> Outcome:
+    """The end of an impact. **Arguments:** `absolute`: as for `Settings`."""
+    settings = Settings(TOLERANCE, diffrax.Dopri5(), absolute=absolute, max_steps=MOST_STEPS)
+    cells = jnp.asarray(problem.start()[0].shape[1])
+    return solve_ensemble(problem, jnp.asarray(LARGEST), cells, settings, traced=True)[0]
+
+
+class Strike(NamedTuple):
+    """The effect of an impact on the sphere that strikes.
+
+    - `free`: the body after the impact; `rebounds`: whether the sphere flies off, or else stays in contact.
+    - `is_slow`: whether the impact is so slow that it may be the last; `fails`: whether it could not be computed.
+    """
+
+    free: FreeBody
+    rebounds: Bool[Array, " cells"]
+    is_slow: Bool[Array, " cells"]
+    fails: Bool[Array, " cells"]
+
+
+def closing_speed(scene: Scene[Top]) -> Float[Array, "..."]:
+    """The speed [m/s] of a rebound below which the contact closes."""
+    return CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
+
+
+def strike(scene: Scene[Top], ball: Ball, free: FreeBody) -> Strike:
+    """The impact of a sphere of a free body on the plane; a slow rebound closes the contact."""
+    speed = greatest(-gap_rate(scene.body, ball, free), 0.0)
+    bounce = jnp.zeros_like(speed) + (0.0 if scene.restitution is None else scene.restitution)
+    rebounds = bounce * speed > closing_speed(scene)
+    free, fails = resolve_impact(scene.body, scene.friction, ball, free, jnp.where(rebounds, bounce, 0.0))
+    return Strike(free, rebounds, ~rebounds & (speed <= closing_speed(scene)), fails)
 
 
 # Impact under set-valued Coulomb friction: the slip may stop, and the contact then sticks or slips again.
@@ -409,30 +435,21 @@ class Skid(AbstractProblem):
         return length(*self.velocity(state)[:2]) / self.pace - STOPS
 
 
-def resolve_coulomb_impact(
-    body: Top, friction: SetValuedCoulomb, ball: Ball, free: FreeBody, restitution: Cells
-) -> tuple[FreeBody, Bool[Array, " cells"]]:
-    """The body after one of its spheres has struck the plane; if the contact sticks, its slip is zero up to round-off.
-
-    **Arguments, returns:** as for `resolve_impact`; this is its limit for a slip speed of 0.
-    """
-    contact = approach(body, ball, free)
-    impact = Impact(body, friction, contact, ball.radius, (1.0 + restitution) * greatest(-contact.velocity[2], 0.0))
-    pace = greatest(length(*contact.velocity[:2]), impact.speed)
-    skid = Skid(impact, friction.mu, pace)
-    settings = Settings(TOLERANCE, diffrax.Dopri5(), absolute=0.1, max_steps=MOST_STEPS)
-    outcome, _ = traced_solve_ensemble(skid, jnp.asarray(LARGEST), jnp.asarray(pace.shape[0]), settings)
+def _coulomb_impulse(impact: Impact, mu: Float[Array, "..."]) -> tuple[ContactImpulse, Int[Array, " cells"]]:
+    """The impulse of an impact under set-valued friction, the limit for a slip speed of 0, and the status of its
+    slipping part."""
+    pace = greatest(length(*impact.approach.velocity[:2]), impact.speed)
+    skid = Skid(impact, mu, pace)
+    outcome = _solved(skid, absolute=0.1)
     stops = skid.slip_left(outcome.state) <= STOPS
     rates = skid.field(outcome.end_time, outcome.state)
-    # An impact that ends while it slips is corrected by one step of Newton's method, as in `Impact.ended`.
-    left, slope = jax.jvp(lambda point: impact.domain_margin(point[2], point[:2]), (outcome.state,), (rates,))
-    step = -left / jnp.where(slope == 0.0, 1.0, slope)
-    step = jnp.where(jnp.abs(step) < 1e-6, step, 0.0)
+    # An impact that ends while it slips is corrected.
+    step = newton_step(lambda point: impact.domain_margin(point[2], point[:2]), (outcome.state,), (rates,))
     state = jnp.where(stops, outcome.state, outcome.state + step * rates)
     impulse = impact.impulse(state[2], state[:2])
-    remaining_impulse = _remaining_impulse(impact, friction.mu, impulse.force)
-    force = vector_of(jnp.where(stops, a + b, a) for a, b in zip(impulse.force, remaining_impulse, strict=True))
-    return apply_impulse(body, contact, free, ContactImpulse(force, None)), outcome.status != LEFT_DOMAIN
+    remaining_impulse = _remaining_impulse(impact, mu, impulse.force)
+    force = tuple(jnp.where(stops, a + b, a) for a, b in zip(impulse.force, remaining_impulse, strict=True))
+    return ContactImpulse(force, None), outcome.status
 
 
 def _remaining_impulse(impact: Impact, mu: Float[Array, "..."], impulse: Vector) -> Vector:
@@ -564,7 +581,11 @@ class LeaningDynamics(AbstractDynamics):
         """The equations for the top of a scene."""
         return cls(scene.body, scene.friction, scene.gravity)
 
-    def motion(self, state: Float[Array, "components ..."]) -> LeaningMotion:
+    @property
+    def weight(self) -> Float[Array, "..."]:
+        return self.body.mass * self.gravity
+
+    def motion(self, state: State) -> LeaningMotion:
         """Evaluate the equations of motion.
 
         **Arguments:**
@@ -593,9 +614,8 @@ class LeaningDynamics(AbstractDynamics):
             )
             for ball, load in zip(spheres, loads, strict=True)
         )
-        weight = m * self.gravity
-        N_1 = -(axial_rate * precession * sine2 + weight * m_0) / (m_1 - m_0)
-        normal = (weight - N_1, N_1)
+        N_1 = -(axial_rate * precession * sine2 + self.weight * m_0) / (m_1 - m_0)
+        normal = (self.weight - N_1, N_1)
 
         u_dot = scale(1.0 / m, sum_vectors(*(scale(N, load.force) for N, load in zip(normal, loads, strict=True))))
         pulls = [dot(perpendicular, load.force) for load in loads]
@@ -610,12 +630,11 @@ class LeaningDynamics(AbstractDynamics):
         stiff = (m_1 - m_0) / ((spheres[1].offset - spheres[0].offset) * sine2)
         return LeaningMotion(rate, normal, power, b, stiff)
 
-    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
+    def margins(self, state: State) -> tuple[Float[Array, "..."], ...]:
         """Both normal forces as fractions of the weight, plus `HOLDS`."""
-        weight = self.body.mass * self.gravity
-        return tuple(force / weight + HOLDS for force in self.motion(state).normal_forces)
+        return tuple(force / self.weight + HOLDS for force in self.motion(state).normal_forces)
 
-    def heavier(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+    def heavier(self, state: State) -> Int[Array, "..."]:
         """The number of the sphere with the greater normal force: contact remains there when the other force vanishes."""
         N_0, N_1 = self.motion(state).normal_forces
         return (N_1 > N_0).astype(int)
@@ -637,7 +656,8 @@ class LeaningDynamics(AbstractDynamics):
         forces, torques, gains = [], [], []
         for ball in spheres:
             contact = approach(self.body, ball, free)
-            slip = Slip(*contact.velocity[:2], (w1, w2, w3 if self.friction.uses_spin else None))
+            x, y, _ = contact.velocity
+            slip = Slip(x, y, (w1, w2, w3 if self.friction.uses_spin else None))
             load = self.friction.per_normal_force(slip)
             forces.append(tuple(zero if part is None else part for part in (*load.force, 1.0 + zero)))
             torques.append(sum_vectors(cross(contact.arm, forces[-1]), load.torque))

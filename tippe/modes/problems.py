@@ -6,18 +6,16 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from nonholonomic.compilation.xla_cpu import compiled_setup
+from nonholonomic.compilation.xla_cpu import compiled_setup, least
 from nonholonomic.geometry import Component, Tangent, Vector, cross, dot, rate_in_frame, scale, stacked, sum_vectors
 from nonholonomic.hybrid import AbstractBatchedMode
 from nonholonomic.integration import AbstractPassive, AbstractProblem, ExtendedProblem
 
 from ..model.body import Top
-from ..model.dynamics import NO_COSINE, Dynamics
-from ..model.launch import COS_THETA, Launch, parts
-from ..model.rigid_body import AbstractRigidBody
-from ..model.rigid_dynamics import AbstractRigidDynamics
-from ..model.scene import Scene
-from ..model.stick_slip import ContactMode, StickSlip
+from ..model.dynamics import COS_THETA, NO_COSINE, AbstractDynamics, Dynamics, State, States, parts
+from ..model.rigid import AbstractRigidBody, AbstractRigidDynamics
+from ..model.scene import Launch, Scene
+from ..model.stick_slip import StickSlip
 
 # Motion on one smooth contact until theta reaches an angle, or the spin reverses, or the contact ends, for many cells.
 
@@ -31,17 +29,18 @@ class InversionProblem(AbstractProblem):
 
     If `cos_angle` is `None`, they end when the spin about the arena's normal reverses; `spin` is the initial spin
     [rad/s]. For a top with a stem, `stem_counts` is 1 if the event is that the stem first carries the top, and 0 if the
-    event is an angle; one program serves both.
+    event is an angle; one program serves both. If the event counts, a run that starts `on_stem` is beyond it; later,
+    reset maps determine when the stem takes over.
     """
 
-    dynamics: Dynamics | StickSlip | ContactMode | AbstractRigidDynamics
+    dynamics: AbstractDynamics
     # An array, or `None`.
     cos_angle: Any
-    states: Float[Array, "components cells"]
-    scales: Float[Array, "components cells"]
+    states: States
+    scales: States
     spin: Float[Array, "..."] | None = None
-    # An array for a top with a stem, or `None`.
-    stem_counts: Any = None
+    stem_counts: Float[Array, "..."] | None = None
+    on_stem: Bool[Array, "..."] | None = None
     # Whether a flight follows where the contact is lost.
     flies: bool = eqx.field(static=True, default=False, kw_only=True)
 
@@ -55,38 +54,40 @@ class InversionProblem(AbstractProblem):
         event = angle if angle is None or isinstance(angle, StemContact) else jnp.asarray(angle)
         return _inversion_problem(scene, launch, event, cells)
 
-    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+    def start(self) -> tuple[States, States]:
         return self.states, self.scales
 
-    def field(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> Any:
+    def field(
+        self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]
+    ) -> Float[Array, "components *lanes"]:
         return self.dynamics.field(state)
 
     def event_function(self, state: Float[Array, "components *lanes"]) -> Float[Array, "*lanes"]:
         if self.cos_angle is None:
-            assert not isinstance(self.dynamics, Dynamics)
+            assert isinstance(self.dynamics, StickSlip | AbstractRigidDynamics)
             assert self.spin is not None
             return self.dynamics.normal_spin(state) / self.spin
-        return state[COS_THETA] - self.cos_angle
+        return self.unless_on_stem(state[COS_THETA] - self.cos_angle)
+
+    def unless_on_stem(self, value: Float[Array, "*lanes"]) -> Float[Array, "*lanes"]:
+        """The event function, or -1 if the stem carries the top and this counts."""
+        if self.stem_counts is None or self.on_stem is None:
+            return value
+        return jnp.where(self.on_stem & (self.stem_counts > 0.0), -1.0, value)
 
     def domain_margin(
         self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]
     ) -> Float[Array, "*lanes"]:
-        return self.dynamics.contact_margin(state)
+        return least(*self.margins(time, state))
 
     def lost_at_start(self, state: Float[Array, "components *lanes"]) -> Bool[Array, "*lanes"] | None:
         # A top that may fly slides on without load: both are the same motion.
         return None if self.flies else self.dynamics.unloaded(state, self.scales)
 
-    def margins(self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]) -> tuple[Any, ...]:
+    def margins(
+        self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]
+    ) -> tuple[Float[Array, "*lanes"], ...]:
         return self.dynamics.margins(state)
-
-
-def beyond_on_stem(
-    value: Float[Array, " cells"], on_stem: Bool[Array, "..."], stem_counts: Float[Array, "..."] | None
-) -> Float[Array, " cells"]:
-    """The event function, or -1 if the stem carries the top and this counts, so that a run which starts on the stem is
-    beyond the event. Later, reset maps determine when the stem takes over."""
-    return value if stem_counts is None else jnp.where(on_stem & (stem_counts > 0.0), -1.0, value)
 
 
 @compiled_setup
@@ -100,12 +101,9 @@ def _inversion_problem(
     dynamics = scene.turning_dynamics
     if angle is None:
         return InversionProblem(dynamics, None, states, scales, dynamics.normal_spin(states))
-    if not scene.has_stem:
-        assert not isinstance(angle, StemContact)
-        return InversionProblem(dynamics, jnp.cos(angle), states, scales)
-    if isinstance(angle, StemContact):
-        return InversionProblem(dynamics, jnp.asarray(NO_COSINE), states, scales, stem_counts=jnp.ones(()))
-    return InversionProblem(dynamics, jnp.cos(angle), states, scales, stem_counts=jnp.zeros(()))
+    cos_angle = jnp.asarray(NO_COSINE) if isinstance(angle, StemContact) else jnp.cos(angle)
+    stem_counts = jnp.asarray(float(isinstance(angle, StemContact))) if scene.has_stem else None
+    return InversionProblem(dynamics, cos_angle, states, scales, stem_counts=stem_counts)
 
 
 # Motion on one smooth contact with the path on the arena, the orientation about the axis and the work of friction.
@@ -131,8 +129,12 @@ class Quadratures(AbstractPassive):
     of_mass: bool = eqx.field(static=True, default=False)
 
     def rates(
-        self, problem: Any, time: Float[Array, "..."], state: Any, passive: Any
-    ) -> Float[Array, "components ..."]:
+        self,
+        problem: Any,
+        time: Float[Array, "..."],
+        state: Float[Array, "core ..."],
+        passive: Float[Array, "rest ..."],
+    ) -> State:
         dynamics, (u, e, L, _) = problem.dynamics, parts(state)
         motion, (*path, c1, c2, c3, _, _) = dynamics.motion(state), passive
         c, frame_rate = (c1, c2, c3), (None, None) if self.of_mass else motion.frame_rate
@@ -151,13 +153,10 @@ def c_rate(c: Vector, axis: Vector, axial_rate: Component, frame_rate: Tangent =
     return sum_vectors(scale(-axial_rate, axis), rate_in_frame(c, frame_rate))
 
 
+@compiled_setup
 def trajectory_problem(modules: tuple[Scene, Launch], cells: int | None = None) -> TrajectoryProblem:
     """The run of one launch, or the runs of several cells; numbers are scalars or arrays with one number per cell."""
-    return _trajectory_problem(*modules, cells)
-
-
-@compiled_setup
-def _trajectory_problem(scene: Scene, launch: Launch, cells: int | None) -> TrajectoryProblem:
+    scene, launch = modules
     size, weight = scene.body.size, scene.body.mass * scene.gravity
     sine, cosine = jnp.sin(launch.theta), jnp.cos(launch.theta)
     perpendicular = (cosine * jnp.cos(launch.azimuth), cosine * jnp.sin(launch.azimuth), -sine)
@@ -187,14 +186,12 @@ class AbstractFlyingMode(AbstractBatchedMode):
     """
 
     scene: Scene[Top]
-    scales: Float[Array, "components cells"]
+    scales: States
     cos_angle: Float[Array, "..."]
     with_quadratures: bool = eqx.field(static=True)
-    stem_counts: Any = eqx.field(kw_only=True, default=None)
+    stem_counts: Float[Array, "..."] | None = eqx.field(kw_only=True, default=None)
 
-    def extended(
-        self, problem: AbstractProblem, passive: AbstractPassive, state: Float[Array, "components cells"]
-    ) -> AbstractProblem:
+    def extended(self, problem: AbstractProblem, passive: AbstractPassive, state: States) -> AbstractProblem:
         """The problem for given states, including the passive quadratures."""
         size = len(problem.start()[0])
         if not self.with_quadratures:

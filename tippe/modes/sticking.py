@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.hybrid import AbstractBatchedMode, Transition, TransitionPath
@@ -13,10 +13,9 @@ from nonholonomic.integration import AbstractProblem, ExtendedProblem
 from nonholonomic.integration.problem import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING
 
 from ..model.body import Top
-from ..model.dynamics import NO_COSINE
-from ..model.launch import COS_THETA, parts
+from ..model.dynamics import COS_THETA, NO_COSINE, AbstractDynamics, Cells, State, States, parts
 from ..model.scene import Scene
-from ..model.stick_slip import AT_REST, Change, ContactMode, Onset, StickSlip
+from ..model.stick_slip import Change, ContactMode, Onset, StickSlip
 from .airborne import (
     FLYING,
     ON_STEM,
@@ -31,7 +30,7 @@ from .airborne import (
     standing,
 )
 from .impact import balls, gap_rate
-from .problems import AbstractFlyingMode, InversionProblem, Quadratures, TrajectoryProblem
+from .problems import InversionProblem, Quadratures, TrajectoryProblem
 
 # Runs with stick and slip: the cells of a table, and a single run with its path.
 
@@ -39,9 +38,7 @@ from .problems import AbstractFlyingMode, InversionProblem, Quadratures, Traject
 SLIPPING, ROLLING = range(2)
 
 
-def contact_energy(
-    scene: Scene[Top], state: Float[Array, "components cells"], number: Int[Array, " cells"]
-) -> tuple[Float[Array, " cells"], Float[Array, " cells"]]:
+def contact_energy(scene: Scene[Top], state: States, number: Int[Array, " cells"]) -> tuple[Cells, Cells]:
     """The least and the greatest energy [J] that a state in a mode may have; here these are the same."""
     assert isinstance(scene.dynamics, StickSlip)
     rolls = scene.dynamics.rolling.carried_along(state)
@@ -52,44 +49,44 @@ def contact_energy(
 class StickSlipMode(AbstractBatchedMode):
     """Slipping or rolling until theta reaches an angle; with `last`, the last crossing counts.
 
-    For a single run whose path is kept, `passive` quadratures follow the first `size` components. For the cells of a
-    table both are `None`. Without an angle, a run ends when the spin about the normal reverses; `spin` is the initial
-    spin.
+    The equations of motion have the first `size` components. For a single run whose path is kept, `passive` quadratures
+    follow. Without an angle, a run ends when the spin about the normal reverses; `spin` is the initial spin.
     """
 
     kind: ContactMode
     # An array, or `None`.
     cos_angle: Any
-    scales: Float[Array, "components cells"]
+    scales: States
     last: bool = eqx.field(static=True)
+    size: int = eqx.field(static=True)
     passive: Quadratures | None = None
-    size: int | None = eqx.field(static=True, default=None)
     spin: Float[Array, "..."] | None = None
 
-    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+    def problem(self, state: States) -> AbstractProblem:
         return self._under(self.kind, state)
 
     def shown(self, state: Float[Array, "components times"]) -> Float[Array, "components times"]:
-        """The velocity of a rolling top follows from the other components of its state."""
-        if not self.kind.rolls:
-            return state
-        core_state = self.kind.stick_slip.rolling.carried_along(state[: self._size(state)])
-        return jnp.concatenate([core_state, state[self._size(state) :]])
+        return self.carried_along(state) if self.kind.rolls else state
+
+    def carried_along(self, state: State) -> State:
+        """The state of a rolling top, whose velocity follows from the other components."""
+        return jnp.concatenate([self.kind.rolling.carried_along(state[: self.size]), state[self.size :]])
 
     def between(self, motion: tuple[Onset, Array], passed: Float[Array, " times"]) -> Float[Array, "components times"]:
         onset, wait = motion
         return onset.at((passed - wait) / jnp.where(onset.length > 0.0, onset.length, 1.0))
 
-    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
+    def reset_map(self, state: States, left: Cells) -> Transition:
         """Stick, slip, or end if the contact is lost. Counts the changes from slip to rolling."""
-        slipping = self._under(self.kind.stick_slip.slipping, state)
-        change = self.kind.ended(state, self._size(state), lambda point: slipping.field(left, point), self.scales, left)
+        slipping = self._under(self.kind.slipping, state)
+        change = self.kind.ended(state, self.size, lambda point: slipping.field(left, point), self.scales, left)
         onset, length = change.onset, change.onset.length
         wait_fraction = -change.wait / jnp.where(length > 0.0, length, 1.0)
         is_falling = (self._event(state) > 0.0) & (self._event(change.state) <= 0.0)
         if self.spin is None:
             crosses = is_falling & ~change.rolls & ~change.lost
-            cosine = onset.of_components(slice(COS_THETA, COS_THETA + 1))
+            rows = slice(COS_THETA, COS_THETA + 1)
+            cosine = Onset(onset.start[rows], length, onset.rates[rows], onset.converged)
             fraction = cosine.falls_to_zero(lambda part: part[0] - self.cos_angle, wait_fraction)
         else:
             # The impulse that stops a slip changes the spin, too.
@@ -112,19 +109,15 @@ class StickSlipMode(AbstractBatchedMode):
             record=None if self.passive is None else _recorded(change),
         )
 
-    def _event(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+    def _event(self, state: States) -> Cells:
         """The function whose fall to zero ends a run."""
         if self.spin is None:
             return state[COS_THETA] - self.cos_angle
-        return self.kind.stick_slip.normal_spin(state[: self._size(state)]) / self.spin
+        return self.kind.normal_spin(state[: self.size]) / self.spin
 
-    def _size(self, state: Float[Array, "components ..."]) -> int:
-        """Number of components in the equations of motion."""
-        return len(state) if self.size is None else self.size
-
-    def _under(self, equations: Any, state: Float[Array, "components cells"]) -> AbstractProblem:
+    def _under(self, equations: AbstractDynamics, state: States) -> AbstractProblem:
         """The motion from some states under given equations."""
-        size = self._size(state)
+        size = self.size
         problem = InversionProblem(equations, self.cos_angle, state[:size], self.scales[:size], self.spin)
         if self.passive is None:
             return problem
@@ -136,6 +129,12 @@ def _recorded(change: Change) -> TransitionPath:
     ends = jnp.where(change.rolls | change.lost, jnp.inf, change.elapsed)
     motions = jax.tree.map(lambda leaf: leaf[None], (change.onset, change.wait))
     return TransitionPath(ends[None], motions, jnp.ones((1, len(ends)), int))
+
+
+def kinds_of(stick_slip: StickSlip, tolerance: float) -> tuple[ContactMode, ContactMode]:
+    """The two kinds of motion, slipping and rolling. **Arguments:** `tolerance`: as for `ContactMode`."""
+    laws = (stick_slip.slipping, stick_slip.rolling, stick_slip.mu, jnp.asarray(tolerance, float))
+    return ContactMode(*laws, rolls=False), ContactMode(*laws, rolls=True)
 
 
 def stick_slip_modes(
@@ -152,25 +151,24 @@ def stick_slip_modes(
 
     - `problem`: the problem of launches in a scene with `SetValuedCoulomb`.
     - `tolerance`: relative tolerance of the integration; `last`: whether the last crossing counts.
-    - `passive`, `size`: as for `StickSlipMode`.
+    - `passive`, `size`: as for `StickSlipMode`; by default without quadratures.
     """
-    stick_slip = problem.dynamics
+    stick_slip, size = problem.dynamics, len(problem.states) if size is None else size
     assert isinstance(stick_slip, StickSlip)
-    kinds = (ContactMode(stick_slip, jnp.asarray(tolerance, float), rolls) for rolls in (False, True))
-    options = (problem.cos_angle, problem.scales, last, passive, size, problem.spin)
-    both_modes = tuple(StickSlipMode(kind, *options) for kind in kinds)
+    options = (problem.cos_angle, problem.scales, last, size, passive, problem.spin)
+    both_modes = tuple(StickSlipMode(kind, *options) for kind in kinds_of(stick_slip, tolerance))
     return both_modes, _first_mode(stick_slip, problem.states)
 
 
 @compiled_setup
-def _first_mode(stick_slip: StickSlip, states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+def _first_mode(stick_slip: StickSlip, states: States) -> Int[Array, " cells"]:
     """The index of the mode in which each cell starts."""
-    return jnp.where(stick_slip.slip_speed(states) <= AT_REST * stick_slip.speed, ROLLING, SLIPPING)
+    return jnp.where(stick_slip.rests(states), ROLLING, SLIPPING)
 
 
 def contact_modes(
-    run: TrajectoryProblem, tolerance: Any
-) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"], Float[Array, "components cells"]]:
+    run: TrajectoryProblem, tolerance: float
+) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"], States]:
     """The modes of runs whose path is kept, the index of each first mode, and the initial states.
 
     **Arguments:** `run`: one run, or the runs of some cells, in a scene with `SetValuedCoulomb`; `tolerance`: relative
@@ -191,40 +189,26 @@ def contact_modes(
 TOUCH_SLIPPING, TOUCH_ROLLING = SLIDING, 2
 
 
-class Touch(AbstractFlyingMode):
-    """Slipping or rolling on the arena; `last` is whether the last crossing of the angle counts."""
+class Touch(StickSlipMode):
+    """Slipping or rolling on the arena, until the contact is lost."""
 
-    kind: ContactMode
-    last: bool = eqx.field(static=True)
-
-    @property
-    def contact_state(self) -> StickSlipMode:
-        """The mode of runs that end where the contact is lost."""
-        passive, size = (Quadratures(self.scene.body.I3), OWN) if self.with_quadratures else (None, None)
-        return StickSlipMode(self.kind, self.cos_angle, self.scales, self.last, passive, size)
-
-    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
-        return self.contact_state.problem(state)
+    scene: Scene[Top] = eqx.field(kw_only=True)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
-        return _at_no_distance(self.contact_state.shown(state))
+        return _at_no_distance(super().shown(state))
 
-    def between(self, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "21 times"]:
-        return _at_no_distance(self.contact_state.between(motion, passed))
+    def between(self, motion: tuple[Onset, Array], passed: Float[Array, " times"]) -> Float[Array, "21 times"]:
+        return _at_no_distance(super().between(motion, passed))
 
-    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
+    def reset_map(self, state: States, left: Cells) -> Transition:
         """Stick, slip, or fly where the contact is lost. Counts flights, and changes from slip to rolling."""
-        transition = self.contact_state.reset_map(state, left)
-        state_after = transition.state
-        if self.kind.rolls:
-            state_after = jnp.concatenate(
-                [self.kind.stick_slip.rolling.carried_along(state_after[:OWN]), state_after[OWN:]]
-            )
+        transition = super().reset_map(state, left)
+        state_after = self.carried_along(transition.state) if self.kind.rolls else transition.state
         flies = (transition.status == LEFT_DOMAIN) & (self.kind.loss(state_after[:OWN]) == 0)
         mode = jnp.where(transition.mode == ROLLING, TOUCH_ROLLING, TOUCH_SLIPPING)
         return transition._replace(
             mode=jnp.where(flies, FLYING, mode),
-            state=jnp.where(flies, lift_off(self.scene, state_after, self.with_quadratures), transition.state),
+            state=jnp.where(flies, lift_off(self.scene, state_after, self.passive is not None), transition.state),
             status=jnp.where(flies, RUNNING, transition.status),
             counts=jnp.concatenate([flies.astype(int)[None], transition.counts]),
         )
@@ -233,28 +217,26 @@ class Touch(AbstractFlyingMode):
 class Land(Fly):
     """Flying over the arena, to a contact that slips or rolls."""
 
-    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
+    def reset_map(self, state: States, left: Cells) -> Transition:
         """Strike the arena; then rebound, or continue to slip or roll."""
         transition, stick_slip = super().reset_map(state, left), self.scene.dynamics
         assert isinstance(stick_slip, StickSlip)
-        rests = stick_slip.slip_speed(transition.state[:OWN]) <= AT_REST * stick_slip.speed
-        mode = jnp.where(rests, TOUCH_ROLLING, TOUCH_SLIPPING)
+        mode = jnp.where(stick_slip.rests(transition.state[:OWN]), TOUCH_ROLLING, TOUCH_SLIPPING)
         counts = jnp.concatenate([transition.counts, jnp.zeros_like(transition.counts)])
         return transition._replace(mode=jnp.where(transition.mode == FLYING, FLYING, mode), counts=counts)
 
 
 def airborne_stick_slip_modes(
     scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
-) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
-    """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `sliding.modes`."""
-    stick_slip, arguments = problem.dynamics, (scene, problem.scales, problem.cos_angle, with_quadratures)
+) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]:
+    """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `hopping_modes`."""
+    stick_slip, passive = problem.dynamics, Quadratures(scene.body.I3) if with_quadratures else None
     assert isinstance(stick_slip, StickSlip)
-    slips, rolls = (
-        Touch(*arguments, ContactMode(stick_slip, jnp.asarray(tolerance, float), rolls_first), last)
-        for rolls_first in (False, True)
-    )
-    rests = stick_slip.slip_speed(problem.states[:OWN]) <= AT_REST * stick_slip.speed
-    return (slips, Land(*arguments), rolls), jnp.where(rests, TOUCH_ROLLING, TOUCH_SLIPPING)
+    options = (problem.cos_angle, problem.scales, last, OWN, passive)
+    slips, rolls = (Touch(kind, *options, scene=scene) for kind in kinds_of(stick_slip, tolerance))
+    flies = Land(scene, problem.scales, problem.cos_angle, with_quadratures)
+    first = jnp.where(stick_slip.rests(problem.states[:OWN]), TOUCH_ROLLING, TOUCH_SLIPPING)
+    return (slips, flies, rolls), first
 
 
 def _at_no_distance(rows: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
@@ -266,27 +248,18 @@ def _at_no_distance(rows: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
 # ended.
 
 
-def on_the_ground(
-    scene: Scene[Top], state: Float[Array, "components cells"], mode: Int[Array, " cells"]
-) -> Float[Array, "14 cells"]:
-    """States of runs, in the layout for sliding on the top's own sphere. States of other modes refer to the foot below
-    that sphere.
-    """
-    return _above_the_ground(scene, state, mode)[0]
-
-
-def airborne_energy(
-    scene: Scene[Top], state: Float[Array, "components cells"], mode: Int[Array, " cells"]
-) -> tuple[Float[Array, " cells"], Float[Array, " cells"]]:
+def airborne_energy(scene: Scene[Top], state: States, mode: Int[Array, " cells"]) -> tuple[Cells, Cells]:
     """The least and the greatest energy [J] that a state in a mode may have; here these are the same."""
-    state, distance, rate = _above_the_ground(scene, state, mode)
+    state, distance, rate = above_the_ground(scene, state, mode)
     if isinstance(scene.dynamics, StickSlip):
         state = jnp.where(mode == TOUCH_ROLLING, scene.dynamics.rolling.carried_along(state), state)
     total = scene.energy(state) + lifted(scene, state, distance, rate)
     return total, total
 
 
-def lifted(scene: Scene[Top], state: Float[Array, "14 ..."], distance: Any, rate: Any) -> Float[Array, "..."]:
+def lifted(
+    scene: Scene[Top], state: Float[Array, "14 ..."], distance: ArrayLike, rate: ArrayLike
+) -> Float[Array, "..."]:
     """Difference [J] between the energy of a flying top and that of the same state in contact; `distance` [m] is that
     of its sphere from the ground, and `rate` [m/s] the rate of this distance."""
     _, e, L, place = parts(state)
@@ -296,17 +269,16 @@ def lifted(scene: Scene[Top], state: Float[Array, "14 ..."], distance: Any, rate
     return scene.body.mass * (potential + 0.5 * ((moment + rate) ** 2 - moment**2))
 
 
-def _above_the_ground(
-    scene: Scene[Top], state: Float[Array, "components cells"], mode: Int[Array, " cells"]
-) -> tuple[Float[Array, "14 cells"], Float[Array, " cells"], Float[Array, " cells"]]:
-    """States as `on_the_ground` has them, and the distance [m] of the top's own sphere with its rate [m/s]."""
+def above_the_ground(
+    scene: Scene[Top], state: States, mode: Int[Array, " cells"]
+) -> tuple[Float[Array, "14 cells"], Cells, Cells]:
+    """States of runs, in the layout for sliding on the top's own sphere; and the distance [m] of this sphere from the
+    ground with its rate [m/s]. States of other modes refer to the foot below this sphere.
+    """
     flies, flight = mode == FLYING, state[:OWN]
     if scene.body.stem is not None:
-        on_stem = mode == ON_STEM
-        flies, flight = (
-            mode != SLIDING,
-            jnp.where(on_stem, lift_off(scene, flight, False, balls(scene.body)[1]), flight),
-        )
+        on_stem = lift_off(scene, flight, False, balls(scene.body)[1])
+        flies, flight = mode != SLIDING, jnp.where(mode == ON_STEM, on_stem, flight)
     flying = flight_state(flight)
     ground = below(scene, flying)
     free = flying_body(scene, flying, ground)
@@ -315,7 +287,7 @@ def _above_the_ground(
     return contact, jnp.where(flies, ground.gap, 0.0), jnp.where(flies, rate, 0.0)
 
 
-def loss(scene: Scene[Top], state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+def loss(scene: Scene[Top], state: State) -> Int[Array, "..."]:
     """Why a contact ended, if it was not merely lost: a code in `LOSSES` (`tippe/model/dynamics.py`)."""
     dynamics, state = scene.dynamics, state[:OWN]
     if scene.body.stem is None:

@@ -1,35 +1,25 @@
-"""Launches of a table and their checks, the events of a top, and the kinds of its runs."""
+"""Launches of a table, the events of a top, and their checks."""
 
-import dataclasses
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable
-from typing import Any, NamedTuple
+from collections.abc import Collection, Iterable
+from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-from nonholonomic.compilation.xla_cpu import compiled_setup
-from nonholonomic.hybrid import AbstractBatchedMode
-from nonholonomic.integration.problem import Status, require_run
+from nonholonomic.integration.problem import require_run
 from nonholonomic.parameters import full_axes, numbers, with_numbers
-from nonholonomic.runs import Start
+from nonholonomic.runs.model import Number
 from nonholonomic.sweeps import Axis, axis
 from nonholonomic.text import shown
 from nonholonomic.validation import IN_DEGREES, as_number, is_traced, require, require_kind, warn
 
+from ..friction import Frictionless
 from ..model.body import Top
-from ..model.dynamics import NO_COSINE
-from ..model.friction import Frictionless
-from ..model.launch import Launch
-from ..model.rigid_body import AbstractRigidBody
-from ..model.scene import Scene
-from ..modes.airborne import airborne_modes, modes_with_stem
-from ..modes.impact import energy_in
-from ..modes.problems import InversionProblem, StemContact, trajectory_problem
-from ..modes.sliding import hopping_modes
-from ..modes.sticking import airborne_energy, airborne_stick_slip_modes, contact_energy, loss, stick_slip_modes
+from ..model.rigid import AbstractRigidBody
+from ..model.scene import Launch, Scene
+from ..modes.problems import StemContact
 
 # The events of a top, and checks of the arguments of a run, before anything compiles and inside a program.
 
@@ -37,7 +27,7 @@ from ..modes.sticking import airborne_energy, airborne_stick_slip_modes, contact
 INVERTED = 0.95 * math.pi
 
 
-def event_of(scene: Scene[Any], angle: Any) -> Float[Array, "..."] | StemContact:
+def event_of(scene: Scene, angle: Any) -> Float[Array, "..."] | StemContact:
     """The event of a run: theta reaches the angle [rad]; or, without an angle, the top has turned over.
 
     A top with a stem has turned over when its stem first carries it: when the stem bears a force or, as it lands, an
@@ -49,7 +39,7 @@ def event_of(scene: Scene[Any], angle: Any) -> Float[Array, "..."] | StemContact
     return as_number(INVERTED if angle is None else angle)
 
 
-def angle_of(scene: Scene[Any], angle: Any) -> Float[Array, "..."]:
+def angle_of(scene: Scene, angle: Any) -> Float[Array, "..."]:
     """The angle [rad] itself; or, without an angle, the inclination beyond which the top has turned over on a level
     plane."""
     event = event_of(scene, angle)
@@ -60,7 +50,7 @@ def angle_of(scene: Scene[Any], angle: Any) -> Float[Array, "..."]:
 LISTS = "inversion_table takes lists, and jax.vmap maps over them"
 
 
-def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str = LISTS) -> None:
+def check_run(scene: Any, launch: Any, t1: Number, tolerance: Number, lists: str = LISTS) -> None:
     """Raise `ValueError` unless the arguments are a scene, a launch that the scene allows, a positive horizon and a
     legal tolerance.
 
@@ -212,7 +202,12 @@ def labels(
 
 
 def launches(
-    scene: Any, launch_values: dict[str, Any], axes: Any, t1: Any, tolerance: Any, taken: Collection[str] = ()
+    scene: Any,
+    launch_values: dict[str, Any],
+    axes: Any,
+    t1: Number,
+    tolerance: Number,
+    taken: Collection[str] = (),
 ) -> tuple[dict[str, Any], list[Axis]]:
     """The scene and launch that all cells share, and the axes of the grid.
 
@@ -262,124 +257,3 @@ def _with_room(scene: Scene, values: Collection[str]) -> Launch:
         name: (0.0,) * size for name, size in sizes.items() if any(f"launch.{name}[{k}]" in values for k in range(size))
     }
     return Launch(theta=0.0, spin=0.0, **parts)
-
-
-# The kinds of runs, one smooth motion or several modes of contact and flight, and the check of their energy: without a
-# drive, energy never grows, and it decreases by the work of friction.
-
-
-class RunKind(NamedTuple):
-    """How to run a kind of scene: its counters besides steps, and its modes.
-
-    `modes` is a function of (scene, problem, tolerance, last) that returns the modes and the index of each cell's first
-    mode; `None` for smooth runs. `energy_in` is a function of (scene, state, mode) that returns the least and the
-    greatest energy [J] that the state may have. `loss` is a function of (scene, state) that returns how a run left its
-    domain, as a code in `LOSSES`; `None` for runs that can only jam, because they continue when contact is lost, and the
-    ball fits everywhere. `flight_state` is true if states in flight have another layout.
-    """
-
-    counts: tuple[str, ...]
-    modes: Callable[..., tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]] | None
-    energy_in: Callable[..., tuple[Float[Array, " cells"], Float[Array, " cells"]]]
-    loss: Callable[..., Int[Array, " cells"]] | None
-    flight_state: bool = False
-
-    @property
-    def smooth(self) -> bool:
-        """Whether a run is one smooth motion."""
-        return self.modes is None
-
-
-#: Descriptions of the counters of a run.
-COUNTED = {"hops": "flights", "sticks": "changes from slip to rolling"}
-
-
-def energy_of_state(
-    scene: Scene[Any], state: Float[Array, "components cells"], mode: Any
-) -> tuple[Float[Array, " cells"], Float[Array, " cells"]]:
-    """The least and the greatest energy [J] of a state of one smooth motion, which are the same."""
-    total = scene.energy(state)
-    return total, total
-
-
-def loss_of_contact(scene: Scene[Any], state: Float[Array, "components cells"]) -> Int[Array, " cells"]:
-    """How a contact has ended, as a code in `LOSSES`."""
-    return scene.dynamics.loss(state)
-
-
-SMOOTH = RunKind((), None, energy_of_state, loss_of_contact)
-STICK_SLIP = RunKind(("sticks",), stick_slip_modes, contact_energy, loss_of_contact)
-HYBRID = RunKind(("hops",), hopping_modes, energy_in, None)
-AIRBORNE = RunKind(("hops",), airborne_modes, airborne_energy, loss, True)
-ON_STEM_TOO = AIRBORNE._replace(modes=modes_with_stem)
-STICK_SLIP_FLY = AIRBORNE._replace(counts=("hops", "sticks"), modes=airborne_stick_slip_modes)
-
-
-def run_kind_of(scene: Scene[Any]) -> RunKind:
-    """The run kind of a scene."""
-    hybrid = scene.contact == "hybrid"
-    if scene.friction.set_valued:
-        return STICK_SLIP_FLY if hybrid else STICK_SLIP
-    if not hybrid:
-        return SMOOTH
-    if scene.flies_in_closed_form:
-        return HYBRID
-    return AIRBORNE if scene.body.stem is None else ON_STEM_TOO
-
-
-def flight_modes(scene: Scene[Top], launch: Launch, tolerance: Any, cells: int = 1) -> Start:
-    """The modes of launches of a hybrid scene, with their path, rotation and work; the index of each first mode; and the
-    initial states."""
-    problem, modes = _start_of_flights(scene, launch, cells), run_kind_of(scene).modes
-    assert modes is not None
-    return (*modes(scene, problem, tolerance, last=False, with_quadratures=True), problem.states)
-
-
-@compiled_setup
-def _start_of_flights(scene: Scene[Top], launch: Launch, cells: int) -> InversionProblem:
-    """The launches, with the passive quadratures."""
-    state, scales = trajectory_problem((scene, launch), cells).start()
-    if scene.flies_in_closed_form:
-        # The path is that of the centre of mass.
-        place = state[8:10] - scene.body.offset * state[2:4]
-        state = jnp.concatenate([state[:8], place, state[10:]])
-    return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state, scales)
-
-
-def why_unresolved(kind: RunKind) -> str:
-    """The reasons why a run of this kind may be unresolved."""
-    grown = (
-        "its energy has grown by more than the tolerance allows, although nothing drives the top: the law of friction pushes "
-        "it, or the arena's heights do not fit its normals"
-    )
-    reasons = "the model does not determine the motion from there on, or the mode changed too often, or"
-    return grown if kind.smooth else f"{reasons} {grown}; tippe.simulate states which"
-
-
-#: Largest allowed error of the energy, relative to its size, divided by the tolerance. Flights over ripples and in a
-#: spheroid stay below 1e-4 of this value; a faulty landing away from the arena once left 8e4 times this value.
-BALANCED = 1e4
-
-
-def allowance(scene: Scene[Any], energy: Any, tolerance: Any) -> Any:
-    """The allowed error [J] of an energy of the given size [J] at a tolerance."""
-    return BALANCED * tolerance * (abs(energy) + scene.body.mass * scene.gravity * scene.body.size)
-
-
-def if_balanced(run: Any, tolerance: float | Float[Array, ""]) -> Any:
-    """A single run, with the status "unresolved" if its energy has grown or does not balance the work of friction and
-    impacts."""
-    energy = np.asarray(run.energy)
-    limit = float(allowance(run.scene, np.max(np.abs(energy)), tolerance))
-    balanced = run.stats["energy_residual"] <= limit and energy[-1] <= energy[0] + limit
-    if balanced or run.status == Status.FAILED.word:
-        return run
-    return dataclasses.replace(run, status=Status.UNRESOLVED.word)
-
-
-def why_unbalanced(run: Any) -> str:
-    """The reason why such a run is "unresolved"."""
-    energy = np.asarray(run.energy)
-    if (gain := energy[-1] - energy[0]) > run.stats["energy_residual"]:
-        return f"the energy has grown by {gain:.1e} J, although nothing drives the top"
-    return f"the energy residual of {run.stats['energy_residual']:.1e} J is beyond what the tolerance allows"

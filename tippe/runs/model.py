@@ -1,55 +1,139 @@
 """The top as a model for the functions of `nonholonomic.runs`."""
 
 import dataclasses
-import functools
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.geometry import Plane
-from nonholonomic.hybrid import BETWEEN, HybridOutcome
+from nonholonomic.hybrid import BETWEEN, AbstractBatchedMode, HybridOutcome
 from nonholonomic.integration import AbstractProblem, CoreProblem, Outcome
 from nonholonomic.integration.problem import FAILED, Status
 from nonholonomic.parameters import description, full_name, numbers, numbers_of
-from nonholonomic.runs import (
-    AbstractModel,
-    AbstractSceneModel,
-    EventFunction,
-    Names,
-    Start,
-    TableForm,
-    model_of,
-    statuses,
-    with_event,
-)
+from nonholonomic.runs.event import EventFunction, with_event
+from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Number, Start, model_of, statuses
+from nonholonomic.runs.table import TableForm
 from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.validation import Bound, all_bounds, legal, require_kind, require_scalars
 
+from ..friction import NoSlip
+from ..model.body import Top
 from ..model.dynamics import LOSSES, NO_COSINE
-from ..model.friction import NoSlip
-from ..model.launch import Launch
-from ..model.scene import Scene, generic_direction
-from ..modes.problems import BEHIND_PATH, InversionProblem, StemContact, TrajectoryProblem, trajectory_problem
-from ..modes.sticking import contact_modes, on_the_ground
-from .launches import (
-    COUNTED,
-    INVERTED,
-    NUMBERS_OF_A_LAUNCH,
-    RunKind,
-    allowance,
-    event_of,
-    flight_modes,
-    labels,
-    run_kind_of,
-    variable_numbers,
+from ..model.scene import Launch, Scene, generic_direction
+from ..modes.airborne import airborne_modes
+from ..modes.impact import energy_in
+from ..modes.plane import hopping_modes
+from ..modes.problems import BEHIND_PATH, InversionProblem, StemContact, trajectory_problem
+from ..modes.sticking import (
+    above_the_ground,
+    airborne_energy,
+    airborne_stick_slip_modes,
+    contact_energy,
+    contact_modes,
+    loss,
+    stick_slip_modes,
 )
-from .observables import AbstractTrajectory
-from .trajectory import ArenaTrajectory, HybridTrajectory, StickSlipArenaTrajectory, Trajectory, simulate_launch
-from .view import COMPONENTS, DIRECTION, ON_CURVED, PASSIVE, PATH, quantities_of
+from .launches import INVERTED, NUMBERS_OF_A_LAUNCH, event_of, labels, variable_numbers
+from .observables import (
+    COMPONENTS,
+    DIRECTION,
+    ON_CURVED,
+    PASSIVE,
+    PATH,
+    AbstractTrajectory,
+    allowance,
+    quantities_of,
+)
+from .trajectory import ArenaTrajectory, HybridTrajectory, Trajectory, simulate_launch
+
+# The kinds of runs: one smooth motion, or several modes of contact and flight.
+
+
+class RunKind(NamedTuple):
+    """How to run a kind of scene: its counters besides steps, and its modes.
+
+    `modes` is a function of (scene, problem, tolerance, last) that returns the modes and the index of each cell's first
+    mode; `None` for smooth runs. `energy_in` is a function of (scene, state, mode) that returns the least and the
+    greatest energy [J] that the state may have. `loss` is a function of (scene, state) that returns how a run left its
+    domain, as a code in `LOSSES`; `None` for runs that can only jam, because they continue when contact is lost, and the
+    ball fits everywhere. `flight_state` is true if states in flight have another layout.
+    """
+
+    counts: tuple[str, ...]
+    modes: Callable[..., tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]] | None
+    energy_in: Callable[..., tuple[Float[Array, " cells"], Float[Array, " cells"]]]
+    loss: Callable[..., Int[Array, " cells"]] | None
+    flight_state: bool = False
+
+    @property
+    def smooth(self) -> bool:
+        """Whether a run is one smooth motion."""
+        return self.modes is None
+
+
+#: Descriptions of the counters of a run.
+COUNTED = {"hops": "flights", "sticks": "changes from slip to rolling"}
+
+
+def loss_of_contact(scene: Scene, state: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+    """How a contact has ended, as a code in `LOSSES`."""
+    return scene.dynamics.loss(state)
+
+
+# The state of one smooth motion has one energy.
+SMOOTH = RunKind((), None, lambda scene, state, mode: (scene.energy(state),) * 2, loss_of_contact)
+STICK_SLIP = RunKind(("sticks",), stick_slip_modes, contact_energy, loss_of_contact)
+HYBRID = RunKind(("hops",), hopping_modes, energy_in, None)
+AIRBORNE = RunKind(("hops",), airborne_modes, airborne_energy, loss, True)
+STICK_SLIP_FLY = AIRBORNE._replace(counts=("hops", "sticks"), modes=airborne_stick_slip_modes)
+
+
+def run_kind_of(scene: Scene) -> RunKind:
+    """The run kind of a scene."""
+    hybrid = scene.contact == "hybrid"
+    if scene.friction.set_valued:
+        return STICK_SLIP_FLY if hybrid else STICK_SLIP
+    if not hybrid:
+        return SMOOTH
+    return HYBRID if scene.flies_in_closed_form else AIRBORNE
+
+
+def flight_modes(scene: Scene[Top], launch: Launch, tolerance: Number, cells: int = 1) -> Start:
+    """The modes of launches of a hybrid scene, with their path, rotation and work; the index of each first mode; and the
+    initial states."""
+    problem, modes = _start_of_flights(scene, launch, cells), run_kind_of(scene).modes
+    assert modes is not None
+    return (*modes(scene, problem, tolerance, last=False, with_quadratures=True), problem.states)
+
+
+@compiled_setup
+def _start_of_flights(scene: Scene[Top], launch: Launch, cells: int) -> InversionProblem:
+    """The launches, with the passive quadratures."""
+    state, scales = trajectory_problem((scene, launch), cells).start()
+    if scene.flies_in_closed_form:
+        # The path is that of the centre of mass.
+        place = state[8:10] - scene.body.offset * state[2:4]
+        state = jnp.concatenate([state[:8], place, state[10:]])
+    return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state, scales)
+
+
+def why_unresolved(kind: RunKind) -> str:
+    """The reasons why a run of this kind may be unresolved."""
+    grown = (
+        "its energy has grown by more than the tolerance allows, although nothing drives the top: the law of friction pushes "
+        "it, or the arena's heights do not fit its normals"
+    )
+    reasons = "the model does not determine the motion from there on, or the mode changed too often, or"
+    return grown if kind.smooth else f"{reasons} {grown}; tippe.simulate states which"
+
+
+# The top as a model.
 
 #: The words of tables, in the order of the integers in their files, which is older than `Status`.
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit", "unresolved")
@@ -101,8 +185,7 @@ class TopModel(AbstractSceneModel):
     def __reduce__(self) -> Any:
         # A traced function cannot be pickled, so each process traces it.
         if self.event is None:
-            numbers = {"scene": self.scene, "launch": self.launch, "angle": self.angle}
-            return functools.partial(TopModel, **numbers, reverses=self.reverses), ()
+            return TopModel, (self.scene, self.launch, self.angle, None, self.reverses)
         return TopModel.of, (self.scene, self.launch, self.event.function)
 
     def without_event(self) -> "TopModel":
@@ -112,7 +195,7 @@ class TopModel(AbstractSceneModel):
         return generic_direction(self.scene, self.launch, cells)
 
     @property
-    def roots(self) -> dict[str, Any]:
+    def roots(self) -> dict[str, PyTree]:
         """The trees whose numbers are parameters."""
         return {"scene": self.scene, "launch": self.launch}
 
@@ -203,12 +286,20 @@ class TopModel(AbstractSceneModel):
             problem = self._problem_without_path(cells, names)
             # A turning frame turns by a different angle for each launch, and the difference would count as divergence.
             return dataclasses.replace(problem, dynamics=self.scene.dynamics) if names else problem
-        run = trajectory_problem((self.scene, self.launch), cells)
-        if names is None or any(self.quantities[name].needs >= PASSIVE for name in names):
+        scene, run = self.scene, trajectory_problem((self.scene, self.launch), cells)
+        needs = {PASSIVE} if names is None else set().union(*(self.quantities[name].needs for name in names))
+        if PASSIVE in needs:
             return run
-        return with_parts(run, self.scene, names)
+        # Only some quantities need the path, and few need rotation or work. On the plane, a run without path, rotation and
+        # work takes half the time. If no quantity has a direction, the frame turns on the level plane, and samples are
+        # thirty to a hundred times as accurate.
+        if scene.level and DIRECTION not in needs:
+            turning = eqx.tree_at(lambda run: run.problem.dynamics, run, scene.turning_dynamics)
+            return CoreProblem(turning, run.leading)
+        has_path = PATH in needs or (ON_CURVED in needs and not isinstance(scene.surface, Plane))
+        return CoreProblem(run, len(run.start()[0]) - BEHIND_PATH if has_path else run.leading)
 
-    def modes(self, cells: int, tolerance: Any, names: Names, continues: bool) -> Start:
+    def modes(self, cells: int, tolerance: Number, names: Names, continues: bool) -> Start:
         scene, launch = self.scene, self.launch
         if self._is_without_path(names):
             assert self.kind.modes is not None
@@ -218,7 +309,7 @@ class TopModel(AbstractSceneModel):
             return contact_modes(trajectory_problem((scene, launch), cells), tolerance)
         return flight_modes(scene, launch, tolerance, cells)
 
-    def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Any:
+    def simulate(self, t1: ArrayLike, times: Any, tolerance: ArrayLike, solver: Any, adjoint: Any) -> Any:
         return simulate_launch(self, t1, times, tolerance, solver, adjoint)
 
     @property
@@ -226,7 +317,7 @@ class TopModel(AbstractSceneModel):
         return quantities_of(self.scene)
 
     def read(
-        self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: Any
+        self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: Int[ArrayLike, "..."] | None
     ) -> dict[str, Array]:
         run = dataclasses.replace(self.moment(rows, mode), start=self.scene.state(self.launch))
         return {name: getattr(run, name) for name in names}
@@ -241,22 +332,20 @@ class TopModel(AbstractSceneModel):
             # Rows without a path, or without rotation and work, end earlier.
             missing = core + len(scene.start(self.launch)[1]) + BEHIND_PATH - len(rows)
             rows = jnp.concatenate([rows, jnp.zeros((missing, *zeros.shape))]) if missing > 0 else rows
-        return kind(zeros, scene, **kind.parts_of(rows, mode, core))
+        return kind(zeros, scene, **kind.parts_of(scene, rows, mode, core))
 
     @property
     def trajectories(self) -> type[AbstractTrajectory]:
         """The class of trajectories of the scene."""
         if self.scene.contact != "hybrid":
             return Trajectory
-        if self.scene.flies_in_closed_form:
-            return HybridTrajectory
-        return StickSlipArenaTrajectory if self.scene.friction.set_valued else ArenaTrajectory
+        return HybridTrajectory if self.scene.flies_in_closed_form else ArenaTrajectory
 
     @property
     def words(self) -> tuple[str, ...]:
         return ("event", "completed", *WORDS[2:])
 
-    def ended(self, outcome: Outcome | HybridOutcome, tolerance: Any) -> Int[Array, " cells"]:
+    def ended(self, outcome: Outcome | HybridOutcome, tolerance: Number) -> Int[Array, " cells"]:
         scene, kind = self.scene, self.kind
         cells = outcome.status.shape[0]
         start = InversionProblem.of(scene, self.launch, None if self.reverses else INVERTED, cells)
@@ -279,7 +368,7 @@ class TopModel(AbstractSceneModel):
     def at_end(self, outcome: Any, start: Float[Array, "components cells"]) -> dict[str, Array]:
         state = jnp.asarray(outcome.state)[: len(start)]
         if self.kind.flight_state:
-            state = on_the_ground(self.scene, state, outcome.mode)
+            state = above_the_ground(self.scene, state, outcome.mode)[0]
         return {"end_theta": self.scene.theta(state)}
 
 
@@ -291,23 +380,8 @@ def _integrated(scene: Scene) -> Scene:
     return scene
 
 
-def with_parts(run: TrajectoryProblem, scene: Scene, names: tuple[str, ...]) -> CoreProblem:
-    """A run with the parts that the named quantities need.
-
-    Only some quantities need the path, and few need rotation or work. On the plane, a run without path, rotation and
-    work takes half the time. If no quantity has a direction, the frame turns on the level plane, and samples are thirty
-    to a hundred times as accurate.
-    """
-    needs = frozenset().union(*(quantities_of(scene)[name].needs for name in names))
-    if scene.level and DIRECTION.isdisjoint(needs):
-        turning = eqx.tree_at(lambda run: run.problem.dynamics, run, scene.turning_dynamics)
-        return CoreProblem(turning, run.leading)
-    path = PATH if isinstance(scene.surface, Plane) else PATH | ON_CURVED
-    return CoreProblem(run, run.leading if path.isdisjoint(needs) else len(run.start()[0]) - BEHIND_PATH)
-
-
 @model_of.register(Scene)
-def _(system: Scene, start: Any, event: Any = None, input: Any = None, jumps: Any = None) -> AbstractModel:
+def _(system: Scene, start: Any, event: Any = None, input: object = None, jumps: object = None) -> AbstractModel:
     require_kind(start, "start", Launch)
     if input is not None or jumps is not None:
         name = "jumps" if input is None else "input"

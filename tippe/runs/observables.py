@@ -3,13 +3,13 @@
 import abc
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from nonholonomic.compilation.cache import padded
 from nonholonomic.geometry import Component, Vector, dot, rate_in_frame, scale, stacked, sum_vectors
@@ -17,21 +17,95 @@ from nonholonomic.hybrid import HybridPath
 from nonholonomic.integration import DenseSolution
 from nonholonomic.integration.dense import all_crossings
 from nonholonomic.integration.problem import Status
-from nonholonomic.runs import explore
-from nonholonomic.sweeps import Quantity, Table, Tabular
-from nonholonomic.terminal import status_line
-from nonholonomic.text import batch_title
+from nonholonomic.parameters import description
+from nonholonomic.runs.model import AbstractModel, Number, Unit, model_of
+from nonholonomic.runs.trajectory import AbstractRun
+from nonholonomic.sweeps import Quantity, Table, chosen, run_table
+from nonholonomic.text import distinguishing_labels, in_unit
 from nonholonomic.validation import is_traced, require_one_run, times_within
-from nonholonomic.views import Page, Stage, Viewable
 
+from ..friction import Frictionless
 from ..model.body import AbstractBody, Top
-from ..model.friction import Frictionless
-from ..model.launch import Launch
-from ..model.rigid_body import AbstractRigidBody
-from ..model.scene import Scene
+from ..model.rigid import AbstractRigidBody
+from ..model.scene import Launch, Scene
 from ..steady import group
 from .launches import INVERTED
-from .view import QUANTITIES, as_stages, names_of, table_of
+
+# The quantities of a run of a tippe top, with units and names, and the table of a run.
+
+#: What a quantity may need in addition to the state: a frame that does not turn about n; the path on a curved arena, or on
+#: any arena; the rotation about the axis and the work; the start of the run.
+DIRECTION, ON_CURVED, PATH, PASSIVE, START = "direction", "curved", "path", "passive", "start"
+
+QUANTITIES = {
+    "theta": Quantity("rad", "inclination θ"),
+    "eta": Quantity("rad", "place η", needs=frozenset({ON_CURVED})),
+    "azimuth": Quantity("rad", "azimuth φ", needs=frozenset({DIRECTION})),
+    "spin": Quantity("rad s-1", "spin ω₃"),
+    "theta_rate": Quantity("rad s-1", "θ'"),
+    "energy": Quantity("J", "energy"),
+    "jellett": Quantity("kg m3 s-1", "Jellett's quantity"),
+    "normal_force": Quantity("N", "normal force"),
+    "axis": Quantity("1", "axis e", "component", needs=frozenset({DIRECTION, ON_CURVED})),
+    "position": Quantity("m", "position of the centre", "component", needs=frozenset({DIRECTION, PATH})),
+    "velocity": Quantity("m s-1", "velocity of the centre", "component", needs=frozenset({DIRECTION, ON_CURVED})),
+    "angular_momentum": Quantity("kg m2 s-1", "angular momentum", "component", needs=frozenset({DIRECTION, ON_CURVED})),
+    "slip": Quantity("m s-1", "slip velocity", "tangent", needs=frozenset({DIRECTION})),
+    "jellett_drift": Quantity("1", "relative drift of Jellett's quantity", needs=frozenset({START})),
+    "spin_angle": Quantity("rad", "spin angle", needs=frozenset({PASSIVE})),
+    "work": Quantity("J", "work of friction", needs=frozenset({PASSIVE})),
+}
+
+#: Quantities of a body of any shape and inertia.
+OF_RIGID_BODIES = {
+    "normal_spin": Quantity("rad s-1", "spin about the normal"),
+    "grip": Quantity("1", "friction over normal force"),
+    "reaction": Quantity("N", "force of the arena", "component", needs=frozenset({DIRECTION, ON_CURVED})),
+}
+
+#: Names of components: in the fixed frame, and in the moving frame.
+COMPONENTS = {"component": ("x", "y", "z"), "tangent": ("t1", "t2")}
+
+
+def quantities_of(scene: Scene) -> dict[str, Quantity]:
+    """The quantities of runs in a scene."""
+    return QUANTITIES | OF_RIGID_BODIES if isinstance(scene.body, AbstractRigidBody) else QUANTITIES
+
+
+def table_of(run: Any, names: Sequence[str] = ()) -> Table:
+    """Quantities of a run, over its times.
+
+    **Arguments:** `run`: a `Trajectory` or a `HybridTrajectory`, not a batch; `names`: as for `chosen`.
+
+    **Raises:** `ValueError` for a batch of runs.
+    """
+    require_one_run(run, "to_table", "; trajectory_table makes a table of many")
+    quantities = chosen(quantities_of(run.scene), names)
+    dims = [quantity.components for quantity in quantities.values() if quantity.components is not None]
+    coords = {"time": np.asarray(run.t)} | {dim: np.array(COMPONENTS[dim]) for dim in dict.fromkeys(dims)}
+    values = {name: np.asarray(quantity.of(name, run)) for name, quantity in quantities.items()}
+    request = description("scene", run.scene) | ({} if run.launch is None else description("launch", run.launch))
+    request |= {"status": str(run.status), "end_time": float(run.end_time)}
+    return run_table(quantities, coords, values, ["time"], request)
+
+
+def names_of(runs: list[Any], unit: Unit = None) -> list[str]:
+    """Names of runs, by what differs in their launches and scenes. **Arguments:** `unit`: as for `plot`."""
+    for run in runs:
+        require_one_run(run, "a picture", ", and pass the others as others=")
+    (angle, per_angle), (rate, per_rate) = (in_unit(si, unit) for si in ("rad", "rad/s"))
+    starts = [
+        (f"θ(0) = {per_angle * float(run.theta[0]):.3g} {angle}", f"{per_rate * float(run.spin[0]):.4g} {rate}")
+        for run in runs
+    ]
+    return distinguishing_labels(starts, [run.scene for run in runs], unit=unit)
+
+
+# The run of a top: one state at each time.
+
+
+#: JAX's arrays, or NumPy's outside of transformations.
+Values: TypeAlias = Array | np.ndarray
 
 
 def of_each_run(function: Callable[[Any], Array]) -> property:
@@ -58,7 +132,7 @@ def unit(vectors: Float[Array, "times 3"]) -> Float[Array, "times 3"]:
     return vectors / jnp.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-class AbstractTrajectory(Viewable, Tabular, eqx.Module):
+class AbstractTrajectory(AbstractRun):
     """A run at its times `t`: states as in `tippe/model/dynamics.py`, the path on the arena, spin angle [rad] and work [J].
 
     Vectors are arrays (times, 3) in the fixed frame (x, y, z); see `Trajectory`.
@@ -110,7 +184,7 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         """Kinetic and potential energy [J]."""
 
     @classmethod
-    def parts_of(cls, rows: Float[Any, "rows times"], mode: Any, core: int) -> dict[str, Any]:
+    def parts_of(cls, scene: Scene, rows: Values, mode: Values | None, core: int) -> dict[str, Any]:
         """The fields `by_time` but the times, from output rows.
 
         **Arguments:** `mode`: the indices of the modes at these times, or `None` for a smooth run; `core`: the number of
@@ -118,9 +192,9 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         """
         return {"states": rows[:core], "cyclic": rows[core:-2], "spin_angle": rows[-2], "work": rows[-1]}
 
-    def with_rows(self, times: Float[np.ndarray, " times"], rows: Any, mode: Any) -> Self:
+    def with_rows(self, times: Float[np.ndarray, " times"], rows: Values, mode: Values | None) -> Self:
         """The same run at other times, from the output rows there."""
-        return dataclasses.replace(self, t=times, **self.parts_of(rows, mode, len(self.start)))
+        return dataclasses.replace(self, t=times, **self.parts_of(self.scene, rows, mode, len(self.start)))
 
     def resampled(self, times: Float[np.ndarray, " times"]) -> Self:
         """The same run at other times, without checking them."""
@@ -225,40 +299,20 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
             raise ValueError("a run made inside jit, vmap or grad has no dense output: pass `times` to simulate")
         return self.resampled(times_within(times, self.end_time, "run"))
 
-    def explore(
-        self, path: Any = None, sliders: dict[str, tuple[float, float]] | None = None, unit: Any = None
-    ) -> Page:
-        """A page with sliders that simulates the run in the browser, until the end of this run; see `tippe.explore`.
+    @property
+    def of_page(self) -> tuple[AbstractModel, float]:
+        assert self.launch is not None
+        return model_of(self.scene, self.launch), float(self.end_time)
 
-        **Raises:** as for `tippe.explore`, and `ValueError` for a batch of runs.
-        """
-        require_one_run(self, "explore", "")
-        return explore(self.scene, self.launch, path, sliders, float(self.end_time), unit=unit)
-
-    @status_line("reading off")
-    def to_table(self) -> Table:
-        return table_of(self)
+    @property
+    def codes(self) -> Int[Array, "..."] | str | None:
+        return self.status
 
     def table_of(self, names: Sequence[str]) -> Table:
         return table_of(self, names)
 
-    def labels_of(self, runs: list[Any], unit: Any) -> list[str]:
+    def labels_of(self, runs: list[Any], unit: Unit) -> list[str]:
         return names_of(runs, unit) if len(runs) > 1 else [""]
-
-    def stages(self, others: Sequence[Any] = (), overlaid: bool = False, unit: Any = None) -> list[Stage]:
-        return as_stages([self, *others], overlaid, unit)
-
-    def with_stats(self, path: DenseSolution | HybridPath, **more: Any) -> Self:
-        """The same run with its statistics: steps, the greatest drift of |e|, the greatest |E - E(0) - work| [J], and
-        more."""
-        energy, work = np.asarray(self.energy), np.asarray(self.work)
-        stats = {
-            "accepted": path.accepted,
-            "rejected": path.rejected,
-            "axis_drift": float(np.max(np.abs(np.linalg.norm(np.asarray(self.states)[2:5], axis=0) - 1.0))),
-            "energy_residual": float(np.max(np.abs(energy - energy[0] - work))),
-        }
-        return eqx.tree_at(lambda run: run.stats, self, stats | more)
 
     @of_each_run
     def normal(self) -> Float[Array, "times 3"]:
@@ -313,11 +367,7 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
             reason = ": a top of group I (tippe.steady.group) cannot"
         return f"not turned over{reason}"
 
-    @status_line("reading off")
-    def __str__(self) -> str:
-        if is_traced(self.t) or self.t.ndim > 1:
-            codes = [] if is_traced((self.t, self.status)) or self.status is None else np.ravel(self.status)
-            return batch_title(self.t.shape, [Status(int(code)).word for code in codes])
+    def in_words(self) -> str:
         word = self.status if isinstance(self.status, str) else Status(int(self.status)).word
         lines = [
             f"Trajectory of {len(self.t)} times, {word} at {float(self.end_time):.6g} s",
@@ -332,3 +382,45 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
             lines.append(f"  drift of |e|: {self.stats['axis_drift']:.1e}")
             lines.append(f"  energy residual: {self.stats['energy_residual']:.1e} J of {float(self.energy[0]):.4g} J")
         return "\n".join(lines)
+
+
+# The check of the energy: without a drive, it never grows, and it decreases by the work of friction.
+
+#: Largest allowed error of the energy, relative to its size, divided by the tolerance. Flights over ripples and in a
+#: spheroid stay below 1e-4 of this value; a faulty landing away from the arena once left 8e4 times this value.
+BALANCED = 1e4
+
+
+#: The kind of a run.
+Run = TypeVar("Run", bound=AbstractTrajectory)
+
+
+def allowance(scene: Scene, energy: Values, tolerance: Number) -> Values:
+    """The allowed error [J] of an energy of the given size [J] at a tolerance."""
+    return BALANCED * tolerance * (abs(energy) + scene.body.mass * scene.gravity * scene.body.size)
+
+
+def audited(run: Run, path: DenseSolution | HybridPath, tolerance: Number, **more: float) -> Run:
+    """A single run with its statistics: steps, the greatest drift of |e|, the greatest |E - E(0) - work| [J], and more. Its
+    status is "unresolved" if its energy has grown or does not balance the work of friction and impacts."""
+    energy, work = np.asarray(run.energy), np.asarray(run.work)
+    residual = float(np.max(np.abs(energy - energy[0] - work)))
+    axis_drift = float(np.max(np.abs(np.linalg.norm(np.asarray(run.states)[2:5], axis=0) - 1.0)))
+    stats = {
+        "accepted": path.accepted,
+        "rejected": path.rejected,
+        "axis_drift": axis_drift,
+        "energy_residual": residual,
+    }
+    limit = float(allowance(run.scene, np.max(np.abs(energy)), tolerance))
+    balanced = residual <= limit and energy[-1] <= energy[0] + limit
+    status = run.status if balanced or run.status == Status.FAILED.word else Status.UNRESOLVED.word
+    return dataclasses.replace(run, stats=stats | more, status=status)
+
+
+def why_unbalanced(run: Any) -> str:
+    """The reason why such a run is "unresolved"."""
+    energy = np.asarray(run.energy)
+    if (gain := energy[-1] - energy[0]) > run.stats["energy_residual"]:
+        return f"the energy has grown by {gain:.1e} J, although nothing drives the top"
+    return f"the energy residual of {run.stats['energy_residual']:.1e} J is beyond what the tolerance allows"

@@ -8,10 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.compilation.xla_cpu import on_device
-from nonholonomic.geometry import scale, sum_vectors, vector_of
+from nonholonomic.geometry import scale, sum_vectors
 from nonholonomic.hybrid import BETWEEN, MOST_ROUNDS, HybridOutcome, HybridPath, Segment, solve_hybrid_dense
 from nonholonomic.integration import DenseSolution, Settings, explicit_tableau, follow
 from nonholonomic.integration.problem import (
@@ -24,13 +24,14 @@ from nonholonomic.integration.problem import (
     require_adjoint,
     require_times,
 )
-from nonholonomic.runs import sampled_if_legal
+from nonholonomic.runs.model import Number
+from nonholonomic.runs.simulate import sampled_if_legal
 from nonholonomic.text import shown
 from nonholonomic.validation import as_number, is_traced, nan_unless
 
-from ..model.dynamics import Motion
-from ..model.friction import length
-from ..model.launch import parts
+from ..friction import length
+from ..model.dynamics import Motion, parts
+from ..model.scene import Scene
 from ..model.stick_slip import StickSlip
 from ..modes.airborne import (
     FLYING,
@@ -45,12 +46,10 @@ from ..modes.airborne import (
     lift_off,
     standing,
 )
-from ..modes.flight import height
 from ..modes.impact import BOTH, TOUCHING, Ball, FreeBody, approach, as_free_body, balls, energy, standing_on
-from ..modes.sliding import MOST_BOUNCES
+from ..modes.plane import MOST_BOUNCES, height
 from ..modes.sticking import lifted
-from .launches import if_balanced, why_unbalanced
-from .observables import AbstractTrajectory, of_each_run
+from .observables import AbstractTrajectory, Values, audited, of_each_run, why_unbalanced
 
 
 class Trajectory(AbstractTrajectory):
@@ -138,8 +137,8 @@ class Trajectory(AbstractTrajectory):
         unresolved = isinstance(self.status, str) and self.status == Status.UNRESOLVED.word
         return super().__str__() + (f"\n  unresolved: {why_unbalanced(self)}" if unresolved else "")
 
-    def with_rows(self, times: Float[np.ndarray, " times"], rows: Any, mode: Any) -> "Trajectory":
-        parts = {"t": times, **self.parts_of(rows, mode, len(self.start))}
+    def with_rows(self, times: Float[np.ndarray, " times"], rows: Values, mode: Values | None) -> "Trajectory":
+        parts = {"t": times, **self.parts_of(self.scene, rows, mode, len(self.start))}
         return dataclasses.replace(self, **dict(zip(parts, on_device(*parts.values()), strict=True)))
 
 
@@ -211,7 +210,7 @@ class HybridTrajectory(AbstractTrajectory):
         if not self.scene.has_stem:
             return np.inf
         segments = self.dense.segments
-        on_stem = [segment.begin for segment in segments if self.touching(np.asarray(segment.number)) >= 1]
+        on_stem = [segment.begin for segment in segments if self.touching(self.scene, np.asarray(segment.number)) >= 1]
         # The stem may bounce before it slides. Values at the end of a flight are those before the impact.
         ends = np.unique([segment.end for segment in segments])
         first = min([*on_stem, np.inf])
@@ -222,7 +221,7 @@ class HybridTrajectory(AbstractTrajectory):
         return float(min([*strokes, first]))
 
     @of_each_run
-    def _stem_gap(self) -> Float[Any, " times"]:
+    def _stem_gap(self) -> Values:
         """Distance of the stem from the arena [m]."""
         main, stem = balls(self.scene.body)
         return self.above[0] + height(main, stem, self.states)
@@ -261,18 +260,13 @@ class HybridTrajectory(AbstractTrajectory):
         return jnp.stack(approach(self.scene.body, self._ball, self._free).velocity[:2], axis=-1)
 
     @classmethod
-    def parts_of(cls, rows: Any, mode: Any, core: int) -> dict[str, Any]:
+    def parts_of(cls, scene: Scene, rows: Values, mode: Any, core: int) -> dict[str, Any]:
         # The rows end with the distance and its rate.
-        parts = super().parts_of(rows[:-2], mode, core)
-        return parts | {"distance": rows[-2:], "contact": cls.touching(mode)}
+        parts = super().parts_of(scene, rows[:-2], mode, core)
+        return parts | {"distance": rows[-2:], "contact": cls.touching(scene, mode)}
 
     @staticmethod
-    def work_in(piece: Segment) -> float:
-        """The work [J] of friction in a segment of the path, without the work of impacts."""
-        return 0.0 if piece.number == BETWEEN else piece.motion.states[-1, -1] - piece.motion.states[-1, 0]
-
-    @staticmethod
-    def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:
+    def touching(scene: Scene, numbers: Values) -> Values:
         """The sphere that touches, for each mode index."""
         return numbers
 
@@ -369,7 +363,7 @@ class ArenaTrajectory(HybridTrajectory):
         # The flying top is treated as one whose own sphere is larger by the distance, so that this sphere touches.
         flying = flight_state(lift_off(scene, self.states, False, Ball(main.offset, main.radius + distance)))
         normal_velocity = scale(rate, carried_frame(scene).normal(place[:3]))
-        return flying._replace(velocity=vector_of(sum_vectors(flying.velocity, normal_velocity)))
+        return flying._replace(velocity=sum_vectors(flying.velocity, normal_velocity))
 
     @property
     def _on_stem(self) -> Motion:
@@ -392,27 +386,12 @@ class ArenaTrajectory(HybridTrajectory):
         return "a flight does not end at the arena"
 
     @staticmethod
-    def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:
+    def touching(scene: Scene, numbers: Values) -> Values:
+        if scene.friction.set_valued:
+            # Between two modes, a slip begins.
+            return -1 * (numbers == FLYING)
         # Also for traced numbers; -1 after the end of a run.
         return (numbers == ON_STEM) - 1 * ((numbers == FLYING) | (numbers == STRIKING) | (numbers < 0))
-
-
-class StickSlipArenaTrajectory(ArenaTrajectory):
-    """An `ArenaTrajectory` under exact Coulomb friction; `stats` also holds `sticks`, the number of changes from slip
-    to rolling."""
-
-    @staticmethod
-    def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:
-        # Between two modes, a slip begins.
-        return -1 * (numbers == FLYING)
-
-    @staticmethod
-    def work_in(piece: Segment) -> float:
-        if piece.number == BETWEEN:
-            rows = piece.at(np.array([piece.begin, piece.end]))
-            # The last rows are the distance and its rate.
-            return float(np.diff(rows[-3])[0])
-        return ArenaTrajectory.work_in(piece)
 
 
 # Simulate one launch of a top: a single run with its path, or a run inside a transformation.
@@ -420,27 +399,27 @@ class StickSlipArenaTrajectory(ArenaTrajectory):
 
 def simulate_launch(
     model: Any,
-    t1: Any,
+    t1: ArrayLike,
     times: Any,
-    tolerance: Any,
+    tolerance: ArrayLike,
     solver: diffrax.AbstractSolver | None,
     adjoint: diffrax.AbstractAdjoint | None,
 ) -> Trajectory | HybridTrajectory:
     """The run of a `TopModel`. **Arguments:** as for `tippe.simulate`."""
     require_adaptive(solver)
     require_adjoint(adjoint)
-    settings = Settings(tolerance, solver)
+    settings, horizon = Settings(tolerance, solver), as_number(t1)
     if times is not None:
         times = as_number(times)
         require_times(times, t1)
     if is_traced((model, times, t1, tolerance)):
-        return _traced(model, times, as_number(t1), settings, adjoint)
+        return _traced(model, times, horizon, settings, adjoint)
     if model.smooth:
-        path = follow(model.problem(None, None), float(t1), settings)
+        path = follow(model.problem(None, None), float(horizon), settings)
     else:
         modes, first, state = model.modes(1, settings.tolerance, None, False)
         start = int(np.asarray(first)[0]), np.asarray(state)[:, 0]
-        path = solve_hybrid_dense(modes, *start, float(t1), settings, counters=len(model.counters))
+        path = solve_hybrid_dense(modes, *start, float(horizon), settings, counters=len(model.counters))
     run = _along(model, path, settings.tolerance)
     if times is None:
         return run
@@ -458,7 +437,7 @@ def _ended(model: Any, outcome: HybridOutcome[Array], tolerance: Float[Array, ""
     return model.ended(outcome, tolerance)[0]
 
 
-def _status(model: Any, path: DenseSolution | HybridPath, tolerance: Any) -> str:
+def _status(model: Any, path: DenseSolution | HybridPath, tolerance: Number) -> str:
     """The word for how a single run has ended."""
     if isinstance(path, HybridPath):
         code, state, mode = path.status, path.state, path.mode
@@ -474,7 +453,7 @@ def _status(model: Any, path: DenseSolution | HybridPath, tolerance: Any) -> str
     return Status(int(_ended(model, outcome, jnp.asarray(tolerance)))).word
 
 
-def _along(model: Any, path: DenseSolution | HybridPath, tolerance: Any) -> Any:
+def _along(model: Any, path: DenseSolution | HybridPath, tolerance: Number) -> Any:
     """The run along its path, at the times of its steps. A run whose energy does not balance the work of friction and
     impacts ends as "unresolved"."""
     scene, kind, times = model.scene, model.trajectories, path.times
@@ -492,15 +471,26 @@ def _along(model: Any, path: DenseSolution | HybridPath, tolerance: Any) -> Any:
         hops = np.array([(segment.begin, segment.end) for segment in segments]).reshape(-1, 2)
         run = dataclasses.replace(run, hops=hops)
         # The remaining work is that of the impacts.
-        in_contact = sum(kind.work_in(segment) for segment in path.segments)
+        in_contact = sum(work_in(scene, segment) for segment in path.segments)
         counted = {"impact_loss": float(in_contact - path.state[-1]), **counted}
-    return if_balanced(run.with_stats(path, **counted), tolerance)
+    return audited(run, path, tolerance, **counted)
+
+
+def work_in(scene: Scene, piece: Segment) -> float:
+    """The work [J] of friction in a segment of the path, without the work of impacts."""
+    if piece.number != BETWEEN:
+        return piece.motion.states[-1, -1] - piece.motion.states[-1, 0]
+    if not scene.friction.set_valued:
+        return 0.0
+    rows = piece.at(np.array([piece.begin, piece.end]))
+    # The last rows are the distance and its rate.
+    return float(np.diff(rows[-3])[0])
 
 
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
 @eqx.filter_jit
 def _traced(
-    model: Any, times: Any, t1: Any, settings: Settings, adjoint: diffrax.AbstractAdjoint | None
+    model: Any, times: Any, t1: Array, settings: Settings, adjoint: diffrax.AbstractAdjoint | None
 ) -> Trajectory | HybridTrajectory:
     """The run inside a transformation; NaN and the status "illegal" if a traced number is out of range."""
     if times is None:
@@ -518,7 +508,7 @@ def _traced(
     stats = {"accepted": outcome.steps[0] - rejected, "rejected": rejected}
     stats |= {name: count[0] for name, count in zip(model.counters, outcome.counts, strict=True)}
     kind, rows = model.trajectories, run.rows
-    parts = kind.parts_of(rows, run.mode, len(start))
+    parts = kind.parts_of(scene, rows, run.mode, len(start))
     if run.passive is not None:
         parts = {"states": rows, "cyclic": run.passive[:-2], "spin_angle": run.passive[-2], "work": run.passive[-1]}
     trajectory = kind(

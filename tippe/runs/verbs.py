@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from pathlib import Path
 from typing import Any
 
 import diffrax
@@ -14,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from nonholonomic.compilation.xla_cpu import greatest, least
 from nonholonomic.derivatives import VariationalProblem, differentiable_solve, in_groups, tangents_by
-from nonholonomic.integration import Lanes, Settings, crossing_time, explicit_tableau, traced_solve_ensemble
+from nonholonomic.integration import Lanes, Settings, crossing_time, solve_ensemble
 from nonholonomic.integration.problem import (
     CROSSED,
     DEFAULT_MAX_STEPS,
@@ -24,29 +25,18 @@ from nonholonomic.integration.problem import (
     require_times,
     run_bounds,
 )
-from nonholonomic.runs import (
-    EventTime,
-    LyapunovExponent,
-    Options,
-    TableForm,
-    TableJob,
-    check_cells,
-    compute_table,
-    explore_model,
-    exponent_of_model,
-    full_sensitivities,
-    samples_of,
-    time_of_event,
-)
-from nonholonomic.runs.trajectory import TOLERANCE
+from nonholonomic.runs.event import EventTime, time_of_event
+from nonholonomic.runs.lyapunov import LyapunovExponent, exponent_of_model
+from nonholonomic.runs.model import Number, settings_for_lanes
+from nonholonomic.runs.sweep import Options, check_cells, compute_table, full_sensitivities, samples_of
+from nonholonomic.runs.table import TableForm, TableJob
 from nonholonomic.sweeps import Table
 from nonholonomic.terminal import status_line
 from nonholonomic.text import shown
 from nonholonomic.validation import as_number, is_traced, require, require_all, require_kind, require_outside, warn
-from nonholonomic.views import Page
 
-from ..model.launch import Launch, inclination, parts
-from ..model.scene import Scene
+from ..model.dynamics import inclination, parts
+from ..model.scene import Launch, Scene
 from ..modes.problems import InversionProblem, StemContact
 from .launches import (
     check_event,
@@ -58,11 +48,10 @@ from .launches import (
     launches,
     require_rigid,
     warn_if_it_cannot_invert,
-    why_unresolved,
 )
-from .model import INVERSIONS, REVERSALS, TopModel
+from .model import INVERSIONS, REVERSALS, TopModel, why_unresolved
+from .observables import QUANTITIES, quantities_of
 from .trajectory import HybridTrajectory, Trajectory
-from .view import QUANTITIES, quantities_of
 
 # Tables of many launches: inversion times, reversal times, and trajectories.
 
@@ -89,7 +78,7 @@ def inversion_table(
     angle: float | None = None,
     tolerance: float = 1e-9,
     crossing: str = "first",
-    path: Any = None,
+    path: str | Path | None = None,
     azimuth: Any = 0.0,
     axes: dict[str, Any] | None = None,
     solver: diffrax.AbstractERK | None = None,
@@ -202,7 +191,7 @@ def reversal_table(
     mu: Any = None,
     t1: float,
     tolerance: float = 1e-9,
-    path: Any = None,
+    path: str | Path | None = None,
     axes: dict[str, Any] | None = None,
     solver: diffrax.AbstractERK | None = None,
     scattered: bool = False,
@@ -272,7 +261,7 @@ def event_table(
     axis_values = {axis.number: axis.values for axis in grid}
     if angle is None:
         check_reversible(roots["launch"], axis_values)
-        request: dict[str, Any] = {"event": "reversal"}
+        request: dict[str, object] = {"event": "reversal"}
     else:
         on_stem = isinstance(angle, StemContact)
         theta = axis_values.get("launch.theta", roots["launch"].theta)
@@ -318,7 +307,7 @@ def trajectory_table(
     axes: dict[str, Any] | None = None,
     quantities: Sequence[str] = ("theta", "eta"),
     tolerance: float = 1e-9,
-    path: Any = None,
+    path: str | Path | None = None,
     progress: bool = True,
     executor: Executor | None = None,
     max_steps: int = DEFAULT_MAX_STEPS,
@@ -444,54 +433,6 @@ def simulate(
     return TopModel(scene=scene, launch=launch).simulate(t1, times, tolerance, solver, adjoint)
 
 
-@status_line("writing a page")
-def explore(
-    scene: Scene,
-    launch: Launch,
-    path: Any = None,
-    sliders: dict[str, tuple[float, float]] | None = None,
-    t1: float = 8.0,
-    unit: str | Sequence[str] | None = None,
-) -> Page:
-    """Make a page with sliders that simulates the top in the browser while you move a slider. The page is one file that
-    needs no network; a notebook shows the returned `Page`. The equations of motion, the Runge-Kutta pair, the step-size
-    control and the location of the event are generated from those of `inversion_table`, or, under `NoSlip`, of
-    `reversal_table`, so times and statuses are the same, at a tolerance of 1e-7. The page also computes a map of these
-    times over two of the sliders; click on the map to set both. The address of the page contains the slider values, so
-    that you can copy a link to a run. Press space to play or pause, and r to reset the sliders.
-
-    **Arguments:**
-
-    - `scene`, `launch`: the run at the start; all numbers must be scalars.
-    - `path`: file to write the page to, or `None`.
-    - `sliders`: name of a parameter -> (lowest, highest) value. The end of a name is enough if only one parameter
-      matches, such as "theta", "spin", "mu", "friction.mu" or "offset". By default theta, spin, the coefficient of
-      friction and, for a top without a stem, the offset; under `NoSlip` theta and spin in both senses.
-    - `t1`: horizon [s].
-    - `unit`: unit of the curves, such as "deg" for all angles.
-
-    **Returns:** a `Page`, with its `html`.
-
-    **Raises:** `ValueError` for arguments out of range, an unknown slider, or equations with an operation of JAX that cannot
-    be written in JavaScript; `ModuleNotFoundError` if the library for views is not installed; `OSError` if the file cannot be
-    written.
-
-    **Example:** a page with two sliders.
-
-    ```
-    >>> import tippe
-    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
-    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
-    >>> page = tippe.explore(scene, tippe.Launch(0.1, 155.0), sliders={"theta": (0.05, 0.5), "spin": (60.0, 200.0)})
-    >>> len(page.html) < 2.5e6
-    True
-
-    ```
-    """
-    check_run(scene, launch, t1, TOLERANCE)
-    return explore_model(TopModel(scene=scene, launch=launch), path, sliders, float(t1), unit)
-
-
 @status_line("simulating")
 def inversion_time(
     scene: Scene,
@@ -546,7 +487,7 @@ def inversion_time(
     check_event(angle, crossing)
     warn_if_it_cannot_invert(scene, launch, launch.theta, angle)
     model = TopModel.timed(scene, launch, event_of(scene, angle))
-    return first_or_last_time(model, t1, crossing, Settings(tolerance, solver))
+    return first_or_last_time(model, t1, crossing, settings_for_lanes(tolerance, solver))
 
 
 @status_line("simulating")
@@ -593,15 +534,14 @@ def reversal_time(
     check_run(scene, launch, t1, tolerance, "reversal_table takes lists, and jax.vmap maps over them")
     require_rigid(scene)
     check_reversible(launch, {})
-    return first_or_last_time(TopModel.timed(scene, launch, None), t1, "first", Settings(tolerance, solver))
+    return first_or_last_time(TopModel.timed(scene, launch, None), t1, "first", settings_for_lanes(tolerance, solver))
 
 
-def first_or_last_time(model: TopModel, t1: Any, crossing: str, settings: Settings) -> Float[Array, ""]:
+def first_or_last_time(model: TopModel, t1: Number, crossing: str, settings: Settings) -> Float[Array, ""]:
     """The time of the event of a launch. **Arguments:** as for `inversion_time`, checked.
 
     **Raises:** `ValueError` for a run that needed too many steps. A warning states any other failure.
     """
-    explicit_tableau(settings.for_lanes)
     time = time_of_event(model, t1, settings, crossing == "last")
     if is_traced((model, t1, time, settings)) or not np.isnan(time):
         return time
@@ -657,8 +597,7 @@ def lyapunov_exponent(
     require_kind(launch, "launch", Launch)
     require_outside((scene, launch, t1, tolerance), "lyapunov_exponent", "lists in the launch in place of vmap")
     require_all(run_bounds(t1, tolerance))
-    settings = Settings(tolerance, solver)
-    explicit_tableau(settings.for_lanes)
+    settings = settings_for_lanes(tolerance, solver)
     shapes = {np.shape(leaf) for leaf in jax.tree.leaves((scene, launch))} - {()}
     if len(shapes) > 1 or any(len(shape) > 1 for shape in shapes):
         raise ValueError(f"scene and launch must hold scalars or one number per launch, not arrays of shapes {shapes}")
@@ -716,7 +655,7 @@ def extended_inversion_time(
     return time_of_inversion(TopModel.timed(scene, launch, as_number(angle)), t1, settings)
 
 
-def time_of_inversion(model: TopModel, t1: Any, settings: Settings) -> Float[Array, ""]:
+def time_of_inversion(model: TopModel, t1: Number, settings: Settings) -> Float[Array, ""]:
     """The extended time of a smooth model until its angle, for checked arguments."""
     return differentiable_solve(*ExtendedTime.of(model, t1, settings, False))
 
@@ -747,9 +686,8 @@ class ExtendedTime(EventTime):
         """The extended times of every cell, and their derivatives along tangents (as of `VariationalProblem`)."""
         is_legal, t1, settings = self.permitted(leaves)
         variational = VariationalProblem(problem, tangents, True)
-        outcome, _ = traced_solve_ensemble(
-            variational, t1, jnp.asarray(cells), settings, one_kernel=not nested, n_blocks=1 + len(tangents)
-        )
+        options = {"one_kernel": not nested, "n_blocks": 1 + len(tangents), "traced": True}
+        outcome, _ = solve_ensemble(variational, t1, jnp.asarray(cells), settings, **options)
         state, *variations = variational.parts(outcome.state)
         has_crossed = outcome.status == CROSSED
 

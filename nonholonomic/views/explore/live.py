@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ...hybrid import MOST_ROUNDS, AbstractBatchedMode, AbstractHoppingMode, HybridOutcome
-from ...hybrid.ensemble import after_reset, after_solve, at_start
-from ...hybrid.sampled_adjoint import mode_numbered, program_groups
+from ...hybrid.ensemble import after_reset, after_solve, at_start, mode_numbered, program_groups
 from ...integration import AbstractProblem, LaneState, Settings, explicit_tableau
 from ...integration.problem import LEFT_DOMAIN, RUNNING, UNRESOLVED, Status
 from ...integration.runge_kutta import Step, inner_stages, middle_weights, watched_places
@@ -261,7 +260,7 @@ class HybridSimulator(NamedTuple):
     def first(self, values: Numbers) -> HybridOutcome[Array]:
         """The run for the sliders' numbers, at its start."""
         _, mode, state = self.start(values)
-        return at_start(jnp, mode, state, 1, self.counters)
+        return at_start(mode, state, 1, self.counters)
 
     def read(self, name: str, values: Numbers) -> Any:
         """A reading at the start of a run."""
@@ -308,11 +307,11 @@ class HybridSimulator(NamedTuple):
         def ended(constants: Any, lane: Any, runs: HybridOutcome) -> HybridOutcome:
             problem = stepper.run(constants)[0]
             outcome = with_crossing_times(problem, back_to_margin(problem, outcome_of(lane)))
-            return after_solve(jnp, runs, outcome, t1)
+            return after_solve(runs, outcome, t1)
 
         def reset(values: Numbers, runs: HybridOutcome) -> HybridOutcome:
             transition = mode_of(values, runs).reset_map(runs.state, _left(t1, runs))
-            return after_reset(jnp, runs, transition, t1)
+            return after_reset(runs, transition, t1)
 
         def lost(values: Numbers, runs: HybridOutcome) -> Any:
             stretch = mode_of(values, runs).lost(runs.state)
@@ -323,7 +322,7 @@ class HybridSimulator(NamedTuple):
             return following.open, state_after.elapsed, following
 
         def closed(values: Numbers, runs: HybridOutcome, stretch: Any) -> HybridOutcome:
-            return after_reset(jnp, runs, mode_of(values, runs).closed(stretch), t1)
+            return after_reset(runs, mode_of(values, runs).closed(stretch), t1)
 
         def output(values: Numbers, runs: HybridOutcome, state: Any) -> Any:
             return mode_of(values, runs).shown(state)

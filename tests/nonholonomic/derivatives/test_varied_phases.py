@@ -13,7 +13,6 @@ from nonholonomic.hybrid import (
     AbstractBatchedMode,
     Transition,
     solve_hybrid_with_tangents,
-    traced_solve_hybrid_with_tangents,
 )
 from nonholonomic.integration import AbstractProblem, Settings
 from nonholonomic.integration.problem import CROSSED, REACHED_END, RUNNING
@@ -125,8 +124,8 @@ def test_a_bouncing_ball_inside_a_transformation(balls):
     def run(modes, directions, first, states, times):
         settings = settings_of(1e-10)
         first = jnp.asarray(first)
-        return traced_solve_hybrid_with_tangents(
-            modes, directions, first, states, times, CELLS, settings, counters=1, ends_on_event=False
+        return solve_hybrid_with_tangents(
+            modes, directions, first, states, times, CELLS, settings, counters=1, ends_on_event=False, traced=True
         )
 
     hybrid_outcome, sensitivities = run(*arguments, times)
@@ -184,8 +183,16 @@ def test_a_grazing_event_is_seen():
 
     @eqx.filter_jit
     def run(modes, directions, first, states):
-        return traced_solve_hybrid_with_tangents(
-            modes, directions, first, states, jnp.asarray(9.0), len(heights), settings_of(tolerance), counters=1
+        return solve_hybrid_with_tangents(
+            modes,
+            directions,
+            first,
+            states,
+            jnp.asarray(9.0),
+            len(heights),
+            settings_of(tolerance),
+            counters=1,
+            traced=True,
         )
 
     hybrid_outcome, sensitivities = jax.tree.map(np.asarray, run(modes, directions, first, states))

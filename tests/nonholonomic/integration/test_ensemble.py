@@ -22,7 +22,7 @@ from nonholonomic.integration import (
     solve_ensemble,
 )
 from nonholonomic.integration.problem import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END
-from nonholonomic.integration.scheduler import AbstractRecorder, LaneScheduler, ensemble_solve
+from nonholonomic.integration.scheduler import LaneScheduler, Recorder
 from nonholonomic.integration.step import try_step
 
 pytestmark = pytest.mark.oldest
@@ -116,7 +116,7 @@ def test_steps_reuse_the_memory_of_their_stages():
     """Filling 50 KB with zeros in every step took a tenth of the time of a table."""
     sizes = []
 
-    class Watching(AbstractRecorder):
+    class Watching(Recorder):
         def begin(self, in_lanes, lane_state, collected):
             return None
 
@@ -216,7 +216,7 @@ def time_of(numbers):
     """The time at which an oscillator of rate w reaches a level; exactly acos(level) / w."""
     problem = Oscillators(numbers[:1], numbers[1:], jnp.asarray(2.0))
     settings = Settings(1e-12, absolute=1.0, lanes=1)
-    outcome, _ = ensemble_solve(problem, jnp.asarray(9.0), jnp.asarray(1), settings)
+    outcome, _ = solve_ensemble(problem, jnp.asarray(9.0), jnp.asarray(1), settings, traced=True)
     return outcome.crossing_time[0]
 
 

@@ -12,7 +12,7 @@ from tuning.trees import error_coefficients, trees
 
 import tippe
 from nonholonomic.integration import Oscillatory8, Settings, Stabilized8, solve_ensemble
-from nonholonomic.integration.pairs import CAUTION
+from nonholonomic.integration.runge_kutta import CAUTION
 from tippe.modes.problems import InversionProblem
 
 OWN = unknowns_of(Oscillatory8().tableau, CAUTION)

@@ -11,8 +11,7 @@ import tippe
 from nonholonomic import AbstractSurface
 from nonholonomic.geometry.surface import as_surface
 from nonholonomic.parameters import description, numbers, with_numbers
-from tippe.friction import AbstractFriction, ContactLoad, Slip
-from tippe.model.friction import as_law
+from tippe.friction import AbstractFriction, ContactLoad, Slip, as_law
 
 KNOTS = np.array([0.0, 0.1, 0.2, 0.5, 2.0])
 

@@ -10,7 +10,7 @@ from models import CASES, NAMES
 
 import nonholonomic
 from nonholonomic.identification import sample
-from nonholonomic.runs import model_of
+from nonholonomic.runs.model import model_of
 
 QUIET = dict(progress=False, tolerance=1e-8)
 

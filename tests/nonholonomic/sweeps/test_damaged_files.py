@@ -12,7 +12,8 @@ from cheap_sweep import BLOCK, cheap_sweep, finished_blocks, resumed
 from disk_faults import half_finished
 
 from nonholonomic.sweeps import Table
-from nonholonomic.sweeps._chunks import same_request
+from nonholonomic.sweeps._store import difference_between
+from nonholonomic.sweeps.grid import Layout
 from nonholonomic.views import Page
 
 pytestmark = pytest.mark.oldest
@@ -192,12 +193,6 @@ def test_foreign_files_and_folders_are_left_alone(images, tmp_path):
             cheap_sweep(path, pytest.fail)
 
 
-def test_a_file_of_an_earlier_version_names_options_that_were_not_set():
-    """It can be resumed: an empty list is the same as no entry."""
-    assert same_request('{"t1": 1.0, "sensitivities": []}', '{"t1": 1.0}') is None
-    assert "sensitivities is ['mu']" in str(same_request('{"sensitivities": ["mu"]}', "{}"))
-
-
 def test_a_user_s_own_files_beside_a_table_stay(tmp_path):
     """A lock, and a folder that has the name of the folder of the chunks: it is refused, or kept with what is in it."""
     path, lock, folder = tmp_path / "table.h5", tmp_path / "table.h5.lock", tmp_path / "table.h5.blocks"
@@ -328,7 +323,6 @@ def test_what_is_not_a_path_is_refused(path):
 
 
 def test_a_number_that_is_missing_in_a_request_is_the_same_again():
-    assert same_request('{"data": [NaN, 1.0]}', '{"data": [NaN, 1.0]}') is None
-    assert "data is [nan, 1.0] in the file and [nan, 2.0]" in same_request(
-        '{"data": [NaN, 1.0]}', '{"data": [NaN, 2.0]}'
-    )
+    first, second = (Layout({}, {}, {}, {"request": f'{{"data": [NaN, {x}]}}'}, {}, {}, 1) for x in (1.0, 2.0))
+    assert difference_between(first, first) is None
+    assert "data is [nan, 1.0] in the file and [nan, 2.0]" in str(difference_between(first, second))

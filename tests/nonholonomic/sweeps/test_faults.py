@@ -19,7 +19,7 @@ from cheap_sweep import BLOCK, cheap_sweep, finished_blocks, resumed
 from disk_faults import FOR_A_BLOCK, FOR_THE_FILE, FOR_THE_FOLDER, Killed, fail_on_disk
 
 from nonholonomic.sweeps import Table, running
-from nonholonomic.sweeps._chunks import ChunkStore
+from nonholonomic.sweeps._store import ChunkStore
 from nonholonomic.sweeps.grid import Layout
 
 pytestmark = pytest.mark.oldest

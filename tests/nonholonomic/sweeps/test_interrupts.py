@@ -13,7 +13,7 @@ import pytest
 from cheap_sweep import cheap_sweep, resumed
 
 from nonholonomic.command_line import INTERRUPTED, PATIENCE
-from nonholonomic.sweeps._chunks import ChunkStore
+from nonholonomic.sweeps._store import ChunkStore
 
 #: How long an answer to Ctrl-C may take [s]: twice as long where other programs keep all cores busy.
 PROMPT = 2.0 if os.getloadavg()[0] <= (os.cpu_count() or 1) else 4.0

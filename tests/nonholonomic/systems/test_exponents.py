@@ -6,7 +6,7 @@ from close import assert_close
 from own_modes import Sleigh
 
 from nonholonomic import AbstractSystem, lyapunov_exponent
-from nonholonomic.runs import model_of
+from nonholonomic.runs.model import model_of
 
 
 class Rail(AbstractSystem):

@@ -11,7 +11,8 @@ from close import assert_close
 
 import nonholonomic
 from nonholonomic import AbstractMode, Hybrid, event_time, simulate, sweep
-from nonholonomic.runs import model_of, page_of
+from nonholonomic.runs.model import model_of
+from nonholonomic.runs.trajectory import page_of
 from nonholonomic.views.explore import programs
 
 

@@ -8,7 +8,7 @@ from close import assert_close
 from own_modes import Ball, Sleigh
 
 from nonholonomic import AbstractSystem, Hybrid, event_time, explore, simulate, sweep
-from nonholonomic.runs import model_of
+from nonholonomic.runs.model import model_of
 
 HEADING, TURN, TIME = 0.3, 1.1, 2.0
 START = ([0.0, 0.0, HEADING], [0.0, 0.0, TURN])

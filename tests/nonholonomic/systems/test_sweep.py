@@ -17,9 +17,9 @@ import stroller
 import tippe
 from nonholonomic import AbstractMode, Hybrid, sweep
 from nonholonomic.integration import Settings
-from nonholonomic.runs import TableForm, model_of
+from nonholonomic.runs.model import model_of
 from nonholonomic.runs.sweep import checksum_of, has_users_code
-from nonholonomic.runs.table import TableJob
+from nonholonomic.runs.table import TableForm, TableJob
 
 HEIGHTS, RESTITUTIONS = np.array([0.5, 1.0, 2.0]), np.array([0.7, 0.8])
 BALL = Hybrid([Ball()], event=Bounces(3.0))
@@ -268,7 +268,7 @@ def test_a_request_is_that_of_the_code_and_its_data(kind):
             stroller.presets.light(), stroller.Graph(GROUNDS[kind](heights)), stroller.Damping(2.0, 1.0, 0.2, 0.05)
         )
         model = model_of(scene, stroller.Launch((0.0, -0.8), 0.3, 2.0))
-        assert has_users_code(model.users)
+        assert has_users_code(model.__reduce__()[1])
         description = json.dumps(model.description())
         assert " at 0x" not in description
         return description, checksum_of(model)

@@ -1,0 +1,655 @@
+"""The file of a table, and the files of the chunks of an unfinished one.
+
+A table's file is HDF5 with dimension scales, as in netCDF-4, so that xarray opens it with named coordinates. Words, such as
+a cell's status, are stored as bytes with the attributes `flag_values` and `flag_meanings` (CF conventions). Checksums
+cover every number: HDF5 has one for the description of the arrays, and the group `checksums`, which xarray does not
+show, has one for each chunk of each variable. A file appears only when it is complete.
+
+Until then, each finished chunk has its own file, in a folder beside the table's file, so that a killed sweep can resume.
+"""
+
+import contextlib
+import json
+import math
+import os
+import platform
+import re
+import shutil
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, cast
+
+try:
+    import fcntl
+except ImportError:  # not a POSIX system
+    fcntl = None
+
+import numpy as np
+
+from ..integration.problem import FORMER_WORDS
+from ..validation import as_path, real_path, replacing, sync_folder, warn
+from .grid import EQUATIONS, PENDING, UNREACHED, Layout, Values, boxes
+
+if TYPE_CHECKING:
+    import h5py
+
+#: The group of the checksums.
+CHECKSUMS = "checksums"
+
+#: The attribute of a table with the long names of its variables; in a file, each variable has its own, as in CF.
+LONG_NAMES, LONG_NAME = "long_names", "long_name"
+
+#: The file's attribute that names the dimensions of variables other than those of the grid.
+INNER = "inner"
+
+#: Variables of tables larger than this [bytes] are read only when needed.
+MAX_BYTES_IN_MEMORY = 1 << 27
+
+#: No compression of HDF5 makes numbers smaller by a greater factor.
+MAX_COMPRESSION = 2000
+
+
+#: Endings of files in other formats, which a table's file must not have.
+OTHER_FORMATS = (".csv", ".tsv", ".txt", ".dat", ".xls", ".xlsx", ".ods", ".json", ".npy", ".npz", ".mat", ".pkl")
+OTHER_FORMATS += (".parquet", ".html", ".htm", ".png", ".jpg", ".svg", ".pdf", ".gif", ".mp4", ".zip", ".zarr")
+
+
+def table_path(path: object) -> Path:
+    """The path of a table's file.
+
+    **Raises:** `ValueError` for a value that is no path, or whose ending belongs to another format.
+    """
+    file = as_path(path, "path")
+    if file.suffix.lower() in OTHER_FORMATS:
+        raise ValueError(
+            f"path = {str(path)!r} must end in .h5: the file is in HDF5; for a CSV or Excel file, use to_dataframe().to_csv or "
+            ".to_excel"
+        )
+    return file
+
+
+def write_file(
+    path: Path, layout: Layout, chunks: Iterable[tuple[int, dict[str, Values]]], folder: Path | None = None
+) -> None:
+    """Write a table completely or not at all; an existing file is replaced.
+
+    **Arguments:** `chunks`: the index of a chunk and its cells by variable, in any order; without chunks, the file only
+    describes the table. `folder`: as for `replacing`.
+
+    **Raises:** `OSError` that names the path if it cannot be written.
+    """
+    # The import takes a tenth of a second, and most processes do not need it.
+    import h5py
+
+    with replacing(path, folder) as scratch, scratch.open("r+b", buffering=0) as disk:
+        stream = Stream(disk)
+        with h5py.File(stream, "w", libver=("v110", "v110"), track_order=True) as file:
+            _describe(file, layout)
+            group = file.create_group(CHECKSUMS)
+            group.attrs["block"] = layout.chunk
+            sums = {name: np.zeros(layout.chunks, np.uint32) for name in layout.kinds}
+            for chunk, values in chunks:
+                for name, kind in layout.kinds.items():
+                    cells = np.ascontiguousarray(values[name], kind)
+                    sums[name][chunk] = zlib.crc32(cells.data)
+                    array, start = cast("h5py.Dataset", file[name]), 0
+                    for box in boxes(layout.shape, *layout.ends(chunk)):
+                        sizes = [part.stop - part.start for part in box]
+                        stop = start + math.prod(sizes)
+                        array[box] = cells[start:stop].reshape((*sizes, *cells.shape[1:]))
+                        start = stop
+                stream.check()
+            for name in layout.coords:
+                sums[name] = np.array([zlib.crc32(cast("h5py.Dataset", file[name])[()])], np.uint32)
+            for name, values in sums.items():
+                group.create_dataset(name, data=values)
+        stream.check()
+
+
+class Stream:
+    """A stream that postpones errors until `check`: HDF5 cannot close a file after a write to a full disk has
+    failed."""
+
+    def __init__(self, disk: IO[bytes]):
+        """Set the file to write to."""
+        self._disk, self._error = disk, None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._disk, name)
+
+    def write(self, data: bytes) -> int:
+        """Write all data, unless an earlier call has failed."""
+        remainder = memoryview(data)
+        with self._postponed():
+            while self._error is None and remainder:
+                remainder = remainder[self._disk.write(remainder) :]
+        return len(data)
+
+    def truncate(self, size: int) -> int:
+        """Change the length of the file, unless an earlier call has failed."""
+        with self._postponed():
+            if self._error is None:
+                self._disk.truncate(size)
+        return size
+
+    @contextlib.contextmanager
+    def _postponed(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self._error = error
+
+    def check(self) -> None:
+        """Raise the postponed error, if any."""
+        if self._error is not None:
+            raise self._error
+
+
+def _describe(file: "h5py.File", layout: Layout) -> None:
+    """Write everything in a table except the numbers of its variables."""
+    attributes: dict[str, Any] = (
+        layout.attributes | ({INNER: layout.inner} if layout.inner else {}) | {"Conventions": "CF-1.10"}
+    )
+    long_names = json.loads(attributes.pop(LONG_NAMES, "{}"))
+    for name, value in attributes.items():
+        _set(file, name, value if isinstance(value, str | int | float) else json.dumps(value))
+    meanings = dict(layout.words)
+    for name, values in layout.coords.items():
+        if values.dtype.kind == "U":
+            meanings[name], values = tuple(values.tolist()), np.arange(len(values), dtype=np.int8)
+        file.create_dataset(name, data=values).make_scale(name)
+    for name, kind in layout.kinds.items():
+        array = file.create_dataset(name, shape=layout.shape + layout.inner_shape(name), dtype=kind)
+        for axis, coordinate in enumerate((*layout.axes, *layout.inner.get(name, ()))):
+            array.dims[axis].attach_scale(file[coordinate])
+    for name in (*layout.coords, *layout.kinds):
+        if name in meanings:
+            file[name].attrs["flag_values"] = np.arange(len(meanings[name]), dtype=np.int8)
+            _set(file[name], "flag_meanings", " ".join(meanings[name]))
+        else:
+            _set(file[name], "units", layout.units.get(name, "1"))
+        if name in long_names:
+            _set(file[name], LONG_NAME, long_names[name])
+
+
+def _set(node: "h5py.HLObject", name: str, value: object) -> None:
+    """Set an attribute; a string is stored at its own length, because no checksum covers HDF5's strings of variable length."""
+    # Only files need it.
+    import h5py
+
+    if isinstance(value, str):
+        data = value.encode()
+        node.attrs.create(name, data, dtype=h5py.string_dtype("utf-8", max(1, len(data))))
+    else:
+        node.attrs.create(name, value)
+
+
+def _values(group: "h5py.Group", name: str, box: tuple[slice, ...] = ()) -> Values:
+    """The numbers of a variable, or those within a box.
+
+    **Raises:** `ValueError` if there cannot be as many numbers in the file: reading them could take all memory.
+    """
+    array = cast("h5py.Dataset", group[name])
+    if array.nbytes > MAX_COMPRESSION * group.file.id.get_filesize():
+        raise ValueError(f"{name} has {array.size} numbers, more than fit into the file")
+    return np.asarray(array[box])
+
+
+def _attribute(node: "h5py.HLObject", name: str) -> Any:
+    """An attribute, a number or a string."""
+    value = node.attrs[name]
+    return value.decode() if isinstance(value, bytes) else value
+
+
+def _text(node: "h5py.HLObject", name: str) -> str:
+    """An attribute that is a string."""
+    value = _attribute(node, name)
+    if not isinstance(value, str):
+        raise ValueError(f"the attribute {name} is not a text")
+    return value
+
+
+class Stored(Mapping[str, Values]):
+    """The variables of a table that stays in its file: each is read, and checked against its checksums, when needed.
+
+    `path`: the file; `layout`: its contents.
+    """
+
+    def __init__(self, path: Path):
+        """Open a file and read its layout.
+
+        **Raises:** `OSError` that names the path if it cannot be read or holds no table.
+        """
+        if not path.exists():
+            raise FileNotFoundError(f"no such file: {path}")
+        if path.is_dir():
+            raise OSError(f"cannot read {path}: it is a folder")
+        self.path = path
+        with self._opened() as file:
+            self.layout, self._sums = _contents(file)
+
+    def __getitem__(self, name: str) -> Values:
+        if name not in self.layout.kinds:
+            raise KeyError(name)
+        return self.layout.shaped(name, self.whole(name))
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.layout.kinds
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.layout.kinds)
+
+    def __len__(self) -> int:
+        return len(self.layout.kinds)
+
+    def whole(self, name: str) -> Values:
+        """A variable of all cells, which are along the first axis.
+
+        **Raises:** `OSError` that names the path if numbers do not match their checksums.
+        """
+        with self._opened() as file:
+            values, sums = _values(file, name), self._sums[name]
+            if name in self.layout.words and np.any((values < PENDING) | (values >= len(self.layout.words[name]))):
+                raise ValueError(f"{name} has codes without a word")
+        values = values.reshape(-1, *self.layout.inner_shape(name))
+        parts = [np.ascontiguousarray(values[slice(*self.layout.ends(chunk))]) for chunk in range(self.layout.chunks)]
+        damaged = sum(zlib.crc32(part.data) != right for part, right in zip(parts, sums, strict=True))
+        if damaged:
+            raise OSError(
+                f"cannot read {self.path}: it is damaged: {damaged} of its {self.layout.chunks} chunks do not match their "
+                "checksums"
+            )
+        return values
+
+    def chunk(self, chunk: int) -> dict[str, Values] | None:
+        """The variables of one chunk; `None` if its numbers do not match their checksums."""
+        first, end = self.layout.ends(chunk)
+        variables = {}
+        with self._opened() as file:
+            for name in self.layout.kinds:
+                parts = [_values(file, name, box) for box in boxes(self.layout.shape, first, end)]
+                shape = self.layout.inner_shape(name)
+                variables[name] = np.concatenate([part.reshape(-1, *shape) for part in parts])
+                if zlib.crc32(variables[name].data) != self._sums[name][chunk]:
+                    return None
+        return variables
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator["h5py.File"]:
+        # Only files need it.
+        import h5py
+
+        try:
+            with h5py.File(self.path, "r") as file:
+                yield file
+        # What a damaged file makes HDF5 and NumPy raise can be of any kind.
+        except Exception as error:
+            reason = f"it is not a table of nonholonomic, or it is damaged ({error or type(error).__name__})"
+            raise OSError(f"cannot read {self.path}: {reason}") from None
+
+
+def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
+    """A file's layout, and its checksums by variable."""
+    coords, kinds, units, words, shapes, long_names = {}, {}, {}, {}, {}, {}
+    if "request" not in file.attrs:
+        raise ValueError("it names no request")
+    attributes = {name: _attribute(file, name) for name in file.attrs if name not in ("Conventions", LONG_NAMES)}
+    for name in ("request", "versions"):
+        if not isinstance(json.loads(attributes.get(name, "{}")), dict):
+            raise ValueError(f"the attribute {name} is not a dictionary")
+    inner = {name: tuple(dims) for name, dims in json.loads(attributes.pop(INNER, "{}")).items()}
+    dims = [*json.loads(attributes["axes"]), *(dim for dims in inner.values() for dim in dims)]
+    checksums = cast("h5py.Group", file[CHECKSUMS])
+    sums = {name: _values(checksums, name) for name in map(str, checksums)}
+    for name in (*dict.fromkeys(dims), *(name for name in map(str, file) if name not in (*dims, CHECKSUMS))):
+        array = cast("h5py.Dataset", file[name])
+        if LONG_NAME in array.attrs:
+            long_names[name] = _text(array, LONG_NAME)
+        if "flag_meanings" in array.attrs:
+            meanings = _text(array, "flag_meanings").split()
+            # Words of earlier versions are converted to current ones.
+            words[name] = (
+                tuple(FORMER_WORDS.get(word, word) for word in meanings) if name == "status" else tuple(meanings)
+            )
+        else:
+            units[name] = _text(array, "units")
+        if name in dims:
+            coords[name] = _values(file, name)
+            if coords[name].ndim != 1:
+                raise ValueError(f"{name} is not a list of numbers")
+            if [zlib.crc32(coords[name])] != sums[name].tolist():
+                raise ValueError(f"{name} does not match its checksum")
+        else:
+            kinds[name], shapes[name] = array.dtype, array.shape
+    if long_names:
+        attributes[LONG_NAMES] = json.dumps(long_names, sort_keys=True)
+    coords = {name: np.array(words.pop(name))[values] if name in words else values for name, values in coords.items()}
+    layout = Layout(coords, kinds, units, attributes, words, inner, int(_attribute(checksums, "block")))
+    if layout.chunk < 1:
+        raise ValueError(f"its chunks have {layout.chunk} cells")
+    for name, shape in shapes.items():
+        if shape != layout.shape + layout.inner_shape(name) or len(sums[name]) != layout.chunks:
+            raise ValueError(f"{name} has the wrong shape")
+    return layout, sums
+
+
+def coded(values: Values, words: tuple[str, ...]) -> tuple[Values, tuple[str, ...]]:
+    """Words as codes, and the words in the order of their codes, beginning with the given ones."""
+    new_words = (word for word in dict.fromkeys(values.ravel().tolist()) if word not in (*words, UNREACHED))
+    words = (*words, *new_words)
+    codes = {word: code for code, word in enumerate(words)} | {UNREACHED: PENDING}
+    return np.vectorize(codes.__getitem__, otypes=[np.int8])(values), words
+
+
+# The chunks of an unfinished table.
+
+#: The files of the folder of a table's chunks, besides those of the chunks: a table without numbers, and the lock.
+HEADER, LOCK = "table.h5", "nonholonomic.lock"
+
+#: The name of a file in the folder that was not finished, as `replacing` names it.
+PART = re.compile(r".+\.[0-9a-f]{32}\.part(\.[^.]*)?")
+
+
+def folder_of(path: Path) -> Path:
+    """The folder of a table's chunks while it is computed, beside the file itself, not beside a link to it."""
+    path = real_path(path)
+    return path.with_name(path.name + ".blocks")
+
+
+def chunks_in(folder: Path, layout: Layout) -> set[int]:
+    """The chunks of a table whose files are in its folder."""
+    chunks = {int(file.stem) for file in folder.glob("*.npz") if file.stem.isdecimal()}
+    return {chunk for chunk in chunks if chunk < layout.chunks}
+
+
+def chunk_file(folder: Path, chunk: int) -> Path:
+    """The file of a chunk."""
+    return folder / f"{chunk}.npz"
+
+
+class AnotherRun(ValueError):
+    """A table's path holds the result of another run, which would be overwritten; `difference` says how the runs differ.
+
+    **Example:**
+
+    >>> from pathlib import Path
+    >>> from nonholonomic.sweeps import AnotherRun
+    >>> print(AnotherRun(Path("times.h5"), "launch.spin is 155 in the file and 160 here"))
+    times.h5 holds the result of another run: launch.spin is 155 in the file and 160 here; give another path or remove it
+    """
+
+    def __init__(self, source: Path, difference: str):
+        super().__init__(f"{source} holds the result of another run: {difference}; give another path or remove it")
+        self.difference = difference
+
+
+class ChunkStore:
+    """The finished chunks of a table's file.
+
+    A chunk counts as finished only when it is complete and on disk. It then survives if the process dies, or if the
+    machine dies and its disk keeps confirmed data.
+
+    `finished`: the indices of the chunks that existed when the sweep began.
+    """
+
+    def __init__(self, path: object, layout: Layout):
+        """Find the chunks of an earlier run of the same request, or create a folder for new ones.
+
+        **Raises:** `OSError` that names the path if it cannot be read or written; `ValueError` that names the first
+        difference if it holds the result of another request or of another version of this package.
+        """
+        self.path = table_path(path)
+        self.folder, self.layout, self._lock = folder_of(self.path), layout, None
+        try:
+            self._lock = self._locked()
+            self._find()
+        except BaseException:
+            self.close()
+            raise
+
+    def _find(self) -> None:
+        for file in list(self.folder.iterdir()):
+            if PART.fullmatch(file.name):
+                file.unlink()
+        stored = Stored(self.path) if self.path.exists() else None
+        header = self.folder / HEADER
+        table = stored or (Stored(header) if header.exists() else None)
+        if table is not None:
+            self._check(table)
+            # The table records the versions with which it was begun; words added since then follow its own words.
+            words = dict(table.layout.words)
+            for name, own_words in words.items():
+                new_words = self.layout.words.get(name, ())
+                words[name] = new_words if new_words[: len(own_words)] == own_words else own_words
+            self.layout = table.layout._replace(words=words)
+        valid = {chunk for chunk in range(self.layout.chunks) if stored is not None and stored.chunk(chunk) is not None}
+        self._whole = len(valid) == self.layout.chunks
+        if self._whole:
+            self.finished = valid
+            return
+        if not header.exists():
+            self._begin(header)
+        chunks_on_disk = chunks_in(self.folder, self.layout)
+        damaged = {chunk for chunk in chunks_on_disk if read_chunk(self.folder, self.layout, chunk) is None}
+        self.finished = chunks_on_disk - damaged
+        if stored is not None:
+            damaged |= set(range(self.layout.chunks)) - valid - self.finished
+            for chunk in sorted(valid - self.finished):
+                values = stored.chunk(chunk)
+                assert values is not None
+                self.write(chunk, values)
+            self.finished |= valid
+        if damaged:
+            warn(
+                f"{self.path} is damaged: {len(damaged)} finished chunks do not match their checksums and are computed again",
+                RuntimeWarning,
+            )
+
+    def _begin(self, header: Path) -> None:
+        """Write a note about the folder's purpose, unless the folder is somebody else's."""
+        foreign = [file.name for file in self.folder.iterdir() if file.name != LOCK]
+        if foreign:
+            raise OSError(
+                f"cannot write {self.path}: the folder of its chunks, {self.folder}, holds other files, such as {foreign[0]}; "
+                "give another path, or move them"
+            )
+        # The chunks remain until the table's file exists.
+        bytes_needed = 2 * self.layout.bytes_of_cells(self.layout.cells)
+        try:
+            room = shutil.disk_usage(self.folder).free
+            if room < bytes_needed:
+                raise OSError(
+                    0,
+                    f"{1e-9 * room:.3g} GB are free, and the table needs {1e-9 * bytes_needed:.3g} GB while it is computed",
+                )
+            sync_folder(self.folder.parent)
+        except OSError as error:
+            raise OSError(f"cannot write {self.path}: {error.strerror}") from None
+        write_file(header, self.layout, ())
+
+    def _check(self, table: Stored) -> None:
+        difference = difference_between(table.layout, self.layout)
+        if difference is not None:
+            raise AnotherRun(self.path if table.path == self.path else self.folder, difference)
+        old, new = table.layout.versions, self.layout.versions
+        changed = [name for name in new if name not in ("nonholonomic", "python") and old.get(name) != new[name]]
+        if changed and table.path != self.path:
+            versions = ", ".join(f"{name} {old.get(name)}, now {new[name]}" for name in changed)
+            warn(f"{self.path} was begun with {versions}: digits may differ", RuntimeWarning)
+
+    def filled(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> Stored:
+        """Store each chunk when it is computed, and write the table's file from these and from the existing chunks.
+
+        Chunks that are written to the file during the computation need not be read again at the end.
+
+        **Raises:** `OSError` that names the path if it cannot be written, or a chunk that is damaged; no chunk is lost.
+        """
+        if not self._whole:
+            write_file(self.path, self.layout, self._all(computed), self.folder)
+        for chunk in chunks_in(self.folder, self.layout):
+            chunk_file(self.folder, chunk).unlink(missing_ok=True)
+        (self.folder / HEADER).unlink(missing_ok=True)
+        return Stored(self.path)
+
+    def _all(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> Iterator[tuple[int, dict[str, Values]]]:
+        for chunk, values in computed:
+            self.write(chunk, values)
+            yield chunk, values
+        for chunk in sorted(self.finished):
+            values_on_disk = read_chunk(self.folder, self.layout, chunk)
+            if values_on_disk is None:
+                raise OSError(f"cannot read {self.folder}: chunk {chunk} is damaged; the same call computes it again")
+            yield chunk, values_on_disk
+
+    def write(self, chunk: int, values: dict[str, Values]) -> None:
+        """Store a chunk.
+
+        **Raises:** `OSError` that names the path if that fails; earlier chunks remain finished.
+        """
+        kinds = self.layout.kinds
+        with replacing(chunk_file(self.folder, chunk)) as scratch, scratch.open("wb") as stream:
+            arrays: dict[str, Any] = {name: np.asarray(cells, kinds[name]) for name, cells in values.items()}
+            np.savez(stream, **arrays)
+
+    def interrupted(self) -> str:
+        """Message after Ctrl-C: what is saved, and how to resume."""
+        numbers = chunks_in(self.folder, self.layout) | self.finished
+        cells = self.layout.cells if self._whole else sum(map(self.layout.size, numbers))
+        total = with_spaces(self.layout.cells)
+        return f"saved {with_spaces(cells)} of {total} cells to {self.path}; run the same call again to resume"
+
+    def _locked(self) -> IO[bytes] | None:
+        """Create the folder, and keep others from computing the same file; the system releases the lock when this process
+        ends."""
+        while True:
+            try:
+                self.folder.mkdir(exist_ok=True)
+            except OSError as error:
+                where = f"; {self.folder} must be a folder or absent" if self.folder.exists() else ""
+                raise OSError(f"cannot write {self.path}: {error.strerror}{where}") from None
+            if fcntl is None:
+                return None
+            try:
+                lock = (self.folder / LOCK).open("a+b", buffering=0)
+            except FileNotFoundError:
+                # A process that has just closed the file has removed the folder.
+                continue
+            except OSError as error:
+                raise OSError(f"cannot write {self.path}: {error.strerror}") from None
+            holder = f"process {os.getpid()} on {platform.node()}".encode()
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                lock.seek(0)
+                other = {holder: "another thread", b"": "another thread or process"}.get(lock.read(), "another process")
+                lock.close()
+                raise OSError(f"cannot write {self.path}: {other} is writing it") from None
+            # A process that has just closed the file has removed its lock, possibly after we opened it.
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(lock.fileno()), (self.folder / LOCK).stat()):
+                    with contextlib.suppress(OSError):
+                        lock.truncate(0)
+                        lock.write(holder)
+                    return lock
+            lock.close()
+
+    def close(self) -> None:
+        """Release the file for others, and remove the folder unless it holds files."""
+        if self._lock is not None:
+            (self.folder / LOCK).unlink(missing_ok=True)
+            self._lock.close()
+        with contextlib.suppress(OSError):
+            self.folder.rmdir()
+
+
+def with_spaces(count: int) -> str:
+    """A count with its digits in groups of three."""
+    return f"{count:,}".replace(",", " ")
+
+
+def saved_cells(path: Path) -> int:
+    """Number of cells of a table that are on disk, in its file or in the files of its chunks.
+
+    **Example:**
+
+    >>> from pathlib import Path
+    >>> from nonholonomic.sweeps import saved_cells
+    >>> saved_cells(Path("none.h5"))
+    0
+    """
+    folder = folder_of(path)
+    if path.exists():
+        return Stored(path).layout.cells
+    if not (folder / HEADER).exists():
+        return 0
+    layout = Stored(folder / HEADER).layout
+    return sum(map(layout.size, chunks_in(folder, layout)))
+
+
+def unfinished(path: Path) -> tuple[Layout, dict[str, Values]] | None:
+    """The finished part of an unfinished table; `None` if there is none.
+
+    **Returns:** its layout, and its variables with all cells along the first axis.
+
+    **Raises:** `OSError` that names the path if a chunk is damaged.
+    """
+    folder = folder_of(path)
+    if path.exists() or not (folder / HEADER).exists():
+        return None
+    layout = Stored(folder / HEADER).layout
+    variables, damaged = layout.empty(layout.cells), 0
+    for chunk in chunks_in(folder, layout):
+        values = read_chunk(folder, layout, chunk)
+        damaged += values is None
+        layout.put(variables, chunk, values or {})
+    if path.exists():
+        # The table was finished in the meantime.
+        return None
+    if damaged:
+        reason = f"{damaged} of its {layout.chunks} chunks do not match their checksums"
+        raise OSError(f"cannot read {path}: it is damaged: {reason}")
+    return layout, variables
+
+
+def read_chunk(folder: Path, layout: Layout, chunk: int) -> dict[str, Values] | None:
+    """The variables of a chunk; `None` if they do not match the checksums of the archive."""
+    try:
+        # NumPy does not close a file that it cannot read.
+        with chunk_file(folder, chunk).open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            variables = {name: archive[name] for name in layout.kinds}
+    # What a damaged file makes NumPy raise can be of any kind.
+    except Exception:
+        return None
+    first, end = layout.ends(chunk)
+    right = {name: (kind, (end - first, *layout.inner_shape(name))) for name, kind in layout.kinds.items()}
+    return variables if {name: (values.dtype, values.shape) for name, values in variables.items()} == right else None
+
+
+def difference_between(old: Layout, new: Layout) -> str | None:
+    """How the table in a file differs from the one to compute, in words; `None` if both are results of one request."""
+    in_file, in_call = (json.loads(layout.attributes["request"]) for layout in (old, new))
+    if "status" in in_file:
+        return "it is a single run, not a table of many"
+    old_versions, new_versions = old.versions, new.versions
+    # Another version of JAX may write the same equations in other words.
+    ignored = () if old_versions.get("jax") == new_versions.get("jax") else (EQUATIONS,)
+    for name in dict.fromkeys([*in_file, *in_call]):
+        # As texts, in which a missing number, NaN, equals itself.
+        if name in ignored or len({json.dumps(of.get(name), sort_keys=True) for of in (in_file, in_call)}) == 1:
+            continue
+        if name == EQUATIONS:
+            return "the code of the system, its event or its input has changed"
+        texts = [repr(request[name]) if name in request else "absent" for request in (in_file, in_call)]
+        return f"{name} is {texts[0]} in the file and {texts[1]} here"
+    for name, values in new.coords.items():
+        if name not in old.coords or not np.array_equal(old.coords[name], values):
+            return f"the axis {name} differs"
+    if list(old.coords) != list(new.coords):
+        return f"its axes are {', '.join(old.coords)}"
+    if old_versions.get("nonholonomic") != new_versions.get("nonholonomic"):
+        texts = [of.get("nonholonomic") for of in (old_versions, new_versions)]
+        return f"nonholonomic is {texts[0]} in the file and {texts[1]} here"
+    if (old.kinds, old.inner, old.chunk) != (new.kinds, new.inner, new.chunk):
+        return f"it was not written by a sweep in {new.chunks} chunks"
+    return None
