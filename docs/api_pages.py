@@ -154,7 +154,7 @@ PAGES = {
             "nonholonomic.derivatives",
             *of(
                 "nonholonomic.derivatives",
-                "solve_ensemble_with_tangents traced_solve_ensemble_with_tangents tangents_of tangent_scale in_groups "
+                "solve_ensemble_with_tangents tangents_of tangent_scale in_groups "
                 "VariationalProblem AbstractDifferentiableSolve differentiable_solve tangents_by sampled_run "
                 "sampled_run_by_diffrax SampledRun growth exponent_of",
             ),

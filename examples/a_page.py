@@ -1,5 +1,5 @@
-"""Show a top that turns over: an animated page, an animation for slides, and the curves (needs the extras `view` and
-`plot`).
+"""Show a top that turns over: an animated page, a film for slides, and the curves (needs the extras `view` and `plot`, and
+Chromium, Chrome or Edge for the film).
 
 The same launch in the cylinder and on the plane, side by side. Open `page-out/tops.html` in a browser; it needs no
 network.
@@ -27,14 +27,14 @@ def draw() -> Any:
 
 
 def main(folder: Path = Path("page-out")) -> None:
-    """Write `tops.html`, `top.gif` and `curves.png` into a folder."""
+    """Write `tops.html`, `top.webm` and `curves.png` into a folder."""
     folder.mkdir(exist_ok=True)
     cylinder, plane = runs()
     print(cylinder.view(folder / "tops.html", others=[plane]))
     # Two seconds at a fifth of real time; `times` are those of the frames, 25 per second.
-    plane.animate(folder / "top.gif", times=np.linspace(3.5, 5.5, 250))
+    plane.animate(folder / "top.webm", times=np.linspace(3.5, 5.5, 250))
     plane.plot(others=[cylinder]).savefig(folder / "curves.png", dpi=110)
-    print(f"wrote tops.html, top.gif and curves.png into {folder}")
+    print(f"wrote tops.html, top.webm and curves.png into {folder}")
 
 
 if __name__ == "__main__":

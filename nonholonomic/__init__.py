@@ -19,7 +19,6 @@ if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
 
 from .compilation.cache import enable_compilation_cache as enable_compilation_cache
-from .formulations import AbstractSystem as AbstractSystem
 from .geometry import AbstractSurface as AbstractSurface
 from .geometry import Cylinder as Cylinder
 from .geometry import Graph as Graph
@@ -45,4 +44,5 @@ from .runs.trajectory import explore as explore
 from .sweeps import Table as Table
 from .sweeps import local_processes as local_processes
 from .systems import AbstractMode as AbstractMode
+from .systems import AbstractSystem as AbstractSystem
 from .systems import Hybrid as Hybrid

@@ -1,4 +1,4 @@
-"""Shared code of the command lines: how they start, what they print at the end, and how Ctrl-C ends them."""
+"""Shared code of the command lines: how they start, and how Ctrl-C ends them."""
 
 import gc
 import os
@@ -7,8 +7,9 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable
-from typing import Any, NoReturn
+from collections.abc import Callable
+from types import FrameType, TracebackType
+from typing import NoReturn
 
 #: Longest time [s] that the main thread may take to report what was saved before the process ends without the report.
 PATIENCE = 1.0
@@ -26,7 +27,7 @@ def import_quietly() -> None:
     """
     program, excepthook = sys.orig_argv[sys.orig_argv.index("-m") + 1], sys.excepthook
 
-    def end(number: int, frame: Any) -> None:
+    def end(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         _end(f"python -m {program}: interrupted")
 
@@ -34,7 +35,7 @@ def import_quietly() -> None:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, end)
 
-    def hook(kind: type[BaseException], error: BaseException, trace: Any) -> None:
+    def hook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
         if issubclass(kind, KeyboardInterrupt):
             print(f"python -m {program}: interrupted", file=sys.stderr)
         else:
@@ -59,7 +60,7 @@ def run_and_exit(main: Callable[[], int], program: str) -> NoReturn:
     warnings.simplefilter("always", UserWarning, append=True)
     shown_texts: set[str] = set()
 
-    def show(message: Warning | str, *_: Any) -> None:
+    def show(message: Warning | str, *_: object) -> None:
         if str(message) not in shown_texts:
             shown_texts.add(str(message))
             print(f"python -m {program}: warning: {message}", file=sys.stderr)
@@ -70,21 +71,6 @@ def run_and_exit(main: Callable[[], int], program: str) -> NoReturn:
     status = interruptible(main, program)
     gc.freeze()
     sys.exit(status)
-
-
-def closing_lines(runs: int, start_time: float, paths: Iterable[Any], page: str, read_from: Any = None) -> str:
-    """The last lines of a command line.
-
-    **Arguments:** `runs`: number of runs; `start_time`: the start of the call, by `time.perf_counter`; `paths`: the
-    files; `page`: what the page shows, and its path; `read_from`: the folder from which all results were read, or `None`.
-    """
-    duration = time.perf_counter() - start_time
-    files = ", ".join(map(str, paths))
-    included = "compilation included"
-    if read_from is not None:
-        # Another installation of the same version may have stored them.
-        included = f"read from {read_from}, where an earlier run stored the results of these options"
-    return f"\n{runs} runs in {duration:.1f} s, {included}. Wrote {files}.\n{page}"
 
 
 def interruptible(main: Callable[[], int], program: str) -> int:

@@ -9,20 +9,23 @@ all modes that have it.
 import dataclasses
 import math
 import re
-from collections.abc import Hashable, Iterable, Iterator, Sequence
-from typing import Any
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import DictKey, GetAttrKey, KeyPath, SequenceKey
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .text import AbstractHeld, Numbers, gathered, likely, name_of, spread
 
+#: The values of a parameter along an axis of a grid.
+Axis = TypeVar("Axis")
 
-def numbers(root: str, tree: Any, functions: bool = True) -> dict[str, Any]:
+
+def numbers(root: str, tree: PyTree, functions: bool = True) -> dict[str, Any]:
     """Every parameter of a tree of modules under its dotted name.
 
     **Arguments:**
@@ -48,12 +51,12 @@ def numbers(root: str, tree: Any, functions: bool = True) -> dict[str, Any]:
     return values
 
 
-def numbers_of(roots: dict[str, Any]) -> dict[str, Any]:
+def numbers_of(roots: dict[str, PyTree]) -> dict[str, Any]:
     """Every parameter of several trees. **Arguments:** `roots`: name -> tree."""
     return {name: value for root, tree in roots.items() for name, value in numbers(root, tree).items()}
 
 
-def _itself(tree: Any) -> Any:
+def _itself(tree: PyTree) -> PyTree:
     """The user's module itself for a module that is evaluated over lanes."""
     return tree.function if isinstance(tree, AbstractHeld) else tree
 
@@ -63,12 +66,12 @@ def _entries(name: str, shape: tuple[int, ...]) -> list[str]:
     return [name + "".join(f"[{k}]" for k in index) for index in np.ndindex(shape)]
 
 
-def is_number(leaf: Any) -> bool:
+def is_number(leaf: object) -> bool:
     """Whether a leaf of a tree is a number or an array of numbers, which may differ from cell to cell."""
     return eqx.is_array(leaf) or isinstance(leaf, np.ndarray | np.inexact | float)
 
 
-def with_numbers(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+def with_numbers(roots: dict[str, PyTree], values: Mapping[str, ArrayLike]) -> dict[str, PyTree]:
     """The trees with some parameters replaced; the modules check the new values.
 
     **Arguments:**
@@ -118,7 +121,7 @@ def as_one(values: Any, name: str, kind: type) -> Any:
 RESTING = ("velocity", "angular_velocity")
 
 
-def _column(parts: Any, name: str, field: str) -> Any:
+def _column(parts: Sequence[ArrayLike], name: str, field: str) -> Array:
     """One number of each module as an array."""
     shapes = {np.shape(part) for part in parts}
     if shapes != {()}:
@@ -160,7 +163,7 @@ class ByName(dict[str, Any]):
             raise KeyError(str(error)) from None
 
 
-def full_axes(axes: dict[str, Any], known: list[str]) -> dict[str, Any]:
+def full_axes(axes: dict[str, Axis], known: list[str]) -> dict[str, Axis]:
     """The axes of a grid under full names; a name may be the end of a full name, such as `"offset"`.
 
     **Arguments:** `axes`: name -> values; `known`: the full names of the parameters.
@@ -168,7 +171,7 @@ def full_axes(axes: dict[str, Any], known: list[str]) -> dict[str, Any]:
     **Raises:** `ValueError` for a name that matches none or several parameters, and for a parameter that is named
     twice.
     """
-    by_full_name: dict[str, Any] = {}
+    by_full_name: dict[str, Axis] = {}
     for name, values in axes.items():
         if not meant(name, known):
             raise _unknown_axis(name, known)
@@ -192,7 +195,7 @@ def _unknown_axis(name: str, known: list[str]) -> ValueError:
     )
 
 
-def _replaced(name: str, tree: Any, values: dict[str, Any]) -> Any:
+def _replaced(name: str, tree: PyTree, values: Mapping[str, Any]) -> PyTree:
     if isinstance(tree, AbstractHeld):
         return type(tree)(_replaced(name, tree.function, values))
     changes = {}
@@ -212,7 +215,7 @@ def _replaced(name: str, tree: Any, values: dict[str, Any]) -> Any:
     return dataclasses.replace(tree, **changes) if changes else tree
 
 
-def description(root: str, tree: Any) -> dict[str, Any]:
+def description(root: str, tree: PyTree) -> dict[str, Any]:
     """A tree of modules as plain data: the kind of every module and the value of every number.
 
     A function is described by its name alone. Nothing in the data is different in another process.
@@ -225,7 +228,7 @@ def description(root: str, tree: Any) -> dict[str, Any]:
     return fields
 
 
-def _is_described(value: Any) -> bool:
+def _is_described(value: object) -> bool:
     return isinstance(value, eqx.Module) and not isinstance(value, Numbers)
 
 
@@ -253,12 +256,12 @@ class TreeForm:
     """
 
     structure: Any
-    kinds: tuple[tuple[tuple[int, ...], Any], ...]
+    kinds: tuple[tuple[tuple[int, ...], np.dtype], ...]
     static_leaves: tuple[Hashable, ...]
     static_structure: Any
 
     @classmethod
-    def of(cls, tree: Any) -> tuple["TreeForm", tuple[Array, ...]]:
+    def of(cls, tree: PyTree) -> tuple["TreeForm", tuple[Array, ...]]:
         """The form of a tree, and its numbers."""
         numbers, static = eqx.partition(tree, is_number)
         leaves, structure = jax.tree.flatten(numbers)
@@ -267,7 +270,7 @@ class TreeForm:
         kinds = tuple((array.shape, array.dtype) for array in arrays)
         return cls(structure, kinds, tuple(static_leaves), static_structure), spread(arrays)
 
-    def tree(self, numbers: Sequence[Array]) -> Any:
+    def tree(self, numbers: Sequence[Array]) -> PyTree:
         """The tree with the given numbers, each a scalar."""
         leaves = gathered(numbers, [shape for shape, _ in self.kinds])
         static = jax.tree.unflatten(self.static_structure, self.static_leaves)
@@ -291,7 +294,7 @@ class Parameters(eqx.Module):
     form: TreeForm = eqx.field(static=True)
 
     @classmethod
-    def of(cls, tree: dict[str, Any]) -> "Parameters":
+    def of(cls, tree: dict[str, PyTree]) -> "Parameters":
         """The numbers of several named trees."""
         form, values = TreeForm.of(tree)
         leaves, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(tree, is_number))
@@ -299,11 +302,11 @@ class Parameters(eqx.Module):
         return cls(values, tuple(names), form)
 
     @property
-    def tree(self) -> dict[str, Any]:
+    def tree(self) -> dict[str, PyTree]:
         """The trees, for values that are scalars."""
         return self.form.tree(self.values)
 
-    def replaced(self, changes: dict[str, Any]) -> "Parameters":
+    def replaced(self, changes: Mapping[str, Any]) -> "Parameters":
         """The parameters with replacements, by name; a name such as `"system.modes[*].drag"` replaces several."""
         values = tuple(
             changes.get(name, changes.get(of_all_modes(name), value))
@@ -386,13 +389,13 @@ def _plain(name: str) -> str:
     return name.replace("[*]", "").replace("[", "_").replace("]", "").replace(".", "_")
 
 
-def has_checks(tree: Any) -> bool:
+def has_checks(tree: PyTree) -> bool:
     """Whether a user's module checks its numbers, so that every value of an axis must be checked."""
     kinds = {kind for module in _modules(tree) for kind in type(module).__mro__ if "__check_init__" in vars(kind)}
     return any(not kind.__module__.startswith("nonholonomic.") for kind in kinds)
 
 
-def check_again(tree: Any) -> None:
+def check_again(tree: PyTree) -> None:
     """Check the numbers of all modules of a tree, as when they are created."""
     for module in _modules(tree):
         for kind in type(module).__mro__:
@@ -400,7 +403,7 @@ def check_again(tree: Any) -> None:
                 vars(kind)["__check_init__"](module)
 
 
-def _modules(tree: Any) -> Iterator[eqx.Module]:
+def _modules(tree: PyTree) -> Iterator[eqx.Module]:
     inner = jax.tree.leaves(tree, is_leaf=lambda node: isinstance(node, eqx.Module) and node is not tree)
     if isinstance(tree, eqx.Module):
         yield tree

@@ -55,7 +55,7 @@ class Progress:
             self._since = time.time()
             self._clear()
 
-    def advance(self, count: int, **notes: Any) -> None:
+    def advance(self, count: int, **notes: object) -> None:
         """Count `count` more items as done; `notes` are shown beside their number."""
         with _LINE.lock:
             self._done, self._notes = self._done + count, notes
@@ -154,17 +154,13 @@ class _Line:
                 elif time.time() - last > LINGER:
                     self._writer = None
                     return
-                self._update()
-
-    def _update(self) -> None:
-        shown = [speaker for speaker in self.speakers if speaker._shown and time.time() - speaker._start >= INTERVAL]
-        if not shown:
-            return
-        owner = next((speaker for speaker in reversed(shown) if speaker._total is not None), shown[0])
-        for hidden_speaker in shown:
-            if hidden_speaker is not owner:
-                hidden_speaker._clear()
-        owner._show()
+                due = [line for line in self.speakers if line._shown and time.time() - line._start >= INTERVAL]
+                owner = next((line for line in reversed(due) if line._total is not None), due[0] if due else None)
+                for line in due:
+                    if line is not owner:
+                        line._clear()
+                if owner is not None:
+                    owner._show()
 
 
 _LINE = _Line()

@@ -7,7 +7,7 @@ import inspect
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike, PyTree
 
 # Users' objects, which are written for a single run, with their arrays as separate numbers.
 
@@ -56,30 +56,26 @@ def gathered(numbers: Sequence[Array], shapes: Sequence[tuple[int, ...]]) -> lis
     return arrays
 
 
-def parted(tree: Any) -> Any:
+def parted(tree: PyTree) -> PyTree:
     """A tree with `Numbers` in place of its arrays, which hold the numbers of a single run."""
 
-    def part(leaf: Any) -> Any:
+    def part(leaf: PyTree) -> PyTree:
         return Numbers(spread([jnp.asarray(leaf)]), leaf.shape) if is_array(leaf) and leaf.ndim else leaf
 
     return jax.tree.map(part, tree)
 
 
-def joined(tree: Any) -> Any:
+def joined(tree: PyTree) -> PyTree:
     """A tree with arrays in place of its `Numbers`."""
-
-    def join(leaf: Any) -> Any:
-        return leaf.array if is_numbers(leaf) else leaf
-
-    return jax.tree.map(join, tree, is_leaf=is_numbers)
+    return jax.tree.map(lambda leaf: leaf.array if is_numbers(leaf) else leaf, tree, is_leaf=is_numbers)
 
 
-def is_numbers(leaf: Any) -> bool:
+def is_numbers(leaf: object) -> bool:
     """Whether a node of a tree is an array as separate numbers."""
     return isinstance(leaf, Numbers)
 
 
-def is_array(leaf: Any) -> bool:
+def is_array(leaf: object) -> bool:
     """Whether a leaf is an array of JAX or NumPy."""
     return isinstance(leaf, jax.Array | np.ndarray)
 
@@ -92,10 +88,10 @@ def is_users(kind: type) -> bool:
 class AbstractHeld(eqx.Module):
     """A user's module that is a function, with `Numbers` in place of its arrays. This object has its attributes, too."""
 
-    function: eqx.AbstractVar[Any]
+    function: eqx.AbstractVar[Callable[..., Any]]
 
     @property
-    def whole(self) -> Any:
+    def whole(self) -> PyTree:
         """The module with its arrays."""
         return joined(self.function)
 
@@ -111,7 +107,7 @@ class AbstractHeld(eqx.Module):
 # Values of parameters as text, with units, and hints for messages.
 
 
-def likely(name: Any, known: Iterable[str]) -> str:
+def likely(name: object, known: Iterable[str]) -> str:
     """The known name that resembles an unknown one, as an addition to a message; empty if there is none."""
     names = list(known)
     anagrams = [candidate for candidate in names if sorted(candidate) == sorted(str(name))]
@@ -125,7 +121,7 @@ def likely(name: Any, known: Iterable[str]) -> str:
     return f"; did you mean {matches[0]!r}?" if matches else ""
 
 
-def likely_fix(value: Any, wanted: str = "") -> str:
+def likely_fix(value: PyTree, wanted: str = "") -> str:
     """A hint for a function or a class instead of its result, a body instead of a scene, or a scene instead of a body.
 
     **Arguments:** `wanted`: name of the class that the value should have.
@@ -209,7 +205,7 @@ def require_unit_of(unit: str | Sequence[str] | None, units: Mapping[str, str]) 
         raise ValueError(f"unit = {shown(unit)} fits nothing that is drawn: {listed}")
 
 
-def require_unit(unit: Any) -> None:
+def require_unit(unit: object) -> None:
     """Raise `ValueError` unless this is `None`, a unit that pictures can show, or a list of such units."""
     known = [name for readable, names in UNITS.items() if readable != "1" for name in names]
     names = [unit] if isinstance(unit, str) else unit
@@ -218,7 +214,7 @@ def require_unit(unit: Any) -> None:
         raise ValueError(f"unit = {shown(unit)} must be one of {', '.join(known)}, or a list of them{hint}")
 
 
-def as_text(value: Any, unit: str | None = "1") -> str:
+def as_text(value: object, unit: str | None = "1") -> str:
     """A value as text: a number to six digits with its unit, or the first and last numbers of an array. Without a unit,
     the numbers of a module have no units either."""
     value = value.array if isinstance(value, Numbers) else value
@@ -244,7 +240,7 @@ def as_text(value: Any, unit: str | None = "1") -> str:
     return repr(value) if name is None else name.rpartition("<locals>.")[2]
 
 
-def name_of(value: Any) -> str:
+def name_of(value: object) -> str:
     """The name of a function, or the kind of another object; unlike its text, it holds no address.
 
     **Example:**
@@ -257,7 +253,7 @@ def name_of(value: Any) -> str:
     return getattr(value, "__qualname__", type(value).__name__)
 
 
-def shown(value: Any) -> str:
+def shown(value: object) -> str:
     """The value for a message, as a user would write it: plain numbers in place of arrays, also within lists."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{shown(name)}: {shown(part)}" for name, part in value.items()) + "}"
@@ -275,7 +271,7 @@ def shown(value: Any) -> str:
     return (as_text(value) if is_known else repr(value)).partition("\n")[0]
 
 
-def described(result: Any) -> str:
+def described(result: PyTree) -> str:
     """What a traced function returns, for a message, such as "an array of shape (2,)" or "a list of 2 values"."""
     if hasattr(result, "shape"):
         return f"an array of shape {result.shape}" if result.shape else f"a number of type {result.dtype}"
@@ -283,7 +279,7 @@ def described(result: Any) -> str:
     return "None" if result is None else f"a {type(result).__name__}{count}"
 
 
-def contents(module: Any, with_units: bool = True) -> list[tuple[str, str]]:
+def contents(module: PyTree, with_units: bool = True) -> list[tuple[str, str]]:
     """The fields of a module as (name, value as text); omitted fields are left out."""
     fields = [(field.name, getattr(module, field.name, None)) for field in dataclasses.fields(module)]
     units = getattr(module, "units", {})
@@ -324,7 +320,7 @@ def batch_title(shape: tuple[int, ...], words: Iterable[str] = ()) -> str:
     return f"{runs}: {ends}" if ends else runs
 
 
-def one_line(module: Any, with_units: bool = True) -> str:
+def one_line(module: PyTree, with_units: bool = True) -> str:
     """A module in one line: `Plane(tilt=0.05 rad)`."""
     return f"{type(module).__name__}({', '.join(f'{name}={text}' for name, text in contents(module, with_units))})"
 
@@ -382,7 +378,7 @@ def differences(modules: list[Any], unit: str | Sequence[str] | None = None) -> 
     return labels
 
 
-def _rounded(number: Any) -> Any:
+def _rounded(number: ArrayLike) -> np.ndarray:
     """A number to four digits."""
     return np.vectorize(lambda part: float(f"{part:.4g}"))(np.asarray(number, float))
 

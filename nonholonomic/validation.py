@@ -13,7 +13,7 @@ import sys
 import tempfile
 import uuid
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from .text import as_html, contents, in_lines, is_users, likely_fix, one_line, shown
 
@@ -78,7 +78,11 @@ UNTRACEABLE = (
 )
 
 
-def as_number(value: Any) -> Float[Array, "..."]:
+#: A number or numbers with which others are compared, or `None`.
+Limit = Any
+
+
+def as_number(value: object) -> Float[Array, "..."]:
     """Convert to a floating-point array of the default precision; anything that is not a number stays unchanged, for
     `require` to reject."""
     try:
@@ -92,12 +96,12 @@ def as_number(value: Any) -> Float[Array, "..."]:
         return value  # pyright: ignore[reportReturnType]
 
 
-def as_number_or_none(value: Any) -> Float[Array, "..."] | None:
+def as_number_or_none(value: object) -> Float[Array, "..."] | None:
     """Like `as_number`, for an optional number."""
     return None if value is None else as_number(value)
 
 
-def as_known(value: Any) -> Float[Array, "..."]:
+def as_known(value: object) -> Float[Array, "..."]:
     """Like `as_number`, but a concrete number stays concrete inside a transformation, where `jax.jit` would trace an
     array."""
     if is_traced(value):
@@ -106,12 +110,12 @@ def as_known(value: Any) -> Float[Array, "..."]:
         return as_number(value)
 
 
-def is_traced(value: Any) -> bool:
+def is_traced(value: PyTree) -> bool:
     """Whether the value, or a leaf of it, is known only while JAX runs a transformation."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value))
 
 
-def largest(*values: Any) -> float:
+def largest(*values: PyTree) -> float:
     """The largest magnitude among concrete finite numbers; 0 without any. For `Bounded.suspicion`."""
     leaves = jax.tree.leaves(values)
     arrays = [np.abs(np.asarray(leaf)) for leaf in leaves if isinstance(leaf, jax.Array) and not is_traced(leaf)]
@@ -124,13 +128,13 @@ def _first(numbers: np.ndarray, holds: np.ndarray) -> str:
 
 
 def require(
-    value: Any,
+    value: object,
     name: str,
     *,
-    above: Any = None,
-    at_least: Any = None,
-    below: Any = None,
-    at_most: Any = None,
+    above: Limit = None,
+    at_least: Limit = None,
+    below: Limit = None,
+    at_most: Limit = None,
     why: str = "",
     unit: str = "",
 ) -> None:
@@ -174,14 +178,14 @@ def require(
             raise ValueError(message + (IN_DEGREES.format(number) if degrees else ""))
 
 
-def require_scalars(values: dict[str, Any], otherwise: str) -> None:
+def require_scalars(values: Mapping[str, Any], otherwise: str) -> None:
     """Raise `ValueError` unless each named value is a single number or omitted; `otherwise` is the advice for lists."""
     for name, value in values.items():
         if value is not None and np.ndim(value) != 0:
             raise ValueError(f"{name} must be one number, not of shape {np.shape(value)}; {otherwise}")
 
 
-def require_kind(value: Any, name: str, kind: type, example: str = "", several: str = "") -> None:
+def require_kind(value: object, name: str, kind: type, example: str = "", several: str = "") -> None:
     """Raise `ValueError` unless a value is of the given kind, such as a `Scene`.
 
     If the value is a module of the same name from another package, such as a stroller's scene for a top, the message
@@ -213,7 +217,7 @@ def require_one_run(run: Any, action: str, many: str) -> None:
         )
 
 
-def require_outside(values: Any, caller: str, instead: str) -> None:
+def require_outside(values: PyTree, caller: str, instead: str) -> None:
     """Raise `ValueError` inside `jit`, `vmap` and `grad` for functions that run on the host only.
 
     **Arguments:** `values`: the arguments to check; `caller`: the function; `instead`: what to use inside
@@ -224,7 +228,7 @@ def require_outside(values: Any, caller: str, instead: str) -> None:
         raise ValueError(f"{caller} cannot be called inside jit, vmap or grad: use {instead} there")
 
 
-def require_whole(value: Any, name: str, at_least: int) -> None:
+def require_whole(value: object, name: str, at_least: int) -> None:
     """Raise `ValueError` unless the value is a whole number of at least `at_least`."""
     if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < at_least:
         raise ValueError(f"{name} = {shown(value)} must be a whole number of at least {at_least}")
@@ -251,7 +255,7 @@ def require_increasing(values: Any, name: str) -> None:
         )
 
 
-def times_within(times: Any, end: Any, run: str) -> Float[np.ndarray, " times"]:
+def times_within(times: ArrayLike, end: ArrayLike, run: str) -> Float[np.ndarray, " times"]:
     """Convert times of output, or one time, to a list; raise `ValueError` unless they increase and lie within [0, `end`].
     **Arguments:** `end`: end of the run [s]; `run`: the word for the run in the message."""
     require(times, "times", at_least=0.0, at_most=end, why=f"the {run} ends there")
@@ -260,7 +264,7 @@ def times_within(times: Any, end: Any, run: str) -> Float[np.ndarray, " times"]:
     return times
 
 
-def require_flag(value: Any, name: str) -> None:
+def require_flag(value: object, name: str) -> None:
     """Raise `ValueError` unless the value is true or false; a word such as "no" would count as true."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} = {shown(value)} must be True or False")
@@ -276,7 +280,7 @@ def require_folder(path: Path, name: str) -> None:
         raise OSError(f"{name} = {path}: nothing can be written there: {error.strerror}") from None
 
 
-def as_path(path: Any, name: str) -> Path:
+def as_path(path: object, name: str) -> Path:
     """Convert to a path; raise `ValueError` for a value that is not a path."""
     if isinstance(path, str | os.PathLike) and path != "" and "\0" not in str(path):
         with contextlib.suppress(TypeError):
@@ -284,7 +288,7 @@ def as_path(path: Any, name: str) -> Path:
     raise ValueError(f"{name} = {shown(path)} must be the path of a file")
 
 
-def require_file(path: Any, name: str, *endings: str) -> Path:
+def require_file(path: object, name: str, *endings: str) -> Path:
     """Raise `ValueError` unless a path has one of the endings, and `OSError` unless a file can be written there.
 
     **Returns:** the path.
@@ -362,10 +366,10 @@ class Bound(NamedTuple):
 
     value: Any
     name: str
-    above: Any = None
-    at_least: Any = None
-    below: Any = None
-    at_most: Any = None
+    above: Limit = None
+    at_least: Limit = None
+    below: Limit = None
+    at_most: Limit = None
     why: str = ""
     unit: str = ""
 
@@ -454,7 +458,7 @@ def require_all(bounds: Iterable[Bound]) -> None:
         bound.require()
 
 
-def all_bounds(module: Any) -> Iterator[Bound]:
+def all_bounds(module: object) -> Iterator[Bound]:
     """The ranges of the numbers of a module and its submodules; none for a module that is not `Bounded`."""
     if isinstance(module, Bounded):
         yield from module.bounds()
@@ -470,7 +474,7 @@ def legal(bounds: Iterable[Bound]) -> Bool[Array, "..."]:
     return functools.reduce(jnp.logical_and, (bound.holds for bound in bounds), jnp.asarray(True))
 
 
-def nan_unless(holds: Bool[Array, ""], tree: Any) -> Any:
+def nan_unless(holds: Bool[Array, ""], tree: PyTree) -> PyTree:
     """The tree with every floating-point number, and every derivative through it, NaN unless `holds`."""
     # Multiply instead of selecting: the derivative of a value that was not selected would be 0.
     factor = jnp.where(holds, 1.0, jnp.nan)

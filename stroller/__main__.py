@@ -2,40 +2,40 @@
 audit."""
 
 import argparse
-import sys
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from html import escape
-from importlib.util import find_spec
 from pathlib import Path
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from nonholonomic import __version__
-from nonholonomic.command_line import closing_lines, run_and_exit
+from nonholonomic.command_line import run_and_exit
 from nonholonomic.compilation.cache import are_kept, enable_compilation_cache, kept_files
 from nonholonomic.geometry import CLOSED, AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.integration import ImplicitMidpoint
-from nonholonomic.sweeps import Table
 from nonholonomic.terminal import Progress, status_line
 from nonholonomic.validation import as_number, replacing, require, require_folder
-from nonholonomic.views import NO_VIEW, can_view, page, picture_as_html
+from nonholonomic.views import Outputs, Stage, can_draw, page_of_job, picture_as_html, run_job
 
+from .model.input import Motion
 from .model.scene import FORKS, Scene
 from .model.vehicle import Damping, Launch, Stroller
-from .planning.obstacles import Box
 from .planning.plan import plan
-from .planning.problem import Goal, Limits
-from .planning.result import Plan, draw_plan, planned_stage
+from .planning.problem import Box, Goal, Limits
+from .planning.result import Plan, planned_stage
 from .runs.trajectory import Trajectory, table_of
 from .runs.verbs import simulate
 from .runs.view import draw_rides, grouped
 
 RIDES = ("without friction", "with friction")
+
+#: The ground and the friction of a ride.
+Name = tuple[str, str]
 
 #: The heading of the energy audit, and the name of its text among the computed files.
 HEADING = (
@@ -43,6 +43,9 @@ HEADING = (
     f"{'residual':>10s} {'slip [m/s]':>10s} {'N min [N]':>10s} {'steps':>6s}  status"
 )
 AUDIT = "audit"
+
+#: The name of the page.
+PAGE = "index.html"
 
 #: Tolerances of the rides that show how the energy residual depends on the tolerance.
 TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
@@ -71,14 +74,14 @@ GROUNDS = {
 class Helm(eqx.Module):
     """Steer alternately left and right, by a torque towards a moving angle, and pull with a constant force."""
 
-    force: Any = eqx.field(converter=as_number)
-    angle: Any = eqx.field(converter=as_number)
-    period: Any = eqx.field(converter=as_number)
+    force: Float[Array, ""] = eqx.field(converter=as_number)
+    angle: Float[Array, ""] = eqx.field(converter=as_number)
+    period: Float[Array, ""] = eqx.field(converter=as_number)
 
     def __check_init__(self) -> None:
         require(self.period, "period", above=0.0)
 
-    def __call__(self, t: Any, motion: Any) -> tuple[Any, Any]:
+    def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         target = self.angle * jnp.sin(2.0 * jnp.pi * t / self.period)
         return self.force, 1.0 * (target - motion.steering) - 0.3 * motion.steering_rate
 
@@ -127,7 +130,7 @@ def parser() -> argparse.ArgumentParser:
     return command
 
 
-def scenes(options: argparse.Namespace) -> dict[tuple[str, str], tuple[Scene, Launch]]:
+def scenes(options: argparse.Namespace) -> dict[Name, tuple[Scene, Launch]]:
     """The rides, without and with friction on each surface: (ground, friction) -> scene and launch."""
     body = Stroller(options.mass, options.wheelbase, options.inertia, options.steering_inertia)
     # Zero damping stands for no friction, so that both rides share one program.
@@ -145,19 +148,21 @@ def scenes(options: argparse.Namespace) -> dict[tuple[str, str], tuple[Scene, La
     return rides
 
 
-def audit(name: str, runs: dict[str, Trajectory]) -> list[str]:
-    """The lines of the energy audit of one ride, one for each integrator."""
+def audited(options: argparse.Namespace, helm: Helm, name: Name) -> tuple[Trajectory, list[str]]:
+    """One ride by Dopri8, and the lines of its energy audit, one for each integrator."""
+    scene, launch = scenes(options)[name]
+    runs = {
+        "Dopri8": simulate(scene, launch, options.t1, helm, tolerance=options.tolerance),
+        "midpoint": simulate(scene, launch, options.t1, helm, solver=ImplicitMidpoint(options.step)),
+    }
     lines = []
     for solver, run in runs.items():
         residual, slip = (float(jnp.max(jnp.abs(part))) for part in (run.energy_residual, run.constraint))
-        numbers = (float(run.energy[0]), float(run.energy[-1]), float(run.work[-1]))
-        columns = " ".join(f"{number:12.6f}" for number in numbers)
-        steps = int(run.stats.steps)
-        min_force = float(jnp.min(run.normal_force))
-        lines.append(
-            f"{name:38s} {solver:10s} {columns} {residual:10.1e} {slip:10.1e} {min_force:10.3f} {steps:6d}  {run.status}"
-        )
-    return lines
+        energies = " ".join(f"{float(part):12.6f}" for part in (run.energy[0], run.energy[-1], run.work[-1]))
+        force, steps = float(jnp.min(run.normal_force)), int(run.stats.steps)
+        ride = f"{', '.join(name):38s} {solver:10s} {energies} {residual:10.1e} {slip:10.1e}"
+        lines.append(f"{ride} {force:10.3f} {steps:6d}  {run.status}")
+    return runs["Dopri8"], lines
 
 
 def tolerance_curve(options: argparse.Namespace, helm: Helm) -> list[str]:
@@ -169,16 +174,6 @@ def tolerance_curve(options: argparse.Namespace, helm: Helm) -> list[str]:
         residual = float(jnp.max(jnp.abs(run.energy_residual)))
         lines.append(f"  {tolerance:7.0e}  {residual:8.1e}  in {int(run.stats.steps)} steps")
     return lines
-
-
-def audited(options: argparse.Namespace, helm: Helm, name: tuple[str, str]) -> tuple[Trajectory, list[str]]:
-    """One ride by Dopri8, and its energy audit by both integrators."""
-    scene, launch = scenes(options)[name]
-    runs = {
-        "Dopri8": simulate(scene, launch, options.t1, helm, tolerance=options.tolerance),
-        "midpoint": simulate(scene, launch, options.t1, helm, solver=ImplicitMidpoint(options.step)),
-    }
-    return runs["Dopri8"], audit(", ".join(name), runs)
 
 
 def parked(options: argparse.Namespace) -> Plan:
@@ -199,43 +194,17 @@ def parked(options: argparse.Namespace) -> Plan:
     )
 
 
-def table(options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory]) -> Table:
-    """The rides as a table over ride and time."""
-    request = {name: value for name, value in vars(options).items() if name != "out"}
-    names = ["_".join(name).replace(" ", "_") for name in rides]
-    return table_of(list(rides.values()), names, request | {"ride": names})
-
-
-def write_page(
-    options: argparse.Namespace,
-    parking: Plan,
-    rides: dict[tuple[str, str], Trajectory],
-    words: list[str],
-    drawings: dict[str, Path],
-) -> Path:
-    """Write the page of the main job: the moving plan and rides if three.js is installed, the audit, and the drawings by
-    their headings."""
+def stages(parking: Plan, rides: dict[Name, Trajectory]) -> list[Stage]:
+    """The stages of the page: the plan, and each ground with its rides."""
     groups: dict[str, list[tuple[int, Trajectory]]] = {}
     for number, ((ground, _), run) in enumerate(rides.items()):
         groups.setdefault(ground, []).append((number, run))
-    viewed = []
-    if can_view():
-        # The title of the stage names the ground of both rides; the name of each ride is beside it.
-        viewed = [planned_stage(parking)]
-        viewed += [
-            stage._replace(title=ground)
-            for ground, stage in zip(groups, grouped(list(groups.values()), [ride for _, ride in rides]), strict=True)
-        ]
-    note = "" if viewed else f'<p class="note">{NO_VIEW}</p>'
-    pictures = [f"<h2>{heading}</h2>{picture_as_html(drawing)}" for heading, drawing in drawings.items()]
-    audit_section = "<h2>Energy against work</h2><pre>" + escape("\n".join(words)) + "</pre>"
-    path = options.out / "index.html"
-    sections = "".join([*pictures[:1], audit_section, *pictures[1:]])
-    page(viewed, "A stroller parks, and rides", 1.0, note, sections).save(path)
-    return path
+    # The title of the stage names the ground of both rides; the name of each ride is beside it.
+    rides_by_ground = zip(groups, grouped(list(groups.values()), [ride for _, ride in rides]), strict=True)
+    return [planned_stage(parking), *(stage._replace(title=ground) for ground, stage in rides_by_ground)]
 
 
-def simulated(options: argparse.Namespace) -> tuple[Plan, dict[tuple[str, str], Trajectory], list[str]]:
+def simulated(options: argparse.Namespace) -> tuple[Plan, dict[Name, Trajectory], list[str]]:
     """The plan, the rides, and the lines of their audit and of the plan, which are printed as the rides end."""
     rides, audits, helm, scenes_to_run = {}, [], Helm(options.force, options.steer, options.period), scenes(options)
     # Compile in parallel, because the compiler uses little more than one core. The two rides of a ground share one program.
@@ -243,7 +212,7 @@ def simulated(options: argparse.Namespace) -> tuple[Plan, dict[tuple[str, str], 
         display.begin()
         locks = {ground: Lock() for ground, _ in scenes_to_run}
 
-        def in_turn(name: tuple[str, str]) -> tuple[Trajectory, list[str]]:
+        def in_turn(name: Name) -> tuple[Trajectory, list[str]]:
             with locks[name[0]]:
                 return audited(options, helm, name)
 
@@ -274,23 +243,43 @@ def computed(options: argparse.Namespace) -> dict[str, bytes]:
     **Returns:** name -> contents of each file, and of the audit.
     """
     parking, rides, audits = simulated(options)
+    names = ["_".join(name).replace(" ", "_") for name in rides]
+    request = {name: value for name, value in vars(options).items() if name != "out"}
     with status_line("drawing"):
-        paths, drawings = [options.out / "rides.h5"], dict[str, Path]()
-        table(options, rides).save(paths[0])
-        if has_matplotlib():
+        table_of(list(rides.values()), names, request | {"ride": names}).save(options.out / "rides.h5")
+        files, pictures = ["rides.h5"], []
+        if can_draw():
             grounds = {ground: scene.surface for (ground, _), (scene, _) in scenes(options).items()}
-            figures = {"parked.png": draw_plan(parking), "rides.png": draw_rides(grounds, rides)}
-            for name, figure in figures.items():
+            for heading, name, figure in (
+                ("Parking", "parked.png", parking.plot()),
+                ("Paths, speeds, energies, side forces", "rides.png", draw_rides(grounds, rides)),
+            ):
                 figure.savefig(options.out / name, dpi=110)
-            paths += [options.out / name for name in figures]
-            drawings |= zip(("Parking", "Paths, speeds, energies, side forces"), paths[1:], strict=True)
-        paths.append(write_page(options, parking, rides, [HEADING, *audits], drawings))
-    return {AUDIT: "\n".join(audits).encode()} | {path.name: path.read_bytes() for path in paths}
+                files.append(name)
+                pictures.append(f"<h2>{heading}</h2>{picture_as_html(options.out / name)}")
+        audit = "<h2>Energy against work</h2><pre>" + escape("\n".join([HEADING, *audits])) + "</pre>"
+        sections = "".join([*pictures[:1], audit, *pictures[1:]])
+        page = page_of_job(lambda: stages(parking, rides), "A stroller parks, and rides", 1.0, sections)
+        page.save(options.out / PAGE)
+    return {AUDIT: "\n".join(audits).encode()} | {name: (options.out / name).read_bytes() for name in [*files, PAGE]}
 
 
-def has_matplotlib() -> bool:
-    """Whether pictures can be drawn."""
-    return find_spec("matplotlib") is not None
+def write(options: argparse.Namespace) -> Outputs:
+    """Write all files, computed or from an earlier run of the same options, and print the audit."""
+    cache = enable_compilation_cache()
+    facts = "rides", sorted((name, repr(value)) for name, value in vars(options).items() if name != "out")
+    require_folder(options.out, "--out")
+    print(HEADING, flush=True)
+    read = are_kept(cache, facts)
+    files = kept_files(cache, facts, lambda: computed(options))
+    paths = {name: options.out / name for name in files if name != AUDIT}
+    if read:
+        print(files[AUDIT].decode())
+        for name, path in paths.items():
+            with replacing(path) as scratch:
+                scratch.write_bytes(files[name])
+    page = paths.pop(PAGE)
+    return Outputs(2 * len(scenes(options)), list(paths.values()), page, cache if read else None)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -301,30 +290,7 @@ def main(arguments: list[str] | None = None) -> int:
     **Returns:** the exit status: 0, or 2 for input that cannot be used.
     """
     options = parser().parse_args(arguments)
-    cache = enable_compilation_cache()
-    start_time = time.perf_counter()
-    facts = "rides", sorted((name, repr(value)) for name, value in vars(options).items() if name != "out")
-    try:
-        require_folder(options.out, "--out")
-        print(HEADING, flush=True)
-        read = are_kept(cache, facts)
-        files = kept_files(cache, facts, lambda: computed(options))
-        if read:
-            print(files[AUDIT].decode())
-            for name in files.keys() - {AUDIT}:
-                with replacing(options.out / name) as scratch:
-                    scratch.write_bytes(files[name])
-    except (ValueError, OSError) as error:
-        print(f"python -m stroller: {error}", file=sys.stderr)
-        return 2
-    if not has_matplotlib():
-        print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
-    *paths, page_path = (
-        options.out / name for name in ("rides.h5", "parked.png", "rides.png", "index.html") if name in files
-    )
-    see = f"To see it, open {page_path}{'' if can_view() else f'. {NO_VIEW}'}"
-    print(closing_lines(2 * len(scenes(options)), start_time, paths, see, cache if read else None))
-    return 0
+    return run_job(lambda: write(options), "stroller")
 
 
 if __name__ == "__main__":

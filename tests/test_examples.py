@@ -14,7 +14,7 @@ EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
 
 #: What an example must find, as a pattern of its output.
 FINDS = {
-    "a_page": r"Page of \d\.\d\d MB(?s:.*)wrote tops.html, top.gif and curves.png into page-out",
+    "a_page": r"Page of \d\.\d\d MB(?s:.*)wrote tops.html, top.webm and curves.png into page-out",
     "explore_top": r"Page of \d\.\d\d MB",
     "explore_ride": r"Page of \d\.\d\d MB",
     "fastest_top": r"0\.42\d\d, I1 / I3 1\.0\d\d\d: 4\.21\d s, least force 0\.9200 mg\nOf 64 tops around it 0 are faster",

@@ -21,7 +21,7 @@ OPTIONAL = {
     "plot of a table": (lambda: small_table().plot(), "matplotlib", "plot"),
     "a portrait": (lambda: run_of_nothing().portrait(), "matplotlib", "plot"),
     "a plot of a run": (lambda: run_of_nothing().plot(), "matplotlib", "plot"),
-    "an animation": (lambda: run_of_nothing().animate("a.gif"), "matplotlib", "plot"),
+    "a film": (lambda: run_of_nothing().animate("a.webm"), "jupyter_threejs_sage", "view"),
     "a page": (lambda: run_of_nothing().view(), "jupyter_threejs_sage", "view"),
     "draws": (lambda: sample(density_of_a_film()[0], None, None), "blackjax", "bayes"),
 }

@@ -1,6 +1,7 @@
 """Every call that takes long where its programs are new says so: none of them computes here, each only waits."""
 
 import importlib
+import sys
 import time
 from types import SimpleNamespace
 
@@ -57,7 +58,7 @@ CALLS = {
     ),
     "profile": (lambda: Identification.profile(stub("_place"), "x"), None, None),
     "page": (lambda: SlowRun().view(), None, None),
-    "animation": (lambda: SlowRun().animate("a.gif"), None, None),
+    "film": (lambda: SlowRun().animate("a.webm"), None, None),
     "curves": (lambda: SlowRun().plot(), None, None),
     "table of a run": (lambda: AbstractRun.to_table(stub("table_of")), None, None),
     "words on a run": (lambda: AbstractRun.__str__(stub("in_words", t=np.zeros(1), codes=None)), None, None),
@@ -94,6 +95,8 @@ def fitted():
 @pytest.mark.parametrize("name", CALLS)
 def test_a_long_call_says_what_it_does_and_leaves_nothing_behind(name, monkeypatch):
     call, module, function = CALLS[name]
+    # A film needs a browser, which is never started here.
+    monkeypatch.setattr("nonholonomic.views.film.BROWSERS", (sys.executable,))
     if module is not None:
         monkeypatch.setattr(importlib.import_module(module), function, waits)
     terminal = watched(monkeypatch)
@@ -104,7 +107,7 @@ def test_a_long_call_says_what_it_does_and_leaves_nothing_behind(name, monkeypat
 
 
 def test_sampling_says_what_it_does_after_its_last_step(monkeypatch):
-    module = importlib.import_module("nonholonomic.identification.sampling")
+    module = importlib.import_module("nonholonomic.identification.result")
     monkeypatch.setattr(module, "drawn", lambda *_: (np.zeros((4, 2, 1)), 0.5, 1, 0.0))
     monkeypatch.setattr(module.Draws, "of", waits)
     terminal = watched(monkeypatch)

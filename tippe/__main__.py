@@ -5,23 +5,31 @@ import functools
 import json
 import math
 import sys
-import time
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
 from html import escape
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from nonholonomic import __version__
-from nonholonomic.command_line import closing_lines, run_and_exit
+from nonholonomic.command_line import run_and_exit
 from nonholonomic.compilation.cache import are_kept, enable_compilation_cache, kept_files
 from nonholonomic.geometry import Cylinder, Plane
 from nonholonomic.sweeps import AnotherRun, Table, saved_cells
 from nonholonomic.terminal import Progress
 from nonholonomic.validation import replacing, require_folder
-from nonholonomic.views import NO_VIEW, Page, can_view, page, picture_as_html, table_as_html
+from nonholonomic.views import (
+    Outputs,
+    Page,
+    can_draw,
+    page_of_job,
+    picture_as_html,
+    run_job,
+    table_as_html,
+    without_motion,
+)
 from nonholonomic.views.explore import live_page
 
 from . import paper, presets, steady
@@ -31,6 +39,10 @@ from .runs.launches import INVERTED
 from .runs.model import TopModel
 from .runs.verbs import inversion_table
 from .runs.view import Panel, draw_launches, page_of_launch, stage_at_start, theta_over_time
+
+# Only for type checkers: matplotlib is optional.
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TOPS = {top.__name__: top for top in (presets.wooden, presets.rutstam, presets.cohen, presets.leine_glocker)}
 
@@ -42,6 +54,8 @@ SAMPLES, SHOWN = 2048, 5.0
 
 #: The page's title, and the placeholder for the contents below the top.
 TITLE, BELOW = "A tippe top climbs onto its stem", "<!-- below -->"
+
+Times = Float[np.ndarray, " times"]
 
 #: The words for the end of a run, as in the table.
 WORDS = {"not_inverted": "not in time", "contact_lost": "lost contact", "does_not_fit": "no room"}
@@ -118,7 +132,7 @@ def described(options: argparse.Namespace) -> list[str]:
     ]
 
 
-def facts(options: argparse.Namespace, kind: str) -> Any:
+def facts(options: argparse.Namespace, kind: str) -> tuple[str, list[tuple[str, str]]]:
     """Everything that a kind of result depends on, besides these packages."""
     return kind, sorted((name, repr(value)) for name, value in vars(options).items() if name != "out")
 
@@ -163,72 +177,48 @@ def sliders(options: argparse.Namespace) -> str:
     return live_page(page_of_launch(model, None, t1)._replace(title=TITLE), stage_at_start(model, t1), 0.2, BELOW).html
 
 
-def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str, Table], Path | None, str]:
-    """The table of each arena, the picture of the displayed launch if matplotlib is installed, and the page with sliders.
-    Each table is printed as soon as it is computed, that of the plane first.
+def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str, Table], list[Path], str]:
+    """The table of each arena, the picture of the displayed launch if matplotlib is installed, and the page with sliders if
+    three.js is. Each table is printed as soon as it is computed, that of the plane first.
 
     They are computed in parallel, because the compiler uses little more than one core. **Arguments:** `cache`: folder for
     results that later commands with the same options read.
     """
-    times = np.linspace(0.0, min(SHOWN, options.t1), SAMPLES)
-    display, unprinted, reports = Progress(3, "job", "compiling"), list(ARENAS), {}
-
-    def table_of(arena: str) -> Table:
-        result = table(options, arena, cache)
-        # One thread at a time.
-        with display.aside():
-            reports[arena] = report(options, arena, result)
-            while unprinted and unprinted[0] in reports:
-                print(reports[unprinted.pop(0)], flush=True)
-        return result
-
-    def angles() -> dict[str, bytes]:
-        run, axes = (scene(options, "plane"), launch_shown(options)), ("launch.theta", "scene.friction.mu")
-        return {"theta": json.dumps(theta_over_time(*run, times, options.tolerance, axes).tolist()).encode()}
-
-    def on_plane() -> tuple[Table, Path | None]:
-        # Compute the table first, because the picture uses its programs.
-        plane = table_of("plane")
-        if not has_matplotlib():
-            return plane, None
-        theta = json.loads(kept_files(cache, facts(options, "theta"), angles)["theta"])
-        cell = options.theta.index(middle(options.theta)), options.mu.index(middle(options.mu))
-        path = options.out / "theta.png"
-        # Drawn while other threads compile.
-        picture(options, times, np.array(theta), float(plane.time[cell])).savefig(path, dpi=130)
-        return plane, path
-
-    def live() -> str:
-        if not can_view():
-            return ""
-        return kept_files(cache, facts(options, "page"), lambda: {"page": sliders(options).encode()})["page"].decode()
-
-    jobs = (lambda: table_of("cylinder"), on_plane, live)
-    threads = ThreadPoolExecutor(2)
+    threads, display = ThreadPoolExecutor(2), Progress(4, "job", "compiling")
+    tables, pictures, live = {}, [], None
     try:
         with display:
             display.begin()
-            futures: list[Any] = [threads.submit(job) for job in jobs]
-            for future in as_completed(futures):
-                future.result()
+            futures = {arena: threads.submit(table, options, arena, cache) for arena in ("cylinder", "plane")}
+            if not without_motion():
+                page_facts, contents = facts(options, "page"), lambda: {"page": sliders(options).encode()}
+                live = threads.submit(kept_files, cache, page_facts, contents)
+            for arena in ARENAS:
+                tables[arena] = futures[arena].result()
+                with display.aside():
+                    print(report(options, arena, tables[arena]), flush=True)
                 display.advance(1)
+                # Drawn while the threads compile, after the table of the plane, whose programs it uses.
+                if arena == "plane" and can_draw():
+                    pictures.append(options.out / "theta.png")
+                    picture(options, *theta_shown(options, cache), tables["plane"]).savefig(pictures[0], dpi=130)
+                    display.advance(1)
+            return tables, pictures, "" if live is None else live.result()["page"].decode()
     finally:
         # After Ctrl-C, the process ends while the compiler is working, which nothing can interrupt.
         threads.shutdown(wait=False, cancel_futures=True)
-    cylinder, (plane, drawing), html = (future.result() for future in futures)
-    return {"plane": plane, "cylinder": cylinder}, drawing, html
 
 
-def has_matplotlib() -> bool:
-    """Whether pictures can be drawn."""
-    return find_spec("matplotlib") is not None
+def theta_shown(options: argparse.Namespace, cache: Path | None) -> tuple[Times, Times]:
+    """The times [s] of the picture, and theta [rad] of the displayed launch on the plane at these times."""
+    times = np.linspace(0.0, min(SHOWN, options.t1), SAMPLES)
 
+    def angles() -> dict[str, bytes]:
+        axes = ("launch.theta", "scene.friction.mu")
+        theta = theta_over_time(scene(options, "plane"), launch_shown(options), times, options.tolerance, axes)
+        return {"theta": json.dumps(theta.tolist()).encode()}
 
-def saved(options: argparse.Namespace) -> str:
-    """Message after Ctrl-C."""
-    cells = sum(saved_cells(options.out / f"{arena}.h5") for arena in ARENAS)
-    total = len(ARENAS) * len(options.theta) * len(options.mu)
-    return f"saved {cells} of {total} cells to {options.out}; run the same command again to resume"
+    return times, np.array(json.loads(kept_files(cache, facts(options, "theta"), angles)["theta"]))
 
 
 def rows_of(options: argparse.Namespace, table: Table) -> list[list[str]]:
@@ -256,8 +246,9 @@ def report(options: argparse.Namespace, arena: str, table: Table) -> str:
     return "\n".join(["", f"Time until it has turned over, {headings(options)[arena]}", *lines])
 
 
-def picture(options: argparse.Namespace, times: Any, theta: Any, end: float) -> Any:
-    """theta(t) of the displayed launch, which has turned over at `end` [s]."""
+def picture(options: argparse.Namespace, times: Times, theta: Times, plane: Table) -> "Figure":
+    """theta(t) of the displayed launch, with the time at which it has turned over in the table of the plane."""
+    end = float(plane.time[options.theta.index(middle(options.theta)), options.mu.index(middle(options.mu))])
     angle, start = angle_counted(options), f"{options.rpm:g} rpm, θ(0) = {middle(options.theta):g}°"
     title = f"{options.top} top, {start}, mu = {middle(options.mu):g}, on a table"
     if end <= times[-1]:
@@ -271,20 +262,37 @@ def picture(options: argparse.Namespace, times: Any, theta: Any, end: float) -> 
     return draw_launches([panel], angle, f"The dot {dot}")
 
 
-def write_page(options: argparse.Namespace, arenas: dict[str, Table], live: str, drawing: Path | None) -> Path:
-    """Write the page of the main job: the top with sliders if three.js is installed, the tables, and the plot, if
-    any."""
+def write(options: argparse.Namespace) -> Outputs:
+    """Compute and write the tables, the picture and the page: the top with sliders if three.js is installed, the tables, and
+    the picture.
+
+    **Raises:** `ValueError` if the folder holds tables of other options.
+    """
+    cache = enable_compilation_cache()
+    print("\n".join(described(options)), flush=True)
+    require_folder(options.out, "--out")
+    read = all(are_kept(cache, facts(options, arena)) for arena in ARENAS)
+    paths = {arena: options.out / f"{arena}.h5" for arena in ARENAS}
+    try:
+        tables, pictures, live = computed(options, cache)
+    except AnotherRun as error:
+        advice = f"name another folder with --out, or remove {options.out}"
+        raise ValueError(f"{options.out} holds another run: {error.difference}; {advice}") from None
+    except KeyboardInterrupt:
+        cells, total = sum(map(saved_cells, paths.values())), len(ARENAS) * len(options.theta) * len(options.mu)
+        words = f"saved {cells} of {total} cells to {options.out}; run the same command again to resume"
+        raise KeyboardInterrupt(words) from None
+    print(f"\n{remark(options)}", flush=True)
     sections = ""
-    for name, heading in headings(options).items():
-        sections += f"<h2>Time until it has turned over, {heading}</h2>" + table_as_html(
-            rows_of(options, arenas[name]), 1
-        )
+    for arena, heading in headings(options).items():
+        rows = table_as_html(rows_of(options, tables[arena]), 1)
+        sections += f"<h2>Time until it has turned over, {heading}</h2>{rows}"
     sections += "".join(f'<p class="note">{escape(line)}</p>' for line in (remark(options), *described(options)))
-    sections += "" if drawing is None else "<h2>θ(t)</h2>" + picture_as_html(drawing)
+    sections += "".join(f"<h2>θ(t)</h2>{picture_as_html(path)}" for path in pictures)
     path = options.out / "index.html"
-    html = live or page([], TITLE, 1.0, f'<p class="note">{NO_VIEW}</p>', BELOW).html
-    Page(html.replace(BELOW, sections)).save(path)
-    return path
+    Page((live or page_of_job(list, TITLE, 1.0, BELOW).html).replace(BELOW, sections)).save(path)
+    cells = sum(table.status.size for table in tables.values())
+    return Outputs(cells, [*paths.values(), *pictures], path, cache if read else None)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -298,33 +306,7 @@ def main(arguments: list[str] | None = None) -> int:
     if "--paper" in arguments:
         return paper.main([word for word in arguments if word != "--paper"])
     options = parser().parse_args(arguments)
-    cache = enable_compilation_cache()
-    start_time = time.perf_counter()
-    try:
-        print("\n".join(described(options)), flush=True)
-        require_folder(options.out, "--out")
-        read = all(are_kept(cache, facts(options, arena)) for arena in ARENAS)
-        arenas, drawing, live = computed(options, cache)
-        print(f"\n{remark(options)}", flush=True)
-        paths = [options.out / f"{arena}.h5" for arena in arenas]
-        if drawing is None:
-            print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
-        else:
-            paths.append(drawing)
-        path = write_page(options, arenas, live, drawing)
-    except AnotherRun as error:
-        advice = f"name another folder with --out, or remove {options.out}"
-        print(f"python -m tippe: {options.out} holds another run: {error.difference}; {advice}", file=sys.stderr)
-        return 2
-    except (ValueError, OSError) as error:
-        print(f"python -m tippe: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(saved(options)) from None
-    cells = sum(table.status.size for table in arenas.values())
-    see = f"To see the top climb onto its stem, open {path}{'' if can_view() else f'. {NO_VIEW}'}"
-    print(closing_lines(cells, start_time, paths, see, cache if read else None))
-    return 0
+    return run_job(lambda: write(options), "tippe", "To see the top climb onto its stem")
 
 
 if __name__ == "__main__":

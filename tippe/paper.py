@@ -9,11 +9,8 @@ motion are not those of a top (`benchmarks/papers/tippe_audit.py`). The same lau
 
 import argparse
 import math
-import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 from html import escape
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,14 +18,13 @@ import jax
 import numpy as np
 
 from nonholonomic import __version__
-from nonholonomic.command_line import closing_lines
 from nonholonomic.compilation.cache import enable_compilation_cache
 from nonholonomic.compilation.xla_cpu import compiled_quickly
 from nonholonomic.geometry import AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.sweeps import Table
 from nonholonomic.terminal import Progress, status_line
 from nonholonomic.validation import require_folder
-from nonholonomic.views import NO_VIEW, Stage, can_view, page, picture_as_html, table_as_html
+from nonholonomic.views import Outputs, Stage, can_draw, page_of_job, picture_as_html, run_job, table_as_html
 
 from .friction import AbstractFriction, Coulomb, Viscous
 from .model.body import Top
@@ -307,15 +303,22 @@ def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[Sta
     return stages(groups)
 
 
-def write_page(options: argparse.Namespace, by_arena: dict[str, Table], drawing: Path | None) -> Path:
-    """Write the page: two moving tops if three.js is installed, the tables, and the picture if there is one."""
-    sections = "<h2>Inversion times</h2>" + table_as_html(list(map(list, rows_of(options, by_arena))), 2)
-    sections += "".join(f'<p class="note">{escape(line)}</p>' for line in described(options))
-    sections += "" if drawing is None else "<h2>θ(t) of every launch</h2>" + picture_as_html(drawing)
-    note = "" if can_view() else f'<p class="note">{NO_VIEW}</p>'
-    path = options.out / "index.html"
-    page(motions(options, by_arena) if can_view() else [], "A tippe top turns over", 0.5, note, sections).save(path)
-    return path
+def write(options: argparse.Namespace) -> Outputs:
+    """Compute and write the tables, the picture if matplotlib is installed, and the page: two moving tops if three.js is
+    installed, the tables, and the picture."""
+    by_arena = tables(options)
+    print(report(options, by_arena))
+    with status_line("drawing"):
+        files = [options.out / f"{arena}.h5" for arena in by_arena]
+        sections = "<h2>Inversion times</h2>" + table_as_html(list(map(list, rows_of(options, by_arena))), 2)
+        sections += "".join(f'<p class="note">{escape(line)}</p>' for line in described(options))
+        if can_draw():
+            files.append(options.out / "theta.png")
+            picture(options, by_arena).savefig(files[-1], dpi=130)
+            sections += "<h2>θ(t) of every launch</h2>" + picture_as_html(files[-1])
+        path = options.out / "index.html"
+        page_of_job(lambda: motions(options, by_arena), "A tippe top turns over", 0.5, sections).save(path)
+    return Outputs(sum(table.status.size for table in by_arena.values()), files, path)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -327,23 +330,4 @@ def main(arguments: list[str] | None = None) -> int:
     """
     options = parser().parse_args(arguments)
     enable_compilation_cache()
-    start_time = time.perf_counter()
-    try:
-        by_arena = tables(options)
-        print(report(options, by_arena))
-        with status_line("drawing"):
-            paths, drawing = [options.out / f"{arena}.h5" for arena in by_arena], None
-            if find_spec("matplotlib") is None:
-                print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
-            else:
-                drawing = options.out / "theta.png"
-                picture(options, by_arena).savefig(drawing, dpi=130)
-                paths.append(drawing)
-            page_path = write_page(options, by_arena, drawing)
-    except (ValueError, OSError) as error:
-        print(f"python -m tippe --paper: {error}", file=sys.stderr)
-        return 2
-    cells = sum(table.status.size for table in by_arena.values())
-    see = f"To see it, open {page_path}{'' if can_view() else f'. {NO_VIEW}'}"
-    print(closing_lines(cells, start_time, paths, see))
-    return 0
+    return run_job(lambda: write(options), "tippe --paper")

@@ -46,7 +46,7 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _log = logging.getLogger(__name__)
 
 
-def enable_compilation_cache(folder: Any = None) -> Path | None:
+def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
     """Keep compiled programs on disk, where later processes find them. Call this function before the first computation.
     If JAX's `jax_compilation_cache_dir` or an earlier call already chose a folder, that folder is kept unless you pass
     another. In JAX's own folder, programs that compile in less than a second are not stored unless
@@ -195,7 +195,7 @@ def sound(entry: bytes) -> bool:
     return True
 
 
-def kept_files(folder: Path | None, facts: Any, compute: Callable[[], dict[str, bytes]]) -> dict[str, bytes]:
+def kept_files(folder: Path | None, facts: object, compute: Callable[[], dict[str, bytes]]) -> dict[str, bytes]:
     """Files that take seconds to compute, such as a page with sliders, stored beside the compiled programs.
 
     **Arguments:** `folder`: that of `enable_compilation_cache`, or `None` to store nothing; `facts`: an object whose
@@ -221,12 +221,12 @@ def kept_files(folder: Path | None, facts: Any, compute: Callable[[], dict[str, 
     return files
 
 
-def are_kept(folder: Path | None, facts: Any) -> bool:
+def are_kept(folder: Path | None, facts: object) -> bool:
     """Whether `kept_files` has stored the files of these facts."""
     return folder is not None and _place(folder, facts).exists()
 
 
-def _place(folder: Path, facts: Any) -> Path:
+def _place(folder: Path, facts: object) -> Path:
     """The archive of some files."""
     settings: Any = jax.config
     machine = (environment_name(), jax.default_backend(), str(jax.numpy.result_type(float)))

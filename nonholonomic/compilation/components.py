@@ -6,24 +6,23 @@ a separate number: zeros and ones disappear, and repeated expressions are comput
 that is not finite still makes a result NaN.
 """
 
+import abc
 import contextlib
 import functools
-import itertools
 import math
 import operator
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike, PyTree
 
 from ..text import AbstractHeld, is_array, is_numbers, is_users, joined, parted
 from ..validation import is_traced
-from .tracing import spelled_out
-from .xla_cpu import bound, read_program, stored, traced
+from .xla_cpu import Equation, Function, Program, bound, read_program, stored, traced
 
 #: Operations on numbers, element by element.
 BY_ELEMENT = """
@@ -53,15 +52,20 @@ TRANSPARENT = """
 #: A function with more scalar operations than this is left in arrays: it would take long to compile.
 MOST_OPERATIONS = 1500
 
-#: Elements of an array: NumPy constants, or traced numbers, one for all lanes or one per lane.
-Elements = Any
+#: An element of an array; and all of them: in an `Evaluation` NumPy constants, or traced numbers for all lanes or one per lane.
+Element = Any
+Elements = np.ndarray
+
+
+#: For each factor of a product, some of its axes.
+Axes = tuple[Sequence[int], Sequence[int]]
 
 
 class TooLarge(Exception):
     """The function has unsupported operations, or too many operations."""
 
 
-def by_components(function: Callable[..., Any], *shapes: Any) -> Callable[..., Any]:
+def by_components(function: Function, *shapes: PyTree) -> Function:
     """Convert a function of numbers to a function of vectors of lanes.
 
     **Arguments:**
@@ -73,127 +77,179 @@ def by_components(function: Callable[..., Any], *shapes: Any) -> Callable[..., A
     function that is faster with arrays.
     """
 
-    def evaluated(*args: Any) -> Any:
+    def evaluated(*args: PyTree) -> PyTree:
         closed, shape = traced(function, *shapes)
-        leaves, evaluation = [_elements(leaf) for leaf in jax.tree.leaves(args)], Evaluation()
-        results = read_program(closed, leaves, evaluation.apply, _constants)
+        evaluation, leaves = Evaluation(), [np.empty((), object) for _ in jax.tree.leaves(shapes)]
+        for elements, number in zip(leaves, jax.tree.leaves(args), strict=True):
+            elements[()] = number
+        results = evaluation.read(closed, leaves)
         numbers = evaluation.with_hidden([result.item() for result in results])
         return jax.tree.unflatten(jax.tree.structure(shape), [jnp.asarray(number) for number in numbers])
 
     return evaluated
 
 
-def over_lanes(function: Callable[..., Any], numbers: tuple[Array, ...], parts: tuple[Array, ...]) -> Any:
+def over_lanes(function: Function, *arguments: PyTree) -> PyTree:
     """A function of one run, evaluated in every lane.
 
-    **Arguments:** `function`: a function of the numbers and of the components of the state, all scalars; `numbers`: each
-    a scalar or one number per lane; `parts`: the components, one number per lane, or scalars for a single run.
+    **Arguments:** `function`: a function of trees of scalars; `arguments`: the trees, with scalars or one number per lane.
 
-    **Returns:** the results, scalars in place of which each lane has its own.
+    **Returns:** the results, with one number per lane, or scalars if no argument has lanes.
     """
-    shapes = tuple(tuple(jax.ShapeDtypeStruct((), jnp.asarray(x).dtype) for x in xs) for xs in (numbers, parts))
+    leaves, structure = jax.tree.flatten(arguments)
+    kinds = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct((), jnp.result_type(leaf)) for leaf in leaves])
+    shape = np.broadcast_shapes(*map(jnp.shape, leaves))
     with contextlib.suppress(TooLarge):
-        results = by_components(function, *shapes)(numbers, parts)
-        return jax.tree.map(lambda result: jnp.broadcast_to(result, parts[0].shape), results)
-    if parts[0].ndim == 0:
-        return spelled_out(function)(numbers, parts)
-    axes = tuple(0 if jnp.ndim(number) else None for number in numbers)
-    return jax.vmap(spelled_out(function), in_axes=(axes, 0))(numbers, parts)
+        results = by_components(function, *kinds)(*arguments)
+        return jax.tree.map(lambda result: jnp.broadcast_to(result, shape), results)
+
+    def of_run(*numbers: Array) -> tuple[Array, ...]:
+        results = spelled_out(function)(*jax.tree.unflatten(structure, numbers))
+        return tuple(map(jnp.asarray, jax.tree.leaves(results)))
+
+    structure_of_results = jax.tree.structure(jax.eval_shape(function, *kinds))
+    return jax.tree.unflatten(structure_of_results, jnp.vectorize(of_run)(*leaves))
 
 
-def _elements(number: Array) -> Elements:
-    """A number in every lane as an array with a single element."""
-    elements = np.empty((), object)
-    elements[()] = number
-    return elements
+class AbstractScalarReader(abc.ABC):
+    """Reads traced programs number by number: an array is a NumPy array of its elements, which are of any kind.
 
+    Operations that move elements cost nothing. Sums and products become operations on pairs of elements.
+    """
 
-def _constants(array: Any) -> Elements:
-    """The elements of an array that is known, or that is traced outside the function."""
-    elements = np.empty(np.shape(array), object)
-    constants_array = array if is_traced(array) else np.asarray(array)
-    for index in np.ndindex(elements.shape):
-        elements[index] = constants_array[index]
-    return elements
+    @abc.abstractmethod
+    def constants(self, array: ArrayLike) -> Elements:
+        """The elements of an array that is known."""
 
+    @abc.abstractmethod
+    def kind(self, equation: Equation) -> str:
+        """The name of an operation that acts element by element. Raises an error for other operations."""
 
-class Evaluation:
-    """An evaluation of a function: the results so far, by operation and operands."""
+    @abc.abstractmethod
+    def element(self, name: str, *numbers: Element, equation: Equation | None = None) -> Element:
+        """The result of an operation, of this name, on single elements; some operations have parameters in `equation`."""
 
-    def __init__(self):
-        self.computed: dict[Any, Any] = {}
-        # Operands are identified by their address, so all of them must stay in memory.
-        self.kept: list[Any] = []
-        # By address: what may not be finite, what makes a result not finite, and what was multiplied by zero.
-        self.risky: set[int] = set()
-        self.sources: dict[int, list[Any]] = {}
-        self.dropped: list[Any] = []
+    def read(self, program: Program, arguments: Sequence[Elements]) -> list[Elements]:
+        """The results of a program."""
+        return read_program(program, arguments, self.apply, self.constants)
 
-    def apply(self, equation: Any, inputs: list[Elements]) -> list[Elements]:
+    def each(self, name: str, *values: Elements, equation: Equation | None = None) -> Elements:
+        """Apply an operation element by element."""
+        broadcast = np.broadcast_arrays(*values)
+        results = np.empty(broadcast[0].shape, object)
+        for index in np.ndindex(results.shape):
+            results[index] = self.element(name, *(value[index] for value in broadcast), equation=equation)
+        return results
+
+    def apply(self, equation: Equation, inputs: list[Elements]) -> Sequence[Elements]:
         """The results of an equation."""
         name, params = equation.primitive.name, equation.params
-        if name in ("jit", "pjit"):
-            return read_program(params["jaxpr"], inputs, self.apply, _constants)
-        if name in BY_ELEMENT.split():
-            return [self._by_element(equation, inputs)]
-        if name == "optimization_barrier":
-            return inputs
-        if name == "dot_general":
-            left, right = inputs
-            return [self._product(left, right, params["dimension_numbers"])]
-        if name in ("reduce_sum", "reduce_max", "reduce_min"):
-            return [self._reduced(name.removeprefix("reduce_").replace("sum", "add"), inputs[0], params["axes"])]
+        if name in MOVES:
+            return [MOVES[name](equation, *inputs)]
+        if name == "iota":
+            return [self.constants(np.indices(params["shape"])[params["dimension"]].astype(params["dtype"]))]
         if name == "split":
             return np.split(inputs[0], np.cumsum(params["sizes"])[:-1], axis=params["axis"])
         if name == "unstack":
-            axis = params["axis"]
-            # The ellipsis keeps an array, even where a single element is left.
-            return [inputs[0][(slice(None),) * axis + (k, ...)] for k in range(inputs[0].shape[axis])]
-        if name in MOVES:
-            return [MOVES[name](equation, *inputs)]
-        raise TooLarge(name)
+            return rows_along(inputs[0], params["axis"])
+        if name in REDUCTIONS:
+            return [self.reduced(REDUCTIONS[name], inputs[0], params["axes"])]
+        if name == "dot_general":
+            return [self._product(inputs[0], inputs[1], *params["dimension_numbers"])]
+        return [self.each(self.kind(equation), *inputs, equation=equation)]
 
-    def _by_element(self, equation: Any, inputs: list[Elements]) -> Elements:
-        shape = equation.outvars[0].aval.shape
-        results, name = np.empty(shape, object), equation.primitive.name
-        broadcast = [np.broadcast_to(value, shape) for value in inputs]
-        for index in np.ndindex(shape):
-            results[index] = self._number(name, [value[index] for value in broadcast], equation)
-        return results
+    def reduced(self, name: str, elements: Elements, axes: Sequence[int]) -> Elements:
+        """Combine the elements along some axes, one by one."""
+        kept = [size for k, size in enumerate(elements.shape) if k not in axes]
+        if not elements.size:
+            return self.constants(np.zeros(kept))
+        rows = np.moveaxis(elements, axes, range(-len(axes), 0)).reshape(*kept, -1)
+        return functools.reduce(functools.partial(self.each, name), rows_along(rows, -1))
 
-    def _number(self, name: str, operands: list[Any], equation: Any = None) -> Any:
-        """A scalar operation: arithmetic, or the operation of an equation."""
-        simplified = _simplified(name, operands)
+    def _product(self, left: Elements, right: Elements, contracted: Axes, batches: Axes) -> Elements:
+        """The sum over the contracted axes; batch axes come first, then those of the left and those of the right."""
+
+        def factor(value: Elements, summed: Sequence[int], batch: Sequence[int]) -> tuple[Elements, list[list[int]]]:
+            free = [k for k in range(value.ndim) if k not in (*summed, *batch)]
+            shape = [[value.shape[k] for k in axes] for axes in (batch, free, summed)]
+            return np.transpose(value, [*batch, *free, *summed]).reshape([math.prod(part) for part in shape]), shape
+
+        (left, (common, rows, _)), (right, (_, columns, _)) = map(factor, (left, right), contracted, batches)
+        products = self.each("mul", left[:, :, None], right[:, None])
+        return self.reduced("add", products, [3]).reshape([*common, *rows, *columns])
+
+
+def rows_along(elements: Elements, axis: int) -> list[Elements]:
+    """The arrays along an axis."""
+    # The ellipsis keeps an array, even where a single element is left.
+    return [np.moveaxis(elements, axis, 0)[k, ...] for k in range(elements.shape[axis])]
+
+
+class Evaluation(AbstractScalarReader):
+    """An evaluation of a function in lanes: the results so far, by operation and operands."""
+
+    def __init__(self):
+        self.computed: dict[Hashable, Element] = {}
+        # Operands are identified by their address, so all of them must stay in memory.
+        self.kept: list[Element] = []
+        # By address: what may not be finite, what makes a result not finite, and what was multiplied by zero.
+        self.risky: set[int] = set()
+        self.sources: dict[int, Sequence[Element]] = {}
+        self.dropped: list[Element] = []
+
+    def constants(self, array: ArrayLike) -> Elements:
+        # An array may be traced outside the function.
+        constants: Any = array if is_traced(array) else np.asarray(array)
+        elements = np.empty(np.shape(constants), object)
+        for index in np.ndindex(elements.shape):
+            elements[index] = constants[index]
+        return elements
+
+    def apply(self, equation: Equation, inputs: list[Elements]) -> Sequence[Elements]:
+        name = equation.primitive.name
+        if name in ("jit", "pjit"):
+            return self.read(equation.params["jaxpr"], inputs)
+        return inputs if name == "optimization_barrier" else super().apply(equation, inputs)
+
+    def kind(self, equation: Equation) -> str:
+        if equation.primitive.name not in BY_ELEMENT.split():
+            raise TooLarge(equation.primitive.name)
+        return equation.primitive.name
+
+    def element(self, name: str, *numbers: Element, equation: Equation | None = None) -> Element:
+        simplified = _simplified(name, numbers)
         if simplified is not None:
             if name == "mul" and _is_constant(simplified):
-                self.dropped += [operand for operand in operands if id(operand) in self.risky]
+                self.dropped += [number for number in numbers if id(number) in self.risky]
             return simplified
-        if all(map(_is_constant, operands)) and name in ("eq", "ne", "lt", "le", "gt", "ge"):
-            return np.bool_(getattr(operator, name)(*operands))
-        if name == "convert_element_type" and _is_constant(operands[0]):
-            return np.dtype(equation.params["new_dtype"]).type(operands[0])
-        keys = tuple((float(x), str(x.dtype)) if _is_constant(x) else id(x) for x in operands)
-        key = (name, "" if name in FUNCTIONS else str(equation.params), keys)
+        if all(map(_is_constant, numbers)) and name in ("eq", "ne", "lt", "le", "gt", "ge"):
+            return np.bool_(getattr(operator, name)(*numbers))
+        # The operations of sums and products have no parameters.
+        params = {} if equation is None or name in FUNCTIONS else equation.params
+        if name == "convert_element_type" and _is_constant(numbers[0]):
+            return np.dtype(params["new_dtype"]).type(numbers[0])
+        keys = tuple((float(x), str(x.dtype)) if _is_constant(x) else id(x) for x in numbers)
+        key = (name, str(params), keys)
         if key not in self.computed:
             if len(self.computed) > MOST_OPERATIONS:
                 raise TooLarge(name)
-            shape = np.broadcast_shapes(*map(np.shape, operands))
-            operands_of_shape = [jnp.broadcast_to(jnp.asarray(operand), shape) for operand in operands]
-            self.kept += operands
-            bind = (
-                FUNCTIONS[name] if name in FUNCTIONS else functools.partial(equation.primitive.bind, **equation.params)
-            )
-            result = bind(*operands_of_shape)
+            operands = jnp.broadcast_arrays(*numbers)
+            self.kept += numbers
+            if name in FUNCTIONS:
+                result = FUNCTIONS[name](*operands)
+            else:
+                assert equation is not None
+                result = equation.primitive.bind(*operands, **params)
             # Stored together with an operand, because XLA would recompute a result that is stored alone.
-            result = stored(result, operands_of_shape[0])[0] if name in COSTLY.split() else result
-            if _is_risky(name, operands, equation) or any(id(operand) in self.risky for operand in operands):
+            result = stored(result, operands[0])[0] if name in COSTLY.split() else result
+            if _is_risky(name, numbers, params) or any(id(number) in self.risky for number in numbers):
                 self.risky.add(id(result))
             if name in TRANSPARENT.split():
-                self.sources[id(result)] = operands[:1] if name == "div" else operands
+                self.sources[id(result)] = numbers[:1] if name == "div" else numbers
             self.computed[key] = result
         return self.computed[key]
 
-    def with_hidden(self, results: list[Any]) -> list[Any]:
+    def with_hidden(self, results: list[Array]) -> list[Array]:
         """The results. The first result is NaN where zero is multiplied by a factor that is not finite and no result
         shows this. Most such factors are also terms of a result, which is then not finite. The other factors, which are
         rare, are multiplied by zero and added to the first result.
@@ -211,51 +267,21 @@ class Evaluation:
         total = functools.reduce(operator.add, factors.values())
         return [result + 0.0 * total if k == place else result for k, result in enumerate(results)]
 
-    def _sum(self, terms: Iterator[Any], name: str = "add") -> Any:
-        return functools.reduce(lambda total, term: self._number(name, [total, term]), terms)
 
-    def _reduced(self, name: str, elements: Elements, axes: Sequence[int]) -> Elements:
-        kept_axes = [k for k in range(elements.ndim) if k not in axes]
-        rows = np.transpose(elements, (*kept_axes, *axes)).reshape(
-            *(elements.shape[k] for k in kept_axes), math.prod(elements.shape[k] for k in axes)
-        )
-        results = np.empty(rows.shape[:-1], object)
-        for index in np.ndindex(results.shape):
-            results[index] = self._sum(iter(rows[index]), name) if rows.shape[-1] else np.float64(0.0)
-        return results
-
-    def _product(self, left: Elements, right: Elements, dimensions: Any) -> Elements:
-        """The sum over the contracted axes; batch axes come first, then those of the left and those of the right."""
-        (sums, right_sums), (batch, right_batch) = dimensions
-        free = [k for k in range(left.ndim) if k not in (*sums, *batch)]
-        right_free = [k for k in range(right.ndim) if k not in (*right_sums, *right_batch)]
-        shapes = [[left.shape[k] for k in batch], [left.shape[k] for k in free], [right.shape[k] for k in right_free]]
-        # There may be no elements: a system without constraints has empty arrays.
-        count = math.prod(left.shape[k] for k in sums)
-        rows = np.transpose(left, (*batch, *free, *sums)).reshape(*shapes[0], *shapes[1], count)
-        columns = np.transpose(right, (*right_batch, *right_free, *right_sums)).reshape(*shapes[0], *shapes[2], count)
-        results = np.empty([*shapes[0], *shapes[1], *shapes[2]], object)
-        for lane, row, column in itertools.product(*(list(np.ndindex(*shape)) for shape in shapes)):
-            pairs = zip(rows[(*lane, *row)], columns[(*lane, *column)], strict=True)
-            terms = (self._number("mul", list(pair)) for pair in pairs)
-            results[(*lane, *row, *column)] = self._sum(terms) if count else np.float64(0.0)
-        return results
-
-
-def _is_constant(number: Any) -> bool:
+def _is_constant(number: Element) -> bool:
     return isinstance(number, np.generic)
 
 
-def _is_risky(name: str, operands: list[Any], equation: Any) -> bool:
+def _is_risky(name: str, operands: Sequence[Element], params: dict[str, Any]) -> bool:
     """Whether the result of an operation may not be finite though its operands are."""
     if name == "div" and _is_constant(operands[1]):
         return operands[1] == 0.0
     if name == "integer_pow":
-        return equation.params["y"] < 0
+        return params["y"] < 0
     return name in RISKY.split()
 
 
-def _simplified(name: str, operands: list[Any]) -> Any:
+def _simplified(name: str, operands: Sequence[Element]) -> Element | None:
     """The result of an operation that needs no computation; otherwise `None`."""
     if name == "select_n" and _is_constant(operands[0]):
         return operands[1 + int(operands[0])]
@@ -291,11 +317,14 @@ ARITHMETIC = {
     "neg": operator.neg,
 }
 
-#: Operations that make up sums and products.
+#: Operations on pairs of elements, which make up the sums, products and extremes of arrays.
 FUNCTIONS = {"add": jax.lax.add, "mul": jax.lax.mul, "max": jax.lax.max, "min": jax.lax.min}
+FUNCTIONS |= {"and": jax.lax.bitwise_and, "or": jax.lax.bitwise_or}
+REDUCTIONS = {"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min"}
+REDUCTIONS |= {"reduce_and": "and", "reduce_or": "or"}
 
 
-def _broadcast(equation: Any, elements: Elements, *dynamic: Any) -> Elements:
+def _broadcast(equation: Equation, elements: Elements) -> Elements:
     shape, places = equation.params["shape"], equation.params["broadcast_dimensions"]
     inner = [1] * len(shape)
     for axis, place in enumerate(places):
@@ -303,32 +332,28 @@ def _broadcast(equation: Any, elements: Elements, *dynamic: Any) -> Elements:
     return np.broadcast_to(elements.reshape(inner), shape)
 
 
-def _padded(equation: Any, elements: Elements, filling: Elements) -> Elements:
-    widths = equation.params["padding_config"]
-    if any(interior for _, _, interior in widths) or any(width < 0 for width in np.ravel(widths)):
-        raise TooLarge("pad")
+def _padded(equation: Equation, elements: Elements, filling: Elements) -> Elements:
     result = np.full(equation.outvars[0].aval.shape, None, object)
     result.fill(filling.item())
-    result[tuple(slice(low, low + size) for (low, _, _), size in zip(widths, elements.shape, strict=True))] = elements
+    places, kept = [], []
+    for (low, _, interior), size, length in zip(
+        equation.params["padding_config"], elements.shape, result.shape, strict=True
+    ):
+        place = low + (1 + interior) * np.arange(size)
+        kept.append(np.flatnonzero((place >= 0) & (place < length)))
+        places.append(place[kept[-1]])
+    result[np.ix_(*places)] = elements[np.ix_(*kept)]
     return result
 
 
-def _sliced(equation: Any, elements: Elements) -> Elements:
+def _sliced(equation: Equation, elements: Elements) -> Elements:
     params = equation.params
     steps = params["strides"] or (1,) * elements.ndim
     return elements[tuple(map(slice, params["start_indices"], params["limit_indices"], steps))]
 
 
-def _reshaped(equation: Any, elements: Elements) -> Elements:
+def _reshaped(equation: Equation, elements: Elements) -> Elements:
     return elements.reshape(equation.outvars[0].aval.shape)
-
-
-def _counted(equation: Any) -> Elements:
-    params = equation.params
-    indices = np.arange(params["shape"][params["dimension"]]).astype(params["dtype"])
-    axes = [1] * len(params["shape"])
-    axes[params["dimension"]] = -1
-    return _constants(np.broadcast_to(indices.reshape(axes), params["shape"]))
 
 
 #: Operations that move numbers.
@@ -336,7 +361,6 @@ MOVES: dict[str, Callable[..., Elements]] = {
     "broadcast_in_dim": _broadcast,
     "concatenate": lambda equation, *parts: np.concatenate(parts, axis=equation.params["dimension"]),
     "expand_dims": _reshaped,
-    "iota": _counted,
     "pad": _padded,
     "reshape": _reshaped,
     "rev": lambda equation, elements: np.flip(elements, equation.params["dimensions"]),
@@ -347,19 +371,64 @@ MOVES: dict[str, Callable[..., Elements]] = {
 }
 
 
+# Products of small matrices as sums of products of their elements.
+
+#: Products with at most this many terms are written as sums of products, which all of XLA's compilers accept.
+MOST_TERMS = 1 << 12
+
+
+def spelled_out(function: Function) -> Function:
+    """The function with products of small matrices written as sums.
+
+    For a product, XLA calls a library, which costs more than the product and does not fit a single kernel.
+    """
+
+    def evaluated(*args: PyTree) -> PyTree:
+        closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
+        return jax.tree.unflatten(jax.tree.structure(shape), read_program(closed, jax.tree.leaves(args), _spelled_out))
+
+    return evaluated
+
+
+def _spelled_out(equation: Equation, inputs: list[Array]) -> Sequence[Array]:
+    name, params = equation.primitive.name, equation.params
+    if name in ("jit", "pjit"):
+        return read_program(params["jaxpr"], inputs, _spelled_out)
+    if name == "dot_general":
+        (_, right_sums), (_, right_batch) = params["dimension_numbers"]
+        left, right = inputs
+        columns = (size for k, size in enumerate(right.shape) if k not in (*right_sums, *right_batch))
+        if left.size * math.prod(columns) <= MOST_TERMS:
+            return [summed_products(left, right, params["dimension_numbers"])]
+    return bound(equation, inputs)
+
+
+def summed_products(left: Array, right: Array, dimensions: tuple[Axes, Axes], inner: int = 0) -> Array:
+    """The sum over the contracted axes of two arrays; batch axes come first, then those of the left and those of the right,
+    and then `inner` axes that both arrays have at the end."""
+    (sums, right_sums), (batch, right_batch) = dimensions
+    free = [k for k in range(left.ndim - inner) if k not in (*sums, *batch)]
+    right_free = [k for k in range(right.ndim - inner) if k not in (*right_sums, *right_batch)]
+    left = jnp.transpose(left, (*batch, *free, *sums, *range(left.ndim - inner, left.ndim)))
+    right = jnp.transpose(right, (*right_batch, *right_free, *right_sums, *range(right.ndim - inner, right.ndim)))
+    first, middle = len(batch), len(batch) + len(free)
+    left = left.reshape(*left.shape[:middle], *(1 for _ in right_free), *left.shape[middle:])
+    right = right.reshape(*right.shape[:first], *(1 for _ in free), *right.shape[first:])
+    end = middle + len(right_free)
+    return jnp.sum(left * right, axis=tuple(range(end, end + len(sums)))) if sums else left * right
+
+
 # Map a function over the last axis of its arguments, and keep this axis last.
 #
 # `jax.vmap` moves the mapped axis to the front of products and of arrays that are joined. Where the axis counts lanes,
 # compilers vectorise only along the last axis, so this costs up to ten times as much for a function of medium size, such as
 # a network of a thousand weights.
 
-#: Reductions, which name the axes that they remove.
-REDUCTIONS = (
-    "reduce_sum reduce_max reduce_min reduce_prod reduce_and reduce_or argmax argmin cumsum cumprod rev squeeze"
-)
+#: Operations whose parameters do not change with an axis at the end.
+UNCHANGED = (*REDUCTIONS, "argmax", "argmin", "cumsum", "cumprod", "rev", "squeeze", "concatenate", "split", "stack")
 
 
-def over_last_axis(function: Callable[..., Any], *shapes: Any) -> Callable[..., Any]:
+def over_last_axis(function: Function, *shapes: PyTree) -> Function:
     """Map a function over the last axis.
 
     **Arguments:** `function`: function of arrays; `shapes`: shapes of its arguments, as for `jax.eval_shape`.
@@ -369,7 +438,7 @@ def over_last_axis(function: Callable[..., Any], *shapes: Any) -> Callable[..., 
     **Raises:** `TooLarge` for operations that it does not know.
     """
 
-    def mapped(*arguments: Any) -> Any:
+    def mapped(*arguments: PyTree) -> PyTree:
         closed, shape = traced(function, *shapes)
         leaves, expected = jax.tree.leaves(arguments), jax.tree.leaves(shapes)
         size = next(leaf.shape[-1] for leaf, own in zip(leaves, expected, strict=True) if leaf.ndim > own.ndim)
@@ -380,13 +449,13 @@ def over_last_axis(function: Callable[..., Any], *shapes: Any) -> Callable[..., 
     return mapped
 
 
-def _with_axis(value: Any, ndim: int, size: int) -> Array:
+def _with_axis(value: ArrayLike, ndim: int, size: int) -> Array:
     """A value with the mapped axis, which has `ndim` axes of its own."""
     value = jnp.asarray(value)
     return value if value.ndim > ndim else jnp.broadcast_to(value[..., None], (*value.shape, size))
 
 
-def _applied(equation: Any, operands: list[Any], size: int) -> Sequence[Any]:
+def _applied(equation: Equation, operands: list[Array], size: int) -> Sequence[Array]:
     """The results of an equation, with one more axis where an operand has one more."""
     own = [atom.aval.ndim for atom in equation.invars]
     if equation.primitive.name in ("jit", "pjit"):
@@ -398,17 +467,17 @@ def _applied(equation: Any, operands: list[Any], size: int) -> Sequence[Any]:
     return results if isinstance(results, list | tuple) else [results]
 
 
-def _mapped(equation: Any, operands: list[Array], own: list[int], size: int) -> Any:
+def _mapped(equation: Equation, operands: list[Array], own: list[int], size: int) -> Any:
     """An operation on operands with one more axis than `own`."""
     name, params = equation.primitive.name, equation.params
     if name in BY_ELEMENT.split():
         # A scalar may meet an array.
         shape = (*equation.outvars[0].aval.shape, size)
         return equation.primitive.bind(*(jnp.broadcast_to(operand, shape) for operand in operands), **params)
-    if name in REDUCTIONS.split() or name in ("concatenate", "split", "stack"):
+    if name in UNCHANGED:
         return equation.primitive.bind(*operands, **params)
     if name == "dot_general":
-        return _product(operands[0], operands[1], params["dimension_numbers"])
+        return summed_products(operands[0], operands[1], params["dimension_numbers"], inner=1)
     if name == "broadcast_in_dim":
         dimensions = (*params["broadcast_dimensions"], len(params["shape"]))
         return jax.lax.broadcast_in_dim(operands[0], (*params["shape"], size), dimensions)
@@ -424,25 +493,10 @@ def _mapped(equation: Any, operands: list[Array], own: list[int], size: int) -> 
     raise TooLarge(name)
 
 
-def _product(left: Array, right: Array, dimensions: Any) -> Array:
-    """The sum over the contracted axes; batch axes come first, then those of the left and those of the right."""
-    (sums, right_sums), (batch, right_batch) = dimensions
-    free = [k for k in range(left.ndim - 1) if k not in (*sums, *batch)]
-    right_free = [k for k in range(right.ndim - 1) if k not in (*right_sums, *right_batch)]
-    left = jnp.transpose(left, (*batch, *free, *sums, left.ndim - 1))
-    right = jnp.transpose(right, (*right_batch, *right_free, *right_sums, right.ndim - 1))
-    shape, middle = left.shape, len(batch) + len(free)
-    left = left.reshape(*shape[:middle], *(1 for _ in right_free), *shape[middle:])
-    shape = right.shape
-    right = right.reshape(*shape[: len(batch)], *(1 for _ in free), *shape[len(batch) :])
-    first = len(batch) + len(free) + len(right_free)
-    return jnp.sum(left * right, axis=tuple(range(first, first + len(sums))))
-
-
 # Users' objects, such as laws and surfaces, whose methods are written for a single run and evaluated in every lane.
 
 
-def method_over_lanes(method: Callable[..., Any]) -> Callable[..., Any]:
+def method_over_lanes(method: Function) -> Function:
     """A user's method, written for a single run, that also accepts arguments with one number per lane.
 
     Single numbers are passed on as they are, with the object's arrays whole. For arrays of numbers, the method is mapped over
@@ -450,25 +504,17 @@ def method_over_lanes(method: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     @functools.wraps(method)
-    def mapped(self: Any, *arguments: Any) -> Any:
+    def mapped(self: eqx.Module, *arguments: PyTree) -> PyTree:
         own = [leaf for leaf in jax.tree.leaves(self, is_leaf=is_numbers) if is_numbers(leaf)]
         if all(jnp.ndim(leaf) == 0 for leaf in jax.tree.leaves((own, arguments))):
             return method(joined(self), *arguments)
         arrays, static = eqx.partition((self, arguments), is_array)
-        leaves, structure = jax.tree.flatten(arrays)
 
-        def of_run(*numbers: Array) -> Any:
-            whole, arguments = joined(eqx.combine(jax.tree.unflatten(structure, numbers), static))
+        def of_run(arrays: PyTree) -> PyTree:
+            whole, arguments = joined(eqx.combine(arrays, static))
             return jax.tree.map(jnp.asarray, method(whole, *arguments))
 
-        kinds = [jax.ShapeDtypeStruct((), jnp.result_type(leaf)) for leaf in leaves]
-        shape = np.broadcast_shapes(*map(jnp.shape, leaves))
-        with contextlib.suppress(TooLarge):
-            results = by_components(of_run, *kinds)(*leaves)
-            return jax.tree.map(lambda result: jnp.broadcast_to(result, shape), results)
-        structure_of_results = jax.tree.structure(jax.eval_shape(of_run, *kinds))
-        results = jnp.vectorize(lambda *numbers: tuple(jax.tree.leaves(of_run(*numbers))))(*leaves)
-        return jax.tree.unflatten(structure_of_results, results)
+        return over_lanes(of_run, arrays)
 
     return mapped
 
@@ -483,7 +529,7 @@ def map_methods(kind: type, names: Sequence[str]) -> None:
         kind.bounds = functools.wraps(bounds)(lambda self: bounds(joined(self)))
 
 
-def held(value: Any, evaluate: Callable[[Any], Any]) -> Any:
+def held(value: Any, evaluate: Function) -> Any:
     """A user's object with `Numbers` in place of its arrays if these hold the numbers of a single run. Arrays with one
     number per lane stay as they are, and so do these packages' own objects.
 
@@ -506,8 +552,8 @@ class Held(AbstractHeld):
     `function` is the module with `Numbers` in place of its arrays: each number is a leaf.
     """
 
-    function: Any
+    function: Function
 
     @method_over_lanes
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: PyTree) -> PyTree:
         return self.function(*arguments)

@@ -1,8 +1,7 @@
-"""Trace a user's functions: on which arguments they depend, of which operations they consist, and when they jump."""
+"""Read traced functions: on which arguments they depend, of which operations they consist, when they jump, and their bounds."""
 
 import contextlib
 import functools
-import math
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -10,13 +9,23 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
-from jaxtyping import Array, Float
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var, jaxpr_as_fun
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from ..validation import UNTRACEABLE, is_traced, warn
-from .xla_cpu import bound, called_program, operations, read_program, traced
-
-# Trace a user's functions to find the arguments on which they depend, and the operations of which they consist.
+from .xla_cpu import (
+    Equation,
+    Function,
+    Program,
+    bound,
+    called_program,
+    opened,
+    operations,
+    programs_in,
+    programs_of,
+    read_program,
+    traced,
+)
 
 #: Operations that XLA compiles into a single kernel on a CPU, forwards and backwards. A function with other operations,
 #: such as LAPACK calls, scatters and sorts, is not compiled into a single kernel.
@@ -29,53 +38,11 @@ ELEMENTARY = """
     squeeze stack stop_gradient sub tan tanh transpose unstack xor zeros_like
 """
 
-#: Products with at most this many terms are written as sums of products, which all of XLA's compilers accept.
-MOST_TERMS = 1 << 12
 
-
-def spelled_out(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function with products of small matrices written as sums.
-
-    For a product, XLA calls a library, which costs more than the product and does not fit a single kernel.
-    """
-
-    def evaluated(*args: Any) -> Any:
-        closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
-        return jax.tree.unflatten(jax.tree.structure(shape), read_program(closed, jax.tree.leaves(args), _spelled_out))
-
-    return evaluated
-
-
-def _spelled_out(equation: Any, inputs: list[Any]) -> Sequence[Any]:
-    name, params = equation.primitive.name, equation.params
-    if name == "dot_general":
-        left, right = inputs
-        return [_product(left, right, params["dimension_numbers"])]
-    return read_program(params["jaxpr"], inputs, _spelled_out) if name in ("jit", "pjit") else bound(equation, inputs)
-
-
-def _product(left: Array, right: Array, dimensions: Any) -> Array:
-    """The sum over the contracted axes; batch axes come first, then those of the left and those of the right."""
-    (sums, right_sums), (batch, right_batch) = dimensions
-    free = [k for k in range(left.ndim) if k not in (*sums, *batch)]
-    right_free = [k for k in range(right.ndim) if k not in (*right_sums, *right_batch)]
-    terms = math.prod(left.shape) * math.prod(right.shape[k] for k in right_free)
-    if terms > MOST_TERMS:
-        return jax.lax.dot_general(left, right, dimensions)
-    left_factor = jnp.transpose(left, (*batch, *free, *sums))
-    right_factor = jnp.transpose(right, (*right_batch, *right_free, *right_sums))
-    shape = [left.shape[k] for k in batch], [left.shape[k] for k in free], [right.shape[k] for k in right_free]
-    contracted = [left.shape[k] for k in sums]
-    left_factor = left_factor.reshape(*shape[0], *shape[1], *(1 for _ in shape[2]), *contracted)
-    right_factor = right_factor.reshape(*shape[0], *(1 for _ in shape[1]), *shape[2], *contracted)
-    products = left_factor * right_factor
-    return jnp.sum(products, axis=tuple(range(-len(contracted), 0))) if contracted else products
-
-
-def is_elementary(function: Callable[..., Any], *args: Any) -> bool:
+def is_elementary(function: Function, *args: PyTree) -> bool:
     """Whether a function and its derivatives consist of operations that fit a single kernel."""
 
-    def pulled_back(*args: Any) -> Any:
+    def pulled_back(*args: PyTree) -> PyTree:
         values, pull = jax.vjp(function, *args)
         return pull(jax.tree.map(jnp.ones_like, values))
 
@@ -87,25 +54,23 @@ def is_elementary(function: Callable[..., Any], *args: Any) -> bool:
     return operations(program) <= set(ELEMENTARY.split())
 
 
-def depends_on_first(function: Callable[..., Any], first: Any, *args: Any) -> bool:
+def depends_on_first(function: Function, first: PyTree, *args: PyTree) -> bool:
     """Whether a function's results depend on its first argument, a number."""
     closed = jax.make_jaxpr(function)(first, *args)
     return any(_reached(closed, [k == 0 for k in range(len(closed.in_avals))]))
 
 
-def dependent_outputs(function: Callable[..., Any], *args: Any) -> list[bool]:
+def dependent_outputs(function: Function, *args: PyTree) -> list[bool]:
     """A mask of the function's results that depend on its arguments."""
     closed = jax.make_jaxpr(function)(*args)
     return _reached(closed, [True] * len(closed.in_avals))
 
 
-def _reached(program: Any, inputs: Sequence[bool]) -> list[bool]:
+def _reached(program: Program, inputs: Sequence[bool]) -> list[bool]:
     """Which results depend on the inputs that are true in a mask."""
-
-    def is_reached(equation: Any, operands: list[bool]) -> list[bool]:
-        return [any(operands)] * len(equation.outvars)
-
-    return read_program(program, inputs, is_reached, known=lambda _: False)
+    return read_program(
+        program, inputs, lambda equation, reached: [any(reached)] * len(equation.outvars), lambda _: False
+    )
 
 
 @contextlib.contextmanager
@@ -120,7 +85,7 @@ def named_errors(function: str, arguments: str) -> Iterator[None]:
         raise ValueError(f"{function} raised {problem}; its arguments are {arguments}") from error
 
 
-def with_own_numbers(event: Callable[..., Any], *args: Any) -> Callable[..., Any]:
+def with_own_numbers(event: Function, *args: PyTree) -> Function:
     """The event itself or, if it closes over traced numbers (such as those of an enclosing `jax.grad`), a module that
     contains these numbers. An event without numbers of its own has `TracedFunction`s in place of its functions."""
     closed, shape = jax.make_jaxpr(event, return_shape=True)(*args)
@@ -129,7 +94,7 @@ def with_own_numbers(event: Callable[..., Any], *args: Any) -> Callable[..., Any
         inputs = [*closed.jaxpr.constvars, *closed.jaxpr.invars]
         program = ClosedJaxpr(closed.jaxpr.replace(constvars=[], invars=inputs), ())
 
-        def evaluated(*args: Any) -> Any:
+        def evaluated(*args: PyTree) -> PyTree:
             results = jaxpr_as_fun(program)(*jax.tree.leaves(args))
             return jax.tree.unflatten(jax.tree.structure(shape), results)
 
@@ -145,7 +110,7 @@ class _WithConstants(eqx.Module):
     consts: list[Array]
     function: "TracedFunction"
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: PyTree) -> PyTree:
         return self.function(self.consts, *args)
 
 
@@ -157,39 +122,39 @@ class TracedFunction:
     **Arguments:** `program`: the traced function, or what calls it.
     """
 
-    def __init__(self, function: Callable[..., Any], program: Any):
+    def __init__(self, function: Function, program: Program):
         functools.update_wrapper(self, function, updated=())
         self.function = function
         # Objects without a value of their own are compared by their address, so they must stay in memory.
         self.program = program
         self.key = _comparable(program)
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: PyTree) -> PyTree:
         return self.function(*args)
 
-    def __eq__(self, other: Any) -> bool:
+    def __eq__(self, other: object) -> bool:
         return isinstance(other, TracedFunction) and self.key == other.key
 
     def __hash__(self) -> int:
         return hash(self.key)
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> tuple[Function, tuple[Function]]:
         # A program cannot be pickled, but the function may be.
         return _itself, (self.function,)
 
 
-def _itself(function: Callable[..., Any]) -> Callable[..., Any]:
+def _itself(function: Function) -> Function:
     return function
 
 
-def _comparable(value: Any) -> Hashable:
+def _comparable(value: object) -> Hashable:
     """A part of a program in a form that is equal for programs with the same operations and constants."""
     if isinstance(value, ClosedJaxpr) and value.jaxpr is not value:
         return _comparable(value.jaxpr), _comparable(value.consts)
     if isinstance(value, Jaxpr):
-        numbers: dict[Any, int] = {}
+        numbers: dict[Var, int] = {}
 
-        def named(variables: Sequence[Any]) -> tuple[Hashable, ...]:
+        def named(variables: Sequence[Var | Literal]) -> tuple[Hashable, ...]:
             return tuple(
                 (str(variable.aval), _comparable(np.asarray(variable.val)))
                 if isinstance(variable, Literal)
@@ -209,16 +174,14 @@ def _comparable(value: Any) -> Hashable:
         return tuple(map(_comparable, value))
     if isinstance(value, jax.Array | np.ndarray | np.generic):
         return np.shape(value), str(value.dtype), np.asarray(value).tobytes()
-    # Numbers by their bytes: 0.0 equals -0.0, and True equals 1.
-    return (type(value), repr(value)) if isinstance(value, int | float) else value if _hashable(value) else id(value)
-
-
-def _hashable(value: Any) -> bool:
-    try:
+    if isinstance(value, int | float):
+        # 0.0 equals -0.0, and True equals 1.
+        return type(value), repr(value)
+    # A tuple with a list in it has a hash function, but no hash.
+    with contextlib.suppress(TypeError):
         hash(value)
-    except TypeError:
-        return False
-    return True
+        return value
+    return id(value)
 
 
 # Find the times at which a user's function of time jumps or has a kink, by reading its jaxpr.
@@ -249,6 +212,8 @@ class Other(NamedTuple):
     depends_on_time: bool
 
 
+Kind = Known | Affine | Other
+
 #: Operations that move elements or change nothing: applied to slope and offset alike.
 LINEAR = ["broadcast_in_dim", "reshape", "squeeze", "expand_dims", "slice", "transpose", "rev", "reduce_sum", "neg"]
 LINEAR += ["copy", "copy_p", "stop_gradient", "optimization_barrier"]
@@ -260,7 +225,7 @@ STAIRS = ["floor", "ceil", "round"]
 SMOOTH = ["sinc"]
 
 
-def jumps_of(function: Callable[..., Any], t: Any, *others: Any) -> tuple[Float[Array, " jumps"], tuple[str, ...]]:
+def jumps_of(function: Function, t: PyTree, *others: PyTree) -> tuple[Float[Array, " jumps"], tuple[str, ...]]:
     """The times at which a function of time and of other arguments may jump or have a kink.
 
     **Arguments:** the function, and examples of its arguments; the numbers that it closes over may be traced.
@@ -284,7 +249,7 @@ def jumps_of(function: Callable[..., Any], t: Any, *others: Any) -> tuple[Float[
 
 
 def in_cells(
-    times_of: Callable[[Any], Float[Array, " jumps"]], numbers: Any, shape: tuple[int, ...]
+    times_of: Callable[[PyTree], Float[Array, " jumps"]], numbers: PyTree, shape: tuple[int, ...]
 ) -> Float[Array, "jumps *cells"] | None:
     """Times that follow from the numbers of a run, for all cells; `None` if there are no times.
 
@@ -298,12 +263,12 @@ def in_cells(
     return jnp.stack(rows) if rows else None
 
 
-def warn_of_unclear(name: str, function: Callable[..., Any], *others: Any, remedy: str = "") -> None:
+def warn_of_unclear(name: str, function: Function, *others: PyTree, remedy: str = "") -> None:
     """Warn if a function of time compares something whose times are unknown. **Arguments:** `name`: the function, such as
     "input(t, motion)"; `others`: examples of its arguments after the time; `remedy`: what else the user can do."""
     unclear: list[str] = []
 
-    def times(*others: Any) -> Array:
+    def times(*others: PyTree) -> Array:
         times, names = jumps_of(function, jnp.zeros(()), *others)
         unclear.extend(names)
         return times
@@ -319,18 +284,19 @@ def warn_of_unclear(name: str, function: Callable[..., Any], *others: Any, remed
 class _Reader(NamedTuple):
     """The times found so far, and the comparisons whose times cannot be found, as the keys of a dictionary."""
 
-    times: list[Any]
+    times: list[Array]
     unclear: dict[str, None]
 
-    def read(self, program: Any, inputs: Sequence[Any]) -> list[Any]:
+    def read(self, program: Program, inputs: Sequence[Kind]) -> list[Kind]:
         """The kinds of the results of a program."""
         return read_program(program, inputs, self.apply, Known)
 
-    def apply(self, equation: Any, inputs: list[Any]) -> list[Any]:
+    def apply(self, equation: Equation, inputs: list[Any]) -> Sequence[Kind]:
         """The kinds of the results of an equation."""
         name, parameters, count = equation.primitive.name, equation.params, len(equation.outvars)
-        if all(isinstance(kind, Known) for kind in inputs):
-            return list(map(Known, bound(equation, [kind.value for kind in inputs])))
+        values = [kind.value for kind in inputs if isinstance(kind, Known)]
+        if len(values) == len(inputs):
+            return list(map(Known, bound(equation, values)))
         depends = any(map(_depends, inputs))
         if parameters.get("name") in SMOOTH:
             return [Other(depends)] * count
@@ -340,7 +306,7 @@ class _Reader(NamedTuple):
             branches = [self.read(branch, inputs[1:]) for branch in parameters["branches"]]
             return [Other(any(map(_depends, (inputs[0], *kinds)))) for kinds in zip(*branches, strict=True)]
         if name in ("while", "scan"):
-            if depends and any(_compares(part) for part in parameters.values()):
+            if depends and any(map(_compares, programs_of(equation))):
                 self.unclear[name] = None
             return [Other(depends)] * count
         if (inner := called_program(equation)) is not None:
@@ -364,7 +330,7 @@ class _Reader(NamedTuple):
             return [moving[0]._replace(bent=True) if is_bent else Other(True)]
         return [_affine(name, equation, inputs) or Other(True)] * count
 
-    def compared(self, name: str, inputs: Sequence[Any]) -> Other:
+    def compared(self, name: str, inputs: Sequence[Kind]) -> Other:
         """A comparison, which is constant between its jumps."""
         # Where two values are equal at an instant only, nothing jumps.
         if not self.solve(inputs) and name not in ("eq", "ne"):
@@ -384,7 +350,7 @@ class _Reader(NamedTuple):
         return True
 
 
-def _affine(name: str, equation: Any, inputs: Sequence[Any]) -> Affine | None:
+def _affine(name: str, equation: Equation, inputs: Sequence[Any]) -> Affine | None:
     """The result of an operation that keeps values affine."""
     if name in LINEAR and len(inputs) == 1:
         bind, parameters = equation.primitive.bind, equation.params
@@ -417,16 +383,314 @@ def _parts(kind: Known | Affine) -> tuple[Any, Any]:
     return kind[:2] if isinstance(kind, Affine) else (0.0, kind.value)
 
 
-def _depends(kind: Any) -> bool:
+def _depends(kind: Kind) -> bool:
     """Whether a value depends on the time other than by jumps that were found."""
     return isinstance(kind, Affine) or (isinstance(kind, Other) and kind.depends_on_time)
 
 
-def _compares(part: Any) -> bool:
-    """Whether a jaxpr compares real numbers."""
-    jaxpr = getattr(part, "jaxpr", part)
-    return hasattr(jaxpr, "eqns") and any(
-        (equation.primitive.name in COMPARISONS and jnp.issubdtype(equation.invars[0].aval.dtype, jnp.inexact))
-        or any(_compares(inner) for inner in equation.params.values())
-        for equation in jaxpr.eqns
-    )
+def _compares(program: Program) -> bool:
+    """Whether a program compares real numbers."""
+    equations: list[Equation] = [equation for inner in programs_in(program) for equation in opened(inner)[0].eqns]
+    comparisons = (equation for equation in equations if equation.primitive.name in COMPARISONS)
+    return any(jnp.issubdtype(equation.invars[0].aval.dtype, jnp.inexact) for equation in comparisons)
+
+
+# Bounds of a function over boxes of its arguments: interval arithmetic on traced operations.
+#
+# The bounds hold up to round-off. They are those of natural interval extension (Moore, Kearfott and Cloud, Introduction to
+# Interval Analysis, SIAM, 2009): exact for a single operation, and too wide where a variable occurs more than once, in
+# proportion to the width of the box.
+
+
+class Bounds(NamedTuple):
+    """Lower and upper bounds of an array, element by element; of truth values, whether they must and may hold."""
+
+    low: Array
+    high: Array
+
+
+class UnboundedError(Exception):
+    """The function has an operation for which there is no rule."""
+
+
+#: Operations that grow with every operand, and those that only move numbers.
+GROWING = """
+    add add_any and asinh atan broadcast_in_dim cbrt ceil clamp concatenate convert_element_type copy copy_p cummax cummin
+    cumsum erf exp exp2 expand_dims expm1 floor full iota log log1p log2 logistic max min optimization_barrier or pad
+    reduce_and reduce_max reduce_min reduce_or reduce_sum reshape rev round sign sinh slice split squeeze stack
+    stop_gradient tanh transpose unstack
+"""
+
+#: Operations that call another traced function; and operations that jump, from one whole number to another.
+CALLS = "closed_call core_call custom_jvp_call custom_vjp_call jit pjit"
+STEPPING = ["ceil", "convert_element_type", "floor", "round", "sign"]
+
+
+class Enclosure(NamedTuple):
+    """The bounds of a function's results over boxes; and where in the boxes the function may jump: the truth values, of any
+    shape, of the comparisons and roundings on the way that are not the same all over a box."""
+
+    results: PyTree
+    leaps: list[Bool[Array, "..."]]
+
+
+def enclosing(function: Function, *shapes: PyTree, loose: bool = False) -> Callable[..., Enclosure]:
+    """The bounds of a function's results over boxes.
+
+    **Arguments:** `function`: a function of arrays; `shapes`: their shapes and types, as for `jax.eval_shape`; `loose`:
+    whether an operation without a rule may have any result.
+
+    **Returns:** a function of `Bounds`, one for each array, that returns an `Enclosure`, with `Bounds` in place of the
+    results. It raises `UnboundedError` if the function has an operation that has no rule.
+
+    **Example:**
+
+    >>> from nonholonomic.compilation.tracing import Bounds, enclosing
+    >>> square = enclosing(lambda x: jnp.cos(x) + x * x, jnp.zeros(()))
+    >>> print(*square(Bounds(jnp.asarray(-1.0), jnp.asarray(2.0))).results)
+    -0.41614683654714235 5.0
+    """
+    program, shape = traced(function, *shapes)
+
+    def enclosed(*boxes: Bounds) -> Enclosure:
+        leaps: list[Array] = []
+        results = _enclosed(program, boxes, leaps, loose)
+        return Enclosure(jax.tree.unflatten(jax.tree.structure(shape), results), leaps)
+
+    return enclosed
+
+
+def _enclosed(program: Program, boxes: Sequence[Bounds], leaps: list[Array], loose: bool) -> list[Bounds]:
+    apply = functools.partial(_applied, leaps=leaps, loose=loose)
+    return read_program(program, boxes, apply, known=_exactly)
+
+
+def _exactly(number: ArrayLike) -> Bounds:
+    """The bounds of a number that is known."""
+    return Bounds(jnp.asarray(number), jnp.asarray(number))
+
+
+def _applied(equation: Equation, boxes: list[Bounds], leaps: list[Array], loose: bool) -> list[Bounds]:
+    """The bounds of the results of an operation."""
+    name = equation.primitive.name
+    try:
+        results = _bounded(equation, boxes, leaps, loose)
+    except UnboundedError:
+        if not loose:
+            raise
+        return [_anything(variable.aval) for variable in equation.outvars]
+    if name == "atan2":
+        leaps.append(_contains(boxes[0]) & (boxes[1].low <= 0.0))
+    elif name == "rem":
+        turns = _quotient(*boxes)
+        leaps.append(jnp.trunc(turns.low) != jnp.trunc(turns.high))
+    elif name in (*COMPARISONS, *STEPPING) and not jnp.issubdtype(boxes[0].low.dtype, bool):
+        is_cast = name == "convert_element_type" and jnp.issubdtype(equation.params["new_dtype"], jnp.inexact)
+        leaps += [] if is_cast else [box.low != box.high for box in results]
+    return results
+
+
+def _anything(aval: Any) -> Bounds:
+    if jnp.issubdtype(aval.dtype, jnp.floating):
+        least, most = -jnp.inf, jnp.inf
+    else:
+        is_truth = jnp.issubdtype(aval.dtype, bool)
+        least, most = (False, True) if is_truth else (jnp.iinfo(aval.dtype).min, jnp.iinfo(aval.dtype).max)
+    return Bounds(jnp.full(aval.shape, least, aval.dtype), jnp.full(aval.shape, most, aval.dtype))
+
+
+def _bounded(equation: Equation, boxes: list[Bounds], leaps: list[Array], loose: bool) -> list[Bounds]:
+    name, same = equation.primitive.name, len(boxes) == 2 and equation.invars[0] is equation.invars[1]
+    if name in CALLS.split() and (program := called_program(equation)) is not None:
+        return _enclosed(program, boxes, leaps, loose)
+    if name in GROWING.split():
+        lows, highs = (
+            (bound(equation, ends) for ends in zip(*boxes, strict=True)) if boxes else 2 * [bound(equation, [])]
+        )
+        return list(map(Bounds, lows, highs))
+    if name == "mul" and same:
+        return [_even(boxes[0], jnp.square)]
+    if name in COMPARISONS and same:
+        # Asks whether this is a number.
+        return [_exactly(jnp.full(boxes[0].low.shape, name in ("eq", "ge", "le")))]
+    if name == "integer_pow":
+        return [_integer_power(equation.params["y"], *boxes)]
+    if name == "reduce_prod":
+        return [_product_along(equation.params["axes"], *boxes)]
+    if name == "dot_general":
+        return [_contracted(equation, *boxes)]
+    if name == "sort" and len(boxes) == 1:
+        return [Bounds(*(bound(equation, [end])[0] for end in boxes[0]))]
+    if name == "scan":
+        return _repeated(equation, boxes, leaps, loose)
+    if name not in RULES or (name in ("div", "rem") and jnp.issubdtype(boxes[0].low.dtype, jnp.integer)):
+        raise UnboundedError(name)
+    return [RULES[name](*boxes)]
+
+
+def _hull(*corners: Array) -> Bounds:
+    return Bounds(functools.reduce(jnp.minimum, corners), functools.reduce(jnp.maximum, corners))
+
+
+def _product(a: Bounds, b: Bounds) -> Bounds:
+    return _hull(a.low * b.low, a.low * b.high, a.high * b.low, a.high * b.high)
+
+
+def _contains(box: Bounds, number: float = 0.0) -> Array:
+    return (box.low <= number) & (box.high >= number)
+
+
+def _everything_where(unknown: Array, box: Bounds) -> Bounds:
+    return Bounds(jnp.where(unknown, -jnp.inf, box.low), jnp.where(unknown, jnp.inf, box.high))
+
+
+def _quotient(a: Bounds, b: Bounds) -> Bounds:
+    zero = _contains(b)
+    low, high = jnp.where(zero, 1.0, b.low), jnp.where(zero, 1.0, b.high)
+    return _everything_where(zero, _product(a, Bounds(1.0 / high, 1.0 / low)))
+
+
+def _even(box: Bounds, function: Callable[[Array], Array]) -> Bounds:
+    """Bounds of a function that is even and grows with the distance from zero."""
+    nearest = jnp.where(_contains(box), 0.0, jnp.minimum(jnp.abs(box.low), jnp.abs(box.high)))
+    return Bounds(function(nearest), function(jnp.maximum(jnp.abs(box.low), jnp.abs(box.high))))
+
+
+def _integer_power(power: int, box: Bounds) -> Bounds:
+    if power < 0:
+        return _quotient(_exactly(jnp.ones_like(box.low)), _integer_power(-power, box))
+
+    def raised(x: Array) -> Array:
+        return jax.lax.integer_pow(x, power)
+
+    return Bounds(raised(box.low), raised(box.high)) if power % 2 else _even(box, raised)
+
+
+def _power(base: Bounds, exponent: Bounds) -> Bounds:
+    safe = Bounds(jnp.where(base.low > 0.0, base.low, 1.0), jnp.where(base.low > 0.0, base.high, 1.0))
+    corners = (x**y for x in safe for y in exponent)
+    return _everything_where(~(base.low > 0.0), _hull(*corners))
+
+
+def _cosine(box: Bounds) -> Bounds:
+    turns = 2.0 * jnp.pi
+    has_top = jnp.floor(box.high / turns) >= jnp.ceil(box.low / turns)
+    has_bottom = jnp.floor(box.high / turns - 0.5) >= jnp.ceil(box.low / turns - 0.5)
+    ends = _hull(jnp.cos(box.low), jnp.cos(box.high))
+    return Bounds(jnp.where(has_bottom, -1.0, ends.low), jnp.where(has_top, 1.0, ends.high))
+
+
+def _tangent(box: Bounds) -> Bounds:
+    has_pole = jnp.floor(box.high / jnp.pi - 0.5) >= jnp.ceil(box.low / jnp.pi - 0.5)
+    return _everything_where(has_pole, Bounds(jnp.tan(box.low), jnp.tan(box.high)))
+
+
+def _angle(y: Bounds, x: Bounds) -> Bounds:
+    """Bounds of atan2, which jumps where y passes zero and x is negative."""
+    ends = _hull(*(jnp.arctan2(a, b) for a in y for b in x))
+    jumps = _contains(y) & (x.low <= 0.0)
+    return Bounds(jnp.where(jumps, -jnp.pi, ends.low), jnp.where(jumps, jnp.pi, ends.high))
+
+
+def _selected(which: Bounds, *cases: Bounds) -> Bounds:
+    known, either = which.low == which.high, _hull(*(end for case in cases for end in case))
+    ends = (jax.lax.select_n(which.low, *case_ends) for case_ends in zip(*cases, strict=True))
+    return Bounds(*(jnp.where(known, end, hull) for end, hull in zip(ends, either, strict=True)))
+
+
+def _remainder(x: Bounds, divisor: Bounds) -> Bounds:
+    """Bounds of the remainder with the sign of x, which jumps where the whole part of the quotient changes."""
+    turns = _quotient(x, divisor)
+    known = jnp.isfinite(turns.low) & (jnp.trunc(turns.low) == jnp.trunc(turns.high))
+    ends = _hull(*(x_end - jnp.trunc(turns.low) * end for x_end in x for end in divisor))
+    most = jnp.maximum(jnp.abs(divisor.low), jnp.abs(divisor.high))
+    low, high = jnp.where(x.low < 0.0, -most, 0.0), jnp.where(x.high > 0.0, most, 0.0)
+    return Bounds(jnp.where(known, ends.low, low), jnp.where(known, ends.high, high))
+
+
+def _polynomial(x: Bounds, *coefficients: Bounds) -> Bounds:
+    value = _exactly(jnp.zeros_like(x.low))
+    for part in reversed(coefficients):
+        product = _product(value, x)
+        value = Bounds(product.low + part.low, product.high + part.high)
+    return value
+
+
+def _product_along(axes: tuple[int, ...], box: Bounds) -> Bounds:
+    for axis in sorted(axes, reverse=True):
+        factors = [Bounds(*(jnp.take(end, k, axis) for end in box)) for k in range(box.low.shape[axis])]
+        box = functools.reduce(_product, factors)
+    return box
+
+
+def _contracted(equation: Equation, a: Bounds, b: Bounds) -> Bounds:
+    """Bounds of a product of matrices, from the middle and the half width of each element."""
+
+    def product(left: Array, right: Array) -> Array:
+        return bound(equation, [left, right])[0]
+
+    (middle, width), (other, other_width) = (((box.low + box.high) / 2.0, (box.high - box.low) / 2.0) for box in (a, b))
+    reach = product(jnp.abs(middle), other_width) + product(width, jnp.abs(other)) + product(width, other_width)
+    value = product(middle, other)
+    return Bounds(value - reach, value + reach)
+
+
+def _repeated(equation: Equation, boxes: list[Bounds], leaps: list[Array], loose: bool) -> list[Bounds]:
+    """Bounds of the results of a loop with a known number of rounds."""
+    program, counts = equation.params["jaxpr"], equation.params
+    fixed, carried = counts.get("num_consts", 0), counts.get("num_carry", 0)
+    if "ft_in" in counts:  # jax 0.11 and later
+        fixed, carried, _ = map(len, counts["ft_in"].unpack())
+    constants, start, rows = boxes[:fixed], boxes[fixed : fixed + carried], boxes[fixed + carried :]
+
+    def round_of(carry: list[Bounds], row: list[Bounds]) -> tuple[list[Bounds], tuple[list[Bounds], list[Array]]]:
+        own: list[Array] = []
+        results = _enclosed(program, [*constants, *carry, *row], own, loose)
+        return results[:carried], (results[carried:], own)
+
+    options = {"length": equation.params["length"], "reverse": equation.params["reverse"]}
+    start = [Bounds(*map(jnp.asarray, box)) for box in start]
+    ends, (stacked, own) = jax.lax.scan(round_of, start, rows, **options)
+    leaps += [jnp.any(leap, axis=0) for leap in own]
+    return [*ends, *stacked]
+
+
+def _equal(a: Bounds, b: Bounds) -> Bounds:
+    return Bounds((a.low == b.high) & (a.high == b.low), (a.low <= b.high) & (a.high >= b.low))
+
+
+def _opposite(box: Bounds) -> Bounds:
+    return Bounds(~box.high, ~box.low)
+
+
+RULES: dict[str, Callable[..., Bounds]] = {
+    "abs": lambda box: _even(box, jnp.abs),
+    "acos": lambda box: Bounds(jnp.arccos(jnp.minimum(box.high, 1.0)), jnp.arccos(jnp.maximum(box.low, -1.0))),
+    "asin": lambda box: Bounds(jnp.arcsin(jnp.maximum(box.low, -1.0)), jnp.arcsin(jnp.minimum(box.high, 1.0))),
+    "atan2": _angle,
+    "cos": _cosine,
+    "cosh": lambda box: _even(box, jnp.cosh),
+    "div": _quotient,
+    "eq": _equal,
+    "ge": lambda a, b: Bounds(a.low >= b.high, a.high >= b.low),
+    "gt": lambda a, b: Bounds(a.low > b.high, a.high > b.low),
+    "le": lambda a, b: Bounds(a.high <= b.low, a.low <= b.high),
+    "lt": lambda a, b: Bounds(a.high < b.low, a.low < b.high),
+    "mul": _product,
+    "ne": lambda a, b: _opposite(_equal(a, b)),
+    "erfc": lambda box: Bounds(jax.lax.erfc(box.high), jax.lax.erfc(box.low)),
+    "is_finite": lambda box: Bounds(jnp.isfinite(box.low) & jnp.isfinite(box.high), jnp.ones(box.low.shape, bool)),
+    "neg": lambda box: Bounds(-box.high, -box.low),
+    "not": _opposite,
+    "one_minus_square": lambda box: RULES["sub"](_exactly(1.0), _even(box, jnp.square)),
+    "polynomial": _polynomial,
+    "pow": _power,
+    "rem": _remainder,
+    "rsqrt": lambda box: _everything_where(~(box.low > 0.0), Bounds(jax.lax.rsqrt(box.high), jax.lax.rsqrt(box.low))),
+    "select_n": _selected,
+    "sin": lambda box: _cosine(Bounds(box.low - 0.5 * jnp.pi, box.high - 0.5 * jnp.pi)),
+    "sqrt": lambda box: Bounds(*(jnp.sqrt(jnp.maximum(end, 0.0)) for end in box)),
+    "square": lambda box: _even(box, jnp.square),
+    "sub": lambda a, b: Bounds(a.low - b.high, a.high - b.low),
+    "tan": _tangent,
+}

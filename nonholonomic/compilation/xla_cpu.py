@@ -14,17 +14,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, Var, jaxpr_as_fun
 from jax.interpreters import mlir, partial_eval
 from jaxlib.version import __version__ as jaxlib_version
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from ..validation import warn
 
 # Traced programs (jaxprs): how to make them, and how to read them equation by equation.
 
+#: A function to be traced or compiled, of any arguments; and a traced one.
+Function = Callable[..., Any]
+Program = Jaxpr | ClosedJaxpr
 
-def traced(function: Callable[..., Any], *arguments: Any) -> tuple[ClosedJaxpr, Any]:
+#: An equation of a traced program, JAX's `JaxprEqn`, whose types lack the shapes of its operands.
+Equation = Any
+
+#: What stands for an array where a program is read.
+Value = TypeVar("Value")
+
+
+def traced(function: Function, *arguments: PyTree) -> tuple[ClosedJaxpr, PyTree]:
     """Trace a function, for those who read its operations.
 
     **Returns:** the program, and the tree of the shapes of its results.
@@ -38,17 +48,17 @@ def traced(function: Callable[..., Any], *arguments: Any) -> tuple[ClosedJaxpr, 
     return program, shape
 
 
-def opened(program: Any) -> tuple[Jaxpr, Sequence[Any]]:
+def opened(program: Program) -> tuple[Jaxpr, Sequence[ArrayLike]]:
     """A program without its constants, and the constants."""
     return (program.jaxpr, program.consts) if isinstance(program, ClosedJaxpr) else (program, ())
 
 
 def read_program(
-    program: Any,
-    arguments: Sequence[Any],
-    apply: Callable[[Any, list[Any]], Sequence[Any]],
-    known: Callable[[Any], Any] = lambda value: value,
-) -> list[Any]:
+    program: Program,
+    arguments: Sequence[Value],
+    apply: Callable[[Equation, list[Value]], Sequence[Value]],
+    known: Callable[[Any], Value] = lambda value: value,
+) -> list[Value]:
     """The results of a program, whose equations are applied to values of any kind.
 
     **Arguments:**
@@ -68,7 +78,7 @@ def read_program(
     jaxpr, constants = opened(program)
     values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*map(known, constants), *arguments), strict=True))
 
-    def read(atom: Any) -> Any:
+    def read(atom: Var | Literal) -> Value:
         return known(atom.val) if isinstance(atom, Literal) else values[atom]
 
     for equation in jaxpr.eqns:
@@ -77,18 +87,18 @@ def read_program(
     return [read(atom) for atom in jaxpr.outvars]
 
 
-def bound(equation: Any, operands: Sequence[Any]) -> Sequence[Any]:
+def bound(equation: Equation, operands: Sequence[ArrayLike]) -> Sequence[Array]:
     """The results of an equation for other operands, by JAX."""
     results = equation.primitive.bind(*operands, **equation.primitive.get_bind_params(equation.params))
     return results if equation.primitive.multiple_results else [results]
 
 
-def called_program(equation: Any) -> Any:
+def called_program(equation: Equation) -> Program | None:
     """The program that an equation calls, such as a compiled function; `None` if it calls none."""
     return next((equation.params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in equation.params), None)
 
 
-def programs_in(program: Any, visited: set[int] | None = None) -> Iterator[Any]:
+def programs_in(program: Program, visited: set[int] | None = None) -> Iterator[Program]:
     """A program and all programs inside it, each once."""
     visited = set() if visited is None else visited
     if id(program) in visited:
@@ -100,18 +110,18 @@ def programs_in(program: Any, visited: set[int] | None = None) -> Iterator[Any]:
             yield from programs_in(inner, visited)
 
 
-def programs_of(equation: Any) -> list[Any]:
+def programs_of(equation: Equation) -> list[Program]:
     """The programs among the parameters of an equation."""
-    return list(filter(_is_program, jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program)))
+
+    def is_program(value: object) -> bool:
+        return isinstance(value, Program)
+
+    return list(filter(is_program, jax.tree.leaves(list(equation.params.values()), is_leaf=is_program)))
 
 
-def operations(program: Any) -> set[str]:
+def operations(program: Program) -> set[str]:
     """The names of the operations of a program and of the programs inside it."""
     return {equation.primitive.name for inner in programs_in(program) for equation in opened(inner)[0].eqns}
-
-
-def _is_program(value: Any) -> bool:
-    return isinstance(value, Jaxpr | ClosedJaxpr)
 
 
 Result = TypeVar("Result")
@@ -276,7 +286,7 @@ def on_device(*arrays: Float[ArrayLike, "..."]) -> tuple[Float[Array, "..."], ..
     return tuple(jax.device_put(np.asarray(array, dtype=float)) for array in arrays)
 
 
-def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+def in_one_kernel(function: Function) -> Function:
     """A function of a tree of arrays that XLA compiles, on a CPU, into a single kernel.
 
     Otherwise every fused operation in the body of a loop is a separate call; for blocks that fit the first-level
@@ -292,7 +302,7 @@ def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     if not _knows_the_attributes():
         return function
 
-    def called(argument: Any) -> Any:
+    def called(argument: PyTree) -> PyTree:
         context = jax.make_jaxpr(jnp.negative)(0.0).jaxpr.eqns[0].ctx
         # The attributes also prevent XLA from fusing small functions inside, such as `where`, into everything that uses
         # them.
@@ -335,7 +345,7 @@ _kernel.def_abstract_eval(lambda *arguments, program, context: [variable.aval fo
 def _called_as_one(*arguments: Array, program: Jaxpr, context: Any) -> list[Array]:
     """The program as a function that is not inlined."""
 
-    def looking_at_all(*arguments: Any) -> Any:
+    def looking_at_all(*arguments: Array) -> PyTree:
         look = sum(jnp.sum(jnp.ravel(leaf)[:1].astype(float)) for leaf in arguments)
         return jaxpr_as_fun(ClosedJaxpr(program, ()))(*arguments), look
 
@@ -369,7 +379,7 @@ def _without_attributes(program: Any, context: Any) -> Any:
     return program.replace(eqns=equations)
 
 
-def _without_unused(use: list[bool], *arguments: Any) -> tuple[list[bool], Any]:
+def _without_unused(use: list[bool], *arguments: Equation) -> tuple[list[bool], Equation]:
     """The equation with a program without unused computations, as JAX 0.12 prunes its own."""
     # Since JAX 0.12, a list of inputs comes before the equation.
     equation = arguments[-1]

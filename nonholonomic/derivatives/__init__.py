@@ -9,7 +9,7 @@ are in `nonholonomic.hybrid`.
 >>> import jax
 >>> import jax.numpy as jnp
 >>> from nonholonomic.derivatives import AbstractDifferentiableSolve, differentiable_solve, tangents_by
->>> from nonholonomic.derivatives import traced_solve_ensemble_with_tangents
+>>> from nonholonomic.derivatives import solve_ensemble_with_tangents
 >>> from nonholonomic.integration import AbstractProblem, Settings, solve_ensemble
 >>> class Decays(AbstractProblem):
 ...     rate: jax.Array  # (cells,), or () for a single run
@@ -33,7 +33,7 @@ are in `nonholonomic.hybrid`.
 ...     def value_and_tangents(self, active, nested, cells, rate):
 ...         problem, tangents, gather = tangents_by(build, active, (rate,), cells)
 ...         options = (t1, jnp.asarray(cells), settings)
-...         outcome, slopes = traced_solve_ensemble_with_tangents(problem, tangents, *options)
+...         outcome, slopes = solve_ensemble_with_tangents(problem, tangents, *options, traced=True)
 ...         return outcome.crossing_time, gather(slopes)
 >>> t1, settings = jnp.asarray(5.0), Settings(1e-9)
 >>> half_life = lambda rate: differentiable_solve(HalfLife(), rate)
@@ -42,7 +42,6 @@ are in `nonholonomic.hybrid`.
 """
 
 from .adjoint import solve_ensemble_with_tangents as solve_ensemble_with_tangents
-from .adjoint import traced_solve_ensemble_with_tangents as traced_solve_ensemble_with_tangents
 from .differentiable import AbstractDifferentiableSolve as AbstractDifferentiableSolve
 from .differentiable import differentiable_solve as differentiable_solve
 from .sampled_runs import SampledRun as SampledRun

@@ -75,14 +75,11 @@ class Checkpoints(NamedTuple):
         room = jax.tree.map(lambda leaf: jnp.zeros((SLOTS, *leaf.shape), leaf.dtype), example)
         return cls(jnp.zeros((), int), jnp.zeros(SLOTS, int), jnp.arange(SLOTS), room)
 
-    def latest(self) -> tuple[Int[Array, ""], Period]:
-        """The latest period, and its number."""
+    def latest(self) -> tuple[Int[Array, ""], Period, "Checkpoints"]:
+        """The number of the latest period, the period, and the checkpoints without it."""
         last = self.depth - 1
-        return self.index[last], jax.tree.map(functools.partial(read, index=self.slot[last]), self.periods)
-
-    def without_latest(self) -> "Checkpoints":
-        """All but the latest period."""
-        return self._replace(depth=self.depth - 1)
+        period = jax.tree.map(functools.partial(read, index=self.slot[last]), self.periods)
+        return self.index[last], period, self._replace(depth=last)
 
     def added(self, index: Int[Array, ""], period: Period) -> "Checkpoints":
         """Add a period; if all slots are full, drop the period whose neighbours are closest."""
@@ -286,11 +283,11 @@ class Passes:
         run = run._replace(limit=jnp.minimum(run.limit, run.number))
         run = jax.lax.while_loop(self.is_recorded, self.backward, run)
         # The steps before are gone: continue from the latest checkpoint.
-        number, (lanes_before, _) = run.checkpoints.latest()
+        number, (lanes_before, _), checkpoints = run.checkpoints.latest()
         return run._replace(
             frontier=lanes_before,
             number=number,
-            checkpoints=run.checkpoints.without_latest(),
+            checkpoints=checkpoints,
             latest_steps=run.latest_steps._replace(first=lanes_before.iterations),
         )
 
@@ -311,13 +308,13 @@ class Passes:
 
     def is_recorded(self, run: Backward) -> Bool[Array, ""]:
         """Whether the steps of the period that the backward pass takes next are kept."""
-        number, (lanes_before, _) = run.checkpoints.latest()
+        number, (lanes_before, _), _ = run.checkpoints.latest()
         recorded = (number == run.limit - 1) & (lanes_before.iterations >= run.latest_steps.first)
         return uncounted((run.checkpoints.depth > 0) & recorded, run.number)
 
     def backward(self, run: Backward) -> Backward:
         """Carry the derivatives through the latest period."""
-        scheduler, (number, (lanes_before, lanes_after)) = self.scheduler, run.checkpoints.latest()
+        scheduler, (number, (lanes_before, lanes_after), checkpoints) = self.scheduler, run.checkpoints.latest()
         steps = run.latest_steps.of_period(lanes_before.iterations, self.recorder.period)
         count = lanes_after.iterations - lanes_before.iterations
         adjoint = self.taken_back(lanes_after.lane_state, steps, count, run.adjoint)
@@ -327,7 +324,6 @@ class Passes:
         gradient = jax.tree.map(
             lambda of_cells, of_lanes: of_cells.at[..., cell].set(of_lanes, mode="drop"), run.gradient, adjoint
         )
-        checkpoints = run.checkpoints.without_latest()
         return run._replace(limit=number, checkpoints=checkpoints, adjoint=adjoint, gradient=gradient)
 
     def taken_back(
@@ -519,7 +515,7 @@ def jump_taken_back(
 MOST_FORWARD = 2
 
 
-def ensemble_solve_with_tangents(
+def solve_ensemble_with_tangents(
     problem: AbstractProblem,
     tangents: tuple[Tangent, ...],
     t1: Float[Array, "..."],
@@ -527,12 +523,10 @@ def ensemble_solve_with_tangents(
     settings: Settings,
     *,
     nonterminal: bool = False,
-    one_kernel: bool = False,
+    one_kernel: bool | None = None,
+    traced: bool = False,
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """Run every cell, and differentiate the time of its event along tangents.
-
-    `solve_ensemble_with_tangents` is compiled on its own, for use outside of other transformed functions;
-    `traced_solve_ensemble_with_tangents` is for use inside them.
 
     **Arguments:** as for `solve_ensemble`, and
 
@@ -552,6 +546,21 @@ def ensemble_solve_with_tangents(
     >>> print(outcome.crossing_time.round(6), slopes[0].round(6))
     [0.693147 0.346574] [-0.693147 -0.173287]
     """
+    one_kernel = not traced if one_kernel is None else one_kernel
+    solve = _in_program if traced else _alone
+    return solve(problem, tangents, t1, cells, settings, nonterminal, one_kernel)
+
+
+def ensemble_solve_with_tangents(
+    problem: AbstractProblem,
+    tangents: tuple[Tangent, ...],
+    t1: Float[Array, "..."],
+    cells: Int[Array, ""],
+    settings: Settings,
+    nonterminal: bool,
+    one_kernel: bool,
+) -> tuple[Outcome, list[Float[Array, " cells"]]]:
+    """`solve_ensemble_with_tangents`, not compiled."""
     horizon = t1
     if nonterminal:
         scheduler = LaneScheduler.of(problem, t1, cells, settings, nonterminal=True, one_kernel=one_kernel)
@@ -571,6 +580,9 @@ def ensemble_solve_with_tangents(
     # With its variations a run takes other steps: where it does not reach the event, it has no derivative.
     arrived = ended.status == (REACHED_END if nonterminal else CROSSED)
     return outcome, [jnp.where(has_delay, jnp.where(arrived, slope, jnp.nan), 0.0) for slope in slopes]
+
+
+_alone, _in_program = compiled_alone(ensemble_solve_with_tangents), eqx.filter_jit(ensemble_solve_with_tangents)
 
 
 def _slopes_by_adjoint(
@@ -615,10 +627,3 @@ def time_of_zero(problem: AbstractProblem, function: Callable[[States], PyTree],
     """
     fall = stop_gradient(jax.jvp(function, (stop_gradient(state),), (problem.field(time, state),))[1])
     return time_at_jump(problem, time, state, time - function(state) / jnp.where(fall == 0.0, 1.0, fall))
-
-
-# With its docstring.
-_in_one_kernel = functools.partial(ensemble_solve_with_tangents, one_kernel=True)
-solve_ensemble_with_tangents = compiled_alone(functools.update_wrapper(_in_one_kernel, ensemble_solve_with_tangents))
-
-traced_solve_ensemble_with_tangents = eqx.filter_jit(ensemble_solve_with_tangents)

@@ -1,5 +1,6 @@
 """Runs sampled at given times, as functions for `jit`, `vmap`, `grad`, `jvp` and their compositions."""
 
+import abc
 import dataclasses
 import functools
 from collections.abc import Callable
@@ -203,6 +204,12 @@ def is_reversible(problem: AbstractProblem) -> bool:
 # Samples of a run as a differentiable solve: its leaves, and how they are assembled into a problem.
 
 
+Tangents: TypeAlias = tuple[Tangent, ...]
+
+#: The times of the samples and the horizon [s], in a block with the cells last.
+Horizon: TypeAlias = tuple[Array, Array]
+
+
 class ProblemSpec(eqx.Module):
     """How to build a problem from numbers and how to integrate it, except for the tolerance."""
 
@@ -214,7 +221,7 @@ class ProblemSpec(eqx.Module):
     # The numbers of axes of the modules' numbers, without an axis of cells.
     axes: tuple[int, ...] = eqx.field(static=True)
 
-    def built(self, numbers: tuple[Array, ...], *extra: object) -> PyTree:
+    def of(self, numbers: tuple[Array, ...], *extra: object) -> PyTree:
         """Build the problem from the modules, with their numbers replaced, and from the extra arguments of `build`."""
         return self.build(eqx.combine(jax.tree.unflatten(self.structure, numbers), self.rest), *extra)
 
@@ -227,13 +234,74 @@ class AbstractSampling(AbstractDifferentiableSolve):
     spec: eqx.AbstractVar[ProblemSpec]
     places: eqx.AbstractVar[Structure]
 
+    @abc.abstractmethod
+    def built(self, spec: ProblemSpec, numbers: tuple[Array, ...], cells: int | None) -> PyTree:
+        """The problem of the modules' numbers, or what else is run; `cells` is `None` if the run is not in a block."""
+
+    @abc.abstractmethod
+    def sampled(
+        self, built: PyTree, tangents: Tangents, horizon: Horizon, spec: ProblemSpec, nested: bool
+    ) -> tuple[PyTree, list[PyTree]]:
+        """The samples, and their derivative along each tangent, the cells first; `nested`: as for `value_and_tangents`."""
+
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.isnan(value)
 
-    def _sorted(self, leaves: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, Array, Array], ProblemSpec]:
-        """Split the leaves into the modules' numbers; times, horizon and tolerance; and the whole spec."""
-        numbers, (times, t1, tolerance, *arrays_of_spec) = leaves[: self.movable], leaves[self.movable :]
-        return numbers, (times, t1, tolerance), eqx.combine(self.spec, jax.tree.unflatten(self.places, arrays_of_spec))
+    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> PyTree:
+        build, numbers, horizon, spec, lanes = self.builder(cells, leaves)
+        return self.sampled(build(numbers, lanes), (), horizon, spec, False)[0]
+
+    def value_and_tangents(
+        self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
+    ) -> tuple[PyTree, list[PyTree]]:
+        build, numbers, horizon, spec, lanes = self.builder(cells, leaves)
+        built, tangents, gather = tangents_by(build, active, numbers, lanes)
+        samples, slopes = in_groups(lambda group: self.sampled(built, group, horizon, spec, nested), tangents)
+        return samples, gather(slopes)
+
+    def push_forward(
+        self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], tangents: tuple[Array, ...]
+    ) -> PyTree:
+        build, numbers, horizon, spec, _ = self.builder(cells, leaves)
+        directions = [cells_last(part, self.spec.axes[k], cells) for k, part in zip(active, tangents, strict=True)]
+        built, direction, size = tangent_along(build, active, numbers, tuple(directions), cells)
+        _, (slope,) = self.sampled(built, (direction,), horizon, spec, False)
+        return jax.tree.map(lambda part: part * size.reshape(-1, *[1] * (part.ndim - 1)), slope)
+
+    def whole_spec(self, leaves: tuple[Array, ...]) -> ProblemSpec:
+        """The spec with its arrays."""
+        return eqx.combine(self.spec, jax.tree.unflatten(self.places, leaves[self.movable + 3 :]))
+
+    def builder(
+        self, cells: int, leaves: tuple[Array, ...]
+    ) -> tuple[Callable[..., PyTree], tuple[Array, ...], Horizon, ProblemSpec, int | None]:
+        """What the leaves stand for.
+
+        **Returns:** a function (the modules' numbers, cells) -> problem; the modules' numbers, in a block scalars or with
+        the cells last; the horizon; the whole spec, with the tolerance; and the number of cells, `None` outside of blocks.
+        """
+        numbers, (times, t1, tolerance), spec = (
+            leaves[: self.movable],
+            leaves[self.movable :][:3],
+            self.whole_spec(leaves),
+        )
+        if self.in_blocks:
+            numbers = tuple(cells_last(number, axes, cells) for number, axes in zip(numbers, spec.axes, strict=True))
+            # One tolerance serves the whole ensemble: the smallest of the batch.
+            times, tolerance = times if times.ndim == 1 else times.T, jnp.min(tolerance)
+        spec = dataclasses.replace(spec, settings=spec.settings.with_tolerance(tolerance))
+        build = functools.partial(self.built, spec)
+        return build, numbers, (times, t1), spec, cells if self.in_blocks else None
+
+
+def cells_last(number: Float[Array, "..."], axes: int, cells: int) -> Float[Array, "..."]:
+    """A number of a module, with `axes` axes of its own after an axis of cells if it has one: a scalar, or an array with
+    the cells in its last axis."""
+    if axes == 0:
+        return number
+    if number.ndim == axes:
+        return jnp.broadcast_to(number[..., None], (*number.shape, cells))
+    return jnp.moveaxis(number, 0, -1)
 
 
 def solve_for_samples(
@@ -442,56 +510,31 @@ class BlockSampling(AbstractSampling):
     places: Structure = eqx.field(static=True)
     core_only: bool = eqx.field(static=True, default=False)
 
-    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
-        build, numbers, arguments, settings = self._builder(leaves, cells)
-        return _samples_and_slopes(VariationalProblem(build(numbers, cells), (), False), arguments, settings)[0]
+    def built(self, spec: ProblemSpec, numbers: tuple[Array, ...], cells: int | None) -> AbstractProblem:
+        problem = spec.of(numbers, cells)
+        return core_problem(problem) if self.core_only else problem
 
-    def value_and_tangents(
-        self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
+    def sampled(
+        self, built: AbstractProblem, tangents: Tangents, horizon: Horizon, spec: ProblemSpec, nested: bool
     ) -> tuple[SampledRun, list[SampledRun]]:
-        build, numbers, arguments, settings = self._builder(leaves, cells)
-        problem, tangents, gather = tangents_by(build, active, numbers, cells)
-
-        def run(group: tuple[Tangent, ...]) -> tuple[SampledRun, list[SampledRun]]:
-            return _samples_and_slopes(VariationalProblem(problem, group, False), arguments, settings, not nested)
-
-        samples, slopes = in_groups(run, tangents)
-        return samples, gather(slopes)
+        return _samples_and_slopes(VariationalProblem(built, tangents, False), horizon, spec.settings, not nested)
 
     def prefers_adjoint(self, active: tuple[int, ...], leaves: tuple[Array, ...]) -> bool:
         if sum(leaves[k].size for k in active) <= MOST_FORWARD:
             return False
-        numbers, _, spec = self._sorted(leaves)
-        return is_reversible(spec.built(numbers, None))
+        return is_reversible(self.whole_spec(leaves).of(leaves[: self.movable], None))
 
     def differentiable(self, primal: SampledRun) -> SampledRun:
         return SampledRun(primal.states, primal.quadratures, primal.end_time, *NOT_DIFFERENTIATED)
-
-    def push_forward(
-        self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], tangents: tuple[Array, ...]
-    ) -> SampledRun:
-        build, numbers, arguments, settings = self._builder(leaves, cells)
-        directions = tuple(
-            _cells_last(part, self.spec.axes[k], cells) for k, part in zip(active, tangents, strict=True)
-        )
-        problem, direction, size = tangent_along(build, active, numbers, directions, cells)
-        _, (slope,) = _samples_and_slopes(VariationalProblem(problem, (direction,), False), arguments, settings)
-        return jax.tree.map(lambda part: part * size.reshape(-1, *[1] * (part.ndim - 1)), slope)
 
     def pull_back(
         self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], cotangents: SampledRun
     ) -> list[Float[Array, "cells ..."]]:
         solve = dataclasses.replace(self, core_only=True) if cotangents.quadratures is None else self
-        build, numbers, (times, t1, tolerance), settings = solve._builder(leaves, cells)
+        build, numbers, (times, t1), spec, _ = solve.builder(cells, leaves)
         rebuilt, point = by_active(build, active, numbers, cells)
-        by_point = samples_pulled_back(
-            rebuilt,
-            point,
-            SampledCotangents.of(rebuilt(*point), times.shape[-1], *cotangents[:3]),
-            times if times.ndim == 1 else times.T,
-            t1,
-            settings.with_tolerance(jnp.min(tolerance)),
-        )
+        by_samples = SampledCotangents.of(rebuilt(*point), len(times), *cotangents[:3])
+        by_point = samples_pulled_back(rebuilt, point, by_samples, times, t1, spec.settings)
         return [jnp.moveaxis(part, -1, 0) for part in by_point]
 
     def for_parts(self, wanted: tuple[int, ...]) -> Self:
@@ -499,47 +542,15 @@ class BlockSampling(AbstractSampling):
         quadratures = any(fields[part % len(fields)] == "quadratures" for part in wanted)
         return self if quadratures else dataclasses.replace(self, core_only=True)
 
-    def _builder(
-        self, leaves: tuple[Array, ...], cells: int
-    ) -> tuple[Callable[..., AbstractProblem], tuple[Array, ...], tuple[Array, Array, Array], Settings]:
-        """A function (the modules' numbers, cells) -> problem; the modules' numbers, scalars or with the cells last;
-        times, horizon and tolerance; the settings."""
-        numbers, arguments, spec = self._sorted(leaves)
-        numbers = tuple(_cells_last(number, axes, cells) for number, axes in zip(numbers, spec.axes, strict=True))
-
-        def build(numbers: tuple[Array, ...], cells: int | None) -> AbstractProblem:
-            problem = spec.built(numbers, cells)
-            return core_problem(problem) if self.core_only else problem
-
-        return build, numbers, arguments, spec.settings
-
-
-def _cells_last(number: Float[Array, "..."], axes: int, cells: int) -> Float[Array, "..."]:
-    """A number of a module, with `axes` axes of its own after an axis of cells if it has one: a scalar, or an array with
-    the cells in its last axis."""
-    if axes == 0:
-        return number
-    if number.ndim == axes:
-        return jnp.broadcast_to(number[..., None], (*number.shape, cells))
-    return jnp.moveaxis(number, 0, -1)
-
 
 @eqx.filter_jit
 def _samples_and_slopes(
-    variational: VariationalProblem, arguments: tuple[Array, Array, Array], settings: Settings, one_kernel: bool = True
+    variational: VariationalProblem, horizon: Horizon, settings: Settings, one_kernel: bool
 ) -> tuple[SampledRun, list[SampledRun]]:
     """The samples of the cells, and their derivative along each tangent."""
-    times, t1, tolerance = arguments
-    outcome, samples = solve_with_samples(
-        variational,
-        times if times.ndim == 1 else times.T,
-        t1,
-        jnp.asarray(variational.problem.start()[0].shape[1]),
-        # One tolerance serves the whole ensemble: the smallest of the batch.
-        settings.with_tolerance(jnp.min(tolerance)),
-        n_blocks=1 + len(variational.tangents),
-        one_kernel=one_kernel,
-    )
+    cells = jnp.asarray(variational.problem.start()[0].shape[1])
+    options = {"n_blocks": 1 + len(variational.tangents), "one_kernel": one_kernel}
+    outcome, samples = solve_with_samples(variational, *horizon, cells, settings, **options)
     counts = (outcome.steps - outcome.rejected, outcome.rejected, outcome.extremes.T)
     return _found(variational, samples, (outcome.end_time, outcome.state, outcome.status), counts)
 
@@ -583,30 +594,22 @@ class SingleSampling(AbstractSampling):
     spec: ProblemSpec
     places: Structure = eqx.field(static=True)
 
-    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
-        numbers, arguments, spec = self._sorted(leaves)
-        samples, _ = _follow(VariationalProblem(spec.built(numbers, None), (), False), arguments, spec)
-        return jax.tree.map(lambda part: part[None], samples)
+    def built(self, spec: ProblemSpec, numbers: tuple[Array, ...], cells: int | None) -> AbstractProblem:
+        return spec.of(numbers, None)
 
-    def value_and_tangents(
-        self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
+    def sampled(
+        self, built: AbstractProblem, tangents: Tangents, horizon: Horizon, spec: ProblemSpec, nested: bool
     ) -> tuple[SampledRun, list[SampledRun]]:
-        numbers, arguments, spec = self._sorted(leaves)
-        problem, tangents, gather = tangents_by(spec.built, active, numbers, None)
-
-        def run(group: tuple[Tangent, ...]) -> tuple[SampledRun, list[SampledRun]]:
-            return _follow(VariationalProblem(problem, group, False), arguments, spec)
-
-        samples, slopes = in_groups(run, tangents)
-        return jax.tree.map(lambda part: part[None], (samples, gather(slopes)))
+        samples = _follow(VariationalProblem(built, tangents, False), horizon, spec)
+        return jax.tree.map(lambda part: part[None], samples)
 
 
 def _follow(
-    variational: VariationalProblem, arguments: tuple[Array, Array, Array], spec: ProblemSpec
+    variational: VariationalProblem, horizon: Horizon, spec: ProblemSpec
 ) -> tuple[SampledRun, list[SampledRun]]:
     """The samples of a run, and their derivative along each tangent."""
-    times, t1, tolerance = arguments
-    path = sample(variational, times, t1, spec.settings.with_tolerance(tolerance), grid=spec.grid)
+    _, t1 = horizon
+    path = sample(variational, *horizon, spec.settings, grid=spec.grid)
     ends = (path.end_time, path.end_state, _status(path, t1))
     counts = (path.accepted, path.rejected, jnp.asarray(NO_EXTREMES))
     samples, slopes = _found(variational, path.states.T, ends, counts)

@@ -18,11 +18,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import eval_jaxpr
 from jaxtyping import Array, Bool, Float, Int
 
 from ..compilation.components import Held
-from ..text import gathered, parted, shown, spread
+from ..compilation.tracing import with_own_numbers
+from ..text import parted, shown
 from ..validation import UNTRACEABLE, Bound, as_number, is_traced
 from .surface import DIVIDED, OPEN, AbstractGradientSurface, AbstractSurface, BallGap, Place
 from .vector import Component, Vector, difference, dot, scale, sum_vectors, tangents, unit
@@ -38,23 +38,6 @@ class Plain(eqx.Module):
     def __call__(self, *at: Float[Array, "..."]) -> Float[Array, "..."]:
         # Users may compare, sort and look up numbers, or join them, which would mix lanes.
         return jnp.vectorize(lambda *numbers: jnp.asarray(self.function(*numbers)))(*at)
-
-
-class Closure(eqx.Module):
-    """A function whose leaves are the traced numbers that it closes over. It was traced with single numbers; since
-    then, each may have become one number per lane."""
-
-    numbers: tuple[Component, ...]
-    # JAX's Jaxpr; equal only if it is the same object.
-    program: Any = eqx.field(static=True)
-
-    def __call__(self, *at: Float[Array, "..."]) -> Float[Array, "..."]:
-        shapes, count = tuple(constant.aval.shape for constant in self.program.constvars), len(self.numbers)
-
-        def value(*scalars: Float[Array, ""]) -> Float[Array, ""]:
-            return eval_jaxpr(self.program, gathered(scalars[:count], shapes), *scalars[count:])[0]
-
-        return jnp.vectorize(value)(*self.numbers, *at)
 
 
 def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> Any:
@@ -86,7 +69,7 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> Any:
         of_one_run = results[0].shape == () and (len(shapes) > 1 or not _takes_lanes(value, len(arguments)))
         return Held(parted(value)) if of_one_run and not isinstance(value, Held) else value
     if any(is_traced(constant) for constant in program.consts):
-        return Closure(spread(program.consts), program.jaxpr)
+        return Held(parted(with_own_numbers(value, *zeros)))
     # Equinox warns of the arrays of a tree, such as JAX's partial functions, but not of those of its method.
     return Plain(value if jax.tree_util.all_leaves([value]) else value.__call__)
 

@@ -2,10 +2,10 @@
 its path.
 
 A mode has its own equations of motion and ends where they cease to hold: a contact opens or closes, slipping ends. The
-mode's `reset_map` gives the transition to the next mode: an impact, a flight in closed form, other equations. All modes
-share one layout of the state. The cells advance in rounds: each round solves the cells of each mode as one ensemble
-(`integration/scheduler.py`) to the event, the horizon or the end of the mode, and applies the reset map to those at its
-end. The loop over rounds runs on the host, with concrete numbers, or inside other transformed functions.
+mode's `reset_map` gives the transition to the next mode: an impact, a flight in closed form, other equations. The states of
+all modes have the same number of components. The cells advance in rounds: each round solves the cells of each mode as one
+ensemble (`integration/scheduler.py`) to the event, the horizon or the end of the mode, and applies the reset map to those
+at its end. The loop over rounds runs on the host, with concrete numbers, or inside other transformed functions.
 """
 
 import abc
@@ -286,19 +286,17 @@ def all_rounds(
     carry: Carry, groups: Sequence[Sequence[int]], solve: Advance, reset: Advance, most_rounds: int = MOST_ROUNDS
 ) -> Carry:
     """Loop over rounds while a cell is running, on the host if the runs are NumPy arrays. **Arguments:** as for `one_round`."""
-    rounds, xp = (
-        functools.partial(one_round, groups=groups, solve=solve, reset=reset),
-        carry[0].status.__array_namespace__(),
-    )
+    xp = carry[0].status.__array_namespace__()
+    advance = functools.partial(one_round, groups=groups, solve=solve, reset=reset)
     if xp is np:
         for _ in range(most_rounds):
-            carry = rounds(carry)
+            carry = advance(carry)
             if not (carry[0].status == RUNNING).any():
                 break
     else:
         carry, _ = jax.lax.while_loop(
             lambda loop: jnp.any(loop[0][0].status == RUNNING) & (loop[1] < most_rounds),
-            lambda loop: (rounds(loop[0]), loop[1] + 1),
+            lambda loop: (advance(loop[0]), loop[1] + 1),
             (carry, jnp.zeros((), int)),
         )
     runs, *records = carry
@@ -476,7 +474,7 @@ def _on_host(program: HostProgram, update: Callable[..., HybridOutcome], t1: Flo
 def _traced_advances(
     modes: tuple[AbstractBatchedMode, ...], t1: Float[Array, " cells"], settings: Settings, options: PyTree
 ) -> tuple[Advance, Advance]:
-    """The same for traced numbers, as parts of one program."""
+    """Advance cells through a mode, and through its reset map, with traced numbers, as parts of one program."""
 
     def solve(numbers: Sequence[int], carry: Carry, active: Bool[Array, " cells"]) -> Carry:
         (runs,), cell = carry, selected_cells(active)
@@ -495,8 +493,8 @@ def _traced_advances(
 
 
 def selected_cells(selected: Bool[Array, " cells"]) -> Int[Array, " cells"]:
-    """The indices of the selected cells. The first selected cell replaces all others, because the states of the others
-    may have another meaning."""
+    """The indices of the selected cells. The first selected cell replaces all others: in other modes, the components of the
+    state may mean something else."""
     return jnp.where(selected, jnp.arange(selected.size), jnp.argmax(selected))
 
 

@@ -21,17 +21,19 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.xla_cpu import greatest, uncounted
-from ..derivatives import tangents_by, tangents_of
+from ..derivatives import tangents_of
 from ..derivatives.adjoint import Checkpoints
+from ..derivatives.differentiable import Structure
 from ..derivatives.sampled_runs import (
     AbstractSampling,
+    Horizon,
     ProblemSpec,
     SampledCotangents,
     mixture,
     samples_pulled_back,
     solve_for_samples,
 )
-from ..derivatives.variation import by_active, tangent_along, where_active
+from ..derivatives.variation import Tangent, by_active, where_active
 from ..derivatives.variation import over_cells as with_cells
 from ..integration import AbstractProblem, Jumps, Lanes, Settings, States
 from ..integration.problem import LEFT_DOMAIN, REACHED_END, RUNNING
@@ -141,25 +143,21 @@ class HybridSampling(AbstractSampling):
 
     movable: int
     spec: ProblemSpec
-    places: PyTree = eqx.field(static=True)
+    places: Structure = eqx.field(static=True)
     counters: int = eqx.field(static=True)
 
-    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> HybridSamples:
-        build, numbers, horizon, settings = self._builder(leaves)
-        return sampled_with_tangents(build(numbers, cells), (), horizon, cells, settings, self.counters)[0]
+    def built(self, spec: ProblemSpec, numbers: tuple[Array, ...], cells: int | None) -> Built:
+        return spec.of(numbers, spec.settings.tolerance, cells)
 
-    def value_and_tangents(
-        self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
+    def sampled(
+        self, built: Built, tangents: tuple[Tangent, ...], horizon: Horizon, spec: ProblemSpec, nested: bool
     ) -> tuple[HybridSamples, list[HybridSamples]]:
         if nested:
             raise ValueError(
                 "second derivatives are not available through changes of mode; take differences of a gradient instead"
             )
-        build, numbers, horizon, settings = self._builder(leaves)
-        built, tangents, gather = tangents_by(build, active, numbers, cells)
-        tangents = tuple((tangent[0], tangent[2]) for tangent in tangents)
-        samples, slopes = sampled_with_tangents(built, tangents, horizon, cells, settings, self.counters)
-        return samples, gather(slopes)
+        tangents, cells = tuple((tangent[0], tangent[2]) for tangent in tangents), built[2].shape[1]
+        return sampled_with_tangents(built, tangents, horizon, cells, spec.settings, self.counters)
 
     def prefers_adjoint(self, active: tuple[int, ...], leaves: tuple[Array, ...]) -> bool:
         if len(active) <= MOST_FORWARD:
@@ -174,22 +172,13 @@ class HybridSampling(AbstractSampling):
     def differentiable(self, primal: HybridSamples) -> HybridSamples:
         return HybridSamples(primal.shown, UNCHANGED, primal.end_time, *(UNCHANGED,) * 7)
 
-    def push_forward(
-        self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], tangents: tuple[Array, ...]
-    ) -> HybridSamples:
-        build, numbers, horizon, settings = self._builder(leaves)
-        built, direction, size = tangent_along(build, active, numbers, tangents, cells)
-        hybrid_tangent = (direction[0], direction[2])
-        _, (slope,) = sampled_with_tangents(built, (hybrid_tangent,), horizon, cells, settings, self.counters)
-        return jax.tree.map(lambda part: part * size.reshape(-1, *[1] * (part.ndim - 1)), slope)
-
     def pull_back(
         self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], cotangents: HybridSamples
     ) -> list[Lanes]:
         if cells == 1 and len(active) <= MOST_FORWARD_ALONE:
             slopes = self.value_and_tangents(active, False, cells, *leaves)[1]
             return [_product(slope, cotangents) for slope in slopes]
-        build, numbers, (times, t1), settings = self._builder(leaves)
+        build, numbers, (times, t1), spec, _ = self.builder(cells, leaves)
         rebuilt, point = by_active(build, active, numbers, cells)
         times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), cells))
         shown, end_time = cotangents.shown, cotangents.end_time
@@ -197,21 +186,8 @@ class HybridSampling(AbstractSampling):
             modes, _, state = rebuilt(*point)
             shown = jnp.zeros((cells, len(jax.eval_shape(modes[0].shown, state)), len(times)))
         end_time = jnp.zeros(cells) if end_time is None else end_time
-        options = (times, jnp.broadcast_to(t1, (cells,)), settings, self.counters)
+        options = (times, jnp.broadcast_to(t1, (cells,)), spec.settings, self.counters)
         return hybrid_samples_pulled_back(rebuilt, point, jnp.moveaxis(shown, 0, -1), end_time, *options)
-
-    def _builder(
-        self, leaves: tuple[Array, ...]
-    ) -> tuple[Callable[..., Built], tuple[Array, ...], tuple[Array, Array], Settings]:
-        """A function (the modules' numbers, cells) -> modes and start; the numbers; times and horizon; the settings."""
-        numbers, (times, t1, tolerance), spec = self._sorted(leaves)
-        # One tolerance serves the whole ensemble: the smallest of the batch.
-        settings = spec.settings.with_tolerance(jnp.min(tolerance))
-
-        def build(numbers: tuple[Array, ...], cells: int | None) -> Built:
-            return spec.built(numbers, settings.tolerance, cells)
-
-        return build, numbers, (times if times.ndim == 1 else times.T, t1), settings
 
 
 def _product(slope: HybridSamples, cotangents: HybridSamples) -> Lanes:
@@ -229,7 +205,7 @@ def _backward(sampling: HybridSampling, *leaves: Array) -> list[PyTree]:
 
     **Raises:** `ValueError` if one of them has a loop without a fixed number of iterations.
     """
-    build, numbers, _, _ = sampling._builder(leaves)
+    build, numbers, *_ = sampling.builder(1, leaves)
     modes, _, state = build(numbers, 1)
 
     def of_mode(mode: AbstractBatchedMode) -> PyTree:
@@ -392,8 +368,7 @@ class Passes:
             return jnp.any(run.frontier.status == RUNNING) & (run.number < run.limit)
 
         def is_kept(run: Rounds) -> Bool[Array, ""]:
-            number, _ = run.checkpoints.latest()
-            return (run.checkpoints.depth > 0) & (number == run.limit - 1)
+            return (run.checkpoints.depth > 0) & (run.checkpoints.latest()[0] == run.limit - 1)
 
         run = jax.lax.while_loop(is_ahead, self.forward, run)
         # At first, the derivatives begin at the ends of the runs; a horizon does not move.
@@ -401,8 +376,8 @@ class Passes:
         costate = run.costate._replace(start_time=jnp.where(is_first, by_end, run.costate.start_time))
         run = run._replace(limit=jnp.minimum(run.limit, run.number), costate=costate)
         run = jax.lax.while_loop(is_kept, self.backward, run)
-        number, kept = run.checkpoints.latest()
-        return run._replace(frontier=kept.before, number=number, checkpoints=run.checkpoints.without_latest())
+        number, kept, checkpoints = run.checkpoints.latest()
+        return run._replace(frontier=kept.before, number=number, checkpoints=checkpoints)
 
     def forward(self, run: Rounds) -> Rounds:
         """Compute the next round."""
@@ -428,7 +403,7 @@ class Passes:
 
     def backward(self, run: Rounds) -> Rounds:
         """Carry the derivatives through the latest round."""
-        (number, kept), costate = run.checkpoints.latest(), run.costate
+        (number, kept, checkpoints), costate = run.checkpoints.latest(), run.costate
         for group in self.groups:
             active = functools.reduce(jnp.logical_or, (kept.before.mode == number for number in group))
             active = active & (kept.before.status == RUNNING)
@@ -436,7 +411,7 @@ class Passes:
             lost = active & (kept.ended.status == LEFT_DOMAIN)
             for cells, step in ((lost, stage.through_reset), (active, stage.through_motion)):
                 costate = jax.lax.cond(jnp.any(cells), step, lambda _, costate: costate, cells, costate)
-        return run._replace(limit=number, checkpoints=run.checkpoints.without_latest(), costate=costate)
+        return run._replace(limit=number, checkpoints=checkpoints, costate=costate)
 
     def primal(self, runs: HybridOutcome[Array]) -> tuple[States, Lanes]:
         """The states of some runs, and the time since their modes began."""

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from ..compilation.cache import padded
 from ..geometry import inverse
@@ -288,6 +288,23 @@ def _control(
     return diffrax.ClipStepSizeController(controller, step_ts=jnp.where(jnp.isnan(ends), jnp.inf, ends))
 
 
+def _solved(
+    problem: AbstractProblem,
+    solver: diffrax.AbstractSolver,
+    times: tuple[Float[ArrayLike, ""], Float[ArrayLike, ""], Float[Array, ""] | None],
+    state: Float[Array, " components"],
+    control: diffrax.AbstractStepSizeController,
+    **options: PyTree,
+) -> diffrax.Solution:
+    """Integrate a problem by Diffrax.
+
+    **Arguments:** `times`: start, end and length of the first step [s]; `options`: of `diffrax.diffeqsolve`.
+    """
+    field = diffrax.ODETerm(lambda t, y, args: args.field(t, y))
+    options = {"args": problem, "stepsize_controller": control, "throw": False, **options}
+    return diffrax.diffeqsolve(field, solver, *times, state, **options)
+
+
 @eqx.filter_jit
 def _piece(
     problem: AbstractProblem,
@@ -301,20 +318,11 @@ def _piece(
 ) -> tuple[diffrax.Solution, Float[Array, "steps 2"] | None]:
     """Integrate as many steps as the settings allow; also bracket the first zero of the domain margin in each step."""
     is_watched = problem.domain_margin(t0, state) is not None
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
-        settings.for_single_runs if dense or is_watched else settings.for_steps_alone,
-        t0,
-        t1,
-        first,
-        state,
-        args=problem,
-        stepsize_controller=_control(problem, settings, state, scales),
-        saveat=diffrax.SaveAt(t0=True, steps=True, dense=dense or is_watched),
-        max_steps=settings.max_steps,
-        event=diffrax.Event(lambda t, y, args, **_: args.domain_margin(t, y) < 0.0) if is_watched else None,
-        throw=False,
-    )
+    solver = settings.for_single_runs if dense or is_watched else settings.for_steps_alone
+    event = diffrax.Event(lambda t, y, args, **_: args.domain_margin(t, y) < 0.0) if is_watched else None
+    options = {"saveat": diffrax.SaveAt(t0=True, steps=True, dense=dense or is_watched), "event": event}
+    control = _control(problem, settings, state, scales)
+    solution = _solved(problem, solver, (t0, t1, first), state, control, max_steps=settings.max_steps, **options)
     return solution, _first_losses(problem, solution, t0) if is_watched else None
 
 
@@ -500,30 +508,18 @@ def sample(
     # Diffrax detects only changes of the margin's sign, so a run that starts outside the domain must end at once.
     at_once = jnp.zeros((), bool) if margin is None else margin <= 0.0
     t1 = jnp.where(at_once, 0.0, t1)
-    event = diffrax.Event(
-        lambda t, y, args, **_: args.domain_margin(t, y), optimistix.Newton(1e-13, 1e-13) if is_watched else None
-    )
+    event = diffrax.Event(lambda t, y, args, **_: args.domain_margin(t, y), optimistix.Newton(1e-13, 1e-13))
     if times is None:
         assert grid is not None
         times, save_at, max_points = grid, diffrax.SubSaveAt(t0=True, steps=True), grid.size - 1
     else:
         save_at, max_points = diffrax.SubSaveAt(ts=jnp.minimum(times, t1)), settings.max_steps
     control = _control(problem, settings, state, scales, jnp.minimum(times, t1)) if grid is None else _GivenSteps(grid)
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
-        settings.for_single_runs if is_watched else settings.for_steps_alone,
-        jnp.zeros_like(t1),
-        t1,
-        None,
-        state,
-        args=problem,
-        stepsize_controller=control,
-        saveat=diffrax.SaveAt(subs=[save_at, diffrax.SubSaveAt(t1=True)]),
-        max_steps=max_points,
-        event=event if is_watched else None,
-        adjoint=diffrax.ForwardMode() if adjoint is None else adjoint,
-        throw=False,
-    )
+    solver = settings.for_single_runs if is_watched else settings.for_steps_alone
+    options = {"max_steps": max_points, "event": event if is_watched else None}
+    options |= {"saveat": diffrax.SaveAt(subs=[save_at, diffrax.SubSaveAt(t1=True)])}
+    options |= {"adjoint": diffrax.ForwardMode() if adjoint is None else adjoint}
+    solution = _solved(problem, solver, (jnp.zeros_like(t1), t1, None), state, control, **options)
     lost = at_once if solution.event_mask is None else at_once | solution.event_mask
     (_, ends), (states, ends_at) = saved(solution)
     end = ends[0]
@@ -567,19 +563,10 @@ def solve_by_diffrax(problem: AbstractProblem, t1: Float[Array, ""], settings: S
         at_once = [condition(jnp.zeros(()), state, cell_problem) <= 0.0 for condition in conditions.values()]
         ends_at_once = functools.reduce(jnp.logical_or, at_once, jnp.asarray(False))
         event = diffrax.Event(list(conditions.values()), root_finder=optimistix.Newton(1e-13, 1e-13))
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
-            settings.for_single_runs,
-            0.0,
-            jnp.where(ends_at_once, 0.0, t1),
-            None,
-            state,
-            args=cell_problem,
-            stepsize_controller=diffrax.PIDController(rtol, settings.absolute * rtol * scale),
-            max_steps=min(settings.max_steps, MOST_STEPS),
-            event=event if conditions else None,
-            throw=False,
-        )
+        options = {"max_steps": min(settings.max_steps, MOST_STEPS), "event": event if conditions else None}
+        control = diffrax.PIDController(rtol, settings.absolute * rtol * scale)
+        times = (0.0, jnp.where(ends_at_once, 0.0, t1), None)
+        solution = _solved(cell_problem, settings.for_single_runs, times, state, control, **options)
         ends, finals = saved(solution)
         end, final = ends[0], finals[0]
         status = jnp.where(end >= t1, REACHED_END, FAILED)

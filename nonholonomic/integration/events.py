@@ -14,7 +14,7 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
-from ..compilation.bounds import Bounds, UnboundedError, enclosing
+from ..compilation.tracing import Bounds, UnboundedError, enclosing
 from .problem import AbstractProblem
 from .runge_kutta import Integers, Lanes, Mask, States, Step, inverse_root
 

@@ -15,14 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from ..compilation.components import over_lanes
-from ..compilation.tracing import depends_on_first, is_elementary, spelled_out, with_own_numbers
+from ..compilation.components import over_lanes, spelled_out
+from ..compilation.tracing import depends_on_first, is_elementary, with_own_numbers
 from ..derivatives import (
     AbstractDifferentiableSolve,
     differentiable_solve,
     solve_ensemble_with_tangents,
     tangents_by,
-    traced_solve_ensemble_with_tangents,
 )
 from ..hybrid import (
     AbstractBatchedMode,
@@ -35,14 +34,13 @@ from ..hybrid.saltation import UNMEASURED, Clock
 from ..integration import (
     AbstractProblem,
     ExtendedProblem,
-    Jumps,
     Lanes,
     Outcome,
     Settings,
     States,
     solve_ensemble,
 )
-from ..integration.problem import CROSSED, REACHED_END, RUNNING, Status, legal_run
+from ..integration.problem import CROSSED, REACHED_END, RUNNING, AbstractDerivedProblem, Status, legal_run
 from ..parameters import Parameters
 from ..terminal import status_line
 from ..text import described, gathered, likely, name_of, shown
@@ -167,30 +165,24 @@ def with_event(model: AbstractModel, event: Any) -> AbstractModel:
     return dataclasses.replace(model, event=dataclasses.replace(model.event, elementary=elementary))
 
 
-class EventProblem(AbstractProblem):
+def with_clock(problem: AbstractProblem) -> ExtendedProblem:
+    """A problem whose state ends with the time."""
+    clock = jnp.zeros_like(problem.start()[0][:1])
+    return ExtendedProblem(problem, Clock(), clock, clock + UNMEASURED)
+
+
+class EventProblem(AbstractDerivedProblem):
     """A problem with a user's event in place of its own.
 
-    - `motion`: the problem, extended by a clock if the event depends on time.
     - `model`: the model with the event; `mode`, `index`: the mode of the problem and its index, or `None`.
+    - `clock`: the time [s] at the start, (1, cells), if the event depends on time; otherwise (0, cells).
     """
 
-    motion: AbstractProblem
+    problem: AbstractProblem
     model: AbstractModel
+    clock: Float[Array, "clocks *cells"]
     mode: AbstractBatchedMode | None = None
     index: int | None = eqx.field(static=True, default=None)
-
-    @classmethod
-    def of(
-        cls,
-        problem: AbstractProblem,
-        model: AbstractModel,
-        clock: Float[Array, "clocks *cells"],
-        mode: AbstractBatchedMode | None = None,
-        index: int | None = None,
-    ) -> "EventProblem":
-        """**Arguments:** `clock`: the time [s] at the start, (1, cells), if the event depends on time; otherwise (0, cells)."""
-        timed = ExtendedProblem(problem, Clock(), clock, jnp.full_like(clock, UNMEASURED))
-        return cls(timed if len(clock) else problem, model, mode, index)
 
     @property
     def direction_decides(self) -> bool:
@@ -198,32 +190,26 @@ class EventProblem(AbstractProblem):
 
     @property
     def fits_one_kernel(self) -> bool:
-        return self.motion.fits_one_kernel and self.model.event.elementary
+        return self.problem.fits_one_kernel and self.model.event.elementary
 
     @property
     def fast(self) -> tuple[bool, bool]:
-        return self.motion.fast[0], True
+        return self.problem.fast[0], True
 
-    def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
-        return self.motion.start()
+    def inner(self, state: States) -> States:
+        return state[:-1] if len(self.clock) else state
+
+    def start(self) -> tuple[States, States]:
+        states, scales = self.problem.start()
+        return jnp.concatenate([states, self.clock]), jnp.concatenate([scales, jnp.full_like(self.clock, UNMEASURED)])
 
     def field(self, time: Lanes, state: States) -> States:
-        return self.motion.field(time, state)
+        core = self.inner(state)
+        rates = self.problem.field(time, core)
+        return jnp.concatenate([rates, jnp.ones_like(state[len(core) :])]) if len(self.clock) else rates
 
     def event_function(self, state: States) -> Lanes:
         return value_in_lanes(self.model, self.mode, self.index, state)
-
-    def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
-        return self.motion.domain_margin(time, state)
-
-    def lost_at_start(self, state: States) -> Bool[Array, "..."] | None:
-        return self.motion.lost_at_start(state)
-
-    def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
-        return self.motion.margins(time, state)
-
-    def jumps(self, time: Lanes, state: States) -> Jumps | None:
-        return self.motion.jumps(time, state)
 
 
 def value_in_lanes(model: AbstractModel, mode: AbstractBatchedMode | None, index: int | None, state: States) -> Lanes:
@@ -265,7 +251,7 @@ class EventMode(AbstractBatchedMode):
     def problem(self, state: Float[Array, "components cells"]) -> EventProblem:
         core, clock = self._parts(state)
         mode = self.modes[self.index]
-        return EventProblem.of(mode.problem(core), self.model, clock, mode, self.index)
+        return EventProblem(mode.problem(core), self.model, clock, mode, self.index)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         core, clock = self._parts(state)
@@ -302,7 +288,7 @@ def problem_of(model: AbstractModel, cells: int | None, names: Names) -> Abstrac
         return model.problem(cells, names)
     problem = model.problem(cells, None if names is None else (*dict.fromkeys((*names, *model.event.names)),))
     clock = jnp.zeros((int(model.event.depends_on_time), *problem.start()[0].shape[1:]))
-    return EventProblem.of(problem, model, clock)
+    return EventProblem(problem, model, clock)
 
 
 def modes_of(model: AbstractModel, cells: int, tolerance: Number, names: Names, continues: bool = False) -> Start:
@@ -380,11 +366,8 @@ class Ensemble(eqx.Module):
         """
         if self.problem is not None:
             arguments = (tuple(tangent.problem for tangent in tangents), jnp.asarray(t1), jnp.asarray(cells), settings)
-            if not traced:
-                outcome, slopes = solve_ensemble_with_tangents(self.problem, *arguments, nonterminal=self.continues)
-                return outcome, slopes, False
-            options = {"nonterminal": self.continues, "one_kernel": one_kernel}
-            return *traced_solve_ensemble_with_tangents(self.problem, *arguments, **options), False
+            options = {"nonterminal": self.continues, "one_kernel": one_kernel, "traced": traced}
+            return *solve_ensemble_with_tangents(self.problem, *arguments, **options), False
         outcome, xp = None, jnp if traced else np
         if self.continues:
             # The derivatives need the run only up to the event, whose time is known.

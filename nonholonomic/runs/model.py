@@ -138,6 +138,11 @@ class AbstractModel(eqx.Module):
         """The slopes that guide a fit: "exact", or "differences" if derivatives do not show the trend of times."""
         return "exact"
 
+    @property
+    def compiles_slowly(self) -> bool:
+        """Whether programs take much longer to compile than to run, above all those with derivatives."""
+        return False
+
     def for_lanes(self) -> tuple["AbstractModel", bool]:
         """The model in a form that is fastest where runs in transformations share lanes, and whether arrays among its leaves
         have the lanes in their last axis."""
@@ -156,10 +161,6 @@ class AbstractModel(eqx.Module):
         """The modes of a model that is not smooth, and the start in them; `continues`: whether a run continues through
         its event."""
         raise NotImplementedError(f"{type(self).__name__} is smooth and has no modes")
-
-    @abc.abstractmethod
-    def simulate(self, t1: ArrayLike, times: Any, tolerance: ArrayLike, solver: Any, adjoint: Any) -> Any:
-        """The run as a trajectory. **Arguments:** as for `nonholonomic.simulate`."""
 
     @abc.abstractmethod
     def without_event(self) -> "AbstractModel":
@@ -281,6 +282,23 @@ def model_of(
     raise ValueError(
         f"system = {shown(system)} must be a tippe.Scene, a stroller.Scene, a nonholonomic.Hybrid or an AbstractSystem"
     )
+
+
+@functools.singledispatch
+def run_of(
+    model: AbstractModel,
+    t1: ArrayLike,
+    times: ArrayLike | None,
+    tolerance: ArrayLike,
+    solver: diffrax.AbstractSolver | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+) -> Any:
+    """The run of a model at given times, or by default at those of its kind.
+
+    Each kind of model registers its own function. **Arguments:** as for `nonholonomic.simulate`; this function checks
+    `times`, `solver` and `adjoint` only.
+    """
+    raise NotImplementedError(f"{type(model).__name__} has no runs")
 
 
 def check_run(model: AbstractModel, t1: ArrayLike, tolerance: ArrayLike) -> None:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from ..compilation.xla_cpu import compiled_alone
+from ..compilation.xla_cpu import compiled_alone, compiled_for_one
 from ..derivatives import sampled_run, sampled_run_by_diffrax
 from ..hybrid import HybridOutcome, HybridSamples, hybrid_samples, solve_hybrid_with_samples
 from ..integration import AbstractProblem, Outcome, Settings, solve_with_samples
@@ -20,7 +20,7 @@ from ..sweeps import Axis, Variable, axis
 from ..terminal import status_line
 from ..validation import as_known, as_number, is_traced, nan_unless, warn
 from .event import modes_of, problem_of
-from .model import AbstractModel, Names, Number, Start, check_run, model_of, settings_for_lanes
+from .model import AbstractModel, Names, Number, Start, check_run, model_of, run_of, settings_for_lanes
 from .trajectory import Trajectory
 
 # Quantities of many runs at given times, in lanes.
@@ -211,18 +211,30 @@ def simulate(
     """
     model = model_of(system, start, None, input, jumps)
     check_run(model, t1, tolerance)
-    return model.simulate(t1, times, tolerance, solver, adjoint)
+    return run_of(model, t1, times, tolerance, solver, adjoint)
 
 
 def simulate_model(
-    model: AbstractModel, t1: ArrayLike, times: Any, tolerance: ArrayLike, solver: diffrax.AbstractSolver | None = None
+    model: AbstractModel,
+    t1: ArrayLike,
+    times: ArrayLike | None,
+    tolerance: ArrayLike,
+    solver: diffrax.AbstractSolver | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
 ) -> Trajectory:
-    """The run of a model at given times, or at equally spaced ones. **Arguments:** as for `simulate`, checked but `times`."""
+    """The run of your own system. It continues through its event, which only its page shows.
+
+    **Arguments:** as for `run_of`; there is no choice of an `adjoint`.
+    """
     times = evenly_spaced(as_known(t1)) if times is None else times
     require_times(times, t1)
     settings = settings_for_lanes(tolerance, solver)
-    unchecked = is_traced((model, times, t1, tolerance))
-    run, extremes = _sampled(model, as_number(times), as_number(t1), settings, unchecked)
+    eventless = model.without_event()
+    unchecked = is_traced((eventless, times, t1, tolerance))
+    # Inside `jit`, a new array is traced.
+    is_alone = not is_traced((as_number(0.0), eventless, times, t1, tolerance))
+    run_sampled = _sampled_alone if eventless.compiles_slowly and is_alone else _sampled
+    run, extremes = run_sampled(eventless, as_number(times), as_number(t1), settings, unchecked)
     if not is_traced(extremes):
         shortest, time, longest = np.asarray(extremes)
         # At a kink, only a few steps are short.
@@ -232,7 +244,7 @@ def simulate_model(
                 f"elsewhere they are up to {longest:.1g} s long: are the coordinates singular there, like Euler angles at "
                 "their pole, or does a function jump? Errors may exceed the tolerance by far"
             )
-    return run
+    return dataclasses.replace(run, model=model)
 
 
 def evenly_spaced(t1: Number) -> Float[Array, " times"]:
@@ -324,8 +336,7 @@ def problem_of_run(modules: tuple[AbstractModel, Names], cells: int | None) -> A
     return problem_of(model, cells, names)
 
 
-@eqx.filter_jit
-def _sampled(
+def _run_and_extremes(
     model: AbstractModel, times: Float[Array, " times"], t1: Float[Array, ""], settings: Settings, unchecked: bool
 ) -> tuple[Trajectory, Float[Array, "3"]]:
     """The run, or NaN and "illegal" if a traced number is out of range; and the extremes of its steps, as in
@@ -356,3 +367,6 @@ def _sampled(
         names=names,
     )
     return run, outcome.extremes[:, 0]
+
+
+_sampled, _sampled_alone = eqx.filter_jit(_run_and_extremes), compiled_for_one(_run_and_extremes)

@@ -244,7 +244,7 @@ def table_of(
     job = TableJob(model, form, t1, crossing, options.settings, slopes, options.errors, samples, timed)
     check_cells(model, grid, options)
     request = {"t1": t1} | ({} if crossing == "first" else {"crossing": crossing})
-    return compute_table(job, grid, {name: labels[name][1] for name in slopes}, request, options)
+    return compute_table(job, grid, request, options)
 
 
 def full_sensitivities(model: AbstractModel, names: Any, crossing: str) -> list[str]:
@@ -271,17 +271,14 @@ def check_cells(model: AbstractModel, grid: list[Axis], options: Options) -> Non
     model.check_axes(grid, [scattered_cells(grid)] if options.scattered else cells_to_check(grid))
 
 
-def compute_table(
-    job: TableJob, grid: list[Axis], units: dict[str, str], request: dict[str, Any], options: Options
-) -> Table:
+def compute_table(job: TableJob, grid: list[Axis], request: dict[str, Any], options: Options) -> Table:
     """Compute the cells of a grid, which were checked.
 
-    **Arguments:** `units`: the units of the parameters in `job.slopes`; `request`: the request of the table, without the
-    model, the samples and the options.
+    **Arguments:** `request`: the request of the table, without the model, the samples and the options.
     """
     variables, slopes = job.variables, job.slopes or {}
-    for name, slope in slopes.items():
-        unit = "s" if units[name] == "1" else f"s ({units[name]})-1"
+    for name, (_, unit, _) in job.model.label([*slopes]).items():
+        slope, unit = slopes[name], "s" if unit == "1" else f"s ({unit})-1"
         variables |= {slope: Variable(unit, np.float64, long_name=f"{job.form.event} time by {name}")}
     request = job.model.description() | {axis.number: "an axis" for axis in grid} | request
     integrator = job.settings.for_single_runs if job.by_diffrax else job.settings.for_lanes

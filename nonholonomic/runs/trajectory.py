@@ -24,7 +24,7 @@ from ..validation import IN_DEGREES, is_traced, require_all, require_file, requi
 from ..views import COLOURS, PALE, Arena, Body, Curve, Mesh, Page, Show, Stage, Trace, Viewable, new_figure
 from ..views.explore import Answer, Frame, HybridSimulator, LiveRun, Simulator, Slider, Summary, live_page
 from ..views.stage import curves_in
-from .model import AbstractModel, Sliders, Unit, model_of
+from .model import AbstractModel, Sliders, Unit, model_of, run_of
 
 # A page with sliders that simulates any model in the browser.
 
@@ -184,7 +184,7 @@ def runs_at_ends(model: AbstractModel, sliders: tuple[Slider, ...], t1: float) -
     """The run of a model, and those at both ends of every slider, which determine what part of the arena is drawn."""
     ends = [{slider.path: end} for slider in sliders for end in (slider.low, slider.high)]
     others = [changed for changed in map(model.replaced, ends) if np.all(changed.legal())]
-    return [changed.simulate(t1, None, DRAWN, None, None) for changed in (model, *others)]
+    return [run_of(changed, t1, None, DRAWN) for changed in (model, *others)]
 
 
 def live_run(
@@ -548,7 +548,7 @@ class Trajectory(AbstractRun):
         if not self._is_one_run:
             raise ValueError("at takes one run outside jit, vmap and grad: pass times= to simulate there")
         times = times_within(times, self.end_time, "run")
-        return self.model.simulate(self.t1, times, self.settings.tolerance, self.settings.solver, None)
+        return run_of(self.model, self.t1, times, self.settings.tolerance, self.settings.solver)
 
     def table_of(self, names: Sequence[str]) -> Table:
         """The table that pictures draw, with the states before and after each reset."""

@@ -29,7 +29,7 @@ import numpy as np
 
 from ..integration.problem import FORMER_WORDS
 from ..validation import as_path, real_path, replacing, sync_folder, warn
-from .grid import EQUATIONS, PENDING, UNREACHED, Layout, Values, boxes
+from .grid import EQUATIONS, LONG_NAMES, PENDING, UNREACHED, Layout, Values, boxes
 
 if TYPE_CHECKING:
     import h5py
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 #: The group of the checksums.
 CHECKSUMS = "checksums"
 
-#: The attribute of a table with the long names of its variables; in a file, each variable has its own, as in CF.
-LONG_NAMES, LONG_NAME = "long_names", "long_name"
+#: The attribute of a variable with its long name, as in CF.
+LONG_NAME = "long_name"
 
 #: The file's attribute that names the dimensions of variables other than those of the grid.
 INNER = "inner"

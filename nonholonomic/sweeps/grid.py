@@ -24,6 +24,9 @@ from ..validation import require
 
 Values = Shaped[np.ndarray, "..."]
 
+#: The attribute of a table with the long names of its variables; in a file, each variable has its own.
+LONG_NAMES = "long_names"
+
 #: The name of the checksum of a user's equations in a request.
 EQUATIONS = "equations"
 
@@ -105,6 +108,16 @@ class Layout(NamedTuple):
     def bytes_of_cells(self, cells: int) -> int:
         """Memory for the numbers of some cells [bytes]."""
         return cells * sum(kind.itemsize * math.prod(self.inner_shape(name)) for name, kind in self.kinds.items())
+
+
+def attributes_of(request: dict[str, object], axes: list[str], long_names: dict[str, str]) -> dict[str, str]:
+    """The attributes of a table: what was computed, over which axes, with which versions, and the long names."""
+    attributes = {
+        "request": json.dumps(request, default=repr),
+        "axes": json.dumps(axes),
+        "versions": json.dumps(versions()),
+    }
+    return attributes | ({LONG_NAMES: json.dumps(long_names, sort_keys=True)} if long_names else {})
 
 
 def axes_of(coords: dict[str, Values], inner: dict[str, tuple[str, ...]]) -> list[str]:

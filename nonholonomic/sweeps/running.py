@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import itertools
-import json
 import os
 import pickle
 import signal
@@ -24,7 +23,7 @@ from ..compilation.cache import forget_programs_if_many, memory_of_machine
 from ..terminal import Progress
 from ..text import shown
 from ..validation import require_flag, warn
-from ._store import LONG_NAMES, ChunkStore, with_spaces
+from ._store import ChunkStore, with_spaces
 from .grid import (
     Axis,
     ChunkTask,
@@ -32,11 +31,11 @@ from .grid import (
     Layout,
     Values,
     Variable,
+    attributes_of,
     columns,
     remote_results,
     size_of,
     stamp,
-    versions,
 )
 from .table import Table
 
@@ -272,16 +271,13 @@ def layout_of(
     coords = {variable.name: variable.values for variable in (*axes, *inner)}
     units = {variable.name: variable.unit for variable in (*axes, *inner) if variable.values.dtype.kind != "U"}
     units |= {name: variable.unit for name, variable in variables.items() if variable.words is None}
-    attributes = {
-        "request": json.dumps(request | {"float": str(np.dtype(jnp.result_type(float)))}),
-        "axes": json.dumps([variable.name for variable in axes]),
-        "versions": json.dumps(versions()),
-    }
     long_names = {variable.name: variable.long_name for variable in (*axes, *inner)}
     long_names |= {name: variable.long_name for name, variable in variables.items()}
-    if any(long_names.values()):
-        present = {name: long_name for name, long_name in long_names.items() if long_name}
-        attributes[LONG_NAMES] = json.dumps(present, sort_keys=True)
+    attributes = attributes_of(
+        request | {"float": str(np.dtype(jnp.result_type(float)))},
+        [variable.name for variable in axes],
+        {name: long_name for name, long_name in long_names.items() if long_name},
+    )
     kinds = {name: np.dtype(variable.kind) for name, variable in variables.items()}
     words = {name: variable.words for name, variable in variables.items() if variable.words is not None}
     dims = {name: variable.inner for name, variable in variables.items() if variable.inner}

@@ -17,8 +17,8 @@ from ..terminal import status_line
 from ..text import as_html, in_unit, likely, readable_unit, require_unit, require_unit_of, shown, text_as_html
 from ..validation import as_path, replacing, require_package
 from ..views import draw_portrait, draw_series, draw_table, require_others
-from ._store import LONG_NAMES, MAX_BYTES_IN_MEMORY, Stored, coded, table_path, unfinished, write_file
-from .grid import UNREACHED, Layout, Values, axes_of, versions
+from ._store import MAX_BYTES_IN_MEMORY, Stored, coded, table_path, unfinished, write_file
+from .grid import LONG_NAMES, UNREACHED, Layout, Values, attributes_of, axes_of
 
 if TYPE_CHECKING:
     import pandas
@@ -499,17 +499,10 @@ def run_table(
     Table over time (2)
       height [m]: 0.95 to 1
     """
-    attributes = {
-        "request": json.dumps(request, default=repr),
-        "axes": json.dumps(axes),
-        "versions": json.dumps(versions()),
-        LONG_NAMES: json.dumps(
-            {"time": "time"} | {name: quantity.long_name for name, quantity in quantities.items()}, sort_keys=True
-        ),
-    }
+    long_names = {"time": "time"} | {name: quantity.long_name for name, quantity in quantities.items()}
     units = {"time": "s"} | {name: quantity.unit for name, quantity in quantities.items()}
     inner = {name: (quantity.components,) for name, quantity in quantities.items() if quantity.components is not None}
-    return Table(coords, values, units, attributes, inner=inner)
+    return Table(coords, values, units, attributes_of(request, axes, long_names), inner=inner)
 
 
 class Tabular(abc.ABC):

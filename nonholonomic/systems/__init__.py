@@ -6,5 +6,6 @@ potential, constraints and forces the equations of motion follow.
 
 from .form import AbstractMode as AbstractMode
 from .form import Hybrid as Hybrid
+from .mechanics import AbstractSystem as AbstractSystem
 from .model import OwnModel as OwnModel
 from .model import page_of_system as page_of_system

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from ..compilation.components import over_lanes
 from ..compilation.tracing import in_cells
@@ -163,7 +163,7 @@ class ModeProblem(AbstractProblem):
         rates, length = self.field(zero, state), jnp.min(jnp.where(jnp.isfinite(unit), unit, 1.0), axis=0)
 
         def change(share: Float[Array, ""]) -> Float[Array, "margins *cells"]:
-            def stage(carry: Any, weights: tuple[Array, Array]) -> Any:
+            def stage(carry: tuple[Array, Array], weights: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
                 rate, total = carry
                 rate = self.field(zero, state + share * length * weights[0] * rate)
                 return (rate, total + weights[1] * rate), None
@@ -181,10 +181,10 @@ class ModeProblem(AbstractProblem):
     def jumps(self, time: Lanes, state: States) -> Jumps | None:
         return None if self.jump_times is None else Jumps.at(self.jump_times, state[-1] - time)
 
-    def _over_lanes(self, function: OfRun, state: States) -> Any:
+    def _over_lanes(self, function: OfRun, state: States) -> PyTree:
         """A user's function, evaluated in every lane."""
 
-        def of_run(numbers: Sequence[Array], parts: tuple[Array, ...]) -> Any:
+        def of_run(numbers: Sequence[Array], parts: tuple[Array, ...]) -> PyTree:
             return function(numbers, *time_and_state(self.form, parts))
 
         return over_lanes(of_run, self.numbers, tuple(state))
@@ -268,9 +268,15 @@ class BatchedMode(AbstractBatchedMode):
         status = jnp.where((number >= 0) & (number < form.modes), RUNNING, FAILED)
         if not form.has_event:
             return Transition(number, state_after, now, status, never, zero[None] + 1)
-        event = _Watched(form, self.mode, numbers, scales)
-        ends = event.is_zero(state) & (event.slope(state) < 0.0)
-        jumps = ~ends & (event.value(state) > 0.0) & (event.value(state_after) <= 0.0)
+
+        def value(state: Float[Array, " components"]) -> Float[Array, ""]:
+            return form.function("event")(numbers, *time_and_state(form, tuple(state)))
+
+        rate = jnp.concatenate([form.function("field", self.mode)(numbers, t, y), jnp.ones(len(state) - form.size)])
+        sizes = jnp.abs(state) + jnp.where(scales < UNMEASURED, scales, 0.0)
+        is_zero = jnp.abs(value(state)) <= ROUND_OFF * jnp.sum(jnp.abs(jax.jacfwd(value)(state)) * sizes)
+        ends = is_zero & (jax.jvp(value, (state,), (rate,))[1] < 0.0)
+        jumps = ~ends & (value(state) > 0.0) & (value(state_after) <= 0.0)
         crossed = ends | jumps
         if self.continues:
             return Transition(number, state_after, now, status, jnp.where(crossed, now, never), zero[None] + 1)
@@ -287,30 +293,6 @@ class BatchedMode(AbstractBatchedMode):
 #: The axis of cells in a `Transition`, for `vmap`.
 _AXES: Any = (0, 1, 0, 0, 0, 1, None, None)
 _TRANSITION_AXES = Transition(*_AXES)
-
-
-class _Watched(eqx.Module):
-    """The event, for a single run: its function for a state with its time."""
-
-    form: Form = eqx.field(static=True)
-    mode: int = eqx.field(static=True)
-    numbers: Sequence[Array]
-    scales: Float[Array, " components"]
-
-    def value(self, state: Float[Array, " components"]) -> Float[Array, ""]:
-        return self.form.function("event")(self.numbers, *time_and_state(self.form, tuple(state)))
-
-    def slope(self, state: Float[Array, " components"]) -> Float[Array, ""]:
-        """The rate of the value along the motion in the mode."""
-        rate = self.form.function("field", self.mode)(self.numbers, *time_and_state(self.form, tuple(state)))
-        rate = jnp.concatenate([rate, jnp.ones(len(state) - self.form.size)])
-        return jax.jvp(self.value, (state,), (rate,))[1]
-
-    def is_zero(self, state: Float[Array, " components"]) -> Bool[Array, ""]:
-        """Whether the function is zero up to round-off."""
-        slopes = jax.jacfwd(self.value)(state)
-        sizes = jnp.abs(state) + jnp.where(self.scales < UNMEASURED, self.scales, 0.0)
-        return jnp.abs(self.value(state)) <= ROUND_OFF * jnp.sum(jnp.abs(slopes) * sizes)
 
 
 class Cells(eqx.Module):
@@ -355,7 +337,7 @@ class Cells(eqx.Module):
         return ModeProblem.of(self.numbers, *self.states(cells), jnp.asarray(ROUND_OFF), self.form, self.form.first)
 
     def modes(
-        self, cells: int, tolerance: Any, continues: bool = False
+        self, cells: int, tolerance: ArrayLike, continues: bool = False
     ) -> tuple[tuple[BatchedMode, ...], Int[Array, " cells"], Float[Array, "components cells"]]:
         """The modes of a system with resets, the index of the first mode, and the initial states in it."""
         states, scales = self.states(cells)

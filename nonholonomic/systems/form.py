@@ -1,40 +1,43 @@
-"""A user's hybrid system without its numbers: the part for which JAX compiles a program, and the traits found by
-tracing."""
+"""What a user writes: modes and mechanical systems in a hybrid system; its form without its numbers, for which JAX compiles a
+program; and what is checked before anything compiles."""
 
 import abc
 import dataclasses
+import difflib
 import functools
+import inspect
 import itertools
 from collections.abc import Callable, Sequence
+from types import CodeType
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from ..compilation.tracing import depends_on_first, is_elementary, jumps_of, named_errors, spelled_out, warn_of_unclear
-from ..compilation.xla_cpu import opened, programs_in, traced
-from ..formulations import AbstractSystem
+from ..compilation.components import spelled_out
+from ..compilation.tracing import depends_on_first, is_elementary, jumps_of, named_errors, warn_of_unclear
+from ..compilation.xla_cpu import Function, opened, programs_in, traced
 from ..parameters import TreeForm
 from ..text import described, shown
+from ..validation import as_number, require, warn
+from .mechanics import AbstractFormulation, AbstractSystem, Lagrange, within_constraints
 
-# A user's own hybrid system: smooth modes with resets between them, as functions of one state.
+# A hybrid system: smooth modes with resets between them, as functions of one state.
 
 State = Float[Array, " components"]
 
 #: The event function, of time [s] and state; the event happens when it falls through zero.
 Event = Callable[[Float[Array, ""], State], Float[Array, ""]]
 
-
-def values_of_margin(margin: Any) -> tuple[Array, ...]:
-    """The values of a margin, one or several, in order."""
-    if isinstance(margin, dict):
-        return tuple(map(jnp.asarray, margin.values()))
-    return (margin,) if jnp.ndim(margin) == 0 else tuple(margin[k] for k in range(margin.shape[0]))
+#: What the `margin` of a mode returns, and its `reset`.
+Margin = Float[Array, "..."] | dict[str, Float[Array, ""]] | None
+Reset = tuple[State, Any] | None
 
 
-def exit_of(margin: Any, number: Any) -> tuple[Any, ...]:
+def exit_of(margin: Any, number: ArrayLike) -> tuple[Any, ...]:
     """The further argument of a reset after the margin of this index has fallen, if there are several: the index, or for a
     dict whether it is the margin of each name."""
     if isinstance(margin, dict):
@@ -87,7 +90,7 @@ class AbstractMode(eqx.Module):
         **Returns:** the rate, (components,).
         """
 
-    def margin(self, t: Float[Array, ""], y: State) -> Float[Array, "..."] | dict[str, Float[Array, ""]] | None:
+    def margin(self, t: Float[Array, ""], y: State) -> Margin:
         """A smooth function that is positive while the mode holds and falls through zero where it ends; or several such
         functions, of which the first to fall ends the mode.
 
@@ -101,7 +104,7 @@ class AbstractMode(eqx.Module):
         """
         return None
 
-    def reset(self, t: Float[Array, ""], y: State) -> tuple[State, Any] | None:
+    def reset(self, t: Float[Array, ""], y: State) -> Reset:
         """The state and mode that follow when the margin has fallen to zero.
 
         The margin of the next state may be zero if it then rises, as for a ball that has just bounced.
@@ -117,15 +120,10 @@ class AbstractMode(eqx.Module):
         return None
 
 
-def require_event(event: Any) -> None:
+def require_event(event: object) -> None:
     """Raise `ValueError` unless the event is a function."""
     if not callable(event):
         raise ValueError(f"event = {shown(event)} must be a function event(t, y) of time and state, or None")
-
-
-def as_modes(modes: Any) -> Any:
-    """A list of modes as a tuple; anything else stays unchanged, for later checks."""
-    return tuple(modes) if isinstance(modes, list | tuple) else modes
 
 
 class Hybrid(eqx.Module):
@@ -160,7 +158,9 @@ class Hybrid(eqx.Module):
     ```
     """
 
-    modes: tuple[AbstractMode | AbstractSystem, ...] = eqx.field(converter=as_modes)
+    modes: tuple[AbstractMode | AbstractSystem, ...] = eqx.field(
+        converter=lambda modes: tuple(modes) if isinstance(modes, list) else modes
+    )
     event: Event | None = None
     first: int = eqx.field(static=True, default=0)
 
@@ -179,11 +179,67 @@ class Hybrid(eqx.Module):
             )
 
 
+# Mechanical systems as modes.
+
+
+class MechanicalMode(AbstractMode):
+    """The motion of a mechanical system, in the state of one of its formulations, as mode `number` of a hybrid system."""
+
+    formulation: AbstractFormulation
+    number: int = eqx.field(static=True, default=0)
+
+    def field(self, t: Float[Array, ""], y: State) -> State:
+        return self.formulation.field(t, y)
+
+    def margin(self, t: Float[Array, ""], y: State) -> Margin:
+        return self.formulation.system.margin(t, *self.formulation.split(y))
+
+    def reset(self, t: Float[Array, ""], y: State, *exit: Any) -> Reset:
+        system: Any = self.formulation.system
+        following = system.reset(t, *self.formulation.split(y), *exit)
+        if following is None:
+            return None
+        q, rate, *number = following
+        return self.formulation.state(q, rate), number[0] if number else self.number
+
+    @property
+    def is_projected(self) -> bool:
+        """Whether a state may violate the constraints, so that `entered` projects it."""
+        system = self.formulation.system
+        return isinstance(self.formulation, Lagrange) and system.freedom < system.dimension
+
+    def entered(self, t: Float[Array, ""], y: State) -> State:
+        """The state after a reset to this mode, with rates that obey the constraints."""
+        q, rate = self.formulation.split(y)
+        return self.formulation.state(q, within_constraints(self.formulation.system, q, rate))
+
+
+class MechanicalEvent(eqx.Module):
+    """An event of a mechanical system, as a function of the formulation's state."""
+
+    formulation: AbstractFormulation
+    event: Event
+
+    def __call__(self, t: Float[Array, ""], y: State) -> Float[Array, ""]:
+        return self.event(t, jnp.concatenate(self.formulation.split(y)))
+
+
+def with_modes_of_systems(hybrid: Hybrid) -> Hybrid:
+    """The hybrid system with the equations of motion of the mechanical systems among its modes, for states (q, rate)."""
+    modes = tuple(
+        MechanicalMode(Lagrange(mode), number) if isinstance(mode, AbstractSystem) else mode
+        for number, mode in enumerate(hybrid.modes)
+    )
+    return dataclasses.replace(hybrid, modes=modes)
+
+
+# The form of a system: what is left without its numbers.
+
 #: The last argument of a reset, in words for a message.
 EXIT = "; and exit, which of them fell, if the mode has several margins"
 
 #: A function of the numbers, the time and the state of one run.
-OfRun = Callable[..., Any]
+OfRun = Function
 
 
 @dataclasses.dataclass(frozen=True)
@@ -216,14 +272,17 @@ class Form:
         as a tuple; or "entered", which projects the state after a reset to a mode onto its constraints. A reset also receives
         the index of the margin that fell."""
 
-        def called(numbers: Sequence[Array], t: Array, y: State, exit: Any = 0) -> Any:
+        def called(numbers: Sequence[Array], t: Array, y: State, exit: ArrayLike = 0) -> PyTree:
             system = self.system(numbers)
             if name == "event":
                 assert system.event is not None
                 return system.event(t, y)
             part: Any = system.modes[mode]
             if name == "margins":
-                return values_of_margin(part.margin(t, y))
+                margin = part.margin(t, y)
+                if isinstance(margin, dict):
+                    return tuple(map(jnp.asarray, margin.values()))
+                return (margin,) if jnp.ndim(margin) == 0 else tuple(margin[k] for k in range(margin.shape[0]))
             return getattr(part, name)(t, y, *(exit_of(part.margin(t, y), exit) if name == "reset" else ()))
 
         return called
@@ -236,7 +295,7 @@ class Form:
         return jnp.concatenate([jumps_of(function, t, y)[0] for function in functions])
 
     @property
-    def arguments(self) -> tuple[Any, ...]:
+    def arguments(self) -> tuple[tuple[jax.ShapeDtypeStruct, ...], jax.ShapeDtypeStruct, jax.ShapeDtypeStruct]:
         """The shapes of the functions' arguments."""
         real = jnp.result_type(float)
         return self.tree.types, jax.ShapeDtypeStruct((), real), jax.ShapeDtypeStruct((self.size,), real)
@@ -296,7 +355,7 @@ def _traits(form: Form) -> Traits:
         _require_shape(form, "event", 0, ())
         step_functions.append(form.function("event"))
 
-    def combined(functions: list[OfRun]) -> Callable[..., Any]:
+    def combined(functions: list[OfRun]) -> OfRun:
         return lambda t, y, *numbers: [function(numbers, t, y) for function in functions]
 
     numbers, t, y = form.arguments
@@ -333,7 +392,7 @@ def arguments_in_words(size: int) -> str:
     return f"the time t, a number, and the state y, an array of shape ({size},)"
 
 
-def _result(form: Form, name: str, mode: int) -> Any:
+def _result(form: Form, name: str, mode: int) -> PyTree:
     """The shape and type that a function returns."""
     words = arguments_in_words(form.size) + (EXIT if name == "reset" else "")
     with named_errors(_name(name, mode), words):
@@ -370,7 +429,7 @@ def _require_shape(form: Form, name: str, mode: int, shape: tuple[int, ...]) -> 
         raise ValueError(f"{function_name} must return floats, not {result.dtype}: it must be smooth")
 
 
-def _require_pair(form: Form, mode: int, result: Any) -> None:
+def _require_pair(form: Form, mode: int, result: object) -> None:
     """Raise `ValueError` unless a reset returns a state and a whole number."""
     expected = f"modes[{mode}].reset(t, y) must return (state, number of the next mode)"
     if not isinstance(result, tuple) or len(result) != 2:
@@ -380,3 +439,140 @@ def _require_pair(form: Form, mode: int, result: Any) -> None:
         raise ValueError(f"{expected}; its state is {described(state)}, not an array of shape ({form.size},)")
     if getattr(number, "shape", None) != () or not jnp.issubdtype(number.dtype, jnp.integer):
         raise ValueError(f"{expected}; its number is {described(number)}, not a whole number")
+
+
+# The checks of a mechanical system and of a start.
+
+
+def is_pair(start: object) -> bool:
+    """Whether a start is a pair (q, rate) of vectors."""
+    return isinstance(start, tuple | list) and len(start) == 2 and all(np.ndim(as_number(part)) == 1 for part in start)
+
+
+def check_start(system: Hybrid | AbstractSystem, start: Any) -> None:
+    """Raise `ValueError` unless the start is one of this system, and warn of misspelt methods."""
+    modes = [system] if isinstance(system, AbstractSystem) else system.modes
+    for mode in modes:
+        warn_of_misspelt_methods(mode, AbstractSystem if isinstance(mode, AbstractSystem) else AbstractMode)
+    mechanical = {number: mode for number, mode in enumerate(modes) if isinstance(mode, AbstractSystem)}
+    sizes = {mode.dimension for mode in mechanical.values()}
+    if len(sizes) > 1:
+        raise ValueError(
+            f"the systems among the modes must have one number of coordinates, not {', '.join(map(str, sorted(sizes)))}"
+        )
+    (size,) = sizes or (None,)
+    if isinstance(system, AbstractSystem) and not (isinstance(start, tuple | list) and len(start) == 2):
+        raise ValueError(f"start = {shown(start)} must be a pair (q, rate) of coordinates and their rates")
+    if isinstance(system, AbstractSystem) or (mechanical and is_pair(start)):
+        for name, part in zip(("q", "rate"), start, strict=True):
+            _check_vector(part, f"start: {name}", size)
+    else:
+        _check_vector(start, "start", None if size is None else 2 * size)
+    for number, mode in mechanical.items():
+        prefix = "" if mode is system else f"modes[{number}]."
+        if prefix and type(mode).lagrangian is not AbstractSystem.lagrangian:
+            raise ValueError(
+                f"{prefix}lagrangian: a system with a Lagrangian of its own cannot be a mode; write metric and potential"
+            )
+        form = Form.of(Hybrid([MechanicalMode(Lagrange(mode))]), 2 * mode.dimension)[0]
+        _check_functions(form, prefix)
+
+
+def _check_vector(value: Any, name: str, size: int | None) -> None:
+    value = as_number(value)
+    if not isinstance(value, jax.Array):
+        raise ValueError(f"{name} = {shown(value)} is not a list of numbers")
+    require(value, name)
+    shape = f"({'components' if size is None else size},)"
+    if np.ndim(value) != 1 or np.size(value) == 0 or size not in (None, np.size(value)):
+        raise ValueError(f"{name} must be of shape {shape}, not {np.shape(value)}; jax.vmap or sweep runs many")
+
+
+@functools.lru_cache(maxsize=256)
+def _check_functions(form: Form, prefix: str) -> None:
+    """Raise `ValueError` that names a function of a system that JAX cannot trace or that returns a wrong shape.
+
+    **Arguments:** `form`: that of a `Hybrid` of one `MechanicalMode`, so that a system with other numbers is not traced
+    again; `prefix`: that of the names of the functions.
+    """
+    n = form.size // 2
+    numbers, t, _ = form.arguments
+    q = jax.ShapeDtypeStruct((n,), t.dtype)
+    functions = {
+        "metric(q)": ((q,), f"of shape ({n}, {n})", lambda shape: shape == (n, n)),
+        "potential(q)": ((q,), "one number", lambda shape: shape == ()),
+        "constraints(q)": (
+            (q,),
+            f"of shape (k, {n}), a row for each constraint",
+            lambda shape: shape is not None and len(shape) == 2 and shape[1] == n,
+        ),
+        "frame(q)": ((q,), f"of shape ({n}, {n})", lambda shape: shape == (n, n)),
+        "force(t, q, rate)": ((t, q, q), f"of shape ({n},)", lambda shape: shape in ((), (1,), (n,))),
+        "margin(t, q, rate)": (
+            (t, q, q),
+            "one number, an array of shape (k,), a dict of numbers by name, or None",
+            lambda shape: shape is None or (shape != "" and (set(shape) == {()} or len(shape) < 2)),
+        ),
+        "reset(t, q, rate)": (
+            (t, q, q),
+            f"(q, rate), both of shape ({n},), or None; as a mode of a Hybrid also (q, rate, number of the next mode)",
+            lambda shape: shape is None or (shape[:2] == ((n,), (n,)) and shape[2:] in ((), ((),))),
+        ),
+    }
+
+    def called(method: str, numbers: Sequence[Array], *arguments: Array) -> PyTree:
+        mode: Any = form.system(numbers).modes[0]
+        system = mode.formulation.system
+        exit = exit_of(system.margin(*arguments), 0) if method == "reset" else ()
+        return getattr(system, method)(*arguments, *exit)
+
+    for name, (arguments, expected_shape, fits) in functions.items():
+        words = f"the coordinates q{' and their rates, each' if 'rate' in name else ','} of shape ({n},)"
+        words = (f"the time t, a number, and {words}" if "(t" in name else words) + EXIT * name.startswith("reset")
+        with named_errors(f"{prefix}{name}", words):
+            result = jax.eval_shape(functools.partial(called, name.partition("(")[0]), numbers, *arguments)
+        shape = _shape_of(result)
+        if name.startswith("margin") and result is None:
+            break  # Nothing calls the reset.
+        if not fits(shape):
+            raise ValueError(f"{prefix}{name} must be {expected_shape}, not {shown(result) if shape == '' else shape}")
+
+
+def _shape_of(result: Any) -> Any:
+    """The shape of an array, a tuple of those of several arrays, `None` for `None`, and "" for anything else."""
+    result = tuple(result.values()) if isinstance(result, dict) else result
+    if isinstance(result, tuple):
+        return tuple(map(_shape_of, result))
+    return None if result is None else getattr(result, "shape", "")
+
+
+#: Least similarity of a name to a known one, as `difflib` measures it: "forces" and "force" have 0.91.
+SIMILARITY = 0.75
+
+
+def warn_of_misspelt_methods(part: AbstractMode | AbstractSystem, base: type) -> None:
+    """Warn of every method of a mode or a system that resembles a method of its base class which the class does not
+    define, unless another method of the class calls it; and of a reset without a margin.
+
+    **Arguments:** `part`: an object of a user's class; `base`: `AbstractMode` or `AbstractSystem`.
+    """
+    kind = type(part)
+    free = [name for name in vars(base) if not name.startswith("_") and getattr(kind, name) is getattr(base, name)]
+    own = {name for parent in kind.__mro__[: kind.__mro__.index(base)] for name in vars(parent)}
+    own -= {field.name for field in dataclasses.fields(kind)}
+    methods = {name: getattr(kind, name) for name in sorted(own) if inspect.isfunction(getattr(kind, name, None))}
+    for name in methods:
+        matches = difflib.get_close_matches(name, free, 1, SIMILARITY)
+        others = (function for other, function in methods.items() if other != name)
+        if matches and not name.startswith("_") and not any(name in _names(other.__code__) for other in others):
+            warn(f"{kind.__name__}.{name} is never called; did you mean {matches[0]}?")
+    if "reset" not in free and "margin" in free:
+        warn(
+            f"{kind.__name__}.reset is never called: write margin as well, which falls to zero where the reset happens"
+        )
+
+
+def _names(code: CodeType) -> set[str]:
+    """The names that a function and the functions inside it use."""
+    inner = (constant for constant in code.co_consts if isinstance(constant, CodeType))
+    return set(code.co_names).union(*map(_names, inner))

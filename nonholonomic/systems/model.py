@@ -3,26 +3,26 @@
 import dataclasses
 import functools
 import operator
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..compilation.tracing import dependent_outputs, named_errors, with_own_numbers
-from ..formulations import AbstractFormulation, AbstractSystem
+from ..compilation.xla_cpu import Function
 from ..hybrid import HybridOutcome
 from ..integration import AbstractProblem, Outcome
 from ..integration.problem import CROSSED, FAILED, UNRESOLVED, Status
 from ..parameters import Parameters, check_again, has_checks, require_apart, short_names
-from ..runs.model import AbstractModel, Names, Start, model_of, statuses
+from ..runs.model import AbstractModel, Names, Start, model_of, run_of, statuses
 from ..runs.simulate import simulate_model
 from ..runs.trajectory import (
     RADIUS,
     TOLERANCE,
-    Trajectory,
     frame_of,
     live_run,
     page_of,
@@ -37,18 +37,28 @@ from ..validation import as_number, is_traced
 from ..views import Stage
 from ..views.explore import Frame, LiveRun, Summary
 from .engine import Cells
-from .form import AbstractMode, Event, Form, Hybrid, arguments_in_words, require_event
-from .system import (
-    RULES,
+from .form import (
+    AbstractMode,
+    Event,
+    Form,
+    Hybrid,
     MechanicalEvent,
     MechanicalMode,
+    arguments_in_words,
     check_start,
-    formulation_of,
     is_pair,
-    parts_of_start,
+    require_event,
+    with_modes_of_systems,
+)
+from .mechanics import (
+    RULES,
+    AbstractFormulation,
+    AbstractSystem,
+    Parts,
+    formulation_of,
+    parts_of_system,
     problem_of_start,
     rooms,
-    with_modes_of_systems,
 )
 
 # A user's own system as a model: its numbers by name, its modes, and its components.
@@ -57,7 +67,7 @@ from .system import (
 class OwnModel(AbstractModel):
     """A `Hybrid` or an `AbstractSystem`, its start and its event, which is a part of `parameters`.
 
-    `form`: the form of the hybrid system; `components_of`: the names of the components of a state.
+    `form`: the form of the hybrid system; `names`: those of the components of a state.
     """
 
     parameters: Parameters
@@ -73,7 +83,7 @@ class OwnModel(AbstractModel):
         form.traits  # noqa: B018  Traced here, so that what is wrong with a user's function is said before anything compiles.
         return cls(parameters=Parameters.of(tree), form=form, names=names_of(tree["system"], form.size))
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> tuple[Function, tuple[dict[str, Any]]]:
         # The structure of a tree with a user's classes cannot be pickled, but the tree can.
         return OwnModel.of, (self.parameters.tree,)
 
@@ -87,7 +97,7 @@ class OwnModel(AbstractModel):
     def value(self, name: str) -> Array:
         return self.parameters.value(name)
 
-    def replaced(self, values: dict[str, Any]) -> "OwnModel":
+    def replaced(self, values: Mapping[str, ArrayLike]) -> "OwnModel":
         new_values = {name: jnp.asarray(value, float) for name, value in values.items()}
         return dataclasses.replace(self, parameters=self.parameters.replaced(new_values))
 
@@ -115,10 +125,10 @@ class OwnModel(AbstractModel):
                 mode = f"modes[{system.first}]." if isinstance(system, Hybrid) else ""
                 raise ValueError(problem_of_start(parts, rule, mode))
 
-    def require_values(self, values: dict[str, Any]) -> None:
+    def require_values(self, values: dict[str, ArrayLike]) -> None:
         check_again(self.replaced(values).parameters.tree)
 
-    def check_axes(self, grid: list[Axis], cells: Any) -> None:
+    def check_axes(self, grid: list[Axis], cells: object) -> None:
         tree = self.parameters.tree
         for axis in grid if has_checks(tree["system"]) or has_checks(tree["event"]) else ():
             for value in axis.values:
@@ -127,7 +137,7 @@ class OwnModel(AbstractModel):
     def legal(self) -> Bool[Array, "..."]:
         return _all_left(rooms(_parts_of_cells(self), jnp))
 
-    def legal_cells(self, columns: dict[str, Any]) -> Any:
+    def legal_cells(self, columns: dict[str, Array]) -> Bool[Array, " cells"]:
         parts = jax.tree.map(np.asarray, _compiled_parts(self.replaced(columns)))
         with np.errstate(all="ignore"):
             return _all_left(rooms(parts, np))
@@ -135,6 +145,10 @@ class OwnModel(AbstractModel):
     @property
     def smooth(self) -> bool:
         return self.form.traits.smooth
+
+    @property
+    def compiles_slowly(self) -> bool:
+        return any(self.form.traits.large)
 
     @property
     def has_event(self) -> bool:
@@ -147,7 +161,7 @@ class OwnModel(AbstractModel):
     def problem(self, cells: int | None, names: Names) -> AbstractProblem:
         return self._cells(cells).problem(cells)
 
-    def modes(self, cells: int, tolerance: Any, names: Names, continues: bool) -> Start:
+    def modes(self, cells: int, tolerance: ArrayLike, names: Names, continues: bool) -> Start:
         return self._cells(cells).modes(cells, tolerance, continues)
 
     def _cells(self, size: int | None) -> Cells:
@@ -176,11 +190,6 @@ class OwnModel(AbstractModel):
         leaves = zip(jax.tree.leaves(batch), jax.tree.leaves(single), depends, strict=True)
         return jax.tree.unflatten(jax.tree.structure(single), [a if d else b for a, b, d in leaves])
 
-    def simulate(self, t1: Any, times: Any, tolerance: Any, solver: Any, adjoint: Any) -> Trajectory:
-        # A run continues through its event, which only its page shows.
-        run = simulate_model(self.without_event(), t1, times, tolerance, solver)
-        return dataclasses.replace(run, model=self)
-
     def without_event(self) -> "OwnModel":
         """The same model without an event."""
         tree = self.parameters.tree
@@ -196,7 +205,7 @@ class OwnModel(AbstractModel):
         return {name: Quantity("1", name) for name in self.names}
 
     def read(
-        self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: Any
+        self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: object
     ) -> dict[str, Array]:
         return {name: part for name, part in zip(self.names, self.components_of(rows), strict=True) if name in names}
 
@@ -218,7 +227,7 @@ class OwnModel(AbstractModel):
     def words(self) -> tuple[str, ...]:
         return ("event", "completed", "stopped", "failed", "unresolved", "illegal")
 
-    def ended(self, outcome: Outcome | HybridOutcome, tolerance: Any) -> Int[Array, " cells"]:
+    def ended(self, outcome: Outcome | HybridOutcome, tolerance: object) -> Int[Array, " cells"]:
         return statuses(outcome.status, Status.STOPPED)
 
     @property
@@ -229,28 +238,43 @@ class OwnModel(AbstractModel):
         return dict(zip(self.names, self.components_of(jnp.asarray(outcome.state)), strict=True))
 
 
+run_of.register(OwnModel, simulate_model)
+
+
+def state_of(start: Array | dict[str, Array]) -> Array:
+    """The state at a start, which may be {"q": coordinates, "rate": rates}."""
+    return jnp.concatenate([start["q"], start["rate"]]) if isinstance(start, dict) else start
+
+
 def assembled(tree: dict[str, Any]) -> tuple[Hybrid, Array, AbstractFormulation | None]:
     """A system as a `Hybrid`, the state at its start, and the formulation of a mechanical system."""
     system, start, event = tree["system"], tree["start"], tree["event"]
     if isinstance(system, Hybrid):
-        state = jnp.concatenate([start["q"], start["rate"]]) if isinstance(start, dict) else start
-        return with_modes_of_systems(system), state, None
+        return with_modes_of_systems(system), state_of(start), None
     formulation = formulation_of(system)
     event = None if event is None else MechanicalEvent(formulation, event)
     return Hybrid([MechanicalMode(formulation)], event), formulation.state(start["q"], start["rate"]), formulation
 
 
-def _all_left(left: dict[str, Any]) -> Any:
+def _all_left(left: Parts) -> Any:
     """Whether no rule of a start is broken."""
     return functools.reduce(operator.and_, (room >= 0.0 for room in left.values()))
 
 
-def _parts_of_cells(model: OwnModel) -> dict[str, Array]:
-    """What the rules of a start compare (`legality.parts_of_start`), for all cells."""
+def _parts_of_cells(model: OwnModel) -> Parts:
+    """What the rules compare: the start, the functions of a mechanical first mode, and the least of its margins; for all
+    cells."""
 
-    def of_one(*numbers: Array) -> dict[str, Array]:
+    def of_one(*numbers: Array) -> Parts:
         tree = model.parameters.form.tree(numbers)
-        return parts_of_start(tree["system"], tree["start"])
+        system = tree["system"]
+        first = system.modes[system.first] if isinstance(system, Hybrid) else system
+        y = state_of(tree["start"])
+        arguments = jnp.split(y, 2) if isinstance(first, AbstractSystem) else [y]
+        parts = parts_of_system(first, *arguments) if isinstance(first, AbstractSystem) else {}
+        margins = jax.tree.leaves(first.margin(jnp.zeros((), y.dtype), *arguments))
+        least = {"margin": functools.reduce(jnp.minimum, map(jnp.min, margins))} if margins else {}
+        return {"y": y} | parts | least
 
     values = jax.lax.stop_gradient(model.parameters.values)
     axes = tuple(0 if jnp.ndim(value) else None for value in values)
@@ -260,15 +284,11 @@ def _parts_of_cells(model: OwnModel) -> dict[str, Array]:
 _compiled_parts = eqx.filter_jit(_parts_of_cells)
 
 
-def checked_event(event: Any, state: Array) -> Event:
-    """The event with its own numbers; raises `ValueError` unless it is a function that accepts a time and a state."""
-    require_event(event)
-    with named_errors("event(t, y)", arguments_in_words(state.size)):
-        return with_own_numbers(event, jnp.zeros(()), state)
-
-
-def require_no_input(input: Any, jumps: Any) -> None:
-    """Raise `ValueError` unless there is no input, because a user's system has none apart from its own functions."""
+@model_of.register(AbstractSystem)
+@model_of.register(Hybrid)
+def _(
+    system: Hybrid | AbstractSystem, start: Any, event: Event | None = None, input: object = None, jumps: object = None
+) -> OwnModel:
     if input is not None:
         raise ValueError(
             f"input = {shown(input)} must be None for your own system: write the input into field(t, y) of a mode or into "
@@ -279,34 +299,28 @@ def require_no_input(input: Any, jumps: Any) -> None:
             f"jumps = {shown(jumps)} must be None for your own system: compare t itself with numbers in its functions, such as "
             "t > self.switch, and the times are found"
         )
-
-
-@model_of.register(Hybrid)
-def _(system: Hybrid, start: Any, event: Event | None = None, input: Any = None, jumps: Any = None) -> OwnModel:
-    require_no_input(input, jumps)
     check_start(system, start)
     # With a mechanical system among the modes, a state is (q, rate).
-    has_pairs = any(isinstance(mode, AbstractSystem) for mode in system.modes) and is_pair(start)
-    pair = dict(zip(("q", "rate"), map(as_number, start), strict=True)) if has_pairs else None
-    state = as_number(start) if pair is None else jnp.concatenate([*pair.values()])
-    event = system.event if event is None else event
+    modes = system.modes if isinstance(system, Hybrid) else (system,)
+    is_mechanical = any(isinstance(mode, AbstractSystem) for mode in modes)
+    has_pair = is_mechanical and is_pair(start)
+    numbers: Array | dict[str, Array] = (
+        dict(zip(("q", "rate"), map(as_number, start), strict=True)) if has_pair else as_number(start)
+    )
+    if event is None and isinstance(system, Hybrid):
+        event = system.event
     if event is not None:
-        system = dataclasses.replace(system, event=checked_event(event, state))
-    return OwnModel.of({"system": system, "start": state if pair is None else pair, "event": None})
-
-
-@model_of.register(AbstractSystem)
-def _(system: AbstractSystem, start: Any, event: Event | None = None, input: Any = None, jumps: Any = None) -> OwnModel:
-    require_no_input(input, jumps)
-    check_start(system, start)
-    q, rate = (as_number(part) for part in start)
-    if event is not None:
-        event = checked_event(event, jnp.concatenate([q, rate]))
-    return OwnModel.of({"system": system, "start": {"q": q, "rate": rate}, "event": event})
+        require_event(event)
+        state = state_of(numbers)
+        with named_errors("event(t, y)", arguments_in_words(state.size)):
+            event = with_own_numbers(event, jnp.zeros(()), state)
+        if isinstance(system, Hybrid):
+            system, event = dataclasses.replace(system, event=event), None
+    return OwnModel.of({"system": system, "start": numbers, "event": event})
 
 
 @model_of.register(AbstractMode)
-def _(system: AbstractMode, start: Any, event: Event | None = None, input: Any = None, jumps: Any = None) -> OwnModel:
+def _(system: AbstractMode, *arguments: object, **options: object) -> OwnModel:
     raise ValueError(
         f"system = {shown(system)} must be a Hybrid or an AbstractSystem; wrap modes in nonholonomic.Hybrid([...])"
     )
@@ -316,21 +330,21 @@ def _(system: AbstractMode, start: Any, event: Event | None = None, input: Any =
 TAKEN = ("time", "status", "end_time", "steps", "rejected", "switches", "mode", "grazes")
 
 
-def names_of(system: Any, size: int) -> tuple[str, ...]:
+def names_of(system: Hybrid | AbstractSystem, size: int) -> tuple[str, ...]:
     """The names of the components of a state: those of the system or of its first mode that has some, or `y0` and so on, or
     `q0` and `rate0` and so on for a mechanical system.
 
     **Raises:** `ValueError` for a wrong number of names, names that are not different words, and names of other columns.
     """
-    modes: Any = system.modes if isinstance(system, Hybrid) else (system,)
-    mechanical: Any = next((mode for mode in modes if isinstance(mode, AbstractSystem)), None)
-    owner: Any = next((mode for mode in modes if mode.names is not None), mechanical)
+    modes = system.modes if isinstance(system, Hybrid) else (system,)
+    mechanical = next((mode for mode in modes if isinstance(mode, AbstractSystem)), None)
+    owner = next((mode for mode in modes if mode.names is not None), mechanical)
     if owner is None:
         return tuple(f"y{k}" for k in range(size))
-    if owner.names is None:
-        return tuple(f"{name}{k}" for name in ("q", "rate") for k in range(owner.dimension))
-    names, has_rates = owner.names, isinstance(owner, AbstractSystem)
+    has_rates = isinstance(owner, AbstractSystem)
     size = owner.dimension if has_rates else size
+    if (names := owner.names) is None:
+        return tuple(f"{name}{k}" for name in ("q", "rate") for k in range(size))
     legal = isinstance(names, tuple | list) and all(isinstance(name, str) and name.isidentifier() for name in names)
     if not legal or len(set(names)) != size or len(names) != size or not set(names).isdisjoint(TAKEN):
         kind = "coordinate" if has_rates else "component of the state"
@@ -347,18 +361,16 @@ def names_of(system: Any, size: int) -> tuple[str, ...]:
 DEFAULT_SLIDERS, TURNS = 3, 40.0
 
 
-def default_ranges(model: OwnModel) -> dict[str, Any]:
-    """The default sliders: the first parameters that are not zero, from half to twice their values."""
-    names = [name for name in model.known if "[*]" not in name and float(model.value(name))]
-    names.sort(key=lambda name: name.startswith("start"))
-    values = {name: float(model.value(name)) for name in names[:DEFAULT_SLIDERS]}
-    return {name: tuple(sorted((0.5 * value, 2.0 * value))) for name, value in values.items()}
-
-
 @page_of.register(OwnModel)
-def page_of_system(model: OwnModel, ranges: Any, t1: float) -> tuple[LiveRun, Stage]:
-    """The page of a model: its run, and the plane on which it is drawn."""
-    sliders = sliders_of(model, default_ranges(model) if ranges is None else ranges)
+def page_of_system(model: OwnModel, ranges: dict[str, Any] | None, t1: float) -> tuple[LiveRun, Stage]:
+    """The page of a model: its run, and the plane on which it is drawn. By default, the first parameters that are not zero
+    have sliders, from half to twice their values."""
+    if ranges is None:
+        names = [name for name in model.known if "[*]" not in name and float(model.value(name))]
+        names.sort(key=lambda name: name.startswith("start"))
+        values = {name: float(model.value(name)) for name in names[:DEFAULT_SLIDERS]}
+        ranges = {name: tuple(sorted((0.5 * value, 2.0 * value))) for name, value in values.items()}
+    sliders = sliders_of(model, ranges)
     runs, names = runs_at_ends(model, sliders, t1), model.names
     centre, scale = frame_of(np.concatenate([plane_points(run) for run in runs]))
     (stage,) = portraits(runs[:1], False, (centre, scale))
@@ -372,7 +384,7 @@ def page_of_system(model: OwnModel, ranges: Any, t1: float) -> tuple[LiveRun, St
             result = jnp.where(failed, jnp.inf, model.components_of(ended.state[:, 0])[0])
         return model.ended(ended, TOLERANCE)[0], result[0]
 
-    def frame(model: OwnModel, time: Any, rows: Array, mode: Any) -> Frame:
+    def frame(model: OwnModel, time: object, rows: Array, mode: object) -> Frame:
         components = model.components_of(rows[:, 0])
         point = (components[jnp.array([0, len(names) - 1])] - centre) * scale
         position = jnp.concatenate([point, jnp.full(1, RADIUS)])

@@ -2,17 +2,23 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..parameters import short_names
 from ..text import in_unit, readable_unit
 from .plot import new_figure
+from .stage import Unit
 
-# Only for type checkers: plots stand below tables and fits, which use them.
+# Only for type checkers: matplotlib is optional, and plots stand below tables and fits, which use them.
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.gridspec import SubplotSpec
+
     from ..identification import Identification
+    from ..identification.conclusions import Profile
 
 #: Greatest number of drawn profiles, and the rise of -2 log likelihood at the end of a 95 % interval.
 MOST_PROFILES, INTERVAL = 6, 3.84
@@ -43,7 +49,7 @@ class _Drawn(NamedTuple):
     curves: np.ndarray
 
     @classmethod
-    def of(cls, fit: "Identification", unit: Any) -> "_Drawn":
+    def of(cls, fit: "Identification", unit: Unit) -> "_Drawn":
         numbers, names = np.asarray(fit.measurements.series), []
         series, factors = [np.flatnonzero(numbers == number) for number in np.unique(numbers)], np.ones(len(numbers))
         for k, indices in enumerate(series):
@@ -80,7 +86,7 @@ class _Drawn(NamedTuple):
         return panels
 
 
-def draw_fit(fit: "Identification", labels: Sequence[str], unit: Any) -> Any:
+def draw_fit(fit: "Identification", labels: Sequence[str], unit: Unit) -> "Figure":
     """Draw a fit: measurements and predictions at the most likely values, with a panel for each quantity; residuals in standard
     errors; profile likelihoods of the determined parameters (with their estimates and intervals, and the parabolas of their
     errors dashed); and correlations. Samples over time and other measurements are side by side.
@@ -103,7 +109,7 @@ def draw_fit(fit: "Identification", labels: Sequence[str], unit: Any) -> Any:
     rows = figure.add_gridspec(2, 1, height_ratios=(1.0 + 2.0 * most, 1.6))
     columns = rows[0].subgridspec(1, len(blocks))
     for column, block in enumerate(blocks):
-        _draw_block(fit, drawn, block, has_time[block[0]], labels, columns[column])
+        _draw_block(fit, drawn, block, has_time[block[0]], labels, figure, columns[column])
     grid = rows[1].subgridspec(1, lower)
     concerns = [*fit.verdict.concerns]
     for k, name in enumerate(profiled):
@@ -111,7 +117,12 @@ def draw_fit(fit: "Identification", labels: Sequence[str], unit: Any) -> Any:
         _draw_profile(fit, name, profile, figure.add_subplot(grid[k]), unit)
         concerns += filter(None, [profile.concern(name)])
     if correlated:
-        _draw_correlation(fit, names, figure.add_subplot(grid[lower - 1]))
+        axes, short = figure.add_subplot(grid[lower - 1]), list(short_names(names).values())
+        image = axes.imshow(fit.correlation, vmin=-1.0, vmax=1.0, cmap="RdBu")
+        axes.set_xticks(range(len(names)), short, rotation=90, fontsize=8)
+        axes.set_yticks(range(len(names)), short, fontsize=8)
+        axes.set_title("correlation", fontsize=9)
+        figure.colorbar(image, ax=axes, shrink=0.8)
     remarks = [*(concerns or ["no concerns about this fit"]), *(f"note: {note}" for note in fit.verdict.notes)]
     figure.suptitle("; ".join(remarks), fontsize=9, wrap=True)
     return figure
@@ -122,13 +133,19 @@ def _with_unit(name: str, unit: str) -> str:
 
 
 def _draw_block(
-    fit: "Identification", drawn: _Drawn, block: list[int], has_time: bool, labels: Sequence[str], place: Any
+    fit: "Identification",
+    drawn: _Drawn,
+    block: list[int],
+    has_time: bool,
+    labels: Sequence[str],
+    figure: "Figure",
+    place: "SubplotSpec",
 ) -> None:
     """Draw series over their times, or over the numbers of their measurements: the data and the residuals."""
     indices = np.concatenate([drawn.series[k] for k in block])
     abscissa = np.full(len(drawn.value), np.nan)
     abscissa[indices] = np.asarray(fit.measurements.time)[indices] if has_time else np.arange(len(indices))
-    panels, figure, first = drawn.panels(block), place.get_gridspec().figure, None
+    panels, first = drawn.panels(block), None
     grid = place.subgridspec(len(panels) + 1, 1, height_ratios=[2.0] * len(panels) + [1.0])
     for row, (name, series) in enumerate(panels.items()):
         axes = figure.add_subplot(grid[row], sharex=first)
@@ -151,7 +168,7 @@ def _draw_block(
         residuals.set_xlabel("measurement")
 
 
-def _draw_data(drawn: _Drawn, axes: Any, series: list[int], abscissa: np.ndarray, has_time: bool) -> None:
+def _draw_data(drawn: _Drawn, axes: "Axes", series: list[int], abscissa: np.ndarray, has_time: bool) -> None:
     """Draw the series of one panel with their predictions, as curves if they have times."""
     several = len(series) > 1
     for k in series:
@@ -170,22 +187,18 @@ def _draw_data(drawn: _Drawn, axes: Any, series: list[int], abscissa: np.ndarray
             axes.plot(abscissa[allowed], drawn.predicted[allowed], "x", color="0.3", label=text)
     indices = np.concatenate([drawn.series[k] for k in series])
     exact, limits = indices[~drawn.is_limit[indices]], indices[drawn.is_limit[indices]]
-    _keep_range(axes, drawn.value[exact], drawn.errors[exact], drawn.predicted[exact])
+    if len(exact):
+        # The measured values set the range, and the predictions as far as they are no farther than these.
+        value, error, predicted = drawn.value[exact], drawn.errors[exact], drawn.predicted[exact]
+        low, high = float(np.min(value - error)), float(np.max(value + error))
+        near = np.clip(predicted[np.isfinite(predicted)], low - 0.5 * (high - low), high + 0.5 * (high - low))
+        low, high = min([low, *near]), max([high, *near])
+        axes.set_ylim(low - MARGIN * (high - low), high + MARGIN * (high - low))
     _draw_limits(axes, abscissa[limits], drawn.value[limits], drawn.upper[limits])
     axes.legend(fontsize=8)
 
 
-def _keep_range(axes: Any, value: np.ndarray, errors: np.ndarray, predicted: np.ndarray) -> None:
-    """Let the measured values set the range, and the predictions as far as they are no farther than these."""
-    if not len(value):
-        return
-    low, high = float(np.min(value - errors)), float(np.max(value + errors))
-    near = np.clip(predicted[np.isfinite(predicted)], low - 0.5 * (high - low), high + 0.5 * (high - low))
-    low, high = min([low, *near]), max([high, *near])
-    axes.set_ylim(low - MARGIN * (high - low), high + MARGIN * (high - low))
-
-
-def _draw_limits(axes: Any, places: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
+def _draw_limits(axes: "Axes", places: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
     """Draw a lower limit as a triangle that points up, an upper limit as one that points down, and a pair of limits as a
     bar; with their values, at the edge of the picture where they lie outside."""
     low, high = axes.get_ylim()
@@ -200,13 +213,13 @@ def _draw_limits(axes: Any, places: np.ndarray, lower: np.ndarray, upper: np.nda
         drawn = min(max(limit, low + 0.03 * (high - low)), high - 0.03 * (high - low))
         axes.plot([place], [drawn], "^" if is_lower else "v", color="C1", label=text)
         shift = 5 if drawn < low + 0.1 * (high - low) else -11
-        apart: Any = {"xytext": (0, shift), "textcoords": "offset points", "ha": "center", "fontsize": 8}
-        axes.annotate(f"{'>' if is_lower else '<'} {limit:.4g}", (place, drawn), **apart)
+        words = f"{'>' if is_lower else '<'} {limit:.4g}"
+        axes.annotate(words, (place, drawn), (0, shift), textcoords="offset points", ha="center", fontsize=8)
         text = None
     axes.set_ylim(low, high)
 
 
-def _draw_profile(fit: "Identification", name: str, profile: Any, axes: Any, unit: Any) -> None:
+def _draw_profile(fit: "Identification", name: str, profile: "Profile", axes: "Axes", unit: Unit) -> None:
     shown, factor = in_unit(fit.units.get(name, "1"), unit)
     estimate, error = fit.estimates[name], fit.standard_errors[name]
     likely = fit.most_likely[name]
@@ -227,12 +240,3 @@ def _draw_profile(fit: "Identification", name: str, profile: Any, axes: Any, uni
     digits = max(0, 1 - math.floor(math.log10(factor * error)))
     value, spread, low, high = (f"{factor * part:.{digits}f}" for part in (estimate, error, *fit.interval(name)))
     axes.set_title(f"{value} ± {spread} {readable_unit(shown)}".rstrip() + f"\n95 %: {low} to {high}", fontsize=9)
-
-
-def _draw_correlation(fit: "Identification", names: list[str], axes: Any) -> None:
-    image = axes.imshow(fit.correlation, vmin=-1.0, vmax=1.0, cmap="RdBu")
-    labels = list(short_names(names).values())
-    axes.set_xticks(range(len(names)), labels, rotation=90, fontsize=8)
-    axes.set_yticks(range(len(names)), labels, fontsize=8)
-    axes.set_title("correlation", fontsize=9)
-    axes.figure.colorbar(image, ax=axes, shrink=0.8)

@@ -1,25 +1,27 @@
 """A self-contained page: an animated 3D view drawn by three.js, and curves.
 
-The page is one HTML file that makes no network requests. `page.html` is its frame; `stage.js` draws a stage,
-`strips.js` the curves, and `player.js` unpacks the data and sets the time. three.js comes from the package
+The page is one HTML file that makes no network requests. `page.html` is its frame; `stage.js` draws a stage, `strips.js` the
+curves, `film.js` saves pictures and films, and `player.js` unpacks the data and sets the time. three.js comes from the package
 jupyter-threejs-sage.
 """
 
 import base64
 import html
 import json
+import os
+import sys
+import time
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from ..validation import replacing, require_file
-from .stage import Mesh, Show, Stage, css, finite
+from .stage import Arrow, Body, Curve, Mesh, Show, Stage, Trace, css, finite
 
 #: Selectable speeds of time.
 SPEEDS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
@@ -30,7 +32,7 @@ NO_VIEW = "The page is without motion: jupyter-threejs-sage is not installed (pi
 #: Path of three.js in its package.
 PACKAGE, LIBRARY = "jupyter_threejs_sage", ("static", "r130", "three.min.js")
 
-SCRIPTS = ("stage.js", "strips.js", "player.js")
+SCRIPTS = ("stage.js", "strips.js", "film.js", "player.js")
 
 LINES = 0x7C8896
 BACKGROUND = 0xFBFBFA
@@ -44,7 +46,7 @@ class Page(NamedTuple):
 
     html: str
 
-    def save(self, path: Any) -> None:
+    def save(self, path: str | os.PathLike[str]) -> None:
         """Write the page to a file, completely or not at all.
 
         **Raises:** `OSError` if it cannot be written; `ValueError` unless the name ends in .html.
@@ -108,36 +110,20 @@ def table_as_html(rows: list[list[str]], heads: int) -> str:
 
 def picture_as_html(path: Path) -> str:
     """A PNG file as an HTML image with embedded data."""
-    return f'<img style="max-width:100%" alt="" src="data:image/png;base64,{_coded(path.read_bytes())}">'
+    coded = base64.b64encode(path.read_bytes()).decode()
+    return f'<img style="max-width:100%" alt="" src="data:image/png;base64,{coded}">'
 
 
-def script(text: str) -> str:
-    """JavaScript as an HTML script element."""
-    return f"<script>{_safe(text)}</script>"
-
-
-def data_script(name: str, data: bytes) -> str:
-    """Bytes as an HTML script element for data, read by its id: deflated, in base64."""
-    return f'<script type="text/plain" id="{name}">{_coded(zlib.compress(data, 9))}</script>'
-
-
-def json_script(name: str, value: Any) -> str:
-    """A value as an HTML script element for data, read by its id: JSON."""
-    return f'<script type="application/json" id="{name}">{_safe(json.dumps(value))}</script>'
-
-
-def _safe(text: str) -> str:
+def script(text: str, attributes: str = "") -> str:
+    """JavaScript, or data with `attributes` that say so, as an HTML script element."""
     # Browsers take "</script>" for the end of a script anywhere, even in data.
-    return text.replace("</", "<\\/")
+    safe_text = text.replace("</", "<\\/")
+    return f"<script{attributes}>{safe_text}</script>"
 
 
 def template(name: str) -> str:
     """The text of a file of this folder, such as a part of a page."""
     return files("nonholonomic.views").joinpath(name).read_text(encoding="utf-8")
-
-
-def _coded(data: bytes) -> str:
-    return base64.b64encode(data).decode("ascii")
 
 
 def _view(stages: list[Stage], speed: float, autoplay: bool) -> str:
@@ -150,12 +136,19 @@ def _view(stages: list[Stage], speed: float, autoplay: bool) -> str:
         "autoplay": autoplay,
         "stages": [_stage(stage, numbers) for stage in stages],
     }
+    floats, whole = (np.concatenate(numbers.parts[kind]) for kind in ("<f4", "<i4"))
+    data = {
+        "library": files(PACKAGE).joinpath(*LIBRARY).read_bytes(),
+        "floats": floats.view(np.uint8).reshape(-1, 4).T.tobytes(),
+        "whole": whole.tobytes(),
+    }
     return "\n".join(
         [
-            data_script("library", files(PACKAGE).joinpath(*LIBRARY).read_bytes()),
-            json_script("facts", facts),
-            data_script("floats", numbers.floats),
-            data_script("whole", numbers.whole),
+            script(json.dumps(facts), ' type="application/json" id="facts"'),
+            *(
+                script(base64.b64encode(zlib.compress(part, 9)).decode(), f' type="text/plain" id="{name}"')
+                for name, part in data.items()
+            ),
             *(script(template(name)) for name in SCRIPTS),
         ]
     )
@@ -171,129 +164,134 @@ class _Numbers:
 
     def __init__(self):
         self.parts: dict[str, list[np.ndarray]] = {"<f4": [], "<i4": []}
-        self.places: dict[bytes, tuple[int, int]] = {}
-        self.lengths = {"<f4": 0, "<i4": 0}
+        self.places: dict[tuple[str, bytes], tuple[int, int]] = {}
 
-    def add(self, values: np.ndarray) -> tuple[int, int]:
-        """Add floats."""
-        return self._add(np.ascontiguousarray(values, dtype="<f4").ravel(), "<f4")
-
-    def add_whole(self, values: np.ndarray) -> tuple[int, int]:
-        """Add whole numbers."""
-        return self._add(np.diff(np.ravel(values), prepend=0).astype("<i4"), "<i4")
-
-    def _add(self, flat: np.ndarray, kind: str) -> tuple[int, int]:
-        key = kind.encode() + flat.tobytes()
+    def add(self, values: np.ndarray, kind: str = "<f4") -> tuple[int, int]:
+        """Add an array of floats, or of whole numbers, "<i4"."""
+        flat = np.diff(values.ravel(), prepend=0) if kind == "<i4" else values.ravel()
+        flat = np.ascontiguousarray(flat, dtype=kind)
+        key = kind, flat.tobytes()
         if key not in self.places:
-            self.places[key] = (self.lengths[kind], flat.size)
-            self.lengths[kind] += flat.size
+            self.places[key] = (sum(map(len, self.parts[kind])), flat.size)
             self.parts[kind].append(flat)
         return self.places[key]
 
-    @property
-    def floats(self) -> bytes:
-        numbers = np.concatenate(self.parts["<f4"])
-        return numbers.view(np.uint8).reshape(-1, 4).T.tobytes()
+    def mesh(self, mesh: Mesh) -> dict[str, object]:
+        """A mesh for the script."""
+        vertices, triangles = self.add(mesh.vertices), self.add(mesh.triangles, "<i4")
+        return {"vertices": vertices, "triangles": triangles, "colour": css(mesh.colour)}
 
-    @property
-    def whole(self) -> bytes:
-        return np.concatenate(self.parts["<i4"]).tobytes()
+    def described(self, part: object) -> object:
+        """A part of a stage for the script: a named tuple by its fields, and arrays by their places."""
+        if isinstance(part, Mesh):
+            return self.mesh(part)
+        if isinstance(part, Trace):
+            part = part._replace(points=finite(part.points))
+        elif isinstance(part, Arrow):
+            part = part._replace(start=finite(part.start), vector=finite(part.vector))
+        if isinstance(part, Show | Body | Trace | Arrow | Curve):
+            fields = {name: self.described(value) for name, value in part._asdict().items()}
+            return fields | ({"colour": css(part.colour)} if isinstance(part, Show | Trace | Arrow) else {})
+        if isinstance(part, tuple):
+            return [self.described(item) for item in part]
+        return part if isinstance(part, str | float | int | None) else self.add(np.asarray(part))
 
 
-def _stage(stage: Stage, numbers: _Numbers) -> dict[str, Any]:
+def _stage(stage: Stage, numbers: _Numbers) -> dict[str, object]:
     """The data of a stage for the script."""
-    camera, follow = view_from(stage)
+    place, target, follow = view_from(stage)
     keys = [(stage.arena.spacing, "")]
     if len(stage.shows) > 1:
         keys += [(show.name, css(show.colour)) for show in stage.shows]
-    arena = _mesh(stage.arena.mesh, numbers) | {"lines": [numbers.add(line) for line in stage.arena.lines]}
     return {
         "title": stage.title,
         "keys": keys,
         "notes": list(dict.fromkeys(show.note for show in stage.shows if show.note)),
         "follow": follow,
-        "camera": (camera[:3], camera[3:6]),
+        "camera": (place, target),
         "angle": ANGLE,
-        "size": _size(stage),
+        "size": max(show.size for show in stage.shows),
         "background": css(BACKGROUND),
         "lines": css(LINES),
-        "arena": arena,
-        "runs": [_show(show, numbers) for show in stage.shows],
+        "arena": numbers.mesh(stage.arena.mesh) | {"lines": [numbers.add(line) for line in stage.arena.lines]},
+        "runs": numbers.described(stage.shows),
     }
 
 
-def _mesh(mesh: Mesh, numbers: _Numbers) -> dict[str, Any]:
-    vertices, triangles = numbers.add(mesh.vertices), numbers.add_whole(mesh.triangles)
-    return {"vertices": vertices, "triangles": triangles, "colour": css(mesh.colour)}
-
-
-def _show(show: Show, numbers: _Numbers) -> dict[str, Any]:
-    return {
-        "name": show.name,
-        "colour": css(show.colour),
-        "times": numbers.add(show.times),
-        "normal": numbers.add(show.normal),
-        "bodies": [
-            {
-                "name": body.name,
-                "meshes": [_mesh(mesh, numbers) for mesh in body.meshes],
-                "position": numbers.add(body.position),
-                "orientation": numbers.add(body.orientation),
-            }
-            for body in show.bodies
-        ],
-        "traces": [
-            {
-                "name": trace.name,
-                "shown": trace.shown,
-                "colour": css(trace.colour),
-                "width": trace.width,
-                "points": numbers.add(finite(trace.points)),
-                "about": None if trace.about is None else numbers.add(trace.about),
-            }
-            for trace in show.traces
-        ],
-        "arrows": [
-            arrow._asdict()
-            | {
-                "colour": css(arrow.colour),
-                "start": numbers.add(finite(arrow.start)),
-                "vector": numbers.add(finite(arrow.vector)),
-            }
-            for arrow in show.arrows
-        ],
-        "curves": [
-            {"label": curve.label, "factor": curve.factor, "values": numbers.add(curve.values)} for curve in show.curves
-        ],
-    }
-
-
-def _size(stage: Stage) -> float:
-    return max(show.size for show in stage.shows)
-
-
-def centre_and_extent(points: Float[np.ndarray, "points 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
-    """The centre of points, and their distance from the centre."""
-    middle = points.mean(axis=0)
-    return middle, float(np.linalg.norm(points - middle, axis=-1).max())
-
-
-def view_from(stage: Stage) -> tuple[list[float], bool]:
-    """The camera (position, target, up), and whether it must follow the body, because the body is small compared with
+def view_from(stage: Stage) -> tuple[list[float], list[float], bool]:
+    """Position and target of the camera [m], and whether it must follow the body, because the body is small compared with
     its path."""
     paths = [finite(show.bodies[0].position) for show in stage.shows]
-    size = _size(stage)
+    size = max(show.size for show in stage.shows)
     points = np.concatenate(paths)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
     reach = np.linalg.norm(points - middle, axis=-1).max()
     follow = stage.follows or bool(reach > 4.0 * size)
     if follow:
-        middle, extent = centre_and_extent(np.stack([path[0] for path in paths]))
-        reach = 1.1 * size + extent
+        starts = np.stack([path[0] for path in paths])
+        middle = starts.mean(axis=0)
+        reach = 1.1 * size + np.linalg.norm(starts - middle, axis=-1).max()
     normal = stage.arena.normal
     view_axis = np.array([0.35, -1.0, 0.0])
     view_axis = view_axis - (view_axis @ normal) * normal
     direction = stage.rise * normal + view_axis / np.linalg.norm(view_axis)
     distance = 1.05 * (reach + 1.6 * size) / np.sin(np.radians(ANGLE) / 2.0)
     place = middle + distance * direction / np.linalg.norm(direction)
-    return [*place.tolist(), *middle.tolist(), 0.0, 0.0, 1.0], follow
+    return place.tolist(), middle.tolist(), follow
+
+
+# What a command line writes and prints at the end.
+
+
+class Outputs(NamedTuple):
+    """What a job has written.
+
+    - `runs`: number of runs; `files`: the tables and pictures; `page`: the page.
+    - `read_from`: the folder from which all results were read, or `None`.
+    """
+
+    runs: int
+    files: list[Path]
+    page: Path
+    read_from: Path | None = None
+
+
+def run_job(job: Callable[[], Outputs], program: str, purpose: str = "To see it") -> int:
+    """Run the job of a command line and print what it has written, or an error as one line.
+
+    **Arguments:** `program`: the name of the command line; `purpose`: what the page is for.
+
+    **Returns:** the exit status: 0, or 2 for input that cannot be used.
+    """
+    start_time = time.perf_counter()
+    try:
+        outputs = job()
+    except (ValueError, OSError) as error:
+        print(f"python -m {program}: {error}", file=sys.stderr)
+        return 2
+    if not can_draw():
+        print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
+    included = "compilation included"
+    if outputs.read_from is not None:
+        # Another installation of the same version may have stored them.
+        included = f"read from {outputs.read_from}, where an earlier run stored the results of these options"
+    files, duration = ", ".join(map(str, outputs.files)), time.perf_counter() - start_time
+    print(f"\n{outputs.runs} runs in {duration:.1f} s, {included}. Wrote {files}.")
+    print(". ".join(filter(None, [f"{purpose}, open {outputs.page}", without_motion()])))
+    return 0
+
+
+def can_draw() -> bool:
+    """Whether matplotlib is installed."""
+    return find_spec("matplotlib") is not None
+
+
+def without_motion() -> str:
+    """Why pages have no motion; empty if three.js is installed."""
+    return "" if can_view() else NO_VIEW
+
+
+def page_of_job(stages: Callable[[], list[Stage]], title: str, speed: float, below: str) -> Page:
+    """The page of a job: the stages if three.js is installed, and HTML below them."""
+    note = f'<p class="note">{without_motion()}</p>' if without_motion() else ""
+    return page([] if note else stages(), title, speed, note, below)

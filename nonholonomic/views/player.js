@@ -54,12 +54,15 @@ window.views = window.views || {};
 
   class Player {
     constructor(root, facts, stages, THREE) {
-      Object.assign(this, { facts, root, listeners: [], now: 0, running: false, before: null, turn: false });
+      Object.assign(this, { facts, root, listeners: [], now: 0, running: false, before: null, turn: false, filming: false });
       const { element } = views, boxes = element("div", root, { id: "stages" });
       boxes.classList.toggle("several", stages.length > 1);
       this.stages = stages.map((fact) => this.figure(element("figure", boxes), fact, THREE));
       this.bar(element("div", root, { id: "controls" }));
-      this.strips = new views.Strips(element("div", root, { id: "strips" }), () => this.runs(), (time) => { this.play(false); this.seek(time); });
+      const strips = element("div", root, { id: "strips" });
+      this.strips = new views.Strips(strips, () => this.runs(), (time) => { this.play(false); this.seek(time); });
+      // What a picture or a film shows.
+      this.parts = [boxes, strips];
       this.measure();
       this.keys();
       this.seek(0);
@@ -112,10 +115,80 @@ window.views = window.views || {};
       this.clock = element("span", controls, { id: "clock" });
       this.speeds = element("select", controls, { id: "speed", title: "speed" });
       for (const [words, factor] of this.facts.speeds) element("option", this.speeds, { textContent: words, value: factor, selected: factor === this.facts.speed });
+      this.savers(controls);
       if (this.root.requestFullscreen) {
         element("button", controls, { id: "full", type: "button", textContent: "Full screen", title: "f", onclick: () => this.fullScreen() });
       }
       this.button.textContent = "▶ play";
+    }
+    // Buttons that save what the page shows: a picture of it, or a film from the time of the slider on.
+    savers(controls) {
+      const { element } = views, words = document.title.trim().replace(/[^\p{L}\p{N}]+/gu, "-").slice(0, 60) || "run";
+      const save = (blob, name) => {
+        const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: `${words}${name}` });
+        link.click();
+        setTimeout(() => URL.revokeObjectURL(link.href), 6e4);
+      };
+      const can = "VideoEncoder" in window;
+      const film = element("button", controls, { id: "save-film", type: "button", innerHTML: "<span>Save </span>film", disabled: !can, title: can ? "record a video from here on" : "this browser cannot make videos" });
+      element("button", controls, { id: "save-picture", type: "button", innerHTML: "<span>Save </span>picture", title: "a PNG file of this moment", onclick: () => {
+        this.root.classList.add("filming");
+        this.seek(this.now);
+        const canvas = views.blank(this);
+        views.paint(canvas, this, `${this.now.toFixed(3)} s`);
+        this.root.classList.remove("filming");
+        canvas.toBlob((blob) => save(blob, `-${this.now.toFixed(3)}s.png`));
+      } });
+      let form = null;
+      film.setAttribute("aria-expanded", "false");
+      film.onclick = () => {
+        if (this.filming) { this.filming = false; return; }
+        if (form) form.remove();
+        form = form ? null : this.filmForm(film, save);
+        film.setAttribute("aria-expanded", String(form !== null));
+      };
+    }
+    // The form for the length and the speed of a film, which shows how much is done; `film` is the button that opened it.
+    filmForm(film, save) {
+      const { element } = views, form = Object.assign(document.createElement("form"), { id: "film", ariaLabel: "film" });
+      this.parts[1].before(form);
+      const field = (words, input) => { const label = element("label", form, { textContent: `${words} ` }); label.append(input); return input; };
+      const seconds = field("length [s]", Object.assign(document.createElement("input"), { type: "number", min: 0.001, step: "any", required: true }));
+      const speed = field("speed", this.speeds.cloneNode(true));
+      speed.removeAttribute("id");
+      speed.value = this.speeds.value;
+      element("button", form, { textContent: "Record" });
+      const told = element("output", form), start = () => (this.now < this.length ? this.now : 0);
+      let chosen = false;
+      const longest = () => { if (!chosen) seconds.value = Number(((this.length - start()) / Number(speed.value)).toFixed(3)); };
+      seconds.oninput = () => { chosen = true; };
+      speed.onchange = longest;
+      longest();
+      seconds.focus();
+      seconds.select();
+      form.onsubmit = async (event) => {
+        event.preventDefault();
+        if (this.filming) return;
+        this.filming = true;
+        film.textContent = "Stop";
+        const tell = (share) => { told.value = `${Math.floor(100 * share)} %`; return this.filming; };
+        try {
+          const blob = await this.film({ from: start(), seconds: Number(seconds.value), speed: Number(speed.value) }, tell);
+          if (this.filming) save(blob, ".webm");
+          told.value = this.filming ? "saved" : "stopped";
+        } catch (error) {
+          told.value = String(error);
+        }
+        this.filming = false;
+        film.innerHTML = "<span>Save </span>film";
+      };
+      return form;
+    }
+    // A film of a run at `times`, or `from` a time on at a speed for some seconds, but not beyond the end.
+    film({ times = null, from = 0, seconds = Infinity, speed = 1, fps = 25 }, tell = () => true) {
+      const step = speed / fps, end = Math.min(this.length, from + seconds * speed);
+      const count = Math.ceil((end - from) / step - 1e-6) + 1;
+      return views.record(this, times || Array.from({ length: count }, (_, k) => Math.min(from + k * step, end)), fps, tell);
     }
     fullScreen() { if (document.fullscreenElement) document.exitFullscreen(); else this.root.requestFullscreen(); }
     keys() {
@@ -188,20 +261,22 @@ window.views = window.views || {};
       this.before = now;
       if (this.now >= this.length) this.play(false); else requestAnimationFrame((next) => this.step(next));
     }
+    // Turn the cameras that go round the bodies, as far as they go in so many sixtieths of a second.
+    orbit(count) {
+      const turned = this.stages.filter((stage) => stage.orbits);
+      for (const stage of turned) {
+        Object.assign(stage.controls, { autoRotate: true, autoRotateSpeed: 2 * count });
+        stage.controls.update();
+        stage.controls.autoRotate = false;
+        stage.render();
+      }
+      return turned.length > 0;
+    }
     spin() {
-      if (this.turn || !this.stages.some((stage) => stage.orbits)) return;
+      if (this.turn) return;
+      // A film turns the cameras itself.
+      const round = () => { this.turn = this.filming || this.orbit(1); if (this.turn) requestAnimationFrame(round); };
       this.turn = true;
-      const round = () => {
-        const turned = this.stages.filter((stage) => stage.orbits);
-        for (const stage of turned) {
-          stage.controls.autoRotate = true;
-          stage.controls.update();
-          stage.controls.autoRotate = false;
-          stage.render();
-        }
-        this.turn = turned.length > 0;
-        if (this.turn) requestAnimationFrame(round);
-      };
       requestAnimationFrame(round);
     }
     // Play once when the stages become visible, unless the reader's system requests reduced motion.
@@ -224,6 +299,7 @@ window.views = window.views || {};
       seek: (time) => { player.touched = true; player.seek(time); },
       play: (wanted) => player.play(wanted),
       setRun: (s, r, run) => player.setRun(s, r, run),
+      film: (wanted, tell) => player.film(wanted, tell),
       onSeek: (listener) => player.listeners.push(listener),
       time: () => player.now,
       playing: () => player.running,

@@ -1,4 +1,4 @@
-"""Plots of tables, and of quantities over time (needs matplotlib)."""
+"""Plots of tables, of quantities over time, and of the curves of a page (needs matplotlib)."""
 
 import functools
 import io
@@ -11,9 +11,14 @@ import numpy as np
 from ..parameters import meant
 from ..text import likely, readable_unit, shown
 from ..validation import require
+from .stage import Stage, css
 
-# Only for type checkers: plots stand below tables and fits, which use them.
+# Only for type checkers: matplotlib is optional, and plots stand below tables and fits, which use them.
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+    from matplotlib.figure import Figure, FigureBase
+
     from ..sweeps import Table
 
 #: Colours of map cells without a finite value, one for each status.
@@ -28,9 +33,15 @@ ROUND_OFF = 1e-9
 #: An axis with at most this many values is drawn as one line per value.
 MOST_LINES = 8
 
+#: Number of characters for which a legend above the panels has room.
+WIDTH = 90
+
+#: Relative range of values below which a panel of curves draws them as constant.
+LEAST_RANGE = 1e-3
+
 
 @functools.cache
-def _kind_of_figure() -> Any:
+def _kind_of_figure() -> type["Figure"]:
     from matplotlib.figure import Figure
 
     class Picture(Figure):
@@ -44,17 +55,9 @@ def _kind_of_figure() -> Any:
     return Picture
 
 
-def new_figure(width: float = 7.0, height: float = 4.5) -> Any:
+def new_figure(width: float = 7.0, height: float = 4.5) -> "Figure":
     """An empty matplotlib figure of a size in inches, which a notebook shows."""
     return _kind_of_figure()(figsize=(width, height), layout="constrained")
-
-
-def _drawing(ax: Any, *size: float) -> tuple[Any, Any]:
-    """A new figure with axes, or `None` and the given axes."""
-    if ax is not None:
-        return None, ax
-    figure = new_figure(*size)
-    return figure, figure.add_subplot()
 
 
 def draw_table(
@@ -62,11 +65,11 @@ def draw_table(
     variable: str | None = None,
     at: dict[str, float] | None = None,
     log: bool = False,
-    ax: Any = None,
+    ax: "Axes | None" = None,
     x: str | None = None,
     y: str | None = None,
     label: str | None = None,
-) -> Any:
+) -> "FigureBase | Axes":
     """Draw a variable over the grid of a table: lines over the first axis, or a map of the first two.
 
     Cells without a finite value are left out of lines and marked by their status in maps.
@@ -77,10 +80,11 @@ def draw_table(
 
     **Raises:** `ValueError` as `Table.plot`.
     """
-    variable = _first_number(table) if variable is None else variable
-    values = table.variables.get(variable) if isinstance(variable, str) else None
-    if values is None or values.dtype.kind == "U":
-        names = [name for name, values in table.variables.items() if values.dtype.kind != "U"]
+    names = [name for name, values in table.variables.items() if values.dtype.kind != "U"]
+    if variable is None and not names:
+        raise ValueError("the table has no numeric variable to draw")
+    variable = names[0] if variable is None else variable
+    if not isinstance(variable, str) or variable not in names:
         raise ValueError(
             f"variable = {shown(variable)} must be a numeric variable of the table: {', '.join(names)}{likely(variable, names)}"
         )
@@ -88,18 +92,22 @@ def draw_table(
     if not dims:
         raise ValueError("a table of one cell has nothing to draw")
     at = {_whole(dims, name): value for name, value in (at or {}).items()}
-    x, y = _whole(dims, x), _whole(dims, y)
+    x, y = (name if name is None else _whole(dims, name) for name in (x, y))
     if not isinstance(label, str | None):
         raise ValueError(f"label = {shown(label)} must be a text")
     names, cut = _drawn(table, variable, at, x, y)
+    values = table.variables[variable]
     visible = _slice(np.where(np.isfinite(values), values, np.nan), dims, names, cut)
-    figure, drawing = _drawing(ax)
+    # The statuses of the drawn cells, if each has one.
+    has_status = "status" in table.variables and not table.inner.get(variable)
+    words = _slice(table.variables["status"], dims, names, cut) if has_status else None
+    drawing = new_figure().add_subplot() if ax is None else ax
     drawing.set_xlabel(table.label(names[0]))
     cuts = [_cut_text(table, name, place, at.get(name)) for name, place in cut.items()]
     if len(names) == 1 or (y is None and len(table.coords[names[1]]) <= MOST_LINES):
         _draw_lines(drawing, table, names, visible.reshape(len(visible), -1), label)
         if not np.any(np.isfinite(visible)):
-            _say_why_it_is_empty(drawing, table, names[0], _words(table, variable, dims, names, cut))
+            _say_why_it_is_empty(drawing, table.coords[names[0]], words)
         drawing.set_ylabel(table.label(variable))
         if log:
             drawing.set_yscale("log")
@@ -108,22 +116,14 @@ def draw_table(
         drawing.set_ylabel(table.label(names[1]))
         cuts = [label, *cuts] if label else cuts
         _draw_map(drawing, table, names, visible, table.label(variable), log)
-        words = _words(table, variable, dims, names, cut)
         if words is not None:
             _mark_words(drawing, table, names, np.where(np.isnan(visible), words, ""))
     drawing.set_title(", ".join(cuts), fontsize="medium")
-    return drawing if figure is None else figure
+    return drawing.figure if ax is None else ax
 
 
-def _words(table: "Table", variable: str, dims: tuple[str, ...], names: list[str], cut: dict[str, int]) -> Any:
-    """The statuses of the drawn cells, if each has one."""
-    has_status = "status" in table.variables and not table.inner.get(variable)
-    return _slice(table.variables["status"], dims, names, cut) if has_status else None
-
-
-def _say_why_it_is_empty(drawing: Any, table: "Table", name: str, words: Any) -> None:
+def _say_why_it_is_empty(drawing: "Axes", values: np.ndarray, words: np.ndarray | None) -> None:
     """Keep the abscissa of lines without any finite value, and count the statuses of their cells."""
-    values = table.coords[name]
     if values.dtype.kind != "U" and len(values) > 1:
         drawing.set_xlim(values.min(), values.max())
     counts = [] if words is None else [f"{np.sum(words == word)} {word.replace('_', ' ')}" for word in np.unique(words)]
@@ -131,14 +131,7 @@ def _say_why_it_is_empty(drawing: Any, table: "Table", name: str, words: Any) ->
     drawing.text(0.5, 0.5, text, transform=drawing.transAxes, ha="center", va="center")
 
 
-def _first_number(table: "Table") -> str:
-    names = [name for name, values in table.variables.items() if values.dtype.kind != "U"]
-    if not names:
-        raise ValueError("the table has no numeric variable to draw")
-    return names[0]
-
-
-def _whole(dims: tuple[str, ...], name: Any) -> Any:
+def _whole(dims: tuple[str, ...], name: str) -> str:
     """The axis that ends with a name, as "launch.spin" does with "spin"; the name itself unless there is one such axis."""
     names = meant(name, dims)
     return names[0] if len(names) == 1 else name
@@ -166,7 +159,7 @@ def _drawn(
     return names, cut | {name: 0 for name in left if name not in names}
 
 
-def _nearest(table: "Table", dims: tuple[str, ...], name: str, value: Any) -> int:
+def _nearest(table: "Table", dims: tuple[str, ...], name: str, value: float | str) -> int:
     """The index of the value of an axis that is nearest to a wanted value within the axis."""
     if name not in dims:
         raise ValueError(f"at: {name!r} must be one of {', '.join(dims)}{likely(name, dims)}")
@@ -187,13 +180,13 @@ def _nearest(table: "Table", dims: tuple[str, ...], name: str, value: Any) -> in
     return int(np.argmin(np.abs(coordinate - value)))
 
 
-def _slice(values: Any, dims: tuple[str, ...], names: list[str], cut: dict[str, int]) -> Any:
+def _slice(values: np.ndarray, dims: tuple[str, ...], names: list[str], cut: dict[str, int]) -> np.ndarray:
     """The values over the drawn dimensions, in their order."""
     left = [name for name in dims if name not in cut]
     return values[tuple(cut.get(name, slice(None)) for name in dims)].transpose([left.index(name) for name in names])
 
 
-def _cut_text(table: "Table", name: str, place: int, wanted: Any = None) -> str:
+def _cut_text(table: "Table", name: str, place: int, wanted: float | None = None) -> str:
     """A coordinate's value as text, "θ(0) = 0.1 rad", with the wanted value where it is another."""
     value = table.coords[name][place]
     text = str(value) if isinstance(value, str) else f"{value:.4g}"
@@ -202,7 +195,7 @@ def _cut_text(table: "Table", name: str, place: int, wanted: Any = None) -> str:
     return text if is_near else f"{text} (nearest to {wanted:.4g})"
 
 
-def _draw_lines(drawing: Any, table: "Table", names: list[str], lines: Any, label: str | None) -> None:
+def _draw_lines(drawing: "Axes", table: "Table", names: list[str], lines: np.ndarray, label: str | None) -> None:
     marker = "o-" if len(lines) <= 100 else "-"
     for index, line in enumerate(lines.T):
         texts = [label or "", _cut_text(table, names[1], index) if len(names) > 1 else ""]
@@ -212,7 +205,7 @@ def _draw_lines(drawing: Any, table: "Table", names: list[str], lines: Any, labe
         drawing.legend()
 
 
-def _draw_map(drawing: Any, table: "Table", names: list[str], visible: Any, label: str, log: bool) -> None:
+def _draw_map(drawing: "Axes", table: "Table", names: list[str], visible: np.ndarray, label: str, log: bool) -> None:
     from matplotlib.colors import LogNorm, Normalize
 
     values = visible[np.isfinite(visible) & (visible > 0.0)] if log else visible[np.isfinite(visible)]
@@ -220,14 +213,14 @@ def _draw_map(drawing: Any, table: "Table", names: list[str], visible: Any, labe
     scale = (LogNorm if log else Normalize)(low, high)
     x, y = table.coords[names[0]], table.coords[names[1]]
     image = drawing.pcolormesh(x, y, visible.T, shading="nearest", norm=scale)
-    is_clipped = values.size and (values.min() < low, values.max() > high)
+    is_clipped = (bool(np.any(values < low)), bool(np.any(values > high)))
     extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(is_clipped, "neither")
     bar = drawing.figure.colorbar(image, ax=drawing, label=label, extend=extend)
     if log:
         _plain_numbers(bar.ax.yaxis)
 
 
-def _plain_numbers(axis: Any) -> None:
+def _plain_numbers(axis: "Axis") -> None:
     """Write the labels of a logarithmic axis as 12.5, not as 1.25 x 10^1, if none is very large or small."""
     low, high = axis.get_view_interval()
     if low >= 1e-4 and high <= 1e5:
@@ -235,7 +228,7 @@ def _plain_numbers(axis: Any) -> None:
         axis.set_minor_formatter("{x:g}" if high < 10.0 * low else "")
 
 
-def _mark_words(drawing: Any, table: "Table", names: list[str], words: Any) -> None:
+def _mark_words(drawing: "Axes", table: "Table", names: list[str], words: np.ndarray) -> None:
     """Paint cells without a value in the grey of their status."""
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
@@ -248,22 +241,20 @@ def _mark_words(drawing: Any, table: "Table", names: list[str], words: Any) -> N
         )
         patches.append(Patch(color=grey, label=word.replace("_", " ")))
     if patches:
+        # The legend stands in the corner of the map with the fewest values.
         x, y = (np.argsort(table.coords[name], kind="stable") for name in names)
-        drawing.legend(handles=patches, loc=_emptiest_corner((words != "")[x][:, y]))
+        is_empty = (words != "")[x][:, y]
+        width, height = ((size + 2) // 3 for size in is_empty.shape)
+        shares = {
+            f"{vertical} {horizontal}": np.mean(is_empty[columns, rows])
+            for vertical, rows in (("upper", slice(-height, None)), ("lower", slice(height)))
+            for horizontal, columns in (("right", slice(-width, None)), ("left", slice(width)))
+        }
+        emptiest: Any = max(shares, key=lambda corner: shares[corner])
+        drawing.legend(handles=patches, loc=emptiest)
 
 
-def _emptiest_corner(is_empty: np.ndarray) -> str:
-    """The corner of a map with the fewest values, for the legend."""
-    width, height = ((size + 2) // 3 for size in is_empty.shape)
-    shares = {
-        f"{vertical} {horizontal}": np.mean(is_empty[columns, rows])
-        for vertical, rows in (("upper", slice(-height, None)), ("lower", slice(height)))
-        for horizontal, columns in (("right", slice(-width, None)), ("left", slice(width)))
-    }
-    return max(shares, key=lambda corner: shares[corner])
-
-
-def draw_portrait(table: "Table", x: str, y: str, ax: Any = None) -> Any:
+def draw_portrait(table: "Table", x: str, y: str, ax: "Axes | None" = None) -> "FigureBase | Axes":
     """Draw one variable of a run's table against another, with a dot at the start.
 
     **Arguments:**
@@ -277,7 +268,7 @@ def draw_portrait(table: "Table", x: str, y: str, ax: Any = None) -> Any:
     **Raises:** `ValueError` for an unknown variable or component.
     """
     (x_values, x_label), (y_values, y_label) = column(table, "x", x), column(table, "y", y)
-    figure, drawing = _drawing(ax, 5.0, 4.5)
+    drawing = new_figure(5.0, 4.5).add_subplot() if ax is None else ax
     (line,) = drawing.plot(x_values, y_values, linewidth=1.0)
     drawing.plot(x_values[:1], y_values[:1], "o", color=line.get_color())
     drawing.set_xlabel(x_label)
@@ -285,10 +276,10 @@ def draw_portrait(table: "Table", x: str, y: str, ax: Any = None) -> Any:
     if {x, y} == {"position.x", "position.y"}:
         # A path, seen from above.
         drawing.set_aspect("equal", adjustable="datalim")
-    return drawing if figure is None else figure
+    return drawing.figure if ax is None else ax
 
 
-def column(table: "Table", argument: str, name: Any, vectors: bool = False) -> tuple[Any, str]:
+def column(table: "Table", argument: str, name: object, vectors: bool = False) -> tuple[np.ndarray, str]:
     """A variable, or one of its components, with its label.
 
     **Arguments:** `argument`: name of the argument in a message; `vectors`: whether the message lists vectors, too.
@@ -314,16 +305,14 @@ def column(table: "Table", argument: str, name: Any, vectors: bool = False) -> t
 
 # Plots of quantities of runs over time (needs matplotlib).
 
-# Only for type checkers: plots stand below tables and fits, which use them.
-if TYPE_CHECKING:
-    from ..sweeps import Table
-
 #: Styles of the lines of a vector's components, and size of a panel [inches].
 STYLES = ("-", "--", ":", "-.")
 PANEL = (7.0, 2.0)
 
 
-def draw_series(tables: Sequence["Table"], names: Sequence[str], labels: Sequence[str], ax: Any = None) -> Any:
+def draw_series(
+    tables: Sequence["Table"], names: Sequence[str], labels: Sequence[str], ax: "Axes | None" = None
+) -> "Figure | Axes":
     """Draw quantities over time, with a panel for each quantity and a colour for each run.
 
     **Arguments:**
@@ -339,37 +328,64 @@ def draw_series(tables: Sequence["Table"], names: Sequence[str], labels: Sequenc
     """
     if ax is not None and len(names) > 1:
         raise ValueError(f"ax takes one quantity, not {len(names)}: {', '.join(names)}")
-    figure = None
     if ax is None:
         figure = new_figure(PANEL[0], 1.5 + PANEL[1] * len(names))
         panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     else:
-        panels = [ax]
+        figure, panels = None, [ax]
     for panel, name in zip(panels, names, strict=True):
-        _draw_panel(panel, tables, name, labels)
+        for table, label in zip(tables, labels, strict=True):
+            lines, quantity = _lines(table, name)
+            colour = None
+            for (component, values), style in zip(lines, itertools.cycle(STYLES)):
+                text = ", ".join(part for part in (label, component) if part)
+                # A line without a text stays out of the legend.
+                (line,) = panel.plot(table["time"], values, style, linewidth=1.2, color=colour, label=text or None)
+                colour = line.get_color()
+            panel.set_ylabel(quantity)
+        panel.margins(x=0.0)
+        if panel.get_legend_handles_labels()[0]:
+            panel.legend(fontsize="small")
     panels[-1].set_xlabel(tables[0].label("time"))
-    return ax if figure is None else figure
+    return figure or panels[0]
 
 
-def _draw_panel(panel: Any, tables: Sequence["Table"], name: str, labels: Sequence[str]) -> None:
-    for table, label in zip(tables, labels, strict=True):
-        lines, quantity = _lines(table, name)
-        colour = None
-        for (component, values), style in zip(lines, itertools.cycle(STYLES)):
-            text = ", ".join(part for part in (label, component) if part)
-            # A line without a text stays out of the legend.
-            (line,) = panel.plot(table["time"], values, style, linewidth=1.2, color=colour, label=text or None)
-            colour = line.get_color()
-        panel.set_ylabel(quantity)
-    panel.margins(x=0.0)
-    if panel.get_legend_handles_labels()[0]:
-        panel.legend(fontsize="small")
-
-
-def _lines(table: "Table", name: str) -> tuple[list[tuple[str, Any]], str]:
+def _lines(table: "Table", name: str) -> tuple[list[tuple[str, np.ndarray]], str]:
     """The components of a quantity with their values, and the label of the quantity."""
     dims = table.inner.get(name, ())
     if len(dims) == 1 and table[dims[0]].dtype.kind == "U":
         return [(str(part), table[name][:, k]) for k, part in enumerate(table[dims[0]])], table.label(name)
     values, label = column(table, "quantity", name, vectors=True)
     return [("", values)], label
+
+
+def draw_curves(stages: list[Stage], names: Sequence[str] = ()) -> "Figure":
+    """Draw the curves of all runs on stages over time, with a panel for each label.
+
+    **Arguments:** `names`: names of the runs for the legend, by default those on the page.
+
+    **Returns:** a matplotlib figure.
+    """
+    shows = [show for stage in stages for show in stage.shows]
+    labels = list(dict.fromkeys(curve.label for show in shows for curve in show.curves))
+    figure = new_figure(7.0, 1.3 + 1.5 * len(labels))
+    for label, panel in zip(labels, figure.subplots(len(labels), 1, sharex=True, squeeze=False)[:, 0], strict=True):
+        for show in shows:
+            for curve in show.curves:
+                if curve.label == label:
+                    panel.plot(show.times, curve.factor * curve.values, color=css(show.colour), linewidth=1.0)
+        panel.margins(x=0.0)
+        low, high = panel.get_ylim()
+        middle = (low + high) / 2.0
+        # Draw values that are constant except for round-off as a constant.
+        min_range = LEAST_RANGE * max(abs(low), abs(high))
+        if high - low < min_range:
+            panel.set_ylim(middle - min_range, middle + min_range)
+        panel.set_ylabel(label, fontsize="small")
+    panel.set_xlabel("time [s]")
+    if len(shows) > 1 or any(names):
+        names = names or [show.name for show in shows]
+        # As many columns as the longest name leaves room for.
+        columns = max(1, WIDTH // (max(map(len, names)) + 6))
+        figure.legend(names, loc="outside upper center", ncols=min(columns, len(names)), fontsize="small")
+    return figure

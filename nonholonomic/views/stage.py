@@ -1,4 +1,4 @@
-"""The contents of pages and animations: arenas, and bodies, traces, arrows and curves on stages.
+"""The contents of pages and films: arenas, and bodies, traces, arrows and curves on stages.
 
 This module does not depend on tops or strollers. Lengths are in metres in the fixed frame (x, y, z), z up; times in
 seconds.
@@ -15,6 +15,9 @@ from ..geometry import AbstractSurface
 from ..text import in_unit, require_unit_of
 
 Points = Float[np.ndarray, "times 3"]
+
+#: A unit, or several, as for `in_unit`; `None` for the SI units.
+Unit = str | Sequence[str] | None
 
 
 class Mesh(NamedTuple):
@@ -66,13 +69,6 @@ class Arrow(NamedTuple):
     through: bool = False
     shown: bool = True
 
-    @property
-    def drawn(self) -> Points:
-        """The vectors with their drawn lengths [m]."""
-        lengths = self.scale * np.linalg.norm(self.vector, axis=-1, keepdims=True)
-        scaled = lengths if self.limit is None else np.minimum(lengths, self.limit)
-        return self.scale * self.vector * np.divide(scaled, lengths, out=np.ones_like(lengths), where=lengths > 0.0)
-
 
 class Curve(NamedTuple):
     """A number over time, with a label that names its unit.
@@ -84,12 +80,7 @@ class Curve(NamedTuple):
     values: Float[np.ndarray, " times"]
     factor: float = 1.0
 
-    @property
-    def drawn(self) -> Float[np.ndarray, " times"]:
-        """The values in the unit of the label."""
-        return self.factor * self.values
-
-    def drawn_in(self, unit: str | Sequence[str] | None) -> "Curve":
+    def drawn_in(self, unit: Unit) -> "Curve":
         """The curve in another unit, if its label ends in a unit that can be converted. **Arguments:** as for `in_unit`."""
         name, bracket, si = self.label.removesuffix("]").rpartition(" [")
         if unit is None or not bracket:
@@ -136,7 +127,7 @@ class Stage(NamedTuple):
     rise: float = 0.3
 
 
-def curves_in(stages: list[Stage], unit: str | Sequence[str] | None) -> list[Stage]:
+def curves_in(stages: list[Stage], unit: Unit) -> list[Stage]:
     """The stages with their curves in other units, as for `in_unit`.
 
     **Raises:** `ValueError` if no curve can be drawn in the unit.
@@ -145,10 +136,14 @@ def curves_in(stages: list[Stage], unit: str | Sequence[str] | None) -> list[Sta
     parts = [label.removesuffix("]").partition(" [") for label in labels]
     require_unit_of(unit, {name: si or "1" for name, _, si in parts})
 
-    def in_units(show: Show) -> Show:
-        return show._replace(curves=tuple(curve.drawn_in(unit) for curve in show.curves))
-
-    return [stage._replace(shows=tuple(map(in_units, stage.shows))) for stage in stages]
+    return [
+        stage._replace(
+            shows=tuple(
+                show._replace(curves=tuple(curve.drawn_in(unit) for curve in show.curves)) for show in stage.shows
+            )
+        )
+        for stage in stages
+    ]
 
 
 #: Colours of a page's runs, for the curves and one half of the body; arrows have other colours.
@@ -182,35 +177,10 @@ def css(colour: int) -> str:
 
 def turned(rotation: Float[np.ndarray, "times 3 3"]) -> Float[np.ndarray, "times 4"]:
     """Quaternions (x, y, z, w) of rotation matrices."""
-    m = np.asarray(rotation, dtype=float)
-    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
-    # Four times the products of the quaternion's components; the column of the largest component has no cancellation.
-    products = np.empty((len(m), 4, 4))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        products[:, i, i] = 1.0 - trace + 2.0 * m[:, i, i]
-        products[:, i, j] = products[:, j, i] = m[:, i, j] + m[:, j, i]
-        products[:, i, 3] = products[:, 3, i] = m[:, k, j] - m[:, j, k]
-    products[:, 3, 3] = 1.0 + trace
-    component = np.argmax(np.diagonal(products, axis1=1, axis2=2), axis=-1)
-    axis = products[np.arange(len(m)), component]
-    return axis / np.linalg.norm(axis, axis=-1, keepdims=True)
+    # Imported here, because most commands draw nothing.
+    from scipy.spatial.transform import Rotation
 
-
-def matrices(orientation: Float[np.ndarray, "times 4"]) -> Float[np.ndarray, "times 3 3"]:
-    """Rotation matrices of quaternions (x, y, z, w)."""
-    x, y, z, w = orientation.T
-    rows = (
-        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
-        (2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)),
-        (2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def nearest(times: Float[np.ndarray, " times"], at: Float[np.ndarray, " frames"]) -> Int[np.ndarray, " frames"]:
-    """The indices of the times that are nearest to the given times."""
-    index = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
-    return index - (at - times[index - 1] < times[index] - at)
+    return Rotation.from_matrix(np.asarray(rotation, dtype=float)).as_quat()
 
 
 # Meshes of simple solids, in a body's own axes.
@@ -341,22 +311,29 @@ def arena(
     """
     points = points[np.all(np.isfinite(points), axis=-1)]
     chart = _Patch(surface, points) if len(surface.coordinates) == 3 else _Chart(surface, points)
-    (first, second), (step_1, step_2), words = chart.ranges(margin, spacing)
-    mesh = chart.grid(*np.meshgrid(np.linspace(*first, FINE), np.linspace(*second, FINE), indexing="ij"))
+    sides, marks, words = [], [], []
+    for number, (place, is_angle, length) in enumerate(zip(chart.places, chart.angles, chart.lengths, strict=True)):
+        low, high = place.min() - margin / length, place.max() + margin / length
+        if is_angle and high - low >= 2.0 * np.pi:
+            low, high = -np.pi, np.pi
+        low, high = chart.legal(number, low, high)
+        step, text = nice(max(spacing / length, (high - low) / MOST_LINES), is_angle)
+        sides.append(np.linspace(low, high, FINE))
+        marks.append(step * np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1))
+        words.append(text)
+    vertices = chart.grid(*np.meshgrid(*sides, indexing="ij")).reshape(-1, 3)
     # One grid for all lines: evaluating a surface is expensive.
-    grid_lines = [(np.full(FINE, a), np.linspace(*second, FINE)) for a in marks(first, step_1)]
-    grid_lines += [(np.linspace(*first, FINE), np.full(FINE, b)) for b in marks(second, step_2)]
-    lines = chart.grid(*np.moveaxis(np.array(grid_lines), 1, 0)) if grid_lines else ()
-    ground = facing(Mesh(mesh.reshape(-1, 3), of_grid(FINE, FINE), GREY), points, normal)
-    return Arena(ground, tuple(lines), words, normal)
-
-
-def facing(mesh: Mesh, points: Float[np.ndarray, "points 3"], normal: Float[np.ndarray, " 3"]) -> Mesh:
-    """The mesh of a surface with its front on the side to which `normal` points at the first of the points."""
-    corners = mesh.vertices[mesh.triangles]
+    lines = [(np.full(FINE, mark), sides[1]) for mark in marks[0]] + [
+        (sides[0], np.full(FINE, mark)) for mark in marks[1]
+    ]
+    drawn_lines = tuple(chart.grid(*np.moveaxis(np.array(lines), 1, 0))) if lines else ()
+    # The front of the mesh is on the side of the normal at the first point.
+    triangles = of_grid(FINE, FINE)
+    corners = vertices[triangles]
     nearest = corners[np.argmin(np.linalg.norm(corners.mean(axis=1) - points[0], axis=-1))]
-    front = np.cross(nearest[1] - nearest[0], nearest[2] - nearest[0]) @ normal
-    return mesh if front > 0.0 else mesh._replace(triangles=mesh.triangles[:, ::-1])
+    if np.cross(nearest[1] - nearest[0], nearest[2] - nearest[0]) @ normal <= 0.0:
+        triangles = triangles[:, ::-1]
+    return Arena(Mesh(vertices, triangles, GREY), drawn_lines, "grid " + " x ".join(dict.fromkeys(words)), normal)
 
 
 # Compile the whole: otherwise every operation would be compiled for every shape.
@@ -371,44 +348,28 @@ def _nearest(surface: AbstractSurface, position: tuple) -> tuple:
 
 
 class _Chart:
-    """A surface whose places are two numbers, lengths or angles."""
+    """A surface whose places are two numbers, lengths or angles.
+
+    - `places`: both numbers at the given points; `angles`: whether a number is an angle; `lengths`: the least length [m]
+      along the surface per unit of a number, at these places.
+    """
 
     def __init__(self, surface: AbstractSurface, points: Float[np.ndarray, "points 3"]):
         self.surface = surface
-        self.places = [np.asarray(number, dtype=float) for number in surface.place_at(own(surface, points.T))]
         self.angles = [unit == "rad" for _, unit in surface.coordinates]
-        for number, angle in enumerate(self.angles):
-            if angle:
-                self.places[number] = np.unwrap(self.places[number])
+        places = [np.asarray(number, dtype=float) for number in surface.place_at(own(surface, points.T))]
+        self.places = [np.unwrap(place) if angle else place for place, angle in zip(places, self.angles, strict=True)]
+        start = self.grid(*self.places)
+        shifts = [[place + 1e-6 * (k == number) for k, place in enumerate(self.places)] for number in (0, 1)]
+        steps = [np.linalg.norm(self.grid(*shifted) - start, axis=-1) for shifted in shifts]
+        self.lengths = [max(float(np.min(step)) / 1e-6, 1e-300) for step in steps]
 
     def grid(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """The points [m] at two numbers, in the fixed frame."""
         return fixed(self.surface, _charted(self.surface, (first, second)))
 
-    def ranges(self, margin: float, spacing: float) -> tuple[list[tuple[float, float]], list[float], str]:
-        """The ranges of both numbers, the steps between lines, and their descriptions."""
-        lengths = [self._length(number) for number in (0, 1)]
-        intervals, steps, words = [], [], []
-        for number, angle in enumerate(self.angles):
-            low, high = self.places[number].min(), self.places[number].max()
-            extra = margin / max(lengths[number], 1e-300)
-            if angle and high - low + 2.0 * extra >= 2.0 * np.pi:
-                low, high = -np.pi, np.pi
-            else:
-                low, high = low - extra, high + extra
-            low, high = self._legal(number, low, high)
-            step = nice(max(spacing / max(lengths[number], 1e-300), (high - low) / MOST_LINES), angle)
-            intervals.append((low, high))
-            steps.append(step)
-            words.append(f"{np.degrees(step):.3g}°" if angle else in_words(step))
-        return intervals, steps, "grid " + " x ".join(dict.fromkeys(words))
-
-    def _length(self, number: int) -> float:
-        """Least length [m] along the surface per unit of a number, at the run's places."""
-        shifted = [place + 1e-6 * (k == number) for k, place in enumerate(self.places)]
-        return float(np.min(np.linalg.norm(self.grid(*shifted) - self.grid(*self.places), axis=-1)) / 1e-6)
-
-    def _legal(self, number: int, low: float, high: float) -> tuple[float, float]:
-        """The part of a range in which numbers are legal: a latitude ends at the poles."""
+    def legal(self, number: int, low: float, high: float) -> tuple[float, float]:
+        """The part of a range in which a number is legal: a latitude ends at the poles."""
         candidates = np.linspace(low, high, 401)
         place = [np.full_like(candidates, np.median(values)) for values in self.places]
         place[number] = candidates
@@ -421,23 +382,23 @@ class _Chart:
 
 
 class _Patch:
-    """A surface whose places are positions: the nearest points to a part of its tangent plane."""
+    """A surface whose places are positions: the nearest points to a part of its tangent plane, whose two lengths stand for
+    the numbers of a `_Chart`."""
 
     def __init__(self, surface: AbstractSurface, points: Float[np.ndarray, "points 3"]):
         self.surface = surface
         self.middle = fixed(surface, _nearest(surface, own(surface, points.mean(axis=0))))
         _, east, north = surface.chart(tuple(own(surface, self.middle)))
         self.axes = np.stack([fixed(surface, east), fixed(surface, north)])
-        self.spread = (points - self.middle) @ self.axes.T
+        self.places = list(((points - self.middle) @ self.axes.T).T)
+        self.angles, self.lengths = [False, False], [1.0, 1.0]
 
     def grid(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         flat = self.middle + first[..., None] * self.axes[0] + second[..., None] * self.axes[1]
         return fixed(self.surface, _nearest(self.surface, own(self.surface, np.moveaxis(flat, -1, 0))))
 
-    def ranges(self, margin: float, spacing: float) -> tuple[list[tuple[float, float]], list[float], str]:
-        ranges = [(part.min() - margin, part.max() + margin) for part in self.spread.T]
-        step = nice(max(spacing, max(high - low for low, high in ranges) / MOST_LINES), False)
-        return ranges, [step, step], f"grid {in_words(step)}"
+    def legal(self, number: int, low: float, high: float) -> tuple[float, float]:
+        return low, high
 
 
 def own(surface: AbstractSurface, position: np.ndarray) -> tuple:
@@ -454,24 +415,14 @@ def fixed(surface: AbstractSurface, vector: tuple) -> np.ndarray:
     return np.stack(np.broadcast_arrays(*(np.asarray(part) for part in surface.in_fixed_frame(components))), axis=-1)
 
 
-def nice(step: float, angle: bool) -> float:
-    """The next round number."""
-    if angle:
-        return float(
-            np.radians(next((candidate for candidate in DEGREES if candidate >= 0.999 * np.degrees(step)), DEGREES[-1]))
-        )
-    unit = 10.0 ** np.floor(np.log10(step))
-    return float(unit * next(candidate for candidate in LENGTHS if candidate * unit >= 0.999 * step))
-
-
-def in_words(length: float) -> str:
-    """A round length with its unit."""
+def nice(step: float, is_angle: bool) -> tuple[float, str]:
+    """The next round length [m] or angle [rad], and its text."""
+    if is_angle:
+        degrees = next((candidate for candidate in DEGREES if candidate >= 0.999 * np.degrees(step)), DEGREES[-1])
+        return float(np.radians(degrees)), f"{degrees:.3g}°"
+    power = 10.0 ** np.floor(np.log10(step))
+    length = float(power * next(candidate for candidate in LENGTHS if candidate * power >= 0.999 * step))
     for unit, metres in (("m", 1.0), ("cm", 1e-2), ("mm", 1e-3)):
         if length >= 0.999 * metres:
-            return f"{length / metres:.3g} {unit}"
-    return f"{length:.1e} m"
-
-
-def marks(range_: tuple[float, float], step: float) -> np.ndarray:
-    """The multiples of a step in a range."""
-    return step * np.arange(np.ceil(range_[0] / step - 1e-9), np.floor(range_[1] / step + 1e-9) + 1)
+            return length, f"{length / metres:.3g} {unit}"
+    return length, f"{length:.1e} m"

@@ -12,11 +12,11 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from nonholonomic.compilation.components import Held
 from nonholonomic.geometry import Plane
 from nonholonomic.hybrid import HybridOutcome
-from nonholonomic.integration import AbstractProblem, ExtendedProblem, Outcome
+from nonholonomic.integration import AbstractProblem, Outcome
 from nonholonomic.integration.problem import Status, require_run
 from nonholonomic.parameters import description, numbers, numbers_of
-from nonholonomic.runs.event import UNMEASURED, Clock, EventFunction, with_event
-from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Number, model_of, statuses
+from nonholonomic.runs.event import EventFunction, with_clock, with_event
+from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Number, model_of, run_of, statuses
 from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.text import name_of
 from nonholonomic.validation import require_kind, require_scalars
@@ -24,7 +24,7 @@ from nonholonomic.validation import require_kind, require_scalars
 from ..model.input import Formula, Input, PerRide, Steady, as_jumps, at_start, check_input
 from ..model.scene import RideProblem, Scene, as_module, has_arrays
 from ..model.vehicle import Damping, Launch, RollingResistance, Stroller
-from .trajectory import DEFAULT_STEPS, QUANTITIES, TIMED, VECTORS, RideState, Trajectory, heading, ride
+from .trajectory import QUANTITIES, TIMED, VECTORS, RideState, heading, ride
 
 #: Names of the coordinates of a place in the fixed frame.
 FIXED = (("x", "m"), ("y", "m"), ("z", "m"))
@@ -184,18 +184,12 @@ class RideModel(AbstractSceneModel):
 
     def problem(self, cells: int | None, names: Names) -> AbstractProblem:
         if cells is None:
-            ride = RideProblem.single(self.scene, self.launch, self.input, self.jumps)
+            ride = RideProblem.of(self.scene, self.launch, self.input, jumps=self.jumps)
         else:
             watched = self.event is None and names is not None and not names
             ride = RideProblem.of(self.scene, self.launch, self.input, cells, watched, self.jumps)
         # The state ends with the time if a quantity depends on the input.
-        if self.input is None or names is None or TIMED.isdisjoint(names):
-            return ride
-        clock = jnp.zeros_like(ride.states[:1])
-        return ExtendedProblem(ride, Clock(), clock, clock + UNMEASURED)
-
-    def simulate(self, t1: ArrayLike, times: Any, tolerance: ArrayLike, solver: Any, adjoint: Any) -> Trajectory:
-        return ride(self, t1, times, tolerance, solver, DEFAULT_STEPS, adjoint)
+        return ride if self.input is None or names is None or TIMED.isdisjoint(names) else with_clock(ride)
 
     def without_event(self) -> "RideModel":
         return dataclasses.replace(self, event=None)
@@ -241,6 +235,9 @@ class RideModel(AbstractSceneModel):
             "energy": energy,
             "residual": energy - scene.energy(start[:size]) - scene.work(states),
         }
+
+
+run_of.register(RideModel, ride)
 
 
 @model_of.register(Scene)

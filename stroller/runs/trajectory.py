@@ -366,8 +366,9 @@ class Trajectory(AbstractRun):
     - `normal_force` [N] of the ground, and `load` [N] on the rear and the front axle, (times, 2);
     - `constraint` [m/s]: speed at which the rear axle and the front wheel slip sideways, (times, 2);
     - `departure`: distance of the position from the ground [m], an integration error;
-    - `stats` of the integration; `spec`: the specification of the run; `steps`: the ends of its steps. They are `None`
-      for a run inside a transformation; if you request events of such a run, the run is repeated.
+    - `stats` of the integration; `model`: its `scene`, `launch` and `input`; `spec`: the model, the horizon and the settings;
+      `steps`: the ends of the steps, `None` for a run inside a transformation; if you request events of such a run, the
+      run is repeated.
 
     **Example:**
 
@@ -398,6 +399,9 @@ class Trajectory(AbstractRun):
         # Python calls this only for names that are not attributes, also while a copy has none yet.
         values = vars(self).get("values", {})
         return values[name] if name in values else super().__getattr__(name)
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *self.values]
 
     def __getitem__(self, name: str) -> Any:
         return self.values[name] if name in QUANTITIES else super().__getitem__(name)
@@ -584,18 +588,15 @@ read_off_compiled: Callable[..., Trajectory] = eqx.filter_jit(read_off)
 
 # One ride: with its steps outside of transformations, and sampled inside.
 
-#: Default limit of the steps of a ride.
-DEFAULT_STEPS = 65536
-
 
 def ride(
     model: Any,
     t1: ArrayLike,
-    times: Any,
+    times: ArrayLike | None,
     tolerance: ArrayLike,
-    solver: diffrax.AbstractSolver | None,
-    max_steps: int,
-    adjoint: diffrax.AbstractAdjoint | None,
+    solver: diffrax.AbstractSolver | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    max_steps: int = 65536,
 ) -> Trajectory:
     """The trajectory of a `RideModel`. **Arguments:** as for `stroller.simulate`; the model was checked."""
     if not isinstance(solver, ImplicitMidpoint):

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from nonholonomic import views
 from nonholonomic.geometry import AbstractQuadric, AbstractSurface
-from nonholonomic.integration import AbstractPassive, ExtendedProblem, LaneState
+from nonholonomic.integration import AbstractPassive, ExtendedProblem
 from nonholonomic.integration.problem import Status
 from nonholonomic.parameters import numbers
 from nonholonomic.runs.model import Sliders, Unit
@@ -78,7 +78,7 @@ def grouped(groups: list[list[tuple[int, Trajectory]]], names: list[str]) -> lis
     return stages
 
 
-def normals(xp: ModuleType, surface: AbstractSurface, side: str | None, position: Values) -> Values:
+def normals(xp: ModuleType, surface: AbstractSurface, side: str | None, position: Values) -> Any:
     """Unit normals at positions (*times, 3), towards the side on which the stroller is. **Arguments:** `xp`: NumPy, or
     `jax.numpy` for a page."""
     components = surface.normal(surface.in_own_axes(tuple(position.T)))
@@ -95,11 +95,11 @@ class Posture(NamedTuple):
       the ground's forces act there.
     """
 
-    places: tuple[Values, ...]
-    rotations: tuple[Values, ...]
-    contacts: tuple[Values, Values]
-    up: Values
-    left: tuple[Values, Values]
+    places: tuple[Any, ...]
+    rotations: tuple[Any, ...]
+    contacts: tuple[Any, Any]
+    up: Any
+    left: tuple[Any, Any]
 
     @classmethod
     def of(
@@ -343,7 +343,7 @@ def rolling_ride(model: RideModel) -> ExtendedProblem[RideProblem]:
     return ExtendedProblem(ride, WheelAngles(), jnp.zeros((3, 1)), jnp.ones((3, 1)))
 
 
-def outcome(model: RideModel, problem: RideProblem, lane: LaneState) -> tuple[Int[Array, ""], Float[Array, ""]]:
+def outcome(model: RideModel, problem: RideProblem, lane: Any) -> tuple[Int[Array, ""], Float[Array, ""]]:
     """The `Status` of a ride and the distance of its end from its start [m], infinite if the ride is not completed."""
     first, last = problem.dynamics.unpack(problem.states)[0], problem.dynamics.unpack(lane.state)[0]
     squares = [(a - b) ** 2 for a, b in zip(first, last, strict=True) if a is not None and b is not None]

@@ -16,7 +16,7 @@ from papers import tippe_audit, tippe_formulas
 from scipy.integrate import solve_ivp
 
 import tippe
-from nonholonomic.formulations import lie_brackets
+from nonholonomic.systems.mechanics import lie_brackets
 from tippe import paper
 
 ROOT = Path(__file__).parents[2]

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nonholonomic.formulations import AbstractSystem
+from nonholonomic.systems.mechanics import AbstractSystem
 
 GRAVITY = 9.81
 

@@ -9,10 +9,10 @@ import pytest
 from close import assert_close
 from egg_reference import Egg
 from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
 from tops import random_states, rutstam_top
 
 import tippe
-from nonholonomic.views.stage import matrices
 
 LAWS = {
     "frictionless": tippe.Frictionless(),
@@ -146,7 +146,9 @@ def test_what_is_drawn_of_a_run_stands_on_the_plane(run):
     corners = np.concatenate([mesh.vertices for mesh in body.meshes])
     square = (corners[:, 0] ** 2 + corners[:, 1] ** 2) / 0.02**2 + (corners[:, 2] - 0.003) ** 2 / 0.028**2
     assert_close(square, 1.0, atol=1e-9)
-    for position, turning in zip(body.position[::50], matrices(body.orientation[::50]), strict=True):
+    for position, turning in zip(
+        body.position[::50], Rotation.from_quat(body.orientation[::50]).as_matrix(), strict=True
+    ):
         lowest_points.append((corners @ turning.T + position)[:, 2].min())
     assert min(lowest_points) > -1e-9
     assert max(lowest_points) < 1e-4

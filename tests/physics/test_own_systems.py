@@ -10,7 +10,7 @@ from rigid_systems import GRAVITY, BallOnTurntable, Bicycle, Disc
 from scipy.linalg import null_space
 
 from nonholonomic import AbstractMode, Hybrid, simulate
-from nonholonomic.formulations import Lagrange
+from nonholonomic.systems.mechanics import Lagrange
 
 #: Basu-Mandal, Chatterjee and Papadopoulos, Proc. R. Soc. A 463 (2007) 1983, Table 1: q, its rates, and its accelerations, in
 #: the order of `Bicycle`; x, y, theta and the rotations of the wheels are 0.

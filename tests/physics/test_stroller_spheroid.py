@@ -9,7 +9,7 @@ from scipy.special import ellipk
 from stroller_chart import Chart
 
 import stroller
-from nonholonomic.formulations import Hamel
+from nonholonomic.systems.mechanics import Hamel
 from stroller import Damping, Launch, Scene, Sphere, Spheroid, Steady, Stroller
 
 BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05)

@@ -15,7 +15,7 @@ import reduced_tops
 from scipy.integrate import solve_ivp
 
 import tippe
-from nonholonomic.formulations import Hamel
+from nonholonomic.systems.mechanics import Hamel
 
 STATES = 1000
 ARENAS = ["plane", "cylinder"]

@@ -72,7 +72,7 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys, monkeypatch, rut
     assert "A tippe top climbs onto its stem" in page
     assert "data:image/png" in page
     # The same again, without three.js: the tables are read, and the page says what is missing.
-    monkeypatch.setattr(job, "can_view", lambda: False)
+    monkeypatch.setattr("nonholonomic.views.page.can_view", lambda: False)
     assert main(arguments) == 0
     assert capsys.readouterr().out.rstrip().endswith(NO_VIEW)
     page = (tmp_path / "index.html").read_text()
@@ -199,7 +199,10 @@ def test_every_option_is_explained():
 def test_the_picture_of_one_launch_states_its_angle_and_fits_a_phone():
     options = argparse.Namespace(top="wooden", rpm=1900.0, mu=[0.1, 0.3, 0.5], theta=[3.0, 12.0, 18.0])
     times = np.linspace(0.0, 5.0, 11)
-    figure = job.picture(options, times, np.minimum(0.2 + times, 3.1), 2.8)
+    plane = tippe.Table(
+        {"theta": np.array(options.theta), "mu": np.array(options.mu)}, {"time": np.full((3, 3), 2.8)}, {}, {}
+    )
+    figure = job.picture(options, times, np.minimum(0.2 + times, 3.1), plane)
     assert figure.axes[0].get_title() == "wooden top, 1900 rpm, θ(0) = 12°, mu = 0.3, on a table"
     assert figure.axes[0].get_legend() is None
     assert figure.get_figwidth() <= 8.0

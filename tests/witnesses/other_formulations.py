@@ -1,4 +1,4 @@
-"""Further formulations of a constrained mechanical system, beside those of `nonholonomic/formulations.py`.
+"""Further formulations of a constrained mechanical system, beside those of `nonholonomic/systems/mechanics.py`.
 
 - `Multipliers`: Hamilton's equations with Lagrange multipliers, the constrained port-Hamiltonian form;
 - `ConstrainedConnection`: geodesics, with forces, of the constrained Levi-Civita connection;
@@ -17,14 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.formulations import (
+from nonholonomic.geometry import solve
+from nonholonomic.systems.mechanics import (
     AbstractFormulation,
     AbstractSystem,
-    AbstractVelocityFormulation,
     Coordinates,
     lie_brackets,
 )
-from nonholonomic.geometry import solve
 from nonholonomic.validation import as_number, is_traced, require, warn
 
 Frame = Callable[[Coordinates], Float[Array, "n n"]]
@@ -109,7 +108,7 @@ class Multipliers(AbstractFormulation):
         return jnp.concatenate([rate, force])
 
 
-class ConstrainedConnection(AbstractVelocityFormulation):
+class ConstrainedConnection(AbstractFormulation):
     """Geodesics, with forces, of the constrained Levi-Civita connection (`stroller.md`, section 6, F3).
 
     With Q the metric projector on the forbidden directions, nabla^D = nabla + nabla Q is a connection on all of the
@@ -122,6 +121,13 @@ class ConstrainedConnection(AbstractVelocityFormulation):
     """
 
     system: AbstractSystem
+
+    def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
+        return jnp.concatenate([q, rate])
+
+    def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
+        q, rate = jnp.split(state, 2)
+        return q, rate
 
     def forbidden(self, q: Coordinates) -> Float[Array, "n n"]:
         """Projector Q = G^-1 W^T (W G^-1 W^T)^-1 W on the directions orthogonal to the allowed ones."""

@@ -13,7 +13,7 @@ from euler_angles import Accelerations, metric, per_normal_force, potential, sli
 from jaxtyping import Array, Float
 from other_formulations import structure_constants
 
-from nonholonomic.formulations import AbstractSystem
+from nonholonomic.systems.mechanics import AbstractSystem
 from tippe.model.body import Top
 from tippe.model.scene import Scene
 

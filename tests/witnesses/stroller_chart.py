@@ -1,4 +1,4 @@
-"""The stroller in coordinates, as data for the formulations of `nonholonomic/formulations.py`.
+"""The stroller in coordinates, as data for the formulations of `nonholonomic/systems/mechanics.py`.
 
 The coordinates are q = (x, y, theta, phi) on a plane and (eta, mu, psi, phi), reduced latitude first as in the paper,
 on a sphere or spheroid, where psi is the paper's theta if the heading is projected. Unlike the P-form, these equations
@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.formulations import AbstractSystem, Coordinates
 from nonholonomic.geometry import AbstractQuadric, Plane, add, inverse, multiply, subtract
+from nonholonomic.systems.mechanics import AbstractSystem, Coordinates
 from stroller.model.dynamics import State
 from stroller.model.input import Input, Motion
 from stroller.model.scene import FORKS, Scene

@@ -10,7 +10,7 @@ from other_formulations import ConstrainedConnection, Multipliers, ReducedBracke
 from stroller_chart import Chart, coordinates, coordinates_and_rates
 
 import stroller
-from nonholonomic.formulations import Hamel
+from nonholonomic.systems.mechanics import Hamel
 from stroller import Damping, Frictionless, Launch, Plane, RollingResistance, Scene, Spheroid, Stroller
 from stroller.runs.trajectory import side_force
 

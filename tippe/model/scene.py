@@ -407,7 +407,7 @@ class Scene(Bounded, Generic[Body]):
         return self.frame.at_foot(self.surface.chart(place_named(self.surface, launch.place))[0])
 
     def state(self, launch: Launch) -> State:
-        """The state at the start of a run (see `launch.py` for its components).
+        """The state at the start of a run (see `dynamics.py` for its components).
 
         **Arguments:**
 

@@ -17,7 +17,7 @@ from nonholonomic.integration import AbstractProblem, CoreProblem, Outcome
 from nonholonomic.integration.problem import FAILED, Status
 from nonholonomic.parameters import description, full_name, numbers, numbers_of
 from nonholonomic.runs.event import EventFunction, with_event
-from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Number, Start, model_of, statuses
+from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Number, Start, model_of, run_of, statuses
 from nonholonomic.runs.table import TableForm
 from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.validation import Bound, all_bounds, legal, require_kind, require_scalars
@@ -299,7 +299,7 @@ class TopModel(AbstractSceneModel):
         has_path = PATH in needs or (ON_CURVED in needs and not isinstance(scene.surface, Plane))
         return CoreProblem(run, len(run.start()[0]) - BEHIND_PATH if has_path else run.leading)
 
-    def modes(self, cells: int, tolerance: Number, names: Names, continues: bool) -> Start:
+    def modes(self, cells: int, tolerance: Any, names: Names, continues: bool) -> Start:
         scene, launch = self.scene, self.launch
         if self._is_without_path(names):
             assert self.kind.modes is not None
@@ -308,9 +308,6 @@ class TopModel(AbstractSceneModel):
         if scene.contact == "stop":
             return contact_modes(trajectory_problem((scene, launch), cells), tolerance)
         return flight_modes(scene, launch, tolerance, cells)
-
-    def simulate(self, t1: ArrayLike, times: Any, tolerance: ArrayLike, solver: Any, adjoint: Any) -> Any:
-        return simulate_launch(self, t1, times, tolerance, solver, adjoint)
 
     @property
     def quantities(self) -> dict[str, Quantity]:
@@ -378,6 +375,9 @@ def _integrated(scene: Scene) -> Scene:
     if scene.contact == "hybrid" and scene.flies_in_closed_form:
         return eqx.tree_at(lambda scene: scene.surface, scene, Plane(NO_TILT))
     return scene
+
+
+run_of.register(TopModel, simulate_launch)
 
 
 @model_of.register(Scene)

@@ -72,23 +72,6 @@ def quantities_of(scene: Scene) -> dict[str, Quantity]:
     return QUANTITIES | OF_RIGID_BODIES if isinstance(scene.body, AbstractRigidBody) else QUANTITIES
 
 
-def table_of(run: Any, names: Sequence[str] = ()) -> Table:
-    """Quantities of a run, over its times.
-
-    **Arguments:** `run`: a `Trajectory` or a `HybridTrajectory`, not a batch; `names`: as for `chosen`.
-
-    **Raises:** `ValueError` for a batch of runs.
-    """
-    require_one_run(run, "to_table", "; trajectory_table makes a table of many")
-    quantities = chosen(quantities_of(run.scene), names)
-    dims = [quantity.components for quantity in quantities.values() if quantity.components is not None]
-    coords = {"time": np.asarray(run.t)} | {dim: np.array(COMPONENTS[dim]) for dim in dict.fromkeys(dims)}
-    values = {name: np.asarray(quantity.of(name, run)) for name, quantity in quantities.items()}
-    request = description("scene", run.scene) | ({} if run.launch is None else description("launch", run.launch))
-    request |= {"status": str(run.status), "end_time": float(run.end_time)}
-    return run_table(quantities, coords, values, ["time"], request)
-
-
 def names_of(runs: list[Any], unit: Unit = None) -> list[str]:
     """Names of runs, by what differs in their launches and scenes. **Arguments:** `unit`: as for `plot`."""
     for run in runs:
@@ -309,7 +292,15 @@ class AbstractTrajectory(AbstractRun):
         return self.status
 
     def table_of(self, names: Sequence[str]) -> Table:
-        return table_of(self, names)
+        require_one_run(self, "to_table", "; trajectory_table makes a table of many")
+        quantities = chosen(quantities_of(self.scene), names)
+        dims = [quantity.components for quantity in quantities.values() if quantity.components is not None]
+        coords = {"time": np.asarray(self.t)} | {dim: np.array(COMPONENTS[dim]) for dim in dict.fromkeys(dims)}
+        values = {name: np.asarray(quantity.of(name, self)) for name, quantity in quantities.items()}
+        request = description("scene", self.scene)
+        request |= {} if self.launch is None else description("launch", self.launch)
+        request |= {"status": str(self.status), "end_time": float(self.end_time)}
+        return run_table(quantities, coords, values, ["time"], request)
 
     def labels_of(self, runs: list[Any], unit: Unit) -> list[str]:
         return names_of(runs, unit) if len(runs) > 1 else [""]

@@ -221,7 +221,7 @@ class HybridTrajectory(AbstractTrajectory):
         return float(min([*strokes, first]))
 
     @of_each_run
-    def _stem_gap(self) -> Values:
+    def _stem_gap(self) -> Any:
         """Distance of the stem from the arena [m]."""
         main, stem = balls(self.scene.body)
         return self.above[0] + height(main, stem, self.states)
@@ -400,10 +400,10 @@ class ArenaTrajectory(HybridTrajectory):
 def simulate_launch(
     model: Any,
     t1: ArrayLike,
-    times: Any,
+    times: ArrayLike | None,
     tolerance: ArrayLike,
-    solver: diffrax.AbstractSolver | None,
-    adjoint: diffrax.AbstractAdjoint | None,
+    solver: diffrax.AbstractSolver | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
 ) -> Trajectory | HybridTrajectory:
     """The run of a `TopModel`. **Arguments:** as for `tippe.simulate`."""
     require_adaptive(solver)

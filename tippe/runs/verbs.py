@@ -44,14 +44,13 @@ from .launches import (
     check_run,
     check_smooth,
     event_of,
-    labels,
     launches,
     require_rigid,
     warn_if_it_cannot_invert,
 )
 from .model import INVERSIONS, REVERSALS, TopModel, why_unresolved
 from .observables import QUANTITIES, quantities_of
-from .trajectory import HybridTrajectory, Trajectory
+from .trajectory import HybridTrajectory, Trajectory, simulate_launch
 
 # Tables of many launches: inversion times, reversal times, and trajectories.
 
@@ -273,10 +272,9 @@ def event_table(
         name: "time_by_" + (short if shorts.count(short) == 1 else name.replace(".", "_"))
         for name, short in zip(names, shorts, strict=True)
     }
-    units = {name: unit for name, (_, unit, _) in labels(scene, roots["launch"], names, ()).items()}
     by_diffrax = method == "diffrax"
     job = TableJob(model, form, float(t1), crossing, settings, slopes, options.errors, by_diffrax=by_diffrax)
-    table = compute_table(job, grid, units, request, options)
+    table = compute_table(job, grid, request, options)
     warn_of_long_runs(table, float(t1), options.max_steps)
     # Tables whose variables stay in the file are not checked.
     if model.smooth and isinstance(table.variables, dict):
@@ -374,7 +372,7 @@ def trajectory_table(
     model = TopModel(scene=roots["scene"], launch=roots["launch"])
     check_cells(model, grid, options)
     job = TableJob(model, TRAJECTORIES, float(t1), "first", settings, samples=samples, timed=False)
-    return compute_table(job, grid, {}, {}, options)
+    return compute_table(job, grid, {}, options)
 
 
 # The functions for single launches, on those of `nonholonomic.runs`.
@@ -430,7 +428,7 @@ def simulate(
     ```
     """
     check_run(scene, launch, t1, tolerance, "jax.vmap(simulate) takes lists, and so does trajectory_table")
-    return TopModel(scene=scene, launch=launch).simulate(t1, times, tolerance, solver, adjoint)
+    return simulate_launch(TopModel(scene=scene, launch=launch), t1, times, tolerance, solver, adjoint)
 
 
 @status_line("simulating")

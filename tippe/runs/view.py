@@ -141,7 +141,7 @@ def show(scene: Scene, motion: DrawnMotion[np.ndarray], number: int, name: str) 
     )
 
 
-def curve_of_rotation(scene: Scene, motion: DrawnMotion[Numbers]) -> tuple[str, Numbers]:
+def curve_of_rotation(scene: Scene, motion: DrawnMotion[Numbers]) -> tuple[str, Any]:
     """Label and values of the curve of the rotation: Jellett's quantity, or, for a body of any shape and inertia, the spin
     about the normal."""
     if isinstance(scene.body, AbstractRigidBody):

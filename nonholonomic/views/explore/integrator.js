@@ -1,5 +1,5 @@
-// The loops over steps and stages, rounds and flights. Everything else is generated from Python (`simulator.py`,
-// `hybrid_simulator.py`) and is in `model`: the equations, the coefficients of the Runge-Kutta pair, the first step, step-size control, the location of
+// The loops over steps and stages, rounds and flights. Everything else is generated from Python (`live.py`) and is
+// in `model`: the equations, the coefficients of the Runge-Kutta pair, the first step, step-size control, the location of
 // events, and what happens between the modes.
 "use strict";
 

@@ -15,9 +15,10 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import ArrayLike
 
-from ...compilation.components import MOVES
-from ...compilation.xla_cpu import called_program, opened, programs_of, read_program, traced
+from ...compilation.components import AbstractScalarReader, rows_along
+from ...compilation.xla_cpu import Equation, called_program, opened, programs_of, traced
 
 #: A number: a Python number if known, otherwise its name or text in JavaScript. A value is an array of numbers.
 Number = str | float
@@ -53,16 +54,11 @@ KNOWN: dict[str, Callable[..., Number]] = {
 KNOWN |= {"max": max, "min": min, "clamp": lambda low, value, high: min(max(value, low), high)}
 KNOWN |= {CHOICE: lambda which, no, yes: yes if which else no}
 
-#: Operations that move elements; evaluated by NumPy, because JAX would compile a program for each.
-MOVED = ("broadcast_in_dim", "concatenate", "expand_dims", "reshape", "rev", "slice", "squeeze", "stack", "transpose")
-
 #: Operations that move elements to indices given by operands, and the positions of these operands.
 INDEXED = {"dynamic_slice": slice(1, None), "dynamic_update_slice": slice(2, None), "gather": slice(1, 2)}
-INDEXED |= {"scatter": slice(1, 2)} | {name: slice(0) for name in ("pad", "split")}
+INDEXED["scatter"] = slice(1, 2)
 
 SAME = ("stop_gradient", "optimization_barrier", "copy", "copy_p", "reduce_precision")
-REDUCTIONS = {"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min"}
-REDUCTIONS |= {"reduce_and": "and", "reduce_or": "or"}
 
 #: Loops with at most this many iterations are unrolled, unless that writes more than this many statements.
 WRITTEN_OUT, MOST_STATEMENTS = 16, 4000
@@ -108,7 +104,7 @@ def javascript(name: str, function: Callable[..., Any], *arguments: Any) -> str:
         names = (f"a{number}[{place}]" for place in itertools.count())
         shapes = [np.zeros(leaf.shape) for leaf in jax.tree.leaves(argument)]
         values += [_map(lambda _, names=names: block.name(next(names)), shape) for shape in shapes]
-    results = _flat(block.call(traced(function, *arguments)[0], values))
+    results = _flat(block.read(traced(function, *arguments)[0], values))
     statements = [f"out[{k}] = {_text(number)};" for k, number in enumerate(results)]
     heads = ", ".join([*(f"a{number}" for number in range(len(arguments))), "out"])
     body = _indented([*block.leading_to(results)[0], *statements, "return out;"])
@@ -132,7 +128,7 @@ def _map(function: Callable[..., Number], *values: Value) -> Value:
         return np.asarray(np.frompyfunc(function, len(values), 1)(*values), object)
 
 
-class _Block:
+class _Block(AbstractScalarReader):
     """Consecutive statements: each defines names, reads others, and has lines of text."""
 
     def __init__(self, names: Any, known: dict[str, str]):
@@ -159,40 +155,28 @@ class _Block:
                 blocks.append(lines)
         return [line for lines in reversed(blocks) for line in lines], names
 
-    def call(self, closed: Any, arguments: Sequence[Value]) -> Values:
-        """The results of a jaxpr."""
-        return read_program(closed, arguments, self.apply, _value)
+    def constants(self, array: ArrayLike) -> Value:
+        return _value(array)
 
-    def apply(self, equation: Any, inputs: Values) -> Values:
-        """The results of one equation."""
+    def apply(self, equation: Equation, inputs: Values) -> Sequence[Value]:
         name, parameters = equation.primitive.name, equation.params
         if name in SAME:
             return inputs
         if name in ("while", "cond", "scan"):
             return getattr(self, f"{name}_")(inputs, **parameters)
         if (inner := called_program(equation)) is not None:
-            return self.call(inner, inputs)
-        if name in MOVED:
-            return [np.asarray(MOVES[name](equation, *inputs), object)]
-        if name == "unstack":
-            return _rows(inputs[0], parameters["axis"])
+            return self.read(inner, inputs)
         if name in INDEXED:
             return self.indexed(equation, inputs, range(len(inputs))[INDEXED[name]])
-        if name in REDUCTIONS:
-            return [self.reduced(REDUCTIONS[name], inputs[0], parameters["axes"])]
         if name == "cumsum":
-            rows = _rows(inputs[0], parameters["axis"])[:: -1 if parameters["reverse"] else 1]
+            rows = rows_along(inputs[0], parameters["axis"])[:: -1 if parameters["reverse"] else 1]
             sums = list(itertools.accumulate(rows, functools.partial(self.each, "add")))
             return [np.stack(sums[:: -1 if parameters["reverse"] else 1], parameters["axis"])]
-        if name == "dot_general":
-            return [self.product(*inputs, *parameters["dimension_numbers"])]
-        if name == "iota":
-            return [_value(np.indices(parameters["shape"])[parameters["dimension"]])]
         if name in ("argmin", "argmax"):
             return [self.extreme("lt" if name == "argmin" else "gt", inputs[0], parameters["axes"][0])]
-        return [self.each(self.kind(equation), *inputs)]
+        return super().apply(equation, inputs)
 
-    def kind(self, equation: Any) -> str:
+    def kind(self, equation: Equation) -> str:
         """An elementwise operation: the name of a primitive, or JavaScript."""
         name, parameters = equation.primitive.name, equation.params
         types = [atom.aval.dtype for atom in equation.invars]
@@ -220,34 +204,12 @@ class _Block:
             raise ValueError(f"the primitive {name!r} of JAX cannot be written in JavaScript; {known}")
         return name
 
-    def each(self, kind: str, *values: Value) -> Value:
-        """Apply an elementwise operation."""
-        return _map(functools.partial(self.element, kind), *values)
-
-    def element(self, kind: str, *numbers: Number) -> Number:
-        if kind in KNOWN and not _strings(numbers):
-            return KNOWN[kind](*numbers)
-        if kind == "{}":
+    def element(self, name: str, *numbers: Number, equation: Equation | None = None) -> Number:
+        if name in KNOWN and not _strings(numbers):
+            return KNOWN[name](*numbers)
+        if name == "{}":
             return numbers[0]
-        return self.name(ELEMENTWISE.get(kind, kind).format(*map(_text, numbers)), *numbers)
-
-    def reduced(self, kind: str, value: Value, axes: Sequence[int]) -> Value:
-        """Combine the elements along some axes, one by one."""
-        for axis in sorted(axes, reverse=True):
-            value = functools.reduce(functools.partial(self.each, kind), _rows(value, axis))
-        return np.asarray(value, object)
-
-    def product(self, a: Value, b: Value, contracted: Any, batch_axes: Any) -> Value:
-        """The product of two arrays, summed over the contracted axes; batch axes are kept."""
-
-        def factor(value: Value, summed: Sequence[int], batch: Sequence[int]) -> tuple[Value, list[list[int]]]:
-            free = [k for k in range(value.ndim) if k not in (*summed, *batch)]
-            shape = [[value.shape[k] for k in axes] for axes in (batch, free, summed)]
-            return np.transpose(value, [*batch, *free, *summed]).reshape([math.prod(part) for part in shape]), shape
-
-        (left, (common, rows, _)), (right, (_, columns, _)) = map(factor, (a, b), contracted, batch_axes)
-        product = self.reduced("add", self.each("mul", left[:, :, None], right[:, None]), [3])
-        return product.reshape([*common, *rows, *columns])
+        return self.name(ELEMENTWISE.get(name, name).format(*map(_text, numbers)), *numbers)
 
     def extreme(self, kind: str, value: Value, axis: int) -> Value:
         """The index of the first extreme element along an axis."""
@@ -256,10 +218,10 @@ class _Block:
             is_better = self.each(kind, candidate[1], extreme[1])
             return [self.each(CHOICE, is_better, *pair) for pair in zip(extreme, candidate, strict=True)]
 
-        rows = enumerate(_rows(value, axis))
+        rows = enumerate(rows_along(value, axis))
         return functools.reduce(choose, ([_value(np.full(row.shape, number)), row] for number, row in rows))[0]
 
-    def indexed(self, equation: Any, inputs: Values, indices: Sequence[int]) -> Values:
+    def indexed(self, equation: Equation, inputs: Values, indices: Sequence[int]) -> Values:
         """Elements at indices that may be known only in JavaScript, which then selects among all possible indices."""
         pool = _flat([value for k, value in enumerate(inputs) if k not in indices])
         unknown = [(k, place) for k in indices for place, x in np.ndenumerate(inputs[k]) if isinstance(x, str)]
@@ -310,9 +272,9 @@ class _Block:
         of_cond, of_body = inputs[:cond_nconsts], inputs[cond_nconsts : cond_nconsts + body_nconsts]
 
         def step(block: "_Block", carry: Values) -> Values:
-            goes_on = block.call(cond_jaxpr, [*of_cond, *carry])[0].item()
+            goes_on = block.read(cond_jaxpr, [*of_cond, *carry])[0].item()
             block.statements.append(([LEAVES], set(_strings([goes_on])), [f"if (!{_text(goes_on)}) break;"]))
-            return block.call(body_jaxpr, [*of_body, *carry])
+            return block.read(body_jaxpr, [*of_body, *carry])
 
         return self.loop("while (true)", inputs[cond_nconsts + body_nconsts :], step)
 
@@ -324,33 +286,29 @@ class _Block:
         unrolled = length <= WRITTEN_OUT and length * _statements(jaxpr) <= MOST_STATEMENTS
         if not rows and len(opened(jaxpr)[0].outvars) == count and not unrolled:
             head = f"for (let k = 0; k < {length}; k++)"
-            return self.loop(head, carry, lambda block, carry: block.call(jaxpr, [*constants, *carry]))
+            return self.loop(head, carry, lambda block, carry: block.read(jaxpr, [*constants, *carry]))
         rows_of_steps: list[Any] = [None] * length
         for k in reversed(range(length)) if reverse else range(length):
-            new_values = self.call(jaxpr, [*constants, *carry, *(np.asarray(row[k], object) for row in rows)])
+            new_values = self.read(jaxpr, [*constants, *carry, *(np.asarray(row[k], object) for row in rows)])
             carry, rows_of_steps[k] = new_values[:count], new_values[count:]
         return [*carry, *(np.stack(parts) for parts in zip(*rows_of_steps, strict=True))]
 
     def cond_(self, inputs: Values, branches: Sequence[Any], **_: Any) -> Values:
         number, operands = inputs[0].item(), inputs[1:]
         if not isinstance(number, str):
-            return self.call(branches[int(number)], operands)
+            return self.read(branches[int(number)], operands)
         variables = self.variables([np.empty(kind.shape) for kind in branches[0].out_avals])
         names, reads = _flat(variables), {number}
         lines = [f"let {', '.join(_strings(names))};"] if names else []
         for k, branch in enumerate(branches):
             block = self.inner()
-            end = _flat(block.call(branch, operands))
+            end = _flat(block.read(branch, operands))
             body, inside_reads = block.leading_to(end)
             assignments = [f"{name} = {_text(value)};" for name, value in zip(names, end, strict=True)]
             lines += [f"{'} else ' if k else ''}if ({number} == {k}) {{", *_indented([*body, *assignments])]
             reads |= inside_reads
         self.statements.append((names, reads, [*lines, "}"]))
         return variables
-
-
-def _rows(value: Value, axis: int) -> Values:
-    return [np.asarray(row, object) for row in np.moveaxis(value, axis, 0)]
 
 
 def _flat(values: Sequence[Value]) -> list[Number]:

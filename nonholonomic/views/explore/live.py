@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ...hybrid import MOST_ROUNDS, AbstractBatchedMode, AbstractHoppingMode, HybridOutcome
 from ...hybrid.ensemble import after_reset, after_solve, at_start, mode_numbered, program_groups
@@ -44,15 +44,6 @@ class Frame(NamedTuple):
     curves: tuple[Float[Array, ""], ...]
     turning_rate: Float[Array, ""]
 
-    def layout(self) -> dict[str, Any]:
-        """The number of items of each kind, for readers of the flat list of numbers."""
-        return {
-            "bodies": len(self.bodies),
-            "traces": [about is not None for _, about in self.traces],
-            "arrows": len(self.arrows),
-            "curves": len(self.curves),
-        }
-
 
 def quaternion(rotation: Float[Array, "3 3"]) -> Float[Array, "4"]:
     """The quaternion (x, y, z, w) of a rotation matrix, from its largest component (Shepperd 1978)."""
@@ -84,7 +75,7 @@ def quaternion(rotation: Float[Array, "3 3"]) -> Float[Array, "4"]:
 Numbers = Float[Array, " numbers"]
 
 #: Functions of a page by name, with examples of their arguments.
-Functions = dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]
+Functions = dict[str, tuple[Callable[..., PyTree], tuple[PyTree, ...]]]
 
 
 class Simulator(NamedTuple):
@@ -99,7 +90,7 @@ class Simulator(NamedTuple):
     problem: Callable[[Numbers], AbstractProblem]
     t1: float
     settings: Settings
-    readings: dict[str, Callable[[Numbers, Any, LaneState], Any]]
+    readings: dict[str, Callable[[Numbers, AbstractProblem, LaneState], PyTree]]
     passes: bool = False
 
     def begin(self, values: Numbers) -> LaneScheduler:
@@ -107,7 +98,7 @@ class Simulator(NamedTuple):
         t1, cells = jnp.asarray(self.t1), jnp.asarray(1)
         return LaneScheduler.of(self.problem(values), t1, cells, self.settings, nonterminal=self.passes)
 
-    def read(self, name: str, values: Numbers) -> Any:
+    def read(self, name: str, values: Numbers) -> PyTree:
         """A reading at the start of a run."""
         scheduler = self.begin(values)
         return self.readings[name](values, scheduler.problem, scheduler.fresh)
@@ -117,7 +108,7 @@ class Simulator(NamedTuple):
 
         **Arguments:** `values`: numbers of the sliders; only their count matters.
         """
-        stepper = Stepper.of(self.begin, (values,), self.settings)
+        stepper = stepper_of(self.begin, (values,), self.settings)
         functions = stepper.functions
         for name, read in self.readings.items():
             functions[name] = (
@@ -130,102 +121,89 @@ class Simulator(NamedTuple):
 class Stepper(NamedTuple):
     """The steps of a motion in JavaScript.
 
-    - `begin`: function that returns the scheduler of one cell; `examples`: example arguments of this function;
-      `settings`: settings of the steps.
     - `constants`, `lane`: the shapes of the constants of a run, and of the lane; `run` computes problem, control and
       absolute tolerances from the constants.
+    - `facts`: the sizes and the coefficients that `integrator.js` reads; `functions`: the functions that it calls.
     """
 
-    begin: Callable[..., LaneScheduler]
-    examples: tuple[Any, ...]
-    settings: Settings
-    constants: Any
+    constants: PyTree
     lane: LaneState
-    run: Callable[[Any], tuple[Any, Control, Any]]
-
-    @classmethod
-    def of(cls, begin: Callable[..., LaneScheduler], examples: tuple[Any, ...], settings: Settings) -> "Stepper":
-        """The steps of the motion that a function begins."""
-        shapes = eqx.filter_eval_shape(functools.partial(_started, begin), *examples)
-        (constants, lane), static = eqx.partition(shapes, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
-        return cls(begin, examples, settings, constants, lane, functools.partial(eqx.combine, static[0]))
-
-    @property
-    def functions(self) -> Functions:
-        """The functions that `integrator.js` calls."""
-        constants, lane, run = self.constants, self.lane, self.run
-        time, state = lane.time, lane.state
-        places = len(watched_places(explicit_tableau(self.settings.for_lanes), self.looks))
-        margins = jax.tree.map(lambda least: jax.ShapeDtypeStruct((places, *least.shape), least.dtype), lane.margins)
-        trial = Step(state, state, state, time, time, margins, (), state, None)
-
-        def after(constants: Any, lane: LaneState, length: Any, trial: Step) -> LaneState:
-            problem, control, atols = run(constants)
-            near = until_jump(problem, control, lane)
-            new_lane = after_step(problem, near, atols, lane, length, trial)
-            return past_jump(problem, control, near, lane, new_lane)
-
-        def length(constants: Any, lane: LaneState) -> Any:
-            return length_to_try(until_jump(*run(constants)[:2], lane), lane)
-
-        return {
-            "begin": (lambda *inputs: eqx.filter(_started(self.begin, *inputs), eqx.is_array), self.examples),
-            "length": (length, (constants, lane)),
-            "field": (lambda constants, time, state: run(constants)[0].field(time, state), (constants, time, state)),
-            "margins": (
-                lambda constants, time, state: run(constants)[0].margins(time, state),
-                (constants, time, state),
-            ),
-            "crossing": (
-                lambda constants, state, rate: run(constants)[0].crossing_along(state, rate),
-                (constants, state, state),
-            ),
-            "after": (after, (constants, lane, time, trial)),
-        }
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        """The sizes and the coefficients that `integrator.js` reads."""
-        tableau = explicit_tableau(self.settings.for_lanes)
-        inner = inner_stages(tableau)
-        return {
-            "constants": size_of(self.constants),
-            "components": self.lane.state.shape[0],
-            "lane": offsets_of(self.lane),
-            "running": RUNNING,
-            "stages": [row.tolist() for row in tableau.a_lower[:inner]],
-            "places": np.asarray(tableau.c[:inner]).tolist(),
-            "looks": self.looks,
-            "margins_count": 0 if self.lane.margins is None else len(self.lane.margins),
-            "step": np.asarray(tableau.b_sol[: 1 + inner]).tolist(),
-            "error": np.asarray(tableau.b_error).tolist(),
-            "middle": middle_weights(tableau),
-        }
-
-    @property
-    def looks(self) -> list[int]:
-        """The stages at which margins and event function are evaluated, too."""
-        return looks_of(self.run(self.constants)[0], explicit_tableau(self.settings.for_lanes), self.lane)
+    run: Callable[[PyTree], tuple[AbstractProblem, Control, PyTree]]
+    facts: dict[str, object]
+    functions: Functions
 
 
-def _started(begin: Callable[..., LaneScheduler], *inputs: Any) -> tuple[Any, LaneState]:
+def stepper_of(begin: Callable[..., LaneScheduler], examples: tuple[PyTree, ...], settings: Settings) -> Stepper:
+    """The steps of a motion. **Arguments:** `begin`: function that returns the scheduler of one cell; `examples`: example
+    arguments of this function; `settings`: settings of the steps."""
+    shapes = eqx.filter_eval_shape(functools.partial(_started, begin), *examples)
+    (constants, lane), static = eqx.partition(shapes, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
+    run, time, state = functools.partial(eqx.combine, static[0]), lane.time, lane.state
+    tableau = explicit_tableau(settings.for_lanes)
+    inner = inner_stages(tableau)
+    # The stages at which margins and event function are evaluated, too.
+    looks = looks_of(run(constants)[0], tableau, lane)
+    places = len(watched_places(tableau, looks))
+    margins = jax.tree.map(lambda least: jax.ShapeDtypeStruct((places, *least.shape), least.dtype), lane.margins)
+    trial = Step(state, state, state, time, time, margins, (), state, None)
+
+    def after(constants: PyTree, lane: LaneState, length: Array, trial: Step) -> LaneState:
+        problem, control, atols = run(constants)
+        near = until_jump(problem, control, lane)
+        new_lane = after_step(problem, near, atols, lane, length, trial)
+        return past_jump(problem, control, near, lane, new_lane)
+
+    def length(constants: PyTree, lane: LaneState) -> Array:
+        problem, control, _ = run(constants)
+        return length_to_try(until_jump(problem, control, lane), lane)
+
+    functions: Functions = {
+        "begin": (lambda *inputs: eqx.filter(_started(begin, *inputs), eqx.is_array), examples),
+        "length": (length, (constants, lane)),
+        "field": (lambda constants, time, state: run(constants)[0].field(time, state), (constants, time, state)),
+        "margins": (lambda constants, time, state: run(constants)[0].margins(time, state), (constants, time, state)),
+        "crossing": (
+            lambda constants, state, rate: run(constants)[0].crossing_along(state, rate),
+            (constants, state, state),
+        ),
+        "after": (after, (constants, lane, time, trial)),
+    }
+    facts = {
+        "constants": size_of(constants),
+        "components": state.shape[0],
+        "lane": offsets_of(lane),
+        "running": RUNNING,
+        "stages": [row.tolist() for row in tableau.a_lower[:inner]],
+        "places": np.asarray(tableau.c[:inner]).tolist(),
+        "looks": looks,
+        "margins_count": 0 if lane.margins is None else len(lane.margins),
+        "step": np.asarray(tableau.b_sol[: 1 + inner]).tolist(),
+        "error": np.asarray(tableau.b_error).tolist(),
+        "middle": middle_weights(tableau),
+    }
+    return Stepper(constants, lane, run, facts, functions)
+
+
+def _started(
+    begin: Callable[..., LaneScheduler], *inputs: PyTree
+) -> tuple[tuple[AbstractProblem, Control, PyTree], LaneState]:
     scheduler = begin(*inputs)
     return (scheduler.problem, scheduler.control, scheduler.atols), scheduler.fresh
 
 
-def as_object(facts: dict[str, Any], functions: Functions, **more: str) -> str:
+def as_object(facts: Mapping[str, object], functions: Functions, **more: str) -> str:
     """A JavaScript object with facts and functions; `more`: text of further entries."""
     lines = [f"{name}: {javascript('', function, *examples)}" for name, (function, examples) in functions.items()]
     lines += [f"{name}: {text}" for name, text in more.items()]
     return "{\n" + ",\n".join([*(f"{name}: {json.dumps(fact)}" for name, fact in facts.items()), *lines]) + "}"
 
 
-def size_of(tree: Any) -> int:
+def size_of(tree: PyTree) -> int:
     """Number of numbers in a tree of arrays."""
     return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
 
 
-def offsets_of(parts: Any) -> dict[str, int]:
+def offsets_of(parts: LaneState | HybridOutcome) -> dict[str, int]:
     """The offset of each part of a named tuple in its flat list of numbers, and under `size` the length of the list."""
     return dict(zip((*parts._fields, "size"), np.cumsum([0, *map(size_of, parts)]).tolist(), strict=True))
 
@@ -254,15 +232,15 @@ class HybridSimulator(NamedTuple):
     t1: float
     settings: Settings
     counters: int
-    readings: dict[str, Callable[[Numbers, HybridOutcome], Any]]
-    frame: Callable[[Numbers, Any, Any, Any], Any] | None = None
+    readings: dict[str, Callable[[Numbers, HybridOutcome], PyTree]]
+    frame: Callable[[Numbers, Array, PyTree, Array], Frame] | None = None
 
     def first(self, values: Numbers) -> HybridOutcome[Array]:
         """The run for the sliders' numbers, at its start."""
         _, mode, state = self.start(values)
         return at_start(mode, state, 1, self.counters)
 
-    def read(self, name: str, values: Numbers) -> Any:
+    def read(self, name: str, values: Numbers) -> PyTree:
         """A reading at the start of a run."""
         assert self.frame is not None, name
         modes, number, state = self.start(values)
@@ -304,7 +282,7 @@ class HybridSimulator(NamedTuple):
             problem = mode_of(values, runs).problem(runs.state)
             return LaneScheduler.of(problem, _left(t1, runs), jnp.asarray(1), self.settings)
 
-        def ended(constants: Any, lane: Any, runs: HybridOutcome) -> HybridOutcome:
+        def ended(constants: PyTree, lane: LaneState, runs: HybridOutcome) -> HybridOutcome:
             problem = stepper.run(constants)[0]
             outcome = with_crossing_times(problem, back_to_margin(problem, outcome_of(lane)))
             return after_solve(runs, outcome, t1)
@@ -313,25 +291,22 @@ class HybridSimulator(NamedTuple):
             transition = mode_of(values, runs).reset_map(runs.state, _left(t1, runs))
             return after_reset(runs, transition, t1)
 
-        def lost(values: Numbers, runs: HybridOutcome) -> Any:
+        def lost(values: Numbers, runs: HybridOutcome) -> PyTree:
             stretch = mode_of(values, runs).lost(runs.state)
             return stretch.open, stretch.elapsed, stretch
 
-        def hop(values: Numbers, runs: HybridOutcome, stretch: Any) -> Any:
+        def hop(values: Numbers, runs: HybridOutcome, stretch: PyTree) -> PyTree:
             state_after, following = mode_of(values, runs).hop(stretch, _left(t1, runs))
             return following.open, state_after.elapsed, following
 
-        def closed(values: Numbers, runs: HybridOutcome, stretch: Any) -> HybridOutcome:
+        def closed(values: Numbers, runs: HybridOutcome, stretch: PyTree) -> HybridOutcome:
             return after_reset(runs, mode_of(values, runs).closed(stretch), t1)
 
-        def output(values: Numbers, runs: HybridOutcome, state: Any) -> Any:
-            return mode_of(values, runs).shown(state)
-
-        def between(values: Numbers, runs: HybridOutcome, stretch: Any, elapsed: Any) -> Any:
+        def between(values: Numbers, runs: HybridOutcome, stretch: PyTree, elapsed: Array) -> PyTree:
             mode = mode_of(values, runs)
             return mode.between(mode.motion_in(stretch), elapsed)
 
-        stepper = Stepper.of(begin, (values, runs), self.settings)
+        stepper = stepper_of(begin, (values, runs), self.settings)
         functions, facts = stepper.functions, stepper.facts
         functions["ended"] = (ended, (stepper.constants, stepper.lane, runs))
         if not isinstance(mode, AbstractHoppingMode):
@@ -344,7 +319,10 @@ class HybridSimulator(NamedTuple):
             if self.frame is not None:
                 functions["between"] = (between, (values, runs, stretch, runs.end_time))
         if self.frame is not None:
-            functions["shown"] = (output, (values, runs, runs.state))
+            functions["shown"] = (
+                lambda values, runs, state: mode_of(values, runs).shown(state),
+                (values, runs, runs.state),
+            )
         return as_object(facts, functions)
 
 
@@ -426,12 +404,19 @@ def live_page(live: LiveRun, stage: Stage, speed: float = 1.0, below: str = "") 
 def programs(live: LiveRun) -> str:
     """The JavaScript of the simulation: the data of the sliders, all functions and the integrator, without a page."""
     values = jnp.array([slider.value for slider in live.sliders])
+    frame = Frame(*eqx.filter_eval_shape(lambda values: live.motion.read("frame", values), values))
     facts = {
         "sliders": [slider._asdict() for slider in live.sliders],
         "words": {int(status): status.word for status in Status} | dict(live.answer.words),
         "answer": {"label": live.answer.label, "unit": live.answer.unit},
         "summaries": [summary._asdict() for summary in live.summaries],
-        "layout": _layout(live.motion, values),
+        # For readers of the flat list of numbers of a frame.
+        "layout": {
+            "bodies": len(frame.bodies),
+            "traces": [about is not None for _, about in frame.traces],
+            "arrows": len(frame.arrows),
+            "curves": len(frame.curves),
+        },
     }
     parts = {
         "facts": json.dumps(facts),
@@ -443,7 +428,3 @@ def programs(live: LiveRun) -> str:
         f"window.live = {{{', '.join(f'{name}: {text}' for name, text in parts.items())}}};\n"
         f"{template('explore/integrator.js')}"
     )
-
-
-def _layout(motion: Simulator | HybridSimulator, values: Numbers) -> dict[str, Any]:
-    return Frame(*eqx.filter_eval_shape(lambda values: motion.read("frame", values), values)).layout()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from other_formulations import ConstrainedConnection, Multipliers, ReducedBracket, Routhian, structure_constants
 
-from nonholonomic.formulations import AbstractSystem, Hamel, Lagrange
+from nonholonomic.systems.mechanics import AbstractSystem, Hamel, Lagrange
 
 LEVI_CIVITA = np.array([[[(i - j) * (j - k) * (k - i) / 2 for k in range(3)] for j in range(3)] for i in range(3)])
 ORIENTATION = jnp.array([0.4, 1.1, -0.7])

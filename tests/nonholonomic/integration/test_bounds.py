@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nonholonomic.compilation.bounds import RULES, Bounds, UnboundedError, enclosing
+from nonholonomic.compilation.tracing import RULES, Bounds, UnboundedError, enclosing
 
 FUNCTIONS = {
     "abs": jnp.abs,

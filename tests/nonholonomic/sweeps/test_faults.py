@@ -18,7 +18,7 @@ import pytest
 from cheap_sweep import BLOCK, cheap_sweep, finished_blocks, resumed
 from disk_faults import FOR_A_BLOCK, FOR_THE_FILE, FOR_THE_FOLDER, Killed, fail_on_disk
 
-from nonholonomic.sweeps import Table, running
+from nonholonomic.sweeps import Table, grid
 from nonholonomic.sweeps._store import ChunkStore
 from nonholonomic.sweeps.grid import Layout
 
@@ -219,10 +219,10 @@ def test_a_reader_beside_the_writer_sees_whole_blocks(tmp_path):
 def test_another_version_is_told_or_refused(tmp_path, monkeypatch):
     """Another version of this package may have other equations; other libraries have other last digits."""
     path = tmp_path / "table.h5"
-    versions = running.versions()
+    versions = grid.versions()
     with monkeypatch.context() as patch:
         fail_on_disk(patch, 20, torn=0.0, error=Killed())
-        patch.setattr(running, "versions", lambda: versions | {"jax": "0.0.1", "python": "2.7"})
+        patch.setattr(grid, "versions", lambda: versions | {"jax": "0.0.1", "python": "2.7"})
         with pytest.raises(Killed):
             cheap_sweep(path)
     with pytest.warns(RuntimeWarning, match=rf"was begun with jax 0\.0\.1, now {versions['jax']}: digits may differ"):
@@ -233,6 +233,6 @@ def test_another_version_is_told_or_refused(tmp_path, monkeypatch):
         warnings.simplefilter("error")
         cheap_sweep(path)
     with monkeypatch.context() as patch:
-        patch.setattr(running, "versions", lambda: versions | {"nonholonomic": "99.0"})
+        patch.setattr(grid, "versions", lambda: versions | {"nonholonomic": "99.0"})
         with pytest.raises(ValueError, match=r"another run: nonholonomic is .* in the file and 99\.0 here"):
             cheap_sweep(path)

@@ -10,8 +10,8 @@ from scipy.integrate import solve_ivp
 
 from nonholonomic import AbstractSystem, simulate
 from nonholonomic.compilation.components import TooLarge, by_components
-from nonholonomic.formulations import Lagrange, within_constraints
 from nonholonomic.runs.model import model_of
+from nonholonomic.systems.mechanics import Lagrange, within_constraints
 
 LANES = tuple(jnp.linspace(0.1, 1.0, 8) * scale for scale in (1.0, -2.0, 0.7, 1.3, 0.4, 3.0))
 SCALARS = tuple(jax.ShapeDtypeStruct((), jnp.float64) for _ in LANES)

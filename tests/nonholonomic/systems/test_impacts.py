@@ -8,7 +8,7 @@ from close import assert_close
 from own_modes import Bumper, Sleigh, after_impact
 
 from nonholonomic import AbstractSystem, Hybrid, simulate
-from nonholonomic.systems.system import check_start
+from nonholonomic.systems.form import check_start
 
 HEADING, SPEED, TIME = 0.4, 1.5, 2.0
 POINT = jnp.array([1.7, 0.4, 0.3, 1.0, 0.2, 0.7, HEADING, SPEED])

@@ -13,14 +13,13 @@ import pytest
 from close import assert_close
 from other_formulations import Routhian
 from own_modes import GRAVITY, Ball, Sleigh, Slip, Stick, bounce, final_turn
-from PIL import Image
 from scipy.integrate import quad
 
 import nonholonomic
 from nonholonomic import AbstractMode, AbstractSystem, Hybrid, event_time, simulate, sweep
-from nonholonomic.formulations import Hamel, Lagrange
 from nonholonomic.sweeps import Table
-from nonholonomic.systems.system import check_start, formulation_of
+from nonholonomic.systems.form import check_start
+from nonholonomic.systems.mechanics import Hamel, Lagrange, formulation_of
 
 START = [1.0, 0.0, 0.0]
 TIMES = jnp.array([0.3, 0.7, 1.1, 1.5])
@@ -167,21 +166,6 @@ def test_resets_are_listed_and_drawn():
         assert len(drawn) == 7
         assert_close(np.sort(drawn)[:4], np.zeros(4), atol=1e-9)
     assert len(run.to_table()["y0"]) == 3
-
-
-def test_an_animation_shows_the_plane_of_the_page(tmp_path):
-    run = simulate(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.0)
-    run.animate(tmp_path / "ball.gif", times=[0.0, 0.4], others=[run.at([0.0, 0.5, 1.0])])
-    with Image.open(tmp_path / "ball.gif") as picture:
-        assert picture.n_frames == 2
-        pictures = []
-        for frame in range(2):
-            picture.seek(frame)
-            pictures.append(np.asarray(picture.convert("RGB"), dtype=float)[50:340])
-    left, right = np.split(np.abs(pictures[1] - pictures[0]).max(axis=-1), 2, axis=1)
-    assert min(np.count_nonzero(left), np.count_nonzero(right)) > 50
-    # The plane has a colour, and the rest of the picture is white.
-    assert 5000 < np.count_nonzero(np.ptp(pictures[0], axis=-1) > 15.0) < 50000
 
 
 def test_resets_need_one_run():

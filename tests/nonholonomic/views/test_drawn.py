@@ -1,14 +1,18 @@
-"""Arenas, animations and pages of a prescribed motion: a ball that rolls along a line."""
+"""Arenas, films and pages of a prescribed motion: a ball that rolls along a line."""
 
 import base64
+import contextlib
 import json
 import re
+import sys
+import time
 import zlib
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from PIL import Image
+from browser import needs_browser, open_browser, wait
+from scipy.spatial.transform import Rotation
 
 from nonholonomic.geometry import Cylinder, Graph, Implicit, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.views import (
@@ -24,8 +28,8 @@ from nonholonomic.views import (
     page,
     turned,
 )
-from nonholonomic.views.animation import Viewable, draw_curves, frame_times, rate_of, speed_as_text, write_animation
-from nonholonomic.views.stage import matrices
+from nonholonomic.views.film import Viewable
+from nonholonomic.views.plot import draw_curves
 
 SURFACES = (
     (Plane(), (0.3, 0.1)),
@@ -62,7 +66,7 @@ def rolling(surface=None) -> Stage:
     position = np.stack([radius * times, zero, zero + radius], axis=-1)
     foot = position * [1.0, 1.0, 0.0]
     body = Body("ball", position, turned(rotation), ball(radius, (0xC8412B, 0xF4E9D2)))
-    np.testing.assert_allclose(matrices(body.orientation), rotation, atol=1e-14)
+    np.testing.assert_allclose(Rotation.from_quat(body.orientation).as_matrix(), rotation, atol=1e-14)
     show = Show(
         "a ball",
         0xC8412B,
@@ -78,29 +82,6 @@ def rolling(surface=None) -> Stage:
     return Stage("rolling", ground, (show,))
 
 
-def test_turns_are_told_from_matrices_and_back():
-    random = np.random.default_rng(0)
-    turning = random.normal(size=(200, 4))
-    # Half turns, where the quaternion's last component is 0, among them.
-    turning[:50, 3] = 0.0
-    turning /= np.linalg.norm(turning, axis=-1, keepdims=True)
-    rotation = turned(matrices(turning))
-    np.testing.assert_allclose(np.abs(np.sum(rotation * turning, axis=-1)), 1.0, atol=1e-12)
-
-
-def test_an_animation_moves(tmp_path):
-    write_animation([rolling()], tmp_path / "ball.gif", np.array([0.0, 1.0, 2.0]))
-    with Image.open(tmp_path / "ball.gif") as picture:
-        assert picture.n_frames == 3
-        pictures = []
-        for frame in range(3):
-            picture.seek(frame)
-            pictures.append(np.asarray(picture.convert("RGB"), dtype=float))
-    assert all(np.mean(np.abs(a - b)) > 0.5 for a, b in zip(pictures, pictures[1:], strict=False))
-    with pytest.raises(ValueError, match=r"ball\.avi' must end in \.gif"):
-        write_animation([rolling()], tmp_path / "ball.avi", None)
-
-
 class Rolling(Viewable):
     """A run with the stage of `rolling`."""
 
@@ -108,30 +89,105 @@ class Rolling(Viewable):
         return [rolling()]
 
 
-def test_an_animation_plays_in_real_time(tmp_path):
-    """By the delays in the file: two seconds last two seconds, or one at twice the speed."""
-    for options, frames, seconds in (({"fps": 5}, 11, 2.0), ({"fps": 20.0, "speed": 4.0}, 11, 0.5)):
-        Rolling().animate(tmp_path / "ball.gif", **options)
-        with Image.open(tmp_path / "ball.gif") as picture:
-            assert picture.n_frames == frames
-            delays = []
-            for frame in range(frames):
-                picture.seek(frame)
-                delays.append(picture.info["duration"] / 1000.0)
-        # The last frame shows the end.
-        assert sum(delays[:-1]) == pytest.approx(seconds)
+#: Play a film, given as base64: duration, width and height, and some of its frames as grey values.
+PLAY = """
+const [film, parts, done] = arguments;
+(async () => {
+  const video = Object.assign(document.createElement("video"), { muted: true, src: `data:video/webm;base64,${film}` });
+  await new Promise((next, fail) => { video.onloadeddata = next; video.onerror = () => fail(video.error.message); });
+  const size = { width: video.videoWidth, height: video.videoHeight };
+  const pen = Object.assign(document.createElement("canvas"), size).getContext("2d", { willReadFrequently: true }), frames = [];
+  for (const part of parts) {
+    video.currentTime = part * video.duration;
+    await new Promise((next) => { video.onseeked = next; });
+    pen.drawImage(video, 0, 0);
+    frames.push([...pen.getImageData(0, 0, size.width, size.height).data.filter((_, k) => k % 4 === 1)]);
+  }
+  done([video.duration, size.width, size.height, frames]);
+})().catch((error) => done(String(error)));
+"""
 
 
-def test_the_picture_states_the_speed():
-    np.testing.assert_allclose(frame_times(8.0, 1.0, 25.0), np.linspace(0.0, 8.0, 201), rtol=1e-12)
-    assert frame_times(0.1, 1.0, 4.0).tolist() == [0.0, 0.1]
-    assert speed_as_text(frame_times(8.0, 1.0, 25.0), 25.0) == ", real time"
-    assert speed_as_text(np.linspace(3.5, 5.5, 251), 25.0) == ", 0.2 times real time"
-    assert speed_as_text(np.array([0.0, 1.0, 3.0, 4.0]), 25.0) == ""
-    # A GIF counts hundredths of a second.
-    assert rate_of(".gif", 30.0) == pytest.approx(100.0 / 3.0)
-    assert rate_of(".gif", 100.0) == 50.0
-    assert rate_of(".mp4", 30.0) == 30.0
+def played(driver, film: bytes, parts: list[float]) -> tuple[float, np.ndarray]:
+    """The duration of a film [s], and its frames at parts of it, (frames, rows, columns)."""
+    duration, width, height, frames = driver.execute_async_script(PLAY, base64.b64encode(film).decode(), parts)
+    return duration, np.array(frames, dtype=float).reshape(len(parts), height, width)
+
+
+@needs_browser
+def test_a_film_plays_the_run_in_its_time(tmp_path, monkeypatch):
+    """The ball has rolled half of its way after half of the film, however long each frame took to draw."""
+    monkeypatch.setattr("nonholonomic.views.film.WINDOW", (500, 700))
+    monkeypatch.setattr("nonholonomic.views.film.HEIGHT", 100)
+    Rolling().animate(tmp_path / "ball.webm", speed=4.0, fps=20)
+    film = (tmp_path / "ball.webm").read_bytes()
+    with open_browser() as driver:
+        driver.set_script_timeout(60.0)
+        duration, frames = played(driver, film, [0.0, 0.5, 1.0])
+    # Two seconds at four times the speed; players add the duration of the last frame.
+    assert 0.49 < duration < 0.56
+    stages, curves = frames[:, 40:120], frames[:, -100:]
+    changed = np.abs(np.diff(frames, axis=0)).max(axis=0) > 60.0
+    assert all(np.count_nonzero(np.abs(step) > 60.0) > 50 for step in np.diff(stages, axis=0))
+    # The cursors in the curves are the last dark columns that move.
+    assert np.count_nonzero(changed[-100:]) > 50
+    assert np.ptp(curves[0]) > 100.0
+
+
+@needs_browser
+def test_a_page_saves_films_and_pictures(tmp_path):
+    """By the keyboard alone; the film begins at the time of the slider, and has the length and the speed that are chosen."""
+    from selenium.webdriver import ActionChains, Keys
+
+    page([rolling()], "A ball", height=100, autoplay=False).save(tmp_path / "page.html")
+    with open_browser() as driver:
+        driver.set_script_timeout(60.0)
+        driver.execute_cdp_cmd("Page.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)})
+        driver.get((tmp_path / "page.html").as_uri())
+        wait(driver, "return !!window.player")
+        driver.execute_script("player.seek(0.5); document.getElementById('save-film').focus()")
+        ActionChains(driver).send_keys(Keys.ENTER, "0.4", Keys.TAB, "2", Keys.TAB, Keys.ENTER).perform()
+        wait(driver, "return document.querySelector('#film output').value === 'saved'")
+        assert driver.execute_script("return player.time()") == pytest.approx(1.3)
+        driver.execute_script("document.getElementById('save-picture').focus()")
+        ActionChains(driver).send_keys(Keys.ENTER).perform()
+        deadline = time.monotonic() + 30.0
+        while not ((tmp_path / "A-ball.webm").exists() and (tmp_path / "A-ball-1.300s.png").exists()):
+            assert time.monotonic() < deadline, list(tmp_path.iterdir())
+            time.sleep(0.05)
+        duration, _ = played(driver, (tmp_path / "A-ball.webm").read_bytes(), [0.0])
+        assert 0.39 < duration < 0.45
+    assert (tmp_path / "A-ball-1.300s.png").read_bytes().startswith(b"\x89PNG")
+
+
+#: A browser that opens a page, and posts something in its place.
+BROWSER = """#!{python}
+import sys, urllib.request
+opener = urllib.request.build_opener(urllib.request.ProxyHandler({{}}))
+assert b"views.ready" in opener.open(sys.argv[-1]).read()
+opener.open(sys.argv[-1] + {name!r}, data=b"no WebGL").close()
+"""
+
+
+@pytest.mark.parametrize("name", ["film", "error", "share"])
+def test_a_film_is_what_the_page_posts(name, tmp_path, monkeypatch):
+    (tmp_path / "browser").write_text(BROWSER.format(python=sys.executable, name=name))
+    (tmp_path / "browser").chmod(0o755)
+    monkeypatch.setattr("nonholonomic.views.film.BROWSERS", ("no-such-browser", str(tmp_path / "browser")))
+    message = {"error": "browser cannot record the page: no WebGL", "share": "browser ended with the status 0 before"}
+    expected = pytest.raises(OSError, match=message[name]) if name in message else contextlib.nullcontext()
+    with expected:
+        Rolling().animate(tmp_path / "ball.webm")
+    if name == "film":
+        assert (tmp_path / "ball.webm").read_bytes() == b"no WebGL"
+    assert len(list(tmp_path.glob("ball*"))) == (name == "film")
+
+
+def test_a_film_without_a_browser_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setattr("nonholonomic.views.film.BROWSERS", ())
+    monkeypatch.setattr(Rolling, "stages", lambda *_: pytest.fail("it was drawn"))
+    with pytest.raises(FileNotFoundError, match=r"needs Chromium, Chrome or Edge.*apt install chromium.*Save film"):
+        Rolling().animate(tmp_path / "ball.webm")
 
 
 @pytest.mark.parametrize(
@@ -141,11 +197,12 @@ def test_the_picture_states_the_speed():
         ({"speed": -1.0}, r"speed = -1\.0 must be greater than 0"),
         ({"speed": 1.0, "times": [0.0, 1.0]}, "speed follows from times and fps: omit speed, or omit times"),
         ({"times": [1.0, 0.0]}, "times"),
+        ({"path": "ball.gif"}, r"path = 'ball\.gif' must end in \.webm"),
     ],
 )
-def test_what_cannot_be_animated_is_refused(options, message, tmp_path):
+def test_what_cannot_be_filmed_is_refused(options, message, tmp_path):
     with pytest.raises(ValueError, match=message):
-        Rolling().animate(tmp_path / "ball.gif", **options)
+        Rolling().animate(**{"path": tmp_path / "ball.webm"} | options)
 
 
 def test_curves_are_drawn_and_what_is_constant_is_flat():
@@ -158,21 +215,14 @@ def test_curves_are_drawn_and_what_is_constant_is_flat():
     assert high - low > 1e-5
 
 
-def test_a_view_and_an_animation_have_the_unit_that_was_asked_for(tmp_path):
+def test_a_view_has_the_unit_that_was_asked_for(tmp_path, monkeypatch):
     run = Rolling()
-    assert '"label": "z [cm]", "factor": 100.0' in run.view(unit="cm").html
-    run.animate(tmp_path / "ball.gif", fps=2.0, unit="mm")
+    monkeypatch.setattr("nonholonomic.views.film.BROWSERS", (sys.executable,))
+    assert re.search(r'"label": "z \[cm\]", "values": \[\d+, \d+\], "factor": 100\.0', run.view(unit="cm").html)
     with pytest.raises(ValueError, match=r"unit = 'deg' fits nothing that is drawn: x \[m\], z \[m\]"):
         run.view(unit="deg")
     with pytest.raises(ValueError, match="unit = 'degree' must be one of"):
-        run.animate(tmp_path / "ball.gif", unit="degree")
-
-
-def test_an_arrow_is_drawn_by_its_scale_up_to_its_limit():
-    (arrow,) = rolling().shows[0].arrows
-    np.testing.assert_allclose(arrow.drawn, np.tile([0.0, 0.0, 0.15], (41, 1)), rtol=1e-14)
-    np.testing.assert_allclose(arrow._replace(limit=None).drawn, np.tile([0.0, 0.0, 0.2], (41, 1)), rtol=1e-14)
-    assert not np.any(arrow._replace(vector=0.0 * arrow.vector).drawn)
+        run.animate(tmp_path / "ball.webm", unit="degree")
 
 
 def test_the_front_of_an_arena_is_towards_the_room():

@@ -8,10 +8,13 @@ generalised force f(t, q, q') of drives and friction. From them follow
 
 Each formulation takes a single state (n,); use `jax.vmap` for many. The models of the vehicles are faster and do not use the
 formulations. `tests/witnesses/other_formulations.py` has further formulations, with which the tests compare these.
+
+At the end of the file are the rules by which a run may start.
 """
 
 import abc
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -20,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .geometry import solve
+from ..geometry import solve
 
 # A mechanical system as data: its metric, potential, constraints and forces, and how it strikes its surroundings.
 
@@ -301,18 +304,7 @@ class Hamel(AbstractFormulation):
         return jnp.concatenate([rate, solve(inertia, forces[:free], positive=True)])
 
 
-class AbstractVelocityFormulation(AbstractFormulation):
-    """Equations of motion whose state is (q, q')."""
-
-    def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
-        return jnp.concatenate([q, rate])
-
-    def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
-        q, rate = jnp.split(state, 2)
-        return q, rate
-
-
-class Lagrange(AbstractVelocityFormulation):
+class Lagrange(AbstractFormulation):
     """Lagrange's equations with multipliers, G q'' + G' q' = dL/dq + f + W^T lambda, with W q'' + W' q' = 0.
 
     The state is (q, q'), so one linear system with the metric is solved
@@ -326,6 +318,13 @@ class Lagrange(AbstractVelocityFormulation):
     """
 
     system: AbstractSystem
+
+    def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
+        return jnp.concatenate([q, rate])
+
+    def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
+        q, rate = jnp.split(state, 2)
+        return q, rate
 
     def field(self, t: Float[ArrayLike, ""], state: Float[Array, " state"], args=None) -> Float[Array, " state"]:
         q, rate = self.split(state)
@@ -343,3 +342,146 @@ class Lagrange(AbstractVelocityFormulation):
         by_constraints, unconstrained = per_mass[:, :-1], per_mass[:, -1]
         multipliers = solve(W @ by_constraints, bend @ rate + W @ unconstrained, positive=True)
         return unconstrained - by_constraints @ multipliers
+
+
+def formulation_of(system: AbstractSystem) -> AbstractFormulation:
+    """The equations of motion for a mechanical system.
+
+    If the system has its own frame, or its own Lagrangian (which may have terms linear in the velocities), the
+    equations are in quasi-velocities, which obey the constraints exactly; otherwise they use Lagrange multipliers.
+    """
+    has_frame = type(system).frame is not AbstractSystem.frame
+    has_lagrangian = type(system).lagrangian is not AbstractSystem.lagrangian
+    return Hamel(system) if has_frame or has_lagrangian else Lagrange(system)
+
+
+# Whether runs of a user's system may start: rules for concrete and traced numbers, and their messages.
+
+#: The margin, in units of the greatest component of the start, below zero by more than which a start is outside its mode; and
+#: the largest relative violation of the constraints. In single precision, both are greater.
+OUTSIDE = VIOLATION = 1e-9
+
+#: Round-off of the rules in units of the precision of a number of size 1.
+ROUND_OFF = 64.0
+
+#: The rules in the order in which the first broken one is reported.
+RULES = ("start", "finite", "symmetry", "rank", "metric", "constraints", "frame", "margin")
+
+#: What the rules compare, by name; for several cells, the cells are along the first axis.
+Parts = dict[str, Any]
+
+
+def parts_of_system(system: AbstractSystem, q: Coordinates, rate: Coordinates) -> Parts:
+    """What the rules compare of a mechanical system: its metric, constraints and frame."""
+    has_metric = type(system).lagrangian is AbstractSystem.lagrangian
+    metric = system.metric(q) if has_metric else jax.hessian(system.lagrangian, argnums=1)(q, rate)
+    W = system.constraints(q)
+    parts = {"metric": metric, "constraints": W}
+    if W.shape[0] and system.freedom and isinstance(formulation_of(system), Hamel):
+        parts["frame"] = W @ system.frame(q)[:, : system.freedom]
+    return parts
+
+
+def rooms(parts: Parts, xp: ModuleType) -> Parts:
+    """The room that each rule leaves: name of a rule in `RULES` -> a number below zero, or NaN, where the start breaks it.
+
+    **Arguments:** `parts`: those of one start or of many; `xp`: `numpy` or `jax.numpy`. For a few starts, NumPy saves the
+    time to compile.
+    """
+    y = parts["y"]
+    round_off = ROUND_OFF * float(jnp.finfo(y.dtype).eps)
+    exact = max(VIOLATION, round_off)
+    left = {"start": 0.0 * xp.sum(y, axis=-1)}
+    if "margin" in parts:
+        left["margin"] = parts["margin"] + max(OUTSIDE, round_off) * xp.maximum(1.0, _greatest(xp, y, 1))
+    if "metric" not in parts:
+        return left
+    G, W, n = parts["metric"], parts["constraints"], parts["metric"].shape[-1]
+    left["finite"] = 0.0 * (xp.sum(G, axis=(-1, -2)) + xp.sum(W, axis=(-1, -2)))
+    # In units in which each coordinate with a mass has a mass of 1, the rules do not depend on the user's units.
+    # Pages and components know no primitive for a diagonal.
+    identity = xp.eye(n, dtype=G.dtype)
+    unit = xp.sqrt(xp.abs(xp.sum(G * identity, axis=-1)))
+    unit = xp.where(unit > 0.0, unit, 1.0)
+    scaled = G / (unit[..., :, None] * unit[..., None, :])
+    left["symmetry"] = exact - _greatest(xp, scaled - scaled.swapaxes(-1, -2), 2)
+    # Projectors on the allowed directions and on the others, by orthonormal rows: batches of LAPACK inside a compiled program
+    # can deadlock.
+    allowed, others = xp.broadcast_to(identity, G.shape), xp.zeros_like(G)
+    independent = xp.ones_like(left["finite"])
+    for k in range(W.shape[-2]):
+        row = _unit(xp, W[..., k, :] / unit)
+        part = _projected(allowed, row)
+        independent = xp.minimum(independent, xp.sqrt(xp.sum(part * part, axis=-1)))
+        # The second projection removes the round-off of the first.
+        part = _unit(xp, _projected(allowed, _unit(xp, part)))
+        square = part[..., :, None] * part[..., None, :]
+        allowed, others = allowed - square, others + square
+    if W.shape[-2]:
+        rate, greatest = parts["y"][..., n:], _greatest(xp, W, 2)
+        left["rank"] = independent - round_off ** (2.0 / 3.0)
+        left["constraints"] = exact * greatest * _greatest(xp, rate, 1) - _greatest(xp, _projected(W, rate), 1)
+        if "frame" in parts:
+            left["frame"] = exact * greatest - _greatest(xp, parts["frame"], 2)
+    left["metric"] = _least_pivot(xp, allowed @ scaled @ allowed + others) - n * round_off
+    return left
+
+
+def _greatest(xp: ModuleType, values: Array, axes: int) -> Array:
+    """The greatest magnitude along the last axes."""
+    return xp.max(xp.abs(values), axis=tuple(range(-axes, 0)), initial=0.0)
+
+
+def _projected(matrix: Array, vector: Array) -> Array:
+    return (matrix @ vector[..., None])[..., 0]
+
+
+def _unit(xp: ModuleType, vector: Array) -> Array:
+    return vector / xp.sqrt(xp.sum(vector * vector, axis=-1))[..., None]
+
+
+def _least_pivot(xp: ModuleType, matrix: Array) -> Array:
+    """The least pivot of a symmetric matrix, which is positive if and only if the matrix is positive definite."""
+    least = matrix[..., 0, 0]
+    while matrix.shape[-1] > 1:
+        pivot, column = matrix[..., 0, 0], matrix[..., 1:, 0]
+        matrix = matrix[..., 1:, 1:] - column[..., :, None] * (column / pivot[..., None])[..., None, :]
+        least = xp.minimum(least, matrix[..., 0, 0])
+    return least
+
+
+def problem_of_start(parts: Parts, rule: str, mode: str) -> str:
+    """What is wrong with a start that breaks a rule. **Arguments:** `mode`: prefix of the names of functions."""
+    if rule == "start":
+        return f"start = {parts['y']} must be finite"
+    if rule == "margin":
+        return f"start: the margin of the first mode is {parts['margin']:.4g}, below zero; start where the margin is positive"
+    W, G = parts["constraints"], parts["metric"]
+    n, k = len(G), len(W)
+    if rule == "finite":
+        name, value = ("constraints", W) if np.isfinite(G).all() else ("metric", G)
+        return f"{mode}{name}(q) = {value.tolist()} at the start must be finite"
+    if rule == "symmetry":
+        return f"{mode}metric(q) = {G.tolist()} at the start must be symmetric"
+    if rule == "constraints":
+        rate = parts["y"][n:]
+        error = np.max(np.abs(W @ rate))
+        return f"start: rate = {rate} violates the constraints by {error:.3g}; constraints(q) @ rate must be 0"
+    if rule == "frame":
+        return (
+            f"{mode}frame(q): the constraints must annihilate its first {n - k} columns, and do so only up to "
+            f"{np.max(np.abs(parts['frame'])):.3g}; leave it out to run with Lagrange multipliers"
+        )
+    lengths = np.linalg.norm(W, axis=1, keepdims=True)
+    spanned = np.linalg.svd(W / np.where(lengths > 0.0, lengths, 1.0)) if k else (None, np.zeros(0), np.eye(n))
+    if rule == "rank":
+        return (
+            f"{mode}constraints(q) has {k} rows of rank {(spanned[1] > VIOLATION).sum()} at the start, and its rows must be "
+            "independent: leave out those that follow from the others"
+        )
+    allowed = spanned[2][k:]
+    least = np.linalg.eigvalsh(allowed @ G @ allowed.T)[0]
+    return (
+        f"{mode}metric(q) must be positive for all rates that the constraints allow, and its least eigenvalue for them is "
+        f"{least:.4g} at the start: a mass or a moment of inertia may be zero or negative, or the coordinates singular there"
+    )
