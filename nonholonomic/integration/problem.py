@@ -587,7 +587,7 @@ def legal_run(
 
 
 def require_run(
-    scene: object, launch: object, t1: ArrayLike, tolerance: ArrayLike, kinds: tuple[type, type], lists: str
+    scene: object, launch: object, t1: object, tolerance: object, kinds: tuple[type, type], lists: str
 ) -> None:
     """Raise `ValueError` unless scene and launch are of these kinds and have scalars only, the horizon is positive, and
     the tolerance is legal.
@@ -610,7 +610,7 @@ def require_run(
     require_scalars(values, lists)
 
 
-def require_times(times: ArrayLike, t1: object) -> None:
+def require_times(times: ArrayLike | None, t1: object) -> None:
     """Raise `ValueError` unless the times of output are an increasing list within [0, t1].
 
     **Example:**
