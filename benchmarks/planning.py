@@ -22,6 +22,7 @@ the longest duration. The excess is that over the shortest path of a point that 
 """
 
 import argparse
+import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -35,15 +36,17 @@ from measure import machine, table, write_csv
 from shortest_paths import dubins, reeds_shepp
 
 import stroller
-from stroller.planning.candidates import Outline, prices
-from stroller.planning.problem import CONFIRMED, Problem, checked_run
+from stroller.planning.plan import CONFIRMED, TIGHT
+from stroller.planning.problem import Problem
+from stroller.planning.result import checked_drive
+from stroller.planning.search import paths_of, prices
 from stroller.planning.transcription import drive_along, interpolate
 
 BODY = stroller.Stroller(mass=5.0, wheelbase=0.25, inertia=0.1, steering_inertia=0.005)
 FRICTION = stroller.Damping(2.0, 0.5, 0.1, 0.05)
 LIMITS = stroller.Limits(steering=np.pi / 3.0, speed=(-0.5, 0.8))
 FOOTPRINT = stroller.Footprint(length=0.5, width=0.25, rear=0.1)
-T1, TIGHT = 25.0, 1e-9
+T1 = 25.0
 
 #: Side of the square [m], number of boxes, their sides [m], least distance of the ends [m] and least clearance there [m].
 SIDE, BOXES, SIDES, APART, FREE = 6.0, (3, 8), (0.3, 1.5), 2.0, 0.05
@@ -83,7 +86,7 @@ def on_plane(seed: int) -> Iterator[Problem]:
         if np.hypot(*np.subtract(start[0], goal[0])) < APART:
             continue
         launch, target = stroller.Launch(*start, 0.0), stroller.Goal(*goal)
-        problem = Problem(scene, launch, target, tuple(boxes), LIMITS, FOOTPRINT)
+        problem = Problem(scene, launch, target, T1, tuple(boxes), LIMITS, FOOTPRINT)
         if problem.clearance_at_ends > FREE:
             yield problem
 
@@ -94,7 +97,7 @@ def on_ground(name: str, seed: int) -> Iterator[Problem]:
     low, high = ((-1.0, -1.3), (1.0, -0.7)) if name == "inside a spheroid" else ((-2.5, -2.5), (2.5, 2.5))
     while True:
         start, goal = (pose(random, low, high) for _ in range(2))
-        problem = Problem(scene, stroller.Launch(*start, 0.0), stroller.Goal(*goal), (), LIMITS, FOOTPRINT)
+        problem = Problem(scene, stroller.Launch(*start, 0.0), stroller.Goal(*goal), T1, (), LIMITS, FOOTPRINT)
         axes = scene.surface.axes
         if np.linalg.norm(np.asarray(problem.start_pose - problem.goal_pose)[:axes]) > APART / 2.0:
             yield problem
@@ -109,15 +112,7 @@ def measured(solve: Callable[[], Any]) -> tuple[Any, float, float]:
 
 def arguments(problem: Problem) -> dict[str, Any]:
     """The arguments of `stroller.plan` for a problem, beside the scene."""
-    _, launch, goal, obstacles, limits, footprint = problem
-    return {
-        "launch": launch,
-        "goal": goal,
-        "t1": T1,
-        "obstacles": obstacles,
-        "limits": limits,
-        "footprint": footprint,
-    }
+    return {name: getattr(problem, name) for name in ("launch", "goal", "t1", "obstacles", "limits", "footprint")}
 
 
 def by_us(problem: Problem, planner: stroller.Planner | None = None) -> Outcome:
@@ -144,19 +139,19 @@ def judged(problem: Problem, answer: Any, cpu: float, wall: float) -> Outcome:
         return Outcome(False, cpu, wall, np.nan)
     splines = [interpolate(part) for part in (answer.steering, answer.front_speed)]
     drive = drive_along(problem.scene.dynamics, problem.start_pose, splines[0], splines[1], answer.t1)
-    _, verdict = checked_run(problem, drive, answer.t1, TIGHT, CONFIRMED)
-    return Outcome(not verdict.hindrances, cpu, wall, verdict.effort)
+    plan = checked_drive(dataclasses.replace(problem, t1=answer.t1), drive, TIGHT, CONFIRMED)
+    return Outcome(plan.reached, cpu, wall, plan.effort)
 
 
 def by_casadi(problem: Problem, with_path: bool, seconds: float) -> Outcome:
     """The outcome of CasADi with IPOPT; building its program is compilation and is not counted."""
     from planning_peers import casadi_program
 
-    outline, path, searched = Outline.of(problem), None, (0.0, 0.0)
+    path, searched = None, (0.0, 0.0)
     if with_path:
-        (paths, _), *searched = measured(lambda: outline.paths(prices(outline, 1, 0, np.random.default_rng(0)), T1))
+        (paths, _), *searched = measured(lambda: paths_of(problem, prices(problem, 1, 0, np.random.default_rng(0))))
         path = paths[0]
-    solve = casadi_program(problem, T1, path, outline.clearance, seconds)
+    solve = casadi_program(problem, T1, path, problem.clearance, seconds)
     answer, cpu, wall = measured(solve)
     return judged(problem, answer, cpu + searched[0], wall + searched[1])
 

@@ -16,10 +16,9 @@ import numpy as np
 from ompl import base, control, util
 
 import stroller
-from stroller.planning.candidates import LIMIT_RESERVE, SMOOTHING, smoothed, timed
-from stroller.planning.obstacles import separation
-from stroller.planning.problem import Problem
-from stroller.planning.search import Path
+from stroller.planning.problem import Problem, separation
+from stroller.planning.search import SMOOTHING, Path, smoothed, timed
+from stroller.planning.transcription import LIMIT_RESERVE
 
 #: Intervals of the collocation, Radau points in each, and discs that cover the footprint.
 INTERVALS, DEGREE, DISCS = 64, 3, 4

@@ -26,13 +26,13 @@ from .model.vehicle import Frictionless as Frictionless
 from .model.vehicle import Launch as Launch
 from .model.vehicle import RollingResistance as RollingResistance
 from .model.vehicle import Stroller as Stroller
-from .planning.obstacles import Box as Box
-from .planning.obstacles import Disc as Disc
-from .planning.obstacles import Footprint as Footprint
 from .planning.plan import plan as plan
 from .planning.plan import track as track
 from .planning.planner import Planner as Planner
 from .planning.planner import learn_planner as learn_planner
+from .planning.problem import Box as Box
+from .planning.problem import Disc as Disc
+from .planning.problem import Footprint as Footprint
 from .planning.problem import Goal as Goal
 from .planning.problem import Limits as Limits
 from .planning.result import Plan as Plan

@@ -25,10 +25,9 @@ from nonholonomic.views import Outputs, Stage, can_draw, page_of_job, picture_as
 from .model.input import Motion
 from .model.scene import FORKS, Scene
 from .model.vehicle import Damping, Launch, Stroller
-from .planning.obstacles import Box
 from .planning.plan import plan
-from .planning.problem import Goal, Limits
-from .planning.result import Plan, draw_plan, planned_stage
+from .planning.problem import Box, Goal, Limits
+from .planning.result import Plan, planned_stage
 from .runs.trajectory import Trajectory, table_of
 from .runs.verbs import simulate
 from .runs.view import draw_rides, grouped
@@ -252,7 +251,7 @@ def computed(options: argparse.Namespace) -> dict[str, bytes]:
         if can_draw():
             grounds = {ground: scene.surface for (ground, _), (scene, _) in scenes(options).items()}
             for heading, name, figure in (
-                ("Parking", "parked.png", draw_plan(parking)),
+                ("Parking", "parked.png", parking.plot()),
                 ("Paths, speeds, energies, side forces", "rides.png", draw_rides(grounds, rides)),
             ):
                 figure.savefig(options.out / name, dpi=110)

@@ -107,7 +107,7 @@ def test_a_long_call_says_what_it_does_and_leaves_nothing_behind(name, monkeypat
 
 
 def test_sampling_says_what_it_does_after_its_last_step(monkeypatch):
-    module = importlib.import_module("nonholonomic.identification.sampling")
+    module = importlib.import_module("nonholonomic.identification.result")
     monkeypatch.setattr(module, "drawn", lambda *_: (np.zeros((4, 2, 1)), 0.5, 1, 0.0))
     monkeypatch.setattr(module.Draws, "of", waits)
     terminal = watched(monkeypatch)

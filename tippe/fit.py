@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping, Sequence
+from os import PathLike
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -12,6 +14,7 @@ from jaxtyping import Array, Float
 
 from nonholonomic.identification import (
     AbstractRecording,
+    Free,
     Identification,
     LogDensity,
     Quantities,
@@ -21,7 +24,7 @@ from nonholonomic.identification import (
 )
 from nonholonomic.integration import Settings
 from nonholonomic.parameters import numbers
-from nonholonomic.runs.identify import AbstractEventTimes, fit_runs, posterior_of_runs, search_options, sources_of
+from nonholonomic.runs.identify import AbstractEventTimes, Cells, Data, Prior, fit_runs, posterior_of_runs
 from nonholonomic.runs.model import AbstractModel
 from nonholonomic.text import distinguishing_labels
 from nonholonomic.validation import as_number, as_number_or_none, is_traced, require_kind, require_scalars, warn
@@ -37,8 +40,8 @@ EXPECTED = "an InversionTimes, a ReversalTimes or a Recording"
 
 def identify(
     scene: Scene,
-    data: Any,
-    free: dict[str, Any],
+    data: Data | Sequence[Data],
+    free: Mapping[str, Free | float],
     *,
     starts: int = 16,
     spread: float = 2.0,
@@ -85,15 +88,20 @@ def identify(
 
     ```
     """
-    search = search_options(starts, spread, seed, max_steps, progress)
+    search = {"starts": starts, "spread": spread, "seed": seed, "max_steps": max_steps, "progress": progress}
     require_kind(scene, "scene", Scene)
     if slopes == "exact":
         check_smooth(scene, "identify with slopes = 'exact'")
-    return fit_runs(scene, sources_of(data, EXPECTED), free, tolerance, search, slopes)
+    return fit_runs(scene, data, free, EXPECTED, tolerance, search, slopes)
 
 
 def log_density(
-    scene: Scene, data: Any, free: dict[str, Any], priors: dict[str, Any] | None = None, *, tolerance: float = 1e-8
+    scene: Scene,
+    data: Data | Sequence[Data],
+    free: Mapping[str, Free | float],
+    priors: Mapping[str, Prior] | None = None,
+    *,
+    tolerance: float = 1e-8,
 ) -> LogDensity:
     """The log of the posterior density of a scene's parameters, as a function of unbounded coordinates.
 
@@ -125,7 +133,7 @@ def log_density(
     (('scene.friction.mu',), (1,))
     """
     require_kind(scene, "scene", Scene)
-    return posterior_of_runs(scene, sources_of(data, EXPECTED), free, priors, tolerance)
+    return posterior_of_runs(scene, data, free, priors, EXPECTED, tolerance)
 
 
 # Measured times of launches: of inversion, and of reversal. Inversion times can be read from a file.
@@ -149,7 +157,7 @@ class AbstractTimes(AbstractEventTimes):
     time: Float[Array, "launches *two"] = eqx.field(converter=as_number)
     error: Float[Array, "..."] = eqx.field(converter=as_number)
     t1: Float[Array, ""] = eqx.field(converter=as_number)
-    until: Any = eqx.field(converter=as_number_or_none, default=None)
+    until: Float[Array, "..."] | None = eqx.field(converter=as_number_or_none, default=None)
     by_tables = True
 
     def __check_init__(self):
@@ -162,7 +170,7 @@ class AbstractTimes(AbstractEventTimes):
             warn(f"time = {middle:g} s is long for a top; times are in seconds: did you mean 1e-3 * time?")
 
     @property
-    def of_each_time(self) -> dict[str, Any]:
+    def of_each_time(self) -> dict[str, Float[Array, "..."] | None]:
         return numbers("launch", self.launch) | super().of_each_time
 
     @property
@@ -171,7 +179,7 @@ class AbstractTimes(AbstractEventTimes):
         theta, spin, _ = np.broadcast_arrays(self.launch.theta, self.launch.spin, np.zeros(self.size))
         return tuple(f"theta {angle:.4g}, spin {rate:.4g}" for angle, rate in zip(theta, spin, strict=True))
 
-    def labels_in(self, unit: Any) -> tuple[str, ...]:
+    def labels_in(self, unit: str | Sequence[str] | None) -> tuple[str, ...]:
         """What differs between the launches."""
         launches = [
             jax.tree.map(lambda leaf, k=k: leaf if jnp.ndim(leaf) == 0 else leaf[k], self.launch)
@@ -222,14 +230,14 @@ class InversionTimes(AbstractTimes):
         # Predictions continue smoothly beyond it.
         return self.t1
 
-    def model(self, system: Any) -> TopModel:
+    def model(self, system: Scene) -> TopModel:
         require_kind(system, "scene", Scene)
         return TopModel.timed(system, self.launch, event_of(system, self.angle))
 
-    def predicted(self, model: Any, t1: Any, settings: Settings) -> Float[Array, ""]:
+    def predicted(self, model: TopModel, t1: Float[Array, ""], settings: Settings) -> Float[Array, ""]:
         return time_of_inversion(model, t1, settings)
 
-    def of_ends(self, model: Any, t1: Any, time: Any, ends: dict[str, Any]) -> Any:
+    def of_ends(self, model: TopModel, t1: Cells, time: Cells, ends: dict[str, Float[Array, " cells"]]) -> Cells:
         angle = angle_of(model.scene, self.angle)
         later = _beyond_horizon(ends["end_theta"], model.launch.theta, angle, t1)
         return np.where(np.isfinite(time), time, np.asarray(later))
@@ -258,7 +266,7 @@ class ReversalTimes(AbstractTimes):
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     units: ClassVar[dict[str, str]] = {"time": "s", "error": "s", "t1": "s", "until": "s"}
 
-    def model(self, system: Any) -> TopModel:
+    def model(self, system: Scene) -> TopModel:
         require_kind(system, "scene", Scene)
         require_rigid(system)
         check_reversible(self.launch, {})
@@ -266,17 +274,17 @@ class ReversalTimes(AbstractTimes):
 
 
 def read_inversion_times(
-    path: Any,
-    columns: Any = None,
+    path: str | PathLike[str],
+    columns: Mapping[str, object] | None = None,
     *,
-    error: Any,
+    error: float | Mapping[str, object],
     t1: float,
     launch: Launch | None = None,
     until: float | None = None,
     angle: float | None = None,
     student: float | None = None,
     decimal: str = ".",
-    never: Any = (),
+    never: str | Sequence[str] = (),
 ) -> InversionTimes:
     """Launches of a top and their inversion times from a text file with a header line and a launch in every line (CSV).
 
@@ -390,9 +398,6 @@ class Recording(AbstractRecording):
 
     launch: Launch
     quantity: str | tuple[str, ...] = eqx.field(static=True, default="theta", converter=as_quantity)
-    t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
-    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
-    side: str = eqx.field(static=True, default="before")
     quantities: ClassVar[Quantities] = QUANTITIES
 
     def model(self, scene: Scene) -> AbstractModel:
@@ -421,12 +426,12 @@ class Recording(AbstractRecording):
 
 
 def read_recording(
-    path: Any,
-    columns: Any = None,
+    path: str | PathLike[str],
+    columns: Mapping[str, object] | None = None,
     fps: float | None = None,
     *,
     launch: Launch,
-    error: Any = None,
+    error: Mapping[str, object] | None = None,
     t0: float = 0.0,
     student: float | None = None,
     decimal: str = ".",

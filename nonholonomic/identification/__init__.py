@@ -16,7 +16,6 @@ Recordings of both vehicles are checked, read from files and converted to `Measu
 0.997
 """
 
-from .conclusions import FitWarning as FitWarning
 from .likelihood import Free as Free
 from .likelihood import Measurements as Measurements
 from .posterior import LogDensity as LogDensity
@@ -25,7 +24,8 @@ from .recording import Quantities as Quantities
 from .recording import as_quantity as as_quantity
 from .recording import read_columns as read_columns
 from .recording import read_launches as read_launches
+from .result import Draws as Draws
 from .result import Identification as Identification
 from .result import identify as identify
-from .sampling import Draws as Draws
-from .sampling import sample as sample
+from .result import sample as sample
+from .search import FitWarning as FitWarning

@@ -1,15 +1,19 @@
 """What a fit concludes: a verdict, intervals, profile likelihoods, and the shape of the posterior in words."""
 
 import math
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from .exploration import FARTHEST, ROWS, Explorer, Mixture, Weighted, fitted, weighted_covariance
-from .least_squares import minimise
-from .likelihood import Measurements, Unknown, whole_periods
-from .posterior import Problem, deviances, linearise, predictions
+from .exploration import FARTHEST, ROWS, Explorer, Mixture, Weighted, fitted, squared_distances, weighted_covariance
+from .likelihood import Measurements, Unknown
+from .posterior import Problem, deviances, predictions
+from .search import SAME, Minima, minimise
+
+# Only for type checkers: results stand above conclusions.
+if TYPE_CHECKING:
+    from .result import Identification
 
 # Judge a fit: the size and order of its residuals, the minima that the data allow, and the undetermined combinations.
 
@@ -22,27 +26,6 @@ FAR = 4.0
 #: Residuals that are all smaller than this are not noise but round-off and integration errors, which may keep their
 #: sign.
 NEGLIGIBLE = 1e-3
-
-#: Ends whose -2 log likelihoods differ by less than this are the same minimum.
-SAME = 0.1
-
-#: Ends agree on a minimum if all their parameters agree to this many standard errors.
-CLOSE = 0.5
-
-
-class FitWarning(UserWarning):
-    """A fit that should not be believed without further checks.
-
-    **Example:** make doubtful fits fail.
-
-    ```
-    >>> import warnings
-    >>> import tippe
-    >>> with warnings.catch_warnings():
-    ...     warnings.simplefilter("error", tippe.FitWarning)
-
-    ```
-    """
 
 
 class Series(NamedTuple):
@@ -78,7 +61,7 @@ class Verdict(NamedTuple):
     notes: tuple[str, ...]
     effective: float
     k: float
-    minima: tuple[Any, ...]
+    minima: tuple["Minimum", ...]
 
     @property
     def good(self) -> bool:
@@ -103,35 +86,50 @@ class Verdict(NamedTuple):
 
 
 def judge(
-    measurements: Measurements,
-    prediction: Float[np.ndarray, " n"],
-    residual: Float[np.ndarray, " n"],
-    degrees: int,
+    ends: Minima,
+    explorer: Explorer,
+    sample: Weighted,
+    distribution: "Distribution",
+    undetermined: tuple[str, ...],
     status: str,
-    trusted: bool,
-    explored: Verdict,
 ) -> Verdict:
     """Judge a fit.
 
-    **Arguments:**
-
-    - `measurements`, `prediction`, `residual`: (n,).
-    - `degrees`: measurements and priors less unknowns, without limits.
-    - `status`: status of the fit; `trusted`: whether the weights can be trusted.
-    - `explored`: the `Verdict` by the exploration alone, whose concerns are about the shape of the likelihood.
+    **Arguments:** `ends`: those of the search; `distribution`: that of the coordinates; `undetermined`: the combinations that
+    the data do not determine; `status`: that of the fit.
 
     **Returns:** a `Verdict`.
     """
-    scores = normal_scores(measurements, prediction)
+    from scipy.stats import chi2
+
+    measurements, by_slopes, concerns = ends.measurements, ends.covariance(ends.best), []
+    prediction, residual = ends.linearised.prediction[ends.best], ends.linearised.residual[ends.best]
     exact = ~np.asarray(measurements.censored)
-    estimated = bool(np.any(np.asarray(measurements.estimated)))
-    p_value = math.nan if estimated or degrees < 1 else chi_squared_tail(float(np.sum(scores[exact] ** 2)), degrees)
+    limits = np.abs(residual[: len(exact)][~exact])
+    degrees = len(residual) - len(by_slopes) - len(limits)
+    scores = normal_scores(measurements, prediction)
+    chi_squared, p_value = float(np.sum(scores[exact] ** 2)), math.nan
+    if degrees > 0 and not np.any(np.asarray(measurements.estimated)):
+        p_value = float(chi2.sf(chi_squared, degrees)) if math.isfinite(chi_squared) else 0.0
     numbers = np.asarray(measurements.series)
     parts = [scores[exact & (numbers == number)] for number in np.unique(numbers)]
-    series = tuple(runs for runs in map(runs_of_signs, parts) if runs.count > 1)
-    p_values = [runs_of_signs(part).p_value for part in parts if np.any(np.abs(part) > NEGLIGIBLE)]
-    limits = np.abs(residual[~exact])
-    concerns = _concerns_of_search(status, trusted, explored)
+    orders = [runs_of_signs(part) for part in parts]
+    p_values = [order.p_value for order, part in zip(orders, parts, strict=True) if np.any(np.abs(part) > NEGLIGIBLE)]
+    p_trend = min(p_values, default=1.0) * max(len(p_values), 1)
+    minima, further, notes = (), *without_prediction(explorer, sample, distribution)
+    notes = (*unsearched(explorer, distribution.estimate), *notes)
+    if distribution.kind == "weights":
+        minima, (others, more) = minima_of(explorer, sample), remarks(explorer, sample, distribution, by_slopes)
+        further, notes = (*further, *others), (*notes, *more)
+    if status != "converged":
+        concerns.append("the fit has not converged: allow more steps (max_steps), or start closer")
+    if distribution.kind == "none":
+        concerns.append(
+            f"there are no errors and intervals: the exploration ended with {sample.effective:.0f} effective draws "
+            f"(k-hat {sample.k:.2f}); start closer, give bounds or priors, or fix numbers"
+        )
+    if len(minima) > 1:
+        concerns.append(f"the data allow {len(minima)} minima: " + "; ".join(map(str, minima)))
     if not np.all(np.isfinite(prediction[exact])):
         missing = int(np.sum(~np.isfinite(prediction[exact])))
         concerns.append(f"the model has no prediction for {missing} measurements: its run ends earlier, or fails")
@@ -142,29 +140,23 @@ def judge(
         )
     if np.any(limits > FAR):
         concerns.append(f"{int(np.sum(limits > FAR))} limits are violated by more than {FAR:.0f} errors")
-    p_trend = min(p_values, default=1.0) * max(len(p_values), 1)
     if p_trend < POOR:
         concerns.append(
             f"the residuals keep their sign for too long (p = {p_trend:.2g}): the model misses a trend, or "
             "errors are correlated"
         )
-    concerns += [*explored.concerns, *(f"the data do not determine {words}" for words in explored.undetermined)]
-    return explored._replace(p_value=p_value, series=series, concerns=tuple(concerns))
-
-
-def _concerns_of_search(status: str, trusted: bool, explored: Verdict) -> list[str]:
-    """The concerns about the search and the weights."""
-    concerns = []
-    if status != "converged":
-        concerns.append("the fit has not converged: allow more steps (max_steps), or start closer")
-    if not trusted:
-        concerns.append(
-            f"there are no errors and intervals: the exploration ended with {explored.effective:.0f} effective draws "
-            f"(k-hat {explored.k:.2f}); start closer, give bounds or priors, or fix numbers"
-        )
-    if len(explored.minima) > 1:
-        concerns.append(f"the data allow {len(explored.minima)} minima: " + "; ".join(map(str, explored.minima)))
-    return concerns
+    return Verdict(
+        p_value=p_value,
+        series=tuple(order for order in orders if order.count > 1),
+        agree=ends.agree,
+        starts=len(ends.starts),
+        undetermined=undetermined,
+        concerns=(*concerns, *further, *(f"the data do not determine {words}" for words in undetermined)),
+        notes=notes,
+        effective=sample.effective,
+        k=sample.k,
+        minima=minima,
+    )
 
 
 def normal_scores(measurements: Measurements, prediction: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -175,13 +167,6 @@ def normal_scores(measurements: Measurements, prediction: Float[np.ndarray, " n"
     freedom = np.asarray(measurements.student)
     heavy = np.isfinite(freedom)
     return np.where(heavy, np.sign(z) * norm.isf(t.sf(np.abs(z), np.where(heavy, freedom, 1.0))), z)
-
-
-def chi_squared_tail(value: float, degrees: int) -> float:
-    """The probability that chi squared exceeds a value."""
-    from scipy.stats import chi2
-
-    return float(chi2.sf(value, degrees)) if math.isfinite(value) else 0.0
 
 
 def runs_of_signs(values: Float[np.ndarray, " n"]) -> Series:
@@ -246,23 +231,25 @@ class Profile(NamedTuple):
         return f"the fit is better with {name} = {self.values[best]:.6g}: start there"
 
 
-def profiled(fit: Any, k: int, values: Float[np.ndarray, " points"]) -> Profile:
+def profiled(fit: "Identification", k: int, values: Float[np.ndarray, " points"]) -> Profile:
     """The profile likelihood of the unknown with index `k`."""
     problem = fit.problem
     held = np.asarray(problem.unknowns[k].coordinate(values))
     coordinates, deviance = _searched(fit, k, held)
-    ends = minimise(problem, coordinates, fit.measurements, fixed=k)
-    at_ends = linearise(problem, ends.coordinates, fit.measurements).deviance
-    improves = np.isfinite(at_ends) & (at_ends <= deviance)
-    coordinates = np.where(improves[:, None], ends.coordinates, coordinates)
-    deviance = np.where(improves, at_ends, deviance)
+    converged = np.isfinite(deviance)
+    if len(problem.names) > 1:
+        ends = minimise(problem, coordinates, fit.measurements, fixed=k)
+        at_ends, converged = ends.linearised.deviance, ends.converged
+        improves = np.isfinite(at_ends) & (at_ends <= deviance)
+        coordinates = np.where(improves[:, None], ends.coordinates, coordinates)
+        deviance = np.where(improves, at_ends, deviance)
     optima = problem.values(coordinates)
     others = {other: optima[:, i] for i, other in enumerate(problem.names) if i != k}
-    return Profile(values, deviance - fit.deviance, others, ends.converged)
+    return Profile(values, deviance - fit.deviance, others, converged)
 
 
 def _searched(
-    fit: Any, k: int, held: Float[np.ndarray, " points"]
+    fit: "Identification", k: int, held: Float[np.ndarray, " points"]
 ) -> tuple[Float[np.ndarray, "points unknowns"], Float[np.ndarray, " points"]]:
     """The best coordinates for every held value, and -2 log likelihood there, by batches of runs without slopes.
 
@@ -279,8 +266,10 @@ def _searched(
     best = np.tile(estimate, (points, 1))
     best[:, k] = held
     best[:, others] += (held - estimate[k])[:, None] * slope
-    least, each = np.full(points, np.inf), max(ROWS // points, 1)
-    for batch in range(BATCHES):
+    # A single unknown leaves nothing to search.
+    batches, each = (BATCHES, max(ROWS // points, 1)) if size > 1 else (1, 1)
+    least = np.full(points, np.inf)
+    for batch in range(batches):
         trial = np.repeat(best[:, None], each, axis=1)
         noise = NARROWER**batch * random.normal(size=(points, each, size - 1)) @ root.T
         trial[..., others] += noise
@@ -460,12 +449,10 @@ def _ridge(mixture: Mixture, a: int, b: int) -> Float[np.ndarray, "points unknow
     return np.stack(curve)
 
 
-def _log_normals(mixture: Mixture, points: np.ndarray) -> np.ndarray:
-    logs = []
-    for share, centre, root in zip(*mixture, strict=True):
-        squares = np.sum(np.linalg.solve(root, (points - centre).T) ** 2, axis=0)
-        logs.append(math.log(share) - 0.5 * squares - np.sum(np.log(np.diag(root))))
-    return np.stack(logs)
+def _log_normals(mixture: Mixture, points: Float[np.ndarray, "n unknowns"]) -> Float[np.ndarray, "components n"]:
+    """The log densities of Gaussian components, weighted by their shares, up to a constant."""
+    squares, log_volumes = squared_distances(points, mixture.centres, mixture.roots)
+    return (np.log(mixture.shares) - log_volumes)[:, None] - 0.5 * squares
 
 
 def minima_of(explorer: Explorer, sample: Weighted) -> tuple[Minimum, ...]:
@@ -497,7 +484,7 @@ def roughness(explorer: Explorer, sample: Weighted) -> float:
     terms = np.stack(columns, axis=1)
     predictions = sample.pool.predictions[used]
     measurements = explorer.density.measurements
-    predictions = predictions - whole_periods(np, predictions - predictions[0], np.asarray(measurements.period))
+    predictions = predictions - measurements.whole_periods(predictions - predictions[0])
     coefficients, *_ = np.linalg.lstsq(root * terms, root * predictions)
     off = (predictions - terms @ coefficients) / np.asarray(measurements.error)
     return float(np.sqrt(np.mean(np.sum(root**2 * off**2, axis=0))))

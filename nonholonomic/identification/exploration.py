@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..terminal import Progress
-from .likelihood import Free, Measurements, own_name, whole_periods
+from .likelihood import Free, Measurements, as_gaussian, own_name
 from .posterior import LogDensity, compared
 
 # The likelihood of measurements whose errors are unknown: the mean over the errors, with a flat prior of their
@@ -62,8 +62,7 @@ def _by_error(measurements: Measurements, prediction: np.ndarray, residual: np.n
         return
     series, freedom = np.asarray(measurements.series), np.asarray(measurements.student)
     difference = np.where(estimated, prediction - np.where(estimated, measurements.value, 0.0), 0.0)
-    period = np.asarray(measurements.period)
-    difference = (difference - whole_periods(np, difference, period)) / np.asarray(measurements.error)
+    difference = (difference - measurements.whole_periods(difference)) / np.asarray(measurements.error)
     for number in np.unique(series[estimated]):
         members = (series == number) & estimated
         z = np.where(np.isfinite(difference[:, members]), difference[:, members], residual[:, members])
@@ -88,6 +87,9 @@ def _by_error(measurements: Measurements, prediction: np.ndarray, residual: np.n
 #: Degrees of freedom of the components: tails heavier than those of a posterior, and a finite covariance.
 FREEDOM = 5.0
 
+#: Nodes of each component for draws of a single unknown, equally spaced in the logit of the probability between these.
+NODES, TAIL = 201, 12.0
+
 #: Iterations of expectation maximisation, and the fraction of the whole covariance that is added to each component's.
 ITERATIONS, SHRINKAGE = 15, 1e-3
 
@@ -105,7 +107,15 @@ class Mixture(NamedTuple):
     roots: Float[np.ndarray, "components unknowns unknowns"]
 
     def draw(self, count: int, random: np.random.Generator) -> Float[np.ndarray, "count unknowns"]:
-        """Independent draws; each component gets its share of them, rounded at random."""
+        """Draws: with a single unknown, one from each of `count` intervals of equal probability; otherwise independent ones,
+        of which each component gets its share, rounded at random."""
+        if self.centres.shape[1] == 1:
+            from scipy.special import expit, stdtr, stdtrit
+
+            shares = np.linspace(-TAIL, TAIL, NODES)
+            places = np.sort(np.ravel(self.centres + self.roots[:, 0] * stdtrit(FREEDOM, expit(shares))))
+            cumulative = self.shares @ stdtr(FREEDOM, (places - self.centres) / self.roots[:, 0])
+            return np.interp((np.arange(count) + random.uniform(size=count)) / count, cumulative, places)[:, None]
         steps = (np.arange(count) + random.uniform()) / count
         which = np.minimum(np.searchsorted(np.cumsum(self.shares), steps), len(self.shares) - 1)
         normal = random.normal(size=(count, self.centres.shape[1]))
@@ -118,7 +128,7 @@ class Mixture(NamedTuple):
         constant = (
             math.lgamma(0.5 * (FREEDOM + size)) - math.lgamma(0.5 * FREEDOM) - 0.5 * size * math.log(FREEDOM * math.pi)
         )
-        squares, log_volumes = _squared_distances(points, self.centres, self.roots)
+        squares, log_volumes = squared_distances(points, self.centres, self.roots)
         constants = np.log(self.shares) + constant - log_volumes
         logs = constants[:, None] - 0.5 * (FREEDOM + size) * np.log1p(squares / FREEDOM)
         return np.logaddexp.reduce(logs, axis=0)
@@ -163,7 +173,7 @@ def fitted(
     shares, covariances = np.full(len(centres), 1.0 / len(centres)), np.tile(whole / len(centres), (len(centres), 1, 1))
     effective = 1.0 / np.sum(weights**2)
     for _ in range(ITERATIONS):
-        squares, log_volumes = _squared_distances(points, centres, np.linalg.cholesky(covariances))
+        squares, log_volumes = squared_distances(points, centres, np.linalg.cholesky(covariances))
         logs = (np.log(shares) - log_volumes)[:, None] - 0.5 * squares
         parts = np.exp(logs - np.logaddexp.reduce(logs, axis=0)) * weights
         shares = np.sum(parts, axis=1)
@@ -191,7 +201,7 @@ def _spread_centres(
     return points[chosen]
 
 
-def _squared_distances(
+def squared_distances(
     points: Float[np.ndarray, "n unknowns"],
     centres: Float[np.ndarray, "components unknowns"],
     roots: Float[np.ndarray, "components unknowns unknowns"],
@@ -284,8 +294,9 @@ def _ends(name: str, unknown: Free, spread: float, duration: float) -> tuple[flo
     if all(bounded) and unknown.prior is None:
         return -5.0, 5.0
     kind = own_name(name)
-    if unknown.gaussian is not None:
-        middle, reach = unknown.gaussian[0], DEVIATIONS * unknown.gaussian[1]
+    if unknown.prior is not None:
+        mean, deviation = as_gaussian(unknown.prior, unknown.start, name)
+        middle, reach = mean, DEVIATIONS * deviation
     elif kind == "t0" and duration > 0.0:
         middle, reach = unknown.start, OF_DURATION * duration
     elif kind.startswith(("launch", "start")):
@@ -300,22 +311,29 @@ def _ends(name: str, unknown: Free, spread: float, duration: float) -> tuple[flo
     return float(unknown.coordinate(low)), float(unknown.coordinate(max(high, low + margin)))
 
 
-#: Number of points in a round; all rounds use one program. With a single unknown, half as many are enough. A round of the
-#: search by slopes uses fewer.
+#: Number of points in a round; all rounds use one program. A round of the search by slopes uses fewer.
 ROWS = 512
 
 #: An exploration ends with at least this many effective draws and a shape k of the weights below `MOST_K`, or after
 #: `ROUNDS` rounds.
 ENOUGH, MOST_K, ROUNDS = 400.0, 0.7, 40
 
-#: Effective number of points to which the likelihood is tempered, for each unknown, and at least.
+#: Effective number of points to which the likelihood is tempered, for each unknown; with several unknowns, at least; half of
+#: the first number with a single unknown.
 TEMPERED, LEAST_TEMPERED = 20.0, 80.0
+
+#: A draw from one of many intervals of equal probability is worth at most so many independent ones: the ends of an interval of
+#: 95 % are then as accurate or better.
+EVEN = 6.0
 
 #: Number of groups of measurements, in the order of their times, and the number of groups whose powers grow together.
 GROUPS, FRONT = 32, 8
 
 #: Components of the proposals, and the share of the draws that the ends of the search by slopes keep.
 COMPONENTS, KEPT = 16, 0.15
+
+#: The density falls towards an end if its logarithm is there less by this.
+FALL = 2.0
 
 #: An unknown does not act if it changes predictions by less than this part of their errors.
 NO_CHANGE = 1e-3
@@ -343,7 +361,7 @@ class Pool(NamedTuple):
     log_density: Float[np.ndarray, " n"]
     log_region: Float[np.ndarray, " n"]
     log_proposal: Float[np.ndarray, " n"]
-    proposals: tuple[tuple[int, Any], ...]
+    proposals: tuple[tuple[int, Region | Mixture], ...]
 
     def candidates(self, count: int) -> Float[np.ndarray, "count unknowns"]:
         """Points from which to refine: the first; then, in turn, the best for all measurements and for the early ones."""
@@ -351,6 +369,12 @@ class Pool(NamedTuple):
         columns = sorted({totals.shape[1] - 1, *(totals.shape[1] * part // 8 for part in (0, 1, 2, 4))}, reverse=True)
         ranked = np.stack([np.argsort(-totals[:, column]) for column in columns], axis=1).reshape(-1)
         return self.points[list(dict.fromkeys([0, *ranked.tolist()]))[:count]]
+
+    @property
+    def bounded(self) -> bool:
+        """Whether there is a single unknown, and the density falls towards both ends of its range."""
+        ends = self.log_density[np.argsort(self.points[:, 0])][[0, -1]]
+        return self.points.shape[1] == 1 and bool(np.all(ends < np.max(self.log_density) - FALL))
 
     def most_probable(self, count: int) -> Int[np.ndarray, " count"]:
         """The numbers of the points with the greatest density, the best first."""
@@ -380,8 +404,14 @@ class Explorer(NamedTuple):
     random: np.random.Generator
 
     @classmethod
-    def of(cls, density: LogDensity, free: dict[str, Free], spread: float, seed: int) -> "Explorer":
+    def of(cls, density: LogDensity, spread: float, seed: int) -> "Explorer":
         """An explorer of the region around start values, as for `region_of`, with measurements grouped by their times."""
+        free = {}
+        for name, unknown in density.problem.free:
+            prior = density.priors.get(name)
+            gaussian = None if prior is None or callable(prior) else (float(prior[0]), float(prior[1]))
+            start, lower, upper = (float(number) for number in (unknown.start, unknown.lower, unknown.upper))
+            free[name] = Free(start, lower, upper, gaussian)
         times = np.asarray(density.measurements.time)
         distinct = np.unique(times)
         count = min(GROUPS, len(distinct))
@@ -391,8 +421,8 @@ class Explorer(NamedTuple):
 
     @property
     def rows(self) -> int:
-        """Number of points in a round."""
-        return ROWS if len(self.region.middle) > 1 else ROWS // 2
+        """Number of points in a round: with a single unknown, whose draws are spread evenly, few are enough."""
+        return ROWS if len(self.region.middle) > 1 else ROWS // 8
 
     def begin(self, seed: int) -> Pool:
         """A pool of quasi-random points in the region."""
@@ -400,7 +430,9 @@ class Explorer(NamedTuple):
         size = len(self.region.middle)
         shapes = ((0, size), (0, values), (0, groups), (0,), (0,), (0,), (0,))
         empty = Pool(*(np.zeros(shape) for shape in shapes), proposals=())
-        return self.extended(empty, self.region.points(ROWS if size > 2 else self.rows // 2, seed), self.region)
+        # The valleys of recordings are narrow.
+        count = ROWS if size > 2 else ROWS // 2 if size == 2 else ROWS // 4 if groups > 1 else self.rows
+        return self.extended(empty, self.region.points(count, seed), self.region)
 
     def acting(self, pool: Pool) -> Bool[np.ndarray, " unknowns"]:
         """Which unknowns act: moved from one of the two best points to the farther end of its range, such an unknown changes a
@@ -410,14 +442,17 @@ class Explorer(NamedTuple):
         moved = np.repeat(points[:, None], len(middle), axis=1)
         ends = middle + np.where(points > middle, -half_width, half_width)
         np.einsum("bkk->bk", moved)[:] = ends
-        predictions = self.density.predictions(np.concatenate([points, moved.reshape(-1, len(middle))]))
-        base, others = predictions[: len(points), None], predictions[len(points) :].reshape(*ends.shape, -1)
+        if len(middle) == 1:
+            base, others = pool.predictions[pool.most_probable(1), None], pool.predictions[:, None]
+        else:
+            predictions = self.density.predictions(np.concatenate([points, moved.reshape(-1, len(middle))]))
+            base, others = predictions[: len(points), None], predictions[len(points) :].reshape(*ends.shape, -1)
         with np.errstate(invalid="ignore"):
             change = np.abs(others - base) / np.asarray(self.density.measurements.error)
         is_same = np.all((others == base) | (change < NO_CHANGE), axis=(0, 2))
         return ~is_same | self.density.proper
 
-    def extended(self, pool: Pool, points: Float[np.ndarray, "rows unknowns"], proposal: Any) -> Pool:
+    def extended(self, pool: Pool, points: Float[np.ndarray, "rows unknowns"], proposal: Region | Mixture) -> Pool:
         """The pool with points that were drawn from a proposal."""
         predictions, each, prior, log_density = self.evaluated(points)
         groups = np.stack([np.sum(each[:, self.group == k], axis=1) for k in range(pool.groups.shape[1])], axis=1)
@@ -425,7 +460,7 @@ class Explorer(NamedTuple):
         old = np.logaddexp(pool.log_proposal, math.log(len(points)) + proposal.log_density(pool.points))
         new = np.logaddexp.reduce([math.log(n) + other.log_density(points) for n, other in proposals], axis=0)
         parts = (points, predictions, groups, prior, log_density, self.region.log_weight(points))
-        grown = (np.concatenate(pair) for pair in zip(pool, parts, strict=False))
+        grown = (np.concatenate(pair) for pair in zip(pool[:6], parts, strict=True))
         return Pool(*grown, log_proposal=np.concatenate([old, new]), proposals=proposals)
 
     def explore(self, pool: Pool, minima: Mixture | None, progress: bool) -> "Weighted":
@@ -458,7 +493,8 @@ class Explorer(NamedTuple):
 
     def proposal(self, pool: Pool, minima: Mixture | None, share: float = KEPT) -> Mixture:
         """The mixture that fits the points so far best; the components around known minima get a share of it."""
-        least = max(LEAST_TEMPERED, TEMPERED * pool.points.shape[1])
+        size = pool.points.shape[1]
+        least = max(LEAST_TEMPERED, TEMPERED * size) if size > 1 else 0.5 * TEMPERED
         halves = [
             fitted(pool.points, tempered_weights(pool, least, power), COMPONENTS, self.random) for power in POWERS
         ]
@@ -495,7 +531,7 @@ class Weighted(NamedTuple):
     def of(cls, pool: Pool) -> "Weighted":
         logs = pool.log_weights(2.0)
         weights, k = smoothed_weights(np.where(np.isfinite(logs), logs, -np.inf))
-        return cls(pool, weights, k, effective_number(weights))
+        return cls(pool, weights, k, independent_number(pool.points, weights))
 
     @property
     def enough(self) -> bool:
@@ -511,6 +547,20 @@ class Weighted(NamedTuple):
 def effective_number(weights: Float[np.ndarray, " n"]) -> float:
     """Number of independent draws that are worth as much as weighted ones (Kish)."""
     return float(1.0 / np.sum(weights**2))
+
+
+def independent_number(points: Float[np.ndarray, "n unknowns"], weights: Float[np.ndarray, " n"]) -> float:
+    """Number of independent draws that are worth as much as weighted points.
+
+    The points of a single unknown are spread evenly, so that chance is left only in the differences of neighbouring weights
+    (Wolter, "An investigation of some estimators of variance for systematic sampling", J. Am. Stat. Assoc. 79 (1984) 781);
+    half of that number, because jumps of the weights, as on a staircase, are not independent.
+    """
+    number = effective_number(weights)
+    if points.shape[1] > 1:
+        return number
+    differences = np.diff(weights[np.argsort(points[:, 0])])
+    return max(number, min(EVEN * number, 1.0 / max(float(np.sum(differences**2)), 1e-300)))
 
 
 def tempered_weights(pool: Pool, least: float, power: float) -> Float[np.ndarray, " n"]:

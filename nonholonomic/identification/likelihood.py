@@ -2,19 +2,23 @@
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import log_ndtr
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..parameters import full_name
 from ..text import shown
 from ..validation import require
+
+# Only for type checkers: data stand above measurements.
+if TYPE_CHECKING:
+    from ..runs.identify import Data
 
 # Compare predictions with measurements: residuals whose squares add up to -2 log likelihood.
 
@@ -66,16 +70,16 @@ class Measurements(eqx.Module):
 
     def __init__(
         self,
-        value: Any,
-        error: Any,
-        censored: Any = False,
+        value: ArrayLike,
+        error: ArrayLike,
+        censored: ArrayLike = False,
         *,
-        upper: Any = None,
-        period: Any = math.inf,
-        student: Any = math.inf,
-        series: Any = 0,
-        time: Any = 0.0,
-        estimated: Any = False,
+        upper: ArrayLike | None = None,
+        period: ArrayLike = math.inf,
+        student: ArrayLike = math.inf,
+        series: ArrayLike = 0,
+        time: ArrayLike = 0.0,
+        estimated: ArrayLike = False,
     ):
         require(error, "error", above=0.0)
         if np.ndim(value) == 0 or np.size(value) == 0:
@@ -96,7 +100,7 @@ class Measurements(eqx.Module):
             if not np.all(np.asarray(arguments[name]) > 0.0):
                 raise ValueError(f"{name} = {shown(arguments[name])} must be positive, or infinite")
 
-        def each(argument: Any, kind: Any) -> Any:
+        def each(argument: ArrayLike, kind: type) -> Array:
             return jnp.broadcast_to(jnp.asarray(argument, kind), shape)
 
         self.value, self.upper, self.error = each(value, float), each(upper, float), each(error, float)
@@ -151,21 +155,20 @@ class Measurements(eqx.Module):
         flat = jnp.where(is_small, 1.0 - 0.5 * share, jnp.log1p(share) / jnp.where(is_small, 1.0, share))
         return jnp.where(heavy, z * jnp.sqrt((freedom + 1.0) / freedom * flat), z)
 
-    def whole_periods(self, off: Float[Array | np.ndarray, "... n"]) -> Float[Array, "... n"]:
-        """Differences rounded to the nearest whole period; without a slope."""
-        return whole_periods(jnp, off, self.period)
+    def whole_periods(self, off: Float[Array | np.ndarray, "... n"]) -> Any:
+        """Differences rounded to the nearest whole period, without a slope; a NumPy array for a NumPy array, because JAX
+        would compile for every number of rows."""
+        xp: Any = np if isinstance(off, np.ndarray) else jnp
+        period = xp.asarray(self.period)
+        wraps = xp.isfinite(period)
+        period = xp.where(wraps, period, 1.0)
+        return xp.where(wraps, period * xp.round(off / period), 0.0)
 
     def standardised(self, prediction: Float[Array | np.ndarray, "... n"]) -> Float[Array, "... n"]:
         """(prediction - value) / error, with whole periods removed; 0 for limits."""
         difference = jnp.where(self.censored, 0.0, prediction - self.value)
         difference = difference - self.whole_periods(difference)
         return difference / self.error
-
-    def residuals_and_slopes(
-        self, prediction: Float[Array | np.ndarray, "... n"]
-    ) -> tuple[Float[Array, "... n"], Float[Array, "... n"]]:
-        """The residuals, and their slopes with respect to the predictions."""
-        return jax.jvp(self.residuals, (prediction,), (jnp.ones_like(prediction),))
 
     def roots_of_information(
         self, prediction: Float[Array | np.ndarray, "... n"], slope: Float[Array, "... n"]
@@ -187,25 +190,6 @@ class Measurements(eqx.Module):
     def with_errors(self, error: Float[Array | np.ndarray, "... n"]) -> "Measurements":
         """The same measurements with other errors."""
         return eqx.tree_at(lambda measurements: measurements.error, self, jnp.broadcast_to(error, self.error.shape))
-
-
-def joined_measurements(parts: list[Measurements]) -> Measurements:
-    """The measurements of several sets, one after the other; their series are renumbered consecutively."""
-    first, renumbered = 0, []
-    for part in parts:
-        renumbered.append(eqx.tree_at(lambda part: part.series, part, part.series + first))
-        first += int(np.max(part.series)) + 1
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *renumbered)
-
-
-def whole_periods(xp: Any, off: Any, period: Any) -> Any:
-    """Differences rounded to the nearest whole period; without a slope, as rounding has none.
-
-    **Arguments:** `xp`: `jax.numpy`, or `numpy` for numbers of rows that vary, each of which JAX would compile.
-    """
-    wraps = xp.isfinite(period)
-    period = xp.where(wraps, period, 1.0)
-    return xp.where(wraps, period * xp.round(off / period), 0.0)
 
 
 def one_sided(z: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -236,7 +220,9 @@ def between(z: Float[Array, "..."], half: Float[Array, "..."]) -> Float[Array, "
     return jnp.where(at_middle, z * jnp.sqrt(curvature), jnp.sign(z) * jnp.sqrt(jnp.where(at_middle, 1.0, deviance)))
 
 
-def estimated_errors(measurements: Measurements, prediction: Any, unknowns: int) -> Float[np.ndarray, " n"]:
+def estimated_errors(
+    measurements: Measurements, prediction: Float[np.ndarray, " n"], unknowns: int
+) -> Float[np.ndarray, " n"]:
     """The errors; unknown errors are estimated from the residuals of their series.
 
     In a fit of k unknowns to N values, the estimate for a series of n values is the root of the sum of squares / (n - k
@@ -245,7 +231,7 @@ def estimated_errors(measurements: Measurements, prediction: Any, unknowns: int)
     """
     errors = np.array(measurements.error)
     series, estimated = np.asarray(measurements.series), np.asarray(measurements.estimated)
-    off = np.asarray(measurements.standardised(jnp.asarray(prediction))) * errors
+    off = np.asarray(measurements.standardised(prediction)) * errors
     for number in np.unique(series[estimated]):
         in_series = (series == number) & estimated & np.isfinite(off)
         n = np.sum(in_series)
@@ -297,15 +283,10 @@ class Free(NamedTuple):
     prior: tuple[float, float] | float | None = None
 
     @property
-    def gaussian(self) -> tuple[float, float] | None:
-        """Mean and standard deviation of the prior."""
-        return as_gaussian(self.prior, self.start)
-
-    @property
     def unit(self) -> float:
         """The unit of changes of the parameter: the size of the start value; if this is 0, the prior's standard
         deviation, or 1."""
-        return abs(self.start) or (self.gaussian[1] if self.gaussian else 1.0)
+        return abs(self.start) or (1.0 if self.prior is None else float(np.ravel(self.prior)[-1]))
 
     @property
     def positive(self) -> bool:
@@ -316,14 +297,24 @@ class Free(NamedTuple):
         """The parameter at a coordinate."""
         return Unknown.of(self).value(coordinate)
 
-    def coordinate(self, value: Any) -> Float[Array, "..."]:
+    def coordinate(self, value: ArrayLike) -> Float[Array, "..."]:
         """The coordinate of a value strictly within the bounds; the inverse of `value`."""
         return Unknown.of(self).coordinate(value)
 
 
-def as_gaussian(prior: Any, start: float) -> Any:
-    """Mean and standard deviation of a prior that may be only a standard deviation about the start value."""
-    return (start, prior) if prior is not None and np.ndim(prior) == 0 else prior
+def as_gaussian(prior: Any, start: float, name: str) -> tuple[float, float]:
+    """Mean and standard deviation of a prior, which may be only a standard deviation about the start value.
+
+    **Raises:** `ValueError` that names the unknown.
+    """
+    if np.shape(prior) not in ((), (2,)):
+        raise ValueError(
+            f"prior of {name} = {shown(prior)} must be a mean and a standard deviation, or only the standard deviation"
+        )
+    mean, deviation = (start, prior) if np.ndim(prior) == 0 else prior
+    require(mean, f"mean of the prior of {name}")
+    require(deviation, f"standard deviation of the prior of {name}", above=0.0)
+    return mean, deviation
 
 
 class Unknown(eqx.Module):
@@ -348,7 +339,7 @@ class Unknown(eqx.Module):
         program."""
         numbers = (free.start, free.unit, free.lower, free.upper)
         start, unit, lower, upper = (np.asarray(number, float) for number in numbers)
-        prior = None if free.gaussian is None else np.asarray(free.gaussian, float)
+        prior = None if free.prior is None else np.asarray(free.prior, float)
         return cls(start, unit, lower, upper, prior, math.isfinite(free.lower), math.isfinite(free.upper))
 
     @property
@@ -370,7 +361,7 @@ class Unknown(eqx.Module):
                 return self.upper - xp.exp(-coordinate)
         return self.start + self.unit * coordinate
 
-    def coordinate(self, value: Any) -> Float[Array, "..."]:
+    def coordinate(self, value: ArrayLike) -> Float[Array, "..."]:
         """The coordinate of a value strictly within the bounds; the inverse of `value`."""
         value = jnp.asarray(value, float)
         if self.has_lower and self.has_upper:
@@ -382,7 +373,7 @@ class Unknown(eqx.Module):
         return (value - self.start) / self.unit
 
 
-def as_free(free: Any, lower: dict[str, float] | None = None) -> dict[str, Free]:
+def as_free(free: Mapping[str, Free | float], lower: dict[str, float] | None = None) -> dict[str, Free]:
     """Unknowns as `Free`, checked.
 
     **Arguments:**
@@ -405,16 +396,7 @@ def as_free(free: Any, lower: dict[str, float] | None = None) -> dict[str, Free]
         if np.ndim(unknown.start) != 0:
             raise ValueError(f"start of {name} must be one number, not of shape {np.shape(unknown.start)}")
         require(unknown.start, f"start of {name}", above=unknown.lower, below=unknown.upper, why="the bounds")
-        prior = None
-        if unknown.prior is not None:
-            if np.shape(unknown.prior) not in ((), (2,)):
-                raise ValueError(
-                    f"prior of {name} = {shown(unknown.prior)} must be a mean and a standard deviation, or only the standard "
-                    "deviation"
-                )
-            prior = as_gaussian(unknown.prior, float(unknown.start))
-            require(prior[0], f"mean of the prior of {name}")
-            require(prior[1], f"standard deviation of the prior of {name}", above=0.0)
+        prior = None if unknown.prior is None else as_gaussian(unknown.prior, float(unknown.start), name)
         unknowns[name] = unknown._replace(
             start=float(unknown.start), lower=float(unknown.lower), upper=float(unknown.upper), prior=prior
         )
@@ -424,11 +406,13 @@ def as_free(free: Any, lower: dict[str, float] | None = None) -> dict[str, Free]
 # Fit several sets of data together: join measurements, and name the parameters that are shared or belong to a single
 # set.
 
+Value = TypeVar("Value")
+
 #: Stands for every set of data that has the parameter.
 EACH = "data[*]."
 
 
-def joined_data(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], Int[np.ndarray, " n"]]:
+def joined_data(data: Sequence["Data"]) -> tuple[Measurements, tuple[str, ...], Int[np.ndarray, " n"]]:
     """The joined measurements of several sets of data, their labels, and the indices of the predictions that were measured.
 
     **Arguments:** `data`: sets of data, each with the attributes `measurements`, `labels`, `seen`, and `size` (the
@@ -437,7 +421,12 @@ def joined_data(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], I
     labels = numbered([source.labels for source in data])
     offsets = np.cumsum([0, *(source.size for source in data)])
     indices = np.concatenate([first + source.seen for first, source in zip(offsets, data, strict=False)])
-    return joined_measurements([source.measurements for source in data]), labels, indices
+    first, parts = 0, []
+    for part in (source.measurements for source in data):
+        # The series are renumbered consecutively.
+        parts.append(eqx.tree_at(lambda part: part.series, part, part.series + first))
+        first += int(np.max(part.series)) + 1
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts), labels, indices
 
 
 def numbered(labels: Sequence[Sequence[str]]) -> tuple[str, ...]:
@@ -446,7 +435,7 @@ def numbered(labels: Sequence[Sequence[str]]) -> tuple[str, ...]:
     return tuple(f"{k}: {label}" if several else label for k, part in enumerate(labels, 1) for label in part)
 
 
-def of_data(parameters: dict[str, Any], k: int) -> dict[str, Any]:
+def of_data(parameters: dict[str, Value], k: int) -> dict[str, Value]:
     """The parameters of one set of data: the shared parameters, and its own parameters without the prefix `data[k].`."""
     prefix = f"data[{k}]."
     shared = {name: value for name, value in parameters.items() if not name.startswith("data[")}
@@ -462,7 +451,10 @@ def own_name(name: str) -> str:
 
 
 def free_numbers(
-    free: Any, shared: list[str], own: list[list[str]], check: Callable[[dict[str, float]], Any]
+    free: Mapping[str, Free | float],
+    shared: list[str],
+    own: list[list[str]],
+    check: Callable[[dict[str, float]], object],
 ) -> dict[str, Free]:
     """The unknowns of a scene and its data: their full names, and a lower bound of 0 for parameters that cannot be negative.
 

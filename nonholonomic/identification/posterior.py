@@ -1,7 +1,7 @@
 """A model with its free parameters, and the posterior of these as a function of unbounded coordinates."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -9,12 +9,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..sweeps.running import workers
 from ..terminal import status_line
 from ..text import shown
-from ..validation import is_traced, require
+from ..validation import is_traced
 from .likelihood import Free, Measurements, Unknown, as_free, as_gaussian
 
 # A model with its free parameters, and predictions with slopes, for many sets of parameters at once.
@@ -32,16 +32,8 @@ COMPARED = 4096
 DIFFERENCE, OF_RECORDING = 0.01, 3e-4
 
 
-def step_of(slopes: str, measurements: Measurements) -> float | None:
-    """The step of the differences for a kind of slopes; `None` for automatic differentiation.
-
-    **Raises:** `ValueError` for an unknown kind.
-    """
-    recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
-    ways = {"exact": None, "differences": OF_RECORDING if recorded else DIFFERENCE}
-    if not isinstance(slopes, str) or slopes not in ways:
-        raise ValueError(f"slopes = {shown(slopes)} must be one of {', '.join(map(repr, ways))}")
-    return ways[slopes]
+#: A function from parameters, name -> (rows,), to predictions (rows, n).
+Model = Callable[[dict[str, Float[Array, " rows"]]], Float[Array, "rows n"]]
 
 
 class Problem(eqx.Module):
@@ -54,16 +46,16 @@ class Problem(eqx.Module):
     - `acts`: which unknowns act on a prediction; the slopes of the others are round-off, and set to zero.
     """
 
-    model: Callable[[dict[str, Float[Array, " rows"]]], Float[Array, "rows n"]]
+    model: Model
     names: tuple[str, ...] = eqx.field(static=True)
     unknowns: tuple[Unknown, ...]
     step: float | None = eqx.field(static=True)
     acts: Bool[np.ndarray, " unknowns"]
 
-    def __init__(self, model: Callable[..., Any], free: tuple[tuple[str, Free], ...], step: float | None = None):
+    def __init__(self, model: Model, free: Mapping[str, Free], step: float | None = None):
         self.model, self.step = model, step
-        self.names = tuple(name for name, _ in free)
-        self.unknowns = tuple(Unknown.of(unknown) for _, unknown in free)
+        self.names = tuple(free)
+        self.unknowns = tuple(map(Unknown.of, free.values()))
         self.acts = np.ones(len(free), bool)
 
     @property
@@ -103,38 +95,24 @@ class Problem(eqx.Module):
 class Linearised(NamedTuple):
     """A model and its likelihood at a point of every row.
 
-    - `prediction`: (rows, n); `residual`: (rows, n), of the data;
-    - `jacobian`: (rows, n, unknowns), slopes of the residuals with respect to the coordinates;
-    - `information`: the same with the expected curvature of the likelihood (`Measurements.information`), for errors;
-    - `prior`, `prior_jacobian`: (rows, priors), (rows, priors, unknowns), of the priors.
+    - `prediction`: (rows, n); `slopes`: (rows, n, unknowns), with respect to the coordinates.
+    - `residual`: (rows, residuals), of the n data, then of the priors; `jacobian`: (rows, residuals, unknowns), its slopes.
+    - `information`: the same with the expected curvature of the likelihood (`Measurements.roots_of_information`), for
+      errors.
     """
 
     prediction: Float[np.ndarray, "rows n"]
-    residual: Float[np.ndarray, "rows n"]
-    jacobian: Float[np.ndarray, "rows n unknowns"]
-    information: Float[np.ndarray, "rows n unknowns"]
-    prior: Float[np.ndarray, "rows priors"]
-    prior_jacobian: Float[np.ndarray, "rows priors unknowns"]
+    slopes: Float[np.ndarray, "rows n unknowns"]
+    residual: Float[np.ndarray, "rows residuals"]
+    jacobian: Float[np.ndarray, "rows residuals unknowns"]
+    information: Float[np.ndarray, "rows residuals unknowns"]
 
     @property
     def deviance(self) -> Float[np.ndarray, " rows"]:
-        """-2 log posterior of every row, up to a constant."""
-        return np.sum(self.residual**2, axis=-1) + np.sum(self.prior**2, axis=-1)
-
-    @property
-    def whole_residual(self) -> Float[np.ndarray, "rows residuals"]:
-        """The residuals of data and priors."""
-        return np.concatenate([self.residual, self.prior], axis=1)
-
-    @property
-    def whole_jacobian(self) -> Float[np.ndarray, "rows residuals unknowns"]:
-        """The slopes of data and priors."""
-        return np.concatenate([self.jacobian, self.prior_jacobian], axis=1)
-
-    @property
-    def whole_information(self) -> Float[np.ndarray, "rows residuals unknowns"]:
-        """The slopes of data and priors that represent the expected curvature."""
-        return np.concatenate([self.information, self.prior_jacobian], axis=1)
+        """-2 log posterior of every row, up to a constant; infinite where the model failed."""
+        of_data, of_priors = np.split(self.residual, [self.prediction.shape[1]], axis=1)
+        deviance = np.sum(of_data**2, axis=1) + np.sum(of_priors**2, axis=1)
+        return np.where(np.isfinite(deviance), deviance, np.inf)
 
 
 @eqx.filter_jit
@@ -153,18 +131,9 @@ def _differentiated(
 _predicted = eqx.filter_jit(Problem.predict)
 
 
-def _differences(problem: Problem, step: float, coordinates: Rows) -> tuple[np.ndarray, np.ndarray]:
-    """Predictions and central differences; if a side has no prediction, its slope is 0."""
-    rows, unknowns = coordinates.shape
-    offsets = step * np.concatenate([np.zeros((1, unknowns)), np.eye(unknowns), -np.eye(unknowns)])
-    moved = predictions(problem, (coordinates[:, None] + offsets).reshape(-1, unknowns))
-    values, values_above, values_below = np.split(moved.reshape(rows, len(offsets), -1), [1, 1 + unknowns], axis=1)
-    with np.errstate(invalid="ignore"):
-        slopes = np.moveaxis(values_above - values_below, 1, -1) / (2.0 * step)
-    return values[:, 0], np.where(np.isfinite(slopes), slopes, 0.0)
-
-
-def predictions_and_slopes(problem: Problem, coordinates: Rows, mask: Any = None) -> tuple[np.ndarray, np.ndarray]:
+def predictions_and_slopes(
+    problem: Problem, coordinates: Rows, mask: Bool[np.ndarray, " rows"] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Predictions and their slopes, for every row of coordinates.
 
     **Arguments:** `coordinates`: (rows, unknowns); `mask`: (rows,), which of the rows that are needed, by default
@@ -172,30 +141,33 @@ def predictions_and_slopes(problem: Problem, coordinates: Rows, mask: Any = None
 
     **Returns:** (rows, n) and (rows, n, unknowns); NaN and 0 for rows that are not needed.
     """
-    coordinates = np.asarray(coordinates, float)
-    mask = np.ones(len(coordinates), bool) if mask is None else np.asarray(mask)
-    points = np.where(mask[:, None], coordinates, np.nan)
+    points = np.asarray(coordinates, float)
+    points = points if mask is None else np.where(mask[:, None], points, np.nan)
     if problem.step is None:
         prediction, slopes = _in_parts(lambda part: _differentiated(problem, part), points, ROWS_WITH_SLOPES)
     else:
-        prediction, slopes = _differences(problem, problem.step, points)
+        rows, unknowns = points.shape
+        offsets = problem.step * np.concatenate([np.zeros((1, unknowns)), np.eye(unknowns), -np.eye(unknowns)])
+        moved = predictions(problem, (points[:, None] + offsets).reshape(-1, unknowns))
+        values, above, below = np.split(moved.reshape(rows, len(offsets), -1), [1, 1 + unknowns], axis=1)
+        with np.errstate(invalid="ignore"):
+            slopes = np.moveaxis(above - below, 1, -1) / (2.0 * problem.step)
+        # If a side has no prediction, the slope is 0.
+        prediction, slopes = values[:, 0], np.where(np.isfinite(slopes), slopes, 0.0)
     return prediction, np.where(problem.acts, slopes, 0.0)
-
-
-def compile_slopes(problem: Problem) -> None:
-    """Compile the program of `predictions_and_slopes`, unless it uses that of `predictions`."""
-    if problem.step is None:
-        predictions_and_slopes(problem, np.full((1, len(problem.names)), np.nan))
 
 
 def predictions(problem: Problem, coordinates: Rows) -> np.ndarray:
     """Predictions without slopes, for every row of coordinates; rows of NaN take no time."""
-    predict = Problem.predict if problem.on_host else _predicted
-    return _in_parts(lambda part: (predict(problem, jnp.asarray(part)),), coordinates, ROWS_OF_CALL)[0]
+    predict, rows = Problem.predict if problem.on_host else _predicted, ROWS_OF_CALL
+    if problem.on_host and len(problem.names) == 1:
+        # Rounds are small, and calls take nearly as long for fewer rows: the cores share a round.
+        rows = ROWS_OF_CALL // 2
+    return _in_parts(lambda part: (predict(problem, jnp.asarray(part)),), coordinates, rows)[0]
 
 
 def _in_parts(
-    function: Callable[[Rows], tuple[Any, ...]], coordinates: Rows, rows_of_part: int
+    function: Callable[[Rows], tuple[Array, ...]], coordinates: Rows, rows_of_part: int
 ) -> tuple[np.ndarray, ...]:
     """The results of a function of some rows for all rows; the cores share its calls, an accelerator has a single one.
 
@@ -215,7 +187,9 @@ def _in_parts(
         return tuple(np.concatenate(result)[: len(coordinates)] for result in results)
 
 
-def linearise(problem: Problem, coordinates: Any, measurements: Measurements, mask: Any = None) -> Linearised:
+def linearise(
+    problem: Problem, coordinates: Rows, measurements: Measurements, mask: Bool[np.ndarray, " rows"] | None = None
+) -> Linearised:
     """Predictions, residuals and their slopes.
 
     **Arguments:**
@@ -232,11 +206,21 @@ def linearise(problem: Problem, coordinates: Any, measurements: Measurements, ma
     shape = (len(coordinates), measurements.value.shape[-1])
     if prediction.shape != shape:
         raise ValueError(f"model must predict {shape} for {shape[0]} sets, not {prediction.shape}")
+    return weighed(problem, coordinates, prediction, slopes, measurements)
+
+
+def weighed(
+    problem: Problem,
+    coordinates: Rows,
+    prediction: Float[np.ndarray, "rows n"],
+    slopes: Float[np.ndarray, "rows n unknowns"],
+    measurements: Measurements,
+) -> Linearised:
+    """Predictions and slopes, compared with measurements and priors; without a run."""
     residual, by_prediction, root = compared(measurements, prediction)
     prior, by_coordinate = map(np.asarray, _priors(problem.unknowns, jnp.asarray(coordinates, float)))
-    return Linearised(
-        prediction, residual, by_prediction[..., None] * slopes, root[..., None] * slopes, prior, by_coordinate
-    )
+    of_all = (np.concatenate([factor[..., None] * slopes, by_coordinate], axis=1) for factor in (by_prediction, root))
+    return Linearised(prediction, slopes, np.concatenate([residual, prior], axis=1), *of_all)
 
 
 def deviances(
@@ -254,7 +238,7 @@ def compared(measurements: Measurements, prediction: Float[np.ndarray, "rows n"]
     All are element by element. Lists of one length let one program serve all fits.
     """
 
-    def listed(values: Any) -> np.ndarray:
+    def listed(values: ArrayLike) -> np.ndarray:
         values = np.broadcast_to(np.asarray(values), prediction.shape).ravel()
         return np.pad(values, (0, -values.size % COMPARED), mode="edge").reshape(-1, COMPARED)
 
@@ -266,7 +250,7 @@ def compared(measurements: Measurements, prediction: Float[np.ndarray, "rows n"]
 
 @eqx.filter_jit
 def _residuals(measurements: Measurements, prediction: Float[np.ndarray, " n"]) -> tuple[Array, Array, Array]:
-    residual, slope = measurements.residuals_and_slopes(prediction)
+    residual, slope = jax.jvp(measurements.residuals, (prediction,), (jnp.ones_like(prediction),))
     return residual, slope, measurements.roots_of_information(prediction, slope)
 
 
@@ -285,8 +269,9 @@ def _priors(unknowns: tuple[Unknown, ...], coordinates: Float[Array, "rows unkno
 
 # The posterior of parameters, as a function of unbounded coordinates for any sampler.
 
-#: The log density of a parameter: (mean, standard deviation) of a Gaussian, or a function of the parameter.
-Prior = tuple[float, float] | Callable[[Float[Array, ""]], Float[Array, ""]]
+#: The log density of a parameter: (mean, standard deviation) of a Gaussian, only the standard deviation, or a function of the
+#: parameter.
+Prior = tuple[float, float] | float | Callable[[Float[Array, ""]], Float[Array, ""]]
 
 
 class LogDensity(eqx.Module):
@@ -319,10 +304,10 @@ class LogDensity(eqx.Module):
     @classmethod
     def of(
         cls,
-        model: Callable[[dict[str, Float[Array, " rows"]]], Float[Array, "rows n"]],
+        model: Model,
         measurements: Measurements,
-        free: Any,
-        priors: Any = None,
+        free: Mapping[str, Free | float],
+        priors: Mapping[str, Prior] | None = None,
         series_units: tuple[str, ...] = (),
         slopes: str = "exact",
     ) -> "LogDensity":
@@ -333,21 +318,21 @@ class LogDensity(eqx.Module):
         """
         unknowns = as_free(free)
         of_unknowns = {name: unknown.prior for name, unknown in unknowns.items() if unknown.prior is not None}
-        all_priors: dict[str, Any] = of_unknowns | dict(priors or {})
-        for name, prior in all_priors.items():
+        leaves: dict[str, Any] = {}
+        for name, prior in (of_unknowns | dict(priors or {})).items():
             if name not in unknowns:
                 raise ValueError(f"priors: {name!r} must be one of {', '.join(unknowns)}")
+            # Numbers become arguments of compiled programs; a function becomes part of them.
             if not callable(prior):
-                if np.shape(prior) not in ((), (2,)):
-                    raise ValueError(
-                        f"priors: {name!r} = {shown(prior)} must be a mean and a standard deviation, only the standard "
-                        "deviation, or a function"
-                    )
-                all_priors[name] = prior = as_gaussian(prior, unknowns[name].start)
-                require(prior[1], f"standard deviation of the prior of {name}", above=0.0)
+                leaves[name] = np.asarray(as_gaussian(prior, unknowns[name].start, name), float)
+            else:
+                leaves[name] = prior if isinstance(prior, eqx.Module) else jax.tree_util.Partial(prior)
         series, estimated = np.asarray(measurements.series), np.asarray(measurements.estimated)
-        leaves = {name: _as_leaves(prior) for name, prior in all_priors.items()}
-        problem = Problem(model, tuple(unknowns.items()), step_of(slopes, measurements))
+        recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
+        steps = {"exact": None, "differences": OF_RECORDING if recorded else DIFFERENCE}
+        if not isinstance(slopes, str) or slopes not in steps:
+            raise ValueError(f"slopes = {shown(slopes)} must be one of {', '.join(map(repr, steps))}")
+        problem = Problem(model, unknowns, steps[slopes])
         open_series = tuple(np.unique(series[estimated]).tolist())
         return cls(problem, measurements, leaves, open_series, series_units)
 
@@ -474,7 +459,11 @@ def _log_prior(
     for unknown, prior, coordinate in zip(unknowns, priors, coordinates[: len(unknowns)], strict=True):
         if prior is not None:
             value, slope = jax.value_and_grad(unknown.value)(coordinate)
-            log_density: Any = prior(value) if callable(prior) else _normal(value, *prior)
+            if callable(prior):
+                log_density: Any = prior(value)
+            else:
+                mean, deviation = prior
+                log_density = -0.5 * ((value - mean) / deviation) ** 2 - jnp.log(deviation * math.sqrt(2.0 * math.pi))
             total += log_density + jnp.log(jnp.abs(slope))
         elif unknown.has_lower and unknown.has_upper:
             # Uniform between two bounds; in the coordinate, the prior would have no finite integral.
@@ -490,16 +479,3 @@ _log_priors = eqx.filter_jit(eqx.filter_vmap(_log_prior, in_axes=(None, None, 0)
 def _value_and_gradient(density: LogDensity, coordinates: Float[Array, "*batch unknowns"]) -> tuple[Array, Array]:
     function = jax.value_and_grad(density)
     return function(coordinates) if coordinates.ndim == 1 else jax.vmap(function)(coordinates)
-
-
-def _as_leaves(prior: Prior) -> Any:
-    """Convert a prior: its numbers become arguments of compiled programs; its function, if any, becomes part of
-    them."""
-    if not callable(prior):
-        return np.asarray(prior, float)
-    return prior if isinstance(prior, eqx.Module) else jax.tree_util.Partial(prior)
-
-
-def _normal(value: Float[Array, ""], mean: Float[Array, ""], deviation: Float[Array, ""]) -> Float[Array, ""]:
-    """Logarithm of the normal density. `jax.scipy.stats` has it, too, but takes 0.15 s to import."""
-    return -0.5 * ((value - mean) / deviation) ** 2 - jnp.log(deviation * math.sqrt(2.0 * math.pi))

@@ -4,17 +4,22 @@ import csv
 import dataclasses
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from os import PathLike
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
-from ..text import UNITS, likely, one_line, shown
+from ..text import UNITS, likely, one_line, readable_unit, shown
 from ..validation import as_number, as_number_or_none, as_path, require, warn
 from .likelihood import Measurements
+
+# Only for type checkers: models stand above fits.
+if TYPE_CHECKING:
+    from ..runs import AbstractModel
 
 # Recorded runs: quantities sampled at the times of a clock, converted to measurements.
 
@@ -24,7 +29,8 @@ class Quantities:
     """The quantities that can be recorded of a run.
 
     - `columns`: name of a quantity with several columns -> their names.
-    - `units`: name of a column -> its SI unit.
+    - `units`: name of a column -> its SI unit; empty if any quantity of a model can be recorded, such as "theta", or a
+      component of a vector, such as "position.x".
     - `angles`: columns with a period of a whole turn.
     - `usual`: column of an angle -> a magnitude [rad] that it rarely exceeds.
     - `launches`: what takes several launches with a measured time each, for messages.
@@ -42,18 +48,19 @@ class Quantities:
     usual: Mapping[str, float] = dataclasses.field(default_factory=dict)
     launches: str = ""
 
-    def of(self, quantity: Any) -> tuple[str, ...]:
+    def of(self, quantity: str | tuple[str, ...]) -> tuple[str, ...]:
         """The columns of a quantity, of a column, or of a tuple of them.
 
         **Raises:** `ValueError` for an unknown column, or one that is named twice.
         """
         words = quantity if isinstance(quantity, tuple) else (quantity,)
+        known = {**self.columns, **{name: (name,) for name in self.units}}
         columns: list[str] = []
         for word in words:
-            columns_of_name = {**self.columns, **{name: (name,) for name in self.units}}
-            if not isinstance(word, str) or word not in columns_of_name:
-                raise ValueError(f"quantity = {shown(word)} must be one of {', '.join(map(repr, columns_of_name))}")
-            columns += columns_of_name[word]
+            if not isinstance(word, str) or (known and word not in known):
+                names = ", ".join(map(repr, known)) or "the names of quantities, such as 'theta' or ('q0', 'q1')"
+                raise ValueError(f"quantity = {shown(word)} must be one of {names}")
+            columns += known.get(word, (word,))
         if not columns or len(set(columns)) < len(columns):
             raise ValueError(f"quantity = {shown(quantity)} must name at least one column, and each only once")
         return tuple(columns)
@@ -64,15 +71,17 @@ class Quantities:
         instead = f"; for launches with a measured time each, use {self.launches}" if self.launches else ""
         return f": a recording is one run, sampled at increasing times{instead}"
 
-    def place(self, column: str) -> tuple[str, int | None]:
-        """The quantity to which a column belongs, and the index of the component; `None` for a quantity of one column."""
+    def place(self, column: str) -> tuple[str, int | str | None]:
+        """The quantity to which a column belongs, and the index or the name of the component; `None` for a quantity of one
+        column."""
         for quantity, columns in self.columns.items():
             if column in columns:
                 return quantity, columns.index(column)
-        return column, None
+        name, _, component = column.partition(".")
+        return name, component or None
 
 
-def as_quantity(words: Any) -> Any:
+def as_quantity(words: object) -> Any:
     """A word, or a tuple of words.
 
     **Example:**
@@ -98,11 +107,11 @@ class AbstractRecording(eqx.Module):
     - `value`: (times,) for one column, (times, columns) for several; NaN where a sample is missing.
     - `error`: standard errors: a scalar, (columns,), or of the shape of `value`; with `None`, they are estimated for
       each column from the residuals.
-    - `quantity`: what was recorded: a quantity, a column, or a tuple of them.
+    - `quantity`: what was recorded: a quantity, a column, or a tuple of them. The attribute `quantities` of a subclass lists
+      what can be recorded.
     - `t0`: the clock's reading [s] at the launch.
-    - `student`: degrees of freedom of Student's t distribution of the errors; `None` for Gaussian errors. The attribute
-      `quantities` of a subclass lists what can be recorded. Its field `side`, where it has one, says which state a sample
-      at the time of a reset is: the one "before" or "after" it.
+    - `student`: degrees of freedom of Student's t distribution of the errors; `None` for Gaussian errors.
+    - `side`: "before" or "after": the state that a sample at the time of a reset is.
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
 
@@ -112,24 +121,21 @@ class AbstractRecording(eqx.Module):
     >>> from nonholonomic.identification import AbstractRecording, Quantities
     >>> class DecayRecording(AbstractRecording):
     ...     quantity: str = eqx.field(static=True, default="level")
-    ...     t0: float = 0.0
-    ...     student: None = None
     ...     quantities = Quantities({}, {"level": "1"}, frozenset())
     >>> DecayRecording(None, [1.0, 2.0], [0.37, 0.135], 0.005).labels
     ('level(1 s)', 'level(2 s)')
     """
 
+    quantities: eqx.AbstractClassVar[Quantities]
     launch: Any
     times: Float[Array, " times"] = eqx.field(converter=as_number)
     value: Float[Array, "times *columns"] = eqx.field(converter=as_number)
-    error: Any = eqx.field(converter=as_number_or_none)
-    quantity: eqx.AbstractVar[str | tuple[str, ...]]
-    t0: eqx.AbstractVar[Float[Array, ""]]
-    student: eqx.AbstractVar[Float[Array, ""] | None]
-    quantities: eqx.AbstractClassVar[Quantities]
+    error: Float[Array, "..."] | None = eqx.field(converter=as_number_or_none)
+    quantity: str | tuple[str, ...] = eqx.field(static=True, converter=as_quantity)
+    t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
+    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
+    side: str = eqx.field(static=True, default="before")
     units: ClassVar[dict[str, str]] = {"times": "s", "t0": "s"}
-    # Without an annotation: a subclass may have a field of this name.
-    side = "before"
 
     def __repr__(self) -> str:
         return one_line(self)
@@ -155,25 +161,19 @@ class AbstractRecording(eqx.Module):
             if np.shape(self.error) not in ((), shape[1:], shape):
                 raise ValueError(f"error must be one number, one for each column, or of shape {shape}")
             require(np.broadcast_to(self.error, shape)[seen], "error", above=0.0)
-        self._suspect_units()
         if self.student is not None:
             require(self.student, "student", above=0.0)
             if np.ndim(self.student) != 0:
                 raise ValueError(f"student must be one number, not of shape {np.shape(self.student)}")
-
-    def _suspect_units(self) -> None:
-        """Warn of angles that are unusually large for radians, and of samples too far apart for seconds."""
-        if self.quantities.usual and len(self.times) > 2 and (apart := np.median(np.diff(self.times))) > FAR_APART:
+        # Unusual units: samples too far apart for seconds, and angles too large for radians.
+        if self.quantities.usual and len(times) > 2 and (apart := np.median(np.diff(times))) > FAR_APART:
             warn(f"times: samples are {apart:g} s apart; times are in seconds: did you mean 1e-3 * times?")
-        samples = np.abs(np.asarray(self.value)).reshape(len(self.times), -1)
-        for name, limit in self.quantities.usual.items():
-            if name not in self.columns:
-                continue
-            greatest_angle = np.nanmax(samples[:, self.columns.index(name)], initial=0.0)
-            if greatest_angle > limit:
+        samples = np.abs(np.asarray(self.value)).reshape(len(times), -1)
+        for name in (name for name in self.quantities.usual if name in self.columns):
+            largest = np.nanmax(samples[:, self.columns.index(name)], initial=0.0)
+            if largest > self.quantities.usual[name]:
                 warn(
-                    f"{name} = {greatest_angle:g} rad is large; recorded angles are in radians: did you mean "
-                    f"np.radians({name})?"
+                    f"{name} = {largest:g} rad is large; recorded angles are in radians: did you mean np.radians({name})?"
                 )
 
     @property
@@ -186,10 +186,14 @@ class AbstractRecording(eqx.Module):
         """The quantities to which the columns belong."""
         return tuple(dict.fromkeys(self.quantities.place(column)[0] for column in self.columns))
 
-    def columns_of(self, model: Any, values: dict[str, Array]) -> list[Float[Array, " times"]]:
+    def columns_of(self, model: "AbstractModel", values: dict[str, Array]) -> list[Float[Array, " times"]]:
         """The columns of the recording from the values of quantities. **Arguments:** `model`: that of the run."""
-        places = [self.quantities.place(column) for column in self.columns]
-        return [values[name] if part is None else values[name][:, part] for name, part in places]
+        columns = []
+        for name, part in map(self.quantities.place, self.columns):
+            dims = model.quantities[name].components
+            index = model.components[dims].index(part) if isinstance(part, str) and dims is not None else part
+            columns.append(values[name] if index is None else values[name][:, index])
+        return columns
 
     @property
     def size(self) -> int:
@@ -207,18 +211,19 @@ class AbstractRecording(eqx.Module):
         all_labels = [f"{column}({time:.4g} s)" for time in np.asarray(self.times) for column in self.columns]
         return tuple(all_labels[i] for i in self.seen)
 
-    def labels_in(self, unit: Any) -> tuple[str, ...]:
+    def labels_in(self, unit: str | Sequence[str] | None) -> tuple[str, ...]:
         """Labels for a picture, which has the times below its curves."""
         return self.labels
 
     @property
     def series_units(self) -> tuple[str, ...]:
-        """The unit of each column, which is a series of the measurements."""
-        return tuple(self.quantities.units[name] for name in self.columns)
+        """The unit of each column, which is a series of the measurements; "1" where only the model knows it."""
+        return tuple(self.quantities.units.get(name, "1") for name in self.columns)
 
-    def units_of(self, model: Any) -> tuple[str, ...]:
+    def units_of(self, model: "AbstractModel") -> tuple[str, ...]:
         """The unit of each series, for the model of the run."""
-        return self.series_units
+        names = (self.quantities.place(column)[0] for column in self.columns)
+        return tuple(readable_unit(model.quantities[name].unit) or "1" for name in names)
 
     @property
     def measurements(self) -> Measurements:
@@ -227,15 +232,15 @@ class AbstractRecording(eqx.Module):
         error = noise(value) if self.error is None else np.asarray(self.error)
         if error.shape == np.shape(self.value):
             error = error.reshape(value.shape)
-        period = [2.0 * math.pi if name in self.quantities.angles else math.inf for name in self.columns]
+        is_angle = np.array([name in self.quantities.angles for name in self.columns])
 
-        def each(numbers_of: Any) -> np.ndarray:
+        def each(numbers_of: ArrayLike) -> np.ndarray:
             return np.broadcast_to(numbers_of, value.shape).reshape(-1)[self.seen]
 
         return Measurements(
             each(value),
             each(error),
-            period=each(period),
+            period=each(np.where(is_angle, 2.0 * math.pi, math.inf)),
             student=math.inf if self.student is None else float(self.student),
             series=each(np.arange(len(self.columns))),
             time=each((np.asarray(self.times) - float(self.times[0]))[:, None]),
@@ -268,6 +273,10 @@ SYNONYMS = {"°": "deg", "degree": "deg", "degrees": "deg", "°/s": "deg/s", "ra
 SYNONYMS |= {"sec": "s", "second": "s", "seconds": "s", "1/min": "rpm", "rev/min": "rpm", "U/min": "rpm"}
 
 
+#: What describes a column: a header with its unit, or a header (for an error, possibly a number) and a unit or factor.
+Column = object
+
+
 class TextTable(NamedTuple):
     """The cells of a file as text: header -> cells; the number of each row's line in the file; the decimal mark; and the
     headers that the file has more than once."""
@@ -281,7 +290,8 @@ class TextTable(NamedTuple):
     @classmethod
     def read(cls, path: Path, decimal: str) -> "TextTable":
         """Read a file of columns."""
-        text = [(number, line) for number, line in enumerate(_text(path).splitlines(), start=1) if _has_cells(line)]
+        lines = enumerate(_text(path).splitlines(), start=1)
+        text = [(number, line) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
         if len(text) < 2:
             raise ValueError(f"path = {str(path)!r} must have a header line and at least one line of numbers")
         marks = ("\t", ";") if decimal == "," else ("\t", ";", ",")
@@ -309,9 +319,9 @@ class TextTable(NamedTuple):
         repeated = tuple(header for header in cells if headers.count(header) > 1)
         return cls(path, cells, [number for number, _ in text[1:]], decimal, repeated)
 
-    def named(self, known: Mapping[str, str]) -> dict[str, Any]:
+    def named(self, known: Mapping[str, str]) -> dict[str, Column]:
         """The columns whose headers are names of the model's columns, with their headers."""
-        columns = {}
+        columns: dict[str, Column] = {}
         for header in self.cells:
             name, unit = _split(header)
             if name.lower() in known:
@@ -328,7 +338,7 @@ class TextTable(NamedTuple):
     def numbers(
         self,
         name: str,
-        header_and_unit: Any,
+        header_and_unit: Column,
         si: str,
         argument: str = "columns",
         remark: str = "",
@@ -340,7 +350,7 @@ class TextTable(NamedTuple):
         numbers = zip(self.lines, self.cells[header], strict=True)
         return size * np.array([self._number(header, line, cell, remark, infinite) for line, cell in numbers])
 
-    def errors(self, name: str, header_and_unit: Any, si: str) -> np.ndarray:
+    def errors(self, name: str, header_and_unit: Column, si: str) -> np.ndarray:
         """The standard errors of a column in SI units, from a column of their own or the same in all lines."""
         header, size = self.parts(name, header_and_unit, si, "error")
         if isinstance(header, str):
@@ -367,14 +377,16 @@ class TextTable(NamedTuple):
             raise ValueError(f"{place} must be finite: write n/a, or nothing, for a missing sample")
         return number
 
-    def parts(self, name: str, header_and_unit: Any, si: str, argument: str) -> tuple[Any, float]:
+    def parts(self, name: str, header_and_unit: Column, si: str, argument: str) -> tuple[Any, float]:
         """The header of a column (or, for an error, possibly a number), and the factor that converts the file's numbers to
         SI units.
 
         **Arguments:** `name`: name of the column of the model; `header_and_unit`: (header, unit), or a header with its
         unit; `si`: the SI unit; `argument`: "columns" or "error", for messages.
         """
-        first, unit = header_and_unit if _is_pair(header_and_unit) else (header_and_unit, None)
+        first, unit = header_and_unit, None
+        if isinstance(header_and_unit, tuple | list) and len(header_and_unit) == 2:
+            first, unit = header_and_unit
         of_header = None
         if isinstance(first, str):
             first = self._header(argument, name, first)
@@ -412,15 +424,15 @@ class TextTable(NamedTuple):
             )
         return matches[0]
 
-    def _ambiguous(self, argument: str, name: str, headers: list[Any]) -> ValueError:
+    def _ambiguous(self, argument: str, name: str, headers: Sequence[object]) -> ValueError:
         """The error for a column that the file has more than once."""
-        listed = " or ".join(shown(header) for header in (headers if len(headers) > 1 else 2 * headers))
+        listed = " or ".join(shown(header) for header in (headers if len(headers) > 1 else [*headers, *headers]))
         return ValueError(
             f"{argument}: {name!r} could be {listed}, columns of {str(self.path)!r}: rename one of them in the file, or pass "
             "the whole header if it differs from the other"
         )
 
-    def _expected(self, argument: str, si: str, header: Any) -> str:
+    def _expected(self, argument: str, si: str, header: object) -> str:
         """What describes a column or its errors, for messages."""
         unit = "deg" if si == "rad" else next(iter(UNITS[si]))
         if header is not None:
@@ -428,10 +440,6 @@ class TextTable(NamedTuple):
         if argument == "error":
             return f"(standard error, unit), such as (1.0, {unit!r}), or (header of a column of standard errors, unit)"
         return f"(header, unit), such as ('tilt', {unit!r}), or a header with its unit, such as 'tilt [{unit}]'"
-
-
-def _is_pair(value: Any) -> bool:
-    return isinstance(value, tuple | list) and len(value) == 2
 
 
 def _text(path: Path) -> str:
@@ -443,10 +451,6 @@ def _text(path: Path) -> str:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:
         return raw.decode("cp1252", errors="replace")
-
-
-def _has_cells(line: str) -> bool:
-    return bool(line.strip()) and not line.lstrip().startswith("#")
 
 
 def _split(header: str) -> tuple[str, str]:
@@ -485,7 +489,12 @@ class Read(NamedTuple):
 
 
 def read_columns(
-    path: Any, columns: Any, fps: float | None, error: Any, quantities: Quantities, decimal: str = "."
+    path: str | PathLike[str],
+    columns: Mapping[str, Column] | None,
+    fps: float | None,
+    error: Mapping[str, Column] | None,
+    quantities: Quantities,
+    decimal: str = ".",
 ) -> Read:
     """Read samples from a text file with a header line and columns separated by commas, semicolons, tabs or blanks.
 
@@ -524,7 +533,12 @@ def read_columns(
     times = _times(file, columns, fps)
     value = np.stack([file.numbers(name, columns[name], known[name]) for name in names], axis=1)
     mask = np.isfinite(times) & np.any(np.isfinite(value), axis=1)
-    _require_increasing(file, times, mask, quantities)
+    lines, seen = np.asarray(file.lines)[mask], times[mask]
+    for k in np.flatnonzero(np.diff(seen) <= 0.0)[:1]:
+        raise ValueError(
+            f"time = {seen[k + 1]:.6g} s in line {lines[k + 1]} of {str(file.path)!r} must be later than "
+            f"{seen[k]:.6g} s in line {lines[k]}{quantities.one_run}"
+        )
     errors = None
     if error is not None:
         if not isinstance(error, Mapping) or set(error) != set(names):
@@ -554,7 +568,12 @@ class ReadLaunches(NamedTuple):
 
 
 def read_launches(
-    path: Any, columns: Any, error: Any, units: Mapping[str, str], decimal: str = ".", never: Any = ()
+    path: str | PathLike[str],
+    columns: Mapping[str, Column] | None,
+    error: float | Mapping[str, Column],
+    units: Mapping[str, str],
+    decimal: str = ".",
+    never: str | Sequence[str] = (),
 ) -> ReadLaunches:
     """Read launches and the measured time of an event of each from a text file with a header line, a launch per line.
 
@@ -604,8 +623,12 @@ def read_launches(
 
 
 def _opened(
-    path: Any, columns: Any, decimal: Any, known: Mapping[str, str], several: Mapping[str, tuple[str, ...]]
-) -> tuple[TextTable, Mapping[str, Any]]:
+    path: str | PathLike[str],
+    columns: Mapping[str, Column] | None,
+    decimal: str,
+    known: Mapping[str, str],
+    several: Mapping[str, tuple[str, ...]],
+) -> tuple[TextTable, Mapping[str, Column]]:
     """The file and its columns, checked. **Arguments:** `known`: name of a column -> its SI unit; `several`: names that
     stand for several columns."""
     if decimal not in (".", ","):
@@ -626,7 +649,7 @@ def _opened(
 
 
 def _times_of_launches(
-    file: TextTable, header_and_unit: Any, never: Any
+    file: TextTable, header_and_unit: Column, never: str | Sequence[str]
 ) -> tuple[Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]:
     """The times of all lines, infinite where the event did not happen, and the limits that the file states."""
     words = (never,) if isinstance(never, str) else never
@@ -656,7 +679,7 @@ def _times_of_launches(
     return np.where(is_limit, np.inf, time), np.where(is_limit, time, np.nan)
 
 
-def _errors_of_times(file: TextTable, error: Any) -> Float[np.ndarray, "*lines"]:
+def _errors_of_times(file: TextTable, error: float | Mapping[str, Column]) -> Float[np.ndarray, "*lines"]:
     """The standard errors of the times [s]."""
     if isinstance(error, Mapping):
         if set(error) != {"time"}:
@@ -670,17 +693,7 @@ def _errors_of_times(file: TextTable, error: Any) -> Float[np.ndarray, "*lines"]
     return np.asarray(error, float)
 
 
-def _require_increasing(file: TextTable, times: np.ndarray, mask: np.ndarray, quantities: Quantities) -> None:
-    """Raise `ValueError` unless the times of the samples increase."""
-    lines, seen = np.asarray(file.lines)[mask], times[mask]
-    for k in np.flatnonzero(np.diff(seen) <= 0.0)[:1]:
-        raise ValueError(
-            f"time = {seen[k + 1]:.6g} s in line {lines[k + 1]} of {str(file.path)!r} must be later than "
-            f"{seen[k]:.6g} s in line {lines[k]}{quantities.one_run}"
-        )
-
-
-def _times(file: TextTable, columns: Mapping[str, Any], fps: Any) -> np.ndarray:
+def _times(file: TextTable, columns: Mapping[str, Column], fps: float | None) -> np.ndarray:
     """The clock's readings in all lines [s]."""
     if fps is not None:
         require(fps, "fps", above=0.0)

@@ -1,45 +1,41 @@
-"""Estimate parameters by maximum likelihood, and the result of a fit."""
+"""Estimate parameters by maximum likelihood, and draw from their posterior.
+
+The exploration of the posterior (`exploration.py`) leaves a mixture of heavy-tailed distributions around all its minima. Each
+chain of draws begins at one of the weighted points of the exploration, proposes draws of the mixture, and accepts them by
+Metropolis and Hastings' rule, so that its draws come from the posterior itself, whatever the mixture is. Because proposals do
+not depend on the chains, the runs of all chains and draws are computed together; a mixture that misses a part of the posterior
+shows in few accepted proposals, and in R-hat and ESS (Tierney, Ann. Stat. 22 (1994) 1701).
+"""
 
 import dataclasses
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, ArrayLike, Float
 
 from ..parameters import ByName, full_name
 from ..terminal import status_line
 from ..text import counted, readable_unit, require_unit, shown, text_as_html
 from ..validation import require, require_flag, require_package, require_scalars, require_whole, warn
 from ..views import draw_fit
-from .conclusions import (
-    CLOSE,
-    SAME,
-    Distribution,
-    FitWarning,
-    Minimum,
-    Profile,
-    Verdict,
-    judge,
-    minima_of,
-    profiled,
-    remarks,
-    unsearched,
-    without_prediction,
-)
-from .exploration import ROWS, Explorer, Weighted
-from .least_squares import Identifiability, Minima, identifiability
-from .likelihood import Measurements, as_free, joined_data, numbered
-from .posterior import LogDensity, Problem, predictions
+from .conclusions import Distribution, Profile, Verdict, judge, profiled
+from .exploration import ROWS, Explorer, Mixture, Weighted, draw_errors
+from .likelihood import Free, Measurements, joined_data, numbered
+from .posterior import LogDensity, Model, Problem, predictions
 from .recording import AbstractRecording
-from .sampling import search
+from .search import FitWarning, Identifiability, Minima, identifiability, search
 
 # The result of a fit: estimates, errors, undetermined combinations, and the outcome of every start.
 
 #: The most likely value is stated where it is farther from the estimate than this part of a standard error.
 NOTICEABLE = 0.1
+
+#: Number of points of a curve, and the greatest number of predictions for each sample.
+POINTS, MOST = 1200, 16
 
 #: Greatest number of rows of the residual table in a summary.
 MOST_ROWS = 24
@@ -145,7 +141,7 @@ class Identification:
         return float(ends[0]), float(ends[1])
 
     @status_line("fitting again")
-    def profile(self, name: str, values: Any = None) -> Profile:
+    def profile(self, name: str, values: ArrayLike | None = None) -> Profile:
         """The profile likelihood of a parameter: the best likelihood with all other parameters free, for each of its
         values.
 
@@ -172,7 +168,7 @@ class Identification:
             self.profiles[k] = self._profiled(k, name, np.linspace(*self.interval(name, 3.0), 13))
         return self.profiles[k]
 
-    def _profiled(self, k: int, name: str, values: Any) -> Profile:
+    def _profiled(self, k: int, name: str, values: ArrayLike) -> Profile:
         """The profile of the parameter with index `k`, which the user calls `name`."""
         free, values = self.problem.unknowns[k], np.atleast_1d(np.asarray(values, float))
         if not np.all((values > free.lower) & (values < free.upper)):
@@ -187,9 +183,35 @@ class Identification:
     @property
     def curves(self) -> tuple[Float[np.ndarray, "slices n"], Float[np.ndarray, "slices n"]]:
         """Times since the first sample of each recording [s] and predictions, at and between the samples, at the most likely
-        point; empty without recordings."""
-        pairs = zip(self.problem.unknowns, self.most_likely.values(), strict=True)
-        return fine_predictions(self.problem, np.array([float(unknown.coordinate(value)) for unknown, value in pairs]))
+        point; empty without recordings.
+
+        Every slice has as many samples as the recordings, at times that are shifted by a fraction of the distance to the next
+        sample, so that the program of the fit predicts them.
+        """
+        problem, data = self.problem, getattr(self.problem.model, "recorded", ())
+        sizes = [len(source.times) for source in data if isinstance(source, AbstractRecording)]
+        if not sizes:
+            return np.zeros((0, 0)), np.zeros((0, 0))
+        pairs = zip(problem.unknowns, self.most_likely.values(), strict=True)
+        coordinates = np.array([float(unknown.coordinate(value)) for unknown, value in pairs])
+        count = int(np.clip(np.ceil(POINTS / max(sizes)), 1, MOST))
+        slices = []
+        for share in np.arange(count) / count:
+            shifted, offsets = [], []
+            for source in data:
+                offsets.append(np.zeros(len(source.seen)))
+                if isinstance(source, AbstractRecording):
+                    times = np.asarray(source.times)
+                    last = times[-1] + share * 1e-6 * (times[-1] - times[0])
+                    moved = np.append(times[:-1] + share * np.diff(times), last)
+                    offsets[-1] += moved[0] - times[0]
+                    source = dataclasses.replace(source, times=moved)
+                shifted.append(source)
+            there = eqx.tree_at(lambda problem: problem.model, problem, problem.model.with_recorded(tuple(shifted)))
+            times = np.asarray(joined_data(shifted)[0].time) + np.concatenate(offsets)
+            slices.append((times, predictions(there, coordinates[None])[0]))
+        times, values = zip(*slices, strict=True)
+        return np.stack(times), np.stack(values)
 
     @property
     def correlation(self) -> Float[np.ndarray, "unknowns unknowns"]:
@@ -212,14 +234,9 @@ class Identification:
         """
         require_package("matplotlib", "plot", "plot")
         require_unit(unit)
-        return draw_fit(self, self._labels(unit), unit)
-
-    def _labels(self, unit: Any) -> tuple[str, ...]:
-        """Short names of the measurements for a picture."""
         sources = getattr(self.problem.model, "recorded", ())
-        if not sources:
-            return tuple(row.label for row in self.residuals)
-        return numbered([source.labels_in(unit) for source in sources])
+        labels = [source.labels_in(unit) for source in sources] or [[row.label for row in self.residuals]]
+        return draw_fit(self, numbered(labels), unit)
 
     def _place(self, name: str) -> int:
         valid = list(self.estimates)
@@ -262,68 +279,44 @@ class Identification:
         return "\n".join(lines)
 
 
-def summarise(
-    problem: Problem, labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample: Weighted
-) -> Identification:
+def summarise(labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample: Weighted) -> Identification:
     """The result of a search and an exploration: the best fit, errors and intervals, and a record of all ends."""
-    names, best, measurements = problem.names, ends.best, ends.measurements
-    deviances, linearised = ends.deviance, ends.linearised
+    problem, best, measurements, count = explorer.density.problem, ends.best, ends.measurements, len(labels)
+    deviances, linearised, optimum = ends.deviance, ends.linearised, ends.coordinates[ends.best]
     statuses = tuple(
         "failed" if np.isinf(deviance) else "converged" if has_converged else "not_converged"
         for deviance, has_converged in zip(deviances, ends.converged, strict=True)
     )
-    optimum, by_slopes = ends.coordinates[best], ends.covariance(best)
+    by_slopes, slopes = ends.covariance(best), problem.slopes(optimum)
     distribution = Distribution.of(optimum, by_slopes, sample)
-    values, start_values, likely, estimates = (
-        np.asarray(problem.values(np.asarray(points)))
-        for points in (ends.coordinates, ends.starts, optimum, distribution.estimate)
-    )
-    slopes = problem.slopes(optimum)
-    covariance = distribution.covariance_of_values(problem, slopes)
-    prediction, residual = linearised.prediction[best], linearised.residual[best]
-    numbers = (measurements.value, measurements.error, prediction, residual, measurements.upper)
-    table = zip(labels, *(np.asarray(part).tolist() for part in numbers), strict=True)
-    combinations = identifiability(problem, likely, slopes, linearised.information[best])
-    priors, limits = linearised.prior.shape[-1], int(np.sum(np.asarray(measurements.censored)))
-    degrees = len(labels) + priors - len(names)
-    # Where the weights hold, a search by slopes that got stuck on a stair does not matter.
-    status = "converged" if distribution.kind == "weights" else statuses[best]
-    minima, concerns, notes = _shape(explorer, sample, distribution, by_slopes)
-    explored = Verdict(
-        p_value=math.nan,
-        series=(),
-        agree=agreement(ends.coordinates, deviances, by_slopes, best),
-        starts=len(deviances),
-        undetermined=combinations.unseen,
-        concerns=concerns,
-        notes=notes,
-        effective=sample.effective,
-        k=sample.k,
-        minima=minima,
-    )
-    trusted = distribution.kind != "none"
+    likely, covariance = problem.values(optimum), distribution.covariance_of_values(problem, slopes)
+    numbers = (measurements.value, measurements.error, linearised.prediction[best], linearised.residual[best, :count])
+    table = zip(labels, *(np.asarray(part).tolist() for part in (*numbers, measurements.upper)), strict=True)
+    combinations = identifiability(problem, likely, slopes, linearised.information[best, :count])
+    # Where the weights hold, a search by slopes that got stuck on a stair, or ended early, does not matter.
+    status = "converged" if distribution.kind in ("weights", "linear") else statuses[best]
     with np.errstate(invalid="ignore"):
         slope_covariance = np.where(by_slopes == 0.0, 0.0, by_slopes * np.outer(slopes, slopes))
 
-    def by_name(numbers: np.ndarray) -> dict[str, Any]:
-        return ByName(zip(names, numbers.tolist() if numbers.ndim == 1 else numbers, strict=True))
+    def by_name(numbers: Sequence[Any] | np.ndarray) -> dict[str, Any]:
+        return ByName(zip(problem.names, numbers, strict=True))
 
     return Identification(
-        estimates=by_name(estimates),
-        standard_errors=by_name(np.sqrt(np.diag(covariance))),
+        estimates=by_name(problem.values(distribution.estimate).tolist()),
+        standard_errors=by_name(np.sqrt(np.diag(covariance)).tolist()),
         covariance=covariance,
-        most_likely=by_name(likely),
-        slope_errors=by_name(np.sqrt(np.diag(slope_covariance))),
+        most_likely=by_name(likely.tolist()),
+        slope_errors=by_name(np.sqrt(np.diag(slope_covariance)).tolist()),
         deviance=float(deviances[best]),
-        degrees=degrees,
+        degrees=linearised.residual.shape[1] - len(likely),
         identifiability=combinations,
         residuals=tuple(ResidualRow(*row) for row in table),
         status=status,
-        starts=by_name(start_values.T),
-        ends=by_name(values.T),
+        starts=by_name(problem.values(ends.starts).T),
+        ends=by_name(problem.values(ends.coordinates).T),
         end_deviances=deviances,
         statuses=statuses,
-        verdict=judge(measurements, prediction, residual, degrees - limits, status, trusted, explored),
+        verdict=judge(ends, explorer, sample, distribution, combinations.unseen, status),
         coordinates=distribution.estimate,
         coordinate_covariance=distribution.covariance,
         distribution=distribution,
@@ -333,87 +326,13 @@ def summarise(
     )
 
 
-def _shape(
-    explorer: Explorer, sample: Weighted, distribution: Distribution, by_slopes: np.ndarray
-) -> tuple[tuple[Minimum, ...], tuple[str, ...], tuple[str, ...]]:
-    """The minima that the data allow, and concerns and notes about the shape of the likelihood."""
-    concerns, notes = without_prediction(explorer, sample, distribution)
-    notes = (*unsearched(explorer, distribution.estimate), *notes)
-    if distribution.kind != "weights":
-        return (), concerns, notes
-    further, others = remarks(explorer, sample, distribution, by_slopes)
-    return minima_of(explorer, sample), (*concerns, *further), (*notes, *others)
-
-
-def agreement(
-    ends: Float[np.ndarray, "starts unknowns"],
-    deviances: Float[np.ndarray, " starts"],
-    covariance: Float[np.ndarray, "unknowns unknowns"],
-    best: int,
-) -> int:
-    """The number of ends that are at the best minimum."""
-    errors = np.sqrt(np.diag(covariance))
-    with np.errstate(invalid="ignore"):
-        distances = np.abs(ends - ends[best]) / errors
-    # Parameters of infinite error are ignored: their value does not matter.
-    is_close = np.all(np.where(np.isfinite(errors), distances, 0.0) < CLOSE, axis=1) | (
-        deviances < deviances[best] + SAME
-    )
-    return int(np.sum(is_close & (deviances < deviances[best] + 1.0)))
-
-
-# Predictions of a fit between the samples of its recordings, to be drawn as curves.
-
-#: Number of points of a curve, and the greatest number of predictions for each sample.
-POINTS, MOST = 1200, 16
-
-
-def fine_predictions(
-    problem: Problem, coordinates: Float[np.ndarray, " unknowns"]
-) -> tuple[Float[np.ndarray, "slices n"], Float[np.ndarray, "slices n"]]:
-    """Times and predictions at and between the samples of all recordings, and other predictions, for the coordinates of a fit.
-
-    Every slice has as many samples as the recordings, at times that are shifted by a fraction of the distance to the next
-    sample, so that the program of the fit predicts them. Without recordings there are no slices.
-
-    **Returns:** times since the first sample of each recording [s], and predictions.
-    """
-    data = getattr(problem.model, "recorded", ())
-    sizes = [len(source.times) for source in data if isinstance(source, AbstractRecording)]
-    if not sizes:
-        return np.zeros((0, 0)), np.zeros((0, 0))
-    count = int(np.clip(np.ceil(POINTS / max(sizes)), 1, MOST))
-    slices = []
-    for k in range(count):
-        shifted = tuple(_shifted(source, k / count) for source in data)
-        moved = eqx.tree_at(lambda problem: problem.model, problem, problem.model.with_recorded(shifted))
-        offsets = [
-            float(new.times[0] - old.times[0]) if isinstance(old, AbstractRecording) else 0.0
-            for new, old in zip(shifted, data, strict=True)
-        ]
-        offset = np.repeat(offsets, [len(source.seen) for source in data])
-        slices.append((np.asarray(joined_data(shifted)[0].time) + offset, predictions(moved, coordinates[None])[0]))
-    times, values = zip(*slices, strict=True)
-    return np.stack(times), np.stack(values)
-
-
-def _shifted(recording: Any, share: float) -> Any:
-    """A recording at times that are moved by a share of the distance to the next sample, where the last sample stays; other
-    data unchanged."""
-    if not isinstance(recording, AbstractRecording):
-        return recording
-    times = np.asarray(recording.times)
-    moved = np.append(times[:-1] + share * np.diff(times), times[-1] + share * 1e-6 * (times[-1] - times[0]))
-    return dataclasses.replace(recording, times=moved)
-
-
 # Estimate parameters by maximum likelihood, with errors and undetermined combinations.
 
 
 def identify(
-    model: Callable[[dict[str, Any]], Any],
+    model: Model,
     measurements: Measurements,
-    free: dict[str, Any],
+    free: Mapping[str, Free | float],
     *,
     starts: int = 16,
     spread: float = 2.0,
@@ -425,11 +344,11 @@ def identify(
 ) -> Identification:
     """Find the parameters of a model that make measurements most likely, and how far the measurements determine them.
 
-    The search has three steps, all in batches. It compares hundreds of quasi-random candidates in a region around the start
-    values (`exploration.py`), refines the best by Levenberg-Marquardt (`least_squares.py`), and explores the likelihood around
-    all minima by adaptive importance sampling (`exploration.py`), until errors and intervals rest on at least 400 effective
-    draws. Slopes make the search fast; they do not enter errors and intervals unless the likelihood is that of a linear
-    model.
+    The search has three steps, all in batches. It compares quasi-random candidates in a region around the start values, 64 for
+    a single unknown and up to 512 for several, refines the best by Levenberg-Marquardt (`search.py`), and explores the
+    likelihood around all minima by adaptive importance sampling (`exploration.py`), until errors and intervals rest on at
+    least 400 effective draws. Slopes make the search fast; they do not enter errors and intervals unless the likelihood is
+    that of a linear model.
 
     **Arguments:**
 
@@ -437,7 +356,7 @@ def identify(
       one set of parameters. With exact `slopes`, JAX differentiates the model in forward mode. A row of NaN may give NaN.
     - `measurements`: `Measurements` of shape (n,).
     - `free`: name -> a `Free`, or only the start value.
-    - `starts`: number of candidates that are refined.
+    - `starts`: greatest number of candidates that are refined.
     - `spread`: how far from its start value an unknown with one bound is searched, as a factor greater than 1 in either
       direction. Priors and two bounds take precedence. A number of a launch is searched within 10 %, and `t0` within 2 % of
       the duration of the recording. Refinement and exploration may leave this region.
@@ -466,7 +385,6 @@ def identify(
     0.99 +- 0.05, good: True
     """
     check_search(starts, spread, seed, max_steps, progress)
-    unknowns = as_free(free)
     if not isinstance(measurements, Measurements) or measurements.value.ndim != 1:
         raise ValueError(f"measurements = {shown(measurements)} must be Measurements of shape (n,)")
     count = measurements.value.size
@@ -474,16 +392,16 @@ def identify(
     if len(labels) != count:
         raise ValueError(f"labels must be {count}, one for each measurement, not {len(labels)}")
     with status_line("fitting", progress):
-        density = LogDensity.of(model, measurements, unknowns, slopes=slopes)
-        explorer = Explorer.of(density, unknowns, spread, seed)
+        density = LogDensity.of(model, measurements, free, slopes=slopes)
+        explorer = Explorer.of(density, spread, seed)
         explorer, minima, sample = search(explorer, starts, max_steps, seed, progress)
-        result = summarise(explorer.density.problem, labels, minima, explorer, sample)
+        result = summarise(labels, minima, explorer, sample)
     if not result.verdict.good:
         warn("; ".join(result.verdict.concerns), FitWarning)
     return result
 
 
-def check_search(starts: Any, spread: Any, seed: Any, max_steps: Any, progress: Any) -> None:
+def check_search(starts: int, spread: float, seed: int, max_steps: int, progress: bool) -> None:
     """Raise `ValueError` unless the arguments are legal for `identify`; a model checks them before it prepares its
     data."""
     for name, value, lower in (("starts", starts, 1), ("seed", seed, 0), ("max_steps", max_steps, 1)):
@@ -493,3 +411,229 @@ def check_search(starts: Any, spread: Any, seed: Any, max_steps: Any, progress: 
     require(spread, "spread", above=1.0)
     require_scalars({"spread": spread}, "it spreads the starts of all parameters")
     require_flag(progress, "progress")
+
+
+# Draws from the posterior.
+
+#: Number of proposals for each draw.
+MOVES = 2
+
+#: Options of the search: range, refined candidates, and their steps.
+SPREAD, STARTS, STEPS = 2.0, 16, 60
+
+#: Draws are from a posterior only if at least this fraction of the proposals is accepted, and if every unknown has at least
+#: this many effective draws for each chain.
+LEAST_ACCEPTED, LEAST_ESS = 0.02, 50.0
+
+#: Draws are far less probable than the start if its log density exceeds their median by more than this and 1 for each unknown;
+#: the most probable point exceeds the median of a normal distribution by about 0.5 for each unknown.
+FAR_BELOW = 10.0
+
+
+class Draws(NamedTuple):
+    """Draws from a posterior.
+
+    - `values`: name -> (chains, draws), where the end of a name is enough; `coordinates`: (chains, draws, unknowns).
+    - `r_hat`, `ess`: name -> number: the potential scale reduction, which should be below 1.01, and the effective number of
+      independent draws.
+    - `units`: name -> unit, of the unknown errors.
+    - `accepted`: fraction of accepted proposals; `runs`: number of parameter sets for which the model ran.
+    - `flaws`: why the draws are not from the posterior, in words; empty if they are, as `good` says. `concerns`: what else to
+      check.
+
+    **Example:** as for `sample`.
+
+    >>> from nonholonomic.identification import Draws
+    >>> Draws._fields[:3]
+    ('values', 'coordinates', 'r_hat')
+    """
+
+    values: dict[str, Float[np.ndarray, "chains draws"]]
+    coordinates: Float[np.ndarray, "chains draws unknowns"]
+    r_hat: dict[str, float]
+    ess: dict[str, float]
+    accepted: float
+    runs: int
+    units: dict[str, str]
+    flaws: tuple[str, ...] = ()
+    concerns: tuple[str, ...] = ()
+
+    @property
+    def good(self) -> bool:
+        """Whether the draws can be used as those of a posterior."""
+        return not self.flaws
+
+    @classmethod
+    def of(
+        cls,
+        density: LogDensity,
+        coordinates: Float[np.ndarray, "chains draws unknowns"],
+        accepted: float,
+        runs: int,
+        excess: float = 0.0,
+    ) -> "Draws":
+        """Draws at given coordinates, with diagnostics. **Arguments:** `excess`: of the log density at the start over the
+        median of the draws."""
+        values = ByName((name, np.asarray(value)) for name, value in density.values(jnp.asarray(coordinates)).items())
+        draws = map(np.asarray, _diagnosed(coordinates))
+        # For a single unknown, these are numbers instead of lists.
+        draws_by_name = (ByName(zip(density.names, numbers.reshape(-1).tolist(), strict=True)) for numbers in draws)
+        r_hat, ess = draws_by_name
+        flaws, concerns = _judged(ess, len(coordinates), accepted), ()
+        if excess > FAR_BELOW + len(ess):
+            concerns = (
+                f"the start is more probable than the draws, by a factor of exp({excess:.4g}): the search missed its "
+                "surroundings; start closer, state priors or bounds, or pass the coordinates of a fit",
+            )
+        return cls(values, coordinates, r_hat, ess, accepted, runs, density.units, flaws, concerns)
+
+    def __str__(self) -> str:
+        width = max(map(len, self.values))
+        chains, draws = next(iter(self.values.values())).shape
+        lines = [f"{chains} chains of {draws} draws, {100.0 * self.accepted:.0f} % accepted, {self.runs} runs"]
+        for name, value in self.values.items():
+            low, middle, high = np.quantile(value, (0.025, 0.5, 0.975))
+            interval = f"{middle:.6g}  ({low:.6g}, {high:.6g})" if self.good else "no interval"
+            quality = f"R-hat {self.r_hat[name]:.4f}, ESS {self.ess[name]:.0f}"
+            unit = f" {readable_unit(self.units[name])}" if name in self.units else ""
+            lines.append(f"  {name:{width}}  {interval}{unit}  {quality}")
+        lines += [f"  NO POSTERIOR: {flaw}" for flaw in self.flaws] + [f"  BUT {concern}" for concern in self.concerns]
+        return "\n".join(lines)
+
+
+def sample(
+    density: LogDensity,
+    centre: ArrayLike | None = None,
+    covariance: ArrayLike | None = None,
+    *,
+    chains: int = 4,
+    warmup: int = 25,
+    draws: int = 500,
+    seed: int = 0,
+    progress: bool = True,
+) -> Draws:
+    """Draw from a posterior, with all its minima.
+
+    **Arguments:**
+
+    - `density`: a `LogDensity`.
+    - `centre`, `covariance`: (unknowns,), (unknowns, unknowns), the `coordinates` and `coordinate_covariance` of an
+      `Identification`, which make the search faster; `None` without a fit.
+    - `chains`: number of chains, at least 2, because R-hat compares chains; `warmup`, `draws`: number of draws of each
+      chain that are discarded and kept; `seed`.
+    - `progress`: whether to show progress, on a terminal or in a notebook.
+
+    **Returns:** `Draws`. If hardly a proposal was accepted, or if an unknown has an ESS below 50 for each chain, these are not
+    draws from the posterior: `draws.good` is false, `draws.flaws` says why, and a `FitWarning` is given, also for draws that
+    are far less probable than the start.
+
+    **Raises:** `ValueError` for arguments out of range, and `ModuleNotFoundError` without BlackJAX, whose diagnostics it uses.
+
+    **Example:** the rate of the subpackage's example.
+
+    >>> from nonholonomic.identification import sample
+    >>> draws = sample(LogDensity.of(decay, measured, free), draws=200, progress=False)
+    >>> print(f"{draws.values['rate'].mean():.2f}")
+    1.00
+    """
+    require_package("blackjax", "bayes", "sample")
+    for name, value, lower in (("chains", chains, 2), ("warmup", warmup, 0), ("draws", draws, 2), ("seed", seed, 0)):
+        require_whole(value, name, lower)
+    require_flag(progress, "progress")
+    known = None
+    if centre is not None:
+        # A component around a fit.
+        numbers, covariance = len(density.problem.names), np.asarray(covariance, float)
+        if covariance.shape != (numbers, numbers) or not np.all(np.isfinite(covariance)):
+            raise ValueError(
+                f"covariance must be finite and of shape {(numbers, numbers)}: the data do not determine all numbers"
+            )
+        if np.shape(centre) != (numbers,):
+            raise ValueError(f"centre = {shown(centre)} must be of shape {(numbers,)}")
+        known = Mixture(np.ones(1), np.asarray(centre, float)[None], np.linalg.cholesky(covariance)[None])
+    with status_line("sampling", progress):
+        sizes = (chains, MOVES * warmup, draws)
+        coordinates, accepted, runs, excess = drawn(density, known, sizes, seed, progress)
+    with status_line("diagnosing the draws", progress):
+        posterior = Draws.of(density, coordinates, accepted, runs, excess)
+    if words := (*(f"these are no draws from the posterior: {flaw}" for flaw in posterior.flaws), *posterior.concerns):
+        warn("; ".join(words), FitWarning)
+    return posterior
+
+
+def _judged(ess: dict[str, float], chains: int, accepted: float) -> tuple[str, ...]:
+    """Why draws are not from a posterior, in words."""
+    name, least = min(ess.items(), key=lambda item: item[1] if item[1] > 0.0 else 0.0)
+    flaws = []
+    if accepted < LEAST_ACCEPTED:
+        flaws.append(
+            f"only {100.0 * accepted:.2g} % of the proposals were accepted: start closer, or state priors or bounds that "
+            "contain the truth"
+        )
+    # The ESS of chains that never move is not a number.
+    if not least >= LEAST_ESS * chains:
+        flaws.append(
+            f"the ESS of {name} is {least:.0f}, below {LEAST_ESS:.0f} for each of {chains} chains: ask for more draws"
+        )
+    return tuple(flaws)
+
+
+def drawn(
+    density: LogDensity, known: Mixture | None, sizes: tuple[int, int, int], seed: int, progress: bool
+) -> tuple[Float[np.ndarray, "chains draws unknowns"], float, int, float]:
+    """Coordinates of draws, the fraction of accepted proposals, the number of runs, and the excess of the log density at the
+    start over the median of the draws.
+
+    **Arguments:** `known`: a component around a fit, or `None`; `sizes`: numbers of chains, of steps before the first
+    draw, and of draws; the others as for `sample`.
+    """
+    chains, discarded, draws = sizes
+    explorer, random = Explorer.of(density, SPREAD, seed), np.random.default_rng(seed)
+    explorer, minima, explored = search(explorer, STARTS, STEPS, seed, progress)
+    components = minima.components
+    if known is not None:
+        components = known if components is None else components.joined(known, 0.5)
+    proposal = explorer.proposal(explored.pool, components)
+    steps = discarded + MOVES * draws
+    first = explored.pool.points[random.choice(explored.runs, chains, p=explored.weights)]
+    start = np.asarray(density.start)[None, : len(density.problem.names)]
+    points = np.concatenate([first, proposal.draw(chains * steps, random)])
+    predictions, log_density = _runs(explorer, np.concatenate([points, start]))
+    order = random.permutation(np.arange(chains, len(points))).reshape(steps, chains)
+    path, accepted = _chains(order, log_density[:-1] - proposal.log_density(points), chains, random)
+    kept = path[discarded + MOVES - 1 :: MOVES].T.reshape(-1)
+    errors = draw_errors(density.measurements, predictions[kept], random)
+    coordinates = np.concatenate([points[kept], errors], axis=1).reshape(chains, draws, -1)
+    excess = float(log_density[-1] - np.median(log_density[kept]))
+    return coordinates, accepted, explored.runs + len(points), excess
+
+
+def _runs(explorer: Explorer, points: Float[np.ndarray, "n unknowns"]) -> tuple[np.ndarray, np.ndarray]:
+    """Predictions and log densities of all points, in batches."""
+    parts = [explorer.evaluated(points[first : first + ROWS]) for first in range(0, len(points), ROWS)]
+    return np.concatenate([part[0] for part in parts]), np.concatenate([part[3] for part in parts])
+
+
+def _chains(
+    order: np.ndarray, ratios: Float[np.ndarray, " points"], chains: int, random: np.random.Generator
+) -> tuple[np.ndarray, float]:
+    """The index of the point of every chain after each step, (steps, chains), and the fraction of accepted proposals.
+
+    The first points are those at which the chains begin.
+    """
+    state, path, accepted = np.arange(chains), np.empty(order.shape, int), 0.0
+    ratios = np.where(np.isfinite(ratios), ratios, -np.inf)
+    for step, proposed in enumerate(order):
+        accept = np.log(random.uniform(size=chains)) < ratios[proposed] - ratios[state]
+        state = np.where(accept, proposed, state)
+        path[step] = state
+        accepted += float(np.mean(accept)) / len(order)
+    return path, accepted
+
+
+@jax.jit
+def _diagnosed(coordinates: Float[Array | np.ndarray, "chains draws unknowns"]) -> tuple[Array, Array]:
+    """The potential scale reduction and the effective sample size of every unknown."""
+    from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
+
+    return potential_scale_reduction(coordinates), effective_sample_size(coordinates)

@@ -3,9 +3,9 @@
 import abc
 import dataclasses
 import math
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -16,13 +16,14 @@ from jaxtyping import Array, Bool, Float, Int
 from ..compilation.xla_cpu import greatest
 from ..identification import AbstractRecording, Free, Identification, LogDensity, Measurements, Quantities, as_quantity
 from ..identification.likelihood import free_numbers, joined_data, of_data, own_name
+from ..identification.posterior import Prior
 from ..identification.result import check_search
 from ..identification.result import identify as most_likely
 from ..integration import Settings
 from ..integration.problem import MOST_STEPS, tolerance_bound
 from ..parameters import full_name, require_apart
 from ..terminal import status_line
-from ..text import likely, one_line, readable_unit, shown
+from ..text import likely, one_line, shown
 from ..validation import as_number, as_number_or_none, nan_unless, require
 from .event import SILENT, time_of_event
 from .model import AbstractModel, check_run, model_of, require_event
@@ -36,19 +37,6 @@ BEYOND = 8.0
 
 #: Quantities with a period of a whole turn.
 ANGLES = frozenset({"azimuth", "eta", "heading", "spin_angle"})
-
-
-@dataclasses.dataclass(frozen=True)
-class AnyQuantities(Quantities):
-    """Quantities of a model that is not yet known: names, or components of vectors such as "position.x"."""
-
-    def of(self, quantity: Any) -> tuple[str, ...]:
-        names = quantity if isinstance(quantity, tuple) else (quantity,)
-        if not names or not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
-            raise ValueError(
-                f"quantity = {shown(quantity)} must name quantities, such as 'theta' or ('q0', 'q1'), each once"
-            )
-        return names
 
 
 class Recording(AbstractRecording):
@@ -66,8 +54,8 @@ class Recording(AbstractRecording):
     - `t0`: the clock's reading at the start.
     - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for outliers; `None`:
       Gaussian.
-    - `input`: the input of a stroller; `jumps`: times [s] at which it jumps, as for `stroller.simulate`.
     - `side`: "before" or "after": the state that a sample at the time of a reset is; a level after a dose is "after".
+    - `input`: the input of a stroller; `jumps`: times [s] at which it jumps, as for `stroller.simulate`.
 
     **Raises:** `ValueError` for shapes that do not fit.
 
@@ -80,56 +68,26 @@ class Recording(AbstractRecording):
     """
 
     quantity: str | tuple[str, ...] = eqx.field(static=True, default="y0", converter=as_quantity)
-    t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
-    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     input: Any = None
-    jumps: Any = None
-    side: str = eqx.field(static=True, default="before")
-    quantities: ClassVar[Quantities] = AnyQuantities({}, {}, ANGLES)
+    jumps: Sequence[float] | Array | None = None
+    quantities: ClassVar[Quantities] = Quantities({}, {}, ANGLES)
 
-    @property
-    def series_units(self) -> tuple[str, ...]:
-        # The system knows them; see `units_of`.
-        return ("1",) * len(self.columns)
-
-    def units_of(self, model: AbstractModel) -> tuple[str, ...]:
-        return tuple(readable_unit(model.quantities[name.partition(".")[0]].unit) or "1" for name in self.columns)
-
-    def model(self, system: Any) -> AbstractModel:
+    def model(self, system: object) -> AbstractModel:
         """The model of the recorded run, checked."""
         model = model_of(system, self.launch, None, self.input, self.jumps).without_event()
-        known = [*model.quantities, *_components(model)]
+        vectors = {name: q.components for name, q in model.quantities.items() if q.components is not None}
+        known = [*model.quantities, *(f"{name}.{part}" for name in vectors for part in model.components[vectors[name]])]
         for name in self.columns:
             if name not in known:
                 default = " (the default)" if self.quantity == "y0" else ""
                 raise ValueError(f"quantity: {name!r}{default} must be one of {', '.join(known)}{likely(name, known)}")
-            if "." not in name and model.quantities[name].components is not None:
+            if name in vectors:
                 raise ValueError(f"quantity: {name!r} has several components: name them, such as '{name}.x'")
         return model
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The quantities to which the columns belong."""
-        return tuple(dict.fromkeys(column.partition(".")[0] for column in self.columns))
 
-    def columns_of(self, model: AbstractModel, values: dict[str, Array]) -> list[Float[Array, " times"]]:
-        """The columns of the recording from the values of quantities."""
-        columns = []
-        for column in self.columns:
-            name, _, component = column.partition(".")
-            dims = model.quantities[name].components
-            columns.append(values[name] if dims is None else values[name][:, model.components[dims].index(component)])
-        return columns
-
-
-def _components(model: AbstractModel) -> list[str]:
-    """The names of the components of all vectors of a model."""
-    return [
-        f"{name}.{component}"
-        for name, quantity in model.quantities.items()
-        if quantity.components is not None
-        for component in model.components[quantity.components]
-    ]
+#: A number of every cell of a table.
+Cells = Float[np.ndarray, " cells"]
 
 
 class AbstractEventTimes(eqx.Module):
@@ -147,8 +105,8 @@ class AbstractEventTimes(eqx.Module):
     time: eqx.AbstractVar[Float[Array, "n *two"]]
     error: eqx.AbstractVar[Float[Array, "..."]]
     t1: eqx.AbstractVar[Float[Array, ""]]
-    until: eqx.AbstractVar[Any]
-    student: eqx.AbstractVar[Any]
+    until: eqx.AbstractVar[Float[Array, "..."] | None]
+    student: eqx.AbstractVar[Float[Array, ""] | None]
 
     #: Whether times through several modes come from the programs of tables, which is faster for flights in closed form.
     by_tables: ClassVar[bool] = False
@@ -191,7 +149,7 @@ class AbstractEventTimes(eqx.Module):
                 )
 
     @property
-    def of_each_time(self) -> dict[str, Any]:
+    def of_each_time(self) -> dict[str, Float[Array, "..."] | None]:
         """The numbers that may differ from time to time, by name."""
         return {"error": self.error, "until": self.until}
 
@@ -218,18 +176,18 @@ class AbstractEventTimes(eqx.Module):
         """A label for each time."""
 
     @abc.abstractmethod
-    def model(self, system: Any) -> AbstractModel:
+    def model(self, system: object) -> AbstractModel:
         """The model of the timed run, checked. The numbers of its start have a value per run if there are several."""
 
-    def predicted(self, model: AbstractModel, t1: Any, settings: Settings) -> Float[Array, ""]:
+    def predicted(self, model: AbstractModel, t1: Float[Array, ""], settings: Settings) -> Float[Array, ""]:
         """The predicted time of one run."""
         return time_of_event(model, t1, settings, False)
 
-    def of_ends(self, model: AbstractModel, t1: Any, time: Any, ends: dict[str, Any]) -> Any:
+    def of_ends(self, model: AbstractModel, t1: Cells, time: Cells, ends: dict[str, Float[Array, " cells"]]) -> Cells:
         """The predictions from a table: from the times of events, infinite without an event, and the ends of the runs."""
         return time
 
-    def labels_in(self, unit: Any) -> tuple[str, ...]:
+    def labels_in(self, unit: str | Sequence[str] | None) -> tuple[str, ...]:
         """Labels for a picture, with numbers in other units."""
         return self.labels
 
@@ -248,14 +206,9 @@ class AbstractEventTimes(eqx.Module):
         """Indices of the measured predictions, which are all predictions."""
         return np.arange(self.size)
 
-    @property
-    def series_units(self) -> tuple[str, ...]:
+    def units_of(self, model: AbstractModel) -> tuple[str, ...]:
         """The unit of the only series of the measurements."""
         return ("s",)
-
-    def units_of(self, model: AbstractModel) -> tuple[str, ...]:
-        """The unit of each series, for the model of the run."""
-        return self.series_units
 
 
 class EventTimes(AbstractEventTimes):
@@ -291,9 +244,9 @@ class EventTimes(AbstractEventTimes):
     t1: Float[Array, ""] = eqx.field(converter=as_number)
     event: Callable[..., Any] | None = None
     input: Any = None
-    until: Any = eqx.field(converter=as_number_or_none, default=None)
+    until: Float[Array, "..."] | None = eqx.field(converter=as_number_or_none, default=None)
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
-    jumps: Any = None
+    jumps: Sequence[float] | Array | None = None
 
     def __check_init__(self):
         if isinstance(self.launch, list | tuple) and any(isinstance(part, eqx.Module) for part in self.launch):
@@ -306,7 +259,7 @@ class EventTimes(AbstractEventTimes):
     def labels(self) -> tuple[str, ...]:
         return tuple(f"time {k + 1}" for k in range(self.size))
 
-    def model(self, system: Any) -> AbstractModel:
+    def model(self, system: object) -> AbstractModel:
         model = model_of(system, self.launch, self.event, self.input, self.jumps)
         require_event(model)
         return model
@@ -323,11 +276,14 @@ AT_ONCE = 1e-6
 #: Parameters of one set of data, name -> (rows,).
 Values = dict[str, Float[Array, " rows"]]
 
+#: A set of data of runs.
+Data = AbstractRecording | AbstractEventTimes
+
 
 class Source(eqx.Module):
     """A set of data and the model of its runs: one run, or one for each value of the numbers of the model's start."""
 
-    data: Any
+    data: Data
     model: AbstractModel
 
     @property
@@ -353,7 +309,7 @@ class Lanes(eqx.Module):
 
     model: AbstractModel
     is_legal: Bool[Array, "*lanes"]
-    horizon: Any
+    horizon: Float[Array, " lanes"] | tuple[Float[Array, "lanes times"], Float[Array, " lanes"]]
 
 
 class DataModel(eqx.Module):
@@ -367,11 +323,11 @@ class DataModel(eqx.Module):
     settings: Settings
 
     @property
-    def recorded(self) -> tuple[Any, ...]:
+    def recorded(self) -> tuple[Data, ...]:
         """The sets of data, for curves between their samples."""
         return tuple(source.data for source in self.data)
 
-    def with_recorded(self, recorded: tuple[Any, ...]) -> "DataModel":
+    def with_recorded(self, recorded: tuple[Data, ...]) -> "DataModel":
         """The model of other sets of data of the same shapes."""
         pairs = zip(recorded, self.data, strict=True)
         return dataclasses.replace(self, data=tuple(Source(data, source.model) for data, source in pairs))
@@ -380,6 +336,22 @@ class DataModel(eqx.Module):
     def on_host(self) -> bool:
         """Whether derivatives through the modes of the runs mislead; such a model is neither traced nor differentiated."""
         return self.data[0].model.fit_slopes == "differences"
+
+    def slopes(self, names: Iterable[str]) -> str:
+        """The slopes that guide a fit of the named unknowns."""
+        # Runs with resets have no derivatives with respect to the times of samples.
+        moves_times = any(own_name(name) == "t0" for name in names)
+        if moves_times and not all(source.model.smooth for source in self.data):
+            return "differences"
+        model = self.data[0].model
+        return "differences" if model.compiles_slowly else model.fit_slopes
+
+    @property
+    def series_units(self) -> tuple[str, ...]:
+        """The unit of each series of the measurements."""
+        counts = [int(np.max(source.data.measurements.series)) + 1 for source in self.data]
+        pairs = zip(self.data, counts, strict=True)
+        return tuple(unit for source, count in pairs for unit in source.data.units_of(source.model)[:count])
 
     def __call__(self, parameters: Values) -> Float[Array, "rows n"]:
         rows = len(next(iter(parameters.values())))
@@ -390,25 +362,20 @@ class DataModel(eqx.Module):
         parts: dict[int, Array] = {}
         for indices in groups.values():
             sources = [self.data[k] for k in indices]
-            predictions = self._predictions(sources, [values[k] for k in indices], rows)
+            predict = _predicted
+            if self.on_host:
+                by_tables = getattr(sources[0].data, "by_tables", False)
+                predict = _predicted_by_tables if by_tables else _compiled
+            lanes = predict(sources, [values[k] for k in indices], rows, self.settings)
+            of_runs = lanes.reshape(rows, -1, *lanes.shape[1:])
             firsts = np.cumsum([0, *(source.runs for source in sources)])
             for k, source, first in zip(indices, sources, firsts, strict=False):
-                of_source = predictions[:, first : first + source.runs]
+                of_source = of_runs[:, first : first + source.runs]
                 if isinstance(source.data, AbstractRecording):
                     parts[k] = of_source[:, 0, : len(source.data.times)].reshape(rows, -1)
                 else:
                     parts[k] = jnp.broadcast_to(of_source, (rows, source.data.size))
         return jnp.concatenate([parts[k] for k in range(len(self.data))], axis=1)[:, self.seen]
-
-    def _predictions(self, sources: list[Source], values: list[Values], rows: int) -> Float[Array, "rows runs ..."]:
-        """The predictions of sets of data with equal keys."""
-        if not self.on_host:
-            predictions = _predicted(sources, values, rows, self.settings)
-        elif getattr(sources[0].data, "by_tables", False):
-            predictions = _predicted_by_tables(sources, values, rows, self.settings)
-        else:
-            predictions = _compiled(sources, values, rows, self.settings)
-        return predictions.reshape(rows, -1, *predictions.shape[1:])
 
 
 def _lanes(sources: list[Source], values: list[Values], rows: int) -> Lanes:
@@ -423,14 +390,16 @@ def _lanes(sources: list[Source], values: list[Values], rows: int) -> Lanes:
     arrays, static = eqx.partition([source.model for source in sources], eqx.is_array)
     model = eqx.combine(jax.tree.map(lambda *leaves: in_lanes([*leaves]), *arrays), static[0])
     moved = {name: in_lanes([jnp.asarray(of_source[name])[:, None] for of_source in values]) for name in values[0]}
-    first = sources[0].data
-    if not isinstance(first, AbstractRecording):
-        horizon: Any = in_lanes([source.data.horizon for source in sources])
+    recordings = [source.data for source in sources if isinstance(source.data, AbstractRecording)]
+    if not recordings:
+        horizon = in_lanes([source.data.horizon for source in sources if isinstance(source.data, AbstractEventTimes)])
     else:
-        size = max(len(source.data.times) for source in sources)
-        clocks = jnp.stack([_lengthened(source.data.times, size) for source in sources])
-        clock = in_lanes([source.data.t0 for source in sources])
-        horizon = (jnp.tile(clocks, (rows, 1)), moved.pop("t0", clock))
+        size = max(len(data.times) for data in recordings)
+        # Recordings get the same length by times shortly after the last one.
+        later = AT_ONCE * jnp.arange(1, size + 1)
+        clocks = [jnp.append(data.times, data.times[-1] + later[: size - len(data.times)]) for data in recordings]
+        clock = in_lanes([data.t0 for data in recordings])
+        horizon = (jnp.tile(jnp.stack(clocks), (rows, 1)), moved.pop("t0", clock))
     moved.pop("t0", None)
 
     def of_lane(model: AbstractModel, values: dict[str, Array]) -> tuple[AbstractModel, Array]:
@@ -441,16 +410,6 @@ def _lanes(sources: list[Source], values: list[Values], rows: int) -> Lanes:
     return Lanes(model, is_legal, horizon)
 
 
-def _model_times(times: Float[Array, " times"], t0: Float[Array, ""]) -> Float[Array, " times"]:
-    """The times of the samples since the launch [s]; 0 for samples before the launch."""
-    return greatest(times - t0, INSTANT * jnp.arange(times.shape[0]))
-
-
-def _lengthened(times: Float[Array, " times"], count: int) -> Float[Array, " count"]:
-    """The times, followed by additional times shortly after the last one."""
-    return jnp.concatenate([times, times[-1] + AT_ONCE * jnp.arange(1, 1 + count - len(times))])
-
-
 def _predicted(sources: list[Source], values: list[Values], rows: int, settings: Settings) -> Float[Array, "lanes ..."]:
     """The predictions in all lanes; NaN for illegal parameters, and after the end of a run."""
     data: Any = sources[0].data
@@ -458,8 +417,10 @@ def _predicted(sources: list[Source], values: list[Values], rows: int, settings:
     def of_lane(lane: Lanes) -> Array:
         if not isinstance(data, AbstractRecording):
             return nan_unless(lane.is_legal, data.predicted(lane.model, lane.horizon, settings))
-        # An illegal run might never end, so it ends at its start.
-        times = jnp.where(lane.is_legal, _model_times(*lane.horizon), 0.0)
+        # Samples before the launch are taken at the launch. An illegal run might never end, so it ends at its start.
+        clock, t0 = lane.horizon
+        times = greatest(clock - t0, INSTANT * jnp.arange(clock.shape[0]))
+        times = jnp.where(lane.is_legal, times, 0.0)
         # A sample at the time of a reset, as accurately as it is known, is the state before it.
         times = times * (1.0 + INSTANT) if data.side == "after" else times
         run = sampled(lane.model, data.names, times, times[-1], settings)
@@ -478,7 +439,8 @@ def _predicted_by_tables(
 ) -> Float[Array, "*lanes"]:
     """The times of events in all lanes, by the programs of tables; NaN for illegal parameters and for runs that failed or are
     unresolved."""
-    lanes = _compiled_lanes(sources, values, rows)
+    data, lanes = sources[0].data, _compiled_lanes(sources, values, rows)
+    assert isinstance(data, AbstractEventTimes)
     is_legal = np.asarray(lanes.is_legal)
     size, count = len(is_legal), int(is_legal.sum())
     predictions = np.full(size, np.nan)
@@ -488,7 +450,7 @@ def _predicted_by_tables(
         order[count:] = order[0]
         cells, t1 = jax.tree.map(lambda leaf: leaf[order] if eqx.is_array(leaf) else leaf, (lanes.model, lanes.horizon))
         status, time, ends = first_events(cells, np.asarray(t1), size, count, settings)
-        time = np.asarray(sources[0].data.of_ends(cells, t1, time, ends))
+        time = data.of_ends(cells, t1, time, ends)
         predictions[order[:count]] = np.where(np.isin(status, SILENT), np.nan, time)[:count]
     return jnp.asarray(predictions)
 
@@ -500,9 +462,9 @@ EXPECTED = "a nonholonomic.Recording or EventTimes"
 
 
 def identify(
-    system: Any,
-    data: Any,
-    free: dict[str, Any],
+    system: object,
+    data: Data | Sequence[Data],
+    free: Mapping[str, Free | float],
     *,
     starts: int = 16,
     spread: float = 2.0,
@@ -549,12 +511,17 @@ def identify(
 
     ```
     """
-    search = search_options(starts, spread, seed, max_steps, progress)
-    return fit_runs(system, sources_of(data, EXPECTED), free, tolerance, search)
+    search = {"starts": starts, "spread": spread, "seed": seed, "max_steps": max_steps, "progress": progress}
+    return fit_runs(system, data, free, EXPECTED, tolerance, search)
 
 
 def log_density(
-    system: Any, data: Any, free: dict[str, Any], priors: dict[str, Any] | None = None, *, tolerance: float = 1e-8
+    system: object,
+    data: Data | Sequence[Data],
+    free: Mapping[str, Free | float],
+    priors: Mapping[str, Prior] | None = None,
+    *,
+    tolerance: float = 1e-8,
 ) -> LogDensity:
     """The log of the posterior density of a system's parameters, as a function of unbounded coordinates.
 
@@ -583,112 +550,83 @@ def log_density(
 
     ```
     """
-    return posterior_of_runs(system, sources_of(data, EXPECTED), free, priors, tolerance)
-
-
-def sources_of(data: Any, expected: str) -> tuple[Any, ...]:
-    """Sets of data as a tuple.
-
-    **Arguments:** `data`: a set or several; `expected`: words for the message.
-
-    **Raises:** `ValueError` unless there is at least one set of data, and all sets are recordings or times of events.
-    """
-    sources = tuple(data) if isinstance(data, list | tuple) else (data,)
-    if not sources or not all(isinstance(source, AbstractRecording | AbstractEventTimes) for source in sources):
-        reader = "; read a file with read_recording" if isinstance(data, str | Path) else ""
-        raise ValueError(f"data = {shown(data)} must be {expected}, or a list of them{reader}")
-    return sources
-
-
-def search_options(starts: Any, spread: Any, seed: Any, max_steps: Any, progress: Any) -> dict[str, Any]:
-    """The options of the search, checked before a model prepares its data."""
-    check_search(starts, spread, seed, max_steps, progress)
-    return {"starts": starts, "spread": spread, "seed": seed, "max_steps": max_steps, "progress": progress}
+    return posterior_of_runs(system, data, free, priors, EXPECTED, tolerance)
 
 
 def fit_runs(
-    system: Any,
-    data: tuple[Any, ...],
-    free: dict[str, Any],
-    tolerance: Any,
+    system: object,
+    data: Data | Sequence[Data],
+    free: Mapping[str, Free | float],
+    expected: str,
+    tolerance: float,
     search: dict[str, Any],
     slopes: str | None = None,
 ) -> Identification:
     """Fit sets of data of runs.
 
-    **Arguments:** as for `identify`; `data`: `sources_of`; `search`: `search_options`; `slopes`: "exact" or "differences", by
-    default as the model requires.
+    **Arguments:** as for `identify`; `expected`: the data that are expected, in words; `search`: how to search, name of an
+    argument -> value; `slopes`: "exact" or "differences", by default as the model requires.
     """
+    check_search(**search)
     with status_line("fitting", search["progress"]):
-        problem = _Fit.of(system, data, free, tolerance)
-        options = {"slopes": slopes or problem.slopes, "labels": problem.labels}
-        fit = most_likely(problem.model, problem.measurements, problem.unknowns, **options, **search)
-    label = problem.model.data[0].model.label
-    names = {name: own_name(name) for name in problem.unknowns}
-    units = {name: "s" if own == "t0" else label([own])[own][1] for name, own in names.items()}
-    return dataclasses.replace(fit, series_units=problem.series_units, units=units)
+        model, measurements, labels, unknowns = prepared(system, data, free, expected, tolerance)
+        fit = most_likely(
+            model, measurements, unknowns, slopes=slopes or model.slopes(unknowns), labels=labels, **search
+        )
+    own = {name: own_name(name) for name in unknowns}
+    label = model.data[0].model.label
+    units = {name: "s" if short == "t0" else label([short])[short][1] for name, short in own.items()}
+    return dataclasses.replace(fit, series_units=model.series_units, units=units)
 
 
 def posterior_of_runs(
-    system: Any, data: tuple[Any, ...], free: dict[str, Any], priors: dict[str, Any] | None, tolerance: Any
+    system: object,
+    data: Data | Sequence[Data],
+    free: Mapping[str, Free | float],
+    priors: Mapping[str, Prior] | None,
+    expected: str,
+    tolerance: float,
 ) -> LogDensity:
-    """The posterior, given sets of data of runs. **Arguments:** as for `log_density`; `data`: `sources_of`."""
-    fit = _Fit.of(system, data, free, tolerance)
+    """The posterior, given sets of data of runs. **Arguments:** as for `log_density`; `expected`: as for `fit_runs`."""
+    model, measurements, _, unknowns = prepared(system, data, free, expected, tolerance)
     if priors is not None and not isinstance(priors, dict):
         raise ValueError(
             f"priors = {shown(priors)} must be a dictionary, name of a number -> (mean, standard deviation)"
         )
-    by_name = {full_name("priors", name, list(fit.unknowns)): prior for name, prior in (priors or {}).items()}
-    return LogDensity.of(fit.model, fit.measurements, fit.unknowns, by_name, fit.series_units, fit.slopes)
+    by_name = {full_name("priors", name, list(unknowns)): prior for name, prior in (priors or {}).items()}
+    return LogDensity.of(model, measurements, unknowns, by_name, model.series_units, model.slopes(unknowns))
 
 
-class _Fit(NamedTuple):
-    """The predictions of the measurements, the measurements with their labels, and the unknowns, all checked."""
+def prepared(
+    system: object, data: Data | Sequence[Data], free: Mapping[str, Free | float], expected: str, tolerance: float
+) -> tuple[DataModel, Measurements, tuple[str, ...], dict[str, Free]]:
+    """The predictions of the measurements, the measurements, their labels, and the unknowns, all checked.
 
-    model: DataModel
-    measurements: Measurements
-    labels: tuple[str, ...]
-    unknowns: dict[str, Free]
+    **Arguments:** as for `fit_runs`.
 
-    @property
-    def slopes(self) -> str:
-        """The slopes that guide the fit."""
-        models = [source.model for source in self.model.data]
-        # Runs with resets have no derivatives with respect to the times of samples.
-        moves_times = any(name.rpartition(".")[2] == "t0" for name in self.unknowns)
-        if moves_times and not all(model.smooth for model in models):
-            return "differences"
-        return "differences" if models[0].compiles_slowly else models[0].fit_slopes
+    **Raises:** `ValueError` unless there is at least one set of data, and all sets are recordings or times of events.
+    """
+    several: tuple[Any, ...] = tuple(data) if isinstance(data, list | tuple) else (data,)
+    if not several or not all(isinstance(source, AbstractRecording | AbstractEventTimes) for source in several):
+        reader = "; read a file with read_recording" if isinstance(data, str | Path) else ""
+        raise ValueError(f"data = {shown(data)} must be {expected}, or a list of them{reader}")
+    tolerance_bound(tolerance).require()
+    sources = tuple(Source(source, source.model(system)) for source in several)
+    own = []
+    for source in sources:
+        names = [name for name in source.model.known if name.startswith(("start", "launch"))]
+        if isinstance(source.data, AbstractRecording):
+            names, end = [*names, "t0"], source.data.times[-1] - source.data.t0
+        else:
+            end = source.data.horizon
+        own.append(names)
+        check_run(source.model, end, tolerance)
+    first = sources[0].model
 
-    @property
-    def series_units(self) -> tuple[str, ...]:
-        """The unit of each series of the measurements."""
-        units: list[str] = []
-        for source in self.model.data:
-            last = int(np.max(source.data.measurements.series))
-            units += source.data.units_of(source.model)[: last + 1]
-        return tuple(units)
+    def check(values: dict[str, float]) -> None:
+        first.require_values({name: value for name, value in values.items() if name != "t0"})
 
-    @classmethod
-    def of(cls, system: Any, data: tuple[Any, ...], free: dict[str, Any], tolerance: Any) -> "_Fit":
-        """**Arguments:** as for `fit_runs`."""
-        tolerance_bound(tolerance).require()
-        models = tuple(source.model(system) for source in data)
-        for source, model in zip(data, models, strict=True):
-            horizon = source.horizon if isinstance(source, AbstractEventTimes) else source.times[-1] - source.t0
-            check_run(model, horizon, tolerance)
-        own = [[name for name in model.known if name.startswith(("start", "launch"))] for model in models]
-        shared = [name for name in models[0].known if name not in own[0]]
-        names_of_data = [
-            [*names, "t0"] if isinstance(source, AbstractRecording) else names
-            for names, source in zip(own, data, strict=True)
-        ]
-
-        def check(values: dict[str, float]) -> None:
-            models[0].require_values({name: value for name, value in values.items() if name != "t0"})
-
-        unknowns = free_numbers(free, shared, names_of_data, check)
-        require_apart("free", unknowns)
-        measurements, labels, seen = joined_data(data)
-        sources = tuple(Source(source, model) for source, model in zip(data, models, strict=True))
-        return cls(DataModel(sources, seen, Settings(tolerance, max_steps=MOST_STEPS)), measurements, labels, unknowns)
+    unknowns = free_numbers(free, [name for name in first.known if name not in own[0]], own, check)
+    require_apart("free", unknowns)
+    measurements, labels, seen = joined_data(several)
+    return DataModel(sources, seen, Settings(tolerance, max_steps=MOST_STEPS)), measurements, labels, unknowns

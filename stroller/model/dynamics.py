@@ -36,16 +36,19 @@ from nonholonomic.geometry import (
 )
 
 from .input import Input, Motion
-from .vehicle import AbstractFriction, AbstractHeading, Drag, Stroller, WheelMotion
+from .vehicle import AbstractFriction, Drag, Heading, Stroller, WheelMotion
 
 State = Float[Array, "components ..."]
 
 
 class Geometry(NamedTuple):
-    """Position and motion of a state, before any force is computed."""
+    """Position and motion of a state, before any force is computed.
+
+    The rear axle moves along `direction` d; `lead` is the factor nu of the heading, `gauge` 1 / sqrt(M_w), and `sine` and
+    `cosine` are those of the steering angle.
+    """
 
     motion: Motion
-    momentum: Float[Array, "..."]
     fork_rate: Float[Array, "..."]
     normal: Vector
     normal_rate: Vector
@@ -59,13 +62,19 @@ class Geometry(NamedTuple):
     normal_force: Component
     front_load: Component
 
+    @property
+    def rear_load(self) -> Component:
+        """Load [N] on the rear axle."""
+        return subtract(self.normal_force, self.front_load)
+
 
 class Forces(NamedTuple):
-    """Drive force [N] and steering torque [N m] of the input, and the friction."""
+    """Drive force [N] and steering torque [N m] of the input, the friction, and the total torque [N m] on the fork."""
 
     drive: Component
     torque: Component
     drag: Drag
+    fork: Component
 
 
 class Power(NamedTuple):
@@ -90,7 +99,7 @@ class Dynamics(eqx.Module):
     surface: AbstractSurface
     friction: AbstractFriction
     gravity: Float[Array, "..."]
-    heading: AbstractHeading
+    heading: Heading
     up: Vector
     side: float = eqx.field(static=True)
     absolute: float | None = eqx.field(static=True)
@@ -100,6 +109,32 @@ class Dynamics(eqx.Module):
         place, heading_end = self.surface.axes, self.surface.axes + self.heading.axes(self.surface)
         return padded(state[:place]), padded(state[place:heading_end]), state[heading_end:]
 
+    def state(
+        self,
+        position: Vector,
+        heading: Vector,
+        steering: Float[Array, "..."],
+        steering_rate: Float[Array, "..."],
+        wheel: Float[Array, "..."],
+        works: int = 0,
+    ) -> State:
+        """The state of a motion.
+
+        **Arguments:** `position` [m], `heading`: vectors in the ground's axes; `steering` [rad], `steering_rate` [rad/s];
+        `wheel`: the free speed w [m/s], that of the front wheel if the heading is intrinsic; `works`: number of work
+        components, which are 0.
+        """
+        sine, cosine = jnp.sin(steering), jnp.cos(steering)
+        _, square, lead = self.heading.direction(heading, self.surface.normal(position), self.side)
+        momentum = wheel * jnp.sqrt(self.inertia(square, lead, sine, cosine))
+        fork_rate = steering_rate
+        if self.absolute is not None:
+            fork_rate = fork_rate + wheel * lead * sine / self.body.wheelbase
+        vectors = (*position[: self.surface.axes], *heading[: self.heading.axes(self.surface)])
+        start = (*vectors, steering, momentum, fork_rate, sine, cosine)
+        example = jnp.broadcast_arrays(*(component for component in start if component is not None))[0]
+        return stacked((*start, *(None,) * works), example[None])
+
     def righted(self, state: State) -> State:
         """The state with sin^2 + cos^2 of the steering angle corrected to 1."""
         first = self.surface.axes + self.heading.axes(self.surface) + 3
@@ -107,39 +142,30 @@ class Dynamics(eqx.Module):
         unit = state[first : first + 2] * (1.0 / jnp.sqrt(sine * sine + cosine * cosine))
         return jnp.concatenate([state[:first], unit, state[first + 2 :]])
 
-    def inertia(self, direction: Vector, lead: Component, sine: Component, cosine: Component) -> Component:
-        """Reduced mass M_w = m cos^2(phi) d.d + J nu^2 sin^2(phi) / l^2 [kg] of the front wheel's speed."""
+    def inertia(self, square: Component, lead: Component, sine: Component, cosine: Component) -> Component:
+        """Reduced mass M_w = m cos^2(phi) d.d + J nu^2 sin^2(phi) / l^2 [kg] of the speed w."""
         arm = multiply(lead, sine, 1.0 / self.body.wheelbase)
-        mass_term = multiply(self.body.mass, cosine, cosine, self.heading.square(direction))
-        return mass_term + self.body.inertia * arm * arm
+        return multiply(self.body.mass, cosine, cosine, square) + self.body.inertia * arm * arm
 
     def geometry(self, state: State) -> Geometry:
         """Velocities, rates and normal force at a state (components, ...)."""
         body, surface, side = self.body, self.surface, self.side
-        r, e, (phi, P, fork_rate, sine, cosine) = (*self.unpack(state)[:2], self.unpack(state)[2][:5])
+        r, e, rest = self.unpack(state)
+        phi, P, fork_rate, sine, cosine = rest[:5]
         n = surface.normal(r)
         unit = self.heading.unit(e, n)
-        d, lead = self.heading.direction(unit, n, side), self.heading.lead(n, side)
-        gauge = 1.0 / jnp.sqrt(self.inertia(d, lead, sine, cosine))
+        d, square, lead = self.heading.direction(unit, n, side)
+        gauge = 1.0 / jnp.sqrt(self.inertia(square, lead, sine, cosine))
         wheel = P * gauge
         velocity = scale(wheel * cosine, d)
         normal_rate = surface.normal_rate(r, velocity)
         normal_force = self.normal_force(n, normal_rate, velocity)
         front_speed = multiply(wheel, lead)
         yaw_rate = front_speed * sine / body.wheelbase
-        motion = Motion(
-            position=r,
-            heading=unit,
-            steering=phi,
-            speed=front_speed * cosine,
-            front_speed=front_speed,
-            yaw_rate=yaw_rate,
-            steering_rate=subtract(fork_rate, multiply(self.absolute, yaw_rate)),
-        )
-        share = None if body.centre is None else body.centre / body.wheelbase
+        steering_rate = subtract(fork_rate, multiply(self.absolute, yaw_rate))
+        motion = Motion(r, unit, phi, front_speed * cosine, front_speed, yaw_rate, steering_rate)
         return Geometry(
             motion=motion,
-            momentum=P,
             fork_rate=fork_rate,
             normal=n,
             normal_rate=normal_rate,
@@ -151,7 +177,7 @@ class Dynamics(eqx.Module):
             sine=sine,
             cosine=cosine,
             normal_force=normal_force,
-            front_load=multiply(normal_force, share),
+            front_load=multiply(normal_force, None if body.centre is None else body.centre / body.wheelbase),
         )
 
     def normal_force(self, normal: Vector, normal_rate: Vector, velocity: Vector) -> Component:
@@ -160,17 +186,13 @@ class Dynamics(eqx.Module):
         return subtract(weight, multiply(self.side, self.body.mass, dot(normal_rate, velocity)))
 
     def forces(self, t: Float[Array, "..."], geometry: Geometry, controls: Input | None) -> Forces:
-        """The forces of the input and of friction at a time [s]."""
+        """The forces of the input, of friction and of the steering spring at a time [s]."""
         motion = geometry.motion
         drive, torque = (None, None) if controls is None else controls(t, motion)
-        rear_load = subtract(geometry.normal_force, geometry.front_load)
         speeds = (motion.speed, motion.front_speed, motion.yaw_rate, motion.steering_rate)
-        return Forces(drive, torque, self.friction.drag(WheelMotion(*speeds, rear_load, geometry.front_load)))
-
-    def fork_torque(self, geometry: Geometry, forces: Forces) -> Component:
-        """Total torque [N m] about the steering axis."""
-        spring = multiply(self.body.steering_spring, geometry.motion.steering)
-        return subtract(add(forces.torque, forces.drag.steering), spring)
+        drag = self.friction.drag(WheelMotion(*speeds, geometry.rear_load, geometry.front_load))
+        spring = multiply(self.body.steering_spring, motion.steering)
+        return Forces(drive, torque, drag, subtract(add(torque, drag.steering), spring))
 
     def power(self, geometry: Geometry, forces: Forces) -> Power:
         """Power [W] through each port."""
@@ -188,7 +210,7 @@ class Dynamics(eqx.Module):
         """Rate of change of the state, (components, ...)."""
         body, g, e = self.body, self.geometry(state), self.unpack(state)[1]
         forces = self.forces(t, g, controls)
-        drag, torque = forces.drag, self.fork_torque(g, forces)
+        drag, torque = forces.drag, forces.fork
         arm = g.sine / body.wheelbase
         weight = body.mass * self.gravity
         # If the centre of mass is ahead of the axle, it swings with the yaw, and its weight has a moment about the
@@ -218,8 +240,7 @@ class Dynamics(eqx.Module):
 
     def energy(self, state: State) -> Float[Array, "..."]:
         """Energy H = P^2/2 + J_f sg^2/2 + m g z + k phi^2/2 [J], where z is the height of the centre of mass."""
-        r, e, (phi, P, fork_rate) = (*self.unpack(state)[:2], self.unpack(state)[2][:3])
-        body = self.body
+        (r, e, (phi, P, fork_rate, *_)), body = self.unpack(state), self.body
         height = add(self.surface.elevation(r), multiply(body.centre, dot(e, self.up)))
         kinetic = 0.5 * (P * P + body.steering_inertia * fork_rate * fork_rate)
         return add(kinetic, multiply(body.mass * self.gravity, height), multiply(0.5, body.steering_spring, phi, phi))
@@ -229,16 +250,15 @@ class Dynamics(eqx.Module):
         total = self.body.mass + self.body.inertia / self.body.wheelbase**2
         return 1.0 / (total * self.geometry(state).gauge ** 2)
 
-    def contact(self, state: State) -> Float[Array, "..."]:
-        """Normal force [N] of the ground on the stroller; negative where the ground would have to pull."""
-        return jnp.broadcast_to(multiply(1.0, self.geometry(state).normal_force), state[0].shape)
-
-    def contact_along(self, state: State, rate: State) -> Float[Array, "..."]:
-        """Like `contact`, for a known rate of the state, which contains the velocity; computing the velocity is
-        expensive."""
-        place, velocity = padded(state[: self.surface.axes]), padded(rate[: self.surface.axes])
-        normal = self.surface.normal(place)
-        force = self.normal_force(normal, self.surface.normal_rate(place, velocity), velocity)
+    def contact(self, state: State, rate: State | None = None) -> Float[Array, "..."]:
+        """Normal force [N] of the ground on the stroller; negative where the ground would have to pull. It is cheaper for a
+        known `rate` of the state, which contains the velocity."""
+        if rate is None:
+            force = self.geometry(state).normal_force
+        else:
+            place, velocity = padded(state[: self.surface.axes]), padded(rate[: self.surface.axes])
+            normal = self.surface.normal(place)
+            force = self.normal_force(normal, self.surface.normal_rate(place, velocity), velocity)
         return jnp.broadcast_to(multiply(1.0, force), state[0].shape)
 
     def side_force(
@@ -268,7 +288,7 @@ class Dynamics(eqx.Module):
             body.inertia * yaw_acceleration,
             multiply(body.mass, body.centre, v, yaw),
             multiply(body.centre, bank),
-            multiply(self.absolute, self.fork_torque(g, forces)),
+            multiply(self.absolute, forces.fork),
             subtract(None, forces.drag.yaw),
         )
         front = g.cosine * spin / body.wheelbase - g.sine * rear_force
@@ -305,16 +325,15 @@ class Dynamics(eqx.Module):
         proper_acceleration = sum_vectors(acceleration, scale(self.gravity, self.surface.up))
         missing_force = sum_vectors(scale(body.mass, proper_acceleration), scale(-1.0, push))
         moment = add(drag.yaw, multiply(drag.front, arm, g.sine))
-        spin = add(body.inertia * yaw_acceleration, multiply(self.absolute, self.fork_torque(g, forces)))
+        spin = add(body.inertia * yaw_acceleration, multiply(self.absolute, forces.fork))
         swept = g.sine * g.lead
         weighted = subtract(g.cosine / arm * subtract(spin, moment), swept * dot(missing_force, g.direction))
         front = weighted / (g.cosine**2 + swept**2)
-        square = self.heading.square(g.direction)
+        square = dot(g.direction, g.direction)
         tilt = multiply(dot(heading, g.normal), dot(left, g.normal))
         return dot(missing_force, g.left) / square - front * (g.cosine + g.sine * tilt / square), front
 
 
 def padded(components: State) -> Vector:
     """A vector made from its components; missing components at the end vanish identically."""
-    vector = (*components, None, None)
-    return vector[0], vector[1], vector[2]
+    return (*components, None, None)[:3]

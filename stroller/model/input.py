@@ -5,22 +5,25 @@ lane, so write it with `jax.numpy` and without `if`. Use an `equinox.Module` for
 """
 
 import contextlib
+import functools
 import inspect
 from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
-import jax.extend
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, Float
 
 from nonholonomic.compilation.components import TooLarge, by_components, over_last_axis, spelled_out
-from nonholonomic.compilation.tracing import in_cells, is_elementary, jumps_of, warn_of_unclear
+from nonholonomic.compilation.tracing import TracedFunction, in_cells, is_elementary, jumps_of, warn_of_unclear
 from nonholonomic.geometry import Vector
 from nonholonomic.text import AbstractHeld, is_users, name_of, shown
 from nonholonomic.validation import Bound, Bounded, as_number, is_traced
+
+from .vehicle import bounds_of
 
 
 class Motion(NamedTuple):
@@ -83,8 +86,7 @@ class Steady(Bounded):
     torque: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
 
     def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.force, "force")
-        yield Bound(self.torque, "torque")
+        return bounds_of(self, "force", "torque")
 
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         return self.force, self.torque
@@ -187,40 +189,29 @@ def jump_times(
     return jnp.stack(rows) if rows else None
 
 
-class Program:
-    """The operations of a function; two programs with equal text are equal, so the second is not compiled again."""
-
-    def __init__(self, jaxpr: Any):
-        self.jaxpr = jaxpr
-        self.text = str(jaxpr)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Program) and self.text == other.text
-
-    def __hash__(self) -> int:
-        return hash(self.text)
-
-
 class Formula(eqx.Module):
-    """An input module made from a function. The arrays in the function are leaves, and its operations are compared by
-    their text.
+    """An input module made from a function. The arrays in the function are leaves, and its operations are compared one by
+    one.
 
     If you define the same function again, as in a notebook's cell, it is not compiled again.
     """
 
     held: tuple[Array, ...]
-    program: Program = eqx.field(static=True)
+    program: TracedFunction = eqx.field(static=True)
     searched: bool = eqx.field(static=True, default=True)
 
     @classmethod
-    def of(cls, controls: Input, t: Any, motion: Any) -> "Formula":
+    def of(cls, controls: Any, t: Any, motion: Any) -> "Formula":
         """The formula of a function that takes scalars of these types; their values do not matter."""
         closed = jax.make_jaxpr(lambda *arguments: tuple(map(as_number, controls(*arguments))))(t, motion)
-        return cls(tuple(closed.consts), Program(closed.jaxpr), is_searched(controls))
+        # The arrays become the first arguments.
+        inputs = [*closed.jaxpr.constvars, *closed.jaxpr.invars]
+        program = ClosedJaxpr(closed.jaxpr.replace(constvars=[], invars=inputs), ())
+        return cls(tuple(closed.consts), TracedFunction(jaxpr_as_fun(program), program), is_searched(controls))
 
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         leaves = jnp.broadcast_arrays(*jax.tree.leaves((t, motion)))
-        run = jax.extend.core.jaxpr_as_fun(jax.extend.core.ClosedJaxpr(self.program.jaxpr, self.held))
+        run = functools.partial(self.program, *self.held)
         for _ in range(leaves[0].ndim):
             run = jax.vmap(run)
         force, torque = run(*leaves)

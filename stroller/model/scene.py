@@ -1,14 +1,13 @@
 """The scene, vehicle, ground, friction and gravity, and its rides as problems."""
 
-import dataclasses
-from collections.abc import Iterator
-from typing import Any, ClassVar
+from collections.abc import Iterable, Iterator
+from typing import Any, ClassVar, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from nonholonomic.compilation.components import Held
 from nonholonomic.geometry import AbstractQuadric, AbstractSurface, Plane, Sphere, Torus, stacked
@@ -28,27 +27,31 @@ from nonholonomic.validation import (
 )
 
 from .dynamics import Dynamics, State
-from .input import MOST_ELEMENTS, Formula, Input, PerRide, at_start, is_searched, jump_times
-from .vehicle import AbstractFriction, Frictionless, Intrinsic, Launch, Projected, Stroller, as_launch, as_law
+from .input import MOST_ELEMENTS, Formula, Input, PerRide, at_start, jump_times
+from .vehicle import AbstractFriction, Frictionless, Heading, Launch, Stroller, as_launch, as_law
 
 # The scene: vehicle, ground, friction and gravity.
 
 #: The default side of a closed surface.
 DRIVES = "outside"
 FORKS = {"relative": None, "absolute": 1.0}
-HEADINGS = {"intrinsic": Intrinsic(), "projected": Projected()}
+HEADINGS = ("intrinsic", "projected")
 
 #: Cosine of the steering angle, or of the slope, below which a start cannot be distinguished from a right angle.
 RIGHT_ANGLE = 1e-9
 
 
-def require_word(word: Any, name: str, words: dict[str, Any]) -> None:
+#: A condition, in JAX for traced numbers.
+Condition: TypeAlias = Bool[Array | np.ndarray, "..."] | bool
+
+
+def require_word(word: object, name: str, words: Iterable[str]) -> None:
     """Raise `ValueError` unless `word` is one of the allowed words."""
-    if not isinstance(word, str) or word not in words:
+    if word not in tuple(words):
         raise ValueError(f"{name} = {shown(word)} must be one of {', '.join(map(repr, words))}")
 
 
-def _holds_somewhere(condition: Any) -> bool:
+def _holds_somewhere(condition: Condition) -> bool:
     """Whether a concrete condition holds anywhere; false for a traced one."""
     return not is_traced(condition) and bool(np.any(condition))
 
@@ -140,7 +143,7 @@ class Scene(Bounded):
             surface=self.surface,
             friction=self.friction,
             gravity=self.gravity,
-            heading=HEADINGS[self.heading],
+            heading=Heading(self.heading == "projected"),
             up=self.surface.up,
             side=self.surface.sign(self.side, DRIVES),
             absolute=FORKS[self.fork],
@@ -149,7 +152,7 @@ class Scene(Bounded):
     def check(self, launch: Launch) -> None:
         """Raise `ValueError` if the scene cannot start with the launch."""
         require_kind(launch, "launch", Launch)
-        require_all(self.start_bounds(launch))
+        require_all(self.surface.place_bounds(launch.place, self.body.wheelbase))
         if _holds_somewhere(self.sideways(launch)):
             raise ValueError(
                 f"steering = {shown(launch.steering)} must differ from a right angle for speed = {shown(launch.speed)}: "
@@ -161,18 +164,14 @@ class Scene(Bounded):
                 "along the ground has no horizontal speed, and the constraints may lose rank"
             )
 
-    def start_bounds(self, launch: Launch) -> Iterator[Bound]:
-        """The ranges of a launch's numbers in this scene."""
-        yield from self.surface.place_bounds(launch.place, self.body.wheelbase)
-
-    def sideways(self, launch: Launch) -> Any:
+    def sideways(self, launch: Launch) -> Condition:
         """Whether a launch has a speed although its front wheel is at a right angle; a concrete value for a concrete
         launch."""
         steering, speed = launch.steering, launch.speed
         xp = jnp if is_traced(steering) or is_traced(speed) else np
         return (xp.abs(xp.cos(xp.asarray(steering))) < RIGHT_ANGLE) & (xp.asarray(speed) != 0.0)
 
-    def level(self, launch: Launch) -> Any:
+    def level(self, launch: Launch) -> Condition:
         """Whether a launch with a projected heading is on the equator; a concrete value for a concrete launch."""
         if self.heading != "projected" or not isinstance(self.surface, AbstractQuadric):
             return False
@@ -181,12 +180,12 @@ class Scene(Bounded):
         sine = xp.sin(xp.asarray(last)) if len(launch.place) == 2 else xp.asarray(last) / xp.asarray(polar)
         return xp.abs(sine) < RIGHT_ANGLE
 
-    def may_start(self, launch: Launch, *modules: Any) -> Bool[Array, "*cells"]:
+    def may_start(self, launch: Launch, *modules: PyTree) -> Bool[Array, "*cells"]:
         """Whether the numbers of the scene, a launch and other modules are legal, cell by cell; for traced numbers,
         which `check` ignores."""
         bounds = [bound for module in (self, launch, *modules) for bound in all_bounds(module)]
         is_stuck = jnp.asarray(self.sideways(launch) | self.level(launch))
-        return legal([*bounds, *self.start_bounds(launch)]) & ~is_stuck
+        return legal([*bounds, *self.surface.place_bounds(launch.place, self.body.wheelbase)]) & ~is_stuck
 
     def state(self, launch: Launch, driven: bool = False) -> State:
         """The state at the start of a run (see `dynamics.py` for its components).
@@ -201,20 +200,10 @@ class Scene(Bounded):
         launch, dynamics = as_launch(launch), self.dynamics
         position, east, north = self.surface.chart(launch.place)
         heading = dynamics.heading.at_angle(launch.heading, east, north)
-        normal = self.surface.normal(position)
-        direction = dynamics.heading.direction(heading, normal, dynamics.side)
-        lead = dynamics.heading.lead(normal, dynamics.side)
-        sine, cosine = jnp.sin(launch.steering), jnp.cos(launch.steering)
-        wheel = launch.speed / (cosine * lead)
-        momentum = wheel * jnp.sqrt(dynamics.inertia(direction, lead, sine, cosine))
-        fork_rate = launch.steering_rate
-        if dynamics.absolute is not None:
-            fork_rate = fork_rate + wheel * lead * sine / self.body.wheelbase
-        axes = (*position[: self.surface.axes], *heading[: dynamics.heading.axes(self.surface)])
-        work_components = (None,) * (2 * driven + self.friction.dissipates)
-        start = (*axes, launch.steering, momentum, fork_rate, sine, cosine, *work_components)
-        shape = jnp.broadcast_arrays(*(component for component in start if component is not None))[0]
-        return stacked(start, shape[None])
+        _, _, lead = dynamics.heading.direction(heading, self.surface.normal(position), dynamics.side)
+        wheel = launch.speed / (jnp.cos(launch.steering) * lead)
+        works = 2 * driven + self.friction.dissipates
+        return dynamics.state(position, heading, launch.steering, launch.steering_rate, wheel, works)
 
     def scales(self, launch: Launch, driven: bool = False) -> State:
         """Scales of absolute errors of the state, component by component.
@@ -242,10 +231,6 @@ class Scene(Bounded):
         """Work [J] done on the stroller so far by its inputs and by friction; negative if they took energy."""
         first = self.surface.axes + self.dynamics.heading.axes(self.surface) + 5
         return jnp.sum(state[first:], axis=0)
-
-    def rank(self, state: State) -> Float[Array, "..."]:
-        """Reduced mass M_w relative to m + J/l^2: at zero the constraints lose rank and the motion is undetermined."""
-        return self.dynamics.rank(state)
 
     def contact(self, state: State) -> Float[Array, "..."]:
         """Normal force [N] of the ground on the stroller; negative where the ground would have to pull."""
@@ -280,73 +265,62 @@ class RideProblem(AbstractProblem):
         return not isinstance(self.input, PerRide) or self.input.by_elements
 
     @classmethod
-    def single(
-        cls,
-        scene: Scene,
-        launch: Launch,
-        controls: Input | None,
-        jumps: tuple[Array, ...] = (),
-        cells: int | None = None,
-    ) -> "RideProblem":
-        """The problem of one ride, which continues if contact or rank is lost. **Arguments:** `jumps`: times at which the
-        input jumps, apart from those that its comparisons of the time show."""
-        driven = controls is not None
-        press = scene.body.mass * (scene.gravity + launch.speed**2 / scene.body.wheelbase + 1e-3)
-        start = (scene.state(launch, driven), scene.scales(launch, driven))
-        times = None
-        if controls is not None and (jumps or is_searched(controls)):
-            t, motion = eqx.filter_eval_shape(at_start, scene, launch)
-            t, motion = jax.tree.map(lambda part: jnp.zeros((), part.dtype), (t, motion))
-            times = jump_times(controls, jumps, t, motion, cells)
-        return cls(scene.dynamics, controls, *start, press, False, False, times)
-
-    @classmethod
     def of(
         cls,
         scene: Scene,
         launch: Launch,
         controls: Input | None,
-        cells: int,
-        watched: bool,
+        cells: int | None = None,
+        watched: bool = False,
         jumps: tuple[Array, ...] = (),
     ) -> "RideProblem":
-        """The problem of the given number of cells; every number is a scalar or one per cell."""
-
-        def spread(states):
-            return jnp.broadcast_to(states.reshape(states.shape[0], -1), (states.shape[0], cells))
-
-        if isinstance(controls, Formula) and has_arrays(controls):
-            t, motion = eqx.filter_eval_shape(at_start, scene, launch)
-            of_one_ride = jax.tree.map(lambda part: jax.ShapeDtypeStruct((), part.dtype), (t, motion))
-            controls = PerRide.of(controls, *of_one_ride).of_cells(cells)
-        ride = cls.single(scene, launch, controls, jumps, cells)
-        guarded, watched = (
-            isinstance(ride.dynamics.heading, Projected),
-            watched and not isinstance(scene.surface, Plane),
+        """The problem of one ride, which continues if contact or rank is lost, or of a number of cells, in which every number
+        is a scalar or one per cell. **Arguments:** `jumps`: times at which the input jumps, apart from those that its
+        comparisons of the time show."""
+        driven, times = controls is not None, None
+        if controls is not None:
+            # The types of the arguments in a single ride.
+            arguments = eqx.filter_eval_shape(at_start, scene, launch)
+            t, motion = jax.tree.map(lambda part: jnp.zeros((), part.dtype), arguments)
+            if cells is not None and isinstance(controls, Formula) and has_arrays(controls):
+                controls = PerRide.of(controls, t, motion).of_cells(cells)
+            times = jump_times(controls, jumps, t, motion, cells)
+        states, scales = scene.state(launch, driven), scene.scales(launch, driven)
+        if cells is not None:
+            states, scales = (
+                jnp.broadcast_to(part.reshape(len(part), -1), (len(part), cells)) for part in (states, scales)
+            )
+        return cls(
+            scene.dynamics,
+            controls,
+            states,
+            scales,
+            press=scene.body.mass * (scene.gravity + launch.speed**2 / scene.body.wheelbase + 1e-3),
+            watched=watched and not isinstance(scene.surface, Plane),
+            guarded=cells is not None and scene.heading == "projected",
+            jump_times=times,
         )
-        columns = {"states": spread(ride.states), "scales": spread(ride.scales)}
-        return dataclasses.replace(ride, **columns, watched=watched, guarded=guarded)
 
     def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
         return self.states, self.scales
 
-    def field(self, time: Float[Array, "..."], state: State) -> Any:
+    def field(self, time: Float[Array, "..."], state: State) -> State:
         return self.dynamics.field(time, state, self.input)
 
-    def event_function(self, state: State) -> Any:
+    def event_function(self, state: State) -> Float[Array, "..."] | None:
         return self.dynamics.contact(state) / self.press + CONTACT_ROUND_OFF if self.watched else None
 
-    def crossing_along(self, state: State, rate: State) -> Any:
-        return self.dynamics.contact_along(state, rate) / self.press + CONTACT_ROUND_OFF if self.watched else None
+    def crossing_along(self, state: State, rate: State) -> Float[Array, "..."] | None:
+        return self.dynamics.contact(state, rate) / self.press + CONTACT_ROUND_OFF if self.watched else None
 
-    def domain_margin(self, time: Float[Array, "..."], state: State) -> Any:
+    def domain_margin(self, time: Float[Array, "..."], state: State) -> Float[Array, "..."] | None:
         return self.dynamics.rank(state) / RANK_LOST - 1.0 if self.guarded else None
 
     def jumps(self, time: Float[Array, "..."], state: State) -> Jumps | None:
         return None if self.jump_times is None else Jumps.at(self.jump_times)
 
 
-def as_module(controls: Input | None, scene: Scene, launch: Launch) -> Any:
+def as_module(controls: Any, scene: Scene, launch: Launch) -> Any:
     """An input as a module whose numbers are leaves, evaluated for single rides. A function, or a module with many numbers, is
     traced once, with scalar arguments."""
     if controls is None or isinstance(controls, Held | Formula):
@@ -354,21 +328,12 @@ def as_module(controls: Input | None, scene: Scene, launch: Launch) -> Any:
     if isinstance(controls, eqx.Module):
         if not (is_users(type(controls)) or has_arrays(controls)):
             return controls
-        if numbers_in(controls) <= MOST_ELEMENTS:
+        if sum(np.size(leaf) for leaf in jax.tree.leaves(controls) if is_array(leaf)) <= MOST_ELEMENTS:
             return Held(parted(controls))
 
-    def motion(scene: Scene, launch: Launch) -> Any:
-        return scene.dynamics.geometry(scene.state(launch, True)).motion
-
-    single: Any = controls
-    return Formula.of(single, jnp.zeros(()), eqx.filter_eval_shape(motion, scene, launch))
+    return Formula.of(controls, *eqx.filter_eval_shape(at_start, scene, launch))
 
 
-def numbers_in(tree: Any) -> int:
-    """How many numbers a tree holds."""
-    return sum(np.size(leaf) for leaf in jax.tree.leaves(tree) if is_array(leaf))
-
-
-def has_arrays(tree: Any) -> bool:
+def has_arrays(tree: PyTree) -> bool:
     """Whether some leaf is an array with axes."""
     return any(eqx.is_array(leaf) and leaf.ndim > 0 for leaf in jax.tree.leaves(tree))

@@ -27,6 +27,27 @@ from nonholonomic.parameters import as_one
 from nonholonomic.text import shown
 from nonholonomic.validation import IN_DEGREES, Bound, Bounded, as_number, largest
 
+
+def as_numbers(value: Any) -> Any:
+    """A sequence of numbers as a tuple of arrays; anything else stays unchanged, for later checks."""
+    try:
+        return tuple(as_number(number) for number in tuple(value))
+    except TypeError:
+        return value
+
+
+def bounds_of(
+    module: Bounded, *names: str, above: float | None = None, at_least: float | None = None
+) -> Iterator[Bound]:
+    """The same limits for several numbers of a module, and for each of those in a tuple; `None` has no limits."""
+    for name in names:
+        value = getattr(module, name)
+        if isinstance(value, tuple):
+            yield from (Bound(number, f"{name}[{k}]", above, at_least) for k, number in enumerate(value))
+        elif value is not None:
+            yield Bound(value, name, above, at_least)
+
+
 # The body: a rigid frame on two rear wheels, with one front wheel in a fork that steers.
 
 #: A wheelbase above this [m], more than any vehicle's, suggests millimetres or centimetres.
@@ -82,12 +103,9 @@ class Stroller(Bounded):
         return f"wheelbase = {longest:g} m is long: was it in {unit}? {longest:g} {unit} are {metres:g} m"
 
     def bounds(self) -> Iterator[Bound]:
-        for name in ("mass", "wheelbase", "inertia", "steering_inertia"):
-            yield Bound(getattr(self, name), name, above=0.0)
-        if self.steering_spring is not None:
-            yield Bound(self.steering_spring, "steering_spring", at_least=0.0)
+        yield from bounds_of(self, "mass", "wheelbase", "inertia", "steering_inertia", above=0.0)
+        yield from bounds_of(self, "steering_spring", "centre", at_least=0.0)
         if self.centre is not None:
-            yield Bound(self.centre, "centre", at_least=0.0)
             yield Bound(self.centre, "centre", at_most=self.wheelbase, why="the wheelbase")
             min_inertia = self.mass * self.centre**2
             yield Bound(
@@ -214,8 +232,7 @@ class Damping(AbstractFriction):
     steering: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
 
     def bounds(self) -> Iterator[Bound]:
-        for name in ("rolling", "front", "scrub", "steering"):
-            yield Bound(getattr(self, name), name, at_least=0.0)
+        return bounds_of(self, "rolling", "front", "scrub", "steering", at_least=0.0)
 
     def drag(self, wheels: WheelMotion) -> Drag:
         return Drag(
@@ -254,8 +271,8 @@ class RollingResistance(AbstractFriction):
     speed: Float[Array, "..."] = eqx.field(converter=as_number)
 
     def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.coefficient, "coefficient", at_least=0.0)
-        yield Bound(self.speed, "speed", above=0.0)
+        yield from bounds_of(self, "coefficient", at_least=0.0)
+        yield from bounds_of(self, "speed", above=0.0)
 
     def drag(self, wheels: WheelMotion) -> Drag:
         return Drag(
@@ -268,115 +285,64 @@ class RollingResistance(AbstractFriction):
         return None if load is None else -self.coefficient * greatest(load, 0.0) * jnp.tanh(speed / self.speed)
 
 
-# Two meanings of "the wheels do not slip sideways" on curved ground; on a plane they are equal.
-#
-# In both, the rear axle moves with the velocity w cos(phi) d and the heading turns at the rate w nu sin(phi) / l, where w
-# is the one free speed of the motion. They differ in the direction d, in the factor nu, and in the vector that turns.
-
 VERTICAL: Vector = (None, None, 1.0)
 
 
-class AbstractHeading(eqx.Module):
-    """The heading, and how it directs and turns the stroller. Vectors are in the ground's axes."""
+class Heading(eqx.Module):
+    """One of two meanings of "the wheels do not slip sideways" on curved ground; on a plane they are equal.
 
-    @abc.abstractmethod
+    In both, the rear axle moves with the velocity w cos(phi) d and the heading turns at the rate w nu sin(phi) / l, where w
+    is the one free speed of the motion. Vectors are in the ground's axes.
+
+    - Intrinsic: the heading is a unit vector e along the ground that turns about the normal: d = e, nu = 1 (section 4).
+    - `projected`: it is a horizontal unit vector h, as in the paper: d = h n_z - z (h.n), nu = n_z (section 3). The velocity
+      along d has the horizontal component n_z h, so the paper's speed is w cos(phi) n_z, which passes through zero at the
+      equator. Where d = 0 the constraints lose rank.
+    """
+
+    projected: bool = eqx.field(static=True)
+
     def axes(self, ground: AbstractSurface) -> int:
         """Number of components of the heading that do not vanish identically."""
+        return 2 if self.projected else ground.axes
 
-    @abc.abstractmethod
     def unit(self, heading: Vector, normal: Vector) -> Vector:
         """The heading, corrected for a drift off the ground or off unit length.
 
         An exact heading is unchanged, and so is its rate.
         """
+        if not self.projected:
+            heading = sum_vectors(heading, scale(subtract(None, dot(heading, normal)), normal))
+        return scale(1.0 / jnp.sqrt(dot(heading, heading)), heading)
 
-    @abc.abstractmethod
-    def direction(self, heading: Vector, normal: Vector, side: float) -> Vector:
-        """The vector d along the ground, from the outward normal and the side: 1 outside, -1 inside."""
+    def direction(self, heading: Vector, normal: Vector, side: float) -> tuple[Vector, Component, Component]:
+        """The vector d along the ground, its square d.d, and the factor nu, from the outward normal and the side: 1
+        outside, -1 inside."""
+        if not self.projected:
+            return heading, 1.0, 1.0
+        lift = scale(subtract(None, dot(heading, normal)), VERTICAL)
+        direction = scale(side, sum_vectors(scale(normal[2], heading), lift))
+        return direction, dot(direction, direction), multiply(side, normal[2])
 
-    @abc.abstractmethod
-    def square(self, direction: Vector) -> Component:
-        """The square d.d."""
-
-    @abc.abstractmethod
-    def lead(self, normal: Vector, side: float) -> Component:
-        """The factor nu."""
-
-    @abc.abstractmethod
     def rate(self, heading: Vector, normal: Vector, normal_rate: Vector, turn: Component, side: float) -> Vector:
         """Rate [1/s] of a heading that turns at the rate `turn` [rad/s] to the driver's left."""
-
-    @abc.abstractmethod
-    def at_angle(self, angle: Float[Array, "..."], east: Vector, north: Vector) -> Vector:
-        """The heading at an angle [rad], given the unit vectors of the place."""
-
-    @abc.abstractmethod
-    def angle(self, heading: Vector, east: Vector, north: Vector) -> Float[Array, "..."]:
-        """The angle [rad] of a heading, in (-pi, pi]."""
-
-
-class Intrinsic(AbstractHeading):
-    """The heading is a unit vector e along the ground that turns about the normal: d = e, nu = 1 (section 4)."""
-
-    def axes(self, ground: AbstractSurface) -> int:
-        return ground.axes
-
-    def unit(self, heading: Vector, normal: Vector) -> Vector:
-        tangent = sum_vectors(heading, scale(subtract(None, dot(heading, normal)), normal))
-        return scale(1.0 / jnp.sqrt(dot(tangent, tangent)), tangent)
-
-    def direction(self, heading: Vector, normal: Vector, side: float) -> Vector:
-        return heading
-
-    def square(self, direction: Vector) -> Component:
-        return 1.0
-
-    def lead(self, normal: Vector, side: float) -> Component:
-        return 1.0
-
-    def rate(self, heading: Vector, normal: Vector, normal_rate: Vector, turn: Component, side: float) -> Vector:
+        if self.projected:
+            # The driver's left is to the left as seen from above on either side, as in the paper's equations.
+            return cross(scale(turn, VERTICAL), heading)
         yaw = scale(multiply(side, turn), normal)
         return cross(sum_vectors(yaw, cross(normal, normal_rate)), heading)
 
     def at_angle(self, angle: Float[Array, "..."], east: Vector, north: Vector) -> Vector:
+        """The heading at an angle [rad], given the unit vectors of the place."""
+        if self.projected:
+            return (jnp.cos(angle), jnp.sin(angle), None)
         return sum_vectors(scale(jnp.cos(angle), east), scale(jnp.sin(angle), north))
 
     def angle(self, heading: Vector, east: Vector, north: Vector) -> Float[Array, "..."]:
+        """The angle [rad] of a heading, in (-pi, pi]."""
+        if self.projected:
+            return jnp.arctan2(heading[1], heading[0])
         return jnp.arctan2(dot(heading, north), dot(heading, east))
-
-
-class Projected(AbstractHeading):
-    """The heading is a horizontal unit vector h, as in the paper: d = h n_z - z (h.n), nu = n_z (section 3).
-
-    The velocity along d has the horizontal component n_z h, so the paper's speed is w cos(phi) n_z, which passes
-    through zero at the equator. Where d = 0 the constraints lose rank.
-    """
-
-    def axes(self, ground: AbstractSurface) -> int:
-        return 2
-
-    def unit(self, heading: Vector, normal: Vector) -> Vector:
-        return scale(1.0 / jnp.sqrt(dot(heading, heading)), heading)
-
-    def direction(self, heading: Vector, normal: Vector, side: float) -> Vector:
-        lift = scale(subtract(None, dot(heading, normal)), VERTICAL)
-        return scale(side, sum_vectors(scale(normal[2], heading), lift))
-
-    def square(self, direction: Vector) -> Component:
-        return dot(direction, direction)
-
-    def lead(self, normal: Vector, side: float) -> Component:
-        return multiply(side, normal[2])
-
-    def rate(self, heading: Vector, normal: Vector, normal_rate: Vector, turn: Component, side: float) -> Vector:
-        # The driver's left is to the left as seen from above on either side, as in the paper's equations.
-        return cross(scale(turn, VERTICAL), heading)
-
-    def at_angle(self, angle: Float[Array, "..."], east: Vector, north: Vector) -> Vector:
-        return (jnp.cos(angle), jnp.sin(angle), None)
-
-    def angle(self, heading: Vector, east: Vector, north: Vector) -> Float[Array, "..."]:
-        return jnp.arctan2(heading[1], heading[0])
 
 
 # Launches: how a ride starts.
@@ -391,13 +357,12 @@ def as_launch(value: Any) -> Any:
 USUAL = {"steering": math.pi, "heading": 4.0 * math.pi}
 
 
-def as_place(value: Any) -> Any:
-    """Two or three numbers as a tuple of arrays; anything else stays unchanged, for later checks."""
-    try:
-        numbers = tuple(value)
-    except TypeError:
-        return value
-    return tuple(as_number(number) for number in numbers)
+def as_place(value: Any) -> tuple[Array, ...]:
+    """Two or three numbers as a tuple of arrays; raises `ValueError` for anything else."""
+    numbers = as_numbers(value)
+    if not (isinstance(numbers, tuple) and len(numbers) in (2, 3)):
+        raise ValueError(f"place = {shown(numbers)} must be a pair of numbers, or (x, y, z) [m]")
+    return numbers
 
 
 def suspected_degrees(module: Bounded) -> str | None:
@@ -454,10 +419,6 @@ class Launch(Bounded):
     steering: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
     steering_rate: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
 
-    def __check_init__(self):
-        if not (isinstance(self.place, tuple) and len(self.place) in (2, 3)):
-            raise ValueError(f"place = {shown(self.place)} must be a pair of numbers, or (x, y, z) [m]")
-
     def suspicion(self) -> str | None:
         fastest = largest(self.speed)
         if fastest > FASTEST:
@@ -465,7 +426,4 @@ class Launch(Bounded):
         return suspected_degrees(self)
 
     def bounds(self) -> Iterator[Bound]:
-        for k, number in enumerate(self.place):
-            yield Bound(number, f"place[{k}]")
-        for name in ("heading", "speed", "steering", "steering_rate"):
-            yield Bound(getattr(self, name), name)
+        return bounds_of(self, "place", "heading", "speed", "steering", "steering_rate")

@@ -1,7 +1,7 @@
 """Plan a drive to a goal, and keep a ride on its plan."""
 
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+import dataclasses
+from collections.abc import Iterable, Iterator
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 from scipy.interpolate import CubicSpline
 
-from nonholonomic.geometry import AbstractSurface, add, cross, dot, scale
+from nonholonomic.geometry import AbstractSurface, cross, difference, dot, scale
 from nonholonomic.terminal import status_line
 from nonholonomic.text import shown
 from nonholonomic.validation import require_flag, require_kind, require_whole
@@ -18,19 +18,30 @@ from ..model.dynamics import padded
 from ..model.input import Motion
 from ..model.scene import Scene
 from ..model.vehicle import Launch
-from ..runs.trajectory import Trajectory
-from .candidates import LIMIT_RESERVE, Outline, prices
-from .obstacles import Footprint
 from .planner import Planner, proposed
-from .problem import ALLOWED, COMPARED, CONFIRMED, MOST_STEERING, Goal, Limits, Verdict, checked_problem, checked_run
-from .result import Plan
-from .transcription import FINE, ORDER, Candidates, Drive, drive_along, evaluate, interpolate, optimise
+from .problem import MOST_STEERING, Box, Disc, Footprint, Goal, Limits, Problem, checked_problem
+from .result import ALLOWED, Plan, checked_drive
+from .search import INTERVALS, paths_of, prices, soonest, unknowns_of
+from .transcription import (
+    FINE,
+    LIMIT_RESERVE,
+    ORDER,
+    Candidates,
+    Drive,
+    Numbers,
+    Task,
+    drive_along,
+    evaluate,
+    interpolate,
+    optimise,
+)
 
 #: Candidates that are optimised together.
 LANES = 2
 
-#: Tolerance of the run that confirms a plan.
+#: Tolerance of the run that confirms a plan; times of a run that is compared with others, and of one that is confirmed.
 TIGHT = 1e-9
+COMPARED, CONFIRMED = 501, 2001
 
 #: A candidate with a greater violation of the constraints (see `transcription.py`) is not worth a run if there is a better one.
 HOPELESS = 0.05
@@ -48,34 +59,13 @@ PATIENCE = 1
 MINIMISED = ("effort", "time")
 
 
-class Log(NamedTuple):
-    """The unknowns of all optimised candidates, batch by batch, and the reasons why batches cannot succeed."""
-
-    tried: list[Any]
-    reasons: list[str]
-
-
-class Attempt(NamedTuple):
-    """An optimised candidate that was driven: its input and duration [s], its run and what it achieves."""
-
-    drive: Drive
-    t1: float
-    run: Trajectory
-    verdict: Verdict
-
-    @property
-    def rank(self) -> tuple[float, float]:
-        """The attempt with the least rank is the best."""
-        return self.verdict.excess, self.verdict.effort
-
-
 def plan(
     scene: Scene,
     launch: Launch,
     goal: Goal,
     t1: Float[ArrayLike, ""],
     *,
-    obstacles: Any = (),
+    obstacles: Iterable[Box | Disc] = (),
     limits: Limits | None = None,
     footprint: Footprint | None = None,
     minimise: str = "effort",
@@ -136,102 +126,85 @@ def plan(
     require_flag(progress, "progress")
     if planner is not None:
         require_kind(planner, "planner", Planner, ", as stroller.learn_planner returns it")
-    problem = checked_problem(scene, launch, goal, t1, obstacles, limits, footprint, tolerance)
-    if minimise == "time" and not problem.limits.ranges().keys() - {"steering"}:
+    in_haste = minimise == "time"
+    problem = checked_problem(
+        scene, launch, goal, t1, obstacles, limits, footprint, tolerance=tolerance, in_haste=in_haste
+    )
+    if in_haste and not problem.limits.ranges().keys() - {"steering"}:
         raise ValueError("minimise = 'time' needs a limit of speed, force, torque or grip, such as Limits(speed=1.0)")
-    duration = float(np.asarray(t1))
+    attempts, tried, reasons = [], [], []
     with status_line("planning", progress):
-        outline = Outline.of(problem)
-        attempts, log = [], Log([], [])
-        in_haste = minimise == "time"
-        guesses = _guesses(outline, duration, in_haste, starts, planner, seed, log)
-        for attempt in _attempts(outline, guesses, duration, in_haste, tolerance, log):
+        guesses = _guesses(problem, starts, planner, seed, reasons)
+        for attempt in _attempts(problem, guesses, tolerance, tried):
             attempts.append(attempt)
-            if not attempt.verdict.hindrances:
+            if attempt.reached:
                 break
-        best = min(attempts, key=lambda attempt: attempt.rank)
-        run, verdict = best.run, best.verdict
-        if verdict.hindrances:
-            run, verdict = checked_run(problem, best.drive, best.t1, TIGHT, CONFIRMED)
-            verdict = in_time(verdict, best.t1, duration)
-            verdict = verdict._replace(hindrances=(*verdict.hindrances, *log.reasons[:1]))
-    return Plan(best.drive, best.t1, run, verdict, problem, jnp.asarray(outline.lines(np.concatenate(log.tried))))
+        best = min(attempts, key=lambda attempt: (attempt.excess, attempt.effort))
+        if not best.reached:
+            best = checked_drive(problem, best.input, TIGHT, CONFIRMED)
+            best = dataclasses.replace(best, hindrances=(*best.hindrances, *reasons[:1]))
+    positions = np.moveaxis(np.concatenate(tried)[:, : INTERVALS + 1, : scene.surface.axes], -1, 0)
+    lines = np.stack(
+        [np.asarray(part) for part in scene.surface.in_fixed_frame(padded(jnp.asarray(positions)))], axis=-1
+    )
+    return dataclasses.replace(best, candidates=jnp.asarray(lines))
 
 
 def _guesses(
-    outline: Outline, t1: float, in_haste: bool, starts: int, planner: Planner | None, seed: int, log: Log
+    problem: Problem, starts: int, planner: Planner | None, seed: int, reasons: list[str]
 ) -> Iterator[tuple[float, Candidates]]:
     """Batches of candidates, each with the length [m] of its shortest way: the proposal of a planner, then what searches
-    find. Candidates that are in haste begin with the duration that their path allows, whatever the longest one `t1` is."""
+    find. Candidates that are in haste begin with the duration that their path allows, whatever the longest one is.
+    `reasons` collects why batches cannot succeed."""
     rng = np.random.default_rng(seed)
     if planner is not None:
-        task = outline.task(outline.distance, t1, outline.clearance)
+        task = Task.of(problem, problem.distance, problem.t1, problem.clearance)
         if (misfit := planner.misfit(task)) is not None:
             raise ValueError(f"planner: {misfit}; learn in this scene")
-        proposal = proposed(planner, task, t1)
+        proposal = proposed(planner, task, problem.t1)
         if proposal is not None:
-            yield outline.distance, Candidates(proposal[None], np.full(1, t1))
+            yield problem.distance, Candidates(proposal[None], np.full(1, problem.t1))
             starts -= 1
     for batch in range(-(-starts // LANES)):
-        paths, reason = outline.paths(prices(outline, LANES, batch, rng, in_haste), t1)
-        log.reasons.extend([reason] if reason else [])
-        if len(log.reasons) > PATIENCE:
+        paths, reason = paths_of(problem, prices(problem, LANES, batch, rng))
+        reasons.extend([reason] if reason else [])
+        if len(reasons) > PATIENCE:
             return
         way = min(float(path.length.sum()) for path in paths)
-        durations = np.array([outline.soonest(path) if in_haste else t1 for path in paths])
-        yield way, Candidates(np.stack(list(map(outline.unknowns, paths, durations))), durations)
+        durations = np.array([soonest(problem, path) if problem.in_haste else problem.t1 for path in paths])
+        unknowns = [unknowns_of(problem, path, t1) for path, t1 in zip(paths, durations, strict=True)]
+        yield way, Candidates(np.stack(unknowns), durations)
 
 
 def _attempts(
-    outline: Outline,
-    guesses: Iterator[tuple[float, Candidates]],
-    t1: float,
-    in_haste: bool,
-    tolerance: float,
-    log: Log,
-) -> Iterator[Attempt]:
-    """Attempts at a problem, best first in each batch of candidates."""
-    within = float(outline.problem.goal.within)
-    widths = [(name, high - low) for name, (low, high) in outline.problem.limits.ranges().items()]
+    problem: Problem, guesses: Iterator[tuple[float, Candidates]], tolerance: float, tried: list[np.ndarray]
+) -> Iterator[Plan]:
+    """Optimised candidates that were driven, best first in each batch; `tried` collects the unknowns of all of them."""
+    widths = [(name, high - low) for name, (low, high) in problem.limits.ranges().items()]
     for batch, (way, candidates) in enumerate(guesses):
-        clearance, reserve = outline.clearance, LIMIT_RESERVE
+        clearance, reserve = problem.clearance, LIMIT_RESERVE
         for _ in range(STRICTER + 1):
-            task = outline.task(way, candidates.durations.mean(), clearance, reserve, in_haste)
-            candidates, violation, values = optimise(candidates, task, FIRMER if in_haste and batch else 1.0)
-            log.tried.append(candidates.unknowns)
+            task = Task.of(problem, way, float(candidates.durations.mean()), clearance, reserve)
+            candidates, violation, values = optimise(candidates, task, FIRMER if problem.in_haste and batch else 1.0)
+            tried.append(np.asarray(candidates.unknowns))
             attempts = []
             for lane in np.lexsort((values, violation > HOPELESS)):
                 if attempts and violation[lane] > HOPELESS:
                     break
-                attempts.append(_driven(outline, candidates, lane, t1, tolerance))
+                (steering, front_speed), t1 = candidates.unknowns[lane].T[-2:], float(candidates.durations[lane])
+                drive = drive_along(problem.scene.dynamics, problem.start_pose, steering, front_speed, t1)
+                attempt = checked_drive(problem, drive, tolerance, COMPARED)
+                # A solution is driven again at a tight tolerance, and this run counts.
+                attempts.append(checked_drive(problem, drive, TIGHT, CONFIRMED) if attempt.reached else attempt)
                 yield attempts[-1]
-            overlap = -max(attempt.verdict.clearance for attempt in attempts)
-            shares = [[-attempt.verdict.margins[name] / width for name, width in widths] for attempt in attempts]
+            overlap = -max(attempt.clearance for attempt in attempts)
+            shares = [[-attempt.margins[name] / width for name, width in widths] for attempt in attempts]
             excess = min(max(share, default=0.0) for share in shares)
-            ends = any(max(attempt.verdict.errors) < within for attempt in attempts)
+            ends = any(max(attempt.errors) < float(problem.goal.within) for attempt in attempts)
             if not ends or not (overlap > 0.0 or ALLOWED < excess < CORRIGIBLE):
                 break
-            clearance += (overlap + 0.5 * outline.clearance) * (overlap > 0.0)
+            clearance += (overlap + 0.5 * problem.clearance) * (overlap > 0.0)
             reserve += 2.0 * excess * (excess > ALLOWED)
-
-
-def _driven(outline: Outline, candidates: Candidates, lane: int, longest: float, tolerance: float) -> Attempt:
-    """An optimised candidate, driven; a solution is driven again at a tight tolerance, and this run counts."""
-    t1, (steering, front_speed) = float(candidates.durations[lane]), candidates.unknowns[lane].T[-2:]
-    drive = drive_along(outline.problem.scene.dynamics, outline.start, steering, front_speed, t1)
-    run, verdict = checked_run(outline.problem, drive, t1, tolerance, COMPARED)
-    if not verdict.hindrances:
-        run, verdict = checked_run(outline.problem, drive, t1, TIGHT, CONFIRMED)
-    return Attempt(drive, t1, run, in_time(verdict, t1, longest))
-
-
-def in_time(verdict: Verdict, t1: float, longest: float) -> Verdict:
-    """A verdict that is also on the duration `t1` [s], which may be `longest` [s]."""
-    if t1 <= longest:
-        return verdict
-    words = f"the drive takes {t1:.4g} s, longer than t1 = {longest:.4g} s"
-    excess = verdict.excess + t1 / longest - 1.0
-    return verdict._replace(excess=excess, hindrances=(*verdict.hindrances, words))
 
 
 # Feedback that keeps a ride on its plan.
@@ -264,7 +237,7 @@ class Tracker(eqx.Module):
     slow: Float[Array, ""]
     side: float = eqx.field(static=True)
 
-    def errors(self, t: Float[Array, "..."], motion: Motion) -> tuple[Any, Any, Any, Any]:
+    def errors(self, t: Numbers, motion: Motion) -> tuple[Numbers, Numbers, Numbers, Numbers]:
         """The planned stroller as seen from this one: distances [m] ahead and to the left, and the sine and the cosine of
         the angle to the left at which it heads."""
         pose = evaluate(self.pose, jnp.asarray(t) / self.drive.duration)
@@ -272,16 +245,15 @@ class Tracker(eqx.Module):
         axes = self.surface.axes
         heading, target = padded(components[axes:]), padded(components[:axes])
         left = scale(self.side, cross(self.surface.normal(motion.position), motion.heading))
-        away = tuple(None if a is None else a - b for a, b in zip(target, motion.position, strict=True))
-        away = (away[0], away[1], away[2])
+        away = difference(target, motion.position)
         return dot(away, motion.heading), dot(away, left), dot(heading, left), dot(heading, motion.heading)
 
-    def storage(self, t: Float[Array, "..."], motion: Motion) -> Float[Array, "..."]:
+    def storage(self, t: Numbers, motion: Motion) -> Numbers:
         """The shaped energy of the errors of place and heading [m^2]: (x^2 + y^2) / 2 + (1 - cos(angle)) / stiffness."""
         ahead, left, _, cosine = self.errors(t, motion)
         return 0.5 * (ahead**2 + left**2) + (1.0 - cosine) / self.across
 
-    def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    def __call__(self, t: Numbers, motion: Motion) -> tuple[Numbers, Numbers]:
         angle, rate, front_speed, force, torque = self.drive.reference(t)
         ahead, left, sine, cosine = self.errors(t, motion)
         speed = front_speed * jnp.cos(angle)
@@ -289,12 +261,7 @@ class Tracker(eqx.Module):
         steering = jnp.arctan(jnp.tan(angle) + self.wheelbase * turn)
         steering = jnp.clip(steering, self.least_steering, self.most_steering)
         wanted = (speed * cosine + self.along * ahead) / jnp.cos(steering)
-        drive = self.drive
-        force = add(drive.climbing(motion), force + drive.speed_gain * (wanted - motion.front_speed))
-        torque = (
-            torque + drive.angle_gain * (steering - motion.steering) + drive.rate_gain * (rate - motion.steering_rate)
-        )
-        return force, torque
+        return self.drive.held(motion, steering, rate, wanted, force, torque)
 
 
 def track(scene: Scene, plan: Plan) -> Tracker:

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from nonholonomic.geometry import Plane, cross, dot, scale
 from nonholonomic.terminal import Progress, status_line
@@ -18,17 +19,15 @@ from nonholonomic.validation import require, require_flag, require_kind, require
 
 from ..model.dynamics import Dynamics, padded
 from ..model.scene import Scene
-from .candidates import Outline
-from .obstacles import FAR
-from .problem import checked_problem
-from .transcription import ORDER, Task, drive_from, motion_at, point_residuals, poses_along, seen_from_above, windows
+from .problem import FAR, Pose, checked_problem, seen_from_above
+from .transcription import ORDER, Numbers, Task, drive_from, motion_at, point_residuals, windows
 
 # A network that proposes drives, step by step: it sees the goal and the obstacles from where the stroller is.
 
 #: Proposals for a problem, and decisions in each of them.
 PROPOSALS, DECISIONS = 4, 32
 
-#: Steps of the Runge-Kutta method between two decisions.
+#: Steps of the Runge-Kutta method between two decisions, each of which is an interval of the plan.
 PARTS = 2
 
 #: Greatest speed of a proposal, in units of that of the straight way.
@@ -48,39 +47,35 @@ MISSED, BROKEN, SPENT = 10.0, 10.0, 0.1
 
 
 class Proposal(NamedTuple):
-    """A drive: coefficients (rows,) of the steering angle [rad] and of the front wheel's speed [m/s], the poses
-    (decisions, parts, components) before each step of the integration, and the pose at the end."""
+    """A drive: coefficients of the steering angle [rad] and of the front wheel's speed [m/s], the poses before each step of
+    the integration, and the pose at the end."""
 
-    steering: Any
-    front_speed: Any
-    poses: Any
-    end: Any
-
-
-def squeezed(lengths: Any) -> Any:
-    """Lengths in wheelbases on a scale that is logarithmic for great ones."""
-    return jnp.arcsinh(lengths)
+    steering: Float[Array, " rows"]
+    front_speed: Float[Array, " rows"]
+    poses: Float[Array, "decisions parts components"]
+    end: Pose
 
 
-def goal_seen(task: Task, pose: Any) -> Any:
+def goal_seen(task: Task, pose: Pose) -> Float[Array, " 6"]:
     """The goal as it is seen from a pose, six numbers: ahead and to the left, on two scales, and its heading."""
     dynamics, axes = task.dynamics, task.dynamics.surface.axes
     place, heading = padded(pose[:axes]), padded(pose[axes:])
     left = scale(dynamics.side, cross(dynamics.surface.normal(place), heading))
-    away, goal_heading = padded((task.goal[0] - pose)[:axes] / task.scales.length), padded(task.goal[0][axes:])
+    away, goal_heading = padded((task.goal[0] - pose)[:axes] / task.length), padded(task.goal[0][axes:])
     ahead, aside = dot(away, heading), dot(away, left)
     turned = [task.has_heading * dot(goal_heading, heading), task.has_heading * dot(goal_heading, left)]
-    return jnp.stack([squeezed(ahead), squeezed(aside), squeezed(4.0 * ahead), squeezed(4.0 * aside), *turned])
+    # Lengths are on a scale that is logarithmic for great ones.
+    return jnp.stack([*(jnp.arcsinh(length) for length in (ahead, aside, 4.0 * ahead, 4.0 * aside)), *turned])
 
 
-def obstacles_seen(task: Task, pose: Any) -> tuple[Any, Any]:
-    """The corners of all obstacles as they are seen from a pose, (obstacles, 8), a disc as a square; and whether a row is an
-    obstacle or only pads the list."""
+def obstacles_seen(task: Task, pose: Pose) -> tuple[Float[Array, "obstacles 8"], Bool[Array, " obstacles"]]:
+    """The corners of all obstacles as they are seen from a pose, a disc as a square; and whether a row is an obstacle or only
+    pads the list."""
     square = jnp.array([[1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
     discs = task.obstacles.centres[:, None] + square * task.obstacles.radii[:, None, None]
     corners = jnp.concatenate([task.obstacles.boxes, discs])
     place, *directions = seen_from_above(task.dynamics, pose)
-    seen = squeezed((corners - place) @ jnp.stack(directions, axis=1) / task.scales.length)
+    seen = jnp.arcsinh((corners - place) @ jnp.stack(directions, axis=1) / task.length)
     return seen.reshape(len(seen), CORNERS), jnp.abs(corners[:, 0, 0]) < 0.1 * FAR
 
 
@@ -126,7 +121,7 @@ class Planner(eqx.Module):
     ground: str = eqx.field(static=True)
 
     @classmethod
-    def untrained(cls, task: Task, key: Any) -> "Planner":
+    def untrained(cls, task: Task, key: Key[Array, ""]) -> "Planner":
         """A planner with random weights for problems such as one."""
         first, second = jax.random.split(key)
         # Single precision is enough for a proposal, and faster.
@@ -147,7 +142,7 @@ class Planner(eqx.Module):
             return f"it has learned with a wheelbase of {self.wheelbase:g} m, and that of this scene is {wheelbase:g} m"
         return None
 
-    def decide(self, task: Task, pose: Any, known: Any) -> Any:
+    def decide(self, task: Task, pose: Pose, known: Float[Array, " known"]) -> Float[Array, " 2"]:
         """Two numbers, from a pose and what else is known."""
         corners, is_there = obstacles_seen(task, pose)
         each = jnp.where(is_there[:, None], jax.vmap(self.of_obstacle)(corners.astype(jnp.float32)), 0.0)
@@ -155,11 +150,11 @@ class Planner(eqx.Module):
         seen = jnp.concatenate([goal_seen(task, pose), known, *place, each.sum(axis=0), each.max(axis=0, initial=0.0)])
         return self.of_step(seen.astype(jnp.float32)).astype(float)
 
-    def propose(self, task: Task, t1: Any, number: Any) -> Proposal:
+    def propose(self, task: Task, t1: Numbers, number: Int[Array, ""]) -> Proposal:
         """One of the proposals for a problem."""
         pose, steering, steering_rate, front_speed = task.start
         duration, change = t1 / DECISIONS, jnp.array([-1.0, 0.0, 1.0])
-        low, high, speed = task.low[0], task.high[0], task.scales.speed
+        low, high, speed = task.low[0], task.high[0], task.speed
         which = jax.nn.one_hot(number, PROPOSALS)
         fixed = jnp.stack([jnp.log(t1), jnp.log(speed), task.has_heading, task.goal[1] / speed])
 
@@ -186,9 +181,9 @@ class Planner(eqx.Module):
         return Proposal(jnp.concatenate([first[0], angles]), jnp.concatenate([first[1], speeds]), poses, end)
 
 
-def merit(task: Task, proposal: Proposal, t1: Any) -> Any:
+def merit(task: Task, proposal: Proposal, t1: Numbers) -> Numbers:
     """How far a proposal is from solving a problem: the weighted squares of what it misses, breaks and spends."""
-    rows = [windows(part[:, None])[..., 0] for part in (proposal.steering, proposal.front_speed)]
+    rows = windows(proposal.steering), windows(proposal.front_speed)
 
     def of_decision(poses, *window):
         def at(pose, part):
@@ -198,41 +193,36 @@ def merit(task: Task, proposal: Proposal, t1: Any) -> Any:
 
     inequalities, effort = jax.vmap(of_decision)(proposal.poses, *rows)
     axes, away = task.dynamics.surface.axes, proposal.end - task.goal[0]
-    missed = jnp.sum(away[:axes] ** 2) / task.scales.length**2 + task.has_heading * jnp.sum(away[axes:] ** 2)
+    missed = jnp.sum(away[:axes] ** 2) / task.length**2 + task.has_heading * jnp.sum(away[axes:] ** 2)
     broken = jnp.sum(jnp.minimum(inequalities, 0.0) ** 2)
     return MISSED * missed + BROKEN * broken + SPENT * jnp.sum(effort**2) / DECISIONS
 
 
-def refined(coefficients: np.ndarray) -> np.ndarray:
-    """The same spline with twice as many intervals."""
-    finer = np.empty(2 * len(coefficients) - ORDER + 1)
-    finer[::2] = (coefficients[:-1] + coefficients[1:]) / 2.0
-    finer[1::2] = (coefficients[:-2] + 6.0 * coefficients[1:-1] + coefficients[2:]) / 8.0
-    return finer
-
-
 @eqx.filter_jit
-def _best(planner: Planner, task: Task, t1: Any) -> tuple[Any, Any, Any]:
-    """The merit and the splines of the best proposal."""
+def _best(planner: Planner, task: Task, t1: Numbers) -> tuple[Numbers, Proposal]:
+    """The merit and the drive of the best proposal."""
 
-    def of_one(number):
+    def of_one(number: Int[Array, ""]) -> tuple[Numbers, Proposal]:
         proposal = planner.propose(task, t1, number)
-        return merit(task, proposal, t1), proposal.steering, proposal.front_speed
+        return merit(task, proposal, t1), proposal
 
-    merits, *splines = jax.vmap(of_one)(jnp.arange(PROPOSALS))
+    merits, proposals = jax.vmap(of_one)(jnp.arange(PROPOSALS))
     best = jnp.argmin(jnp.where(jnp.isfinite(merits), merits, jnp.inf))
-    return merits[best], splines[0][best], splines[1][best]
+    return jax.tree.map(lambda part: part[best], (merits, proposals))
 
 
-def proposed(planner: Planner, task: Task, t1: float) -> np.ndarray | None:
+def proposed(planner: Planner, task: Task, t1: float) -> Float[np.ndarray, "rows unknowns"] | None:
     """The best proposal as unknowns of the optimiser (see `transcription.py`); `None` if no proposal is finite."""
-    least, *splines = _best(planner, task, jnp.asarray(t1))
+    least, proposal = jax.tree.map(np.asarray, _best(planner, task, jnp.asarray(t1)))
     if not np.isfinite(least):
         return None
-    steering, front_speed = (refined(np.asarray(part)) for part in splines)
-    poses = poses_along(task.dynamics, task.start[0], steering, front_speed, t1)
-    poses = np.concatenate([poses, poses[-1:], poses[-1:]])
-    return np.concatenate([poses, np.stack([steering, front_speed], axis=1)], axis=1)
+    # The same splines with an interval for each step of the integration.
+    coarse = np.stack([proposal.steering, proposal.front_speed], axis=1)
+    splines = np.empty((PARTS * (len(coarse) - ORDER + 1) + ORDER - 1, 2))
+    splines[::2] = (coarse[:-1] + coarse[1:]) / 2.0
+    splines[1::2] = (coarse[:-2] + 6.0 * coarse[1:-1] + coarse[2:]) / 8.0
+    poses = np.concatenate([proposal.poses.reshape(-1, len(proposal.end)), np.tile(proposal.end, (ORDER - 1, 1))])
+    return np.concatenate([poses, splines], axis=1)
 
 
 # Train a planner: a network that proposes drives.
@@ -314,25 +304,24 @@ def learn_planner(
         begin = time.perf_counter()
         while time.perf_counter() - begin < DRAWING * seconds or len(tasks) < BATCH * (seconds > 0.0):
             tasks.append(drawn_task(scene, problems, random, len(tasks)))
-        if seconds == 0.0:
-            return planner
         return trained(planner, scene.dynamics, tasks, random, (1.0 - DRAWING) * seconds, progress)
 
 
-def drawn_task(scene: Scene, problems: Any, random: np.random.Generator, number: int) -> tuple[Task, float]:
+def drawn_task(
+    scene: Scene, problems: Callable[[np.random.Generator], dict[str, Any]], random: np.random.Generator, number: int
+) -> tuple[Task, float]:
     """A random problem as the optimiser needs it, and its duration [s]; `number` names the draw in messages."""
     parts = problems(random)
     try:
-        arguments = arguments_of(parts)
-        problem = checked_problem(scene, **arguments, tolerance=1e-6)
+        _require_arguments(parts)
+        problem = checked_problem(scene, **parts)
     except ValueError as error:
         raise ValueError(f"problems: draw {number}: {error}") from None
-    outline, t1 = Outline.of(problem), float(arguments["t1"])
-    return outline.task(outline.distance, t1, outline.clearance), t1
+    return Task.of(problem, problem.distance, problem.t1, problem.clearance), problem.t1
 
 
-def arguments_of(parts: Any) -> dict[str, Any]:
-    """The arguments of `plan` of which a problem consists; raises `ValueError` for anything else."""
+def _require_arguments(parts: object) -> None:
+    """Raise `ValueError` unless these are arguments of `plan` of which a problem consists."""
     if not isinstance(parts, dict):
         needed, optional = ", ".join(NEEDED), ", ".join(name for name in TASK_PARTS if name not in NEEDED)
         raise ValueError(f"{shown(parts)} must be a dict with {needed}, and if needed {optional}")
@@ -342,25 +331,21 @@ def arguments_of(parts: Any) -> dict[str, Any]:
     for name in NEEDED:
         if name not in parts:
             raise ValueError(f"{name!r} is missing: a problem needs {', '.join(NEEDED)}")
-    return dict.fromkeys(TASK_PARTS) | {"obstacles": ()} | parts
 
 
-def stacked(tasks: list[tuple[Task, float]]) -> tuple[Task, np.ndarray]:
+def stacked(tasks: list[tuple[Task, float]]) -> tuple[Task, Float[np.ndarray, " tasks"]]:
     """Tasks with as many obstacles each, as arrays with one row for each of them, without their common dynamics."""
     most = [max(len(getattr(task.obstacles, name)) for task, _ in tasks) for name in ("boxes", "radii")]
     # A task without a limit of the grip has a limit that nothing reaches.
-    with_grip = any(task.with_grip for task, _ in tasks)
-    padded = [
-        dataclasses.replace(task, dynamics=None, obstacles=task.obstacles.padded(*most), with_grip=with_grip)
-        for task, _ in tasks
-    ]
+    common = {"dynamics": None, "with_grip": any(task.with_grip for task, _ in tasks)}
+    padded = [dataclasses.replace(task, obstacles=task.obstacles.padded(*most), **common) for task, _ in tasks]
     return jax.tree.map(lambda *parts: np.stack(parts), *padded), np.array([t1 for _, t1 in tasks])
 
 
-def loss(planner: Planner, dynamics: Dynamics, tasks: Task, t1: Any) -> Any:
+def loss(planner: Planner, dynamics: Dynamics, tasks: Task, t1: Float[Array, " tasks"]) -> Float[Array, ""]:
     """What learning minimises: the mean over all problems of the merit of the best proposal, on a logarithmic scale."""
 
-    def of_one(task, t1):
+    def of_one(task: Task, t1: Numbers) -> Numbers:
         task = eqx.tree_at(lambda task: task.dynamics, task, dynamics, is_leaf=lambda part: part is None)
         merits = jax.vmap(lambda number: merit(task, planner.propose(task, t1, number), t1))(jnp.arange(PROPOSALS))
         values = jnp.log1p(merits)
@@ -380,18 +365,17 @@ def trained(
     """A planner after steps of Adam, for `seconds` after the first step, which compiles."""
     import optax
 
+    if seconds == 0.0:
+        return planner
     pool, times = stacked(tasks)
-    optimiser = optax.scale_by_adam()
+    # A drive that went astray has no useful slope.
+    optimiser = optax.apply_if_finite(optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam()), 2**31 - 1)
 
     @eqx.filter_jit
-    def step(planner, state, tasks, t1, rate):
+    def step(planner: Planner, state: Any, tasks: Task, t1: Float[Array, " tasks"], rate: Float[Array, ""]) -> Any:
         value, slopes = eqx.filter_value_and_grad(loss)(planner, dynamics, tasks, t1)
-        norm = jnp.sqrt(sum(jnp.sum(part**2) for part in jax.tree.leaves(slopes)))
-        # A drive that went astray has no useful slope.
-        usable = jnp.where(jnp.isfinite(norm), 1.0 / jnp.maximum(norm, 1.0), 0.0)
-        slopes = jax.tree.map(lambda part: jnp.where(usable > 0.0, usable * part, 0.0).astype(part.dtype), slopes)
         change, state = optimiser.update(slopes, state)
-        change = jax.tree.map(lambda part: (-rate * part).astype(jnp.float32), change)
+        change = jax.tree.map(lambda part: (-rate * part).astype(part.dtype), change)
         return eqx.apply_updates(planner, change), state, value
 
     state, number = optimiser.init(eqx.filter(planner, eqx.is_inexact_array)), 0
@@ -401,7 +385,7 @@ def trained(
             chosen = random.choice(len(tasks), BATCH, replace=False)
             rate = RATE * min(1.0, (number + 1) / RISE) * (0.5 + 0.5 * np.cos(np.pi * spent))
             batch = jax.tree.map(lambda part, chosen=chosen: part[chosen], pool)
-            planner, state, value = step(planner, state, batch, times[chosen], jnp.asarray(rate))
+            planner, state, value = step(planner, state, batch, jnp.asarray(times[chosen]), jnp.asarray(rate))
             value, now = float(value), time.perf_counter()
             if number == 0:
                 begin = now

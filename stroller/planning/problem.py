@@ -1,18 +1,18 @@
-"""A planning problem, checked before anything compiles, and the check of a drive."""
+"""A planning problem as the user states it, checked before anything compiles, and the distances of its obstacles."""
 
-from collections.abc import Iterator
-from typing import Any, ClassVar, NamedTuple
+import functools
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, ClassVar, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
-from scipy.interpolate import CubicSpline
+from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.geometry import AbstractSurface, Plane, cross, scale
 from nonholonomic.integration.problem import require_run
-from nonholonomic.text import readable_unit, shown
+from nonholonomic.text import shown
 from nonholonomic.validation import (
     Bound,
     Bounded,
@@ -24,69 +24,270 @@ from nonholonomic.validation import (
     require_scalars,
 )
 
-from ..model.dynamics import padded
+from ..model.dynamics import Dynamics, padded
 from ..model.scene import Scene
-from ..model.vehicle import Launch, as_place, suspected_degrees
-from ..runs.trajectory import Trajectory
-from ..runs.verbs import simulate
-from .obstacles import Box, Disc, Footprint, require_obstacles
-from .transcription import seen_from_above
+from ..model.vehicle import Launch, Stroller, as_numbers, as_place, bounds_of, suspected_degrees
 
-# Flat maps of the ground, on which paths are searched: x and y where the ground names its places so, and otherwise the
-# tangent plane between start and goal, whose points the nearest points of the ground represent.
+#: Numbers, and points (..., points, 2), in NumPy or in JAX.
+Numbers: TypeAlias = Float[Array | np.ndarray, "..."]
+Points: TypeAlias = Float[Array | np.ndarray, "... points 2"]
+
+# Obstacles, and the footprint of the stroller, in the horizontal plane.
+
+#: The numbers of boxes and of discs are padded to a multiple of this, so that other problems use the same programs.
+PADDING = 8
+
+#: Distance [m] of the obstacles that pad a list.
+FAR = 1e9
+
+#: Length, width and rear overhang of the drawn vehicle, in units of the wheelbase.
+DRAWN = (1.4, 0.87, 0.2)
+
+#: Square of a length [m^2] that keeps the slope of a distance finite where the distance vanishes.
+SMALLEST_SQUARE = 1e-18
 
 
-def is_flat(surface: AbstractSurface) -> bool:
-    """Whether the ground names its places by two lengths, x and y."""
-    return tuple(surface.coordinates) == (("x", "m"), ("y", "m"))
+def require_pair(value: object, name: str, example: str) -> None:
+    """Raise `ValueError` unless the value is a pair of single numbers."""
+    if not (isinstance(value, tuple) and len(value) == 2 and all(np.shape(number) == () for number in value)):
+        raise ValueError(f"{name} = {shown(value)} must be a pair of numbers, such as {example}")
 
 
-class Chart(eqx.Module):
-    """A map of the ground. On a curved one, `origin` and the unit vectors `east` and `north` span the tangent plane."""
+class Box(Bounded):
+    """A rectangular obstacle in the coordinates x and y.
 
-    surface: AbstractSurface
-    origin: Float[Array, " 3"] | None = None
-    east: Float[Array, " 3"] | None = None
-    north: Float[Array, " 3"] | None = None
+    **Arguments:**
+
+    - `centre`: its middle (x, y) [m].
+    - `size`: its lengths [m] along its own two axes, positive.
+    - `angle`: angle [rad] from x to its first axis.
+
+    **Raises:** `ValueError` for numbers out of range.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> stroller.Box(centre=(1.0, 0.3), size=(0.5, 0.25))
+    Box(centre=(1, 0.3) m, size=(0.5, 0.25) m, angle=0 rad)
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"centre": "m", "size": "m", "angle": "rad"}
+
+    centre: tuple[Float[Array, ""], ...] = eqx.field(converter=as_numbers)
+    size: tuple[Float[Array, ""], ...] = eqx.field(converter=as_numbers)
+    angle: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
+
+    def __check_init__(self):
+        require_pair(self.centre, "centre", "(1.0, 0.5)")
+        require_pair(self.size, "size", "(0.5, 0.25)")
+
+    def bounds(self) -> Iterator[Bound]:
+        yield from bounds_of(self, "centre", "angle")
+        yield from bounds_of(self, "size", above=0.0)
+
+    @property
+    def corners(self) -> Float[np.ndarray, "4 2"]:
+        """The corners [m], counterclockwise."""
+        cosine, sine = np.cos(float(self.angle)), np.sin(float(self.angle))
+        own = np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]]) * np.array(self.size, dtype=float) / 2.0
+        return np.array(self.centre, dtype=float) + own @ np.array([[cosine, sine], [-sine, cosine]])
+
+    def distance(self, polygon: Float[np.ndarray, "*n 4 2"]) -> Float[np.ndarray, "*n"]:
+        """The exact distance [m] of polygons from the box, negative where they overlap."""
+        return signed_distance(polygon, self.corners)
+
+
+class Disc(Bounded):
+    """A round obstacle in the coordinates x and y.
+
+    **Arguments:**
+
+    - `centre`: its middle (x, y) [m].
+    - `radius`: its radius [m], positive.
+
+    **Raises:** `ValueError` for numbers out of range.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> stroller.Disc(centre=(1.0, 0.3), radius=0.2)
+    Disc(centre=(1, 0.3) m, radius=0.2 m)
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"centre": "m", "radius": "m"}
+
+    centre: tuple[Float[Array, ""], ...] = eqx.field(converter=as_numbers)
+    radius: Float[Array, ""] = eqx.field(converter=as_number)
+
+    def __check_init__(self):
+        require_pair(self.centre, "centre", "(1.0, 0.5)")
+
+    def bounds(self) -> Iterator[Bound]:
+        yield from bounds_of(self, "centre")
+        yield from bounds_of(self, "radius", above=0.0)
+
+    def distance(self, polygon: Points) -> Numbers:
+        """The exact distance [m] of polygons from the disc, negative where they overlap."""
+        return disc_distance(polygon, np.array(self.centre, dtype=float), float(self.radius))
+
+
+class Footprint(Bounded):
+    """The rectangle that must not touch an obstacle, as seen from above.
+
+    **Arguments:**
+
+    - `length`, `width`: its size [m] along and across the heading, positive.
+    - `rear`: distance [m] from its rear end to the rear axle, in [0, `length`].
+
+    **Raises:** `ValueError` for numbers out of range.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> stroller.Footprint(length=0.5, width=0.25, rear=0.1)
+    Footprint(length=0.5 m, width=0.25 m, rear=0.1 m)
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"length": "m", "width": "m", "rear": "m"}
+
+    length: Float[Array, ""] = eqx.field(converter=as_number)
+    width: Float[Array, ""] = eqx.field(converter=as_number)
+    rear: Float[Array, ""] = eqx.field(converter=as_number)
+
+    def bounds(self) -> Iterator[Bound]:
+        yield from bounds_of(self, "length", "width", above=0.0)
+        yield Bound(self.rear, "rear", at_least=0.0)
+        yield Bound(self.rear, "rear", at_most=self.length, why="the length")
 
     @classmethod
-    def between(cls, surface: AbstractSurface, side: float, start: Any, goal: Any) -> "Chart":
-        """A map for a start and a goal, whose positions are in the ground's axes."""
-        if is_flat(surface):
-            return cls(surface)
-        middle = surface.nearest(padded((jnp.asarray(start) + jnp.asarray(goal)) / 2.0))
-        position, east, _ = surface.chart(surface.place_at(middle))
-        north = scale(side, cross(surface.normal(position), east))
-        zero = jnp.zeros(())
-        columns = [jnp.stack([zero if part is None else zero + part for part in v]) for v in (position, east, north)]
-        return cls(surface, *columns)
+    def of(cls, body: Stroller) -> "Footprint":
+        """The footprint of the vehicle that the pages draw."""
+        return cls(*(part * body.wheelbase for part in DRAWN))
 
-    def position(self, point: Float[Array, " 2"]) -> Float[Array, " axes"]:
-        """The position [m] of a point of the map, in the ground's axes."""
-        if self.origin is None or self.east is None or self.north is None:
-            place = self.surface.charted((point[0], point[1]))[0]
-        else:
-            place = self.surface.nearest(padded(self.origin + point[0] * self.east + point[1] * self.north))
-        return jnp.stack(place[: self.surface.axes])
+    def corners(self, place: Points, heading: Points, left: Points) -> Points:
+        """The corners [m], counterclockwise. **Arguments:** `place`: the rear axle [m]; `heading`, `left`: unit vectors
+        of the stroller, seen from above."""
+        front, half = self.length - self.rear, self.width / 2.0
+        along = np.array([1.0, 1.0, 0.0, 0.0])[:, None] * front - np.array([0.0, 0.0, 1.0, 1.0])[:, None] * self.rear
+        across = np.array([-1.0, 1.0, 1.0, -1.0])[:, None] * half
+        return place[..., None, :] + along * heading[..., None, :] + across * left[..., None, :]
 
-    def point(self, pose: Any) -> np.ndarray:
-        """The point and the heading (x, y, angle) on the map of a pose."""
-        axes = self.surface.axes
-        place, heading = np.asarray(pose[:axes]), np.asarray(pose[axes:])
-        if self.origin is not None:
-            plane = np.stack([np.asarray(self.east), np.asarray(self.north)])
-            place, heading = plane @ (place - np.asarray(self.origin)), plane @ heading
-        return np.array([place[0], place[1], np.arctan2(heading[1], heading[0])])
 
-    @eqx.filter_jit
-    def poses(self, points: Float[Array, "n 3"]) -> Float[Array, "n components"]:
-        """The poses of points and headings on the map."""
+class Obstacles(eqx.Module):
+    """The obstacles as arrays, padded: corners of the boxes (boxes, 4, 2), centres (discs, 2) and radii of the discs."""
 
-        def pose(point):
-            place, along = jax.jvp(self.position, (point[:2],), (jnp.stack([jnp.cos(point[2]), jnp.sin(point[2])]),))
-            return jnp.concatenate([place, along / jnp.sqrt(jnp.sum(along**2))])
+    boxes: Float[Array | np.ndarray, "boxes 4 2"]
+    centres: Float[Array | np.ndarray, "discs 2"]
+    radii: Float[Array | np.ndarray, " discs"]
 
-        return jax.vmap(pose)(points)
+    @classmethod
+    def of(cls, obstacles: Sequence[Box | Disc]) -> "Obstacles":
+        """Boxes and discs as arrays, padded."""
+        boxes = np.array([box.corners for box in obstacles if isinstance(box, Box)]).reshape(-1, 4, 2)
+        discs = [[*disc.centre, disc.radius] for disc in obstacles if isinstance(disc, Disc)]
+        circles = np.array(discs, dtype=float).reshape(-1, 3)
+        counts = (-(-len(parts) // PADDING) * PADDING for parts in (boxes, circles))
+        return cls(boxes, circles[:, :2], circles[:, 2]).padded(*counts)
+
+    def padded(self, boxes: int, discs: int) -> "Obstacles":
+        """The obstacles with others far away, so that there are so many boxes and discs; in NumPy, because JAX would
+        compile a program for every number of obstacles."""
+        others = Box((FAR, FAR), (1.0, 1.0)).corners, np.full(2, FAR), np.ones(())
+        counts, parts = (boxes, discs, discs), (self.boxes, self.centres, self.radii)
+        more = [np.broadcast_to(far, (n - len(a), *far.shape)) for a, far, n in zip(parts, others, counts, strict=True)]
+        return Obstacles(*(jnp.asarray(np.concatenate(pair)) for pair in zip(parts, more, strict=True)))
+
+    def gaps(self, corners: Points) -> Numbers:
+        """A lower bound [m] of the distance of footprints from every obstacle, with a slope everywhere."""
+        xp = np if isinstance(corners, np.ndarray) else jnp
+        boxes = separation(corners[..., None, :, :], self.boxes)
+        discs = disc_distance(corners[..., None, :, :], self.centres, self.radii)
+        return xp.concatenate([boxes, discs], axis=-1)
+
+
+def require_obstacles(obstacles: Iterable[Box | Disc]) -> tuple[Box | Disc, ...]:
+    """A list of obstacles as a tuple; raise `ValueError` for anything else."""
+    if isinstance(obstacles, Box | Disc):
+        raise ValueError("obstacles = one obstacle must be a list: write obstacles=[obstacle]")
+    try:
+        parts = tuple(obstacles)
+    except TypeError:
+        raise ValueError(f"obstacles = {shown(obstacles)} must be a list of Box and Disc") from None
+    for k, part in enumerate(parts):
+        if not isinstance(part, Disc):
+            require_kind(part, f"obstacles[{k}]", Box, " or a Disc")
+    return parts
+
+
+# Distances between a convex polygon that moves and obstacles: convex polygons and discs. Arrays have the shape
+# (..., vertices, 2), counterclockwise. The functions use only operators and methods that NumPy and JAX share, so that the
+# optimiser and the check share them.
+
+
+def _least(values: Numbers, axis: int) -> Numbers:
+    """The least of some values along an axis, with the derivative of that value.
+
+    JAX divides the derivative of `min` by the number of values that equal the result: if XLA computes a value again and
+    rounds it differently, that number is zero.
+    """
+    xp: Any = np if isinstance(values, np.ndarray) else jnp
+    return xp.take_along_axis(values, xp.expand_dims(values.argmin(axis), axis), axis).squeeze(axis)
+
+
+def _next(polygon: Points) -> Points:
+    return polygon[..., np.roll(np.arange(polygon.shape[-2]), -1), :]
+
+
+def _face_gaps(polygon: Points, points: Points) -> Numbers:
+    """How far points (..., points, 2) are outside each face of a polygon: (..., faces, points)."""
+    edge = _next(polygon) - polygon
+    length = (edge * edge).sum(-1) ** 0.5
+    normal_x, normal_y = edge[..., 1] / length, -edge[..., 0] / length
+    offset = normal_x * polygon[..., 0] + normal_y * polygon[..., 1]
+    x, y = points[..., None, :, 0], points[..., None, :, 1]
+    return normal_x[..., None] * x + normal_y[..., None] * y - offset[..., None]
+
+
+def separation(first: Points, second: Points) -> Numbers:
+    """Greatest gap [m] between two polygons across a face of either.
+
+    This is the exact depth of penetration (negative) of polygons that overlap (the separating-axis theorem; Ericson,
+    Real-Time Collision Detection (2005), section 5.2), and a lower bound of the distance of others.
+    """
+    gap, gap_back = (-_least(-_least(_face_gaps(*pair), -1), -1) for pair in ((first, second), (second, first)))
+    return gap + (gap_back - gap).clip(0.0)
+
+
+def _edge_distance(polygon: Points, points: Points) -> Numbers:
+    """Distance [m] of points (..., points, 2) from the boundary of a polygon."""
+    edge = (_next(polygon) - polygon)[..., :, None, :]
+    along = points[..., None, :, :] - polygon[..., :, None, :]
+    part = ((along * edge).sum(-1) / (edge * edge).sum(-1)).clip(0.0, 1.0)
+    away = along - part[..., None] * edge
+    return (_least((away * away).sum(-1), -2) + SMALLEST_SQUARE) ** 0.5
+
+
+def signed_distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Distance [m] between two polygons, or minus the depth of penetration if they overlap."""
+    gap = separation(first, second)
+    corners = np.minimum(_edge_distance(first, second).min(-1), _edge_distance(second, first).min(-1))
+    return np.where(gap > 0.0, corners, gap)
+
+
+def disc_distance(polygon: Points, centre: Points, radius: Numbers | float) -> Numbers:
+    """Distance [m] between a polygon and a disc, or minus the depth of penetration if they overlap."""
+    point = centre[..., None, :]
+    inside = _face_gaps(polygon, point).max(-2)[..., 0] < 0.0
+    return _edge_distance(polygon, point)[..., 0] * (1.0 - 2.0 * inside) - radius
 
 
 # What a plan must achieve, and what it must not exceed.
@@ -127,31 +328,21 @@ class Goal(Bounded):
     speed: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
     within: Float[Array, ""] = eqx.field(converter=as_number, default=0.05)
 
-    def __check_init__(self):
-        if not (isinstance(self.place, tuple) and len(self.place) in (2, 3)):
-            raise ValueError(f"place = {shown(self.place)} must be a pair of numbers, or (x, y, z) [m]")
-
     def suspicion(self) -> str | None:
         return suspected_degrees(self)
 
     def bounds(self) -> Iterator[Bound]:
-        for k, number in enumerate(self.place if isinstance(self.place, tuple) else ()):
-            yield Bound(number, f"place[{k}]")
-        if self.heading is not None:
-            yield Bound(self.heading, "heading")
-        yield Bound(self.speed, "speed")
-        yield Bound(self.within, "within", above=0.0)
+        yield from bounds_of(self, "place", "heading", "speed")
+        yield from bounds_of(self, "within", above=0.0)
 
 
 def as_range(value: Any) -> Any:
     """A bound as the pair (-bound, bound); a pair and `None` stay as they are."""
-    if value is None:
-        return None
-    try:
-        return tuple(as_number(number) for number in tuple(value))
-    except TypeError:
-        bound = as_number(value)
-        return (-bound, bound) if isinstance(bound, Array) else value
+    numbers = as_numbers(value)
+    if isinstance(numbers, tuple) or value is None:
+        return numbers
+    bound = as_number(value)
+    return (-bound, bound) if isinstance(bound, Array) else value
 
 
 class Limits(Bounded):
@@ -198,8 +389,7 @@ class Limits(Bounded):
 
     def bounds(self) -> Iterator[Bound]:
         for name in self.units:
-            value = getattr(self, name)
-            if isinstance(value, tuple) and len(value) == 2:
+            if (value := getattr(self, name)) is not None:
                 yield Bound(value[0], f"{name}[0]")
                 yield Bound(value[1], f"{name}[1]", above=value[0], why="the lower bound")
 
@@ -222,69 +412,166 @@ class Limits(Bounded):
 
 # A planning problem, checked before anything compiles.
 
+#: Distance to keep from obstacles while planning, in units of the footprint's length: the check examines the ride between the
+#: points at which the optimiser looks.
+RESERVE = 0.04
+
 #: Headings at which a goal without a heading is examined.
 HEADINGS = 72
 
+#: A place of the rear axle and a heading, in the ground's axes, as one array.
+Pose: TypeAlias = Float[Array, " components"]
 
-class Problem(NamedTuple):
-    """A planning problem, as the user states it."""
+
+def seen_from_above(
+    dynamics: Dynamics, pose: Pose
+) -> tuple[Float[Array, " 2"], Float[Array, " 2"], Float[Array, " 2"]]:
+    """The components x and y of the place, of the heading and of the direction to the left."""
+    axes = dynamics.surface.axes
+    place, heading = padded(pose[:axes]), padded(pose[axes:])
+    left = scale(dynamics.side, cross(dynamics.surface.normal(place), heading))
+    return jnp.stack(place[:2]), jnp.stack(heading[:2]), jnp.stack(left[:2])
+
+
+class Chart(eqx.Module):
+    """A flat map of the ground, on which paths are searched: x and y where the ground names its places so, and otherwise a
+    tangent plane, whose points the nearest points of the ground represent. `origin` and the unit vectors `east` and `north`
+    span this plane."""
+
+    surface: AbstractSurface
+    origin: Float[Array, " 3"] | None = None
+    east: Float[Array, " 3"] | None = None
+    north: Float[Array, " 3"] | None = None
+
+    @classmethod
+    def tangent(cls, surface: AbstractSurface, side: float, middle: Float[Array, " axes"]) -> "Chart":
+        """A map of the ground near a position in its axes."""
+        position, east, _ = surface.chart(surface.place_at(surface.nearest(padded(middle))))
+        north = scale(side, cross(surface.normal(position), east))
+        zero = jnp.zeros(())
+        columns = [jnp.stack([zero if part is None else zero + part for part in v]) for v in (position, east, north)]
+        return cls(surface, *columns)
+
+    def position(self, point: Float[Array, " 2"]) -> Float[Array, " axes"]:
+        """The position [m] of a point of the map, in the ground's axes."""
+        if self.origin is None or self.east is None or self.north is None:
+            place = self.surface.charted((point[0], point[1]))[0]
+        else:
+            place = self.surface.nearest(padded(self.origin + point[0] * self.east + point[1] * self.north))
+        return jnp.stack(place[: self.surface.axes])
+
+    def point(self, pose: Pose) -> Float[np.ndarray, " 3"]:
+        """The point and the heading (x, y, angle) on the map of a pose."""
+        axes = self.surface.axes
+        place, heading = np.asarray(pose[:axes]), np.asarray(pose[axes:])
+        if self.origin is not None:
+            plane = np.stack([np.asarray(self.east), np.asarray(self.north)])
+            place, heading = plane @ (place - np.asarray(self.origin)), plane @ heading
+        return np.array([place[0], place[1], np.arctan2(heading[1], heading[0])])
+
+    @eqx.filter_jit
+    def poses(self, points: Float[Array, "n 3"]) -> Float[Array, "n components"]:
+        """The poses of points and headings on the map."""
+
+        def pose(point):
+            place, along = jax.jvp(self.position, (point[:2],), (jnp.stack([jnp.cos(point[2]), jnp.sin(point[2])]),))
+            return jnp.concatenate([place, along / jnp.sqrt(jnp.sum(along**2))])
+
+        return jax.vmap(pose)(points)
+
+
+class Problem(eqx.Module):
+    """A planning problem, as the user states it. `t1` is the duration [s] of the drive, or, `in_haste`, where the time is
+    minimised, the longest one."""
 
     scene: Scene
     launch: Launch
     goal: Goal
+    t1: float
     obstacles: tuple[Box | Disc, ...]
     limits: Limits
     footprint: Footprint
+    in_haste: bool = False
 
-    def pose(self, place: Any, heading: Any) -> Any:
+    def pose(self, place: tuple[ArrayLike, ...], heading: ArrayLike) -> Pose:
         """Position and heading, in the ground's axes, as one array."""
         surface = self.scene.surface
         position, east, north = surface.chart(place)
-        direction = self.scene.dynamics.heading.at_angle(heading, east, north)
+        direction = self.scene.dynamics.heading.at_angle(jnp.asarray(heading), east, north)
         return jnp.stack([*position[: surface.axes], *direction[: surface.axes]])
 
-    @property
-    def start_pose(self) -> Any:
+    @functools.cached_property
+    def start_pose(self) -> Pose:
         """The pose of the launch."""
         return self.pose(self.launch.place, self.launch.heading)
 
-    @property
-    def goal_pose(self) -> Any:
+    @functools.cached_property
+    def goal_pose(self) -> Pose:
         """The pose of the goal; its heading is 0 if the goal has none."""
         return self.pose(self.goal.place, 0.0 if self.goal.heading is None else self.goal.heading)
 
     @property
+    def distance(self) -> float:
+        """The straight distance [m] from the start to the goal."""
+        return float(np.linalg.norm(np.asarray(self.goal_pose - self.start_pose)[: self.scene.surface.axes]))
+
+    @property
     def is_flat(self) -> bool:
-        """Whether the ground names its places by x and y."""
-        return is_flat(self.scene.surface)
+        """Whether the ground names its places by two lengths, x and y."""
+        return tuple(self.scene.surface.coordinates) == (("x", "m"), ("y", "m"))
 
-    @property
-    def goal_corners(self) -> np.ndarray:
-        """The corners (4, 2) [m] of the footprint at the goal, seen from above."""
-        return np.asarray(self.footprint.corners(*seen_from_above(self.scene.dynamics, self.goal_pose)))
+    @functools.cached_property
+    def chart(self) -> Chart:
+        """A flat map of the ground."""
+        surface, axes = self.scene.surface, self.scene.surface.axes
+        if self.is_flat:
+            return Chart(surface)
+        return Chart.tangent(surface, self.scene.dynamics.side, (self.start_pose[:axes] + self.goal_pose[:axes]) / 2.0)
 
-    def gaps(self, pose: Any) -> np.ndarray:
+    @functools.cached_property
+    def obstacle_arrays(self) -> Obstacles:
+        """The obstacles as arrays."""
+        return Obstacles.of(self.obstacles)
+
+    def corners(self, pose: Pose) -> Float[np.ndarray, "4 2"]:
+        """The corners [m] of the footprint at a pose, seen from above."""
+        return np.asarray(self.footprint.corners(*seen_from_above(self.scene.dynamics, pose)))
+
+    def gaps(self, pose: Pose) -> Float[np.ndarray, " obstacles"]:
         """The distance [m] of the footprint at a pose from every obstacle, negative for an overlap."""
-        corners = self.footprint.corners(*seen_from_above(self.scene.dynamics, pose))
-        return np.array([obstacle.distance(np.asarray(corners)) for obstacle in self.obstacles])
+        return np.array([obstacle.distance(self.corners(pose)) for obstacle in self.obstacles])
 
-    @property
-    def clearance_at_ends(self) -> float:
-        """The distance [m] of the footprint from the obstacles at the start and at the goal; infinite without obstacles."""
-        if not self.obstacles:
-            return np.inf
-        return float(min(self.gaps(self.start_pose).min(), self._gaps_at_goal().min()))
-
-    def _gaps_at_goal(self) -> np.ndarray:
+    def gaps_at_goal(self) -> Float[np.ndarray, " obstacles"]:
         """The distance [m] from every obstacle at the goal; at the best of all headings if the goal has none."""
         if self.goal.heading is not None:
             return self.gaps(self.goal_pose)
         headings = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False)
         return max((self.gaps(self.pose(self.goal.place, heading)) for heading in headings), key=np.min)
 
+    @functools.cached_property
+    def clearance_at_ends(self) -> float:
+        """The distance [m] of the footprint from the obstacles at the start and at the goal; infinite without obstacles."""
+        if not self.obstacles:
+            return np.inf
+        return float(min(self.gaps(self.start_pose).min(), self.gaps_at_goal().min()))
+
+    @property
+    def clearance(self) -> float:
+        """The clearance [m] to keep at first."""
+        return min(RESERVE * float(self.footprint.length), 0.5 * self.clearance_at_ends)
+
 
 def checked_problem(
-    scene: Any, launch: Any, goal: Any, t1: Any, obstacles: Any, limits: Any, footprint: Any, tolerance: Any
+    scene: Scene,
+    launch: Launch,
+    goal: Goal,
+    t1: ArrayLike,
+    obstacles: Iterable[Box | Disc] = (),
+    limits: Limits | None = None,
+    footprint: Footprint | None = None,
+    *,
+    tolerance: float = 1e-6,
+    in_haste: bool = False,
 ) -> Problem:
     """A planning problem; raises `ValueError` unless its parts are legal and its start and goal are free."""
     require_run(scene, launch, t1, tolerance, (Scene, Launch), "plan each problem by a call of its own")
@@ -299,33 +586,30 @@ def checked_problem(
     require_kind(limits, "limits", Limits)
     footprint = Footprint.of(scene.body) if footprint is None else footprint
     require_kind(footprint, "footprint", Footprint)
-    problem = Problem(scene, launch, goal, require_obstacles(obstacles), limits, footprint)
-    _require_goal_on_ground(problem)
-    _require_limits(problem)
-    _require_free(problem)
-    return problem
-
-
-def _require_goal_on_ground(problem: Problem) -> None:
-    scene, goal = problem.scene, problem.goal
+    duration = float(np.asarray(t1))
+    problem = Problem(scene, launch, goal, duration, require_obstacles(obstacles), limits, footprint, in_haste)
     try:
         require_all(scene.surface.place_bounds(goal.place, scene.body.wheelbase))
     except ValueError as error:
         raise ValueError(f"goal: {error}") from None
     if not np.all(np.isfinite(problem.goal_pose)):
         raise ValueError(f"goal: place = {goal.place} must be on the ground, where it has no finite position")
+    _require_limits(problem)
+    _require_free(problem)
+    return problem
 
 
 def _require_limits(problem: Problem) -> None:
     """Raise `ValueError` if the start or the goal is out of the limits."""
-    launch, goal = problem.launch, problem.goal
-    values = [("launch.steering", launch.steering), ("launch.speed", launch.speed), ("goal.speed", goal.speed)]
-    ranges = problem.limits.ranges()
-    for name, value in values:
-        low, high = ranges.get(name.partition(".")[2], (None, None))
-        require(
-            value, name, at_least=low, at_most=high, why="limits; no plan can keep a limit that is broken at its ends"
-        )
+    launch, goal, ranges = problem.launch, problem.goal, problem.limits.ranges()
+    why = "limits; no plan can keep a limit that is broken at its ends"
+    for owner, name, value in (
+        ("launch", "steering", launch.steering),
+        ("launch", "speed", launch.speed),
+        ("goal", "speed", goal.speed),
+    ):
+        low, high = ranges.get(name, (None, None))
+        require(value, f"{owner}.{name}", at_least=low, at_most=high, why=why)
 
 
 def _require_free(problem: Problem) -> None:
@@ -339,7 +623,7 @@ def _require_free(problem: Problem) -> None:
             f"obstacles: a {type(surface).__name__} names its places ({names}); obstacles need a ground with places "
             "(x [m], y [m]), such as a Plane or a Graph"
         )
-    for name, gaps in (("launch", problem.gaps(problem.start_pose)), ("goal", problem._gaps_at_goal())):
+    for name, gaps in (("launch", problem.gaps(problem.start_pose)), ("goal", problem.gaps_at_goal())):
         if gaps.min() <= 0.0:
             nearest = int(np.argmin(gaps))
             place = ", ".join(f"{float(number):g}" for number in getattr(problem, name).place)
@@ -347,134 +631,3 @@ def _require_free(problem: Problem) -> None:
                 f"{name}: at place = ({place}) the footprint overlaps obstacles[{nearest}] by {abs(gaps[nearest]):.3g} m: "
                 f"move the {name} or the obstacle, or pass a smaller footprint"
             )
-
-
-# The check of a drive: a run at a tight tolerance, the exact clearance of the whole footprint, and every limit.
-
-#: Times of a run that is compared with others and of one that is confirmed, and how many times finer the closest approaches
-#: are examined.
-COMPARED, CONFIRMED, FINER = 501, 2001, 10
-
-#: By how much a limit may be exceeded, in units of its range: a drive keeps the speed and the angle of a plan up to small
-#: errors, and a limit may be the very value at its start or goal.
-ALLOWED = 1e-3
-
-
-class Verdict(NamedTuple):
-    """What a run achieves: its errors at the end (place [m], heading [rad], speed [m/s]), the clearance [m], the margin of
-    every limit, the effort [N^2 s], and what is wrong: a number, 0 for a solution, and the reasons in words."""
-
-    errors: tuple[float, float, float]
-    clearance: float
-    margins: dict[str, float]
-    effort: float
-    excess: float
-    hindrances: tuple[str, ...]
-
-
-def clearance_of(run: Trajectory, problem: Problem) -> tuple[float, int]:
-    """The least distance [m] between the footprint and an obstacle, negative for an overlap, and the obstacle's number;
-    infinite without obstacles."""
-    if not problem.obstacles:
-        return np.inf, -1
-    corners = corners_of(run, problem)
-    coarse = np.stack([obstacle.distance(corners) for obstacle in problem.obstacles], axis=-1)
-    times = np.asarray(run.t)
-    # Between two times, no corner moves further than this.
-    moved = np.linalg.norm(np.diff(corners, axis=0), axis=-1).max(axis=-1)
-    lower = np.minimum(coarse[:-1], coarse[1:]) - moved[:, None]
-    path = CubicSpline(times, corners)
-    least, nearest = coarse.min(), int(np.argmin(coarse.min(axis=0)))
-    for number, obstacle in enumerate(problem.obstacles):
-        step = np.flatnonzero(lower[:, number] < least)
-        inner = times[step][:, None] + np.diff(times)[step][:, None] * np.arange(1, FINER) / FINER
-        fine = obstacle.distance(path(inner.ravel())).min(initial=np.inf)
-        if fine < least:
-            least, nearest = fine, number
-    return float(least), nearest
-
-
-def corners_of(run: Trajectory, problem: Problem) -> np.ndarray:
-    """The corners [m] of the footprint at the times of a run, seen from above: (times, 4, 2)."""
-    return np.asarray(_corners(problem.scene.dynamics, problem.footprint, jnp.asarray(run.state)))
-
-
-@eqx.filter_jit
-def _corners(dynamics: Any, footprint: Footprint, states: Any) -> Any:
-    axes = dynamics.surface.axes
-    return jax.vmap(lambda state: footprint.corners(*seen_from_above(dynamics, state[: 2 * axes])))(states)
-
-
-def inputs_of(run: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """The force [N] and the torque [N m] of a run at its times."""
-    force, torque = _inputs(run.model, run.t, run.state)
-    return np.asarray(force), np.asarray(torque)
-
-
-@eqx.filter_jit
-def _inputs(model: Any, times: Any, states: Any) -> Any:
-    def at(t, state):
-        return model.input(t, model.scene.dynamics.geometry(state).motion)
-
-    return jax.vmap(at)(times, states)
-
-
-def margins_of(run: Trajectory, limits: Limits) -> dict[str, float]:
-    """The distance of a run from every limit, negative where it is exceeded."""
-    force, torque = inputs_of(run)
-    values = {"steering": run.steering, "speed": run.speed, "force": force, "torque": torque}
-    values["grip"] = run.grip()[:, : len(run.loaded_axles)]
-    return {
-        name: float(min(np.min(values[name]) - low, high - np.max(values[name])))
-        for name, (low, high) in limits.ranges().items()
-    }
-
-
-def errors_of(run: Trajectory, problem: Problem) -> tuple[float, float, float]:
-    """The errors at the end: of the place [m], of the heading [rad] and of the speed [m/s]."""
-    goal, axes = problem.goal, problem.scene.surface.axes
-    target = np.asarray(problem.goal_pose)
-    end = np.asarray(run.state[-1, : 2 * axes])
-    turn = 0.0
-    if goal.heading is not None:
-        turn = 2.0 * np.arcsin(min(1.0, 0.5 * np.linalg.norm(end[axes:] - target[axes:])))
-    place = float(np.linalg.norm(end[:axes] - target[:axes]))
-    return place, float(turn), abs(float(run.speed[-1]) - float(goal.speed))
-
-
-def judge(run: Trajectory, problem: Problem) -> Verdict:
-    """What a run achieves, and what stands in the way."""
-    errors, margins = errors_of(run, problem), margins_of(run, problem.limits)
-    clearance, nearest = clearance_of(run, problem)
-    within, length = float(problem.goal.within), float(problem.footprint.length)
-    units = {name: readable_unit(unit) for name, unit in Limits.units.items()}
-    # What is wrong, each relative to what is allowed, and the words for it.
-    wrong = [
-        (error / within - 1.0, f"the {name} at the end is off by {error:.3g} {unit}")
-        for name, unit, error in zip(("place", "heading", "speed"), ("m", "rad", "m/s"), errors, strict=True)
-    ]
-    wrong.append((-clearance / length, f"the footprint overlaps obstacles[{nearest}] by {-clearance:.3g} m"))
-    for name, (low, high) in problem.limits.ranges().items():
-        excess = -margins[name] / (high - low) - ALLOWED
-        wrong.append((excess, f"the {name} exceeds its limit by {-margins[name]:.3g} {units[name]}".rstrip()))
-    if run.status != "completed":
-        # Where the run has no end, what is unknown there is no reason.
-        last = np.asarray(run.t)[np.isfinite(run.speed)].max(initial=0.0)
-        ended = f"the run ends with the status {run.status!r}, after {last:.4g} s of {float(run.t[-1]):.4g} s"
-        wrong = [(1.0, ended), *(pair for pair in wrong if not np.isnan(pair[0]))]
-    hindrances = tuple(words for excess, words in wrong if not excess <= 0.0)
-    total = sum(max(excess, 0.0) for excess, _ in wrong)
-    return Verdict(errors, clearance, margins, effort_of(run), float(np.nan_to_num(total, nan=np.inf)), hindrances)
-
-
-def effort_of(run: Trajectory) -> float:
-    """The effort [N^2 s]: the integral over time of F^2 + (torque / l)^2, with the force F and the wheelbase l."""
-    force, torque = inputs_of(run)
-    squares = force**2 + (torque / float(run.model.scene.body.wheelbase)) ** 2
-    return float(np.trapezoid(squares, np.asarray(run.t)))
-
-
-def checked_run(problem: Problem, drive: Any, t1: float, tolerance: float, times: int) -> tuple[Trajectory, Verdict]:
-    """A run of an input, and what it achieves at a number of times."""
-    run = simulate(problem.scene, problem.launch, t1, drive, times=np.linspace(0.0, t1, times), tolerance=tolerance)
-    return run, judge(run, problem)

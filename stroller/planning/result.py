@@ -1,11 +1,14 @@
-"""The result of a plan, and its pictures."""
+"""The result of a plan: the check of a drive, by a run at a tight tolerance, and its pictures."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.interpolate import CubicSpline
 
 from nonholonomic.geometry import AbstractSurface
 from nonholonomic.terminal import status_line
@@ -15,12 +18,11 @@ from nonholonomic.views import DARK, Body, Mesh, Page, Stage, arena, bar, page
 from nonholonomic.views.plot import new_figure
 from nonholonomic.views.stage import curves_in, of_grid
 
+from ..model.dynamics import Dynamics
 from ..runs.trajectory import Trajectory
-from .obstacles import Box, Disc
-from .problem import Problem, Verdict, corners_of
+from ..runs.verbs import simulate
+from .problem import Box, Disc, Footprint, Limits, Points, Problem, seen_from_above
 from .transcription import Drive
-
-# Pictures of a plan: from above, and as a page.
 
 #: Heights of drawn obstacles, and radii of drawn lines, in units of the wheelbase.
 HEIGHT, THIN, RAISED = 0.5, 0.008, 0.03
@@ -41,130 +43,6 @@ STONE, FAINT, GREEN = 0x8A8F98, 0x5B8DB8, 0x1F8A4C
 UNTURNED = (0.0, 0.0, 0.0, 1.0)
 
 
-def outline(obstacle: Box | Disc) -> Float[np.ndarray, "corners 2"]:
-    """The outline of an obstacle [m]."""
-    if isinstance(obstacle, Box):
-        return obstacle.corners
-    angle = 2.0 * np.pi * np.arange(SIDES) / SIDES
-    unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    return np.array(obstacle.centre, dtype=float) + float(obstacle.radius) * unit
-
-
-def draw_plan(plan: Any, unit: Any = None) -> Any:
-    """The plan from above, and its speed and steering angle over time in a unit as for `in_unit`, as a matplotlib figure."""
-    figure = new_figure(9.0, 4.5)
-    above, curves = figure.subplots(1, 2, width_ratios=(3, 2))
-    for obstacle in plan.problem.obstacles:
-        above.fill(*outline(obstacle).T, color="0.6")
-    for line in plan.candidates:
-        above.plot(line[:, 0], line[:, 1], color="0.75", linewidth=0.7)
-    corners = corners_of(plan.run, plan.problem)
-    flat = plan.problem.is_flat
-    if flat:
-        for number in np.linspace(0, len(corners) - 1, OUTLINES).astype(int):
-            above.plot(*np.concatenate([corners[number], corners[number][:1]]).T, color="C0", linewidth=0.6)
-    path = np.asarray(plan.run.place if flat else plan.run.position)
-    above.plot(path[:, 0], path[:, 1], color="C0", label="rear axle")
-    if flat and plan.problem.goal.heading is None:
-        above.plot(*np.asarray(plan.problem.goal_pose[:2])[:, None], "x", color="C2", label="goal")
-    elif flat:
-        target = plan.problem.goal_corners
-        above.plot(*np.concatenate([target, target[:1]]).T, color="C2", linewidth=1.2, label="goal")
-    above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
-    above.set_title("reaches the goal" if plan.reached else "; ".join(plan.hindrances), fontsize="small")
-    above.legend(fontsize="small")
-    for name, values, si in (("speed", plan.run.speed, "m/s"), ("steering angle", plan.run.steering, "rad")):
-        text, factor = in_unit(si, unit)
-        curves.plot(plan.run.t, factor * values, label=f"{name} [{text}]")
-    curves.set_xlabel("time [s]")
-    curves.legend(fontsize="small")
-    return figure
-
-
-def planned_stage(plan: Any) -> Stage:
-    """The run of a plan on its stage, with obstacles, candidates, footprint and goal."""
-    (stage,) = plan.run.stages()
-    scene, (show, *_) = plan.problem.scene, stage.shows
-    length, count = float(scene.body.wheelbase), len(show.times)
-    surface, outlines = scene.surface, [outline(part) for part in plan.problem.obstacles]
-    feet = [on_ground(surface, corners) for corners in outlines]
-    points = np.concatenate([np.asarray(plan.run.position), *feet])
-    ground = arena(surface, points, stage.arena.normal, 3.0 * length, length)
-    still = [("candidates", [ribbon(line, RAISED, THIN, FAINT, length) for line in plan.candidates])]
-    if feet:
-        still.append(("obstacles", [prism(foot, HEIGHT * length) for foot in feet]))
-    if plan.problem.is_flat:
-        still.append(("goal", [goal_mark(plan.problem, 2.0 * RAISED * length, 2.0 * THIN * length)]))
-    place, turn = np.zeros((count, 3)), np.tile(UNTURNED, (count, 1))
-    bodies = tuple(Body(name, place, turn, tuple(meshes)) for name, meshes in still)
-    vehicle = show.bodies[0]
-    own = plan.problem.footprint.corners(np.zeros(2), np.array([1.0, 0.0]), np.array([0.0, 1.0]))
-    # The frame's origin is the middle of the rear axle, above the ground.
-    low = np.concatenate([np.asarray(own), np.full((4, 1), -0.17 * length)], axis=1)
-    edge = Body("footprint", vehicle.position, vehicle.orientation, (frame_of(low, 0.0, 1.5 * THIN * length, DARK),))
-    title = f"plan of {plan.t1:.3g} s: {'reaches the goal' if plan.reached else 'does not reach the goal'}"
-    shows = (show._replace(bodies=(*show.bodies, edge, *bodies)),)
-    return stage._replace(title=title, arena=ground, shows=shows, rise=RISE)
-
-
-def goal_mark(problem: Problem, raised: float, radius: float) -> Mesh:
-    """The outline of the footprint at the goal, or a cross at a goal without a heading."""
-    if problem.goal.heading is not None:
-        return frame_of(on_ground(problem.scene.surface, problem.goal_corners), raised, radius, GREEN)
-    arm = CROSS * float(problem.scene.body.wheelbase)
-    ends = np.asarray(problem.goal_pose[:2]) + arm * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
-    points = on_ground(problem.scene.surface, ends) + np.array([0.0, 0.0, raised])
-    return joined([bar(tuple(points[k]), tuple(points[k + 1]), radius, GREEN) for k in (0, 2)])
-
-
-def on_ground(surface: AbstractSurface, points: np.ndarray) -> Float[np.ndarray, "points 3"]:
-    """Points (points, 2) of x and y on the ground, in the fixed frame."""
-    position = surface.chart((points[:, 0], points[:, 1]))[0]
-    return np.stack([np.broadcast_to(part, len(points)) for part in surface.in_fixed_frame(position)], axis=-1)
-
-
-def prism(foot: Float[np.ndarray, "corners 3"], height: float) -> Mesh:
-    """An upright prism on its corners on the ground."""
-    top = np.array(foot)
-    top[:, 2] = foot[:, 2].max() + height
-    count = len(foot)
-    ring = np.arange(count)
-    following = np.roll(ring, -1)
-    sides = np.concatenate(
-        [np.stack([ring, following, ring + count], -1), np.stack([following, following + count, ring + count], -1)]
-    )
-    lid = np.stack([np.full(count - 2, count), count + ring[1:-1], count + ring[2:]], -1)
-    return Mesh(np.concatenate([foot, top]), np.concatenate([sides, lid]), STONE)
-
-
-def frame_of(corners: np.ndarray, raised: float, radius: float, colour: int) -> Mesh:
-    """The outline of a quadrilateral, as bars."""
-    points = corners + np.array([0.0, 0.0, raised])
-    return joined(
-        [bar(tuple(a), tuple(b), radius, colour) for a, b in zip(points, np.roll(points, -1, axis=0), strict=True)]
-    )
-
-
-def ribbon(line: np.ndarray, raised: float, half: float, colour: int, length: float) -> Mesh:
-    """A thin band along a line, above the ground."""
-    along = np.gradient(line, axis=0)
-    across = np.stack([-along[:, 1], along[:, 0], np.zeros(len(line))], axis=-1)
-    across *= half * length / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
-    above = line + np.array([0.0, 0.0, raised * length])
-    vertices = np.stack([above - across, above + across], axis=1).reshape(-1, 3)
-    return Mesh(vertices, of_grid(len(line), 2), colour)
-
-
-def joined(meshes: list[Mesh]) -> Mesh:
-    """Several meshes of one colour as one."""
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    triangles = [mesh.triangles + start for mesh, start in zip(meshes, starts, strict=True)]
-    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(triangles), meshes[0].colour)
-
-
-# The result of a plan.
-
-
 class Plan(eqx.Module):
     """A planned drive, its run at a tolerance of 1e-9, and what the check of this run says.
 
@@ -177,6 +55,7 @@ class Plan(eqx.Module):
     - `effort`: integral over time of F^2 + (torque / wheelbase)^2 [N^2 s];
     - `errors`: errors of place [m], heading [rad] and speed [m/s] at the end;
     - `hindrances`: what is wrong with the run, in words; empty if the goal is reached;
+    - `excess`: the same as a number, 0 if the goal is reached, by which attempts are compared;
     - `candidates`: the paths [m] of all optimised candidates, (candidates, knots, 3), in the fixed frame.
 
     `print` shows the result, `plot` draws it, and `view` writes a page on which it is played.
@@ -197,35 +76,23 @@ class Plan(eqx.Module):
     """
 
     input: Drive
-    t1: float
     run: Trajectory
-    verdict: Verdict
     problem: Problem
-    candidates: Float[Array, "candidates knots 3"]
+    clearance: float
+    margins: dict[str, float]
+    effort: float
+    errors: tuple[float, float, float]
+    hindrances: tuple[str, ...]
+    excess: float
+    candidates: Float[Array | np.ndarray, "candidates knots 3"]
+
+    @property
+    def t1(self) -> float:
+        return float(self.input.duration)
 
     @property
     def reached(self) -> bool:
-        return not self.verdict.hindrances
-
-    @property
-    def clearance(self) -> float:
-        return self.verdict.clearance
-
-    @property
-    def margins(self) -> dict[str, float]:
-        return self.verdict.margins
-
-    @property
-    def effort(self) -> float:
-        return self.verdict.effort
-
-    @property
-    def errors(self) -> tuple[float, float, float]:
-        return self.verdict.errors
-
-    @property
-    def hindrances(self) -> tuple[str, ...]:
-        return self.verdict.hindrances
+        return not self.hindrances
 
     def __str__(self) -> str:
         units = {name: readable_unit(unit) for name, unit in self.problem.limits.units.items()}
@@ -259,10 +126,36 @@ class Plan(eqx.Module):
         """
         require_package("matplotlib", "plot", "plot")
         require_unit(unit)
-        return draw_plan(self, unit)
+        figure = new_figure(9.0, 4.5)
+        above, curves = figure.subplots(1, 2, width_ratios=(3, 2))
+        for obstacle in self.problem.obstacles:
+            above.fill(*outline(obstacle).T, color="0.6")
+        for line in self.candidates:
+            above.plot(line[:, 0], line[:, 1], color="0.75", linewidth=0.7)
+        problem = self.problem
+        if problem.is_flat:
+            corners = np.asarray(corners_of(problem.scene.dynamics, problem.footprint, self.run.state))
+            for number in np.linspace(0, len(corners) - 1, OUTLINES).astype(int):
+                above.plot(*np.concatenate([corners[number], corners[number][:1]]).T, color="C0", linewidth=0.6)
+        path = np.asarray(self.run.place if problem.is_flat else self.run.position)
+        above.plot(path[:, 0], path[:, 1], color="C0", label="rear axle")
+        if problem.is_flat and problem.goal.heading is None:
+            above.plot(*np.asarray(problem.goal_pose[:2])[:, None], "x", color="C2", label="goal")
+        elif problem.is_flat:
+            target = problem.corners(problem.goal_pose)
+            above.plot(*np.concatenate([target, target[:1]]).T, color="C2", linewidth=1.2, label="goal")
+        above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+        above.set_title("reaches the goal" if self.reached else "; ".join(self.hindrances), fontsize="small")
+        above.legend(fontsize="small")
+        for name, values, si in (("speed", self.run.speed, "m/s"), ("steering angle", self.run.steering, "rad")):
+            text, factor = in_unit(si, unit)
+            curves.plot(self.run.t, factor * values, label=f"{name} [{text}]")
+        curves.set_xlabel("time [s]")
+        curves.legend(fontsize="small")
+        return figure
 
     @status_line("drawing")
-    def view(self, path: Any = None, unit: str | Sequence[str] | None = None) -> Page:
+    def view(self, path: str | Path | None = None, unit: str | Sequence[str] | None = None) -> Page:
         """An animated page of the drive, with its obstacles, the footprint, and the candidates as thin lines (needs
         jupyter-threejs-sage).
 
@@ -282,3 +175,178 @@ class Plan(eqx.Module):
         if path is not None:
             html_page.save(path)
         return html_page
+
+
+# The check of a drive: a run at a tight tolerance, the exact clearance of the whole footprint, and every limit.
+
+#: How many times finer the closest approaches are examined.
+FINER = 10
+
+#: By how much a limit may be exceeded, in units of its range: a drive keeps the speed and the angle of a plan up to small
+#: errors, and a limit may be the very value at its start or goal.
+ALLOWED = 1e-3
+
+
+def checked_drive(problem: Problem, drive: Drive, tolerance: float, times: int) -> Plan:
+    """The drive as a plan: its run, with a number of times, what this run achieves, and what stands in the way."""
+    t1 = float(drive.duration)
+    run = simulate(problem.scene, problem.launch, t1, drive, times=np.linspace(0.0, t1, times), tolerance=tolerance)
+    force, torque = map(np.asarray, inputs_of(problem.scene.dynamics, drive, run.t, run.state))
+    values = {"steering": run.steering, "speed": run.speed, "force": force, "torque": torque}
+    values["grip"] = run.grip()[:, : len(run.loaded_axles)]
+    ranges, units = problem.limits.ranges(), {name: readable_unit(unit) for name, unit in Limits.units.items()}
+    margins = {
+        name: float(min(np.min(values[name]) - low, high - np.max(values[name])))
+        for name, (low, high) in ranges.items()
+    }
+    errors, (clearance, nearest) = errors_of(run, problem), clearance_of(run, problem)
+    within, length = float(problem.goal.within), float(problem.footprint.length)
+    # What is wrong, each relative to what is allowed, and the words for it.
+    wrong = [
+        (error / within - 1.0, f"the {name} at the end is off by {error:.3g} {unit}")
+        for name, unit, error in zip(("place", "heading", "speed"), ("m", "rad", "m/s"), errors, strict=True)
+    ]
+    wrong.append((-clearance / length, f"the footprint overlaps obstacles[{nearest}] by {-clearance:.3g} m"))
+    for name, (low, high) in ranges.items():
+        excess = -margins[name] / (high - low) - ALLOWED
+        wrong.append((excess, f"the {name} exceeds its limit by {-margins[name]:.3g} {units[name]}".rstrip()))
+    if run.status != "completed":
+        # Where the run has no end, what is unknown there is no reason.
+        last = np.asarray(run.t)[np.isfinite(run.speed)].max(initial=0.0)
+        ended = f"the run ends with the status {run.status!r}, after {last:.4g} s of {float(run.t[-1]):.4g} s"
+        wrong = [(1.0, ended), *(pair for pair in wrong if not np.isnan(pair[0]))]
+    wrong.append((t1 / problem.t1 - 1.0, f"the drive takes {t1:.4g} s, longer than t1 = {problem.t1:.4g} s"))
+    hindrances = tuple(words for excess, words in wrong if not excess <= 0.0)
+    excess = float(np.nan_to_num(sum(max(excess, 0.0) for excess, _ in wrong), nan=np.inf))
+    squares = force**2 + (torque / float(problem.scene.body.wheelbase)) ** 2
+    effort = float(np.trapezoid(squares, np.asarray(run.t)))
+    return Plan(drive, run, problem, clearance, margins, effort, errors, hindrances, excess, np.zeros((0, 0, 3)))
+
+
+def errors_of(run: Trajectory, problem: Problem) -> tuple[float, float, float]:
+    """The errors at the end: of the place [m], of the heading [rad] and of the speed [m/s]."""
+    goal, axes = problem.goal, problem.scene.surface.axes
+    away = np.asarray(run.state[-1, : 2 * axes]) - np.asarray(problem.goal_pose)
+    turn = 0.0 if goal.heading is None else 2.0 * np.arcsin(min(1.0, 0.5 * np.linalg.norm(away[axes:])))
+    return float(np.linalg.norm(away[:axes])), float(turn), abs(float(run.speed[-1]) - float(goal.speed))
+
+
+def clearance_of(run: Trajectory, problem: Problem) -> tuple[float, int]:
+    """The least distance [m] between the footprint and an obstacle, negative for an overlap, and the obstacle's number;
+    infinite without obstacles."""
+    if not problem.obstacles:
+        return np.inf, -1
+    corners = np.asarray(corners_of(problem.scene.dynamics, problem.footprint, run.state))
+    coarse = np.stack([obstacle.distance(corners) for obstacle in problem.obstacles], axis=-1)
+    times = np.asarray(run.t)
+    # Between two times, no corner moves further than this.
+    moved = np.linalg.norm(np.diff(corners, axis=0), axis=-1).max(axis=-1)
+    lower = np.minimum(coarse[:-1], coarse[1:]) - moved[:, None]
+    path = CubicSpline(times, corners)
+    least, nearest = coarse.min(), int(np.argmin(coarse.min(axis=0)))
+    for number, obstacle in enumerate(problem.obstacles):
+        step = np.flatnonzero(lower[:, number] < least)
+        inner = times[step][:, None] + np.diff(times)[step][:, None] * np.arange(1, FINER) / FINER
+        fine = obstacle.distance(path(inner.ravel())).min(initial=np.inf)
+        if fine < least:
+            least, nearest = fine, number
+    return float(least), nearest
+
+
+@eqx.filter_jit
+def corners_of(dynamics: Dynamics, footprint: Footprint, states: Float[Array, "times components"]) -> Points:
+    """The corners [m] of the footprint at the states of a run, seen from above."""
+    axes = dynamics.surface.axes
+    return jax.vmap(lambda state: footprint.corners(*seen_from_above(dynamics, state[: 2 * axes])))(states)
+
+
+@eqx.filter_jit
+def inputs_of(
+    dynamics: Dynamics, drive: Drive, times: Float[Array, " times"], states: Float[Array, "times components"]
+) -> tuple[Float[Array, " times"], Float[Array, " times"]]:
+    """The force [N] and the torque [N m] of a drive along a run."""
+    return jax.vmap(lambda t, state: drive(t, dynamics.geometry(state).motion))(times, states)
+
+
+# The parts of pictures.
+
+
+def outline(obstacle: Box | Disc) -> Float[np.ndarray, "corners 2"]:
+    """The outline of an obstacle [m]."""
+    if isinstance(obstacle, Box):
+        return obstacle.corners
+    angle = 2.0 * np.pi * np.arange(SIDES) / SIDES
+    unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.array(obstacle.centre, dtype=float) + float(obstacle.radius) * unit
+
+
+def planned_stage(plan: Plan) -> Stage:
+    """The run of a plan on its stage, with obstacles, candidates, footprint and goal."""
+    (stage,) = plan.run.stages()
+    problem, (show, *_) = plan.problem, stage.shows
+    surface, length, count = problem.scene.surface, float(problem.scene.body.wheelbase), len(show.times)
+    feet = [on_ground(surface, outline(part)) for part in problem.obstacles]
+    points = np.concatenate([np.asarray(plan.run.position), *feet])
+    ground = arena(surface, points, stage.arena.normal, 3.0 * length, length)
+    still = [("candidates", [ribbon(line, RAISED * length, THIN * length) for line in plan.candidates])]
+    if feet:
+        still.append(("obstacles", [prism(foot, HEIGHT * length) for foot in feet]))
+    if problem.is_flat:
+        still.append(("goal", [goal_mark(problem, 2.0 * RAISED * length, 2.0 * THIN * length)]))
+    place, turn = np.zeros((count, 3)), np.tile(UNTURNED, (count, 1))
+    bodies = tuple(Body(name, place, turn, tuple(meshes)) for name, meshes in still)
+    vehicle = show.bodies[0]
+    own = problem.footprint.corners(np.zeros(2), np.array([1.0, 0.0]), np.array([0.0, 1.0]))
+    # The frame's origin is the middle of the rear axle, above the ground.
+    low = np.concatenate([np.asarray(own), np.full((4, 1), -0.17 * length)], axis=1)
+    edge = bars(low, np.roll(low, -1, axis=0), 1.5 * THIN * length, DARK)
+    footprint = Body("footprint", vehicle.position, vehicle.orientation, (edge,))
+    title = f"plan of {plan.t1:.3g} s: {'reaches the goal' if plan.reached else 'does not reach the goal'}"
+    shows = (show._replace(bodies=(*show.bodies, footprint, *bodies)),)
+    return stage._replace(title=title, arena=ground, shows=shows, rise=RISE)
+
+
+def goal_mark(problem: Problem, raised: float, radius: float) -> Mesh:
+    """The outline of the footprint at the goal, or a cross at a goal without a heading."""
+    surface, place = problem.scene.surface, np.asarray(problem.goal_pose[:2])
+    if problem.goal.heading is not None:
+        corners = on_ground(surface, problem.corners(problem.goal_pose), raised)
+        return bars(corners, np.roll(corners, -1, axis=0), radius, GREEN)
+    arm = CROSS * float(problem.scene.body.wheelbase)
+    ends = on_ground(surface, place + arm * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]]), raised)
+    return bars(ends[:2], ends[2:], radius, GREEN)
+
+
+def on_ground(
+    surface: AbstractSurface, points: Float[np.ndarray, "points 2"], raised: float = 0.0
+) -> Float[np.ndarray, "points 3"]:
+    """Points of x and y on the ground, or above it, in the fixed frame."""
+    position = surface.chart((points[:, 0], points[:, 1]))[0]
+    columns = [np.broadcast_to(part, len(points)) for part in surface.in_fixed_frame(position)]
+    return np.stack(columns, axis=-1) + np.array([0.0, 0.0, raised])
+
+
+def prism(foot: Float[np.ndarray, "corners 3"], height: float) -> Mesh:
+    """An upright prism on its corners on the ground, and a lid of triangles about its middle."""
+    top = np.array(foot)
+    top[:, 2] = foot[:, 2].max() + height
+    columns = np.stack([np.broadcast_to(top.mean(axis=0), top.shape), top, foot], axis=1)
+    closed = np.concatenate([columns, columns[:1]])
+    return Mesh(closed.reshape(-1, 3), of_grid(len(closed), 3), STONE)
+
+
+def bars(starts: Float[np.ndarray, "bars 3"], ends: Float[np.ndarray, "bars 3"], radius: float, colour: int) -> Mesh:
+    """Round bars between pairs of points, as one mesh."""
+    meshes = [bar(tuple(a), tuple(b), radius, colour) for a, b in zip(starts, ends, strict=True)]
+    vertices = np.concatenate([mesh.vertices for mesh in meshes])
+    triangles = [mesh.triangles + k * len(mesh.vertices) for k, mesh in enumerate(meshes)]
+    return Mesh(vertices, np.concatenate(triangles), colour)
+
+
+def ribbon(line: Float[np.ndarray, "points 3"], raised: float, half: float) -> Mesh:
+    """A thin band along a line, above the ground."""
+    along = np.gradient(line, axis=0)
+    across = np.stack([-along[:, 1], along[:, 0], np.zeros(len(line))], axis=-1)
+    across *= half / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
+    above = line + np.array([0.0, 0.0, raised])
+    return Mesh(np.stack([above - across, above + across], axis=1).reshape(-1, 3), of_grid(len(line), 2), FAINT)

@@ -1,20 +1,25 @@
-"""A path around obstacles: hybrid A* over arcs that the stroller can drive, forwards and backwards.
+"""Paths around obstacles, and the candidates of a plan: paths that are driven within the given time.
 
-Method: Dolgov et al., Int. J. Robotics Research 29 (2010) 485. Nodes keep exact poses; a grid of places, headings and
-directions of travel keeps the cheapest node of each cell. Nodes are expanded many at a time, in NumPy. The shortest ways
-without obstacles from a node to the goal (`shortcuts`) bound its cost from below, and complete its path if they are free.
+The paths come from hybrid A* over arcs that the stroller can drive, forwards and backwards (Dolgov et al., Int. J. Robotics
+Research 29 (2010) 485). Nodes keep exact poses; a grid of places, headings and directions of travel keeps the cheapest node
+of each cell. Nodes are expanded many at a time, in NumPy. The shortest ways without obstacles from a node to the goal
+(`shortcuts`) bound its cost from below, and complete its path if they are free.
 """
 
 import heapq
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from .obstacles import FAR, Footprint, Obstacles
+from .problem import FAR, Footprint, Limits, Numbers, Obstacles, Problem
+from .transcription import LIMIT_RESERVE, ORDER
+
+# The region of a search, and what the stroller may do there.
 
 #: Headings of the grid, cells along the longer side of the region, nodes expanded at a time, and most of them in all.
 HEADINGS, MOST_CELLS, BATCH, MOST_NODES = 24, 128, 48, 400_000
@@ -79,12 +84,11 @@ class Ground(NamedTuple):
         cls, poses: Float[np.ndarray, "poses 3"], obstacles: Obstacles, footprint: Footprint, radius: float
     ) -> "Ground":
         """A region around the start, the goal and all obstacles, with space to turn with the least `radius` [m]."""
-        boxes, centres = np.asarray(obstacles.boxes).reshape(-1, 2), np.asarray(obstacles.centres)
-        radii = np.asarray(obstacles.radii)[:, None]
-        points = np.concatenate([boxes, centres - radii, centres + radii])
-        points = np.concatenate([poses[:, :2], points[np.abs(points).max(axis=1) < 0.1 * FAR]])
         # NumPy would otherwise dispatch every operation with these to JAX.
         obstacles, footprint = jax.tree.map(np.asarray, (obstacles, footprint))
+        boxes, centres, radii = obstacles.boxes.reshape(-1, 2), obstacles.centres, obstacles.radii[:, None]
+        points = np.concatenate([boxes, centres - radii, centres + radii])
+        points = np.concatenate([poses[:, :2], points[np.abs(points).max(axis=1) < 0.1 * FAR]])
         reach = max(2.5 * float(footprint.length), TURNING_SPACE * radius)
         low, high = points.min(axis=0) - reach, points.max(axis=0) + reach
         cell = max(0.2 * float(footprint.length), float((high - low).max()) / MOST_CELLS)
@@ -93,65 +97,67 @@ class Ground(NamedTuple):
     @property
     def shape(self) -> tuple[int, int]:
         """The number of cells in each direction."""
-        return tuple(np.ceil(self.size / self.cell).astype(int) + 1)  # pyright: ignore[reportReturnType]
+        nx, ny = np.ceil(self.size / self.cell).astype(int) + 1
+        return nx, ny
+
+    def places(self, points: Float[np.ndarray, "*n 2"]) -> tuple[Int[np.ndarray, "*n"], Int[np.ndarray, "*n"]]:
+        """The cells of points, in x and y."""
+        x, y = np.moveaxis(((points - self.low) / self.cell).astype(int), -1, 0)
+        nx, ny = self.shape
+        return x.clip(0, nx - 1), y.clip(0, ny - 1)
+
+    def cells(self, poses: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+        """The numbers of the cells of places, headings and directions of travel."""
+        x, y = self.places(poses[:, :2])
+        heading = np.floor(poses[:, 2] / (2.0 * np.pi) * HEADINGS + 0.5).astype(int) % HEADINGS
+        return ((x * self.shape[1] + y) * HEADINGS + heading) * 2 + (direction > 0.0)
 
     def is_free(self, poses: Float[np.ndarray, "*n 3"], clearance: float) -> Bool[np.ndarray, "*n"]:
         """Whether the footprint is inside the region and keeps its distance from all obstacles."""
-        x, y, heading = poses[..., 0], poses[..., 1], poses[..., 2]
         place = poses[..., :2] - self.low
-        inside = np.all((place >= 0.0) & (place <= self.size), axis=-1, keepdims=True)[..., 0]
-        length, rear = float(self.footprint.length), float(self.footprint.rear)
-        ahead = length / 2.0 - rear
-        centre = np.stack([x + ahead * np.cos(heading), y + ahead * np.sin(heading)], axis=-1)
-        free, radius = inside.copy(), 0.5 * np.hypot(length, float(self.footprint.width)) + clearance
+        free = np.all((place >= 0.0) & (place <= self.size), axis=-1)
         if not len(self.obstacles.boxes) and not len(self.obstacles.radii):
             return free
-        near = np.argwhere(self.distance(centre) < radius)
-        index = tuple(near.T)
-        close = poses[index]
-        forward = np.stack([np.cos(close[:, 2]), np.sin(close[:, 2])], axis=-1)
+        forward = np.stack([np.cos(poses[..., 2]), np.sin(poses[..., 2])], axis=-1)
+        length = float(self.footprint.length)
+        centre = poses[..., :2] + (length / 2.0 - float(self.footprint.rear)) * forward
+        # Only where the circle about the footprint may touch an obstacle, its corners are looked at.
+        close = self.distance(centre) < 0.5 * np.hypot(length, float(self.footprint.width)) + clearance
+        forward = forward[close]
         left = np.stack([-forward[:, 1], forward[:, 0]], axis=-1)
-        corners = self.footprint.corners(close[:, :2], forward, left)
-        free[index] &= self.obstacles.gaps(corners).min(axis=-1) > clearance
+        corners = self.footprint.corners(poses[close][:, :2], forward, left)
+        free[close] &= self.obstacles.gaps(corners).min(axis=-1) > clearance
         return free
 
     def distance(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
         """A lower bound [m] of the distance of points from all obstacles, exact outside of them."""
-        boxes = np.asarray(self.obstacles.boxes)
-        middle, side = boxes.mean(axis=1), boxes[:, 0] - boxes[:, 3]
-        length = np.linalg.norm(side, axis=-1)
-        axis = side / length[:, None]
-        width = np.linalg.norm(boxes[:, 1] - boxes[:, 0], axis=-1)
-        away = points[..., None, :] - middle
+        boxes = self.obstacles.boxes
+        side = boxes[:, 0] - boxes[:, 3]
+        length, width = np.linalg.norm(side, axis=-1), np.linalg.norm(boxes[:, 1] - boxes[:, 0], axis=-1)
+        axis, away = side / length[:, None], points[..., None, :] - boxes.mean(axis=1)
         along = np.abs((away * axis).sum(-1)) - length / 2.0
         across = np.abs(away[..., 1] * axis[:, 0] - away[..., 0] * axis[:, 1]) - width / 2.0
         gaps = np.hypot(along.clip(0.0), across.clip(0.0))
-        discs = np.linalg.norm(points[..., None, :] - np.asarray(self.obstacles.centres), axis=-1)
-        discs = discs - np.asarray(self.obstacles.radii)
-        return np.concatenate([gaps, discs, np.full((*gaps.shape[:-1], 1), np.inf)], axis=-1).min(axis=-1)
+        discs = np.linalg.norm(points[..., None, :] - self.obstacles.centres, axis=-1) - self.obstacles.radii
+        return np.concatenate([gaps, discs], axis=-1).min(axis=-1, initial=np.inf)
 
     def way_to(self, place: Float[np.ndarray, " 2"], clearance: float) -> Float[np.ndarray, "x y"]:
         """Length [m] of the shortest way of a disc as wide as the vehicle from every cell to a place; infinite if there is
         none."""
         nx, ny = self.shape
-        x, y = np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij")
-        points = self.low + self.cell * (np.stack([x, y], axis=-1) + 0.5)
+        points = self.low + self.cell * (np.moveaxis(np.indices((nx, ny)), 0, -1) + 0.5)
         half = 0.5 * float(self.footprint.width) + clearance
         free = self.distance(points) > half - 0.7 * self.cell
         number = np.arange(nx * ny).reshape(nx, ny)
-        starts, ends, lengths = [], [], []
+        links = []
         for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
             here = (slice(0, nx - dx), slice(max(0, -dy), ny - max(0, dy)))
             there = (slice(dx, nx), slice(max(0, dy), ny + min(0, dy)))
             both = free[here] & free[there]
-            starts.append(number[here][both])
-            ends.append(number[there][both])
-            lengths.append(np.full(both.sum(), self.cell * np.hypot(dx, dy)))
-        links = (np.concatenate(starts), np.concatenate(ends))
-        graph = scipy.sparse.csr_array((np.concatenate(lengths), links), shape=(nx * ny, nx * ny))
-        goal = np.clip(((place - self.low) / self.cell).astype(int), 0, np.array(self.shape) - 1)
-        way = scipy.sparse.csgraph.dijkstra(graph, directed=False, indices=number[tuple(goal)])
-        return way.reshape(nx, ny)
+            links.append([number[here][both], number[there][both], np.full(both.sum(), self.cell * np.hypot(dx, dy))])
+        starts, ends, lengths = map(np.concatenate, zip(*links, strict=True))
+        graph = scipy.sparse.csr_array((lengths, (starts, ends)), shape=(nx * ny, nx * ny))
+        return scipy.sparse.csgraph.dijkstra(graph, directed=False, indices=number[self.places(place)]).reshape(nx, ny)
 
 
 class Steps(NamedTuple):
@@ -161,25 +167,35 @@ class Steps(NamedTuple):
     greatest: float
     directions: tuple[float, ...]
 
+    @classmethod
+    def of(cls, problem: Problem, share: float) -> "Steps":
+        """What the limits of speed and steering angle, of whose curvature only a share is used, allow a search."""
+        angles = Limits(steering=problem.limits.steering).arrays(LIMIT_RESERVE)
+        low, high = (float(np.tan(angle[0])) / float(problem.scene.body.wheelbase) for angle in angles)
+        slowest, fastest = problem.limits.ranges().get("speed", (-np.inf, np.inf))
+        directions = tuple(sign for sign, speed in ((1.0, fastest), (-1.0, -slowest)) if speed > 0.0)
+        return cls(max(low, share * low), min(high, share * high), directions)
+
     @property
     def sharpest(self) -> float:
         """The greatest curvature [1/m] to either side."""
         return max(-self.least, self.greatest)
 
+    def arcs(self, cell: float) -> Float[np.ndarray, "arcs 3"]:
+        """The arcs of a step in a grid with cells of a size [m]: direction of travel, curvature and length.
 
-def arcs(ground: Ground, steps: Steps) -> Float[np.ndarray, "arcs 3"]:
-    """The arcs of a step: direction of travel, curvature and length.
-
-    A curve that turns by less than a heading of the grid would end in the cell of a cheaper one, and the search would not turn.
-    """
-    step = 1.5 * ground.cell
-    bends = np.unique(np.clip(steps.sharpest * np.array(CURVATURES), steps.least, steps.greatest))
-    length = np.minimum(step, MOST_TURN / np.maximum(np.abs(bends), 1e-9))
-    length = np.maximum(length, MOST_TURN / steps.sharpest * (bends != 0.0))
-    return np.array([[sign, k, s] for sign in steps.directions for k, s in zip(bends, length, strict=True)])
+        A curve that turns by less than a heading of the grid would end in the cell of a cheaper one, and the search would not
+        turn.
+        """
+        bends = np.unique(np.clip(self.sharpest * np.array(CURVATURES), self.least, self.greatest))
+        length = np.minimum(1.5 * cell, MOST_TURN / np.maximum(np.abs(bends), 1e-9))
+        length = np.maximum(length, MOST_TURN / self.sharpest * (bends != 0.0))
+        return np.array([[sign, k, s] for sign in self.directions for k, s in zip(bends, length, strict=True)])
 
 
-def driven(poses: Float[np.ndarray, "*n 3"], direction, curvature, length) -> Float[np.ndarray, "*n 3"]:
+def driven(
+    poses: Float[np.ndarray, "*n 3"], direction: Numbers, curvature: Numbers, length: Numbers
+) -> Float[np.ndarray, "*n 3"]:
     """Poses at the ends of arcs."""
     turn = direction * curvature * length
     heading = poses[..., 2] + turn / 2.0
@@ -188,46 +204,6 @@ def driven(poses: Float[np.ndarray, "*n 3"], direction, curvature, length) -> Fl
         [poses[..., 0] + chord * np.cos(heading), poses[..., 1] + chord * np.sin(heading), poses[..., 2] + turn],
         axis=-1,
     )
-
-
-class Tree:
-    """The nodes of a search, in growing arrays."""
-
-    def __init__(self, start: Float[np.ndarray, " 3"]):
-        self.pose = np.zeros((4096, 3))
-        self.cost, self.parent, self.move = np.zeros(4096), np.full(4096, -1), np.zeros((4096, 3))
-        self.pose[0], self.count = start, 1
-
-    def add(self, pose, cost, parent, move) -> np.ndarray:
-        """Add nodes; returns their numbers."""
-        number = np.arange(self.count, self.count + len(pose))
-        while number.size and number[-1] >= len(self.pose):
-            self.pose, self.cost = np.concatenate([self.pose, self.pose]), np.concatenate([self.cost, self.cost])
-            self.parent, self.move = np.concatenate([self.parent] * 2), np.concatenate([self.move] * 2)
-        self.pose[number], self.cost[number], self.parent[number], self.move[number] = pose, cost, parent, move
-        self.count += len(pose)
-        return number
-
-    def branch(self, node: int) -> list[int]:
-        """The nodes from the start to a node."""
-        nodes = [node]
-        while self.parent[nodes[-1]] >= 0:
-            nodes.append(int(self.parent[nodes[-1]]))
-        return nodes[::-1]
-
-
-class Children(NamedTuple):
-    """The free ends of moves from some nodes: poses (children, 3), costs [m], numbers of the parents, and the moves (children,
-    3), each a direction of travel, a curvature and a length."""
-
-    pose: np.ndarray
-    cost: np.ndarray
-    parent: np.ndarray
-    move: np.ndarray
-
-    def only(self, which: np.ndarray) -> "Children":
-        """Some of the children."""
-        return Children(*(part[which] for part in self))
 
 
 def shortcuts(
@@ -261,7 +237,7 @@ def shortcuts(
                 turns = (turned + bend - heading, -bend, goal[2] - turned)
                 ways.append(((either,) * 3, (first, middle, last), turns, 0.0))
 
-    def piece(sign: float, radius: float, turn: Any, straight: Any) -> list[np.ndarray]:
+    def piece(sign: float, radius: float, turn: Numbers | float, straight: Numbers | float) -> list[np.ndarray]:
         arc = (np.mod(sign * np.sign(radius) * turn + TIE, 2.0 * np.pi) - TIE).clip(0.0)
         return list(np.broadcast_arrays(sign, 1.0 / radius if radius else 0.0, abs(radius) * arc + straight + 0.0 * x))
 
@@ -273,104 +249,262 @@ def shortcuts(
     return np.array(pieces).reshape(len(pieces), 3, 3, len(poses)).transpose(1, 2, 0, 3)
 
 
-@np.errstate(invalid="ignore")
-def search(
-    ground: Ground, start: np.ndarray, goal: np.ndarray, has_heading: bool, steps: Steps, costs: Costs
-) -> tuple[Path | None, float, bool]:
-    """The cheapest path that the search finds from one pose (3,) to another, or `None`; the distance [m] from the goal to the
-    nearest place it came to; and whether it has looked everywhere."""
-    ordinary, tree, way = arcs(ground, steps), Tree(start), ground.way_to(goal[:2], costs.clearance)
-    # A path with more pieces than a shortcut begins with an arc of any length, and one with fewer with none.
-    first = np.concatenate([ordinary * [1.0, 1.0, times] for times in range(FIRST_ARCS)])
-    best = np.full(np.prod(ground.shape) * HEADINGS * 2, np.inf)
-    frontier, nearest = [(0.0, 0)], float(np.linalg.norm(start[:2] - goal[:2]))
-    path, least = None, np.inf
-    while frontier and frontier[0][0] < least - TIE and tree.count < MOST_NODES:
-        nodes = np.array([heapq.heappop(frontier)[1] for _ in range(min(BATCH, len(frontier)))])
-        cells = _cells(ground, tree.pose[nodes], tree.move[nodes, 0])
-        # A cheaper node of the same cell has replaced the others. The start has no cell.
-        nodes = nodes[(nodes == 0) | (tree.cost[nodes] <= best[cells] + TIE)]
-        if not nodes.size:
-            continue
-        children = _children(ground, tree, first if nodes[0] == 0 else ordinary, nodes, steps, costs)
-        ahead = way[tuple(_places(ground, children.pose).T)]
-        cells = _cells(ground, children.pose, children.move[:, 0])
+class Nodes(NamedTuple):
+    """Nodes of a search: poses (nodes, 3), costs [m], numbers of the parents, and the moves (nodes, 3) that led from these,
+    each a direction of travel, a curvature and a length."""
+
+    pose: Float[np.ndarray, "nodes 3"]
+    cost: Float[np.ndarray, " nodes"]
+    parent: Int[np.ndarray, " nodes"]
+    move: Float[np.ndarray, "nodes 3"]
+
+    def only(self, which: np.ndarray) -> "Nodes":
+        """Some of the nodes."""
+        return Nodes(*(part[which] for part in self))
+
+
+class Search:
+    """A search for the cheapest path from one pose (3,) to another.
+
+    - `tree`: all nodes, of which the first is the start, and their number `count`; `best`: the least cost in each cell;
+    - `path`, `least`: the cheapest path that a shortcut has completed, and its cost [m];
+    - `nearest`: distance [m] from the goal to the nearest place of a node.
+    """
+
+    def __init__(
+        self, ground: Ground, start: np.ndarray, goal: np.ndarray, has_heading: bool, steps: Steps, costs: Costs
+    ):
+        self.ground, self.goal, self.has_heading, self.steps, self.costs = ground, goal, has_heading, steps, costs
+        arcs = steps.arcs(ground.cell)
+        # A path with more pieces than a shortcut begins with an arc of any length, and one with fewer with none.
+        self.first_moves = np.concatenate([arcs * [1.0, 1.0, times] for times in range(FIRST_ARCS)])
+        self.moves, self.way = arcs, ground.way_to(goal[:2], costs.clearance)
+        most = MOST_NODES + max(BATCH * len(arcs), len(self.first_moves))
+        self.tree = Nodes(np.zeros((most, 3)), np.zeros(most), np.zeros(most, dtype=int), np.zeros((most, 3)))
+        self.tree.pose[0], self.count = start, 1
+        self.best = np.full(np.prod(ground.shape) * HEADINGS * 2, np.inf)
+        self.path, self.least = None, np.inf
+        self.nearest = float(np.linalg.norm(start[:2] - goal[:2]))
+
+    @np.errstate(invalid="ignore")
+    def run(self) -> tuple[Path | None, float, bool]:
+        """The cheapest path that the search finds, or `None`; the distance [m] from the goal to the nearest place it came
+        to; and whether it has looked everywhere."""
+        frontier, tree, ground = [(0.0, 0)], self.tree, self.ground
+        while frontier and frontier[0][0] < self.least - TIE and self.count < MOST_NODES:
+            nodes = np.array([heapq.heappop(frontier)[1] for _ in range(min(BATCH, len(frontier)))])
+            cells = ground.cells(tree.pose[nodes], tree.move[nodes, 0])
+            # A cheaper node of the same cell has replaced the others. The start has no cell.
+            nodes = nodes[(nodes == 0) | (tree.cost[nodes] <= self.best[cells] + TIE)]
+            if not nodes.size:
+                continue
+            children, numbers = self.expanded(nodes)
+            away = np.linalg.norm(children.pose[:, :2] - self.goal[:2], axis=-1)
+            turn = np.abs((children.pose[:, 2] - self.goal[2] + np.pi) % (2.0 * np.pi) - np.pi) * self.has_heading
+            self.nearest = float(away.min(initial=self.nearest))
+            arrived = (away < ARRIVAL[0] * ground.cell) & (turn < ARRIVAL[1] * 2.0 * np.pi / HEADINGS)
+            if arrived.any():
+                missing = children.cost + away + turn / self.steps.sharpest
+                return self.path_by(int(numbers[arrived][np.argmin(missing[arrived])]), np.zeros((0, 3))), 0.0, True
+            ahead = np.maximum(self.way[ground.places(children.pose[:, :2])], self.cut_short(children, numbers))
+            for entry in zip((children.cost + ahead).tolist(), numbers.tolist(), strict=True):
+                heapq.heappush(frontier, entry)
+        return self.path, self.nearest, not frontier
+
+    def expanded(self, nodes: Int[np.ndarray, " nodes"]) -> tuple[Nodes, Int[np.ndarray, " children"]]:
+        """The new nodes at the ends of all moves from some nodes: those that touch no obstacle, have a way to the goal, and
+        are the cheapest in their cells; and their numbers in the tree."""
+        ground, tree, moves = self.ground, self.tree, self.first_moves if nodes[0] == 0 else self.moves
+        parent, move = np.repeat(nodes, len(moves)), np.tile(moves, (len(nodes), 1))
+        poses = self.along(tree.pose[parent], move)
+        children = Nodes(poses[:, -1], tree.cost[parent] + self.price(tree.move[parent].T, move.T), parent, move)
+        children = children.only(np.asarray(ground.is_free(poses, self.costs.clearance).all(axis=1)))
+        cells = ground.cells(children.pose, children.move[:, 0])
         order = np.lexsort((children.cost, cells))
         kept = order[np.unique(cells[order], return_index=True)[1]]
-        kept = kept[(children.cost[kept] < best[cells[kept]] - TIE) & np.isfinite(ahead[kept])]
-        best[cells[kept]] = children.cost[kept]
-        children, ahead = children.only(kept), ahead[kept]
-        numbers = tree.add(*children)
-        away = np.linalg.norm(children.pose[:, :2] - goal[:2], axis=-1)
-        turn = np.abs((children.pose[:, 2] - goal[2] + np.pi) % (2.0 * np.pi) - np.pi) * has_heading
-        nearest = float(away.min(initial=nearest))
-        arrived = (away < ARRIVAL[0] * ground.cell) & (turn < ARRIVAL[1] * 2.0 * np.pi / HEADINGS)
-        if arrived.any():
-            missing = children.cost + away + turn / steps.sharpest
-            return _path(tree, int(numbers[arrived][np.argmin(missing[arrived])]), np.zeros((0, 3))), 0.0, True
-        ways = shortcuts(children.pose, goal, has_heading, steps)
+        has_way = np.isfinite(self.way[ground.places(children.pose[kept, :2])])
+        kept = kept[(children.cost[kept] < self.best[cells[kept]] - TIE) & has_way]
+        self.best[cells[kept]] = children.cost[kept]
+        children = children.only(kept)
+        numbers = np.arange(self.count, self.count + len(kept))
+        for part, added in zip(tree, children, strict=True):
+            part[numbers] = added
+        self.count += len(kept)
+        return children, numbers
+
+    def cut_short(self, children: Nodes, numbers: Int[np.ndarray, " children"]) -> Float[np.ndarray, " children"]:
+        """Look for a cheaper path to the goal by shortcuts from new nodes, and return the least price [m] of a shortcut from
+        each, 0 where there is none."""
+        ways = shortcuts(children.pose, self.goal, self.has_heading, self.steps)
         price, before = np.zeros(ways.shape[2:]), children.move.T[:, None]
         for move in ways:
-            price += _price(ground, steps, costs, before, move)
+            price += self.price(before, move)
             before = np.where(move[2] > TIE, move, before)
         price = np.nan_to_num(price, nan=np.inf)
         total = children.cost + price
         for number in np.argsort(total, axis=None)[:EXAMINED]:
             which, child = np.unravel_index(number, total.shape)
-            if total[which, child] >= least:
+            if total[which, child] >= self.least:
                 break
-            whole = _path(tree, int(numbers[child]), ways[..., which, child])
-            if ground.is_free(_along(ground, whole.poses[:-1], np.stack(whole[1:], axis=1)), costs.clearance).all():
-                path, least = whole, total[which, child]
+            whole = self.path_by(int(numbers[child]), ways[..., which, child])
+            poses = self.along(whole.poses[:-1], np.stack(whole[1:], axis=1))
+            if self.ground.is_free(poses, self.costs.clearance).all():
+                self.path, self.least = whole, total[which, child]
         shortest = price.min(axis=0, initial=np.inf)
-        ahead = np.maximum(ahead, np.where(np.isfinite(shortest), shortest, 0.0))
-        for entry in zip((children.cost + ahead).tolist(), numbers.tolist(), strict=True):
-            heapq.heappush(frontier, entry)
-    return path, nearest, not frontier
+        return np.where(np.isfinite(shortest), shortest, 0.0)
+
+    def price(self, before: np.ndarray, move: np.ndarray) -> np.ndarray:
+        """The price [m] of a move after another one; each is a direction, 0 for none, a curvature and a length."""
+        (direction, bend, length), costs, sharpest = move, self.costs, self.steps.sharpest
+        change = costs.reversal * (before[0] * direction < 0.0)
+        change = change + 0.5 * costs.turning * self.ground.cell * np.abs(before[1] - bend) / sharpest
+        factor = np.where(direction < 0.0, costs.backwards, 1.0) * (1.0 + costs.turning * np.abs(bend) / sharpest)
+        return length * factor + change * (length > TIE)
+
+    def along(self, pose: np.ndarray, moves: np.ndarray) -> Float[np.ndarray, "moves samples 3"]:
+        """Poses along moves, each from a pose of its own."""
+        count = max(SAMPLES, int(np.ceil(SAMPLES * moves[:, 2].max() / (1.5 * self.ground.cell))))
+        direction, bend, length = moves.T[..., None]
+        return driven(pose[:, None], direction, bend, length * np.arange(1, count + 1) / count)
+
+    def path_by(self, node: int, more: np.ndarray) -> Path:
+        """The path to a node, and by more pieces from there."""
+        branch = [node]
+        while branch[-1]:
+            branch.append(int(self.tree.parent[branch[-1]]))
+        branch = branch[::-1]
+        poses, moves = (
+            list(self.tree.pose[branch]),
+            np.concatenate([self.tree.move[branch[1:]], more[more[:, 2] > TIE]]),
+        )
+        for piece in moves[len(branch) - 1 :]:
+            poses.append(driven(poses[-1], *piece))
+        return Path(np.array(poses), *moves.T)
 
 
-def _price(ground: Ground, steps: Steps, costs: Costs, before: Any, move: Any) -> Any:
-    """The price [m] of a move after another one; each is a direction, 0 for none, a curvature and a length."""
-    direction, bend, length = move
-    change = costs.reversal * (before[0] * direction < 0.0)
-    change = change + 0.5 * costs.turning * ground.cell * np.abs(before[1] - bend) / steps.sharpest
-    factor = np.where(direction < 0.0, costs.backwards, 1.0) * (1.0 + costs.turning * np.abs(bend) / steps.sharpest)
-    return length * factor + change * (length > TIE)
+# The candidates of a plan: paths from searches at different prices, driven within the given time, as first guesses.
+
+#: Number of intervals of a plan.
+INTERVALS = 64
+
+#: Curvature of the arcs of the searches for neighbouring lanes, in units of the greatest one: less, because the fork takes time
+#: to turn, and nearly all, because a somewhat wider turn may need a detour.
+SEARCH_CURVATURES = (0.98, 0.85)
+
+#: Length of the shortest drive that is expected, in units of the path of a search, which consists of arcs.
+OPTIMISTIC = 0.8
+
+#: Neighbouring knots over which the steering angle and the speed of a path are averaged.
+SMOOTHING = (2, 1)
+
+#: Share of a section's time in which the stroller speeds up, and again slows down.
+RAMP = 0.2
+
+#: Time that a change of direction takes, in units of the time for one wheelbase.
+CHANGE = 1.5
 
 
-def _children(ground: Ground, tree: Tree, moves: np.ndarray, nodes: np.ndarray, steps: Steps, costs: Costs) -> Children:
-    """The ends of all moves from some nodes that touch no obstacle."""
-    parent, which = (part.ravel() for part in np.meshgrid(nodes, np.arange(len(moves)), indexing="ij"))
-    move = moves[which]
-    poses = _along(ground, tree.pose[parent], move)
-    cost = tree.cost[parent] + _price(ground, steps, costs, tree.move[parent].T, move.T)
-    free = ground.is_free(poses, costs.clearance).all(axis=1)
-    return Children(poses[:, -1], cost, parent, move).only(np.asarray(free))
+def prices(problem: Problem, count: int, batch: int, rng: np.random.Generator) -> list[Costs]:
+    """What the searches of a batch minimise: ordinary prices first, or mostly the time at the limits of the speed in haste,
+    then random ones."""
+    length, keep = float(problem.footprint.length), problem.clearance
+    low, high = problem.limits.ranges().get("speed", (-1.0, 1.0))
+    backwards = high / -low if low < 0.0 < high else 1.0
+    if batch == 0:
+        usual = [Costs(1.5 * length, 0.1, 1.0, 0.9 * keep), Costs(0.5 * length, 0.3, 1.5, 1.8 * keep)]
+        if problem.in_haste:
+            usual = [Costs(0.1 * length, 0.0, backwards, 0.9 * keep), Costs(0.5 * length, 0.1, backwards, 1.8 * keep)]
+        return [usual[k % 2] for k in range(count)]
+    spread = np.exp(rng.normal(size=(count, 4)) * np.array([1.0, 0.7, 0.5, 0.5]))
+    middle = np.array([length, 0.2, 1.2 * backwards if problem.in_haste else 1.2, 0.7 * keep])
+    return [Costs(*map(float, row)) for row in middle * spread]
 
 
-def _along(ground: Ground, pose: np.ndarray, moves: np.ndarray) -> Float[np.ndarray, "moves samples 3"]:
-    """Poses along moves, each from a pose of its own."""
-    count = max(SAMPLES, int(np.ceil(SAMPLES * moves[:, 2].max() / (1.5 * ground.cell))))
-    direction, bend, length = moves.T[..., None]
-    return driven(pose[:, None], direction, bend, length * np.arange(1, count + 1) / count)
+def paths_of(problem: Problem, costs: list[Costs]) -> tuple[list[Path], str | None]:
+    """A path for each of several prices, straight to the goal where the search finds none; and a reason, in words, why
+    none can be driven in time, if there is one."""
+    start, goal = problem.chart.point(problem.start_pose), problem.chart.point(problem.goal_pose)
+    radius = 1.0 / Steps.of(problem, min(SEARCH_CURVATURES)).sharpest
+    ground = Ground.of(np.stack([start, goal]), problem.obstacle_arrays, problem.footprint, radius)
+    has_heading = problem.goal.heading is not None
+    results = [
+        Search(ground, start, goal, has_heading, Steps.of(problem, SEARCH_CURVATURES[lane % 2]), prices).run()
+        for lane, prices in enumerate(costs)
+    ]
+    paths = [path for path, _, _ in results if path is not None]
+    if not paths:
+        nearest, was_all = min(result[1] for result in results), all(result[2] for result in results)
+        cut_short = f"the search ended after {MOST_NODES} poses without a path"
+        what = "no path to the goal was found" if was_all else cut_short
+        away = goal[:2] - start[:2]
+        poses = np.stack([start, goal])
+        poses[:, 2] = np.arctan2(away[1], away[0])
+        straight = Path(poses, np.ones(1), np.zeros(1), np.array([max(float(np.hypot(*away)), 1e-3)]))
+        return [straight] * len(costs), f"{what}; the nearest ended {nearest:.2g} m from the goal"
+    low, high = problem.limits.ranges().get("speed", (-np.inf, np.inf))
+    way, fastest, reason = min(float(path.length.sum()) for path in paths), max(-low, high), None
+    if OPTIMISTIC * way > fastest * problem.t1:
+        reason = f"the shortest path that was found, {way:.3g} m, takes {way / fastest:.3g} s at the limit of the speed"
+    return [path or paths[0] for path, _, _ in results], reason
 
 
-def _places(ground: Ground, pose: np.ndarray) -> np.ndarray:
-    """The cells of x and y."""
-    return np.clip(((pose[:, :2] - ground.low) / ground.cell).astype(int), 0, np.array(ground.shape) - 1)
+def soonest(problem: Problem, path: Path) -> float:
+    """A time [s] that a path takes at least, by the limits of speed, force, grip and torque."""
+    scene, body = problem.scene, problem.scene.body
+    way = max(float(path.length.sum()), float(body.wheelbase))
+    most = {name: max(-low, high) for name, (low, high) in problem.limits.ranges().items()}
+    # The way from rest to rest with the greatest acceleration, and a turn of the wheel by 1 rad in the same manner.
+    accelerations = [most.get("force", np.inf) / body.mass, most.get("grip", np.inf) * scene.gravity]
+    slowest = [way / accelerations[0], way / accelerations[1], body.steering_inertia / most.get("torque", np.inf)]
+    return max(way / most.get("speed", np.inf), 2.0 * float(np.sqrt(max(slowest))))
 
 
-def _cells(ground: Ground, pose: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """The numbers of the cells of places, headings and directions of travel."""
-    place, (_, ny) = _places(ground, pose), ground.shape
-    heading = np.floor(pose[:, 2] / (2.0 * np.pi) * HEADINGS + 0.5).astype(int) % HEADINGS
-    return ((place[:, 0] * ny + place[:, 1]) * HEADINGS + heading) * 2 + (direction > 0.0)
+def unknowns_of(problem: Problem, path: Path, t1: float) -> Float[np.ndarray, "rows unknowns"]:
+    """A path, driven within `t1` [s], as unknowns of the optimiser (see `transcription.py`)."""
+    wheelbase = float(problem.scene.body.wheelbase)
+    points, speed, curvature = timed(path, INTERVALS + 1, t1, wheelbase)
+    steering = smoothed(np.arctan(wheelbase * curvature), SMOOTHING[0])
+    front_speed = smoothed(speed, SMOOTHING[1]) / np.cos(steering)
+    poses = np.asarray(problem.chart.poses(jnp.asarray(points)))
+    poses = np.concatenate([poses, poses[-1:], poses[-1:]])
+    splines = np.pad(np.stack([steering, front_speed], axis=1), ((1, ORDER - 3), (0, 0)), mode="edge")
+    return np.concatenate([poses, splines], axis=1)
 
 
-def _path(tree: Tree, node: int, more: np.ndarray) -> Path:
-    """The path to a node, and by more pieces from there."""
-    branch = np.array(tree.branch(node))
-    poses, moves = list(tree.pose[branch]), np.concatenate([tree.move[branch[1:]], more[more[:, 2] > TIE]])
-    for piece in moves[len(branch) - 1 :]:
-        poses.append(driven(poses[-1], *piece))
-    return Path(np.array(poses), *moves.T)
+def smoothed(values: Float[np.ndarray, " n"], width: int) -> Float[np.ndarray, " n"]:
+    """A running mean over 2 `width` + 1 values."""
+    padded = np.pad(values, width, mode="edge")
+    return np.convolve(padded, np.full(2 * width + 1, 1.0 / (2 * width + 1)), mode="valid")
+
+
+def timed(
+    path: Path, knots: int, t1: float, wheelbase: float
+) -> tuple[Float[np.ndarray, "knots 3"], Float[np.ndarray, " knots"], Float[np.ndarray, " knots"]]:
+    """Poses, speeds of the rear axle [m/s] and curvatures [1/m] at evenly spaced times from 0 to `t1`."""
+    # The sections between changes of direction.
+    cuts = [0, *(np.flatnonzero(np.diff(path.direction)) + 1), len(path.direction)]
+    lengths = np.array([path.length[a:b].sum() for a, b in zip(cuts, cuts[1:], strict=False)])
+    shares = (lengths + CHANGE * wheelbase) / (lengths + CHANGE * wheelbase).sum()
+    ends = np.concatenate([[0.0], np.cumsum(shares)])
+    time = np.linspace(0.0, 1.0, knots)
+    section = np.clip(np.searchsorted(ends, time, side="right") - 1, 0, len(lengths) - 1)
+    way, rate = progress((time - ends[section]) / shares[section])
+    start = np.array([path.length[:cut].sum() for cut in cuts])
+    along = start[section] + way * lengths[section]
+    piece_ends = np.cumsum(path.length)
+    piece = np.clip(np.searchsorted(piece_ends, along), 0, len(piece_ends) - 1)
+    into = along - (piece_ends - path.length)[piece]
+    poses = driven(path.poses[piece], path.direction[piece], path.curvature[piece], into)
+    speed = rate * lengths[section] / (shares[section] * t1)
+    return poses, speed * path.direction[piece], path.curvature[piece]
+
+
+def progress(part: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Share of a section's length, and its rate, at a share of its time: smooth ramps and constant speed between."""
+    top = 1.0 / (1.0 - RAMP)
+    ramp = lambda u: u**3 - 0.5 * u**4  # noqa: E731
+    slope = lambda u: 3.0 * u**2 - 2.0 * u**3  # noqa: E731
+    u, v = np.clip(part / RAMP, 0.0, 1.0), np.clip((1.0 - part) / RAMP, 0.0, 1.0)
+    middle = np.clip(part, RAMP, 1.0 - RAMP) - RAMP
+    way = top * (RAMP * ramp(u) + middle + RAMP * (0.5 - ramp(v)))
+    return way, top * np.minimum(slope(u), slope(v))

@@ -8,86 +8,72 @@ that no motion connects yet.
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
+from scipy.interpolate import make_interp_spline
 
-from nonholonomic.geometry import Vector, add, cross, dot, multiply, scale, stacked, subtract
+from nonholonomic.geometry import Vector, add, dot, multiply, scale, subtract
 
 from ..model.dynamics import Dynamics, padded
 from ..model.input import Motion
-from .obstacles import Footprint, Obstacles
+from .problem import Footprint, Obstacles, Pose, Problem, seen_from_above
+
+#: Numbers in JAX; and coefficients of the splines of the steering angle and of the front wheel's speed.
+Numbers: TypeAlias = Float[Array, "..."]
+Splines: TypeAlias = tuple[Numbers, Numbers]
 
 # Inverse dynamics: the force and the torque that move the stroller with a given speed and steering angle.
 #
 # Position and heading follow from the speed of the front wheel and the steering angle alone, on every ground; force and
 # torque enter the rates of the momentum P and of the fork linearly (`model/dynamics.py`), which determines them.
 
-Pose = Float[Array, "components ..."]
-
 
 class Rates(NamedTuple):
     """Steering angle phi [rad], its two derivatives, and speed of the front wheel [m/s] and its derivative."""
 
-    steering: Any
-    steering_rate: Any
-    steering_acceleration: Any
-    front_speed: Any
-    front_acceleration: Any
+    steering: Numbers
+    steering_rate: Numbers
+    steering_acceleration: Numbers
+    front_speed: Numbers
+    front_acceleration: Numbers
 
 
 class Actuation(NamedTuple):
     """What a motion needs: force [N], torque [N m], speed of the rear axle [m/s], normal force [N] and, if asked for,
     the coefficient of friction of each loaded axle."""
 
-    force: Any
-    torque: Any
-    speed: Any
-    normal_force: Any
-    grip: Any
+    force: Numbers
+    torque: Numbers
+    speed: Numbers
+    normal_force: Numbers
+    grip: Float[Array, " axles"]
 
 
-def state_of(dynamics: Dynamics, pose: Pose, steering: Any, steering_rate: Any, front_speed: Any) -> Any:
+def state_of(
+    dynamics: Dynamics, pose: Pose, steering: Numbers, steering_rate: Numbers, front_speed: Numbers
+) -> Numbers:
     """The state (see `model/dynamics.py`) of a stroller without work components; the heading is intrinsic."""
     axes = dynamics.surface.axes
-    heading = padded(pose[axes:])
-    sine, cosine = jnp.sin(steering), jnp.cos(steering)
-    momentum = front_speed * jnp.sqrt(dynamics.inertia(heading, 1.0, sine, cosine))
-    fork_rate = steering_rate
-    if dynamics.absolute is not None:
-        fork_rate = fork_rate + front_speed * sine / dynamics.body.wheelbase
-    return stacked((*pose, steering, momentum, fork_rate, sine, cosine), pose)
-
-
-def no_input(t: Any, motion: Any) -> tuple[Any, Any]:
-    """An input without force and torque."""
-    return 0.0, 0.0
-
-
-def pose_rate(dynamics: Dynamics, pose: Pose, steering: Any, front_speed: Any) -> Pose:
-    """Rate of the position and the heading."""
-    state = state_of(dynamics, pose, steering, 0.0, front_speed)
-    return dynamics.field(jnp.zeros(()), state, no_input)[: len(pose)]
+    return dynamics.state(padded(pose[:axes]), padded(pose[axes:]), steering, steering_rate, front_speed)
 
 
 def actuation(dynamics: Dynamics, pose: Pose, rates: Rates, with_grip: bool) -> Actuation:
     """Force, torque and contact forces of a motion."""
-    components = len(pose)
-    state, body = state_of(dynamics, pose, *rates[:2], rates.front_speed), dynamics.body
-    geometry = dynamics.geometry(state)
-    coasting = dynamics.field(jnp.zeros(()), state, no_input)
+    components, body = len(pose), dynamics.body
+    values = (pose, rates.steering, rates.steering_rate, rates.front_speed)
+    state = state_of(dynamics, *values)
+    geometry, coasting = dynamics.geometry(state), dynamics.field(jnp.zeros(()), state)
 
-    def momenta(pose, steering, steering_rate, front_speed):
-        state = state_of(dynamics, pose, steering, steering_rate, front_speed)
-        return state[components + 1], state[components + 2]
+    def momenta(*values: Array) -> Float[Array, " 2"]:
+        return state_of(dynamics, *values)[components + 1 : components + 3]
 
     changes = (coasting[:components], rates.steering_rate, rates.steering_acceleration, rates.front_acceleration)
-    values = (pose, rates.steering, rates.steering_rate, rates.front_speed)
     _, (momentum_rate, fork_acceleration) = jax.jvp(momenta, values, changes)
     torque = body.steering_inertia * (fork_acceleration - coasting[components + 2])
     momentum_change = momentum_rate - coasting[components + 1]
@@ -99,10 +85,8 @@ def actuation(dynamics: Dynamics, pose: Pose, rates: Rates, with_grip: bool) -> 
         # `side_force` expects the work components.
         whole = jnp.concatenate([state, jnp.zeros(2 + dynamics.friction.dissipates)])
         sides = dynamics.side_force(jnp.zeros(()), whole, lambda t, motion: (force, torque))
-        load = (geometry.normal_force, geometry.front_load)
-        rear_load = load[0] if load[1] is None else load[0] - load[1]
-        loads = [rear_load] if load[1] is None else [rear_load, load[1]]
-        grip = jnp.stack([jnp.abs(side) / part for side, part in zip(sides, loads, strict=False)])
+        loads = [load for load in (geometry.rear_load, geometry.front_load) if load is not None]
+        grip = jnp.stack([jnp.abs(side) / load for side, load in zip(sides, loads, strict=False)])
     normal_force = jnp.broadcast_to(multiply(1.0, geometry.normal_force), jnp.shape(rates.steering))
     return Actuation(force, torque, geometry.motion.speed, normal_force, grip)
 
@@ -116,9 +100,9 @@ def actuation(dynamics: Dynamics, pose: Pose, rates: Rates, with_grip: bool) -> 
 ORDER = 4
 
 
-def basis(u: Any) -> tuple[Any, Any, Any]:
+def basis(u: Numbers | float) -> tuple[list[Numbers | float], list[Numbers | float], list[Numbers | float]]:
     """The weights of an interval's four coefficients at a part `u` of it, in [0, 1], and their first and second
-    derivatives: each a list of four."""
+    derivatives."""
     v = 1.0 - u
     value = [v**3 / 6.0, (3.0 * u**3 - 6.0 * u**2 + 4.0) / 6.0, (3.0 * v**3 - 6.0 * v**2 + 4.0) / 6.0, u**3 / 6.0]
     slope = [-(v**2) / 2.0, (3.0 * u**2 - 4.0 * u) / 2.0, -(3.0 * v**2 - 4.0 * v) / 2.0, u**2 / 2.0]
@@ -126,14 +110,15 @@ def basis(u: Any) -> tuple[Any, Any, Any]:
     return value, slope, bend
 
 
-def weighted(weights: list[Any], coefficients: Any) -> Any:
+def weighted(weights: list[Numbers | float], coefficients: Numbers | list[Numbers]) -> Numbers:
     """The sum of four coefficients, along axis 0, with weights."""
-    return sum(weight * coefficients[k] for k, weight in enumerate(weights))
+    a, b, c, d = weights
+    return a * coefficients[0] + b * coefficients[1] + c * coefficients[2] + d * coefficients[3]
 
 
 # Every run of a plan traces its input several times; `jit` keeps the trace.
 @partial(jax.jit, static_argnames="derivative", inline=True)
-def evaluate(coefficients: Any, part: Any, derivative: int = 0) -> Any:
+def evaluate(coefficients: Numbers, part: Numbers | float, derivative: int = 0) -> Numbers:
     """The value of a spline, or of its derivative, at parts of its whole length, held constant beyond its ends.
 
     Derivatives are with respect to the number of intervals passed.
@@ -144,21 +129,19 @@ def evaluate(coefficients: Any, part: Any, derivative: int = 0) -> Any:
     return weighted(basis(position - first)[derivative], [coefficients[first + k] for k in range(ORDER)])
 
 
-def interpolate(values: np.ndarray) -> np.ndarray:
-    """Coefficients of the spline through values (knots, ...) at its knots, without curvature at the ends."""
-    count = len(values) + 2
-    # The diagonals of the matrix, from the second above to the second below.
-    diagonals = np.zeros((5, count))
-    diagonals[1:4, :] = np.array([[1.0], [4.0], [1.0]]) / 6.0
-    diagonals[2, 0], diagonals[1, 1], diagonals[0, 2] = 1.0, -2.0, 1.0
-    diagonals[2, -1], diagonals[3, -2], diagonals[4, -3] = 1.0, -2.0, 1.0
-    ends = np.zeros_like(values[:1])
-    return scipy.linalg.solve_banded((2, 2), diagonals, np.concatenate([ends, values, ends]))
+def interpolate(values: Float[np.ndarray, "knots *n"]) -> Float[np.ndarray, "coefficients *n"]:
+    """Coefficients of the spline through values at its knots, without curvature at the ends."""
+    knots = np.arange(1.0 - ORDER, len(values) + ORDER - 1)
+    return make_interp_spline(knots[ORDER - 1 : 1 - ORDER], values, t=knots, bc_type="natural").c
 
 
 #: Number of steps of the Runge-Kutta method in an interval; constraints hold at the start of each step, and at the end of the
 #: drive.
 STEPS = 3
+
+#: Share of every limit's range to keep in reserve at first: the check examines the ride between the points at which the
+#: optimiser looks.
+LIMIT_RESERVE = 0.003
 
 #: Smallest normal force, in units of the weight.
 LEAST_CONTACT = 0.02
@@ -171,14 +154,6 @@ BETWEEN = np.array([1.0 / 24.0, 1.0 / 6.0, 0.5, 5.0 / 6.0, 23.0 / 24.0])
 SMOOTHNESS, EASE = 0.02, 0.1
 
 
-class Scales(NamedTuple):
-    """Units of the residuals: length [m], speed [m/s] and force [N]."""
-
-    length: Any
-    speed: Any
-    force: Any
-
-
 class Task(eqx.Module):
     """What all candidates of a plan have in common.
 
@@ -186,46 +161,73 @@ class Task(eqx.Module):
     - `has_heading`: 1 if the goal has a heading, else 0.
     - `low`, `high`: limits of steering, speed, force, torque and grip.
     - `clearance`: the distance [m] to keep from obstacles.
+    - `length` [m], `speed` [m/s], `force` [N]: units of the residuals.
     - `haste`: weight [1/s] of the duration in the objective; 0 where the duration is given.
     """
 
     dynamics: Dynamics
     footprint: Footprint
     obstacles: Obstacles
-    start: tuple[Any, Any, Any, Any]
-    goal: tuple[Any, Any]
-    has_heading: Any
+    start: tuple[Pose, Float[Array, ""], Float[Array, ""], Float[Array, ""]]
+    goal: tuple[Pose, Float[Array, ""]]
+    has_heading: Float[Array, ""]
     low: Float[Array, " limits"]
     high: Float[Array, " limits"]
-    clearance: Any
-    scales: Scales
-    haste: Any
+    clearance: Float[Array, ""]
+    length: Float[Array, ""]
+    speed: Float[Array, ""]
+    force: Float[Array, ""]
+    haste: Float[Array, ""]
     with_grip: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, problem: Problem, way: float, t1: float, clearance: float, reserve: float = LIMIT_RESERVE) -> "Task":
+        """The task of a problem, for drives of the length `way` [m] and a duration of about `t1` [s], with a clearance [m] and
+        a share of every limit's range in reserve."""
+        launch, goal, body = problem.launch, problem.goal, problem.scene.body
+        speed = max(way, float(body.wheelbase)) / t1
+        ends = np.array([[launch.steering, launch.speed], [launch.steering, goal.speed]])
+        low, high = problem.limits.arrays(reserve)
+        # No drive keeps a reserve that its start or its goal does not have.
+        low[:2], high[:2] = np.minimum(low[:2], ends.min(axis=0)), np.maximum(high[:2], ends.max(axis=0))
+        front_speed = launch.speed / jnp.cos(launch.steering)
+        force = float(body.mass) * speed / min(1.0, 0.1 * t1)
+        return cls(
+            dynamics=problem.scene.dynamics,
+            footprint=problem.footprint,
+            obstacles=problem.obstacle_arrays,
+            start=(problem.start_pose, launch.steering, launch.steering_rate, front_speed),
+            goal=(problem.goal_pose, goal.speed),
+            has_heading=jnp.asarray(0.0 if goal.heading is None else 1.0),
+            low=jnp.asarray(low),
+            high=jnp.asarray(high),
+            clearance=jnp.asarray(clearance),
+            length=body.wheelbase,
+            speed=jnp.asarray(speed),
+            force=jnp.asarray(force),
+            haste=jnp.asarray(1.0 / t1 if problem.in_haste else 0.0),
+            with_grip=problem.limits.grip is not None,
+        )
 
 
 class Residuals(NamedTuple):
-    """Residuals of an interval: equalities, inequalities (at least 0) and the objective, in units of the scales."""
+    """Residuals of an interval: equalities, inequalities (at least 0) and the objective, in the units of the task."""
 
-    equalities: Any
-    inequalities: Any
-    objective: Any
-
-
-def seen_from_above(dynamics: Dynamics, pose: Any) -> tuple[Any, Any, Any]:
-    """The components x and y of the place, of the heading and of the direction to the left, each (2,)."""
-    axes = dynamics.surface.axes
-    place, heading = padded(pose[:axes]), padded(pose[axes:])
-    left = scale(dynamics.side, cross(dynamics.surface.normal(place), heading))
-    return jnp.stack(place[:2]), jnp.stack(heading[:2]), jnp.stack(left[:2])
+    equalities: Numbers
+    inequalities: Numbers
+    objective: Numbers
 
 
-def drive_from(dynamics: Dynamics, pose: Any, window: Any, part: Any, step: Any, duration: Any) -> Any:
+def drive_from(
+    dynamics: Dynamics, pose: Pose, window: Splines, part: Numbers | float, step: float, duration: Numbers
+) -> Pose:
     """The pose a step later, by the classical Runge-Kutta method; `part` and `step` in units of the interval."""
     steering, speed = window
 
-    def rate(u, pose):
+    def rate(u: Numbers | float, pose: Pose) -> Pose:
         weights = basis(u)[0]
-        return duration * pose_rate(dynamics, pose, weighted(weights, steering), weighted(weights, speed))
+        state = state_of(dynamics, pose, weighted(weights, steering), jnp.zeros(()), weighted(weights, speed))
+        return duration * dynamics.field(jnp.zeros(()), state)[: len(pose)]
 
     k1 = rate(part, pose)
     k2 = rate(part + step / 2.0, pose + step / 2.0 * k1)
@@ -234,7 +236,7 @@ def drive_from(dynamics: Dynamics, pose: Any, window: Any, part: Any, step: Any,
     return pose + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
 
 
-def motion_at(window: Any, part: Any, duration: Any) -> Rates:
+def motion_at(window: Splines, part: Numbers | float, duration: Numbers) -> Rates:
     """The steering and the speed at a part of an interval that takes `duration` [s]."""
     (steering, speed), (value, slope, bend) = window, basis(part)
     return Rates(
@@ -246,23 +248,24 @@ def motion_at(window: Any, part: Any, duration: Any) -> Rates:
     )
 
 
-def point_residuals(task: Task, pose: Any, motion: Rates) -> tuple[Any, Any]:
+def point_residuals(task: Task, pose: Pose, motion: Rates) -> tuple[Float[Array, " inequalities"], Float[Array, " 2"]]:
     """Inequalities and objective at one point."""
     needed = actuation(task.dynamics, pose, motion, task.with_grip)
-    scales = task.scales
     values = jnp.stack([motion.steering, needed.speed, needed.force, needed.torque])
-    units = jnp.stack([1.0, scales.speed, scales.force, scales.force * scales.length])
+    units = jnp.stack([1.0, task.speed, task.force, task.force * task.length])
     within = [(values - task.low[:4]) / units, (task.high[:4] - values) / units, task.high[4] - needed.grip]
     corners = task.footprint.corners(*seen_from_above(task.dynamics, pose))
-    gaps = (task.obstacles.gaps(corners) - task.clearance) / scales.length
+    gaps = (task.obstacles.gaps(corners) - task.clearance) / task.length
     weight = task.dynamics.body.mass * task.dynamics.gravity
-    contact = needed.normal_force / jnp.maximum(weight, scales.force) - LEAST_CONTACT * (weight > 0.0)
-    effort = jnp.stack([needed.force, needed.torque / task.dynamics.body.wheelbase]) / scales.force
+    contact = needed.normal_force / jnp.maximum(weight, task.force) - LEAST_CONTACT * (weight > 0.0)
+    effort = jnp.stack([needed.force, needed.torque / task.dynamics.body.wheelbase]) / task.force
     return jnp.concatenate([*within, gaps, contact[None]]), effort
 
 
-def interval_residuals(window: Any, task: Task, index: Any, intervals: int, duration: Any) -> Residuals:
-    """All residuals of the interval `index` of `intervals`, from its window (4, unknowns)."""
+def interval_residuals(
+    window: Float[Array, "4 unknowns"], task: Task, index: Int[Array, ""], intervals: int, duration: Numbers
+) -> Residuals:
+    """All residuals of the interval `index` of `intervals`."""
     poses, splines = window[:, :-2], (window[:, -2], window[:, -1])
     is_last = index == intervals - 1
 
@@ -275,42 +278,32 @@ def interval_residuals(window: Any, task: Task, index: Any, intervals: int, dura
     # No interval follows the last one.
     first, last = motion_at(splines, 0.0, duration), motion_at(splines, 1.0, duration)
     at_end, _ = point_residuals(task, end, last)
-    between = motion_at(splines, BETWEEN, duration)
+    between = motion_at(splines, jnp.asarray(BETWEEN), duration)
     values = jnp.stack([between.steering, between.front_speed * jnp.cos(between.steering)], axis=-1)
-    within = jnp.concatenate([values - task.low[:2], task.high[:2] - values]) / jnp.stack([1.0, task.scales.speed])
+    within = jnp.concatenate([values - task.low[:2], task.high[:2] - values]) / jnp.stack([1.0, task.speed])
     inequalities = jnp.concatenate([inequalities.ravel(), jnp.where(is_last, at_end, 1.0), within.ravel()])
-    axes, length = task.dynamics.surface.axes, task.scales.length
+    axes, length = task.dynamics.surface.axes, task.length
     units = jnp.concatenate([jnp.full(axes, length), jnp.ones(len(end) - axes)])
     at_start, at_goal = jnp.where(index == 0, 1.0, 0.0), jnp.where(is_last, 1.0, 0.0)
     (pose, steering, steering_rate, front_speed), (goal, goal_speed) = task.start, task.goal
     starts = [first.steering - steering, (first.steering_rate - steering_rate) * duration]
-    starts += [(first.front_speed - front_speed) / task.scales.speed]
+    starts += [(first.front_speed - front_speed) / task.speed]
     away = (poses[1] - goal) / units * jnp.concatenate([jnp.ones(axes), jnp.full(axes, task.has_heading)])
     ends = [last.steering_rate * duration]
-    ends += [(last.front_speed * jnp.cos(last.steering) - goal_speed) / task.scales.speed]
+    ends += [(last.front_speed * jnp.cos(last.steering) - goal_speed) / task.speed]
     equalities = [(poses[1] - end) / units, at_start * (poses[0] - pose) / units, at_start * jnp.stack(starts)]
     equalities += [at_goal * away, at_goal * jnp.stack(ends)]
     bends = splines[0][2] - 2.0 * splines[0][1] + splines[0][0], splines[1][2] - 2.0 * splines[1][1] + splines[1][0]
-    smooth = SMOOTHNESS * jnp.stack([bends[0], bends[1] / task.scales.speed])
+    smooth = SMOOTHNESS * jnp.stack([bends[0], bends[1] / task.speed])
     objective = jnp.concatenate([effort.ravel() / jnp.sqrt(STEPS * intervals), smooth])
     objective = jnp.where(task.haste > 0.0, EASE, 1.0) * objective
     return Residuals(jnp.concatenate(equalities), inequalities, objective)
 
 
-def windows(unknowns: Any) -> Any:
-    """The windows (intervals, 4, unknowns) of all intervals of the unknowns (rows, unknowns)."""
+def windows(unknowns: Float[Array, "rows *n"]) -> Float[Array, "intervals 4 *n"]:
+    """The windows of all intervals of the unknowns, or of a spline."""
     intervals = len(unknowns) - ORDER + 1
     return jnp.stack([unknowns[k : k + intervals] for k in range(ORDER)], axis=1)
-
-
-def residuals(unknowns: Any, task: Task, t1: Any) -> Residuals:
-    """The residuals of all intervals of a candidate."""
-    intervals = len(unknowns) - ORDER + 1
-
-    def of_one(window, index):
-        return interval_residuals(window, task, index, intervals, t1 / intervals)
-
-    return jax.vmap(of_one)(windows(unknowns), jnp.arange(intervals))
 
 
 # Optimisation of all candidates together: an augmented Lagrangian, minimised by damped Gauss-Newton steps.
@@ -328,43 +321,28 @@ LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-6, 1.0, 1e6
 class Candidates(NamedTuple):
     """Candidates in lanes: unknowns (lanes, rows, unknowns) and durations (lanes,) [s]."""
 
-    unknowns: Any
-    durations: Any
+    unknowns: Float[Array | np.ndarray, "lanes rows unknowns"]
+    durations: Float[Array | np.ndarray, " lanes"]
 
 
-class Schedule(NamedTuple):
-    """How the optimiser proceeds: the penalties of the constraints, in turn, the most Gauss-Newton steps with each, and the
-    relative change of what is minimised at which it stops."""
-
-    penalties: tuple[float, ...]
-    steps: int
-    settled: float
-
-
-#: Least effort in a given time, and least time: with small penalties the duration soon falls below the least one, and the
-#: multipliers then bring it back. From above, the limits of the speed stop every step.
-CALM, HASTY = Schedule((100.0, 300.0, *(1e3,) * 6), 8, 0.02), Schedule((10.0, *(30.0,) * 15), 60, 2e-3)
+#: The penalties of the constraints, in turn, the most Gauss-Newton steps with each, and the relative change of the objective
+#: at which the optimiser stops: for the least effort in a given time, and for the least time. With small penalties the
+#: duration soon falls below the least one, and the multipliers then bring it back. From above, the limits of the speed stop
+#: every step.
+CALM, HASTY = ((100.0, 300.0, *(1e3,) * 6), 8, 0.02), ((10.0, *(30.0,) * 15), 60, 2e-3)
 
 
 class Multipliers(NamedTuple):
     """Multipliers in units of the penalty, shaped as the constraints."""
 
-    equalities: Any
-    inequalities: Any
-
-
-def _penalised(evaluation: Residuals, multipliers: Multipliers, penalty: Any) -> Any:
-    """The residuals of the augmented Lagrangian, as one list per interval."""
-    root = jnp.sqrt(penalty)
-    shifted = evaluation.inequalities + multipliers.inequalities
-    broken = jnp.where(shifted < 0.0, shifted, 0.0)
-    return jnp.concatenate(
-        [root * (evaluation.equalities + multipliers.equalities), root * broken, evaluation.objective], -1
-    )
+    equalities: Numbers
+    inequalities: Numbers
 
 
 @eqx.filter_jit
-def _normal_equations(candidates: Candidates, task: Task, multipliers: Multipliers, penalty: Any) -> Any:
+def _normal_equations(
+    candidates: Candidates, task: Task, multipliers: Multipliers, penalty: Numbers
+) -> tuple[Numbers, Numbers, Numbers, Numbers]:
     """Merit (lanes,), gradient, lower band of the Gauss-Newton matrix without its last row, and this row, of every lane.
 
     The last of the unknowns is the logarithm of the factor of the duration; the speeds change inversely to it, so that the
@@ -375,6 +353,8 @@ def _normal_equations(candidates: Candidates, task: Task, multipliers: Multiplie
         rows, width = unknowns.shape
         intervals = rows - ORDER + 1
 
+        root = jnp.sqrt(penalty)
+
         # The poses of the third and the fourth row of a window have no influence.
         used = np.array([k for k in range(ORDER * width) if k < 2 * width or k % width >= width - 2])
 
@@ -384,8 +364,11 @@ def _normal_equations(candidates: Candidates, task: Task, multipliers: Multiplie
                 changed = window.ravel().at[used].set(numbers[:-1]).reshape(window.shape)
                 changed = changed.at[:, -1].multiply(t1 / duration)
                 evaluation = interval_residuals(changed, task, index, intervals, duration / intervals)
-                value = _penalised(evaluation, multipliers, penalty)
-                value = jnp.append(value, task.haste * duration / jnp.sqrt(intervals))
+                shifted = evaluation.inequalities + multipliers.inequalities
+                broken = root * jnp.where(shifted < 0.0, shifted, 0.0)
+                missed = root * (evaluation.equalities + multipliers.equalities)
+                time = task.haste * duration / jnp.sqrt(intervals)
+                value = jnp.concatenate([missed, broken, evaluation.objective, time[None]])
                 return value, value
 
             slope, value = jax.jacfwd(terms, has_aux=True)(jnp.append(window.ravel()[used], 0.0))
@@ -404,9 +387,17 @@ def _normal_equations(candidates: Candidates, task: Task, multipliers: Multiplie
 
 
 @eqx.filter_jit
-def constraints(candidates: Candidates, task: Task) -> Residuals:
-    """The residuals of every lane."""
-    return jax.vmap(lambda unknowns, t1: residuals(unknowns, task, t1))(*candidates)
+def residuals(candidates: Candidates, task: Task) -> Residuals:
+    """The residuals of all intervals of every lane."""
+    intervals = candidates.unknowns.shape[1] - ORDER + 1
+
+    def of_lane(unknowns, t1):
+        def of_one(window, index):
+            return interval_residuals(window, task, index, intervals, t1 / intervals)
+
+        return jax.vmap(of_one)(windows(unknowns), jnp.arange(intervals))
+
+    return jax.vmap(of_lane)(*candidates)
 
 
 def _step(equations: list[np.ndarray], damping: np.ndarray) -> np.ndarray:
@@ -475,27 +466,27 @@ def optimise(candidates: Candidates, task: Task, firmness: float = 1.0) -> tuple
     **Returns:** the candidates, and the violation of each and its effort or duration.
     """
     in_haste = bool(task.haste > 0.0)
-    schedule, enough = (HASTY, np.all) if in_haste else (CALM, np.any)
+    (penalties, steps, settled), enough = (HASTY, np.all) if in_haste else (CALM, np.any)
     # Where the weight makes the effort large, the penalties would be too weak beside it.
-    least = float(objective(constraints(candidates, task)).min())
-    task = eqx.tree_at(lambda task: task.scales.force, task, task.scales.force * np.sqrt(max(1.0, least)))
-    evaluation = constraints(candidates, task)
+    least = float(objective(residuals(candidates, task)).min())
+    task = eqx.tree_at(lambda task: task.force, task, task.force * np.sqrt(max(1.0, least)))
+    evaluation = residuals(candidates, task)
     multipliers = Multipliers(jnp.zeros_like(evaluation.equalities), jnp.zeros_like(evaluation.inequalities))
     values = np.full(len(candidates.durations), np.inf)
     damping = np.full(len(candidates.durations), FIRST_DAMPING)
-    last, *_ = penalties = firmness * np.array(schedule.penalties)
-    for penalty in penalties:
+    last = firmness * penalties[0]
+    for penalty in firmness * np.array(penalties):
         multipliers, last = Multipliers(*(part * (last / penalty) for part in multipliers)), penalty
-        candidates, damping = _minimise(candidates, task, multipliers, penalty, schedule.steps, damping)
-        evaluation, before = constraints(candidates, task), values
+        candidates, damping = _minimise(candidates, task, multipliers, penalty, steps, damping)
+        evaluation, before = residuals(candidates, task), values
         values = candidates.durations if in_haste else objective(evaluation)
-        if enough((violation(evaluation) < FEASIBLE) & (np.abs(values - before) < schedule.settled * values)):
+        if enough((violation(evaluation) < FEASIBLE) & (np.abs(values - before) < settled * values)):
             break
         multipliers = Multipliers(
             multipliers.equalities + evaluation.equalities,
             jnp.minimum(multipliers.inequalities + evaluation.inequalities, 0.0),
         )
-    return candidates, violation(evaluation), values
+    return candidates, violation(evaluation), np.asarray(values)
 
 
 # The input of a plan: a force and a torque over time, and feedback that holds the planned speed and steering angle.
@@ -503,8 +494,8 @@ def optimise(candidates: Candidates, task: Task, firmness: float = 1.0) -> tuple
 #: How fast feedback removes an error of the steering angle and of the speed [1/s].
 STEERING_RATE, SPEED_RATE = 8.0, 4.0
 
-#: Values of force and torque in an interval of the plan, and Runge-Kutta steps between them.
-FINE, FINE_STEPS = 8, 1
+#: Values of force and torque in an interval of the plan.
+FINE = 8
 
 
 class Drive(eqx.Module):
@@ -527,7 +518,7 @@ class Drive(eqx.Module):
     angle_gain: Float[Array, ""]
     rate_gain: Float[Array, ""]
 
-    def reference(self, t: Float[Array, "..."]) -> tuple[Any, Any, Any, Any, Any]:
+    def reference(self, t: Numbers) -> tuple[Numbers, Numbers, Numbers, Numbers, Numbers]:
         """Planned steering angle [rad], its rate [rad/s], speed of the front wheel [m/s], force [N] without the weight's
         part, and torque [N m]."""
         part = jnp.asarray(t) / self.duration
@@ -540,61 +531,52 @@ class Drive(eqx.Module):
             evaluate(self.torque, part),
         )
 
-    def climbing(self, motion: Motion) -> Any:
-        """The force [N] that holds the stroller against its weight; `None` where the ground is level."""
-        return dot(self.weight, motion.heading)
-
-    def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        angle, rate, speed, force, torque = self.reference(t)
-        force = add(self.climbing(motion), force + self.speed_gain * (speed - motion.front_speed))
+    def held(
+        self, motion: Motion, angle: Numbers, rate: Numbers, speed: Numbers, force: Numbers, torque: Numbers
+    ) -> tuple[Numbers, Numbers]:
+        """Force and torque that hold a steering angle, its rate and the speed of the front wheel, from the planned force and
+        torque."""
+        # No weight acts against the heading where the ground is level.
+        climbing = dot(self.weight, motion.heading)
+        force = add(climbing, force + self.speed_gain * (speed - motion.front_speed))
         torque = torque + self.angle_gain * (angle - motion.steering) + self.rate_gain * (rate - motion.steering_rate)
         return force, torque
 
+    def __call__(self, t: Numbers, motion: Motion) -> tuple[Numbers, Numbers]:
+        return self.held(motion, *self.reference(t))
+
 
 @eqx.filter_jit
-def _needed(dynamics: Dynamics, pose: Any, steering: Any, front_speed: Any, t1: Any) -> tuple[Any, Any, Any]:
+def _needed(
+    dynamics: Dynamics, pose: Pose, splines: Splines, t1: Numbers
+) -> tuple[Float[Array, " fine"], Float[Array, " fine"], Float[Array, "fine components"]]:
     """Force, torque and pose of a drive from a pose, `FINE` times in every interval and at the end."""
-    intervals = len(steering) - ORDER + 1
-    duration, width = t1 / intervals, 1.0 / FINE
+    intervals = len(splines[0]) - ORDER + 1
+    duration = t1 / intervals
 
-    def forces(pose, window, part):
+    def step(pose: Pose, k: Int[Array, ""]) -> tuple[Pose, tuple[Numbers, Numbers, Pose]]:
+        first = jnp.minimum(k // FINE, intervals - 1)
+        steering, front_speed = (jax.lax.dynamic_slice_in_dim(spline, first, ORDER) for spline in splines)
+        window, part = (steering, front_speed), k / FINE - first
         needed = actuation(dynamics, pose, motion_at(window, part, duration), False)
-        return needed.force, needed.torque, pose
+        end = drive_from(dynamics, pose, window, part, 1.0 / FINE, duration)
+        return end, (needed.force, needed.torque, pose)
 
-    def over_interval(pose, window):
-        def over_part(pose, k):
-            end = pose
-            for step in range(FINE_STEPS):
-                first = (k + step / FINE_STEPS) * width
-                end = drive_from(dynamics, end, window, first, width / FINE_STEPS, duration)
-            return end, forces(pose, window, k * width)
-
-        return jax.lax.scan(over_part, pose, jnp.arange(FINE))
-
-    rows = (windows(steering[:, None])[..., 0], windows(front_speed[:, None])[..., 0])
-    end, values = jax.lax.scan(over_interval, pose, rows)
-    last = forces(end, (rows[0][-1], rows[1][-1]), 1.0)
-    return tuple(  # pyright: ignore[reportReturnType]
-        jnp.concatenate([value.reshape(-1, *value.shape[2:]), final[None]])
-        for value, final in zip(values, last, strict=True)
-    )
+    return jax.lax.scan(step, pose, jnp.arange(intervals * FINE + 1))[1]
 
 
-def poses_along(dynamics: Dynamics, pose: Any, steering: np.ndarray, front_speed: np.ndarray, t1: float) -> np.ndarray:
-    """The poses at the knots of a drive from a pose, (knots, components)."""
-    return np.asarray(_needed(dynamics, pose, steering, front_speed, jnp.asarray(t1, dtype=float))[2])[::FINE]
-
-
-def drive_along(dynamics: Dynamics, pose: Any, steering: np.ndarray, front_speed: np.ndarray, t1: float) -> Drive:
+def drive_along(
+    dynamics: Dynamics, pose: Pose, steering: Float[np.ndarray, " n"], front_speed: Float[np.ndarray, " n"], t1: float
+) -> Drive:
     """The input that gives a stroller, from a pose, the steering angle and the speed of two splines."""
-    force, torque, poses = _needed(dynamics, pose, steering, front_speed, jnp.asarray(t1, dtype=float))
+    duration, splines = jnp.asarray(t1, dtype=float), (jnp.asarray(steering), jnp.asarray(front_speed))
+    force, torque, poses = _needed(dynamics, pose, splines, duration)
     body = dynamics.body
     weight = scale(body.mass * dynamics.gravity, dynamics.up)
     force = subtract(force, dot(weight, padded(poses[:, dynamics.surface.axes :].T)))
     return Drive(
-        duration=jnp.asarray(t1, dtype=float),
-        steering=jnp.asarray(steering),
-        front_speed=jnp.asarray(front_speed),
+        duration,
+        *splines,
         force=jnp.asarray(interpolate(np.asarray(force))),
         torque=jnp.asarray(interpolate(np.asarray(torque))),
         weight=weight,

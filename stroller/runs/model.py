@@ -184,7 +184,7 @@ class RideModel(AbstractSceneModel):
 
     def problem(self, cells: int | None, names: Names) -> AbstractProblem:
         if cells is None:
-            ride = RideProblem.single(self.scene, self.launch, self.input, self.jumps)
+            ride = RideProblem.of(self.scene, self.launch, self.input, jumps=self.jumps)
         else:
             watched = self.event is None and names is not None and not names
             ride = RideProblem.of(self.scene, self.launch, self.input, cells, watched, self.jumps)

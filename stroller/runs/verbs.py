@@ -1,7 +1,8 @@
 """The functions of the stroller: rides, tables, crossings, fits, plots and pages."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from os import PathLike
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -11,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.identification import (
     AbstractRecording,
+    Free,
     Identification,
     LogDensity,
     Quantities,
@@ -19,14 +21,14 @@ from nonholonomic.identification import (
 )
 from nonholonomic.integration.problem import DEFAULT_MAX_STEPS
 from nonholonomic.parameters import full_axes
-from nonholonomic.runs.identify import fit_runs, posterior_of_runs, search_options, sources_of
+from nonholonomic.runs.identify import Data, Prior, fit_runs, posterior_of_runs
 from nonholonomic.runs.model import AbstractModel
 from nonholonomic.runs.sweep import Options, table_of
 from nonholonomic.runs.table import TableForm
 from nonholonomic.sweeps import Table
 from nonholonomic.terminal import status_line
 from nonholonomic.text import shown
-from nonholonomic.validation import as_number, as_number_or_none, require_kind, require_outside
+from nonholonomic.validation import require_kind, require_outside
 
 from ..model.input import Input
 from ..model.scene import Scene
@@ -180,8 +182,8 @@ EXPECTED = "a Recording or a nonholonomic.EventTimes"
 
 def identify(
     scene: Scene,
-    data: Any,
-    free: dict[str, Any],
+    data: Data | Sequence[Data],
+    free: Mapping[str, Free | float],
     *,
     starts: int = 16,
     spread: float = 2.0,
@@ -222,13 +224,18 @@ def identify(
 
     ```
     """
-    search = search_options(starts, spread, seed, max_steps, progress)
+    search = {"starts": starts, "spread": spread, "seed": seed, "max_steps": max_steps, "progress": progress}
     require_kind(scene, "scene", Scene)
-    return fit_runs(scene, sources_of(data, EXPECTED), free, tolerance, search)
+    return fit_runs(scene, data, free, EXPECTED, tolerance, search)
 
 
 def log_density(
-    scene: Scene, data: Any, free: dict[str, Any], priors: dict[str, Any] | None = None, *, tolerance: float = 1e-8
+    scene: Scene,
+    data: Data | Sequence[Data],
+    free: Mapping[str, Free | float],
+    priors: Mapping[str, Prior] | None = None,
+    *,
+    tolerance: float = 1e-8,
 ) -> LogDensity:
     """The log of the posterior density of the parameters of a scene and its launch, as a function of unbounded coordinates.
 
@@ -253,7 +260,7 @@ def log_density(
     ```
     """
     require_kind(scene, "scene", Scene)
-    return posterior_of_runs(scene, sources_of(data, EXPECTED), free, priors, tolerance)
+    return posterior_of_runs(scene, data, free, priors, EXPECTED, tolerance)
 
 
 # Recorded rides of strollers, from arrays and from files.
@@ -281,10 +288,11 @@ class Recording(AbstractRecording):
     - `quantity`: "position" ("x", "y", "z") [m] of the rear axle in the fixed frame, "heading", "steering" [rad],
       "speed" [m/s], "yaw_rate" or "steering_rate" [rad/s], all as in `Trajectory`; or a tuple of some of these words. A
       heading may differ by whole turns.
-    - `input`, `jumps`: the input of the ride and the times at which it jumps, as for `simulate`.
     - `t0`: the clock's reading [s] at the launch. Before this time, the stroller is at its launch position.
     - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for data with outliers;
       `None` for Gaussian errors.
+    - `side`: as for `nonholonomic.Recording`; a ride has no resets.
+    - `input`, `jumps`: the input of the ride and the times at which it jumps, as for `simulate`.
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
 
@@ -300,9 +308,7 @@ class Recording(AbstractRecording):
     launch: Launch
     quantity: str | tuple[str, ...] = eqx.field(static=True, default="position", converter=as_quantity)
     input: Input | None = None
-    t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
-    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
-    jumps: object = None
+    jumps: Sequence[float] | Array | None = None
     quantities: ClassVar[Quantities] = QUANTITIES
 
     def model(self, scene: Scene) -> AbstractModel:
@@ -316,17 +322,17 @@ class Recording(AbstractRecording):
 
 
 def read_recording(
-    path: Any,
-    columns: Any = None,
+    path: str | PathLike[str],
+    columns: Mapping[str, object] | None = None,
     fps: float | None = None,
     *,
     launch: Launch,
-    error: Any = None,
+    error: Mapping[str, object] | None = None,
     input: Input | None = None,
     t0: float = 0.0,
     student: float | None = None,
     decimal: str = ".",
-    jumps: object = None,
+    jumps: Sequence[float] | Array | None = None,
 ) -> Recording:
     """A recording of a ride from a text file of columns with a header line (CSV).
 

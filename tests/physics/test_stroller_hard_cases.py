@@ -200,7 +200,7 @@ def test_projected_heading_loses_rank_on_the_equator():
     W = Chart(scene).constraints(place.at[0].set(0.0).at[1].set(0.0))
     assert np.linalg.matrix_rank(np.asarray(W), tol=1e-12) == 1
     state = scene.state(Launch((0.0, -1e-6), np.pi / 2, 0.0))
-    np.testing.assert_allclose(scene.rank(state), 0.0, atol=1e-10)
+    np.testing.assert_allclose(scene.dynamics.rank(state), 0.0, atol=1e-10)
     run = stroller.simulate(scene, Launch((0.0, -1e-6), np.pi / 2, 0.0, 0.0), 1e-3, tolerance=1e-8)
     assert run.status in ("rank_lost", "failed")
     assert run.rank_lost_at == 0.0
@@ -213,7 +213,7 @@ def test_rank_is_kept_by_the_intrinsic_heading():
     angles = jnp.linspace(-3.0, 3.0, 41)
     states = scene.state(Launch((0.0 * angles, angles / 2.1), angles, 0.0, angles))
     expected = min(M, J / L**2) / (M + J / L**2)
-    assert float(jnp.min(scene.rank(states))) >= expected * (1.0 - 1e-12)
+    assert float(jnp.min(scene.dynamics.rank(states))) >= expected * (1.0 - 1e-12)
 
 
 def test_gradients_are_finite_through_the_jackknife(jackknife):

@@ -121,7 +121,7 @@ def test_lanes_with_their_own_places_and_hills_are_single_scenes():
     field = eqx.filter_jit(lambda problem: problem.field(jnp.zeros(3), problem.states))(problem)
     for k, height in enumerate(heights):
         hill = eqx.tree_at(lambda scene: scene.surface.height.height, HILL, jnp.asarray(height))
-        single = RideProblem.single(hill, Launch(tuple(places[:, k]), 0.1, 2.5, 0.2), None)
+        single = RideProblem.of(hill, Launch(tuple(places[:, k]), 0.1, 2.5, 0.2), None)
         np.testing.assert_allclose(problem.states[:, k], single.states, atol=1e-14)
         np.testing.assert_allclose(field[:, k], single.field(jnp.zeros(()), single.states), atol=1e-13)
 

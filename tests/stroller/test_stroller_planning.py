@@ -16,13 +16,11 @@ from shortest_paths import dubins, reeds_shepp
 
 import stroller
 from stroller.planning import planner as planner_module
-from stroller.planning.candidates import Outline, prices, steps_of
-from stroller.planning.obstacles import Obstacles, disc_distance, separation, signed_distance
 from stroller.planning.planner import proposed
-from stroller.planning.problem import checked_problem, inputs_of
-from stroller.planning.result import planned_stage
-from stroller.planning.search import Costs, Ground, Steps, arcs, search
-from stroller.planning.transcription import Rates, actuation, drive_along, evaluate, interpolate
+from stroller.planning.problem import Obstacles, checked_problem, disc_distance, separation, signed_distance
+from stroller.planning.result import inputs_of, planned_stage
+from stroller.planning.search import Costs, Ground, Search, Steps, paths_of, prices
+from stroller.planning.transcription import Rates, Task, actuation, drive_along, evaluate, interpolate
 
 BODY = stroller.Stroller(mass=5.0, wheelbase=0.25, inertia=0.1, steering_inertia=0.005)
 SCENE = stroller.Scene(BODY, friction=stroller.Damping(2.0, 0.5, 0.1, 0.05))
@@ -145,8 +143,8 @@ def test_a_plan_shows_what_it_achieves(parked, tmp_path):
 
 def test_a_goal_without_a_heading_is_drawn_as_a_cross(parked):
     _, _, plan = parked
-    problem = plan.problem._replace(goal=stroller.Goal((1.9, 0.3)))
-    cross = plan.__class__(plan.input, plan.t1, plan.run, plan.verdict, problem, plan.candidates)
+    problem = dataclasses.replace(plan.problem, goal=stroller.Goal((1.9, 0.3)))
+    cross = dataclasses.replace(plan, problem=problem)
     (mark,) = [line for line in cross.plot().axes[0].lines if line.get_label() == "goal"]
     assert mark.get_marker() == "x"
     assert_close(np.array(mark.get_data()).ravel(), [1.9, 0.3])
@@ -181,7 +179,8 @@ def test_limits_hold_until_the_end(t1):
     limits = stroller.Limits(steering=1.0, speed=1.0, force=3.0)
     _, plan = freely(stroller.Goal((4.0, 0.0), speed=0.5), t1, limits)
     assert plan.reached, str(plan)
-    assert np.max(np.abs(inputs_of(plan.run)[0])) < 3.0
+    force, _ = inputs_of(SCENE.dynamics, plan.input, plan.run.t, plan.run.state)
+    assert np.max(np.abs(force)) < 3.0
 
 
 @pytest.mark.parametrize(
@@ -219,10 +218,10 @@ def test_the_wheel_can_be_limited_to_one_side():
 def test_a_search_keeps_to_what_the_limits_allow(steering, speed, bends, directions):
     """And the optimiser may use the values of launch and goal, which are 0."""
     limits = stroller.Limits(steering=steering, speed=speed)
-    problem = checked_problem(SCENE, START, GOAL, 12.0, GAP, limits, FOOTPRINT, 1e-6)
-    task, steps = Outline.of(problem).task(1.0, 12.0, 0.0), steps_of(problem, 0.85)
+    problem = checked_problem(SCENE, START, GOAL, 12.0, GAP, limits, FOOTPRINT)
+    task, steps = Task.of(problem, 1.0, 12.0, 0.0), Steps.of(problem, 0.85)
     assert all(low <= 0.0 <= high for low, high in zip(task.low[:2], task.high[:2], strict=True))
-    moves = arcs(SimpleNamespace(cell=0.1), steps)
+    moves = steps.arcs(0.1)
     assert_close(np.unique(moves[:, 1]) / steps.sharpest, bends, atol=0.02)
     assert tuple(np.unique(moves[:, 0])) == directions
 
@@ -230,15 +229,15 @@ def test_a_search_keeps_to_what_the_limits_allow(steering, speed, bends, directi
 def test_a_solution_that_a_finer_run_refutes_is_not_the_end(monkeypatch):
     """The first confirming run fails: the search goes on with another candidate."""
     module, confirmed = importlib.import_module("stroller.planning.plan"), []
-    run_and_judge = module.checked_run
+    run_and_judge = module.checked_drive
 
-    def checked_run(problem, drive, t1, tolerance, times):
-        run, verdict = run_and_judge(problem, drive, t1, tolerance, times)
+    def checked_drive(problem, drive, tolerance, times):
+        plan = run_and_judge(problem, drive, tolerance, times)
         if tolerance == module.TIGHT:
             confirmed.append(drive)
-        return run, verdict._replace(hindrances=("refuted",) if len(confirmed) == 1 else verdict.hindrances)
+        return dataclasses.replace(plan, hindrances=("refuted",) if len(confirmed) == 1 else plan.hindrances)
 
-    monkeypatch.setattr(module, "checked_run", checked_run)
+    monkeypatch.setattr(module, "checked_drive", checked_drive)
     _, plan = freely(stroller.Goal((3.0, 1.0)), 10.0, LIMITS)
     assert plan.reached
     assert len(confirmed) == 2
@@ -266,7 +265,7 @@ def test_the_search_finds_the_shortest_path_on_the_empty_plane():
         start, goal = np.zeros(3), np.array([x, y, heading])
         footprint = stroller.Footprint(1.4 * wheelbase, 0.87 * wheelbase, 0.2 * wheelbase)
         ground = Ground.of(np.stack([start, goal]), Obstacles.of(()), footprint, 1.0)
-        path, _, _ = search(ground, start, goal, True, Steps(-1.0, 1.0, directions), prices)
+        path, _, _ = Search(ground, start, goal, True, Steps(-1.0, 1.0, directions), prices).run()
         assert 1.0 - 1e-9 < path.length.sum() / shortest(*path.poses[-1]) < 1.1
         assert np.hypot(*(path.poses[-1] - goal)[:2]) < ground.cell
 
@@ -276,19 +275,17 @@ def test_a_search_in_haste_reverses_where_that_takes_less_time(slowest, directio
     """To a goal behind the start: straight back, or around with two U-turns forwards."""
     launch, goal = stroller.Launch((0.0, 0.0), 0.0, 0.0), stroller.Goal((-2.0, 0.0), 0.0)
     limits = stroller.Limits(steering=1.0, speed=(slowest, 0.8))
-    outline = Outline.of(checked_problem(SCENE, launch, goal, 12.0, (), limits, FOOTPRINT, 1e-6))
-    (path,), _ = outline.paths(prices(outline, 1, 0, np.random.default_rng(0), in_haste=True), 12.0)
+    problem = checked_problem(SCENE, launch, goal, 12.0, (), limits, FOOTPRINT, in_haste=True)
+    (path,), _ = paths_of(problem, prices(problem, 1, 0, np.random.default_rng(0)))
     assert path.length[path.direction == direction].sum() > 0.9 * path.length.sum()
 
 
 def test_a_search_that_is_cut_short_says_so(monkeypatch):
     """The U-turn between two walls needs more poses than it may look at; and a goal that is walled in needs none."""
     launch, goal = stroller.Launch((0.0, 0.0), 0.0, 0.0), stroller.Goal((0.0, 0.0), np.pi)
-    outline = Outline.of(
-        checked_problem(SCENE, launch, goal, 12.0, room(-1.5, 1.5, -0.3, 0.3), LIMITS, FOOTPRINT, 1e-6)
-    )
+    problem = checked_problem(SCENE, launch, goal, 12.0, room(-1.5, 1.5, -0.3, 0.3), LIMITS, FOOTPRINT)
     monkeypatch.setattr("stroller.planning.search.MOST_NODES", 50)
-    _, reason = outline.paths(prices(outline, 1, 0, np.random.default_rng(0)), 12.0)
+    _, reason = paths_of(problem, prices(problem, 1, 0, np.random.default_rng(0)))
     assert re.match(r"the search ended after \d+ poses without a path; the nearest", reason)
 
 
@@ -353,8 +350,8 @@ WALLED_IN = (stroller.Launch((-2.0, 0.5), 0.0, 0.0), stroller.Goal((0.5, 0.5), 0
 
 def test_the_search_says_that_a_goal_is_walled_in():
     launch, goal, walls = WALLED_IN
-    outline = Outline.of(checked_problem(SCENE, launch, goal, 12.0, walls, LIMITS, FOOTPRINT, 1e-6))
-    _, reason = outline.paths(prices(outline, 1, 0, np.random.default_rng(0)), 12.0)
+    problem = checked_problem(SCENE, launch, goal, 12.0, walls, LIMITS, FOOTPRINT)
+    _, reason = paths_of(problem, prices(problem, 1, 0, np.random.default_rng(0)))
     assert re.match(r"no path to the goal was found; the nearest ended \S+ m from the goal", reason)
 
 

@@ -16,8 +16,8 @@ from tops import rutstam_top
 import nonholonomic
 import tippe
 from nonholonomic.identification import Free, Measurements
-from nonholonomic.identification.least_squares import coordinate_covariance, minimise
 from nonholonomic.identification.posterior import linearise
+from nonholonomic.identification.search import coordinate_covariance, minimise
 
 LAUNCH = tippe.Launch(theta=[0.2, 0.2, 0.3, 0.2], spin=[110.0, 140.0, 110.0, 60.0])
 LAUNCHES = list(zip(np.asarray(LAUNCH.theta).tolist(), np.asarray(LAUNCH.spin).tolist(), strict=True))

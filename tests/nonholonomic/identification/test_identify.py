@@ -12,10 +12,10 @@ import scipy.stats
 from close import assert_close
 from terminal import Terminal
 
-from nonholonomic.identification import FitWarning, Free, Measurements, identify, least_squares
+from nonholonomic.identification import FitWarning, Free, Measurements, identify, search
 from nonholonomic.identification.exploration import region_of
-from nonholonomic.identification.least_squares import coordinate_covariance
 from nonholonomic.identification.likelihood import MISSING, one_sided
+from nonholonomic.identification.search import coordinate_covariance
 from nonholonomic.parameters import full_name
 
 X = np.linspace(0.0, 1.0, 12)
@@ -52,8 +52,8 @@ def test_it_says_on_a_terminal_what_it_does(regression, monkeypatch):
     value, fit = regression
     monkeypatch.setattr("nonholonomic.terminal.INTERVAL", 0.01)
     # All is compiled by now; the first thing that a fit does is made to take its time.
-    compiled = least_squares.linearise
-    monkeypatch.setattr(least_squares, "linearise", lambda *arguments: (time.sleep(0.6), compiled(*arguments))[1])
+    compiled = search.linearise
+    monkeypatch.setattr(search, "linearise", lambda *arguments: (time.sleep(0.6), compiled(*arguments))[1])
     for progress in (True, False):
         stream = Terminal()
         monkeypatch.setattr(sys, "stderr", stream)
