@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.cache import padded
 from ..geometry import inverse
@@ -291,7 +291,7 @@ def _control(
 def _solved(
     problem: AbstractProblem,
     solver: diffrax.AbstractSolver,
-    times: tuple[Float[ArrayLike, ""], Float[ArrayLike, ""], Float[Array, ""] | None],
+    times: tuple[Float[Array, ""] | float, Float[Array, ""] | float, Float[Array, ""] | None],
     state: Float[Array, " components"],
     control: diffrax.AbstractStepSizeController,
     **options: PyTree,
