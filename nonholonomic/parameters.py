@@ -182,7 +182,7 @@ def full_axes(axes: dict[str, Axis], known: list[str]) -> dict[str, Axis]:
     return by_full_name
 
 
-def meant(name: object, known: Sequence[str]) -> list[str]:
+def meant(name: Any, known: Sequence[str]) -> list[str]:
     """The full names that match a name."""
     return [name] if name in known else [known_name for known_name in known if known_name.endswith("." + str(name))]
 

@@ -234,7 +234,7 @@ def require_whole(value: object, name: str, at_least: int) -> None:
         raise ValueError(f"{name} = {shown(value)} must be a whole number of at least {at_least}")
 
 
-def require_increasing(values: ArrayLike, name: str) -> None:
+def require_increasing(values: Any, name: str) -> None:
     """Raise `ValueError` unless the values are a non-empty list, each greater than the one before.
 
     **Arguments:** `values`: numbers; traced lists pass; `name`: name in the message.

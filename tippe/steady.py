@@ -217,7 +217,7 @@ def tumbling_angles(scene: Scene[Top], jellett: float, samples: int = 2001) -> l
 
 
 def tumbling_state(scene: Scene[Top], motion: Tumbling) -> Float[Array, " 8"]:
-    """State of the vector form of a tumbling top whose axis leans towards t1.
+    """States of the vector form of a tumbling top whose axis leans towards t1.
 
     **Example:** with the scene of the module.
 
@@ -393,7 +393,7 @@ def _root_of_ratio(value: Float[Array, "..."], excess: Float[Array, "..."]) -> F
 
 
 def standing_state(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = False) -> Float[Array, " components"]:
-    """State of the vector form of a standing top at the arena's lowest point.
+    """States of the vector form of a standing top at the arena's lowest point.
 
     **Arguments:**
 

@@ -155,7 +155,7 @@ class AbstractScalarReader(abc.ABC):
         if name in REDUCTIONS:
             return [self.reduced(REDUCTIONS[name], inputs[0], params["axes"])]
         if name == "dot_general":
-            return [self._product(*inputs, *params["dimension_numbers"])]
+            return [self._product(inputs[0], inputs[1], *params["dimension_numbers"])]
         return [self.each(self.kind(equation), *inputs, equation=equation)]
 
     def reduced(self, name: str, elements: Elements, axes: Sequence[int]) -> Elements:
@@ -199,7 +199,7 @@ class Evaluation(AbstractScalarReader):
 
     def constants(self, array: ArrayLike) -> Elements:
         # An array may be traced outside the function.
-        constants = array if is_traced(array) else np.asarray(array)
+        constants: Any = array if is_traced(array) else np.asarray(array)
         elements = np.empty(np.shape(constants), object)
         for index in np.ndindex(elements.shape):
             elements[index] = constants[index]

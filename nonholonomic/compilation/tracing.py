@@ -390,11 +390,9 @@ def _depends(kind: Kind) -> bool:
 
 def _compares(program: Program) -> bool:
     """Whether a program compares real numbers."""
-    return any(
-        equation.primitive.name in COMPARISONS and jnp.issubdtype(equation.invars[0].aval.dtype, jnp.inexact)
-        for inner in programs_in(program)
-        for equation in opened(inner)[0].eqns
-    )
+    equations: list[Equation] = [equation for inner in programs_in(program) for equation in opened(inner)[0].eqns]
+    comparisons = (equation for equation in equations if equation.primitive.name in COMPARISONS)
+    return any(jnp.issubdtype(equation.invars[0].aval.dtype, jnp.inexact) for equation in comparisons)
 
 
 # Bounds of a function over boxes of its arguments: interval arithmetic on traced operations.

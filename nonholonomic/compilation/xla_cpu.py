@@ -56,7 +56,7 @@ def opened(program: Program) -> tuple[Jaxpr, Sequence[ArrayLike]]:
 def read_program(
     program: Program,
     arguments: Sequence[Value],
-    apply: Callable[[list[Value]], Sequence[Value]],
+    apply: Callable[[Equation, list[Value]], Sequence[Value]],
     known: Callable[[Any], Value] = lambda value: value,
 ) -> list[Value]:
     """The results of a program, whose equations are applied to values of any kind.
@@ -345,7 +345,7 @@ _kernel.def_abstract_eval(lambda *arguments, program, context: [variable.aval fo
 def _called_as_one(*arguments: Array, program: Jaxpr, context: Any) -> list[Array]:
     """The program as a function that is not inlined."""
 
-    def looking_at_all(*arguments: Array) -> tuple[list[Array], Array]:
+    def looking_at_all(*arguments: Array) -> PyTree:
         look = sum(jnp.sum(jnp.ravel(leaf)[:1].astype(float)) for leaf in arguments)
         return jaxpr_as_fun(ClosedJaxpr(program, ()))(*arguments), look
 

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import operator
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -96,7 +97,7 @@ class OwnModel(AbstractModel):
     def value(self, name: str) -> Array:
         return self.parameters.value(name)
 
-    def replaced(self, values: dict[str, ArrayLike]) -> "OwnModel":
+    def replaced(self, values: Mapping[str, ArrayLike]) -> "OwnModel":
         new_values = {name: jnp.asarray(value, float) for name, value in values.items()}
         return dataclasses.replace(self, parameters=self.parameters.replaced(new_values))
 
@@ -303,7 +304,9 @@ def _(
     modes = system.modes if isinstance(system, Hybrid) else (system,)
     is_mechanical = any(isinstance(mode, AbstractSystem) for mode in modes)
     has_pair = is_mechanical and is_pair(start)
-    numbers = dict(zip(("q", "rate"), map(as_number, start), strict=True)) if has_pair else as_number(start)
+    numbers: Array | dict[str, Array] = (
+        dict(zip(("q", "rate"), map(as_number, start), strict=True)) if has_pair else as_number(start)
+    )
     if event is None and isinstance(system, Hybrid):
         event = system.event
     if event is not None:

@@ -29,6 +29,7 @@ from nonholonomic.geometry import (
     subtract,
     sum_vectors,
 )
+from nonholonomic.integration import States
 from nonholonomic.integration.problem import Status
 
 from ..friction import AbstractFriction, ContactLoad, Slip, length
@@ -39,11 +40,6 @@ from .body import AbstractBody, AbstractMeridian, ContactGeometry, Top
 # In the arena's moving frame (t1, t2, n): velocity (u1, u2) of the centre of mass along the arena [m/s], axis (e1, e2,
 # e3) [1], angular momentum (L1, L2, L3) about the centre of mass [kg m^2/s], then the arena's place. The components are
 # along axis 0.
-
-#: A state: its components along axis 0, each a scalar or one number per lane; the states of cells; a number for each cell.
-State = Float[Array, "components ..."]
-States = Float[Array, "components cells"]
-Cells = Float[Array, " cells"]
 
 #: Indices of the parts in a state.
 VELOCITY, AXIS, MOMENTUM, PLACE = slice(0, 2), slice(2, 5), slice(5, 8), slice(8, None)
@@ -61,13 +57,13 @@ class Parts(NamedTuple):
     place: tuple[Component, ...]
 
 
-def parts(state: State) -> Parts:
+def parts(state: States) -> Parts:
     """Split a state into its parts."""
     u1, u2, e1, e2, e3, L1, L2, L3, *place = (state[k] for k in range(len(state)))
     return Parts((u1, u2), (e1, e2, e3), (L1, L2, L3), tuple(place))
 
 
-def joined(*vectors: tuple[Component, ...]) -> State:
+def joined(*vectors: tuple[Component, ...]) -> States:
     """The state made of its parts, in order; a component is a scalar or has one number per lane."""
     return jnp.stack(jnp.broadcast_arrays(*(component for part in vectors for component in part)))
 
@@ -150,7 +146,7 @@ class AbstractDynamics(eqx.Module):
         """Weight of the body [N]."""
 
     @abc.abstractmethod
-    def motion(self, state: State) -> Any:
+    def motion(self, state: States) -> Any:
         """Evaluate the equations of motion.
 
         **Arguments:** `state`: velocity, axis and angular momentum, and the place, as above.
@@ -159,18 +155,18 @@ class AbstractDynamics(eqx.Module):
         """
 
     @abc.abstractmethod
-    def margins(self, state: State) -> tuple[Float[Array, "..."], ...]:
+    def margins(self, state: States) -> tuple[Float[Array, "..."], ...]:
         """The smooth functions whose least value is the contact margin."""
 
-    def field(self, state: State) -> State:
+    def field(self, state: States) -> States:
         """Rate of change of the state, (components, ...)."""
         return stacked(self.motion(state).rate, state)
 
-    def contact_margin(self, state: State) -> Float[Array, "..."]:
+    def contact_margin(self, state: States) -> Float[Array, "..."]:
         """The least of `margins`."""
         return least(*self.margins(state))
 
-    def unloaded(self, state: State, scales: State) -> Bool[Array, "..."] | None:
+    def unloaded(self, state: States, scales: States) -> Bool[Array, "..."] | None:
         """A mask of the states with N = 0, up to round-off, whose motion does not increase N; `None` if the contact
         margin alone decides.
 
@@ -190,7 +186,7 @@ class AbstractDynamics(eqx.Module):
 class AbstractContactDynamics(AbstractDynamics):
     """Equations of motion of a body on a single contact, which ends as one of `LOSSES`."""
 
-    def margins(self, state: State) -> tuple[Float[Array, "..."], ...]:
+    def margins(self, state: States) -> tuple[Float[Array, "..."], ...]:
         """The margin for each of `LOSSES`: the normal force as a fraction of the weight, plus a round-off allowance for
         a start with N = 0; the excess of the Painlevé factor over `JAMMED`; and the excess of the room over `FITS`, if
         the arena has places where the ball does not fit."""
@@ -198,7 +194,7 @@ class AbstractContactDynamics(AbstractDynamics):
         lost, jammed = motion.normal_force / self.weight + NO_LOAD, motion.painleve_factor - JAMMED
         return (lost, jammed) if motion.room is None else (lost, jammed, motion.room - FITS)
 
-    def loss(self, state: State) -> Int[Array, "..."]:
+    def loss(self, state: States) -> Int[Array, "..."]:
         """How a contact with zero margin has ended: a code in `LOSSES`."""
         lost, *others = self.margins(state)
         # At the located end, the margin is round-off of either sign; if another margin has vanished, N is many times
@@ -214,14 +210,14 @@ class AbstractRollingDynamics(AbstractContactDynamics):
     """
 
     @abc.abstractmethod
-    def evaluate(self, state: State) -> tuple[Motion, Vector]:
+    def evaluate(self, state: States) -> tuple[Motion, Vector]:
         """The motion, whose `friction` is the force along the arena per unit normal force; and the force of the arena on
         the body [N] in the moving frame: the components along the arena, and the normal force."""
 
-    def motion(self, state: State) -> Motion:
+    def motion(self, state: States) -> Motion:
         return self.evaluate(state)[0]
 
-    def grip(self, state: State, mu: Float[Array, "..."]) -> Float[Array, "..."]:
+    def grip(self, state: States, mu: Float[Array, "..."]) -> Float[Array, "..."]:
         """Reserve of friction, mu N - |F_t|, as a fraction of the weight; negative where the top must slip.
 
         **Arguments:**
@@ -283,11 +279,11 @@ class Dynamics(AbstractContactDynamics):
     def weight(self) -> Float[Array, "..."]:
         return self.mass * self.gravity
 
-    def unloaded(self, state: State, scales: State) -> Bool[Array, "..."] | None:
+    def unloaded(self, state: States, scales: States) -> Bool[Array, "..."] | None:
         # On a level plane, N = 0 can last only for an instant.
         return None if self.turns is not None else super().unloaded(state, scales)
 
-    def motion(self, state: State) -> Motion:
+    def motion(self, state: States) -> Motion:
         """Evaluate the equations of motion, solving for the normal force with friction included.
 
         **Arguments:**
@@ -372,13 +368,13 @@ class RollingDynamics(AbstractRollingDynamics):
     def weight(self) -> Float[Array, "..."]:
         return self.body.mass * self.gravity
 
-    def carried_along(self, state: State) -> State:
+    def carried_along(self, state: States) -> States:
         """The state with the velocity that follows from axis and angular momentum of the rolling top."""
         _, e, L, place = parts(state)
         u = cross(self.body.meridian.contact(e), angular_velocity(self.body, e, L))
         return joined(u[:2], e, L, place)
 
-    def evaluate(self, state: State) -> tuple[Motion, Vector]:
+    def evaluate(self, state: States) -> tuple[Motion, Vector]:
         """The motion and the reaction F.
 
         (J + m (r^2 - r r^T)) w' = -w x L + m r x (r' x w) + m g r x z, with r' = a e' - R n'; then u' = r' x w + r x w',
@@ -412,7 +408,7 @@ class RollingDynamics(AbstractRollingDynamics):
         slip = Slip(zero, zero, (w[0], w[1], None))
         return Motion(rate, F[2], load, slip, V, o, dot(L, e), 1.0 + zero, room), F
 
-    def with_slip(self, state: State, slip: Slip) -> State:
+    def with_slip(self, state: States, slip: Slip) -> States:
         """The state after an impulse at the contact that gives the contact point the given velocity along the arena.
 
         The angular momentum about the contact, K = L - m r x u, does not change in the impulse: w solves (J + m (r^2 -
@@ -438,12 +434,12 @@ class RollingDynamics(AbstractRollingDynamics):
         L = sum_vectors(scale(self.body.I1, w), scale((self.body.I3 - self.body.I1) * axial_rate, e))
         return joined(u[:2], e, L, place)
 
-    def with_unit_axes(self, state: State) -> State:
+    def with_unit_axes(self, state: States) -> States:
         """The state with the axis at unit length."""
         axis = state[AXIS]
         return state.at[AXIS].set(axis / jnp.sqrt(jnp.sum(axis * axis, axis=0)))
 
-    def unit_impulse(self, state: State, axis: int) -> tuple[Component, ...]:
+    def unit_impulse(self, state: States, axis: int) -> tuple[Component, ...]:
         """The impulse at the contact that changes the velocity of the contact point by 1 m/s along an axis of the arena
         [N s].
 
@@ -457,7 +453,7 @@ class RollingDynamics(AbstractRollingDynamics):
         w = self._over_inertia(e, r, scale(self.body.mass, cross(r, v)))
         return scale(self.body.mass, sum_vectors(cross(r, w), v))
 
-    def angular_velocity(self, state: State) -> Vector:
+    def angular_velocity(self, state: States) -> Vector:
         """Angular velocity of the body [rad/s] in the moving frame."""
         _, e, L, _ = parts(state)
         return angular_velocity(self.body, e, L)

@@ -39,6 +39,7 @@ from nonholonomic.geometry import (
     subtract,
     sum_vectors,
 )
+from nonholonomic.integration import States
 from nonholonomic.text import shown
 from nonholonomic.validation import UNTRACEABLE, Bound, Bounded, as_number, is_traced
 
@@ -48,7 +49,6 @@ from .dynamics import (
     AbstractContactDynamics,
     AbstractRollingDynamics,
     Motion,
-    State,
     from_frame,
     joined,
     parts,
@@ -539,7 +539,7 @@ class AbstractRigidDynamics(AbstractContactDynamics):
     def weight(self) -> Float[Array, "..."]:
         return self.body.mass * self.gravity
 
-    def attitude(self, state: State) -> Attitude:
+    def attitude(self, state: States) -> Attitude:
         """The attitude and rotation of the body, and its contact point."""
         _, e, L, place = parts(state)
         c = tuple(place[-3:])
@@ -569,17 +569,17 @@ class AbstractRigidDynamics(AbstractContactDynamics):
         lever_rate = to_frame((subtract(path[0], slip[0]), subtract(path[1], slip[1]), None), axes)
         return ContactMotion(sum_vectors(normal_rate, frame_part), lever_rate, path, frame)
 
-    def angular_velocity(self, state: State) -> Vector:
+    def angular_velocity(self, state: States) -> Vector:
         """Angular velocity of the body in the frame [rad/s]."""
         attitude = self.attitude(state)
         return from_frame(attitude.angular_velocity, attitude.axes)
 
-    def mass_from_contact(self, state: State) -> Vector:
+    def mass_from_contact(self, state: States) -> Vector:
         """Vector from the contact to the centre of mass [m], in the frame."""
         attitude = self.attitude(state)
         return scale(-1.0, from_frame(attitude.lever, attitude.axes))
 
-    def energy(self, state: State) -> Float[Array, "..."]:
+    def energy(self, state: States) -> Float[Array, "..."]:
         """Kinetic energy plus weight times the height of the centre of mass [J]."""
         (u1, u2), _, _, place = parts(self.carried_along(state))
         (_, normal, momentum, w, lever, _), place = self.attitude(state), place[:-3]
@@ -588,14 +588,14 @@ class AbstractRigidDynamics(AbstractContactDynamics):
         height = add(self.frame.height(place), dot(self.mass_from_contact(state), self.frame.vertical(place)))
         return self.body.mass * (0.5 * (u1**2 + u2**2 + vertical_speed**2) + self.gravity * height) + rotation
 
-    def normal_spin(self, state: State) -> Float[Array, "..."]:
+    def normal_spin(self, state: States) -> Float[Array, "..."]:
         """Angular velocity about the arena's normal [rad/s]."""
         attitude = self.attitude(state)
         return dot(attitude.angular_velocity, attitude.normal)
 
     def carried_rates(
         self,
-        state: State,
+        state: States,
         attitude: Attitude,
         contact: ContactMotion,
         push: Tangent,
@@ -618,7 +618,7 @@ class AbstractRigidDynamics(AbstractContactDynamics):
         e_dot, L_dot = sum_vectors(z_rate, rate_in_frame(e, o)), sum_vectors(torque, rate_in_frame(L, o))
         return (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate, *sum_vectors(x_rate, rate_in_frame(place[-3:], o)))
 
-    def carried_along(self, state: State) -> State:
+    def carried_along(self, state: States) -> States:
         """The state with the velocity that the friction law imposes; only `NoSlip` imposes a velocity."""
         return state
 
@@ -629,7 +629,7 @@ class RigidSlipping(AbstractRigidDynamics):
     friction: AbstractFriction
     per_mass: Float[Array, "..."]
 
-    def motion(self, state: State) -> Motion:
+    def motion(self, state: States) -> Motion:
         """Evaluate the equations of motion, solving for the normal force with friction included.
 
         With q = r x n and J the inertia, all in the body's axes, the centre of mass rises at u.n = -w.q. Its second rate gives
@@ -666,7 +666,7 @@ class RigidSlipping(AbstractRigidDynamics):
 class RigidRolling(AbstractRollingDynamics, AbstractRigidDynamics):
     """The equations of motion of a body whose contact point is at rest: the nonholonomic constraint itself."""
 
-    def evaluate(self, state: State) -> tuple[Motion, Vector]:
+    def evaluate(self, state: States) -> tuple[Motion, Vector]:
         """The motion and the reaction F in the frame.
 
         In the body's axes, with the velocity r x w of the centre of mass and r' the rate of r as a vector,
@@ -703,7 +703,7 @@ class RigidRolling(AbstractRollingDynamics, AbstractRigidDynamics):
             inertia.yz - m * r[1] * r[2],
         )
 
-    def with_slip(self, state: State, slip: Slip) -> State:
+    def with_slip(self, state: States, slip: Slip) -> States:
         """As `RollingDynamics.with_slip`."""
         (u1, u2), e, _, place = parts(state)
         attitude = self.attitude(state)
@@ -716,20 +716,20 @@ class RigidRolling(AbstractRollingDynamics, AbstractRigidDynamics):
         u = from_frame(sum_vectors(cross(r, w), v), attitude.axes)
         return joined(u[:2], e, from_frame(self.body.inertia.tensor.times(w), attitude.axes), place)
 
-    def unit_impulse(self, state: State, axis: int) -> tuple[Component, ...]:
+    def unit_impulse(self, state: States, axis: int) -> tuple[Component, ...]:
         """As `RollingDynamics.unit_impulse`."""
         attitude = self.attitude(state)
         v = tuple(part[axis] for part in attitude.axes)
         w = self._about_contact(attitude.lever).solve(scale(self.body.mass, cross(attitude.lever, v)))
         return scale(self.body.mass, from_frame(sum_vectors(cross(attitude.lever, w), v), attitude.axes))
 
-    def with_unit_axes(self, state: State) -> State:
+    def with_unit_axes(self, state: States) -> States:
         """The state with the body's axes at unit length and at right angles."""
         e, x = state[AXIS] / jnp.linalg.norm(state[AXIS], axis=0), state[-3:]
         x = x - jnp.sum(e * x, axis=0) * e
         return state.at[AXIS].set(e).at[-3:].set(x / jnp.linalg.norm(x, axis=0))
 
-    def carried_along(self, state: State) -> State:
+    def carried_along(self, state: States) -> States:
         """The state with the velocity r x w of the centre of mass."""
         attitude = self.attitude(state)
         u = from_frame(cross(attitude.lever, attitude.angular_velocity), attitude.axes)

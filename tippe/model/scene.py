@@ -29,6 +29,7 @@ from nonholonomic.geometry import (
     sum_vectors,
 )
 from nonholonomic.geometry.surface import as_surface
+from nonholonomic.integration import States
 from nonholonomic.parameters import as_one, numbers
 from nonholonomic.text import likely_fix, shown, suspected_gravity
 from nonholonomic.validation import Bound, Bounded, as_number, largest, require, require_all, require_kind
@@ -39,8 +40,6 @@ from .dynamics import (
     TURNING,
     Dynamics,
     RollingDynamics,
-    State,
-    States,
     angular_velocity,
     from_frame,
     inclination,
@@ -406,7 +405,7 @@ class Scene(Bounded, Generic[Body]):
             return self.frame.at_angle(launch.eta)
         return self.frame.at_foot(self.surface.chart(place_named(self.surface, launch.place))[0])
 
-    def state(self, launch: Launch) -> State:
+    def state(self, launch: Launch) -> States:
         """The state at the start of a run (see `dynamics.py` for its components).
 
         **Arguments:**
@@ -437,7 +436,7 @@ class Scene(Bounded, Generic[Body]):
                 u = sum_vectors(u, scale(-body.offset, cross(w, e)[:2]))
         return joined(u, e, L, self.start(launch)[0])
 
-    def scales(self, launch: Launch) -> State:
+    def scales(self, launch: Launch) -> States:
         """Scales of absolute errors of the state, component by component.
 
         Velocities are measured in units of sqrt(g R) with the body's size R, directions in units of 1, angular momenta
@@ -464,26 +463,26 @@ class Scene(Bounded, Generic[Body]):
         x_axis = (one, one, tilt) if isinstance(self.body, AbstractRigidBody) else ()
         return joined(velocities, (tilt, tilt, one), momenta, place, x_axis)
 
-    def field(self, state: State) -> State:
+    def field(self, state: States) -> States:
         """Rate of change of the state: (m/s^2, 1/s, N m, 1/s) for (velocity, axis, angular momentum, place)."""
         return self.dynamics.field(state)
 
-    def normal_force(self, state: State) -> Float[Array, "..."]:
+    def normal_force(self, state: States) -> Float[Array, "..."]:
         """Force of the arena on the top along n [N]; at zero the contact is lost."""
         return self.dynamics.motion(state).normal_force
 
-    def slip_velocity(self, state: State) -> Float[Array, "2 ..."]:
+    def slip_velocity(self, state: States) -> Float[Array, "2 ..."]:
         """Velocity of the material contact point in the moving frame [m/s]."""
         slip = self.dynamics.motion(state).slip
         return jnp.stack([slip.x, slip.y])
 
-    def friction_power(self, state: State) -> Float[Array, "..."]:
+    def friction_power(self, state: States) -> Float[Array, "..."]:
         """Power of friction N (f.v_s + tau.w) [W], at most 0 (`tippe.md`, section 2)."""
         motion = self.dynamics.motion(state)
         power = motion.friction_power
         return jnp.zeros_like(motion.normal_force) if power is None else power
 
-    def energy(self, state: State) -> Float[Array, "..."]:
+    def energy(self, state: States) -> Float[Array, "..."]:
         """Kinetic energy plus weight times the height of the centre of mass above the arena's lowest point [J]."""
         body, dynamics = self.body, self.dynamics
         if isinstance(body, AbstractRigidBody):
@@ -496,7 +495,7 @@ class Scene(Bounded, Generic[Body]):
         height = dynamics.frame.height(place) + dot(body.mass_from_frame(e), dynamics.frame.vertical(place))
         return 0.5 * body.mass * speed2 + rotation + body.mass * self.gravity * height
 
-    def jellett(self, state: State) -> Float[Array, "..."]:
+    def jellett(self, state: States) -> Float[Array, "..."]:
         """Jellett's quantity L.(R n - a e) [kg m^3/s]: for a sphere on the plane, constant under every friction at the
         contact point. For other bodies -L.r, which is nearly constant while they spin fast.
 
@@ -509,25 +508,25 @@ class Scene(Bounded, Generic[Body]):
         lever = self.body.meridian.at(e[2])
         return lever.radius * L[2] - lever.offset * dot(e, L)
 
-    def theta(self, state: State) -> Float[Array, "..."]:
+    def theta(self, state: States) -> Float[Array, "..."]:
         """Angle [rad] from the arena's normal to the axis, in [0, pi]."""
         return inclination(parts(state).axis)
 
-    def spin(self, state: State) -> Float[Array, "..."]:
+    def spin(self, state: States) -> Float[Array, "..."]:
         """Angular velocity about the axis, w.e [rad/s]."""
         _, e, L, _ = parts(state)
         if isinstance(self.body, AbstractRigidBody):
             return dot(e, self.angular_velocity(state))
         return dot(e, L) / self.body.I3
 
-    def angular_velocity(self, state: State) -> Vector:
+    def angular_velocity(self, state: States) -> Vector:
         """Angular velocity of the body in the moving frame [rad/s]."""
         if isinstance(self.body, AbstractRigidBody):
             return self._rigid_dynamics.angular_velocity(state)
         _, e, L, _ = parts(state)
         return angular_velocity(self.body, e, L)
 
-    def path_from_frame(self, state: State) -> Vector:
+    def path_from_frame(self, state: States) -> Vector:
         """Vector from the point with which the frame moves to the point whose path is reported [m], in the moving
         frame."""
         if isinstance(self.body, AbstractRigidBody):

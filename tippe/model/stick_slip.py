@@ -21,9 +21,10 @@ from numpy.polynomial import Polynomial, legendre
 
 from nonholonomic.compilation.xla_cpu import greatest
 from nonholonomic.geometry import AbstractFrame
+from nonholonomic.integration import States
 
 from ..friction import Frictionless, Slip, length
-from .dynamics import FITS, AbstractContactDynamics, Dynamics, Motion, RollingDynamics, State
+from .dynamics import FITS, AbstractContactDynamics, Dynamics, Motion, RollingDynamics
 from .rigid import RigidRolling, RigidSlipping
 
 # The onset of a slip: an implicit step from a contact at rest to a slipping contact, of the length that the tolerance
@@ -87,18 +88,18 @@ class Onset(eqx.Module):
     - `converged`: whether the step reached the tolerance.
     """
 
-    start: State
+    start: States
     length: Float[Array, "..."]
     rates: Float[Array, "components stages ..."]
     converged: Bool[Array, "..."]
 
-    def at(self, fraction: Float[Array, "..."]) -> State:
+    def at(self, fraction: Float[Array, "..."]) -> States:
         """The state after a fraction of the step."""
         powers = jnp.stack([fraction**k for k in range(STAGES + 1)])
         return self.start + self.length * jnp.einsum("ps,p...,cs...->c...", INTEGRALS, powers, self.rates)
 
     def falls_to_zero(
-        self, event: Callable[[State], Float[Array, "..."]], first: Float[Array, "..."]
+        self, event: Callable[[States], Float[Array, "..."]], first: Float[Array, "..."]
     ) -> Float[Array, "..."]:
         """The fraction of the step, after `first`, at which a function of the state falls to zero; 1 if it does not fall
         so far."""
@@ -117,7 +118,7 @@ class Onset(eqx.Module):
         return fraction - jnp.where(is_inside, shift, 0.0)
 
     @property
-    def end(self) -> State:
+    def end(self) -> States:
         """The state at the end of the step, NaN if the step did not converge."""
         state = self.start + self.length * jnp.einsum("s,cs...->c...", WEIGHTS[-1], self.rates)
         return jnp.where(self.converged, state, jnp.nan)
@@ -125,10 +126,10 @@ class Onset(eqx.Module):
 
 def slip_onset(
     stick_slip: "StickSlip",
-    field: Callable[[State], State],
-    state: State,
+    field: Callable[[States], States],
+    state: States,
     size: int,
-    scales: State,
+    scales: States,
     max_duration: Float[Array, "..."],
     tolerance: Float[Array, ""],
 ) -> Onset:
@@ -214,7 +215,7 @@ class _Contact(eqx.Module):
     unit: Float[Array, "..."]
 
     @classmethod
-    def of(cls, stick_slip: "StickSlip", state: State, rate: State) -> "_Contact":
+    def of(cls, stick_slip: "StickSlip", state: States, rate: States) -> "_Contact":
         rolling, mu, weight = stick_slip.rolling, stick_slip.mu, stick_slip.weight
         grip, grip_rate = jax.jvp(lambda point: rolling.grip(point, mu), (state,), (rate,))
         F1, F2, N = rolling.evaluate(state)[1]
@@ -319,7 +320,7 @@ class StickSlip(AbstractContactDynamics):
         """The speed sqrt(g R) [m/s]."""
         return jnp.sqrt(self.slipping.gravity * self.rolling.body.size)
 
-    def motion(self, state: State) -> Motion:
+    def motion(self, state: States) -> Motion:
         """Evaluate the equations of motion for the state's kind of motion.
 
         **Arguments:**
@@ -332,24 +333,24 @@ class StickSlip(AbstractContactDynamics):
         kinds = (self.slipping.motion(state), self.rolling.motion(state))
         return jax.tree.map(lambda slipping, rolling: jnp.where(slips, slipping, rolling), *kinds)
 
-    def loss(self, state: State) -> Int[Array, "..."]:
+    def loss(self, state: States) -> Int[Array, "..."]:
         """How a contact with zero margin has ended: a code in `LOSSES`. Only a slipping contact can jam."""
         return self.slipping.loss(state)
 
-    def slip_speed(self, state: State) -> Float[Array, "..."]:
+    def slip_speed(self, state: States) -> Float[Array, "..."]:
         """Speed of the contact point along the arena [m/s]."""
         slip = self.slipping.motion(state).slip
         return length(slip.x, slip.y)
 
-    def rests(self, state: State) -> Bool[Array, "..."]:
+    def rests(self, state: States) -> Bool[Array, "..."]:
         """Whether the contact is at rest."""
         return self.slip_speed(state) <= AT_REST * self.speed
 
-    def normal_spin(self, state: State) -> Float[Array, "..."]:
+    def normal_spin(self, state: States) -> Float[Array, "..."]:
         """Angular velocity of a rigid body about the arena's normal [rad/s]."""
         return self.rolling.angular_velocity(state)[2]
 
-    def stopped(self, state: State) -> State:
+    def stopped(self, state: States) -> States:
         """The state after the impulse that stops the slip, with the body's axes at unit length.
 
         Step errors change this length, so the slip after the impulse would be as large as these errors; but
@@ -358,7 +359,7 @@ class StickSlip(AbstractContactDynamics):
         zero = jnp.zeros_like(state[0])
         return self.rolling.with_slip(self.rolling.with_unit_axes(state), Slip(zero, zero))
 
-    def grip_left(self, state: State) -> Float[Array, "..."]:
+    def grip_left(self, state: States) -> Float[Array, "..."]:
         """The reserve of a rolling top before it slips, as a fraction of the weight."""
         return self.rolling.grip(state, self.mu) + ROUNDING
 
@@ -371,7 +372,7 @@ class Change(NamedTuple):
     - `elapsed`: time until the motion continues [s].
     """
 
-    state: State
+    state: States
     rolls: Bool[Array, "..."]
     lost: Bool[Array, "..."]
     onset: Onset
@@ -388,11 +389,11 @@ class ContactMode(StickSlip):
     tolerance: Float[Array, ""]
     rolls: bool = eqx.field(static=True)
 
-    def motion(self, state: State) -> Motion:
+    def motion(self, state: States) -> Motion:
         """The equations of motion of this kind."""
         return (self.rolling if self.rolls else self.slipping).motion(state)
 
-    def margins(self, state: State) -> tuple[Float[Array, "..."], ...]:
+    def margins(self, state: States) -> tuple[Float[Array, "..."], ...]:
         """Positive while this kind of motion lasts. Rolling leaves the friction cone before the normal force
         vanishes."""
         if self.rolls:
@@ -400,19 +401,19 @@ class ContactMode(StickSlip):
             return (grip,) if room is None else (grip, room - FITS)
         return (*self.slipping.margins(state), self.slip_left(state))
 
-    def slip_left(self, state: State) -> Float[Array, "..."]:
+    def slip_left(self, state: States) -> Float[Array, "..."]:
         """Excess of the slip speed over the speed at which a slip ends, in units of sqrt(g R). A slip that grows does
         not end."""
         speed, change = self._slowing(state)
         way = LEFT * self.tolerance * self.rolling.body.size
         return (speed - jnp.sqrt(2.0 * way * greatest(-change, 0.0))) / self.speed
 
-    def _slowing(self, state: State) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    def _slowing(self, state: States) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """The slip's speed [m/s] and its rate."""
         return jax.jvp(self.slip_speed, (state,), (self.slipping.field(state),))
 
     def ended(
-        self, state: State, size: int, slipping: Callable[[State], State], scales: State, left: Float[Array, "..."]
+        self, state: States, size: int, slipping: Callable[[States], States], scales: States, left: Float[Array, "..."]
     ) -> Change:
         """The change that follows the end of this kind of motion.
 

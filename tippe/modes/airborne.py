@@ -30,11 +30,11 @@ from nonholonomic.geometry import (
     tangents,
 )
 from nonholonomic.hybrid import Transition
-from nonholonomic.integration import AbstractPassive, AbstractProblem
+from nonholonomic.integration import AbstractPassive, AbstractProblem, Lanes, States
 from nonholonomic.integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED
 
 from ..model.body import Top
-from ..model.dynamics import COS_THETA, Cells, Dynamics, State, States, from_frame, joined, parts, to_frame
+from ..model.dynamics import COS_THETA, Dynamics, from_frame, joined, parts, to_frame
 from ..model.scene import Scene
 from .impact import (
     TOUCHING,
@@ -77,7 +77,7 @@ class FlightState(NamedTuple):
     momentum: Vector
 
 
-def flight_state(state: State) -> FlightState:
+def flight_state(state: States) -> FlightState:
     """Split a flight state into its parts."""
     return FlightState(*(tuple(state[k + i] for i in range(3)) for k in range(0, 12, 3)))
 
@@ -234,7 +234,7 @@ class QuadraturesInFlight(AbstractPassive):
         return jnp.concatenate([problem.field(time, state), stacked(rates, passive)])
 
 
-def lift_off(scene: Scene[Top], state: State, with_quadratures: bool, ball: Ball | None = None) -> State:
+def lift_off(scene: Scene[Top], state: States, with_quadratures: bool, ball: Ball | None = None) -> States:
     """The flight state of a top that has lost contact, from its state in contact, including passive quadratures.
 
     **Arguments:** `ball`: the sphere that touched, by default the top's own.
@@ -275,25 +275,25 @@ class OneOfTwo(InversionProblem):
     contact_ball: Ball = eqx.field(kw_only=True)
     other_ball: Ball = eqx.field(kw_only=True)
 
-    def event_function(self, state: States) -> Cells:
+    def event_function(self, state: States) -> Lanes:
         # theta is measured from the normal below the top's own sphere; if this sphere slides, the state contains
         # cos(theta).
         assert self.on_stem is not None
         cosine_of_theta = _cosine_beside(self.scene, self.contact_ball, self.other_ball, state)
         return self.unless_on_stem(jnp.where(self.on_stem, cosine_of_theta, state[COS_THETA]) - self.cos_angle)
 
-    def margins(self, time: Cells, state: States) -> tuple[Cells, ...]:
+    def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
         return (*super().margins(time, state), clearance(self.scene, self.contact_ball, self.other_ball, state))
 
 
 @compiled_setup
-def _cosine_beside(scene: Scene[Top], contact_ball: Ball, other_ball: Ball, state: State) -> Float[Array, "..."]:
+def _cosine_beside(scene: Scene[Top], contact_ball: Ball, other_ball: Ball, state: States) -> Float[Array, "..."]:
     """The cosine of the angle between the axis and the normal below the other sphere, while a sphere slides."""
     return cosine(scene, flight_state(lift_off(scene, state, False, contact_ball)), other_ball)
 
 
 @compiled_setup
-def clearance(scene: Scene[Top], contact_ball: Ball, other_ball: Ball, state: State) -> Float[Array, "..."]:
+def clearance(scene: Scene[Top], contact_ball: Ball, other_ball: Ball, state: States) -> Float[Array, "..."]:
     """Distance of the other sphere from the arena as a fraction of R, plus the round-off allowed at lift-off."""
     return gap_margin(scene, flight_state(lift_off(scene, state[:OWN], False, contact_ball)), other_ball, OVERLAP)
 
@@ -323,7 +323,7 @@ class ArenaSlide(AbstractFlyingMode):
         flight = Fly(self.scene, self.scales, self.cos_angle, self.with_quadratures)
         return jnp.where(self.number == 1, flight.shown(lift_off(self.scene, state, True, contact_ball)), rows)
 
-    def reset_map(self, state: States, left: Cells) -> Transition:
+    def reset_map(self, state: States, left: Lanes) -> Transition:
         """Fly if the contact is lost, strike with the other sphere if it is at the arena, and end if the contact jams
         or the sphere does not fit. Counts the flights.
         """
@@ -374,7 +374,7 @@ class Fly(AbstractFlyingMode):
         rows = [jnp.stack(c_vector), state[OWN + 3 :], jnp.stack([ground.gap, rate])]
         return jnp.concatenate([in_contact(ground, free), *rows])
 
-    def reset_map(self, state: States, left: Cells) -> Transition:
+    def reset_map(self, state: States, left: Lanes) -> Transition:
         """The impact of the sphere that touches the arena, after which the top rebounds, or slides on that sphere if
         the rebound would be slow.
 

@@ -27,12 +27,12 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from nonholonomic.compilation.xla_cpu import greatest, least
 from nonholonomic.geometry import Component, Vector, add, cross, dot, multiply, scale, subtract, sum_vectors
-from nonholonomic.integration import AbstractProblem, Outcome, Settings, solve_ensemble
+from nonholonomic.integration import AbstractProblem, Lanes, Outcome, Settings, States, solve_ensemble
 from nonholonomic.integration.problem import LEFT_DOMAIN, MOST_STEPS
 
 from ..friction import AbstractFriction, ContactLoad, SetValuedCoulomb, Slip, length
 from ..model.body import ContactGeometry, Top
-from ..model.dynamics import AbstractDynamics, Cells, Dynamics, State, angular_velocity, joined, parts
+from ..model.dynamics import AbstractDynamics, Dynamics, angular_velocity, joined, parts
 from ..model.scene import Scene
 from ..model.stick_slip import StickSlip
 
@@ -101,7 +101,7 @@ def standing_on(dynamics: Dynamics | StickSlip, ball: Ball) -> Dynamics:
     return dataclasses.replace(dynamics, meridian=ContactGeometry(ball.offset, ball.radius, coupling))
 
 
-def as_free_body(body: Top, ball: Ball, state: State) -> FreeBody:
+def as_free_body(body: Top, ball: Ball, state: States) -> FreeBody:
     """A top that stands on a sphere, as a free body: the sphere's centre is at rest along the normal.
 
     **Arguments:** `state`: (8, ...), as in `tippe/model/dynamics.py`.
@@ -111,7 +111,7 @@ def as_free_body(body: Top, ball: Ball, state: State) -> FreeBody:
     return FreeBody((*velocity, -ball.offset * axis_rate(body, axis, momentum)[2]), height, axis, momentum)
 
 
-def contact_state(free: FreeBody) -> State:
+def contact_state(free: FreeBody) -> States:
     """The state (8, ...) of a top in contact; the omitted components follow from the contact."""
     return joined(free.velocity[:2], free.axis, free.momentum)
 
@@ -132,7 +132,7 @@ def gap_rate(body: Top, ball: Ball, free: FreeBody) -> Float[Array, "..."]:
 
 
 def still_parting(
-    rate: Float[Array, "..."], gravity: Float[Array, "..."], radius: Float[Array, "..."], rounding: Cells | float = 0.0
+    rate: Float[Array, "..."], gravity: Float[Array, "..."], radius: Float[Array, "..."], rounding: Lanes | float = 0.0
 ) -> Float[Array, "..."]:
     """The round-off allowed for the distance of a sphere, as a fraction of R.
 
@@ -153,7 +153,7 @@ def energy(body: Top, gravity: Float[ArrayLike, "..."], free: FreeBody) -> Float
 
 
 def energy_in(
-    scene: Scene[Top], state: State, number: Int[Array, "..."]
+    scene: Scene[Top], state: States, number: Int[Array, "..."]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """The least and the greatest energy [J] that a state at the end of a mode, or of a flight from there, may have.
 
@@ -222,14 +222,14 @@ class Impact(AbstractProblem):
     friction: AbstractFriction
     approach: Approach
     radius: Float[Array, "..."]
-    gained: Cells
+    gained: Lanes
 
     @property
-    def speed(self) -> Cells:
+    def speed(self) -> Lanes:
         """Speed along the normal before the impact [m/s], positive because it is the unit of the impulses."""
         return greatest(jnp.abs(self.approach.velocity[2]), 1e-12)
 
-    def impulse(self, normal: Cells, state: Float[Array, "rows cells"]) -> ContactImpulse:
+    def impulse(self, normal: Lanes, state: Float[Array, "rows cells"]) -> ContactImpulse:
         """The impulses at a stage of the impact."""
         unit = self.speed / self.approach.response[2][2]
         force = (state[0] * unit, state[1] * unit, normal * unit)
@@ -255,7 +255,7 @@ class Impact(AbstractProblem):
         zeros = jnp.zeros((5 if has_torque else 2, *self.gained.shape))
         return zeros, jnp.ones_like(zeros)
 
-    def field(self, time: Cells, state: Float[Array, "rows cells"]) -> Float[Array, "rows cells"]:
+    def field(self, time: Lanes, state: Float[Array, "rows cells"]) -> Float[Array, "rows cells"]:
         contact, (velocity, w) = self.approach, self.changes(self.impulse(time, state))
         load = self.load(sum_vectors(contact.velocity, velocity), sum_vectors(contact.angular_velocity, w))
         torque = scale(1.0 / self.radius, load.torque) if len(state) > 2 else ()
@@ -265,7 +265,7 @@ class Impact(AbstractProblem):
     def event_function(self, state: Float[Array, "rows cells"]) -> None:
         return None
 
-    def domain_margin(self, time: Cells, state: Float[Array, "rows cells"]) -> Cells:
+    def domain_margin(self, time: Lanes, state: Float[Array, "rows cells"]) -> Lanes:
         impulse, response = self.impulse(time, state), self.approach.response
         change, angular_change = self.changes(impulse)
         missing = (self.gained - change[2]) / self.speed
@@ -280,14 +280,14 @@ class Impact(AbstractProblem):
         shortfall = -gain * response[2][2] / self.speed**2
         return least(missing, jnp.where(approaches > shortfall, approaches, shortfall))
 
-    def ended(self, time: Cells, state: Float[Array, "rows cells"]) -> ContactImpulse:
+    def ended(self, time: Lanes, state: Float[Array, "rows cells"]) -> ContactImpulse:
         """The impulses of an impact whose end has been located, corrected."""
         rates = self.field(time, state)
         step = newton_step(self.domain_margin, (time, state), (jnp.ones_like(time), rates))
         return self.impulse(time + step, state + step * rates)
 
 
-def newton_step(margin: Callable[..., Cells], point: tuple[Array, ...], rates: tuple[Array, ...]) -> Cells:
+def newton_step(margin: Callable[..., Lanes], point: tuple[Array, ...], rates: tuple[Array, ...]) -> Lanes:
     """One step of Newton's method to the zero of a margin along some rates, from its located zero.
 
     The search leaves an error of 1e-10, and this step leaves its square, which is round-off.
@@ -316,7 +316,7 @@ def approach(body: Top, ball: Ball, free: FreeBody) -> Approach:
 
 
 def resolve_impact(
-    body: Top, friction: AbstractFriction, ball: Ball, free: FreeBody, restitution: Cells
+    body: Top, friction: AbstractFriction, ball: Ball, free: FreeBody, restitution: Lanes
 ) -> tuple[FreeBody, Bool[Array, " cells"]]:
     """The body after one of its spheres has struck the plane; unchanged if the sphere does not approach the plane.
 
@@ -408,7 +408,7 @@ class Skid(AbstractProblem):
 
     impact: Impact
     mu: Float[Array, "..."]
-    pace: Cells
+    pace: Lanes
 
     def velocity(self, state: Float[Array, "3 cells"]) -> Vector:
         """Velocity of the contact point [m/s]."""
@@ -420,17 +420,17 @@ class Skid(AbstractProblem):
         zeros = jnp.zeros((3, *self.pace.shape))
         return zeros, jnp.ones_like(zeros)
 
-    def field(self, time: Cells, state: Float[Array, "3 cells"]) -> Float[Array, "3 cells"]:
+    def field(self, time: Lanes, state: Float[Array, "3 cells"]) -> Float[Array, "3 cells"]:
         v1, v2, _ = self.velocity(state)
         return jnp.stack([-self.mu * v1, -self.mu * v2, length(v1, v2)]) / self.pace
 
     def event_function(self, state: Float[Array, "3 cells"]) -> None:
         return None
 
-    def domain_margin(self, time: Cells, state: Float[Array, "3 cells"]) -> Cells:
+    def domain_margin(self, time: Lanes, state: Float[Array, "3 cells"]) -> Lanes:
         return least(self.impact.domain_margin(state[2], state[:2]), self.slip_left(state))
 
-    def slip_left(self, state: Float[Array, "3 cells"]) -> Cells:
+    def slip_left(self, state: Float[Array, "3 cells"]) -> Lanes:
         """Slip speed above the threshold at which a slip has stopped, as a fraction of the speed of arrival."""
         return length(*self.velocity(state)[:2]) / self.pace - STOPS
 
@@ -485,27 +485,27 @@ def _remaining_impulse(impact: Impact, mu: Float[Array, "..."], impulse: Vector)
 
 
 def sticking_force(
-    matrix: tuple[Cells, Cells, Cells], coupling: tuple[Cells, Cells], mu: Float[Array, "..."]
-) -> tuple[Cells, Cells]:
+    matrix: tuple[Lanes, Lanes, Lanes], coupling: tuple[Lanes, Lanes], mu: Float[Array, "..."]
+) -> tuple[Lanes, Lanes]:
     """The f with |f| <= mu that minimises f.A f / 2 + f.b, for A = (A11, A12, A22) positive definite.
 
     (A + k) f = -b, and 1 / |f| grows with k and is concave, so Newton's method finds |f| = mu from k = 0 on.
     """
     a, b, c = matrix
 
-    def solved(k: Cells, right: tuple[Cells, Cells]) -> tuple[Cells, Cells]:
+    def solved(k: Lanes, right: tuple[Lanes, Lanes]) -> tuple[Lanes, Lanes]:
         determinant = (a + k) * (c + k) - b * b
         x, y = right
         return ((c + k) * x - b * y) / determinant, ((a + k) * y - b * x) / determinant
 
-    def force(k: Cells) -> tuple[Cells, Cells]:
+    def force(k: Lanes) -> tuple[Lanes, Lanes]:
         return solved(k, (-coupling[0], -coupling[1]))
 
     free = length(*force(jnp.zeros_like(a)))
     is_beyond = (free > mu) & (mu > 0.0)
     normal_impulse = jnp.where(is_beyond, mu, 1.0)
 
-    def newton(_: int, k: Cells) -> Cells:
+    def newton(_: int, k: Lanes) -> Lanes:
         f1, f2 = force(k)
         size = jnp.where(is_beyond, length(f1, f2), 1.0)
         g1, g2 = solved(k, (f1, f2))
@@ -585,7 +585,7 @@ class LeaningDynamics(AbstractDynamics):
     def weight(self) -> Float[Array, "..."]:
         return self.body.mass * self.gravity
 
-    def motion(self, state: State) -> LeaningMotion:
+    def motion(self, state: States) -> LeaningMotion:
         """Evaluate the equations of motion.
 
         **Arguments:**
@@ -630,11 +630,11 @@ class LeaningDynamics(AbstractDynamics):
         stiff = (m_1 - m_0) / ((spheres[1].offset - spheres[0].offset) * sine2)
         return LeaningMotion(rate, normal, power, b, stiff)
 
-    def margins(self, state: State) -> tuple[Float[Array, "..."], ...]:
+    def margins(self, state: States) -> tuple[Float[Array, "..."], ...]:
         """Both normal forces as fractions of the weight, plus `HOLDS`."""
         return tuple(force / self.weight + HOLDS for force in self.motion(state).normal_forces)
 
-    def heavier(self, state: State) -> Int[Array, "..."]:
+    def heavier(self, state: States) -> Int[Array, "..."]:
         """The number of the sphere with the greater normal force: contact remains there when the other force vanishes."""
         N_0, N_1 = self.motion(state).normal_forces
         return (N_1 > N_0).astype(int)

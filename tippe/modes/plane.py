@@ -22,12 +22,12 @@ from jaxtyping import Array, Bool, Float, Int
 from nonholonomic.compilation.xla_cpu import compiled_setup, greatest
 from nonholonomic.geometry import Vector, cross, dot, scale, subtract, sum_vectors
 from nonholonomic.hybrid import AbstractHoppingMode, Transition, TransitionPath
-from nonholonomic.integration import AbstractProblem
+from nonholonomic.integration import AbstractProblem, Lanes, States
 from nonholonomic.integration.dense import halved
 from nonholonomic.integration.problem import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
 
 from ..model.body import Top
-from ..model.dynamics import COS_THETA, Cells, Dynamics, State, States, parts
+from ..model.dynamics import COS_THETA, Dynamics, parts
 from ..model.scene import Scene
 from .impact import (
     TOUCHING,
@@ -70,19 +70,19 @@ class Descent(NamedTuple):
     start.
     """
 
-    start: Cells
-    speed: Cells
-    gravity: Cells
-    rate: Cells
-    cosine: Cells
-    sine: Cells
+    start: Lanes
+    speed: Lanes
+    gravity: Lanes
+    rate: Lanes
+    cosine: Lanes
+    sine: Lanes
 
-    def value(self, time: Cells) -> Cells:
+    def value(self, time: Lanes) -> Lanes:
         angle = self.rate * time
         swing = 2.0 * self.cosine * jnp.sin(0.5 * angle) ** 2 + self.sine * angle_less_sine(angle)
         return self.start + time * (self.speed - 0.5 * self.gravity * time) - swing
 
-    def slope(self, time: Cells) -> Cells:
+    def slope(self, time: Lanes) -> Lanes:
         angle = self.rate * time
         swing = self.cosine * jnp.sin(angle) + self.sine * 2.0 * jnp.sin(0.5 * angle) ** 2
         return self.speed - self.gravity * time - self.rate * swing
@@ -146,7 +146,7 @@ def _descent(
     return Descent(start, speed, gravity, motion.rate, cosine, sine)
 
 
-def landing(descent: Descent, max_time: Cells) -> tuple[Cells, Bool[Array, " cells"]]:
+def landing(descent: Descent, max_time: Lanes) -> tuple[Lanes, Bool[Array, " cells"]]:
     """Time at which the distance first falls below zero, after a start at zero or above.
 
     **Arguments:** `max_time`: time [s] to search.
@@ -165,7 +165,7 @@ def landing(descent: Descent, max_time: Cells) -> tuple[Cells, Bool[Array, " cel
     bend = jnp.arccos(-jnp.minimum(ratio, 1.0))
     has_no_inflection = ratio >= 1.0
 
-    def next_inflection(time: Cells) -> Cells:
+    def next_inflection(time: Lanes) -> Lanes:
         angles = [jnp.mod(mode + side * bend - rate * time, 2.0 * jnp.pi) for side in (1.0, -1.0)]
         # Skip the inflection just reached.
         angles = [jnp.where(angle < 1e-9, 2.0 * jnp.pi, angle) for angle in angles]
@@ -198,21 +198,21 @@ def landing(descent: Descent, max_time: Cells) -> tuple[Cells, Bool[Array, " cel
     return jnp.where(located, time, jnp.inf), ~located & ~is_over
 
 
-def landed_at(descent: Descent, time: Cells) -> Cells:
+def landed_at(descent: Descent, time: Lanes) -> Lanes:
     """A time at which the distance is zero, with its derivatives (implicit function theorem)."""
     value, slope = descent.value(time), stop_gradient(descent.slope(time))
     is_regular = jnp.isfinite(time) & (slope < 0.0)
     return time - jnp.where(is_regular, (value - stop_gradient(value)) / jnp.where(is_regular, slope, 1.0), 0.0)
 
 
-def _roots(height: Cells, speed: Cells, gravity: Cells) -> tuple[Cells, Cells, Bool[Array, " cells"]]:
+def _roots(height: Lanes, speed: Lanes, gravity: Lanes) -> tuple[Lanes, Lanes, Bool[Array, " cells"]]:
     """Times between which a body thrown from a height is above zero; and whether it never is."""
     square = speed**2 + 2.0 * gravity * height
     root = jnp.sqrt(greatest(square, 0.0))
     return (speed - root) / gravity, (speed + root) / gravity, square <= 0.0
 
 
-def angle_reached(body: Top, free: FreeBody, cos_angle: Float[Array, "..."], horizon: Cells, last: bool) -> Cells:
+def angle_reached(body: Top, free: FreeBody, cos_angle: Float[Array, "..."], horizon: Lanes, last: bool) -> Lanes:
     """Time in flight at which theta rises through an angle, for the first or for the last time; infinite if theta does
     not reach the angle by `horizon`.
 
@@ -253,20 +253,20 @@ class Air(NamedTuple):
     """
 
     free: FreeBody
-    elapsed: Cells
+    elapsed: Lanes
     ball: Int[Array, " cells"]
     rising: Bool[Array, " cells"]
     falls: Bool[Array, " cells"] | None
     status: Int[Array, " cells"]
-    crossing_time: Cells
+    crossing_time: Lanes
     flights: Int[Array, " cells"]
     open: Bool[Array, " cells"]
-    log_rates: Cells
+    log_rates: Lanes
     quadratures: Float[Array, "7 cells"] | None = None
 
 
 def take_flight(
-    scene: Scene[Top], air: Air, cos_angle: Float[Array, "..."], left: Cells, last: bool
+    scene: Scene[Top], air: Air, cos_angle: Float[Array, "..."], left: Lanes, last: bool
 ) -> tuple[Air, Bool[Array, " cells"]]:
     """One flight, until a sphere reaches the plane, theta reaches the angle (unless `last`), or the time since the loss
     of contact reaches `left` [s].
@@ -388,7 +388,7 @@ def quadratures_after(
     return jnp.stack([x + u1 * time, y + u2 * time, *c_vector, angle + spin_rate * time, work + 0.0 * time])
 
 
-def clearance(dynamics: Dynamics, contact_ball: Ball, other_ball: Ball, state: State) -> Float[Array, "..."]:
+def clearance(dynamics: Dynamics, contact_ball: Ball, other_ball: Ball, state: States) -> Float[Array, "..."]:
     """Distance of the other sphere from the plane as a fraction of the radius of the touching sphere, plus the
     round-off allowed at lift-off.
     """
@@ -399,7 +399,7 @@ def clearance(dynamics: Dynamics, contact_ball: Ball, other_ball: Ball, state: S
     )
 
 
-def height(contact_ball: Ball, other_ball: Ball, state: State) -> Float[Array, "..."]:
+def height(contact_ball: Ball, other_ball: Ball, state: States) -> Float[Array, "..."]:
     """Distance [m] of the other sphere from the plane, for a top that stands on the sphere `contact_ball`."""
     return contact_ball.radius - other_ball.radius + (other_ball.offset - contact_ball.offset) * state[COS_THETA]
 
@@ -419,7 +419,7 @@ class SlidingOnOne(InversionProblem):
     contact_ball: Ball = eqx.field(kw_only=True)
     other_ball: Ball = eqx.field(kw_only=True)
 
-    def margins(self, time: Cells, state: States) -> tuple[Cells, ...]:
+    def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
         assert isinstance(self.dynamics, Dynamics)
         return (*super().margins(time, state), clearance(self.dynamics, self.contact_ball, self.other_ball, state))
 
@@ -456,7 +456,7 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
         free_after = flown(self.scene.body, self.scene.gravity, free, passed)
         return shown(self.scene.body, free_after, quadratures_after(self.scene.body, free, quadratures, passed))
 
-    def reset_map(self, state: States, left: Cells) -> Transition:
+    def reset_map(self, state: States, left: Lanes) -> Transition:
         """Fly, and bounce, until a sphere stays on the plane; or let the other sphere land if it touches the plane.
 
         Counts the flights.
@@ -499,7 +499,7 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
             quadratures=state[OWN:] if self.with_quadratures else None,
         )
 
-    def hop(self, air: Air, left: Cells) -> tuple[Air, Air]:
+    def hop(self, air: Air, left: Lanes) -> tuple[Air, Air]:
         """One flight of a top whose contact is open, and the impact at its end."""
         air_after, has_landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
         if air.falls is None:
@@ -544,7 +544,7 @@ class Lean(AbstractFlyingMode):
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
         return shown(self.scene.body, as_free_body(self.scene.body, balls(self.scene.body)[0], state), state[OWN:])
 
-    def reset_map(self, state: States, left: Cells) -> Transition:
+    def reset_map(self, state: States, left: Lanes) -> Transition:
         """Slide on the sphere whose normal force has not vanished."""
         number, body = LeaningDynamics.of(self.scene).heavier(state), self.scene.body
         state_at_rest = contact_state(at_rest(body, as_free_body(body, balls(body)[0], state)))

@@ -9,10 +9,10 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from nonholonomic.compilation.xla_cpu import compiled_setup, least
 from nonholonomic.geometry import Component, Tangent, Vector, cross, dot, rate_in_frame, scale, stacked, sum_vectors
 from nonholonomic.hybrid import AbstractBatchedMode
-from nonholonomic.integration import AbstractPassive, AbstractProblem, ExtendedProblem
+from nonholonomic.integration import AbstractPassive, AbstractProblem, ExtendedProblem, Lanes, States
 
 from ..model.body import Top
-from ..model.dynamics import COS_THETA, NO_COSINE, AbstractDynamics, Dynamics, State, States, parts
+from ..model.dynamics import COS_THETA, NO_COSINE, AbstractDynamics, Dynamics, parts
 from ..model.rigid import AbstractRigidBody, AbstractRigidDynamics
 from ..model.scene import Launch, Scene
 from ..model.stick_slip import StickSlip
@@ -57,36 +57,30 @@ class InversionProblem(AbstractProblem):
     def start(self) -> tuple[States, States]:
         return self.states, self.scales
 
-    def field(
-        self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]
-    ) -> Float[Array, "components *lanes"]:
+    def field(self, time: Lanes, state: States) -> States:
         return self.dynamics.field(state)
 
-    def event_function(self, state: Float[Array, "components *lanes"]) -> Float[Array, "*lanes"]:
+    def event_function(self, state: States) -> Lanes:
         if self.cos_angle is None:
             assert isinstance(self.dynamics, StickSlip | AbstractRigidDynamics)
             assert self.spin is not None
             return self.dynamics.normal_spin(state) / self.spin
         return self.unless_on_stem(state[COS_THETA] - self.cos_angle)
 
-    def unless_on_stem(self, value: Float[Array, "*lanes"]) -> Float[Array, "*lanes"]:
+    def unless_on_stem(self, value: Lanes) -> Lanes:
         """The event function, or -1 if the stem carries the top and this counts."""
         if self.stem_counts is None or self.on_stem is None:
             return value
         return jnp.where(self.on_stem & (self.stem_counts > 0.0), -1.0, value)
 
-    def domain_margin(
-        self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]
-    ) -> Float[Array, "*lanes"]:
+    def domain_margin(self, time: Lanes, state: States) -> Lanes:
         return least(*self.margins(time, state))
 
-    def lost_at_start(self, state: Float[Array, "components *lanes"]) -> Bool[Array, "*lanes"] | None:
+    def lost_at_start(self, state: States) -> Bool[Array, "*lanes"] | None:
         # A top that may fly slides on without load: both are the same motion.
         return None if self.flies else self.dynamics.unloaded(state, self.scales)
 
-    def margins(
-        self, time: Float[Array, "*lanes"], state: Float[Array, "components *lanes"]
-    ) -> tuple[Float[Array, "*lanes"], ...]:
+    def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
         return self.dynamics.margins(state)
 
 
@@ -134,7 +128,7 @@ class Quadratures(AbstractPassive):
         time: Float[Array, "..."],
         state: Float[Array, "core ..."],
         passive: Float[Array, "rest ..."],
-    ) -> State:
+    ) -> States:
         dynamics, (u, e, L, _) = problem.dynamics, parts(state)
         motion, (*path, c1, c2, c3, _, _) = dynamics.motion(state), passive
         c, frame_rate = (c1, c2, c3), (None, None) if self.of_mass else motion.frame_rate

@@ -9,11 +9,11 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.hybrid import AbstractBatchedMode, Transition, TransitionPath
-from nonholonomic.integration import AbstractProblem, ExtendedProblem
+from nonholonomic.integration import AbstractProblem, ExtendedProblem, Lanes, States
 from nonholonomic.integration.problem import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING
 
 from ..model.body import Top
-from ..model.dynamics import COS_THETA, NO_COSINE, AbstractDynamics, Cells, State, States, parts
+from ..model.dynamics import COS_THETA, NO_COSINE, AbstractDynamics, parts
 from ..model.scene import Scene
 from ..model.stick_slip import Change, ContactMode, Onset, StickSlip
 from .airborne import (
@@ -38,7 +38,7 @@ from .problems import InversionProblem, Quadratures, TrajectoryProblem
 SLIPPING, ROLLING = range(2)
 
 
-def contact_energy(scene: Scene[Top], state: States, number: Int[Array, " cells"]) -> tuple[Cells, Cells]:
+def contact_energy(scene: Scene[Top], state: States, number: Int[Array, " cells"]) -> tuple[Lanes, Lanes]:
     """The least and the greatest energy [J] that a state in a mode may have; here these are the same."""
     assert isinstance(scene.dynamics, StickSlip)
     rolls = scene.dynamics.rolling.carried_along(state)
@@ -68,7 +68,7 @@ class StickSlipMode(AbstractBatchedMode):
     def shown(self, state: Float[Array, "components times"]) -> Float[Array, "components times"]:
         return self.carried_along(state) if self.kind.rolls else state
 
-    def carried_along(self, state: State) -> State:
+    def carried_along(self, state: States) -> States:
         """The state of a rolling top, whose velocity follows from the other components."""
         return jnp.concatenate([self.kind.rolling.carried_along(state[: self.size]), state[self.size :]])
 
@@ -76,7 +76,7 @@ class StickSlipMode(AbstractBatchedMode):
         onset, wait = motion
         return onset.at((passed - wait) / jnp.where(onset.length > 0.0, onset.length, 1.0))
 
-    def reset_map(self, state: States, left: Cells) -> Transition:
+    def reset_map(self, state: States, left: Lanes) -> Transition:
         """Stick, slip, or end if the contact is lost. Counts the changes from slip to rolling."""
         slipping = self._under(self.kind.slipping, state)
         change = self.kind.ended(state, self.size, lambda point: slipping.field(left, point), self.scales, left)
@@ -109,7 +109,7 @@ class StickSlipMode(AbstractBatchedMode):
             record=None if self.passive is None else _recorded(change),
         )
 
-    def _event(self, state: States) -> Cells:
+    def _event(self, state: States) -> Lanes:
         """The function whose fall to zero ends a run."""
         if self.spin is None:
             return state[COS_THETA] - self.cos_angle
@@ -200,7 +200,7 @@ class Touch(StickSlipMode):
     def between(self, motion: tuple[Onset, Array], passed: Float[Array, " times"]) -> Float[Array, "21 times"]:
         return _at_no_distance(super().between(motion, passed))
 
-    def reset_map(self, state: States, left: Cells) -> Transition:
+    def reset_map(self, state: States, left: Lanes) -> Transition:
         """Stick, slip, or fly where the contact is lost. Counts flights, and changes from slip to rolling."""
         transition = super().reset_map(state, left)
         state_after = self.carried_along(transition.state) if self.kind.rolls else transition.state
@@ -217,7 +217,7 @@ class Touch(StickSlipMode):
 class Land(Fly):
     """Flying over the arena, to a contact that slips or rolls."""
 
-    def reset_map(self, state: States, left: Cells) -> Transition:
+    def reset_map(self, state: States, left: Lanes) -> Transition:
         """Strike the arena; then rebound, or continue to slip or roll."""
         transition, stick_slip = super().reset_map(state, left), self.scene.dynamics
         assert isinstance(stick_slip, StickSlip)
@@ -248,7 +248,7 @@ def _at_no_distance(rows: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
 # ended.
 
 
-def airborne_energy(scene: Scene[Top], state: States, mode: Int[Array, " cells"]) -> tuple[Cells, Cells]:
+def airborne_energy(scene: Scene[Top], state: States, mode: Int[Array, " cells"]) -> tuple[Lanes, Lanes]:
     """The least and the greatest energy [J] that a state in a mode may have; here these are the same."""
     state, distance, rate = above_the_ground(scene, state, mode)
     if isinstance(scene.dynamics, StickSlip):
@@ -271,7 +271,7 @@ def lifted(
 
 def above_the_ground(
     scene: Scene[Top], state: States, mode: Int[Array, " cells"]
-) -> tuple[Float[Array, "14 cells"], Cells, Cells]:
+) -> tuple[Float[Array, "14 cells"], Lanes, Lanes]:
     """States of runs, in the layout for sliding on the top's own sphere; and the distance [m] of this sphere from the
     ground with its rate [m/s]. States of other modes refer to the foot below this sphere.
     """
@@ -287,7 +287,7 @@ def above_the_ground(
     return contact, jnp.where(flies, ground.gap, 0.0), jnp.where(flies, rate, 0.0)
 
 
-def loss(scene: Scene[Top], state: State) -> Int[Array, "..."]:
+def loss(scene: Scene[Top], state: States) -> Int[Array, "..."]:
     """Why a contact ended, if it was not merely lost: a code in `LOSSES` (`tippe/model/dynamics.py`)."""
     dynamics, state = scene.dynamics, state[:OWN]
     if scene.body.stem is None:
