@@ -96,7 +96,7 @@ def moving_leaves(
     closed = jax.make_jaxpr(values)(*leaves)
     is_used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))[1]
     return jax.tree.map(
-        lambda rate, is_used: is_used and rate is not None,
+        lambda rate, is_used: bool(is_used) and rate is not None,
         direction,
         jax.tree.unflatten(structure, is_used),
         is_leaf=lambda rate: rate is None,

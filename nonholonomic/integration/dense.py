@@ -291,7 +291,7 @@ def _control(
 def _solved(
     problem: AbstractProblem,
     solver: diffrax.AbstractSolver,
-    times: tuple[Float[ArrayLike, ""], Float[ArrayLike, ""], Float[Array, ""] | None],
+    times: tuple[Float[Array, ""] | float, Float[Array, ""] | float, Float[Array, ""] | None],
     state: Float[Array, " components"],
     control: diffrax.AbstractStepSizeController,
     **options: PyTree,

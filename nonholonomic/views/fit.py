@@ -163,7 +163,7 @@ def _draw_block(
     if has_time:
         residuals.set_xlabel("time since the first sample [s]")
     elif len(indices) <= MOST_LABELS:
-        residuals.set_xticks(abscissa[indices], [labels[i] for i in indices], rotation=20, ha="right", fontsize=8)
+        residuals.set_xticks(abscissa[indices], [str(labels[i]) for i in indices], rotation=20, ha="right", fontsize=8)
     else:
         residuals.set_xlabel("measurement")
 
