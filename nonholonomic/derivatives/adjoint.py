@@ -26,7 +26,7 @@ from ..integration.problem import CROSSED, REACHED_END, RUNNING, time_at_jump
 from ..integration.runge_kutta import Stages, moved_state, over_stages
 from ..integration.scheduler import InLanes, LaneScheduler, Recorder, SchedulerState, outcome_of, with_crossing_times
 from ..integration.step import length_to_try, try_step, until_jump
-from .variation import Tangent, VariationalProblem, in_groups, moving_leaves, slopes_by_variations
+from .variation import RunOptions, Tangent, Tangents, VariationalProblem, in_groups, moving_leaves, slopes_by_variations
 
 # The periods of an ensemble solve that are kept for its adjoint: where some of them begin and end, and the steps of the
 # latest ones.
@@ -210,14 +210,12 @@ def solve_with_adjoint(
     moving: Moving,
     probe: Tangent,
     ends_on_event: bool,
-    t1: Float[Array, "..."],
-    cells: Int[Array, ""],
-    settings: Settings,
+    options: RunOptions,
     recorder: StepRecorder,
 ) -> tuple[Outcome, Derivatives]:
     """Run every cell to its end, and differentiate the quantity that a recorder measures there.
 
-    **Arguments:** as for `solve_ensemble`, in one kernel, except `nonterminal`, and
+    **Arguments:**
 
     - `moving`: the leaves with respect to which to differentiate, scalars or (..., cells).
     - `probe`: a tangent of the problem. Its variation is also integrated and takes part in step-size control, so that
@@ -240,7 +238,7 @@ def solve_with_adjoint(
         is_leaf=lambda rate: rate is None,
     )
     variational = VariationalProblem(problem, (probe,), ends_on_event)
-    scheduler = LaneScheduler.of(variational, t1, cells, settings, one_kernel=True, n_blocks=2)
+    scheduler = LaneScheduler.of(variational, *options, one_kernel=True, n_blocks=2)
     # Without tangents, a `VariationalProblem` is the problem itself, with the option not to end on its event.
     passes = Passes(scheduler, VariationalProblem(moving, (), ends_on_event), recorder)
     run = passes.start(VariationalProblem(numbers, (), ends_on_event))
@@ -517,7 +515,7 @@ MOST_FORWARD = 2
 
 def solve_ensemble_with_tangents(
     problem: AbstractProblem,
-    tangents: tuple[Tangent, ...],
+    tangents: Tangents,
     t1: Float[Array, "..."],
     cells: Int[Array, ""],
     settings: Settings,
@@ -548,31 +546,25 @@ def solve_ensemble_with_tangents(
     """
     one_kernel = not traced if one_kernel is None else one_kernel
     solve = _in_program if traced else _alone
-    return solve(problem, tangents, t1, cells, settings, nonterminal, one_kernel)
+    return solve(problem, tangents, (t1, cells, settings), nonterminal, one_kernel)
 
 
 def ensemble_solve_with_tangents(
-    problem: AbstractProblem,
-    tangents: tuple[Tangent, ...],
-    t1: Float[Array, "..."],
-    cells: Int[Array, ""],
-    settings: Settings,
-    nonterminal: bool,
-    one_kernel: bool,
+    problem: AbstractProblem, tangents: Tangents, options: RunOptions, nonterminal: bool, one_kernel: bool
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """`solve_ensemble_with_tangents`, not compiled."""
-    horizon = t1
     if nonterminal:
-        scheduler = LaneScheduler.of(problem, t1, cells, settings, nonterminal=True, one_kernel=one_kernel)
-        outcome = scheduler.solve()[0]
+        outcome = LaneScheduler.of(problem, *options, nonterminal=True, one_kernel=one_kernel).solve()[0]
         # The derivatives need the run only up to the event, whose time is now known.
-        horizon = jnp.where(jnp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
-    options = (not nonterminal, horizon, cells, settings)
+        options = (jnp.where(jnp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0), *options[1:])
     if one_kernel and problem.fits_one_kernel and len(tangents) > MOST_FORWARD:
-        ended, slopes = _slopes_by_adjoint(problem, tangents, *options)
+        ended, slopes = _slopes_by_adjoint(problem, tangents, not nonterminal, options)
     else:
-        solve = functools.partial(slopes_by_variations, problem, one_kernel=one_kernel)
-        ended, slopes = in_groups(lambda group: solve(group, *options), tangents)
+
+        def solve(group: Tangents) -> tuple[Outcome, list[Float[Array, " cells"]]]:
+            return slopes_by_variations(problem, group, not nonterminal, options, one_kernel)
+
+        ended, slopes = in_groups(solve, tangents)
     if not nonterminal:
         outcome = with_crossing_times(problem, ended)
     # An event at the start has a fixed time, whatever the tangent.
@@ -586,7 +578,7 @@ _alone, _in_program = compiled_alone(ensemble_solve_with_tangents), eqx.filter_j
 
 
 def _slopes_by_adjoint(
-    problem: AbstractProblem, tangents: tuple[Tangent, ...], ends_on_event: bool, *options: Any
+    problem: AbstractProblem, tangents: Tangents, ends_on_event: bool, options: RunOptions
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """The result of `slopes_by_variations`, at a cost that does not depend on the number of tangents."""
 
@@ -597,9 +589,8 @@ def _slopes_by_adjoint(
     moving = moving_leaves(problem, tangents[0], field_and_event)
     shares = shares_of(len(tangents)).tolist()
     mixture = jax.tree.map(lambda *rates: sum(c * rate for c, rate in zip(shares, rates, strict=True)), *tangents)
-    ended, (by_start, by_number) = solve_with_adjoint(
-        problem, moving, mixture, ends_on_event, *options, recorder=StepRecorder()
-    )
+    ended, gradient = solve_with_adjoint(problem, moving, mixture, ends_on_event, options, StepRecorder())
+    by_start, by_number = gradient
 
     def slope(direction: Tangent) -> Float[Array, " cells"]:
         start = eqx.filter_jvp(lambda problem: problem.start()[0], (problem,), (direction,))[1]

@@ -24,6 +24,7 @@ from .adjoint import StepRecord, StepRecorder, shares_of, solve_with_adjoint, ti
 from .differentiable import AbstractDifferentiableSolve, Structure, differentiable_solve
 from .variation import (
     Tangent,
+    Tangents,
     VariationalProblem,
     by_active,
     in_groups,
@@ -159,9 +160,8 @@ def samples_pulled_back(
 
     moving = moving_leaves(problem, probe, field_and_margin)
     recorder = SampledStepRecorder(SampleTimes.of(times, cells, components), cotangents)
-    outcome, (by_start, by_number) = solve_with_adjoint(
-        problem, moving, probe, False, t1, jnp.asarray(cells), settings, recorder
-    )
+    options = (t1, jnp.asarray(cells), settings)
+    outcome, (by_start, by_number) = solve_with_adjoint(problem, moving, probe, False, options, recorder)
     sample_times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), cells)).T
     is_moved = VariationalProblem(problem, (probe,), False).start()[0][len(by_start) :] != 0.0
     initial = jnp.where((sample_times <= 0.0)[..., None] & is_moved.T[:, None], cotangents.states, 0.0)
@@ -203,8 +203,6 @@ def is_reversible(problem: AbstractProblem) -> bool:
 
 # Samples of a run as a differentiable solve: its leaves, and how they are assembled into a problem.
 
-
-Tangents: TypeAlias = tuple[Tangent, ...]
 
 #: The times of the samples and the horizon [s], in a block with the cells last.
 Horizon: TypeAlias = tuple[Array, Array]
@@ -280,11 +278,8 @@ class AbstractSampling(AbstractDifferentiableSolve):
         **Returns:** a function (the modules' numbers, cells) -> problem; the modules' numbers, in a block scalars or with
         the cells last; the horizon; the whole spec, with the tolerance; and the number of cells, `None` outside of blocks.
         """
-        numbers, (times, t1, tolerance), spec = (
-            leaves[: self.movable],
-            leaves[self.movable :][:3],
-            self.whole_spec(leaves),
-        )
+        numbers, spec = leaves[: self.movable], self.whole_spec(leaves)
+        times, t1, tolerance = leaves[self.movable : self.movable + 3]
         if self.in_blocks:
             numbers = tuple(cells_last(number, axes, cells) for number, axes in zip(numbers, spec.axes, strict=True))
             # One tolerance serves the whole ensemble: the smallest of the batch.

@@ -28,6 +28,11 @@ from ..terminal import Progress
 #: A tree like the problem, with the rate at which each number moves in its place; `None` for numbers that do not move.
 Tangent: TypeAlias = PyTree
 
+Tangents: TypeAlias = tuple[Tangent, ...]
+
+#: The horizon [s], the number of cells and the settings of an ensemble solve.
+RunOptions: TypeAlias = tuple[Float[Array, "..."], Int[Array, ""], Settings]
+
 #: From leaves and a number of cells, `None` for a single run, to a problem.
 Build: TypeAlias = Callable[[tuple[Array, ...], int | None], PyTree]
 
@@ -46,7 +51,7 @@ def tangent_scale(number: Float[Array, "..."]) -> Float[Array, "..."]:
 
 def tangents_of(
     build: Callable[..., PyTree], numbers: tuple[Array, ...], tangents: list[tuple[Array, ...]]
-) -> tuple[Tangent, ...]:
+) -> Tangents:
     """The tangents of a problem that is built from numbers.
 
     **Arguments:**
@@ -105,7 +110,7 @@ def moving_leaves(
 
 def tangents_by(
     build: Build, active: tuple[int, ...], leaves: tuple[Array, ...], cells: int | None
-) -> tuple[PyTree, tuple[Tangent, ...], Callable[[list[PyTree]], list[PyTree]]]:
+) -> tuple[PyTree, Tangents, Callable[[list[PyTree]], list[PyTree]]]:
     """Build a problem and its tangents along leaves, each scaled by the leaf's own size.
 
     **Arguments:**
@@ -173,11 +178,7 @@ def over_cells(leaf: Float[Array, "..."], cells: int) -> Float[Array, "... cells
 
 
 def tangent_along(
-    build: Build,
-    active: tuple[int, ...],
-    leaves: tuple[Array, ...],
-    tangents: tuple[Array, ...],
-    cells: int,
+    build: Build, active: tuple[int, ...], leaves: tuple[Array, ...], tangents: tuple[Array, ...], cells: int
 ) -> tuple[PyTree, Tangent, Float[Array, " cells"]]:
     """Build a problem and its tangent in one direction of its leaves, which is scaled by the size of the leaves.
 
@@ -218,7 +219,7 @@ class VariationalProblem(AbstractDerivedProblem):
     """
 
     problem: AbstractProblem
-    tangents: tuple[Tangent, ...]
+    tangents: Tangents
     ends_on_event: bool = eqx.field(static=True)
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
@@ -269,14 +270,7 @@ class VariationalProblem(AbstractDerivedProblem):
 
 
 def slopes_by_variations(
-    problem: AbstractProblem,
-    tangents: tuple[Tangent, ...],
-    ends_on_event: bool,
-    t1: Float[Array, "..."],
-    cells: Int[Array, ""],
-    settings: Settings,
-    *,
-    one_kernel: bool,
+    problem: AbstractProblem, tangents: Tangents, ends_on_event: bool, options: RunOptions, one_kernel: bool
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """Run every cell with its variations, and differentiate the time of the event at its end.
 
@@ -285,7 +279,7 @@ def slopes_by_variations(
     - `problem`, `tangents`: as for `VariationalProblem`.
     - `ends_on_event`: whether runs end on the event; otherwise they end at the horizon, which then counts as the
       event's time.
-    - The others as for `LaneScheduler.of`.
+    - `one_kernel`: as for `LaneScheduler.of`.
 
     **Returns:** the `Outcome`, without crossing times, and for each tangent the derivative of the event's time.
     """
@@ -293,7 +287,7 @@ def slopes_by_variations(
     # The variations take part in step-size control: the state alone may be at rest while its tangent is not, and the
     # steps would become too long for the tangent.
     blocks = 1 + len(tangents)
-    ended = LaneScheduler.of(variational, t1, cells, settings, n_blocks=blocks, one_kernel=one_kernel).solve()[0]
+    ended = LaneScheduler.of(variational, *options, n_blocks=blocks, one_kernel=one_kernel).solve()[0]
     state, *variations = variational.parts(ended.state)
 
     def event_time(problem: AbstractProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
@@ -306,9 +300,7 @@ def slopes_by_variations(
     return ended._replace(state=state), slopes
 
 
-def in_groups(
-    run: Callable[..., tuple[PyTree, list[PyTree]]], tangents: tuple[Tangent, ...]
-) -> tuple[PyTree, list[PyTree]]:
+def in_groups(run: Callable[..., tuple[PyTree, list[PyTree]]], tangents: Tangents) -> tuple[PyTree, list[PyTree]]:
     """Apply `run` to many tangents, a few at a time, with one program.
 
     **Arguments:**

@@ -191,11 +191,11 @@ class PlaneFrame(AbstractFrame):
         return jnp.zeros_like(cyclic[0])
 
     def axes(self, place: Place, cyclic: Place) -> tuple[Vector, Vector, Vector]:
-        zero, unit = jnp.zeros_like(cyclic[0]), jnp.ones_like(cyclic[0])
+        zero, one = jnp.zeros_like(cyclic[0]), jnp.ones_like(cyclic[0])
         if self.slope is None:
-            return (unit, zero, zero), (zero, unit, zero), (zero, zero, unit)
-        sine, cosine = unit * self.slope[0], unit * self.slope[1]
-        return (cosine, zero, sine), (zero, unit, zero), (-sine, zero, cosine)
+            return (one, zero, zero), (zero, one, zero), (zero, zero, one)
+        sine, cosine = one * self.slope[0], one * self.slope[1]
+        return (cosine, zero, sine), (zero, one, zero), (-sine, zero, cosine)
 
     def position(self, place: Place, cyclic: Place) -> Vector:
         x, y = (*place, *cyclic)
@@ -269,8 +269,8 @@ class CylinderFrame(AbstractRoundFrame):
 
     def axes(self, place: Place, cyclic: Place) -> tuple[Vector, Vector, Vector]:
         sine, cosine = place
-        zero, unit = jnp.zeros_like(sine), jnp.ones_like(sine)
-        return (cosine, zero, sine), (zero, unit, zero), (-sine, zero, cosine)
+        zero, one = jnp.zeros_like(sine), jnp.ones_like(sine)
+        return (cosine, zero, sine), (zero, one, zero), (-sine, zero, cosine)
 
     def position(self, place: Place, cyclic: Place) -> Vector:
         sine, cosine = place

@@ -319,8 +319,8 @@ class Plane(AbstractSurface):
         return position[:2]
 
     def charted(self, place: Place) -> tuple[Vector, Vector, Vector]:
-        unit = jnp.ones_like(place[0])
-        return (place[0], place[1], None), (unit, jnp.zeros_like(unit), None), (jnp.zeros_like(unit), unit, None)
+        one, zero = jnp.ones_like(place[0]), jnp.zeros_like(place[0])
+        return (place[0], place[1], None), (one, zero, None), (zero, one, None)
 
     def in_fixed_frame(self, vector: Vector) -> Vector:
         x, y, z = super().in_fixed_frame(vector)

@@ -52,7 +52,7 @@ MAX_COMPRESSION = 2000
 
 #: Endings of files in other formats, which a table's file must not have.
 OTHER_FORMATS = (".csv", ".tsv", ".txt", ".dat", ".xls", ".xlsx", ".ods", ".json", ".npy", ".npz", ".mat", ".pkl")
-OTHER_FORMATS += (".parquet", ".html", ".htm", ".png", ".jpg", ".svg", ".pdf", ".gif", ".mp4", ".zip", ".zarr")
+OTHER_FORMATS += (".parquet", ".html", ".htm", ".png", ".jpg", ".svg", ".pdf", ".gif", ".mp4", ".webm", ".zip", ".zarr")
 
 
 def table_path(path: object) -> Path:

@@ -24,19 +24,7 @@ from ..terminal import Progress
 from ..text import shown
 from ..validation import require_flag, warn
 from ._store import ChunkStore, with_spaces
-from .grid import (
-    Axis,
-    ChunkTask,
-    Job,
-    Layout,
-    Values,
-    Variable,
-    attributes_of,
-    columns,
-    remote_results,
-    size_of,
-    stamp,
-)
+from .grid import Axis, ChunkTask, Job, Layout, Values, Variable, attributes_of, columns, remote_results, size_of, stamp
 from .table import Table
 
 # Dispatch chunks to an executor as its workers become free, and dispatch a chunk again if its worker died.

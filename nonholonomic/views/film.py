@@ -126,7 +126,7 @@ class Viewable(abc.ABC):
         - `others`, `overlaid`, `unit`: as for `view`.
         - `speed`: seconds of the run per second of the film, 1 by default; 0.1 is ten times slower than reality. With
           `times`, the speed follows from `times` and `fps`.
-        - `fps`: frames per second. Without a graphics card, drawing takes about 0.1 s for each frame.
+        - `fps`: frames per second. Without a graphics card, drawing takes about 0.3 s for each frame.
 
         **Raises:** `ModuleNotFoundError` if jupyter-threejs-sage is not installed; `ValueError` for another file type, an
         unknown unit, a batch of runs, numbers out of range, or both `times` and `speed`; `OSError` if there is no browser, if

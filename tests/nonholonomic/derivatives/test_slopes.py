@@ -52,7 +52,7 @@ def solve(point, tangents, patience, cells, solver, **options):
     arguments = (jnp.asarray(50.0), cells, Settings(1e-11, solver))
     directions = tangents_of(build, point, tangents)
     return adjoint.ensemble_solve_with_tangents(
-        build(*point), directions, *arguments, **({"nonterminal": False, "one_kernel": True} | options)
+        build(*point), directions, arguments, **({"nonterminal": False, "one_kernel": True} | options)
     )
 
 
@@ -202,7 +202,7 @@ def test_a_component_at_rest_has_its_tangent_integrated(names):
         directions = tangents_of(AtRest, point, tangents)
         arguments = (jnp.asarray(5.0), jnp.asarray(4), Settings(1e-10))
         return adjoint.ensemble_solve_with_tangents(
-            AtRest(*point), directions, *arguments, nonterminal=False, one_kernel=True
+            AtRest(*point), directions, arguments, nonterminal=False, one_kernel=True
         )
 
     _, derivatives = run()

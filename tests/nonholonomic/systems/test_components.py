@@ -8,8 +8,9 @@ from close import assert_close
 from own_modes import Sleigh
 from scipy.integrate import solve_ivp
 
-from nonholonomic import AbstractSystem, simulate
+from nonholonomic import AbstractSystem, Recording, log_density, simulate
 from nonholonomic.compilation.components import TooLarge, by_components
+from nonholonomic.identification.posterior import OF_RECORDING
 from nonholonomic.runs.model import model_of
 from nonholonomic.systems.mechanics import Lagrange, within_constraints
 
@@ -152,3 +153,11 @@ def test_a_large_field_stands_once_in_a_program_and_its_motion_is_that_of_scipy(
     start = np.concatenate([q, rate])
     expected = solve_ivp(field, (0.0, 2.0), start, method="DOP853", rtol=1e-11, atol=1e-11).y[:, -1]
     assert_close(run.state[-1], expected, rtol=1e-7)
+
+
+def test_a_fit_of_a_system_with_a_large_field_takes_differences():
+    """A program with derivatives would take a minute to compile."""
+    for system, size, expected in ((CarWithTrailer(), 5, OF_RECORDING), (Sleigh(), 3, None)):
+        data = Recording((np.zeros(size), np.zeros(size)), [1.0, 2.0], [0.0, 0.1], 0.01, "q0")
+        density = log_density(system, data, {"start.q[0]": 0.0})
+        assert density.problem.step == expected
