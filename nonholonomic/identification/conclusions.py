@@ -117,7 +117,15 @@ def judge(
     p_values = [order.p_value for order, part in zip(orders, parts, strict=True) if np.any(np.abs(part) > NEGLIGIBLE)]
     p_trend = min(p_values, default=1.0) * max(len(p_values), 1)
     minima, further, notes = (), *without_prediction(explorer, sample, distribution)
-    notes = (*unsearched(explorer, distribution.estimate), *notes)
+    region, names = explorer.region, explorer.density.problem.names
+    is_outside = np.abs(distribution.estimate - region.middle) > region.half_width
+    if np.any(is_outside):
+        outside = ", ".join(name for name, is_out in zip(names, is_outside, strict=True) if is_out)
+        notes = (
+            f"{outside}: outside of the range in which minima were searched, so better ones may be missing; start closer, or "
+            "state a prior",
+            *notes,
+        )
     if distribution.kind == "weights":
         minima, (others, more) = minima_of(explorer, sample), remarks(explorer, sample, distribution, by_slopes)
         further, notes = (*further, *others), (*notes, *more)
@@ -488,18 +496,6 @@ def roughness(explorer: Explorer, sample: Weighted) -> float:
     coefficients, *_ = np.linalg.lstsq(root * terms, root * predictions)
     off = (predictions - terms @ coefficients) / np.asarray(measurements.error)
     return float(np.sqrt(np.mean(np.sum(root**2 * off**2, axis=0))))
-
-
-def unsearched(explorer: Explorer, estimate: Float[np.ndarray, " unknowns"]) -> tuple[str, ...]:
-    """A note of estimates that are outside of the searched range, if there are any."""
-    is_inside = explorer.region.searched(estimate)
-    names = [name for name, inside in zip(explorer.density.problem.names, is_inside, strict=True) if not inside]
-    if not names:
-        return ()
-    return (
-        f"{', '.join(names)}: outside of the range in which minima were searched, so better ones may be missing; start "
-        "closer, or state a prior",
-    )
 
 
 def without_prediction(

@@ -256,10 +256,6 @@ class Region(NamedTuple):
         beyond = (np.abs(points - self.middle) / self.half_width - 1.0).clip(0.0)
         return -0.5 * np.sum((beyond / EDGE) ** 2, axis=1)
 
-    def searched(self, points: Float[np.ndarray, "*n unknowns"]) -> Bool[np.ndarray, "*n unknowns"]:
-        """Which coordinates are within the box."""
-        return np.abs(points - self.middle) <= self.half_width
-
     def contains(self, points: Float[np.ndarray, "n unknowns"]) -> np.ndarray:
         """Which points are near enough for a weight."""
         return np.all(np.abs(points - self.middle) <= FARTHEST * self.half_width, axis=1)
@@ -537,11 +533,6 @@ class Weighted(NamedTuple):
     def enough(self) -> bool:
         """Whether means and quantiles over the weights can be trusted."""
         return self.effective >= ENOUGH and self.k < MOST_K
-
-    @property
-    def runs(self) -> int:
-        """Number of parameter sets for which the model ran."""
-        return len(self.weights)
 
 
 def effective_number(weights: Float[np.ndarray, " n"]) -> float:

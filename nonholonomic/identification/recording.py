@@ -276,6 +276,10 @@ SYNONYMS |= {"sec": "s", "second": "s", "seconds": "s", "1/min": "rpm", "rev/min
 #: What describes a column: a header with its unit, or a header (for an error, possibly a number) and a unit or factor.
 Column = object
 
+#: A path, and columns by name.
+AnyPath = str | PathLike[str]
+Columns = Mapping[str, Column] | None
+
 
 class TextTable(NamedTuple):
     """The cells of a file as text: header -> cells; the number of each row's line in the file; the decimal mark; and the
@@ -489,12 +493,7 @@ class Read(NamedTuple):
 
 
 def read_columns(
-    path: str | PathLike[str],
-    columns: Mapping[str, Column] | None,
-    fps: float | None,
-    error: Mapping[str, Column] | None,
-    quantities: Quantities,
-    decimal: str = ".",
+    path: AnyPath, columns: Columns, fps: float | None, error: Columns, quantities: Quantities, decimal: str = "."
 ) -> Read:
     """Read samples from a text file with a header line and columns separated by commas, semicolons, tabs or blanks.
 
@@ -568,8 +567,8 @@ class ReadLaunches(NamedTuple):
 
 
 def read_launches(
-    path: str | PathLike[str],
-    columns: Mapping[str, Column] | None,
+    path: AnyPath,
+    columns: Columns,
     error: float | Mapping[str, Column],
     units: Mapping[str, str],
     decimal: str = ".",
@@ -623,11 +622,7 @@ def read_launches(
 
 
 def _opened(
-    path: str | PathLike[str],
-    columns: Mapping[str, Column] | None,
-    decimal: str,
-    known: Mapping[str, str],
-    several: Mapping[str, tuple[str, ...]],
+    path: AnyPath, columns: Columns, decimal: str, known: Mapping[str, str], several: Mapping[str, tuple[str, ...]]
 ) -> tuple[TextTable, Mapping[str, Column]]:
     """The file and its columns, checked. **Arguments:** `known`: name of a column -> its SI unit; `several`: names that
     stand for several columns."""

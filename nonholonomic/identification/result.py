@@ -595,23 +595,19 @@ def drawn(
         components = known if components is None else components.joined(known, 0.5)
     proposal = explorer.proposal(explored.pool, components)
     steps = discarded + MOVES * draws
-    first = explored.pool.points[random.choice(explored.runs, chains, p=explored.weights)]
+    first = explored.pool.points[random.choice(len(explored.weights), chains, p=explored.weights)]
     start = np.asarray(density.start)[None, : len(density.problem.names)]
     points = np.concatenate([first, proposal.draw(chains * steps, random)])
-    predictions, log_density = _runs(explorer, np.concatenate([points, start]))
+    every = np.concatenate([points, start])
+    parts = [explorer.evaluated(every[first : first + ROWS]) for first in range(0, len(every), ROWS)]
+    predictions, log_density = (np.concatenate([part[k] for part in parts]) for k in (0, 3))
     order = random.permutation(np.arange(chains, len(points))).reshape(steps, chains)
     path, accepted = _chains(order, log_density[:-1] - proposal.log_density(points), chains, random)
     kept = path[discarded + MOVES - 1 :: MOVES].T.reshape(-1)
     errors = draw_errors(density.measurements, predictions[kept], random)
     coordinates = np.concatenate([points[kept], errors], axis=1).reshape(chains, draws, -1)
     excess = float(log_density[-1] - np.median(log_density[kept]))
-    return coordinates, accepted, explored.runs + len(points), excess
-
-
-def _runs(explorer: Explorer, points: Float[np.ndarray, "n unknowns"]) -> tuple[np.ndarray, np.ndarray]:
-    """Predictions and log densities of all points, in batches."""
-    parts = [explorer.evaluated(points[first : first + ROWS]) for first in range(0, len(points), ROWS)]
-    return np.concatenate([part[0] for part in parts]), np.concatenate([part[3] for part in parts])
+    return coordinates, accepted, len(explored.weights) + len(points), excess
 
 
 def _chains(

@@ -164,6 +164,7 @@ class Counted:
         return trend + self.tooth * (phase - np.floor(phase) - 0.5)
 
 
+@pytest.mark.filterwarnings("ignore:the data allow:nonholonomic.identification.FitWarning")
 @pytest.mark.parametrize(("tooth", "least", "most"), [(0.0, 100, 300), (TOOTH, 200, 1500)])
 def test_a_smooth_likelihood_of_one_unknown_takes_few_runs(tooth, least, most):
     """By differences, as for tops that hop, of which every run takes long."""
