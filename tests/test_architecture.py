@@ -36,10 +36,10 @@ VEHICLE_HEIGHT = {"model": 0, "modes": 1, "runs": 2, "planning": 3}
 
 #: Lines of code, without blank lines, comments and docstrings, of the longest file.
 MOST_LINES = 450
-MOST_FILES_OUTSIDE = 9
+MOST_FILES_OUTSIDE = 6
 
 #: The size of the three packages: it may shrink. Imports are a share of the lines of code.
-MOST = {"files": 133, "lines": 27_322, "functions": 3208, "Any": 1927, "imports": 0.0970}
+MOST = {"files": 118, "lines": 25_500, "functions": 2870, "Any": 480, "imports": 0.0945}
 
 
 class Arrow(NamedTuple):

@@ -17,29 +17,10 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from ..compilation.components import over_lanes, spelled_out
 from ..compilation.tracing import depends_on_first, is_elementary, with_own_numbers
-from ..derivatives import (
-    AbstractDifferentiableSolve,
-    differentiable_solve,
-    solve_ensemble_with_tangents,
-    tangents_by,
-)
-from ..hybrid import (
-    AbstractBatchedMode,
-    HybridOutcome,
-    Transition,
-    solve_hybrid,
-    solve_hybrid_with_tangents,
-)
+from ..derivatives import AbstractDifferentiableSolve, differentiable_solve, solve_ensemble_with_tangents, tangents_by
+from ..hybrid import AbstractBatchedMode, HybridOutcome, Transition, solve_hybrid, solve_hybrid_with_tangents
 from ..hybrid.saltation import UNMEASURED, Clock
-from ..integration import (
-    AbstractProblem,
-    ExtendedProblem,
-    Lanes,
-    Outcome,
-    Settings,
-    States,
-    solve_ensemble,
-)
+from ..integration import AbstractProblem, ExtendedProblem, Lanes, Outcome, Settings, States, solve_ensemble
 from ..integration.problem import CROSSED, REACHED_END, RUNNING, AbstractDerivedProblem, Status, legal_run
 from ..parameters import Parameters
 from ..terminal import status_line

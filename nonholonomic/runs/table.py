@@ -171,12 +171,7 @@ class TableJob(NamedTuple):
         return variables | {name: sampled[name] for name in names}
 
     def _results(
-        self,
-        cells: AbstractModel,
-        columns: dict[str, Any],
-        size: int,
-        count: int,
-        slopes: dict[str, str] | None,
+        self, cells: AbstractModel, columns: dict[str, Any], size: int, count: int, slopes: dict[str, str] | None
     ) -> dict[str, Any]:
         """The variables of one run of every cell."""
         derivatives, grazing, settings = {}, False, self.settings

@@ -238,10 +238,7 @@ def recorded(html_page: Page, browser: str) -> bytes:
 
     **Raises:** `OSError` if the page posts an error, and if the browser ends or stays silent.
     """
-    with (
-        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile,
-        _Recorder(html_page.html) as server,
-    ):
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile, _Recorder(html_page.html) as server:
         # Chromium refuses to run as root, as in a container, unless its sandbox is off.
         is_root = hasattr(os, "geteuid") and os.geteuid() == 0
         command = [browser, *OPTIONS, *(["--no-sandbox"] if is_root else [])]

@@ -202,12 +202,7 @@ def labels(
 
 
 def launches(
-    scene: Any,
-    launch_values: dict[str, Any],
-    axes: Any,
-    t1: Number,
-    tolerance: Number,
-    taken: Collection[str] = (),
+    scene: Any, launch_values: dict[str, Any], axes: Any, t1: Number, tolerance: Number, taken: Collection[str] = ()
 ) -> tuple[dict[str, Any], list[Axis]]:
     """The scene and launch that all cells share, and the axes of the grid.
 

@@ -40,16 +40,7 @@ from ..modes.sticking import (
     stick_slip_modes,
 )
 from .launches import INVERTED, NUMBERS_OF_A_LAUNCH, event_of, labels, variable_numbers
-from .observables import (
-    COMPONENTS,
-    DIRECTION,
-    ON_CURVED,
-    PASSIVE,
-    PATH,
-    AbstractTrajectory,
-    allowance,
-    quantities_of,
-)
+from .observables import COMPONENTS, DIRECTION, ON_CURVED, PASSIVE, PATH, AbstractTrajectory, allowance, quantities_of
 from .trajectory import ArenaTrajectory, HybridTrajectory, Trajectory, simulate_launch
 
 # The kinds of runs: one smooth motion, or several modes of contact and flight.
