@@ -241,7 +241,8 @@ class AbstractGradientSurface(AbstractSurface):
 
     def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
         gradient, gradient_rate = self.gradient(position), self.gradient_rate(position, velocity)
-        normal, per_size = unit(gradient), 1.0 / jnp.sqrt(dot(gradient, gradient))
+        per_size = 1.0 / jnp.sqrt(dot(gradient, gradient))
+        normal = scale(per_size, gradient)
         along_normal = scale(subtract(None, dot(normal, gradient_rate)), normal)
         return scale(per_size, sum_vectors(gradient_rate, along_normal))
 
