@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
@@ -77,7 +76,8 @@ def minimise(
     starts = np.asarray(starts, float)
     coordinates = starts.copy()
     count, unknowns = coordinates.shape
-    of_rows = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, leaf.shape[-1])), measurements)
+    # By NumPy: JAX would compile a program for every number of rows.
+    of_rows = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (count, leaf.shape[-1])), measurements)
     moving = np.array([k for k in range(unknowns) if k != fixed], int)
     bounded = [unknown.has_lower or unknown.has_upper for unknown in problem.unknowns]
     reach = np.where(bounded, FARTHEST, np.inf)[moving]

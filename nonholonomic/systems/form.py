@@ -307,7 +307,7 @@ class Form:
 
 
 #: A field with more operations on arrays is large: that of a car with a trailer has 800, that of a top in Euler angles 150.
-LARGE = 60
+LARGE = 500
 
 
 class Traits(NamedTuple):
