@@ -258,6 +258,13 @@ def at_start(
     )
 
 
+def _advanced(advance: Advance, numbers: Sequence[int], carry: Carry, mask: Bool[Numbers, " cells"]) -> Carry:
+    """The carry after the masked cells have advanced, if there are any."""
+    if isinstance(mask, np.ndarray):
+        return advance(numbers, carry, mask) if mask.any() else carry
+    return jax.lax.cond(jnp.any(mask), lambda: advance(numbers, carry, mask), lambda: carry)
+
+
 def one_round(carry: Carry, groups: Sequence[Sequence[int]], solve: Advance, reset: Advance) -> Carry:
     """Advance every running cell through its mode, and through the reset map if it is at the end of the mode.
 
@@ -267,18 +274,13 @@ def one_round(carry: Carry, groups: Sequence[Sequence[int]], solve: Advance, res
     - `solve`, `reset`: advance the cells to the end of their mode, and through the reset map.
     """
 
-    def advanced(advance: Advance, numbers: Sequence[int], carry: Carry, mask: Bool[Numbers, " cells"]) -> Carry:
-        if isinstance(mask, np.ndarray):
-            return advance(numbers, carry, mask) if mask.any() else carry
-        return jax.lax.cond(jnp.any(mask), lambda: advance(numbers, carry, mask), lambda: carry)
-
     # A cell that changes its mode during the round waits for the next round.
     mode_before = carry[0].mode
     for numbers in groups:
         active = functools.reduce(operator.or_, (mode_before == number for number in numbers))
         active = active & (carry[0].status == RUNNING)
-        carry = advanced(solve, numbers, carry, active)
-        carry = advanced(reset, numbers, carry, active & (carry[0].status == LEFT_DOMAIN))
+        carry = _advanced(solve, numbers, carry, active)
+        carry = _advanced(reset, numbers, carry, active & (carry[0].status == LEFT_DOMAIN))
     return carry
 
 
