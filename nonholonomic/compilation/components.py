@@ -162,7 +162,7 @@ class AbstractScalarReader(abc.ABC):
         """Combine the elements along some axes, one by one."""
         kept = [size for k, size in enumerate(elements.shape) if k not in axes]
         if not elements.size:
-            return self.constants(np.zeros(kept))
+            return self.constants(np.full(kept, {"mul": 1.0, "and": True, "or": False}.get(name, 0.0)))
         rows = np.moveaxis(elements, axes, range(-len(axes), 0)).reshape(*kept, -1)
         return functools.reduce(functools.partial(self.each, name), rows_along(rows, -1))
 

@@ -357,8 +357,8 @@ class Passes:
                 return index - 1, *step_taken_back(weights, problem, self.moving, *point, adjoint, memory)
 
             state, stages = lane_state.state, len(weights.fractions)
-            rooms = (jnp.zeros((count, *state.shape), state.dtype) for count in (stages, stages - 1, stages + 1))
-            memory = StageMemory(*rooms)
+            sizes = (stages, stages - 1, stages + 1)
+            memory = StageMemory(*(jnp.zeros((size, *state.shape), state.dtype) for size in sizes))
             return jax.lax.while_loop(lambda carry: carry[0] > 0, step, (count, adjoint, memory))[1]
 
         return self.scheduler.in_kernel(loop)((lane_state, share, record, count, adjoint))

@@ -161,7 +161,7 @@ def _change(
         factor = jnp.where(jnp.all(is_absent), 0.0, tangent)
         return jnp.where(is_absent, 0.0, product(slope, factor))
 
-    return sum(map(share, present, tangents), jnp.zeros(()))
+    return sum((share(*pair) for pair in zip(present, tangents, strict=True)), jnp.zeros(()))
 
 
 class ValueAndTangents(AbstractSolve):

@@ -111,12 +111,12 @@ class SampledStepRecorder(StepRecorder):
 
     def arriving(self, lane_state: LaneState, steps: StepRecord) -> Float[Array, "iterations components lanes"]:
         assert steps.fixed is not None
-        rows = self.cotangents.states.at[self._cell(lane_state), steps.sample].get(mode="fill", fill_value=0.0)
+        rows = self.cotangents.states.at[self.times.cell_of(lane_state), steps.sample].get(mode="fill", fill_value=0.0)
         # Where the derivative is zero, a NaN cotangent, such as that of theta at the pole, has no effect.
         return jnp.where(steps.fixed, 0.0, jnp.moveaxis(rows, -1, 1))
 
     def share_of_end(self, lane_state: LaneState) -> tuple[Lanes, States]:
-        cell, has_left = self._cell(lane_state), (lane_state.status == LEFT_DOMAIN) & (lane_state.time > 0.0)
+        cell, has_left = self.times.cell_of(lane_state), (lane_state.status == LEFT_DOMAIN) & (lane_state.time > 0.0)
         at_end = jnp.where(lane_state.status == REACHED_END, self.cotangents.end_state[:, cell], 0.0)
         return jnp.where(has_left, self.cotangents.end_time[cell], 0.0), at_end
 
@@ -126,9 +126,6 @@ class SampledStepRecorder(StepRecorder):
         if problem.domain_margin(time, state) is None:
             return jnp.zeros_like(time), state
         return time_of_zero(problem, lambda state: problem.domain_margin(time, state), time, state), state
-
-    def _cell(self, lane_state: LaneState) -> Int[Array, "*lanes"]:
-        return jnp.minimum(lane_state.cell, len(self.cotangents.end_time) - 1)
 
 
 def samples_pulled_back(
@@ -261,7 +258,7 @@ class AbstractSampling(AbstractDifferentiableSolve):
         self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], tangents: tuple[Array, ...]
     ) -> PyTree:
         build, numbers, horizon, spec, _ = self.builder(cells, leaves)
-        directions = [cells_last(part, self.spec.axes[k], cells) for k, part in zip(active, tangents, strict=True)]
+        directions = [_cells_last(part, self.spec.axes[k], cells) for k, part in zip(active, tangents, strict=True)]
         built, direction, size = tangent_along(build, active, numbers, tuple(directions), cells)
         _, (slope,) = self.sampled(built, (direction,), horizon, spec, False)
         return jax.tree.map(lambda part: part * size.reshape(-1, *[1] * (part.ndim - 1)), slope)
@@ -281,7 +278,7 @@ class AbstractSampling(AbstractDifferentiableSolve):
         numbers, spec = leaves[: self.movable], self.whole_spec(leaves)
         times, t1, tolerance = leaves[self.movable : self.movable + 3]
         if self.in_blocks:
-            numbers = tuple(cells_last(number, axes, cells) for number, axes in zip(numbers, spec.axes, strict=True))
+            numbers = tuple(_cells_last(number, axes, cells) for number, axes in zip(numbers, spec.axes, strict=True))
             # One tolerance serves the whole ensemble: the smallest of the batch.
             times, tolerance = times if times.ndim == 1 else times.T, jnp.min(tolerance)
         spec = dataclasses.replace(spec, settings=spec.settings.with_tolerance(tolerance))
@@ -289,7 +286,7 @@ class AbstractSampling(AbstractDifferentiableSolve):
         return build, numbers, (times, t1), spec, cells if self.in_blocks else None
 
 
-def cells_last(number: Float[Array, "..."], axes: int, cells: int) -> Float[Array, "..."]:
+def _cells_last(number: Float[Array, "..."], axes: int, cells: int) -> Float[Array, "..."]:
     """A number of a module, with `axes` axes of its own after an axis of cells if it has one: a scalar, or an array with
     the cells in its last axis."""
     if axes == 0:

@@ -139,6 +139,7 @@ def tangents_by(
         return (*zeros[:k], zeros[k].at[index].set(sizes[k][index]), *zeros[k + 1 :])
 
     def gather(slopes: list[PyTree]) -> list[PyTree]:
+        assert len(slopes) == len(entries)
         remaining = iter(slopes)
 
         def of_leaf(size: Array, shape: tuple[int, ...]) -> PyTree:

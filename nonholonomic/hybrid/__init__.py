@@ -3,10 +3,10 @@ derivatives.
 
 `solve_hybrid` integrates an ensemble of runs, each through the modes of a system; `solve_hybrid_dense` integrates a single
 run with its path, and `hybrid_resets` returns the resets of one. `solve_hybrid_with_tangents` carries tangents through every
-reset by the saltation matrix. With `traced=True`, both functions for ensembles work inside other transformed functions.
-`solve_hybrid_with_samples` returns the states of an ensemble at times, and `hybrid_samples` those of a run inside a
-transformation, both with their derivatives. A run that is not over after `MOST_ROUNDS` modes is `UNRESOLVED`; `BETWEEN`
-is the number of the segment of a `HybridPath` between two modes.
+reset by the saltation matrix. With `traced=True`, `solve_hybrid` and `solve_hybrid_with_tangents` work inside other
+transformed functions. `solve_hybrid_with_samples` returns the states of an ensemble at times, and `hybrid_samples` those of
+a run inside a transformation, both with their derivatives. A run that is not over after `MOST_ROUNDS` modes is `UNRESOLVED`;
+`BETWEEN` is the number of the segment of a `HybridPath` between two modes.
 
 **Example:** two bouncing balls. The event is the highest point: the velocity falls through zero.
 

@@ -35,7 +35,7 @@ Mode = TypeVar("Mode", bound="AbstractBatchedMode")
 
 
 class TransitionPath(NamedTuple):
-    """Path of a single run from one mode to the next, as successive stretches of motion in closed form.
+    """Path from one mode to the next, with the cells last, as successive stretches of motion in closed form.
 
     - `ends`: when each stretch ends [s], counted from the end of the mode; infinite for unused entries.
     - `motions`: for each stretch the argument of `AbstractBatchedMode.between`; the first axis of every leaf counts the
@@ -59,7 +59,7 @@ class Transition(NamedTuple, Generic[Numbers]):
     `status` is `RUNNING` where the motion continues in the mode numbered `mode`, otherwise the code for how it ended;
     `state` is the new state, `elapsed` [s] the duration of the transition, and `crossing_time` [s] the last time of the
     event during the transition, infinite if there was none. `counts` contains the counters, one per row. `record` is
-    the path of a single run (`ensemble.py`); `None` for instantaneous transitions, or where no path is kept. `log_rates` is
+    the path, for the output rows on the way; `None` for instantaneous transitions, or where no path is kept. `log_rates` is
     the sum of the logarithms of the rates of the event functions at the events during the transition; `None` if there
     are none.
 
@@ -252,7 +252,7 @@ def at_start(
         state=state,
         steps=zeros,
         rejected=zeros,
-        extremes=xp.stack([xp.full(shape, xp.inf), *xp.zeros((2, len(mode)))]),
+        extremes=xp.tile(xp.asarray(NO_EXTREMES)[:, None], len(mode)),
         mode=mode,
         counts=xp.zeros((counters, len(mode)), int),
     )
@@ -273,7 +273,6 @@ def one_round(carry: Carry, groups: Sequence[Sequence[int]], solve: Advance, res
     - `groups`: the indices of the modes, in groups; one program serves the modes of a group.
     - `solve`, `reset`: advance the cells to the end of their mode, and through the reset map.
     """
-
     # A cell that changes its mode during the round waits for the next round.
     mode_before = carry[0].mode
     for numbers in groups:
@@ -354,8 +353,9 @@ def after_reset(
 
 @eqx.filter_jit
 def problem_of_cells(
-    mode: AbstractBatchedMode, cell: Int[Numbers, " cells"], state: Float[Numbers, "components cells"]
+    mode: AbstractBatchedMode, cell: Int[Numbers, " cells"] | int, state: Float[Numbers, "components *cells"]
 ) -> AbstractProblem:
+    """The motion of some cells in a mode; of a single cell as a problem without an axis of cells."""
     return of_cells(mode, cell).problem(jnp.asarray(state))
 
 
@@ -382,7 +382,7 @@ def solve_hybrid(
 
     The loop runs on the host, round by round, with concrete numbers. All calls with the same number of cells, padding
     included, share their compiled programs. If `traced`, the loop is one program, for use inside other transformed functions;
-    in each round, every mode then runs all cells, but the horizon is 0 for cells in another mode.
+    in each round, every mode with a running cell then runs all cells, but the horizon is 0 for cells in another mode.
 
     **Arguments:**
 
@@ -395,7 +395,7 @@ def solve_hybrid(
     - `counters`: number of counters, the rows of `Transition.counts`.
     - `nonterminal`, `n_blocks`: as for `solve_ensemble`.
     - `most_rounds`: a cell that needs more ends as `UNRESOLVED`.
-    - `traced`: whether numbers may be traced, except that of `cells`.
+    - `traced`: whether numbers may be traced.
 
     **Returns:** a `HybridOutcome`, of NumPy arrays, or of JAX's if `traced`.
 
@@ -653,12 +653,6 @@ class HybridPath(NamedTuple):
         return np.minimum(np.searchsorted(ends, times), len(ends) - 1)
 
 
-@eqx.filter_jit
-def _problem(mode: AbstractBatchedMode, state: States) -> AbstractProblem:
-    """The motion in a mode of one cell, as a problem without an axis of cells."""
-    return of_cells(mode, 0).problem(state)
-
-
 _shown = eqx.filter_jit(lambda mode, states: mode.shown(states))
 _between = eqx.filter_jit(lambda mode, motion, elapsed: mode.between(motion, elapsed))
 
@@ -707,7 +701,7 @@ def solve_hybrid_dense(
 
     def solve(number: int, _: Int[np.ndarray, "1"], runs: HybridOutcome[np.ndarray]) -> Outcome[np.ndarray]:
         begin, steps = runs.end_time[0].item(), runs.steps[0].item()
-        problem = _problem(modes[number], jnp.asarray(runs.state[:, 0]))
+        problem = problem_of_cells(modes[number], 0, runs.state[:, 0])
         rest = dataclasses.replace(settings, max_steps=settings.max_steps - steps)
         path = follow(problem, t1 - begin, rest, piece=PIECE_OF_MODE)
         end = begin + float(path.times[-1])

@@ -11,7 +11,7 @@ Non-Smooth Mechanical Systems, 2004, ch. 7). The next mode counts its time from 
 the term -f dt of this matrix; the term is added where a time is held fixed.
 
 The rate of the event function at an event is the denominator of the derivative. Where this rate may be zero within the
-tolerance, the event is grazing and the derivative has no correct digits; `GRAZING` counts such events.
+tolerance (`GRAZING`), the event is grazing and the derivative has no correct digits; a counter counts such events.
 """
 
 import math
@@ -270,8 +270,7 @@ def variational_start(state: States, tangents: Tangents) -> States:
     return jnp.concatenate([with_row(part, zero) for part in (state, *variations)])
 
 
-# Ensembles of hybrid runs with the derivatives of the times of their events, which `saltation.py` carries through every
-# change of mode.
+# Ensembles of hybrid runs with the derivatives of the times of their events.
 
 
 class Slopes(NamedTuple, Generic[Numbers]):

@@ -55,17 +55,15 @@ from .ensemble import (
 )
 from .saltation import VariationalMode, along, delay, variational_modes, variational_start
 from .samples import (
-    UNCHANGED,
+    Built,
     HybridSamples,
     Recorded,
+    derivative,
     reset_with_rows,
     sampled_rounds,
     sampled_with_tangents,
     weighted,
 )
-
-#: The modes, the index of the first mode of every cell, and the initial states.
-Built = tuple[tuple[AbstractBatchedMode, ...], Array, States]
 
 #: From some modules (scene, launch, ...), the tolerance and a number of cells to the modes, the index of the first mode
 #: of every cell, and the initial states.
@@ -170,7 +168,7 @@ class HybridSampling(AbstractSampling):
         return True
 
     def differentiable(self, primal: HybridSamples) -> HybridSamples:
-        return HybridSamples(primal.shown, UNCHANGED, primal.end_time, *(UNCHANGED,) * 7)
+        return derivative(primal.shown, primal.end_time)
 
     def pull_back(
         self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], cotangents: HybridSamples

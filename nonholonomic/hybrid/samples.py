@@ -35,6 +35,9 @@ from .ensemble import (
 )
 from .saltation import Tangents, VariationalMode, variational_modes, variational_start
 
+#: The modes, the index of the first mode of every cell, and the initial states.
+Built = tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"], States]
+
 # Output rows of runs between two modes, at given times, for many cells at once.
 
 #: A sample this much later than the last stretch of a transition, as a fraction of the horizon, still belongs to it.
@@ -242,10 +245,6 @@ def output_rows(
     return rows
 
 
-#: In the derivative of `HybridSamples`: the entries that have none.
-UNCHANGED: Any = None
-
-
 class HybridSamples(NamedTuple):
     """Hybrid runs at given times, all floats.
 
@@ -270,6 +269,12 @@ class HybridSamples(NamedTuple):
     rejected: Float[Array, "*cells"]
     extremes: Float[Array, "*cells 3"]
     counts: Float[Array, "*cells kinds"]
+
+
+def derivative(shown: Float[Array, "*cells shown times"], end_time: Float[Array, "*cells"]) -> HybridSamples:
+    """A derivative of `HybridSamples`, of which the other entries have none."""
+    none: Any = None
+    return HybridSamples(shown, none, end_time, *(none,) * 7)
 
 
 @compiled_alone
@@ -308,7 +313,7 @@ def solve_hybrid_with_samples(
 
 
 def sampled_with_tangents(
-    built: tuple[tuple[AbstractBatchedMode, ...], Array, States],
+    built: Built,
     tangents: Tangents,
     horizon: tuple[Array, Array],
     cells: Int[Array, ""] | int,
@@ -336,8 +341,7 @@ def sampled_with_tangents(
             # The variation of the time follows that of the state; a horizon does not move.
             delay = jnp.where(grazes, jnp.nan, ended.state[(k + 1) * (size + 1) + size])
             delay = jnp.where(ended.status == REACHED_END, 0.0, delay)
-            shown = jnp.moveaxis(variation + invalid, -1, 0)
-            slopes.append(HybridSamples(shown, UNCHANGED, delay, *(UNCHANGED,) * 7))
+            slopes.append(derivative(jnp.moveaxis(variation + invalid, -1, 0), delay))
         return samples, slopes
 
     return in_groups(run, tangents)

@@ -221,9 +221,10 @@ def _least_minimum(
 #
 # A step is as long as the motion of the state allows. A user's margin or event function may change faster: waves that a body
 # flies over, an explicit time, a product of distances, a narrow dip. The motion inside a step is a polynomial, whose error
-# is known. Interval arithmetic bounds the function and its slope along parts of it, which are halved until each
-# part is known to have no zero, or one. A function for which there are no bounds, such as one with a loop, is looked at in
-# many places; between them it is a cubic whose error is estimated, and the step is cut where this error could hide a zero.
+# is estimated. Interval arithmetic bounds the function and its slope along parts of it, which are halved until each
+# part is known to have no zero, or one. A function for which there are no bounds, such as one with a loop of unknown length,
+# is looked at in many places; between them it is a cubic whose error is estimated, and the step is cut where this error
+# could hide a zero.
 
 Functions = Float[Array, "functions *lanes"]
 
@@ -234,7 +235,7 @@ STATE_SHARE = 0.25
 #: margin, or a run has just passed its event.
 AT_ZERO = 1e-9
 
-#: The shortest parts that are bounded, as a fraction of the step: where the step begins on a zero, and elsewhere.
+#: The shortest parts that are bounded, as a fraction of the step: at its start, which may be on a zero, and elsewhere.
 SHORTEST_FIRST, SHORTEST = 2.0**-12, 2.0**-30
 
 #: Number of intervals between looks at a function without bounds, and of the intervals on either side whose mismatch counts.
@@ -274,7 +275,7 @@ class Path(NamedTuple):
         return cls(time, length, state, slope, square, cube, bulge)
 
     def error(self, place: Lanes) -> Lanes:
-        """How many times the bulge the error of the state at a place is."""
+        """The error of the state at a place, as a multiple of the bulge."""
         return STATE_SHARE * 16.0 * (place * (1.0 - place)) ** 2
 
     def derivatives(self, place: Lanes) -> list[States]:

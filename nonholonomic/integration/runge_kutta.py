@@ -1,4 +1,4 @@
-"""Explicit Runge-Kutta methods: one step of many lanes by the tableau of any of Diffrax's solvers, and two pairs of orders 8
+"""Explicit Runge-Kutta methods: one step of many lanes by the tableau of any such solver of Diffrax, and two pairs of orders 8
 and 7 whose free weights are tuned to a kind of motion.
 
 The pairs have the thirteen stages, and all simplifying assumptions, of Prince and Dormand's pair RK8(7)13M (High order
@@ -101,7 +101,7 @@ def explicit_step(
     - `tableau`: the method.
     - `field`: (time [s], state) -> rate of the state.
     - `margins`, `crossing`: a function of (time, state) that returns the margins, and a function of (state, rate) that
-      returns the event function; either may be `None`. Their values, one per lane, should stay positive. Both are
+      returns the event function or `None`. Their values, one per lane, should stay positive. Both are
       evaluated at the end of the step and at the stages `looks`. The margins, which may need the whole state, are
       evaluated during these stages. The event function, which may need few components, is evaluated after all stages.
     - `time`, `state`, `rate`: time and state at the start of the step, and the field there.

@@ -117,7 +117,7 @@ class Recorder(eqx.Module):
 class LaneScheduler(eqx.Module):
     """Runs the cells of a problem in lanes; holds their initial states and the settings.
 
-    Leaves of `problem`, `t1`, `atols` and `fresh` are scalars or hold one number per cell in their last axis.
+    Leaves of `problem`, `control.t1`, `atols` and `fresh` are scalars or hold one number per cell in their last axis.
     """
 
     problem: AbstractProblem
@@ -300,8 +300,7 @@ def _fresh_lanes(
     problem: AbstractProblem, control: Control, states: States, rates: States, lengths: Lanes
 ) -> LaneState:
     """Every cell at its start; a cell that starts beyond the event or outside the domain has ended."""
-    zero = jnp.zeros_like(lengths)
-    false = jnp.zeros(lengths.shape, bool)
+    zero, zeros, false = jnp.zeros_like(lengths), jnp.zeros(lengths.shape, int), jnp.zeros(lengths.shape, bool)
     if problem.direction_decides:
         before_event = _holds(problem, problem.event_function, states, rates, lengths)
         lost, margin = problem.lost_at_start(states), problem.domain_margin(zero, states)
@@ -324,7 +323,6 @@ def _fresh_lanes(
         if domain_margin is not None:
             status = jnp.where(domain_margin <= 0.0, LEFT_DOMAIN, status)
         crossing_time = jnp.where(is_beyond, zero, jnp.inf)
-    zero, zeros = jnp.zeros_like(lengths), jnp.zeros(lengths.shape, int)
     return LaneState(
         cell=jnp.arange(lengths.shape[0]),
         status=status,
@@ -337,7 +335,7 @@ def _fresh_lanes(
         margins=stop_gradient(jnp.stack(margins)) if (margins := problem.margins(zero, states)) else None,
         first_crossing=crossing_time,
         crossing_time=crossing_time,
-        bracketing=jnp.zeros(lengths.shape, bool),
+        bracketing=false,
         bracket=Bracket(zero, zero, zero, zero, zero, zeros),
         steps=zeros,
         rejected=zeros,

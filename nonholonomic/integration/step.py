@@ -203,7 +203,7 @@ def after_step(
     error, margin = stored(error, stop_gradient(trial.margin))
     is_known = jnp.isfinite(error)
     # A step to a state that is not finite counts as one with a huge error.
-    error = jnp.where(jnp.isfinite(error) & ~jnp.isnan(margin), error, jnp.inf)
+    error = jnp.where(is_known & ~jnp.isnan(margin), error, jnp.inf)
     accurate = error <= 1.0
     # Negative inside the step: end the step there and check again, so that the first of several events is located.
     fast_margins, fast_event = problem.fast

@@ -51,6 +51,15 @@ def test_zeros_are_not_computed_with():
     assert "add" not in [equation.primitive.name for equation in jaxpr.eqns]
 
 
+def test_an_empty_sum_is_zero_and_an_empty_product_is_one():
+    def empty(*parts):
+        none = jnp.stack(parts)[:0]
+        return parts[0] + jnp.sum(none), parts[0] * jnp.prod(none), parts[0] + jnp.all(none > 0.0) - jnp.any(none > 0.0)
+
+    for result, expected in zip(by_components(empty, *SCALARS)(*LANES), (0.0, 0.0, 1.0), strict=True):
+        assert_close(result, LANES[0] + expected)
+
+
 def hidden_in_zeros(*parts):
     """Two roots: one is multiplied only by zeros of a matrix, the other is also a term elsewhere."""
     vector = jnp.stack([jnp.sqrt(parts[0]), jnp.sqrt(parts[3]), parts[2]])
