@@ -226,7 +226,7 @@ MEMBERS = {
     "nonholonomic.hybrid.Segment": "at",
     "nonholonomic.derivatives.VariationalProblem": "parts",
     "nonholonomic.sweeps.Quantity": "of",
-    "nonholonomic.identification.AbstractRecording": "columns size seen labels series_units measurements",
+    "nonholonomic.identification.AbstractRecording": "columns size seen labels measurements",
     "nonholonomic.identification.Quantities": "of",
     "nonholonomic.identification.LogDensity": "of names units start values predict replicate",
     "nonholonomic.sweeps.Tabular": "readable portrait_axes to_table to_xarray save portrait",

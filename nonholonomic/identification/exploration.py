@@ -87,7 +87,8 @@ def _by_error(measurements: Measurements, prediction: np.ndarray, residual: np.n
 #: Degrees of freedom of the components: tails heavier than those of a posterior, and a finite covariance.
 FREEDOM = 5.0
 
-#: Nodes of each component for draws of a single unknown, equally spaced in the logit of the probability between these.
+#: Number of nodes of each component for draws of a single unknown; they are equally spaced in the logit of the probability,
+#: from -`TAIL` to `TAIL`.
 NODES, TAIL = 201, 12.0
 
 #: Iterations of expectation maximisation, and the fraction of the whole covariance that is added to each component's.
@@ -307,15 +308,15 @@ def _ends(name: str, unknown: Free, spread: float, duration: float) -> tuple[flo
     return float(unknown.coordinate(low)), float(unknown.coordinate(max(high, low + margin)))
 
 
-#: Number of points in a round; all rounds use one program. A round of the search by slopes uses fewer.
+#: Greatest number of points that are evaluated together, and of points in a round; the program of the priors has as many rows.
 ROWS = 512
 
 #: An exploration ends with at least this many effective draws and a shape k of the weights below `MOST_K`, or after
 #: `ROUNDS` rounds.
 ENOUGH, MOST_K, ROUNDS = 400.0, 0.7, 40
 
-#: Effective number of points to which the likelihood is tempered, for each unknown; with several unknowns, at least; half of
-#: the first number with a single unknown.
+#: The likelihood is tempered to this effective number of points for each unknown, and to at least the second number in all;
+#: with a single unknown, to half of the first number.
 TEMPERED, LEAST_TEMPERED = 20.0, 80.0
 
 #: A draw from one of many intervals of equal probability is worth at most so many independent ones: the ends of an interval of
@@ -328,7 +329,7 @@ GROUPS, FRONT = 32, 8
 #: Components of the proposals, and the share of the draws that the ends of the search by slopes keep.
 COMPONENTS, KEPT = 16, 0.15
 
-#: The density falls towards an end if its logarithm is there less by this.
+#: The density falls towards an end of the range if its logarithm is there less than its maximum by more than this.
 FALL = 2.0
 
 #: An unknown does not act if it changes predictions by less than this part of their errors.
@@ -432,15 +433,16 @@ class Explorer(NamedTuple):
 
     def acting(self, pool: Pool) -> Bool[np.ndarray, " unknowns"]:
         """Which unknowns act: moved from one of the two best points to the farther end of its range, such an unknown changes a
-        prediction. Unknowns with a prior or between two bounds need not act: their posterior has an end."""
+        prediction; a single unknown changes it from the best point to another one of the pool. Unknowns with a prior or
+        between two bounds need not act: their posterior has an end."""
         middle, half_width = self.region.middle, self.region.half_width
-        points = pool.points[pool.most_probable(2)]
-        moved = np.repeat(points[:, None], len(middle), axis=1)
-        ends = middle + np.where(points > middle, -half_width, half_width)
-        np.einsum("bkk->bk", moved)[:] = ends
         if len(middle) == 1:
             base, others = pool.predictions[pool.most_probable(1), None], pool.predictions[:, None]
         else:
+            points = pool.points[pool.most_probable(2)]
+            moved = np.repeat(points[:, None], len(middle), axis=1)
+            ends = middle + np.where(points > middle, -half_width, half_width)
+            np.einsum("bkk->bk", moved)[:] = ends
             predictions = self.density.predictions(np.concatenate([points, moved.reshape(-1, len(middle))]))
             base, others = predictions[: len(points), None], predictions[len(points) :].reshape(*ends.shape, -1)
         with np.errstate(invalid="ignore"):

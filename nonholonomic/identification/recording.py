@@ -215,11 +215,6 @@ class AbstractRecording(eqx.Module):
         """Labels for a picture, which has the times below its curves."""
         return self.labels
 
-    @property
-    def series_units(self) -> tuple[str, ...]:
-        """The unit of each column, which is a series of the measurements; "1" where only the model knows it."""
-        return tuple(self.quantities.units.get(name, "1") for name in self.columns)
-
     def units_of(self, model: "AbstractModel") -> tuple[str, ...]:
         """The unit of each series, for the model of the run."""
         names = (self.quantities.place(column)[0] for column in self.columns)

@@ -344,11 +344,11 @@ def identify(
 ) -> Identification:
     """Find the parameters of a model that make measurements most likely, and how far the measurements determine them.
 
-    The search has three steps, all in batches. It compares quasi-random candidates in a region around the start values, 64 for
-    a single unknown and up to 512 for several, refines the best by Levenberg-Marquardt (`search.py`), and explores the
-    likelihood around all minima by adaptive importance sampling (`exploration.py`), until errors and intervals rest on at
-    least 400 effective draws. Slopes make the search fast; they do not enter errors and intervals unless the likelihood is
-    that of a linear model.
+    The search has three steps, all in batches. It compares quasi-random candidates in a region around the start values, 64
+    for a single unknown (128 for recordings) and up to 512 for several, refines the best by Levenberg-Marquardt
+    (`search.py`), and explores the likelihood around all minima by adaptive importance sampling (`exploration.py`), until
+    errors and intervals rest on at least 400 effective draws. Slopes make the search fast; they do not enter errors and
+    intervals unless the likelihood is that of a linear model.
 
     **Arguments:**
 
@@ -475,10 +475,9 @@ class Draws(NamedTuple):
         """Draws at given coordinates, with diagnostics. **Arguments:** `excess`: of the log density at the start over the
         median of the draws."""
         values = ByName((name, np.asarray(value)) for name, value in density.values(jnp.asarray(coordinates)).items())
-        draws = map(np.asarray, _diagnosed(coordinates))
-        # For a single unknown, these are numbers instead of lists.
-        draws_by_name = (ByName(zip(density.names, numbers.reshape(-1).tolist(), strict=True)) for numbers in draws)
-        r_hat, ess = draws_by_name
+        # For a single unknown, the diagnostics are numbers instead of lists.
+        diagnostics = (np.ravel(numbers).tolist() for numbers in _diagnosed(coordinates))
+        r_hat, ess = (ByName(zip(density.names, numbers, strict=True)) for numbers in diagnostics)
         flaws, concerns = _judged(ess, len(coordinates), accepted), ()
         if excess > FAR_BELOW + len(ess):
             concerns = (

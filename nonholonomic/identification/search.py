@@ -288,21 +288,26 @@ class Minima(NamedTuple):
     def agree(self) -> int:
         """The number of ends that are at the best minimum."""
         errors = np.sqrt(np.diag(self.covariance(self.best)))
+        # Failed ends are infinite.
         with np.errstate(invalid="ignore"):
             distances = np.abs(self.coordinates - self.coordinates[self.best]) / errors
+            excess = self.deviance - np.min(self.deviance)
         # Parameters of infinite error are ignored: their value does not matter.
         is_close = np.all(np.where(np.isfinite(errors), distances, 0.0) < CLOSE, axis=1)
-        excess = self.deviance - np.min(self.deviance)
         return int(np.sum((is_close | (excess < SAME)) & (excess < 1.0)))
 
-    def joined(self, other: "Minima") -> "Minima":
-        """The best of the ends of two searches, as many as this one has."""
-        rows = len(self.starts)
-        order = np.argsort(np.concatenate([self.deviance, other.deviance]), kind="stable")[:rows]
-        starts, coordinates, converged, linearised = jax.tree.map(
-            lambda mine, others: np.concatenate([mine, others])[order], self[:4], other[:4]
-        )
-        return Minima(starts, coordinates, converged, linearised, self.measurements)
+    def joined(self, problem: Problem, other: "Minima") -> "Minima":
+        """The best of the ends of two searches, as many as this one has.
+
+        Each search has estimated unknown errors for itself, and -2 log likelihoods with different errors cannot be compared:
+        both are compared with the errors of the search that is the better one with the errors of this one.
+        """
+        is_better = np.min(other.weighed(problem, self.measurements).deviance) < np.min(self.deviance)
+        measurements = other.measurements if is_better else self.measurements
+        pair = self.weighed(problem, measurements), other.weighed(problem, measurements)
+        order = np.argsort(np.concatenate([minima.deviance for minima in pair]), kind="stable")[: len(self.starts)]
+        ends = jax.tree.map(lambda *parts: np.concatenate(parts)[order], *(minima[:4] for minima in pair))
+        return Minima(*ends, measurements)
 
     def with_rows(self, rows: Int[np.ndarray, " few"], later: "Minima") -> "Minima":
         """These minima, of which some rows were fitted further."""
@@ -336,6 +341,8 @@ class Minima(NamedTuple):
 
     def weighed(self, problem: Problem, measurements: Measurements) -> "Minima":
         """The same ends, compared with measurements of other errors."""
+        if measurements is self.measurements:
+            return self
         at_ends = self.linearised
         at_ends = weighed(problem, self.coordinates, at_ends.prediction, at_ends.slopes, measurements)
         return self._replace(linearised=at_ends, measurements=measurements)
@@ -374,8 +381,8 @@ def refine(
     **Arguments:** `in_parts`: whether recordings are also fitted in stages, of which the better of the two ends counts;
     predicted late samples can be wrong by whole turns, and would then lead to another minimum; the others as for `minimise`.
     """
-    duration = float(np.max(np.asarray(measurements.time)))
-    if in_parts and duration > 0.0:
+    if in_parts:
+        duration = float(np.max(np.asarray(measurements.time)))
         steps, coordinates = min(max_steps, AT_ONCE), starts
         minima = minimise(problem, starts, measurements, max_steps=steps, progress=progress)
         for part in PARTS:
@@ -476,7 +483,8 @@ def search(
     minima = refine(problem, pool.candidates(starts), measurements, steps, progress, in_parts=recorded)
     if recorded:
         between = minima.between()
-        minima = minima.joined(refine(problem, between, minima.measurements, min(max_steps, BETWEEN), progress))
+        later = refine(problem, between, minima.measurements, min(max_steps, BETWEEN), progress)
+        minima = minima.joined(problem, later)
     # Along a direction without any slope, the likelihood has no end that an exploration could find.
     has_end = bool(np.all(np.isfinite(minima.covariance(minima.best))))
     sample = explorer.explore(pool, minima.components, progress) if has_end else Weighted.of(pool)
@@ -515,7 +523,8 @@ def _refuse_milliseconds(explorer: Explorer, pool: Pool | None) -> None:
     model = problem.model.with_recorded(shorter)
     off = predictions(eqx.tree_at(lambda problem: problem.model, problem, model), points) - value
     off = off - measurements.whole_periods(off)
-    least = np.min(np.sum((off / error)[:, is_sample] ** 2, axis=1))
+    # Candidates whose runs fail have no prediction.
+    least = np.fmin.reduce(np.sum((off / error)[:, is_sample] ** 2, axis=1))
     parts = [(value / error)[is_sample & (series == number)] for number in np.unique(series[is_sample])]
     if least < EXPLAINED * sum(part.size * np.var(part) for part in parts):
         raise ValueError(
@@ -531,8 +540,8 @@ def _improved(problem: Problem, minima: Minima, sample: Weighted, max_steps: int
     deviance = deviances(problem, pool.points[order], pool.predictions[order], minima.measurements)
     if np.min(deviance) < np.min(minima.deviance) - IMPROVED:
         later = refine(problem, pool.points[order], minima.measurements, min(max_steps, FEW_STEPS), progress)
-        is_better = np.min(later.deviance) < np.min(minima.deviance)
-        return minima.weighed(problem, later.measurements).joined(later) if is_better else minima
+        is_better = np.min(later.weighed(problem, minima.measurements).deviance) < np.min(minima.deviance)
+        return minima.joined(problem, later) if is_better else minima
     if minima.converged[minima.best]:
         return minima
     rows = np.argsort(minima.deviance)[:count]

@@ -591,7 +591,8 @@ def posterior_of_runs(
     model, measurements, _, unknowns = prepared(system, data, free, expected, tolerance)
     if priors is not None and not isinstance(priors, dict):
         raise ValueError(
-            f"priors = {shown(priors)} must be a dictionary, name of a number -> (mean, standard deviation)"
+            f"priors = {shown(priors)} must be a dictionary, name of a number -> (mean, standard deviation), only the standard "
+            "deviation, or a function"
         )
     by_name = {full_name("priors", name, list(unknowns)): prior for name, prior in (priors or {}).items()}
     return LogDensity.of(model, measurements, unknowns, by_name, model.series_units, model.slopes(unknowns))

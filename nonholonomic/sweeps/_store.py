@@ -414,7 +414,7 @@ class ChunkStore:
                 file.unlink()
         stored = Stored(self.path) if self.path.exists() else None
         header = self.folder / HEADER
-        table = stored or (Stored(header) if header.exists() else None)
+        table = Stored(header) if stored is None and header.exists() else stored
         if table is not None:
             self._check(table)
             # The table records the versions with which it was begun; words added since then follow its own words.
@@ -632,6 +632,9 @@ def difference_between(old: Layout, new: Layout) -> str | None:
     if "status" in in_file:
         return "it is a single run, not a table of many"
     old_versions, new_versions = old.versions, new.versions
+    if old_versions.get("nonholonomic") != new_versions.get("nonholonomic"):
+        texts = [of.get("nonholonomic") for of in (old_versions, new_versions)]
+        return f"nonholonomic is {texts[0]} in the file and {texts[1]} here"
     # Another version of JAX may write the same equations in other words.
     ignored = () if old_versions.get("jax") == new_versions.get("jax") else (EQUATIONS,)
     for name in dict.fromkeys([*in_file, *in_call]):
@@ -647,9 +650,6 @@ def difference_between(old: Layout, new: Layout) -> str | None:
             return f"the axis {name} differs"
     if list(old.coords) != list(new.coords):
         return f"its axes are {', '.join(old.coords)}"
-    if old_versions.get("nonholonomic") != new_versions.get("nonholonomic"):
-        texts = [of.get("nonholonomic") for of in (old_versions, new_versions)]
-        return f"nonholonomic is {texts[0]} in the file and {texts[1]} here"
     if (old.kinds, old.inner, old.chunk) != (new.kinds, new.inner, new.chunk):
         return f"it was not written by a sweep in {new.chunks} chunks"
     return None

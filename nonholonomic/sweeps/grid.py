@@ -110,13 +110,9 @@ class Layout(NamedTuple):
         return cells * sum(kind.itemsize * math.prod(self.inner_shape(name)) for name, kind in self.kinds.items())
 
 
-def attributes_of(request: dict[str, object], axes: list[str], long_names: dict[str, str]) -> dict[str, str]:
-    """The attributes of a table: what was computed, over which axes, with which versions, and the long names."""
-    attributes = {
-        "request": json.dumps(request, default=repr),
-        "axes": json.dumps(axes),
-        "versions": json.dumps(versions()),
-    }
+def attributes_of(request: str, axes: list[str], long_names: dict[str, str]) -> dict[str, str]:
+    """The attributes of a table: what was computed, in JSON, over which axes, with which versions, and the long names."""
+    attributes = {"request": request, "axes": json.dumps(axes), "versions": json.dumps(versions())}
     return attributes | ({LONG_NAMES: json.dumps(long_names, sort_keys=True)} if long_names else {})
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import itertools
+import json
 import os
 import pickle
 import signal
@@ -262,7 +263,7 @@ def layout_of(
     long_names = {variable.name: variable.long_name for variable in (*axes, *inner)}
     long_names |= {name: variable.long_name for name, variable in variables.items()}
     attributes = attributes_of(
-        request | {"float": str(np.dtype(jnp.result_type(float)))},
+        json.dumps(request | {"float": str(np.dtype(jnp.result_type(float)))}),
         [variable.name for variable in axes],
         {name: long_name for name, long_name in long_names.items() if long_name},
     )

@@ -185,13 +185,13 @@ class Table(eqx.Module):
             return np.broadcast_to(expanded, shape).reshape(-1)
 
         columns, units = {dim: column(self.coords[dim], (dim,)) for dim in dims}, dict(self.units)
-        for name in self.variables:
+        for name, whole in self.variables.items():
             own_dims = self.dims(name)
             components = [dim for dim in own_dims if dim in component_dims]
             for index in np.ndindex(*(len(self.coords[dim]) for dim in components)):
                 place = dict(zip(components, index, strict=True))
                 column_name = ".".join([name, *(str(self.coords[dim][k]) for dim, k in place.items())])
-                values = self.variables[name][tuple(place.get(dim, slice(None)) for dim in own_dims)]
+                values = whole[tuple(place.get(dim, slice(None)) for dim in own_dims)]
                 columns[column_name] = column(values, tuple(dim for dim in own_dims if dim not in place))
                 if name in units:
                     units[column_name] = units[name]
@@ -315,8 +315,8 @@ class Table(eqx.Module):
         chosen = [next(iter(self.variables)) if name is None else str(name).partition(".")[0] for name in names]
         if unit is None or not all(name in self.variables for name in chosen):
             return self
-        drawn = [*dict.fromkeys(chosen), *self.coords]
-        require_unit_of(unit, {name: self.units.get(name, "1") for name in drawn})
+        kept = [*dict.fromkeys(chosen), *self.coords]
+        require_unit_of(unit, {name: self.units.get(name, "1") for name in kept})
         units = {name: in_unit(si, unit) for name, si in self.units.items()}
 
         def converted(values: Mapping[str, Values], names: Sequence[str]) -> dict[str, Values]:
@@ -502,7 +502,7 @@ def run_table(
     long_names = {"time": "time"} | {name: quantity.long_name for name, quantity in quantities.items()}
     units = {"time": "s"} | {name: quantity.unit for name, quantity in quantities.items()}
     inner = {name: (quantity.components,) for name, quantity in quantities.items() if quantity.components is not None}
-    return Table(coords, values, units, attributes_of(request, axes, long_names), inner=inner)
+    return Table(coords, values, units, attributes_of(json.dumps(request, default=repr), axes, long_names), inner=inner)
 
 
 class Tabular(abc.ABC):

@@ -15,6 +15,8 @@ from matplotlib.figure import Figure
 
 from nonholonomic.identification import FitWarning, Free, Measurements, identify
 from nonholonomic.identification.conclusions import normal_scores, runs_of_signs
+from nonholonomic.identification.posterior import Problem
+from nonholonomic.identification.search import refine
 
 T = np.linspace(0.0, 4.0, 115)
 
@@ -130,6 +132,21 @@ def test_estimated_errors_are_those_of_the_scatter():
     assert_close(fit.standard_errors["b"], np.std(value[40:], ddof=1) / math.sqrt(40.0), rtol=0.01)
     assert math.isnan(fit.verdict.p_value)
     assert "the errors were estimated from it" in str(fit)
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_better_of_two_searches_is_that_of_the_smaller_residuals(seed, swapped):
+    """Each search estimates the unknown error for itself, so that both end with the same -2 log likelihood."""
+    value = np.sin(6.0 * T) + 0.5 * np.random.default_rng(seed).normal(size=T.size)
+    data = Measurements(value, 1.0, estimated=True)
+    problem = Problem(oscillation, {"height": Free(1.0), "rate": Free(6.0)})
+    near, far = (refine(problem, np.array([[1.0, rate]]), data, 60, False) for rate in (0.0, 1.0))
+    scatter = [np.std(value - minima.linearised.prediction[0]) for minima in (near, far)]
+    assert scatter[0] < 0.8 * scatter[1]
+    both = far.joined(problem, near) if swapped else near.joined(problem, far)
+    assert_close(both.coordinates[both.best], near.coordinates[0])
+    assert_close(both.measurements.error, near.measurements.error)
 
 
 def test_as_many_unknowns_as_measurements_leave_nothing_to_judge_by():
