@@ -4,6 +4,7 @@ python benchmarks/code_path.py [table] [simulate] [gradient]
 """
 
 import argparse
+import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -76,10 +77,14 @@ def calls() -> dict[str, Callable[[], object]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("calls", nargs="*", choices=[*calls(), []], help="which calls, all by default")
-    print(f"{'call':10s} {'files':>6s} {'functions':>10s} {'moves':>6s}")
-    for name in parser.parse_args().calls or calls():
-        path = code_path(calls()[name])
-        print(f"{name:10s} {path.files:6d} {path.functions:10d} {path.moves:6d}")
+    names = parser.parse_args().calls or [*calls()]
+    if len(names) == 1:
+        path = code_path(calls()[names[0]])
+        print(f"{names[0]}: {path.files} files, {path.functions} functions, {path.moves} moves")
+    else:
+        # In a process of its own, every call is a first one.
+        for name in names:
+            subprocess.run([sys.executable, __file__, name], check=True)
 
 
 if __name__ == "__main__":

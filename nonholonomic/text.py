@@ -8,7 +8,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -145,6 +145,8 @@ UNITS = {
     "1": {"1": 1.0, "%": 1e-2},
 }
 
+#: The unit of drawn numbers, such as "deg", or several for numbers of different dimensions; `None` for SI units.
+Unit: TypeAlias = str | Sequence[str] | None
 
 #: How many numbers of an array are shown; longer arrays show the first and the last ones.
 SHOWN = 4
@@ -174,7 +176,7 @@ def readable_unit(unit: str) -> str:
     return re.sub(r"(?<=[A-Za-z])\d+", lambda power: power[0].translate(_SUPERSCRIPTS), text)
 
 
-def in_unit(si: str, unit: str | Sequence[str] | None) -> tuple[str, float]:
+def in_unit(si: str, unit: Unit) -> tuple[str, float]:
     """The unit in which to show a number in the SI unit `si`, and the factor that converts the number.
 
     **Arguments:** `unit`: one of `UNITS`, such as "deg", or several for numbers of different dimensions, or `None`
@@ -188,13 +190,13 @@ def in_unit(si: str, unit: str | Sequence[str] | None) -> tuple[str, float]:
     return si, 1.0
 
 
-def _with_rates(unit: str | Sequence[str] | None) -> list[str]:
+def _with_rates(unit: Unit) -> list[str]:
     """The units that a user names, and then the rates that they imply."""
     names = [unit] if isinstance(unit, str) else [*(unit or ())]
     return [*names, *(f"{name}/s" for name in names)]
 
 
-def require_unit_of(unit: str | Sequence[str] | None, units: Mapping[str, str]) -> None:
+def require_unit_of(unit: Unit, units: Mapping[str, str]) -> None:
     """Raise `ValueError` if none of the drawn numbers can be shown in a unit, as in lengths for an angle.
 
     **Arguments:** `unit`: as for `in_unit`; `units`: name of a number -> its SI unit.
@@ -331,9 +333,7 @@ def in_lines(title: str, rows: list[tuple[str, str]]) -> str:
     return "\n".join([title, *(f"  {name:{width}}  {text}" for name, text in rows)])
 
 
-def distinguishing_labels(
-    starts: list[tuple[str, ...]], *groups: list[Any], unit: str | Sequence[str] | None = None
-) -> list[str]:
+def distinguishing_labels(starts: list[tuple[str, ...]], *groups: list[Any], unit: Unit = None) -> list[str]:
     """Labels that distinguish runs, by what differs between them only.
 
     **Arguments:** `starts`: for each run, the same number of texts, such as its angle and its spin; `groups`: modules of
@@ -351,7 +351,7 @@ def distinguishing_labels(
     ]
 
 
-def differences(modules: list[Any], unit: str | Sequence[str] | None = None) -> list[list[str]]:
+def differences(modules: list[Any], unit: Unit = None) -> list[list[str]]:
     """What distinguishes each module from the others, as text: its kind, or some of its parameters.
 
     **Arguments:** `unit`: units for their numbers, as for `in_unit`.

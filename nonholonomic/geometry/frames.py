@@ -28,6 +28,7 @@ from .vector import (
     Vector,
     add,
     cross,
+    difference,
     dot,
     multiply,
     planar_length,
@@ -323,7 +324,7 @@ class SphereFrame(AbstractRoundFrame):
 
 def along(n: Vector, direction: Vector) -> tuple[Vector, Vector]:
     """Unit vectors across n: t1 along the projection of a direction onto the tangent plane, and t2 = n x t1."""
-    t1 = unit(sum_vectors(direction, scale(-1.0 * dot(n, direction), n)))
+    t1 = unit(difference(direction, scale(dot(n, direction), n)))
     return t1, cross(n, t1)
 
 

@@ -107,11 +107,11 @@ def second_derivative(function: Callable[..., Component], at: Vector, a: Vector,
 #: Most iterations of a search. Most searches take three to six; ten times as many would not move any point.
 MOST_ITERATIONS = 40
 
-#: Smaller curvatures of the minimised function are raised to this value, relative to the curvature above a flat
-#: surface.
+#: The least curvature of the minimised function, relative to the curvature above a flat surface. If a curvature is smaller,
+#: both are raised by the same amount.
 LEAST_CURVATURE = 0.05
 
-#: A search ends when a step is shorter than this fraction of the distance; the last step squares this error.
+#: A search ends when a step is shorter than this fraction of the unit for steps; the last step squares this error.
 SETTLED = 1e-8
 
 #: Steps shorter than this fraction are accepted without comparing values: the gain is below round-off.
@@ -119,7 +119,8 @@ UNSEEN = 1e-4
 
 
 def newton_step(a: Component, b: Component, c: Component, x: Component, y: Component) -> tuple[Component, Component]:
-    """Solution s of ((a, b), (b, c)) s = (x, y), with smaller eigenvalues raised to `LEAST_CURVATURE`."""
+    """Solution s of ((a, b), (b, c)) s = (x, y), with both eigenvalues raised by the same amount if one is less than
+    `LEAST_CURVATURE`."""
     least_eigenvalue = 0.5 * (a + c) - jnp.sqrt((0.5 * (a - c)) ** 2 + b**2)
     lift = jnp.maximum(LEAST_CURVATURE - jax.lax.stop_gradient(least_eigenvalue), 0.0)
     a, c = a + lift, c + lift
@@ -187,7 +188,8 @@ def descended(
 class AbstractLevel(AbstractGradientSurface):
     """A surface on which a function is zero; bodies are where the function is positive."""
 
-    #: Start points for the search for the nearest point, about a position; its distance is less than 1 in their unit.
+    #: Start points for the search for the nearest point, relative to the position; their unit is an upper bound of its
+    #: distance from the surface.
     starts: ClassVar[Float[np.ndarray, "sectors starts 3"]]
 
     @abc.abstractmethod

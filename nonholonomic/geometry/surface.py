@@ -430,7 +430,7 @@ class AbstractQuadric(AbstractGradientSurface):
         """Equatorial radius A and polar semi-axis c [m]."""
 
     def gradient(self, position: Vector) -> Vector:
-        # N r [1/m] has unit length on the surface.
+        # N r [1/m], half the gradient of r.N r.
         equatorial, polar = self.semi_axes
         across, along = 1.0 / (equatorial * equatorial), 1.0 / (polar * polar)
         return (multiply(across, position[0]), multiply(across, position[1]), multiply(along, position[2]))

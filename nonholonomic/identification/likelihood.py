@@ -385,7 +385,7 @@ def as_free(free: Mapping[str, Free | float], lower: dict[str, float] | None = N
 
     **Raises:** `ValueError` that names the unknown and the problem.
     """
-    if not isinstance(free, dict) or not free:
+    if not isinstance(free, Mapping) or not free:
         raise ValueError(f"free = {shown(free)} must be a non-empty dictionary, name of a number -> start value")
     unknowns = {}
     for name, start in free.items():

@@ -202,7 +202,7 @@ def value_in_lanes(model: AbstractModel, mode: AbstractBatchedMode | None, index
         rows = mode.shown(rows) if rows.ndim == 2 else mode.shown(rows[:, None])[:, 0]
     values = model.read(event.names, time, rows, index)
     leaves, structure = jax.tree.flatten(event)
-    # The components of every value, lane by lane.
+    # Every component of every value, an array over lanes.
     shapes = [value.shape[time.ndim :] for value in values.values()]
     parts = [
         value[(..., *component)]
@@ -502,7 +502,8 @@ _compiled = eqx.filter_jit(time_of_event)
 class EventTime(AbstractDifferentiableSolve):
     """Times of the events of cells. The leaves are the numbers of the model, floats first, the horizon and the tolerance.
 
-    - `structures`, `rest`: the model without its floats and its other numbers; `settings`: without the tolerance.
+    - `movable`: number of floats of the model; `structures`, `rest`: the model without its numbers; `settings`: without the
+      tolerance.
     - `last`: whether the last crossing counts; `unchecked`: whether numbers were traced, so that nothing checked them.
     """
 

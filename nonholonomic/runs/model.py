@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any, ClassVar, Self, TypeAlias
 
 import diffrax
@@ -23,9 +23,6 @@ from ..validation import require_all
 
 #: A single number, or one for each cell.
 Number: TypeAlias = Array | np.ndarray | float
-
-#: Unit of the drawn numbers, such as "deg", or several.
-Unit: TypeAlias = str | Sequence[str] | None
 
 #: The ranges of sliders: name of a parameter -> (lowest, highest) value.
 Sliders: TypeAlias = dict[str, tuple[float, float]]

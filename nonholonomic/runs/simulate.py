@@ -224,7 +224,7 @@ def simulate_model(
 ) -> Trajectory:
     """The run of your own system. It continues through its event, which only its page shows.
 
-    **Arguments:** as for `run_of`; there is no choice of an `adjoint`.
+    **Arguments:** as for `run_of`; `adjoint` is not used.
     """
     times = evenly_spaced(as_known(t1)) if times is None else times
     require_times(times, t1)
@@ -313,7 +313,7 @@ def sampled_if_legal(
     adjoint: diffrax.AbstractAdjoint | None = None,
 ) -> tuple[Bool[Array, ""], SampledRows, Settings]:
     """Whether all numbers, which may be traced, are legal; the run with the rows for all quantities, of zero length if the
-    numbers are not legal; and its settings. **Arguments:** as for `sampled`."""
+    numbers are not legal, unless there is a `grid`; and its settings. **Arguments:** as for `sampled`."""
     is_legal, horizon, tolerance = legal_run(model.legal(), t1, settings.tolerance, times)
     if grid is None:
         t1, times = horizon, jnp.where(is_legal, times, 0.0)
@@ -322,7 +322,7 @@ def sampled_if_legal(
         model = nan_unless(is_legal, model)
     settings = settings.with_tolerance(tolerance)
     run = sampled(model, None, times, t1, settings, grid, adjoint)
-    # The derivatives of a run of zero length are 0: those of an illegal run are made NaN here.
+    # The derivatives of a run of zero length are 0; here, those of an illegal run become NaN.
     numbers = [leaf for leaf in jax.tree.leaves(model) if eqx.is_inexact_array(leaf)]
     changes = [jnp.where(jnp.isfinite(leaf), leaf - jax.lax.stop_gradient(leaf), 0.0) for leaf in numbers]
     change = jnp.where(is_legal, 0.0, jnp.nan) * sum(map(jnp.sum, changes))

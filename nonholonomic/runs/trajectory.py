@@ -19,12 +19,12 @@ from ..integration.problem import Status, run_bounds
 from ..parameters import of_all_modes
 from ..sweeps import Quantity, Table, Tabular, run_table
 from ..terminal import status_line
-from ..text import as_text, batch_title, distinguishing_labels, likely, readable_unit, require_unit, shown
+from ..text import Unit, as_text, batch_title, distinguishing_labels, likely, readable_unit, require_unit, shown
 from ..validation import IN_DEGREES, is_traced, require_all, require_file, require_one_run, times_within
 from ..views import COLOURS, PALE, Arena, Body, Curve, Mesh, Page, Show, Stage, Trace, Viewable, new_figure
 from ..views.explore import Answer, Frame, HybridSimulator, LiveRun, Simulator, Slider, Summary, live_page
 from ..views.stage import curves_in
-from .model import AbstractModel, Sliders, Unit, model_of, run_of
+from .model import AbstractModel, Sliders, model_of, run_of
 
 # A page with sliders that simulates any model in the browser.
 

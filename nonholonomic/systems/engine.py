@@ -96,10 +96,8 @@ class ModeProblem(AbstractProblem):
         return self.states, self.scales
 
     def field(self, time: Lanes, state: States) -> States:
-        if self.form.traits.large[self.mode]:
-            rates = _rates_out_of_line(self.form, self.mode, self.numbers, tuple(state))
-        else:
-            rates = _rates(self.form, self.mode, self.numbers, tuple(state))
+        rates_of = _rates_out_of_line if self.form.traits.large[self.mode] else _rates
+        rates = rates_of(self.form, self.mode, self.numbers, tuple(state))
         clock = (jnp.ones_like(state[0]),) if self.form.traits.depends_on_time else ()
         return jnp.stack((*rates, *clock))
 

@@ -99,8 +99,8 @@ class AbstractSystem(eqx.Module):
     ) -> Float[Array, "..."] | dict[str, Float[Array, ""]] | None:
         """A smooth function that is positive while the system moves freely and falls through zero where it strikes something,
         such as the distance from a wall; several in an array, (k,), or in a dict by name, of which the first to fall counts;
-        `None`, the default, for a system that strikes nothing. An oscillation in time that is
-        faster than the motion can be missed: let `force` contain it.
+        `None`, the default, for a system that strikes nothing. The function may change faster than the motion, as for
+        `AbstractMode.margin`.
         """
         return None
 
@@ -307,10 +307,9 @@ class Hamel(AbstractFormulation):
 class Lagrange(AbstractFormulation):
     """Lagrange's equations with multipliers, G q'' + G' q' = dL/dq + f + W^T lambda, with W q'' + W' q' = 0.
 
-    The state is (q, q'), so one linear system with the metric is solved
-    for the force and the rows of W together. The metric may be singular if it is positive for the allowed rates, as with
-    parts without mass. The Lagrangian must be kinetic minus potential energy. Source:
-    `stroller.md`, section 6, F1.
+    The state is (q, q'), so one linear system with the metric is solved for the force and the rows of W together. The metric
+    may be singular if it is positive for the allowed rates, as with parts without mass. The Lagrangian must be kinetic minus
+    potential energy. Source: `stroller.md`, section 6, F1.
 
     **Arguments:**
 
@@ -357,8 +356,8 @@ def formulation_of(system: AbstractSystem) -> AbstractFormulation:
 
 # Whether runs of a user's system may start: rules for concrete and traced numbers, and their messages.
 
-#: The margin, in units of the greatest component of the start, below zero by more than which a start is outside its mode; and
-#: the largest relative violation of the constraints. In single precision, both are greater.
+#: How far the margin may be below zero at the start, in units of the greatest component of the start or, if that is less
+#: than 1, of 1; and the largest relative violation of the constraints. In single precision, both are greater.
 OUTSIDE = VIOLATION = 1e-9
 
 #: Round-off of the rules in units of the precision of a number of size 1.

@@ -2,8 +2,10 @@
 "use strict";
 window.views = window.views || {};
 (() => {
-  //: Height of the line with the time, width of the margins, greatest width of a film in pixels, and frames between two key frames.
+  //: Height of the line with the time, width of the margins, greatest width of a film in pixels, and most frames between two key frames.
   const HEAD = 28, MARGIN = 8, WIDEST = 1920, KEY_EVERY = 50;
+  //: Longest time between two key frames [s]: a frame states its time since the last one in milliseconds, in 16 bits.
+  const KEY_WITHIN = 30;
   //: Codec (VP9), and its bits per second for each pixel of a frame.
   const CODEC = "vp09.00.41.08", BITS = 4;
 
@@ -87,7 +89,7 @@ window.views = window.views || {};
     player.play(false);
     player.root.classList.add("filming");
     player.seek(times[0]);
-    const canvas = blank(player), bitrate = BITS * canvas.width * canvas.height;
+    const canvas = blank(player), bitrate = BITS * canvas.width * canvas.height, keyEvery = Math.min(KEY_EVERY, Math.ceil(KEY_WITHIN * fps));
     const encoder = new VideoEncoder({
       output: (chunk) => {
         const data = new Uint8Array(chunk.byteLength);
@@ -103,7 +105,7 @@ window.views = window.views || {};
         player.seek(time);
         paint(canvas, player, `${time.toFixed(3)} s${words}`);
         const frame = new VideoFrame(canvas, { timestamp: (1e6 * k) / fps, duration: 1e6 / fps });
-        encoder.encode(frame, { keyFrame: k % KEY_EVERY === 0 });
+        encoder.encode(frame, { keyFrame: k % keyEvery === 0 });
         frame.close();
         if (tell((k + 1) / times.length) === false) break;
         while (encoder.encodeQueueSize > 1) await new Promise((next) => encoder.addEventListener("dequeue", next, { once: true }));

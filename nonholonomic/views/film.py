@@ -6,23 +6,23 @@ A browser without a window records the film: it opens the page, and the page pos
 import abc
 import json
 import os
+import secrets
 import shutil
 import subprocess
 import tempfile
 import time
 from collections.abc import Sequence
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from ..terminal import status_line
-from ..text import require_unit, shown
+from ..text import Unit, require_unit, shown
 from ..validation import replacing, require, require_file, require_increasing, require_package
 from .page import Page, page, script
 from .plot import draw_curves
-from .stage import Stage, Unit, curves_in
+from .stage import Stage, curves_in
 
 # Only for type checkers: matplotlib is optional.
 if TYPE_CHECKING:
@@ -40,14 +40,14 @@ BROWSERS = (
 
 #: Without a graphics card, the processor draws the stages; everything else is then faster without WebGL.
 OPTIONS = (
-    *(
-        "--headless=new",
-        "--no-first-run",
-        "--hide-scrollbars",
-        "--force-device-scale-factor=1",
-        "--disable-dev-shm-usage",
-    ),
-    *("--enable-unsafe-swiftshader", "--disable-gpu-rasterization", "--disable-accelerated-2d-canvas"),
+    "--headless=new",
+    "--no-first-run",
+    "--hide-scrollbars",
+    "--force-device-scale-factor=1",
+    "--disable-dev-shm-usage",
+    "--enable-unsafe-swiftshader",
+    "--disable-gpu-rasterization",
+    "--disable-accelerated-2d-canvas",
     "--disable-gpu-compositing",
 )
 
@@ -57,8 +57,8 @@ WINDOW, HEIGHT, PATIENCE = (1280, 1000), 520, 180.0
 #: The script that records a film; the page posts each frame's share of the film, and the film or an error at the end.
 RECORD = """
 const post = (name, body) => fetch(name, { method: "POST", body });
-views.ready.then((player) => player.film([REQUEST], (share) => { post("/share", String(share)); }))
-  .then((film) => post("/film", film), (error) => post("/error", String(error)));
+views.ready.then((player) => player.film([REQUEST], (share) => { post("share", String(share)); }))
+  .then((film) => post("film", film), (error) => post("error", String(error)));
 """
 
 
@@ -197,69 +197,73 @@ def require_browser() -> str:
     return browser
 
 
-class _Exchange(BaseHTTPRequestHandler):
-    """Serve the page to the browser, and keep what the page posts."""
-
-    server: "_Recorder"
-
-    def do_GET(self) -> None:
-        self._answer(200, self.server.html.encode())
-
-    def do_POST(self) -> None:
-        self.server.posts[self.path] = self.rfile.read(int(self.headers["Content-Length"]))
-        self.server.heard = time.monotonic()
-        self._answer(204, b"")
-
-    def _answer(self, status: int, body: bytes) -> None:
-        self.send_response(status)
-        self.send_header("Content-Type", "text/html; charset=utf-8")
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        self.wfile.write(body)
-
-    def log_message(self, format: str, *args: object) -> None:
-        """Print nothing."""
-
-
-class _Recorder(ThreadingHTTPServer):
-    """A server of one page: `posts` are the contents that the page has posted by their names, and `heard` is the time of the
-    last one."""
-
-    #: How long one request is waited for [s].
-    timeout = 0.2
-
-    def __init__(self, html: str):
-        super().__init__(("127.0.0.1", 0), _Exchange)
-        self.html, self.posts, self.heard = html, dict[str, bytes](), time.monotonic()
-
-
 def recorded(html_page: Page, browser: str) -> bytes:
-    """The film that a page posts at "/film" when a browser opens it without a window.
+    """The film that a page posts as "film" when a browser opens it without a window.
 
     **Raises:** `OSError` if the page posts an error, and if the browser ends or stays silent.
     """
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile, _Recorder(html_page.html) as server:
+    # Imported here, because most programs make no film.
+    from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+    # Only the browser knows the folder, so that no other program can read the page or post a film.
+    folder, html = f"/{secrets.token_urlsafe()}/", html_page.html.encode()
+    posts: dict[str, bytes] = {}
+    heard = time.monotonic()
+
+    class Exchange(BaseHTTPRequestHandler):
+        """Serve the page to the browser, and keep what the page posts, by its name."""
+
+        def do_GET(self) -> None:
+            nonlocal heard
+            is_post = self.command == "POST"
+            body = self.rfile.read(int(self.headers["Content-Length"])) if is_post else b""
+            if not self.path.startswith(folder):
+                return self.send_error(404)
+            if is_post:
+                posts[self.path.removeprefix(folder)] = body
+                heard = time.monotonic()
+            answer = b"" if is_post else html
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.send_header("Content-Length", str(len(answer)))
+            self.end_headers()
+            self.wfile.write(answer)
+
+        do_POST = do_GET
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Print nothing."""
+
+    with (
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile,
+        ThreadingHTTPServer(("127.0.0.1", 0), Exchange) as server,
+    ):
+        # How long `handle_request` waits for a request [s]; then the loop looks after the browser.
+        server.timeout = 0.2
         # Chromium refuses to run as root, as in a container, unless its sandbox is off.
         is_root = hasattr(os, "geteuid") and os.geteuid() == 0
         command = [browser, *OPTIONS, *(["--no-sandbox"] if is_root else [])]
         command += [f"--window-size={WINDOW[0]},{WINDOW[1]}", f"--user-data-dir={profile}"]
-        process = subprocess.Popen(
-            [*command, f"http://127.0.0.1:{server.server_port}/"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
+        command.append(f"http://127.0.0.1:{server.server_port}{folder}")
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
             while True:
                 server.handle_request()
                 # In this order: a browser that has ended has posted all that it will.
                 has_ended = process.poll() is not None
-                if server.posts.keys() & {"/film", "/error"}:
+                if posts.keys() & {"film", "error"}:
                     break
                 if has_ended:
                     raise OSError(f"{browser} ended with the status {process.returncode} before the film was complete")
-                if time.monotonic() - server.heard > PATIENCE:
+                if time.monotonic() - heard > PATIENCE:
                     raise OSError(f"{browser} has drawn nothing for {PATIENCE:g} s")
         finally:
             process.terminate()
-            process.wait()
-    if "/error" in server.posts:
-        raise OSError(f"{browser} cannot record the page: {server.posts['/error'].decode()}")
-    return server.posts["/film"]
+            try:
+                process.wait(10.0)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+    if "error" in posts:
+        raise OSError(f"{browser} cannot record the page: {posts['error'].decode()}")
+    return posts["film"]

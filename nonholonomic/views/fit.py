@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..parameters import short_names
-from ..text import in_unit, readable_unit
+from ..text import Unit, in_unit, readable_unit
 from .plot import new_figure
-from .stage import Unit
 
 # Only for type checkers: matplotlib is optional, and plots stand below tables and fits, which use them.
 if TYPE_CHECKING:

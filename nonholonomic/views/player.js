@@ -115,14 +115,16 @@ window.views = window.views || {};
       this.clock = element("span", controls, { id: "clock" });
       this.speeds = element("select", controls, { id: "speed", title: "speed" });
       for (const [words, factor] of this.facts.speeds) element("option", this.speeds, { textContent: words, value: factor, selected: factor === this.facts.speed });
-      this.savers(controls);
+      // These stay together on a narrow screen.
+      const tools = element("span", controls, { id: "tools" });
+      this.savers(tools);
       if (this.root.requestFullscreen) {
-        element("button", controls, { id: "full", type: "button", textContent: "Full screen", title: "f", onclick: () => this.fullScreen() });
+        element("button", tools, { id: "full", type: "button", textContent: "Full screen", title: "f", onclick: () => this.fullScreen() });
       }
       this.button.textContent = "▶ play";
     }
     // Buttons that save what the page shows: a picture of it, or a film from the time of the slider on.
-    savers(controls) {
+    savers(tools) {
       const { element } = views, words = document.title.trim().replace(/[^\p{L}\p{N}]+/gu, "-").slice(0, 60) || "run";
       const save = (blob, name) => {
         const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: `${words}${name}` });
@@ -130,8 +132,8 @@ window.views = window.views || {};
         setTimeout(() => URL.revokeObjectURL(link.href), 6e4);
       };
       const can = "VideoEncoder" in window;
-      const film = element("button", controls, { id: "save-film", type: "button", innerHTML: "<span>Save </span>film", disabled: !can, title: can ? "record a video from here on" : "this browser cannot make videos" });
-      element("button", controls, { id: "save-picture", type: "button", innerHTML: "<span>Save </span>picture", title: "a PNG file of this moment", onclick: () => {
+      const film = element("button", tools, { id: "save-film", type: "button", innerHTML: "<span>Save </span>film", disabled: !can, title: can ? "record a video from here on" : "this browser cannot make videos" });
+      element("button", tools, { id: "save-picture", type: "button", innerHTML: "<span>Save </span>picture", title: "a PNG file of this moment", onclick: () => {
         this.root.classList.add("filming");
         this.seek(this.now);
         const canvas = views.blank(this);

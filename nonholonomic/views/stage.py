@@ -4,7 +4,6 @@ This module does not depend on tops or strollers. Lengths are in metres in the f
 seconds.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,12 +11,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..geometry import AbstractSurface
-from ..text import in_unit, require_unit_of
+from ..text import Unit, in_unit, require_unit_of
 
 Points = Float[np.ndarray, "times 3"]
-
-#: A unit, or several, as for `in_unit`; `None` for the SI units.
-Unit = str | Sequence[str] | None
 
 
 class Mesh(NamedTuple):

@@ -17,11 +17,11 @@ from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_ve
 from nonholonomic.integration import ImplicitMidpoint, Settings, explicit_tableau, follow, sample
 from nonholonomic.integration.dense import all_crossings
 from nonholonomic.integration.problem import REACHED_END, require_adaptive, require_adjoint, require_times
-from nonholonomic.runs.model import AbstractModel, Unit
+from nonholonomic.runs.model import AbstractModel
 from nonholonomic.runs.simulate import evenly_spaced, sampled_if_legal
 from nonholonomic.runs.trajectory import AbstractRun
 from nonholonomic.sweeps import Quantity, Table, chosen, run_table
-from nonholonomic.text import distinguishing_labels
+from nonholonomic.text import Unit, distinguishing_labels
 from nonholonomic.validation import (
     as_known,
     is_traced,

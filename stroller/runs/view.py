@@ -15,7 +15,7 @@ from nonholonomic.geometry import AbstractQuadric, AbstractSurface
 from nonholonomic.integration import AbstractPassive, ExtendedProblem
 from nonholonomic.integration.problem import Status
 from nonholonomic.parameters import numbers
-from nonholonomic.runs.model import Sliders, Unit
+from nonholonomic.runs.model import Sliders
 from nonholonomic.runs.trajectory import (
     TOLERANCE,
     explore_model,
@@ -26,6 +26,7 @@ from nonholonomic.runs.trajectory import (
     stages_of,
 )
 from nonholonomic.terminal import status_line
+from nonholonomic.text import Unit
 from nonholonomic.views.explore import Frame, LiveRun, Summary, quaternion
 
 from ..model.dynamics import State
@@ -248,7 +249,7 @@ def explore(
     sliders: Sliders | None = None,
     t1: float = 8.0,
     input: Input | None = None,
-    unit: str | Sequence[str] | None = None,
+    unit: Unit = None,
     jumps: Sequence[Any] | Array | None = None,
 ) -> views.Page:
     """Make a page with sliders that simulates the ride in the browser while you move a slider.

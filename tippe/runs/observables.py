@@ -18,10 +18,10 @@ from nonholonomic.integration import DenseSolution
 from nonholonomic.integration.dense import all_crossings
 from nonholonomic.integration.problem import Status
 from nonholonomic.parameters import description
-from nonholonomic.runs.model import AbstractModel, Number, Unit, model_of
+from nonholonomic.runs.model import AbstractModel, Number, model_of
 from nonholonomic.runs.trajectory import AbstractRun
 from nonholonomic.sweeps import Quantity, Table, chosen, run_table
-from nonholonomic.text import distinguishing_labels, in_unit
+from nonholonomic.text import Unit, distinguishing_labels, in_unit
 from nonholonomic.validation import is_traced, require_one_run, times_within
 
 from ..friction import Frictionless

@@ -17,7 +17,7 @@ from nonholonomic.integration import AbstractProblem, Settings, crossing_time
 from nonholonomic.integration.problem import CROSSED, REACHED_END, Status
 from nonholonomic.parameters import numbers, numbers_of, with_numbers
 from nonholonomic.runs.event import Ensemble
-from nonholonomic.runs.model import Sliders, Unit
+from nonholonomic.runs.model import Sliders
 from nonholonomic.runs.table import at_the_end
 from nonholonomic.runs.trajectory import (
     TOLERANCE,
@@ -30,7 +30,7 @@ from nonholonomic.runs.trajectory import (
 )
 from nonholonomic.sweeps import chunk_for
 from nonholonomic.terminal import status_line
-from nonholonomic.text import readable_unit
+from nonholonomic.text import Unit, readable_unit
 from nonholonomic.views.explore import Frame, LiveRun, Summary, quaternion
 
 from ..friction import NoSlip
@@ -255,7 +255,7 @@ def explore(
     path: str | Path | None = None,
     sliders: Sliders | None = None,
     t1: float = 8.0,
-    unit: str | Sequence[str] | None = None,
+    unit: Unit = None,
 ) -> views.Page:
     """Make a page with sliders that simulates the top in the browser while you move a slider. The page is one file that
     needs no network; a notebook shows the returned `Page`. The equations of motion, the Runge-Kutta pair, the step-size
