@@ -367,6 +367,7 @@ MOVES: dict[str, Callable[..., Elements]] = {
     "slice": _sliced,
     "squeeze": _reshaped,
     "stack": lambda equation, *parts: np.stack(parts, axis=equation.params["axis"]),
+    "tile": lambda equation, elements: np.tile(elements, equation.params["reps"]),
     "transpose": lambda equation, elements: np.transpose(elements, equation.params["permutation"]),
 }
 
@@ -483,6 +484,8 @@ def _mapped(equation: Equation, operands: list[Array], own: list[int], size: int
         return jax.lax.broadcast_in_dim(operands[0], (*params["shape"], size), dimensions)
     if name in ("reshape", "expand_dims"):
         return operands[0].reshape(*equation.outvars[0].aval.shape, size)
+    if name == "tile":
+        return jnp.tile(operands[0], (*params["reps"], 1))
     if name == "transpose":
         return jnp.transpose(operands[0], (*params["permutation"], own[0]))
     if name == "slice":

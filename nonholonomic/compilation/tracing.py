@@ -35,7 +35,7 @@ ELEMENTARY = """
     exp2 expand_dims expm1 floor full ge gt integer_pow iota is_finite jit le lgamma log log1p log2 logistic lt max min mul ne
     neg nextafter not one_minus_square optimization_barrier or pad pjit polynomial pow reduce_and reduce_max reduce_min
     reduce_or reduce_prod reduce_sum rem reshape rev round rsqrt select_and_n select_n sign sin sinh slice split sqrt square
-    squeeze stack stop_gradient sub tan tanh transpose unstack xor zeros_like
+    squeeze stack stop_gradient sub tan tanh tile transpose unstack xor zeros_like
 """
 
 
@@ -216,7 +216,7 @@ Kind = Known | Affine | Other
 
 #: Operations that move elements or change nothing: applied to slope and offset alike.
 LINEAR = ["broadcast_in_dim", "reshape", "squeeze", "expand_dims", "slice", "transpose", "rev", "reduce_sum", "neg"]
-LINEAR += ["copy", "copy_p", "stop_gradient", "optimization_barrier"]
+LINEAR += ["copy", "copy_p", "stop_gradient", "optimization_barrier", "tile"]
 COMPARISONS = ["gt", "ge", "lt", "le", "eq", "ne", "lt_to", "le_to"]
 KINKS = ["max", "min", "abs", "sign", "clamp"]
 STAIRS = ["floor", "ceil", "round"]
@@ -418,7 +418,7 @@ GROWING = """
     add add_any and asinh atan broadcast_in_dim cbrt ceil clamp concatenate convert_element_type copy copy_p cummax cummin
     cumsum erf exp exp2 expand_dims expm1 floor full iota log log1p log2 logistic max min optimization_barrier or pad
     reduce_and reduce_max reduce_min reduce_or reduce_sum reshape rev round sign sinh slice split squeeze stack
-    stop_gradient tanh transpose unstack
+    stop_gradient tanh tile transpose unstack
 """
 
 #: Operations that call another traced function; and operations that jump, from one whole number to another.

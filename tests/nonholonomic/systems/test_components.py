@@ -80,10 +80,10 @@ def test_a_number_that_is_not_finite_does_not_disappear_with_the_zeros_of_a_matr
 
 
 def test_what_newer_versions_of_jax_trace_as_one_operation_is_evaluated_number_by_number():
-    """Products by `einsum`, binary logarithms, and the derivatives of inverse functions."""
+    """Products by `einsum`, copies by `tile`, binary logarithms, and the derivatives of inverse functions."""
 
     def function(*parts):
-        vector = jnp.stack(parts[:2])
+        vector = jnp.tile(jnp.stack(parts[:2]), 2)[1:3][::-1]
         slope = jax.grad(lambda x: jnp.arctan(x) + jnp.tanh(x) + jnp.log2(x))
         return jnp.einsum("i,ij,j->", vector, jnp.array([[1.0, 2.0], [2.0, 5.0]]), vector), slope(parts[2])
 

@@ -23,7 +23,7 @@ def shapes(*arguments):
     [
         lambda w, x: jnp.tanh(w @ x + 0.1 * jnp.arange(4.0)),
         lambda w, x: (jnp.max(w @ jnp.outer(x, x), axis=1)[::-1], jnp.sum(w * x) / jnp.linalg.norm(x)),
-        lambda w, x: jnp.concatenate([w.T.reshape(-1)[2:9], jnp.stack([x[0], x[2]]), jnp.ones(2)]),
+        lambda w, x: jnp.concatenate([w.T.reshape(-1)[2:9], jnp.tile(x[::2], 2), jnp.ones(2)]),
         lambda w, x: jnp.where(x[0] > 0.0, jnp.einsum("ij,kj->ik", w, w), jax.nn.softmax(w, axis=0)[:, :1]),
         lambda w, x: jnp.ones(2),
     ],
