@@ -7,17 +7,18 @@ range raise an error; traced numbers out of range make `legal` false and the res
 import contextlib
 import dataclasses
 import functools
+import inspect
 import operator
 import os
 import sys
 import tempfile
 import uuid
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -26,7 +27,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from .text import as_html, contents, in_lines, is_users, likely_fix, one_line, shown
+from .text import as_html, contents, in_lines, is_users, likely, likely_fix, one_line, shown
 
 # Warnings, which point to the user's line.
 
@@ -386,11 +387,51 @@ class Bound(NamedTuple):
         return functools.reduce(jnp.logical_and, conditions)
 
 
-class Bounded(eqx.Module):
+Constructor = TypeVar("Constructor", bound=Callable[..., object])
+
+
+def explaining(constructor: Constructor) -> Constructor:
+    """Let a class method that constructs an object name its arguments where it is called with others, and add the
+    class's advice."""
+
+    @functools.wraps(constructor)
+    def explained(cls: Any, *values: object, **named: object) -> object:
+        try:
+            return constructor(cls, *values, **named)
+        except TypeError:
+            function = cls if constructor.__name__ == "__call__" else getattr(cls, constructor.__name__)
+            signature = inspect.signature(function)
+            try:
+                signature.bind(*values, **named)
+            except TypeError as error:
+                known = signature.parameters
+                takes_all = any(parameter.kind is parameter.VAR_KEYWORD for parameter in known.values())
+                unknown = [name for name in named if name not in known and not takes_all]
+                wrong = [f"{name} = {shown(named[name])} is not among them{likely(name, known)}" for name in unknown]
+                advice = [cls.advice[name] for name in cls.advice if name in unknown or f"'{name}'" in str(error)]
+                words = [
+                    f"{shown(function)} takes {', '.join(known)}",
+                    *(wrong or [str(error)]),
+                    *dict.fromkeys(advice),
+                ]
+                raise TypeError("; ".join(words)) from None
+            raise
+
+    return explained  # pyright: ignore[reportReturnType]
+
+
+#: The metaclass of `Bounded`. For type checkers it is that of `eqx.Module`, whose constructors they know.
+Explaining: Any = type("Explaining", (type(eqx.Module),), {"__call__": explaining(type(eqx.Module).__call__)})
+
+
+class Bounded(eqx.Module, metaclass=Explaining):
     """A module whose numbers have ranges and units; concrete numbers out of range raise an error."""
 
     #: The units of the module's own numbers, by name.
     units: ClassVar[dict[str, str]] = {}
+
+    #: What to do about an argument that is missing, or that the constructor does not have, by name.
+    advice: ClassVar[dict[str, str]] = {}
 
     def bounds(self) -> Iterable[Bound]:
         """The ranges of the module's own numbers, in the order in which they are to be checked.

@@ -245,6 +245,14 @@ REFUSED = {
         lambda: tippe.inversion_table(TOP, theta=0.1, spin=[10**400], t1=1.0),
         "spin is an integer beyond 1.8e308 and must be finite",
     ),
+    "a beginning and an end for a horizon": (
+        lambda: tippe.simulate(TOP, LAUNCH, (0, 8)),
+        "t1 = (0, 8) must be one number, the end of the run [s], which starts at t = 0: did you mean t1=8?",
+    ),
+    "a beginning and an end of a ride": (
+        lambda: stroller.simulate(PRAM, RIDE, np.array([0.0, 8.0])),
+        "t1 = [0, 8] must be one number, the end of the run [s], which starts at t = 0: did you mean t1=8.0?",
+    ),
     "bytes": (lambda: tippe.Viscous(b"1"), "mu = b'1' is not a number"),
     "an unknown variable to draw": (
         lambda: nonholonomic.sweeps.Table({"mu": np.ones(2)}, {"time": np.ones(2)}, {}, {}).plot("tme"),
@@ -368,6 +376,63 @@ def test_a_message_shows_a_traced_number_as_traced():
     texts = []
     jax.jit(lambda x: texts.append(shown((x, 1.0))) or x)(0.3)
     assert texts == ["(traced float64[], 1.0)"]
+
+
+#: Calls with other arguments than those of the constructor, and the message.
+CALLED = {
+    "Coulomb's law without its slip speed": (
+        lambda: tippe.Coulomb(0.3),
+        "Coulomb takes mu, slip_speed; missing a required argument: 'slip_speed'; usual slip speeds are 0.01 to 0.1 m/s, "
+        "as in slip_speed=0.05",
+    ),
+    "Contensou's law without its slip speed": (
+        lambda: tippe.Contensou(0.3, 1e-3),
+        "missing a required argument: 'slip_speed'; usual slip speeds are 0.01 to 0.1 m/s, as in slip_speed=0.05",
+    ),
+    "a spin for revolutions a minute": (
+        lambda: tippe.Launch.degrees(theta=6, spin=20),
+        "missing a required argument: 'rpm'; Launch takes spin in rad/s, Launch.degrees takes rpm: 20 turns a second are "
+        "spin=125.7 or rpm=1200",
+    ),
+    "revolutions a minute for a spin": (
+        lambda: tippe.Launch(theta=0.1, rpm=1200),
+        "rpm = 1200 is not among them; Launch takes spin in rad/s, Launch.degrees takes rpm",
+    ),
+    "a diameter for a radius": (
+        lambda: tippe.Top.turned(diameter=0.04, mass=0.02, stem_radius=0.005),
+        "diameter = 0.04 is not among them; the radius is half the diameter",
+    ),
+    "no moments of inertia": (
+        lambda: tippe.Top(0.02, 0.02),
+        "Top takes mass, radius, offset, I1, I3, stem; missing a required argument: 'offset'; Top.turned computes",
+    ),
+    "a letter less": (
+        lambda: tippe.Cylinder(radus=0.3),
+        "radus = 0.3 is not among them; did you mean 'radius'",
+    ),
+    "a number too many": (lambda: tippe.Viscous(0.3, 0.01), "Viscous takes mu; too many positional arguments"),
+}
+
+
+@pytest.mark.parametrize("name", CALLED)
+def test_a_constructor_names_the_arguments_that_it_takes(name):
+    call, message = CALLED[name]
+    with pytest.raises(TypeError, match=re.escape(message)):
+        call()
+
+
+def test_an_error_within_a_constructor_is_not_taken_for_one_of_its_arguments():
+    class Own(tippe.AbstractFriction):
+        mu: float
+
+        def __check_init__(self):
+            raise TypeError("from within")
+
+        def per_normal_force(self, slip):
+            raise NotImplementedError
+
+    with pytest.raises(TypeError, match="from within"):
+        Own(0.3)
 
 
 @pytest.mark.parametrize("name", REFUSED)

@@ -56,6 +56,9 @@ class ContactLoad(NamedTuple):
 #: Addition to the message about an object that is not a friction law.
 A_LAW = " law, such as tippe.Viscous(0.3) or tippe.Coulomb(mu=0.3, slip_speed=0.01)"
 
+#: What to do where an argument of Coulomb's law is missing.
+ADVICE = {"slip_speed": "usual slip speeds are 0.01 to 0.1 m/s, as in slip_speed=0.05"}
+
 #: A coefficient of friction, and a slip speed [m/s], above which another unit is suspected.
 GREATEST_MU, GREATEST_SLIP_SPEED = 5.0, 5.0
 
@@ -207,6 +210,7 @@ class Coulomb(AbstractFriction):
     """
 
     units: ClassVar[dict[str, str]] = {"mu": "1", "slip_speed": "m s-1"}
+    advice: ClassVar[dict[str, str]] = ADVICE
     isotropic: ClassVar[bool] = True
 
     mu: Float[Array, "..."] = eqx.field(converter=as_number)
@@ -256,6 +260,7 @@ class Contensou(AbstractFriction):
     """
 
     units: ClassVar[dict[str, str]] = {"mu": "1", "contact_radius": "m", "slip_speed": "m s-1"}
+    advice: ClassVar[dict[str, str]] = ADVICE
     uses_spin: ClassVar[bool] = True
     isotropic: ClassVar[bool] = True
 

@@ -554,6 +554,9 @@ def run_bounds(t1: object, tolerance: object) -> Iterator[Bound]:
     >>> [bound.name for bound in run_bounds(t1=5.0, tolerance=1e-9)]
     ['t1', 'tolerance']
     """
+    if isinstance(t1, list | tuple | np.ndarray) and np.shape(t1) == (2,):
+        end = f"the end of the run [s], which starts at t = 0: did you mean t1={shown(t1[1])}?"
+        raise ValueError(f"t1 = {shown(t1)} must be one number, {end}")
     yield Bound(t1, "t1", above=0.0)
     yield tolerance_bound(tolerance)
 

@@ -21,7 +21,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.geometry import Component, Vector, as_function, scale, sum_vectors
 from nonholonomic.text import shown
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require, warn
+from nonholonomic.validation import Bound, Bounded, as_number, explaining, is_traced, require, warn
 
 
 class ContactGeometry(NamedTuple):
@@ -218,6 +218,8 @@ class Top(AbstractBody):
     """
 
     units: ClassVar[dict[str, str]] = {"mass": "kg", "radius": "m", "offset": "m", "I1": "kg m2", "I3": "kg m2"}
+    advice: ClassVar[dict[str, str]] = {"diameter": "the radius is half the diameter"}
+    advice |= dict.fromkeys(("offset", "I1", "I3"), "Top.turned computes offset, I1 and I3 from the shape")
 
     mass: Float[Array, "..."] = eqx.field(converter=as_number)
     radius: Float[Array, "..."] = eqx.field(converter=as_number)
@@ -227,6 +229,7 @@ class Top(AbstractBody):
     stem: Stem | None = None
 
     @classmethod
+    @explaining
     def turned(
         cls,
         radius: ArrayLike,

@@ -32,7 +32,7 @@ from nonholonomic.geometry.surface import as_surface
 from nonholonomic.integration import States
 from nonholonomic.parameters import as_one, numbers
 from nonholonomic.text import likely_fix, shown, suspected_gravity
-from nonholonomic.validation import Bound, Bounded, as_number, largest, require, require_all, require_kind
+from nonholonomic.validation import Bound, Bounded, as_number, explaining, largest, require, require_all, require_kind
 
 from ..friction import A_LAW, AbstractFriction, Frictionless, NoSlip, SetValuedCoulomb, as_law
 from .body import AbstractBody, Top
@@ -52,6 +52,9 @@ from .stick_slip import StickSlip
 
 #: Spins above this [rad/s] suggest revolutions per minute: by hand a top gets 100 to 300 rad/s, 1000 to 3000 rpm.
 FASTEST = 1000.0
+
+#: What to do where the spin is missing, or in another unit.
+SPINS = "Launch takes spin in rad/s, Launch.degrees takes rpm: 20 turns a second are spin=125.7 or rpm=1200"
 
 
 class Launch(Bounded):
@@ -93,6 +96,7 @@ class Launch(Bounded):
 
     units: ClassVar[dict[str, str]] = {"theta": "rad", "spin": "rad s-1", "eta": "rad", "azimuth": "rad"}
     units |= {"place": "m or rad", "velocity": "m s-1", "angular_velocity": "rad s-1"}
+    advice: ClassVar[dict[str, str]] = dict.fromkeys(("spin", "rpm"), SPINS)
 
     theta: Float[Array, "..."] = eqx.field(converter=as_number)
     spin: Float[Array, "..."] = eqx.field(converter=as_number)
@@ -111,6 +115,7 @@ class Launch(Bounded):
     )
 
     @classmethod
+    @explaining
     def degrees(
         cls, theta: ArrayLike, rpm: ArrayLike, *, eta: ArrayLike = 0.0, azimuth: ArrayLike = 0.0, **others: Any
     ) -> "Launch":
