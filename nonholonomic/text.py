@@ -122,7 +122,8 @@ def likely(name: object, known: Iterable[str]) -> str:
 
 
 def likely_fix(value: PyTree, wanted: str = "") -> str:
-    """A hint for a function or a class instead of its result, a body instead of a scene, or a scene instead of a body.
+    """A hint for a function or a class instead of its result, a body or a system instead of a scene, or a scene instead of a
+    body.
 
     **Arguments:** `wanted`: name of the class that the value should have.
     """
@@ -130,6 +131,8 @@ def likely_fix(value: PyTree, wanted: str = "") -> str:
         return f"; did you mean {value.__name__}(...)?"
     if isinstance(value, eqx.Module) and hasattr(value, "body"):
         return "; the body of this scene is its .body"
+    if wanted == "Scene" and hasattr(value, "metric"):
+        return "; nonholonomic.simulate runs a system of your own, and gives gradients to optimise its numbers"
     if wanted == "Scene" and isinstance(value, eqx.Module) and hasattr(value, "mass"):
         return "; put this body into one, as in Scene(body)"
     return f"; did you mean {value.__name__}()?" if inspect.isfunction(value) else ""

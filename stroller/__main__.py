@@ -205,8 +205,13 @@ def stages(parking: Plan, rides: dict[Name, Trajectory]) -> list[Stage]:
 
 
 def simulated(options: argparse.Namespace) -> tuple[Plan, dict[Name, Trajectory], list[str]]:
-    """The plan, the rides, and the lines of their audit and of the plan, which are printed as the rides end."""
-    rides, audits, helm, scenes_to_run = {}, [], Helm(options.force, options.steer, options.period), scenes(options)
+    """The plan, the rides, and the lines of their audit; the plan and the lines are printed as soon as they are known."""
+    rides, audits, helm, scenes_to_run = (
+        {},
+        [HEADING],
+        Helm(options.force, options.steer, options.period),
+        scenes(options),
+    )
     # Compile in parallel, because the compiler uses little more than one core. The two rides of a ground share one program.
     with Progress(len(scenes_to_run) + 2, "ride") as display, ThreadPoolExecutor(2) as threads:
         display.begin()
@@ -216,24 +221,25 @@ def simulated(options: argparse.Namespace) -> tuple[Plan, dict[Name, Trajectory]
             with locks[name[0]]:
                 return audited(options, helm, name)
 
+        planned = threads.submit(parked, options)
         futures = {
             name: threads.submit(in_turn, name) for name in sorted(scenes_to_run, key=lambda name: RIDES.index(name[1]))
         }
         curves = threads.submit(tolerance_curve, options, helm)
-        planned = threads.submit(parked, options)
-        for name in scenes_to_run:
-            rides[name], lines = futures[name].result()
-            audits += lines
+
+        def print_lines(lines: list[str]) -> None:
             with display.aside():
                 print("\n".join(lines), flush=True)
             display.advance(1)
-        curve = ["", *curves.result()]
-        display.advance(1)
+
         parking = planned.result()
-        display.advance(1)
-        curve += ["", f"Parking: {parking}"]
-        with display.aside():
-            print("\n".join(curve), flush=True)
+        print_lines([f"Parking: {parking}", "", HEADING])
+        for name in scenes_to_run:
+            rides[name], lines = futures[name].result()
+            audits += lines
+            print_lines(lines)
+        curve = ["", *curves.result()]
+        print_lines(curve)
     return parking, rides, [*audits, *curve]
 
 
@@ -257,11 +263,12 @@ def computed(options: argparse.Namespace) -> dict[str, bytes]:
                 figure.savefig(options.out / name, dpi=110)
                 files.append(name)
                 pictures.append(f"<h2>{heading}</h2>{picture_as_html(options.out / name)}")
-        audit = "<h2>Energy against work</h2><pre>" + escape("\n".join([HEADING, *audits])) + "</pre>"
-        sections = "".join([*pictures[:1], audit, *pictures[1:]])
+        plan_text, audit = (f"<pre>{escape(text)}</pre>" for text in (str(parking), "\n".join(audits)))
+        sections = "".join([*pictures[:1], plan_text, "<h2>Energy against work</h2>", audit, *pictures[1:]])
         page = page_of_job(lambda: stages(parking, rides), "A stroller parks, and rides", 1.0, sections)
         page.save(options.out / PAGE)
-    return {AUDIT: "\n".join(audits).encode()} | {name: (options.out / name).read_bytes() for name in [*files, PAGE]}
+    printed = "\n".join([f"Parking: {parking}", "", *audits])
+    return {AUDIT: printed.encode()} | {name: (options.out / name).read_bytes() for name in [*files, PAGE]}
 
 
 def write(options: argparse.Namespace) -> Outputs:
@@ -269,7 +276,6 @@ def write(options: argparse.Namespace) -> Outputs:
     cache = enable_compilation_cache()
     facts = "rides", sorted((name, repr(value)) for name, value in vars(options).items() if name != "out")
     require_folder(options.out, "--out")
-    print(HEADING, flush=True)
     read = are_kept(cache, facts)
     files = kept_files(cache, facts, lambda: computed(options))
     paths = {name: options.out / name for name in files if name != AUDIT}

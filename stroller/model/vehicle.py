@@ -366,9 +366,13 @@ def as_place(value: Any) -> tuple[Array, ...]:
 
 
 def suspected_degrees(module: Bounded) -> str | None:
-    """The suspicion that an angle of a module, of those that have usual values, is in degrees; `None` if none is."""
+    """The suspicion that an angle of a module, of those that have usual values, is in degrees; `None` if none is. Raises
+    `ValueError` for an angle beyond a turn."""
     for name, limit in USUAL.items():
-        if (magnitude := largest(getattr(module, name, None))) > limit:
+        if (magnitude := largest(getattr(module, name, None))) > 2.0 * math.pi:
+            value, degrees = shown(getattr(module, name)), IN_DEGREES.format(f"{magnitude:g}")
+            raise ValueError(f"{name} = {value} must be within [-2 pi, 2 pi]{degrees}")
+        if magnitude > limit:
             return f"{name} = {magnitude:g} rad is large{IN_DEGREES.format(f'{magnitude:g}')}"
     return None
 
@@ -393,7 +397,8 @@ class Launch(Bounded):
     - `steering`: angle phi [rad] of the front wheel, positive to the driver's left.
     - `steering_rate`: rate phi' of the steering angle [rad/s].
 
-    **Raises:** `ValueError` for numbers that are not finite, or a place that does not have two or three numbers.
+    **Raises:** `ValueError` for numbers that are not finite, angles beyond 2 pi, or a place that does not have two or three
+    numbers.
 
     **Example:**
 

@@ -18,6 +18,8 @@ from nonholonomic.validation import (
     Bounded,
     as_number,
     as_number_or_none,
+    is_traced,
+    largest,
     require,
     require_all,
     require_kind,
@@ -337,12 +339,12 @@ class Goal(Bounded):
 
 
 def as_range(value: Any) -> Any:
-    """A bound as the pair (-bound, bound); a pair and `None` stay as they are."""
+    """A positive bound as the pair (-bound, bound); a pair, `None` and anything else stay as they are."""
     numbers = as_numbers(value)
     if isinstance(numbers, tuple) or value is None:
         return numbers
     bound = as_number(value)
-    return (-bound, bound) if isinstance(bound, Array) else value
+    return (-bound, bound) if isinstance(bound, Array) and (is_traced(bound) or bound > 0.0) else value
 
 
 class Limits(Bounded):
@@ -382,7 +384,11 @@ class Limits(Bounded):
         for name in self.units:
             value = getattr(self, name)
             if value is not None and not (isinstance(value, tuple) and len(value) == 2):
-                raise ValueError(f"{name} = {shown(value)} must be a bound, such as 1.0, or a pair (low, high)")
+                bound = f"{largest(as_number(value)) or 1.0:g}"
+                raise ValueError(
+                    f"{name} = {shown(value)} must be one positive number, such as {bound} for (-{bound}, {bound}), or a "
+                    "pair (lowest, highest)"
+                )
 
     def suspicion(self) -> str | None:
         return suspected_degrees(self)
@@ -415,6 +421,9 @@ class Limits(Bounded):
 #: Distance to keep from obstacles while planning, in units of the footprint's length: the check examines the ride between the
 #: points at which the optimiser looks.
 RESERVE = 0.04
+
+#: The greatest distance of a goal [wheelbases]: the splines of a plan cannot end a longer drive exactly.
+FARTHEST = 1e5
 
 #: Headings at which a goal without a heading is examined.
 HEADINGS = 72
@@ -574,6 +583,7 @@ def checked_problem(
     in_haste: bool = False,
 ) -> Problem:
     """A planning problem; raises `ValueError` unless its parts are legal and its start and goal are free."""
+    require_kind(scene, "scene", Scene, ", as plans know one vehicle, the Stroller")
     require_run(scene, launch, t1, tolerance, (Scene, Launch), "plan each problem by a call of its own")
     scene.check(launch)
     if scene.heading == "projected" and not isinstance(scene.surface, Plane):
@@ -594,6 +604,11 @@ def checked_problem(
         raise ValueError(f"goal: {error}") from None
     if not np.all(np.isfinite(problem.goal_pose)):
         raise ValueError(f"goal: place = {goal.place} must be on the ground, where it has no finite position")
+    if problem.distance > FARTHEST * float(scene.body.wheelbase):
+        away = f"it is {problem.distance:.3g} m from the launch, more than {FARTHEST:.0f} wheelbases"
+        raise ValueError(
+            f"goal: place = {shown(goal.place)} is too far: {away}; plan a long way in stages, goal by goal"
+        )
     _require_limits(problem)
     _require_free(problem)
     return problem

@@ -109,7 +109,8 @@ class Plan(eqx.Module):
             f"  tried      {len(self.candidates)} candidates",
             *(f"  hindrance  {words}" for words in self.hindrances),
         ]
-        return "\n".join(lines)
+        # A run that failed has no end, and no value of what depends on it.
+        return "\n".join(line for line in lines if " nan " not in line)
 
     def __repr__(self) -> str:
         return str(self)
@@ -229,7 +230,7 @@ def errors_of(run: Trajectory, problem: Problem) -> tuple[float, float, float]:
     """The errors at the end: of the place [m], of the heading [rad] and of the speed [m/s]."""
     goal, axes = problem.goal, problem.scene.surface.axes
     away = np.asarray(run.state[-1, : 2 * axes]) - np.asarray(problem.goal_pose)
-    turn = 0.0 if goal.heading is None else 2.0 * np.arcsin(min(1.0, 0.5 * np.linalg.norm(away[axes:])))
+    turn = 0.0 if goal.heading is None else 2.0 * np.arcsin(np.minimum(1.0, 0.5 * np.linalg.norm(away[axes:])))
     return float(np.linalg.norm(away[:axes])), float(turn), abs(float(run.speed[-1]) - float(goal.speed))
 
 

@@ -11,7 +11,7 @@ import stroller
 from nonholonomic.runs.trajectory import TOLERANCE
 from nonholonomic.views.explore import programs
 from stroller.runs.model import RideModel
-from stroller.runs.view import page_of_ride
+from stroller.runs.view import default_ranges, page_of_ride
 
 pytestmark = needs_browser
 
@@ -113,3 +113,9 @@ def test_what_is_no_slider_is_refused(sliders, message):
     launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
     with pytest.raises(ValueError, match=message):
         stroller.explore(scene_on(stroller.Plane()), launch, sliders=sliders)
+
+
+def test_the_default_sliders_stay_within_a_turn():
+    """A launch refuses angles beyond 2 pi."""
+    launch = stroller.Launch((0.0, 0.0), 6.2, 1.0)
+    assert default_ranges(scene_on(stroller.Plane()), launch)["launch.heading"] == (6.2 - np.pi, 2.0 * np.pi)

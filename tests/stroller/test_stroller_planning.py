@@ -14,6 +14,7 @@ import pytest
 from close import assert_close
 from shortest_paths import dubins, reeds_shepp
 
+import nonholonomic
 import stroller
 from stroller.planning import planner as planner_module
 from stroller.planning.planner import proposed
@@ -338,11 +339,14 @@ def test_with_reverse_the_least_time_is_close_to_the_shortest_path():
 
 
 def test_a_goal_very_far_away_gets_a_reason():
-    """A million metres in 20 s."""
-    _, plan = freely(stroller.Goal((1e6, 1e6)), 20.0, LIMITS)
+    """Ten thousand metres in 20 s; and a run that fails has no end."""
+    _, plan = freely(stroller.Goal((1e4, 1e4)), 20.0, LIMITS)
     assert not plan.reached
     assert "nan" not in str(plan)
-    assert "takes 1.77e+06 s at the limit of the speed" in plan.hindrances[-1]
+    assert "takes 1.77e+04 s at the limit of the speed" in plan.hindrances[-1]
+    failed = dataclasses.replace(plan, errors=(np.nan,) * 3, effort=np.nan, hindrances=("the run ends",))
+    assert "nan" not in str(failed)
+    assert "hindrance  the run ends" in str(failed)
 
 
 WALLED_IN = (stroller.Launch((-2.0, 0.5), 0.0, 0.0), stroller.Goal((0.5, 0.5), 0.0), room(0.0, 1.2, 0.0, 1.0))
@@ -483,6 +487,10 @@ START, GOAL = stroller.Launch((0.7, 0.8), 0.0, 0.0), stroller.Goal((1.9, 0.3), 0
         ({"launch": stroller.Launch((0.7, 0.8), 0.0, 0.0, -1.2)}, "launch.steering = -1.2 must be at least"),
         ({"goal": stroller.Goal((1.9, 0.3), 0.0, speed=-0.7)}, "goal.speed = -0.7 must be at least -0.5"),
         ({"goal": START}, "goal = .* must be a Goal"),
+        (
+            {"goal": stroller.Goal((1e9, 0.3))},
+            r"goal: place = \(1000000000.0, 0.3\) .* 1e\+09 m .* more than 100000 wheelbases; plan a long way in stages",
+        ),
         ({"t1": 0.0}, "t1 = 0.0 must be greater than 0"),
         ({"minimise": "energy"}, "minimise = 'energy' must be one of 'effort', 'time'"),
         (
@@ -501,6 +509,22 @@ def test_a_bad_problem_is_refused_before_anything_compiles(changed, message, cap
     with jax.log_compiles(), pytest.raises(ValueError, match=message):
         stroller.plan(SCENE, **arguments)
     assert not [text for text in caplog.messages if "Finished XLA compilation" in text and "normal" in text]
+
+
+class Sleigh(nonholonomic.AbstractSystem):
+    mass: float = 1.0
+    dimension = 1
+
+    def metric(self, q):
+        return jnp.full((1, 1), self.mass)
+
+
+@pytest.mark.parametrize(
+    ("scene", "fix"), [(BODY, "put this body into one"), (Sleigh(), "nonholonomic.simulate runs a system of your own")]
+)
+def test_plans_know_one_vehicle(scene, fix):
+    with pytest.raises(ValueError, match=f"must be a Scene, as plans know one vehicle, the Stroller; {fix}"):
+        stroller.plan(scene, START, GOAL, 12.0)
 
 
 def test_obstacles_need_x_and_y():
@@ -529,7 +553,15 @@ def test_a_goal_is_on_the_ground():
         (lambda: stroller.Disc((0.0, 0.0), -1.0), "radius = -1.0 must be greater than 0"),
         (lambda: stroller.Footprint(0.5, 0.2, 0.6), "rear = 0.6 must be at most 0.5"),
         (lambda: stroller.Limits(speed=(0.5, -0.5)), r"speed\[1\] = -0.5 must be greater than 0.5"),
-        (lambda: stroller.Limits(speed="fast"), "speed = .* must be a bound"),
+        (
+            lambda: stroller.Limits(speed=-2.0),
+            r"speed = -2.0 must be one positive number, such as 2 for \(-2, 2\), or a pair \(lowest, highest\)",
+        ),
+        (lambda: stroller.Limits(speed="fast"), "speed = .* must be one positive number, such as 1 for"),
+        (lambda: stroller.Limits(steering=45.0), r"steering = \(-45.0, 45.0\) .* did you mean np.radians\(45\)"),
+        (lambda: stroller.Goal((0.0, 0.0), -90.0), r"heading = -90.0 must be within .* did you mean np.radians\(90\)"),
+        (lambda: stroller.Launch((0.0, 0.0), [0.0, 90.0], 1.0), r"heading = \[0, 90\] .* mean np.radians\(90\)"),
+        (lambda: stroller.Launch((0.0, 0.0), 0.0, 1.0, 30.0), r"steering = 30.0 .* did you mean np.radians\(30\)"),
         (lambda: stroller.Goal((0.0, 0.0), within=0.0), "within = 0.0 must be greater than 0"),
         (lambda: stroller.Goal(1.0), "place = 1.0 must be a pair of numbers"),
     ],

@@ -217,12 +217,15 @@ def test_main_job(tmp_path, capsys, monkeypatch):
     audit = [line.split() for line in printed.splitlines() if "midpoint" in line]
     assert len(audit) == 2
     assert all(float(columns[-5]) < 1e-11 for columns in audit)
-    assert "Parking: Plan of 15 s: reaches the goal" in printed
+    # The plan comes first, and the audit of the rides behind it, here and on the page.
+    assert printed.startswith("Parking: Plan of 15 s: reaches the goal")
+    assert printed.index("candidates") < printed.index("residual") < printed.index("midpoint")
     assert all((tmp_path / name).stat().st_size > 10_000 for name in ("parked.png", "rides.png"))
     page = (tmp_path / "index.html").read_text()
     assert 'id="floats"' in page
     assert re.findall(r'"title": "([^"]+)"', page) == ["plan of 15 s: reaches the goal", "inside the spheroid"]
     assert audit[0][-1] in page
+    assert page.index("<pre>Plan of 15 s") < page.index("Energy against work")
     assert f"To see it, open {tmp_path / 'index.html'}" in printed
     with xarray.open_dataset(tmp_path / "rides.h5", engine="h5netcdf") as dataset:
         assert {"ride": 2, "time": 201}.items() <= dict(dataset.sizes).items()
