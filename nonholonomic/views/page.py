@@ -142,16 +142,10 @@ def _view(stages: list[Stage], speed: float, autoplay: bool) -> str:
         "floats": floats.view(np.uint8).reshape(-1, 4).T.tobytes(),
         "whole": whole.tobytes(),
     }
-    return "\n".join(
-        [
-            script(json.dumps(facts), ' type="application/json" id="facts"'),
-            *(
-                script(base64.b64encode(zlib.compress(part, 9)).decode(), f' type="text/plain" id="{name}"')
-                for name, part in data.items()
-            ),
-            *(script(template(name)) for name in SCRIPTS),
-        ]
-    )
+    scripts = [script(json.dumps(facts), ' type="application/json" id="facts"')]
+    for name, part in data.items():
+        scripts.append(script(base64.b64encode(zlib.compress(part, 9)).decode(), f' type="text/plain" id="{name}"'))
+    return "\n".join([*scripts, *(script(template(name)) for name in SCRIPTS)])
 
 
 class _Numbers:

@@ -132,14 +132,10 @@ def curves_in(stages: list[Stage], unit: Unit) -> list[Stage]:
     parts = [label.removesuffix("]").partition(" [") for label in labels]
     require_unit_of(unit, {name: si or "1" for name, _, si in parts})
 
-    return [
-        stage._replace(
-            shows=tuple(
-                show._replace(curves=tuple(curve.drawn_in(unit) for curve in show.curves)) for show in stage.shows
-            )
-        )
-        for stage in stages
-    ]
+    def drawn(show: Show) -> Show:
+        return show._replace(curves=tuple(curve.drawn_in(unit) for curve in show.curves))
+
+    return [stage._replace(shows=tuple(map(drawn, stage.shows))) for stage in stages]
 
 
 #: Colours of a page's runs, for the curves and one half of the body; arrows have other colours.
@@ -191,14 +187,8 @@ def revolved(profile: list[tuple[float, float]] | Float[np.ndarray, "points 2"],
     profile = np.asarray(profile, dtype=float)
     angle = np.linspace(0.0, 2.0 * np.pi, SEGMENTS + 1)
     radius, height = profile.T
-    vertices = np.stack(
-        [
-            radius * np.cos(angle)[:, None],
-            radius * np.sin(angle)[:, None],
-            np.broadcast_to(height, (len(angle), len(height))),
-        ],
-        axis=-1,
-    )
+    corners = radius * np.cos(angle)[:, None], radius * np.sin(angle)[:, None], height
+    vertices = np.stack(np.broadcast_arrays(*corners), axis=-1)
     return Mesh(vertices.reshape(-1, 3), of_grid(len(angle), len(profile)), colour)
 
 
@@ -220,10 +210,7 @@ def striped(profile: Float[np.ndarray, "points 2"], colours: tuple[int, int]) ->
     mesh = revolved(profile, colours[0])
     middles = mesh.vertices[mesh.triangles].mean(axis=1)
     first = np.floor(np.arctan2(middles[:, 1], middles[:, 0]) / np.pi * SECTORS / 2.0).astype(int) % 2 == 0
-    return (
-        Mesh(mesh.vertices, mesh.triangles[first], colours[0]),
-        Mesh(mesh.vertices, mesh.triangles[~first], colours[1]),
-    )
+    return mesh._replace(triangles=mesh.triangles[first]), Mesh(mesh.vertices, mesh.triangles[~first], colours[1])
 
 
 def rod(radius: float, begin: float, end: float, knob: float, colour: int) -> Mesh:
@@ -259,15 +246,9 @@ def wheel(radius: float, width: float, colours: tuple[int, int]) -> tuple[Mesh, 
     edge = [(inner, half), (radius, half), (radius, -half), (inner, -half), (inner, half)]
     tyre = revolved(edge, colours[0])
     rotation = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    spokes = [
-        bar(
-            (-inner * np.cos(a), 0.0, -inner * np.sin(a)),
-            (inner * np.cos(a), 0.0, inner * np.sin(a)),
-            0.35 * half,
-            colour,
-        )
-        for a, colour in zip(np.pi * np.arange(3) / 3.0, (colours[1], colours[0], colours[0]), strict=True)
-    ]
+    ends = [(inner * np.cos(a), 0.0, inner * np.sin(a)) for a in np.pi * np.arange(6) / 3.0]
+    colours_of_spokes = (colours[1], colours[0], colours[0])
+    spokes = [bar(ends[k + 3], ends[k], 0.35 * half, colour) for k, colour in enumerate(colours_of_spokes)]
     return tyre._replace(vertices=tyre.vertices @ rotation), *spokes
 
 
@@ -319,9 +300,8 @@ def arena(
         words.append(text)
     vertices = chart.grid(*np.meshgrid(*sides, indexing="ij")).reshape(-1, 3)
     # One grid for all lines: evaluating a surface is expensive.
-    lines = [(np.full(FINE, mark), sides[1]) for mark in marks[0]] + [
-        (sides[0], np.full(FINE, mark)) for mark in marks[1]
-    ]
+    lines = [(np.full(FINE, mark), sides[1]) for mark in marks[0]]
+    lines += [(sides[0], np.full(FINE, mark)) for mark in marks[1]]
     drawn_lines = tuple(chart.grid(*np.moveaxis(np.array(lines), 1, 0))) if lines else ()
     # The front of the mesh is on the side of the normal at the first point.
     triangles = of_grid(FINE, FINE)

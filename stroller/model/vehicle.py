@@ -369,11 +369,12 @@ def suspected_degrees(module: Bounded) -> str | None:
     """The suspicion that an angle of a module, of those that have usual values, is in degrees; `None` if none is. Raises
     `ValueError` for an angle beyond a turn."""
     for name, limit in USUAL.items():
-        if (magnitude := largest(getattr(module, name, None))) > 2.0 * math.pi:
-            value, degrees = shown(getattr(module, name)), IN_DEGREES.format(f"{magnitude:g}")
-            raise ValueError(f"{name} = {value} must be within [-2 pi, 2 pi]{degrees}")
+        magnitude = largest(getattr(module, name, None))
+        degrees = IN_DEGREES.format(f"{magnitude:g}")
+        if magnitude > 2.0 * math.pi:
+            raise ValueError(f"{name} = {shown(getattr(module, name))} must be within [-2 pi, 2 pi]{degrees}")
         if magnitude > limit:
-            return f"{name} = {magnitude:g} rad is large{IN_DEGREES.format(f'{magnitude:g}')}"
+            return f"{name} = {magnitude:g} rad is large{degrees}"
     return None
 
 

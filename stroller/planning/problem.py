@@ -385,10 +385,8 @@ class Limits(Bounded):
             value = getattr(self, name)
             if value is not None and not (isinstance(value, tuple) and len(value) == 2):
                 bound = f"{largest(as_number(value)) or 1.0:g}"
-                raise ValueError(
-                    f"{name} = {shown(value)} must be one positive number, such as {bound} for (-{bound}, {bound}), or a "
-                    "pair (lowest, highest)"
-                )
+                words = f"one positive number, such as {bound} for (-{bound}, {bound}), or a pair (lowest, highest)"
+                raise ValueError(f"{name} = {shown(value)} must be {words}")
 
     def suspicion(self) -> str | None:
         return suspected_degrees(self)

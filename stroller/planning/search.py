@@ -200,10 +200,8 @@ def driven(
     turn = direction * curvature * length
     heading = poses[..., 2] + turn / 2.0
     chord = direction * length * np.sinc(turn / (2.0 * np.pi))
-    return np.stack(
-        [poses[..., 0] + chord * np.cos(heading), poses[..., 1] + chord * np.sin(heading), poses[..., 2] + turn],
-        axis=-1,
-    )
+    changes = chord * np.cos(heading), chord * np.sin(heading), turn
+    return poses + np.stack(np.broadcast_arrays(*changes), axis=-1)
 
 
 def shortcuts(
@@ -373,10 +371,8 @@ class Search:
         while branch[-1]:
             branch.append(int(self.tree.parent[branch[-1]]))
         branch = branch[::-1]
-        poses, moves = (
-            list(self.tree.pose[branch]),
-            np.concatenate([self.tree.move[branch[1:]], more[more[:, 2] > TIE]]),
-        )
+        poses = list(self.tree.pose[branch])
+        moves = np.concatenate([self.tree.move[branch[1:]], more[more[:, 2] > TIE]])
         for piece in moves[len(branch) - 1 :]:
             poses.append(driven(poses[-1], *piece))
         return Path(np.array(poses), *moves.T)

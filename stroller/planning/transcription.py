@@ -289,8 +289,7 @@ def interval_residuals(
     starts = [first.steering - steering, (first.steering_rate - steering_rate) * duration]
     starts += [(first.front_speed - front_speed) / task.speed]
     away = (poses[1] - goal) / units * jnp.concatenate([jnp.ones(axes), jnp.full(axes, task.has_heading)])
-    ends = [last.steering_rate * duration]
-    ends += [(last.front_speed * jnp.cos(last.steering) - goal_speed) / task.speed]
+    ends = [last.steering_rate * duration, (last.front_speed * jnp.cos(last.steering) - goal_speed) / task.speed]
     equalities = [(poses[1] - end) / units, at_start * (poses[0] - pose) / units, at_start * jnp.stack(starts)]
     equalities += [at_goal * away, at_goal * jnp.stack(ends)]
     bends = splines[0][2] - 2.0 * splines[0][1] + splines[0][0], splines[1][2] - 2.0 * splines[1][1] + splines[1][0]
