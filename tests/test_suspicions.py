@@ -52,7 +52,7 @@ SUSPECTED = {
     ),
     "a mass in g": (
         lambda: tippe.Top.turned(0.021, mass=20.0, cut=0.0155, stem_radius=0.005, stem_length=0.013),
-        "mass = 20 kg in a sphere of radius 0.021 m is denser than any metal: was it in g? 20 g are 0.02 kg",
+        "mass = 20 kg is unusual for a top: was it in g? Then mass=0.02, I1=",
     ),
     "friction in per cent": (
         lambda: tippe.Coulomb(27.0, 0.05),

@@ -68,13 +68,8 @@ TABLE_2 = PrintedTable(0.0, 0.3, tuple(map(Row, THETAS, (25.0, 22.0, *(None,) * 
 TABLE_3 = PrintedTable(math.pi / 2.0, 0.3, tuple(map(Row, THETAS, (23.0, 19.0, 20.0, 22.0, *(None,) * 5))))
 
 #: The arenas by name, and their numbers.
-SURFACES = {
-    "sphere RADIUS": Sphere,
-    "spheroid EQUATORIAL POLAR": Spheroid,
-    "torus RING TUBE": Torus,
-    "paraboloid P": Paraboloid,
-    "plane TILT": Plane,
-}
+SURFACES = {"sphere RADIUS": Sphere, "spheroid EQUATORIAL POLAR": Spheroid, "torus RING TUBE": Torus}
+SURFACES |= {"paraboloid P": Paraboloid, "plane TILT": Plane}
 
 #: Times at which theta is drawn, and the tops on the page.
 SAMPLES = 3000

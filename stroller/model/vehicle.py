@@ -79,14 +79,8 @@ class Stroller(Bounded):
     ```
     """
 
-    units: ClassVar[dict[str, str]] = {
-        "mass": "kg",
-        "wheelbase": "m",
-        "inertia": "kg m2",
-        "steering_inertia": "kg m2",
-        "steering_spring": "N m rad-1",
-        "centre": "m",
-    }
+    units: ClassVar[dict[str, str]] = {"mass": "kg", "wheelbase": "m", "inertia": "kg m2", "steering_inertia": "kg m2"}
+    units |= {"steering_spring": "N m rad-1", "centre": "m"}
 
     mass: Float[Array, "..."] = eqx.field(converter=as_number)
     wheelbase: Float[Array, "..."] = eqx.field(converter=as_number)
@@ -411,13 +405,8 @@ class Launch(Bounded):
     ```
     """
 
-    units: ClassVar[dict[str, str]] = {
-        "place": "m or rad",
-        "heading": "rad",
-        "speed": "m s-1",
-        "steering": "rad",
-        "steering_rate": "rad s-1",
-    }
+    units: ClassVar[dict[str, str]] = {"place": "m or rad", "heading": "rad", "speed": "m s-1", "steering": "rad"}
+    units |= {"steering_rate": "rad s-1"}
 
     place: tuple[Float[Array, "..."], ...] = eqx.field(converter=as_place)
     heading: Float[Array, "..."] = eqx.field(converter=as_number)

@@ -36,23 +36,11 @@ UNITS |= {"tilt": "rad", "radius": "m", "equatorial": "m", "polar": "m", "ring":
 UNITS |= {"scene.friction.steering": "N m s"}
 
 #: Descriptions of the axes.
-LONG_NAMES = {
-    "scene.friction.steering": "damping of the steering",
-    "steering_inertia": "inertia of the fork",
-    "steering_spring": "spring of the fork",
-    "steering": "steering angle φ(0)",
-    "speed": "speed v(0)",
-    "heading": "heading ψ(0)",
-    "steering_rate": "steering rate φ'(0)",
-    "mass": "mass m",
-    "x0": "x(0)",
-    "y0": "y(0)",
-    "z0": "z(0)",
-    "mu0": "μ(0)",
-    "eta0": "η(0)",
-    "force": "drive force",
-    "torque": "steering torque",
-}
+LONG_NAMES = {"scene.friction.steering": "damping of the steering", "steering_inertia": "inertia of the fork"}
+LONG_NAMES |= {"steering_spring": "spring of the fork", "steering": "steering angle φ(0)", "speed": "speed v(0)"}
+LONG_NAMES |= {"heading": "heading ψ(0)", "steering_rate": "steering rate φ'(0)", "mass": "mass m", "x0": "x(0)"}
+LONG_NAMES |= {"y0": "y(0)", "z0": "z(0)", "mu0": "μ(0)", "eta0": "η(0)", "force": "drive force"}
+LONG_NAMES |= {"torque": "steering torque"}
 
 #: The numbers of a ride's end.
 ENDS = {

@@ -1,6 +1,7 @@
 """Tops turned from one material, and those of the literature: mass properties, what is refused, launches in degrees."""
 
 import math
+import re
 
 import jax
 import numpy as np
@@ -114,6 +115,56 @@ def test_a_shape_can_be_differentiated():
 
     step = 1e-5
     assert_close(jax.grad(offset)(0.02), float(offset(0.02 + step) - offset(0.02 - step)) / (2.0 * step), rtol=1e-5)
+
+
+@pytest.mark.parametrize("stem_radius", [0.002, 0.003, 0.004, 0.005, 0.006])
+@pytest.mark.parametrize("hole", [{}, {"hole_radius": 0.012, "hole_depth": 0.02}])
+def test_a_top_is_turned_from_its_mass_its_radius_and_its_stem(stem_radius, hole):
+    """It turns over, and its print says what was assumed, which another spelling of the same shape gives."""
+    top = tippe.Top.turned(0.02, mass=0.018, stem_radius=stem_radius, **hole)
+    assert steady.group(top) == "II"
+    assert "assumed  'cut = 0.35 radius + 1.1 stem_radius, stem_length 5 % beyond where the rim touches'" in str(top)
+    cut = 0.35 * 0.02 + 1.1 * stem_radius
+    length = 1.05 * 0.02 * (0.02 - stem_radius) / cut - cut + stem_radius
+    same = tippe.Top.turned(0.02, mass=0.018, cut=cut, stem_radius=stem_radius, stem_length=length, **hole)
+    assert_close(jax.tree.leaves(top), jax.tree.leaves(same), rtol=1e-12)
+    assert same.assumed is None
+    assert "stem_length 5 %" not in str(tippe.Top.turned(0.02, mass=0.018, stem_radius=0.005, stem_length=0.017))
+    # A copy with another mass is a top of the same shape.
+    assert jax.tree.map(lambda leaf: 2.0 * leaf, top).assumed == top.assumed
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"cut": 0.021},
+        {"cut": -0.015},
+        {"stem_radius": 0.014},
+        {"stem_length": 0.004},
+        {"hole_radius": 0.0},
+        {"hole_depth": 0.032},
+        {"stem_length": 0.0099},
+        {"hole_radius": 0.0, "hole_depth": 0.0, "stem_length": 0.03},
+        {"hole_radius": 0.0, "hole_depth": 0.0, "stem_radius": 0.0075, "cut": None, "stem_length": None},
+        {"radius": 0.0217, "cut": 0.0143, "stem_length": 0.0081},
+    ],
+)
+def test_a_shape_that_cannot_be_turned_is_answered_by_three_digits_with_which_it_can(change):
+    shape = SHAPE | change
+    with pytest.raises(ValueError, match=r"; \w+ = [\d.]+ would do$") as caught:
+        tippe.Top.turned(density=700.0, **shape)
+    message = str(caught.value)
+    assert not re.search(r"\d\.\d{7}", message)
+    name, number = re.search(r"; (\w+) = ([\d.]+) would do$", message).groups()
+    assert len(number.lstrip("0.")) <= 3
+    tippe.Top.turned(density=700.0, **shape | {name: float(number)})
+
+
+def test_a_shape_that_no_single_length_mends_is_refused_without_advice():
+    with pytest.raises(ValueError, match=r"radius = 0.0 must be greater than 0.0$"):
+        tippe.Top.turned(density=700.0, **SHAPE | {"radius": 0.0})
+    with pytest.raises(ValueError, match=r"cut = 'a' is not a number$"):
+        tippe.Top.turned(density=700.0, **SHAPE | {"cut": "a"})
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from nonholonomic.integration.problem import FAILED, LEFT_DOMAIN, REACHED_END
 from tippe.modes.problems import InversionProblem
 
 # Scenes are scaled beyond the size of any top.
-pytestmark = pytest.mark.filterwarnings("ignore:radius = .* is large for a top:UserWarning")
+pytestmark = pytest.mark.filterwarnings("ignore:.* for a top:UserWarning")
 
 #: Examples are drawn in batches of this many lanes, so that one compiled program runs them all.
 LANES = 16

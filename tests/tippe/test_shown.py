@@ -38,16 +38,40 @@ def test_a_scene_tells_its_numbers_with_units():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"radius": 20.0}, "radius = 20 m is large for a top: was it in mm?"),
-        ({"radius": 2.0}, "radius = 2 m is large for a top: was it in cm?"),
-        ({"I1": 29.94, "I3": 32.0}, "I1 = 3.74e+06 m R^2 .* was I1 in g cm.2"),
-        ({"mass": 20.0}, "I1 = 0.000374 m R^2 .* was the mass in g"),
-        ({"I1": [2.994e-6, 1e-3], "I3": 3.2e-6}, "are mass, radius and I1 in kg, m and kg m.2"),
+        ({"radius": 20.0}, "radius = 20 m is unusual for a top: was it in mm? Then radius=0.02"),
+        ({"radius": 2.0}, "radius = 2 m is unusual for a top: was it in cm? Then radius=0.02"),
+        ({"radius": 300.0}, "radius = 300 m is large for a top: was it in mm?"),
+        (
+            {"I1": 29.94, "I3": 32.0},
+            "I1 = 29.94 kg m², I3 = 32 kg m² are unusual for a top: were they in g cm^2? Then I1=2.994e-06",
+        ),
+        ({"mass": 20.0}, "mass = 20 kg is unusual for a top: was it in g? Then mass=0.02"),
+        ({"I1": [2.994e-6, 1e-3], "I3": 3.2e-6}, "are mass, radius and I1 in kg, m and kg m^2"),
+        # All in g and mm, with the moments of inertia in SI units or in g mm^2.
+        (
+            {"mass": 18.0, "radius": 19.0, "offset": 6.0},
+            "mass = 18 kg, radius = 19 m, offset = 6 m are unusual for a top: were they in g and in mm? "
+            "Then mass=0.018, radius=0.019, offset=0.006",
+        ),
+        (
+            {"mass": 18.0, "radius": 19.0, "offset": 6.0, "I1": 2600.0, "I3": 2650.0},
+            "were they in g and in mm? Then mass=0.018, radius=0.019, offset=0.006, I1=2.6e-06, I3=2.65e-06",
+        ),
+        # With the moments of inertia of the top, and computed from the diameter.
+        ({"radius": 0.04}, "radius = 0.04 m is unusual for a top: was it the diameter? Then radius=0.02"),
+        ({"radius": 0.04, "I1": 1.2e-5, "I3": 1.28e-5}, "was it the diameter? Then radius=0.02, I1=3e-06, I3=3.2e-06"),
     ],
 )
 def test_another_unit_is_suspected(change, message):
-    with pytest.warns(UserWarning, match=message.replace("+", r"\+").replace("R^2", r"R\^2").replace("?", r"\?")):
+    with pytest.warns(UserWarning, match=re.escape(message)) as caught:
         tippe.Top(**GOOD | change)
+    assert len(caught) == 1
+
+
+def test_light_tops_and_those_in_units_of_their_own_are_not_suspected():
+    # A table-tennis ball, and a top with unit mass and unit radius.
+    tippe.Top(2.7e-3, 0.02, 0.0, 7.2e-7, 7.2e-7)
+    tippe.Top(1.0, 1.0, 0.3, 0.374, 0.4)
 
 
 def test_a_suspicion_is_told_once():

@@ -10,6 +10,9 @@ c.
 """
 
 import abc
+import contextlib
+import itertools
+import re
 from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, NamedTuple
 
@@ -20,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.geometry import Component, Vector, as_function, scale, sum_vectors
-from nonholonomic.text import shown
+from nonholonomic.text import readable_unit, shown
 from nonholonomic.validation import Bound, Bounded, as_number, explaining, is_traced, require, warn
 
 
@@ -141,17 +144,80 @@ def half_ball(radius: Number, centre: Number) -> Moments:
     return volume, volume * centre + moment, axial, axial + 2.0 * moment * centre + volume * centre**2
 
 
+#: The lengths of a turned top that are assumed unless they are given: with them, tops with usual stems are of group II.
+ASSUMED = {"cut": "cut = 0.35 radius + 1.1 stem_radius", "stem_length": "stem_length 5 % beyond where the rim touches"}
+
+
+def _turned(lengths: dict[str, Any]) -> tuple[Number, ...]:
+    """Volume, offset, axial and transverse moments with density 1, and the height of the stem's end above the centre of
+    the sphere. **Arguments and errors:** as for `Top.turned`."""
+    for name, length in lengths.items():
+        if length is not None or name not in ASSUMED:
+            require(length, name, above=None if name.startswith("hole") else 0.0, at_least=0.0)
+    is_drilled = bool(lengths["hole_radius"] or lengths["hole_depth"])
+    names = ("radius", "stem_radius", "hole_radius", "hole_depth")
+    radius, stem_radius, hole_radius, hole_depth = (as_number(lengths[name]) for name in names)
+    usual_cut = 0.35 * radius + 1.1 * jnp.minimum(stem_radius, 0.45 * radius)
+    cut = usual_cut if lengths["cut"] is None else as_number(lengths["cut"])
+    require(cut, "cut", below=radius, why="the radius of the sphere")
+    rim = jnp.sqrt(radius**2 - cut**2)
+    require(stem_radius, "stem_radius", below=rim, why="the radius of the flat that the cut leaves")
+    # The height of the centre of the stem's end. On the level plane, sphere and stem touch together where cos(theta) is
+    # (stem_radius - radius) / tip; the rim touches where it is -cut / radius.
+    least_tip = radius * (radius - stem_radius) / cut
+    usual_length = 1.05 * least_tip - cut + stem_radius
+    stem_length = usual_length if lengths["stem_length"] is None else as_number(lengths["stem_length"])
+    require(stem_length, "stem_length", above=stem_radius, why="the stem ends in a half ball")
+    if is_drilled:
+        require(hole_radius, "hole_radius", above=stem_radius, why="the hole is drilled around the stem")
+        require(hole_radius, "hole_radius", below=rim, why="the radius of the flat that the cut leaves")
+        wall = cut + jnp.sqrt(radius**2 - hole_radius**2)
+        require(hole_depth, "hole_depth", above=0.0, below=wall, why="the hole must not pierce the sphere")
+    tip = cut + stem_length - stem_radius
+    reason = "else the rim of the cut touches the table before the stem; lengthen the stem, or cut less off"
+    require(stem_length, "stem_length", above=least_tip - cut + stem_radius, why=reason)
+    # Of the whole top with density 1, about the centre of the sphere.
+    bottom = cut - hole_depth
+    hole, shaft = cylinder(hole_radius, bottom, cut), cylinder(stem_radius, bottom, tip)
+    parts = (truncated_ball(radius, cut), scale(-1.0, hole), shaft, half_ball(stem_radius, tip))
+    volume, first, axial, transverse = sum_vectors(*parts)
+    offset = -first / volume
+    reason = "the centre of mass lies above the centre of the sphere: shorten the stem, or drill a hole around it"
+    require(offset, "offset", at_least=0.0, why=reason)
+    return volume, offset, axial, transverse - volume * offset**2, tip
+
+
+def _remedy(lengths: dict[str, Any], message: str) -> str:
+    """The message about lengths of which no top can be turned, with a length of three digits that would do instead of one
+    of them, if there is one."""
+    message = re.sub(r"\d+\.\d{6,}", lambda number: f"{float(number[0]):.4g}", message)
+    numbers = {name: as_number(0.0 if value is None else value) for name, value in lengths.items()}
+    if any(not isinstance(number, jax.Array) or is_traced(number) or number.ndim for number in numbers.values()):
+        return message
+    names = ("stem_length", "cut", "hole_radius", "hole_depth", "stem_radius")
+    for name in sorted(names, key=lambda name: not message.startswith(name)):
+        start = abs(float(numbers[name])) or float(numbers["radius"])
+        for power in (sign * k for k in range(50) for sign in (1, -1)):
+            number = f"{start * 1.03**power:.3g}"
+            with contextlib.suppress(ValueError):
+                _turned(lengths | {name: float(number)})
+                return f"{message}; {name} = {number} would do"
+    return message
+
+
 # The body: an eccentric sphere whose mass is symmetric about the axis through its two centres.
 
-#: Units that are often used for moments of inertia by mistake, in kg m^2.
-INERTIAS = {"kg cm^2": 1e-4, "kg mm^2": 1e-6, "g cm^2": 1e-7, "g mm^2": 1e-9}
+#: Units that are often used by mistake, in SI units.
+MASSES, LENGTHS = {"": 1.0, "in g": 1e-3}, {"": 1.0, "in mm": 1e-3, "in cm": 1e-2, "the diameter": 0.5}
+INERTIAS = {"": 1.0, "in kg cm^2": 1e-4, "in kg mm^2": 1e-6, "in g cm^2": 1e-7, "in g mm^2": 1e-9}
 
 #: Least density of the material of a turned top that is not suspicious [kg/m^3].
 LEAST_DENSITY = 50.0
-#: A mean density [kg/m^3] above that of osmium.
-GREATEST_DENSITY = 23_000.0
-#: The radius [m] above which another unit is suspected, and the plausible range of I1 / (m R^2).
-GREATEST_RADIUS = 1.0
+#: Mean densities [kg/m^3]: below that of a table-tennis ball, and above that of osmium.
+LEAST_MEAN, GREATEST_DENSITY = 80.0, 23_000.0
+#: The radius [m] above which another unit is suspected, the greatest that it may have in that unit, and the plausible
+#: range of I1 / (m R^2).
+GREATEST_RADIUS, GREATEST_TOY = 1.0, 0.1
 RATIOS = (0.1, 2.0)
 
 
@@ -227,6 +293,8 @@ class Top(AbstractBody):
     I1: Float[Array, "..."] = eqx.field(converter=as_number)
     I3: Float[Array, "..."] = eqx.field(converter=as_number)
     stem: Stem | None = None
+    #: The lengths that `turned` has assumed, as text.
+    assumed: str | None = eqx.field(static=True, default=None, init=False)
 
     @classmethod
     @explaining
@@ -236,9 +304,9 @@ class Top(AbstractBody):
         density: ArrayLike | None = None,
         *,
         mass: ArrayLike | None = None,
-        cut: ArrayLike,
+        cut: ArrayLike | None = None,
         stem_radius: ArrayLike,
-        stem_length: ArrayLike,
+        stem_length: ArrayLike | None = None,
         hole_radius: ArrayLike = 0.0,
         hole_depth: ArrayLike = 0.0,
     ) -> "Top":
@@ -255,9 +323,10 @@ class Top(AbstractBody):
         - `density`: density of the material [kg/m^3]: beech 700, acrylic 1180, aluminium 2700; or, instead, `mass`: mass
           of the whole top [kg].
         - `cut`: height of the flat above the centre of the sphere, less than `radius`; the sphere is cut off above the
-          flat.
+          flat. By default, 0.35 `radius` + 1.1 `stem_radius`, with which most tops turn over.
         - `stem_radius`: radius of the stem, which is a cylinder that ends in a half ball.
-        - `stem_length`: length of the stem above the flat.
+        - `stem_length`: length of the stem above the flat. By default, the half ball's centre is 5 % farther from the
+          sphere's centre than it must be for the stem to touch the table before the rim. The top shows what is `assumed`.
         - `hole_radius`, `hole_depth`: a hole drilled from the flat around the stem; the stem stands on the bottom of
           the hole.
 
@@ -292,39 +361,17 @@ class Top(AbstractBody):
                 f"{min_density:g} g/cm^3 are {1e3 * min_density:g} kg/m^3"
             )
         lengths = {"radius": radius, "cut": cut, "stem_radius": stem_radius, "stem_length": stem_length}
-        for name, length in lengths.items():
-            require(length, name, above=0.0)
-        for name, length in {"hole_radius": hole_radius, "hole_depth": hole_depth}.items():
-            require(length, name, at_least=0.0)
-        is_drilled = bool(hole_radius or hole_depth)
-        radius, cut, stem_radius, stem_length = map(as_number, lengths.values())
-        hole_radius, hole_depth = as_number(hole_radius), as_number(hole_depth)
-        require(cut, "cut", below=radius, why="the radius of the sphere")
-        rim = jnp.sqrt(radius**2 - cut**2)
-        require(stem_radius, "stem_radius", below=rim, why="the radius of the flat that the cut leaves")
-        require(stem_length, "stem_length", above=stem_radius, why="the stem ends in a half ball")
-        if is_drilled:
-            require(hole_radius, "hole_radius", above=stem_radius, why="the hole is drilled around the stem")
-            require(hole_radius, "hole_radius", below=rim, why="the radius of the flat that the cut leaves")
-            wall = cut + jnp.sqrt(radius**2 - hole_radius**2)
-            require(hole_depth, "hole_depth", above=0.0, below=wall, why="the hole must not pierce the sphere")
-        # The height of the centre of the stem's end. On the level plane, sphere and stem touch together where cos(theta) is
-        # (stem_radius - radius) / tip; the rim touches where it is -cut / radius.
-        tip, least_tip = cut + stem_length - stem_radius, radius * (radius - stem_radius) / cut
-        reason = "else the rim of the cut touches the table before the stem; lengthen the stem, or cut less off"
-        require(tip, "cut + stem_length - stem_radius", above=least_tip, why=reason)
-        # Of the whole top with density 1, about the centre of the sphere.
-        bottom = cut - hole_depth
-        hole, shaft = cylinder(hole_radius, bottom, cut), cylinder(stem_radius, bottom, tip)
-        parts = (truncated_ball(radius, cut), scale(-1.0, hole), shaft, half_ball(stem_radius, tip))
-        volume, first, axial, transverse = sum_vectors(*parts)
-        offset = -first / volume
-        reason = "the centre of mass lies above the centre of the sphere: shorten the stem, or drill a hole around it"
-        require(offset, "offset", at_least=0.0, why=reason)
-        transverse = transverse - volume * offset**2
+        lengths |= {"hole_radius": hole_radius, "hole_depth": hole_depth}
+        try:
+            volume, offset, axial, transverse, tip = _turned(lengths)
+        except ValueError as error:
+            raise ValueError(_remedy(lengths, str(error))) from None
         density = as_number(density) if mass is None else as_number(mass) / volume
-        stem = Stem(stem_radius, tip + offset)
-        return cls(density * volume, radius, offset, density * transverse, density * axial, stem)
+        assumed = [text for name, text in ASSUMED.items() if lengths[name] is None]
+        stem = Stem(as_number(stem_radius), tip + offset)
+        top = cls(density * volume, radius, offset, density * transverse, density * axial, stem)
+        object.__setattr__(top, "assumed", ", ".join(assumed) or None)
+        return top
 
     def __check_init__(self):
         if self.stem is not None and not isinstance(self.stem, Stem):
@@ -363,29 +410,47 @@ class Top(AbstractBody):
         return (-self.offset * axis[0], -self.offset * axis[1], -self.offset * axis[2])
 
     def suspicion(self) -> str | None:
-        numbers = (self.mass, self.radius, self.I1)
-        if any(is_traced(number) or not isinstance(number, jax.Array) for number in numbers):
+        if is_traced(self):
             return None
-        mass, radius, I1 = (np.asarray(number, dtype=float) for number in numbers)
-        max_radius = float(np.max(radius))
-        if max_radius > GREATEST_RADIUS:
-            unit = "mm" if max_radius > 10.0 else "cm"
-            return f"radius = {max_radius:g} m is large for a top: was it in {unit}?"
-        ratios = I1 / (mass * radius**2)
-        odd_ratios = np.ravel(ratios[(ratios < RATIOS[0]) | (ratios > RATIOS[1])])
-        if odd_ratios.size:
-            ratio = float(odd_ratios[0])
-            mistakes = {f"I1 in {unit}": factor for unit, factor in INERTIAS.items()} | {"the mass in g": 1e3}
-            suspects = [mistake for mistake, factor in mistakes.items() if RATIOS[0] <= ratio * factor <= RATIOS[1]]
-            question = f"was {suspects[0]}?" if suspects else "are mass, radius and I1 in kg, m and kg m^2?"
-            return f"I1 = {ratio:.3g} m R^2 is out of the range {RATIOS} of bodies like a top: {question}"
-        if np.all(mass < GREATEST_DENSITY * 4.0 / 3.0 * np.pi * radius**3):
+        values = {name: np.asarray(getattr(self, name), dtype=float) for name in self.units}
+        mass, radius, offset, I1, _ = values.values()
+        density, ratio = mass / (4.0 / 3.0 * np.pi * radius**3), I1 / (mass * radius**2)
+
+        def fits(m: float, r: float, inertia: float, least: float, greatest: float) -> bool:
+            """Whether mass, radius and I1 times these factors are those of a top."""
+            mean, part = density * m / r**3, ratio * inertia / (m * r**2)
+            within = (mean >= least) & (mean < GREATEST_DENSITY) & (part >= RATIOS[0]) & (part <= RATIOS[1])
+            return bool(np.all(within & (r * radius <= greatest)))
+
+        # A very light sphere is legal, and suspicious only where half its radius is that of a usual top.
+        is_legal = fits(1.0, 1.0, 1.0, 0.0, GREATEST_RADIUS)
+        if is_legal and np.all(density >= LEAST_MEAN):
             return None
-        heaviest, smallest = float(np.max(mass)), float(np.min(radius))
-        return (
-            f"mass = {heaviest:g} kg in a sphere of radius {smallest:g} m is denser than any metal: was it in g? "
-            f"{heaviest:g} g are {heaviest / 1e3:g} kg"
-        )
+        # Moments of inertia in no unit were computed from the mass and the lengths.
+        options = itertools.product(MASSES, ["the diameter"] if is_legal else LENGTHS, (None, *INERTIAS))
+        for in_mass, in_length, in_inertia in sorted(options, key=lambda units: sum(map(bool, units))):
+            m, r = MASSES[in_mass], LENGTHS[in_length]
+            inertia = m * r**2 if in_inertia is None else INERTIAS[in_inertia]
+            if fits(m, r, inertia, LEAST_MEAN, GREATEST_TOY):
+                in_offset = in_length if np.any(offset >= r * radius) else ""
+                asked = dict(zip(values, (in_mass, in_length, in_offset, in_inertia, in_inertia), strict=True))
+                factors = dict(zip(values, (m, r, LENGTHS[in_offset], inertia, inertia), strict=True))
+                odd = [
+                    f"{name} = {np.max(values[name]):g} {readable_unit(self.units[name])}"
+                    for name in values
+                    if asked[name]
+                ]
+                right = [
+                    f"{name}={np.max(values[name]) * factors[name]:.4g}" for name in values if factors[name] != 1.0
+                ]
+                words = "is unusual for a top: was it" if len(odd) == 1 else "are unusual for a top: were they"
+                units = " and ".join(dict.fromkeys(filter(None, asked.values())))
+                return f"{', '.join(odd)} {words} {units}? Then {', '.join(right)}"
+        if np.any(radius > GREATEST_RADIUS):
+            unit = "mm" if np.max(radius) > 10.0 else "cm"
+            return f"radius = {np.max(radius):g} m is large for a top: was it in {unit}?"
+        question = f"I1 = {np.max(ratio):.3g} m R^2 is unusual for a top: are mass, radius and I1 in kg, m and kg m^2?"
+        return None if is_legal else question
 
 
 # Bodies of revolution other than spheres: the spheroid, and any convex body that a support function describes.

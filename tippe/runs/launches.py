@@ -133,23 +133,10 @@ def require_rigid(scene: Scene) -> None:
 UNITS = Top.units | Scene.units | Launch.units
 
 #: Descriptions of the axes.
-LONG_NAMES = {
-    "theta": "θ(0)",
-    "eta": "η(0)",
-    "azimuth": "φ(0)",
-    "spin": "spin ω₃(0)",
-    "mu": "friction μ",
-    "mass": "mass m",
-    "radius": "radius",
-    "offset": "offset a",
-    "equatorial": "equatorial half axis b",
-    "polar": "polar half axis p",
-    "I1": "moment of inertia I₁",
-    "I3": "moment of inertia I₃",
-    "gravity": "gravity g",
-    "slip_speed": "slip speed",
-    "restitution": "restitution e_N",
-}
+LONG_NAMES = {"theta": "θ(0)", "eta": "η(0)", "azimuth": "φ(0)", "spin": "spin ω₃(0)", "mu": "friction μ"}
+LONG_NAMES |= {"mass": "mass m", "radius": "radius", "offset": "offset a", "equatorial": "equatorial half axis b"}
+LONG_NAMES |= {"polar": "polar half axis p", "I1": "moment of inertia I₁", "I3": "moment of inertia I₃"}
+LONG_NAMES |= {"gravity": "gravity g", "slip_speed": "slip speed", "restitution": "restitution e_N"}
 
 #: The parts of a launch that consist of several numbers: the name of an axis along each number, and its unit.
 SEVERAL = {
