@@ -106,6 +106,7 @@ class Plan(eqx.Module):
             *([f"  clearance  {self.clearance:.3g} m from {obstacles}"] if count else []),
             *(f"  {name:9s}  margin {margin:.3g} {units[name]}".rstrip() for name, margin in self.margins.items()),
             f"  effort     {self.effort:.4g} N² s",
+            f"  grip       {self.run.grip_in_words}",
             f"  tried      {len(self.candidates)} candidates",
             *(f"  hindrance  {words}" for words in self.hindrances),
         ]

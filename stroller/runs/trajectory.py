@@ -450,14 +450,16 @@ class Trajectory(AbstractRun):
         return coefficient * jnp.maximum(self.load, 0.0) - jnp.abs(self.side_force)
 
     @property
-    def _grip_line(self) -> str:
-        """The greatest friction coefficient that each axle needs, and the axle that slips if tyres cannot provide
-        it."""
+    def grip_in_words(self) -> str:
+        """The greatest friction coefficient that each axle needs, the axle that slips if tyres cannot provide it, and the
+        side force of a wheel without load."""
         grip_needed = dict(zip(self.loaded_axles, np.max(np.asarray(self.grip()), axis=0), strict=False))
         text = " and ".join(f"{grip:.3g} under the {name} axle" for name, grip in grip_needed.items())
         slips = " and ".join(name for name, grip in grip_needed.items() if grip > MOST_GRIP)
         remark = f": the {slips} wheels would slip, because tyres provide at most {MOST_GRIP:g}" if slips else ""
-        return f"needs a friction coefficient of {text}{remark}"
+        force = float(np.max(np.abs(self.side_force[:, 1]))) * (len(grip_needed) == 1)
+        side = f"; the front wheel carries no load, and a side force of up to {force:.3g} N" if force > 0.0 else ""
+        return f"needs a friction coefficient of {text}{remark}{side}"
 
     def at(self, times: Float[ArrayLike, " times"]) -> "Trajectory":
         """The same ride at other times, as accurate as the integration.
@@ -551,7 +553,7 @@ class Trajectory(AbstractRun):
             f"work {float(self.work[-1]):.6g} J, residual {float(jnp.max(jnp.abs(self.energy_residual))):.1e} J",
             f"  normal force    {float(jnp.min(self.normal_force)):.6g} N to {float(jnp.max(self.normal_force)):.6g} N",
             f"  side forces     up to {shown(jnp.max(jnp.abs(self.side_force), axis=0))} N, rear and front",
-            f"  grip            {self._grip_line}",
+            f"  grip            {self.grip_in_words}",
             f"  no-slip         {float(jnp.max(jnp.abs(self.constraint))):.1e} m/s",
         ]
         error = float(jnp.max(self.wheelbase_error))

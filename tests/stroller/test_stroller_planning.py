@@ -131,6 +131,13 @@ def test_a_plan_shows_what_it_achieves(parked, tmp_path):
     lines = str(plan).splitlines()
     assert lines[0] == "Plan of 12 s: reaches the goal"
     assert any(line.startswith("  speed      margin 0.") for line in lines)
+    # As the run says; the centre of mass is above the rear axle.
+    grip, force = np.max(plan.run.grip()[:, 0]), np.max(np.abs(plan.run.side_force[:, 1]))
+    words = (
+        f"needs a friction coefficient of {grip:.3g} under the rear axle; the front wheel carries no load, and a side"
+    )
+    assert f"  grip       {words} force of up to {force:.3g} N" in lines
+    assert words in str(plan.run)
     figure = plan.plot()
     assert [line.get_label() for line in figure.axes[1].lines] == ["speed [m/s]", "steering angle [rad]"]
     speed, steering = plan.plot(unit=("deg", "km/h")).axes[1].lines
