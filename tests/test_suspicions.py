@@ -83,6 +83,19 @@ SUSPECTED = {
         lambda: tippe.inversion_table(tippe.Scene(rutstam_top()), theta=[0.1], spin=155.0, t1=1.0),
         "friction = Frictionless(): without friction no top turns over",
     ),
+    "turns a second": (
+        lambda: tippe.inversion_time(TOP, tippe.Launch(0.1, -20.0), 1.0),
+        "spin = 20 rad/s is slow: this top needs about 76.9 rad/s to turn over; was it in turns a second? "
+        "20 turns a second are 125.7 rad/s",
+    ),
+    "turns a second in a table": (
+        lambda: tippe.inversion_table(TOP, theta=[0.1, 0.2], spin=[15.0, 20.0], t1=1.0),
+        "spin = 20 rad/s is slow: this top needs about 76.9 rad/s to turn over; was it in turns a second?",
+    ),
+    "turns a second of a top with a stem": (
+        lambda: tippe.inversion_table(tippe.presets.classroom(), theta=0.1, spin=20.0, t1=1.0),
+        "spin = 20 rad/s is slow: this top needs about 34 rad/s to turn over; was it in turns a second?",
+    ),
     "exactly upright": (
         lambda: tippe.inversion_time(TOP, tippe.Launch(0.0, 155.0), 1.0),
         "theta = 0.0 is exactly upright, where a top stays forever",
@@ -139,11 +152,19 @@ def test_python_shows_a_warning_once_for_a_line():
     assert [warning.filename for warning in caught] == [__file__] * 2
 
 
+@pytest.mark.filterwarnings("error")
 def test_what_is_usual_is_not_suspected(nothing_runs):
     tippe.Launch(0.1, [-900.0, 900.0])
     tippe.Scene(rutstam_top(), tippe.Cylinder(10.0))
     stroller.Launch((0.0, 0.0), 6.2, 1.0, steering=-1.5)
     assert tippe.inversion_time(TOP, LAUNCH, 1.0) == jnp.inf
+    # So slow that no top turns over by as many turns a second, fast for turns a second, and among faster ones.
+    for spin in (5.0, 60.0):
+        tippe.inversion_time(TOP, tippe.Launch(0.1, spin), 1.0)
+    tippe.inversion_table(TOP, theta=0.1, spin=[20.0, 155.0], t1=1.0)
+    # A top of group I turns over at no spin.
+    upright = tippe.Scene(tippe.Top(0.02, 0.02, 0.002, 2.1e-6, 3.2e-6), friction=tippe.Viscous(0.3))
+    tippe.inversion_time(upright, tippe.Launch(0.1, 20.0), 1.0)
     # A push tips it.
     tippe.inversion_time(TOP, tippe.Launch(0.0, 155.0, velocity=(0.1, 0.0)), 1.0)
 

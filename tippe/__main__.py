@@ -53,7 +53,7 @@ ARENAS = ("plane", "cylinder")
 SAMPLES, SHOWN = 2048, 5.0
 
 #: The page's title, and the placeholder for the contents below the top.
-TITLE, BELOW = "A tippe top climbs onto its stem", "<!-- below -->"
+TITLE, BELOW = "A tippe top on a table", "<!-- below -->"
 
 Times = Float[np.ndarray, " times"]
 
@@ -66,8 +66,8 @@ def parser() -> argparse.ArgumentParser:
     command = argparse.ArgumentParser(
         prog="python -m tippe",
         description="A tippe top turns over, through flights and onto its stem. Computes inversion times over the inclination "
-        "and the friction, on a table and in a cylinder. Writes HDF5 tables, a picture, and a page on which the top climbs "
-        "onto its stem. `python -m tippe --paper --help` describes the tables of the papers.",
+        "and the friction, on a table and in a cylinder. Writes HDF5 tables, a picture, and a page on which the top "
+        "moves. `python -m tippe --paper --help` describes the tables of the papers.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     command.add_argument("--version", action="version", version=f"nonholonomic {__version__}")
@@ -256,10 +256,10 @@ def picture(options: argparse.Namespace, times: Times, theta: Times, plane: Tabl
         index = np.searchsorted(times, end)
         times, theta = np.insert(times, index, end), np.insert(theta, index, max(angle, np.interp(end, times, theta)))
     panel = Panel(title, times, theta[None], theta[:1], np.array([end if end <= times[-1] else np.inf]))
-    dot = "is the first time above the dashed angle."
+    dot = "The dot is the first time above the dashed angle."
     if TOPS[options.top]().stem is not None:
-        dot = "is the time at which the stem first carries the top. On the dashed line, sphere and stem touch together."
-    return draw_launches([panel], angle, f"The dot {dot}")
+        dot = "The dot is the time at which the stem first carries the top. On the dashed line, sphere and stem touch together."
+    return draw_launches([panel], angle, dot if end <= times[-1] else f"Not turned over by {times[-1]:g} s.")
 
 
 def write(options: argparse.Namespace) -> Outputs:
@@ -282,17 +282,18 @@ def write(options: argparse.Namespace) -> Outputs:
         cells, total = sum(map(saved_cells, paths.values())), len(ARENAS) * len(options.theta) * len(options.mu)
         words = f"saved {cells} of {total} cells to {options.out}; run the same command again to resume"
         raise KeyboardInterrupt(words) from None
-    print(f"\n{remark(options)}", flush=True)
+    turned_over = np.concatenate([table.status.ravel() for table in tables.values()]) == "inverted"
+    claim = f"{turned_over.sum()} of {turned_over.size} tops have turned over within {options.t1:g} s."
+    print(f"\n{claim} {remark(options)}", flush=True)
     sections = ""
     for arena, heading in headings(options).items():
         rows = table_as_html(rows_of(options, tables[arena]), 1)
         sections += f"<h2>Time until it has turned over, {heading}</h2>{rows}"
-    sections += "".join(f'<p class="note">{escape(line)}</p>' for line in (remark(options), *described(options)))
+    sections += "".join(f'<p class="note">{escape(line)}</p>' for line in (claim, remark(options), *described(options)))
     sections += "".join(f"<h2>θ(t)</h2>{picture_as_html(path)}" for path in pictures)
     path = options.out / "index.html"
     Page((live or page_of_job(list, TITLE, 1.0, BELOW).html).replace(BELOW, sections)).save(path)
-    cells = sum(table.status.size for table in tables.values())
-    return Outputs(cells, [*paths.values(), *pictures], path, cache if read else None)
+    return Outputs(turned_over.size, [*paths.values(), *pictures], path, cache if read else None)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -306,7 +307,7 @@ def main(arguments: list[str] | None = None) -> int:
     if "--paper" in arguments:
         return paper.main([word for word in arguments if word != "--paper"])
     options = parser().parse_args(arguments)
-    return run_job(lambda: write(options), "tippe", "To see the top climb onto its stem")
+    return run_job(lambda: write(options), "tippe", "To see the top move")
 
 
 if __name__ == "__main__":

@@ -308,14 +308,8 @@ def _simplified(name: str, operands: Sequence[Element]) -> Element | None:
 
 
 #: Operations that are applied to constants immediately.
-ARITHMETIC = {
-    "add": operator.add,
-    "add_any": operator.add,
-    "sub": operator.sub,
-    "mul": operator.mul,
-    "div": operator.truediv,
-    "neg": operator.neg,
-}
+ARITHMETIC = {"add": operator.add, "add_any": operator.add, "sub": operator.sub, "mul": operator.mul}
+ARITHMETIC |= {"div": operator.truediv, "neg": operator.neg}
 
 #: Operations on pairs of elements, which make up the sums, products and extremes of arrays.
 FUNCTIONS = {"add": jax.lax.add, "mul": jax.lax.mul, "max": jax.lax.max, "min": jax.lax.min}

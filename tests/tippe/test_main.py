@@ -59,7 +59,8 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys, monkeypatch, rut
         "A wooden top: 17.8 g, 40 mm across, a stem 10 mm thick, its centre of mass 1.77 mm below"
     )
     assert "I1 / I3 = 0.952 lies between 1 - a / R = 0.911 and 1 + a / R = 1.089, so it can turn over." in printed
-    assert printed.rstrip().endswith(f"To see the top climb onto its stem, open {tmp_path / 'index.html'}")
+    assert printed.rstrip().endswith(f"To see the top move, open {tmp_path / 'index.html'}")
+    assert "4 of 8 tops have turned over within 8 s." in printed
     rows = [line.split() for line in printed.splitlines() if line.strip().startswith("18 deg")]
     run = tippe.simulate(rutstam_scene, tippe.Launch.degrees(18, 1480), 8.0)
     first = run.t[np.argmax(np.asarray(run.theta) > 0.95 * np.pi)]
@@ -69,8 +70,9 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys, monkeypatch, rut
         assert data["time"].dims == ("theta", "mu")
     page = (tmp_path / "index.html").read_text()
     assert "<td>18 deg</td>" in page
+    assert "4 of 8 tops have turned over within 8 s." in page
     assert "window.live" in page
-    assert "A tippe top climbs onto its stem" in page
+    assert "A tippe top on a table" in page
     assert "data:image/png" in page
     # The same again, without three.js: the tables are read, and the page says what is missing.
     monkeypatch.setattr(importlib.import_module("nonholonomic.views.page"), "can_view", lambda: False)
@@ -207,3 +209,7 @@ def test_the_picture_of_one_launch_states_its_angle_and_fits_a_phone():
     assert figure.axes[0].get_title() == "wooden top, 1900 rpm, θ(0) = 12°, mu = 0.3, on a table"
     assert figure.axes[0].get_legend() is None
     assert figure.get_figwidth() <= 8.0
+    assert figure.get_suptitle().startswith("The dot is the time at which the stem first carries the top.")
+    # Without a dot, nothing is said of one.
+    plane.variables["time"][:] = np.inf
+    assert job.picture(options, times, 0.2 + 0.0 * times, plane).get_suptitle() == "Not turned over by 5 s."

@@ -46,6 +46,9 @@ def angle_of(scene: Scene, angle: Any) -> Float[Array, "..."]:
     return scene.body.stem_angle if isinstance(event, StemContact) else event
 
 
+#: The most turns a second by hand: greater spins are not taken for turns a second.
+MOST_TURNS = 50.0
+
 #: Advice in messages about lists, where a table is the better choice.
 LISTS = "inversion_table takes lists, and jax.vmap maps over them"
 
@@ -60,11 +63,12 @@ def check_run(scene: Any, launch: Any, t1: Number, tolerance: Number, lists: str
     scene.check_start(launch)
 
 
-def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, angle: Any) -> None:
-    """Warn if the scene has no friction, or if the top stands exactly upright on a level plane or is inverted already.
+def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, spin: object, angle: Any) -> None:
+    """Warn if the scene has no friction, if the top stands exactly upright on a level plane or is inverted already, or if
+    it is too slow to turn over, and would not be if its spin were in turns a second.
 
-    **Arguments:** `launch`: its theta is ignored; `theta`: one angle or several [rad]; `angle`: the angle to be
-    reached, or `None` (see `event_of`).
+    **Arguments:** `launch`: its theta and its spin are ignored; `theta`: one angle or several [rad]; `spin`: one or
+    several [rad/s]; `angle`: the angle to be reached, or `None` (see `event_of`).
     """
     if isinstance(scene.friction, Frictionless):
         warn(
@@ -85,6 +89,18 @@ def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, angle: An
     at_rest = launch.velocity is None and launch.angular_velocity is None
     if scene.level and at_rest and np.any(np.asarray(theta) == 0.0):
         warn("theta = 0.0 is exactly upright, where a top stays forever: launch it at a small angle, such as 0.01 rad")
+    if not isinstance(scene.body, Top) or not at_rest or is_traced((scene, spin)):
+        return
+    # The spin of which Jellett's constant is that of the tumbling top at the angle (`steady.tumbling`).
+    body, fastest = scene.body, float(np.max(np.abs(np.asarray(spin))))
+    mass, R, a, I1, I3 = (float(getattr(body, name)) for name in body.units)
+    end, start = (float(np.cos(np.min(inclination))) for inclination in (limit, theta))
+    if abs(I1 - I3) * R < I3 * a and start * R > a and fastest <= MOST_TURNS:
+        precession = math.sqrt(mass * float(scene.gravity) * a / (I3 * (a / R - end) + I1 * end))
+        slowest = R * (I1 * (1.0 - end**2) + I3 * (end - a / R) ** 2) * precession / (I3 * (R * start - a))
+        if fastest < slowest < 2.0 * math.pi * fastest:
+            advice = f"was it in turns a second? {fastest:g} turns a second are {2.0 * math.pi * fastest:.4g} rad/s"
+            warn(f"spin = {fastest:g} rad/s is slow: this top needs about {slowest:.3g} rad/s to turn over; {advice}")
 
 
 def check_smooth(scene: Scene, caller: str) -> None:

@@ -263,8 +263,8 @@ def event_table(
         request: dict[str, object] = {"event": "reversal"}
     else:
         on_stem = isinstance(angle, StemContact)
-        theta = axis_values.get("launch.theta", roots["launch"].theta)
-        warn_if_it_cannot_invert(scene, roots["launch"], theta, None if on_stem else float(angle))
+        theta, spin = (axis_values.get(f"launch.{name}", getattr(roots["launch"], name)) for name in ("theta", "spin"))
+        warn_if_it_cannot_invert(scene, roots["launch"], theta, spin, None if on_stem else float(angle))
         request = {"event": "contact of the stem"} if on_stem else {"angle": float(angle)}
     request |= {"t1": float(t1), "crossing": crossing, "method": method}
     shorts = [name.rsplit(".", 1)[-1] for name in names]
@@ -483,7 +483,7 @@ def inversion_time(
     """
     check_run(scene, launch, t1, tolerance)
     check_event(angle, crossing)
-    warn_if_it_cannot_invert(scene, launch, launch.theta, angle)
+    warn_if_it_cannot_invert(scene, launch, launch.theta, launch.spin, angle)
     model = TopModel.timed(scene, launch, event_of(scene, angle))
     return first_or_last_time(model, t1, crossing, settings_for_lanes(tolerance, solver))
 
