@@ -197,10 +197,11 @@ def parked(options: argparse.Namespace) -> Plan:
 def stages(parking: Plan, rides: dict[Name, Trajectory]) -> list[Stage]:
     """The stages of the page: the plan, and each ground with its rides."""
     groups: dict[str, list[tuple[int, Trajectory]]] = {}
-    for number, ((ground, _), run) in enumerate(rides.items()):
+    # The plan has the first colour.
+    for number, ((ground, _), run) in enumerate(rides.items(), 1):
         groups.setdefault(ground, []).append((number, run))
     # The title of the stage names the ground of both rides; the name of each ride is beside it.
-    rides_by_ground = zip(groups, grouped(list(groups.values()), [ride for _, ride in rides]), strict=True)
+    rides_by_ground = zip(groups, grouped(list(groups.values()), ["", *(ride for _, ride in rides)]), strict=True)
     return [planned_stage(parking), *(stage._replace(title=ground) for ground, stage in rides_by_ground)]
 
 

@@ -9,6 +9,7 @@ import base64
 import html
 import json
 import os
+import re
 import sys
 import time
 import zlib
@@ -93,10 +94,8 @@ def page(
     parts = {"TITLE": html.escape(title), "HEIGHT": str(height), "ABOVE": above, "BELOW": below, "VIEW": ""}
     if stages:
         parts["VIEW"] = "\n".join([_view(stages, speed, autoplay), *scripts])
-    page = template("page.html")
-    for name, text in parts.items():
-        page = page.replace(f"[{name}]", text)
-    return Page(page)
+    # In one pass: a title may contain the mark of another part.
+    return Page(re.sub(r"\[([A-Z]+)\]", lambda mark: parts[mark[1]], template("page.html")))
 
 
 def table_as_html(rows: list[list[str]], heads: int) -> str:
@@ -111,7 +110,7 @@ def table_as_html(rows: list[list[str]], heads: int) -> str:
 def picture_as_html(path: Path) -> str:
     """A PNG file as an HTML image with embedded data."""
     coded = base64.b64encode(path.read_bytes()).decode()
-    return f'<img style="max-width:100%" alt="" src="data:image/png;base64,{coded}">'
+    return f'<div class="wide"><img alt="" src="data:image/png;base64,{coded}"></div>'
 
 
 def script(text: str, attributes: str = "") -> str:

@@ -56,7 +56,9 @@ window.views = window.views || {};
     constructor(root, facts, stages, THREE) {
       Object.assign(this, { facts, root, listeners: [], now: 0, running: false, before: null, turn: false, filming: false });
       const { element } = views, boxes = element("div", root, { id: "stages" });
-      boxes.classList.toggle("several", stages.length > 1);
+      // The legend of the curves tells runs of equal names on several stages apart.
+      const names = stages.flatMap((fact) => fact.runs.map((run) => run.name)), once = (name) => names.indexOf(name) === names.lastIndexOf(name);
+      for (const { title, runs } of stages) for (const run of runs) run.legend = once(run.name) ? run.name : `${title}, ${run.name}`;
       this.stages = stages.map((fact) => this.figure(element("figure", boxes), fact, THREE));
       this.bar(element("div", root, { id: "controls" }));
       const strips = element("div", root, { id: "strips" });
@@ -295,7 +297,15 @@ window.views = window.views || {};
 
   views.ready = (async () => {
     const facts = JSON.parse(text("facts")), [unpack, THREE] = await Promise.all([arrays(), library()]);
-    const player = new Player(document.getElementById("view"), facts, facts.stages.map((stage) => unpacked(stage, unpack)), THREE);
+    const root = document.getElementById("view");
+    let player = null;
+    try {
+      player = new Player(root, facts, facts.stages.map((stage) => unpacked(stage, unpack)), THREE);
+    } catch (error) {
+      root.replaceChildren();
+      views.element("p", root, { className: "warning", textContent: `This view needs WebGL, which the browser does not provide (${error.message}). Open the page in another browser, or switch on hardware acceleration.` });
+      return null;
+    }
     if (facts.autoplay) player.autoplay();
     const handle = {
       seek: (time) => { player.touched = true; player.seek(time); },

@@ -155,7 +155,8 @@ window.views = window.views || {};
       if (through) part(new THREE.SphereGeometry(1.8 * width, 20, 14));
       scene.add(group);
       const label = element("span", this.labels, { className: "force" });
-      label.style.color = colour;
+      // Dark enough to be read on the ground.
+      label.style.color = new THREE.Color(colour).multiplyScalar(0.5).getStyle();
       return { group, shaft, tip, head, unit, scale, limit: limit ?? Infinity, label, shown, size: 0 };
     }
 
@@ -276,14 +277,23 @@ window.views = window.views || {};
         const at = point.clone().project(camera);
         return [((at.x + 1) / 2) * width, ((1 - at.y) / 2) * height, at.z < 1 && Math.abs(at.x) < 1 && Math.abs(at.y) < 1];
       };
-      const put = (label, [x, y, seen], lift) => {
+      const taken = [];
+      // A label that would overlap another one moves up.
+      const put = (label, [x, below, seen], lift) => {
         label.style.display = seen ? "" : "none";
-        label.style.transform = `translate(${x.toFixed(1)}px, ${(y - lift).toFixed(1)}px)`;
+        if (!seen) return;
+        const wide = 7 * label.textContent.length + 12;
+        let y = below - lift;
+        for (const other of taken.sort((a, b) => b.y - a.y)) {
+          if (x < other.x + other.wide && other.x < x + wide && Math.abs(y - other.y) < 19) y = other.y - 19;
+        }
+        taken.push({ x, y, wide });
+        label.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px)`;
       };
       this.runs.forEach((run, k) => {
         if (run.name) {
           const over = new THREE.Vector3(...run.normal).multiplyScalar(1.7 * this.size).add(run.bodies[0].position);
-          put(run.name, onScreen(over), 18 + 22 * k);
+          put(run.name, onScreen(over), 18);
         }
         for (const arrow of run.arrows) {
           if (arrow.unit !== "N" || !arrow.group.visible || k > 0) { arrow.label.style.display = "none"; continue; }

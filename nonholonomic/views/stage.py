@@ -138,8 +138,9 @@ def curves_in(stages: list[Stage], unit: Unit) -> list[Stage]:
     return [stage._replace(shows=tuple(map(drawn, stage.shows))) for stage in stages]
 
 
-#: Colours of a page's runs, for the curves and one half of the body; arrows have other colours.
-COLOURS = (0xC8412B, 0x2A6FB0, 0x2E8B57, 0x8C5A3C, 0xD0679D, 0x3B9AA8)
+#: Colours of a page's runs, for the curves, their numbers and one half of the body, with a contrast of 4.5 to 1 on white and to
+#: white on them; arrows have other colours.
+COLOURS = (0xC8412B, 0x2A6FB0, 0x28794C, 0x8C5A3C, 0xB8437F, 0x2A7A87)
 
 #: Colour of the other half of the body.
 PALE = 0xF4E9D2

@@ -31,7 +31,7 @@ window.views = window.views || {};
       Object.assign(this, { runs, seek, now: 0, pointed: null });
       if (runs().length > 1) {
         const legend = views.element("div", parent, { className: "names" });
-        for (const run of runs()) views.element("span", legend, { textContent: run.name }).style.color = run.colour;
+        for (const run of runs()) views.element("span", legend, { textContent: run.legend ?? run.name }).style.color = run.colour;
       }
       const labels = [...new Set(runs().flatMap((run) => run.curves.map((curve) => curve.label)))];
       this.strips = labels.map((label) => {
@@ -51,7 +51,7 @@ window.views = window.views || {};
         return strip;
       });
       this.refresh();
-      new ResizeObserver(() => { this.strips.forEach((strip) => { strip.pale = null; }); this.draw(this.now); }).observe(parent);
+      new ResizeObserver(() => { this.strips.forEach((strip) => { strip.ahead = null; }); this.draw(this.now); }).observe(parent);
     }
     // Read the runs again after their values or times have changed.
     refresh() {
@@ -70,7 +70,7 @@ window.views = window.views || {};
         // Label the round-off of a body at the ground as 0.
         const rounded = (end) => Math.abs(end) < 1e-8 * (high - low) ? 0 : end;
         [low, high] = [rounded(low), rounded(high)];
-        Object.assign(strip, { low, high, pale: null });
+        Object.assign(strip, { low, high, ahead: null });
       }
     }
     paint(strip) {
@@ -80,9 +80,9 @@ window.views = window.views || {};
       const [x0, x1, y0, y1] = [LEFT * ratio, width - 4 * ratio, height - FOOT * ratio, 6 * ratio];
       const x = (t) => x0 + (t / this.duration) * (x1 - x0);
       const y = (v) => y0 + ((v - strip.low) / (strip.high - strip.low)) * (y1 - y0);
-      const drawn = (alpha, thick) => {
+      const drawn = (thick) => {
         const layer = Object.assign(document.createElement("canvas"), { width, height }), pen = layer.getContext("2d");
-        Object.assign(pen, { globalAlpha: alpha, lineWidth: thick * ratio, lineJoin: "round" });
+        Object.assign(pen, { lineWidth: thick * ratio, lineJoin: "round" });
         for (const curve of strip.curves) {
           pen.strokeStyle = curve.colour; pen.beginPath();
           let down = false;
@@ -95,14 +95,14 @@ window.views = window.views || {};
         }
         return layer;
       };
-      Object.assign(strip, { x, y, x0, x1, y0, y1, ratio, pale: drawn(0.28, 1), strong: drawn(1, 1.5) });
+      Object.assign(strip, { x, y, x0, x1, y0, y1, ratio, ahead: drawn(0.8), passed: drawn(2.2) });
     }
     draw(time) {
       this.now = time;
       for (const strip of this.strips) this.drawOne(strip, time);
     }
     drawOne(strip, time) {
-      if (!strip.pale) this.paint(strip);
+      if (!strip.ahead) this.paint(strip);
       const { canvas, x0, x1, y0, y1, ratio } = strip, pen = canvas.getContext("2d"), now = strip.x(time);
       pen.clearRect(0, 0, canvas.width, canvas.height);
       Object.assign(pen, { fillStyle: "#6b7280", font: `${11 * ratio}px system-ui, sans-serif`, textAlign: "right" });
@@ -110,8 +110,8 @@ window.views = window.views || {};
       pen.fillText(digits(strip.low), x0 - 6 * ratio, y0);
       Object.assign(pen, { strokeStyle: "#dde1e6", lineWidth: ratio });
       pen.strokeRect(x0, y1, x1 - x0, y0 - y1);
-      pen.drawImage(strip.pale, 0, 0);
-      pen.save(); pen.beginPath(); pen.rect(0, 0, now, canvas.height); pen.clip(); pen.drawImage(strip.strong, 0, 0); pen.restore();
+      pen.drawImage(strip.ahead, 0, 0);
+      pen.save(); pen.beginPath(); pen.rect(0, 0, now, canvas.height); pen.clip(); pen.drawImage(strip.passed, 0, 0); pen.restore();
       const upright = (at, dashes) => {
         pen.strokeStyle = "#23262b"; pen.setLineDash(dashes); pen.beginPath(); pen.moveTo(at, y0); pen.lineTo(at, y1); pen.stroke(); pen.setLineDash([]);
       };

@@ -305,8 +305,9 @@ def planned_stage(plan: Plan) -> Stage:
     low = np.concatenate([np.asarray(own), np.full((4, 1), -0.17 * length)], axis=1)
     edge = bars(low, np.roll(low, -1, axis=0), 1.5 * THIN * length, DARK)
     footprint = Body("footprint", vehicle.position, vehicle.orientation, (edge,))
-    title = f"plan of {plan.t1:.3g} s: {'reaches the goal' if plan.reached else 'does not reach the goal'}"
-    shows = (show._replace(bodies=(*show.bodies, footprint, *bodies)),)
+    name = f"plan of {plan.t1:.3g} s"
+    title = f"{name}: {'reaches the goal' if plan.reached else 'does not reach the goal'}"
+    shows = (show._replace(name=name, bodies=(*show.bodies, footprint, *bodies)),)
     return stage._replace(title=title, arena=ground, shows=shows, rise=RISE)
 
 

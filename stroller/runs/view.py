@@ -406,8 +406,8 @@ def draw_rides(grounds: dict[str, AbstractSurface], rides: dict[tuple[str, str],
 
     figure = Figure(figsize=(18.0, 4.2 * len(grounds)), layout="constrained")
     layout = figure.add_gridspec(len(grounds), 4, width_ratios=(1.5, 1.0, 1.0, 1.0))
-    # As on the page, whose curves are those of all grounds.
-    colours = {name: views.css(views.COLOURS[number % len(views.COLOURS)]) for number, name in enumerate(rides)}
+    # As on the page, whose curves are those of all grounds, after that of a plan.
+    colours = {name: views.css(views.COLOURS[number % len(views.COLOURS)]) for number, name in enumerate(rides, 1)}
     for row, (name, ground) in enumerate(grounds.items()):
         on_ground = {ride: run for (place_name, ride), run in rides.items() if place_name == name}
         space = figure.add_subplot(layout[row, 0], projection="3d")

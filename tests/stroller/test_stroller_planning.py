@@ -16,6 +16,7 @@ from shortest_paths import dubins, reeds_shepp
 
 import nonholonomic
 import stroller
+from stroller import __main__ as job
 from stroller.planning import planner as planner_module
 from stroller.planning.planner import proposed
 from stroller.planning.problem import Obstacles, checked_problem, disc_distance, separation, signed_distance
@@ -147,6 +148,14 @@ def test_a_plan_shows_what_it_achieves(parked, tmp_path):
     assert "steering angle [deg]" in page.html
     assert (tmp_path / "plan.html").read_text() == page.html
     assert all(f'"{name}"' in page.html for name in ("obstacles", "candidates", "footprint", "goal"))
+
+
+def test_a_plan_and_rides_on_one_page_have_colours_of_their_own(parked):
+    _, _, plan = parked
+    rides = {("plane", name): plan.run for name in ("without friction", "with friction")}
+    colours = [show.colour for stage in job.stages(plan, rides) for show in stage.shows]
+    assert len(set(colours)) == 3
+    assert [show.name for show in job.stages(plan, rides)[0].shows] == ["plan of 12 s"]
 
 
 def test_a_goal_without_a_heading_is_drawn_as_a_cross(parked):

@@ -336,9 +336,30 @@ def test_keys_play_and_reset(browser, page):
     wait(browser, "return !player.playing()")
     body.send_keys("r")
     wait(browser, "return live.values()[0] === 0.1")
+    # A menu with the focus takes the letter itself.
+    browser.execute_script("live.set([0.4, 100])")
+    browser.find_element("id", "across").send_keys("r")
+    assert browser.execute_script("return live.values()") == [0.4, 100.0]
+    body.send_keys("r")
     slider = browser.find_element("css selector", "input[name=theta]")
     slider.send_keys(Keys.ARROW_RIGHT)
     assert browser.execute_script("return live.values()[0]") == pytest.approx(0.1 + 0.45 / 1000, abs=0.45 / 1000)
+
+
+def test_labels_are_text(browser, page):
+    """A quantity may be called what HTML would read as a mark."""
+    reset(browser)
+    texts = browser.execute_script(
+        "const { answer, summaries } = live.facts, kept = [answer.label, summaries[0].label];"
+        "answer.label = 'time <b>t</b>'; summaries[0].label = '<i>q</i>';"
+        "live.simulate(300); live.map.update(live.values(), true);"
+        "const texts = ['result', 'legend'].map((id) => document.getElementById(id));"
+        "const marks = texts.map((one) => one.querySelectorAll('b').length), words = texts.map((one) => one.textContent);"
+        "[answer.label, summaries[0].label] = kept; live.simulate(300); return [marks, words]"
+    )
+    assert texts[0] == [0, 0]
+    assert "time <b>t</b>" in texts[1][0]
+    assert "<i>q</i>" in texts[1][0]
 
 
 def test_numbers_that_do_not_fit_together_are_refused_in_the_page(browser, rutstam_scene):

@@ -52,15 +52,19 @@
 
   function tell(outcome, run, took) {
     const [status, found] = outcome, word = (words[status] || "illegal").replace(/_/g, " ");
-    const rows = facts.summaries.map(({ label, unit, curve }) => {
+    result.replaceChildren();
+    element("span", result, { textContent: facts.answer.label });
+    element("strong", result, { textContent: Number.isFinite(found) ? `${digits(found)} ${facts.answer.unit}` : word });
+    element("span", result, { className: "word", textContent: Number.isFinite(found) ? word : "\u00a0" });
+    const list = element("dl", result), entry = (kind, ...texts) => element(kind, list).append(...texts);
+    for (const { label, unit, curve } of facts.summaries) {
       const all = run.curves[curve].values, [begin, end] = [all[0], all[all.length - 1]];
       const drift = Math.max(...all.map((one) => Math.abs(one - begin))) / Math.abs(begin);
-      if (drift < 1e-5) return `<dt>${label}</dt><dd>${digits(begin)} ${unit}</dd><dt></dt><dd>constant to ${drift.toExponential(0)}</dd>`;
-      return `<dt>${label}</dt><dd><span>${digits(begin)} →</span> <span>${digits(end)} ${unit}</span></dd>`;
-    });
-    const big = Number.isFinite(found) ? `${digits(found)} ${facts.answer.unit}` : word;
-    result.innerHTML = `<span>${facts.answer.label}</span><strong>${big}</strong>` +
-      `<span class="word">${Number.isFinite(found) ? word : "&nbsp;"}</span><dl>${rows.join("")}</dl>`;
+      entry("dt", label);
+      if (drift < 1e-5) { entry("dd", `${digits(begin)} ${unit}`); entry("dt"); entry("dd", `constant to ${drift.toExponential(0)}`); continue; }
+      const [from, to] = [`${digits(begin)} →`, `${digits(end)} ${unit}`].map((textContent) => Object.assign(document.createElement("span"), { textContent }));
+      entry("dd", from, " ", to);
+    }
     median = [...median, took].slice(-51);
     const middle = [...median].sort((a, b) => a - b)[median.length >> 1];
     document.getElementById("timing").textContent = `Integrated in your browser in ${middle.toFixed(1)} ms, with the equations and the method of the tables.`;
@@ -117,6 +121,8 @@
   const reset = () => set([...initial]);
   document.getElementById("reset").addEventListener("click", reset);
   document.addEventListener("keydown", (event) => {
+    // A menu and a field take letters themselves.
+    if (event.target.matches?.("select, textarea, input:not([type=range])")) return;
     if (event.key === "r" && !event.ctrlKey && !event.metaKey && !event.altKey) reset();
   });
   window.addEventListener("hashchange", () => set(fromAddress()));
@@ -124,7 +130,7 @@
   set(fromAddress());
   if (window.views) {
     player = await window.views.ready;
-    simulate(3000);
+    if (player) simulate(3000);
   }
   live.ready = true;
 })();

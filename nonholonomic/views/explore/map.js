@@ -105,16 +105,18 @@ function makeMap(box, live, integrator, choose) {
   }
   function showLegend(known, low, high) {
     if (!workers.length) return;
-    const entries = [];
+    const entry = (...parts) => { const span = document.createElement("span"); span.append(...parts); return span; };
+    legend.replaceChildren();
     if (low <= high) {
-      const shades = [0, 0.25, 0.5, 0.75, 1].map(colour).join(",");
-      entries.push(`<span>${answer.label}</span>`, `<span>${short(low)}<span class="scale" style="background:linear-gradient(90deg,${shades})"></span>${short(high)}\u00a0${answer.unit}</span>`);
+      const scale = Object.assign(document.createElement("span"), { className: "scale" }), shades = [0, 0.25, 0.5, 0.75, 1].map(colour).join(",");
+      scale.style.background = `linear-gradient(90deg,${shades})`;
+      legend.append(entry(answer.label), entry(short(low), scale, `${short(high)}\u00a0${answer.unit}`));
     }
     for (const status of new Set(known.filter((one) => !Number.isFinite(one[1])).map((one) => one[0]))) {
-      const word = words[status] || "illegal";
-      entries.push(`<span><i style="background:${colours[word] || "#fff"};border:1px solid #dde1e6"></i>${word.replace(/_/g, " ")}</span>`);
+      const word = words[status] || "illegal", box = document.createElement("i");
+      Object.assign(box.style, { background: colours[word] || "#fff", border: "1px solid #dde1e6" });
+      legend.append(entry(box, word.replace(/_/g, " ")));
     }
-    legend.innerHTML = entries.join("");
   }
 
   // Start the map again if a slider that is not one of its axes has moved.

@@ -1,5 +1,6 @@
 """The page of a run, opened in a real browser without a network, draws the bodies at their positions in the run."""
 
+import contextlib
 import time
 
 import numpy as np
@@ -8,7 +9,7 @@ from browser import complaints, needs_browser, open_browser, wait
 
 import stroller
 import tippe
-from nonholonomic.views import page
+from nonholonomic.views import COLOURS, css, page
 from nonholonomic.views.page import ANGLE
 from nonholonomic.views.stage import curves_in
 
@@ -266,3 +267,95 @@ def test_play_runs_to_the_end_and_pause_stops(browser):
     browser.execute_script("player.seek(0.95); player.play(true)")
     wait(browser, "return !player.playing()")
     assert browser.execute_script("return player.time()") == 1.0
+
+
+@contextlib.contextmanager
+def opened(driver, html, path, width=500):
+    """A page in a window of its own, of a width in pixels."""
+    first = driver.current_window_handle
+    html.save(path)
+    driver.switch_to.new_window("tab")
+    screen = {"width": width, "height": 500, "deviceScaleFactor": 1, "mobile": False}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+    try:
+        yield driver
+    finally:
+        driver.close()
+        driver.switch_to.window(first)
+
+
+def luminance(colour: str) -> float:
+    """The relative luminance of a colour, as WCAG 2 defines it."""
+    parts = [int(part) / 255.0 for part in colour.removeprefix("rgb(").removesuffix(")").split(",")]
+    linear = [part / 12.92 if part <= 0.03928 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+    return float(np.dot(linear, (0.2126, 0.7152, 0.0722)))
+
+
+def contrast(first: str, second: str) -> float:
+    low, high = sorted((luminance(first), luminance(second)))
+    return (high + 0.05) / (low + 0.05)
+
+
+def test_stages_with_equal_rides_are_told_apart(browser, stages, tmp_path):
+    """In the legend of the curves, by their titles; and three stages leave no gap in two columns."""
+    two = stages[1]._replace(shows=tuple(s._replace(name=f"ride {k}") for k, s in enumerate(stages[1].shows)))
+    parts = [stages[0], two._replace(title="plane"), two._replace(title="slope")]
+    html = page(parts, "Three stages", height=100, autoplay=False)
+    with opened(browser, html, tmp_path / "three.html", 1000):
+        browser.get((tmp_path / "three.html").as_uri())
+        wait(browser, "return !!window.player")
+        names = browser.execute_script(
+            "return [...document.querySelectorAll('.names span')].map((one) => one.textContent)"
+        )
+        assert names == [stages[0].shows[0].name, "plane, ride 0", "plane, ride 1", "slope, ride 0", "slope, ride 1"]
+        edges = browser.execute_script(
+            "return [...document.querySelectorAll('.scene, #stages')]"
+            ".map((one) => Math.round(one.getBoundingClientRect().right))"
+        )
+        assert edges[3] == edges[0]
+        assert edges[1] < edges[2] == edges[0]
+        # Forces and names are written where they hide no other one, dark enough to be read on white and on the ground.
+        labels = browser.execute_script(
+            "player.seek(0.02); return [...document.querySelectorAll('figure:last-child .labels span')]"
+            ".filter((one) => one.style.display !== 'none').map((one) => {"
+            "const { x, y, width, height } = one.getBoundingClientRect(), style = getComputedStyle(one);"
+            "return [x, y, x + width, y + height, style.color, style.backgroundColor, one.className]; })"
+        )
+        assert len(labels) > 3
+        for k, (x0, y0, x1, y1, *_) in enumerate(labels):
+            for a0, b0, a1, b1, *_ in labels[:k]:
+                assert x1 <= a0 or a1 <= x0 or y1 <= b0 + 1 or b1 <= y0 + 1
+        for *_, colour, background, kind in labels:
+            assert contrast(colour, background if kind == "name" else "rgb(217, 221, 226)") > 4.5
+
+
+def test_curves_and_their_numbers_can_be_read():
+    assert all(contrast(f"{c >> 16}, {c >> 8 & 255}, {c & 255}", "255, 255, 255") > 4.5 for c in COLOURS)
+    assert len({css(colour) for colour in COLOURS}) == 6
+
+
+def test_a_browser_without_webgl_says_so(browser, stages, tmp_path):
+    with opened(browser, page(stages, "No picture"), tmp_path / "flat.html"):
+        script = {"source": "HTMLCanvasElement.prototype.getContext = () => null"}
+        browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", script)
+        browser.get((tmp_path / "flat.html").as_uri())
+        wait(browser, "return document.getElementById('view').textContent.includes('This view needs WebGL')")
+        browser.get_log("browser")
+
+
+def test_a_page_asks_for_nothing_from_elsewhere(browser, stages, tmp_path):
+    """Whatever a title or a label contains."""
+    assert "default-src 'none'" in browser.execute_script("return document.querySelector('meta[http-equiv]').content")
+    assert (
+        browser.execute_async_script(
+            "const done = arguments[0]; fetch('https://example.org').then(() => done('loaded'), (error) => done(error.name))"
+        )
+        == "TypeError"
+    )
+    assert any("Content Security Policy" in entry["message"] for entry in browser.get_log("browser"))
+
+
+def test_a_title_may_contain_the_marks_of_the_page():
+    html = page([], "Runs of Box[VIEW] and [BELOW]", below="<p>text</p>").html
+    assert html.count("Runs of Box[VIEW] and [BELOW]") == 2
+    assert html.count("<p>text</p>") == 1
