@@ -249,6 +249,10 @@ REFUSED = {
         lambda: tippe.simulate(TOP, LAUNCH, (0, 8)),
         "t1 = (0, 8) must be one number, the end of the run [s], which starts at t = 0: did you mean t1=8?",
     ),
+    "two horizons": (
+        lambda: tippe.simulate(TOP, LAUNCH, (1.0, 8.0)),
+        "t1 must be one number, not of shape (2,); jax.vmap(simulate) takes lists",
+    ),
     "a beginning and an end of a ride": (
         lambda: stroller.simulate(PRAM, RIDE, np.array([0.0, 8.0])),
         "t1 = [0, 8] must be one number, the end of the run [s], which starts at t = 0: did you mean t1=8.0?",

@@ -554,7 +554,7 @@ def run_bounds(t1: object, tolerance: object) -> Iterator[Bound]:
     >>> [bound.name for bound in run_bounds(t1=5.0, tolerance=1e-9)]
     ['t1', 'tolerance']
     """
-    if isinstance(t1, list | tuple | np.ndarray) and np.shape(t1) == (2,):
+    if isinstance(t1, list | tuple | np.ndarray) and not is_traced(t1) and np.shape(t1) == (2,) and t1[0] == 0.0:
         end = f"the end of the run [s], which starts at t = 0: did you mean t1={shown(t1[1])}?"
         raise ValueError(f"t1 = {shown(t1)} must be one number, {end}")
     yield Bound(t1, "t1", above=0.0)
