@@ -304,7 +304,7 @@ window.views = window.views || {};
     } catch (error) {
       root.replaceChildren();
       views.element("p", root, { className: "warning", textContent: `This view needs WebGL, which the browser does not provide (${error.message}). Open the page in another browser, or switch on hardware acceleration.` });
-      return null;
+      throw error;
     }
     if (facts.autoplay) player.autoplay();
     const handle = {

@@ -129,7 +129,8 @@
   Object.assign(live, { set, map, values: () => values, simulate, asks, moves, player: () => player });
   set(fromAddress());
   if (window.views) {
-    player = await window.views.ready;
+    // Without WebGL, the sliders still compute the result.
+    player = await window.views.ready.catch(() => null);
     if (player) simulate(3000);
   }
   live.ready = true;
